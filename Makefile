@@ -1,0 +1,29 @@
+# The two commands: `make demo` and `make test`. Both make their own .venv; nothing but Python >= 3.10 and make is needed.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN     = $(VENV)/bin
+ENVIRON = OMP_WAIT_POLICY=passive
+DEMO    = $$($(BIN)/python -m threestudio_gaussiandreamer.demo)
+
+.PHONY: demo test ablations bench clean
+
+demo: $(VENV)/ready                ## train the bundled toy from a coarse prior, offline, on the CPU
+	$(ENVIRON) $(BIN)/python launch.py --config $(DEMO) --train
+
+test: $(VENV)/ready                ## the whole test suite, as CI runs it
+	$(ENVIRON) $(BIN)/python -m pytest
+
+ablations: $(VENV)/ready           ## the paper's ablations as a table, measured against a known truth
+	$(ENVIRON) $(BIN)/python benchmarks/ablations.py
+
+bench: $(VENV)/ready               ## the rasteriser's speed and memory on the benchmark scene
+	$(ENVIRON) $(BIN)/python benchmarks/bench_splatting.py
+
+$(VENV)/ready: pyproject.toml setup.py constraints.txt requirements-dev.txt $(wildcard threestudio_gaussiandreamer/splatting/native/*)
+	$(PYTHON) -c 'import sys; sys.exit("Python >= 3.10 is needed, this is " + sys.version) if sys.version_info < (3, 10) else 0'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
+	touch $@
+
+clean:
+	rm -rf $(VENV) build *.egg-info outputs
