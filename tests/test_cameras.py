@@ -1,0 +1,91 @@
+"""The conventions, checked against hand-computed geometry."""
+
+import math
+
+import pytest
+import torch
+
+from threestudio_gaussiandreamer import cameras
+from threestudio_gaussiandreamer.cameras import Orbit, OrbitRanges
+from threestudio_gaussiandreamer.streams import generator
+
+
+def view(elevation=0.0, azimuth=0.0, distance=2.0, fovy=60.0):
+    return Orbit(*(torch.tensor([v]) for v in (elevation, azimuth, distance, math.radians(fovy))))
+
+
+def project(point, orbit, height, width):
+    viewmats, Ks = cameras.to_opencv(orbit.c2w, orbit.fovy, height, width)
+    t = viewmats[0, :3, :3] @ torch.tensor(point) + viewmats[0, :3, 3]
+    pixel = Ks[0] @ (t / t[2])
+    return pixel[:2], t[2]
+
+
+@pytest.mark.parametrize(
+    "elevation, azimuth, position", [(0, 0, (2, 0, 0)), (0, 90, (0, 2, 0)), (90, 0, (0, 0, 2)), (30, 180, (-math.sqrt(3), 0, 1))]
+)
+def test_azimuth_0_is_plus_x_90_is_plus_y_and_z_is_up(elevation, azimuth, position):
+    c2w = view(elevation, azimuth).c2w
+    assert torch.allclose(c2w[0, :3, 3], torch.tensor(position, dtype=torch.float32), atol=1e-6)
+    assert torch.allclose(c2w[0, :3, :3].T @ c2w[0, :3, :3], torch.eye(3), atol=1e-6)
+    assert torch.linalg.det(c2w[0, :3, :3]) > 0.999
+
+
+def test_the_front_camera_sees_y_to_the_right_and_z_up():
+    pixel, depth = project([0.0, 0.5, 0.0], view(), 100, 200)
+    assert pixel[0] > 100 and pixel[1] == pytest.approx(50, abs=1e-4) and depth == pytest.approx(2.0)
+    pixel, _ = project([0.0, 0.0, 0.5], view(), 100, 200)
+    assert pixel[0] == pytest.approx(100, abs=1e-4) and pixel[1] < 50  # row 0 is on top
+
+
+def test_the_vertical_field_of_view_spans_the_height_and_pixels_are_square():
+    half = 2.0 * math.tan(math.radians(30))
+    pixel, _ = project([0.0, 0.0, half], view(), 100, 200)
+    assert pixel[1] == pytest.approx(0.0, abs=1e-3)
+    pixel, _ = project([0.0, half, 0.0], view(), 100, 200)
+    assert pixel[0] == pytest.approx(150.0, abs=1e-3)  # as many pixels sideways as upwards: f is the same for both axes
+
+
+def test_rays_through_pixel_centres_agree_with_the_projection():
+    orbit = view(20.0, 40.0)
+    rays = cameras.ray_directions(orbit.c2w, orbit.fovy, 6, 8)
+    assert torch.allclose(rays.norm(dim=-1), torch.ones(1, 6, 8), atol=1e-6)
+    point = orbit.c2w[0, :3, 3] + 1.7 * rays[0, 4, 2]
+    pixel, _ = project(point.tolist(), orbit, 6, 8)
+    assert torch.allclose(pixel, torch.tensor([2.5, 4.5]), atol=1e-4)
+
+
+def test_the_host_projection_matrix_puts_the_top_row_at_minus_one():
+    orbit = view()
+    clip = cameras.projection(orbit.fovy, 2.0)[0] @ torch.linalg.inv(orbit.c2w)[0] @ torch.tensor([0.0, 0.0, 2 * math.tan(math.radians(30)), 1.0])
+    assert (clip[1] / clip[3]).item() == pytest.approx(-1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("elevation", [90.0, -90.0])
+def test_straight_up_and_down_give_a_rigid_camera(elevation):
+    c2w = view(elevation, 30.0).c2w
+    assert c2w.isfinite().all()
+    assert torch.allclose(c2w[0, :3, :3].T @ c2w[0, :3, :3], torch.eye(3), atol=1e-5)
+
+
+def test_sampled_views_stay_in_the_papers_ranges_and_cover_the_circle():
+    ranges = OrbitRanges()
+    for step in range(50):
+        orbit = cameras.sample_orbit(4, ranges, generator(0, "camera", step))
+        assert (orbit.elevation >= -10.001).all() and (orbit.elevation <= 60.001).all()
+        assert (orbit.distance >= 1.5).all() and (orbit.distance <= 4.0).all()
+        assert (torch.rad2deg(orbit.fovy) >= 40).all() and (torch.rad2deg(orbit.fovy) <= 70.001).all()
+        assert sorted(((orbit.azimuth + 180) // 90).tolist()) == [0, 1, 2, 3]
+
+
+def test_held_out_views_are_fixed_distinct_and_in_no_pool():
+    held_out, pool = cameras.held_out_orbit(24), cameras.camera_pool(200, OrbitRanges(), 0)
+    assert len(held_out.c2w.flatten(1).unique(dim=0)) == 24
+    assert torch.cdist(held_out.c2w.flatten(1), pool.c2w.flatten(1)).min() > 1e-3
+
+
+def test_the_pool_covers_all_azimuths_and_both_elevation_rules():
+    pool = cameras.camera_pool(200, OrbitRanges(), 3)
+    assert (pool.azimuth.diff() > -2).all() and pool.azimuth.min() < -175 and pool.azimuth.max() > 175
+    assert torch.equal(pool.distance, cameras.camera_pool(200, OrbitRanges(), 3).distance)
+    assert not torch.equal(pool.distance, cameras.camera_pool(200, OrbitRanges(), 4).distance)

@@ -1,0 +1,162 @@
+"""Camera conventions, said once and converted in one place.
+
+World: right-handed, z up; azimuth 0 = +x is the front, azimuth 90 = +y. Angles of a view (elevation, azimuth) are in
+degrees, ``fovy`` is vertical and in radians. The host's cameras are OpenGL: the columns of ``c2w`` are right, up, back.
+Inside the maths cameras are OpenCV: ``viewmats`` world to camera with x right, y down, z forward; ``Ks`` in pixels, pixel
+centres at +0.5. Images are (B, H, W, C) with row 0 on top.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from .streams import generator
+
+
+class Orbit(NamedTuple):
+    """Cameras on spheres around the origin, looking at it."""
+
+    elevation: Float[Tensor, " B"]
+    """Degrees above the horizon."""
+    azimuth: Float[Tensor, " B"]
+    """Degrees from +x towards +y."""
+    distance: Float[Tensor, " B"]
+    """World units."""
+    fovy: Float[Tensor, " B"]
+    """Radians, vertical."""
+
+    @property
+    def c2w(self) -> Float[Tensor, "B 4 4"]:
+        return orbit_c2w(self.elevation, self.azimuth, self.distance)
+
+
+def orbit_positions(elevation_deg: Float[Tensor, " B"], azimuth_deg: Float[Tensor, " B"], distance: Float[Tensor, " B"]) -> Float[Tensor, "B 3"]:
+    """Points at ``distance`` from the origin, in world units."""
+    elevation, azimuth = torch.deg2rad(elevation_deg), torch.deg2rad(azimuth_deg)
+    horizontal = distance * torch.cos(elevation)
+    return torch.stack([horizontal * torch.cos(azimuth), horizontal * torch.sin(azimuth), distance * torch.sin(elevation)], -1)
+
+
+def look_at(position: Float[Tensor, "B 3"], center: Float[Tensor, "B 3"], up: Float[Tensor, "B 3"]) -> Float[Tensor, "B 4 4"]:
+    """OpenGL ``c2w`` of cameras at ``position`` that look at ``center``; straight up or down takes +x as the picture's top."""
+    forward = F.normalize(center - position, dim=-1)
+    right = torch.linalg.cross(forward, up)
+    degenerate = right.norm(dim=-1, keepdim=True) < 1e-6
+    fallback = torch.linalg.cross(forward, torch.tensor([1.0, 0.0, 0.0], dtype=up.dtype, device=up.device).expand_as(up))
+    right = F.normalize(torch.where(degenerate, fallback, right), dim=-1)
+    up = torch.linalg.cross(right, forward)
+    c2w = torch.eye(4, dtype=position.dtype, device=position.device).repeat(len(position), 1, 1)
+    c2w[:, :3] = torch.stack([right, up, -forward, position], -1)
+    return c2w
+
+
+def orbit_c2w(
+    elevation_deg: Float[Tensor, " B"],
+    azimuth_deg: Float[Tensor, " B"],
+    distance: Float[Tensor, " B"],
+    center: Float[Tensor, "B 3"] | None = None,
+    up: Float[Tensor, "B 3"] | None = None,
+) -> Float[Tensor, "B 4 4"]:
+    """OpenGL ``c2w`` of cameras on a sphere around the origin, looking at ``center`` (default: the origin)."""
+    position = orbit_positions(elevation_deg, azimuth_deg, distance)
+    center = torch.zeros_like(position) if center is None else center
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=position.dtype, device=position.device).expand_as(position) if up is None else up
+    return look_at(position, center, up)
+
+
+def focal_length(fovy: Float[Tensor, " B"], height: int) -> Float[Tensor, " B"]:
+    """Focal length in pixels, the same for both axes: ``f = H / (2 tan(fovy / 2))``."""
+    return 0.5 * height / torch.tan(0.5 * fovy)
+
+
+def intrinsics(fovy: Float[Tensor, " B"], height: int, width: int) -> Float[Tensor, "B 3 3"]:
+    """Pinhole matrices in pixels with the principal point in the image's centre."""
+    Ks = torch.zeros(len(fovy), 3, 3, dtype=fovy.dtype, device=fovy.device)
+    Ks[:, 0, 0] = Ks[:, 1, 1] = focal_length(fovy, height)
+    Ks[:, 0, 2], Ks[:, 1, 2], Ks[:, 2, 2] = 0.5 * width, 0.5 * height, 1.0
+    return Ks
+
+
+def to_opencv(
+    c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int
+) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 3 3"]]:
+    """The host's OpenGL cameras as ``(viewmats, Ks)``: flip the camera's y and z axes, invert the rigid motion."""
+    flip = torch.tensor([1.0, -1.0, -1.0], dtype=c2w.dtype, device=c2w.device)
+    rotation = (c2w[:, :3, :3] * flip).transpose(1, 2)
+    viewmats = torch.zeros_like(c2w)
+    viewmats[:, :3, :3] = rotation
+    viewmats[:, :3, 3:] = -rotation @ c2w[:, :3, 3:]
+    viewmats[:, 3, 3] = 1.0
+    return viewmats, intrinsics(fovy, height, width)
+
+
+def ray_directions(
+    c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int, normalize: bool = True
+) -> Float[Tensor, "B H W 3"]:
+    """World directions through the pixel centres; unit length, or forward component 1 without ``normalize``."""
+    rows = torch.arange(height, dtype=c2w.dtype, device=c2w.device) + 0.5 - 0.5 * height
+    columns = torch.arange(width, dtype=c2w.dtype, device=c2w.device) + 0.5 - 0.5 * width
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    focal = focal_length(fovy, height)[:, None, None]
+    directions = torch.stack([x / focal, -y / focal, torch.full_like(x, -1.0).expand(len(c2w), -1, -1)], -1)
+    directions = directions @ c2w[:, None, :3, :3].transpose(-1, -2)
+    return F.normalize(directions, dim=-1) if normalize else directions
+
+
+def projection(fovy: Float[Tensor, " B"], aspect: float, near: float = 0.01, far: float = 100.0) -> Float[Tensor, "B 4 4"]:
+    """threestudio's projection matrices (y negated: the top row has NDC y = -1)."""
+    tan = torch.tan(0.5 * fovy)
+    matrix = torch.zeros(len(fovy), 4, 4, dtype=fovy.dtype, device=fovy.device)
+    matrix[:, 0, 0], matrix[:, 1, 1] = 1.0 / (tan * aspect), -1.0 / tan
+    matrix[:, 2, 2], matrix[:, 2, 3] = -(far + near) / (far - near), -2.0 * far * near / (far - near)
+    matrix[:, 3, 2] = -1.0
+    return matrix
+
+
+class OrbitRanges(NamedTuple):
+    """Ranges that training views are drawn from; the paper's by default."""
+
+    elevation: tuple[float, float] = (-10.0, 60.0)
+    azimuth: tuple[float, float] = (-180.0, 180.0)
+    distance: tuple[float, float] = (1.5, 4.0)
+    fovy_deg: tuple[float, float] = (40.0, 70.0)
+
+
+def sample_orbit(batch: int, ranges: OrbitRanges, rng: torch.Generator, uniform_azimuth: bool = True) -> Orbit:
+    """Draw ``batch`` training views.
+
+    As in threestudio, with probability one half the elevations of a batch are uniform in angle, otherwise uniform on the
+    sphere (uniform in the sine); with ``uniform_azimuth`` the batch covers the whole azimuth range, one view per sector.
+    """
+    by_angle, u = torch.rand(1, generator=rng) < 0.5, torch.rand(4, batch, generator=rng)
+    low, high = (math.sin(math.radians(e)) for e in ranges.elevation)
+    elevation = _lerp(ranges.elevation, u[0]) if by_angle else torch.rad2deg(torch.asin((low + (high - low) * u[0]).clamp(-1.0, 1.0)))
+    sector = (u[1] + torch.arange(batch)) / batch if uniform_azimuth else u[1]
+    fovy = torch.deg2rad(_lerp(ranges.fovy_deg, u[3]))
+    return Orbit(elevation, _lerp(ranges.azimuth, sector), _lerp(ranges.distance, u[2]), fovy)
+
+
+def _lerp(ends: tuple[float, float], u: Tensor) -> Tensor:
+    return ends[0] + (ends[1] - ends[0]) * u
+
+
+def held_out_orbit(count: int = 24) -> Orbit:
+    """The views that a run is scored on: fixed, all around, four heights, three distances, fovy 50 degrees; in no bank."""
+    index = torch.arange(count)
+    elevation = torch.tensor([0.0, 15.0, 30.0, 45.0])[index % 4]
+    distance = torch.tensor([2.0, 2.6, 3.2])[index % 3]
+    return Orbit(elevation, 360.0 * index / count, distance, torch.full((count,), math.radians(50.0)))
+
+
+def camera_pool(count: int, ranges: OrbitRanges, seed: int, stream: str = "camera-pool") -> Orbit:
+    """``count`` fixed training views: stratified in azimuth, each drawn from its own stream."""
+    rng = generator(seed, stream)
+    pool = sample_orbit(count, ranges, rng)
+    # one elevation rule for the whole pool would bias it: mix both
+    other = sample_orbit(count, ranges, generator(seed, stream, 1))
+    mix = torch.rand(count, generator=rng) < 0.5
+    return pool._replace(elevation=torch.where(mix, pool.elevation, other.elevation))
