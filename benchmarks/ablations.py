@@ -1,0 +1,133 @@
+"""The paper's ablations and claims as tables, measured in dB against a known truth; one command, minutes on a CPU.
+
+    python benchmarks/ablations.py                          # the paper's ablations
+    python benchmarks/ablations.py --table faces            # prior against random start under a view-blind score, five seeds
+    python benchmarks/ablations.py --table guidance         # guidance scale 100: plain, annealed, clipped
+    python benchmarks/ablations.py --mesh spot.glb --seeds 0 1 2 --size 128
+
+Each row is an ordinary run of configs/demo.yaml with a few options changed; its score is the PSNR on held-out views that no bank
+holds. `view-exact` knows the picture from every camera (an upper bound: reconstruction). `view-blind` knows only pictures from
+anywhere, in a low-dimensional linear latent, as a real diffusion model does: that is where a prior matters. Neither says
+anything about the quality of a real diffusion model.
+"""
+
+import argparse
+import csv
+import json
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+RANDOM_START = ["system.geometry.prior_type=random-prior", "system.geometry.prior={num_points: 10000, shape: sphere}", "system.geometry.grow.enabled=false"]
+VIEW_BLIND = ["system.guidance.mode=view-agnostic", "system.guidance.space=latent", "system.guidance.latent_size=16"]
+NO_ANNEALING = ["system.guidance.max_step_percent=0.98"]
+STRONG = ["system.guidance.guidance_scale=101"]  # threestudio's 100
+
+TABLES = {
+    "ablations": {
+        "default": [],
+        "random start": RANDOM_START,
+        "no growing": ["system.geometry.grow.enabled=false"],
+        "no perturbation": ["system.geometry.grow.color_range=[0.0, 0.0]"],
+        "radius 0.005": ["system.geometry.grow.radius=0.005"],
+        "radius 0.02": ["system.geometry.grow.radius=0.02"],
+        "radius 0.05": ["system.geometry.grow.radius=0.05"],
+        "no schedule": NO_ANNEALING,
+        "paper's rates": [f"system.geometry.lr_{name}" for name in ("means=5e-5", "scales=1e-3", "quats=1e-2", "opacities=1e-2")],
+    },
+    "faces": {"prior": [], "random start": RANDOM_START},
+    "guidance": {
+        "scale 1": [],
+        "scale 100": [*STRONG, *NO_ANNEALING],
+        "scale 100, annealed": STRONG,
+        "scale 100, annealed, clipped": [*STRONG, "system.guidance.grad_clip=[0, 1.5, 2.0, 1000]"],
+    },
+}
+SCORES = {"ablations": ("view-exact", "view-blind"), "faces": ("view-blind",), "guidance": ("view-exact",)}
+
+
+def main() -> None:
+    arguments = parse_arguments()
+    rows = []
+    for variant, overrides in TABLES[arguments.table].items():
+        for score in SCORES[arguments.table]:
+            guidance = VIEW_BLIND if score == "view-blind" else []
+            runs = [run(arguments, seed, [*guidance, *overrides]) for seed in arguments.seeds]
+            rows.append(summary(variant, score, runs))
+            print_row(rows[-1])
+    write(arguments, rows)
+
+
+def parse_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--table", choices=TABLES, default="ablations")
+    parser.add_argument("--mesh", default="", help="another object than the bundled one")
+    parser.add_argument("--seeds", type=int, nargs="+", help="default: 0, or 0 to 4 for faces")
+    parser.add_argument("--size", type=int, default=128, help="width and height of the training renders")
+    parser.add_argument("--steps", type=int, default=1200)
+    parser.add_argument("--out", type=Path, help="CSV file; default: benchmarks/results/<table>.csv")
+    parser.add_argument("overrides", nargs="*", help="more key=value options for every run")
+    arguments = parser.parse_args()
+    arguments.seeds = arguments.seeds or (list(range(5)) if arguments.table == "faces" else [0])
+    return arguments
+
+
+def run(arguments: argparse.Namespace, seed: int, overrides: list[str]) -> dict:
+    """One training run in a process of its own; its metrics."""
+    with tempfile.TemporaryDirectory() as folder:
+        options = [
+            f"exp_root_dir={folder}", "name=run", "tag=run", "use_timestamp=false", f"seed={seed}",
+            f"trainer.max_steps={arguments.steps}", f"trainer.val_check_interval={arguments.steps}", "trainer.enable_progress_bar=false",
+            f"data.width={arguments.size}", f"data.height={arguments.size}", f"system.evaluation.size={arguments.size}",
+            "data.n_test_views=2", "data.eval_width=64", "data.eval_height=64",
+            *([f"system.guidance.mesh={arguments.mesh}"] if arguments.mesh else []), *overrides, *arguments.overrides,
+        ]  # fmt: skip
+        command = [sys.executable, str(ROOT / "launch.py"), "--config", str(ROOT / "configs/demo.yaml"), "--train", *options]
+        finished = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+        if finished.returncode:
+            sys.exit(f"a run failed ({finished.returncode}):\n{' '.join(command)}\n{finished.stderr[-3000:]}")
+        return json.loads((Path(folder) / "run/run/save/metrics.json").read_text())
+
+
+def summary(variant: str, score: str, runs: list[dict]) -> dict:
+    values = {key: [r["result"][key] for r in runs] for key in ("psnr", "ssim", "multi_face", "gaussians", "seconds")}
+    return {
+        "variant": variant,
+        "score": score,
+        "seeds": len(runs),
+        "start_psnr": statistics.median(r["prior"]["psnr"] for r in runs),
+        **{key: statistics.median(v) for key, v in values.items()},
+        "psnr_min": min(values["psnr"]),
+        "psnr_max": max(values["psnr"]),
+    }
+
+
+def print_row(row: dict) -> None:
+    spread = f" ({row['psnr_min']:.2f}..{row['psnr_max']:.2f})" if row["seeds"] > 1 else ""
+    print(
+        f"{row['variant']:<30}{row['score']:<12}{row['start_psnr']:6.2f} -> {row['psnr']:6.2f} dB{spread}  SSIM {row['ssim']:.3f}"
+        f"  multi-face {100 * row['multi_face']:3.0f} %  {row['gaussians']:.0f} Gaussians  {row['seconds']:.0f} s",
+        flush=True,
+    )
+
+
+def write(arguments: argparse.Namespace, rows: list[dict]) -> None:
+    path = arguments.out or ROOT / f"benchmarks/results/{arguments.table}.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT).stdout.strip()
+    about = f"{platform.machine()}, {platform.processor() or 'CPU'}, commit {commit or 'unknown'}, {time.strftime('%Y-%m-%d')}, {' '.join(sys.argv[1:])}"
+    with open(path, "w", newline="") as file:
+        file.write(f"# {about}\n")
+        writer = csv.DictWriter(file, fieldnames=rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    print(f"\n{path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""What several test files share: small clouds, and a home without surprises."""
+
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning barriers are slow on a busy machine
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from threestudio_gaussiandreamer.point_cloud import PointCloud
+
+
+@pytest.fixture(autouse=True)
+def same_seed(monkeypatch):
+    """Runs seed through the environment; a test must not inherit another one's."""
+    monkeypatch.setenv("PL_GLOBAL_SEED", "0")
+
+
+@pytest.fixture
+def sphere_points() -> PointCloud:
+    """400 points on a sphere of radius 0.7, coloured by their place."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(400, 3))
+    points *= 0.7 / np.linalg.norm(points, axis=1, keepdims=True)
+    return PointCloud(points.astype(np.float32), (points / 1.4 + 0.5).astype(np.float32))
+
+
+@pytest.fixture
+def shared_folder() -> Path:
+    """A folder with real meshes beside the repository; a test that uses it skips where it isn't there."""
+    folder = Path(os.environ.get("GAUSSIANDREAMER_SHARED", Path(__file__).parents[2] / "shared"))
+    if not (folder / "assets").is_dir():
+        pytest.skip("set GAUSSIANDREAMER_SHARED to a folder with assets/*.glb")
+    return folder

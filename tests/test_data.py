@@ -1,0 +1,104 @@
+"""Batches have the host's keys and are a function of (seed, step)."""
+
+import itertools
+import math
+
+import pytest
+import torch
+
+from threestudio_gaussiandreamer.data import GaussianDreamerDataModule
+from threestudio_gaussiandreamer.errors import UserError
+
+KEYS = {
+    "c2w": (4, 4, 4),
+    "mvp_mtx": (4, 4, 4),
+    "proj_mtx": (4, 4, 4),
+    "camera_positions": (4, 3),
+    "light_positions": (4, 3),
+    "elevation": (4,),
+    "azimuth": (4,),
+    "camera_distances": (4,),
+    "fovy": (4,),
+}
+
+
+def module(**cfg):
+    data = GaussianDreamerDataModule({"batch_size": 4, "height": 32, "width": 48, **cfg})
+    data.setup("fit")
+    return data
+
+
+def batches(data, count, start=0):
+    data.train_dataset.start_step = start
+    return list(itertools.islice(iter(data.train_dataloader()), count))
+
+
+def test_a_training_batch_has_the_hosts_keys_shapes_and_units():
+    (batch,) = batches(module(), 1)
+    assert {k: tuple(v.shape) for k, v in batch.items() if torch.is_tensor(v)} == KEYS
+    assert batch["height"] == 32 and batch["width"] == 48
+    assert batch["fovy"].max() < math.pi and batch["azimuth"].abs().max() > 10  # radians, degrees
+    assert torch.equal(batch["camera_positions"], batch["c2w"][:, :3, 3])
+
+
+def test_rays_are_there_when_asked_for():
+    (batch,) = batches(module(rays=True), 1)
+    assert batch["rays_o"].shape == batch["rays_d"].shape == (4, 32, 48, 3)
+    assert torch.allclose(batch["rays_d"].norm(dim=-1), torch.ones(4, 32, 48), atol=1e-6)
+    (plain,) = batches(module(rays=True, rays_d_normalize=False), 1)
+    assert torch.allclose((plain["rays_d"] @ -plain["c2w"][:, None, :3, 2:3])[..., 0], torch.ones(4, 32, 48), atol=1e-5)
+
+
+def test_validation_and_test_batches_hold_one_view_and_its_index():
+    data = module(n_val_views=4, n_test_views=5, eval_height=20, eval_width=30)
+    val, test = list(data.val_dataloader()), list(data.test_dataloader())
+    assert [b["azimuth"].item() for b in val] == [0, 90, 180, 270]
+    assert [b["azimuth"].item() for b in test] == [0, 90, 180, 270, 360]
+    assert val[2]["index"].tolist() == [2] and val[2]["c2w"].shape == (1, 4, 4) and val[2]["height"] == 20
+
+
+def test_a_stream_that_starts_at_step_3_continues_the_one_that_never_stopped():
+    whole, rest = batches(module(camera_perturb=0.1, up_perturb=0.1), 5), batches(module(camera_perturb=0.1, up_perturb=0.1), 2, start=3)
+    for a, b in zip(whole[3:], rest, strict=True):
+        assert torch.equal(a["c2w"], b["c2w"]) and torch.equal(a["fovy"], b["fovy"])
+
+
+def test_no_batch_is_degenerate():
+    for batch in batches(module(), 6):
+        assert batch["elevation"].unique().numel() == 4 and batch["azimuth"].unique().numel() == 4
+
+
+def test_a_resolution_milestone_takes_effect_at_its_step():
+    data = module(height=[16, 32], width=[16, 32], batch_size=[4, 2], resolution_milestones=[3])
+    assert [(b["height"], len(b["c2w"])) for b in batches(data, 5)] == [(16, 4)] * 3 + [(32, 2)] * 2
+
+
+def test_a_pool_repeats_its_cameras_and_still_covers_the_circle():
+    data = module(train_views=8)
+    seen = torch.cat([b["c2w"].flatten(1) for b in batches(data, 20)])
+    assert len(seen.unique(dim=0)) == 8
+    assert all(sorted((b["azimuth"] // 90).tolist()) == [-2, -1, 0, 1] for b in batches(data, 5))
+
+
+def test_progressive_views_widen_from_the_evaluation_view():
+    first, last = batches(module(progressive_until=100), 1)[0], batches(module(progressive_until=100), 1, start=100)[0]
+    assert first["azimuth"].abs().max() == 0 and torch.allclose(first["elevation"], torch.tensor(15.0), atol=1e-4)
+    assert last["azimuth"].abs().max() > 90
+
+
+@pytest.mark.parametrize(
+    "wrong, named",
+    [
+        ({"elevation_range": [60, -10]}, "elevation_range"),
+        ({"camera_distance_range": [0, 1]}, "camera_distance_range"),
+        ({"fovy_range": [40, 190]}, "fovy_range"),
+        ({"height": [16, 32]}, "height"),
+        ({"width": 0}, "width"),
+        ({"eval_batch_size": 2}, "eval_batch_size"),
+        ({"n_test_views": 0}, "n_test_views"),
+        ({"train_views": -1}, "train_views"),
+    ],
+)
+def test_a_wrong_value_is_named(wrong, named):
+    with pytest.raises(UserError, match=named):
+        module(**wrong)

@@ -1,0 +1,163 @@
+"""The cloud: its start from points, its size, its rates, its checkpoint."""
+
+import numpy as np
+import pytest
+import torch
+
+from threestudio_gaussiandreamer import sh
+from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.geometry import GaussianCloud
+from threestudio_gaussiandreamer.grow import nearest_distance_scales
+from threestudio_gaussiandreamer.host import register
+from threestudio_gaussiandreamer.point_cloud import PointCloud
+from threestudio_gaussiandreamer.splatting import Rasterized
+
+NO_GROWTH = {"enabled": False}
+
+
+def started(cloud, **cfg):
+    geometry = GaussianCloud({"grow": NO_GROWTH, **cfg})
+    geometry.start_from(geometry.grown(cloud))
+    return geometry
+
+
+def seen(geometry, gradient=1.0, contribution=0.5, size=64):
+    """What a render of one view returns, with a gradient on every projected centre."""
+    n = len(geometry)
+    means2d = torch.zeros(1, n, 2, requires_grad=True)
+    means2d.grad = torch.full((1, n, 2), gradient)
+    empty = torch.zeros(1, 1, 1, 1)
+    return Rasterized(empty, empty, empty, means2d, torch.ones(1, n), torch.full((1, n), contribution))
+
+
+def test_each_point_becomes_one_gaussian_as_the_paper_says(sphere_points):
+    geometry = started(sphere_points)
+    assert len(geometry) == 400
+    assert torch.equal(geometry.means, torch.from_numpy(sphere_points.points))
+    assert torch.allclose(geometry.opacities(), torch.tensor(0.1))
+    assert torch.allclose(geometry.colors(torch.zeros(1, 3)), torch.from_numpy(sphere_points.colors), atol=1e-6)
+    nearest = torch.from_numpy(nearest_distance_scales(sphere_points.points, "nearest"))
+    assert torch.allclose(geometry.scales(), nearest[:, None].expand(-1, 3), rtol=1e-5)
+    assert torch.equal(geometry.quats, torch.tensor([1.0, 0, 0, 0]).expand(400, 4))
+
+
+def test_growing_is_configured_and_seeded(sphere_points, monkeypatch):
+    grow = {"num_candidates": 20_000, "radius": 0.05, "max_points": 300}
+    first = started(sphere_points, grow=grow)
+    assert len(first) == 700
+    assert torch.equal(first.means, started(sphere_points, grow=grow).means)
+    monkeypatch.setenv("PL_GLOBAL_SEED", "1")
+    assert not torch.equal(first.means, started(sphere_points, grow=grow).means)
+
+
+def test_some_options_of_a_group_keep_the_defaults_of_the_others():
+    cfg = GaussianCloud({"densify": {"every": 50}}).cfg
+    assert cfg.densify.every == 50 and cfg.densify.stop == 900 and cfg.grow.radius == 0.01
+
+
+def test_the_cap_holds_at_the_start(sphere_points):
+    assert len(started(sphere_points, max_gaussians=123)) == 123
+
+
+def test_the_cloud_takes_its_size_from_the_checkpoint_and_never_asks_the_prior(sphere_points, tmp_path):
+    geometry = started(sphere_points, sh_degree=2)
+    geometry.observe(seen(geometry), 64, 64)
+    torch.save(geometry.state_dict(), tmp_path / "c.pt")
+    other = GaussianCloud({"sh_degree": 2, "prior_type": "no-such-prior"})
+    other.load_state_dict(torch.load(tmp_path / "c.pt", weights_only=True))
+    for name, value in geometry.state_dict().items():
+        assert torch.equal(value, other.state_dict()[name]), name
+    assert other.gradient_sum.sum() > 0
+
+
+def test_spherical_harmonics_are_padded_and_cut(sphere_points):
+    third = started(sphere_points, sh_degree=3)
+    assert third.sh.shape == (400, 16, 3) and third.sh_rest.abs().sum() == 0
+    third.sh_rest.data.normal_()
+    first = GaussianCloud({"sh_degree": 1})
+    first.set_arrays(**{k: getattr(third, k).detach() for k in ("means", "log_scales", "quats", "logit_opacities")}, sh=third.sh.detach())
+    assert torch.equal(first.sh, third.sh[:, :4])
+    assert third.colors(torch.randn(2, 3)).shape == (2, 400, 3)
+
+
+def test_colours_see_the_direction_from_the_camera(sphere_points):
+    geometry = started(sphere_points, sh_degree=1)
+    geometry.sh_rest.data.normal_()
+    camera = torch.tensor([[0.0, 0.0, 5.0]])
+    dirs = torch.nn.functional.normalize(geometry.means - camera, dim=-1)
+    assert torch.allclose(geometry.colors(camera)[0], sh.sh_to_colors(geometry.sh, dirs), atol=1e-6)
+
+
+def test_learning_rates_follow_their_schedules(sphere_points):
+    geometry = started(sphere_points, lr_means=[0, 2e-4, 1e-4, 100], lr_sh_rest=0.5, sh_degree=1)
+    optimizer = torch.optim.Adam(geometry.parameter_groups())
+    geometry.set_learning_rates(optimizer, 0, 50)
+    rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
+    assert rates["means"] == pytest.approx(1.5e-4) and rates["sh_rest"] == 0.5 and rates["log_scales"] == 1e-3
+    assert len(rates) == 6
+
+
+def test_degree_zero_has_no_group_for_bands_it_does_not_have(sphere_points):
+    assert "sh_rest" not in {group["name"] for group in started(sphere_points).parameter_groups()}
+
+
+def test_densification_happens_at_its_steps_only_and_the_optimiser_follows(sphere_points):
+    densify = {"enabled": True, "start": 4, "stop": 9, "every": 4, "min_opacity": 0.01, "grad_threshold": 1.0}
+    geometry = started(sphere_points, densify=densify)
+    optimizer = torch.optim.Adam(geometry.parameter_groups())
+    sizes = []
+    for step in range(1, 13):
+        geometry.observe(seen(geometry), 64, 64)
+        sum((p**2).sum() for p in geometry.parameters()).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        geometry.after_step(optimizer, step)
+        sizes.append(len(geometry))
+    assert sizes == [400] * 3 + [800] * 4 + [1600] * 5
+    assert optimizer.param_groups[0]["params"][0] is geometry.means
+    assert optimizer.state[geometry.means]["exp_avg"].shape == (1600, 3)
+
+
+def test_a_densification_that_selects_nobody_changes_nothing(sphere_points):
+    plain = started(sphere_points)
+    idle = started(sphere_points, densify={"enabled": True, "start": 1, "stop": 9, "every": 1, "min_opacity": 1e-9, "grad_threshold": 1e9, "max_scale": 1e9})
+    for geometry in (plain, idle):
+        optimizer = torch.optim.Adam(geometry.parameter_groups(), lr=1e-2)
+        for step in range(1, 6):
+            sum((p**2).sum() for p in geometry.parameters()).backward()
+            optimizer.step()
+            optimizer.zero_grad()
+            geometry.after_step(optimizer, step)
+    assert all(torch.equal(a, b) for a, b in zip(plain.parameters(), idle.parameters(), strict=True))
+
+
+@register("test-two-points-prior")
+class TwoPoints:
+    def __init__(self, cfg):
+        pass
+
+    def __call__(self, prompt):
+        return PointCloud(np.float32([[0, 0, 0], [1, 0, 0]]), np.float32([[1, 0, 0], [0, 1, 0]]))
+
+
+def test_initialize_runs_the_prior_by_its_name():
+    geometry = GaussianCloud({"prior_type": "test-two-points-prior", "grow": NO_GROWTH})
+    cloud = geometry.initialize("anything")
+    assert len(geometry) == len(cloud.points) == 2
+
+
+@pytest.mark.parametrize(
+    "wrong, named",
+    [
+        ({"scale_rule": "nearst"}, "nearest"),
+        ({"init_opacity": 1.0}, "init_opacity"),
+        ({"sh_degree": 4}, "sh_degree"),
+        ({"min_gaussians": 10, "max_gaussians": 5}, "min_gaussians"),
+        ({"grow": {"radius": 0}}, "grow.radius"),
+        ({"grow": {"color_range": [0.2, 0.0]}}, "color_range"),
+        ({"lr_means": [1, 2, 3, 4, 5]}, "lr_means"),
+    ],
+)
+def test_a_value_out_of_range_is_named(wrong, named):
+    with pytest.raises(UserError, match=named):
+        GaussianCloud(wrong)

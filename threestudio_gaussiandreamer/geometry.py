@@ -1,0 +1,282 @@
+"""Geometry ``gaussiandreamer-cloud``: a cloud of 3D Gaussians that starts from a 3D prior.
+
+Parameters (the names say how they are stored): ``means`` (N, 3) world units, ``log_scales`` (N, 3), ``quats`` (N, 4) wxyz,
+``logit_opacities`` (N,), ``sh0`` (N, 1, 3) and ``sh_rest`` (N, K - 1, 3) with K = (sh_degree + 1)^2. The cloud is empty until :meth:`initialize` runs the
+prior or a checkpoint is loaded; it takes its size from the checkpoint, so the prior isn't needed again.
+
+==================  =========================================================================================================
+option              meaning
+==================  =========================================================================================================
+prior_type, prior   the registered prior and its options
+grow                Algorithm 1 of the paper: enabled, num_candidates, radius (in half box sides), color_range, clamp, max_points
+scale_rule          first standard deviation: ``nearest`` (the paper: distance to the nearest point) or ``rms3`` (the released
+                    code: root mean square distance to the three nearest)
+scale_factor        multiplies it
+init_opacity        opacity of every Gaussian at the start
+sh_degree           0 to 3
+lr_*                learning rate of each attribute: a number or a schedule; lr_sh_rest for the bands above degree 0
+densify             enabled, start, stop, every (steps), grad_threshold, split_scale, min_opacity, max_scale (world units)
+max_gaussians       exact cap, reached by dropping what contributes least; min_gaussians: the floor that pruning never passes
+keep_attributes     with gaussians-prior: start from all attributes of that cloud, not only from points and colours
+==================  =========================================================================================================
+"""
+
+import logging
+import math
+from dataclasses import dataclass, field
+from typing import Any, List
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from . import densify, sh
+from .densify import PARAMETERS, Change, Rules, Statistics
+from .errors import UserError, unknown
+from .grow import SCALE_RULES, grow, nearest_distance_scales
+from .host import BaseGeometry, C, find, register, run_seed, validate_schedule
+from .nested import adopt_nested
+from .point_cloud import PointCloud
+from .splatting import Rasterized
+from .streams import generator, numpy_generator
+
+logger = logging.getLogger(__name__)
+STATISTICS = ("gradient_sum", "gradient_count", "contribution")
+LEARNING_RATES = {
+    "means": "lr_means",
+    "log_scales": "lr_scales",
+    "quats": "lr_quats",
+    "logit_opacities": "lr_opacities",
+    "sh0": "lr_sh",
+    "sh_rest": "lr_sh_rest",
+}
+LOG_SCALE_RANGE = (-20.0, 10.0)
+
+
+@dataclass
+class GrowConfig:
+    enabled: bool = True
+    num_candidates: int = 1_000_000
+    radius: float = 0.01
+    color_range: List[float] = field(default_factory=lambda: [0.0, 0.2])
+    clamp: bool = True
+    max_points: int = 400_000
+
+
+@dataclass
+class DensifyConfig:
+    enabled: bool = False
+    start: int = 400
+    stop: int = 900
+    every: int = 100
+    grad_threshold: float = 2e-4
+    split_scale: float = 0.04
+    min_opacity: float = 0.05
+    max_scale: float = 0.4
+
+
+@register("gaussiandreamer-cloud")
+class GaussianCloud(BaseGeometry):
+    @dataclass
+    class Config(BaseGeometry.Config):
+        prior_type: str = "random-prior"
+        prior: dict = field(default_factory=dict)
+        grow: GrowConfig = field(default_factory=GrowConfig)
+        scale_rule: str = "nearest"
+        scale_factor: float = 1.0
+        init_opacity: float = 0.1
+        sh_degree: int = 0
+        keep_attributes: bool = True
+        lr_means: Any = 5e-5
+        lr_scales: Any = 1e-3
+        lr_quats: Any = 1e-2
+        lr_opacities: Any = 1e-2
+        lr_sh: Any = 1.25e-2
+        lr_sh_rest: Any = 6.25e-4
+        densify: DensifyConfig = field(default_factory=DensifyConfig)
+        max_gaussians: int = 500_000
+        min_gaussians: int = 64
+
+        def __post_init__(self) -> None:
+            adopt_nested(self)
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            """Raises UserError for a value out of range, before any long work."""
+            where = "system.geometry"
+            if cfg.scale_rule not in SCALE_RULES:
+                raise unknown(f"{where}.scale_rule", cfg.scale_rule, SCALE_RULES)
+            if not 0 < cfg.init_opacity < 1:
+                raise UserError(f"{where}.init_opacity: expected a number between 0 and 1, got {cfg.init_opacity}")
+            if cfg.sh_degree not in (0, 1, 2, 3):
+                raise UserError(f"{where}.sh_degree: expected 0, 1, 2 or 3, got {cfg.sh_degree}")
+            if not 0 < cfg.min_gaussians <= cfg.max_gaussians:
+                raise UserError(f"{where}: expected 0 < min_gaussians <= max_gaussians, got {cfg.min_gaussians} and {cfg.max_gaussians}")
+            for name in ("scale_factor", "grow.radius", "densify.every", "densify.split_scale", "densify.max_scale"):
+                value = _nested(cfg, name)
+                if not value > 0:
+                    raise UserError(f"{where}.{name}: expected a positive number, got {value}")
+            if len(cfg.grow.color_range) != 2 or cfg.grow.color_range[0] > cfg.grow.color_range[1]:
+                raise UserError(f"{where}.grow.color_range: expected [low, high], got {list(cfg.grow.color_range)}")
+            for name in LEARNING_RATES.values():
+                validate_schedule(cfg[name], f"{where}.{name}")
+
+    cfg: Config
+
+    def configure(self) -> None:
+        self.Config.check(self.cfg)
+        self.bands = (self.cfg.sh_degree + 1) ** 2
+        self._allocate(0)
+
+    # -- size ----------------------------------------------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def _shapes(self, n: int) -> dict[str, tuple[int, ...]]:
+        harmonics = {"sh0": (n, 1, 3), "sh_rest": (n, self.bands - 1, 3)}
+        return {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,), **harmonics}
+
+    def _allocate(self, n: int, device: torch.device | str = "cpu") -> None:
+        for name, shape in self._shapes(n).items():
+            setattr(self, name, nn.Parameter(torch.zeros(shape, device=device)))
+        for name in STATISTICS:
+            self.register_buffer(name, torch.zeros(n, device=device))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """Take the size from the checkpoint before its tensors are copied in."""
+        means = state_dict.get(prefix + "means")
+        if means is not None and len(means) != len(self):
+            self._allocate(len(means), self.means.device)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    # -- derived quantities --------------------------------------------------------------------------------------------------
+
+    def scales(self) -> Float[Tensor, "N 3"]:
+        """Standard deviations along the axes, world units; clamped where exp would over- or underflow float32."""
+        return self.log_scales.clamp(*LOG_SCALE_RANGE).exp()
+
+    def opacities(self) -> Float[Tensor, " N"]:
+        return torch.sigmoid(self.logit_opacities)
+
+    @property
+    def sh(self) -> Float[Tensor, "N K 3"]:
+        """All bands of the spherical harmonics."""
+        return torch.cat([self.sh0, self.sh_rest], 1)
+
+    def colors(self, camera_positions: Float[Tensor, "B 3"]) -> Float[Tensor, "N 3"] | Float[Tensor, "B N 3"]:
+        """RGB, not negative; per view when the spherical harmonics have more than the constant band."""
+        if self.bands == 1:
+            return sh.sh0_to_rgb(self.sh0[:, 0]).clamp_min(0.0)
+        dirs = torch.nn.functional.normalize(self.means.detach()[None] - camera_positions[:, None], dim=-1)
+        return sh.sh_to_colors(self.sh, dirs)
+
+    # -- start ---------------------------------------------------------------------------------------------------------------
+
+    def initialize(self, prompt: str, make_cloud: Any = None) -> PointCloud:
+        """Run the prior, grow and perturb its points, and start one Gaussian on each; returns the prior's points.
+
+        ``make_cloud(prior, prompt)`` may stand in for ``prior(prompt)``, for instance to read a cached result.
+        """
+        prior = find(self.cfg.prior_type)(self.cfg.prior)
+        if self.cfg.keep_attributes and hasattr(prior, "gaussians"):
+            arrays = prior.gaussians(prompt)
+            self.set_arrays(**arrays._asdict())
+            return prior.cloud(arrays)
+        cloud = make_cloud(prior, prompt) if make_cloud else prior(prompt)
+        self.start_from(self.grown(cloud))
+        return cloud
+
+    def grown(self, cloud: PointCloud) -> PointCloud:
+        """Noisy point growing and colour perturbation (the paper's Algorithm 1), within the cap."""
+        if not self.cfg.grow.enabled:
+            return cloud
+        options = {k: v for k, v in dict(self.cfg.grow).items() if k not in ("enabled", "color_range")}
+        return grow(cloud, color_range=tuple(self.cfg.grow.color_range), **options, generator=numpy_generator(run_seed(), "grow"))
+
+    def start_from(self, cloud: PointCloud) -> None:
+        """One Gaussian on each point: its colour, opacity ``init_opacity``, an isotropic scale from the nearest distances."""
+        points, colors = self._capped(cloud.points, cloud.colors)
+        n, scales = len(points), nearest_distance_scales(points, self.cfg.scale_rule) * self.cfg.scale_factor
+        harmonics = np.zeros((n, self.bands, 3), np.float32)
+        harmonics[:, 0] = sh.rgb_to_sh0(torch.from_numpy(np.ascontiguousarray(colors, np.float32))).numpy()
+        self.set_arrays(
+            means=points,
+            log_scales=np.repeat(np.log(scales)[:, None], 3, 1),
+            quats=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+            logit_opacities=np.full(n, math.log(self.cfg.init_opacity / (1 - self.cfg.init_opacity))),
+            sh=harmonics,
+        )
+
+    def _capped(self, points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """At most ``max_gaussians`` points, a seeded uniform choice."""
+        if len(points) <= self.cfg.max_gaussians:
+            return points, colors
+        logger.warning("the prior and its growth give %d points; keeping %d of them (system.geometry.max_gaussians)", len(points), self.cfg.max_gaussians)
+        rows = np.sort(numpy_generator(run_seed(), "cap").choice(len(points), self.cfg.max_gaussians, replace=False))
+        return points[rows], colors[rows]
+
+    def set_arrays(self, *, sh: Any, **arrays: Any) -> None:
+        """Replace the cloud; spherical harmonics ``sh`` (N, K', 3) are padded with zeros or cut to ``sh_degree``."""
+        device = self.means.device
+        self._allocate(len(arrays["means"]), device)
+        with torch.no_grad():
+            for name, value in arrays.items():
+                getattr(self, name).copy_(torch.as_tensor(value))
+            bands = torch.as_tensor(sh)[:, : self.bands].to(device)
+            self.sh0.copy_(bands[:, :1])
+            self.sh_rest[:, : bands.shape[1] - 1] = bands[:, 1:]
+            self.logit_opacities.clamp_(-15.0, 15.0)
+            self.log_scales.clamp_(*LOG_SCALE_RANGE)
+
+    def parameters_by_name(self) -> dict[str, nn.Parameter]:
+        return {name: getattr(self, name) for name in PARAMETERS}
+
+    # -- optimisation --------------------------------------------------------------------------------------------------------
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """One optimiser group per attribute, named after it; the rates are set every step by :meth:`set_learning_rates`."""
+        named = self.parameters_by_name().items()
+        return [{"params": [parameter], "name": name, "lr": 0.0} for name, parameter in named if parameter.numel() or name != "sh_rest"]
+
+    def set_learning_rates(self, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
+        for group in optimizer.param_groups:
+            if group.get("name") in LEARNING_RATES:
+                group["lr"] = C(self.cfg[LEARNING_RATES[group["name"]]], epoch, step)
+
+    def observe(self, out: Rasterized, width: int, height: int, loss_scale: float = 1.0) -> None:
+        """Add one step's screen-space gradients and contributions to the statistics."""
+        if out.means2d.grad is not None:
+            self.gradient_sum += densify.screen_gradients(out.means2d.grad, width, height, loss_scale).sum(0)
+            self.gradient_count += (out.radii > 0).sum(0)
+        torch.maximum(self.contribution, out.contribution.amax(0), out=self.contribution)
+
+    def after_step(self, optimizer: torch.optim.Optimizer, step: int) -> bool:
+        """Densify and prune where the schedule says so; ``step`` counts finished optimiser steps. True if N may have changed."""
+        cfg = self.cfg.densify
+        if not cfg.enabled or not cfg.start <= step < cfg.stop or step % cfg.every:
+            return False
+        mean_gradient = self.gradient_sum / self.gradient_count.clamp_min(1)
+        rules = Rules(cfg.grad_threshold, cfg.split_scale, cfg.min_opacity, cfg.max_scale, self.cfg.max_gaussians, self.cfg.min_gaussians)
+        change = densify.densify_and_prune(
+            self.parameters_by_name(), Statistics(mean_gradient, self.contribution), rules, generator(run_seed(), "split", step)
+        )
+        self.apply_change(change, optimizer)
+        return True
+
+    def apply_change(self, change: Change, optimizer: torch.optim.Optimizer) -> None:
+        """Replace the cloud by ``change`` and move the optimiser's rows along; the statistics start anew."""
+        old = self.parameters_by_name()
+        new = {name: nn.Parameter(value) for name, value in change.values.items()}
+        densify.update_optimizer(optimizer, old, new, change)
+        for name, parameter in new.items():
+            setattr(self, name, parameter)
+        for name in STATISTICS:
+            self.register_buffer(name, torch.zeros(len(change.parents), device=self.means.device))
+
+
+def _nested(cfg: Any, dotted: str) -> Any:
+    for key in dotted.split("."):
+        cfg = cfg[key]
+    return cfg

@@ -1,0 +1,56 @@
+"""The prior's result beside the run's other files: it is computed once, and a run that starts again in its folder reads it."""
+
+import hashlib
+import json
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any, Optional
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from .files import atomic_file
+from .host import info, run_seed
+from .ply import write_points
+from .point_cloud import PointCloud
+
+
+def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud:
+    """``prior(prompt)``, from ``save/prior/points.npz`` when the same prior, options, prompt and seed left it there.
+
+    ``points.ply`` beside it is for people and viewers; without a ``save_dir`` nothing is cached.
+    """
+    if save_dir is None:
+        return prior(prompt)
+    path, key = Path(save_dir) / "prior" / "points.npz", cache_key(prior, prompt)
+    cloud = read_cache(path, key)
+    if cloud is not None:
+        info(f"the prior's points come from {path}")
+        return cloud
+    cloud = prior(prompt)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path) as file:
+        np.savez_compressed(file, key=np.array(key), **{name: value for name, value in cloud._asdict().items() if value is not None})
+    write_points(path.with_suffix(".ply"), cloud)
+    return cloud
+
+
+def cache_key(prior: Any, prompt: str) -> str:
+    """A digest of everything that the prior's result depends on."""
+    options = OmegaConf.to_container(prior.cfg) if OmegaConf.is_config(prior.cfg) else vars(prior.cfg)
+    content = [type(prior).__module__, type(prior).__qualname__, options, prompt, run_seed()]
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def read_cache(path: Path, key: str) -> Optional[PointCloud]:
+    """The cached cloud when it was made by the same prior; None when there is none, another one, or a damaged file."""
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            if str(data["key"]) != key:
+                return None
+            return PointCloud(**{name: data[name] for name in data.files if name != "key"})
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error):
+        return None

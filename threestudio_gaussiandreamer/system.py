@@ -1,0 +1,289 @@
+"""System ``gaussiandreamer-system``: a prior becomes a cloud, score distillation improves it, the result is looked at and measured.
+
+The life of a run, in the host's order: ``configure_optimizers`` prepares prompt, guidance and cloud; ``training_step`` renders,
+asks the guidance for its losses, steps the optimiser, then densifies and prunes (after the step, so that no update is lost and
+a checkpoint written after it holds the cloud that the next step starts from); validation writes a grid of pictures, test a
+turntable, and where the guidance knows the truth the cloud is scored on views that no bank holds.
+
+=============  ==============================================================================================================
+option         meaning
+=============  ==============================================================================================================
+loss.lambda_*  weight of each loss, a number or a schedule: ``sds`` and every other ``loss_*`` of the guidance;
+               ``sparsity`` mean sqrt(alpha^2 + 0.01); ``opaque`` entropy of alpha, which pushes it to 0 or 1
+optimizer      name (a torch optimiser) and args; the learning rates belong to the geometry and the background
+evaluation     views, size (pixels), supersample, every (steps; 0: only at start and end): PSNR and SSIM on held-out views
+=============  ==============================================================================================================
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Optional
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from .background import FlatBackground
+from .errors import UserError, unknown
+from .evaluate import EvaluationConfig, HeldOut, Measurements
+from .guidance.base import ScoreDistillation
+from .host import BaseLift3DSystem, find, info, register, validate_schedule
+from .metrics import psnr
+from .nested import adopt_nested
+from .ply import write_gaussians, write_points
+from .point_cloud import PointCloud
+from .prior_cache import cached_cloud
+
+REGULARISERS = ("sparsity", "opaque")
+
+
+@register("gaussiandreamer-system")
+class GaussianDreamerSystem(BaseLift3DSystem):
+    @dataclass
+    class Config(BaseLift3DSystem.Config):
+        exporter_type: str = "gaussiandreamer-exporter"
+        evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+        def __post_init__(self) -> None:
+            adopt_nested(self)
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            EvaluationConfig.check(cfg.evaluation)
+            for name, weight in cfg.loss.items():
+                validate_schedule(weight, f"system.loss.{name}")
+            for name in cfg.optimizer:
+                if name not in ("name", "args"):
+                    raise unknown("key system.optimizer.", name, ("name", "args"))
+            optimizer = cfg.optimizer.get("name", "Adam")
+            if not isinstance(getattr(torch.optim, str(optimizer), None), type):
+                raise unknown("system.optimizer.name", optimizer, [n for n, v in vars(torch.optim).items() if isinstance(v, type)])
+
+    cfg: Config
+
+    # -- start ---------------------------------------------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        self.Config.check(self.cfg)
+        super().configure()
+        self.automatic_optimization = False
+        self.guidance = self.measurements = None
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        self.prepare_guidance()
+        self.ensure_cloud()
+        own_background = isinstance(self.background, FlatBackground)
+        groups = self.geometry.parameter_groups() + (self.background.parameter_groups() if own_background else [])
+        arguments = {"betas": (0.9, 0.99), "eps": 1e-15, **self.cfg.optimizer.get("args", {})}
+        return getattr(torch.optim, self.cfg.optimizer.get("name", "Adam"))(groups, lr=0.0, **arguments)
+
+    def prepare_guidance(self) -> None:
+        """Before the prior runs, so that missing weights show in seconds."""
+        self.prompt_processor = find(self.cfg.prompt_processor_type)(self.cfg.prompt_processor)
+        self.prompt_utils = self.prompt_processor()
+        self.guidance = find(self.cfg.guidance_type)(self.cfg.guidance)
+
+    def ensure_cloud(self) -> None:
+        """Run the prior, unless a checkpoint brought the cloud."""
+        if len(self.geometry):
+            return
+        prompt = getattr(self, "prompt_utils", None) or find(self.cfg.prompt_processor_type)(self.cfg.prompt_processor)
+        self.geometry.initialize(str(getattr(prompt, "prompt", "")), lambda prior, text: cached_cloud(prior, text, self._save_dir))
+        info(f"the cloud starts with {len(self.geometry)} Gaussians")
+
+    def on_fit_start(self) -> None:
+        super().on_fit_start()
+        caster = getattr(self.guidance, "caster", None)
+        if caster is not None and self._save_dir is not None:
+            self.measurements = Measurements(HeldOut(self.cfg.evaluation, caster), Path(self._save_dir))
+
+    def on_train_start(self) -> None:
+        dataset = self.trainer.train_dataloader.dataset
+        if hasattr(dataset, "start_step"):
+            dataset.start_step = self.global_step
+        if self.global_step == 0:
+            self.score("prior")
+        if self.measurements:
+            self.measurements.start_clock()
+
+    # -- one step ------------------------------------------------------------------------------------------------------------
+
+    def forward(self, batch: dict[str, Any]) -> dict[str, Any]:
+        return self.renderer(**batch)
+
+    def training_step(self, batch: dict[str, Any], batch_idx: int) -> None:
+        optimizer = self.optimizers()
+        self.set_learning_rates(optimizer)
+        out = self(batch)
+        losses = self.losses(out, batch)
+        loss = torch.stack(list(losses.values())).sum()
+        self.manual_backward(loss)
+        self.geometry.observe(out["rasterized"], batch["width"], batch["height"], self.loss_scale())
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+        # self.optimizers() wraps the torch optimiser, whose rows have to follow the Gaussians
+        self.geometry.after_step(optimizer.optimizer, self.global_step)
+        self.report(out, batch, losses, loss)
+
+    def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
+        for part in (self.geometry, self.background):
+            if hasattr(part, "set_learning_rates"):
+                part.set_learning_rates(optimizer, self.true_current_epoch, self.true_global_step)
+
+    def losses(self, out: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
+        """The weighted losses: every ``loss_*`` that the guidance returns, and our regularisers on the real alpha."""
+        guided = self.guidance(out["comp_rgb"], self.prompt_utils, **batch, rgb_as_latents=False, comp_rgb_bg=out["comp_rgb_bg"])
+        self._log_sometimes({f"train/{k}": v for k, v in guided.items() if not k.startswith("loss_") and k != "eval"})
+        raw = {k.removeprefix("loss_"): v for k, v in guided.items() if k.startswith("loss_")}
+        weights = {name.removeprefix("lambda_"): self.C(weight) for name, weight in self.cfg.loss.items()}
+        self._check_weights(weights, raw)
+        raw |= {name: regulariser(name, out["opacity"]) for name in REGULARISERS if weights.get(name)}
+        return {name: value * weights[name] for name, value in raw.items()}
+
+    def _check_weights(self, weights: dict[str, float], raw: dict[str, Tensor]) -> None:
+        for name in weights:
+            if name not in raw and name not in REGULARISERS:
+                raise unknown("weight system.loss.lambda_*", f"lambda_{name}", [f"lambda_{n}" for n in (*raw, *REGULARISERS)])
+        for name in raw:
+            if name not in weights:
+                raise UserError(f"the guidance returns loss_{name}: give its weight, for instance system.loss.lambda_{name}=1")
+
+    def loss_scale(self) -> float:
+        """The factor that automatic mixed precision leaves on every gradient that isn't a parameter's."""
+        scaler = getattr(self.trainer.precision_plugin, "scaler", None)
+        return 1.0 if scaler is None else float(scaler.get_scale())
+
+    def report(self, out: dict[str, Any], batch: dict[str, Any], losses: dict[str, Tensor], loss: Tensor) -> None:
+        """Loss, count and, where it is known, dB: to the progress bar and the loggers, every ``log_every_n_steps``."""
+        if not self._log_now():
+            return
+        self.log_dict({f"train/loss_{name}": value.detach() for name, value in losses.items()})
+        shown = {"loss": loss.detach(), "gaussians": float(len(self.geometry))}
+        truth = self.truth(batch, out)
+        if truth is not None:
+            shown["dB"] = psnr(out["comp_rgb"].detach(), truth).mean()
+        self.log_dict(shown, prog_bar=True)
+
+    def truth(self, batch: dict[str, Any], out: dict[str, Any]) -> Optional[Float[Tensor, "B H W 3"]]:
+        """What these views should look like, where the guidance knows it."""
+        target = getattr(self.guidance, "target_rgb", None)
+        return None if target is None else target(batch, out["comp_rgb_bg"].detach())
+
+    def _log_now(self) -> bool:
+        every = self.trainer.log_every_n_steps
+        return bool(every) and self.global_step % every == 0
+
+    def _log_sometimes(self, values: dict[str, Any]) -> None:
+        if self._log_now():
+            self.log_dict({name: float(value) for name, value in values.items()})
+
+    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        super().on_train_batch_end(outputs, batch, batch_idx)
+        every = self.cfg.evaluation.every
+        if every and self.global_step % every == 0:
+            self.score("curve")
+
+    # -- measuring -----------------------------------------------------------------------------------------------------------
+
+    def score(self, key: str) -> None:
+        """Score the cloud on the held-out views, where the truth is known."""
+        if self.measurements:
+            scores = self.measurements.score(key, self.renderer, self.global_step, len(self.geometry))
+            info(f"{key}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f} on {self.cfg.evaluation.views} held-out views")
+
+    def on_train_end(self) -> None:
+        if self.measurements:
+            self.measurements.stop_clock()
+        self.score("result")
+
+    def summary(self) -> str:
+        """Where the pictures, the video and the clouds are, and what was measured; printed when a run has ended."""
+        folder = Path(self._save_dir or ".")
+        found = [path for pattern in ("held_out/compare.png", "it*-test.mp4", "it*-export/*.ply") for path in sorted(folder.glob(pattern))]
+        lines = [str(path) for path in found]
+        return "\n".join([*lines, *(["", self.measurements.table()] if self.measurements else [])])
+
+    # -- looking -------------------------------------------------------------------------------------------------------------
+
+    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
+        out = self(batch)
+        images = picture_row(out)
+        truth = self.truth(batch, out) if self.guidance is not None else None
+        if truth is not None:
+            images.append(_rgb(truth[0]))
+        if isinstance(self.guidance, ScoreDistillation):
+            images.append(_rgb(self.denoised(out, batch)))
+        self.save_image_grid(f"it{self.true_global_step}-{int(batch['index'][0])}.png", images, name="validation_step", step=self.true_global_step)
+
+    def denoised(self, out: dict[str, Any], batch: dict[str, Any]) -> Float[Tensor, "H W 3"]:
+        """What the score model makes of this render in one step, at the render's size."""
+        guided = self.guidance(out["comp_rgb"], self.prompt_utils, **batch, rgb_as_latents=False, guidance_eval=True, comp_rgb_bg=out["comp_rgb_bg"])
+        image = guided["eval"]["imgs_1step"][:1].permute(0, 3, 1, 2)
+        size = out["comp_rgb"].shape[1:3]
+        return F.interpolate(image, size, mode="bilinear", align_corners=False)[0].permute(1, 2, 0).clamp(0, 1)
+
+    def on_validation_epoch_end(self) -> None:
+        pass
+
+    def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
+        name = f"it{self.true_global_step}-test/{int(batch['index'][0])}.png"
+        self.save_image_grid(name, [_rgb(self(batch)["comp_rgb"][0])], name="test_step", step=self.true_global_step)
+
+    def on_test_epoch_end(self) -> None:
+        folder = f"it{self.true_global_step}-test"
+        self.save_img_sequence(folder, folder, r"(\d+)\.png", save_format="mp4", fps=30, name="test", step=self.true_global_step)
+        if self.guidance is not None:
+            self.export()
+
+    def export(self) -> None:
+        """Write what the exporter makes, as ``--export`` does; a training run ends with it."""
+        exporter = find(self.cfg.exporter_type)(self.cfg.exporter, geometry=self.geometry, material=self.material, background=self.background)
+        for out in exporter():
+            getattr(self, f"save_{out.save_type}")(f"it{self.true_global_step}-export/{out.save_name}", **out.params)
+
+    def on_validation_start(self) -> None:
+        self.ensure_cloud()
+
+    def on_test_start(self) -> None:
+        self.ensure_cloud()
+
+    def on_predict_start(self) -> None:
+        self.ensure_cloud()
+        super().on_predict_start()
+
+    # -- savers that the exporters name --------------------------------------------------------------------------------------
+
+    def save_ply(self, filename: str, **arrays: Any) -> str:
+        path = self.get_save_path(filename)
+        write_gaussians(path, **arrays)
+        return path
+
+    def save_points(self, filename: str, cloud: PointCloud) -> str:
+        path = self.get_save_path(filename)
+        write_points(path, cloud)
+        return path
+
+
+def regulariser(name: str, alpha: Float[Tensor, "B H W 1"]) -> Tensor:
+    """threestudio's terms on the rendered alpha: ``sparsity`` wants little of it, ``opaque`` wants it near 0 or 1."""
+    if name == "sparsity":
+        return (alpha**2 + 0.01).sqrt().mean()
+    clamped = alpha.clamp(1e-3, 1 - 1e-3)
+    return F.binary_cross_entropy(clamped, clamped)
+
+
+def picture_row(out: dict[str, Any]) -> list[dict[str, Any]]:
+    """Colour, depth, normals and alpha of the first view, as the host's image grid wants them."""
+    images = [_rgb(out["comp_rgb"][0])]
+    depth, alpha = out["depth"][0, ..., 0], out["opacity"][0, ..., 0]
+    visible = depth[alpha > 0.5]
+    near, far = (float(visible.min()), float(visible.max()) + 1e-6) if len(visible) else (0.0, 1.0)
+    images.append({"type": "grayscale", "img": depth, "kwargs": {"cmap": "jet", "data_range": (near, far)}})
+    if "comp_normal" in out:
+        images.append(_rgb(out["comp_normal"][0]))
+    return [*images, {"type": "grayscale", "img": alpha, "kwargs": {"cmap": None, "data_range": (0, 1)}}]
+
+
+def _rgb(image: Float[Tensor, "H W 3"]) -> dict[str, Any]:
+    return {"type": "rgb", "img": image, "kwargs": {"data_format": "HWC"}}
