@@ -1,0 +1,163 @@
+"""Whole runs of a few steps: with a mocked guidance (copy this one for your own), against a known truth, killed and resumed."""
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from threestudio_gaussiandreamer.experiment import main
+from threestudio_gaussiandreamer.host import BaseObject, register
+from threestudio_gaussiandreamer.ply import read_gaussians
+
+CONFIGS = Path(__file__).parent.parent / "configs"
+SMALL = [
+    "data.width=24", "data.height=24", "data.eval_width=32", "data.eval_height=32", "data.n_test_views=3", "data.train_views=12",
+    "system.geometry.prior.num_points=150", "system.geometry.prior.color_smoothing=0", "system.geometry.grow.num_candidates=20000",
+    "system.geometry.grow.radius=0.05", "system.geometry.grow.max_points=50", "system.evaluation.size=24", "system.evaluation.views=6",
+    "trainer.enable_progress_bar=false", "trainer.log_every_n_steps=1", "use_timestamp=false", "tag=t",
+]  # fmt: skip
+
+
+@dataclass
+class _Config(BaseObject.Config):
+    color: tuple = (0.9, 0.2, 0.1)
+
+
+@register("test-mock-guidance")
+class MockGuidance(BaseObject):
+    """threestudio's call: pulls every render towards one colour. A score model in your tests looks like this."""
+
+    Config = _Config
+
+    def __call__(self, rgb, prompt_utils, elevation, azimuth, camera_distances, rgb_as_latents=False, guidance_eval=False, **kwargs):
+        target = torch.tensor(list(self.cfg.color)).expand_as(rgb)
+        return {"loss_sds": 0.5 * ((rgb - target) ** 2).sum() / len(rgb), "grad_norm": (rgb - target).norm().detach(), "min_step": 20, "max_step": 980}
+
+
+@pytest.fixture(scope="module")
+def painted_box(tmp_path_factory):
+    """A box whose six sides have six colours, as a GLB."""
+    import trimesh
+
+    box = trimesh.creation.box(extents=(1.0, 1.6, 1.2))
+    box = box.subdivide().subdivide()
+    sides = np.abs(box.face_normals).argmax(1) * 2 + (box.face_normals.max(1) > 0.5)
+    palette = np.array([[220, 40, 40], [40, 200, 60], [50, 80, 220], [230, 210, 50], [200, 60, 200], [60, 210, 210]])
+    box.unmerge_vertices()
+    box.visual.vertex_colors = np.repeat(palette[sides], 3, axis=0)
+    path = tmp_path_factory.mktemp("assets") / "box.glb"
+    box.export(path)
+    return path
+
+
+def launch(folder, mesh, *options, stage="--train"):
+    overrides = [f"exp_root_dir={folder}", f"system.guidance.mesh={mesh}", *SMALL, *options]
+    return main(["--config", str(CONFIGS / "demo.yaml"), stage, "--gpu", "cpu", *overrides])
+
+
+def trial(folder):
+    return Path(folder) / "demo" / "t"
+
+
+def cloud_of(path):
+    return torch.load(path, weights_only=True, map_location="cpu")["state_dict"]
+
+
+def same(a, b):
+    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+def mocked_config(folder, mesh, **system):
+    """The demo's YAML with the mock in the place of its guidance."""
+    cfg = yaml.safe_load((CONFIGS / "demo.yaml").read_text())
+    cfg["system"] |= {"guidance_type": "test-mock-guidance", "guidance": {}, **system}
+    cfg["system"]["geometry"]["prior"]["path"] = str(mesh)
+    path = folder / "mocked.yaml"
+    path.write_text(yaml.safe_dump(cfg))
+    return path
+
+
+def test_a_run_with_a_mocked_guidance_goes_from_prior_to_files(tmp_path, painted_box):
+    overrides = [f"exp_root_dir={tmp_path}", *SMALL, "trainer.max_steps=6", "trainer.val_check_interval=3"]
+    assert main(["--config", str(mocked_config(tmp_path, painted_box)), "--train", "--gpu", "cpu", *overrides]) == 0
+    save = trial(tmp_path) / "save"
+    assert (save / "it3-0.png").is_file() and (save / "it6-0.png").is_file()
+    assert (save / "it6-test.mp4").stat().st_size > 0 and (save / "it6-test" / "2.png").is_file()
+    assert len(read_gaussians(save / "it6-export" / "gaussians.ply").means) == 200
+    assert (trial(tmp_path) / "ckpts" / "last.ckpt").is_file() and (trial(tmp_path) / "cmd.txt").is_file()
+
+
+def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, painted_box, capsys):
+    assert launch(tmp_path, painted_box, "trainer.max_steps=60", "trainer.val_check_interval=60") == 0
+    metrics = json.loads((trial(tmp_path) / "save" / "metrics.json").read_text())
+    assert metrics["result"]["psnr"] > metrics["prior"]["psnr"] + 1.5  # 60 steps at 24 pixels give about 4 dB
+    assert metrics["result"]["step"] == 60 and metrics["result"]["gaussians"] == 200
+    printed = capsys.readouterr().out
+    assert "compare.png" in printed and "test.mp4" in printed and ".ply" in printed and "multi-face" in printed
+    rows = list(csv.DictReader(open(trial(tmp_path) / "csv_logs" / "version_0" / "metrics.csv")))
+    assert {"loss", "gaussians", "dB", "train/loss_sds", "train/grad_norm"} <= set(rows[0])
+
+
+DENSIFY = ["system.geometry.densify.enabled=true", "system.geometry.densify.start=2", "system.geometry.densify.stop=8",
+           "system.geometry.densify.every=2", "system.geometry.densify.grad_threshold=1e-4", "system.geometry.densify.min_opacity=0.01"]  # fmt: skip
+
+
+@pytest.mark.parametrize("stop", [3, 4, 5])
+def test_a_stopped_and_resumed_run_equals_the_run_that_never_stopped(tmp_path, painted_box, stop):
+    """Bit for bit: Gaussians, moments, statistics; the stops lie before, at and after a densification, with more validation."""
+    options = [*DENSIFY, "checkpoint.every_n_train_steps=1"]
+    assert launch(tmp_path / "whole", painted_box, *options, "trainer.max_steps=9", "trainer.val_check_interval=9") == 0
+    assert launch(tmp_path / "parts", painted_box, *options, f"trainer.max_steps={stop}", "trainer.val_check_interval=1") == 0
+    last = trial(tmp_path / "parts") / "ckpts" / "last.ckpt"
+    assert launch(tmp_path / "parts", painted_box, *options, "trainer.max_steps=9", "trainer.val_check_interval=2", f"resume={last}") == 0
+    whole, parts = (torch.load(trial(tmp_path / name) / "ckpts" / "last.ckpt", weights_only=True) for name in ("whole", "parts"))
+    assert whole["global_step"] == parts["global_step"] == 9
+    assert len(whole["state_dict"]["geometry.means"]) > 250  # it did densify
+    assert same(whole["state_dict"], parts["state_dict"])
+    states = [c["optimizer_states"][0]["state"] for c in (whole, parts)]
+    assert all(torch.equal(states[0][i][k], states[1][i][k]) for i in states[0] for k in ("exp_avg", "exp_avg_sq", "step"))
+
+
+def test_test_validate_and_export_use_the_checkpoint_and_no_prior(tmp_path, painted_box):
+    mesh = tmp_path / "box.glb"
+    mesh.write_bytes(painted_box.read_bytes())
+    assert launch(tmp_path, mesh, "trainer.max_steps=3", "trainer.val_check_interval=3") == 0
+    save, last = trial(tmp_path) / "save", trial(tmp_path) / "ckpts" / "last.ckpt"
+    trained = (save / "it3-test" / "1.png").read_bytes()
+    for path in (*save.glob("it3-test/*"), *save.glob("it3-export/*"), save / "it3-0.png", save / "it3-test.mp4"):
+        path.unlink()
+    mesh.unlink()  # neither prior nor target is needed any more
+    for stage in ("--test", "--validate", "--export"):
+        assert launch(tmp_path, mesh, f"resume={last}", stage=stage) == 0
+    assert (save / "it3-test" / "1.png").read_bytes() == trained
+    assert (save / "it3-0.png").is_file()
+    exported = read_gaussians(save / "it3-export" / "gaussians.ply")
+    assert np.array_equal(exported.means, cloud_of(last)["geometry.means"].numpy())
+
+
+@pytest.mark.parametrize("name, sign", [("sparsity", -1), ("opaque", 1)])
+def test_regularisers_have_real_gradients_on_the_real_alpha(tmp_path, painted_box, name, sign):
+    """Sparsity makes the cloud fainter; opaque pushes alphas above one half to one."""
+    base = ["trainer.max_steps=15", "trainer.val_check_interval=15", "system.geometry.init_opacity=0.7"]
+    weights = ["system.loss.lambda_sds=0", f"system.loss.lambda_{name}=100"]
+    assert launch(tmp_path, painted_box, *base, *weights) == 0
+    opacity = torch.sigmoid(cloud_of(trial(tmp_path) / "ckpts" / "last.ckpt")["geometry.logit_opacities"]).mean()
+    assert sign * (opacity - 0.7) > 0.02
+
+
+def test_a_learned_background_learns_and_is_in_the_checkpoint(tmp_path, painted_box):
+    config = mocked_config(tmp_path, painted_box, background={"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": 0.1})
+    overrides = [f"exp_root_dir={tmp_path}", *SMALL, "trainer.max_steps=20", "trainer.val_check_interval=20"]
+    assert main(["--config", str(config), "--train", "--gpu", "cpu", *overrides]) == 0
+    color = torch.sigmoid(cloud_of(trial(tmp_path) / "ckpts" / "last.ckpt")["background.logit"])
+    assert color[0] > 0.7 and color[1] < 0.35 and color[2] < 0.3  # on its way from grey to the mock's (0.9, 0.2, 0.1)
+
+
+def test_the_weight_of_a_loss_that_nobody_returns_is_named(tmp_path, painted_box, capsys):
+    assert launch(tmp_path, painted_box, "system.loss.lambda_spasity=1.0", "trainer.max_steps=2") == 2
+    assert "lambda_sparsity" in capsys.readouterr().err

@@ -1,0 +1,90 @@
+// Memory that only grows, and objects made of it that are used again instead of being freed.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <cstdlib>
+#include <memory>
+#include <mutex>
+#include <vector>
+
+#if defined(__linux__)
+#include <sys/mman.h>
+#include <unistd.h>
+#endif
+
+namespace splat {
+
+// What a call would have needed; becomes its return value.
+struct OutOfMemory {
+  int64_t bytes;
+};
+
+inline int64_t memory_of_machine() {
+#if defined(__linux__)
+  return int64_t(sysconf(_SC_PHYS_PAGES)) * sysconf(_SC_PAGESIZE);
+#else
+  return int64_t(1) << 36;
+#endif
+}
+
+// Linux grants memory that it doesn't have, and then kills: better to refuse.
+inline void check_memory(int64_t bytes) {
+  if (bytes > memory_of_machine() / 4 * 3) throw OutOfMemory{bytes};
+}
+
+template <class T> class Buffer {
+ public:
+  Buffer() = default;
+  Buffer(const Buffer&) = delete;
+  Buffer& operator=(const Buffer&) = delete;
+  ~Buffer() { std::free(data_); }
+
+  // Room for `count` items; the old contents are lost when it grows.
+  T* reserve(size_t count) {
+    if (count > capacity_) grow(count + count / 4 + 64);
+    return data_;
+  }
+  T* data() { return data_; }
+  const T* data() const { return data_; }
+  T& operator[](size_t i) { return data_[i]; }
+  const T& operator[](size_t i) const { return data_[i]; }
+
+ private:
+  void grow(size_t count) {
+    const size_t bytes = sizeof(T) * count, huge_page = size_t(1) << 21;
+    std::free(data_);
+    data_ = nullptr, capacity_ = 0;
+    void* fresh = nullptr;
+    if (posix_memalign(&fresh, bytes >= huge_page ? huge_page : 64, bytes)) throw OutOfMemory{int64_t(bytes)};
+#if defined(__linux__)
+    if (bytes >= huge_page) madvise(fresh, bytes, MADV_HUGEPAGE);
+#endif
+    data_ = static_cast<T*>(fresh), capacity_ = count;
+  }
+
+  T* data_ = nullptr;
+  size_t capacity_ = 0;
+};
+
+// Hands out objects whose buffers have already grown; keeps at most two idle ones.
+template <class T> class Pool {
+ public:
+  std::unique_ptr<T> take() {
+    std::lock_guard<std::mutex> lock(mutex_);
+    if (idle_.empty()) return std::make_unique<T>();
+    std::unique_ptr<T> item = std::move(idle_.back());
+    idle_.pop_back();
+    return item;
+  }
+  void give(std::unique_ptr<T> item) {
+    std::lock_guard<std::mutex> lock(mutex_);
+    if (idle_.size() < 2) idle_.push_back(std::move(item));
+  }
+
+ private:
+  std::mutex mutex_;
+  std::vector<std::unique_ptr<T>> idle_;
+};
+
+}  // namespace splat

@@ -1,0 +1,144 @@
+// SIMD vectors by GCC's vector extensions: as many lanes as the instruction set of this build has.
+#pragma once
+
+#include <cstdint>
+#include <cstring>
+#include <utility>
+
+#define SPLAT_FN static inline __attribute__((always_inline))
+
+namespace splat {
+
+#if defined(__AVX512F__)
+constexpr int LANES = 16;
+#elif defined(__AVX2__)
+constexpr int LANES = 8;
+#else
+constexpr int LANES = 4;
+#endif
+
+template <int N> struct Vector {
+  typedef float Float __attribute__((vector_size(4 * N)));
+  typedef int32_t Int __attribute__((vector_size(4 * N)));
+};
+using Floats = Vector<LANES>::Float;
+using Ints = Vector<LANES>::Int;
+using Quad = Vector<4>::Float;    // four pixels of a row
+using Octet = Vector<8>::Float;   // one number per row of blocks in a tile
+using OctetInts = Vector<8>::Int;
+
+template <class V> constexpr int lanes_of() { return sizeof(V) / 4; }
+
+template <class V = Floats> SPLAT_FN V load(const float* p) {
+  V v;
+  std::memcpy(&v, p, sizeof v);
+  return v;
+}
+template <class V> SPLAT_FN void store(float* p, V v) { std::memcpy(p, &v, sizeof v); }
+
+// Lane l of the result is lane `pattern(l)` of a and b laid end to end; `pattern` is a captureless lambda.
+template <class V, class Pattern, int... L> SPLAT_FN V shuffle(V a, V b, Pattern pattern, std::integer_sequence<int, L...>) {
+#if defined(__clang__)
+  return __builtin_shufflevector(a, b, pattern(L)...);
+#else
+  return __builtin_shuffle(a, b, typename Vector<lanes_of<V>()>::Int{pattern(L)...});
+#endif
+}
+template <class V, class Pattern> SPLAT_FN V shuffle(V a, V b, Pattern pattern) {
+  return shuffle(a, b, pattern, std::make_integer_sequence<int, lanes_of<V>()>());
+}
+
+template <class V> SPLAT_FN V square_root(V x) {
+  for (int l = 0; l < lanes_of<V>(); l++) x[l] = __builtin_sqrtf(x[l]);
+  return x;
+}
+
+// Whether x >= bound in any lane.
+SPLAT_FN bool any_at_least(Floats x, float bound) {
+  const Ints reached = x >= bound;
+  int32_t any = 0;
+  for (int l = 0; l < LANES; l++) any |= reached[l];
+  return any != 0;
+}
+
+// 2^x for -126 <= x < 128, relative error 3e-7; garbage below. Adding 1.5 * 2^23 rounds to an integer n, which is then both
+// the number to take off and, in the low bits, the exponent to add; a minimax polynomial does the rest in [-1/2, 1/2].
+SPLAT_FN Floats exp2(Floats x) {
+  const float rounder = 12582912.0f;
+  const Floats rounded = x + rounder, r = x - (rounded - rounder);
+  Floats y = 0.001327647129073739f * r + 0.009675540961325169f;
+  y = y * r + 0.05550713092088699f;
+  y = y * r + 0.24022120237350464f;
+  y = y * r + 0.6931469440460205f;
+  y = y * r + 1.0f;
+  return (Floats)((Ints)y + ((Ints)rounded << 23));
+}
+
+// log2(x) of a normal x > 0, relative error 2e-7: exponent + 2 atanh((m - 1) / (m + 1)) / ln 2 with m in [sqrt(1/2), sqrt(2)).
+SPLAT_FN Floats log2(Floats x) {
+  const Ints shifted = (Ints)x - 0x3f3504f3;  // the bits of sqrt(1/2)
+  const Ints exponent = shifted >> 23;
+  const Floats m = (Floats)((Ints)x - (exponent << 23));
+  const Floats s = (m - 1.0f) / (m + 1.0f), s2 = s * s;
+  Floats y = 0.32059890f * s2 + 0.41219858f;
+  y = y * s2 + 0.57707802f;
+  y = y * s2 + 0.96179669f;
+  y = y * s2 + 2.88539008f;
+  return y * s + __builtin_convertvector(exponent, Floats);
+}
+
+// ---- rows of memory <-> lanes ----------------------------------------------------------------------------------------------
+
+// Transposes each 4x4 square of four vectors.
+template <class V> SPLAT_FN void transpose_quads(V& r0, V& r1, V& r2, V& r3) {
+  constexpr int N = lanes_of<V>();
+  const auto low = [](int l) { return (l & ~3) + ((l & 3) >> 1) + (l & 1) * N; };
+  const auto high = [](int l) { return (l & ~3) + 2 + ((l & 3) >> 1) + (l & 1) * N; };
+  const auto front = [](int l) { return (l & ~3) + (l & 1) + ((l & 2) >> 1) * N; };
+  const auto back = [](int l) { return (l & ~3) + 2 + (l & 1) + ((l & 2) >> 1) * N; };
+  const V t0 = shuffle(r0, r1, low), t1 = shuffle(r2, r3, low), t2 = shuffle(r0, r1, high), t3 = shuffle(r2, r3, high);
+  r0 = shuffle(t0, t1, front), r1 = shuffle(t0, t1, back), r2 = shuffle(t2, t3, front), r3 = shuffle(t2, t3, back);
+}
+
+// Transposes the LANES x LANES square in place.
+SPLAT_FN void transpose(Floats r[LANES]) {
+  for (int i = 0; i < LANES; i += 4) transpose_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);
+  const auto even = [](int l) { return (l & 3) + 8 * (l >> 2); };      // 128-bit groups 0, 2 of a, then of b
+  const auto odd = [](int l) { return (l & 3) + 8 * (l >> 2) + 4; };
+  if constexpr (LANES == 8) {
+    const auto first = [](int l) { return l < 4 ? l : l + 4; };
+    const auto second = [](int l) { return l < 4 ? l + 4 : l + 8; };
+    for (int k = 0; k < 4; k++) {
+      const Floats a = r[k], b = r[4 + k];
+      r[k] = shuffle(a, b, first), r[4 + k] = shuffle(a, b, second);
+    }
+  }
+  if constexpr (LANES == 16) {
+    for (int k = 0; k < 4; k++) {
+      const Floats a = shuffle(r[k], r[4 + k], even), b = shuffle(r[k], r[4 + k], odd);
+      const Floats c = shuffle(r[8 + k], r[12 + k], even), d = shuffle(r[8 + k], r[12 + k], odd);
+      r[k] = shuffle(a, c, even), r[8 + k] = shuffle(a, c, odd);
+      r[4 + k] = shuffle(b, d, even), r[12 + k] = shuffle(b, d, odd);
+    }
+  }
+}
+
+constexpr int ROW = 16;  // floats in a cache line; the rows below
+
+// Columns 0 .. COUNT - 1 of LANES rows, where row l starts at `row(l)`; COUNT is rounded up to whole vectors.
+template <int COUNT, class Row> SPLAT_FN void load_columns(Row row, Floats* columns) {
+  for (int first = 0; first < COUNT; first += LANES) {
+    for (int l = 0; l < LANES; l++) columns[first + l] = load(row(l) + first);
+    transpose(columns + first);
+  }
+}
+
+// The 16 columns as LANES rows one after the other.
+SPLAT_FN void store_columns(Floats columns[ROW], float* rows) {
+  for (int first = 0; first < ROW; first += LANES) {
+    transpose(columns + first);
+    for (int l = 0; l < LANES; l++) store(rows + l * ROW + first, columns[first + l]);
+  }
+}
+
+}  // namespace splat

@@ -1,0 +1,70 @@
+// What is known of one view between the stages and between a forward pass and its backward pass.
+#pragma once
+
+#include <deque>
+#include <vector>
+
+#include "buffer.h"
+#include "lanes.h"
+#include "scene.h"
+#include "splat_math.h"
+
+namespace splat {
+
+// A tile is 8 x 8 blocks of 4 x 4 pixels; a strip is as many pixels of a block as there are lanes.
+constexpr int TILE = 32, BLOCK = 4, BLOCKS_PER_ROW = TILE / BLOCK, BLOCKS = BLOCKS_PER_ROW * BLOCKS_PER_ROW;
+constexpr int BLOCK_PIXELS = BLOCK * BLOCK, TILE_PIXELS = TILE * TILE, STRIPS = BLOCK_PIXELS / LANES;
+
+constexpr int SLICE = 2048;  // Gaussians projected by one task
+
+struct TileSpan {
+  uint16_t begin, end;  // tile columns
+};
+
+// The tiles of one Gaussian: a span of columns in each tile row from `row` on. Every pair of Gaussian and tile has a slot,
+// where the backward pass puts its gradient; those of a Gaussian follow one another.
+struct Coverage {
+  int32_t slot, slots;  // the first one, counted within the slice
+  int32_t span;         // index of the first one in the slice
+  uint16_t row, rows;
+};
+
+// SLICE consecutive Gaussians.
+struct Slice {
+  std::vector<TileSpan> spans;
+  int64_t slots;
+  int32_t visible, first_slot;
+};
+
+// A Gaussian in a tile.
+struct Entry {
+  int32_t gaussian, slot;
+};
+
+// A colour, depth and transmittance per pixel of a tile, block after block.
+struct Planes {
+  alignas(64) float red[TILE_PIXELS], green[TILE_PIXELS], blue[TILE_PIXELS], depth[TILE_PIXELS], transmittance[TILE_PIXELS];
+};
+
+struct View {
+  int index, tiles_x, tiles_y;
+  int64_t entry_count;
+  Camera camera;
+  Buffer<Splat> splats;         // (N)
+  Buffer<Coverage> coverage;    // (N)
+  std::vector<Slice> slices;
+  Buffer<uint64_t> keys, spare_keys;  // depth << 32 | Gaussian
+  Buffer<int32_t> histogram;
+  Buffer<int32_t> tile_begin;   // (tiles + 1) into entries
+  Buffer<Entry> entries;        // by tile, then by depth
+  Buffer<uint64_t> block_masks; // per entry, the blocks of the tile that it touches
+  Buffer<Planes> planes;        // (tiles) before the background
+
+  int tiles() const { return tiles_x * tiles_y; }
+  const Slice& slice_of(int64_t gaussian) const { return slices[gaussian / SLICE]; }
+};
+
+// Never shrinks, so that the views' buffers are used again; the scene says how many there are.
+using Views = std::deque<View>;
+
+}  // namespace splat

@@ -1,0 +1,279 @@
+"""The image model in plain torch, exact and in bounded memory, for machines without a compiled kernel; any device.
+
+Each tile of 8 x 8 pixels has a list of splats. All tiles walk through their lists together, a slice of splats per step, as
+blocks (tiles, rows, columns, splats) of bounded size; a tile leaves when its list ends or its pixels are finished. Backward
+walks the same way and computes the blocks again, so nothing the size of pixels x splats is ever stored.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple, Optional
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from .options import RasterizeOptions
+from .output import Rasterized, compose, track_means2d
+from .projection import project
+from .tiles import TILE, Grid, Lists, bound, list_splats, make_grid, regions
+
+SPLATS_PER_STEP = 64
+ELEMENTS_PER_BLOCK = 2**20
+PIXELS = TILE * TILE
+SHAPE_COLUMNS = 6
+FAINTEST = 1e-30
+
+
+def unavailable() -> Optional[str]:
+    """None: plain torch runs everywhere."""
+
+
+def rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, height, background, options: RasterizeOptions) -> Rasterized:
+    """All views; arguments as in `splatting.rasterize`, already validated."""
+    splats = project(means, quats, scales, opacities, colors, viewmats, Ks, width, height, options)
+    splats = splats._replace(means2d=track_means2d(splats, (colors, background), options.absgrad))
+    absgrad = getattr(splats.means2d, "absgrad", None)
+    sums, contribution = _Blend.apply(*splats, colors, absgrad, width, height, options)
+    return compose(sums, splats, contribution, background, options)
+
+
+class Table(NamedTuple):
+    """The visible splats of all views, front to back, one column each; the last column is a splat that draws nothing."""
+
+    ids: Tensor  # (S,) view * N + Gaussian
+    columns: Tensor  # (8 + C, S + 1): mean x, y, conic a, k, c, opacity, then the features: colour, depth, 1
+    lists: list[Lists]
+    grid: Grid
+    capped: bool  # whether any opacity exceeds alpha_max
+
+
+class Block(NamedTuple):
+    """Part of a step: G tiles with K splats each; lists that end are filled up with the splat that draws nothing."""
+
+    tiles: Tensor  # (G,)
+    splats: Tensor  # (G * K,)
+    mean_x: Tensor  # (G, K) from the tile's middle; so are the others
+    mean_y: Tensor
+    a: Tensor
+    k: Tensor
+    c: Tensor
+    opacity: Tensor
+    features: Tensor  # (G, C + 2, K)
+
+
+class _Blend(torch.autograd.Function):
+    """Sums of features weighted with alpha_i T_i (B, H, W, C + 2), and contributions (B, N)."""
+
+    @staticmethod
+    def forward(ctx, means2d, conics, opacities, depths, extents, visible, colors, absgrad, width, height, options):
+        table = _tabulate(means2d, conics, opacities, depths, extents, visible, colors, width, height, options)
+        sums, largest = _forward(table, width, height, options)
+        ctx.save_for_backward(sums)
+        ctx.table, ctx.absgrad, ctx.options, ctx.shape, ctx.colors_dim = table, absgrad, options, visible.shape, colors.dim()
+        contribution = depths.new_zeros(visible.numel()).index_copy_(0, table.ids, largest[:-1]).view(visible.shape)
+        ctx.mark_non_differentiable(contribution)
+        return sums, contribution
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad, _):
+        columns, absolute = _backward(ctx.table, *ctx.saved_tensors, grad, ctx.absgrad is not None, ctx.options)
+        if ctx.absgrad is not None:
+            ctx.absgrad.view(-1, 2).index_add_(0, ctx.table.ids, absolute[:, :-1].t())
+        full = columns.new_zeros(ctx.shape.numel(), len(columns)).index_copy_(0, ctx.table.ids, columns[:, :-1].t())
+        means2d, conics, opacities, colors, depths, _ = full.view(*ctx.shape, len(columns)).split([2, 3, 1, len(columns) - SHAPE_COLUMNS - 2, 1, 1], -1)
+        colors = colors if ctx.colors_dim == 3 else colors.sum(0)
+        return means2d, conics, opacities[..., 0], depths[..., 0], None, None, colors, None, None, None, None
+
+
+def _tabulate(means2d, conics, opacities, depths, extents, visible, colors, width, height, options) -> Table:
+    """Sorts the visible splats by depth, ties by index, and lists them for each tile."""
+    views, gaussians = visible.shape
+    ids = visible.flatten().nonzero()[:, 0]
+    ids = ids[depths.flatten()[ids].argsort(stable=True)]
+    means2d, conics, opacities, depths, extents = (x.flatten(0, 1)[ids] for x in (means2d, conics, opacities, depths, extents))
+    colors = colors[ids % gaussians] if colors.dim() == 2 else colors.flatten(0, 1)[ids]
+    grid = make_grid(views, width, height)
+    bounds = bound(means2d, conics, opacities, extents, ids // gaussians, grid, options.alpha_min)
+    lists = [list_splats(bounds, region, grid) for region in regions(bounds, grid)]
+    columns = torch.cat([means2d.t(), conics.t(), opacities[None], colors.t(), depths[None], torch.ones_like(depths)[None]])
+    return Table(ids, torch.nn.functional.pad(columns, (0, 1)), lists, grid, bool((opacities > options.alpha_max).any()))
+
+
+def _forward(table: Table, width: int, height: int, options: RasterizeOptions) -> tuple[Tensor, Tensor]:
+    """The sums (B, H, W, C + 2), and each splat's largest weight (S + 1,)."""
+    transmittances = _start(table, width, height)
+    sums = table.columns.new_zeros(table.grid.tiles, (len(table.columns) - SHAPE_COLUMNS) * PIXELS)
+    largest = table.columns.new_zeros(table.columns.shape[1])
+    for block in _march(table, transmittances, options):
+        alphas = _alphas(block, options)
+        chain = _chain(alphas, transmittances.index_select(0, block.tiles))
+        weights = _weights(alphas, chain, options)
+        transmittances.index_copy_(0, block.tiles, chain[..., -1])
+        sums.index_add_(0, block.tiles, _product(block.features, weights.transpose(1, 2)).flatten(1))
+        largest.scatter_reduce_(0, block.splats, weights.amax(1).flatten(), "amax")
+    return _from_tiles(sums, table.grid, width, height), largest
+
+
+def _backward(table: Table, sums: Tensor, grad: Tensor, absolute: bool, options: RasterizeOptions) -> tuple[Tensor, Tensor]:
+    """Gradients of the table's columns, and (2, S + 1) sums over pixels of the absolute gradient of the mean.
+
+    With ``g_i = <grad, features_i>`` the loss is ``L = sum_i g_i alpha_i T_i``, hence
+    ``alpha_i dL/dalpha_i = w_i g_i - alpha_i / (1 - alpha_i) sum_{j>i} w_j g_j`` with ``w_i = alpha_i T_i``. Front to back the
+    sum is what is left of L at the pixel, which starts as <grad, sums>: T is never divided by anything.
+    """
+    height, width = grad.shape[1:3]
+    transmittances = _start(table, width, height)
+    cotangents = _to_tiles(grad, table.grid)
+    left = (cotangents * _to_tiles(sums, table.grid)).sum(1)
+    columns = torch.zeros_like(table.columns)
+    absolutes = columns.new_zeros(2, columns.shape[1])
+    for block in _march(table, transmittances, options):
+        alphas = _alphas(block, options)
+        chain = _chain(alphas, transmittances.index_select(0, block.tiles))
+        weights = _weights(alphas, chain, options)
+        transmittances.index_copy_(0, block.tiles, chain[..., -1])
+        cotangent = cotangents.index_select(0, block.tiles)
+        gains = _product(cotangent.transpose(1, 2), block.features).mul_(weights)
+        behind = _accumulate(gains, left.index_select(0, block.tiles))
+        left.index_copy_(0, block.tiles, behind[..., -1])
+        slopes = torch.addcmul(gains, weights / chain[..., 1:].clamp(min=FAINTEST), behind[..., 1:], value=-1)
+        if table.capped:
+            slopes *= alphas < options.alpha_max
+        grads = torch.cat([_splat_gradients(block, slopes), _product(cotangent, weights)], 1)
+        columns.index_add_(1, block.splats, grads.transpose(0, 1).flatten(1))
+        if absolute:
+            absolutes.index_add_(1, block.splats, _absolute_gradients(block, slopes).transpose(0, 1).flatten(1))
+    return columns, absolutes
+
+
+def _start(table: Table, width: int, height: int) -> Tensor:
+    """Transmittance (tiles, PIXELS) before the first splat: 1 inside the image, 0 outside."""
+    ones = table.columns.new_ones(table.grid.views, height, width, 1)
+    return _to_tiles(ones, table.grid)[:, 0]
+
+
+def _march(table: Table, transmittances: Tensor, options: RasterizeOptions) -> Iterator[Block]:
+    """Blocks front to back; whoever takes one writes the tiles' transmittances behind it before taking the next."""
+    for lists in table.lists:
+        active, depth = torch.arange(len(lists.tiles), device=lists.tiles.device), 0
+        while len(active):
+            size = ELEMENTS_PER_BLOCK // (SPLATS_PER_STEP * PIXELS)
+            for part, longest in zip(active.split(size), lists.counts[active[::size]].tolist()):
+                yield _block(table, lists, part, depth, min(longest - depth, SPLATS_PER_STEP))
+            depth += SPLATS_PER_STEP
+            unfinished = transmittances[lists.tiles[active]].amax(1) >= options.stop
+            active = active[unfinished & (lists.counts[active] > depth)]
+
+
+def _block(table: Table, lists: Lists, part: Tensor, depth: int, length: int) -> Block:
+    """Entries ``depth`` to ``depth + length - 1`` of the lists named by ``part``."""
+    places = depth + torch.arange(length, device=part.device)
+    entries = (lists.starts[part, None] + places).clamp(max=len(lists.splats) - 1)
+    nothing = table.columns.shape[1] - 1
+    splats = torch.where(places < lists.counts[part, None], lists.splats[entries].long(), nothing).flatten()
+    columns = table.columns.index_select(1, splats).view(-1, len(part), length)
+    tiles = lists.tiles[part]
+    middle_x, middle_y = (origin[:, None] + TILE / 2 for origin in table.grid.origins(tiles))
+    mean_x, mean_y, a, k, c, opacity = columns[:SHAPE_COLUMNS]
+    return Block(tiles, splats, mean_x - middle_x, mean_y - middle_y, a, k, c, opacity, columns[SHAPE_COLUMNS:].transpose(0, 1).contiguous())
+
+
+def _alphas(block: Block, options: RasterizeOptions) -> Tensor:
+    """(G, PIXELS, K): ``min(alpha_max, opacity exp(-q / 2))``, or zero below alpha_min.
+
+    ``q / 2 = (x(column) - y(row))^2 + z(row)``: only the square is as large as the block.
+    """
+    steep = (block.a / 2).sqrt()[:, None]
+    from_x, from_y = _offsets(block.mean_x), _offsets(block.mean_y)
+    x, y = steep * from_x, steep * block.k[:, None] * from_y
+    top = block.opacity.clamp(min=FAINTEST).log()[:, None] - block.c[:, None] / 2 * from_y**2
+    root = x[:, None] - y[:, :, None]
+    alphas = torch.addcmul(top[:, :, None], root, root, value=-1).exp_().clamp_(max=options.alpha_max)
+    return torch.nn.functional.threshold_(alphas, _just_below(options.alpha_min, alphas), 0.0).flatten(1, 2)
+
+
+def _chain(alphas: Tensor, transmittances: Tensor) -> Tensor:
+    """(G, PIXELS, K + 1): transmittance before each splat and after the last, as if no pixel stopped."""
+    chain = alphas.new_empty(*alphas.shape[:2], alphas.shape[2] + 1)
+    chain[..., 0] = transmittances
+    torch.sub(alphas.new_ones(()), alphas, out=chain[..., 1:])
+    return torch.cumprod(chain, -1, out=chain)
+
+
+def _weights(alphas: Tensor, chain: Tensor, options: RasterizeOptions) -> Tensor:
+    """(G, PIXELS, K): ``alpha_i T_i`` where ``T_i >= stop``, else zero."""
+    return torch.nn.functional.threshold(chain[..., :-1], _just_below(options.stop, chain), 0.0).mul_(alphas)
+
+
+def _accumulate(gains: Tensor, left: Tensor) -> Tensor:
+    """(G, PIXELS, K + 1): ``left`` minus the gains so far, before each splat and after the last."""
+    behind = torch.cat([left[..., None], gains.neg()], -1)
+    return torch.cumsum(behind, -1, out=behind)
+
+
+def _splat_gradients(block: Block, slopes: Tensor) -> Tensor:
+    """(G, 6, K): gradients of mean x, y, a, k, c, opacity from ``slopes``, the gradient of the exponent ``log(opacity) - q / 2``.
+
+    They are linear in the six moments of the slopes over the tile's pixels, (1, x, y, x^2, x y, y^2) from its middle.
+    """
+    s, sx, sy, sxx, sxy, syy = _product(_monomials(slopes), slopes).unbind(1)
+    k, y = block.k, -block.mean_y
+    t = -block.mean_x - k * y  # d.x - k d.y at the middle; elsewhere x - k y is added
+    st, sty, sd = sx - k * sy, sxy - k * syy, sy + y * s
+    slopes_t = st + t * s
+    slopes_tt = sxx - k * sxy - k * sty + t * (2 * st + t * s)
+    slopes_td = sty + t * sy + y * slopes_t
+    slopes_dd = syy + y * (sy + sd)
+    grad_x = block.a * slopes_t
+    grad_y = block.c * sd - k * grad_x
+    return torch.stack([grad_x, grad_y, -slopes_tt / 2, block.a * slopes_td, -slopes_dd / 2, s / block.opacity.clamp(min=FAINTEST)], 1)
+
+
+def _absolute_gradients(block: Block, slopes: Tensor) -> Tensor:
+    """(G, 2, K): sums over the pixels of |gradient of mean x| and |gradient of mean y|."""
+    from_x, from_y = _offsets(block.mean_x)[:, None], _offsets(block.mean_y)[:, :, None]
+    slopes = slopes.view(len(slopes), TILE, TILE, -1)
+    k, c = block.k[:, None, None], block.c[:, None, None]
+    along_x = block.a[:, None, None] * (from_x - k * from_y)
+    return torch.stack([(slopes * along_x).abs().sum((1, 2)), (slopes * (c * from_y - k * along_x)).abs().sum((1, 2))], 1)
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    """Matrix products of a batch. A single one is done twice: alone, it would be shared among the threads and rounded by their number."""
+    return a @ b if len(b) > 1 else (a @ b.repeat(2, 1, 1))[:1]
+
+
+def _offsets(means: Tensor) -> Tensor:
+    """(G, TILE, K): pixel centres of a row or column minus the means (G, K), both from the tile's middle."""
+    return _centres(means)[:, None] - means[:, None]
+
+
+def _centres(like: Tensor) -> Tensor:
+    return torch.arange(TILE, dtype=like.dtype, device=like.device) - (TILE - 1) / 2
+
+
+def _monomials(like: Tensor) -> Tensor:
+    """(6, PIXELS): 1, x, y, x^2, x y, y^2 at the pixel centres, from the tile's middle."""
+    y, x = (axis.flatten() for axis in torch.meshgrid(_centres(like), _centres(like), indexing="ij"))
+    return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
+
+
+def _just_below(bound: float, like: Tensor) -> float:
+    """The number that ``x > number`` means ``x >= bound`` in the type of ``like``: torch's fast threshold is exclusive."""
+    bound = torch.tensor(bound, dtype=like.dtype)
+    return torch.nextafter(bound, torch.tensor(-torch.inf, dtype=like.dtype)).item()
+
+
+def _to_tiles(image: Tensor, grid: Grid) -> Tensor:
+    """(B, H, W, F) to (tiles, F, PIXELS), zeros outside the image."""
+    views, height, width, features = image.shape
+    image = torch.nn.functional.pad(image, (0, 0, 0, grid.columns * TILE - width, 0, grid.rows * TILE - height))
+    image = image.view(views, grid.rows, TILE, grid.columns, TILE, features)
+    return image.permute(0, 1, 3, 5, 2, 4).reshape(grid.tiles, features, PIXELS)
+
+
+def _from_tiles(tiles: Tensor, grid: Grid, width: int, height: int) -> Tensor:
+    """The inverse of `_to_tiles`."""
+    tiles = tiles.view(grid.views, grid.rows, grid.columns, -1, TILE, TILE).permute(0, 1, 4, 2, 5, 3)
+    return tiles.reshape(grid.views, grid.rows * TILE, grid.columns * TILE, -1)[:, :height, :width].contiguous()
