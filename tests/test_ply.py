@@ -1,0 +1,339 @@
+"""PLY files: bit-for-bit round trips, what other programs write, and what is damaged or lies."""
+
+import os
+import struct
+
+import numpy as np
+import pytest
+
+from threestudio_gaussiandreamer import ply
+from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.point_cloud import PointCloud
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+def gaussians(count=50, degree=0, seed=0):
+    shapes = [(count, 3), (count, (degree + 1) ** 2, 3), (count,), (count, 3), (count, 4)]
+    return ply.GaussianArrays(*(rng(seed + i).normal(size=shape).astype(np.float32) for i, shape in enumerate(shapes)))
+
+
+def cloud(count=50, normals=True):
+    values = rng(9).normal(size=(count, 3)).astype(np.float32)
+    return PointCloud(points=values, colors=rng(8).random((count, 3), np.float32), normals=values if normals else None)
+
+
+def assert_same(arrays, expected):
+    for name in expected._fields:
+        a, b = getattr(arrays, name), getattr(expected, name)
+        assert a is b is None or (a.dtype == np.float32 and a.shape == b.shape and a.tobytes() == b.tobytes()), name
+
+
+def header(encoding="ascii", count=2, properties=("float x", "float y", "float z"), before="", after=""):
+    lines = [f"property {entry}" for entry in properties]
+    return "\n".join(["ply", f"format {encoding} 1.0", *filter(None, [before]), f"element vertex {count}", *lines, after, "end_header\n"])
+
+
+def saved(folder, content, name="file.ply"):
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode("latin-1"))
+    return path
+
+
+class TestGaussians:
+    @pytest.mark.parametrize("degree", [0, 1, 2, 3])
+    @pytest.mark.parametrize("count", [0, 1, 50])
+    def test_reading_back_gives_the_same_bits(self, tmp_path, degree, count):
+        expected = gaussians(count, degree)
+        ply.write_gaussians(tmp_path / "a.ply", **expected._asdict())
+        assert_same(ply.read_gaussians(tmp_path / "a.ply"), expected)
+
+    def test_special_floats_survive(self, tmp_path):
+        arrays = gaussians(4)
+        arrays.means[0] = [-0.0, 1e-45, 3.4e38]
+        arrays.logit_opacities[:2] = [np.inf, -np.inf]
+        arrays.log_scales[0, 2] = -np.inf
+        ply.write_gaussians(tmp_path / "a.ply", **arrays._asdict())
+        assert_same(ply.read_gaussians(tmp_path / "a.ply"), arrays)
+
+    def test_the_layout_is_the_one_of_the_viewers(self, tmp_path):
+        arrays = gaussians(2, degree=1)
+        ply.write_gaussians(tmp_path / "a.ply", **arrays._asdict())
+        head, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
+        names = [line.split()[-1] for line in head.decode().splitlines() if line.startswith("property float ")]
+        rest = [f"f_rest_{i}" for i in range(9)]
+        assert names == [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity", *ply.LOG_SCALES, *ply.QUATS]
+        assert head.startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n")
+        row = np.array(struct.unpack(f"<{len(names)}f", data[: 4 * len(names)]), np.float32)
+        np.testing.assert_array_equal(row[names.index("f_rest_0") :][:9], arrays.sh[0, 1:].T.ravel())  # red's three, green's, blue's
+        np.testing.assert_array_equal(row[-4:], arrays.quats[0])
+        assert len(data) == 2 * 4 * len(names)
+
+    def test_padding_to_degree_3_is_the_248_byte_vertex(self, tmp_path):
+        arrays = gaussians(5)
+        ply.write_gaussians(tmp_path / "a.ply", **arrays._asdict(), pad_sh_degree=3)
+        data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[1]
+        assert len(data) == 5 * 248  # what Unity's importer insists on
+        read = ply.read_gaussians(tmp_path / "a.ply")
+        np.testing.assert_array_equal(read.sh[:, :1], arrays.sh)
+        assert read.sh.shape == (5, 16, 3) and not read.sh[:, 1:].any()
+        assert ply.padded_sh(gaussians(2, degree=2).sh, 1).shape == (2, 9, 3)  # never cuts
+
+    def test_shapes_that_disagree_are_refused(self, tmp_path):
+        with pytest.raises((ValueError, TypeError), match="quats"):
+            ply.write_gaussians(tmp_path / "a.ply", **{**gaussians(3)._asdict(), "quats": np.zeros((4, 4))})
+        assert not list(tmp_path.iterdir())
+
+    @pytest.mark.parametrize("order", ["<", ">"])
+    def test_any_order_of_properties_and_bytes_and_extra_ones(self, tmp_path, order):
+        expected = gaussians(7, degree=1)
+        names = [*ply.GAUSSIAN, *(f"f_rest_{i}" for i in range(9)), "segment"]
+        columns = dict(zip(ply.MEANS, expected.means.T, strict=True), opacity=expected.logit_opacities, segment=np.arange(7))
+        columns |= {f"f_dc_{i}": expected.sh[:, 0, i] for i in range(3)} | {f"scale_{i}": expected.log_scales[:, i] for i in range(3)}
+        columns |= {f"rot_{i}": expected.quats[:, i] for i in range(4)}
+        columns |= {f"f_rest_{i}": expected.sh[:, 1 + i % 3, i // 3] for i in range(9)}
+        names = list(rng().permutation(names))
+        rows = np.zeros(7, [(name, order + "f8") for name in names])
+        for name in names:
+            rows[name] = columns[name]
+        encoding = "binary_little_endian" if order == "<" else "binary_big_endian"
+        path = saved(tmp_path, header(encoding, 7, [f"double {name}" for name in names]).encode() + rows.tobytes())
+        assert_same(ply.read_gaussians(path), expected)
+        assert ply.is_gaussian_ply(path)
+
+    def test_text(self, tmp_path):
+        expected = gaussians(3)
+        columns = [expected.means, expected.sh[:, 0], expected.logit_opacities[:, None], expected.log_scales, expected.quats]
+        rows = np.concatenate(columns, axis=1)
+        text = "\n".join(" ".join(repr(float(value)) for value in row) for row in rows)
+        assert_same(ply.read_gaussians(saved(tmp_path, header("ascii", 3, [f"float {n}" for n in ply.GAUSSIAN]) + text)), expected)
+
+    def test_what_is_missing_is_named(self, tmp_path):
+        ply.write_points(tmp_path / "points.ply", cloud())
+        with pytest.raises(UserError, match="lack f_dc_0.*plain points"):
+            ply.read_gaussians(tmp_path / "points.ply")
+        two_dimensional = [f"float {name}" for name in ply.GAUSSIAN if name != "scale_2"]
+        with pytest.raises(UserError, match="lack scale_2"):
+            ply.read_gaussians(saved(tmp_path, header("ascii", 0, two_dimensional)))
+
+    @pytest.mark.parametrize("rest", [["f_rest_0"], [f"f_rest_{i}" for i in range(6)], ["f_rest_0", "f_rest_1", "f_rest_3"]])
+    def test_impossible_harmonics_are_refused(self, tmp_path, rest):
+        path = saved(tmp_path, header("ascii", 0, [f"float {name}" for name in (*ply.GAUSSIAN, *rest)]))
+        with pytest.raises(UserError, match="f_rest"):
+            ply.read_gaussians(path)
+
+    @pytest.mark.parametrize("field", ply.GaussianArrays._fields)
+    def test_rows_that_are_not_numbers_are_counted(self, tmp_path, field):
+        arrays = gaussians(6)
+        getattr(arrays, field)[[2, 4]] = np.nan
+        ply.write_gaussians(tmp_path / "a.ply", **arrays._asdict())
+        with pytest.raises(UserError, match="a.ply.*2 of 6.*first in vertex 2"):
+            ply.read_gaussians(tmp_path / "a.ply")
+        read = ply.read_gaussians(tmp_path / "a.ply", allow_non_finite=True)
+        np.testing.assert_array_equal(ply.usable(read), [True, True, False, True, False, True])
+
+    def test_is_gaussian_ply(self, tmp_path):
+        ply.write_points(tmp_path / "points.ply", cloud())
+        ply.write_gaussians(tmp_path / "gaussians.ply", **gaussians()._asdict())
+        assert ply.is_gaussian_ply(tmp_path / "gaussians.ply")
+        others = [tmp_path / "points.ply", tmp_path / "none.ply", tmp_path, saved(tmp_path, "x")]
+        assert not any(ply.is_gaussian_ply(path) for path in others)
+
+
+class TestPoints:
+    @pytest.mark.parametrize("normals", [True, False])
+    @pytest.mark.parametrize("count", [0, 1, 50])
+    def test_reading_back_gives_the_same_bits(self, tmp_path, count, normals):
+        expected = cloud(count, normals)
+        ply.write_points(tmp_path / "a.ply", expected)
+        assert_same(ply.read_points(tmp_path / "a.ply"), expected)
+
+    def test_viewers_find_bytes(self, tmp_path):
+        import trimesh
+
+        expected = cloud(20)
+        ply.write_points(tmp_path / "a.ply", expected)
+        read = trimesh.load(tmp_path / "a.ply")
+        np.testing.assert_array_equal(read.vertices, expected.points)
+        np.testing.assert_array_equal(read.colors[:, :3], np.rint(expected.colors * 255))
+
+    @pytest.mark.parametrize(
+        "properties, values",
+        [
+            (["uchar red", "uchar green", "uchar blue"], "255 0 51"),
+            (["ushort red", "ushort green", "ushort blue"], "65535 0 13107"),
+            (["float red", "float green", "float blue"], "1.0 0 0.2"),
+            (["float red", "float green", "float blue"], "255 0 51"),
+            (["uchar diffuse_red", "uchar diffuse_green", "uchar diffuse_blue"], "255 0 51"),
+        ],
+    )
+    def test_colours_of_other_programs(self, tmp_path, properties, values):
+        text = header("ascii", 1, ["float x", "float y", "float z", *properties]) + f"1 2 3 {values}\n"
+        read = ply.read_points(saved(tmp_path, text))
+        np.testing.assert_allclose(read.colors, [[1.0, 0.0, 0.2]], atol=1e-6)
+        np.testing.assert_array_equal(read.points, [[1, 2, 3]])
+
+    def test_no_colours_are_grey(self, tmp_path):
+        np.testing.assert_array_equal(ply.read_points(saved(tmp_path, header() + "1 2 3\n4 5 6\n")).colors, np.full((2, 3), 0.5))
+
+    def test_line_ends_blank_lines_and_comments(self, tmp_path):
+        text = header().replace("ascii 1.0", "ascii 1.0\ncomment end_header is below\nobj_info x") + "1 2 3\n\n4 5 6"
+        assert ply.read_points(saved(tmp_path, text.replace("\n", "\r\n"))).points.shape == (2, 3)
+        binary = header("binary_little_endian").replace("\n", "\r\n").encode() + np.arange(6, dtype="<f4").tobytes()
+        np.testing.assert_array_equal(ply.read_points(saved(tmp_path, binary)).points, [[0, 1, 2], [3, 4, 5]])
+
+    @pytest.mark.parametrize("encoding, order", [("ascii", ""), ("binary_little_endian", "<"), ("binary_big_endian", ">")])
+    def test_elements_before_and_after_are_skipped(self, tmp_path, encoding, order):
+        before = "element face 2\nproperty list uchar int vertex_indices\nproperty float area\nelement edge 1\nproperty int a"
+        after = "element empty 1000000000000\nelement face 1\nproperty list uchar int vertex_indices"
+        head = header(encoding, 2, before=before, after=after)
+        if encoding == "ascii":
+            content = head + "3 0 1 2 0.5\n4 0 1 2 3 0.5\n7\n1 2 3\n4 5 6\n3 0 1 2\n"
+        else:
+            faces = struct.pack(f"{order}B3if", 3, 0, 1, 2, 0.5) + struct.pack(f"{order}B4if", 4, 0, 1, 2, 3, 0.5)
+            content = head.encode() + faces + struct.pack(f"{order}i", 7) + struct.pack(f"{order}6f", 1, 2, 3, 4, 5, 6) + b"\3"
+        np.testing.assert_array_equal(ply.read_points(saved(tmp_path, content)).points, [[1, 2, 3], [4, 5, 6]])
+
+    def test_gaussians_are_read_as_their_coloured_centres(self, tmp_path):
+        arrays = gaussians(30)
+        ply.write_gaussians(tmp_path / "a.ply", **arrays._asdict())
+        read = ply.read_points(tmp_path / "a.ply")
+        np.testing.assert_array_equal(read.points, arrays.means)
+        np.testing.assert_allclose(read.colors, (0.5 + 0.28209479 * arrays.sh[:, 0]).clip(0, 1), atol=1e-6)
+
+    def test_not_finite_is_refused_or_left_to_the_caller(self, tmp_path):
+        path = saved(tmp_path, header() + "1 2 3\n4 nan 6\n")
+        with pytest.raises(UserError, match="positions of 1 of 2"):
+            ply.read_points(path)
+        assert np.isnan(ply.read_points(path, allow_non_finite=True).points[1, 1])
+
+
+class TestDamage:
+    @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+    @pytest.mark.parametrize("count", [3, 10**12, 10**18])
+    def test_a_lying_count_allocates_nothing(self, tmp_path, encoding, count):
+        import tracemalloc
+
+        data = b"1 2 3\n4 5 6\n" if encoding == "ascii" else bytes(24)
+        path = saved(tmp_path, header(encoding, count).encode() + data)
+        tracemalloc.start()
+        with pytest.raises(UserError, match="file.ply.*(truncated|announced)"):
+            ply.read_points(path)
+        assert tracemalloc.get_traced_memory()[1] < 4 << 20  # the header's limit, and change
+        tracemalloc.stop()
+
+    @pytest.mark.parametrize(
+        "content, problem",
+        [
+            ("", "not a PLY"),
+            ("solid cube", "not a PLY"),
+            ("ply\n", "no end"),
+            ("ply\n" + "comment x\n" * 200_000, "no end"),
+            ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\n", "no end"),
+            (header("binary_middle_endian"), "binary_middle_endian"),
+            (header().replace("format ascii 1.0\n", ""), "format None"),
+            (header(count=-1), "NAME COUNT"),
+            (header(count="many"), "NAME COUNT"),
+            (header(count="1" * 30), "NAME COUNT"),
+            (header(count=0).replace("vertex", "point"), "no vertices"),
+            (header(properties=["float x", "quad y"]), "number type"),
+            (header(properties=["float x", "float x"]), "same name"),
+            (header(properties=["list uchar int x"]), "list"),
+            (header(properties=["float x", "float y"]) + "1 2\n3 4\n", "lack z"),
+            (header(properties=[]), "lack x, y, z"),
+            ("ply\nformat ascii 1.0\nproperty float x\nend_header\n", "property of an element"),
+            (header().replace("element", "elephant"), "unknown line"),
+            (header() + "1 2 3\n4.5 5\n", "not readable"),
+            (header() + "1 2 3\n4 5 fox\n", "not readable"),
+            (header() + "1 2 3 4\n1 2 3 4\n", "3 numbers are announced"),
+            (header() + "1 2 3\n" + " " * 99, "2 vertices of 3 numbers"),
+            (header("binary_little_endian") + "x" * 23, "need 24 bytes, but 23"),
+            (header("binary_little_endian", before="element face 9\nproperty list uint int i") + "\xff" * 24, "truncated or damaged"),
+            (header("binary_little_endian", before=f"element edge {10**18}\nproperty double a\nproperty double b") + "x" * 24, "truncated"),
+            (header("binary_little_endian", before="element face 99999999\nproperty list uint int i") + "\0" * 24, "truncated"),
+        ],
+    )
+    def test_each_kind_is_named(self, tmp_path, content, problem):
+        with pytest.raises(UserError, match="file.ply") as error:
+            ply.read_points(saved(tmp_path, content))
+        assert problem in str(error.value)
+
+    def test_a_missing_file_names_its_neighbours(self, tmp_path):
+        saved(tmp_path, "ply", "hamburger.ply")
+        with pytest.raises(UserError, match="hambuger.ply' does not exist.*hamburger.ply"):
+            ply.read_gaussians(tmp_path / "hambuger.ply")
+        with pytest.raises(UserError, match="no folder"):
+            ply.read_points(tmp_path / "no" / "file.ply")
+        with pytest.raises(UserError, match="is a folder"):
+            ply.read_points(tmp_path)
+        for name in ("a\0b", "a" * 5000):
+            with pytest.raises(UserError, match="PLY file"):
+                ply.read_points(name)
+
+    def test_mutations_are_an_error_or_a_correct_load(self, tmp_path):
+        """Five hundred damaged files: whatever is loaded has consistent shapes, and nothing but UserError comes out."""
+        ply.write_gaussians(tmp_path / "gaussians.ply", **gaussians(20, 1)._asdict())
+        ply.write_points(tmp_path / "points.ply", cloud(20))
+        faces = "element face 2\nproperty list uchar int vertex_indices"
+        saved(tmp_path, header(before=faces) + "3 0 1 2\n3 0 1 2\n1 2 3\n4 5 6\n", "text.ply")
+        originals = [path.read_bytes() for path in sorted(tmp_path.glob("*.ply"))]
+        generator, loaded = rng(1), 0
+        for _ in range(500):
+            path = saved(tmp_path, mutated(originals[generator.integers(3)], generator))
+            for read in (ply.read_gaussians, ply.read_points):
+                try:
+                    arrays = read(path)
+                except UserError as error:
+                    assert "file.ply" in str(error)
+                else:
+                    loaded += 1
+                    assert len({len(values) for values in arrays if values is not None}) == 1
+                    assert sum(values.size for values in arrays if values is not None) <= 4 * path.stat().st_size
+        assert loaded > 50  # the mutations aren't all fatal, so both outcomes were tried
+
+
+def mutated(content, generator):
+    """A copy with bytes changed, cut out, repeated or appended, preferably in the header."""
+    content = bytearray(content)
+    for _ in range(generator.integers(1, 4)):
+        reach = len(content) if generator.random() < 0.5 else min(len(content), 400)
+        start = int(generator.integers(0, max(reach, 1)))
+        length = int(generator.integers(1, 30))
+        kind = generator.integers(5)
+        if kind == 0:
+            content[start : start + length] = generator.bytes(length)
+        elif kind == 1:
+            del content[start : start + length]
+        elif kind == 2:
+            del content[start:]
+        elif kind == 3:
+            content[start:start] = content[start : start + length]
+        elif content:
+            content[start % len(content)] ^= 1 << int(generator.integers(8))
+    return bytes(content)
+
+
+class TestAtomicWriting:
+    def test_a_failure_leaves_the_earlier_file_and_no_other(self, tmp_path, monkeypatch):
+        ply.write_points(tmp_path / "a.ply", cloud(10))
+        before = (tmp_path / "a.ply").read_bytes()
+
+        def disk_full(descriptor):
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(os, "fsync", disk_full)
+        with pytest.raises(UserError, match="cannot write.*a.ply.*No space left"):
+            ply.write_points(tmp_path / "a.ply", cloud(20))
+        assert (tmp_path / "a.ply").read_bytes() == before
+        assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+    def test_a_missing_folder_is_named(self, tmp_path):
+        with pytest.raises(UserError, match="cannot write.*no/a.ply"):
+            ply.write_points(tmp_path / "no" / "a.ply", cloud())
+
+    def test_the_mode_is_that_of_an_ordinary_file(self, tmp_path):
+        (tmp_path / "ordinary").write_text("")
+        ply.write_points(tmp_path / "a.ply", cloud())
+        assert (tmp_path / "a.ply").stat().st_mode == (tmp_path / "ordinary").stat().st_mode

@@ -1,0 +1,56 @@
+"""``gaussiandreamer-exporter``: several formats in one export.
+
+============  ==============================================================================================
+option        meaning
+============  ==============================================================================================
+formats       names of registered exporters without their ``-exporter``: ``ply``, ``points``, ...
+options       options of some of them: ``{ply: {pad_sh_degree: 3}}``
+save_video    also render the turntable
+============  ==============================================================================================
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, Dict, List, Optional
+
+from ..errors import UserError, unknown
+from ..host import BaseBackground, BaseGeometry, BaseMaterial, Exporter, ExporterOutput, find, names, register
+
+SUFFIX = "-exporter"
+
+
+@register("gaussiandreamer-exporter")
+class BundleExporter(Exporter):
+    """The files of every format, in the order of ``formats``."""
+
+    @dataclass
+    class Config(Exporter.Config):
+        formats: List[str] = field(default_factory=lambda: ["ply", "points"])
+        options: Dict[str, Any] = field(default_factory=dict)
+        save_video: bool = True
+
+        @staticmethod
+        def check(cfg: "BundleExporter.Config") -> None:
+            """Raises UserError for a format that isn't registered, or options of one that isn't asked for."""
+            for name in cfg.formats:
+                if name not in available_formats():
+                    raise unknown("export format", name, available_formats())
+            for name in cfg.options:
+                if name not in cfg.formats:
+                    raise UserError(f"options.{name}: the formats are {', '.join(cfg.formats)}; options of another one have no effect")
+
+    cfg: Config
+
+    def configure(self, geometry: BaseGeometry, material: Optional[BaseMaterial], background: Optional[BaseBackground]) -> None:
+        super().configure(geometry, material, background)
+        self.Config.check(self.cfg)  # threestudio's own host doesn't
+        parts = dict(geometry=geometry, material=material, background=background)
+        self.exporters = [find(name + SUFFIX)(self.cfg.options.get(name, {}), **parts) for name in self.cfg.formats]
+
+    def __call__(self) -> List[ExporterOutput]:
+        return [output for exporter in self.exporters for output in exporter()]
+
+
+def available_formats() -> list[str]:
+    """The formats that can be asked for: every registered exporter but the bundle itself."""
+    exporters = [name.removesuffix(SUFFIX) for name in names() if name.endswith(SUFFIX)]
+    return [name for name in exporters if name != "gaussiandreamer"]

@@ -1,0 +1,48 @@
+"""``ply-exporter``: the Gaussians as a PLY that every viewer of 3D Gaussian splatting reads.
+
+==============  ===================================================================================
+option          meaning
+==============  ===================================================================================
+save_name       name of the file in the export folder
+pad_sh_degree   append zero harmonics up to this degree, for importers that insist on degree 3
+save_video      also render the turntable
+==============  ===================================================================================
+"""
+
+from dataclasses import dataclass
+from typing import List, Optional
+
+import numpy as np
+
+from ..errors import UserError
+from ..host import BaseGeometry, Exporter, ExporterOutput, register
+from ..ply import padded_sh
+from .base import gaussian_arrays
+
+
+@register("ply-exporter")
+class PlyExporter(Exporter):
+    """One file of save_type "ply"; its params are the arguments of ``ply.write_gaussians``."""
+
+    @dataclass
+    class Config(Exporter.Config):
+        save_name: str = "gaussians.ply"
+        pad_sh_degree: Optional[int] = None
+
+        @staticmethod
+        def check(cfg: "PlyExporter.Config") -> None:
+            """Raises UserError for a degree that no viewer knows."""
+            if cfg.pad_sh_degree not in (None, 0, 1, 2, 3):
+                raise UserError(f"pad_sh_degree: expected null, 0, 1, 2 or 3, got {cfg.pad_sh_degree}")
+
+    cfg: Config
+
+    def configure(self, geometry: BaseGeometry, *args: object, **kwargs: object) -> None:
+        self.Config.check(self.cfg)  # threestudio's own host doesn't
+        super().configure(geometry, *args, **kwargs)
+
+    def __call__(self) -> List[ExporterOutput]:
+        arrays = gaussian_arrays(self.geometry)
+        if self.cfg.pad_sh_degree is not None:
+            arrays = arrays._replace(sh=np.ascontiguousarray(padded_sh(arrays.sh, self.cfg.pad_sh_degree)))
+        return [ExporterOutput(save_name=self.cfg.save_name, save_type="ply", params=arrays._asdict())]

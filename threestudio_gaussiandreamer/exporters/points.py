@@ -1,0 +1,47 @@
+"""``points-exporter``: the centres of the Gaussians as a coloured point cloud, for programs that know no Gaussians.
+
+===========  ==================================================================================
+option       meaning
+===========  ==================================================================================
+save_name    name of the file in the export folder
+min_opacity  leave out Gaussians fainter than this; 0 keeps all, in their order
+save_video   also render the turntable
+===========  ==================================================================================
+"""
+
+from dataclasses import dataclass
+from typing import List
+
+from ..errors import UserError
+from ..host import BaseGeometry, Exporter, ExporterOutput, register
+from ..ply import opaque, sh0_colors
+from ..point_cloud import PointCloud
+from .base import gaussian_arrays
+
+
+@register("points-exporter")
+class PointsExporter(Exporter):
+    """One file of save_type "points"; its params are ``{"cloud": PointCloud}``."""
+
+    @dataclass
+    class Config(Exporter.Config):
+        save_name: str = "points.ply"
+        min_opacity: float = 0.0
+
+        @staticmethod
+        def check(cfg: "PointsExporter.Config") -> None:
+            """Raises UserError for a value out of range."""
+            if not 0 <= cfg.min_opacity <= 1:
+                raise UserError(f"min_opacity: expected a number in [0, 1], got {cfg.min_opacity}")
+
+    cfg: Config
+
+    def configure(self, geometry: BaseGeometry, *args: object, **kwargs: object) -> None:
+        self.Config.check(self.cfg)  # threestudio's own host doesn't
+        super().configure(geometry, *args, **kwargs)
+
+    def __call__(self) -> List[ExporterOutput]:
+        arrays = gaussian_arrays(self.geometry)
+        keep = opaque(arrays, self.cfg.min_opacity)
+        cloud = PointCloud(points=arrays.means[keep], colors=sh0_colors(arrays.sh[keep, 0]))
+        return [ExporterOutput(save_name=self.cfg.save_name, save_type="points", params={"cloud": cloud})]

@@ -1,0 +1,76 @@
+"""Reading and writing files so that a mistake is one clear message and a crash leaves nothing half-written."""
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from difflib import get_close_matches
+from pathlib import Path
+from typing import BinaryIO
+
+from .errors import UserError
+
+
+def existing_file(path: str | os.PathLike, kind: str) -> Path:
+    """``path`` as a :class:`Path` when a file is there; ``kind`` ("mesh", "PLY file") names it in the message.
+
+    Raises:
+        UserError: nothing, or no file, is there; the message lists the files of that folder with near names.
+    """
+    try:
+        path = Path(path).expanduser()
+        if path.is_file():
+            return path
+        reason = "is a folder, not a file" if path.is_dir() else "does not exist"
+        neighbours = near_names(path)
+    except (OSError, ValueError, RuntimeError) as error:  # a name too long, a NUL inside, a "~stranger"
+        raise UserError(f"{kind} {str(path)!r}: not a usable file name ({error}).") from error
+    raise UserError(f"{kind} {str(path)!r} {reason}{neighbours}")
+
+
+def near_names(path: Path) -> str:
+    """The end of a "missing" message: the files beside ``path`` with near names or of its kind."""
+    folder = path.parent
+    if not folder.is_dir():
+        return f": there is no folder {str(folder)!r} either."
+    names = sorted(entry.name for entry in folder.iterdir() if entry.is_file())
+    near = get_close_matches(path.name, names, n=3, cutoff=0.5) or [name for name in names if Path(name).suffix == path.suffix][:3]
+    return f"; near names in {str(folder)!r}: {', '.join(near)}." if near else f"; no file in {str(folder)!r} has a near name."
+
+
+@contextmanager
+def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
+    """A binary file that appears under ``path`` whole, on success, or not at all; what was there stays until then.
+
+    The content goes to a temporary file beside it, which is flushed to the disk before it takes the name.
+
+    Raises:
+        UserError: the folder is missing or unwritable, the disk is full, ...
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name[:100]}.{os.getpid()}-{threading.get_ident()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        raise UserError(f"cannot write {str(path)!r}: {error.strerror or error}. An earlier file of this name is untouched.") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the renaming itself durable, where the system lets a folder be opened (not on Windows)."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        os.fsync(descriptor)
+    except OSError:
+        pass  # some network file systems can't; the file itself is synced
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,167 @@
+"""What every 3D prior is: a prompt to a checked, coloured point cloud, with an optional layer of ground below it.
+
+===============  ============================================================================================
+option           meaning (all priors have these)
+===============  ============================================================================================
+ground           add the paper's layer of randomly coloured points below the object
+ground_points    how many
+ground_size      side of the square they fill, in units of the longest side of the object's box
+ground_height    its z in world units, or ``auto``: the bottom of the object
+===============  ============================================================================================
+
+A prior is one file: a subclass of :class:`Prior` with :meth:`~Prior.generate`, registered under a name.
+"""
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..errors import UserError
+from ..host import BaseObject, run_seed
+from ..point_cloud import PointCloud
+from ..streams import numpy_generator
+
+logger = logging.getLogger(__name__)
+
+MAX_NON_FINITE = 0.05
+"""More bad points than this fraction mean that the source is broken, not that it has a few stray rows."""
+GREY = 0.5
+
+
+class Prior(BaseObject):
+    """``prior(prompt)`` gives the points that the Gaussians start from; the same prompt and seed give the same points."""
+
+    @dataclass
+    class Config(BaseObject.Config):
+        ground: bool = False
+        ground_points: int = 20_000
+        ground_size: float = 1.5
+        ground_height: Any = "auto"
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            """Raises UserError for a value out of range, before any long work."""
+            require_positive(cfg, "ground_points", "ground_size")
+            if cfg.ground_height != "auto" and not is_number(cfg.ground_height):
+                raise UserError(f"ground_height: expected 'auto' or a number in world units, got {cfg.ground_height!r}")
+
+    cfg: Config
+
+    def configure(self) -> None:
+        self.Config.check(self.cfg)  # threestudio's own host doesn't
+
+    def __call__(self, prompt: str) -> PointCloud:
+        """The points for ``prompt``: float32, finite, colours in [0, 1], z up, +x the front.
+
+        Raises:
+            UserError: the source is missing, unreadable, empty, or more than 5 % of it is not finite.
+        """
+        cloud = validated(self.generate(prompt, numpy_generator(run_seed(), "prior")), type(self).__name__)
+        if not self.cfg.ground:
+            return cloud
+        return with_ground(cloud, self.cfg, numpy_generator(run_seed(), "ground"))
+
+    def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
+        """The object's points, which need not be checked yet; ``generator`` is the only source of randomness."""
+        raise NotImplementedError(f"{type(self).__name__}.generate")
+
+
+# ------------------------------------------------------------------------------------------------- checks of options
+
+
+def is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def require_positive(cfg: Any, *names: str) -> None:
+    """Raise UserError for the first of these options that is not a finite number above 0."""
+    for name in names:
+        if not (is_number(cfg[name]) and cfg[name] > 0):
+            raise UserError(f"{name}: expected a number above 0, got {cfg[name]!r}")
+
+
+def require_not_negative(cfg: Any, *names: str) -> None:
+    """Raise UserError for the first of these options that is not a finite number of 0 or more."""
+    for name in names:
+        if not (is_number(cfg[name]) and cfg[name] >= 0):
+            raise UserError(f"{name}: expected 0 or more, got {cfg[name]!r}")
+
+
+def require_path(cfg: Any) -> None:
+    """Raise UserError when the option ``path`` is not set."""
+    if not cfg.path:
+        raise UserError("path: this prior reads a file; set path to it")
+
+
+def require_color(cfg: Any) -> None:
+    """Raise UserError unless the option ``color`` is null, "grey", "random" or three numbers in [0, 1]."""
+    color = cfg.color
+    if color is None or color in ("grey", "random"):
+        return
+    if isinstance(color, str) or len(color) != 3 or not all(is_number(value) and 0 <= value <= 1 for value in color):
+        raise UserError(f"color: expected null, 'grey', 'random' or [red, green, blue] in [0, 1], got {color!r}")
+
+
+# --------------------------------------------------------------------------------------------------- points and colours
+
+
+def chosen_colors(color: Any, count: int, generator: np.random.Generator) -> Float[np.ndarray, "P 3"]:
+    """``count`` colours: uniformly random in [0, 1], grey, or all the same."""
+    if color == "random":
+        return generator.random((count, 3), np.float32)
+    return np.tile(np.float32([GREY] * 3 if color == "grey" else list(color)), (count, 1))
+
+
+def validated(cloud: PointCloud, name: str) -> PointCloud:
+    """``cloud`` as float32 without the rows that are not finite, its colours clipped to [0, 1].
+
+    Raises:
+        UserError: no points, arrays that don't fit each other, or more than 5 % of rows that are not finite.
+    """
+    points, colors = (np.asarray(values, np.float32) for values in (cloud.points, cloud.colors))
+    if points.ndim != 2 or points.shape[1:] != (3,) or colors.shape != points.shape:
+        raise UserError(f"{name} gave points {points.shape} and colours {colors.shape}: (P, 3) of both were expected")
+    if not len(points):
+        raise UserError(f"{name} gave no points: its source is empty")
+    finite = np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1)
+    if bad := int((~finite).sum()):
+        report_non_finite(bad, len(points), name)
+    cloud = without_rows(cloud._replace(points=points, colors=colors.clip(0.0, 1.0)), finite)
+    return cloud if cloud.normals is None else cloud._replace(normals=np.nan_to_num(np.asarray(cloud.normals, np.float32)))
+
+
+def report_non_finite(bad: int, count: int, name: str) -> None:
+    """Say that rows are dropped, or raise UserError when there are too many of them."""
+    if bad > MAX_NON_FINITE * count:
+        raise UserError(f"{bad} of the {count} points of {name} are NaN or infinite (at most 5 % may be): check the source")
+    logger.warning("%s: dropped %d of %d points that are NaN or infinite", name, bad, count)
+
+
+def without_rows(cloud: PointCloud, keep: Bool[np.ndarray, " P"]) -> PointCloud:
+    """The kept points, and the faces all of whose corners are kept."""
+    if keep.all():
+        return cloud
+    faces = cloud.faces
+    if faces is not None:
+        faces = (np.cumsum(keep) - 1)[faces[keep[faces].all(axis=1)]]
+    normals = None if cloud.normals is None else cloud.normals[keep]
+    return PointCloud(points=cloud.points[keep], colors=cloud.colors[keep], normals=normals, faces=faces)
+
+
+def with_ground(cloud: PointCloud, cfg: Any, generator: np.random.Generator) -> PointCloud:
+    """``cloud`` followed by a horizontal square of randomly coloured points, centred below its box (paper, appendix)."""
+    low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
+    side = cfg.ground_size * ((high - low).max() or 1.0)
+    points = (low + high) / 2 + generator.uniform(-0.5, 0.5, (cfg.ground_points, 3)) * [side, side, 0.0]
+    points[:, 2] = low[2] if cfg.ground_height == "auto" else cfg.ground_height
+    colors = chosen_colors("random", len(points), generator)
+    upwards = np.tile(np.float32([0, 0, 1]), (len(points), 1))
+    return PointCloud(
+        points=np.concatenate([cloud.points, points]).astype(np.float32),
+        colors=np.concatenate([cloud.colors, colors]),
+        normals=None if cloud.normals is None else np.concatenate([cloud.normals, upwards]),
+        faces=cloud.faces,
+    )

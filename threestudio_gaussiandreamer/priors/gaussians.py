@@ -1,0 +1,75 @@
+"""``gaussians-prior``: a trained cloud of Gaussians (the PLY of any 3DGS program) as the start.
+
+============  ========================================================================================
+option        meaning
+============  ========================================================================================
+path          the PLY file
+min_opacity   leave out Gaussians fainter than this, in [0, 1]
+ground, ...   see ``priors/base.py``; not with all attributes
+============  ========================================================================================
+
+Called as any prior it gives the centres and the colours of the constant harmonic, to be grown and sized anew; the
+geometry may instead take every attribute from :meth:`GaussiansPrior.gaussians` and go on where that training stopped.
+
+Limits: the prompt is not read; positions stay as they are (world units, z up): no turning, no scaling.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import UserError
+from ..files import existing_file
+from ..host import register
+from ..ply import GaussianArrays, opaque, read_gaussians, sh0_colors, usable
+from ..point_cloud import PointCloud
+from .base import Prior, is_number, report_non_finite, require_path
+
+
+@register("gaussians-prior")
+class GaussiansPrior(Prior):
+    """The Gaussians of a PLY file."""
+
+    @dataclass
+    class Config(Prior.Config):
+        path: str = ""
+        min_opacity: float = 0.0
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            Prior.Config.check(cfg)
+            require_path(cfg)
+            if not (is_number(cfg.min_opacity) and 0 <= cfg.min_opacity <= 1):
+                raise UserError(f"min_opacity: expected a number in [0, 1], got {cfg.min_opacity!r}")
+
+    cfg: Config
+
+    def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
+        return self.cloud(self._read())
+
+    def gaussians(self, prompt: str) -> GaussianArrays:
+        """Every attribute of the trained Gaussians, whatever the prompt.
+
+        Raises:
+            UserError: missing, damaged or empty, as :meth:`__call__`; or ``ground``, which has no trained attributes.
+        """
+        if self.cfg.ground:
+            raise UserError("ground: ground points have no trained attributes; set system.geometry.keep_attributes=false, or ground=false")
+        return self._read()
+
+    @staticmethod
+    def cloud(arrays: GaussianArrays) -> PointCloud:
+        """The coloured centres of Gaussians."""
+        return PointCloud(points=arrays.means, colors=sh0_colors(arrays.sh[:, 0]))
+
+    def _read(self) -> GaussianArrays:
+        path = existing_file(self.cfg.path, "PLY file")
+        arrays = read_gaussians(path, allow_non_finite=True)
+        keep = usable(arrays)
+        if bad := int((~keep).sum()):
+            report_non_finite(bad, len(keep), str(path))
+        keep &= opaque(arrays, self.cfg.min_opacity)
+        if not keep.any():
+            raise UserError(f"no Gaussians in {str(path)!r} with an opacity of {self.cfg.min_opacity} or more, among {len(keep)}")
+        return GaussianArrays(*(values[keep] for values in arrays))

@@ -1,0 +1,113 @@
+"""``mesh-prior``: any triangle mesh as the coarse shape, in place of what a text-to-3D model would give.
+
+================  ===========================================================================================
+option            meaning
+================  ===========================================================================================
+path              GLB, glTF, OBJ, PLY, STL, OFF, ... with texture, vertex colours, face colours or none (grey)
+scale             half the longest side of the result, world units
+up, front         the file's axes, ``+x`` to ``-z``; ``auto`` and null: by the kind of file (see ``meshes.py``)
+num_points        0: the mesh's vertices, as the paper takes them from Shap-E; else points uniform over the surface
+color_smoothing   average each colour over this many nearest points: the coarse colours of a text-to-3D model
+color             null: the mesh's colours; ``grey``, ``random`` or [r, g, b] in [0, 1] in their place
+jitter            standard deviation of noise on the positions, in units of ``scale``: a wrong, coarse shape
+ground, ...       see ``priors/base.py``
+================  ===========================================================================================
+
+Limits: the prompt is not read. Few vertices make a sparse start: give ``num_points`` for a low-polygon mesh.
+"""
+
+import logging
+from dataclasses import dataclass
+from typing import Any, Optional
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..files import existing_file
+from ..host import register
+from ..meshes import Mesh, load_mesh, sample_surface, surface_colors
+from ..point_cloud import PointCloud
+from .base import Prior, chosen_colors, require_color, require_not_negative, require_path, require_positive
+
+logger = logging.getLogger(__name__)
+
+SMOOTHING_BLOCK = 8192
+"""Rows that are averaged at a time, so that memory doesn't grow with points times neighbours."""
+
+
+@register("mesh-prior")
+class MeshPrior(Prior):
+    """The vertices of a mesh, or points on its surface."""
+
+    @dataclass
+    class Config(Prior.Config):
+        path: str = ""
+        scale: float = 1.0
+        up: str = "auto"
+        front: Optional[str] = None
+        num_points: int = 0
+        color_smoothing: int = 0
+        color: Any = None
+        jitter: float = 0.0
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            Prior.Config.check(cfg)
+            require_path(cfg)
+            require_positive(cfg, "scale")
+            require_not_negative(cfg, "num_points", "color_smoothing", "jitter")
+            require_color(cfg)
+
+    cfg: Config
+
+    def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
+        cfg = self.cfg
+        mesh = load_mesh(existing_file(cfg.path, "mesh"), scale=cfg.scale, up=cfg.up, front=cfg.front)
+        if cfg.color is None and not mesh.has_colors:
+            logger.warning("%s has no colours: grey is used", cfg.path)
+        cloud = mesh_cloud(mesh, cfg.num_points, generator)
+        if cfg.color is not None:
+            cloud = cloud._replace(colors=chosen_colors(cfg.color, len(cloud.points), generator))
+        if cfg.color_smoothing > 1:
+            cloud = cloud._replace(colors=smoothed_colors(cloud, cfg.color_smoothing))
+        return cloud._replace(points=cloud.points + generator.normal(scale=cfg.jitter * cfg.scale, size=cloud.points.shape))
+
+
+def mesh_cloud(mesh: Mesh, num_points: int, generator: np.random.Generator) -> PointCloud:
+    """The vertices of ``mesh`` with its faces, or ``num_points`` points uniform over its surface."""
+    if num_points == 0:
+        return vertex_cloud(mesh)
+    points, face_index, barycentric = sample_surface(mesh, num_points, generator)
+    colors = surface_colors(mesh, face_index, barycentric)
+    return PointCloud(points=points, colors=colors, normals=face_normals(mesh)[face_index])
+
+
+def vertex_cloud(mesh: Mesh) -> PointCloud:
+    """Each vertex with its colour: where a texture has a seam or faces differ, that of one of its faces."""
+    corner = np.zeros(len(mesh.vertices), np.int64)
+    corner[mesh.faces.ravel()] = np.arange(mesh.faces.size)  # any corner of any face at this vertex
+    colors = surface_colors(mesh, corner // 3, np.eye(3)[corner % 3])
+    return PointCloud(points=mesh.vertices, colors=colors, faces=mesh.faces)
+
+
+def face_normals(mesh: Mesh) -> Float[np.ndarray, "F 3"]:
+    """Unit normals, by the order of the corners; zero for a face without area."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / np.where(lengths > 0, lengths, 1.0)
+
+
+def smoothed_colors(cloud: PointCloud, neighbours: int) -> Float[np.ndarray, "P 3"]:
+    """Each colour averaged over the ``neighbours`` nearest points, itself among them."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(cloud.points)
+    neighbours = min(neighbours, len(cloud.points))
+
+    def average(points: Float[np.ndarray, "Q 3"]) -> Float[np.ndarray, "Q 3"]:
+        nearest: Int[np.ndarray, "Q K"] = tree.query(points, k=range(1, neighbours + 1), workers=-1)[1]
+        return cloud.colors[nearest].mean(axis=1)
+
+    starts = range(0, len(cloud.points), SMOOTHING_BLOCK)
+    return np.concatenate([average(cloud.points[start : start + SMOOTHING_BLOCK]) for start in starts])
