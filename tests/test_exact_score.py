@@ -1,0 +1,206 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from threestudio_gaussiandreamer import sds
+from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.exact_score import (
+    LinearLatent,
+    color_matrix,
+    denoise,
+    log_density,
+    mode_variance,
+    responsibilities,
+    squared_distances,
+)
+
+ABAR = sds.sd_alphas_cumprod()
+
+
+def randn(*shape, seed=0, dtype=torch.float64):
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 6), st.integers(1, 8), st.integers(0, 999), st.sampled_from([0.0, 0.1, 0.7]), st.integers(0, 10**6))
+def test_eps_is_the_score_of_the_density(modes, dims, t, std, seed):
+    """eps_hat = -sigma grad log p_t, against autograd, to 1e-10 relative to the gradient's size."""
+    bank, z = randn(modes, dims, seed=seed), randn(3, dims, seed=seed + 1).requires_grad_()
+    abar = ABAR[t].expand(3)
+    log_prior = randn(modes, seed=seed + 2)
+    (score,) = torch.autograd.grad(log_density(z, abar, bank, std=std, log_prior=log_prior).sum(), z)
+    out = denoise(z.detach(), abar, bank, std=std, log_prior=log_prior)
+    expected = -(1 - abar).sqrt()[:, None] * score
+    torch.testing.assert_close(out.eps, expected, rtol=1e-10, atol=1e-10 * (1 + expected.abs().max().item()))
+
+
+@pytest.mark.parametrize("name", sorted(sds.WEIGHTS))
+def test_one_sharp_mode_gives_a_weighted_squared_error_without_noise(name):
+    """K = 1, s = 0: w (eps_hat - eps) = w (a / sigma) (x - x_1), whatever eps is."""
+    x, target, noise = randn(3, 4, 50)
+    abar = ABAR[torch.tensor([20, 300, 600, 980])]
+    eps = denoise(sds.add_noise(x, noise, abar), abar, target[:, None]).eps
+    weight = sds.weight(name, abar)[:, None]
+    expected = weight * (abar / (1 - abar)).sqrt()[:, None] * (x - target)
+    torch.testing.assert_close(weight * (eps - noise), expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("std", [0.3, 1.0])
+def test_the_denoised_is_the_posterior_mean_by_quadrature(std):
+    """K = 2, d = 1: E[x0 | z] and the responsibilities against scipy's quad, to 1e-8."""
+    from scipy.integrate import quad
+
+    centers, prior, abar = np.array([-0.8, 1.1]), np.array([0.3, 0.7]), float(ABAR[400])
+    a, variance = math.sqrt(abar), 1 - abar
+
+    def joint(x0, z, k):
+        return prior[k] * math.exp(-((x0 - centers[k]) ** 2) / (2 * std**2) - (z - a * x0) ** 2 / (2 * variance)) / std
+
+    for z in (-2.0, -0.1, 0.4, 1.7):
+        integrals = [[quad(lambda x: x**p * joint(x, z, k), -15, 15, epsabs=1e-14, epsrel=1e-12, limit=400)[0] for k in (0, 1)] for p in (0, 1)]
+        mass, moment = np.array(integrals)
+        out = denoise(
+            torch.tensor([[z]], dtype=torch.float64),
+            ABAR[400:401],
+            torch.tensor(centers)[:, None],
+            std=std,
+            log_prior=torch.tensor(prior).log(),
+        )
+        np.testing.assert_allclose(out.denoised.item(), moment.sum() / mass.sum(), rtol=0, atol=1e-8)
+        np.testing.assert_allclose(out.responsibilities[0].numpy(), mass / mass.sum(), rtol=0, atol=1e-8)
+
+
+def test_ddim_from_noise_lands_on_an_image_of_the_bank():
+    bank, z = 3 * randn(6, 40), randn(8, 40, seed=1)
+    t = torch.full((8,), 999)
+    samples = sds.ddim_sample(lambda z, t: denoise(z, ABAR[t], bank).eps, z, t, ABAR, steps=100)
+    nearest = torch.cdist(samples, bank).min(dim=1)
+    assert nearest.values.max() < 1e-6
+    assert len(nearest.indices.unique()) > 1
+
+
+def test_denoised_and_eps_agree():
+    """z = a D + sigma eps_hat, always."""
+    bank, z, abar = randn(5, 9), randn(4, 9, seed=1), ABAR[torch.tensor([10, 200, 600, 990])]
+    out = denoise(z, abar, bank, std=0.4)
+    torch.testing.assert_close(sds.add_noise(out.denoised, out.eps, abar), z, rtol=0, atol=1e-12)
+
+
+def test_responsibilities_sum_to_one_even_when_all_modes_are_far():
+    z, bank, abar = 1e4 * randn(3, 6), randn(7, 6, seed=1), ABAR[torch.tensor([0, 400, 999])]
+    out = denoise(z, abar, bank)
+    torch.testing.assert_close(out.responsibilities.sum(1), torch.ones(3, dtype=torch.float64), rtol=0, atol=1e-14)
+    assert torch.isfinite(out.eps).all()
+
+
+def test_perplexity_counts_the_modes_that_share_z():
+    bank = torch.eye(4, dtype=torch.float64)
+    middle = denoise(torch.zeros(1, 4, dtype=torch.float64), ABAR[500:501], bank)
+    corner = denoise(1e3 * bank[:1], ABAR[0:1], bank)
+    assert math.isclose(middle.perplexity, 4, abs_tol=1e-12) and math.isclose(corner.perplexity, 1, abs_tol=1e-12)
+
+
+def test_classifier_free_guidance_acts_on_the_means():
+    """eps_u + s (eps_c - eps_u) is the eps of the mean m_u + s (m_c - m_u) (equal widths), and D likewise."""
+    bank, z, abar, scale = randn(6, 10), randn(3, 10, seed=1), ABAR[torch.tensor([100, 500, 800])], 7.5
+    only_two = torch.tensor([0.0, 0.0] + [-torch.inf] * 4)
+    distances = squared_distances(z, bank, abar)
+    cond = denoise(z, abar, bank, std=0.3, log_prior=only_two, distances=distances)
+    uncond = denoise(z, abar, bank, std=0.3)
+    means = [out.responsibilities @ bank for out in (cond, uncond)]
+    guided_mean = means[1] + scale * (means[0] - means[1])
+    expected = denoise(z, abar, guided_mean[:, None], std=0.3)
+    torch.testing.assert_close(sds.classifier_free(cond.eps, uncond.eps, scale), expected.eps, rtol=0, atol=1e-11)
+    torch.testing.assert_close(sds.classifier_free(cond.denoised, uncond.denoised, scale), expected.denoised, rtol=0, atol=1e-11)
+    torch.testing.assert_close(cond.eps, denoise(z, abar, bank[:2], std=0.3).eps, rtol=0, atol=1e-12)
+
+
+def test_a_batch_is_its_items_with_shared_and_with_own_banks():
+    z, abar, own = randn(3, 12), ABAR[torch.tensor([5, 400, 950])], randn(3, 4, 12, seed=1)
+    log_prior = randn(3, 4, seed=2)
+    for bank in (own, own[0]):
+        together = denoise(z, abar, bank, std=0.2, log_prior=log_prior)
+        for i in range(3):
+            part = bank[i : i + 1] if bank.dim() == 3 else bank
+            alone = denoise(z[i : i + 1], abar[i : i + 1], part, std=0.2, log_prior=log_prior[i : i + 1])
+            for whole, single in zip(together, alone):
+                # matrix products of different shapes may sum in another order
+                torch.testing.assert_close(whole[i : i + 1], single, rtol=0, atol=1e-12)
+
+
+def test_distances_in_chunks_are_the_distances(monkeypatch):
+    z, bank, abar = randn(2, 30), randn(11, 30, seed=1), ABAR[torch.tensor([50, 700])]
+    whole = squared_distances(z, bank, abar)
+    monkeypatch.setattr("threestudio_gaussiandreamer.exact_score.CHUNK_ELEMENTS", 150)
+    torch.testing.assert_close(squared_distances(z, bank, abar), whole, rtol=1e-15, atol=0)
+
+
+def test_logits_in_float32_at_512_are_stable():
+    """Differences keep the logits of float32 images within 0.01 nat of the exact ones; expanding the square does not."""
+    size = 3 * 512 * 512
+    bank = torch.rand(2, size, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    bank[1] = bank[0] + 1e-3 * randn(size, seed=1, dtype=torch.float32)  # near twins: the logits nearly cancel
+    abar = ABAR[20:21]
+    z = sds.add_noise(bank[:1], randn(1, size, seed=2, dtype=torch.float32), abar)
+    variance = 2 * mode_variance(abar, 0.0)
+    logits = -squared_distances(z, bank, abar) / variance[:, None]
+    wide_z, wide_bank = z.double(), bank.double()
+    exact = -(wide_z[:, None] - abar.sqrt() * wide_bank).square().sum(-1) / variance[:, None]
+    a = float(abar.sqrt())
+    expanded = -((z @ z.T) - 2 * a * z @ bank.T + a * a * bank.square().sum(1)) / variance[:, None]
+
+    def gap(values):
+        return float(values[0, 0] - values[0, 1])
+
+    assert abs(gap(logits) - gap(exact)) < 0.01
+    assert abs(gap(expanded) - gap(exact)) > 0.1
+
+
+def test_temperature_smooths():
+    distances, variance = torch.tensor([[0.0, 10.0]], dtype=torch.float64), torch.tensor([0.5], dtype=torch.float64)
+    sharp, smooth = (responsibilities(distances, variance, temperature=value)[0, 1] for value in (1.0, 10.0))
+    assert math.isclose(sharp, 1 / (1 + math.exp(10)), rel_tol=1e-9) and math.isclose(smooth, 1 / (1 + math.exp(1)), rel_tol=1e-9)
+
+
+# The linear latent
+
+
+def test_the_latent_is_linear_and_its_adjoint_exact():
+    latent = LinearLatent(4, color_matrix(4), 1.7)
+    x, direction, y = randn(2, 3, 16, 8).requires_grad_(), randn(2, 3, 16, 8, seed=1), randn(2, 4, 4, 2, seed=2)
+    latents = latent.encode(x)
+    (adjoint,) = torch.autograd.grad((latents * y).sum(), x)
+    change = latent.encode(x.detach() + direction) - latents.detach()
+    torch.testing.assert_close((adjoint * direction).sum(), (change * y).sum(), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("channels", [3, 4, 6])
+def test_decode_inverts_encode_on_what_the_latent_holds(channels):
+    latent = LinearLatent(4, color_matrix(channels), 2.5)
+    rgb = torch.rand(2, 3, 4, 4, generator=torch.Generator().manual_seed(0)).repeat_interleave(4, 2).repeat_interleave(4, 3)
+    latents = latent.encode(rgb)
+    assert latents.shape == (2, channels, 4, 4)
+    torch.testing.assert_close(latent.decode(latents), rgb, rtol=0, atol=1e-5)  # float32 through a pseudo-inverse
+
+
+@pytest.mark.parametrize("channels", [4, 5, 8])
+def test_color_matrices_have_orthonormal_columns(channels):
+    matrix = color_matrix(channels)
+    torch.testing.assert_close(matrix.T @ matrix, torch.eye(3), rtol=0, atol=1e-6)
+
+
+def test_normalised_has_unit_variance_on_its_images():
+    images = torch.rand(20, 3, 8, 8, generator=torch.Generator().manual_seed(0)) * 0.1 + 0.3
+    latent = LinearLatent(1, color_matrix(4)).normalised(images)
+    assert math.isclose(latent.encode(images).std(), 1, rel_tol=1e-4)
+
+
+def test_latents_name_what_they_cannot_do():
+    with pytest.raises(UserError, match="at least 3 channels"):
+        color_matrix(2)
+    with pytest.raises(UserError, match="one colour"):
+        LinearLatent().normalised(torch.full((2, 3, 4, 4), 0.5))

@@ -1,0 +1,293 @@
+import logging
+
+import numpy as np
+import pytest
+
+from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.meshes import Mesh, face_areas, find_mesh, load_mesh, sample_surface, surface_colors, surface_distances
+
+trimesh = pytest.importorskip("trimesh")
+THIRDS = np.full((1, 3), 1 / 3)
+
+
+def box(extents=(1, 1, 1), center=(0, 0, 0)):
+    mesh = trimesh.creation.box(extents)
+    mesh.apply_translation(center)
+    return mesh
+
+
+def saved(mesh, path):
+    mesh.export(path)
+    return path
+
+
+def textured_quad(image, uv=((0, 0), (1, 0), (1, 1), (0, 1)), y=0.0, size=1.0):
+    """A square in the xz plane, corners in the order of ``uv``."""
+    from PIL import Image
+
+    corners = np.array([[0, y, 0], [1, y, 0], [1, y, 1], [0, y, 1]]) * [size, 1, size]
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(np.asarray(image, dtype=np.uint8)))
+    visual = trimesh.visual.TextureVisuals(uv=np.array(uv, dtype=float), material=material)
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False)
+
+
+def center_color(mesh, face=0):
+    return surface_colors(mesh, np.array([face]), THIRDS)[0]
+
+
+def facing(mesh, direction):
+    """The index of the face whose normal points most along ``direction``."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    return int((np.cross(b - a, c - a) @ np.asarray(direction)).argmax())
+
+
+# Pose
+
+
+def test_the_box_is_centred_and_its_longest_half_side_is_the_scale(tmp_path):
+    mesh = load_mesh(saved(box((2, 5, 1), (100, -3, 7)), tmp_path / "box.stl"), scale=1.5)
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    np.testing.assert_allclose(high, [0.6, 1.5, 0.3], atol=1e-6)  # STL holds float32
+    np.testing.assert_allclose(low, -high, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_units_do_not_matter(tmp_path, scale):
+    mesh = box((2, 5, 1))
+    plain = load_mesh(saved(mesh, tmp_path / "a.ply"))
+    mesh.apply_scale(scale)
+    np.testing.assert_allclose(load_mesh(saved(mesh, tmp_path / "b.ply")).vertices, plain.vertices, atol=1e-6)
+
+
+def arrow(direction, side):
+    """A mesh whose farthest vertex along x, y, z tells the axes apart: long along ``direction``, short along ``side``."""
+    third = np.cross(direction, side)
+    return trimesh.Trimesh([3 * np.array(direction, float), 2 * np.array(side, float), third, [0.0, 0, 0]], [[0, 1, 2], [0, 1, 3], [1, 2, 3]])
+
+
+@pytest.mark.parametrize("name", ["a.glb", "a.obj"])
+def test_y_up_files_face_plus_z(tmp_path, name):
+    """glTF: +z is the front and +y is up, so (z, x, y) of the file are the world's (x, y, z)."""
+    mesh = load_mesh(saved(arrow((0, 0, 1), (0, 1, 0)), tmp_path / name), scale=1.5)
+    corner = mesh.vertices[mesh.vertices[:, 0].argmax()] - mesh.vertices.min(axis=0)
+    top = mesh.vertices[mesh.vertices[:, 2].argmax()] - mesh.vertices.min(axis=0)
+    np.testing.assert_allclose(corner, [3, 1, 0], atol=1e-5)  # third = z cross y = -x, so y starts at -1
+    np.testing.assert_allclose(top, [0, 1, 2], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.off"])
+def test_z_up_files_keep_their_axes(tmp_path, name):
+    mesh = arrow((1, 0, 0), (0, 0, 1))
+    loaded = load_mesh(saved(mesh, tmp_path / name), scale=1.5)
+    np.testing.assert_allclose(np.ptp(loaded.vertices, axis=0), np.ptp(mesh.vertices, axis=0), atol=1e-5)
+    assert loaded.vertices[:, 0].argmax() == 0
+
+
+@pytest.mark.parametrize(("up", "front"), [("+y", "-x"), ("-z", "+y"), ("+x", None), ("-y", "+z")])
+def test_up_and_front_can_be_given_and_nothing_is_mirrored(tmp_path, up, front):
+    from threestudio_gaussiandreamer.meshes import AXES
+
+    path = saved(arrow((1, 0, 0), (0, 1, 0)), tmp_path / "a.ply")
+    mesh, plain = load_mesh(path, up=up, front=front), load_mesh(path, up="+z", front="+x")
+    front = front or "+y"  # the axis after x
+    side = np.cross(AXES[up], AXES[front])
+    np.testing.assert_allclose(mesh.vertices, plain.vertices @ np.stack([AXES[front], side, AXES[up]]).T, atol=1e-12)
+    assert np.isclose(np.linalg.det(np.stack([AXES[front], side, AXES[up]])), 1)
+
+
+def test_a_scene_is_merged_with_its_transforms(tmp_path):
+    scene = trimesh.Scene()
+    scene.add_geometry(box(), transform=trimesh.transformations.translation_matrix([0, 0, 3]))
+    scene.add_geometry(box())
+    mesh = load_mesh(saved(scene, tmp_path / "scene.glb"))
+    assert len(mesh.faces) == 24
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [2, 0.5, 0.5], atol=1e-6)
+
+
+# Colours
+
+
+def test_a_mesh_without_colours_is_grey(tmp_path):
+    mesh = load_mesh(saved(box(), tmp_path / "plain.glb"))
+    assert not mesh.has_colors
+    np.testing.assert_array_equal(center_color(mesh), 0.5)
+
+
+def test_vertex_colours_are_interpolated(tmp_path):
+    source = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], vertex_colors=np.eye(3, 4) * 255 + [0, 0, 0, 255])
+    mesh = load_mesh(saved(source, tmp_path / "a.ply"))
+    assert mesh.has_colors
+    weights = np.array([[0.2, 0.3, 0.5]])
+    np.testing.assert_allclose(surface_colors(mesh, np.array([0]), weights), weights, atol=1e-6)
+
+
+def test_face_colours(tmp_path):
+    source = box()
+    source.visual.face_colors = np.random.default_rng(0).integers(0, 255, (12, 4))
+    mesh = load_mesh(saved(source, tmp_path / "a.ply"))
+    expected = source.visual.face_colors[:, :3] / 255
+    np.testing.assert_allclose([center_color(mesh, face) for face in range(12)], expected, atol=1e-6)
+
+
+def test_a_material_without_texture_colours_the_mesh_in_srgb(tmp_path):
+    source = box()
+    source.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 55, 255]))
+    mesh = load_mesh(saved(source, tmp_path / "a.glb"))
+    linear = 55 / 255
+    np.testing.assert_allclose(center_color(mesh), [1, 0, 1.055 * linear ** (1 / 2.4) - 0.055], atol=1e-6)
+
+
+IMAGE = [[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]]  # red green / blue white
+
+
+def test_the_textures_first_row_is_at_v_1(tmp_path):
+    mesh = load_mesh(saved(textured_quad(IMAGE), tmp_path / "a.glb"))
+    near_corners = surface_colors(mesh, np.array([0, 0, 0]), np.eye(3) * 0.75 + 0.25 / 3)
+    blue, white, green = near_corners  # at uv (0, 0), (1, 0), (1, 1)
+    assert blue.argmax() == 2 and green.argmax() == 1 and white.min() > blue.min() and white.min() > 0.3
+
+
+def test_texels_are_bilinear_and_repeat():
+    """Values at texel centres are the texels', halfway between two their mean; outside [0, 1] the texture repeats."""
+    texture = np.array(IMAGE, dtype=np.float32) / 255
+    places = np.array([[0.25, 0.75], [0.5, 0.75], [0.75, 0.25], [1.25, -0.25], [0.0, 0.75]])
+    expected = [[1, 0, 0], [0.5, 0.5, 0], [1, 1, 1], [1, 0, 0], [0.5, 0.5, 0]]
+    for place, color in zip(places, expected):
+        mesh = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]), uv=np.repeat(place[None], 3, axis=0).astype(np.float32), texture=texture)
+        np.testing.assert_allclose(center_color(mesh), color, atol=1e-6)
+
+
+def test_a_texture_is_tinted_by_its_material(tmp_path):
+    quad = textured_quad(np.full((2, 2, 3), 255))
+    quad.visual.material.baseColorFactor = [255, 0, 255, 255]
+    np.testing.assert_allclose(center_color(load_mesh(saved(quad, tmp_path / "a.glb"))), [1, 0, 1], atol=1e-6)
+    quad.visual.material.baseColorFactor = [102, 102, 102, 255]  # trimesh's "no colour given"
+    np.testing.assert_allclose(center_color(load_mesh(saved(quad, tmp_path / "b.glb"))), 1, atol=1e-6)
+
+
+def test_a_scene_of_textures_and_colours_keeps_them_apart(tmp_path):
+    """Two textures of different sizes (one of them repeating), vertex colours and a plain part."""
+    red, checks = np.tile([[[255, 0, 0]]], (3, 5, 1)), np.tile([[[0, 0, 255], [0, 255, 0]]], (1, 1, 1))
+    repeated = textured_quad(checks, uv=((0, 0), (4, 0), (4, 1), (0, 1)), y=1.0)
+    coloured = box(center=(5, 0, 0))
+    coloured.visual.vertex_colors = [255, 255, 0, 255]
+    scene = trimesh.Scene([textured_quad(red), repeated, coloured, box(center=(9, 0, 0))])
+    mesh = load_mesh(saved(scene, tmp_path / "a.glb"))
+    assert len(mesh.faces) == 28 and mesh.tiles.shape == (28, 4)
+    order = np.lexsort(mesh.vertices[mesh.faces].mean(axis=1)[:, 1:].T[::-1])  # by the file's x, then y
+    red_face, striped_face = sorted((face for face in range(28) if mesh.tiles[face, 2]), key=lambda f: mesh.vertices[mesh.faces[f], 2].mean())[::2]
+    np.testing.assert_allclose(center_color(mesh, red_face), [1, 0, 0], atol=1e-6)
+    across = mesh.uv[mesh.faces[striped_face], 0]
+    weights = [np.linalg.lstsq(np.stack([across, np.ones(3)]), [4 * u, 1], rcond=None)[0] for u in (0.0625, 0.1875, 0.3125, 0.8125)]
+    stripes = surface_colors(mesh, np.full(4, striped_face), np.array(weights))  # at u = 1/4, 3/4, 5/4 and 13/4 of the texture
+    np.testing.assert_allclose(stripes, [[0, 0, 1], [0, 1, 0], [0, 0, 1], [0, 0, 1]], atol=1e-5)
+    np.testing.assert_allclose(center_color(mesh, order[-13]), [1, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(center_color(mesh, order[-1]), 0.5, atol=1e-6)
+
+
+# Sampling
+
+
+def test_samples_are_uniform_over_the_area_and_ignore_empty_faces():
+    from scipy import stats
+
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 3, 0]], float)
+    mesh = Mesh(vertices, np.array([[0, 1, 2], [1, 1, 2], [1, 3, 2]]))
+    points, faces, weights = sample_surface(mesh, 20000, np.random.default_rng(0))
+    areas = face_areas(mesh)
+    np.testing.assert_allclose(areas, [0.5, 0, 1.5], atol=1e-12)
+    assert not (faces == 1).any()
+    assert stats.binomtest(int((faces == 0).sum()), 20000, 0.25).pvalue > 0.01
+    first = points[faces == 0]
+    assert stats.kstest(1 - (1 - first[:, 0]) ** 2, "uniform").pvalue > 0.01  # the marginal of a uniform right triangle
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-12)
+
+
+def test_surface_distances_of_a_sphere(tmp_path):
+    mesh = load_mesh(saved(trimesh.creation.icosphere(4), tmp_path / "a.ply"))
+    points = np.array([[1.5, 0, 0], [0, 0, 0], [0, 1.0, 0]])
+    # spacing of 2e5 samples on a sphere is 0.008; the icosphere's faces lie up to 0.002 inside
+    np.testing.assert_allclose(surface_distances(mesh, points), [0.5, 1.0, 0.0], atol=0.012)
+
+
+# Bad input
+
+
+def test_a_few_bad_vertices_are_dropped_with_a_count(tmp_path, caplog):
+    source = trimesh.creation.icosphere(3)  # 642 vertices
+    vertices = np.array(source.vertices)
+    vertices[7], vertices[50] = np.nan, np.inf
+    path = saved(trimesh.Trimesh(vertices, source.faces, process=False), tmp_path / "a.off")
+    with caplog.at_level(logging.WARNING):
+        mesh = load_mesh(path)
+    assert "dropped 2 of 642" in caplog.text
+    assert len(mesh.vertices) == 640 and np.isfinite(mesh.vertices).all()
+    np.testing.assert_allclose(np.abs(mesh.vertices).max(), 1, atol=1e-6)
+
+
+def test_many_bad_vertices_are_an_error(tmp_path):
+    source = trimesh.creation.icosphere(2)
+    vertices = source.vertices.copy()
+    vertices[:20] = np.nan
+    with pytest.raises(UserError, match="20 of 162 vertices"):
+        load_mesh(saved(trimesh.Trimesh(vertices, source.faces, process=False), tmp_path / "a.off"))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("missing.glb", None, "does not exist"),
+        ("a.xlsx", b"x", "unknown mesh format"),
+        ("noise.glb", b"not a glb at all" * 9, "can't read the mesh"),
+        ("empty.obj", b"", "no faces|can't read"),
+        ("points.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n", "no faces"),
+        ("flat.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "zero area"),
+        ("line.obj", b"v 0 0 0\nv 1 1 1\nv 2 2 2\nf 1 2 3\n", "zero area"),
+        ("range.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "names vertex 7|can't read"),
+    ],
+)
+def test_what_cannot_be_used_is_named(tmp_path, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(UserError, match=message):
+        load_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"), [({"up": "z"}, "up axis 'z'"), ({"front": "+w"}, "front axis"), ({"up": "+z", "front": "-z"}, "along"), ({"scale": 0}, "scale")]
+)
+def test_bad_options_are_named(tmp_path, options, message):
+    with pytest.raises(UserError, match=message):
+        load_mesh(saved(box(), tmp_path / "a.ply"), **options)
+
+
+# Real meshes
+
+
+def test_the_bundled_toy_is_found_by_its_name_and_faces_the_front(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert find_mesh("toy.glb").stat().st_size < 400_000
+    mesh = load_mesh("toy.glb")
+    points, *where = sample_surface(mesh, 20000, np.random.default_rng(0))
+    red, green, blue = surface_colors(mesh, *where).T
+    nose = (red < 0.2) & (green < 0.2) & (points[:, 0] > 0)
+    assert nose.sum() > 50 and abs(points[nose, 1].mean() - points[:, 1].min() - np.ptp(points[:, 1]) / 3) < 0.2
+    assert points[nose, 2].mean() > 0.2
+    tail = (points[:, 1] > 0.5) & (np.minimum(np.minimum(red, green), blue) > 0.7)
+    assert tail.sum() > 100  # its pale tip is on the left
+    saved(box(), tmp_path / "toy.glb")
+    assert len(load_mesh("toy.glb").faces) == 12  # a file of that name comes first
+
+
+@pytest.mark.parametrize(("name", "front", "faces"), [("spot", "-z", 5856), ("duck", "+x", 4212)])
+def test_shared_meshes(shared_folder, name, front, faces):
+    mesh = load_mesh(shared_folder / "assets" / f"{name}.glb", front=front)
+    assert mesh.faces.shape == (faces, 3) and mesh.texture is not None
+    np.testing.assert_allclose(np.abs(mesh.vertices).max(), 1, atol=1e-9)
+    points, *where = sample_surface(mesh, 20000, np.random.default_rng(0))
+    colors = surface_colors(mesh, *where)
+    assert colors.min() >= 0 and colors.max() <= 1
+    red, green, blue = colors.T
+    # the duck's orange beak, the cow's pink snout: in front
+    nose = (red > 0.9) & (green < 0.6) & (blue < 0.3) if name == "duck" else (red > 0.9) & (blue > 0.5) & (blue < 0.75)
+    assert nose.sum() > 200 and points[nose, 0].mean() > 0.5

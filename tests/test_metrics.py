@@ -1,0 +1,59 @@
+import math
+
+import pytest
+import torch
+
+from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.metrics import azimuth_difference, floater_mass, multi_face_rate, psnr, ssim
+
+
+def images(*shape, seed=0):
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def test_psnr_of_a_known_error():
+    a = images(2, 8, 8, 3)
+    assert math.isclose(psnr(a, a + 0.1), 20, abs_tol=1e-4)
+    assert psnr(a, a) == 100
+
+
+def test_psnr_agrees_with_torchmetrics():
+    reference = pytest.importorskip("torchmetrics.functional.image")
+    a, b = images(2, 20, 30, 3), images(2, 20, 30, 3, seed=1)
+    torch.testing.assert_close(psnr(a, b), reference.peak_signal_noise_ratio(b, a, data_range=1.0))
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.3])
+def test_ssim_agrees_with_torchmetrics(noise):
+    reference = pytest.importorskip("torchmetrics.functional.image")
+    a = images(3, 6, 6, 3).repeat_interleave(8, 1).repeat_interleave(8, 2)
+    b = (a + noise * torch.randn(a.shape, generator=torch.Generator().manual_seed(1))).clamp(0, 1)
+    expected = reference.structural_similarity_index_measure(b.movedim(-1, 1), a.movedim(-1, 1), data_range=1.0, reduction="none")
+    # both are float32 with E[x^2] - E[x]^2 against a constant of 9e-4
+    torch.testing.assert_close(ssim(a, b), expected, rtol=0, atol=2e-4)
+    torch.testing.assert_close(ssim(a[0], b[0]), ssim(a, b)[0], rtol=0, atol=1e-6)
+
+
+def test_ssim_of_equal_images_is_one_and_small_ones_are_refused():
+    a = images(16, 16, 3)
+    torch.testing.assert_close(ssim(a, a), torch.tensor(1.0), rtol=0, atol=1e-5)
+    with pytest.raises(UserError, match="at least 6 pixels"):
+        ssim(a[:5], a[:5])
+
+
+def test_azimuths_wrap():
+    a, b = torch.tensor([350.0, -170.0, 10.0, 0.0]), torch.tensor([10.0, 170.0, 10.0, 540.0])
+    assert azimuth_difference(a, b).tolist() == [20, 20, 0, 180]
+
+
+def test_multi_face_rate_counts_views_of_the_wrong_side():
+    bank, azimuths = images(8, 32, 32, 3), torch.arange(8) * 45.0
+    assert multi_face_rate(bank, bank, azimuths, azimuths) == 0
+    everywhere_the_back = bank[4].expand(8, -1, -1, -1)
+    assert multi_face_rate(everywhere_the_back, bank, azimuths, azimuths) == 5 / 8  # 180 and its two neighbours at 45 are right
+
+
+def test_floater_mass_is_weighted_by_opacity():
+    distances, opacities = torch.tensor([0.0, 0.03, 0.05, 0.1]), torch.tensor([0.5, 0.5, 0.2, 0.8])
+    assert math.isclose(floater_mass(distances, opacities, extent=2.0), 0.5)  # farther than 0.04
+    assert floater_mass(distances, torch.zeros(4), extent=2.0) == 0

@@ -1,0 +1,101 @@
+import math
+
+import pytest
+import torch
+
+from threestudio_gaussiandreamer import sds
+from threestudio_gaussiandreamer.errors import UserError
+
+ABAR = sds.sd_alphas_cumprod()
+
+
+def test_the_schedule_is_stable_diffusions():
+    assert ABAR.dtype == torch.float64 and len(ABAR) == 1000
+    # Published figures of the scaled-linear schedule: sigma_0 = .029, sqrt(abar/(1-abar)) = 7.2 at t = 20 and .077 at 980.
+    assert math.isclose((1 - ABAR[0]).sqrt(), 0.0292, abs_tol=1e-4)
+    ratio = (ABAR / (1 - ABAR)).sqrt()
+    assert math.isclose(ratio[20], 7.2, abs_tol=0.05) and math.isclose(ratio[980], 0.077, abs_tol=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("percents", "expected"), [((0.02, 0.98), (20, 980)), ((0.0, 1.0), (1, 999)), ((1.0, 1.0), (999, 999)), ((0.02, 0.55), (20, 550))]
+)
+def test_step_range_is_clamped_to_the_valid_timesteps(percents, expected):
+    assert sds.step_range(*percents) == expected
+
+
+@pytest.mark.parametrize("percents", [(0.5, 0.4), (-0.1, 0.5), (0.1, 1.2)])
+def test_step_range_names_what_is_wrong(percents):
+    with pytest.raises(UserError, match="step_percent"):
+        sds.step_range(*percents)
+
+
+def test_timesteps_cover_the_range_with_both_ends():
+    draws = torch.cat([sds.timesteps(8, 20, 27, seed=0, step=step) for step in range(100)])
+    assert set(draws.tolist()) == set(range(20, 28))
+
+
+def test_timesteps_depend_on_step_and_item_but_not_on_the_batch_size():
+    four, two = (sds.timesteps(size, 1, 999, seed=3, step=7) for size in (4, 2))
+    assert torch.equal(four[:2], two)
+    assert not torch.equal(four, sds.timesteps(4, 1, 999, seed=3, step=8))
+    assert not torch.equal(four, sds.timesteps(4, 1, 999, seed=4, step=7))
+
+
+def test_timesteps_stay_inside_the_table():
+    draws = torch.cat([sds.timesteps(8, 0, 10, seed=0, step=step, num_train=5) for step in range(50)])
+    assert draws.min() == 1 and draws.max() == 4
+
+
+def test_timesteps_refuse_an_empty_range():
+    with pytest.raises(UserError, match="21 is above the largest 20"):
+        sds.timesteps(1, 21, 20, seed=0, step=0)
+
+
+def test_predict_x0_undoes_add_noise():
+    x, noise = torch.randn(2, 3, 3, 4, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    abar = ABAR[torch.tensor([20, 500, 980])]
+    # float64 rounding, magnified by sigma/a = 13 at t = 980
+    torch.testing.assert_close(sds.predict_x0(sds.add_noise(x, noise, abar), noise, abar), x, rtol=0, atol=1e-13)
+
+
+def test_classifier_free_guidance_convention():
+    cond, uncond = torch.tensor([2.0]), torch.tensor([1.0])
+    assert sds.classifier_free(cond, uncond, 1.0) == cond
+    assert sds.classifier_free(cond, uncond, 0.0) == uncond
+    threestudio = cond + 100 * (cond - uncond)
+    assert sds.classifier_free(cond, uncond, 101.0) == threestudio
+
+
+@pytest.mark.parametrize(("name", "expected"), [("sds", 0.75), ("uniform", 1.0), ("fantasia3d", 0.375)])
+def test_weights(name, expected):
+    assert sds.weight(name, torch.tensor([0.25], dtype=torch.float64)).item() == expected
+
+
+def test_an_unknown_weight_names_the_nearest():
+    with pytest.raises(UserError, match="'fantasia3d'"):
+        sds.weight("fantasia", ABAR[:1])
+
+
+def test_sds_loss_has_the_gradient_it_is_given():
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(4, 3, 8, 8, generator=generator).requires_grad_()
+    grad = torch.randn(4, 3, 8, 8, generator=generator)
+    loss = sds.sds_loss(x, grad)
+    loss.backward()
+    # x - (x - grad) rounds: float32 epsilon times |x|
+    torch.testing.assert_close(x.grad, grad / 4, rtol=0, atol=1e-6)
+    torch.testing.assert_close(loss.detach(), 0.5 * grad.square().sum() / 4)
+
+
+def test_ddim_with_the_true_noise_of_a_point_lands_on_it():
+    point = torch.randn(1, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def predict(z, t):
+        abar = ABAR[t]
+        return (z - sds.per_item(abar.sqrt(), z) * point) / sds.per_item((1 - abar).sqrt(), z)
+
+    z = torch.randn(3, 5, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    for steps in (1, 7, 50):
+        out = sds.ddim_sample(predict, z, torch.tensor([3, 500, 980]), ABAR, steps=steps)
+        torch.testing.assert_close(out, point.expand(3, 5), rtol=0, atol=1e-11)

@@ -1,0 +1,324 @@
+"""Guidance ``exact-score-guidance``: the optimal denoiser of a mesh's pictures, in closed form; no weights, no prompt.
+
+It stands in for a diffusion model where the pipeline is to be measured or shown offline, and says nothing about the quality
+of a real one. The data distribution is a mixture of narrow Gaussians around ray-cast pictures of the mesh (formulas and limits:
+``exact_score.py``), composited on the render's own background.
+
+==================  ===================================================================================================
+option              meaning
+==================  ===================================================================================================
+mesh                path of the mesh, or the bare name of a bundled one; scale, up, front: as in ``meshes.load_mesh``
+mode                ``view-exact``: the picture from this very camera (reconstruction: an upper bound, not generation);
+                    ``direction-bins``: the bank views on the camera's side (front, side, back, overhead), what
+                    view-dependent prompts can know; ``view-agnostic``: all bank views (multi-face without a prior)
+space               ``pixel``: sharp, posteriors of one picture; ``latent``: pooling and a colour matrix at unit
+                    variance on the bank, where as in a real latent several pictures compete
+image_size          height of the pictures that are compared, pixels; 0 = as rendered; the render is resized to it
+latent_size         height of the latent in pixels (image_size is a multiple); latent_channels; color_matrix: false
+                    keeps the three colours
+std                 width s of each mode, in the units of the space (pixels in [-1, 1])
+temperature         of the responsibilities; 1 = exact, larger = smoother
+bank_*              number of views, their ranges (degrees, world units) and their seed
+supersample         rays per pixel and axis; max_cached_targets: pictures of view-exact kept in memory (4 bytes a pixel)
+guidance_scale      1 = none (the default here); otherwise the unconditional mixture is the bank, with this view in it
+==================  ===================================================================================================
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Optional, Tuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..cameras import Orbit, OrbitRanges, camera_pool
+from ..errors import UserError, unknown
+from ..exact_score import LinearLatent, color_matrix, denoise, squared_distances
+from ..host import register
+from ..meshes import load_mesh
+from ..raycast import MeshCaster, TargetCache, over_background
+from .base import ScoreDistillation
+
+MODES = ("view-exact", "direction-bins", "view-agnostic")
+SPACES = ("pixel", "latent")
+DIRECTIONS = ("side", "front", "back", "overhead")
+MAX_MODE_BYTES = 2**31
+
+
+class Bank(NamedTuple):
+    """Pictures of the mesh from all around, at one size."""
+
+    orbit: Orbit
+    rgba: Float[Tensor, "K H W 4"]
+    """uint8, premultiplied."""
+    pooled: Float[Tensor, "K 4 h w"]
+    """float32 in [0, 1], averaged over the latent's pixels."""
+    latent: LinearLatent
+
+
+class Mixture(NamedTuple):
+    """What one item is compared with."""
+
+    modes: Float[Tensor, "K c h w"]
+    log_prior: Optional[Float[Tensor, " K"]]
+    """0 or -inf: which modes the conditional mixture has; None = all, and no unconditional one is asked for."""
+
+
+@register("exact-score-guidance")
+class ExactScoreGuidance(ScoreDistillation):
+    @dataclass
+    class Config(ScoreDistillation.Config):
+        guidance_scale: float = 1.0
+        mesh: str = ""
+        scale: float = 1.0
+        up: str = "auto"
+        front: Optional[str] = None
+        mode: str = "view-exact"
+        space: str = "pixel"
+        image_size: int = 0
+        latent_size: int = 16
+        latent_channels: int = 4
+        color_matrix: bool = True
+        std: float = 0.0
+        temperature: float = 1.0
+        bank_views: int = 200
+        bank_seed: int = 0
+        bank_elevation_range: Tuple[float, float] = (-10.0, 60.0)
+        bank_distance_range: Tuple[float, float] = (1.5, 4.0)
+        bank_fovy_range: Tuple[float, float] = (40.0, 70.0)
+        supersample: int = 2
+        max_cached_targets: int = 512
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            ScoreDistillation.Config.check(cfg)
+            _check_choices(cfg)
+            _check_numbers(cfg)
+
+    cfg: Config
+
+    def configure(self) -> None:
+        super().configure()
+        cfg = self.cfg
+        self.caster = MeshCaster(load_mesh(cfg.mesh, scale=cfg.scale, up=cfg.up, front=cfg.front))
+        self._targets = TargetCache(self.caster, cfg.supersample, cfg.max_cached_targets)
+        self._banks: dict[tuple[int, int], Bank] = {}
+        self._size: Optional[tuple[int, int]] = None
+        self._perplexity = 1.0
+        ranges = OrbitRanges(cfg.bank_elevation_range, (-180.0, 180.0), cfg.bank_distance_range, cfg.bank_fovy_range)
+        self.bank_orbit = camera_pool(cfg.bank_views, ranges, cfg.bank_seed, "bank")
+
+    # The path of score distillation ---------------------------------------------------------------------------------------
+
+    def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B c h w"]:
+        self._size = self._picture_size(*rgb.shape[-2:])
+        return self._latent().encode(_resized(rgb, self._size))
+
+    def decode(self, latents: Float[Tensor, "B c h w"]) -> Float[Tensor, "B 3 H W"]:
+        return self._latent().decode(latents)
+
+    def condition(
+        self, prompt_utils: Any = None, *, comp_rgb_bg: Optional[Tensor] = None, c2w: Tensor, fovy: Tensor, **batch: Any
+    ) -> list[Mixture]:
+        """The mixture of each item; needs ``encode`` before, which says at what size."""
+        if self._size is None:
+            raise UserError("exact-score-guidance compares pictures: give it renders, not latents (rgb_as_latents)")
+        background = _background(comp_rgb_bg, len(c2w), c2w.device)
+        exact = self._exact_modes(c2w, fovy, background) if self.cfg.mode == "view-exact" else None
+        if exact is not None and not self.guided:
+            return [Mixture(mode[None], None) for mode in exact]
+        bins = view_directions(batch["elevation"], batch["azimuth"]) if self.cfg.mode == "direction-bins" else [None] * len(c2w)
+        return [self._mixture(None if exact is None else exact[i], background[i], bins[i]) for i in range(len(c2w))]
+
+    def predict(self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: list[Mixture]) -> tuple[Tensor, Optional[Tensor]]:
+        abar = self.alphas_cumprod.to(t.device)[t]
+        items = [self._predict_item(z[i : i + 1].flatten(1), abar[i : i + 1], mixture) for i, mixture in enumerate(condition)]
+        cond = torch.cat([item[0].eps for item in items]).view_as(z)
+        self._perplexity = float(torch.cat([item[0].perplexity for item in items]).mean())
+        if items[0][1] is None:
+            return cond, None
+        return cond, torch.cat([item[1].eps for item in items]).view_as(z)
+
+    def report(self) -> dict[str, float]:
+        """How many pictures share a noisy latent on average: 1 is retrieval of the nearest one."""
+        return {"perplexity": self._perplexity}
+
+    def _predict_item(self, z: Float[Tensor, "1 d"], abar: Float[Tensor, "1"], mixture: Mixture) -> tuple:
+        modes = mixture.modes.flatten(1)
+        options = {"std": self.cfg.std, "temperature": self.cfg.temperature}
+        if mixture.log_prior is None:
+            return denoise(z, abar, modes, **options), None
+        distances = squared_distances(z, modes, abar)
+        cond = denoise(z, abar, modes, log_prior=mixture.log_prior, distances=distances, **options)
+        return cond, denoise(z, abar, modes, distances=distances, **options)
+
+    # Mixtures -------------------------------------------------------------------------------------------------------------
+
+    def _mixture(self, exact: Optional[Tensor], background: Float[Tensor, "bh bw 3"], direction: Optional[int]) -> Mixture:
+        """The bank on this background, with the exact view (c, h, w) before it, if any, as the only conditional mode."""
+        bank = self.bank(*self._size)
+        if exact is not None:
+            modes = torch.cat([exact[None], bank_modes(bank, background)])
+            return Mixture(modes, _log_prior(torch.arange(len(modes), device=modes.device) == 0))
+        if direction is None:
+            return Mixture(bank_modes(bank, background), None)
+        members = self._members(direction).to(bank.rgba.device)
+        if self.guided:
+            return Mixture(bank_modes(bank, background), _log_prior(members.to(background.device)))
+        return Mixture(bank_modes(_rows(bank, members), background), None)
+
+    def _members(self, direction: int) -> Float[Tensor, " K"]:
+        """The bank views of a direction; all of them where it has none (overhead, in a bank that stays below 60 degrees)."""
+        members = view_directions(self.bank_orbit.elevation, self.bank_orbit.azimuth) == int(direction)
+        return members if members.any() else torch.ones_like(members)
+
+    def _exact_modes(self, c2w: Tensor, fovy: Tensor, background: Float[Tensor, "B bh bw 3"]) -> Float[Tensor, "B c h w"]:
+        rgba = self._targets(c2w, fovy, *self._size)
+        return self._latent().encode(_composite(rgba, background))
+
+    def bank(self, height: int, width: int) -> Bank:
+        """The bank at a picture size; that of the last size is kept."""
+        if (height, width) not in self._banks:
+            self._banks = {(height, width): self._cast_bank(height, width)}
+        return self._banks[height, width]
+
+    def _cast_bank(self, height: int, width: int) -> Bank:
+        cameras = zip(self.bank_orbit.c2w.numpy(), self.bank_orbit.fovy.tolist(), strict=True)
+        images = self.caster.render_views(cameras, height, width, supersample=self.cfg.supersample, progress="bank of views")
+        images = torch.from_numpy(images).to(self.device)
+        factor = self._factor(height, width)
+        pooled = F.avg_pool2d(images.movedim(-1, 1), factor)
+        latent = LinearLatent(factor)
+        if self.cfg.space == "latent":
+            matrix = color_matrix(self.cfg.latent_channels if self.cfg.color_matrix else 3)
+            latent = latent._replace(matrix=matrix).normalised(pooled[:, :3])
+        return Bank(self.bank_orbit, (images * 255).round().byte(), pooled, latent)
+
+    def _latent(self) -> LinearLatent:
+        return LinearLatent() if self.cfg.space == "pixel" else self.bank(*self._size).latent
+
+    def _picture_size(self, height: int, width: int) -> tuple[int, int]:
+        """The size of the compared pictures for a render of this size: ``image_size`` high, with the render's aspect."""
+        size = self.cfg.image_size
+        height, width = (size, max(1, round(width * size / height))) if size else (height, width)
+        needed = 12 * self.cfg.bank_views * height * width
+        if self.cfg.space == "pixel" and (self.cfg.mode != "view-exact" or self.guided) and needed > MAX_MODE_BYTES:
+            raise UserError(
+                f"a bank of {self.cfg.bank_views} views of {height}x{width} pixels needs {needed / 2**30:.1f} GiB for each item:"
+                " use system.guidance.space=latent, or a smaller system.guidance.image_size"
+            )
+        return height, width
+
+    def _factor(self, height: int, width: int) -> int:
+        if self.cfg.space == "pixel":
+            return 1
+        factor = height // self.cfg.latent_size
+        if factor * self.cfg.latent_size != height or width % max(factor, 1):
+            raise UserError(
+                f"pictures of {height}x{width} can't be pooled to a latent {self.cfg.latent_size} high: give a"
+                " system.guidance.image_size that is a multiple of system.guidance.latent_size"
+            )
+        return factor
+
+    # What is known of the truth -------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def target_rgb(self, batch: dict[str, Any], comp_rgb_bg: Optional[Tensor] = None, *, size: Optional[tuple[int, int]] = None) -> Float[Tensor, "B H W 3"]:
+        """The mesh from the batch's own cameras, on the background of the render, at (height, width) = ``size`` or the batch's."""
+        height, width = size or (batch["height"], batch["width"])
+        rgba = self._targets(batch["c2w"], batch["fovy"], height, width)
+        background = _background(comp_rgb_bg, len(rgba), rgba.device)
+        return _composite(rgba, background).movedim(1, -1)
+
+    def cast_targets(self, c2w: Float[Tensor, "N 4 4"], fovy: Float[Tensor, " N"], height: int, width: int) -> None:
+        """Cast the targets of known cameras ahead of training, with a progress bar; as many as the cache holds."""
+        count = self.cfg.max_cached_targets
+        self._targets(c2w[:count], fovy[:count], height, width, progress="target views")
+
+    @torch.no_grad()
+    def bank_images(self, size: int, background: Optional[Tensor] = None) -> Float[Tensor, "K H W 3"]:
+        """The bank's pictures at ``size`` x ``size`` on one colour (3,), black by default, for the multi-face meter."""
+        cameras = zip(self.bank_orbit.c2w.numpy(), self.bank_orbit.fovy.tolist(), strict=True)
+        rgba = torch.from_numpy(self.caster.render_views(cameras, size, size, supersample=self.cfg.supersample))
+        return over_background(rgba, torch.zeros(3) if background is None else background.detach().cpu().reshape(3))
+
+    @property
+    def bank_azimuths(self) -> Float[Tensor, " K"]:
+        """Degrees."""
+        return self.bank_orbit.azimuth
+
+
+def view_directions(elevation: Float[Tensor, " B"], azimuth: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
+    """The direction of views in degrees, an index into DIRECTIONS, by threestudio's rules for view-dependent prompts.
+
+    Front within 45 degrees of azimuth 0, back beyond 135, overhead above 60 degrees of elevation, otherwise side.
+    """
+    azimuth = ((azimuth + 180) % 360 - 180).abs()
+    directions = torch.where(azimuth < 45, 1, torch.where(azimuth > 135, 2, 0))
+    return torch.where(elevation > 60, 3, directions)
+
+
+def bank_modes(bank: Bank, background: Float[Tensor, "bh bw 3"]) -> Float[Tensor, "K c h w"]:
+    """The bank's latents on a background of one colour (1, 1, 3) or of pixels (H', W', 3)."""
+    if background.shape[:2] == (1, 1):  # pooling and compositing commute
+        pooled = bank.pooled.to(background.device)
+        return bank.latent.encode_pooled(pooled[:, :3] + (1 - pooled[:, 3:]) * background.reshape(3, 1, 1))
+    return torch.cat([bank.latent.encode(_composite(rgba, background[None])) for rgba in bank.rgba.split(16)])
+
+
+def _rows(bank: Bank, members: Tensor) -> Bank:
+    return bank._replace(rgba=bank.rgba[members], pooled=bank.pooled[members])
+
+
+def _log_prior(members: Tensor) -> Float[Tensor, " K"]:
+    return torch.where(members, 0.0, -torch.inf)
+
+
+def _background(background: Optional[Tensor], batch: int, device: torch.device) -> Float[Tensor, "B bh bw 3"]:
+    """The render's background, detached; black without one."""
+    return torch.zeros(batch, 1, 1, 3, device=device) if background is None else background.detach().float().expand(batch, -1, -1, -1)
+
+
+def _composite(rgba: Tensor, background: Float[Tensor, "B bh bw 3"]) -> Float[Tensor, "B 3 H W"]:
+    """uint8 pictures (B, H, W, 4) over the background, which is resized to them."""
+    background = background.movedim(-1, 1)
+    if background.shape[-2:] != (1, 1):
+        background = _resized(background, tuple(rgba.shape[1:3]))
+    rgba = rgba.movedim(-1, 1).contiguous().to(background) / 255
+    return rgba[:, :3] + (1 - rgba[:, 3:]) * background
+
+
+def _resized(images: Float[Tensor, "B c H W"], size: tuple[int, int]) -> Float[Tensor, "B c h w"]:
+    """Images at another size: box averages for whole factors, else bilinear with antialiasing."""
+    height, width = images.shape[-2:]
+    if (height, width) == size:
+        return images
+    if height % size[0] == 0 and width % size[1] == 0:
+        return F.avg_pool2d(images, (height // size[0], width // size[1]))
+    return F.interpolate(images, size, mode="bilinear", align_corners=False, antialias=True)
+
+
+def _check_choices(cfg: Any) -> None:
+    for name, choices in (("mode", MODES), ("space", SPACES)):
+        if cfg[name] not in choices:
+            raise unknown(f"system.guidance.{name}", cfg[name], choices)
+    if not cfg.mesh:
+        raise UserError("system.guidance.mesh: give the path of the mesh whose pictures are the truth")
+
+
+def _check_numbers(cfg: Any) -> None:
+    for name in ("latent_size", "bank_views", "supersample", "max_cached_targets"):
+        if cfg[name] < 1:
+            raise UserError(f"system.guidance.{name}: expected at least 1, got {cfg[name]}")
+    for name in ("std", "image_size"):
+        if cfg[name] < 0:
+            raise UserError(f"system.guidance.{name}: expected 0 or more, got {cfg[name]}")
+    if cfg.latent_channels < 3:
+        raise UserError(f"system.guidance.latent_channels: expected at least 3, got {cfg.latent_channels}")
+    if not cfg.temperature > 0:
+        raise UserError(f"system.guidance.temperature: expected more than 0, got {cfg.temperature}")
+    for name in ("bank_elevation_range", "bank_distance_range", "bank_fovy_range"):
+        low, high = cfg[name]
+        if not low <= high or (name != "bank_elevation_range" and low <= 0):
+            raise UserError(f"system.guidance.{name}: expected [low, high] with low <= high, distances and angles of view above 0, got [{low}, {high}]")

@@ -1,0 +1,84 @@
+"""How good a result is: PSNR and SSIM against the truth, the multi-face meter, the floater meter."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from .errors import UserError
+
+MAX_PSNR = 100.0
+SSIM_WINDOW = 11
+
+
+def psnr(image: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
+    """-10 log10 of the mean squared error over all that is given, images in [0, 1], in dB; at most 100."""
+    error = (image - truth).square().mean()
+    return -10 * error.clamp_min(10 ** (-MAX_PSNR / 10)).log10()
+
+
+def ssim(image: Float[Tensor, "*batch H W C"], truth: Float[Tensor, "*batch H W C"]) -> Float[Tensor, "*batch"]:
+    """Structural similarity of images in [0, 1], one per image (Wang et al. 2004, eq. 13).
+
+    11 x 11 Gaussian window of sigma 1.5 around every pixel, the image reflected at its border, K1 0.01, K2 0.03, mean over
+    pixels and channels: torchmetrics' default, which a test compares.
+
+    Raises:
+        UserError: a side too short to be reflected.
+    """
+    if min(image.shape[-3:-1]) <= SSIM_WINDOW // 2:
+        raise UserError(f"SSIM needs images of at least {SSIM_WINDOW // 2 + 1} pixels a side, not {tuple(image.shape[-3:-1])}")
+    mean_x, mean_y = _window_mean(image), _window_mean(truth)
+    var_x = _window_mean(image**2) - mean_x**2
+    var_y = _window_mean(truth**2) - mean_y**2
+    covariance = _window_mean(image * truth) - mean_x * mean_y
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
+    structure = (2 * covariance + c2) / (var_x + var_y + c2)
+    return (luminance * structure).mean(dim=(-3, -2, -1))
+
+
+def multi_face_rate(
+    renders: Float[Tensor, "V H W 3"],
+    bank_images: Float[Tensor, "K h w 3"],
+    view_azimuths: Float[Tensor, " V"],
+    bank_azimuths: Float[Tensor, " K"],
+    *,
+    threshold: float = 45.0,
+    size: int = 32,
+) -> float:
+    """The share of views whose nearest bank view is more than ``threshold`` degrees of azimuth away.
+
+    Nearest by squared error at ``size`` x ``size`` pixels; renders and bank lie on the same background. Azimuths in degrees. A
+    bank from other heights and distances confuses views of like outline: best it has the views' own cameras, turned around.
+    """
+    views, bank = (_shrunk(images, size).flatten(1) for images in (renders, bank_images.to(renders)))
+    nearest = torch.cdist(views, bank).argmin(dim=1)
+    apart = azimuth_difference(view_azimuths, bank_azimuths.to(view_azimuths)[nearest.to(view_azimuths.device)])
+    return (apart > threshold).double().mean().item()
+
+
+def azimuth_difference(a: Float[Tensor, "*n"], b: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """The angle between two azimuths, degrees in [0, 180]."""
+    return ((a - b + 180) % 360 - 180).abs()
+
+
+def floater_mass(distances: Float[Tensor, " N"], opacities: Float[Tensor, " N"], *, extent: float, share: float = 0.02) -> float:
+    """The opacity-weighted share of Gaussians farther than ``share`` of ``extent`` (the box's longest side) from the surface."""
+    total = opacities.sum()
+    return (opacities[distances > share * extent].sum() / total).item() if total > 0 else 0.0
+
+
+def _window_mean(images: Float[Tensor, "*batch H W C"]) -> Float[Tensor, "*batch H W C"]:
+    """The Gaussian-weighted mean of the window around each pixel, separably."""
+    offsets = torch.arange(SSIM_WINDOW, device=images.device, dtype=images.dtype) - SSIM_WINDOW // 2
+    kernel = torch.softmax(-(offsets**2) / (2 * 1.5**2), dim=0)
+    planes = images.movedim(-1, -3).reshape(-1, 1, *images.shape[-3:-1])
+    planes = F.pad(planes, [SSIM_WINDOW // 2] * 4, mode="reflect")
+    planes = F.conv2d(F.conv2d(planes, kernel.reshape(1, 1, -1, 1)), kernel.reshape(1, 1, 1, -1))
+    return planes.reshape(*images.shape[:-3], images.shape[-1], *planes.shape[-2:]).movedim(-3, -1)
+
+
+def _shrunk(images: Float[Tensor, "n H W C"], size: int) -> Float[Tensor, "n s s C"]:
+    """Images at ``size`` x ``size``, each pixel the mean of what it covers."""
+    return F.adaptive_avg_pool2d(images.movedim(-1, 1), (size, size)).movedim(1, -1)
