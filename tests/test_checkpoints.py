@@ -1,0 +1,161 @@
+"""Checkpoint files: whole or absent, damage noticed, no code executed."""
+
+import os
+import pickle
+import random
+import resource
+import signal
+import time
+
+import pytest
+import torch
+
+from threestudio_gaussiandreamer.builtin.weights import load_checkpoint, load_file, newest_readable, previous_of, save_file
+from threestudio_gaussiandreamer.checkpoints import AtomicCheckpointIO
+from threestudio_gaussiandreamer.errors import UserError
+
+
+def content(step: int = 7, size: int = 2000) -> dict:
+    return {"state_dict": {"means": torch.arange(float(size)) + step}, "epoch": 0, "global_step": step, "note": "text"}
+
+
+def same(a: dict, b: dict) -> bool:
+    return a["global_step"] == b["global_step"] and torch.equal(a["state_dict"]["means"], b["state_dict"]["means"])
+
+
+def test_plain_torch_reads_it_and_so_do_we(tmp_path):
+    save_file(tmp_path / "a.ckpt", content())
+    assert same(load_checkpoint(tmp_path / "a.ckpt"), content())
+    assert same(torch.load(tmp_path / "a.ckpt", weights_only=True), content())
+    assert os.listdir(tmp_path) == ["a.ckpt"]
+
+
+def test_a_checkpoint_of_plain_torch_is_read_too(tmp_path):
+    torch.save(content(), tmp_path / "a.ckpt")
+    assert same(load_checkpoint(tmp_path / "a.ckpt"), content())
+
+
+def test_the_file_that_is_replaced_is_kept(tmp_path):
+    path = tmp_path / "last.ckpt"
+    for step in (1, 2, 3):
+        save_file(path, content(step))
+    assert load_file(path)["global_step"] == 3
+    assert previous_of(path).name == "last-prev.ckpt" and load_file(previous_of(path))["global_step"] == 2
+
+
+def test_truncation_anywhere_is_noticed(tmp_path):
+    path = tmp_path / "a.ckpt"
+    save_file(path, content())
+    whole = path.read_bytes()
+    rng = random.Random(0)
+    for cut in [0, 1, *range(len(whole) - 100, len(whole)), *(rng.randrange(len(whole)) for _ in range(50))]:
+        path.write_bytes(whole[:cut])
+        with pytest.raises(UserError, match="a.ckpt"):
+            load_file(path)
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_a_flipped_byte_never_gives_other_numbers(tmp_path, own):
+    path = tmp_path / "a.ckpt"
+    save_file(path, content()) if own else torch.save(content(), path)
+    whole = path.read_bytes()
+    rng = random.Random(0)
+    refused = 0
+    for _ in range(200):
+        damaged = bytearray(whole)
+        damaged[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
+        path.write_bytes(damaged)
+        try:
+            assert same(load_file(path), content())
+        except UserError as error:
+            assert str(path) in str(error)
+            refused += 1
+    # every byte of ours is covered; a foreign archive has padding that no checksum covers
+    assert refused == 200 if own else refused >= 150
+
+
+def test_a_damaged_file_names_its_neighbours(tmp_path):
+    save_file(tmp_path / "last.ckpt", content(1))
+    save_file(tmp_path / "last.ckpt", content(2))
+    data = bytearray((tmp_path / "last.ckpt").read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "last.ckpt").write_bytes(data)
+    with pytest.raises(UserError, match="checksum doesn't match.*last-prev.ckpt"):
+        load_file(tmp_path / "last.ckpt")
+    assert newest_readable(tmp_path / "last.ckpt") == tmp_path / "last-prev.ckpt"
+    assert newest_readable(tmp_path / "other.ckpt") is None
+
+
+class Bomb:
+    def __reduce__(self):
+        return os.mkdir, ("exploded",)
+
+
+def test_code_in_a_pickle_is_not_executed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    torch.save({"state_dict": {}, "epoch": 0, "global_step": 0, "x": Bomb()}, "bomb.ckpt")
+    (tmp_path / "bare.ckpt").write_bytes(pickle.dumps(Bomb()))
+    for name, message in (("bomb.ckpt", "could run code"), ("bare.ckpt", "doesn't end as torch.save")):
+        with pytest.raises(UserError, match=message):
+            AtomicCheckpointIO().load_checkpoint(name, weights_only=False)
+    assert not (tmp_path / "exploded").exists()
+
+
+@pytest.mark.parametrize("foreign", [{"model": 1}, [1, 2], torch.ones(3)])
+def test_a_foreign_file_is_not_a_checkpoint(tmp_path, foreign):
+    torch.save(foreign, tmp_path / "a.ckpt")
+    with pytest.raises(UserError, match="isn't a training checkpoint: it has no .*state_dict"):
+        load_checkpoint(tmp_path / "a.ckpt")
+
+
+def test_a_missing_file_lists_what_is_there(tmp_path):
+    save_file(tmp_path / "last.ckpt", content())
+    with pytest.raises(UserError, match="there is no checkpoint .*lst.ckpt; in the same folder there are .*last.ckpt"):
+        load_file(tmp_path / "lst.ckpt")
+
+
+def test_a_full_disk_leaves_the_earlier_file_and_no_temporary_one(tmp_path):
+    save_file(tmp_path / "last.ckpt", content(1))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(UserError, match="could not be written: .*untouched"):
+            save_file(tmp_path / "last.ckpt", content(2, size=200_000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert os.listdir(tmp_path) == ["last.ckpt"] and load_file(tmp_path / "last.ckpt")["global_step"] == 1
+
+
+def test_a_folder_that_is_a_file_is_named(tmp_path):
+    (tmp_path / "ckpts").write_text("")
+    with pytest.raises(UserError, match="ckpts/last.ckpt could not be written"):
+        save_file(tmp_path / "ckpts" / "last.ckpt", content())
+
+
+def test_killed_at_any_moment_the_last_or_the_previous_is_whole(tmp_path):
+    path = tmp_path / "last.ckpt"
+    save_file(path, content(0))
+    rng = random.Random(0)
+    for _ in range(15):
+        child = os.fork()
+        if child == 0:
+            # only torch.save runs here, which needs no thread that the fork has lost
+            for step in range(10_000):
+                save_file(path, content(step, size=50_000))
+            os._exit(0)
+        time.sleep(rng.uniform(0.01, 0.08))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        saved = load_file(path)
+        assert torch.equal(saved["state_dict"]["means"], content(saved["global_step"], len(saved["state_dict"]["means"]))["state_dict"]["means"])
+
+
+def test_lightnings_door(tmp_path):
+    door = AtomicCheckpointIO()
+    path = tmp_path / "ckpts" / "last.ckpt"
+    assert door.saved_step(path) == -1
+    door.save_checkpoint(content(9), path)
+    assert door.saved_step(path) == 9 and same(door.load_checkpoint(path, map_location=lambda storage, place: storage), content(9))
+    door.remove_checkpoint(path)
+    door.remove_checkpoint(path)
+    assert not path.exists()

@@ -1,0 +1,198 @@
+"""Checkpoint files: written so that a crash leaves the earlier one whole, read so that damage is noticed and no code runs.
+
+A file is what ``torch.save`` writes, a zip archive, with ``sha256:<hex>`` of everything before it as the archive's comment.
+Plain ``torch.load`` reads it.
+"""
+
+import contextlib
+import hashlib
+import os
+import pickle
+import shutil
+import zipfile
+from pathlib import Path
+from typing import Any, Optional
+
+import torch
+
+from ..errors import UserError
+from .logs import warn
+
+_MARK = b"sha256:"
+_COMMENT_BYTES = len(_MARK) + 64
+_END_OF_ARCHIVE = b"PK\x05\x06"
+_END_RECORD_BYTES = 22
+_BLOCK_BYTES = 1 << 20
+
+
+def save_file(path: str | os.PathLike, content: Any) -> None:
+    """Write ``content`` to ``path``; the earlier file stays until the new one is whole, and then beside it as ``<stem>-prev``.
+
+    Raises:
+        UserError: the disk is full or the folder can't be written; the earlier file is untouched.
+    """
+    path = Path(path)
+    # one name: what a killed process leaves is overwritten by the next save
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        torch.save(content, temporary)
+        _append_checksum(temporary)
+        _keep_previous(path)
+        os.replace(temporary, path)
+        _sync_folder(path.parent)
+    except (OSError, RuntimeError) as error:
+        raise UserError(f"the checkpoint {path} could not be written: {_reason(error)}; an earlier file of that name is untouched") from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
+    """What :func:`save_file` or ``torch.save`` wrote; never executes code from the file.
+
+    Raises:
+        UserError: no such file, a damaged one, or one that isn't a checkpoint.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"there is no checkpoint {path}" + _siblings(path))
+    _verify(path)
+    try:
+        return torch.load(path, map_location=map_location, weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise UserError(f"{path} holds Python objects that could run code when read, so it isn't read: {_reason(error)}") from error
+    except (RuntimeError, OSError, ValueError, KeyError, EOFError) as error:
+        raise UserError(f"{path} isn't a checkpoint, or is damaged: {_reason(error)}") from error
+
+
+def previous_of(path: str | os.PathLike) -> Path:
+    """Where :func:`save_file` keeps the file that it replaces."""
+    path = Path(path)
+    return path.with_name(f"{path.stem}-prev{path.suffix}")
+
+
+def newest_readable(path: str | os.PathLike) -> Optional[Path]:
+    """``path`` if it is a whole checkpoint, else the file that it replaced if that one is, else None; says what is damaged."""
+    for candidate in (Path(path), previous_of(path)):
+        if candidate.is_file():
+            try:
+                load_checkpoint(candidate)
+                return candidate
+            except UserError as error:
+                warn(str(error))
+    return None
+
+
+def load_module_weights(
+    path: str, module_name: Optional[str] = None, ignore_modules: Optional[list[str]] = None, map_location: Any = "cpu"
+) -> tuple[dict, int, int]:
+    """Parameters of one module (its prefix removed), or of all but the ignored ones, with the epoch and step of a checkpoint.
+
+    Raises:
+        UserError: the file is missing, damaged or no checkpoint, or has nothing for that module.
+    """
+    checkpoint = load_checkpoint(path, map_location)
+    state = checkpoint["state_dict"]
+    if module_name:
+        state = {key.removeprefix(f"{module_name}."): value for key, value in state.items() if key.startswith(f"{module_name}.")}
+    for ignored in ignore_modules or []:
+        state = {key: value for key, value in state.items() if not key.startswith(f"{ignored}.")}
+    if not state:
+        raise UserError(f"the checkpoint {path} has no parameters of {module_name!r}; it has {sorted(checkpoint['state_dict'])}")
+    return state, checkpoint["epoch"], checkpoint["global_step"]
+
+
+def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:
+    """A training checkpoint: a dict with at least ``state_dict``, ``epoch`` and ``global_step``.
+
+    Raises:
+        UserError: as :func:`load_file`, or the file holds something else.
+    """
+    checkpoint = load_file(path, map_location)
+    missing = {"state_dict", "epoch", "global_step"} - set(checkpoint if isinstance(checkpoint, dict) else ())
+    if missing:
+        raise UserError(f"{path} isn't a training checkpoint: it has no {', '.join(sorted(missing))}")
+    return checkpoint
+
+
+def _append_checksum(path: Path) -> None:
+    with open(path, "r+b") as file:
+        file.seek(-_END_RECORD_BYTES, os.SEEK_END)
+        end = file.read()
+        if end[:4] != _END_OF_ARCHIVE or end[-2:] != b"\0\0":
+            raise RuntimeError("torch.save did not write a zip archive without a comment")
+        file.seek(-2, os.SEEK_END)
+        file.write(_COMMENT_BYTES.to_bytes(2, "little") + _MARK)
+        file.seek(0)
+        digest = _digest(file, os.fstat(file.fileno()).st_size)
+        file.seek(0, os.SEEK_END)
+        file.write(digest.hexdigest().encode())
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _verify(path: Path) -> None:
+    with open(path, "rb") as file:
+        mark_at = max(os.path.getsize(path) - _COMMENT_BYTES, 0)
+        file.seek(mark_at)
+        tail = file.read()
+        if not tail.startswith(_MARK):
+            return _verify_foreign(path, tail)
+        file.seek(0)
+        digest = _digest(file, mark_at + len(_MARK))
+    if digest.hexdigest().encode() != tail[len(_MARK) :]:
+        raise UserError(f"the checkpoint {path} is damaged: its checksum doesn't match{_siblings(path)}")
+
+
+def _verify_foreign(path: Path, tail: bytes) -> None:
+    """A file of plain torch: a whole archive by its end, and each record by the checksum that torch writes but doesn't read."""
+    if tail[-_END_RECORD_BYTES:][:4] != _END_OF_ARCHIVE or not tail.endswith(b"\0\0"):
+        raise UserError(f"{path} isn't a checkpoint, or is cut short: it doesn't end as torch.save ends a file{_siblings(path)}")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except (zipfile.BadZipFile, NotImplementedError, OSError, ValueError, RuntimeError) as error:
+        raise UserError(f"the checkpoint {path} is damaged: {error}{_siblings(path)}") from error
+    if damaged:
+        raise UserError(f"the checkpoint {path} is damaged: the checksum of {damaged} doesn't match{_siblings(path)}")
+
+
+def _digest(file: Any, count: int) -> Any:
+    digest = hashlib.sha256()
+    for start in range(0, count, _BLOCK_BYTES):
+        digest.update(file.read(min(_BLOCK_BYTES, count - start)))
+    return digest
+
+
+def _keep_previous(path: Path) -> None:
+    if not path.exists():
+        return
+    kept = previous_of(path)
+    temporary = kept.with_name(f".{kept.name}.tmp")
+    temporary.unlink(missing_ok=True)
+    try:
+        os.link(path, temporary)
+    except OSError:
+        # a file system without hard links
+        shutil.copyfile(path, temporary)
+    os.replace(temporary, kept)
+
+
+def _sync_folder(folder: Path) -> None:
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _siblings(path: Path) -> str:
+    others = sorted(str(other) for other in path.parent.glob("*.ckpt") if other != path) if path.parent.is_dir() else []
+    return f"; in the same folder there are {', '.join(others)}" if others else ""
+
+
+def _reason(error: Exception) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -1,0 +1,132 @@
+"""The launcher: from a command line to a trained, tested and exported cloud.
+
+``python launch.py --config demo.yaml --train key=value ...``, or the console script ``gaussiandreamer`` with the same arguments.
+A run is a list of stages: choose the device, load the extensions, load and check the configuration, build data and system, make the
+folder, train, test. What the user can mend ends it with one message and exit code 2, before anything is written.
+"""
+
+import argparse
+import contextlib
+import logging
+import os
+import shlex
+import signal
+import sys
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any, Optional
+
+from .errors import UserError
+from .launch_options import PROGRAM, announce_device, choose_gpu, find_config, parse_arguments
+
+NOISE = (
+    # Lightning's advice that doesn't apply to an endless stream of cameras made on the fly, or to a run that is resumed
+    ".*does not have many workers.*",
+    ".*Checkpoint directory .* exists and is not empty.*",
+    ".*checkpoint that ended before the epoch ended.*",
+    ".*ModelCheckpoint with manual optimization.*",
+    ".*callbacks used to create the checkpoint need to be provided.*",
+    ".*predict returned None.*",
+    ".*`isinstance\\(treespec, LeafSpec\\)` is deprecated.*",
+)
+
+
+def console() -> None:
+    """Entry point of the console script ``gaussiandreamer``."""
+    sys.exit(main())
+
+
+def main(argv: Optional[Sequence[str]] = None) -> int:
+    """Run one command line (default: this process's); returns the exit code.
+
+    0 done; 2 something the user can mend, said in one message; 130 and 143 stopped by Ctrl-C and SIGTERM.
+    """
+    # idle OpenMP threads that spin make a busy machine many times slower; torch reads this when it is imported
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    argv = list(sys.argv[1:] if argv is None else argv)
+    try:
+        args = parse_arguments(argv)
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    try:
+        with _terminable():
+            return run(args, argv)
+    except UserError as error:
+        if args.verbose:
+            traceback.print_exc()
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 128 + signal.SIGINT
+
+
+def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
+    """The stages of one run; see the module's docstring. Returns the exit code."""
+    config_paths = [find_config(name) for name in args.config]
+    choose_gpu(args.gpu)
+    if args.typecheck:
+        from . import typecheck
+
+        typecheck.install()
+    # torch and Lightning are imported from here on, so that --help and mistakes in the arguments cost no seconds
+    from . import register_parts
+    from .config import load_config
+    from .config_check import check_config
+    from .extensions import load_extensions
+
+    configure_logging(args.verbose)
+    n_gpus = announce_device(args.gpu)
+    register_parts()
+    load_extensions()
+    cfg = load_config(*config_paths, cli_args=args.overrides, n_gpus=max(n_gpus, 1))
+    check_config(cfg)
+
+    from .trial import Trial
+
+    trial = Trial(cfg, args, config_paths, shlex.join([*PROGRAM, *argv]), n_gpus)
+    return trial.run()
+
+
+class StderrHandler(logging.Handler):
+    """Messages as plain lines to what ``sys.stderr`` is at that moment."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(self.format(record), file=sys.stderr, flush=True)
+
+
+def configure_logging(verbose: bool) -> None:
+    """Our messages to stderr as plain lines; Lightning's only from warnings up, unless ``verbose``."""
+    logger = logging.getLogger(__package__)
+    if not logger.handlers:
+        logger.addHandler(StderrHandler())
+        logger.propagate = False
+    logger.setLevel(logging.DEBUG if verbose else logging.INFO)
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.INFO if verbose else logging.WARNING)
+    if not verbose:
+        for message in NOISE:
+            warnings.filterwarnings("ignore", message=message)
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM ends the process through ``finally`` blocks, with code 143."""
+
+    def end(signum: int, frame: Any) -> None:
+        sys.exit(128 + signum)
+
+    try:
+        earlier = signal.signal(signal.SIGTERM, end)
+    except ValueError:  # not the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, earlier)
+
+
+if __name__ == "__main__":
+    console()
