@@ -118,7 +118,7 @@ def make_batch(
 
 
 class TrainCameras(IterableDataset, Updateable):
-    """An endless stream of training batches; ``start_step`` is set by the system so that a resumed run goes on."""
+    """An endless stream of training batches; a resumed run's begins at ``start_step``."""
 
     def __init__(self, cfg: CameraConfig, rank: int = 0) -> None:
         self.cfg, self.start_step, self.rank = cfg, 0, rank
@@ -216,6 +216,8 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         self.val_dataset, self.test_dataset = EvalCameras(self.cfg, "val"), EvalCameras(self.cfg, "test")
 
     def train_dataloader(self) -> DataLoader:
+        # Lightning asks for the loader after it restored the loops and before it fetches the first batch
+        self.train_dataset.start_step = self.trainer.global_step if self.trainer is not None else self.train_dataset.start_step
         return DataLoader(self.train_dataset, batch_size=None, collate_fn=self.train_dataset.collate)
 
     def val_dataloader(self) -> DataLoader:

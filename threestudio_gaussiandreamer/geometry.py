@@ -33,6 +33,7 @@ from torch import Tensor, nn
 
 from . import densify, sh
 from .densify import PARAMETERS, Change, Rules, Statistics
+from .distributed import all_max, all_sum
 from .errors import UserError, unknown
 from .grow import SCALE_RULES, grow, nearest_distance_scales
 from .host import BaseGeometry, C, find, register, run_seed, validate_schedule
@@ -248,9 +249,9 @@ class GaussianCloud(BaseGeometry):
     def observe(self, out: Rasterized, width: int, height: int, loss_scale: float = 1.0) -> None:
         """Add one step's screen-space gradients and contributions to the statistics."""
         if out.means2d.grad is not None:
-            self.gradient_sum += densify.screen_gradients(out.means2d.grad, width, height, loss_scale).sum(0)
-            self.gradient_count += (out.radii > 0).sum(0)
-        torch.maximum(self.contribution, out.contribution.amax(0), out=self.contribution)
+            self.gradient_sum += all_sum(densify.screen_gradients(out.means2d.grad, width, height, loss_scale).sum(0))
+            self.gradient_count += all_sum((out.radii > 0).sum(0))
+        torch.maximum(self.contribution, all_max(out.contribution.amax(0)), out=self.contribution)
 
     def after_step(self, optimizer: torch.optim.Optimizer, step: int) -> bool:
         """Densify and prune where the schedule says so; ``step`` counts finished optimiser steps. True if N may have changed."""

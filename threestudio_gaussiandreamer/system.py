@@ -25,6 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .background import FlatBackground
+from .distributed import average_gradients
 from .errors import UserError, unknown
 from .evaluate import EvaluationConfig, HeldOut, Measurements
 from .guidance.base import ScoreDistillation
@@ -99,9 +100,6 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             self.measurements = Measurements(HeldOut(self.cfg.evaluation, caster), Path(self._save_dir))
 
     def on_train_start(self) -> None:
-        dataset = self.trainer.train_dataloader.dataset
-        if hasattr(dataset, "start_step"):
-            dataset.start_step = self.global_step
         if self.global_step == 0:
             self.score("prior")
         if self.measurements:
@@ -119,6 +117,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         losses = self.losses(out, batch)
         loss = torch.stack(list(losses.values())).sum()
         self.manual_backward(loss)
+        average_gradients(self.parameters())
         self.geometry.observe(out["rasterized"], batch["width"], batch["height"], self.loss_scale())
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
