@@ -3,12 +3,13 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN     = $(VENV)/bin
 ENVIRON = OMP_WAIT_POLICY=passive
-DEMO    = $$($(BIN)/python -m threestudio_gaussiandreamer.demo)
+# without the CPU kernel (no C++ compiler) plain torch draws, and the demo is smaller
+SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import available_backends as b; print("--config configs/demo-small.yaml" if b()["cpu"] else "")')
 
 .PHONY: demo test ablations bench clean
 
 demo: $(VENV)/ready                ## train the bundled toy from a coarse prior, offline, on the CPU
-	$(ENVIRON) $(BIN)/python launch.py --config $(DEMO) --train
+	$(ENVIRON) $(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
 
 test: $(VENV)/ready                ## the whole test suite, as CI runs it
 	$(ENVIRON) $(BIN)/python -m pytest
@@ -25,5 +26,5 @@ $(VENV)/ready: pyproject.toml setup.py constraints.txt requirements-dev.txt $(wi
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
 	touch $@
 
-clean:
+clean:                             ## remove what the others made
 	rm -rf $(VENV) build *.egg-info outputs

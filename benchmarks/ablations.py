@@ -21,31 +21,52 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
-RANDOM_START = ["system.geometry.prior_type=random-prior", "system.geometry.prior={num_points: 10000, shape: sphere}", "system.geometry.grow.enabled=false"]
-VIEW_BLIND = ["system.guidance.mode=view-agnostic", "system.guidance.space=latent", "system.guidance.latent_size=16"]
-NO_ANNEALING = ["system.guidance.max_step_percent=0.98"]
-STRONG = ["system.guidance.guidance_scale=101"]  # threestudio's 100
+RANDOM_START = {
+    "system.geometry.prior_type": "random-prior",
+    "system.geometry.prior": {"num_points": 10000, "shape": "sphere"},
+    "system.geometry.grow.enabled": False,
+}
+# One distance for cameras and bank: otherwise a nearer view is one more mode to drift to, and zoom hides what the faces do.
+VIEW_BLIND = {
+    "system.guidance.mode": "view-agnostic",
+    "system.guidance.space": "latent",
+    "system.guidance.latent_size": 16,
+    "system.guidance.bank_views": 500,
+    "data.camera_distance_range": [2.5, 2.5],
+    "data.fovy_range": [50, 50],
+    "system.guidance.bank_distance_range": [2.5, 2.5],
+    "system.guidance.bank_fovy_range": [50.0, 50.0],
+}
+NO_ANNEALING = {"system.guidance.max_step_percent": 0.98}
+LATENT = {"system.guidance.space": "latent", "system.guidance.latent_size": 16}
+STRONG = {"system.guidance.guidance_scale": 101.0}  # threestudio's 100
+CLIPPED = {"system.guidance.grad_clip": [0, 1.5, 2.0, 1000]}
+PAPER_RATES = {f"system.geometry.lr_{name}": rate for name, rate in (("means", 5e-5), ("scales", 1e-3), ("quats", 1e-2), ("opacities", 1e-2))}
 
+# Options replace what the demo's YAML has under their key, whole sections included.
 TABLES = {
     "ablations": {
-        "default": [],
+        "default": {},
         "random start": RANDOM_START,
-        "no growing": ["system.geometry.grow.enabled=false"],
-        "no perturbation": ["system.geometry.grow.color_range=[0.0, 0.0]"],
-        "radius 0.005": ["system.geometry.grow.radius=0.005"],
-        "radius 0.02": ["system.geometry.grow.radius=0.02"],
-        "radius 0.05": ["system.geometry.grow.radius=0.05"],
+        "no growing": {"system.geometry.grow.enabled": False},
+        "no perturbation": {"system.geometry.grow.color_range": [0.0, 0.0]},
+        "radius 0.005": {"system.geometry.grow.radius": 0.005},
+        "radius 0.02": {"system.geometry.grow.radius": 0.02},
+        "radius 0.05": {"system.geometry.grow.radius": 0.05},
         "no schedule": NO_ANNEALING,
-        "paper's rates": [f"system.geometry.lr_{name}" for name in ("means=5e-5", "scales=1e-3", "quats=1e-2", "opacities=1e-2")],
+        "the paper's rates": PAPER_RATES,
     },
-    "faces": {"prior": [], "random start": RANDOM_START},
+    "faces": {"prior": {}, "random start": RANDOM_START},
     "guidance": {
-        "scale 1": [],
-        "scale 100": [*STRONG, *NO_ANNEALING],
-        "scale 100, annealed": STRONG,
-        "scale 100, annealed, clipped": [*STRONG, "system.guidance.grad_clip=[0, 1.5, 2.0, 1000]"],
+        "scale 1": LATENT,
+        "scale 100": LATENT | STRONG | NO_ANNEALING,
+        "scale 100, annealed": LATENT | STRONG,
+        "scale 100, annealed, clipped": LATENT | STRONG | CLIPPED,
     },
 }
 SCORES = {"ablations": ("view-exact", "view-blind"), "faces": ("view-blind",), "guidance": ("view-exact",)}
@@ -56,8 +77,8 @@ def main() -> None:
     rows = []
     for variant, overrides in TABLES[arguments.table].items():
         for score in SCORES[arguments.table]:
-            guidance = VIEW_BLIND if score == "view-blind" else []
-            runs = [run(arguments, seed, [*guidance, *overrides]) for seed in arguments.seeds]
+            guidance = VIEW_BLIND if score == "view-blind" else {}
+            runs = [run(arguments, seed, guidance | overrides) for seed in arguments.seeds]
             rows.append(summary(variant, score, runs))
             print_row(rows[-1])
     write(arguments, rows)
@@ -77,21 +98,37 @@ def parse_arguments() -> argparse.Namespace:
     return arguments
 
 
-def run(arguments: argparse.Namespace, seed: int, overrides: list[str]) -> dict:
+def run(arguments: argparse.Namespace, seed: int, options: dict[str, Any]) -> dict:
     """One training run in a process of its own; its metrics."""
+    size, steps = arguments.size, arguments.steps
+    common = {
+        "name": "run", "tag": "run", "use_timestamp": False, "seed": seed, "data.width": size, "data.height": size,
+        "system.evaluation.size": size, "data.n_test_views": 2, "data.eval_width": 64, "data.eval_height": 64,
+        "trainer.max_steps": steps, "trainer.val_check_interval": steps, "trainer.enable_progress_bar": False,
+        "system.guidance.bank_seed": seed, "system.guidance.image_size": size,
+    }  # fmt: skip
+    mesh = {"system.guidance.mesh": arguments.mesh} if arguments.mesh else {}
     with tempfile.TemporaryDirectory() as folder:
-        options = [
-            f"exp_root_dir={folder}", "name=run", "tag=run", "use_timestamp=false", f"seed={seed}",
-            f"trainer.max_steps={arguments.steps}", f"trainer.val_check_interval={arguments.steps}", "trainer.enable_progress_bar=false",
-            f"data.width={arguments.size}", f"data.height={arguments.size}", f"system.evaluation.size={arguments.size}",
-            "data.n_test_views=2", "data.eval_width=64", "data.eval_height=64",
-            *([f"system.guidance.mesh={arguments.mesh}"] if arguments.mesh else []), *overrides, *arguments.overrides,
-        ]  # fmt: skip
-        command = [sys.executable, str(ROOT / "launch.py"), "--config", str(ROOT / "configs/demo.yaml"), "--train", *options]
+        cfg = changed_demo({**common, **mesh, **options, "exp_root_dir": folder})
+        path = Path(folder) / "run.yaml"
+        path.write_text(yaml.safe_dump(cfg))
+        command = [sys.executable, str(ROOT / "launch.py"), "--config", str(path), "--train", *arguments.overrides]
         finished = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
         if finished.returncode:
-            sys.exit(f"a run failed ({finished.returncode}):\n{' '.join(command)}\n{finished.stderr[-3000:]}")
+            sys.exit(f"a run failed ({finished.returncode}): {options}\n{finished.stderr[-3000:]}")
         return json.loads((Path(folder) / "run/run/save/metrics.json").read_text())
+
+
+def changed_demo(options: dict[str, Any]) -> dict:
+    """configs/demo.yaml with each dotted key replaced."""
+    cfg = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())
+    for dotted, value in options.items():
+        *sections, key = dotted.split(".")
+        section = cfg
+        for name in sections:
+            section = section[name]
+        section[key] = value
+    return cfg
 
 
 def summary(variant: str, score: str, runs: list[dict]) -> dict:

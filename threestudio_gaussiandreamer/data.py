@@ -33,7 +33,7 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset
 from . import cameras
 from .cameras import Orbit, OrbitRanges
 from .errors import UserError
-from .host import Updateable, parse_structured, pl, register, register_builtin, run_seed
+from .host import Updateable, item_seed, parse_structured, pl, register, register_builtin, run_seed
 from .streams import generator
 
 
@@ -120,8 +120,8 @@ def make_batch(
 class TrainCameras(IterableDataset, Updateable):
     """An endless stream of training batches; a resumed run's begins at ``start_step``."""
 
-    def __init__(self, cfg: CameraConfig, rank: int = 0) -> None:
-        self.cfg, self.start_step, self.rank = cfg, 0, rank
+    def __init__(self, cfg: CameraConfig) -> None:
+        self.cfg, self.start_step = cfg, 0
         sizes = [v if isinstance(v, (list, tuple)) else [v] for v in map(_plain, (cfg.height, cfg.width, cfg.batch_size))]
         stages = max(map(len, sizes))
         self.sizes = list(zip(*[v * stages if len(v) == 1 else v for v in sizes], strict=True))
@@ -135,9 +135,9 @@ class TrainCameras(IterableDataset, Updateable):
             step += 1
 
     def collate(self, step: int) -> dict[str, Any]:
-        """The batch that trains ``step``: a function of (seed, step, rank)."""
+        """The batch that trains ``step``: a function of (seed, step), different in each process that trains along."""
         height, width, batch_size = self.sizes[bisect.bisect_right(self.cfg.resolution_milestones, step)]
-        rng = generator(run_seed(), "camera", step, self.rank)
+        rng = generator(item_seed(), "camera", step)
         orbit = self._pick(batch_size, rng) if self.pool else cameras.sample_orbit(batch_size, self._ranges(step), rng, self.cfg.batch_uniform_azimuth)
         c2w = self._perturbed(orbit, rng)
         return make_batch(orbit, c2w, self._lights(c2w, rng), height, width, self.cfg.rays, self.cfg.rays_d_normalize)
@@ -210,9 +210,8 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         CameraConfig.check(self.cfg)
 
     def setup(self, stage: str | None = None) -> None:
-        rank = self.trainer.global_rank if self.trainer is not None else 0
         if stage in (None, "fit"):
-            self.train_dataset = TrainCameras(self.cfg, rank)
+            self.train_dataset = TrainCameras(self.cfg)
         self.val_dataset, self.test_dataset = EvalCameras(self.cfg, "val"), EvalCameras(self.cfg, "test")
 
     def train_dataloader(self) -> DataLoader:

@@ -7,7 +7,9 @@ import os
 from collections.abc import Callable
 
 from .builtin.schedule import C, validate_schedule
+from .distributed import rank
 from .errors import UserError, unknown
+from .streams import derive_seed
 
 
 def _threestudio_is_importable() -> bool:
@@ -21,7 +23,7 @@ def _threestudio_is_importable() -> bool:
     except ModuleNotFoundError as error:
         if error.name == "threestudio":
             return False
-        raise UserError(f"threestudio is on the Python path but can't be imported: {error}; install what it needs or take it off") from error
+        raise UserError(f"threestudio is on the Python path but can't be imported: {error}; mend it or take it off") from error
     except Exception as error:
         raise UserError(f"threestudio is on the Python path but can't be imported: {error!r}; mend it or take it off") from error
     return hasattr(threestudio, "register")
@@ -39,9 +41,14 @@ if _threestudio_is_importable():
     from threestudio.systems.base import BaseLift3DSystem, BaseSystem
     from threestudio.utils.base import BaseModule, BaseObject, Updateable
     from threestudio.utils.config import parse_structured
-    from threestudio.utils.misc import get_device
+    from threestudio.utils.misc import get_device, get_rank
 
     NAME = "threestudio"
+
+    def run_seed() -> int:
+        """The seed of this run, the same in every process of it; 0 without one."""
+        # threestudio gives each process the seed of the run plus its rank
+        return int(os.environ.get("PL_GLOBAL_SEED", get_rank())) - get_rank()
 
     def names() -> list[str]:
         """All registered names, sorted."""
@@ -85,10 +92,14 @@ else:
     NAME = "builtin"
     register_builtin = register
 
+    def run_seed() -> int:
+        """The seed of this run, the same in every process of it; 0 without one."""
+        return int(os.environ.get("PL_GLOBAL_SEED", 0))
 
-def run_seed() -> int:
-    """The seed of this run, as ``seed_everything`` keeps it; 0 without one."""
-    return int(os.environ.get("PL_GLOBAL_SEED", 0))
+
+def item_seed() -> int:
+    """The seed of what differs between processes that train one cloud together: cameras, noise, backgrounds."""
+    return run_seed() if rank() == 0 else derive_seed(run_seed(), "rank", rank())
 
 
 __all__ = [
@@ -109,6 +120,7 @@ __all__ = [
     "find",
     "get_device",
     "info",
+    "item_seed",
     "names",
     "parse_structured",
     "pl",

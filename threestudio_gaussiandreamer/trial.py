@@ -1,6 +1,6 @@
 """One trial: its folder, its parts, its trainer, and the stage that was asked for.
 
-    outputs/<name>/<tag>@<time>/{ckpts, configs/{raw,parsed}.yaml, code, save, tb_logs, csv_logs, cmd.txt}
+``outputs/<name>/<tag>@<time>/{ckpts, configs/{raw,parsed}.yaml, code, save, tb_logs, csv_logs, cmd.txt}``
 """
 
 import argparse
@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Optional
 
-from .builtin.logs import get_rank
 from .builtin.weights import load_checkpoint
 from .callbacks import GracefulStop, ProgressBar, RunRecord, Stopped
 from .checkpoints import AtomicCheckpointIO
@@ -20,6 +19,7 @@ from .config_check import plain
 from .errors import UserError
 from .host import find, info, pl, warn
 from .launch_options import PROGRAM
+from .strategy import ReplicatedStrategy
 
 
 class Trial:
@@ -52,7 +52,7 @@ class Trial:
             with lightning_errors(self.cfg.resume):
                 getattr(self, self.args.stage)()
             self.summarize()
-        except UserError:
+        except (UserError, KeyboardInterrupt, SystemExit):
             self.discard_if_unused()
             raise
         except Stopped as stop:
@@ -64,7 +64,8 @@ class Trial:
         """Everything before the first long work: checks first, the folder last."""
         checkpoint = self.read_resume()
         require_writable(self.folder)
-        pl.seed_everything(self.cfg.seed + get_rank(), workers=True)
+        # one seed for all processes: what they draw differently, they draw by their rank
+        pl.seed_everything(self.cfg.seed, workers=True)
         self.data = find(self.cfg.data_type)(self.cfg.data)
         self.system = find(self.cfg.system_type)(self.cfg.system, resumed=self.cfg.resume is not None)
         if checkpoint is not None and self.args.stage != "train":
@@ -109,7 +110,7 @@ class Trial:
     # -- the trainer ---------------------------------------------------------------------------------------------------------
 
     def build_trainer(self) -> Any:
-        """Lightning's Trainer on the chosen device; the one place where a strategy for several GPUs is decided."""
+        """Lightning's Trainer on the chosen device."""
         options = {"enable_model_summary": False, "enable_progress_bar": True, **plain(self.cfg.trainer)}
         checkpoint_io = AtomicCheckpointIO()
         training = self.args.stage == "train"
@@ -148,8 +149,8 @@ class Trial:
         self.folder.mkdir(parents=True, exist_ok=True)
 
     def discard_if_unused(self) -> None:
-        """Remove the folder again if this run made it and no step was taken in it."""
-        if self.made is None or (self.trainer is not None and self.trainer.global_step):
+        """Remove the folder again if this run made it and has nothing to show for it."""
+        if self.made is None or (self.trainer is not None and self.trainer.global_step) or any(self.folder.glob("save/it*")):
             return
         shutil.rmtree(self.folder, ignore_errors=True)
         # parents are removed as long as they are this run's and empty
@@ -175,7 +176,8 @@ def require_writable(folder: Path) -> None:
         with tempfile.TemporaryFile(dir=existing) as file:
             file.write(b"0")
     except OSError as error:
-        raise UserError(f"the output folder {folder} can't be written: {error.strerror} ({existing}); choose another exp_root_dir") from error
+        why = f"{error.strerror} ({existing})"
+        raise UserError(f"the output folder {folder} can't be written: {why}; choose another exp_root_dir") from error
 
 
 @contextlib.contextmanager

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from .. import sds, streams
 from ..errors import UserError
-from ..host import BaseObject, C, run_seed, validate_schedule, warn
+from ..host import BaseObject, C, item_seed, validate_schedule, warn
 
 
 class NonFiniteScore(UserError):
@@ -123,7 +123,13 @@ class ScoreDistillation(BaseObject, ABC):
         self.grad_clip = None if self.cfg.grad_clip is None else C(self.cfg.grad_clip, epoch, global_step)
 
     def __call__(
-        self, rgb: Float[Tensor, "B H W c"], prompt_utils: Any = None, *, rgb_as_latents: bool = False, guidance_eval: bool = False, **batch: Any
+        self,
+        rgb: Float[Tensor, "B H W c"],
+        prompt_utils: Any = None,
+        *,
+        rgb_as_latents: bool = False,
+        guidance_eval: bool = False,
+        **batch: Any,
     ) -> dict[str, Any]:
         """The loss whose gradient is the score distillation gradient, and what to log.
 
@@ -156,9 +162,9 @@ class ScoreDistillation(BaseObject, ABC):
     def add_noise(self, latents: Float[Tensor, "B c h w"]) -> Noised:
         """This step's timesteps and noise on ``latents``."""
         device = latents.device
-        t = sds.timesteps(len(latents), self.min_step, self.max_step, seed=run_seed(), step=self.step, num_train=len(self.alphas_cumprod))
+        t = sds.timesteps(len(latents), self.min_step, self.max_step, seed=item_seed(), step=self.step, num_train=len(self.alphas_cumprod))
         abar = self.alphas_cumprod.double().cpu()[t].to(device)
-        noise = streams.normal_per_item(tuple(latents.shape), run_seed(), "noise", self.step, device)
+        noise = streams.normal_per_item(tuple(latents.shape), item_seed(), "noise", self.step, device)
         return Noised(t.to(device), abar, noise, sds.add_noise(latents, noise, abar))
 
     def predict_noise(self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Any) -> Float[Tensor, "B c h w"]:
@@ -235,7 +241,7 @@ def _captions(levels: list[float], batch: dict[str, Any]) -> list[str]:
     captions = [f"n{level:.02f}" for level in levels]
     for letter, name, digits in (("e", "elevation", 1), ("a", "azimuth", 1), ("c", "camera_distances", 2)):
         if name in batch:
-            captions = [f"{caption}\n{letter}{float(value):.0{digits}f}" for caption, value in zip(captions, batch[name])]
+            captions = [f"{caption}\n{letter}{float(value):.0{digits}f}" for caption, value in zip(captions, batch[name], strict=True)]
     return captions
 
 

@@ -23,7 +23,6 @@ from typing import Any, Optional
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..files import existing_file
 from ..host import register
 from ..meshes import Mesh, load_mesh, sample_surface, surface_colors
 from ..point_cloud import PointCloud
@@ -62,7 +61,7 @@ class MeshPrior(Prior):
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         cfg = self.cfg
-        mesh = load_mesh(existing_file(cfg.path, "mesh"), scale=cfg.scale, up=cfg.up, front=cfg.front)
+        mesh = load_mesh(cfg.path, scale=cfg.scale, up=cfg.up, front=cfg.front)
         if cfg.color is None and not mesh.has_colors:
             logger.warning("%s has no colours: grey is used", cfg.path)
         cloud = mesh_cloud(mesh, cfg.num_points, generator)
