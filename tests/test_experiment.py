@@ -231,6 +231,26 @@ def test_stopped_and_resumed_equals_never_stopped(launch, name, code, step):
     assert "save/it6-test.mp4" in files(trial())
 
 
+def test_stopped_during_validation_and_resumed_equals_never_stopped(launch, monkeypatch):
+    assert launch("--train", "name=whole")[0] == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(tiny_parts.TinySystem, "validation_step", lambda self, batch, batch_idx: os.kill(os.getpid(), signal.SIGTERM))
+        # the second view brings the second signal, which would end it at once
+        code, out, _ = launch("--train", "data.views=1")
+    assert code == 143 and "stopped at step 3" in out
+    parsed = f"{trial()}/configs/parsed.yaml"
+    assert launch("--train", f"resume={trial()}/ckpts/last.ckpt", config=parsed)[0] == 0
+    (whole,) = Path("outputs/whole").glob("*/ckpts/last.ckpt")
+    assert_same_training(trial() / "ckpts/last.ckpt", whole)
+
+
+@pytest.mark.parametrize("where", ["configure", "on_fit_start"])
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_before_training_a_signal_ends_it_at_once(launch, monkeypatch, where, name, code):
+    monkeypatch.setattr(tiny_parts.TinySystem, where, lambda self: os.kill(os.getpid(), getattr(signal, name)))
+    assert launch("--train")[0] == code and os.listdir() == ["tiny.yaml"]
+
+
 def test_a_resumed_run_keeps_its_first_configuration_and_adds_its_command(launch, trained):
     code, _, _ = launch("--train", f"resume={trained}/ckpts/last.ckpt", "trainer.max_steps=8", config=f"{trained}/configs/parsed.yaml")
     assert code == 0 and trial() == trained
@@ -248,14 +268,14 @@ def test_resume_auto_goes_on_where_the_last_run_stopped(launch):
 
 
 def test_a_full_disk_is_named_and_the_earlier_checkpoint_stays(launch, monkeypatch):
-    original = torch.save
+    original = os.fsync
 
-    def save(content, path):
-        if content["global_step"] == 4:
+    def fsync(descriptor):
+        if "step=4" in os.readlink(f"/proc/self/fd/{descriptor}"):
             raise OSError(28, "No space left on device")
-        original(content, path)
+        original(descriptor)
 
-    monkeypatch.setattr(torch, "save", save)
+    monkeypatch.setattr(os, "fsync", fsync)
     code, _, err = launch("--train", "checkpoint.every_n_train_steps=2")
     assert code == 2 and "No space left on device" in err and "Traceback" not in err
     assert load_file(trial() / "ckpts/last.ckpt")["global_step"] == 2 and not list(trial().glob("ckpts/.*"))
@@ -277,7 +297,7 @@ def test_a_second_ctrl_c_stops_at_once(launch, monkeypatch):
 
     monkeypatch.setattr(tiny_parts.TinySystem, "training_step", endless_step)
     code, _, _ = launch("--train")
-    assert code == 130 and not (trial() / "ckpts/last.ckpt").exists()
+    assert code == 130 and not Path("outputs").exists()
 
 
 def test_the_handlers_are_put_back(launch):
@@ -318,8 +338,77 @@ def test_launch_py_with_parts_dropped_into_custom(tmp_path):
     resume = shlex.split(re.search("to go on: (.*)", out)[1])
     step = int(re.search(r"stopped at step (\d+)", out)[1])
     resumed = subprocess.run(
-        [sys.executable, *resume[1:], f"trainer.max_steps={step + 3}"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120
+        [sys.executable, *resume[1:], f"trainer.max_steps={step + 3}"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     assert resumed.returncode == 0, resumed.stderr
     (last,) = tmp_path.glob("outputs/tiny/*/ckpts/last.ckpt")
     assert load_file(last)["global_step"] == step + 3
+
+
+PRIOR_FILE = """
+from dataclasses import dataclass
+from threestudio_gaussiandreamer.host import register
+from threestudio_gaussiandreamer.point_cloud import PointCloud
+from threestudio_gaussiandreamer.priors.base import Prior
+
+@register("ring-prior")
+class RingPrior(Prior):
+    @dataclass
+    class Config(Prior.Config):
+        count: int = 64
+
+    def generate(self, prompt, generator):
+        points = generator.normal(size=(self.cfg.count, 3))
+        return PointCloud((0.5 * points).astype("float32"), generator.random((self.cfg.count, 3)).astype("float32"))
+"""
+GUIDANCE_FILE = '''
+from dataclasses import dataclass
+from threestudio_gaussiandreamer.host import BaseObject, register
+
+@register("red-guidance")
+class RedGuidance(BaseObject):
+    @dataclass
+    class Config(BaseObject.Config):
+        strength: float = 1.0
+
+    def __call__(self, rgb, prompt_utils, **batch):
+        """Pulls every pixel towards red: the smallest guidance there is."""
+        return {"loss_sds": self.cfg.strength * (rgb - rgb.new_tensor([1.0, 0.0, 0.0])).square().mean()}
+'''
+OWN_CONFIG = """
+name: own
+tag: run
+data_type: gaussiandreamer-datamodule
+data: {width: 16, height: 16, batch_size: 2, eval_width: 16, eval_height: 16, n_test_views: 2}
+system_type: gaussiandreamer-system
+system:
+  geometry_type: gaussiandreamer-cloud
+  geometry: {prior_type: ring-prior, prior: {count: 32}}
+  background_type: gaussiandreamer-background
+  renderer_type: gaussiandreamer-splatting
+  prompt_processor_type: plain-prompt-processor
+  prompt_processor: {prompt: a red ring}
+  guidance_type: red-guidance
+  loss: {lambda_sds: 100.0}
+trainer: {max_steps: 3, num_sanity_val_steps: 0, limit_val_batches: 0, enable_progress_bar: false}
+"""
+
+
+def test_a_prior_and_a_guidance_of_one_file_each_dropped_into_custom(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    for name, source in (("ring_prior.py", PRIOR_FILE), ("red_guidance.py", GUIDANCE_FILE)):
+        (tmp_path / "custom").mkdir(exist_ok=True)
+        (tmp_path / "custom" / name).write_text(source)
+    (tmp_path / "own.yaml").write_text(OWN_CONFIG)
+    assert main(["--config", "own.yaml", "--train"]) == 0, capsys.readouterr().err
+    (run,) = Path("outputs/own").iterdir()
+    assert {"code/custom/ring_prior.py", "code/custom/red_guidance.py", "save/it3-test.mp4"} <= files(run)
+    # misspelt keys of parts that come from custom/ are found too
+    assert main(["--config", "own.yaml", "--train", "system.guidance.strenght=2"]) == 2
+    assert "did you mean 'system.guidance.strength'" in capsys.readouterr().err

@@ -139,7 +139,7 @@ def test_anything_else_is_no_schedule(value):
 @given(st.lists(st.floats(-10, 10), min_size=3, max_size=6), st.integers(-5, 80))
 def test_a_piecewise_schedule_is_numpys_interpolation(values, step):
     steps = [10 * i for i in range(len(values))]
-    knots = [steps[0], values[0]] + [x for pair in zip(values[1:], steps[1:]) for x in pair]
+    knots = [steps[0], values[0]] + [x for pair in zip(values[1:], steps[1:], strict=True) for x in pair]
     # exact up to the rounding of one multiplication
     assert C(knots, 0, step) == pytest.approx(np.interp(step, steps, values), abs=1e-12)
     assert C_max(knots) == max(values)
@@ -272,7 +272,8 @@ def test_a_system_configures_then_loads_weights_then_post_configures(tmp_path):
         def post_configure(self) -> None:
             calls.append(("post_configure", self.geometry.means.tolist()))
 
-    save_file(tmp_path / "a.ckpt", {"state_dict": {"geometry.means": torch.tensor([1.0, 2.0]), "x.y": torch.ones(1)}, "epoch": 0, "global_step": 3})
+    state = {"geometry.means": torch.tensor([1.0, 2.0]), "x.y": torch.ones(1)}
+    save_file(tmp_path / "a.ckpt", {"state_dict": state, "epoch": 0, "global_step": 3})
     System({"weights": str(tmp_path / "a.ckpt"), "weights_ignore_modules": ["x"]}, resumed=True)
     assert calls == [("configure", True, None), ("post_configure", [1.0, 2.0])]
 

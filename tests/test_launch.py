@@ -15,7 +15,10 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 def test_help_imports_neither_torch_nor_lightning():
-    code = "import sys; from threestudio_gaussiandreamer.experiment import main; assert main(['--help']) == 0; print('torch' in sys.modules, 'omegaconf' in sys.modules)"
+    code = (
+        "import sys; from threestudio_gaussiandreamer.experiment import main; assert main(['--help']) == 0; "
+        "print('torch' in sys.modules, 'omegaconf' in sys.modules)"
+    )
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True)
     assert done.stdout.startswith("usage:") and done.stdout.endswith("False False\n"), done.stderr
 

@@ -1,7 +1,8 @@
 """The check of a whole configuration before any work: every key at every depth, every type, every registered name.
 
-A section ``x`` belongs to the part that the key ``x_type`` beside it names: ``data_type`` and ``data``, ``system.geometry_type`` and
-``system.geometry``, ``system.geometry.prior_type`` and ``system.geometry.prior``. The keys of a section are the fields of its part's ``Config``.
+A section ``x`` belongs to the part that the key ``x_type`` beside it names: ``data_type`` and ``data``, ``system.geometry_type``
+and ``system.geometry``, ``system.geometry.prior_type`` and ``system.geometry.prior``. The keys of a section are the fields of its
+part's ``Config``.
 """
 
 import dataclasses

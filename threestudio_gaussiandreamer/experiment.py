@@ -12,6 +12,7 @@ import os
 import shlex
 import signal
 import sys
+import threading
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
@@ -50,16 +51,16 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     except SystemExit as stop:
         return int(stop.code or 0)
     try:
-        with _terminable():
+        with _signals():
             return run(args, argv)
     except UserError as error:
         if args.verbose:
             traceback.print_exc()
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit) as stop:
         print("stopped", file=sys.stderr)
-        return 128 + signal.SIGINT
+        return stop.code if isinstance(stop, SystemExit) else 128 + signal.SIGINT
 
 
 def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
@@ -111,21 +112,23 @@ def configure_logging(verbose: bool) -> None:
 
 
 @contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM ends the process through ``finally`` blocks, with code 143."""
+def _signals() -> Iterator[None]:
+    """SIGTERM ends the process through ``finally`` blocks, with code 143; afterwards all handlers are what they were."""
 
     def end(signum: int, frame: Any) -> None:
         sys.exit(128 + signum)
 
-    try:
-        earlier = signal.signal(signal.SIGTERM, end)
-    except ValueError:  # not the main thread
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
+    # Lightning leaves Ctrl-C ignored once it has seen one
+    earlier = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGTERM, end)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, earlier)
+        for signum, handler in earlier.items():
+            signal.signal(signum, handler)
 
 
 if __name__ == "__main__":

@@ -10,10 +10,11 @@ from typing import Optional
 
 from .errors import UserError, unknown
 
-_SCRIPT = Path(sys.argv[0]).name
-PROGRAM = (
-    ["python", sys.argv[0]] if _SCRIPT == "launch.py" else [_SCRIPT] if _SCRIPT == "gaussiandreamer" else ["python", "-m", f"{__package__}.experiment"]
-)
+# how this process was started, for the lines that say how to go on
+PROGRAM = {
+    "launch.py": ["python", sys.argv[0]],
+    "gaussiandreamer": ["gaussiandreamer"],
+}.get(Path(sys.argv[0]).name, ["python", "-m", f"{__package__}.experiment"])
 
 
 def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
@@ -59,6 +60,8 @@ def choose_gpu(gpu: Optional[str]) -> None:
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
     elif "CUDA_VISIBLE_DEVICES" not in os.environ:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpu or "0"
+    elif gpu is not None:
+        print(f"CUDA_VISIBLE_DEVICES={os.environ['CUDA_VISIBLE_DEVICES']} is set: --gpu {gpu} is ignored", file=sys.stderr)
 
 
 def announce_device(gpu: Optional[str]) -> int:

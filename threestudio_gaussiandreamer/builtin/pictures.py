@@ -8,10 +8,10 @@ import numpy as np
 
 from ..errors import UserError
 
-# knots of the colour maps, RGB in [0,255] at equal distances over [0,1]
+# knots of the colour maps at equal distances over [0,1]
 _COLOR_MAPS = {
-    "jet": [(0, 0, 128), (0, 0, 255), (0, 128, 255), (0, 255, 255), (128, 255, 128), (255, 255, 0), (255, 128, 0), (255, 0, 0), (128, 0, 0)],
-    "magma": [(0, 0, 4), (28, 16, 68), (79, 18, 123), (129, 37, 129), (181, 54, 122), (229, 80, 100), (251, 135, 97), (254, 194, 135), (252, 253, 191)],
+    "jet": "000080 0000ff 0080ff 00ffff 80ff80 ffff00 ff8000 ff0000 800000",
+    "magma": "000004 1c1044 4f127b 812581 b5367a e55064 fb8761 fec287 fcfdbf",
 }
 
 
@@ -35,7 +35,7 @@ def grayscale(image: np.ndarray, *, data_range: Optional[tuple[float, float]] = 
         return np.repeat(_to_bytes(values)[..., None], 3, axis=-1)
     if cmap not in _COLOR_MAPS:
         raise ValueError(f"unknown colour map {cmap!r}; expected None or one of {', '.join(_COLOR_MAPS)}")
-    knots = np.array(_COLOR_MAPS[cmap], dtype=np.float64)
+    knots = np.array([list(bytes.fromhex(knot)) for knot in _COLOR_MAPS[cmap].split()], dtype=np.float64)
     positions = np.linspace(0, 1, len(knots))
     return np.stack([np.interp(values, positions, knots[:, c]) for c in range(3)], axis=-1).round().astype(np.uint8)
 
@@ -115,11 +115,11 @@ def _even(image: np.ndarray) -> np.ndarray:
 
 
 def _cell_size(images: list[np.ndarray], align: Any) -> tuple[int, int]:
-    heights, widths = zip(*(image.shape[:2] for image in images))
+    heights, widths = np.array([image.shape[:2] for image in images]).T
     if align == "max":
-        return max(heights), max(widths)
+        return int(heights.max()), int(widths.max())
     if align == "min":
-        return min(heights), min(widths)
+        return int(heights.min()), int(widths.min())
     return (align, align) if isinstance(align, int) else tuple(align)
 
 

@@ -17,7 +17,7 @@ def register(name: str) -> Callable[[type], type]:
     def enter(cls: type) -> type:
         taken = _parts.get(name)
         if taken is not None and _identity(taken) != _identity(cls):
-            raise UserError(f"the name {name!r} is taken by {'.'.join(_identity(taken))}: register {'.'.join(_identity(cls))} under another name")
+            raise UserError(f"the name {name!r} is taken by {_identity(taken)}: register {_identity(cls)} under another name")
         _parts[name] = cls
         return cls
 
@@ -48,6 +48,6 @@ def _lookup(name: str) -> type:
     return _parts[name]
 
 
-def _identity(cls: type) -> tuple[str, str]:
+def _identity(cls: type) -> str:
     # a module that is executed again makes new class objects of the same name: still the same part
-    return cls.__module__, cls.__qualname__
+    return f"{cls.__module__}.{cls.__qualname__}"

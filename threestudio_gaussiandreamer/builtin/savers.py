@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Optional
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from ..errors import UserError
@@ -195,4 +194,4 @@ def _wandb_logger(options: Any) -> Any:
 
         return WandbLogger(project=options.get("project"), name=options.get("name"))
     except ModuleNotFoundError as error:
-        raise UserError(f"system.loggers.wandb.enable is true, but {error.name} isn't installed: pip install wandb, or set it to false") from error
+        raise UserError(f"system.loggers.wandb.enable is true, but {error.name} isn't installed: pip install wandb") from error

@@ -110,7 +110,7 @@ def _finite(value: Any, name: str) -> float:
 
 
 def _increasing(steps: list[float], name: str) -> list[float]:
-    if any(later <= earlier for earlier, later in zip(steps, steps[1:])):
+    if any(later <= earlier for earlier, later in zip(steps, steps[1:], strict=False)):
         raise UserError(f"{name}: its steps {steps} must increase (for a hard switch write [500, v0, v1, 501])")
     return steps
 

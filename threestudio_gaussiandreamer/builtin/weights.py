@@ -4,18 +4,20 @@ A file is what ``torch.save`` writes, a zip archive, with ``sha256:<hex>`` of ev
 Plain ``torch.load`` reads it.
 """
 
-import contextlib
 import hashlib
+import io
 import os
 import pickle
 import shutil
 import zipfile
+from glob import escape as glob_escape
 from pathlib import Path
 from typing import Any, Optional
 
 import torch
 
 from ..errors import UserError
+from ..files import atomic_file
 from .logs import warn
 
 _MARK = b"sha256:"
@@ -32,20 +34,12 @@ def save_file(path: str | os.PathLike, content: Any) -> None:
         UserError: the disk is full or the folder can't be written; the earlier file is untouched.
     """
     path = Path(path)
-    # one name: what a killed process leaves is overwritten by the next save
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        torch.save(content, temporary)
-        _append_checksum(temporary)
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    _prepare_folder(path)
+    with atomic_file(path) as file:
+        file.write(_with_checksum(buffer.getvalue()))
         _keep_previous(path)
-        os.replace(temporary, path)
-        _sync_folder(path.parent)
-    except (OSError, RuntimeError) as error:
-        raise UserError(f"the checkpoint {path} could not be written: {_reason(error)}; an earlier file of that name is untouched") from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
 
 
 def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
@@ -116,20 +110,22 @@ def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:
     return checkpoint
 
 
-def _append_checksum(path: Path) -> None:
-    with open(path, "r+b") as file:
-        file.seek(-_END_RECORD_BYTES, os.SEEK_END)
-        end = file.read()
-        if end[:4] != _END_OF_ARCHIVE or end[-2:] != b"\0\0":
-            raise RuntimeError("torch.save did not write a zip archive without a comment")
-        file.seek(-2, os.SEEK_END)
-        file.write(_COMMENT_BYTES.to_bytes(2, "little") + _MARK)
-        file.seek(0)
-        digest = _digest(file, os.fstat(file.fileno()).st_size)
-        file.seek(0, os.SEEK_END)
-        file.write(digest.hexdigest().encode())
-        file.flush()
-        os.fsync(file.fileno())
+def _prepare_folder(path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # what a process that was killed while saving has left
+        for stale in path.parent.glob(f".{glob_escape(path.name)}.*.tmp"):
+            stale.unlink(missing_ok=True)
+    except OSError as error:
+        raise UserError(f"the folder of the checkpoint {path} can't be written: {error.strerror or error}") from error
+
+
+def _with_checksum(archive: bytes) -> bytes:
+    """A zip archive that ends without a comment, with its checksum as the comment."""
+    if archive[-_END_RECORD_BYTES:][:4] != _END_OF_ARCHIVE or not archive.endswith(b"\0\0"):
+        raise RuntimeError("torch.save did not write a zip archive without a comment")
+    marked = archive[:-2] + _COMMENT_BYTES.to_bytes(2, "little") + _MARK
+    return marked + hashlib.sha256(marked).hexdigest().encode()
 
 
 def _verify(path: Path) -> None:
@@ -177,16 +173,6 @@ def _keep_previous(path: Path) -> None:
         # a file system without hard links
         shutil.copyfile(path, temporary)
     os.replace(temporary, kept)
-
-
-def _sync_folder(folder: Path) -> None:
-    if os.name != "posix":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _siblings(path: Path) -> str:
