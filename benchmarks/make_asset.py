@@ -101,7 +101,11 @@ def rounded_ends(v: np.ndarray, share: float = 0.12) -> tuple[np.ndarray, np.nda
 
 def smooth(knots: np.ndarray, closed: bool) -> Callable[[np.ndarray], np.ndarray]:
     """A Catmull-Rom curve through the knots, t in [0, 1] (periodic when closed, else held at its ends)."""
-    padded = np.concatenate([knots[-1:], knots, knots[:2]]) if closed else np.concatenate([2 * knots[:1] - knots[1:2], knots, 2 * knots[-1:] - knots[-2:-1]])
+    padded = (
+        np.concatenate([knots[-1:], knots, knots[:2]])
+        if closed
+        else np.concatenate([2 * knots[:1] - knots[1:2], knots, 2 * knots[-1:] - knots[-2:-1]])
+    )
     spans = len(padded) - 3
 
     def curve(t: np.ndarray) -> np.ndarray:
@@ -183,7 +187,9 @@ def paint_head(points: np.ndarray) -> np.ndarray:
     x, y, z = points.T
     front, side = x > 0.05, np.abs(y)
     color = fur(points, ORANGE)
-    color = blend(color, RUST, within(0.3 - np.sin(17 * side + 1.2 * grain(points, 5)), 0.5) * within(x + 0.02, 0.06) * within(0.2 - z, 0.1))
+    color = blend(
+        color, RUST, within(0.3 - np.sin(17 * side + 1.2 * grain(points, 5)), 0.5) * within(x + 0.02, 0.06) * within(0.2 - z, 0.1)
+    )
     mask = z - (0.30 + 0.16 * np.clip(side / 0.3, 0, 1) ** 1.5) + 0.5 * np.clip(0.12 - x, 0, 1)
     color = blend(color, fur(points, CREAM), within(mask, 0.02) * within(-x, 0.05))  # cheeks
     color = blend(color, RUST, within(side - 0.028 * (1 + 6 * np.clip(z - 0.45, 0, 1)), 0.02) * within(0.42 - z, 0.03) * front)  # blaze
@@ -290,7 +296,12 @@ def fox() -> list[Part]:
         Part(*ellipsoid((0, 0, -0.40), (0.36, 0.37, 0.50), taper=0.22), paint_body, (40, 26), (210, 190)),
         Part(*tube(TAIL, (0.07, 0.13, 0.19, 0.19, 0.13, 0.02)), paint_tail, (20, 30), (120, 130)),
         Part(*tube(NECK, [0.088] * 8, closed=True, side=(0, 0, 1)), paint_scarf, (10, 48), (44, 130)),
-        Part(*tube([(0.30, -0.15, 0.02), (0.385, -0.19, -0.14), (0.40, -0.21, -0.40)], (0.075, 0.085, 0.095), flat=0.3), paint_scarf_end, (14, 12), (96, 84)),
+        Part(
+            *tube([(0.30, -0.15, 0.02), (0.385, -0.19, -0.14), (0.40, -0.21, -0.40)], (0.075, 0.085, 0.095), flat=0.3),
+            paint_scarf_end,
+            (14, 12),
+            (96, 84),
+        ),
         Part(*ellipsoid((0.43, 0, 0.28), (0.21, 0.17, 0.13), tilt=-6), paint_snout, (24, 16), (120, 76)),
         Part(*ellipsoid((0.625, 0, 0.335), (0.05, 0.06, 0.045)), paint_nose, (12, 8), (28, 20)),
         Part(*tube([(-0.30, 0, -0.22), (-0.56, 0, -0.22)], (0.03, 0.03)), paint_brass, (10, 6), (16, 16)),
@@ -321,7 +332,7 @@ def build(parts: list[Part]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     """Vertices (V, 3), texture coordinates (V, 2) with v downwards, faces (F, 3) and the texture (512, 512, 3) in [0, 1]."""
     texture = np.full((TEXTURE, TEXTURE, 3), 0.5)
     vertices, uvs, faces, count = [], [], [], 0
-    for index, (part, corner) in enumerate(zip(parts, pack([part.texels for part in parts]))):
+    for index, (part, corner) in enumerate(zip(parts, pack([part.texels for part in parts]), strict=True)):
         points, uv, triangles = surface(part, corner)
         hidden = np.any([other.inside(points) for i, other in enumerate(parts) if i != index], axis=0)
         triangles = triangles[~hidden[triangles].all(axis=1)]
@@ -381,14 +392,23 @@ def write_glb(path: Path, vertices: np.ndarray, uv: np.ndarray, faces: np.ndarra
     from PIL import Image
 
     image = io.BytesIO()
-    colors = Image.fromarray((texture * 255).round().astype(np.uint8)).quantize(256, kmeans=2, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    colors = Image.fromarray((texture * 255).round().astype(np.uint8)).quantize(
+        256, kmeans=2, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE
+    )
     colors.save(image, "PNG", optimize=True)
     positions = vertices[:, [1, 2, 0]].astype("<f4")  # x, y, z of the file are the world's y, z, x
     chunks = [positions.tobytes(), uv.astype("<f4").tobytes(), faces.astype("<u2").tobytes(), image.getvalue()]
     offsets = np.cumsum([0] + [len(padded(chunk)) for chunk in chunks])
-    views = [{"buffer": 0, "byteOffset": int(offset), "byteLength": len(chunk)} for offset, chunk in zip(offsets, chunks)]
+    views = [{"buffer": 0, "byteOffset": int(offset), "byteLength": len(chunk)} for offset, chunk in zip(offsets, chunks, strict=True)]
     accessors = [
-        {"bufferView": 0, "componentType": 5126, "count": len(vertices), "type": "VEC3", "min": positions.min(0).tolist(), "max": positions.max(0).tolist()},
+        {
+            "bufferView": 0,
+            "componentType": 5126,
+            "count": len(vertices),
+            "type": "VEC3",
+            "min": positions.min(0).tolist(),
+            "max": positions.max(0).tolist(),
+        },
         {"bufferView": 1, "componentType": 5126, "count": len(uv), "type": "VEC2"},
         {"bufferView": 2, "componentType": 5123, "count": faces.size, "type": "SCALAR"},
     ]

@@ -61,7 +61,9 @@ def test_the_denoised_is_the_posterior_mean_by_quadrature(std):
         return prior[k] * math.exp(-((x0 - centers[k]) ** 2) / (2 * std**2) - (z - a * x0) ** 2 / (2 * variance)) / std
 
     for z in (-2.0, -0.1, 0.4, 1.7):
-        integrals = [[quad(lambda x: x**p * joint(x, z, k), -15, 15, epsabs=1e-14, epsrel=1e-12, limit=400)[0] for k in (0, 1)] for p in (0, 1)]
+        integrals = [
+            [quad(lambda x: x**p * joint(x, z, k), -15, 15, epsabs=1e-14, epsrel=1e-12, limit=400)[0] for k in (0, 1)] for p in (0, 1)
+        ]
         mass, moment = np.array(integrals)
         out = denoise(
             torch.tensor([[z]], dtype=torch.float64),
@@ -127,7 +129,7 @@ def test_a_batch_is_its_items_with_shared_and_with_own_banks():
         for i in range(3):
             part = bank[i : i + 1] if bank.dim() == 3 else bank
             alone = denoise(z[i : i + 1], abar[i : i + 1], part, std=0.2, log_prior=log_prior[i : i + 1])
-            for whole, single in zip(together, alone):
+            for whole, single in zip(together, alone, strict=True):
                 # matrix products of different shapes may sum in another order
                 torch.testing.assert_close(whole[i : i + 1], single, rtol=0, atol=1e-12)
 

@@ -356,8 +356,21 @@ def test_directions_follow_threestudios_rules():
 
 def test_a_direction_without_bank_views_takes_all(mesh_path):
     exact = guidance(mesh_path, mode="direction-bins", bank_elevation_range=[0.0, 20.0])
-    assert exact._members(DIRECTIONS.index("overhead")).all()
-    assert 0 < exact._members(DIRECTIONS.index("front")).sum() < 24
+    views = {"elevation": torch.tensor([70.0, 10.0, 10.0]), "azimuth": torch.tensor([0.0, 0.0, 180.0])}
+    overhead, front, back = exact._members(views, 3)
+    assert overhead.all() and 0 < front.sum() < 24 and not (front & back).any()
+
+
+@pytest.mark.parametrize(("mode", "modes"), [("view-exact", 1), ("view-agnostic", 25)])
+def test_the_cameras_own_view_is_one_of_the_modes_unless_it_is_left_out(mesh_path, mode, modes):
+    for include in (True, False):
+        exact = guidance(mesh_path, mode=mode, bank_includes_view=include)
+        exact.encode(uniform(1, 3, 16, 16))
+        (mixture,) = exact.condition(**batch(30.0))
+        own = (mixture.modes[0] + 1) / 2
+        is_own = torch.allclose(own.movedim(0, -1), exact.target_rgb(batch(30.0))[0], atol=1e-6)
+        left_out = mode == "view-agnostic" and not include
+        assert len(mixture.modes) == modes - left_out and is_own != left_out
 
 
 def test_evaluation_shows_the_truth(mesh_path):

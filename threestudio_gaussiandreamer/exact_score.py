@@ -42,9 +42,7 @@ class Denoised(NamedTuple):
     """exp of the responsibilities' entropy: how many images share z, in [1, K]; float64."""
 
 
-def squared_distances(
-    z: Float[Tensor, "B d"], bank: Float[Tensor, "*batch K d"], abar: Float[Tensor, " B"]
-) -> Float[Tensor, "B K"]:
+def squared_distances(z: Float[Tensor, "B d"], bank: Float[Tensor, "*batch K d"], abar: Float[Tensor, " B"]) -> Float[Tensor, "B K"]:
     """|z - sqrt(abar) x_k|^2 in float64; the bank is shared, (K, d), or per item, (B, K, d)."""
     bank = bank.expand(len(z), -1, -1)
     scaled = abar.double().sqrt().to(z.device).reshape(-1, 1, 1)

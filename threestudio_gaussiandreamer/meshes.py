@@ -218,7 +218,7 @@ def _merge(parts: list[Mesh]) -> Mesh:
     offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
     merged = Mesh(
         vertices=np.concatenate([part.vertices for part in parts]),
-        faces=np.concatenate([part.faces + offset for part, offset in zip(parts, offsets)]),
+        faces=np.concatenate([part.faces + offset for part, offset in zip(parts, offsets[:-1], strict=True)]),
     )
     if any(part.has_colors for part in parts):
         merged = merged._replace(vertex_colors=np.concatenate([_vertex_factor(part) for part in parts]))
