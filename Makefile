@@ -11,7 +11,7 @@ SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import
 demo: $(VENV)/ready                ## train the bundled toy from a coarse prior, offline, on the CPU
 	$(ENVIRON) $(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
 
-test: $(VENV)/ready                ## the whole test suite, as CI runs it
+test: $(VENV)/ready-for-tests                ## the whole test suite, as CI runs it
 	$(ENVIRON) $(BIN)/python -m pytest
 
 ablations: $(VENV)/ready           ## the paper's ablations as a table, measured against a known truth
@@ -20,11 +20,21 @@ ablations: $(VENV)/ready           ## the paper's ablations as a table, measured
 bench: $(VENV)/ready               ## the rasteriser's speed and memory on the benchmark scene
 	$(ENVIRON) $(BIN)/python benchmarks/bench_splatting.py
 
-$(VENV)/ready: pyproject.toml setup.py constraints.txt requirements-dev.txt $(wildcard threestudio_gaussiandreamer/splatting/native/*)
+# installed once; again when what is installed changes
+PACKAGE = pyproject.toml setup.py constraints.txt $(wildcard threestudio_gaussiandreamer/splatting/native/*.h threestudio_gaussiandreamer/splatting/native/*.cpp)
+PIP     = $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
+$(BIN)/python:
 	$(PYTHON) -c 'import sys; sys.exit("Python >= 3.10 is needed, this is " + sys.version) if sys.version_info < (3, 10) else 0'
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/ready: requirements.txt $(PACKAGE) | $(BIN)/python
+	$(PIP) -r requirements.txt
 	touch $@
+
+$(VENV)/ready-for-tests: requirements-dev.txt $(PACKAGE) | $(BIN)/python
+	$(PIP) -r requirements-dev.txt
+	touch $@ $(VENV)/ready
 
 clean:                             ## remove what the others made
 	rm -rf $(VENV) build *.egg-info outputs

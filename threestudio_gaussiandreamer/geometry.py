@@ -175,12 +175,16 @@ class GaussianCloud(BaseGeometry):
 
     # -- start ---------------------------------------------------------------------------------------------------------------
 
+    def prior(self) -> Any:
+        """The prior of the configuration, which hasn't run yet."""
+        return find(self.cfg.prior_type)(self.cfg.prior)
+
     def initialize(self, prompt: str, make_cloud: Any = None) -> PointCloud:
         """Run the prior, grow and perturb its points, and start one Gaussian on each; returns the prior's points.
 
         ``make_cloud(prior, prompt)`` may stand in for ``prior(prompt)``, for instance to read a cached result.
         """
-        prior = find(self.cfg.prior_type)(self.cfg.prior)
+        prior = self.prior()
         if self.cfg.keep_attributes and hasattr(prior, "gaussians"):
             arrays = prior.gaussians(prompt)
             self.set_arrays(**arrays._asdict())

@@ -14,12 +14,13 @@ from .files import atomic_file
 from .host import info, run_seed
 from .ply import write_points
 from .point_cloud import PointCloud
+from .priors.turntable import save_turntable
 
 
 def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud:
     """``prior(prompt)``, from ``save/prior/points.npz`` when the same prior, options, prompt and seed left it there.
 
-    ``points.ply`` beside it is for people and viewers; without a ``save_dir`` nothing is cached.
+    ``points.ply`` and ``turntable.gif`` beside it are for people and viewers; without a ``save_dir`` nothing is cached.
     """
     if save_dir is None:
         return prior(prompt)
@@ -33,6 +34,7 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
     with atomic_file(path) as file:
         np.savez_compressed(file, key=np.array(key), **{name: value for name, value in cloud._asdict().items() if value is not None})
     write_points(path.with_suffix(".ply"), cloud)
+    save_turntable(cloud, path.with_name("turntable.gif"))
     return cloud
 
 

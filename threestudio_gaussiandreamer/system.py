@@ -54,6 +54,8 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             EvaluationConfig.check(cfg.evaluation)
             for name, weight in cfg.loss.items():
                 validate_schedule(weight, f"system.loss.{name}")
+            if cfg.scheduler is not None:
+                raise UserError("system.scheduler isn't used: learning rates are schedules themselves, for instance system.geometry.lr_means")
             for name in cfg.optimizer:
                 if name not in ("name", "args"):
                     raise unknown("key system.optimizer.", name, ("name", "args"))
@@ -72,6 +74,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         self.guidance = self.measurements = None
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
+        self.preflight()
         self.prepare_guidance()
         self.ensure_cloud()
         own_background = isinstance(self.background, FlatBackground)
@@ -79,8 +82,14 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         arguments = {"betas": (0.9, 0.99), "eps": 1e-15, **self.cfg.optimizer.get("args", {})}
         return getattr(torch.optim, self.cfg.optimizer.get("name", "Adam"))(groups, lr=0.0, **arguments)
 
+    def preflight(self) -> None:
+        """What the prior needs is looked for before models are loaded: what is missing shows in seconds."""
+        prior = None if len(self.geometry) else self.geometry.prior()
+        if hasattr(prior, "preflight"):
+            prior.preflight()
+
     def prepare_guidance(self) -> None:
-        """Before the prior runs, so that missing weights show in seconds."""
+        """Before the prior runs, since its weights may be missing too."""
         self.prompt_processor = find(self.cfg.prompt_processor_type)(self.cfg.prompt_processor)
         self.prompt_utils = self.prompt_processor()
         self.guidance = find(self.cfg.guidance_type)(self.cfg.guidance)

@@ -53,7 +53,6 @@ class NoMaterial(BaseMaterial):
     class Config(BaseMaterial.Config):
         n_output_dims: int = 3
         color_activation: str = "sigmoid"
-        requires_normal: bool = False
 
     cfg: Config
 

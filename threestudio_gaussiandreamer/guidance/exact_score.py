@@ -19,6 +19,8 @@ latent_size         height of the latent in pixels (image_size is a multiple); l
 std                 width s of each mode, in the units of the space (pixels in [-1, 1])
 temperature         of the responsibilities; 1 = exact, larger = smoother
 bank_*              number of views, their ranges (degrees, world units) and their seed
+bank_includes_view  the bank stands for all views, so the camera's own is one of them, with the weight of any other;
+                    without it the nearest view of the bank is a floor that hides what is to be measured
 supersample         rays per pixel and axis; max_cached_targets: pictures of view-exact kept in memory (4 bytes a pixel)
 guidance_scale      1 = none (the default here); otherwise the unconditional mixture is the bank, with this view in it
 ==================  ===================================================================================================
@@ -29,7 +31,7 @@ from typing import Any, NamedTuple, Optional, Tuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..cameras import Orbit, OrbitRanges, camera_pool
@@ -77,12 +79,13 @@ class ExactScoreGuidance(ScoreDistillation):
         mode: str = "view-exact"
         space: str = "pixel"
         image_size: int = 0
-        latent_size: int = 16
+        latent_size: int = 32
         latent_channels: int = 4
         color_matrix: bool = True
         std: float = 0.0
         temperature: float = 1.0
         bank_views: int = 200
+        bank_includes_view: bool = True
         bank_seed: int = 0
         bank_elevation_range: Tuple[float, float] = (-10.0, 60.0)
         bank_distance_range: Tuple[float, float] = (1.5, 4.0)
@@ -125,11 +128,9 @@ class ExactScoreGuidance(ScoreDistillation):
         if self._size is None:
             raise UserError("exact-score-guidance compares pictures: give it renders, not latents (rgb_as_latents)")
         background = _background(comp_rgb_bg, len(c2w), c2w.device)
-        exact = self._exact_modes(c2w, fovy, background) if self.cfg.mode == "view-exact" else None
-        if exact is not None and not self.guided:
-            return [Mixture(mode[None], None) for mode in exact]
-        bins = view_directions(batch["elevation"], batch["azimuth"]) if self.cfg.mode == "direction-bins" else [None] * len(c2w)
-        return [self._mixture(None if exact is None else exact[i], background[i], bins[i]) for i in range(len(c2w))]
+        own = self._own_views(c2w, fovy, background) if self._needs_own_view else [None] * len(c2w)
+        members = self._members(batch, len(c2w))
+        return [self._mixture(own[i], members[i], background[i]) for i in range(len(c2w))]
 
     def predict(self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: list[Mixture]) -> tuple[Tensor, Optional[Tensor]]:
         abar = self.alphas_cumprod.to(t.device)[t]
@@ -155,27 +156,36 @@ class ExactScoreGuidance(ScoreDistillation):
 
     # Mixtures -------------------------------------------------------------------------------------------------------------
 
-    def _mixture(self, exact: Optional[Tensor], background: Float[Tensor, "bh bw 3"], direction: Optional[int]) -> Mixture:
-        """The bank on this background, with the exact view (c, h, w) before it, if any, as the only conditional mode."""
-        bank = self.bank(*self._size)
-        if exact is not None:
-            modes = torch.cat([exact[None], bank_modes(bank, background)])
-            return Mixture(modes, _log_prior(torch.arange(len(modes), device=modes.device) == 0))
-        if direction is None:
-            return Mixture(bank_modes(bank, background), None)
-        members = self._members(direction).to(bank.rgba.device)
-        if self.guided:
-            return Mixture(bank_modes(bank, background), _log_prior(members.to(background.device)))
-        return Mixture(bank_modes(_rows(bank, members), background), None)
+    @property
+    def _needs_own_view(self) -> bool:
+        return self.cfg.mode == "view-exact" or self.cfg.bank_includes_view
 
-    def _members(self, direction: int) -> Float[Tensor, " K"]:
-        """The bank views of a direction; all of them where it has none (overhead, in a bank that stays below 60 degrees)."""
-        members = view_directions(self.bank_orbit.elevation, self.bank_orbit.azimuth) == int(direction)
-        return members if members.any() else torch.ones_like(members)
+    def _mixture(
+        self, own: Optional[Float[Tensor, "1 c h w"]], members: Bool[Tensor, " K"], background: Float[Tensor, "bh bw 3"]
+    ) -> Mixture:
+        """The camera's own view, if any, then the bank's; conditional are the own view and the bank's ``members``."""
+        own_views = [] if own is None else [own]
+        if members.all() or not self.guided:
+            bank = [bank_modes(_rows(self.bank(*self._size), members), background)] if members.any() else []
+            return Mixture(torch.cat(own_views + bank), None)
+        conditional = torch.cat([torch.ones(len(own_views), dtype=torch.bool), members]).to(background.device)
+        modes = torch.cat([*own_views, bank_modes(self.bank(*self._size), background)])
+        return Mixture(modes, torch.where(conditional, 0.0, -torch.inf))
 
-    def _exact_modes(self, c2w: Tensor, fovy: Tensor, background: Float[Tensor, "B bh bw 3"]) -> Float[Tensor, "B c h w"]:
+    def _members(self, batch: dict[str, Any], count: int) -> Bool[Tensor, "B K"]:
+        """Which views of the bank the conditional mixture of each item has."""
+        if self.cfg.mode == "view-exact":
+            return torch.zeros(count, self.cfg.bank_views, dtype=torch.bool)
+        if self.cfg.mode == "view-agnostic":
+            return torch.ones(count, self.cfg.bank_views, dtype=torch.bool)
+        bank = view_directions(self.bank_orbit.elevation, self.bank_orbit.azimuth)
+        members = bank == view_directions(batch["elevation"], batch["azimuth"]).cpu()[:, None]
+        # a bank that stays below 60 degrees has no overhead views
+        return torch.where(members.any(dim=1, keepdim=True), members, torch.ones_like(members))
+
+    def _own_views(self, c2w: Tensor, fovy: Tensor, background: Float[Tensor, "B bh bw 3"]) -> Float[Tensor, "B 1 c h w"]:
         rgba = self._targets(c2w, fovy, *self._size)
-        return self._latent().encode(_composite(rgba, background))
+        return self._latent().encode(_composite(rgba, background))[:, None]
 
     def bank(self, height: int, width: int) -> Bank:
         """The bank at a picture size; that of the last size is kept."""
@@ -224,7 +234,9 @@ class ExactScoreGuidance(ScoreDistillation):
     # What is known of the truth -------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def target_rgb(self, batch: dict[str, Any], comp_rgb_bg: Optional[Tensor] = None, *, size: Optional[tuple[int, int]] = None) -> Float[Tensor, "B H W 3"]:
+    def target_rgb(
+        self, batch: dict[str, Any], comp_rgb_bg: Optional[Tensor] = None, *, size: Optional[tuple[int, int]] = None
+    ) -> Float[Tensor, "B H W 3"]:
         """The mesh from the batch's own cameras, on the background of the render, at (height, width) = ``size`` or the batch's."""
         height, width = size or (batch["height"], batch["width"])
         rgba = self._targets(batch["c2w"], batch["fovy"], height, width)
@@ -267,12 +279,9 @@ def bank_modes(bank: Bank, background: Float[Tensor, "bh bw 3"]) -> Float[Tensor
     return torch.cat([bank.latent.encode(_composite(rgba, background[None])) for rgba in bank.rgba.split(16)])
 
 
-def _rows(bank: Bank, members: Tensor) -> Bank:
-    return bank._replace(rgba=bank.rgba[members], pooled=bank.pooled[members])
-
-
-def _log_prior(members: Tensor) -> Float[Tensor, " K"]:
-    return torch.where(members, 0.0, -torch.inf)
+def _rows(bank: Bank, members: Bool[Tensor, " K"]) -> Bank:
+    members = members.to(bank.rgba.device)
+    return bank if members.all() else bank._replace(rgba=bank.rgba[members], pooled=bank.pooled[members])
 
 
 def _background(background: Optional[Tensor], batch: int, device: torch.device) -> Float[Tensor, "B bh bw 3"]:
@@ -321,4 +330,6 @@ def _check_numbers(cfg: Any) -> None:
     for name in ("bank_elevation_range", "bank_distance_range", "bank_fovy_range"):
         low, high = cfg[name]
         if not low <= high or (name != "bank_elevation_range" and low <= 0):
-            raise UserError(f"system.guidance.{name}: expected [low, high] with low <= high, distances and angles of view above 0, got [{low}, {high}]")
+            raise UserError(
+                f"system.guidance.{name}: expected [low, high] with low <= high, distances and angles of view above 0, got [{low}, {high}]"
+            )

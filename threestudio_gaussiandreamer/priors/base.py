@@ -53,6 +53,13 @@ class Prior(BaseObject):
     def configure(self) -> None:
         self.Config.check(self.cfg)  # threestudio's own host doesn't
 
+    def preflight(self) -> None:
+        """Look in seconds whether ``generate`` can have what it needs; called before any long work.
+
+        Raises:
+            UserError: what is missing, and what to do.
+        """
+
     def __call__(self, prompt: str) -> PointCloud:
         """The points for ``prompt``: float32, finite, colours in [0, 1], z up, +x the front.
 

@@ -1,0 +1,93 @@
+"""Every shipped configuration builds, and every key that is accepted is read by somebody."""
+
+import ast
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from threestudio_gaussiandreamer import host, register_parts
+from threestudio_gaussiandreamer.config import load_config
+from threestudio_gaussiandreamer.config_check import check_config
+
+register_parts()
+ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "threestudio_gaussiandreamer"
+CONFIGS = sorted(path.name for path in (ROOT / "configs").glob("*.yaml"))
+OVERLAYS = {"demo-small.yaml": "demo.yaml"}
+
+
+def loaded(name, tmp_path):
+    paths = [ROOT / "configs" / part for part in (OVERLAYS.get(name), name) if part]
+    cfg = load_config(*paths, cli_args=["system.prompt_processor.prompt=a fox", f"exp_root_dir={tmp_path}"])
+    check_config(cfg)
+    return cfg
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_shipped_configuration_is_valid_and_its_parts_can_be_built(name, tmp_path):
+    cfg = loaded(name, tmp_path)
+    data = host.find(cfg.data_type)(cfg.data)
+    system = host.find(cfg.system_type)(cfg.system)
+    assert len(system.geometry) == 0 and data.cfg.batch_size == 4
+    assert system.cfg.exporter_type == "gaussiandreamer-exporter"
+
+
+def test_the_papers_numbers_are_the_papers(tmp_path):
+    """Section 4.1 (implementation details) and 3.3 of the paper."""
+    cfg = loaded("gaussiandreamer.yaml", tmp_path)
+    system = host.find(cfg.system_type)(cfg.system)
+    geometry, data = system.geometry.cfg, cfg.data
+    assert [geometry[f"lr_{name}"] for name in ("means", "opacities", "sh", "scales", "quats")] == [5e-5, 1e-2, 1.25e-2, 1e-3, 1e-2]
+    assert (geometry.init_opacity, geometry.sh_degree, geometry.grow.radius, list(geometry.grow.color_range)) == (0.1, 0, 0.01, [0.0, 0.2])
+    assert geometry.scale_rule == "nearest" and not geometry.densify.enabled
+    assert (cfg.trainer.max_steps, data.batch_size, data.width, system.renderer.cfg.downsample) == (1200, 4, 1024, 2)
+    assert list(data.camera_distance_range) == [1.5, 4.0] and list(data.elevation_range) == [-10, 60] and list(data.azimuth_range) == [-180, 180]
+    steps = cfg.system.guidance.max_step_percent
+    assert [host.C(steps, 0, step) for step in (0, 500, 501, 1199)] == [0.98, 0.98, 0.55, 0.55]
+    assert cfg.system.guidance.guidance_scale == 101  # the host's 100
+
+
+def test_the_released_codes_numbers_are_the_codes(tmp_path):
+    cfg = loaded("gaussiandreamer-official.yaml", tmp_path)
+    geometry = host.find(cfg.system_type)(cfg.system).geometry.cfg
+    assert host.C(geometry.lr_means, 0, 0) == 2e-4 and geometry.lr_scales == 5e-3 and geometry.lr_quats == 1e-3
+    assert geometry.scale_rule == "rms3" and geometry.densify.enabled and geometry.densify.grad_threshold == 2e-4
+    steps = [s for s in range(1, 1201) if geometry.densify.start <= s < geometry.densify.stop and s % geometry.densify.every == 0]
+    assert steps == [400, 500, 600, 700, 800]
+    assert list(cfg.system.guidance.grad_clip) == [0, 1.5, 2.0, 1000]
+
+
+def config_classes():
+    """(part, Config) of everything registered by this package, with the dataclasses nested in them."""
+    found = {}
+    for name in host.names():
+        part = host.find(name)
+        if part.__module__.startswith(PACKAGE.name) and dataclasses.is_dataclass(getattr(part, "Config", None)):
+            found[f"{name}"] = part.Config
+            for field in dataclasses.fields(part.Config):
+                if dataclasses.is_dataclass(field.type):
+                    found[f"{name}.{field.name}"] = field.type
+    return found
+
+
+def names_that_are_read():
+    """Attributes, strings, keywords and parameters in the package's code, the bodies of dataclasses aside."""
+    read = set()
+    for path in PACKAGE.rglob("*.py"):
+        tree = ast.parse(path.read_text())
+        docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
+                read.add(node.attr)
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+                read |= set(node.value.replace(".", " ").split())
+            elif isinstance(node, ast.arg):
+                read.add(node.arg)
+    return read
+
+
+def test_every_accepted_key_is_read_by_somebody():
+    read = names_that_are_read()
+    unread = [f"{name}.{field.name}" for name, cls in config_classes().items() for field in dataclasses.fields(cls) if field.name not in read]
+    assert not unread, unread

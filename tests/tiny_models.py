@@ -1,0 +1,223 @@
+"""Tiny random-weight models in the files of the real ones, made when a test asks for them: a folder each, in diffusers' format.
+
+Every file is laid out as on the hub (safetensors weights, tokenizer files as published, scheduler configurations of the real
+models), so what loads these is what loads the real ones. Only the sizes differ, and what they draw is noise.
+"""
+
+import json
+from io import BytesIO
+from pathlib import Path
+
+import torch
+
+TEXT_WIDTH = 32
+PUBLISHED_VAE_NAMES = {"to_q.": "query.", "to_k.": "key.", "to_v.": "value.", "to_out.0.": "proj_attn."}
+"""The attention's names in Stable Diffusion's VAE files, which are older than today's."""
+CORPUS = "a photo of an iron man fox corgi in the snow, side view front back overhead kicks with his left leg, ugly blurry"
+
+
+def nothing_cached(monkeypatch, folder: Path) -> None:
+    """Hide the models that this machine may have in the hub's cache."""
+    import huggingface_hub
+
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(folder / "empty"))
+
+
+def stable_diffusion(folder: Path, *, prediction: str = "epsilon", seed: int = 0) -> Path:
+    """Stable Diffusion 2.1: UNet on 8x8x4 latents, VAE 64x64 to 8x8, OpenCLIP-like text encoder; ``prediction``: epsilon, v_prediction."""
+    from diffusers import AutoencoderKL, DDIMScheduler, PNDMScheduler, UNet2DConditionModel
+
+    torch.manual_seed(seed)
+    unet = UNet2DConditionModel(
+        sample_size=8,
+        block_out_channels=(16, 32),
+        layers_per_block=1,
+        down_block_types=("CrossAttnDownBlock2D", "DownBlock2D"),
+        up_block_types=("UpBlock2D", "CrossAttnUpBlock2D"),
+        cross_attention_dim=TEXT_WIDTH,
+        attention_head_dim=(2, 4),
+        use_linear_projection=True,
+        norm_num_groups=8,
+    )
+    _listen_to_text(unet)
+    unet.save_pretrained(folder / "unet")
+    AutoencoderKL(
+        sample_size=64,
+        block_out_channels=(8, 8, 16, 16),
+        layers_per_block=1,
+        down_block_types=("DownEncoderBlock2D",) * 4,
+        up_block_types=("UpDecoderBlock2D",) * 4,
+        latent_channels=4,
+        norm_num_groups=4,
+    ).save_pretrained(folder / "vae")
+    _rename(folder / "vae" / "diffusion_pytorch_model.safetensors", PUBLISHED_VAE_NAMES)
+    clip_text_encoder(folder)
+    trained = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear", "steps_offset": 1, "set_alpha_to_one": False}
+    # as published: 2.1-base has the first, 2.1 (768, v-prediction) the second
+    scheduler = PNDMScheduler(**trained, skip_prk_steps=True) if prediction == "epsilon" else DDIMScheduler(**trained, clip_sample=False)
+    scheduler.register_to_config(prediction_type=prediction)
+    scheduler.save_pretrained(folder / "scheduler")
+    return _index(
+        folder,
+        "StableDiffusionPipeline",
+        unet=["diffusers", "UNet2DConditionModel"],
+        vae=["diffusers", "AutoencoderKL"],
+        text_encoder=["transformers", "CLIPTextModel"],
+        tokenizer=["transformers", "CLIPTokenizer"],
+        scheduler=["diffusers", type(scheduler).__name__],
+        safety_checker=[None, None],
+        feature_extractor=[None, None],
+        requires_safety_checker=False,
+    )
+
+
+def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
+    """DeepFloyd IF, stage 1: UNet on 16x16 pixels with six output channels, T5 encoder."""
+    from diffusers import DDPMScheduler, UNet2DConditionModel
+
+    torch.manual_seed(seed)
+    unet = UNet2DConditionModel(
+        sample_size=16,
+        in_channels=3,
+        out_channels=6,
+        block_out_channels=(16, 32),
+        layers_per_block=1,
+        down_block_types=("ResnetDownsampleBlock2D", "SimpleCrossAttnDownBlock2D"),
+        mid_block_type="UNetMidBlock2DSimpleCrossAttn",
+        up_block_types=("SimpleCrossAttnUpBlock2D", "ResnetUpsampleBlock2D"),
+        cross_attention_dim=64,
+        encoder_hid_dim=TEXT_WIDTH,
+        attention_head_dim=8,
+        addition_embed_type="text",
+        addition_embed_type_num_heads=2,
+        cross_attention_norm="group_norm",
+        resnet_time_scale_shift="scale_shift",
+        norm_num_groups=8,
+        act_fn="gelu",
+    )
+    _listen_to_text(unet)
+    unet.save_pretrained(folder / "unet")
+    t5_text_encoder(folder)
+    DDPMScheduler(
+        beta_schedule="squaredcos_cap_v2", prediction_type="epsilon", variance_type="learned_range", thresholding=True, sample_max_value=1.5
+    ).save_pretrained(folder / "scheduler")
+    return _index(
+        folder,
+        "IFPipeline",
+        unet=["diffusers", "UNet2DConditionModel"],
+        text_encoder=["transformers", "T5EncoderModel"],
+        tokenizer=["transformers", "T5Tokenizer"],
+        scheduler=["diffusers", "DDPMScheduler"],
+        safety_checker=[None, None],
+        feature_extractor=[None, None],
+        watermarker=[None, None],
+        requires_safety_checker=False,
+    )
+
+
+def _listen_to_text(unet: torch.nn.Module) -> None:
+    """Enlarge what the cross-attention brings in: with PyTorch's initial weights two prompts give nearly the same picture."""
+    for name, weight in unet.named_parameters():
+        if name.endswith(("attn2.to_v.weight", "add_v_proj.weight")):
+            weight.data *= 10
+
+
+def clip_text_encoder(folder: Path) -> None:
+    """``text_encoder`` and ``tokenizer`` of Stable Diffusion 2.1: CLIP, padded with "!" (which one of its two files denies)."""
+    from transformers import CLIPTextConfig, CLIPTextModel
+
+    vocabulary = _byte_vocabulary()
+    start, end = vocabulary["<|startoftext|>"], vocabulary["<|endoftext|>"]
+    config = CLIPTextConfig(
+        vocab_size=len(vocabulary),
+        hidden_size=TEXT_WIDTH,
+        intermediate_size=48,
+        num_hidden_layers=2,
+        num_attention_heads=2,
+        hidden_act="gelu",
+        bos_token_id=start,
+        eos_token_id=end,
+        pad_token_id=0,
+    )
+    CLIPTextModel(config).save_pretrained(folder / "text_encoder")
+    _publish_clip(folder / "text_encoder" / "model.safetensors")
+    tokenizer = folder / "tokenizer"
+    tokenizer.mkdir(parents=True)
+    _json(tokenizer / "vocab.json", vocabulary)
+    (tokenizer / "merges.txt").write_text("#version: 0.2\nf o\nfo x</w>\n", encoding="utf-8")
+    special = {"bos_token": "<|startoftext|>", "eos_token": "<|endoftext|>", "unk_token": "<|endoftext|>"}
+    _json(tokenizer / "special_tokens_map.json", special | {"pad_token": "!"})
+    _json(
+        tokenizer / "tokenizer_config.json",
+        special | {"pad_token": "<|endoftext|>", "model_max_length": 77, "tokenizer_class": "CLIPTokenizer", "do_lower_case": True},
+    )
+
+
+def t5_text_encoder(folder: Path) -> None:
+    """``text_encoder`` and ``tokenizer`` of DeepFloyd IF: T5 v1.1 and a sentencepiece model."""
+    from transformers import T5Config, T5EncoderModel
+
+    tokenizer = folder / "tokenizer"
+    tokenizer.mkdir(parents=True)
+    (tokenizer / "spiece.model").write_bytes(_sentencepiece())
+    special = {"eos_token": "</s>", "unk_token": "<unk>", "pad_token": "<pad>"}
+    _json(tokenizer / "tokenizer_config.json", special | {"tokenizer_class": "T5Tokenizer", "model_max_length": 512, "extra_ids": 100})
+    config = T5Config(
+        vocab_size=200, d_model=TEXT_WIDTH, d_kv=8, d_ff=48, num_layers=2, num_heads=4, feed_forward_proj="gated-gelu", tie_word_embeddings=False
+    )
+    T5EncoderModel(config).save_pretrained(folder / "text_encoder")
+
+
+def _publish_clip(path: Path) -> None:
+    """The names of the published files: with the prefix that transformers 5 leaves out, and the positions that were once saved."""
+    from safetensors.torch import load_file, save_file
+
+    tensors = load_file(path)
+    prefix = "" if any(name.startswith("text_model.") for name in tensors) else "text_model."
+    tensors = {prefix + name: tensor for name, tensor in tensors.items()}
+    save_file(tensors | {"text_model.embeddings.position_ids": torch.arange(77)[None]}, path, metadata={"format": "pt"})
+
+
+def _rename(path: Path, names: dict[str, str]) -> None:
+    from safetensors.torch import load_file, save_file
+
+    tensors = load_file(path)
+    for new, old in names.items():
+        tensors = {name.replace(new, old): tensor for name, tensor in tensors.items()}
+    save_file(tensors, path, metadata={"format": "pt"})
+
+
+def _byte_vocabulary() -> dict[str, int]:
+    """CLIP's byte-level vocabulary without most of its merges: each byte, each byte at a word's end, two merges, start and end."""
+    printable = [*range(ord("!"), ord("~") + 1), *range(ord("¡"), ord("¬") + 1), *range(ord("®"), ord("ÿ") + 1)]
+    others = [chr(256 + i) for i in range(256 - len(printable))]
+    letters = [*map(chr, printable), *others]
+    tokens = [*letters, *(letter + "</w>" for letter in letters), "fo", "fox</w>", "<|startoftext|>", "<|endoftext|>"]
+    return {token: index for index, token in enumerate(tokens)}
+
+
+def _sentencepiece() -> bytes:
+    import sentencepiece
+
+    model = BytesIO()
+    sentencepiece.SentencePieceTrainer.train(
+        sentence_iterator=iter([CORPUS] * 20),
+        model_writer=model,
+        vocab_size=60,
+        hard_vocab_limit=False,
+        pad_id=0,
+        eos_id=1,
+        unk_id=2,
+        bos_id=-1,
+        minloglevel=2,
+    )
+    return model.getvalue()
+
+
+def _index(folder: Path, pipeline: str, **components) -> Path:
+    _json(folder / "model_index.json", {"_class_name": pipeline, "_diffusers_version": "0.8.0", **components})
+    return folder
+
+
+def _json(path: Path, content: dict) -> None:
+    path.write_text(json.dumps(content, ensure_ascii=False), encoding="utf-8")

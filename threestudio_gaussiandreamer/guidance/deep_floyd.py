@@ -1,0 +1,38 @@
+"""Guidance ``gaussiandreamer-deep-floyd-guidance``: score distillation in the pixels of DeepFloyd IF's first stage, 64 x 64.
+
+Options: those of ``guidance/text_to_image.py``; ``guidance_scale`` is 20 unless given, as in threestudio. The UNet also predicts
+the variance of its reverse step, which distillation doesn't need.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from ..host import register, register_builtin
+from ..prompt_processors import DEEP_FLOYD
+from .text_to_image import TextToImageDistillation
+
+
+@register_builtin("deep-floyd-guidance")
+@register("gaussiandreamer-deep-floyd-guidance")
+class DeepFloydGuidance(TextToImageDistillation):
+    @dataclass
+    class Config(TextToImageDistillation.Config):
+        pretrained_model_name_or_path: str = DEEP_FLOYD
+        guidance_scale: float = 20.0
+
+    cfg: Config
+
+    def load(self, folder: Path) -> None:
+        super().load(folder)
+        self.image_size = self.cfg.image_size or self.sample_size
+
+    def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B 3 s s"]:
+        """The pixels themselves, in [-1, 1]."""
+        return self.resized(rgb, self.image_size) * 2 - 1
+
+    def decode(self, latents: Float[Tensor, "B 3 s s"]) -> Float[Tensor, "B 3 s s"]:
+        return (latents / 2 + 0.5).clamp(0, 1)

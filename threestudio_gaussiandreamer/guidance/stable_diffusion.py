@@ -1,0 +1,95 @@
+"""Guidance ``gaussiandreamer-stable-diffusion-guidance``: score distillation in the latent space of Stable Diffusion.
+
+Takes any model in diffusers' Stable Diffusion format (1.x, 2.x; predicting noise, v or x0). Options beside those of
+``guidance/text_to_image.py``:
+
+===================  ==================================================================================================
+option               meaning
+===================  ==================================================================================================
+enable_vae_slicing   encode one image at a time and again in the backward pass: the memory of one image, one more encoding
+enable_vae_tiling    encode and decode in overlapping tiles: for images much larger than the model's
+===================  ==================================================================================================
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from ..errors import UserError
+from ..host import item_seed, register, register_builtin, warn
+from ..prompt_processors import STABLE_DIFFUSION
+from ..streams import normal_per_item
+from .base import NonFiniteScore
+from .half_precision import GradientBorder
+from .text_to_image import TextToImageDistillation
+
+
+@register_builtin("stable-diffusion-guidance")
+@register("gaussiandreamer-stable-diffusion-guidance")
+class StableDiffusionGuidance(TextToImageDistillation):
+    @dataclass
+    class Config(TextToImageDistillation.Config):
+        pretrained_model_name_or_path: str = STABLE_DIFFUSION
+        enable_vae_slicing: bool = False
+        enable_vae_tiling: bool = False
+
+    cfg: Config
+    components = ("unet", "vae", "scheduler")
+
+    def load(self, folder: Path) -> None:
+        from diffusers import AutoencoderKL
+
+        super().load(folder)
+        self.vae = self.network(AutoencoderKL, folder, "vae")
+        self.vae.enable_slicing()  # of pictures that are decoded to be looked at
+        if self.cfg.enable_vae_tiling:
+            self.vae.enable_tiling()
+        factor = 2 ** (len(self.vae.config.block_out_channels) - 1)
+        self.image_size = self.cfg.image_size or self.sample_size * factor
+        if self.image_size % factor:
+            raise UserError(f"system.guidance.image_size: expected a multiple of {factor}, got {self.image_size}")
+        self._bad_backwards = 0
+
+    def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B 4 h w"]:
+        """A draw from the VAE's posterior, a function of (seed, step, item), at unit variance; float32."""
+        images = self.resized(rgb, self.image_size) * 2 - 1
+        if self.dtype == torch.float32:
+            return self._encode(images)
+        border = GradientBorder(self._count_bad_backwards)
+        return border.leave(self._encode(border.enter(images)))
+
+    def _encode(self, images: Float[Tensor, "B 3 s s"]) -> Float[Tensor, "B 4 h w"]:
+        images = images.to(self.dtype)
+        if self.cfg.enable_vae_slicing and torch.is_grad_enabled():
+            parts = [checkpoint(self._moments, image, use_reentrant=False) for image in images.split(1)]
+            mean, std = (torch.cat(part) for part in zip(*parts, strict=True))
+        else:
+            mean, std = self._moments(images)
+        noise = normal_per_item(tuple(mean.shape), item_seed(), "vae", self.step, mean.device)
+        return (mean.float() + std.float() * noise) * self.vae.config.scaling_factor
+
+    def _moments(self, images: Float[Tensor, "B 3 s s"]) -> tuple[Tensor, Tensor]:
+        posterior = self.vae.encode(images).latent_dist
+        return posterior.mean, posterior.std
+
+    def decode(self, latents: Float[Tensor, "B 4 h w"]) -> Float[Tensor, "B 3 s s"]:
+        images = self.vae.decode((latents / self.vae.config.scaling_factor).to(self.dtype)).sample.float()
+        return (images / 2 + 0.5).clamp(0, 1)
+
+    def _count_bad_backwards(self, bad: Bool[Tensor, " B"]) -> None:
+        """The encoder's gradient of some items isn't finite: they were left out; stop when that goes on."""
+        count = int(bad.sum())
+        self._bad_backwards = self._bad_backwards + 1 if count else 0
+        self.bad_items += count
+        if self._bad_backwards >= self.cfg.max_bad_steps:
+            raise NonFiniteScore(
+                f"the gradient of the VAE was NaN or infinite in {self._bad_backwards} steps in a row (step {self.step}): "
+                "set system.guidance.half_precision_weights=false"
+            )
+        if count:
+            warn(f"step {self.step}: the VAE's gradient of {count} of {len(bad)} items isn't finite; they are left out")

@@ -1,0 +1,229 @@
+"""What guidances by a text-to-image diffusion model share: loading its UNet, its noise schedule, and one forward pass for all prompts.
+
+==================================  ===================================================================================
+option                              meaning
+==================================  ===================================================================================
+pretrained_model_name_or_path       the model, the prompt processor's: a folder or a hub id; ``revision`` of a hub id
+guidance_scale, ..._step_percent,   see ``guidance/base.py``; classifier-free guidance in the usual convention, where 1 is
+grad_clip, weighting_strategy, ...  none (threestudio's 100 is 101 here)
+recon_std_rescale                   0 to 1: bring the contrast of the guided x0 back to that of the conditional one
+                                    (Lin et al. 2023, as in MVDream), which undoes the over-exposure of large scales
+view_dependent_prompting            use the prompt of each view's direction
+image_size                          height and width that the model sees, pixels; none = what it was trained with
+half_precision_weights              float16 on a GPU; images, latents, gradients and splatting stay float32
+enable_channels_last_format         lay the weights out channels last
+enable_torch_compile                compile the UNet on its first use
+enable_attention_slicing            attention in slices: less memory, slower
+enable_sequential_cpu_offload       keep the UNet's weights in the CPU's memory: least memory, much slower
+enable_memory_efficient_attention   torch's own attention is so already; accepted for threestudio's configurations
+==================================  ===================================================================================
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple, Optional
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from .. import sds
+from ..errors import UserError, unknown
+from ..host import debug, info
+from ..hub import find_model, load, require_diffusion
+from .base import ScoreDistillation
+from .half_precision import weights_type
+
+MIN_ABAR = 2.0**-24
+"""Schedules with zero terminal signal would divide by zero at their last step."""
+
+
+class Condition(NamedTuple):
+    """The prompts of B views: k rows for each."""
+
+    embeddings: Float[Tensor, "kB N F"]
+    """All prompts, all negative prompts, then with Perp-Neg two more for each view, view by view."""
+    negative_weights: Optional[Float[Tensor, "B 2"]]
+    """The weights of those two, <= 0; None without Perp-Neg."""
+
+
+class TextToImageDistillation(ScoreDistillation):
+    """Score distillation from a UNet that is conditioned on text embeddings; a subclass knows its images."""
+
+    @dataclass
+    class Config(ScoreDistillation.Config):
+        pretrained_model_name_or_path: str = ""
+        revision: Optional[str] = None
+        recon_std_rescale: float = 0.0
+        view_dependent_prompting: bool = True
+        image_size: Optional[int] = None
+        half_precision_weights: bool = True
+        enable_channels_last_format: bool = False
+        enable_torch_compile: bool = False
+        enable_attention_slicing: bool = False
+        enable_sequential_cpu_offload: bool = False
+        enable_memory_efficient_attention: bool = False
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            ScoreDistillation.Config.check(cfg)
+            if not 0 <= cfg.recon_std_rescale <= 1:
+                raise UserError(f"system.guidance.recon_std_rescale: expected a number in [0, 1], got {cfg.recon_std_rescale}")
+            if cfg.image_size is not None and cfg.image_size < 1:
+                raise UserError(f"system.guidance.image_size: expected a positive number of pixels, got {cfg.image_size}")
+
+    cfg: Config
+    components: ClassVar[tuple[str, ...]] = ("unet", "scheduler")
+
+    # Loading --------------------------------------------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        super().configure()
+        require_diffusion()
+        self.dtype = weights_type(self.cfg.half_precision_weights, self.device)
+        folder = find_model(
+            self.cfg.pretrained_model_name_or_path, self.components, half=self.dtype == torch.float16, revision=self.cfg.revision
+        )
+        info(f"loading {self.cfg.pretrained_model_name_or_path} in {str(self.dtype).removeprefix('torch.')}")
+        self.set_schedule(folder)
+        self.load(folder)
+
+    def set_schedule(self, folder: Path) -> None:
+        """The noise schedule that the model was trained with, in float64, and what its UNet predicts."""
+        from diffusers import DDPMScheduler
+
+        scheduler = load(DDPMScheduler, folder, "scheduler")
+        self.prediction_type = scheduler.config.prediction_type
+        if self.prediction_type not in PREDICTIONS:
+            raise unknown("prediction_type of the model's scheduler", self.prediction_type, PREDICTIONS)
+        self.alphas_cumprod = torch.cumprod(1 - scheduler.betas.double(), dim=0).clamp_min(MIN_ABAR)
+        self._abar = self.alphas_cumprod.to(self.device)
+        self.update_step(0, 0)
+
+    def load(self, folder: Path) -> None:
+        """Load the networks; a subclass adds its own."""
+        from diffusers import UNet2DConditionModel
+
+        cfg = self.cfg
+        self.unet = self.network(UNet2DConditionModel, folder, "unet", on_device=not cfg.enable_sequential_cpu_offload)
+        self.text_width = self.unet.config.encoder_hid_dim or self.unet.config.cross_attention_dim
+        self.sample_size = self.unet.config.sample_size
+        if cfg.enable_memory_efficient_attention:
+            debug("enable_memory_efficient_attention: torch's attention is memory efficient already")
+        if cfg.enable_attention_slicing:
+            self.unet.set_attention_slice(1)
+        if cfg.enable_sequential_cpu_offload:
+            self._offload()
+        if cfg.enable_torch_compile:
+            self.unet = torch.compile(self.unet)
+
+    def network(self, network_class: Any, folder: Path, component: str, *, on_device: bool = True) -> nn.Module:
+        """One frozen network of the model."""
+        half = self.dtype == torch.float16
+        network = load(network_class, folder, component, half=half, torch_dtype=self.dtype).eval().requires_grad_(False)
+        if self.cfg.enable_channels_last_format:
+            network.to(memory_format=torch.channels_last)
+        return network.to(self.device) if on_device else network
+
+    def _offload(self) -> None:
+        try:
+            from accelerate import cpu_offload
+        except ImportError as error:
+            raise UserError("enable_sequential_cpu_offload needs accelerate: pip install accelerate") from error
+        cpu_offload(self.unet, execution_device=self.device)
+
+    # The path of score distillation ---------------------------------------------------------------------------------------
+
+    def condition(self, prompt_utils: Any, **batch: Any) -> Condition:
+        """The text embeddings of these views; ``prompt_utils`` is ours or threestudio's ``PromptProcessorOutput``."""
+        if not hasattr(prompt_utils, "get_text_embeddings"):
+            raise UserError("this guidance needs text embeddings: set system.prompt_processor_type to the processor of its model")
+        views = (batch["elevation"], batch["azimuth"], batch["camera_distances"], self.cfg.view_dependent_prompting)
+        if getattr(prompt_utils, "use_perp_neg", False):
+            embeddings, weights = prompt_utils.get_text_embeddings_perp_neg(*views)
+            weights = weights.to(self.device)
+        else:
+            embeddings, weights = prompt_utils.get_text_embeddings(*views), None
+        if embeddings.shape[-1] != self.text_width:
+            raise UserError(
+                f"the text embeddings have {embeddings.shape[-1]} channels, {self.cfg.pretrained_model_name_or_path} takes {self.text_width}: "
+                "give system.prompt_processor and system.guidance the same pretrained_model_name_or_path"
+            )
+        return Condition(embeddings.to(self.device), weights)
+
+    def predict(self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition) -> tuple[Tensor, Optional[Tensor]]:
+        batch = len(z)
+        if condition.negative_weights is None:
+            eps = self.noise(z, t, condition.embeddings if self.guided else condition.embeddings[:batch])
+            return eps[:batch], eps[batch:] if self.guided else None
+        eps = self.noise(z, t, condition.embeddings)
+        negative = eps[2 * batch :].unflatten(0, (batch, 2))
+        return perp_neg(eps[:batch], eps[batch : 2 * batch], negative, condition.negative_weights), eps[batch : 2 * batch]
+
+    def predict_noise(self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition) -> Float[Tensor, "B c h w"]:
+        cond, uncond = self.predict(z, t, condition)
+        if uncond is None:
+            return cond
+        guided = sds.classifier_free(cond, uncond, self.cfg.guidance_scale)
+        return rescaled(guided, cond, z, self._abar[t], self.cfg.recon_std_rescale) if self.cfg.recon_std_rescale else guided
+
+    def noise(self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], embeddings: Float[Tensor, "kB N F"]) -> Float[Tensor, "kB c h w"]:
+        """The UNet's prediction as noise, float32, for each row of ``embeddings`` on the latent of its view, in one forward pass."""
+        rows = view_of_row(len(z), len(embeddings)).to(z.device)
+        z, t = z[rows], t[rows]
+        output = self.unet(z.to(self.dtype), t, encoder_hidden_states=embeddings.to(self.dtype)).sample.float()
+        # a model may predict the variance of the reverse step beside it
+        return PREDICTIONS[self.prediction_type](output[:, : z.shape[1]], z, self._abar[t])
+
+    def resized(self, images: Float[Tensor, "B 3 H W"], size: int) -> Float[Tensor, "B 3 s s"]:
+        """The images at the model's size; when shrunk more than twofold, bilinear sampling would skip pixels without antialiasing."""
+        if images.shape[-2:] == (size, size):
+            return images
+        antialias = max(images.shape[-2:]) > 2 * size
+        return F.interpolate(images, (size, size), mode="bilinear", align_corners=False, antialias=antialias)
+
+
+# Formulas -------------------------------------------------------------------------------------------------------------------
+
+PREDICTIONS = {
+    "epsilon": lambda output, z, abar: output,
+    "v_prediction": lambda output, z, abar: sds.per_item(abar.sqrt(), z) * output + sds.per_item((1 - abar).sqrt(), z) * z,
+    "sample": lambda output, z, abar: (z - sds.per_item(abar.sqrt(), z) * output) / sds.per_item((1 - abar).sqrt(), z),
+}
+"""What the network puts out, as noise: it may predict the noise, v = sqrt(abar) eps - sqrt(1 - abar) x0 (Salimans and Ho 2022), or x0."""
+
+
+def view_of_row(views: int, rows: int) -> Int[Tensor, " kB"]:
+    """Which view each row of a :class:`Condition` belongs to: 0..B-1, 0..B-1, then 0, 0, 1, 1, ..."""
+    order = torch.arange(views)
+    return torch.cat([order, order, order.repeat_interleave(2)])[:rows]
+
+
+def perp_neg(
+    cond: Float[Tensor, "B c h w"], uncond: Float[Tensor, "B c h w"], negative: Float[Tensor, "B 2 c h w"], weights: Float[Tensor, "B 2"]
+) -> Float[Tensor, "B c h w"]:
+    """eps_u + d + sum_i w_i (n_i - proj_d n_i), where d = eps_c - eps_u, n_i = eps_i - eps_u (Armandpour et al. 2023, eq. 9).
+
+    Guided with scale s this is eps_u + s (d + ...), the paper's formula.
+    """
+    wanted = (cond - uncond)[:, None]
+    unwanted = negative - uncond[:, None]
+    inner = (unwanted * wanted).sum(dim=(2, 3, 4), keepdim=True)
+    length = wanted.square().sum(dim=(2, 3, 4), keepdim=True).clamp_min(1e-6)
+    perpendicular = unwanted - inner / length * wanted
+    return cond + (weights.to(cond)[:, :, None, None, None] * perpendicular).sum(dim=1)
+
+
+def rescaled(
+    guided: Float[Tensor, "B c h w"], cond: Float[Tensor, "B c h w"], z: Float[Tensor, "B c h w"], abar: Float[Tensor, " B"], share: float
+) -> Float[Tensor, "B c h w"]:
+    """The guided noise whose x0 has its standard deviation brought to that of the conditional x0, by ``share`` (0 none, 1 all)."""
+    x0, reference = sds.predict_x0(z, guided, abar), sds.predict_x0(z, cond, abar)
+    factor = _deviation(reference) / _deviation(x0)
+    x0 = x0 * (share * factor + 1 - share)
+    return PREDICTIONS["sample"](x0, z, abar)
+
+
+def _deviation(x: Float[Tensor, "B c h w"]) -> Float[Tensor, "B 1 1 1"]:
+    return x.std(dim=(1, 2, 3), keepdim=True).clamp_min(1e-8)

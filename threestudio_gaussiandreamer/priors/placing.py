@@ -1,0 +1,50 @@
+"""What the priors with a network share: their axes and size in the world, their device, their randomness."""
+
+import numpy as np
+import torch
+
+from ..errors import UserError, unknown
+from ..grow import half_longest_side
+from ..meshes import AXES
+from ..point_cloud import PointCloud
+
+HORIZONTAL = ("+x", "-x", "+y", "-y")
+
+
+def check_front(front: str) -> None:
+    """Raise UserError unless ``front`` is an axis of the plane."""
+    if front not in HORIZONTAL:
+        raise unknown("front axis", front, HORIZONTAL)
+
+
+def placed(cloud: PointCloud, *, front: str, scale: float, normalize: bool) -> PointCloud:
+    """``cloud``, whose z is up, turned so that ``front`` is +x, and scaled.
+
+    Args:
+        scale: world units for one unit of the cloud; with ``normalize`` half the longest side of the box, which is centred.
+    """
+    axis = AXES[front]
+    points = np.asarray(cloud.points, np.float64) @ np.stack([axis, np.cross(AXES["+z"], axis), AXES["+z"]]).T
+    if normalize:
+        points = (points - (points.min(axis=0) + points.max(axis=0)) / 2) / (half_longest_side(points) or 1.0)
+    return cloud._replace(points=(scale * points).astype(np.float32))
+
+
+def chosen_device(name: str, default: torch.device) -> torch.device:
+    """The device called ``name``, or the run's for "auto".
+
+    Raises:
+        UserError: there is no such device.
+    """
+    if name == "auto":
+        return torch.device(default)
+    try:
+        torch.empty(0, device=name)
+        return torch.device(name)
+    except (RuntimeError, AssertionError) as error:  # a CPU build of PyTorch asserts
+        raise UserError(f"device: {name!r} can't be used here ({str(error).splitlines()[0]}): give 'auto', 'cpu' or 'cuda'") from error
+
+
+def torch_generator(generator: np.random.Generator) -> torch.Generator:
+    """A CPU generator of torch whose seed is drawn from ``generator``."""
+    return torch.Generator().manual_seed(int(generator.integers(2**62)))

@@ -1,0 +1,217 @@
+"""``shap-e-prior``: OpenAI's Shap-E, the text-to-3D model that the paper starts from, with diffusers' networks.
+
+===================  ================================================================================================
+option               meaning
+===================  ================================================================================================
+model                a folder in the format of diffusers' ``ShapEPipeline``, or an id of the hub
+revision             of the model on the hub
+allow_bin            where a part has no safetensors, read its ``.bin`` (with ``weights_only``: it can't run code)
+checkpoint           ``.pth`` in OpenAI's format whose weights replace the text-to-latent network's: Cap3D's finetuned
+                     ``shapE_finetuned_with_330kdata.pth``, as in the paper; null: as published
+prompt               asked of Shap-E in place of the run's prompt
+guidance_scale       1 = none; 15 in the paper's code
+num_inference_steps  noise levels; 64
+sigma_min, _max      the lowest and highest of them; 1e-3 and 160
+grid_size            the signed distance is asked for on a grid of this many points along each axis of [-1, 1]^3
+query_batch_size     points asked for at a time: less is less memory
+colors               ``display``: as a picture shows them; ``linear``: what the paper's code takes, which is darker
+scale                world units for one of Shap-E's; 1.6 in the paper's code. With ``normalize``: half the longest side
+normalize            centre the box and make its longest half side ``scale``
+front                the axis of Shap-E's space that looks at azimuth 0
+half_precision       run the text-to-latent network in float16, on a GPU only, as the paper's code does
+device               ``auto``: the run's GPU, or the CPU
+ground, ...          see ``priors/base.py``
+===================  ================================================================================================
+
+The points are the vertices of the surface, with its faces. Shap-E's space has z up, and its objects look along -y, the
+convention of the Blender scenes that it was trained on: its own preview begins with a camera on that side. So the
+front becomes +x by a quarter turn, (x, y, z) -> (-y, x, z).
+
+The latents are sampled by ``karras.py`` and not by ``ShapEPipeline``: its scheduler takes the noise levels from the
+training schedule (403 to 0.108 in place of 160 to 1e-3), clamps after guidance rather than before, and the pipeline offers no
+grid size. The signed distances that the published code surrounds the grid with make its surface smaller by
+``(grid_size - 1) / (grid_size + 1)``; so does ours.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Optional
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..errors import UserError, unknown
+from ..files import existing_file
+from ..host import info, register
+from ..hub import files_below
+from ..point_cloud import PointCloud
+from .base import Prior, require_positive
+from .clip import load_text_encoder, load_tokenizer, text_condition
+from .karras import Network, guided_denoiser, karras_sigmas, sample_heun
+from .placing import check_front, chosen_device, placed, torch_generator
+from .pretrained import WeightFile, free_memory, load_weights, locate, pick_weights, reading, require_extra, require_files, tokenizer_files
+from .shap_e_checkpoint import load_original_prior
+
+PARTS = {"prior": "diffusion_pytorch_model", "shap_e_renderer": "diffusion_pytorch_model", "text_encoder": "model"}
+"""The folders with weights, and what their files are called."""
+CONFIGS = ("prior/config.json", "shap_e_renderer/config.json", "text_encoder/config.json", "scheduler/scheduler_config.json")
+COLORS = ("display", "linear")
+
+
+@register("shap-e-prior")
+class ShapEPrior(Prior):
+    """The vertices of the mesh that Shap-E imagines for the prompt."""
+
+    @dataclass
+    class Config(Prior.Config):
+        model: str = "openai/shap-e"
+        revision: Optional[str] = None
+        allow_bin: bool = False
+        checkpoint: Optional[str] = None
+        prompt: Optional[str] = None
+        guidance_scale: float = 15.0
+        num_inference_steps: int = 64
+        sigma_min: float = 1e-3
+        sigma_max: float = 160.0
+        grid_size: int = 128
+        query_batch_size: int = 65536
+        colors: str = "display"
+        scale: float = 1.6
+        normalize: bool = False
+        front: str = "-y"
+        half_precision: bool = True
+        device: str = "auto"
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            Prior.Config.check(cfg)
+            require_positive(cfg, "guidance_scale", "num_inference_steps", "sigma_min", "sigma_max", "query_batch_size", "scale")
+            if not cfg.sigma_min < cfg.sigma_max:
+                raise UserError(f"sigma_min: expected less than sigma_max, {cfg.sigma_max}, got {cfg.sigma_min}")
+            if cfg.grid_size < 2:
+                raise UserError(f"grid_size: expected 2 or more, got {cfg.grid_size}")
+            if cfg.colors not in COLORS:
+                raise unknown("colors", cfg.colors, COLORS)
+            check_front(cfg.front)
+
+    cfg: Config
+
+    def preflight(self) -> None:
+        """Check in seconds that all files can be had, before any long work.
+
+        Raises:
+            UserError: what is missing, and what to do.
+        """
+        require_extra("diffusion", "diffusers", "transformers")
+        chosen_device(self.cfg.device, self.device)
+        locate(self.cfg.model, self._picks, option="model", revision=self.cfg.revision, download=False)
+        if self.cfg.checkpoint:
+            existing_file(self.cfg.checkpoint, "Shap-E checkpoint")
+
+    def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
+        self.preflight()
+        folder = locate(self.cfg.model, self._picks, option="model", revision=self.cfg.revision)
+        device = chosen_device(self.cfg.device, self.device)
+        info(f"Shap-E: {self.cfg.prompt or prompt!r} on {device}")
+        latents = self._sample(folder, self.cfg.prompt or prompt, device, torch_generator(generator))
+        cloud = self._decode(folder, latents, device)
+        free_memory()
+        info(f"Shap-E: a mesh of {len(cloud.points)} vertices and {len(cloud.faces)} faces")
+        return placed(cloud, front=self.cfg.front, scale=self.cfg.scale, normalize=self.cfg.normalize)
+
+    def _picks(self, files: Collection[str]) -> list[str]:
+        names = require_files(files, CONFIGS, self.cfg.model) + tokenizer_files(files, "tokenizer/", self.cfg.model)
+        return names + [self._weights(files, part).name for part in PARTS]
+
+    def _weights(self, files: Collection[str], part: str) -> WeightFile:
+        return pick_weights(files, f"{part}/", PARTS[part], allow_bin=self.cfg.allow_bin, model=self.cfg.model)
+
+    def _sample(self, folder: Path, prompt: str, device: torch.device, rng: torch.Generator) -> Float[Tensor, "1 N D"]:
+        """Latents of the shape, from text features through the text-to-latent network; both are dropped on return."""
+        condition = self._condition(folder, prompt, device)
+        prior = self._part(folder, "prior", device)
+        if self.cfg.checkpoint:
+            load_original_prior(prior, self.cfg.checkpoint)
+        alphas_cumprod, prediction = read_schedule(folder)
+        noise = torch.randn(1, prior.config.num_embeddings, prior.config.embedding_dim, generator=rng).to(device)
+        network = prior_network(prior, condition, self.cfg.guidance_scale, half=self.cfg.half_precision and device.type == "cuda")
+        denoise = guided_denoiser(network, alphas_cumprod, scale=self.cfg.guidance_scale, prediction=prediction)
+        sigmas = karras_sigmas(self.cfg.num_inference_steps, self.cfg.sigma_min, self.cfg.sigma_max)
+        return sample_heun(denoise, noise, sigmas, generator=rng, progress="Shap-E")
+
+    def _condition(self, folder: Path, prompt: str, device: torch.device) -> Float[Tensor, "1 D"]:
+        encoder = load_text_encoder(folder, self._weights(files_below(folder), "text_encoder"), "text_encoder").to(device)
+        return text_condition(load_tokenizer(folder, "tokenizer"), encoder, prompt)
+
+    def _decode(self, folder: Path, latents: Float[Tensor, "1 N D"], device: torch.device) -> PointCloud:
+        """The surface where the signed distance is 0, in Shap-E's own space."""
+        renderer = self._part(folder, "shap_e_renderer", device)
+        return decoded(renderer, latents, grid_size=self.cfg.grid_size, query_batch_size=self.cfg.query_batch_size, colors=self.cfg.colors)
+
+    def _part(self, folder: Path, part: str, device: torch.device) -> Any:
+        """One network, always in float32: in half precision the renderer's encoding of positions loses all detail."""
+        from diffusers import PriorTransformer
+        from diffusers.pipelines.shap_e.renderer import ShapERenderer
+
+        kind = {"prior": PriorTransformer, "shap_e_renderer": ShapERenderer}[part]
+        return load_weights(kind, folder, self._weights(files_below(folder), part), part).to(device)
+
+
+def read_schedule(folder: Path) -> tuple[Float[np.ndarray, "T"], str]:
+    """The abar of each timestep, and what the network predicts ("sample" or "epsilon"), from the model's own scheduler."""
+    from diffusers import HeunDiscreteScheduler
+
+    with reading(f"the scheduler in {str(folder)!r}"):
+        scheduler = HeunDiscreteScheduler.from_pretrained(folder, subfolder="scheduler", local_files_only=True)
+    prediction = scheduler.config.prediction_type
+    if prediction not in ("sample", "epsilon"):
+        raise UserError(f"the scheduler in {str(folder)!r} has the prediction type {prediction!r}: Shap-E's is 'sample'")
+    return scheduler.alphas_cumprod.double().numpy(), prediction
+
+
+def prior_network(prior: Any, condition: Float[Tensor, "1 D"], scale: float, *, half: bool) -> Network:
+    """diffusers' network with its condition, first the prompt's and then, where there is guidance, that of no prompt."""
+    conditions = condition if scale == 1 else torch.cat([condition, torch.zeros_like(condition)])
+
+    def predict(z: Tensor, timesteps: Tensor) -> Tensor:
+        with torch.autocast(z.device.type, torch.float16, enabled=half):
+            output = prior(z, timesteps, conditions).predicted_image_embedding
+        return output[..., : z.shape[-1]]  # the rest is the variance, which this sampler doesn't use
+
+    return predict
+
+
+@torch.no_grad()
+def decoded(renderer: Any, latents: Float[Tensor, "1 N D"], *, grid_size: int, query_batch_size: int, colors: str) -> PointCloud:
+    """The mesh of ``latents`` by marching cubes, with the texture field's colours at its vertices.
+
+    Raises:
+        UserError: the latents are not finite, or the signed distance is negative everywhere.
+    """
+    if not torch.isfinite(latents).all():
+        raise UserError("Shap-E's latents are not finite: set half_precision: false, or check its weights")
+    renderer.mesh_decoder.register_forward_hook(_refuse_empty)
+    try:
+        mesh = renderer.decode_to_mesh(latents, latents.device, grid_size=grid_size, query_batch_size=query_batch_size)
+    except torch.OutOfMemoryError as error:
+        raise UserError(f"Shap-E's grid of {grid_size}^3 does not fit the memory: set grid_size or query_batch_size lower") from error
+    linear = torch.stack([mesh.vertex_channels[name] for name in "RGB"], dim=-1).float().cpu().numpy()
+    return PointCloud(
+        points=mesh.verts.float().cpu().numpy(),
+        colors=linear if colors == "linear" else display_colors(linear),
+        faces=mesh.faces.cpu().numpy(),
+    )
+
+
+def _refuse_empty(decoder: Any, inputs: tuple, mesh: Any) -> None:
+    """A hook behind marching cubes: what follows it in the renderer can't cope with a mesh without vertices."""
+    if not len(mesh.faces):
+        raise UserError("Shap-E found no surface for this prompt: try another seed, another prompt or a larger grid_size")
+
+
+def display_colors(linear: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+    """Linear light as display values (IEC 61966-2-1): the inverse of what the decoder does to its texture field."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055).astype(np.float32)

@@ -1,0 +1,264 @@
+"""SMPL's pose, and optionally its shape, from the positions of its joints: a small optimisation with priors.
+
+The body model is the user's own file, an NPZ of SMPL, SMPL-H or SMPL-X: their first 22 joints are the same. The kinematics
+are smplx's. What is minimised, over the rotations of all joints (axis-angle), a translation and a few shape
+coefficients, summed over the frames, which share nothing:
+
+    sum_j |joint_j - target_j|^2 / s^2  +  pose |theta|^2  +  shape |beta|^2  +  limits sum max(0, low - theta, theta - high)^2
+
+with s = 10 mm: one centimetre on one joint weighs as one radian of a rotation does at ``pose`` = 1. The limits keep knees and elbows
+from bending backwards, which positions alone would allow. The way there: first where the whole body is and looks, then
+the pose under a strong prior, then under the final one.
+"""
+
+import math
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..errors import UserError
+from ..files import existing_file
+from .pretrained import require_extra
+
+FIELDS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
+"""Arrays of a body model's file that are used."""
+CONVERT = (
+    "python -c \"import pickle, numpy as np; d = pickle.load(open('SMPL_NEUTRAL.pkl', 'rb'), encoding='latin1'); "
+    "np.savez('SMPL_NEUTRAL.npz', **{k: np.array(d[k].toarray() if hasattr(d[k], 'toarray') else d[k]) for k in "
+    "('v_template', 'shapedirs', 'posedirs', 'J_regressor', 'weights', 'kintree_table', 'f')})\""
+)
+BODY_JOINTS = 22
+"""The first joints of SMPL, SMPL-H and SMPL-X, and all of HumanML3D."""
+SMPL_JOINTS = 24
+TRUNK = (0, 1, 2, 3, 6, 9, 13, 14, 16, 17)
+"""Pelvis, hips, spine, collars and shoulders, which move almost as one."""
+SCALE = 0.01
+"""Metres on a joint that weigh as one unit of the priors."""
+SHAPE_WEIGHT = 0.01
+LIMITS_WEIGHT = 1000.0
+STAGES = ((1.0, 0.2), (0.02, 1.0))
+"""Weight of the pose prior, and the share of the iterations, of each stage."""
+DEGREES = math.pi / 180
+LIMITS = {
+    # joint: axis: (low, high) in degrees. Knees bend about x, the elbows about y, the left one's negative side.
+    4: {0: (0, 150), 1: (-15, 15), 2: (-15, 15)},
+    5: {0: (0, 150), 1: (-15, 15), 2: (-15, 15)},
+    18: {1: (-150, 5)},
+    19: {1: (-5, 150)},
+    **{joint: {0: (-60, 60), 1: (-60, 60), 2: (-60, 60)} for joint in (3, 6, 9, 12, 15)},  # spine, neck, head
+    **{joint: {0: (-60, 60), 1: (-45, 45), 2: (-45, 45)} for joint in (7, 8)},  # ankles
+}
+
+
+class BodyModel(NamedTuple):
+    """A skinned body, float64 tensors in the layout of smplx's functions."""
+
+    template: Float[Tensor, "V 3"]
+    """Metres, y up, looking along +z."""
+    shape_directions: Float[Tensor, "V 3 B"]
+    pose_directions: Float[Tensor, "P V3"]
+    joint_regressor: Float[Tensor, "J V"]
+    parents: Int[Tensor, " J"]
+    weights: Float[Tensor, "V J"]
+    faces: Int[np.ndarray, "F 3"]
+
+
+class BodyFit(NamedTuple):
+    """The bodies that were fitted to F frames."""
+
+    pose: Float[Tensor, "F J 3"]
+    """Axis-angle rotation of each joint, the whole body's first; radians."""
+    shape: Float[Tensor, "F B"]
+    translation: Float[Tensor, "F 3"]
+    residuals: Float[np.ndarray, "F K"]
+    """Distance of each fitted joint from where it should be, millimetres."""
+
+
+def load_body_model(path: str, *, num_shape: int = 10) -> BodyModel:
+    """Read the user's body model; only NPZ, because the PKL files of SMPL run code when they are opened.
+
+    Args:
+        num_shape: shape coefficients that are used.
+
+    Raises:
+        UserError: missing, a pickle, or not a body model; the message says what to do.
+    """
+    file = existing_file(path, "body model")
+    if file.suffix.lower() == ".pkl":
+        raise UserError(f"body model {path!r} is a pickle, which could run code, and isn't opened; if it is yours, convert it:\n{CONVERT}")
+    arrays = _arrays(file)
+    _check_shapes(arrays, path)
+    vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
+    parents = torch.from_numpy(arrays["kintree_table"][0].astype(np.int64))
+    parents[0] = -1
+    return BodyModel(
+        template=_tensor(arrays["v_template"]),
+        shape_directions=_tensor(arrays["shapedirs"][:, :, :num_shape]),
+        pose_directions=_tensor(arrays["posedirs"]).reshape(vertices * 3, 9 * (joints - 1)).T.contiguous(),
+        joint_regressor=_tensor(arrays["J_regressor"]),
+        parents=parents,
+        weights=_tensor(arrays["weights"]),
+        faces=arrays["f"].astype(np.int64),
+    )
+
+
+def fit_bodies(model: BodyModel, targets: Float[np.ndarray, "F K 3"], *, fit_shape: bool = True, iterations: int = 300) -> BodyFit:
+    """Bodies whose joints are where ``targets`` has them.
+
+    Args:
+        targets: 22 or 24 joints in SMPL's order, metres, y up; the last two of 24 are used when the model has no more.
+        fit_shape: the shape coefficients too; else the model's mean shape.
+        iterations: the most of the last stage.
+    """
+    require_extra("body", "smplx")
+    wanted = _tensor(targets)[:, : SMPL_JOINTS if len(model.parents) == SMPL_JOINTS else BODY_JOINTS]
+    frames, joints = len(wanted), len(model.parents)
+    pose = torch.zeros(frames, joints, 3, dtype=torch.float64)
+    pose[:, 0], translation = _placed(model, wanted)
+    shape = torch.zeros(frames, model.shape_directions.shape[-1], dtype=torch.float64)
+    moved = [pose, translation, *([shape] if fit_shape else [])]
+    with _one_thread():
+        for weight, share in STAGES:
+            _minimise(moved, lambda weight=weight: energy(model, pose, shape, translation, wanted, weight), int(share * iterations))
+    found = posed_joints(model, pose, shape, translation)[:, : wanted.shape[1]]
+    residuals = 1000 * (found - wanted).norm(dim=-1)
+    return BodyFit(pose.detach(), shape.detach(), translation.detach(), residuals.detach().numpy())
+
+
+def energy(
+    model: BodyModel, pose: Tensor, shape: Tensor, translation: Tensor, wanted: Float[Tensor, "F K 3"], pose_weight: float
+) -> Tensor:
+    """What is minimised, summed over the frames; see the module."""
+    found = posed_joints(model, pose, shape, translation)[:, : wanted.shape[1]]
+    data = ((found - wanted) / SCALE).square().sum()
+    return data + pose_weight * pose[:, 1:].square().sum() + SHAPE_WEIGHT * shape.square().sum() + LIMITS_WEIGHT * beyond_limits(pose)
+
+
+def beyond_limits(pose: Float[Tensor, "F J 3"]) -> Tensor:
+    """Squared radians by which rotations leave ``LIMITS``, summed."""
+    rows = [(joint, axis, low * DEGREES, high * DEGREES) for joint, axes in LIMITS.items() for axis, (low, high) in axes.items()]
+    joints, axes = torch.tensor([row[:2] for row in rows]).T
+    low, high = torch.tensor([row[2:] for row in rows], dtype=pose.dtype).T
+    angles = pose[:, joints, axes]
+    return (low - angles).clamp_min(0).square().sum() + (angles - high).clamp_min(0).square().sum()
+
+
+def posed_joints(
+    model: BodyModel, pose: Float[Tensor, "F J 3"], shape: Float[Tensor, "F B"], translation: Float[Tensor, "F 3"]
+) -> Float[Tensor, "F J 3"]:
+    """Where the joints are; cheaper than the whole body, since vertices are needed for the shape only."""
+    from smplx.lbs import batch_rigid_transform, batch_rodrigues
+
+    frames, joints = pose.shape[:2]
+    rest = model.joint_regressor @ model.template + torch.einsum("fb,jcb->fjc", shape, _joint_directions(model))
+    rotations = batch_rodrigues(pose.reshape(-1, 3)).reshape(frames, joints, 3, 3)
+    return batch_rigid_transform(rotations, rest, model.parents, dtype=pose.dtype)[0] + translation[:, None]
+
+
+@torch.no_grad()
+def posed_vertices(model: BodyModel, fit: BodyFit) -> Float[np.ndarray, "F V 3"]:
+    """The surfaces of the fitted bodies: metres, y up."""
+    from smplx.lbs import lbs
+
+    vertices, _ = lbs(
+        fit.shape,
+        fit.pose.flatten(1),
+        model.template,
+        model.shape_directions,
+        model.pose_directions,
+        model.joint_regressor,
+        model.parents,
+        model.weights,
+    )
+    return (vertices + fit.translation[:, None]).numpy()
+
+
+def _joint_directions(model: BodyModel) -> Float[Tensor, "J 3 B"]:
+    return torch.einsum("jv,vcb->jcb", model.joint_regressor, model.shape_directions)
+
+
+def _placed(model: BodyModel, wanted: Float[Tensor, "F K 3"]) -> tuple[Float[Tensor, "F 3"], Float[Tensor, "F 3"]]:
+    """The rotation (axis-angle) and translation that bring the resting trunk nearest to the wanted one (Kabsch 1976)."""
+    from scipy.spatial.transform import Rotation
+
+    rest = (model.joint_regressor @ model.template)[list(TRUNK)]
+    there = wanted[:, list(TRUNK)]
+    covariance = torch.einsum("fkc,kd->fcd", there - there.mean(1, keepdim=True), rest - rest.mean(0))
+    u, _, vt = torch.linalg.svd(covariance)
+    signs = torch.ones(len(wanted), 3, dtype=wanted.dtype)
+    signs[:, 2] = torch.linalg.det(u @ vt).sign()
+    rotation = u @ (signs[:, :, None] * vt)
+    root = (model.joint_regressor @ model.template)[0]  # the body turns about its first joint
+    translation = there.mean(1) - torch.einsum("fcd,d->fc", rotation, rest.mean(0) - root) - root
+    return _tensor(Rotation.from_matrix(rotation.numpy()).as_rotvec()), translation
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """For thousands of tiny operations: on a busy machine, threads that wait for each other make them a hundred times slower."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _minimise(moved: list[Tensor], loss: Callable[[], Tensor], iterations: int) -> None:
+    """L-BFGS over ``moved``, in place."""
+    for tensor in moved:
+        tensor.requires_grad_(True)
+    optimiser = torch.optim.LBFGS(moved, max_iter=iterations, history_size=20, line_search_fn="strong_wolfe", tolerance_change=1e-5)
+
+    def closure() -> Tensor:
+        optimiser.zero_grad()
+        value = loss()
+        value.backward()
+        return value
+
+    optimiser.step(closure)
+    for tensor in moved:
+        tensor.requires_grad_(False)
+
+
+def _arrays(file: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(file, allow_pickle=False) as content:
+            missing = [name for name in FIELDS if name not in content.files]
+            if missing:
+                raise UserError(f"body model {str(file)!r} has no {', '.join(missing)}: an NPZ of SMPL, SMPL-H or SMPL-X was expected")
+            return {name: content[name] for name in FIELDS}
+    except (ValueError, OSError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(
+            f"body model {str(file)!r} can't be read ({error}): an NPZ of plain arrays was expected; from a PKL it is made by\n{CONVERT}"
+        ) from error
+
+
+def _check_shapes(arrays: dict[str, np.ndarray], path: str) -> None:
+    """Raise UserError unless the arrays are those of one body with at least SMPL's 22 body joints."""
+    vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
+    fits = (
+        arrays["v_template"].shape == (vertices, 3)
+        and arrays["shapedirs"].shape[:2] == (vertices, 3)
+        and arrays["posedirs"].shape == (vertices, 3, 9 * (joints - 1))
+        and arrays["J_regressor"].shape == (joints, vertices)
+        and arrays["weights"].shape == (vertices, joints)
+        and arrays["kintree_table"].shape[-1] == joints
+        and arrays["f"].shape[1:] == (3,)
+    )
+    if not fits or joints < BODY_JOINTS:
+        shapes = ", ".join(f"{name} {arrays[name].shape}" for name in FIELDS)
+        raise UserError(f"body model {path!r} has arrays that don't fit each other or too few joints ({BODY_JOINTS} are needed): {shapes}")
+
+
+def _tensor(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float64))

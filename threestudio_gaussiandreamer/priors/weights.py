@@ -1,0 +1,70 @@
+"""Reading published ``.pt`` and ``.pth`` files of weights: tensors only, and every name accounted for."""
+
+import pickle
+import zipfile
+from collections.abc import Iterable, Mapping
+
+import torch
+from torch import Tensor, nn
+
+from ..errors import UserError
+from ..files import existing_file
+
+WRAPPER = "model_state_dict"
+"""The key of the weights where a file of training holds more than them."""
+NAMED = 4
+"""How many names a message lists."""
+
+
+def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
+    """The tensors of a checkpoint by name; it is unpickled with ``weights_only``, so that it can't run code.
+
+    Args:
+        kind: what the file is, for messages ("Shap-E checkpoint").
+
+    Raises:
+        UserError: the file is missing, unreadable, refused, or holds no tensors by name.
+    """
+    file = existing_file(path, kind)
+    try:  # a zip is mapped, so what isn't wanted, as an optimiser's state, is never read
+        content = torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
+    except pickle.UnpicklingError as error:
+        raise UserError(
+            f"{kind} {path!r} holds more than tensors, or is no file of PyTorch, and is not unpickled, since that could run code:"
+            f" {str(error).strip().splitlines()[0][:200]}"
+        ) from error
+    except (OSError, RuntimeError, EOFError, ValueError) as error:
+        raise UserError(f"{kind} {path!r} can't be read: {type(error).__name__}: {str(error).strip()[:200]}") from error
+    state = content.get(WRAPPER, content) if isinstance(content, Mapping) else {}
+    if not state or not all(isinstance(value, Tensor) for value in state.values()):
+        raise UserError(f"{kind} {path!r} holds no weights by name: a state dict, or a dict with {WRAPPER!r}, was expected")
+    return dict(state)
+
+
+def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> None:
+    """Put ``state`` into ``module``, converted to its dtype.
+
+    Raises:
+        UserError: a name is missing or unknown, or a shape differs; the message lists a few.
+    """
+    own = module.state_dict()
+    missing, unknown = own.keys() - state.keys(), state.keys() - own.keys()
+    differing = [
+        f"{name} {tuple(state[name].shape)} for {tuple(own[name].shape)}"
+        for name in own.keys() & state.keys()
+        if state[name].shape != own[name].shape
+    ]
+    problems = [
+        f"{len(names)} {word} ({named(names)})"
+        for word, names in (("missing", missing), ("unknown", unknown), ("of another shape", differing))
+        if names
+    ]
+    if problems:
+        raise UserError(f"{what} does not fit the model: names {', '.join(problems)}")
+    module.load_state_dict(state)
+
+
+def named(names: Iterable[str]) -> str:
+    """The first few of ``names``, sorted."""
+    names = sorted(names)
+    return ", ".join(names[:NAMED]) + (f", and {len(names) - NAMED} more" if len(names) > NAMED else "")
