@@ -5,12 +5,19 @@ import os
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning barriers are slow on a busy machine
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from threestudio_gaussiandreamer.point_cloud import PointCloud
+
+
+@pytest.fixture(autouse=True, scope="session")
+def heard_ctrl_c():
+    """A shell's background job starts with Ctrl-C ignored; the tests that send one need Python's own answer to it."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True)

@@ -82,6 +82,8 @@ class ProgressBar(pl.callbacks.TQDMProgressBar):
     def get_metrics(self, trainer: Any, pl_module: Any) -> dict[str, Any]:
         metrics = super().get_metrics(trainer, pl_module)
         metrics.pop("v_num", None)
+        if "gaussians" in metrics:
+            metrics["gaussians"] = int(metrics["gaussians"])  # Lightning logs floats: 1e+4
         return metrics
 
     def on_exception(self, trainer: Any, pl_module: Any, exception: BaseException) -> None:
