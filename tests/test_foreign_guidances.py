@@ -84,7 +84,8 @@ def config(path, **system):
     cfg = yaml.safe_load((Path(__file__).parents[1] / "configs" / "demo.yaml").read_text())
     sizes = {"width": 16, "height": 16, "eval_width": 16, "eval_height": 16, "n_test_views": 2, "train_views": 0}
     geometry = {**cfg["system"]["geometry"], "prior_type": "random-prior", "prior": {"num_points": 60}, "grow": {"num_candidates": 100}}
-    cfg |= {"data": {**cfg["data"], **sizes}, "system": {**cfg["system"], "geometry": geometry, **system}, "tag": "t", "use_timestamp": False}
+    cfg |= {"data": {**cfg["data"], **sizes}, "system": {**cfg["system"], "geometry": geometry, **system}}
+    cfg |= {"tag": "t", "use_timestamp": False}
     cfg["trainer"] |= {"max_steps": 3, "val_check_interval": 3, "log_every_n_steps": 1, "enable_progress_bar": False}
     path.write_text(yaml.safe_dump(cfg))
     return path

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 import tiny_models
 
-huggingface_hub = pytest.importorskip("huggingface_hub")
-pytest.importorskip("diffusers")
-
 from threestudio_gaussiandreamer import hub
 from threestudio_gaussiandreamer.errors import UserError
+
+huggingface_hub = pytest.importorskip("huggingface_hub")
+pytest.importorskip("diffusers")
 
 TEXT = ("tokenizer", "text_encoder")
 IMAGE = ("unet", "vae", "scheduler")
@@ -143,7 +143,9 @@ def test_all_shards_must_be_there():
         hub.component_weights(names[:-1], "text_encoder", half=False)
 
 
-@pytest.mark.parametrize("fp16", ["model.fp16.safetensors", "model.fp16-00001-of-00001.safetensors", "model-00001-of-00001.fp16.safetensors"])
+@pytest.mark.parametrize(
+    "fp16", ["model.fp16.safetensors", "model.fp16-00001-of-00001.safetensors", "model-00001-of-00001.fp16.safetensors"]
+)
 def test_the_wanted_precision_is_preferred_and_the_other_one_will_do(fp16):
     half, full = f"unet/{fp16}", "unet/model.safetensors"
     assert hub.component_weights([half, full], "unet", half=True) == ([half], "fp16")

@@ -162,9 +162,8 @@ def t5_text_encoder(folder: Path) -> None:
     (tokenizer / "spiece.model").write_bytes(_sentencepiece())
     special = {"eos_token": "</s>", "unk_token": "<unk>", "pad_token": "<pad>"}
     _json(tokenizer / "tokenizer_config.json", special | {"tokenizer_class": "T5Tokenizer", "model_max_length": 512, "extra_ids": 100})
-    config = T5Config(
-        vocab_size=200, d_model=TEXT_WIDTH, d_kv=8, d_ff=48, num_layers=2, num_heads=4, feed_forward_proj="gated-gelu", tie_word_embeddings=False
-    )
+    sizes = {"d_model": TEXT_WIDTH, "d_kv": 8, "d_ff": 48, "num_layers": 2, "num_heads": 4}
+    config = T5Config(vocab_size=200, **sizes, feed_forward_proj="gated-gelu", tie_word_embeddings=False)
     T5EncoderModel(config).save_pretrained(folder / "text_encoder")
 
 

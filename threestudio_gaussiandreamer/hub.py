@@ -284,7 +284,8 @@ def explain(name: str, error: Exception) -> str:
     if isinstance(error, OSError) and error.errno in DISK_ERRORS:
         return f"model {name!r} could not be written to the cache: {error}. HF_HOME says where the cache is."
     reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-    return f"model {name!r} ({OPTION}) is not on this disk, or not all of it, and the hub could not be reached ({reason}).{_how_to_get(name)}"
+    lacking = f"model {name!r} ({OPTION}) is not on this disk, or not all of it"
+    return f"{lacking}, and the hub could not be reached ({reason}).{_how_to_get(name)}"
 
 
 def _how_to_get(name: str) -> str:

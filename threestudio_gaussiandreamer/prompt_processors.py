@@ -102,15 +102,20 @@ class TextEncoderPromptProcessor(BaseObject):
         self.Config.check(self.cfg)
         require_diffusion()
         self.prompt = chosen_prompt(self.cfg)
+        half = self.half and self.device.type == "cuda"
+        folder = find_model(self.cfg.pretrained_model_name_or_path, COMPONENTS, half=half, revision=self.cfg.revision)
+        self._output = self._encoded(folder)
+
+    def _encoded(self, folder: Path) -> PromptEmbeddings:
+        """All prompts of this run, encoded."""
         cfg = self.cfg
-        directions = view_directions(cfg.front_threshold, cfg.back_threshold, cfg.overhead_threshold, prefix=cfg.view_dependent_prompt_front)
+        thresholds = (cfg.front_threshold, cfg.back_threshold, cfg.overhead_threshold)
+        directions = view_directions(*thresholds, prefix=cfg.view_dependent_prompt_front)
         prompts_vd = [cfg.get(f"prompt_{direction.name}") or direction.prompt(self.prompt) for direction in directions]
         info(f"prompts: {'; '.join(prompts_vd)}")
         negative_vd = [direction.negative_prompt(cfg.negative_prompt) for direction in directions]
-        half = self.half and self.device.type == "cuda"
-        folder = find_model(cfg.pretrained_model_name_or_path, COMPONENTS, half=half, revision=cfg.revision)
         found = self._embeddings(folder, [self.prompt, cfg.negative_prompt, *prompts_vd, *negative_vd])
-        self._output = PromptEmbeddings(
+        return PromptEmbeddings(
             text_embeddings=found[:1],
             uncond_text_embeddings=found[1:2],
             text_embeddings_vd=found[2:6],
@@ -118,10 +123,7 @@ class TextEncoderPromptProcessor(BaseObject):
             directions=directions,
             direction2idx={direction.name: index for index, direction in enumerate(directions)},
             use_perp_neg=cfg.use_perp_neg,
-            perp_neg_f_sb=tuple(cfg.perp_neg_f_sb),
-            perp_neg_f_fsb=tuple(cfg.perp_neg_f_fsb),
-            perp_neg_f_fs=tuple(cfg.perp_neg_f_fs),
-            perp_neg_f_sf=tuple(cfg.perp_neg_f_sf),
+            **{name: tuple(cfg[name]) for name in ("perp_neg_f_sb", "perp_neg_f_fsb", "perp_neg_f_fs", "perp_neg_f_sf")},
             prompt=self.prompt,
             prompts_vd=prompts_vd,
         )

@@ -29,6 +29,7 @@ from .distributed import average_gradients
 from .errors import UserError, unknown
 from .evaluate import EvaluationConfig, HeldOut, Measurements
 from .guidance.base import ScoreDistillation
+from .guidance.foreign import call_guidance, trainable_groups
 from .host import BaseLift3DSystem, find, info, register, validate_schedule
 from .metrics import psnr
 from .nested import adopt_nested
@@ -37,6 +38,7 @@ from .point_cloud import PointCloud
 from .prior_cache import cached_cloud
 
 REGULARISERS = ("sparsity", "opaque")
+GUIDANCE_LR = 1e-4  # of what a guidance trains itself, such as the LoRA of variational score distillation
 
 
 @register("gaussiandreamer-system")
@@ -52,6 +54,9 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         @staticmethod
         def check(cfg: Any) -> None:
             EvaluationConfig.check(cfg.evaluation)
+            for name in ("geometry", "renderer", "guidance", "prompt_processor"):
+                if not cfg[f"{name}_type"]:
+                    raise UserError(f"system.{name}_type is empty: name a registered part")
             for name, weight in cfg.loss.items():
                 validate_schedule(weight, f"system.loss.{name}")
             if cfg.scheduler is not None:
@@ -71,7 +76,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         self.Config.check(self.cfg)
         super().configure()
         self.automatic_optimization = False
-        self.guidance = self.measurements = None
+        self.__dict__["guidance"] = self.measurements = None
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         self.preflight()
@@ -79,6 +84,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         self.ensure_cloud()
         own_background = isinstance(self.background, FlatBackground)
         groups = self.geometry.parameter_groups() + (self.background.parameter_groups() if own_background else [])
+        groups += trainable_groups(self.guidance, GUIDANCE_LR)
         arguments = {"betas": (0.9, 0.99), "eps": 1e-15, **self.cfg.optimizer.get("args", {})}
         return getattr(torch.optim, self.cfg.optimizer.get("name", "Adam"))(groups, lr=0.0, **arguments)
 
@@ -92,7 +98,8 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         """Before the prior runs, since its weights may be missing too."""
         self.prompt_processor = find(self.cfg.prompt_processor_type)(self.cfg.prompt_processor)
         self.prompt_utils = self.prompt_processor()
-        self.guidance = find(self.cfg.guidance_type)(self.cfg.guidance)
+        # past nn.Module's registration: a guidance's weights belong neither into the checkpoint nor among the system's modules
+        self.__dict__["guidance"] = find(self.cfg.guidance_type)(self.cfg.guidance)
 
     def ensure_cloud(self) -> None:
         """Run the prior, unless a checkpoint brought the cloud."""
@@ -126,7 +133,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         losses = self.losses(out, batch)
         loss = torch.stack(list(losses.values())).sum()
         self.manual_backward(loss)
-        average_gradients(self.parameters())
+        average_gradients(parameter for group in optimizer.param_groups for parameter in group["params"])
         self.geometry.observe(out["rasterized"], batch["width"], batch["height"], self.loss_scale())
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
@@ -141,13 +148,17 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     def losses(self, out: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         """The weighted losses: every ``loss_*`` that the guidance returns, and our regularisers on the real alpha."""
-        guided = self.guidance(out["comp_rgb"], self.prompt_utils, **batch, rgb_as_latents=False, comp_rgb_bg=out["comp_rgb_bg"])
+        guided = self.guide(out, batch)
         self._log_sometimes({f"train/{k}": v for k, v in guided.items() if not k.startswith("loss_") and k != "eval"})
         raw = {k.removeprefix("loss_"): v for k, v in guided.items() if k.startswith("loss_")}
         weights = {name.removeprefix("lambda_"): self.C(weight) for name, weight in self.cfg.loss.items()}
         self._check_weights(weights, raw)
         raw |= {name: regulariser(name, out["opacity"]) for name in REGULARISERS if weights.get(name)}
         return {name: value * weights[name] for name, value in raw.items()}
+
+    def guide(self, out: dict[str, Any], batch: dict[str, Any], **options: Any) -> dict[str, Any]:
+        """What the guidance makes of these renders; it gets the whole batch, and the background that they lie on."""
+        return call_guidance(self.guidance, out["comp_rgb"], self.prompt_utils, batch, comp_rgb_bg=out["comp_rgb_bg"], **options)
 
     def _check_weights(self, weights: dict[str, float], raw: dict[str, Tensor]) -> None:
         for name in weights:
@@ -221,15 +232,16 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         if truth is not None:
             images.append(_rgb(truth[0]))
         if isinstance(self.guidance, ScoreDistillation):
-            images.append(_rgb(self.denoised(out, batch)))
+            images += self.score_pictures(out, batch)
         self.save_image_grid(f"it{self.true_global_step}-{int(batch['index'][0])}.png", images, name="validation_step", step=self.true_global_step)
 
-    def denoised(self, out: dict[str, Any], batch: dict[str, Any]) -> Float[Tensor, "H W 3"]:
-        """What the score model makes of this render in one step, at the render's size."""
-        guided = self.guidance(out["comp_rgb"], self.prompt_utils, **batch, rgb_as_latents=False, guidance_eval=True, comp_rgb_bg=out["comp_rgb_bg"])
-        image = guided["eval"]["imgs_1step"][:1].permute(0, 3, 1, 2)
+    def score_pictures(self, out: dict[str, Any], batch: dict[str, Any]) -> list[dict[str, Any]]:
+        """What the score model sees and makes of this render: noisy, denoised in one step, denoised in many."""
+        pictures = self.guide(out, batch, guidance_eval=True)["eval"]
         size = out["comp_rgb"].shape[1:3]
-        return F.interpolate(image, size, mode="bilinear", align_corners=False)[0].permute(1, 2, 0).clamp(0, 1)
+        images = [pictures[name][:1].permute(0, 3, 1, 2) for name in ("imgs_noisy", "imgs_1step", "imgs_final")]
+        images = [F.interpolate(image, size, mode="bilinear", align_corners=False) for image in images]
+        return [_rgb(image[0].permute(1, 2, 0).clamp(0, 1)) for image in images]
 
     def on_validation_epoch_end(self) -> None:
         pass

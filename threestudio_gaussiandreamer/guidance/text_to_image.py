@@ -147,7 +147,8 @@ class TextToImageDistillation(ScoreDistillation):
             embeddings, weights = prompt_utils.get_text_embeddings(*views), None
         if embeddings.shape[-1] != self.text_width:
             raise UserError(
-                f"the text embeddings have {embeddings.shape[-1]} channels, {self.cfg.pretrained_model_name_or_path} takes {self.text_width}: "
+                f"the text embeddings have {embeddings.shape[-1]} channels, "
+                f"{self.cfg.pretrained_model_name_or_path} takes {self.text_width}: "
                 "give system.prompt_processor and system.guidance the same pretrained_model_name_or_path"
             )
         return Condition(embeddings.to(self.device), weights)
