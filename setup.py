@@ -14,7 +14,7 @@ from setuptools.command.build_ext import build_ext
 PACKAGE = "threestudio_gaussiandreamer.splatting.native"
 NATIVE = Path(*PACKAGE.split("."))
 # Not -ffast-math: linking with it makes the whole process flush denormals.
-FLAGS = "-std=c++17 -O3 -g0 -fno-math-errno -fno-trapping-math -ffp-contract=fast -fvisibility=hidden -fopenmp".split()
+FLAGS = "-std=c++17 -O3 -g0 -fno-math-errno -fno-trapping-math -ffp-contract=fast -fvisibility=hidden -pthread".split()
 X86_BUILDS = {"v4": ["-march=x86-64-v4", "-mprefer-vector-width=512"], "v3": ["-march=x86-64-v3"], "base": ["-Wno-psabi"]}
 
 
@@ -27,7 +27,7 @@ def extensions() -> list[Extension]:
             sources=[str(NATIVE / "rasterize.cpp")],
             depends=sorted(map(str, NATIVE.glob("*.h"))),
             extra_compile_args=FLAGS + flags,
-            extra_link_args=["-fopenmp"],
+            extra_link_args=["-pthread"],
             language="c++",
             optional=True,
         )

@@ -88,7 +88,7 @@ def run(cloud: Cloud, viewmats: Tensor, Ks: Tensor, width: int, height: int, bac
     background = None if background is None else background.detach().to(dtype).requires_grad_()
     out = rasterize(*leaves, viewmats, Ks.to(dtype), width, height, background=background, **options)
     torch.autograd.backward([out.image, out.alpha, out.depth], cotangents(out))
-    grads = {name: leaf.grad for name, leaf in zip(NAMES, leaves)} | {"means2d": out.means2d.grad}
+    grads = {name: leaf.grad for name, leaf in zip(NAMES, leaves, strict=True)} | {"means2d": out.means2d.grad}
     if background is not None:
         grads["background"] = background.grad
     if camera_gradient:

@@ -20,10 +20,10 @@ def by_scipy(dirs, degree):
     """Real harmonics out of associated Legendre functions (which hold the Condon-Shortley phase) and cos, sin of m phi."""
     x, y, z = (dirs / dirs.norm(dim=-1, keepdim=True)).numpy().T
     phi, basis = np.arctan2(y, x), []
-    for l in range(degree + 1):
-        for m in range(-l, l + 1):
-            norm = math.sqrt((2 * l + 1) / (4 * math.pi) * math.factorial(l - abs(m)) / math.factorial(l + abs(m)))
-            legendre = norm * special.lpmv(abs(m), l, z)
+    for band in range(degree + 1):
+        for m in range(-band, band + 1):
+            norm = math.sqrt((2 * band + 1) / (4 * math.pi) * math.factorial(band - abs(m)) / math.factorial(band + abs(m)))
+            legendre = norm * special.lpmv(abs(m), band, z)
             basis.append(legendre if m == 0 else math.sqrt(2) * legendre * (np.sin if m < 0 else np.cos)(abs(m) * phi))
     return np.stack(basis, -1)
 

@@ -35,7 +35,7 @@ def sh_to_colors(sh: Float[Tensor, "N K C"], dirs: Float[Tensor, "*views N 3"]) 
         UserError: K isn't 1, 4, 9 or 16.
     """
     if sh.shape[-2] not in COEFFICIENTS:
-        raise UserError(f"sh must have 1, 4, 9 or 16 coefficients for degree 0 to 3 in its second-to-last dimension; got {tuple(sh.shape)}.")
+        raise UserError(f"sh must have the shape (N, K, C) with K = 1, 4, 9 or 16 for degree 0 to 3; got {tuple(sh.shape)}.")
     basis = sh_basis(dirs, COEFFICIENTS.index(sh.shape[-2]))
     # A sum of products stays in the tensors' own precision under autocast, which a matrix product would not.
     return (0.5 + sum(b[..., None] * sh[:, k] for k, b in enumerate(basis))).clamp_min(0)

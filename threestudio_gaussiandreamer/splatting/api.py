@@ -4,7 +4,8 @@ import functools
 import importlib
 import logging
 from dataclasses import dataclass
-from typing import Optional, Union
+from types import ModuleType
+from typing import Optional
 
 import torch
 from jaxtyping import Float
@@ -26,7 +27,7 @@ class Backend:
     devices: Optional[tuple[str, ...]] = None  # None: any
     dtypes: tuple[torch.dtype, ...] = (torch.float32, torch.float64)
 
-    def load(self):
+    def load(self) -> ModuleType:
         return importlib.import_module(f".{self.module}", __package__)
 
     def refuses(self, tensor: Tensor) -> Optional[str]:
@@ -56,13 +57,13 @@ def rasterize(
     quats: Float[Tensor, "N 4"],
     scales: Float[Tensor, "N 3"],
     opacities: Float[Tensor, " N"],
-    colors: Float[Tensor, "*views N C"],
+    colors: Float[Tensor, "... N C"],
     viewmats: Float[Tensor, "B 4 4"],
     Ks: Float[Tensor, "B 3 3"],
     width: int,
     height: int,
     *,
-    background: Optional[Float[Tensor, "*views C"]] = None,
+    background: Optional[Float[Tensor, "... C"]] = None,
     near: float = 0.01,
     far: float = 1e10,
     eps2d: float = 0.3,
@@ -146,7 +147,8 @@ def _check_shapes(tensors: dict[str, Tensor]) -> None:
     n, views = _length(tensors, "means", "(N, 3)"), _length(tensors, "viewmats", "(B, 4, 4)")
     channels = tensors["colors"].shape[-1] if tensors["colors"].dim() else 0
     if views == 0 or channels == 0:
-        raise UserError(f"at least one view and one colour channel are needed; got viewmats {_shape(tensors['viewmats'])}, colors {_shape(tensors['colors'])}.")
+        got = f"viewmats {_shape(tensors['viewmats'])}, colors {_shape(tensors['colors'])}"
+        raise UserError(f"at least one view and one colour channel are needed; got {got}.")
     expected = {
         "means": [("(N, 3)", (n, 3))],
         "quats": [("(N, 4)", (n, 4))],
@@ -160,7 +162,8 @@ def _check_shapes(tensors: dict[str, Tensor]) -> None:
     for name, tensor in tensors.items():
         if tuple(tensor.shape) not in [shape for _, shape in expected[name]]:
             wanted = " or ".join(f"{words} = {shape}" for words, shape in expected[name])
-            raise UserError(f"{name} must have the shape {wanted}; got {_shape(tensor)}. N={n} is from means, B={views} from viewmats, C={channels} from colors.")
+            sizes = f"N={n} is from means, B={views} from viewmats, C={channels} from colors"
+            raise UserError(f"{name} must have the shape {wanted}; got {_shape(tensor)}. {sizes}.")
 
 
 def _length(tensors: dict[str, Tensor], name: str, wanted: str) -> int:
@@ -206,32 +209,31 @@ def _convert(gaussians: dict[str, Tensor], cameras: dict[str, Tensor]) -> tuple[
     """Everything contiguous and float32, or float64 where all Gaussians are; only the cameras are narrowed in silence."""
     wide = [name for name, tensor in gaussians.items() if tensor.dtype == torch.float64]
     if wide and len(wide) < len(gaussians):
-        raise UserError(f"all of {', '.join(gaussians)} must be float64 or none; only {', '.join(wide)} {'is' if len(wide) == 1 else 'are'}.")
+        raise UserError(f"{', '.join(gaussians)} must all be float64 or none of them; float64 here: {', '.join(wide)}.")
     dtype = torch.float64 if wide else torch.float32
     return tuple({name: tensor.to(dtype).contiguous() for name, tensor in group.items()} for group in (gaussians, cameras))
 
 
 def _choose(name: str, tensor: Tensor) -> Backend:
     """The backend of that name, or for "auto" the first one that takes such tensors."""
-    if name == "auto":
-        refusals = {}
-        for name, backend in BACKENDS.items():
-            refusals[name] = backend.refuses(tensor)
-            if refusals[name] is None:
-                break
-        _report_slow_path(name, tensor.device.type, tensor.dtype, refusals.get("cpu"))
-        return BACKENDS[name]
-    if name not in BACKENDS:
+    if name not in ("auto", *BACKENDS):
         raise unknown("backend", name, ["auto", *BACKENDS])
-    reason = BACKENDS[name].refuses(tensor)
-    if reason is not None:
-        usable = [other for other, backend in BACKENDS.items() if backend.refuses(tensor) is None]
-        raise UserError(f"the backend {name!r} can't run: {reason}. Use backend='auto', or one of {', '.join(usable)}.")
-    return BACKENDS[name]
+    refusals = {name: backend.refuses(tensor) for name, backend in BACKENDS.items()}
+    usable = [name for name, reason in refusals.items() if reason is None]
+    if name == "auto":
+        _report_slow_path(usable[0], tensor)
+    elif refusals[name] is not None:
+        raise UserError(f"the backend {name!r} can't run: {refusals[name]}. Use backend='auto', or one of {', '.join(usable)}.")
+    return BACKENDS[usable[0] if name == "auto" else name]
 
 
-@functools.lru_cache(maxsize=None)
-def _report_slow_path(name: str, device: str, dtype: torch.dtype, reason: Optional[str]) -> None:
-    """Say once that the compiled kernel isn't used though it would fit."""
-    if name == "torch" and device == "cpu" and dtype == torch.float32:
-        log.warning("splatting with plain torch on the CPU, many times slower than the compiled kernel: %s.", reason)
+def _report_slow_path(chosen: str, tensor: Tensor) -> None:
+    """Say once for each reason that the kernel made for this device isn't used though the tensors would suit it."""
+    for name, backend in BACKENDS.items():
+        if name != chosen and tensor.device.type in (backend.devices or ()) and tensor.dtype in backend.dtypes:
+            _warn_once(f"splatting in plain torch, many times slower than backend {name!r}, which can't run: {backend.refuses(tensor)}.")
+
+
+@functools.cache
+def _warn_once(message: str) -> None:
+    log.warning(message)

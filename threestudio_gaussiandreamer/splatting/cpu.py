@@ -2,7 +2,7 @@
 
 The library is built by ``pip install`` (see ``setup.py``) once per instruction set: v4 (AVX-512, 16 lanes), v3 (AVX2, 8 lanes)
 and base (4 lanes, any processor). The best one for this machine is loaded; the environment variable GAUSSIANDREAMER_ISA forces
-one. It uses as many threads as torch does. Kernels blend three channels; more are drawn three at a time.
+one. It uses as many threads as torch does. Kernels blend three channels; other numbers are drawn three at a time.
 """
 
 import ctypes
@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..errors import UserError, unknown
+from . import torch_backend
 from .options import RasterizeOptions
 from .output import Rasterized
 
@@ -36,18 +37,23 @@ def unavailable() -> Optional[str]:
 def rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, height, background, options: RasterizeOptions) -> Rasterized:
     """All views; arguments as in `splatting.rasterize`, already validated."""
     views, channels = len(viewmats), colors.shape[-1]
+    if channels > CHANNELS and options.absgrad:
+        # A sum of absolute values doesn't split into groups of channels.
+        return torch_backend.rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, height, background, options)
     if background is None:
         background = means.new_zeros(views, channels)
-    gaussians = (means, quats, scales, opacities)
-    tracked = torch.is_grad_enabled() and any(x.requires_grad for x in (*gaussians, colors, viewmats, background))
+    inputs = (means, quats, scales, opacities, viewmats)
+    tracked = torch.is_grad_enabled() and any(x.requires_grad for x in (*inputs, colors, background))
     means2d = means.new_zeros(views, len(means), 2).requires_grad_(tracked)
-    frame = Frame(width, height, options, tracked, torch.get_num_threads())
-    pictures = [
-        _Rasterize.apply(*gaussians, colors[..., c : c + CHANNELS], viewmats, background[:, c : c + CHANNELS], means2d, Ks, frame)
-        for c in range(0, channels, CHANNELS)
-    ]
-    image = pictures[0][0] if channels == CHANNELS else torch.cat([picture[0] for picture in pictures], -1)
-    return Rasterized(image, *pictures[0][1:3], means2d, *pictures[0][3:])
+    frame = Frame(width, height, options, tracked, torch.get_num_threads(), _library())
+    groups = (
+        [(colors, background)] if channels <= CHANNELS else zip(colors.split(CHANNELS, -1), background.split(CHANNELS, -1), strict=True)
+    )
+    images, alphas, depths, radii, contributions = zip(
+        *(_Rasterize.apply(*inputs, *group, means2d, Ks, frame) for group in groups), strict=True
+    )
+    image = images[0] if channels <= CHANNELS else torch.cat(images, -1)
+    return Rasterized(image, alphas[0], depths[0], means2d, radii[0], contributions[0])
 
 
 class Frame(NamedTuple):
@@ -58,56 +64,71 @@ class Frame(NamedTuple):
     options: RasterizeOptions
     tracked: bool
     threads: int
+    library: ctypes.CDLL
 
 
 class _Rasterize(torch.autograd.Function):
-    """Three channels. ``means2d`` is filled in place and takes part as an input, so that autograd hands it its gradient."""
+    """Up to three channels. ``means2d`` is filled in place, and is an input so that autograd hands it its gradient."""
 
     @staticmethod
-    def forward(ctx, means, quats, scales, opacities, colors, viewmats, background, means2d, Ks, frame):
-        inputs = (means, quats, scales, opacities, _three(colors), viewmats, _three(background), Ks)
-        options = frame.options
-        size = (len(viewmats), frame.height // options.downsample, frame.width // options.downsample)
+    def forward(ctx, means, quats, scales, opacities, viewmats, colors, background, means2d, Ks, frame):
+        inputs = (means, quats, scales, opacities, viewmats, _widen(colors), _widen(background), Ks)
+        scale = frame.options.downsample
+        size = (len(viewmats), frame.height // scale, frame.width // scale)
         image, alpha, depth = (means.new_empty(*size, channels) for channels in (CHANNELS, 1, 1))
         radii, contribution = (means.new_empty(size[0], len(means)) for _ in range(2))
         pictures = _Pictures(*map(_pointer, (image, alpha, depth, means2d, radii, contribution)))
         handle = ctypes.c_void_p()
-        _check(_library().splat_forward(_scene(inputs, frame), _settings(frame), pictures, ctypes.byref(handle) if frame.tracked else None))
-        ctx.state, ctx.frame, ctx.means2d = _State(handle) if frame.tracked else None, frame, means2d
-        ctx.save_for_backward(*inputs)
+        _check(
+            frame.library.splat_forward(_scene(inputs, frame), _settings(frame), pictures, ctypes.byref(handle) if frame.tracked else None)
+        )
+        ctx.frame, ctx.means2d, ctx.channels = frame, means2d, colors.shape[-1]
+        ctx.save_for_backward(*inputs, _State(frame.library, handle).as_tensor())
+        ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii, contribution)
-        return image[..., : colors.shape[-1]], alpha, depth, radii, contribution
+        return _narrow(image, ctx.channels), alpha, depth, radii, contribution
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_image, d_alpha, d_depth, *_):
-        inputs, frame = ctx.saved_tensors, ctx.frame
-        means, quats, scales, opacities, colors, viewmats, background, _ = inputs
-        channels = d_image.shape[-1]
-        upstream = tuple(x.contiguous() for x in (_three(d_image), d_alpha, d_depth))
-        d_viewmats = torch.empty_like(viewmats) if ctx.needs_input_grad[5] else None
-        absgrad = torch.empty_like(ctx.means2d) if frame.options.absgrad else None
-        grads = [*map(torch.empty_like, (means, quats, scales, opacities, colors, background)), d_viewmats, torch.empty_like(ctx.means2d)]
-        gradients = _Gradients(*map(_pointer, (*grads, absgrad)))
-        _check(_library().splat_backward(ctx.state.handle, _scene(inputs, frame), _settings(frame), _Upstream(*map(_pointer, upstream)), gradients))
+        (*inputs, state), frame, means2d = ctx.saved_tensors, ctx.frame, ctx.means2d
+        d_inputs = [torch.empty_like(x) for x in inputs[:-1]]
+        if not ctx.needs_input_grad[VIEWMATS]:
+            d_inputs[VIEWMATS] = None
+        d_means2d, absgrad = torch.empty_like(means2d), torch.empty_like(means2d) if frame.options.absgrad else None
+        upstream = [
+            None if d is None else _widen(d, channels) for d, channels in zip((d_image, d_alpha, d_depth), (CHANNELS, 1, 1), strict=True)
+        ]
+        gradients = _Gradients(*map(_pointer, (*d_inputs, d_means2d, absgrad)))
+        _check(
+            frame.library.splat_backward(
+                state.owner.handle, _scene(inputs, frame), _settings(frame), _Upstream(*map(_pointer, upstream)), gradients
+            )
+        )
         if absgrad is not None:
-            ctx.means2d.absgrad = absgrad + getattr(ctx.means2d, "absgrad", 0)
-        d_means, d_quats, d_scales, d_opacities, d_colors, d_background, _, d_means2d = grads
-        d_colors, d_background = d_colors[..., :channels], d_background[..., :channels]
-        return d_means, d_quats, d_scales, d_opacities, d_colors, d_viewmats, d_background, d_means2d, None, None
+            means2d.absgrad = absgrad + getattr(means2d, "absgrad", 0)
+        *d_gaussians, d_colors, d_background = d_inputs
+        return *d_gaussians, _narrow(d_colors, ctx.channels), _narrow(d_background, ctx.channels), d_means2d, None, None
 
 
-def _three(x: Tensor) -> Tensor:
+VIEWMATS = 4  # among the inputs
+
+
+def _widen(x: Tensor, channels: int = CHANNELS) -> Tensor:
     """Contiguous, with zeros for the channels that are missing."""
-    missing = CHANNELS - x.shape[-1]
+    missing = channels - x.shape[-1]
     return torch.nn.functional.pad(x, (0, missing)) if missing else x.contiguous()
+
+
+def _narrow(x: Tensor, channels: int) -> Tensor:
+    return x if channels == CHANNELS else x[..., :channels]
 
 
 # ---- the C interface: native/scene.h -------------------------------------------------------------------------------------------
 
 
 class _Scene(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_void_p) for name in "means quats scales opacities colors viewmats background Ks".split()]
+    _fields_ = [(name, ctypes.c_void_p) for name in "means quats scales opacities viewmats colors background Ks".split()]
     _fields_ += [("gaussians", ctypes.c_int64)] + [(name, ctypes.c_int32) for name in "views width height colors_per_view".split()]
 
 
@@ -125,23 +146,28 @@ class _Upstream(ctypes.Structure):
 
 
 class _Gradients(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_void_p) for name in "means quats scales opacities colors background viewmats means2d absgrad".split()]
+    _fields_ = [(name, ctypes.c_void_p) for name in "means quats scales opacities viewmats colors background means2d absgrad".split()]
 
 
 class _State:
-    """Owns what a backward pass needs from its forward pass, for as long as autograd may ask for it."""
+    """Owns what a backward pass needs from its forward pass."""
 
-    def __init__(self, handle: ctypes.c_void_p):
-        self.handle = handle
-        self.release = _library().splat_release
+    def __init__(self, library: ctypes.CDLL, handle: ctypes.c_void_p):
+        self.library, self.handle = library, handle
+
+    def as_tensor(self) -> Tensor:
+        """Something to save for backward: autograd lets go of it with the other saved tensors, long before the context dies."""
+        tensor = torch.empty(0)
+        tensor.owner = self
+        return tensor
 
     def __del__(self):
-        self.release(self.handle)
+        self.library.splat_release(self.handle)
 
 
 def _scene(inputs: tuple[Tensor, ...], frame: Frame) -> _Scene:
-    means, colors, viewmats = inputs[0], inputs[4], inputs[5]
-    return _Scene(*map(_pointer, inputs[:8]), len(means), len(viewmats), frame.width, frame.height, colors.dim() == 3)
+    means, viewmats, colors = inputs[0], inputs[VIEWMATS], inputs[VIEWMATS + 1]
+    return _Scene(*map(_pointer, inputs), len(means), len(viewmats), frame.width, frame.height, colors.dim() == 3)
 
 
 def _settings(frame: Frame) -> _Settings:
@@ -157,19 +183,27 @@ def _pointer(tensor: Optional[Tensor]) -> Optional[int]:
 def _check(needed: int) -> None:
     if needed:
         size = f"{needed / 2**30:.1f} GiB" if needed > 0 else "more memory than there is"
-        raise UserError(f"these Gaussians cover so many tiles that drawing them needs {size}: use fewer views per call, fewer or smaller Gaussians.")
+        raise UserError(
+            f"these Gaussians cover so many tiles that drawing them needs {size}: use fewer views per call, fewer or smaller Gaussians."
+        )
 
 
-@functools.lru_cache(maxsize=None)
+def usable_builds() -> list[str]:
+    """The builds that are installed and that this processor runs, best first."""
+    if not _path("base").exists():
+        return []
+    best = _load("base").splat_best_isa().decode()
+    return [name for name in BUILDS[BUILDS.index(best) :] if _path(name).exists()]
+
+
+@functools.cache
 def _library() -> ctypes.CDLL:
-    """The build that GAUSSIANDREAMER_ISA names, else the best one that exists and that this processor runs."""
-    forced = os.environ.get("GAUSSIANDREAMER_ISA")
+    """The build that GAUSSIANDREAMER_ISA names, else the best one."""
+    forced, usable = os.environ.get("GAUSSIANDREAMER_ISA"), usable_builds()
     if forced and forced not in BUILDS:
         raise unknown("instruction set in GAUSSIANDREAMER_ISA", forced, BUILDS)
-    if not _path("base").exists():
-        raise OSError("the kernel library isn't built: install the package with a C++ compiler at hand (g++ 9 or later)")
-    best = _load("base").splat_best_isa().decode()
-    usable = [name for name in BUILDS[BUILDS.index(best) :] if _path(name).exists()]
+    if not usable:
+        raise OSError("the kernel library isn't built: install the package with a C++ compiler at hand (g++ 11 or later)")
     if forced and forced not in usable:
         raise UserError(f"GAUSSIANDREAMER_ISA={forced}, but this machine and installation only have {', '.join(usable)}.")
     return _load(forced or usable[0])
@@ -182,7 +216,12 @@ def _path(build: str) -> pathlib.Path:
 def _load(build: str) -> ctypes.CDLL:
     library = ctypes.CDLL(str(_path(build)))
     library.splat_forward.restype = library.splat_backward.restype = ctypes.c_int64
-    library.splat_forward.argtypes = [ctypes.POINTER(_Scene), ctypes.POINTER(_Settings), ctypes.POINTER(_Pictures), ctypes.POINTER(ctypes.c_void_p)]
+    library.splat_forward.argtypes = [
+        ctypes.POINTER(_Scene),
+        ctypes.POINTER(_Settings),
+        ctypes.POINTER(_Pictures),
+        ctypes.POINTER(ctypes.c_void_p),
+    ]
     library.splat_backward.argtypes = [ctypes.c_void_p, *map(ctypes.POINTER, (_Scene, _Settings, _Upstream, _Gradients))]
     library.splat_release.argtypes = [ctypes.c_void_p]
     library.splat_best_isa.restype = ctypes.c_char_p

@@ -15,6 +15,7 @@ from .options import RasterizeOptions
 
 SMALLEST_QUATERNION = 1e-12
 FRUSTUM_MARGIN = 0.3
+ZERO = torch.zeros(())
 
 
 class Splats(NamedTuple):
@@ -160,7 +161,7 @@ def _finite(x) -> Tensor:
     return finite
 
 
-def _keep(mask, x, otherwise=torch.zeros(())) -> Tensor:
+def _keep(mask, x, otherwise=ZERO) -> Tensor:
     """``x`` where the mask of its leading dimensions holds, else the constant."""
     return torch.where(mask.reshape(mask.shape + (1,) * (x.dim() - mask.dim())), x, otherwise.to(x))
 

@@ -16,7 +16,7 @@ from .output import Rasterized, compose, track_means2d
 from .projection import Splats, project
 
 CHUNK_BYTES = 2**29
-TENSORS_PER_PAIR = 16
+TENSORS_PER_PAIR = 24
 
 
 def unavailable() -> Optional[str]:
@@ -29,7 +29,7 @@ def rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, heig
     splats = splats._replace(means2d=track_means2d(splats, (colors, background), options.absgrad))
     colors = colors.expand(len(viewmats), -1, -1)
     views = [render_view(splats, colors, view, width, height, options) for view in range(len(viewmats))]
-    sums, contribution = (torch.stack(x) for x in zip(*views))
+    sums, contribution = (torch.stack(x) for x in zip(*views, strict=True))
     return compose(sums.unflatten(1, (height, width)), splats, contribution, background, options)
 
 
@@ -49,7 +49,7 @@ def render_view(splats: Splats, colors: Tensor, view: int, width: int, height: i
     absgrad = splats.means2d.absgrad[view] if hasattr(splats.means2d, "absgrad") else None
     chunks = pixel_centres(width, height, splats.depths).split(_pixels_per_chunk(front_to_back))
     blended = [_blend_in_bounded_memory(len(chunks) > 1, pixels, front_to_back, options, absgrad) for pixels in chunks]
-    sums, largest = zip(*blended)
+    sums, largest = zip(*blended, strict=True)
     contribution = splats.depths.new_zeros(splats.depths.shape[1])
     return torch.cat(sums), contribution.index_copy(0, front_to_back.ids, torch.stack(largest).amax(0))
 
@@ -78,7 +78,8 @@ def blend(pixels: Tensor, splats: Sorted, options: RasterizeOptions, absgrad: Op
     alphas = torch.where(alphas >= options.alpha_min, alphas, 0)
     transmittances = torch.cat([torch.ones_like(alphas[:, :1]), (1 - alphas[:, :-1]).cumprod(1)], 1)
     weights = torch.where(transmittances >= options.stop, alphas * transmittances, 0)
-    return weights @ splats.features, weights.detach().amax(0)
+    # Not a matrix product, which autocast would round to bfloat16 if it were on during backward.
+    return (weights[..., None] * splats.features).sum(1), weights.detach().amax(0)
 
 
 def _accumulate(total: Tensor, ids: Tensor, values: Tensor) -> None:

@@ -3,13 +3,14 @@
 The tiles of all views form one grid, views stacked from top to bottom, so one pass serves a batch.
 """
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 TILE = 8
-CANDIDATES_PER_REGION = 2**22
+CANDIDATES_PER_SLICE = 2**22
 CANDIDATES_PER_TEST = 2**17
 # Widens the bounds of the float32 tests; the blend decides each pixel exactly, so a splat too many costs time only.
 SLACK = 1e-3
@@ -29,15 +30,6 @@ class Grid(NamedTuple):
     def origins(self, tiles: Tensor) -> tuple[Tensor, Tensor]:
         """x and y (G,) of the upper left corners, in pixels of the tiles' own view."""
         return tiles % self.columns * TILE, tiles // self.columns % self.rows * TILE
-
-
-class Region(NamedTuple):
-    """A rectangle of the grid: columns left to right-1, rows top to bottom-1."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
 
 
 class Bounds(NamedTuple):
@@ -74,58 +66,41 @@ def bound(means2d, conics, opacities, extents, views, grid: Grid, alpha_min: flo
     return Bounds(shapes, torch.cat([low.t().long() + shift, high.t().long() + shift]), first_rows)
 
 
-def regions(bounds: Bounds, grid: Grid) -> list[Region]:
-    """The grid cut in halves until each part has few enough candidates, or is one tile."""
-    counts = _candidates_per_tile(bounds.rectangles, grid).cpu()
-    pending, done = [Region(0, 0, grid.columns, grid.views * grid.rows)], []
-    while pending:
-        region = pending.pop()
-        columns, rows = region.right - region.left, region.bottom - region.top
-        total = counts[region.top : region.bottom, region.left : region.right].sum()
-        if total <= CANDIDATES_PER_REGION or columns * rows == 1:
-            done.append(region)
-        elif rows >= columns:
-            middle = region.top + rows // 2
-            pending += [region._replace(top=middle), region._replace(bottom=middle)]
-        else:
-            middle = region.left + columns // 2
-            pending += [region._replace(left=middle), region._replace(right=middle)]
-    return done
+def slices(bounds: Bounds) -> list[tuple[int, int]]:
+    """First and last + 1 splat of parts that are drawn one behind the other, each with a bounded number of candidates."""
+    size = bounds.rectangles[2:] - bounds.rectangles[:2]
+    part = size.clamp(min=0).prod(0).cumsum(0) // CANDIDATES_PER_SLICE
+    ends = part.unique_consecutive(return_counts=True)[1].cumsum(0).tolist()
+    return list(pairwise([0, *ends]))
 
 
-def list_splats(bounds: Bounds, region: Region, grid: Grid) -> Lists:
-    """Every pair of splat and tile in the region whose splat reaches a pixel centre of the tile, sorted by tile."""
-    rectangles, region = bounds.rectangles, bounds.rectangles.new_tensor(region)[:, None]
-    low = torch.maximum(rectangles[:2], region[:2])
-    width, height = (torch.minimum(rectangles[2:], region[2:]) - low).clamp(min=0)
+def list_splats(bounds: Bounds, first: int, last: int, unfinished: Tensor, grid: Grid) -> Lists:
+    """Pairs of a splat ``first`` to ``last - 1`` and an unfinished tile of which it reaches a pixel centre, sorted by tile.
+
+    ``unfinished`` (tiles,) bool.
+    """
+    left, top, right, bottom = bounds.rectangles[:, first:last]
+    width, height = (right - left).clamp(min=0), (bottom - top).clamp(min=0)
     counts = width * height
-    boxes = torch.stack([*low, width, counts.cumsum(0) - counts, bounds.first_rows])
-    splats = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
-    parts = [_test(bounds, boxes, part, i * CANDIDATES_PER_TEST, grid) for i, part in enumerate(splats.split(CANDIDATES_PER_TEST))]
-    tiles, splats = (torch.cat(x) for x in zip(*parts))
+    boxes = torch.stack([left, top, width, counts.cumsum(0) - counts, bounds.first_rows[first:last]])
+    splats = torch.repeat_interleave(torch.arange(last - first, device=counts.device), counts)
+    shapes, parts = bounds.shapes[:, first:last], splats.split(CANDIDATES_PER_TEST)
+    pairs = [_test(shapes, boxes, part, i * CANDIDATES_PER_TEST, unfinished, grid) for i, part in enumerate(parts)]
+    tiles, splats = (torch.cat(x) for x in zip(*pairs, strict=True))
     tiles, order = tiles.sort(stable=True)
-    return _longest_first(*tiles.unique_consecutive(return_counts=True), splats[order])
+    return _longest_first(*tiles.unique_consecutive(return_counts=True), splats[order] + first)
 
 
-def _candidates_per_tile(rectangles: Tensor, grid: Grid) -> Tensor:
-    """How many rectangles cover each tile: corners of a second difference, summed up twice."""
-    width = grid.columns + 1
-    corners = rectangles.new_zeros((grid.views * grid.rows + 1) * width)
-    left, top, right, bottom = rectangles
-    filled = ((right > left) & (bottom > top)).long()
-    for row, column, sign in ((top, left, 1), (top, right, -1), (bottom, left, -1), (bottom, right, 1)):
-        corners.index_add_(0, row * width + column, sign * filled)
-    return corners.view(-1, width).cumsum(0).cumsum(1)[:-1, :-1]
-
-
-def _test(bounds: Bounds, boxes: Tensor, splats: Tensor, first: int, grid: Grid) -> tuple[Tensor, Tensor]:
+def _test(shapes: Tensor, boxes: Tensor, splats: Tensor, first: int, unfinished: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
     """Tiles and splats of the candidates ``first``, ``first + 1``, ... that pass the exact test."""
     left, top, width, first_candidate, first_row = boxes.index_select(1, splats)
     within = torch.arange(first, first + len(splats), device=splats.device) - first_candidate
     row = torch.div(within, width, rounding_mode="floor")
     column, row = left + within - row * width, top + row
-    reached = _reaches(bounds.shapes.index_select(1, splats), column * TILE + 0.5, (row - first_row) * TILE + 0.5).nonzero()[:, 0]
-    return (row * grid.columns + column)[reached].int(), splats[reached].int()
+    tiles = row * grid.columns + column
+    reached = _reaches(shapes.index_select(1, splats), column * TILE + 0.5, (row - first_row) * TILE + 0.5)
+    kept = (reached & unfinished.index_select(0, tiles)).nonzero()[:, 0]
+    return tiles[kept].int(), splats[kept].int()
 
 
 def _reaches(shapes, left, top) -> Tensor:

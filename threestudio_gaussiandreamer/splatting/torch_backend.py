@@ -1,8 +1,11 @@
 """The image model in plain torch, exact and in bounded memory, for machines without a compiled kernel; any device.
 
-Each tile of 8 x 8 pixels has a list of splats. All tiles walk through their lists together, a slice of splats per step, as
-blocks (tiles, rows, columns, splats) of bounded size; a tile leaves when its list ends or its pixels are finished. Backward
-walks the same way and computes the blocks again, so nothing the size of pixels x splats is ever stored.
+Each tile of 8 x 8 pixels has a list of splats. All tiles walk through their lists together, 64 splats per step, as blocks
+(tiles, pixels, splats) of bounded size; a tile leaves when its list ends or its pixels are finished. Backward walks the same
+way and computes the blocks again, so nothing the size of pixels x splats is ever stored. Lists are made for a slice of the
+splats at a time, front to back, so they are bounded too.
+
+On a CPU the result has the same bits for any number of threads, but for gradients of the cameras.
 """
 
 from collections.abc import Iterator
@@ -11,14 +14,18 @@ from typing import NamedTuple, Optional
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import pad, threshold, threshold_
+from torch.utils.checkpoint import checkpoint
 
 from .options import RasterizeOptions
 from .output import Rasterized, compose, track_means2d
-from .projection import project
-from .tiles import TILE, Grid, Lists, bound, list_splats, make_grid, regions
+from .projection import Splats, project
+from .tiles import TILE, Bounds, Grid, Lists, bound, list_splats, make_grid, slices
 
 SPLATS_PER_STEP = 64
 ELEMENTS_PER_BLOCK = 2**20
+KEPT_SLICES = 4
+PROJECTED_AT_ONCE = 2**18
 PIXELS = TILE * TILE
 SHAPE_COLUMNS = 6
 FAINTEST = 1e-30
@@ -30,11 +37,22 @@ def unavailable() -> Optional[str]:
 
 def rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, height, background, options: RasterizeOptions) -> Rasterized:
     """All views; arguments as in `splatting.rasterize`, already validated."""
-    splats = project(means, quats, scales, opacities, colors, viewmats, Ks, width, height, options)
+    splats = _project((means, quats, scales, opacities, colors), viewmats, Ks, width, height, options)
     splats = splats._replace(means2d=track_means2d(splats, (colors, background), options.absgrad))
     absgrad = getattr(splats.means2d, "absgrad", None)
     sums, contribution = _Blend.apply(*splats, colors, absgrad, width, height, options)
     return compose(sums, splats, contribution, background, options)
+
+
+def _project(gaussians, viewmats, Ks, width, height, options) -> Splats:
+    """`project`, of many Gaussians in parts that backward computes again: autograd keeps a hundred numbers of each."""
+    size = max(1, PROJECTED_AT_ONCE // len(viewmats))
+    parts = list(zip(*(x.split(size, -1 if x.dim() == 1 else -2) for x in gaussians), strict=True))
+    if len(parts) == 1:
+        return project(*gaussians, viewmats, Ks, width, height, options)
+    again = {"use_reentrant": False, "preserve_rng_state": False}
+    projected = [checkpoint(project, *part, viewmats, Ks, width, height, options, **again) for part in parts]
+    return Splats(*(torch.cat(x, 1) for x in zip(*projected, strict=True)))
 
 
 class Table(NamedTuple):
@@ -42,7 +60,9 @@ class Table(NamedTuple):
 
     ids: Tensor  # (S,) view * N + Gaussian
     columns: Tensor  # (8 + C, S + 1): mean x, y, conic a, k, c, opacity, then the features: colour, depth, 1
-    lists: list[Lists]
+    bounds: Bounds
+    slices: list[tuple[int, int]]
+    lists: list[Lists]  # of the first slices, kept by the forward pass for the backward pass
     grid: Grid
     capped: bool  # whether any opacity exceeds alpha_max
 
@@ -77,17 +97,20 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, grad, _):
-        columns, absolute = _backward(ctx.table, *ctx.saved_tensors, grad, ctx.absgrad is not None, ctx.options)
+        with torch.autocast(grad.device.type, enabled=False):
+            columns, absolute = _backward(ctx.table, *ctx.saved_tensors, grad, ctx.absgrad is not None, ctx.options)
         if ctx.absgrad is not None:
             ctx.absgrad.view(-1, 2).index_add_(0, ctx.table.ids, absolute[:, :-1].t())
         full = columns.new_zeros(ctx.shape.numel(), len(columns)).index_copy_(0, ctx.table.ids, columns[:, :-1].t())
-        means2d, conics, opacities, colors, depths, _ = full.view(*ctx.shape, len(columns)).split([2, 3, 1, len(columns) - SHAPE_COLUMNS - 2, 1, 1], -1)
+        channels = len(columns) - SHAPE_COLUMNS - 2
+        parts = full.view(*ctx.shape, len(columns)).split([2, 3, 1, channels, 1, 1], -1)
+        means2d, conics, opacities, colors, depths, _ = parts
         colors = colors if ctx.colors_dim == 3 else colors.sum(0)
         return means2d, conics, opacities[..., 0], depths[..., 0], None, None, colors, None, None, None, None
 
 
 def _tabulate(means2d, conics, opacities, depths, extents, visible, colors, width, height, options) -> Table:
-    """Sorts the visible splats by depth, ties by index, and lists them for each tile."""
+    """The visible splats of all views by depth, ties by index."""
     views, gaussians = visible.shape
     ids = visible.flatten().nonzero()[:, 0]
     ids = ids[depths.flatten()[ids].argsort(stable=True)]
@@ -95,9 +118,9 @@ def _tabulate(means2d, conics, opacities, depths, extents, visible, colors, widt
     colors = colors[ids % gaussians] if colors.dim() == 2 else colors.flatten(0, 1)[ids]
     grid = make_grid(views, width, height)
     bounds = bound(means2d, conics, opacities, extents, ids // gaussians, grid, options.alpha_min)
-    lists = [list_splats(bounds, region, grid) for region in regions(bounds, grid)]
     columns = torch.cat([means2d.t(), conics.t(), opacities[None], colors.t(), depths[None], torch.ones_like(depths)[None]])
-    return Table(ids, torch.nn.functional.pad(columns, (0, 1)), lists, grid, bool((opacities > options.alpha_max).any()))
+    columns = pad(columns, (0, 1))
+    return Table(ids, columns, bounds, slices(bounds), [], grid, bool((opacities > options.alpha_max).any()))
 
 
 def _forward(table: Table, width: int, height: int, options: RasterizeOptions) -> tuple[Tensor, Tensor]:
@@ -106,10 +129,7 @@ def _forward(table: Table, width: int, height: int, options: RasterizeOptions) -
     sums = table.columns.new_zeros(table.grid.tiles, (len(table.columns) - SHAPE_COLUMNS) * PIXELS)
     largest = table.columns.new_zeros(table.columns.shape[1])
     for block in _march(table, transmittances, options):
-        alphas = _alphas(block, options)
-        chain = _chain(alphas, transmittances.index_select(0, block.tiles))
-        weights = _weights(alphas, chain, options)
-        transmittances.index_copy_(0, block.tiles, chain[..., -1])
+        _, _, weights = _composite(block, transmittances, options)
         sums.index_add_(0, block.tiles, _product(block.features, weights.transpose(1, 2)).flatten(1))
         largest.scatter_reduce_(0, block.splats, weights.amax(1).flatten(), "amax")
     return _from_tiles(sums, table.grid, width, height), largest
@@ -119,8 +139,9 @@ def _backward(table: Table, sums: Tensor, grad: Tensor, absolute: bool, options:
     """Gradients of the table's columns, and (2, S + 1) sums over pixels of the absolute gradient of the mean.
 
     With ``g_i = <grad, features_i>`` the loss is ``L = sum_i g_i alpha_i T_i``, hence
-    ``alpha_i dL/dalpha_i = w_i g_i - alpha_i / (1 - alpha_i) sum_{j>i} w_j g_j`` with ``w_i = alpha_i T_i``. Front to back the
-    sum is what is left of L at the pixel, which starts as <grad, sums>: T is never divided by anything.
+    ``alpha_i dL/dalpha_i = w_i g_i - w_i / T_{i+1} sum_{j>i} w_j g_j`` with ``w_i = alpha_i T_i``. Front to back the sum is what
+    is left of L at the pixel, which starts as <grad, sums>, and T is the same running product as in forward; back to front,
+    as usual, T would have to be recovered by dividing again and again.
     """
     height, width = grad.shape[1:3]
     transmittances = _start(table, width, height)
@@ -129,18 +150,15 @@ def _backward(table: Table, sums: Tensor, grad: Tensor, absolute: bool, options:
     columns = torch.zeros_like(table.columns)
     absolutes = columns.new_zeros(2, columns.shape[1])
     for block in _march(table, transmittances, options):
-        alphas = _alphas(block, options)
-        chain = _chain(alphas, transmittances.index_select(0, block.tiles))
-        weights = _weights(alphas, chain, options)
-        transmittances.index_copy_(0, block.tiles, chain[..., -1])
+        alphas, behind, weights = _composite(block, transmittances, options)
         cotangent = cotangents.index_select(0, block.tiles)
         gains = _product(cotangent.transpose(1, 2), block.features).mul_(weights)
-        behind = _accumulate(gains, left.index_select(0, block.tiles))
-        left.index_copy_(0, block.tiles, behind[..., -1])
-        slopes = torch.addcmul(gains, weights / chain[..., 1:].clamp(min=FAINTEST), behind[..., 1:], value=-1)
+        features = _product(cotangent, weights)
+        rest = _subtract_one_by_one(gains, left, block.tiles)
+        slopes = gains.addcmul_(weights.div_(behind), rest, value=-1)
         if table.capped:
             slopes *= alphas < options.alpha_max
-        grads = torch.cat([_splat_gradients(block, slopes), _product(cotangent, weights)], 1)
+        grads = torch.cat([_splat_gradients(block, slopes), features], 1)
         columns.index_add_(1, block.splats, grads.transpose(0, 1).flatten(1))
         if absolute:
             absolutes.index_add_(1, block.splats, _absolute_gradients(block, slopes).transpose(0, 1).flatten(1))
@@ -154,16 +172,30 @@ def _start(table: Table, width: int, height: int) -> Tensor:
 
 
 def _march(table: Table, transmittances: Tensor, options: RasterizeOptions) -> Iterator[Block]:
-    """Blocks front to back; whoever takes one writes the tiles' transmittances behind it before taking the next."""
-    for lists in table.lists:
+    """Blocks front to back; whoever takes one moves the transmittances behind it (`_composite`) before taking the next."""
+    for lists in _lists(table, transmittances, options):
         active, depth = torch.arange(len(lists.tiles), device=lists.tiles.device), 0
         while len(active):
             size = ELEMENTS_PER_BLOCK // (SPLATS_PER_STEP * PIXELS)
-            for part, longest in zip(active.split(size), lists.counts[active[::size]].tolist()):
+            for part, longest in zip(active.split(size), lists.counts[active[::size]].tolist(), strict=True):
                 yield _block(table, lists, part, depth, min(longest - depth, SPLATS_PER_STEP))
             depth += SPLATS_PER_STEP
-            unfinished = transmittances[lists.tiles[active]].amax(1) >= options.stop
-            active = active[unfinished & (lists.counts[active] > depth)]
+            active = active[_unfinished(transmittances[lists.tiles[active]], options) & (lists.counts[active] > depth)]
+
+
+def _lists(table: Table, transmittances: Tensor, options: RasterizeOptions) -> Iterator[Lists]:
+    """The tile lists of one slice after the other, made for the tiles that are still unfinished when its turn comes."""
+    for i, (first, last) in enumerate(table.slices):
+        if i == len(table.lists) < KEPT_SLICES:
+            table.lists.append(list_splats(table.bounds, first, last, _unfinished(transmittances, options), table.grid))
+        if i < len(table.lists):
+            yield table.lists[i]
+        elif (unfinished := _unfinished(transmittances, options)).any():
+            yield list_splats(table.bounds, first, last, unfinished, table.grid)
+
+
+def _unfinished(transmittances: Tensor, options: RasterizeOptions) -> Tensor:
+    return transmittances.amax(1) >= options.stop
 
 
 def _block(table: Table, lists: Lists, part: Tensor, depth: int, length: int) -> Block:
@@ -175,8 +207,9 @@ def _block(table: Table, lists: Lists, part: Tensor, depth: int, length: int) ->
     columns = table.columns.index_select(1, splats).view(-1, len(part), length)
     tiles = lists.tiles[part]
     middle_x, middle_y = (origin[:, None] + TILE / 2 for origin in table.grid.origins(tiles))
-    mean_x, mean_y, a, k, c, opacity = columns[:SHAPE_COLUMNS]
-    return Block(tiles, splats, mean_x - middle_x, mean_y - middle_y, a, k, c, opacity, columns[SHAPE_COLUMNS:].transpose(0, 1).contiguous())
+    mean_x, mean_y, *conic_and_opacity = columns[:SHAPE_COLUMNS]
+    features = columns[SHAPE_COLUMNS:].transpose(0, 1).contiguous()
+    return Block(tiles, splats, mean_x - middle_x, mean_y - middle_y, *conic_and_opacity, features)
 
 
 def _alphas(block: Block, options: RasterizeOptions) -> Tensor:
@@ -190,26 +223,31 @@ def _alphas(block: Block, options: RasterizeOptions) -> Tensor:
     top = block.opacity.clamp(min=FAINTEST).log()[:, None] - block.c[:, None] / 2 * from_y**2
     root = x[:, None] - y[:, :, None]
     alphas = torch.addcmul(top[:, :, None], root, root, value=-1).exp_().clamp_(max=options.alpha_max)
-    return torch.nn.functional.threshold_(alphas, _just_below(options.alpha_min, alphas), 0.0).flatten(1, 2)
+    return threshold_(alphas, _just_below(options.alpha_min, alphas), 0.0).flatten(1, 2)
 
 
-def _chain(alphas: Tensor, transmittances: Tensor) -> Tensor:
-    """(G, PIXELS, K + 1): transmittance before each splat and after the last, as if no pixel stopped."""
+def _composite(block: Block, transmittances: Tensor, options: RasterizeOptions) -> tuple[Tensor, Tensor, Tensor]:
+    """Alphas, ``T_{i+1}`` and weights ``alpha_i T_i``, each (G, PIXELS, K); moves the tiles' transmittances behind the block.
+
+    Weights are zero where ``T_i < stop``; the transmittance goes on as if no pixel stopped. One that is too small to divide
+    by becomes infinity: what is behind it can't be seen.
+    """
+    alphas = _alphas(block, options)
     chain = alphas.new_empty(*alphas.shape[:2], alphas.shape[2] + 1)
-    chain[..., 0] = transmittances
+    chain[..., 0] = transmittances.index_select(0, block.tiles)
     torch.sub(alphas.new_ones(()), alphas, out=chain[..., 1:])
-    return torch.cumprod(chain, -1, out=chain)
+    torch.cumprod(chain, -1, out=chain)
+    transmittances.index_copy_(0, block.tiles, chain[..., -1])
+    weights = threshold(chain[..., :-1], _just_below(options.stop, chain), 0.0).mul_(alphas)
+    return alphas, threshold_(chain[..., 1:], FAINTEST, torch.inf), weights
 
 
-def _weights(alphas: Tensor, chain: Tensor, options: RasterizeOptions) -> Tensor:
-    """(G, PIXELS, K): ``alpha_i T_i`` where ``T_i >= stop``, else zero."""
-    return torch.nn.functional.threshold(chain[..., :-1], _just_below(options.stop, chain), 0.0).mul_(alphas)
-
-
-def _accumulate(gains: Tensor, left: Tensor) -> Tensor:
-    """(G, PIXELS, K + 1): ``left`` minus the gains so far, before each splat and after the last."""
-    behind = torch.cat([left[..., None], gains.neg()], -1)
-    return torch.cumsum(behind, -1, out=behind)
+def _subtract_one_by_one(gains: Tensor, left: Tensor, tiles: Tensor) -> Tensor:
+    """What is ``left`` behind each splat, (G, PIXELS, K), when the gains are taken off front to back; updates ``left``."""
+    rest = torch.cat([left.index_select(0, tiles)[..., None], gains.neg()], -1)
+    torch.cumsum(rest, -1, out=rest)
+    left.index_copy_(0, tiles, rest[..., -1])
+    return rest[..., 1:]
 
 
 def _splat_gradients(block: Block, slopes: Tensor) -> Tensor:
@@ -240,7 +278,7 @@ def _absolute_gradients(block: Block, slopes: Tensor) -> Tensor:
 
 
 def _product(a: Tensor, b: Tensor) -> Tensor:
-    """Matrix products of a batch. A single one is done twice: alone, it would be shared among the threads and rounded by their number."""
+    """Matrix products of a batch. A single one is done twice: alone, threads would share it and their number would round it."""
     return a @ b if len(b) > 1 else (a @ b.repeat(2, 1, 1))[:1]
 
 
@@ -268,7 +306,7 @@ def _just_below(bound: float, like: Tensor) -> float:
 def _to_tiles(image: Tensor, grid: Grid) -> Tensor:
     """(B, H, W, F) to (tiles, F, PIXELS), zeros outside the image."""
     views, height, width, features = image.shape
-    image = torch.nn.functional.pad(image, (0, 0, 0, grid.columns * TILE - width, 0, grid.rows * TILE - height))
+    image = pad(image, (0, 0, 0, grid.columns * TILE - width, 0, grid.rows * TILE - height))
     image = image.view(views, grid.rows, TILE, grid.columns, TILE, features)
     return image.permute(0, 1, 3, 5, 2, 4).reshape(grid.tiles, features, PIXELS)
 

@@ -6,20 +6,25 @@
 
 namespace splat {
 
-// Stable sort by the upper 32 bits (least significant digit first), of which those below `lowest` and above `highest` are
-// constant after subtraction. Returns whichever of the two arrays holds the result.
+constexpr int DIGIT_BITS = 12;
+
+// One pass of a radix sort: stable, by the digit that `digit(item)` gives.
+template <class Digit> SPLAT_FN void sort_by_digit(const uint64_t* items, uint64_t* sorted, int64_t count, Digit digit) {
+  int32_t begin[1 << DIGIT_BITS] = {};
+  for (int64_t i = 0; i < count; i++) begin[digit(items[i])]++;
+  int32_t sum = 0;
+  for (int32_t& b : begin) {
+    const int32_t here = b;
+    b = sum, sum += here;
+  }
+  for (int64_t i = 0; i < count; i++) sorted[begin[digit(items[i])]++] = items[i];
+}
+
+// Stable sort by the upper 32 bits, which lie in [lowest, highest]. Returns whichever of the two arrays holds the result.
 inline uint64_t* radix_sort(uint64_t* items, uint64_t* spare, int64_t count, uint32_t lowest, uint32_t highest) {
-  constexpr int DIGIT = 11;
-  int32_t begin[1 << DIGIT];
-  for (int shift = 0; (uint64_t(highest - lowest) >> shift) != 0; shift += DIGIT) {
-    const auto digit = [&](uint64_t item) { return (uint32_t(item >> 32) - lowest) >> shift & ((1 << DIGIT) - 1); };
-    std::fill(begin, begin + (1 << DIGIT), 0);
-    for (int64_t i = 0; i < count; i++) begin[digit(items[i])]++;
-    for (int32_t d = 0, sum = 0; d < (1 << DIGIT); d++) {
-      const int32_t here = begin[d];
-      begin[d] = sum, sum += here;
-    }
-    for (int64_t i = 0; i < count; i++) spare[begin[digit(items[i])]++] = items[i];
+  for (int shift = 0; (uint64_t(highest - lowest) >> shift) != 0; shift += DIGIT_BITS) {
+    sort_by_digit(items, spare, count,
+                  [=](uint64_t item) { return (uint32_t(item >> 32) - lowest) >> shift & ((1 << DIGIT_BITS) - 1); });
     std::swap(items, spare);
   }
   return items;
@@ -47,10 +52,29 @@ inline const uint64_t* sort_by_depth(View& view, int64_t visible) {
 
 // Calls visit(tile) for the tiles of a Gaussian, in the order of its slots.
 template <class Visit> SPLAT_FN void for_each_tile(const View& view, uint32_t gaussian, Visit visit) {
-  const Coverage& c = view.coverage[gaussian];
-  const TileSpan* spans = view.slice_of(gaussian).spans.data() + c.span;
-  for (int r = 0; r < c.rows; r++)
-    for (int x = spans[r].begin, tile = (c.row + r) * view.tiles_x; x < spans[r].end; x++) visit(tile + x);
+  const Coverage& c = view.coverage(gaussian);
+  const bool cut = c.all.begin == c.all.end;
+  const TileSpan* spans = cut ? view.slice_of(gaussian).spans.data() + c.span : &c.all;
+  for (int r = 0; r < c.rows; r++) {
+    const TileSpan span = spans[cut ? r : 0];
+    for (int x = span.begin; x < span.end; x++) visit((c.row + r) * view.tiles_x + x);
+  }
+}
+
+// The visible Gaussians in the order of their depth, in parts of equal size.
+struct DepthOrder {
+  const uint64_t* keys;  // the lower halves are the Gaussians
+  int64_t visible;
+  int parts;
+};
+
+// Calls visit(gaussian) for one part, in order.
+template <class Visit> SPLAT_FN void for_each_of_part(const View& view, const DepthOrder& order, int64_t part, Visit visit) {
+  const int64_t end = order.visible * (part + 1) / order.parts;
+  for (int64_t i = order.visible * part / order.parts; i < end; i++) {
+    __builtin_prefetch(&view.coverage(uint32_t(order.keys[std::min(i + 24, end - 1)])));
+    visit(uint32_t(order.keys[i]));
+  }
 }
 
 // Sets each slice's first slot and the number of entries.
@@ -61,56 +85,62 @@ inline void number_slots(View& view) {
   if (view.entry_count > INT32_MAX) throw OutOfMemory{view.entry_count * int64_t(sizeof(float) * ROW)};
 }
 
+inline void count_tiles(View& view, const DepthOrder& order, int64_t part) {
+  int32_t* counts = view.histogram.data() + part * view.tiles();
+  std::fill(counts, counts + view.tiles(), 0);
+  for_each_of_part(view, order, part,
+                   [&](uint32_t gaussian) { for_each_tile(view, gaussian, [&](int tile) { counts[tile]++; }); });
+}
+
 // From the counts per (part, tile) to where each part writes its first entry of each tile.
 inline void scan_histogram(View& view, int parts) {
-  const int tiles = view.tiles();
   int32_t sum = 0;
-  for (int tile = 0; tile < tiles; tile++) {
+  for (int tile = 0; tile < view.tiles(); tile++) {
     view.tile_begin[tile] = sum;
     for (int part = 0; part < parts; part++) {
-      int32_t& here = view.histogram[size_t(part) * tiles + tile];
+      int32_t& here = view.histogram[size_t(part) * view.tiles() + tile];
       const int32_t count = here;
       here = sum, sum += count;
     }
   }
-  view.tile_begin[tiles] = sum;
+  view.tile_begin[view.tiles()] = sum;
 }
 
-// Deals the Gaussians `order[0..visible)` to the tiles; each part takes an equal run of them, so the order survives.
-inline void deal_to_tiles(View& view, const uint64_t* order, int64_t visible, int threads) {
-  const int parts = int(std::min<int64_t>(threads, visible / SLICE + 1)), tiles = view.tiles();
-  int32_t* histogram = view.histogram.reserve(size_t(parts) * tiles);
-  Entry* entries = view.entries.reserve(view.entry_count);
-  view.tile_begin.reserve(tiles + 1);
-  parallel_for(parts, threads, [&](int64_t part) {
-    int32_t* counts = histogram + part * tiles;
-    std::fill(counts, counts + tiles, 0);
-    for (int64_t i = visible * part / parts; i < visible * (part + 1) / parts; i++)
-      for_each_tile(view, uint32_t(order[i]), [&](int tile) { counts[tile]++; });
+inline void fill_tiles(View& view, const DepthOrder& order, int64_t part) {
+  int32_t* next = view.histogram.data() + part * view.tiles();
+  for_each_of_part(view, order, part, [&](uint32_t gaussian) {
+    int32_t slot = int32_t(view.slot_begin(gaussian));
+    for_each_tile(view, gaussian, [&](int tile) { view.entries[next[tile]++] = {int32_t(gaussian), slot++}; });
   });
-  scan_histogram(view, parts);
-  parallel_for(parts, threads, [&](int64_t part) {
-    int32_t* next = histogram + part * tiles;
-    for (int64_t i = visible * part / parts; i < visible * (part + 1) / parts; i++) {
-      const uint32_t gaussian = uint32_t(order[i]);
-      int32_t slot = view.slice_of(gaussian).first_slot + view.coverage[gaussian].slot;
-      for_each_tile(view, gaussian, [&](int tile) { entries[next[tile]++] = {int32_t(gaussian), slot++}; });
-    }
-  });
+}
+
+// Deals the Gaussians to the tiles; each part takes an equal run of them, so the order survives.
+inline void deal_to_tiles(View& view, const uint64_t* keys, int64_t visible, int threads) {
+  const DepthOrder order = {keys, visible, int(std::min<int64_t>(threads, visible / SLICE + 1))};
+  view.histogram.reserve(size_t(order.parts) * view.tiles());
+  view.entries.reserve(view.entry_count), view.tile_begin.reserve(view.tiles() + 1);
+  parallel_for(order.parts, threads, 1, [&](int64_t part) { count_tiles(view, order, part); });
+  scan_histogram(view, order.parts);
+  parallel_for(order.parts, threads, 1, [&](int64_t part) { fill_tiles(view, order, part); });
 }
 
 // Stages 1 to 3 of one view.
-inline void build_view(const SplatScene& scene, const SplatSettings& settings, const SplatPictures& out, View& view, int index, int threads) {
-  view.index = index;
-  view.tiles_x = (scene.width + TILE - 1) / TILE, view.tiles_y = (scene.height + TILE - 1) / TILE;
-  view.camera = make_camera(scene, index);
-  view.slices.resize((scene.gaussians + SLICE - 1) / SLICE);
-  const size_t padded = view.slices.size() * SLICE;
-  view.splats.reserve(padded), view.coverage.reserve(padded), view.keys.reserve(padded), view.spare_keys.reserve(padded);
-  parallel_for(view.slices.size(), threads, [&](int64_t i) { project_slice(scene, settings, out, view, i); });
+inline void build_view(const ForwardCall& call, View& view, int index, int threads) {
+  view.prepare(call.scene, index);
+  view.camera = make_camera(call.scene, index);
+  parallel_for(view.slices.size(), threads, 1, [&](int64_t i) { project_slice(call, view, i); });
   number_slots(view);
   const int64_t visible = gather_keys(view);
   deal_to_tiles(view, sort_by_depth(view, visible), visible, threads);
+}
+
+// Stages 1 to 3 of all views: whole views in parallel when there are enough of them, else within each view.
+inline void build_views(const ForwardCall& call, Views& views) {
+  const int threads = call.settings.threads;
+  const bool by_view = call.scene.views >= threads;
+  while (views.size() < size_t(call.scene.views)) views.emplace_back();
+  parallel_for(call.scene.views, by_view ? threads : 1, 1,
+               [&](int64_t v) { build_view(call, views[v], int(v), by_view ? 1 : threads); });
 }
 
 }  // namespace splat

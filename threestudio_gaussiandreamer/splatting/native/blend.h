@@ -7,37 +7,35 @@
 namespace splat {
 
 struct BlendScratch {
-  alignas(64) LocalSplat splats[CHUNK];
+  Staged staged;
   alignas(64) float peaks[CHUNK * LANES];  // largest weight of each splat, per lane
   alignas(64) float transmittance[TILE_PIXELS];
-  BlockLists lists;
-  Planes planes;
 };
 
-// Blends the splats of `list` into a strip; false when all its pixels have stopped.
-SPLAT_FN bool blend_strip(BlendScratch& scratch, const StripPixels& pixels, const uint16_t* list, int count, const BlendLimits& limits) {
+// Blends the splats of `list` into a strip of `p`; false when all its pixels have stopped.
+SPLAT_FN bool blend_strip(BlendScratch& scratch, Planes& p, const StripPixels& pixels, const uint16_t* list, int count,
+                          const BlendLimits& limits) {
   const int at = pixels.first;
-  Planes& p = scratch.planes;
-  Floats transmittance = load(scratch.transmittance + at), end = load(p.transmittance + at);
+  Floats transmittance = load(scratch.transmittance + at), sum = load(p.alpha + at);
   Floats red = load(p.red + at), green = load(p.green + at), blue = load(p.blue + at), depth = load(p.depth + at);
-  for (int i = 0; i < count;) {
+  bool live = true;
+  for (int i = 0; i < count && live;) {
     for (const int stop = std::min(i + CHECK_EVERY, count); i < stop; i++) {
-      const LocalSplat& s = scratch.splats[list[i]];
+      const LocalSplat& s = scratch.staged.splats[list[i]];
       float* peak = scratch.peaks + list[i] * LANES;
       Floats y1, y2;
       const Floats alpha = alpha_of(power_at(s, pixels, y1, y2), limits.log2_alpha_min, limits.alpha_max);
-      const Floats weight = weight_of(alpha, transmittance, limits.stop), next = transmittance - alpha * transmittance;
-      end = select(transmittance >= limits.stop, next, end);
-      transmittance = next;
-      red += weight * s.red, green += weight * s.green, blue += weight * s.blue, depth += weight * s.depth;
+      const Floats weight = weight_of(alpha, transmittance, limits.stop);
+      transmittance -= alpha * transmittance;
+      sum += weight, red += weight * s.red, green += weight * s.green, blue += weight * s.blue, depth += weight * s.depth;
       store(peak, maximum(weight, load(peak)));
     }
     transmittance = select(transmittance >= limits.stop, transmittance, Floats{});  // keeps it out of the denormals
-    if (!any_at_least(transmittance, limits.stop)) break;
+    live = any_at_least(transmittance, limits.stop);
   }
-  store(scratch.transmittance + at, transmittance), store(p.transmittance + at, end);
+  store(scratch.transmittance + at, transmittance), store(p.alpha + at, sum);
   store(p.red + at, red), store(p.green + at, green), store(p.blue + at, blue), store(p.depth + at, depth);
-  return any_at_least(transmittance, limits.stop);
+  return live;
 }
 
 // A maximum is exact, so the order of the tiles doesn't matter; positive floats compare like their bits.
@@ -55,50 +53,40 @@ inline void raise_contributions(const View& view, int first, int count, const fl
     for (int l = 0; l < LANES; l++) rows[l] = load(peaks + (i + l) * LANES);
     transpose(rows);
     for (int l = 1; l < LANES; l++) rows[0] = maximum(rows[0], rows[l]);
-    for (int l = 0; l < std::min(LANES, count - i); l++) raise_to(contribution + view.entries[first + i + l].gaussian, rows[0][l]);
+    const Entry* entries = view.entries.data() + first + i;
+    for (int l = 0; l < std::min(LANES, count - i); l++) raise_to(contribution + entries[l].gaussian, rows[0][l]);
   }
 }
 
-// Blends one chunk of the tile's entries; returns how many strips are left, out of `live`.
-inline int blend_chunk(BlendScratch& scratch, int count, uint64_t* live, const BlendLimits& limits) {
-  int left = 0;
-  std::memset(scratch.peaks, 0, sizeof(float) * LANES * count);
-  for (int block = 0; block < BLOCKS; block++)
-    for (int strip = 0; strip < STRIPS; strip++) {
-      if (!(live[strip] >> block & 1)) continue;
-      if (blend_strip(scratch, strip_pixels(block, strip), scratch.lists.splats[block], scratch.lists.lengths[block], limits))
-        left++;
-      else
-        live[strip] &= ~(uint64_t(1) << block);
-    }
-  return left;
-}
-
-inline void clear(Planes& planes) {
-  std::memset(&planes, 0, sizeof planes);
-  std::fill(planes.transmittance, planes.transmittance + TILE_PIXELS, 1.0f);
-}
-
-// One tile of one view into the pictures, and into the view what a backward pass needs.
-inline void blend_tile(View& view, int tile, const BlendLimits& limits, const OutputPlan& plan, bool keep, float* contribution) {
-  const TileFrame frame = frame_of(view, tile);
+// Blends all entries of a tile into `planes`; notes in the view which blocks each of them touches.
+inline void blend_entries(const ForwardCall& call, View& view, const TileFrame& frame, Planes& planes) {
+  const BlendLimits limits = limits_of(call.settings);
+  uint64_t* masks = call.keep ? view.block_masks.data() : nullptr;
   BlendScratch scratch;
-  clear(scratch.planes);
+  LiveStrips live;
   start_transmittance(view, frame, scratch.transmittance);
-  uint64_t live[STRIPS];
-  std::fill(live, live + STRIPS, ~uint64_t(0));
-  for (int first = frame.begin, left = 1; first < frame.end && left; first += CHUNK) {
+  int first = frame.begin;
+  for (; first < frame.end && live.any(); first += CHUNK) {
     const int count = std::min(CHUNK, frame.end - first);
-    stage(view, frame, first, count, scratch.splats, scratch.lists, [&](int entry, const Splat& splat) {
-      const uint64_t mask = block_mask(splat, float(frame.left), float(frame.top));
-      if (keep) view.block_masks[entry] = mask;
-      return mask;
+    stage<true>(view, frame, first, count, masks, scratch.staged);
+    std::memset(scratch.peaks, 0, sizeof(float) * LANES * count);
+    for_each_live_strip(scratch.staged, live, [&](const StripPixels& pixels, const uint16_t* list, int length) {
+      return blend_strip(scratch, planes, pixels, list, length, limits);
     });
-    left = blend_chunk(scratch, count, live, limits);
-    raise_contributions(view, first, count, scratch.peaks, contribution);
+    raise_contributions(view, first, count, scratch.peaks, call.out.contribution + view.index * call.scene.gaussians);
   }
-  write_tile(plan, frame, scratch.planes);
-  if (keep && frame.end > frame.begin) view.planes[tile] = scratch.planes;
+  if (masks && first < frame.end) std::fill(masks + first, masks + frame.end, 0);
+}
+
+// One tile of one view into the pictures and, for a backward pass, into the view.
+inline void blend_tile(const ForwardCall& call, View& view, int tile) {
+  const TileFrame frame = frame_of(view, tile);
+  const bool empty = frame.begin == frame.end;
+  Planes local;
+  Planes& planes = call.keep && !empty ? view.planes[tile] : local;
+  std::memset(&planes, 0, sizeof planes);
+  if (!empty) blend_entries(call, view, frame, planes);
+  write_tile(call, view.index, frame, planes);
 }
 
 }  // namespace splat

@@ -1,4 +1,4 @@
-// Arrays of 3 or 4 interleaved floats (x y z x y z ...) <-> one vector per component.
+// Arrays of 2, 3 or 4 interleaved floats (x y z x y z ...) <-> one vector per component.
 #pragma once
 
 #include "lanes.h"
@@ -17,6 +17,11 @@ template <int C, class V> SPLAT_FN V component_of_4(V v0, V v1, V v2, V v3) {
   const V front = shuffle(v0, v1, [](int l) { return (4 * l + C) % (2 * N); });
   const V back = shuffle(v2, v3, [](int l) { return (4 * l + C) % (2 * N); });
   return shuffle(front, back, [](int l) { return 4 * l + C < 2 * N ? l : N + l; });
+}
+
+template <int K, class V> SPLAT_FN V part_of_2(V x, V y) {
+  constexpr int N = lanes_of<V>();
+  return shuffle(x, y, [](int l) { return (K * N + l) / 2 + (l % 2 ? N : 0); });
 }
 
 template <int K, class V> SPLAT_FN V part_of_3(V x, V y, V z) {
@@ -40,7 +45,13 @@ template <class V = Floats> SPLAT_FN Vec3<V> load3(const float* p) {
 
 SPLAT_FN Vec4<Floats> load4(const float* p) {
   const Floats v0 = load(p), v1 = load(p + LANES), v2 = load(p + 2 * LANES), v3 = load(p + 3 * LANES);
-  return {component_of_4<0>(v0, v1, v2, v3), component_of_4<1>(v0, v1, v2, v3), component_of_4<2>(v0, v1, v2, v3), component_of_4<3>(v0, v1, v2, v3)};
+  return {component_of_4<0>(v0, v1, v2, v3), component_of_4<1>(v0, v1, v2, v3), component_of_4<2>(v0, v1, v2, v3),
+          component_of_4<3>(v0, v1, v2, v3)};
+}
+
+SPLAT_FN void store2(float* p, const Vec2<Floats>& v) {
+  store(p, part_of_2<0>(v.x, v.y));
+  store(p + LANES, part_of_2<1>(v.x, v.y));
 }
 
 template <class V> SPLAT_FN void store3(float* p, const Vec3<V>& v) {

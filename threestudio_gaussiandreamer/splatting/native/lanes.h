@@ -5,6 +5,10 @@
 #include <cstring>
 #include <utility>
 
+#if defined(__AVX512F__)
+#include <immintrin.h>
+#endif
+
 #define SPLAT_FN static inline __attribute__((always_inline))
 
 namespace splat {
@@ -23,9 +27,7 @@ template <int N> struct Vector {
 };
 using Floats = Vector<LANES>::Float;
 using Ints = Vector<LANES>::Int;
-using Quad = Vector<4>::Float;    // four pixels of a row
-using Octet = Vector<8>::Float;   // one number per row of blocks in a tile
-using OctetInts = Vector<8>::Int;
+using Quad = Vector<4>::Float;  // four pixels of a row
 
 template <class V> constexpr int lanes_of() { return sizeof(V) / 4; }
 
@@ -53,12 +55,19 @@ template <class V> SPLAT_FN V square_root(V x) {
   return x;
 }
 
+#if defined(__AVX512F__)
+// As the generic ones in splat_math.h, which GCC 12 turns into a comparison and a blend where there are mask registers.
+SPLAT_FN Floats minimum(Floats a, Floats b) { return (Floats)_mm512_maskz_min_ps(0xffff, (__m512)a, (__m512)b); }
+SPLAT_FN Floats maximum(Floats a, Floats b) { return (Floats)_mm512_maskz_max_ps(0xffff, (__m512)a, (__m512)b); }
+#endif
+
 // Whether x >= bound in any lane.
 SPLAT_FN bool any_at_least(Floats x, float bound) {
-  const Ints reached = x >= bound;
-  int32_t any = 0;
-  for (int l = 0; l < LANES; l++) any |= reached[l];
-  return any != 0;
+  Ints any = x >= bound;
+  if constexpr (LANES >= 16) any |= shuffle(any, any, [](int l) { return (l + 8) % LANES; });
+  if constexpr (LANES >= 8) any |= shuffle(any, any, [](int l) { return (l + 4) % LANES; });
+  any |= shuffle(any, any, [](int l) { return (l + 2) % LANES; });
+  return (any[0] | any[1]) != 0;
 }
 
 // 2^x for -126 <= x < 128, relative error 3e-7; garbage below. Adding 1.5 * 2^23 rounds to an integer n, which is then both
@@ -103,7 +112,7 @@ template <class V> SPLAT_FN void transpose_quads(V& r0, V& r1, V& r2, V& r3) {
 // Transposes the LANES x LANES square in place.
 SPLAT_FN void transpose(Floats r[LANES]) {
   for (int i = 0; i < LANES; i += 4) transpose_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);
-  const auto even = [](int l) { return (l & 3) + 8 * (l >> 2); };      // 128-bit groups 0, 2 of a, then of b
+  const auto even = [](int l) { return (l & 3) + 8 * (l >> 2); };  // 128-bit groups 0, 2 of a, then of b
   const auto odd = [](int l) { return (l & 3) + 8 * (l >> 2) + 4; };
   if constexpr (LANES == 8) {
     const auto first = [](int l) { return l < 4 ? l : l + 4; };

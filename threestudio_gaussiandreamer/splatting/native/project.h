@@ -1,10 +1,8 @@
 // Stage 1: Gaussians to splats, and which tiles each splat touches.
 #pragma once
 
-#include <cmath>
-
+#include "calls.h"
 #include "interleaved.h"
-#include "view.h"
 
 namespace splat {
 
@@ -33,12 +31,16 @@ SPLAT_FN Vec3<Floats> load_vec3(const float* p, int count) { return load_items<3
 
 SPLAT_FN Floats load_scalars(const float* p, int count) { return load_items<1>(p, count, load<Floats>); }
 
-SPLAT_FN Gaussians load_gaussians(const SplatScene& scene, int64_t first, int count) {
-  return {load_vec3(scene.means + 3 * first, count), load_vec3(scene.scales + 3 * first, count), load_items<4>(scene.quats + 4 * first, count, load4),
-          load_scalars(scene.opacities + first, count)};
+SPLAT_FN Gaussians load_gaussians(const SplatScene& scene, Group group) {
+  const auto [first, count] = group;
+  return {load_vec3(scene.means + 3 * first, count), load_vec3(scene.scales + 3 * first, count),
+          load_items<4>(scene.quats + 4 * first, count, load4), load_scalars(scene.opacities + first, count)};
 }
 
-inline const float* colors_of(const SplatScene& scene, int view) { return scene.colors + (scene.colors_per_view ? 3 * scene.gaussians * view : 0); }
+SPLAT_FN Vec3<Floats> load_colors(const SplatScene& scene, int view, Group group) {
+  const int64_t offset = scene.colors_per_view ? scene.gaussians * view : 0;
+  return load_vec3(scene.colors + 3 * (offset + group.first), group.count);
+}
 
 // Everything about one vector of Gaussians in one view; the backward pass computes it again.
 struct Projection {
@@ -59,14 +61,27 @@ SPLAT_FN Projection project(const Camera& camera, const Vec3<Floats>& means, con
 
 SPLAT_FN Ints all_finite(const Gaussians& g, const Vec3<Floats>& colors) {
   const Vec3<Floats> sum = 0.0f * g.means + 0.0f * g.scales + 0.0f * colors;
-  return finite(sum.x + sum.y + sum.z + 0.0f * g.quats.w + 0.0f * g.quats.x + 0.0f * g.quats.y + 0.0f * g.quats.z + 0.0f * g.opacities);
+  return finite(sum.x + sum.y + sum.z + 0.0f * g.quats.w + 0.0f * g.quats.x + 0.0f * g.quats.y + 0.0f * g.quats.z +
+                0.0f * g.opacities);
+}
+
+// Where alpha >= alpha_min.
+struct Reach {
+  Floats log2_opacity, level;  // level = log2(opacity / alpha_min)
+  Vec2<Floats> extent;         // pixels, half the box
+};
+
+SPLAT_FN Reach reach_of(const SplatSettings& settings, const Projection& p, Floats opacity) {
+  const Floats compensated = settings.antialias ? opacity * p.whitening.compensation : opacity;
+  const Floats log2_opacity = log2(maximum(compensated, Floats{} + 1e-37f)), level = log2_opacity - std::log2(settings.alpha_min);
+  return {log2_opacity, level, extents(p.whitening, level)};
 }
 
 // In front of the camera, representable, opaque enough for a pixel, and with a box that meets the image.
-SPLAT_FN Ints visible_lanes(const Camera& camera, const SplatSettings& settings, const Projection& p, Floats level, const Vec2<Floats>& extent) {
+SPLAT_FN Ints visible_lanes(const Camera& camera, const SplatSettings& settings, const Projection& p, const Reach& reach) {
   const Whitening<Floats>& w = p.whitening;
-  const Vec2<Floats>& mean = p.screen.mean;
-  const Ints in_range = (p.t.z > settings.near) & (p.t.z < settings.far) & (level >= 0.0f);
+  const Vec2<Floats>&mean = p.screen.mean, &extent = reach.extent;
+  const Ints in_range = (p.t.z > settings.near) & (p.t.z < settings.far) & (reach.level >= 0.0f);
   const Ints drawable = finite(w.a) & finite(w.b) & finite(w.c) & finite(mean.x) & finite(mean.y) & (w.a > 0.0f) & (w.c > 0.0f);
   const Ints in_columns = (mean.x + extent.x >= 0.0f) & (mean.x - extent.x <= camera.size.x);
   const Ints in_rows = (mean.y + extent.y >= 0.0f) & (mean.y - extent.y <= camera.size.y);
@@ -75,38 +90,46 @@ SPLAT_FN Ints visible_lanes(const Camera& camera, const SplatSettings& settings,
 
 // Tiles along one axis of the pixels whose centres lie within centre +- extent, a little more to be safe.
 struct TileRange {
-  int32_t first[LANES], last[LANES];
+  Ints first, last;
 };
 
 SPLAT_FN TileRange tile_range(Floats centre, Floats extent, float size) {
   const Floats zero = {}, end = zero + (size - 1.0f), reach = extent + 1e-3f;
-  TileRange range;
-  const Ints first = __builtin_convertvector(clamp(centre - reach + 0.5f, zero, end) * (1.0f / TILE), Ints);
-  const Ints last = __builtin_convertvector(clamp(centre + reach - 0.5f, zero, end) * (1.0f / TILE), Ints);
-  std::memcpy(range.first, &first, sizeof first);
-  std::memcpy(range.last, &last, sizeof last);
-  return range;
+  return {__builtin_convertvector(clamp(centre - reach + 0.5f, zero, end) * (1.0f / TILE), Ints),
+          __builtin_convertvector(clamp(centre + reach - 0.5f, zero, end) * (1.0f / TILE), Ints)};
 }
 
-// Columns [first, last] cut down to those that the ellipse meets in one row of tiles.
-inline TileSpan cut_span(const Splat& s, int row, int first, int last) {
-  const float top = row * TILE + 0.5f - s.y;
-  const Span<float> x = row_span(s, top, top + (TILE - 1));
-  const float low = clamp(s.x + x.low - 0.501f, 0.0f, float(last * TILE)), high = clamp(s.x + x.high - 0.499f, -1.0f, float(last * TILE));
-  const int begin = std::max(first, int(std::ceil(low)) / TILE), end = high < 0 ? begin : std::max(begin, int(high) / TILE + 1);
-  return {uint16_t(begin), uint16_t(std::min(end, std::max(begin, last + 1)))};
+inline Ellipse<float> ellipse_of(const Splat& s) {
+  return {s.x, s.y, s.extent_y, s.c * s.c, s.level, s.inverse_a, s.tilt, s.slant};
 }
 
-// Appends the tiles of a splat within columns [x0, x1] and rows [y0, y1] to its slice. The exact cut pays from six tiles on.
+// Columns [first, last] of tiles cut down to those that the ellipse meets in one row of tiles, a little more to be safe.
+inline TileSpan cut_span(const Ellipse<float>& ellipse, int row, int first, int last) {
+  const float top = row * TILE + 0.5f;
+  const Span<float> x = row_span(ellipse, top, top + (TILE - 1));
+  const float low = clamp(x.low - 0.501f, 0.0f, float(last * TILE)), high = clamp(x.high - 0.499f, -1.0f, float(last * TILE));
+  const int begin = std::max(first, int(std::ceil(low)) / TILE), end = high < 0 ? begin : int(high) / TILE + 1;
+  return {uint16_t(begin), uint16_t(std::max(begin, std::min(end, last + 1)))};
+}
+
+inline Coverage no_coverage(const Slice& slice) { return {int32_t(slice.slots), 0, 0, 0, {0, 0}}; }
+
+// The tiles of a splat within columns [x0, x1] and rows [y0, y1]. Cutting the rows exactly pays from six tiles on.
 inline Coverage cover(const Splat& splat, int x0, int x1, int y0, int y1, Slice& slice) {
-  const int32_t first_slot = int32_t(slice.slots), first_span = int32_t(slice.spans.size());
-  const bool cut = x1 > x0 && y1 > y0 && (x1 - x0 + 1) * (y1 - y0 + 1) >= 6;
-  for (int y = y0; y <= y1; y++) {
-    const TileSpan span = cut ? cut_span(splat, y, x0, x1) : TileSpan{uint16_t(x0), uint16_t(x1 + 1)};
-    slice.spans.push_back(span);
-    slice.slots += span.end - span.begin;
+  if (x1 < x0 || y1 < y0) return no_coverage(slice);
+  const int columns = x1 - x0 + 1, rows = y1 - y0 + 1;
+  const Coverage box = {
+      int32_t(slice.slots), int32_t(slice.spans.size()), uint16_t(y0), uint16_t(rows), {uint16_t(x0), uint16_t(x1 + 1)}};
+  if (columns == 1 || rows == 1 || columns * rows < 6) {
+    slice.slots += columns * rows;
+    return box;
   }
-  return {first_slot, int32_t(slice.slots - first_slot), first_span, uint16_t(y0), uint16_t(y1 - y0 + 1)};
+  const Ellipse<float> ellipse = ellipse_of(splat);
+  for (int y = y0; y <= y1; y++) {
+    slice.spans.push_back(cut_span(ellipse, y, x0, x1));
+    slice.slots += slice.spans.back().end - slice.spans.back().begin;
+  }
+  return {box.slot, box.span, box.row, box.rows, {0, 0}};
 }
 
 // A depth key orders as the depth does: positive floats compare like their bits.
@@ -116,49 +139,58 @@ inline uint64_t depth_key(float depth, int64_t gaussian) {
   return uint64_t(bits) << 32 | uint64_t(gaussian);
 }
 
-SPLAT_FN void store_splats(const Projection& p, Floats log2_opacity, Floats level, const Vec2<Floats>& extent, const Vec3<Floats>& colors, Splat* splats) {
+SPLAT_FN void store_splats(const Projection& p, const Reach& reach, const Vec3<Floats>& colors, Splat* splats) {
   const Whitening<Floats>& w = p.whitening;
   const Floats a = w.a * WHITENING_SCALE, b = w.b * WHITENING_SCALE, c = w.c * WHITENING_SCALE;
-  Floats columns[ROW] = {p.screen.mean.x, p.screen.mean.y, a, b, c, log2_opacity, p.t.z, colors.x, colors.y, colors.z,
-                         1.0f / a, w.xy / w.yy, extent.x * w.xy / w.xx, extent.x, extent.y, level};
-  store_columns(columns, reinterpret_cast<float*>(splats));
+  const Floats tilt = w.xy / w.yy, slant = reach.extent.x * w.xy / w.xx;
+  Floats columns[ROW] = {
+      p.screen.mean.x, p.screen.mean.y, a,        b,    c,     reach.log2_opacity, p.t.z,          colors.x,
+      colors.y,        colors.z,        1.0f / a, tilt, slant, reach.extent.x,     reach.extent.y, reach.level};
+  store_columns(columns, &splats->x);
 }
 
-SPLAT_FN void store_screen(const SplatPictures& out, int64_t at, int count, const Projection& p, const Vec2<Floats>& extent, Ints visible) {
-  const Floats zero = {};
-  const Floats x = select(visible, p.screen.mean.x, zero), y = select(visible, p.screen.mean.y, zero);
-  const Floats radius = select(visible, maximum(extent.x, extent.y), zero);
-  for (int l = 0; l < count; l++) out.means2d[2 * (at + l)] = x[l], out.means2d[2 * (at + l) + 1] = y[l];
-  store_items<1>(out.radii + at, count, [&](float* q) { store(q, radius); });
-  store_items<1>(out.contribution + at, count, [&](float* q) { store(q, zero); });
+// Means and radii of the visible lanes, zeros elsewhere; the contributions start at zero.
+SPLAT_FN void store_screen(const ForwardCall& call, int view, Group group, const Projection& p, const Reach& reach,
+                           Ints visible) {
+  const int64_t at = view * call.scene.gaussians + group.first;
+  const Floats zero = {}, radius = select(visible, maximum(reach.extent.x, reach.extent.y), zero);
+  const Vec2<Floats> mean = {select(visible, p.screen.mean.x, zero), select(visible, p.screen.mean.y, zero)};
+  store_items<2>(call.out.means2d + 2 * at, group.count, [&](float* q) { store2(q, mean); });
+  store_items<1>(call.out.radii + at, group.count, [&](float* q) { store(q, radius); });
+  store_items<1>(call.out.contribution + at, group.count, [&](float* q) { store(q, zero); });
 }
 
-// LANES Gaussians from `first` on, of which `count` exist.
-inline void project_lanes(const SplatScene& scene, const SplatSettings& settings, const SplatPictures& out, View& view, Slice& slice, int64_t first, int count) {
-  const Gaussians g = load_gaussians(scene, first, count);
-  const Vec3<Floats> colors = load_vec3(colors_of(scene, view.index) + 3 * first, count);
-  const Projection p = project(view.camera, g.means, world_axes(quat_to_rotation(g.quats).matrix, g.scales), settings.eps2d);
-  const Floats opacity = settings.antialias ? g.opacities * p.whitening.compensation : g.opacities;
-  const Floats log2_opacity = log2(maximum(opacity, Floats{} + 1e-37f)), level = log2_opacity - std::log2(settings.alpha_min);
-  const Vec2<Floats> extent = extents(p.whitening, level);
-  const Ints visible = all_finite(g, colors) & visible_lanes(view.camera, settings, p, level, extent);
-  store_splats(p, log2_opacity, level, extent, colors, view.splats.data() + first);
-  store_screen(out, view.index * scene.gaussians + first, count, p, extent, visible);
-
-  const TileRange x = tile_range(p.screen.mean.x, extent.x, view.camera.size.x), y = tile_range(p.screen.mean.y, extent.y, view.camera.size.y);
-  uint64_t* keys = view.keys.data() + first / SLICE * SLICE;
-  for (int l = 0; l < count; l++) {
-    view.coverage[first + l] = visible[l] ? cover(view.splats[first + l], x.first[l], x.last[l], y.first[l], y.last[l], slice) : Coverage{};
-    if (visible[l]) keys[slice.visible++] = depth_key(view.splats[first + l].depth, first + l);
+// Notes the tiles and the depth of the visible lanes.
+inline void list_lanes(View& view, Slice& slice, Group group, const Projection& p, const Reach& reach, Ints visible) {
+  const TileRange x = tile_range(p.screen.mean.x, reach.extent.x, view.camera.size.x);
+  const TileRange y = tile_range(p.screen.mean.y, reach.extent.y, view.camera.size.y);
+  uint64_t* keys = view.keys.data() + group.first / SLICE * SLICE;
+  for (int l = 0; l < group.count; l++) {
+    const int64_t gaussian = group.first + l;
+    const Splat& splat = view.splats[gaussian];
+    view.coverage(gaussian) = visible[l] ? cover(splat, x.first[l], x.last[l], y.first[l], y.last[l], slice) : no_coverage(slice);
+    if (visible[l]) keys[slice.visible++] = depth_key(splat.depth, gaussian);
   }
 }
 
-inline void project_slice(const SplatScene& scene, const SplatSettings& settings, const SplatPictures& out, View& view, int64_t index) {
+inline void project_group(const ForwardCall& call, View& view, Slice& slice, Group group) {
+  const Gaussians g = load_gaussians(call.scene, group);
+  const Vec3<Floats> colors = load_colors(call.scene, view.index, group);
+  const Mat3<Floats> axes = world_axes(quat_to_rotation(g.quats).matrix, g.scales);
+  const Projection p = project(view.camera, g.means, axes, call.settings.eps2d);
+  const Reach reach = reach_of(call.settings, p, g.opacities);
+  const Ints visible = all_finite(g, colors) & visible_lanes(view.camera, call.settings, p, reach);
+  store_splats(p, reach, colors, view.splats.data() + group.first);
+  store_screen(call, view.index, group, p, reach, visible);
+  list_lanes(view, slice, group, p, reach, visible);
+}
+
+inline void project_slice(const ForwardCall& call, View& view, int64_t index) {
   Slice& slice = view.slices[index];
   slice.spans.clear(), slice.slots = 0, slice.visible = 0;
-  const int64_t end = std::min<int64_t>(scene.gaussians, (index + 1) * SLICE);
-  for (int64_t first = index * SLICE; first < end; first += LANES)
-    project_lanes(scene, settings, out, view, slice, first, int(std::min<int64_t>(LANES, end - first)));
+  const int64_t end = std::min<int64_t>(call.scene.gaussians, (index + 1) * SLICE);
+  for_each_group(index * SLICE, end, [&](Group group) { project_group(call, view, slice, group); });
+  (&view.coverage(end - 1))[1] = no_coverage(slice);
 }
 
 }  // namespace splat

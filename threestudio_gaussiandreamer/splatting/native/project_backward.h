@@ -1,4 +1,5 @@
-// Stage 5, the adjoint of stage 1: each Gaussian adds up its slots, view after view, and takes the gradient through its projection.
+// Stage 5, the adjoint of stage 1: each Gaussian adds up its slots, view after view, and takes the gradient through its
+// projection.
 #pragma once
 
 #include "blend_backward.h"
@@ -29,42 +30,65 @@ struct ViewGradients {
   Floats opacities;
 };
 
-// Adds up each Gaussian's slots in their order, as LANES rows; false when none of these Gaussians touches a tile.
-inline bool gather_slots(const View& view, const float* slots, int64_t first, int count, float* rows, Ints& drawn) {
-  const int32_t slice_slot = view.slice_of(first).first_slot;
-  bool any = false;
+// Adds up each Gaussian's slots in their order, as LANES rows; says which of the Gaussians have any.
+inline Ints gather_slots(const View& view, const float* slots, Group group, float* rows) {
+  Ints drawn = {};
   for (int l = 0; l < LANES; l++) {
-    const Coverage c = l < count ? view.coverage[first + l] : Coverage{};
-    const float* slot = slots + int64_t(slice_slot + c.slot) * ROW;
+    const bool exists = l < group.count;
+    const int64_t begin = exists ? view.slot_begin(group.first + l) : 0, end = exists ? view.slot_end(group.first + l) : 0;
     Floats sum[ROW / LANES] = {};
-    for (int s = 0; s < c.slots; s++, slot += ROW)
-      for (int k = 0; k < ROW / LANES; k++) sum[k] += load(slot + k * LANES);
+    for (int64_t slot = begin; slot < end; slot++)
+      for (int k = 0; k < ROW / LANES; k++) sum[k] += load(slots + slot * ROW + k * LANES);
     for (int k = 0; k < ROW / LANES; k++) store(rows + l * ROW + k * LANES, sum[k]);
-    drawn[l] = c.slots ? -1 : 0;
-    any |= c.slots != 0;
+    drawn[l] = begin < end ? -1 : 0;
   }
-  return any;
+  return drawn;
 }
 
-SPLAT_FN Vec3<Floats> keep(Ints mask, const Vec3<Floats>& v) { return {select(mask, v.x, Floats{}), select(mask, v.y, Floats{}), select(mask, v.z, Floats{})}; }
+SPLAT_FN Floats keep(Ints mask, Floats x) { return select(mask, x, Floats{}); }
+SPLAT_FN Vec3<Floats> keep(Ints mask, const Vec3<Floats>& v) { return {keep(mask, v.x), keep(mask, v.y), keep(mask, v.z)}; }
 SPLAT_FN Mat3<Floats> keep(Ints mask, const Mat3<Floats>& m) { return {keep(mask, m.x), keep(mask, m.y), keep(mask, m.z)}; }
 
-// From one view's sums to its gradients.
-SPLAT_FN ViewGradients project_vjp(const Camera& camera, const SplatSettings& settings, const Gaussians& g, const Mat3<Floats>& axes_in_world, const Floats* sums, Ints drawn) {
-  const Projection p = project(camera, g.means, axes_in_world, settings.eps2d);
+// LANES Gaussians and what follows from them alone.
+struct Shapes {
+  Gaussians gaussians;
+  Rotation<Floats> rotation;
+  Mat3<Floats> axes;  // in the world
+};
+
+SPLAT_FN Shapes load_shapes(const SplatScene& scene, Group group) {
+  const Gaussians g = load_gaussians(scene, group);
+  const Rotation<Floats> rotation = quat_to_rotation(g.quats);
+  return {g, rotation, world_axes(rotation.matrix, g.scales)};
+}
+
+SPLAT_FN Vec2<Floats> mean2d_gradient(const Whitening<Floats>& w, const Floats* sums) {
+  return {UNSCALE * (w.a * sums[U_Y1]), UNSCALE * (w.b * sums[U_Y1] + w.c * sums[U_Y2])};
+}
+
+// Gradients of the rows of U; with the compensation, sums[U] also counts.
+SPLAT_FN void footprint_gradient(const Projection& p, const Floats* sums, bool antialias, Vec3<Floats>& d_u0,
+                                 Vec3<Floats>& d_u1) {
   const Whitening<Floats>& w = p.whitening;
-  const Floats compensated = settings.antialias ? sums[U] : Floats{};
-  const float unscale2 = UNSCALE * UNSCALE;
-  const Vec2<Floats> d_mean = {UNSCALE * (w.a * sums[U_Y1]), UNSCALE * (w.b * sums[U_Y1] + w.c * sums[U_Y2])};
+  const float unscale = UNSCALE * UNSCALE;
+  const Floats xx = unscale * sums[U_Y1_Y1], xy = unscale * sums[U_Y1_Y2], yy = unscale * sums[U_Y2_Y2];
+  const Floats compensated = antialias ? sums[U] : Floats{};
+  whiten_vjp(w, p.screen.u0, p.screen.u1, xx - compensated, xy, yy - compensated, d_u0, d_u1);
+  if (antialias) compensation_vjp(w, p.screen.u0, compensated, d_u0, d_u1);
+}
+
+// From one view's sums to its gradients.
+SPLAT_FN ViewGradients project_vjp(const Camera& camera, const SplatSettings& settings, const Shapes& shapes, const Floats* sums,
+                                   Ints drawn) {
+  const Projection p = project(camera, shapes.gaussians.means, shapes.axes, settings.eps2d);
+  const Vec2<Floats> d_mean = mean2d_gradient(p.whitening, sums);
+  Vec3<Floats> d_u0, d_u1, d_t;
+  Mat3<Floats> d_axes;
+  footprint_gradient(p, sums, settings.antialias, d_u0, d_u1);
+  to_screen_vjp(camera, p.screen, p.axes, d_mean, sums[DEPTH], d_u0, d_u1, d_t, d_axes);
   ViewGradients d;
-  Vec3<Floats> d_u0, d_u1;
-  whiten_vjp(w, p.screen.u0, p.screen.u1, unscale2 * sums[U_Y1_Y1] - compensated, unscale2 * sums[U_Y1_Y2], unscale2 * sums[U_Y2_Y2] - compensated, d_u0, d_u1);
-  if (settings.antialias) compensation_vjp(w, p.screen.u0, compensated, d_u0, d_u1);
-  to_screen_vjp(camera, p.screen, p.axes, d_mean, sums[DEPTH], d_u0, d_u1, d.t, d.axes);
-  d.t = keep(drawn, d.t), d.axes = keep(drawn, d.axes);
-  d.mean2d = {select(drawn, d_mean.x, Floats{}), select(drawn, d_mean.y, Floats{})};
-  d.opacities = select(drawn, sums[U] / g.opacities, Floats{});
-  d.colors = {sums[RED], sums[GREEN], sums[BLUE]};
+  d.t = keep(drawn, d_t), d.axes = keep(drawn, d_axes), d.mean2d = {keep(drawn, d_mean.x), keep(drawn, d_mean.y)};
+  d.opacities = keep(drawn, sums[U] / shapes.gaussians.opacities), d.colors = {sums[RED], sums[GREEN], sums[BLUE]};
   return d;
 }
 
@@ -77,75 +101,84 @@ SPLAT_FN void add_view(WorldGradients& sum, const Camera& camera, const ViewGrad
 }
 
 // t = R mean + T and axes = R axes_in_world.
-SPLAT_FN void add_viewmat(ViewmatSums& sum, const Gaussians& g, const Mat3<Floats>& axes_in_world, const ViewGradients& d, Ints drawn) {
-  const Vec3<Floats> mean = keep(drawn, g.means);
-  const Mat3<Floats> n = keep(drawn, axes_in_world);
+SPLAT_FN void add_viewmat(ViewmatSums& sum, const Shapes& shapes, const ViewGradients& d, Ints drawn) {
+  const Vec3<Floats> mean = keep(drawn, shapes.gaussians.means);
+  const Mat3<Floats> n = keep(drawn, shapes.axes);
   const auto row = [&](const Floats& d_t, const Vec3<Floats>& d_axis) {
     return Vec3<Floats>{d_t * mean.x + dot(d_axis, n.x), d_t * mean.y + dot(d_axis, n.y), d_t * mean.z + dot(d_axis, n.z)};
   };
-  sum.rotation = {sum.rotation.x + row(d.t.x, d.axes.x), sum.rotation.y + row(d.t.y, d.axes.y), sum.rotation.z + row(d.t.z, d.axes.z)};
+  sum.rotation = {sum.rotation.x + row(d.t.x, d.axes.x), sum.rotation.y + row(d.t.y, d.axes.y),
+                  sum.rotation.z + row(d.t.z, d.axes.z)};
   sum.translation = sum.translation + d.t;
 }
 
-SPLAT_FN void store_pairs(float* p, int count, Floats x, Floats y) {
-  for (int l = 0; l < count; l++) p[2 * l] = x[l], p[2 * l + 1] = y[l];
+SPLAT_FN void store_vec2(float* p, int count, const Vec2<Floats>& v) {
+  store_items<2>(p, count, [&](float* q) { store2(q, v); });
 }
 
 SPLAT_FN void store_vec3(float* p, int count, const Vec3<Floats>& v) {
   store_items<3>(p, count, [&](float* q) { store3(q, v); });
 }
 
-SPLAT_FN void store_view(const SplatGradients& out, bool colors_per_view, int64_t at, int count, const ViewGradients& d, const Floats* sums) {
-  store_pairs(out.means2d + 2 * at, count, d.mean2d.x, d.mean2d.y);
-  if (out.absgrad) store_pairs(out.absgrad + 2 * at, count, UNSCALE * UNSCALE * sums[ABS_X], UNSCALE * UNSCALE * sums[ABS_Y]);
-  if (colors_per_view) store_vec3(out.colors + 3 * at, count, d.colors);
+SPLAT_FN void store_view(const BackwardCall& call, int view, Group group, const ViewGradients& d, const Floats* sums) {
+  const SplatGradients& out = call.out;
+  const int64_t at = view * call.scene.gaussians + group.first;
+  const float unscale = UNSCALE * UNSCALE;
+  store_vec2(out.means2d + 2 * at, group.count, d.mean2d);
+  if (out.absgrad) store_vec2(out.absgrad + 2 * at, group.count, {unscale * sums[ABS_X], unscale * sums[ABS_Y]});
+  if (call.scene.colors_per_view) store_vec3(out.colors + 3 * at, group.count, d.colors);
 }
 
 // Through rotation and scale; nothing flows to a Gaussian that isn't drawn, finite or not.
-SPLAT_FN void store_world(const SplatGradients& out, bool colors_per_view, int64_t at, int count, const Gaussians& g, const Rotation<Floats>& rotation, const WorldGradients& d, Ints drawn) {
+SPLAT_FN void store_world(const BackwardCall& call, Group group, const Shapes& shapes, const WorldGradients& d, Ints drawn) {
+  const auto [first, count] = group;
+  const SplatGradients& out = call.out;
   Mat3<Floats> d_rotation;
   Vec3<Floats> d_scales;
-  world_axes_vjp(rotation.matrix, g.scales, d.axes, d_rotation, d_scales);
-  const Vec4<Floats> q = quat_to_rotation_vjp(rotation, d_rotation);
-  const Vec4<Floats> d_quats = {select(drawn, q.w, Floats{}), select(drawn, q.x, Floats{}), select(drawn, q.y, Floats{}), select(drawn, q.z, Floats{})};
-  store_vec3(out.means + 3 * at, count, d.means);
-  store_vec3(out.scales + 3 * at, count, keep(drawn, d_scales));
-  store_items<4>(out.quats + 4 * at, count, [&](float* p) { store4(p, d_quats); });
-  store_items<1>(out.opacities + at, count, [&](float* p) { store(p, d.opacities); });
-  if (!colors_per_view) store_vec3(out.colors + 3 * at, count, d.colors);
+  world_axes_vjp(shapes.rotation.matrix, shapes.gaussians.scales, d.axes, d_rotation, d_scales);
+  const Vec4<Floats> q = quat_to_rotation_vjp(shapes.rotation, d_rotation);
+  const Vec4<Floats> d_quats = {keep(drawn, q.w), keep(drawn, q.x), keep(drawn, q.y), keep(drawn, q.z)};
+  store_vec3(out.means + 3 * first, count, d.means);
+  store_vec3(out.scales + 3 * first, count, keep(drawn, d_scales));
+  store_items<4>(out.quats + 4 * first, count, [&](float* p) { store4(p, d_quats); });
+  store_items<1>(out.opacities + first, count, [&](float* p) { store(p, d.opacities); });
+  if (!call.scene.colors_per_view) store_vec3(out.colors + 3 * first, count, d.colors);
 }
 
-// The gradients of LANES Gaussians from `first` on, of which `count` exist; `viewmats` holds a sum per view, or is null.
-inline void project_lanes_backward(const SplatScene& scene, const SplatSettings& settings, const Views& views, const float* slots, const int64_t* slot_begin,
-                                   const SplatGradients& out, int64_t first, int count, ViewmatSums* viewmats) {
-  const Gaussians g = load_gaussians(scene, first, count);
-  const Rotation<Floats> rotation = quat_to_rotation(g.quats);
-  const Mat3<Floats> axes = world_axes(rotation.matrix, g.scales);
+SPLAT_FN bool any_lane(Ints mask) { return any_at_least(select(mask, Floats{} + 1.0f, Floats{}), 1.0f); }
+
+// All gradients of a group; `viewmats` holds a sum per view, or none.
+inline void project_group_backward(const BackwardCall& call, Group group, std::vector<ViewmatSums>& viewmats) {
+  const Shapes shapes = load_shapes(call.scene, group);
   WorldGradients world = {};
   Ints drawn_anywhere = {};
-  for (int v = 0; v < scene.views; v++) {
+  for (int v = 0; v < call.scene.views; v++) {
+    const View& view = call.views[v];
     alignas(64) float rows[LANES * ROW];
     Floats sums[ROW] = {};
-    Ints drawn;
     ViewGradients d = {};
-    if (gather_slots(views[v], slots + slot_begin[v] * ROW, first, count, rows, drawn)) {
+    const Ints drawn = gather_slots(view, call.slots(view), group, rows);
+    if (any_lane(drawn)) {
       load_columns<SUMS>([&](int l) { return rows + l * ROW; }, sums);
-      d = project_vjp(views[v].camera, settings, g, axes, sums, drawn);
-      add_view(world, views[v].camera, d);
-      if (viewmats) add_viewmat(viewmats[v], g, axes, d, drawn);
+      d = project_vjp(view.camera, call.settings, shapes, sums, drawn);
+      add_view(world, view.camera, d);
+      if (!viewmats.empty()) add_viewmat(viewmats[v], shapes, d, drawn);
       drawn_anywhere |= drawn;
     }
-    store_view(out, scene.colors_per_view, v * scene.gaussians + first, count, d, sums);
+    store_view(call, v, group, d, sums);
   }
-  store_world(out, scene.colors_per_view, first, count, g, rotation, world, drawn_anywhere);
+  store_world(call, group, shapes, world, drawn_anywhere);
 }
 
-inline void store_viewmat(const ViewmatSums& sum, float* rows) {
-  const Vec3<Floats>* axes = &sum.rotation.x;
-  const Floats translation[3] = {sum.translation.x, sum.translation.y, sum.translation.z};
-  for (int r = 0; r < 3; r++)
-    for (int l = 0; l < LANES; l++)
-      rows[4 * r] += axes[r].x[l], rows[4 * r + 1] += axes[r].y[l], rows[4 * r + 2] += axes[r].z[l], rows[4 * r + 3] += translation[r][l];
+// Adds the lanes up into the first three rows of a 4x4 matrix.
+inline void store_viewmat(const ViewmatSums& sum, float* matrix) {
+  const Vec3<Floats>* rows[3] = {&sum.rotation.x, &sum.rotation.y, &sum.rotation.z};
+  const Floats* translation[3] = {&sum.translation.x, &sum.translation.y, &sum.translation.z};
+  for (int r = 0; r < 3; r++, matrix += 4)
+    for (int l = 0; l < LANES; l++) {
+      matrix[0] += rows[r]->x[l], matrix[1] += rows[r]->y[l], matrix[2] += rows[r]->z[l];
+      matrix[3] += (*translation[r])[l];
+    }
 }
 
 }  // namespace splat

@@ -13,96 +13,89 @@ struct SplatState {
 
 namespace splat {
 
+constexpr int TILE_GRAIN = 4;        // neighbours share splats, and so cache lines
 constexpr int BACKWARD_SLICE = 512;  // Gaussians per task, and per partial sum of d loss / d viewmats
 
-// What only lives during a backward pass.
-struct Workspace {
-  Buffer<float> slots;       // (entries of all views, ROW)
-  Buffer<float> background;  // (views, tiles, 3)
-  Buffer<float> viewmats;    // (slices, views, 16)
-};
-
-static Pool<SplatState>& states = *new Pool<SplatState>;  // never destroyed: a thread may still be at work at exit
+// Never destroyed: a thread may still be at work when the process ends.
+static Pool<SplatState>& states = *new Pool<SplatState>;
 static Pool<Workspace>& workspaces = *new Pool<Workspace>;
 
-static BlendLimits limits_of(const SplatSettings& s) { return {std::log2(s.alpha_min), s.alpha_max, s.stop}; }
-
-// Stages 1 to 3 of all views: whole views in parallel when there are enough of them, else within each view.
-static void build_views(const SplatScene& scene, const SplatSettings& settings, const SplatPictures& out, Views& views) {
-  const bool by_view = scene.views >= settings.threads;
-  parallel_for(scene.views, by_view ? settings.threads : 1,
-               [&](int64_t v) { build_view(scene, settings, out, views[v], int(v), by_view ? 1 : settings.threads); });
+static void blend_views(const ForwardCall& call, Views& views) {
+  const int tiles = views[0].tiles();
+  for (int v = 0; call.keep && v < call.scene.views; v++)
+    views[v].block_masks.reserve(views[v].entry_count), views[v].planes.reserve(tiles);
+  parallel_for(int64_t(tiles) * call.scene.views, call.settings.threads, TILE_GRAIN,
+               [&](int64_t i) { blend_tile(call, views[i / tiles], int(i % tiles)); });
 }
 
-static void blend_views(const SplatScene& scene, const SplatSettings& settings, const SplatPictures& out, Views& views, bool keep) {
-  const int width = scene.width / settings.downsample, height = scene.height / settings.downsample, tiles = views[0].tiles();
-  const BlendLimits limits = limits_of(settings);
-  for (int v = 0; keep && v < scene.views; v++) views[v].block_masks.reserve(views[v].entry_count), views[v].planes.reserve(tiles);
-  parallel_for(int64_t(tiles) * scene.views, settings.threads, [&](int64_t i) {
-    View& view = views[i / tiles];
-    const OutputPlan plan = {layers_of(out.image, out.alpha, out.depth, view.index, int64_t(width) * height), background_of(scene, view.index), width, height, settings.downsample};
-    blend_tile(view, int(i % tiles), limits, plan, keep, out.contribution + view.index * scene.gaussians);
+static void forward(const ForwardCall& call, Views& views) {
+  build_views(call, views);
+  blend_views(call, views);
+}
+
+static int64_t slices_of(const SplatScene& scene) { return (scene.gaussians + BACKWARD_SLICE - 1) / BACKWARD_SLICE; }
+
+// Numbers the slots of all views and makes room for whatever the backward pass writes on its way.
+static void prepare(BackwardCall& call) {
+  int64_t slots = 0;
+  for (int v = 0; v < call.scene.views; v++) call.first_slots.push_back(slots), slots += call.views[v].entry_count;
+  check_memory(slots * ROW * int64_t(sizeof(float)));
+  call.work.slots.reserve(slots * ROW);
+  call.work.background.reserve(3 * int64_t(call.views[0].tiles()) * call.scene.views);
+  const int64_t viewmats = call.out.viewmats ? 16 * slices_of(call.scene) * call.scene.views : 0;
+  std::fill_n(call.work.viewmats.reserve(viewmats), viewmats, 0.0f);
+}
+
+static void blend_views_backward(const BackwardCall& call) {
+  const int tiles = call.views[0].tiles();
+  parallel_for(int64_t(tiles) * call.scene.views, call.settings.threads, TILE_GRAIN, [&](int64_t i) {
+    const Vec3<float> background = blend_tile_backward(call, call.views[i / tiles], int(i % tiles));
+    std::memcpy(call.work.background.data() + 3 * i, &background, sizeof background);
   });
 }
 
-static void forward(const SplatScene& scene, const SplatSettings& settings, const SplatPictures& out, Views& views, bool keep) {
-  while (views.size() < size_t(scene.views)) views.emplace_back();
-  build_views(scene, settings, out, views);
-  blend_views(scene, settings, out, views, keep);
+static void project_slice_backward(const BackwardCall& call, int64_t slice) {
+  std::vector<ViewmatSums> viewmats(call.out.viewmats ? call.scene.views : 0);
+  const int64_t end = std::min<int64_t>(call.scene.gaussians, (slice + 1) * BACKWARD_SLICE);
+  for_each_group(slice * BACKWARD_SLICE, end, [&](Group group) { project_group_backward(call, group, viewmats); });
+  float* matrices = call.work.viewmats.data() + 16 * slice * call.scene.views;
+  for (size_t v = 0; v < viewmats.size(); v++) store_viewmat(viewmats[v], matrices + 16 * v);
 }
 
-// Where each view's slots begin; the last element is their number.
-static std::vector<int64_t> slots_of(const Views& views, int count) {
-  std::vector<int64_t> begin = {0};
-  for (int v = 0; v < count; v++) begin.push_back(begin.back() + views[v].entry_count);
-  return begin;
-}
-
-static void blend_views_backward(const SplatScene& scene, const SplatSettings& settings, const SplatUpstream& upstream, const Views& views,
-                                 const std::vector<int64_t>& slot_begin, bool absolute, Workspace& work) {
-  const int width = scene.width / settings.downsample, height = scene.height / settings.downsample, tiles = views[0].tiles();
-  const BlendLimits limits = limits_of(settings);
-  parallel_for(int64_t(tiles) * scene.views, settings.threads, [&](int64_t i) {
-    const View& view = views[i / tiles];
-    const BackwardPlan plan = {layers_of(upstream.image, upstream.alpha, upstream.depth, view.index, int64_t(width) * height), background_of(scene, view.index), width, height,
-                               settings.downsample, absolute};
-    const Vec3<float> background = blend_tile_backward(view, int(i % tiles), limits, plan, work.slots.data() + slot_begin[view.index] * ROW);
-    std::memcpy(work.background.data() + 3 * i, &background, sizeof background);
-  });
-}
-
-static void project_views_backward(const SplatScene& scene, const SplatSettings& settings, const Views& views, const std::vector<int64_t>& slot_begin,
-                                   const SplatGradients& out, Workspace& work) {
-  const int64_t slices = (scene.gaussians + BACKWARD_SLICE - 1) / BACKWARD_SLICE;
-  parallel_for(slices, settings.threads, [&](int64_t slice) {
-    std::vector<ViewmatSums> sums(out.viewmats ? scene.views : 0);
-    const int64_t end = std::min<int64_t>(scene.gaussians, (slice + 1) * BACKWARD_SLICE);
-    for (int64_t first = slice * BACKWARD_SLICE; first < end; first += LANES)
-      project_lanes_backward(scene, settings, views, work.slots.data(), slot_begin.data(), out, first, int(std::min<int64_t>(LANES, end - first)),
-                             out.viewmats ? sums.data() : nullptr);
-    for (size_t v = 0; v < sums.size(); v++) store_viewmat(sums[v], work.viewmats.data() + 16 * (slice * scene.views + v));
-  });
-}
-
-// out[g] = the sum over i of parts[i * stride + g], in double and in the order of i.
+// out[i] = the sum over p of parts[p * stride + i] for i < width, in double and in the order of p.
 static void sum_parts(const float* parts, int64_t count, int64_t stride, int width, float* out) {
-  for (int g = 0; g < width; g++) {
+  for (int i = 0; i < width; i++) {
     double sum = 0;
-    for (int64_t i = 0; i < count; i++) sum += parts[i * stride + g];
-    out[g] = float(sum);
+    for (int64_t p = 0; p < count; p++) sum += parts[p * stride + i];
+    out[i] = float(sum);
   }
 }
 
-static void backward(const SplatScene& scene, const SplatSettings& settings, const SplatUpstream& upstream, const SplatGradients& out, const Views& views, Workspace& work) {
-  const std::vector<int64_t> slot_begin = slots_of(views, scene.views);
-  const int64_t tiles = views[0].tiles(), slices = (scene.gaussians + BACKWARD_SLICE - 1) / BACKWARD_SLICE;
-  work.slots.reserve(slot_begin.back() * ROW), work.background.reserve(3 * tiles * scene.views);
-  if (out.viewmats) std::fill_n(work.viewmats.reserve(16 * slices * scene.views), 16 * slices * scene.views, 0.0f);
-  blend_views_backward(scene, settings, upstream, views, slot_begin, out.absgrad != nullptr, work);
-  project_views_backward(scene, settings, views, slot_begin, out, work);
-  for (int v = 0; v < scene.views; v++) {
-    sum_parts(work.background.data() + 3 * tiles * v, tiles, 3, 3, out.background + 3 * v);
-    if (out.viewmats) sum_parts(work.viewmats.data() + 16 * v, slices, 16 * scene.views, 16, out.viewmats + 16 * v);
+static void sum_over_views(const BackwardCall& call) {
+  const int64_t tiles = call.views[0].tiles(), views = call.scene.views;
+  for (int v = 0; v < views; v++) {
+    sum_parts(call.work.background.data() + 3 * tiles * v, tiles, 3, 3, call.out.background + 3 * v);
+    if (call.out.viewmats)
+      sum_parts(call.work.viewmats.data() + 16 * v, slices_of(call.scene), 16 * views, 16, call.out.viewmats + 16 * v);
+  }
+}
+
+static void backward(BackwardCall call) {
+  prepare(call);
+  blend_views_backward(call);
+  parallel_for(slices_of(call.scene), call.settings.threads, 1, [&](int64_t slice) { project_slice_backward(call, slice); });
+  sum_over_views(call);
+}
+
+// 0, or the bytes that couldn't be had; -1 when even that isn't known.
+template <class Body> static int64_t guarded(const Body& body) {
+  try {
+    body();
+    return 0;
+  } catch (const OutOfMemory& e) {
+    return e.bytes;
+  } catch (const std::bad_alloc&) {
+    return -1;
   }
 }
 
@@ -111,41 +104,39 @@ static void backward(const SplatScene& scene, const SplatSettings& settings, con
 extern "C" {
 
 int64_t splat_forward(const SplatScene* scene, const SplatSettings* settings, const SplatPictures* out, SplatState** state) {
-  std::unique_ptr<SplatState> own = splat::states.take();
-  try {
-    splat::forward(*scene, *settings, *out, own->views, state != nullptr);
-  } catch (const splat::OutOfMemory& e) {
-    return e.bytes;
-  } catch (const std::bad_alloc&) {
-    return -1;
-  }
-  if (state) *state = own.release();
-  else splat::states.give(std::move(own));
-  return 0;
+  return splat::guarded([&] {
+    std::unique_ptr<SplatState> own = splat::states.take();
+    splat::forward({*scene, *settings, *out, state != nullptr}, own->views);
+    if (state)
+      *state = own.release();
+    else
+      splat::states.give(std::move(own));
+  });
 }
 
-int64_t splat_backward(SplatState* state, const SplatScene* scene, const SplatSettings* settings, const SplatUpstream* upstream, const SplatGradients* out) {
-  std::unique_ptr<splat::Workspace> work = splat::workspaces.take();
-  try {
-    splat::backward(*scene, *settings, *upstream, *out, state->views, *work);
-  } catch (const splat::OutOfMemory& e) {
-    return e.bytes;
-  } catch (const std::bad_alloc&) {
-    return -1;
-  }
-  splat::workspaces.give(std::move(work));
-  return 0;
+int64_t splat_backward(SplatState* state, const SplatScene* scene, const SplatSettings* settings, const SplatUpstream* upstream,
+                       const SplatGradients* out) {
+  return splat::guarded([&] {
+    std::unique_ptr<splat::Workspace> work = splat::workspaces.take();
+    splat::backward({*scene, *settings, *upstream, *out, state->views, {}, *work});
+    splat::workspaces.give(std::move(work));
+  });
 }
 
-void splat_release(SplatState* state) { splat::states.give(std::unique_ptr<SplatState>(state)); }
+void splat_release(SplatState* state) {
+  if (state) splat::states.give(std::unique_ptr<SplatState>(state));
+}
 
 const char* splat_best_isa() {
 #if defined(__x86_64__)
   __builtin_cpu_init();
-  if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512cd")) return "v4";
-  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2")) return "v3";
-#endif
+  const bool v3 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2");
+  const bool v4 = __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512cd") &&
+                  __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl");
+  return v3 && v4 ? "v4" : v3 ? "v3" : "base";
+#else
   return "base";
+#endif
 }
 
 }  // extern "C"

@@ -4,15 +4,15 @@
 #include <cstdint>
 
 struct SplatScene {
-  const float* means;      // (N, 3)
-  const float* quats;      // (N, 4) w x y z, any length
-  const float* scales;     // (N, 3) standard deviations
-  const float* opacities;  // (N)
-  const float* colors;     // (N, 3) or, with colors_per_view, (B, N, 3)
-  const float* viewmats;   // (B, 4, 4) world to camera, OpenCV
-  const float* background; // (B, 3)
-  const float* Ks;         // (B, 3, 3) pixels
-  int64_t gaussians;       // N
+  const float* means;            // (N, 3)
+  const float* quats;            // (N, 4) w x y z, any length
+  const float* scales;           // (N, 3) standard deviations
+  const float* opacities;        // (N)
+  const float* viewmats;         // (B, 4, 4) world to camera, OpenCV
+  const float* colors;           // (N, 3) or, with colors_per_view, (B, N, 3)
+  const float* background;       // (B, 3)
+  const float* Ks;               // (B, 3, 3) pixels
+  int64_t gaussians;             // N
   int32_t views, width, height;  // B and the rendered size
   int32_t colors_per_view;
 };
@@ -33,16 +33,16 @@ struct SplatPictures {
 };
 
 struct SplatUpstream {
-  const float *image, *alpha, *depth;  // d loss / d pictures
+  const float *image, *alpha, *depth;  // d loss / d pictures; null is zero
 };
 
 // What a backward pass fills; those that may be null aren't computed then.
 struct SplatGradients {
-  float *means, *quats, *scales, *opacities, *colors;  // as in SplatScene
-  float* background;  // (B, 3)
-  float* viewmats;    // (B, 4, 4) or null
-  float* means2d;     // (B, N, 2)
-  float* absgrad;     // (B, N, 2) or null: sum over pixels of the absolute value
+  float *means, *quats, *scales, *opacities;  // as in SplatScene
+  float* viewmats;                            // may be null
+  float *colors, *background;
+  float* means2d;  // (B, N, 2)
+  float* absgrad;  // (B, N, 2), sums over the pixels of absolute values; may be null
 };
 
 // What a backward pass needs from its forward pass.
@@ -54,7 +54,7 @@ extern "C" {
 // given back by `splat_release`.
 int64_t splat_forward(const SplatScene*, const SplatSettings*, const SplatPictures*, SplatState** state);
 int64_t splat_backward(SplatState*, const SplatScene*, const SplatSettings*, const SplatUpstream*, const SplatGradients*);
-void splat_release(SplatState*);
+void splat_release(SplatState*);  // null is ignored
 // The best build for this processor: "v4", "v3" or "base".
 const char* splat_best_isa();
 }

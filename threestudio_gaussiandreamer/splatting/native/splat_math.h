@@ -32,10 +32,18 @@ SPLAT_FN float log2(float x) { return __builtin_log2f(x); }
 template <class F> SPLAT_FN F clamp(F x, F low, F high) { return minimum(maximum(x, low), high); }
 template <class F> SPLAT_FN auto finite(F x) { return x * 0.0f == 0.0f; }
 
-template <class F> struct Vec2 { F x, y; };
-template <class F> struct Vec3 { F x, y, z; };
-template <class F> struct Vec4 { F w, x, y, z; };
-template <class F> struct Mat3 { Vec3<F> x, y, z; };  // rows
+template <class F> struct Vec2 {
+  F x, y;
+};
+template <class F> struct Vec3 {
+  F x, y, z;
+};
+template <class F> struct Vec4 {
+  F w, x, y, z;
+};
+template <class F> struct Mat3 {
+  Vec3<F> x, y, z;
+};  // rows
 
 template <class F> SPLAT_FN Vec3<F> operator+(const Vec3<F>& a, const Vec3<F>& b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 template <class F> SPLAT_FN Vec3<F> operator-(const Vec3<F>& a, const Vec3<F>& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
@@ -45,13 +53,16 @@ template <class F> SPLAT_FN Vec3<F> cross(const Vec3<F>& a, const Vec3<F>& b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 template <class A, class F> SPLAT_FN Mat3<F> multiply(const Mat3<A>& a, const Mat3<F>& b) {
-  return {a.x.x * b.x + a.x.y * b.y + a.x.z * b.z, a.y.x * b.x + a.y.y * b.y + a.y.z * b.z, a.z.x * b.x + a.z.y * b.y + a.z.z * b.z};
+  return {a.x.x * b.x + a.x.y * b.y + a.x.z * b.z, a.y.x * b.x + a.y.y * b.y + a.y.z * b.z,
+          a.z.x * b.x + a.z.y * b.y + a.z.z * b.z};
 }
 template <class A, class F> SPLAT_FN Mat3<F> multiply_transposed(const Mat3<A>& a, const Mat3<F>& b) {  // a' b
-  return {a.x.x * b.x + a.y.x * b.y + a.z.x * b.z, a.x.y * b.x + a.y.y * b.y + a.z.y * b.z, a.x.z * b.x + a.y.z * b.y + a.z.z * b.z};
+  return {a.x.x * b.x + a.y.x * b.y + a.z.x * b.z, a.x.y * b.x + a.y.y * b.y + a.z.y * b.z,
+          a.x.z * b.x + a.y.z * b.y + a.z.z * b.z};
 }
 template <class A, class F> SPLAT_FN Vec3<F> multiply_transposed(const Mat3<A>& a, const Vec3<F>& v) {  // a' v
-  return {a.x.x * v.x + a.y.x * v.y + a.z.x * v.z, a.x.y * v.x + a.y.y * v.y + a.z.y * v.z, a.x.z * v.x + a.y.z * v.y + a.z.z * v.z};
+  return {a.x.x * v.x + a.y.x * v.y + a.z.x * v.z, a.x.y * v.x + a.y.y * v.y + a.z.y * v.z,
+          a.x.z * v.x + a.y.z * v.y + a.z.z * v.z};
 }
 
 // ---- Gaussians in the world ------------------------------------------------------------------------------------------------
@@ -100,7 +111,9 @@ template <class F> SPLAT_FN Mat3<F> world_axes(const Mat3<F>& rotation, const Ve
           {r.z.x * scale.x, r.z.y * scale.y, r.z.z * scale.z}};
 }
 
-template <class F> SPLAT_FN void world_axes_vjp(const Mat3<F>& rotation, const Vec3<F>& scale, const Mat3<F>& d, Mat3<F>& d_rotation, Vec3<F>& d_scale) {
+template <class F>
+SPLAT_FN void world_axes_vjp(const Mat3<F>& rotation, const Vec3<F>& scale, const Mat3<F>& d, Mat3<F>& d_rotation,
+                             Vec3<F>& d_scale) {
   const Mat3<F>& r = rotation;
   d_rotation = world_axes(d, scale);
   d_scale = {r.x.x * d.x.x + r.y.x * d.y.x + r.z.x * d.z.x, r.x.y * d.x.y + r.y.y * d.y.y + r.z.y * d.z.y,
@@ -122,7 +135,9 @@ template <class F> SPLAT_FN Vec3<F> to_camera(const Camera& camera, const Vec3<F
           dot(camera.rotation.z, mean) + camera.translation.z};
 }
 
-template <class F> SPLAT_FN Vec3<F> to_camera_vjp(const Camera& camera, const Vec3<F>& d_t) { return multiply_transposed(camera.rotation, d_t); }
+template <class F> SPLAT_FN Vec3<F> to_camera_vjp(const Camera& camera, const Vec3<F>& d_t) {
+  return multiply_transposed(camera.rotation, d_t);
+}
 
 template <class F> struct Screen {
   F inverse_depth;
@@ -138,13 +153,18 @@ template <class F> SPLAT_FN Screen<F> to_screen(const Camera& camera, const Vec3
   const Vec2<F> slope = {clamp(ray.x, zero + camera.slope_low.x, zero + camera.slope_high.x),
                          clamp(ray.y, zero + camera.slope_low.y, zero + camera.slope_high.y)};
   const Vec2<F> mean = {camera.focal.x * ray.x + camera.centre.x, camera.focal.y * ray.y + camera.centre.y};
-  return {inverse, ray, slope, mean, (camera.focal.x * inverse) * (axes.x - slope.x * axes.z), (camera.focal.y * inverse) * (axes.y - slope.y * axes.z)};
+  return {inverse,
+          ray,
+          slope,
+          mean,
+          (camera.focal.x * inverse) * (axes.x - slope.x * axes.z),
+          (camera.focal.y * inverse) * (axes.y - slope.y * axes.z)};
 }
 
 // Gradients of t and the axes; d_depth is that of t.z itself. The clamped slope is constant, the focal / z before it isn't.
 template <class F>
-SPLAT_FN void to_screen_vjp(const Camera& camera, const Screen<F>& s, const Mat3<F>& axes, const Vec2<F>& d_mean, const F& d_depth, const Vec3<F>& d_u0,
-                            const Vec3<F>& d_u1, Vec3<F>& d_t, Mat3<F>& d_axes) {
+SPLAT_FN void to_screen_vjp(const Camera& camera, const Screen<F>& s, const Mat3<F>& axes, const Vec2<F>& d_mean,
+                            const F& d_depth, const Vec3<F>& d_u0, const Vec3<F>& d_u1, Vec3<F>& d_t, Mat3<F>& d_axes) {
   const F zero = {};
   d_axes.x = (camera.focal.x * s.inverse_depth) * d_u0;
   d_axes.y = (camera.focal.y * s.inverse_depth) * d_u1;
@@ -177,15 +197,20 @@ template <class F> SPLAT_FN Whitening<F> whiten(const Vec3<F>& u0, const Vec3<F>
 }
 
 // From M = sum of u y y' over the pixels, where u = d loss / d ln(alpha): d loss / d cov = P' M P / 2 and
-// d loss / d U = P' M P U. With the compensation, whose log has the derivative (U U')^-1 U - P' P U, `total` is the sum of u.
-template <class F> SPLAT_FN void whiten_vjp(const Whitening<F>& w, const Vec3<F>& u0, const Vec3<F>& u1, const F& m_xx, const F& m_xy, const F& m_yy, Vec3<F>& d_u0, Vec3<F>& d_u1) {
+// d loss / d U = P' M P U.
+template <class F>
+SPLAT_FN void whiten_vjp(const Whitening<F>& w, const Vec3<F>& u0, const Vec3<F>& u1, const F& m_xx, const F& m_xy, const F& m_yy,
+                         Vec3<F>& d_u0, Vec3<F>& d_u1) {
   const Vec3<F> p0 = w.a * u0 + w.b * u1, p1 = w.c * u1;
   const Vec3<F> q0 = m_xx * p0 + m_xy * p1, q1 = m_xy * p0 + m_yy * p1;
   d_u0 = w.a * q0;
   d_u1 = w.b * q0 + w.c * q1;
 }
 
-template <class F> SPLAT_FN void compensation_vjp(const Whitening<F>& w, const Vec3<F>& u0, const F& total, Vec3<F>& d_u0, Vec3<F>& d_u1) {
+// What the compensation adds. Its log has the derivative (U U')^-1 U - P' P U, so with the sum `total` of u the first term is
+// added here, and for the second one M goes into `whiten_vjp` less total on its diagonal.
+template <class F>
+SPLAT_FN void compensation_vjp(const Whitening<F>& w, const Vec3<F>& u0, const F& total, Vec3<F>& d_u0, Vec3<F>& d_u1) {
   const F zero = {}, scale = select(w.area > zero, total / w.area, zero);
   d_u0 = d_u0 + scale * cross(w.v, w.n);
   d_u1 = d_u1 + (scale * w.c) * cross(w.n, u0);
@@ -213,22 +238,34 @@ struct alignas(64) Splat {
   float level;               // log2(opacity / alpha_min) = |y|^2 on the ellipse's rim
 };
 
-template <class F> struct Span { F low, high; };
+// The rim of a splat, where alpha = alpha_min, around (x, y).
+template <class F> struct Ellipse {
+  F x, y, extent_y;
+  F c2, level;  // |y|^2 <= level inside; c2 = c * c
+  F inverse_a, tilt, slant;
+};
 
-// x - splat.x of the ellipse inside the rows y_low <= y - splat.y <= y_high; meaningless when they miss it.
-template <class F> SPLAT_FN Span<F> row_span(const Splat& splat, F y_low, F y_high) {
-  const F zero = {};
-  const F right = clamp(zero + splat.slant, y_low, y_high), left = clamp(zero - splat.slant, y_low, y_high);
-  const float c2 = splat.c * splat.c;
-  const F half_right = square_root(maximum(splat.level - c2 * right * right, zero)) * splat.inverse_a;
-  const F half_left = square_root(maximum(splat.level - c2 * left * left, zero)) * splat.inverse_a;
-  return {splat.tilt * left - half_left, splat.tilt * right + half_right};
+template <class F> struct Span {
+  F low, high;
+};
+
+// Columns of the ellipse inside the rows y_low <= y <= y_high; meaningless when they miss it. Its right side bulges most at
+// `slant` above the centre, its left side as far below.
+template <class F> SPLAT_FN Span<F> row_span(const Ellipse<F>& e, F y_low, F y_high) {
+  const F zero = {}, right = clamp(e.slant, y_low - e.y, y_high - e.y), left = clamp(-e.slant, y_low - e.y, y_high - e.y);
+  const F half_right = square_root(maximum(e.level - e.c2 * right * right, zero)) * e.inverse_a;
+  const F half_left = square_root(maximum(e.level - e.c2 * left * left, zero)) * e.inverse_a;
+  return {e.x + (e.tilt * left - half_left), e.x + (e.tilt * right + half_right)};
+}
+
+template <class F> SPLAT_FN auto meets_rows(const Ellipse<F>& e, F y_low, F y_high) {
+  return (y_low - e.y <= e.extent_y) & (y_high - e.y >= -e.extent_y);
 }
 
 // alpha = min(alpha_max, 2^power), zero below alpha_min.
 template <class F> SPLAT_FN F alpha_of(F power, float log2_alpha_min, float alpha_max) {
   const F zero = {};
-  return select(power >= zero + log2_alpha_min, minimum(exp2(power), zero + alpha_max), zero);
+  return select(power >= zero + log2_alpha_min, minimum(exp2(power), F(zero + alpha_max)), zero);
 }
 
 // Front-to-back compositing of one splat with transmittance T before it: it counts while T >= stop, so the one that brings

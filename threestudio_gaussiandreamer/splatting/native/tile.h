@@ -1,78 +1,131 @@
 // What the forward and the backward blend share: the splats of a tile in its own coordinates, and which blocks they touch.
 #pragma once
 
-#include "view.h"
+#include "calls.h"
 
 namespace splat {
 
-constexpr int CHUNK = 256;     // splats staged at a time
-constexpr int PREFETCH = 32;   // splats ahead
-constexpr int CHECK_EVERY = 8; // splats between two looks at whether all pixels of a strip have stopped
+constexpr int CHUNK = 256;      // splats staged at a time
+constexpr int PREFETCH = 32;    // splats ahead
+constexpr int CHECK_EVERY = 4;  // splats between two looks at whether all pixels of a strip have stopped
+
+struct TileFrame {
+  int left, top;
+  int begin, end;  // entries
+  bool inside;     // all of its pixels belong to the image
+};
+
+inline TileFrame frame_of(const View& view, int tile) {
+  const int left = tile % view.tiles_x * TILE, top = tile / view.tiles_x * TILE;
+  const bool inside = left + TILE <= view.camera.size.x && top + TILE <= view.camera.size.y;
+  return {left, top, view.tile_begin[tile], view.tile_begin[tile + 1], inside};
+}
 
 // y = (a X + b Y + shift_x, c Y + shift_y) at pixel (X, Y) of the tile; log2(alpha) = log2_opacity - |y|^2.
 struct alignas(64) LocalSplat {
   float a, b, c, shift_x, shift_y, log2_opacity;
-  float red, green, blue, depth;
+  float red, green, blue, depth, unused[6];
 };
 
-SPLAT_FN LocalSplat to_tile(const Splat& s, float left, float top) {
-  const float x = s.x - left, y = s.y - top;
-  return {s.a, s.b, s.c, -(s.a * x + s.b * y), -s.c * y, s.log2_opacity, s.red, s.green, s.blue, s.depth};
+// The columns of a Splat, one splat per lane.
+struct SplatLanes {
+  Floats x, y, a, b, c, log2_opacity, depth, red, green, blue, inverse_a, tilt, slant, extent_x, extent_y, level;
+};
+
+SPLAT_FN SplatLanes load_splats(const View& view, const TileFrame& frame, int entry, int count) {
+  SplatLanes lanes;
+  load_columns<ROW>([&](int l) { return &view.splats[view.entries[entry + std::min(l, count - 1)].gaussian].x; }, &lanes.x);
+  lanes.x -= float(frame.left), lanes.y -= float(frame.top);
+  return lanes;
 }
 
-// Bit 8 r + c is set when the ellipse comes near a pixel centre of block (r, c): one lane per row of blocks finds the
-// ellipse's columns.
-SPLAT_FN uint64_t block_mask(const Splat& splat, float left, float top) {
-  const Octet zero = {}, row = {0, 1, 2, 3, 4, 5, 6, 7};
-  const Octet y_low = row * float(BLOCK) + (top + 0.5f - splat.y), y_high = y_low + float(BLOCK - 1);
-  const Octet nearest = clamp(zero, y_low, y_high);
-  const OctetInts meets = nearest * nearest <= zero + (splat.extent_y * splat.extent_y + 1e-3f);
-  const Span<Octet> x = row_span(splat, y_low, y_high);
-  const float to_block = 1.0f / BLOCK, shift = splat.x - left;
-  const Octet first = clamp((x.low + (shift + 0.499f)) * to_block, zero, zero + 8.0f);
-  const Octet end = clamp((x.high + (shift - 0.499f)) * to_block + 1.0f, zero, zero + 8.0f);
-  const OctetInts one = {1, 1, 1, 1, 1, 1, 1, 1};
-  const OctetInts bits = meets & ((one << __builtin_convertvector(end, OctetInts)) - 1) & ~((one << __builtin_convertvector(first, OctetInts)) - 1);
+SPLAT_FN void store_local(const SplatLanes& s, LocalSplat* local) {
+  const Floats zero = {};
+  const Floats shift_x = -(s.a * s.x + s.b * s.y), shift_y = -s.c * s.y;
+  Floats columns[ROW] = {s.a,    s.b,     s.c,  shift_x, shift_y, s.log2_opacity, s.red, s.green,
+                         s.blue, s.depth, zero, zero,    zero,    zero,           zero,  zero};
+  store_columns(columns, &local->a);
+}
+
+// Bits [first, end) where the ellipse comes near a pixel centre of a column of blocks, in one row of blocks.
+SPLAT_FN Ints blocks_in_row(const Ellipse<Floats>& ellipse, int row) {
+  const Floats zero = {}, top = zero + (row * BLOCK + 0.5f), bottom = top + float(BLOCK - 1), side = zero + float(BLOCKS_PER_ROW);
+  const Span<Floats> x = row_span(ellipse, top, bottom);
+  const Ints first = __builtin_convertvector(clamp((x.low + 0.499f) * (1.0f / BLOCK), zero, side), Ints);
+  const Ints end = __builtin_convertvector(clamp((x.high + (BLOCK - 0.499f)) * (1.0f / BLOCK), zero, side), Ints);
+  const Ints one = Ints{} + 1;
+  return meets_rows(ellipse, top - 1e-3f, bottom + 1e-3f) & ((one << end) - 1) & ~((one << first) - 1);
+}
+
+// Bit 8 r + c of each mask is set when the splat touches block (r, c) of the tile.
+SPLAT_FN void block_masks(const SplatLanes& s, uint64_t* masks) {
+  const Ellipse<Floats> ellipse = {s.x, s.y, s.extent_y, s.c * s.c, s.level, s.inverse_a, s.tilt, s.slant};
+  Ints halves[2] = {};
+  for (int row = 0; row < BLOCKS_PER_ROW; row++) halves[row / 4] |= blocks_in_row(ellipse, row) << (8 * (row % 4));
+  for (int l = 0; l < LANES; l++) masks[l] = uint64_t(uint32_t(halves[1][l])) << 32 | uint32_t(halves[0][l]);
+}
+
+// Turns 64 x 64 bits over: bit i of word j becomes bit j of word i (Warren, Hacker's Delight, 7-3).
+inline void transpose_bits(uint64_t* words) {
+  uint64_t mask = 0x00000000ffffffff;
+  for (int step = 32; step; step >>= 1, mask ^= mask << step)
+    for (int i = 0; i < 64; i += 2 * step)
+      for (int j = i; j < i + step; j++) {
+        const uint64_t swap = (words[j] >> step ^ words[j + step]) & mask;
+        words[j] ^= swap << step, words[j + step] ^= swap;
+      }
+}
+
+// The positions of the bits of each byte, low to high.
+struct BitPositions {
+  uint8_t of[256][8] = {};
+  uint8_t count[256] = {};
+  constexpr BitPositions() {
+    for (int byte = 0; byte < 256; byte++)
+      for (int bit = 0; bit < 8; bit++)
+        if (byte >> bit & 1) of[byte][count[byte]++] = uint8_t(bit);
+  }
+};
+constexpr BitPositions BIT_POSITIONS;
+
+// The staged splats of a chunk and, for each block, which of them touch it.
+struct Staged {
+  alignas(64) LocalSplat splats[CHUNK];
+  alignas(64) uint64_t touching[CHUNK];  // by splat while they are staged; then [64 splats][block], one bit per splat
+  int groups;                            // of 64 splats
+};
+
+// Writes the splats that touch a block, front to back; returns how many. Up to 7 more elements are overwritten.
+SPLAT_FN int list_block(const Staged& staged, int block, uint16_t* list) {
   typedef uint8_t Bytes __attribute__((vector_size(8)));
-  const Bytes bytes = __builtin_convertvector(bits, Bytes);
-  uint64_t mask;
-  std::memcpy(&mask, &bytes, sizeof mask);
-  return mask;
-}
-
-// For each block the staged splats that touch it, front to back.
-struct BlockLists {
-  int32_t lengths[BLOCKS];
-  uint16_t splats[BLOCKS][CHUNK];
-
-  void clear() { std::memset(lengths, 0, sizeof lengths); }
-  void add(uint16_t splat, uint64_t mask) {
-    for (; mask; mask &= mask - 1) {
-      const int block = __builtin_ctzll(mask);
-      splats[block][lengths[block]++] = splat;
+  typedef uint16_t Shorts __attribute__((vector_size(16)));
+  int count = 0;
+  for (int group = 0; group < staged.groups; group++)
+    for (uint64_t word = staged.touching[group * 64 + block], first = group * 64; word; word >>= 8, first += 8) {
+      Bytes positions;
+      std::memcpy(&positions, BIT_POSITIONS.of[word & 255], sizeof positions);
+      const Shorts splats = __builtin_convertvector(positions, Shorts) + uint16_t(first);
+      std::memcpy(list + count, &splats, sizeof splats);
+      count += BIT_POSITIONS.count[word & 255];
     }
-  }
-};
-
-struct TileFrame {
-  int index, left, top;
-  int begin, end;  // entries
-};
-
-inline TileFrame frame_of(const View& view, int tile) {
-  return {tile, tile % view.tiles_x * TILE, tile / view.tiles_x * TILE, view.tile_begin[tile], view.tile_begin[tile + 1]};
+  return count;
 }
 
-// Copies `count` splats of a tile into its coordinates; `mask_of(entry, splat)` says which blocks each one touches.
-template <class MaskOf> SPLAT_FN void stage(const View& view, const TileFrame& frame, int first, int count, LocalSplat* local, BlockLists& lists, MaskOf mask_of) {
-  lists.clear();
-  for (int i = 0; i < count; i++) {
-    const int entry = first + i;
-    __builtin_prefetch(&view.splats[view.entries[std::min(entry + PREFETCH, frame.end - 1)].gaussian]);
-    const Splat& splat = view.splats[view.entries[entry].gaussian];
-    local[i] = to_tile(splat, float(frame.left), float(frame.top));
-    lists.add(uint16_t(i), mask_of(entry, splat));
+// Brings `count` splats into the coordinates of a tile; the masks of the blocks that they touch are found, or read back.
+template <bool FIND>
+SPLAT_FN void stage(const View& view, const TileFrame& frame, int first, int count, uint64_t* masks, Staged& staged) {
+  for (int i = 0; i < count; i += LANES) {
+    for (int l = 0; l < LANES; l++)
+      __builtin_prefetch(&view.splats[view.entries[std::min(first + i + l + PREFETCH, frame.end - 1)].gaussian]);
+    const SplatLanes splats = load_splats(view, frame, first + i, count - i);
+    store_local(splats, staged.splats + i);
+    if (FIND) block_masks(splats, staged.touching + i);
   }
+  staged.groups = (count + 63) / 64;
+  if (FIND && masks) std::memcpy(masks + first, staged.touching, sizeof(uint64_t) * count);
+  if (!FIND) std::memcpy(staged.touching, masks + first, sizeof(uint64_t) * count);
+  std::fill(staged.touching + count, staged.touching + staged.groups * 64, 0);
+  for (int group = 0; group < staged.groups; group++) transpose_bits(staged.touching + group * 64);
 }
 
 // The pixel centres of a strip in tile coordinates.
@@ -85,11 +138,12 @@ struct StripPixels {
 SPLAT_FN StripPixels strip_pixels(int block, int strip) {
   Floats column, row;
   for (int l = 0; l < LANES; l++) column[l] = float(l % BLOCK), row[l] = float(l / BLOCK);
-  const float left = (block % BLOCKS_PER_ROW) * BLOCK + 0.5f, top = (block / BLOCKS_PER_ROW) * BLOCK + strip * (LANES / BLOCK) + 0.5f;
+  const float left = (block % BLOCKS_PER_ROW) * BLOCK + 0.5f;
+  const float top = (block / BLOCKS_PER_ROW) * BLOCK + strip * (LANES / BLOCK) + 0.5f;
   return {block * BLOCK_PIXELS + strip * LANES, left, top, column + left, row + top};
 }
 
-// log2(alpha) of a splat at the pixels of a strip, before cap and threshold.
+// y of a splat at the pixels of a strip, and its log2(alpha) there before cap and threshold.
 SPLAT_FN Floats power_at(const LocalSplat& s, const StripPixels& pixels, Floats& y1, Floats& y2) {
   y1 = s.a * pixels.x + (s.b * pixels.y + s.shift_x);
   y2 = s.c * pixels.y + s.shift_y;
@@ -98,15 +152,36 @@ SPLAT_FN Floats power_at(const LocalSplat& s, const StripPixels& pixels, Floats&
 
 // Transmittance 1 for pixels of the image, 0 for those of the tile that lie outside of it: they have stopped already.
 inline void start_transmittance(const View& view, const TileFrame& frame, float* transmittance) {
+  if (frame.inside) return (void)std::fill(transmittance, transmittance + TILE_PIXELS, 1.0f);
   for (int block = 0; block < BLOCKS; block++)
     for (int p = 0; p < BLOCK_PIXELS; p++) {
-      const int x = frame.left + block % BLOCKS_PER_ROW * BLOCK + p % BLOCK, y = frame.top + block / BLOCKS_PER_ROW * BLOCK + p / BLOCK;
+      const int x = frame.left + block % BLOCKS_PER_ROW * BLOCK + p % BLOCK;
+      const int y = frame.top + block / BLOCKS_PER_ROW * BLOCK + p / BLOCK;
       transmittance[block * BLOCK_PIXELS + p] = x < view.camera.size.x && y < view.camera.size.y ? 1.0f : 0.0f;
     }
 }
 
-struct BlendLimits {
-  float log2_alpha_min, alpha_max, stop;
+// Which strips still have pixels that haven't stopped: a bit per block for each strip.
+struct LiveStrips {
+  uint64_t blocks[STRIPS];
+
+  LiveStrips() { std::fill(blocks, blocks + STRIPS, ~uint64_t(0)); }
+  bool any() const {
+    return std::any_of(blocks, blocks + STRIPS, [](uint64_t b) { return b != 0; });
+  }
 };
+
+// Calls blend(pixels, list, length), which says whether the strip lives on, for each live strip and the splats that touch it.
+template <class Blend> SPLAT_FN void for_each_live_strip(const Staged& staged, LiveStrips& live, Blend blend) {
+  uint16_t list[CHUNK + 8];
+  for (int block = 0; block < BLOCKS; block++) {
+    uint64_t alive = 0;
+    for (int strip = 0; strip < STRIPS; strip++) alive |= live.blocks[strip] >> block & 1;
+    const int length = alive ? list_block(staged, block, list) : 0;
+    for (int strip = 0; length && strip < STRIPS; strip++)
+      if (live.blocks[strip] >> block & 1 && !blend(strip_pixels(block, strip), list, length))
+        live.blocks[strip] &= ~(uint64_t(1) << block);
+  }
+}
 
 }  // namespace splat

@@ -21,12 +21,14 @@ struct TileSpan {
   uint16_t begin, end;  // tile columns
 };
 
-// The tiles of one Gaussian: a span of columns in each tile row from `row` on. Every pair of Gaussian and tile has a slot,
-// where the backward pass puts its gradient; those of a Gaussian follow one another.
+// The tiles of one Gaussian: `rows` rows of tiles from `row` on, in each of them the columns of `all`, or when that is empty
+// the spans of the slice from `span` on. Every pair of Gaussian and tile has a slot, where the backward pass puts its
+// gradient; those of a Gaussian follow one another, up to the first one of the next Gaussian.
 struct Coverage {
-  int32_t slot, slots;  // the first one, counted within the slice
-  int32_t span;         // index of the first one in the slice
+  int32_t slot;  // the first one, counted within the slice
+  int32_t span;
   uint16_t row, rows;
+  TileSpan all;
 };
 
 // SLICE consecutive Gaussians.
@@ -41,27 +43,39 @@ struct Entry {
   int32_t gaussian, slot;
 };
 
-// A colour, depth and transmittance per pixel of a tile, block after block.
+// Sums of weight * (colour, depth, 1) per pixel of a tile, block after block. 1 - alpha is what the background still gets.
 struct Planes {
-  alignas(64) float red[TILE_PIXELS], green[TILE_PIXELS], blue[TILE_PIXELS], depth[TILE_PIXELS], transmittance[TILE_PIXELS];
+  alignas(64) float red[TILE_PIXELS], green[TILE_PIXELS], blue[TILE_PIXELS], depth[TILE_PIXELS], alpha[TILE_PIXELS];
 };
 
 struct View {
   int index, tiles_x, tiles_y;
   int64_t entry_count;
   Camera camera;
-  Buffer<Splat> splats;         // (N)
-  Buffer<Coverage> coverage;    // (N)
+  Buffer<Splat> splats;        // (N)
+  Buffer<Coverage> coverages;  // (N), and one more behind each slice
   std::vector<Slice> slices;
   Buffer<uint64_t> keys, spare_keys;  // depth << 32 | Gaussian
   Buffer<int32_t> histogram;
-  Buffer<int32_t> tile_begin;   // (tiles + 1) into entries
-  Buffer<Entry> entries;        // by tile, then by depth
-  Buffer<uint64_t> block_masks; // per entry, the blocks of the tile that it touches
-  Buffer<Planes> planes;        // (tiles) before the background
+  Buffer<int32_t> tile_begin;    // (tiles + 1) into entries
+  Buffer<Entry> entries;         // by tile, then by depth
+  Buffer<uint64_t> block_masks;  // per entry, the blocks of the tile that it touches
+  Buffer<Planes> planes;         // (tiles) before the background; those of empty tiles aren't set
+
+  // Room for everything whose size doesn't depend on where the Gaussians are.
+  void prepare(const SplatScene& scene, int view) {
+    index = view, tiles_x = (scene.width + TILE - 1) / TILE, tiles_y = (scene.height + TILE - 1) / TILE;
+    slices.resize((scene.gaussians + SLICE - 1) / SLICE);
+    const size_t padded = slices.size() * SLICE;
+    splats.reserve(padded), keys.reserve(padded), spare_keys.reserve(padded), coverages.reserve(padded + slices.size());
+  }
 
   int tiles() const { return tiles_x * tiles_y; }
   const Slice& slice_of(int64_t gaussian) const { return slices[gaussian / SLICE]; }
+  Coverage& coverage(int64_t gaussian) { return coverages[gaussian + gaussian / SLICE]; }
+  const Coverage& coverage(int64_t gaussian) const { return coverages[gaussian + gaussian / SLICE]; }
+  int64_t slot_begin(int64_t gaussian) const { return slice_of(gaussian).first_slot + coverage(gaussian).slot; }
+  int64_t slot_end(int64_t gaussian) const { return slice_of(gaussian).first_slot + (&coverage(gaussian))[1].slot; }
 };
 
 // Never shrinks, so that the views' buffers are used again; the scene says how many there are.
