@@ -399,7 +399,7 @@ def write_glb(path: Path, vertices: np.ndarray, uv: np.ndarray, faces: np.ndarra
     positions = vertices[:, [1, 2, 0]].astype("<f4")  # x, y, z of the file are the world's y, z, x
     chunks = [positions.tobytes(), uv.astype("<f4").tobytes(), faces.astype("<u2").tobytes(), image.getvalue()]
     offsets = np.cumsum([0] + [len(padded(chunk)) for chunk in chunks])
-    views = [{"buffer": 0, "byteOffset": int(offset), "byteLength": len(chunk)} for offset, chunk in zip(offsets, chunks, strict=True)]
+    views = [{"buffer": 0, "byteOffset": int(offset), "byteLength": len(chunk)} for offset, chunk in zip(offsets[:-1], chunks, strict=True)]
     accessors = [
         {
             "bufferView": 0,

@@ -60,10 +60,11 @@ def test_the_denoised_is_the_posterior_mean_by_quadrature(std):
     def joint(x0, z, k):
         return prior[k] * math.exp(-((x0 - centers[k]) ** 2) / (2 * std**2) - (z - a * x0) ** 2 / (2 * variance)) / std
 
+    def integral(power, z, k):
+        return quad(lambda x0: x0**power * joint(x0, z, k), -15, 15, epsabs=1e-14, epsrel=1e-12, limit=400)[0]
+
     for z in (-2.0, -0.1, 0.4, 1.7):
-        integrals = [
-            [quad(lambda x: x**p * joint(x, z, k), -15, 15, epsabs=1e-14, epsrel=1e-12, limit=400)[0] for k in (0, 1)] for p in (0, 1)
-        ]
+        integrals = [[integral(power, z, k) for k in (0, 1)] for power in (0, 1)]
         mass, moment = np.array(integrals)
         out = denoise(
             torch.tensor([[z]], dtype=torch.float64),

@@ -49,7 +49,9 @@ def test_the_silhouette_of_a_sphere(distance, fovy, size):
         assert abs(span + 1 - 2 * radius) < 1.5
 
 
-@pytest.mark.parametrize(("side", "elevation", "azimuth"), [("+x", 0, 0), ("+y", 0, 90), ("-x", 0, 180), ("-y", 0, -90), ("+z", 89.9, 0), ("-z", -89.9, 0)])
+@pytest.mark.parametrize(
+    ("side", "elevation", "azimuth"), [("+x", 0, 0), ("+y", 0, 90), ("-x", 0, 180), ("-y", 0, -90), ("+z", 89.9, 0), ("-z", -89.9, 0)]
+)
 def test_each_side_of_a_cube_is_seen_from_its_side(side, elevation, azimuth):
     image = MeshCaster(cube()).render(look(elevation, azimuth, 3), math.radians(40), 32, 32)
     np.testing.assert_allclose(image[16, 16], [*COLORS[side], 1], atol=1e-6)
@@ -127,7 +129,7 @@ def test_many_views_are_the_single_views():
     caster = MeshCaster(cube())
     views = [(look(10 * i, 40 * i, 2 + 0.1 * i), 0.8) for i in range(6)]
     together = caster.render_views(views, 12, 18, supersample=2)
-    for image, view in zip(together, views):
+    for image, view in zip(together, views, strict=True):
         np.testing.assert_array_equal(image, caster.render(*view, 12, 18, 2))
     assert caster.render_views([], 12, 18).shape == (0, 12, 18, 4)
 

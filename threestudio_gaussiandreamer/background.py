@@ -37,7 +37,7 @@ class FlatBackground(BaseBackground):
                 raise unknown("system.background.mode", cfg.mode, MODES)
             if not all(0.0 <= c <= 1.0 for c in cfg.color):
                 raise UserError(f"system.background.color: expected three numbers in [0, 1], got {list(cfg.color)}")
-            validate_schedule(cfg.lr, "system.background.lr")
+            validate_schedule(cfg.lr, "system.background.lr", minimum=0)
 
     cfg: Config
 

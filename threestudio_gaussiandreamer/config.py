@@ -13,11 +13,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from glob import escape as glob_escape
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Optional
 
 import yaml
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from .builtin.base import fill
@@ -31,7 +32,7 @@ from .prompts import read_prompt
 TOP_LEVEL_TEXT = ("name", "tag", "description")
 PROMPT_TEXT = ("prompt", "negative_prompt", "prompt_front", "prompt_side", "prompt_back", "prompt_overhead")
 # a path may hold what YAML reads as a comment or a mapping; only null and interpolations are still special
-PATH_ENDINGS = ("path", "_file", "_dir", "resume", "weights")
+PATH_ENDINGS = ("path", "mesh", "_file", "_dir", "resume", "weights")
 # stands for "${" of a text while interpolations are resolved; a character of Unicode's private use area
 PROTECTED = "$\ue000{"
 SLUG_BYTES = 64
@@ -204,11 +205,27 @@ def _merge(sources: list[DictConfig]) -> DictConfig:
         merged = OmegaConf.merge(*sources)
     except OmegaConfBaseException as error:
         raise UserError(f"the configurations can't be merged: {_explain(error)}") from error
+    except TypeError as error:
+        clash = next(filter(None, (_clash(a, b) for a, b in combinations(sources, 2))), "a key")
+        raise UserError(f"the configurations can't be merged: {clash} is a list in one and a section in another") from error
     for section in ("data", "system", "trainer", "checkpoint"):
         # "trainer:" with nothing below it is null in YAML
         if section in merged and merged._get_node(section)._is_none():
             merged[section] = {}
     return merged
+
+
+def _clash(a: DictConfig, b: DictConfig, section: str = "") -> Optional[str]:
+    """The first key that is a list in one and a section in the other."""
+    for key in a:
+        one, other = a._get_node(key), b._get_node(key) if key in b else None
+        if isinstance(one, (DictConfig, ListConfig)) and isinstance(other, (DictConfig, ListConfig)):
+            if type(one) is not type(other):
+                return f"{section}{key}"
+            found = _clash(one, other, f"{section}{key}.") if isinstance(one, DictConfig) else None
+            if found:
+                return found
+    return None
 
 
 def _require_mandatory(cfg: DictConfig) -> None:
@@ -240,7 +257,13 @@ def _resolve(cfg: DictConfig) -> None:
 
 
 def protect(text: str) -> str:
-    """``text`` as a value that resolving leaves alone, also where another value refers to it; :func:`_unprotect` ends it."""
+    """``text`` as a value that resolving leaves alone, also where another value refers to it; :func:`_unprotect` ends it.
+
+    Raises:
+        UserError: it is ``???``, which means in every configuration that a value is missing.
+    """
+    if text == MISSING:
+        raise UserError(f"{MISSING!r} can't be a text: in configurations it means that a value is missing; add a word")
     return text.replace("${", PROTECTED)
 
 
@@ -301,6 +324,8 @@ def _name_folders(cfg: Any) -> None:
     """``exp_root_dir/name/tag@time``; a run that is resumed from its ``parsed.yaml`` keeps its time, and so its folder."""
     if not cfg.tag and not cfg.use_timestamp:
         raise UserError("a run needs a tag when use_timestamp is false: both name its folder")
+    if "\0" in cfg.exp_root_dir:
+        raise UserError(f"exp_root_dir is {cfg.exp_root_dir!r}; no folder's name has a NUL")
     tag = safe_name(cfg.tag) if cfg.tag else ""
     cfg.exp_dir = escape(os.path.join(cfg.exp_root_dir, safe_name(cfg.name)))
     if cfg.timestamp is None:

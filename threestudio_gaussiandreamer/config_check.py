@@ -8,6 +8,7 @@ part's ``Config``.
 import dataclasses
 import difflib
 import inspect
+import os
 import types
 import typing
 from collections.abc import Collection, Mapping
@@ -28,11 +29,14 @@ LAUNCHER_SETS = {
     "logger": "the launcher and system.loggers",
     "plugins": "the launcher",
     "inference_mode": "the launcher",
+    "enable_checkpointing": "the launcher",
     "default_root_dir": "exp_root_dir",
     "dirpath": "exp_root_dir, name and tag",
 }
 # what would start or look for other processes
 NEEDS_PROCESSES = ("strategy", "num_nodes", "sync_batchnorm")
+# what Lightning takes and fails on later
+AT_LEAST = {"log_every_n_steps": 0, "num_sanity_val_steps": -1, "max_steps": -1}
 LOGGER_KEYS = ("enable", "project", "name")
 
 
@@ -50,10 +54,12 @@ def check_config(cfg: Any) -> None:
     _check_loss(cfg.system.get("loss"), getattr(find(cfg.system_type), "LOSSES", None))
     _check_loggers(cfg.system.get("loggers"))
     _check_arguments("trainer", cfg.trainer, pl.Trainer)
+    _check_trainer_ranges(cfg.trainer)
     _check_arguments("checkpoint", cfg.checkpoint, pl.callbacks.ModelCheckpoint)
-    _build("checkpoint", pl.callbacks.ModelCheckpoint, plain(cfg.checkpoint))
+    _check_file_name("checkpoint.filename", cfg.checkpoint.get("filename"))
+    build("checkpoint", pl.callbacks.ModelCheckpoint, plain(cfg.checkpoint))
     options = {key: value for key, value in plain(cfg.trainer).items() if key not in NEEDS_PROCESSES}
-    _build("trainer", pl.Trainer, {**options, "devices": 1, "logger": False})
+    build("trainer", pl.Trainer, {**options, "devices": 1, "logger": False})
 
 
 def check_part(path: str, type_name: Any, values: Any) -> None:
@@ -66,8 +72,16 @@ def check_part(path: str, type_name: Any, values: Any) -> None:
     typed = _typed(path, values, config_class)
     for key in typed:
         section = key.removesuffix("_type")
-        if section != key and section in typed and typed[key]:
+        if section == key or section not in typed:
+            continue
+        if not typed[key] and _default(config_class, key):
+            raise UserError(f"{path}.{key} is empty: name a registered part, such as {_default(config_class, key)!r}")
+        if typed[key]:
             check_part(f"{path}.{section}", typed[key], typed[section])
+
+
+def _default(config_class: type, key: str) -> Any:
+    return next(field.default for field in dataclasses.fields(config_class) if field.name == key)
 
 
 def _find(path: str, type_name: Any) -> type:
@@ -130,7 +144,7 @@ def _check_loggers(loggers: Any) -> None:
     for name, options in (loggers or {}).items():
         if name != "wandb":
             raise _unknown_key("system.loggers", name, ["wandb"])
-        for key in options:
+        for key in _mapping(f"system.loggers.{name}", options):
             if key not in LOGGER_KEYS:
                 raise _unknown_key("system.loggers.wandb", key, LOGGER_KEYS)
 
@@ -164,10 +178,27 @@ def _plain_types(annotation: Any) -> set[type]:
     return {annotation} if annotation in (int, float, bool, str, type(None)) else set()
 
 
-def _build(section: str, owner: type, arguments: dict) -> None:
-    """Build it once and drop it: Lightning checks combinations and literals only then."""
+def _check_trainer_ranges(trainer: Any) -> None:
+    for key, lowest in AT_LEAST.items():
+        if (trainer.get(key) if trainer.get(key) is not None else lowest) < lowest:
+            raise UserError(f"trainer.{key}: expected {lowest} or more, got {trainer[key]}")
+    if trainer.get("val_check_interval") in (0, 0.0):
+        raise UserError("trainer.val_check_interval: expected a number of steps above 0 (for no validation: trainer.limit_val_batches=0)")
+
+
+def _check_file_name(path: str, name: Any) -> None:
+    if name is not None and (os.path.isabs(name) or os.path.normpath(name).startswith(os.pardir)):
+        raise UserError(f"{path} is {name!r}; expected a name below the folder of the checkpoints")
+
+
+def build(section: str, owner: type, arguments: dict) -> Any:
+    """``owner(**arguments)``: Lightning checks combinations and literals only then.
+
+    Raises:
+        UserError: it doesn't accept them.
+    """
     try:
-        owner(**arguments)
+        return owner(**arguments)
     except (MisconfigurationException, TypeError, ValueError) as error:
         raise UserError(f"{section}: {error}") from error
 

@@ -84,6 +84,17 @@ class CameraConfig:
                 raise UserError(f"data.{name}: {len(values)} entries need {len(values) - 1} data.resolution_milestones, got {len(cfg.resolution_milestones)}")
             if any(not isinstance(v, int) or isinstance(v, bool) or v < 1 for v in (values if listed else [values])):
                 raise UserError(f"data.{name}: expected whole numbers >= 1, got {values}")
+        _check_milestones(cfg)
+        for name in ("camera_perturb", "center_perturb", "up_perturb", "light_position_perturb", "progressive_until"):
+            if cfg[name] < 0:
+                raise UserError(f"data.{name}: expected 0 or more, got {cfg[name]}")
+        if not cfg.eval_camera_distance > 0:
+            raise UserError(f"data.eval_camera_distance: expected a positive distance, got {cfg.eval_camera_distance}")
+        if not 0 < cfg.eval_fovy_deg < 180:
+            raise UserError(f"data.eval_fovy_deg: expected degrees between 0 and 180, got {cfg.eval_fovy_deg}")
+        if not -90 <= min(cfg.elevation_range[0], cfg.eval_elevation_deg) <= max(cfg.elevation_range[1], cfg.eval_elevation_deg) <= 90:
+            elevations = [*cfg.elevation_range, cfg.eval_elevation_deg]
+            raise UserError(f"data.elevation_range, data.eval_elevation_deg: expected degrees from -90 to 90, got {elevations}")
         if cfg.eval_batch_size != 1:
             raise UserError(f"data.eval_batch_size: views are evaluated one at a time, expected 1, got {cfg.eval_batch_size}")
         for name in ("eval_height", "eval_width", "n_val_views", "n_test_views"):
@@ -91,6 +102,14 @@ class CameraConfig:
                 raise UserError(f"data.{name}: expected at least 1, got {cfg[name]}")
         if cfg.train_views < 0:
             raise UserError(f"data.train_views: expected 0 (continuous) or a number of views, got {cfg.train_views}")
+
+
+def _check_milestones(cfg: Any) -> None:
+    milestones = list(cfg.resolution_milestones)
+    if any(later <= earlier for earlier, later in zip([0, *milestones], milestones, strict=False)):
+        raise UserError(f"data.resolution_milestones: expected increasing steps above 0, got {milestones}")
+    if milestones and not any(isinstance(_plain(cfg[name]), list) and len(cfg[name]) > 1 for name in ("height", "width", "batch_size")):
+        raise UserError(f"data.resolution_milestones: give data.height, data.width or data.batch_size {len(milestones) + 1} entries")
 
 
 def make_batch(

@@ -110,7 +110,7 @@ class Measurements:
     def __init__(self, held_out: HeldOut, folder: Path) -> None:
         self.held_out, self.folder = held_out, folder
         self.path = folder / "metrics.json"
-        self.values: dict[str, Any] = json.loads(self.path.read_text()) if self.path.is_file() else {}
+        self.values: dict[str, Any] = _read_json(self.path)
         self.seconds = float(self.values.get("seconds", 0.0))
         self._started: Optional[float] = None
 
@@ -170,6 +170,15 @@ class Measurements:
                 face = f"{100 * v['multi_face']:.0f} %"
                 lines.append(f"{key:<10}{v['psnr']:6.2f}   {v['ssim']:6.4f}   {face:>10}   {v['gaussians']:9d}   {v['seconds']:7.1f}")
         return "\n".join(lines)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """The mapping in a JSON file; empty when there is none, or a damaged one, whose numbers are measured anew."""
+    try:
+        values = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return values if isinstance(values, dict) else {}
 
 
 def _row(images: Float[Tensor, "V H W 3"], count: int = 6) -> np.ndarray:

@@ -55,7 +55,7 @@ def responsibilities(
     distances: Float[Tensor, "B K"],
     variance: Float[Tensor, " B"],
     *,
-    log_prior: Optional[Float[Tensor, "*batch K"]] = None,
+    log_prior: Optional[Float[Tensor, "*prior K"]] = None,
     temperature: float = 1.0,
 ) -> Float[Tensor, "B K"]:
     """gamma = softmax((log pi - distances / 2v) / temperature) in float64.
@@ -74,7 +74,7 @@ def denoise(
     bank: Float[Tensor, "*batch K d"],
     *,
     std: float = 0.0,
-    log_prior: Optional[Float[Tensor, "*batch K"]] = None,
+    log_prior: Optional[Float[Tensor, "*prior K"]] = None,
     temperature: float = 1.0,
     distances: Optional[Float[Tensor, "B K"]] = None,
 ) -> Denoised:
@@ -105,7 +105,7 @@ def log_density(
     bank: Float[Tensor, "*batch K d"],
     *,
     std: float = 0.0,
-    log_prior: Optional[Float[Tensor, "*batch K"]] = None,
+    log_prior: Optional[Float[Tensor, "*prior K"]] = None,
 ) -> Float[Tensor, " B"]:
     """log p_t(z), float64, with the ``log_prior`` normalised (uniform without one)."""
     variance = mode_variance(abar, std).to(z.device)

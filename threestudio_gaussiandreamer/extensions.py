@@ -52,7 +52,7 @@ def _load(entry: Path) -> str:
 def _cause(error: Exception, entry: Path) -> str:
     """``file:line: what``, the line being the innermost one inside the extension."""
     what = f"{type(error).__name__}: {error}"
-    if isinstance(error, SyntaxError):
+    if isinstance(error, SyntaxError) and error.lineno:
         return f"{error.filename}:{error.lineno}: {error.msg}"
     root = str(entry.resolve())
     inside = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(root)]

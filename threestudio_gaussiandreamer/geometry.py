@@ -118,10 +118,18 @@ class GaussianCloud(BaseGeometry):
                 value = _nested(cfg, name)
                 if not value > 0:
                     raise UserError(f"{where}.{name}: expected a positive number, got {value}")
+            for name in ("grow.num_candidates", "grow.max_points", "densify.start", "densify.stop", "densify.grad_threshold"):
+                value = _nested(cfg, name)
+                if value < 0:
+                    raise UserError(f"{where}.{name}: expected 0 or more, got {value}")
+            if cfg.densify.enabled and cfg.densify.start >= cfg.densify.stop:
+                raise UserError(f"{where}.densify: expected start < stop, got {cfg.densify.start} and {cfg.densify.stop}")
+            if not 0 <= cfg.densify.min_opacity < 1:
+                raise UserError(f"{where}.densify.min_opacity: expected a number from 0 to 1, got {cfg.densify.min_opacity}")
             if len(cfg.grow.color_range) != 2 or cfg.grow.color_range[0] > cfg.grow.color_range[1]:
                 raise UserError(f"{where}.grow.color_range: expected [low, high], got {list(cfg.grow.color_range)}")
             for name in LEARNING_RATES.values():
-                validate_schedule(cfg[name], f"{where}.{name}")
+                validate_schedule(cfg[name], f"{where}.{name}", minimum=0)
 
     cfg: Config
 

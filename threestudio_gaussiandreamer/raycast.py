@@ -97,7 +97,9 @@ class MeshCaster:
         return colors
 
 
-def over_background(rgba: Float[np.ndarray, "... 4"], background: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+def over_background(
+    rgba: Float[np.ndarray | Tensor, "... 4"], background: Float[np.ndarray | Tensor, "... 3"]
+) -> Float[np.ndarray | Tensor, "... 3"]:
     """Premultiplied ``rgba`` over ``background``: C + (1 - coverage) background. Takes numpy arrays and tensors alike."""
     return rgba[..., :3] + (1 - rgba[..., 3:]) * background
 
@@ -135,16 +137,16 @@ class TargetCache:
         self.caster, self.supersample, self.capacity = caster, supersample, capacity
         self._pictures: OrderedDict[tuple, Tensor] = OrderedDict()
 
-    def __call__(
-        self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int, *, progress: str = ""
-    ) -> UInt8[Tensor, "B H W 4"]:
+    def __call__(self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int) -> UInt8[Tensor, "B H W 4"]:
         """Premultiplied colour and coverage of each camera, on the cameras' device."""
         cameras = list(zip(c2w.detach().float().cpu().numpy(), fovy.detach().tolist(), strict=True))
         keys = [(matrix.tobytes(), angle, height, width) for matrix, angle in cameras]
-        missing = {key: camera for key, camera in zip(keys, cameras) if key not in self._pictures}
-        images = self.caster.render_views(missing.values(), height, width, supersample=self.supersample, progress=progress)
+        missing = {key: camera for key, camera in zip(keys, cameras, strict=True) if key not in self._pictures}
+        images = self.caster.render_views(missing.values(), height, width, supersample=self.supersample)
         found = {key: self._pictures[key] for key in keys if key not in missing}
-        found |= {key: torch.from_numpy(np.round(image * 255).astype(np.uint8)).to(c2w.device) for key, image in zip(missing, images)}
+        found |= {
+            key: torch.from_numpy(np.round(image * 255).astype(np.uint8)).to(c2w.device) for key, image in zip(missing, images, strict=True)
+        }
         self._remember(found)
         return torch.stack([found[key] for key in keys])
 

@@ -47,6 +47,10 @@ class SplattingRenderer(Rasterizer):
             _check_backend(cfg.backend)
             if cfg.downsample not in (1, 2):
                 raise UserError(f"system.renderer.downsample: expected 1 or 2, got {cfg.downsample}")
+            if not cfg.radius > 0:
+                raise UserError(f"system.renderer.radius: expected a positive number, got {cfg.radius}")
+            if cfg.eps2d < 0:
+                raise UserError(f"system.renderer.eps2d: expected 0 or more square pixels, got {cfg.eps2d}")
             if not 0 < cfg.near < cfg.far:
                 raise UserError(f"system.renderer: expected 0 < near < far, got near={cfg.near}, far={cfg.far}")
 

@@ -15,6 +15,8 @@ evaluation     views, size (pixels), supersample, every (steps; 0: only at start
 =============  ==============================================================================================================
 """
 
+import inspect
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
@@ -59,14 +61,13 @@ class GaussianDreamerSystem(BaseLift3DSystem):
                     raise UserError(f"system.{name}_type is empty: name a registered part")
             for name, weight in cfg.loss.items():
                 validate_schedule(weight, f"system.loss.{name}")
+            _check_losses(cfg)
             if cfg.scheduler is not None:
                 raise UserError("system.scheduler isn't used: learning rates are schedules themselves, for instance system.geometry.lr_means")
             for name in cfg.optimizer:
                 if name not in ("name", "args"):
                     raise unknown("key system.optimizer.", name, ("name", "args"))
-            optimizer = cfg.optimizer.get("name", "Adam")
-            if not isinstance(getattr(torch.optim, str(optimizer), None), type):
-                raise unknown("system.optimizer.name", optimizer, [n for n, v in vars(torch.optim).items() if isinstance(v, type)])
+            _check_optimizer(cfg.optimizer)
 
     cfg: Config
 
@@ -85,8 +86,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         own_background = isinstance(self.background, FlatBackground)
         groups = self.geometry.parameter_groups() + (self.background.parameter_groups() if own_background else [])
         groups += trainable_groups(self.guidance, GUIDANCE_LR)
-        arguments = {"betas": (0.9, 0.99), "eps": 1e-15, **self.cfg.optimizer.get("args", {})}
-        return getattr(torch.optim, self.cfg.optimizer.get("name", "Adam"))(groups, lr=0.0, **arguments)
+        return optimizer_of(self.cfg.optimizer, groups)
 
     def preflight(self) -> None:
         """What the prior needs is looked for before models are loaded: what is missing shows in seconds."""
@@ -152,21 +152,13 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         self._log_sometimes({f"train/{k}": v for k, v in guided.items() if not k.startswith("loss_") and k != "eval"})
         raw = {k.removeprefix("loss_"): v for k, v in guided.items() if k.startswith("loss_")}
         weights = {name.removeprefix("lambda_"): self.C(weight) for name, weight in self.cfg.loss.items()}
-        self._check_weights(weights, raw)
+        check_weights(weights, raw)
         raw |= {name: regulariser(name, out["opacity"]) for name in REGULARISERS if weights.get(name)}
         return {name: value * weights[name] for name, value in raw.items()}
 
     def guide(self, out: dict[str, Any], batch: dict[str, Any], **options: Any) -> dict[str, Any]:
         """What the guidance makes of these renders; it gets the whole batch, and the background that they lie on."""
         return call_guidance(self.guidance, out["comp_rgb"], self.prompt_utils, batch, comp_rgb_bg=out["comp_rgb_bg"], **options)
-
-    def _check_weights(self, weights: dict[str, float], raw: dict[str, Tensor]) -> None:
-        for name in weights:
-            if name not in raw and name not in REGULARISERS:
-                raise unknown("weight system.loss.lambda_*", f"lambda_{name}", [f"lambda_{n}" for n in (*raw, *REGULARISERS)])
-        for name in raw:
-            if name not in weights:
-                raise UserError(f"the guidance returns loss_{name}: give its weight, for instance system.loss.lambda_{name}=1")
 
     def loss_scale(self) -> float:
         """The factor that automatic mixed precision leaves on every gradient that isn't a parameter's."""
@@ -258,7 +250,8 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     def export(self) -> None:
         """Write what the exporter makes, as ``--export`` does; a training run ends with it."""
-        exporter = find(self.cfg.exporter_type)(self.cfg.exporter, geometry=self.geometry, material=self.material, background=self.background)
+        parts = {"geometry": self.geometry, "material": self.material, "background": self.background}
+        exporter = find(self.cfg.exporter_type)(self.cfg.exporter, **parts)
         for out in exporter():
             getattr(self, f"save_{out.save_type}")(f"it{self.true_global_step}-export/{out.save_name}", **out.params)
 
@@ -283,6 +276,47 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         path = self.get_save_path(filename)
         write_points(path, cloud)
         return path
+
+
+def optimizer_of(options: Any, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
+    """The optimiser ``{name, args}`` over parameter groups that bring their own learning rates."""
+    kind = getattr(torch.optim, options.get("name", "Adam"))
+    ours = {"betas": (0.9, 0.99), "eps": 1e-15}
+    accepted = {name: value for name, value in ours.items() if name in inspect.signature(kind).parameters}
+    return kind(groups, lr=0.0, **accepted | dict(options.get("args", {})))
+
+
+def _check_optimizer(options: Any) -> None:
+    name, arguments = options.get("name", "Adam"), options.get("args", {})
+    if not isinstance(getattr(torch.optim, str(name), None), type):
+        raise unknown("system.optimizer.name", name, [n for n, v in vars(torch.optim).items() if isinstance(v, type)])
+    if not isinstance(arguments, Mapping):
+        raise UserError(f"system.optimizer.args: expected keys and values, got {arguments!r}")
+    try:
+        optimizer_of(options, [{"params": [torch.zeros(1, requires_grad=True)], "lr": 0.0} for _ in range(2)])
+    except (TypeError, ValueError, AssertionError) as error:
+        raise UserError(f"system.optimizer: {name} doesn't accept this: {error}") from error
+
+
+def _check_losses(cfg: Any) -> None:
+    """Names of weights, where it is known before the first step which losses the guidance returns."""
+    guidance = find(cfg.guidance_type)
+    for name in cfg.loss:
+        if not name.startswith("lambda_"):
+            raise UserError(f"unknown key 'system.loss.{name}': weights of losses are called lambda_<loss>, such as lambda_sds")
+    known = getattr(guidance, "LOSSES", ("sds",) if issubclass(guidance, ScoreDistillation) else None)
+    if known is not None:
+        check_weights([name.removeprefix("lambda_") for name in cfg.loss], known)
+
+
+def check_weights(weights: Iterable[str], losses: Iterable[str]) -> None:
+    """Raise UserError unless every weight belongs to a loss or a regulariser, and every loss has its weight."""
+    for name in weights:
+        if name not in losses and name not in REGULARISERS:
+            raise unknown("weight system.loss.lambda_*", f"lambda_{name}", [f"lambda_{n}" for n in (*losses, *REGULARISERS)])
+    for name in losses:
+        if name not in weights:
+            raise UserError(f"the guidance returns loss_{name}: give its weight, for instance system.loss.lambda_{name}=1")
 
 
 def regulariser(name: str, alpha: Float[Tensor, "B H W 1"]) -> Tensor:

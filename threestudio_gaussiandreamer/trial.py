@@ -5,9 +5,11 @@
 
 import argparse
 import contextlib
+import errno
 import shlex
 import shutil
 import tempfile
+import traceback
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Optional
@@ -15,11 +17,19 @@ from typing import Any, Optional
 from .builtin.weights import load_checkpoint
 from .callbacks import GracefulStop, ProgressBar, RunRecord, Stopped
 from .checkpoints import AtomicCheckpointIO
-from .config_check import plain
+from .config_check import MisconfigurationException, build, plain
 from .errors import UserError
 from .host import find, info, pl, warn
 from .launch_options import PROGRAM
 from .strategy import ReplicatedStrategy
+
+# what ends a run that can't write its results
+WRITE_ERRORS = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM),
+    *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG),
+)
+# without it Lightning refuses to read a checkpoint
+LIGHTNINGS_KEY = "pytorch-lightning_version"
 
 
 class Trial:
@@ -49,11 +59,14 @@ class Trial:
         """
         try:
             self.start()
-            with lightning_errors(self.cfg.resume):
+            with lightning_errors(self.cfg.resume), write_errors():
                 getattr(self, self.args.stage)()
             self.summarize()
-        except (UserError, KeyboardInterrupt, SystemExit):
+        except (UserError, KeyboardInterrupt, SystemExit) as stop:
             self.discard_if_unused()
+            # between training and its end, while the test views are rendered
+            if self.args.stage == "train" and not isinstance(stop, UserError) and self.last.is_file():
+                print(f"to go on: {self.resume_command()}", flush=True)
             raise
         except Stopped as stop:
             print(f"stopped at step {stop.step}; to go on: {self.resume_command()}", flush=True)
@@ -81,6 +94,8 @@ class Trial:
                 warn(f"no checkpoint given (resume=...): --{self.args.stage} shows what training would start from")
             return None
         checkpoint = load_checkpoint(self.cfg.resume)
+        if LIGHTNINGS_KEY not in checkpoint:
+            raise UserError(f"{self.cfg.resume} isn't a training checkpoint: it has no {LIGHTNINGS_KEY}, which Lightning writes")
         self.resumed_step = checkpoint["global_step"]
         return checkpoint["epoch"], self.resumed_step
 
@@ -115,16 +130,18 @@ class Trial:
         checkpoint_io = AtomicCheckpointIO()
         training = self.args.stage == "train"
         callbacks = [ProgressBar()] if options["enable_progress_bar"] else []
-        return pl.Trainer(
-            accelerator="gpu" if self.n_gpus else "cpu",
-            devices=self.n_gpus or 1,
-            logger=self.build_loggers() if training else False,
-            callbacks=callbacks + (self.training_callbacks(checkpoint_io) if training else []),
-            plugins=[checkpoint_io],
-            inference_mode=False,
-            default_root_dir=str(self.folder),
-            **options,
-        )
+        ours = {
+            "accelerator": "gpu" if self.n_gpus else "cpu",
+            "devices": self.n_gpus or 1,
+            "logger": self.build_loggers() if training else False,
+            "callbacks": callbacks + (self.training_callbacks(checkpoint_io) if training else []),
+            "plugins": [checkpoint_io],
+            "inference_mode": False,
+            "default_root_dir": str(self.folder),
+        }
+        if self.n_gpus > 1:
+            options.setdefault("strategy", ReplicatedStrategy())
+        return build("trainer", pl.Trainer, options | ours)
 
     def build_loggers(self) -> list:
         folder = str(self.folder)
@@ -146,7 +163,10 @@ class Trial:
     def make_folder(self) -> None:
         missing = [folder for folder in (self.folder, *self.folder.parents) if not folder.exists()]
         self.made = missing[-1] if missing else None
-        self.folder.mkdir(parents=True, exist_ok=True)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise _unwritable(self.folder, error) from error
 
     def discard_if_unused(self) -> None:
         """Remove the folder again if this run made it and has nothing to show for it."""
@@ -171,13 +191,18 @@ def require_writable(folder: Path) -> None:
     Raises:
         UserError: it isn't a folder, or nothing can be written there.
     """
-    existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    existing: Optional[Path] = None
     try:
+        existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
         with tempfile.TemporaryFile(dir=existing) as file:
             file.write(b"0")
     except OSError as error:
-        why = f"{error.strerror} ({existing})"
-        raise UserError(f"the output folder {folder} can't be written: {why}; choose another exp_root_dir") from error
+        raise _unwritable(folder, error, f" ({existing})" if existing else "") from error
+
+
+def _unwritable(folder: Path, error: Exception, where: str = "") -> UserError:
+    why = getattr(error, "strerror", None) or str(error)
+    return UserError(f"the output folder {folder} can't be written: {why}{where}; choose another exp_root_dir")
 
 
 @contextlib.contextmanager
@@ -185,7 +210,8 @@ def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
     """Lightning's ways of ending, translated.
 
     Raises:
-        UserError: the checkpoint's parameters or optimiser aren't those of this configuration.
+        UserError: the checkpoint's parameters or optimiser aren't those of this configuration, or the trainer's options don't
+            go together with what is to be run.
         KeyboardInterrupt: Ctrl-C outside of training, of which Lightning makes a SystemExit(1).
     """
     try:
@@ -194,10 +220,35 @@ def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
         if isinstance(stop.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt from None
         raise
+    except MisconfigurationException as error:
+        raise UserError(f"trainer: {error}") from error
     except (RuntimeError, ValueError, KeyError) as error:
-        if checkpoint is None or isinstance(error, UserError) or not is_mismatch(error):
+        if isinstance(error, ValueError) and _raised_by_lightning(error):
+            raise UserError(f"trainer: {str(error).strip()}") from error
+        if checkpoint is None or isinstance(error, UserError) or not (is_mismatch(error) or _raised_by_lightning(error)):
             raise
         raise UserError(f"the checkpoint {checkpoint} was made by another configuration: {str(error).strip()}") from error
+
+
+@contextlib.contextmanager
+def write_errors() -> Iterator[None]:
+    """What the system says while results are written, as a message.
+
+    Raises:
+        UserError: the disk is full, or something else is where a file or folder is to be made.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in WRITE_ERRORS:
+            raise
+        raise UserError(f"cannot write {error.filename or 'the results'}: {error.strerror}; make room, or choose another exp_root_dir") from error
+
+
+def _raised_by_lightning(error: Exception) -> bool:
+    """Whether Lightning itself refused, as against something that it called."""
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    return frame.f_globals.get("__name__", "").startswith(pl.__name__)
 
 
 def is_mismatch(error: Exception) -> bool:

@@ -12,6 +12,7 @@ from torch import nn
 
 from ..errors import UserError, unknown
 from .text import escape
+from .types import check_types
 from .weights import load_module_weights
 
 
@@ -40,6 +41,7 @@ def fill(config_class: Any, values: Any = None) -> DictConfig:
         if key not in known:
             raise unknown("key", key, known)
     try:
+        check_types(config_class, values or {})
         return OmegaConf.structured(config_class(**{key: escape(value) for key, value in (values or {}).items()}))
     except OmegaConfBaseException as error:
         raise UserError(f"{error.full_key or error.key}: {str(error).splitlines()[0]}") from error
@@ -134,6 +136,8 @@ class BaseModule(nn.Module, Updateable):
 
     def _load_weights(self, source: str) -> None:
         path, _, module_name = source.rpartition(":")
+        if not path:
+            raise UserError(f"weights: expected <checkpoint>:<module>, such as last.ckpt:geometry, got {source!r}")
         state_dict, epoch, global_step = load_module_weights(path, module_name=module_name)
         self.load_state_dict(state_dict)
         self.do_update_step(epoch, global_step, on_load_weights=True)

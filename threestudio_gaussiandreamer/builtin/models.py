@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Optional, Tuple
 import torch
 from torch import Tensor, nn
 
+from ..errors import unknown
 from .base import BaseModule, BaseObject
 from .registry import register
 
@@ -45,6 +46,9 @@ class BaseMaterial(BaseModule):
         return {}
 
 
+COLOR_ACTIVATIONS = {"sigmoid": torch.sigmoid, "none": lambda x: x}
+
+
 @register("no-material")
 class NoMaterial(BaseMaterial):
     """Passes colours through a sigmoid; without ``input_feature_dims`` there is nothing to learn."""
@@ -54,11 +58,15 @@ class NoMaterial(BaseMaterial):
         n_output_dims: int = 3
         color_activation: str = "sigmoid"
 
+        @staticmethod
+        def check(cfg: Any) -> None:
+            if cfg.color_activation not in COLOR_ACTIVATIONS:
+                raise unknown("system.material.color_activation", cfg.color_activation, COLOR_ACTIVATIONS)
+
     cfg: Config
 
     def forward(self, features: Tensor, **kwargs: Any) -> Tensor:
-        activations = {"sigmoid": torch.sigmoid, "none": lambda x: x}
-        return activations[self.cfg.color_activation](features)
+        return COLOR_ACTIVATIONS[self.cfg.color_activation](features)
 
 
 class BaseBackground(BaseModule):

@@ -31,6 +31,8 @@ class SaverMixin:
 
     def get_save_path(self, filename: str) -> str:
         path = os.path.join(self.get_save_dir(), filename)
+        if os.path.relpath(path, self.get_save_dir()).startswith(os.pardir):
+            raise UserError(f"the file name {filename!r} leads out of the folder of results {self.get_save_dir()}")
         os.makedirs(os.path.dirname(path), exist_ok=True)
         return path
 
@@ -194,4 +196,4 @@ def _wandb_logger(options: Any) -> Any:
 
         return WandbLogger(project=options.get("project"), name=options.get("name"))
     except ModuleNotFoundError as error:
-        raise UserError(f"system.loggers.wandb.enable is true, but {error.name} isn't installed: pip install wandb") from error
+        raise UserError(f"system.loggers.wandb.enable is true, but wandb isn't installed: pip install wandb") from error

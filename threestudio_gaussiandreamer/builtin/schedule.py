@@ -44,13 +44,15 @@ def C_max(value: Any) -> float:
     return max(parse_schedule(value).values)
 
 
-def validate_schedule(value: Any, name: str = "the schedule") -> Any:
-    """``value`` itself when it can be given to :func:`C`.
+def validate_schedule(value: Any, name: str = "the schedule", minimum: float = -math.inf) -> Any:
+    """``value`` itself when it can be given to :func:`C` and never falls below ``minimum``.
 
     Raises:
-        UserError: it can't; the message names it by ``name``.
+        UserError: it can't, or does; the message names it by ``name``.
     """
-    parse_schedule(value, name)
+    lowest = min(parse_schedule(value, name).values)
+    if lowest < minimum:
+        raise UserError(f"{name}: expected values of {minimum:g} or more, got {lowest:g}")
     return value
 
 

@@ -8,8 +8,10 @@ import hashlib
 import io
 import os
 import pickle
+import re
 import shutil
 import zipfile
+from collections.abc import Mapping
 from glob import escape as glob_escape
 from pathlib import Path
 from typing import Any, Optional
@@ -55,7 +57,10 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
     try:
         return torch.load(path, map_location=map_location, weights_only=True)
     except pickle.UnpicklingError as error:
-        raise UserError(f"{path} holds Python objects that could run code when read, so it isn't read: {_reason(error)}") from error
+        # torch's own first line advises to read it all the same
+        found = re.search(r"GLOBAL (\S+)", str(error))
+        what = f": {found[1]}" if found else ""
+        raise UserError(f"{path} holds Python objects that could run code when read, so it isn't read{what}") from error
     except (RuntimeError, OSError, ValueError, KeyError, EOFError) as error:
         raise UserError(f"{path} isn't a checkpoint, or is damaged: {_reason(error)}") from error
 
@@ -107,6 +112,9 @@ def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:
     missing = {"state_dict", "epoch", "global_step"} - set(checkpoint if isinstance(checkpoint, dict) else ())
     if missing:
         raise UserError(f"{path} isn't a training checkpoint: it has no {', '.join(sorted(missing))}")
+    for key, kind in (("state_dict", Mapping), ("epoch", int), ("global_step", int)):
+        if not isinstance(checkpoint[key], kind):
+            raise UserError(f"{path} isn't a training checkpoint: its {key} is of type {type(checkpoint[key]).__name__}")
     return checkpoint
 
 

@@ -4,8 +4,17 @@ An exporter is one file: a subclass of the host's ``Exporter`` registered as ``<
 of ``ExporterOutput(save_name, save_type, params)``; the system writes each with its ``save_<save_type>(name, **params)``.
 """
 
+import os
+
+from ..errors import UserError
 from ..host import BaseGeometry
 from ..ply import GaussianArrays
+
+
+def require_file_name(name: str) -> None:
+    """Raise UserError unless ``name`` is that of a file inside the export folder."""
+    if not name or name != os.path.basename(name) or name in (os.curdir, os.pardir):
+        raise UserError(f"save_name: expected the name of a file, without folders, got {name!r}")
 
 
 def gaussian_arrays(geometry: BaseGeometry) -> GaussianArrays:

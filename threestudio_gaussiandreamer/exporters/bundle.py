@@ -9,11 +9,12 @@ save_video    also render the turntable
 ============  ==============================================================================================
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional
 
 from ..errors import UserError, unknown
-from ..host import BaseBackground, BaseGeometry, BaseMaterial, Exporter, ExporterOutput, find, names, register
+from ..host import BaseBackground, BaseGeometry, BaseMaterial, Exporter, ExporterOutput, find, names, parse_structured, register
 
 SUFFIX = "-exporter"
 
@@ -37,6 +38,7 @@ class BundleExporter(Exporter):
             for name in cfg.options:
                 if name not in cfg.formats:
                     raise UserError(f"options.{name}: the formats are {', '.join(cfg.formats)}; options of another one have no effect")
+                _check_options(name, cfg.options[name])
 
     cfg: Config
 
@@ -48,6 +50,15 @@ class BundleExporter(Exporter):
 
     def __call__(self) -> List[ExporterOutput]:
         return [output for exporter in self.exporters for output in exporter()]
+
+
+def _check_options(name: str, options: Any) -> None:
+    if not isinstance(options, Mapping):
+        raise UserError(f"options.{name}: expected keys and values, got {options!r}")
+    try:
+        parse_structured(find(name + SUFFIX).Config, options)
+    except UserError as error:
+        raise UserError(f"options.{name}: {error}") from error
 
 
 def available_formats() -> list[str]:

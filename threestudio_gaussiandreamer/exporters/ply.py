@@ -17,7 +17,7 @@ import numpy as np
 from ..errors import UserError
 from ..host import BaseGeometry, Exporter, ExporterOutput, register
 from ..ply import padded_sh
-from .base import gaussian_arrays
+from .base import gaussian_arrays, require_file_name
 
 
 @register("ply-exporter")
@@ -32,6 +32,7 @@ class PlyExporter(Exporter):
         @staticmethod
         def check(cfg: "PlyExporter.Config") -> None:
             """Raises UserError for a degree that no viewer knows."""
+            require_file_name(cfg.save_name)
             if cfg.pad_sh_degree not in (None, 0, 1, 2, 3):
                 raise UserError(f"pad_sh_degree: expected null, 0, 1, 2 or 3, got {cfg.pad_sh_degree}")
 

@@ -16,7 +16,7 @@ from ..errors import UserError
 from ..host import BaseGeometry, Exporter, ExporterOutput, register
 from ..ply import opaque, sh0_colors
 from ..point_cloud import PointCloud
-from .base import gaussian_arrays
+from .base import gaussian_arrays, require_file_name
 
 
 @register("points-exporter")
@@ -31,6 +31,7 @@ class PointsExporter(Exporter):
         @staticmethod
         def check(cfg: "PointsExporter.Config") -> None:
             """Raises UserError for a value out of range."""
+            require_file_name(cfg.save_name)
             if not 0 <= cfg.min_opacity <= 1:
                 raise UserError(f"min_opacity: expected a number in [0, 1], got {cfg.min_opacity}")
 

@@ -188,7 +188,8 @@ class ScoreDistillation(BaseObject, ABC):
         self.bad_steps = self.bad_steps + 1 if count else 0
         if self.bad_steps >= self.cfg.max_bad_steps:
             raise NonFiniteScore(
-                f"the score model returned NaN or infinity in {self.bad_steps} steps in a row (step {self.step}, {self.bad_items} items so far):"
+                f"the score model returned NaN or infinity in {self.bad_steps} steps in a row"
+                f" (step {self.step}, {self.bad_items} items so far):"
                 " use full precision (half_precision_weights=false), and check the model and the prior"
             )
         if count:

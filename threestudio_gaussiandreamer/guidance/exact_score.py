@@ -24,6 +24,9 @@ bank_includes_view  the bank stands for all views, so the camera's own is one of
 supersample         rays per pixel and axis; max_cached_targets: pictures of view-exact kept in memory (4 bytes a pixel)
 guidance_scale      1 = none (the default here); otherwise the unconditional mixture is the bank, with this view in it
 ==================  ===================================================================================================
+
+A score that doesn't know the camera doesn't know its distance either: a faint start is drawn to far views before it is drawn to
+the right side. To measure the faces alone, give cameras and bank one distance and one angle of view.
 """
 
 from dataclasses import dataclass
@@ -31,29 +34,28 @@ from typing import Any, NamedTuple, Optional, Tuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from ..cameras import Orbit, OrbitRanges, camera_pool
+from ..cameras import OrbitRanges, camera_pool
 from ..errors import UserError, unknown
 from ..exact_score import LinearLatent, color_matrix, denoise, squared_distances
 from ..host import register
 from ..meshes import load_mesh
 from ..raycast import MeshCaster, TargetCache, over_background
+from ..view_prompts import view_directions
 from .base import ScoreDistillation
 
 MODES = ("view-exact", "direction-bins", "view-agnostic")
 SPACES = ("pixel", "latent")
-DIRECTIONS = ("side", "front", "back", "overhead")
 MAX_MODE_BYTES = 2**31
 
 
 class Bank(NamedTuple):
     """Pictures of the mesh from all around, at one size."""
 
-    orbit: Orbit
-    rgba: Float[Tensor, "K H W 4"]
-    """uint8, premultiplied."""
+    rgba: UInt8[Tensor, "K H W 4"]
+    """Premultiplied."""
     pooled: Float[Tensor, "K 4 h w"]
     """float32 in [0, 1], averaged over the latent's pixels."""
     latent: LinearLatent
@@ -178,8 +180,8 @@ class ExactScoreGuidance(ScoreDistillation):
             return torch.zeros(count, self.cfg.bank_views, dtype=torch.bool)
         if self.cfg.mode == "view-agnostic":
             return torch.ones(count, self.cfg.bank_views, dtype=torch.bool)
-        bank = view_directions(self.bank_orbit.elevation, self.bank_orbit.azimuth)
-        members = bank == view_directions(batch["elevation"], batch["azimuth"]).cpu()[:, None]
+        bank = direction_indices(self.bank_orbit.elevation, self.bank_orbit.azimuth)
+        members = bank == direction_indices(batch["elevation"], batch["azimuth"]).cpu()[:, None]
         # a bank that stays below 60 degrees has no overhead views
         return torch.where(members.any(dim=1, keepdim=True), members, torch.ones_like(members))
 
@@ -203,7 +205,7 @@ class ExactScoreGuidance(ScoreDistillation):
         if self.cfg.space == "latent":
             matrix = color_matrix(self.cfg.latent_channels if self.cfg.color_matrix else 3)
             latent = latent._replace(matrix=matrix).normalised(pooled[:, :3])
-        return Bank(self.bank_orbit, (images * 255).round().byte(), pooled, latent)
+        return Bank((images * 255).round().byte(), pooled, latent)
 
     def _latent(self) -> LinearLatent:
         return LinearLatent() if self.cfg.space == "pixel" else self.bank(*self._size).latent
@@ -243,11 +245,6 @@ class ExactScoreGuidance(ScoreDistillation):
         background = _background(comp_rgb_bg, len(rgba), rgba.device)
         return _composite(rgba, background).movedim(1, -1)
 
-    def cast_targets(self, c2w: Float[Tensor, "N 4 4"], fovy: Float[Tensor, " N"], height: int, width: int) -> None:
-        """Cast the targets of known cameras ahead of training, with a progress bar; as many as the cache holds."""
-        count = self.cfg.max_cached_targets
-        self._targets(c2w[:count], fovy[:count], height, width, progress="target views")
-
     @torch.no_grad()
     def bank_images(self, size: int, background: Optional[Tensor] = None) -> Float[Tensor, "K H W 3"]:
         """The bank's pictures at ``size`` x ``size`` on one colour (3,), black by default, for the multi-face meter."""
@@ -261,14 +258,12 @@ class ExactScoreGuidance(ScoreDistillation):
         return self.bank_orbit.azimuth
 
 
-def view_directions(elevation: Float[Tensor, " B"], azimuth: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
-    """The direction of views in degrees, an index into DIRECTIONS, by threestudio's rules for view-dependent prompts.
-
-    Front within 45 degrees of azimuth 0, back beyond 135, overhead above 60 degrees of elevation, otherwise side.
-    """
-    azimuth = ((azimuth + 180) % 360 - 180).abs()
-    directions = torch.where(azimuth < 45, 1, torch.where(azimuth > 135, 2, 0))
-    return torch.where(elevation > 60, 3, directions)
+def direction_indices(elevation: Float[Tensor, " B"], azimuth: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
+    """The direction of views in degrees, by threestudio's rules for view-dependent prompts: 0 side, 1 front, 2 back, 3 overhead."""
+    indices = torch.zeros_like(azimuth, dtype=torch.long)
+    for index, direction in enumerate(view_directions(45, 45, 60)):
+        indices[direction.condition(elevation, azimuth, azimuth)] = index
+    return indices
 
 
 def bank_modes(bank: Bank, background: Float[Tensor, "bh bw 3"]) -> Float[Tensor, "K c h w"]:
@@ -289,8 +284,8 @@ def _background(background: Optional[Tensor], batch: int, device: torch.device) 
     return torch.zeros(batch, 1, 1, 3, device=device) if background is None else background.detach().float().expand(batch, -1, -1, -1)
 
 
-def _composite(rgba: Tensor, background: Float[Tensor, "B bh bw 3"]) -> Float[Tensor, "B 3 H W"]:
-    """uint8 pictures (B, H, W, 4) over the background, which is resized to them."""
+def _composite(rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B bh bw 3"]) -> Float[Tensor, "B 3 H W"]:
+    """Premultiplied pictures over the background, which is resized to them."""
     background = background.movedim(-1, 1)
     if background.shape[-2:] != (1, 1):
         background = _resized(background, tuple(rgba.shape[1:3]))

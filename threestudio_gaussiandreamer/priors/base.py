@@ -13,6 +13,7 @@ A prior is one file: a subclass of :class:`Prior` with :meth:`~Prior.generate`, 
 """
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,7 @@ from jaxtyping import Bool, Float
 
 from ..errors import UserError
 from ..host import BaseObject, run_seed
+from ..meshes import _pose
 from ..point_cloud import PointCloud
 from ..streams import numpy_generator
 
@@ -103,12 +105,17 @@ def require_path(cfg: Any) -> None:
         raise UserError("path: this prior reads a file; set path to it")
 
 
+def require_axes(cfg: Any, kind: str) -> None:
+    """Raise UserError unless the options ``up`` and ``front`` name two axes that aren't parallel, for a ``kind`` of file ("glb")."""
+    _pose(kind, cfg.up, cfg.front)
+
+
 def require_color(cfg: Any) -> None:
     """Raise UserError unless the option ``color`` is null, "grey", "random" or three numbers in [0, 1]."""
     color = cfg.color
     if color is None or color in ("grey", "random"):
         return
-    if isinstance(color, str) or len(color) != 3 or not all(is_number(value) and 0 <= value <= 1 for value in color):
+    if isinstance(color, (str, int, float, Mapping)) or len(color) != 3 or not all(is_number(value) and 0 <= value <= 1 for value in color):
         raise UserError(f"color: expected null, 'grey', 'random' or [red, green, blue] in [0, 1], got {color!r}")
 
 

@@ -20,6 +20,7 @@ Limits: the prompt is not read; the pose is the file's. At ``scale`` above 1.5 t
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Optional
 
 import numpy as np
@@ -28,7 +29,7 @@ from ..files import existing_file
 from ..host import register
 from ..meshes import load_mesh
 from ..point_cloud import PointCloud
-from .base import Prior, chosen_colors, require_color, require_not_negative, require_path, require_positive
+from .base import Prior, chosen_colors, require_axes, require_color, require_not_negative, require_path, require_positive
 from .mesh import mesh_cloud
 
 
@@ -49,6 +50,7 @@ class BodyPrior(Prior):
         def check(cfg: Any) -> None:
             Prior.Config.check(cfg)
             require_path(cfg)
+            require_axes(cfg, Path(cfg.path).suffix.lower().lstrip("."))
             require_positive(cfg, "scale")
             require_not_negative(cfg, "num_points")
             require_color(cfg)

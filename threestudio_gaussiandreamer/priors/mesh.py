@@ -18,6 +18,7 @@ Limits: the prompt is not read. Few vertices make a sparse start: give ``num_poi
 
 import logging
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Optional
 
 import numpy as np
@@ -26,7 +27,7 @@ from jaxtyping import Float, Int
 from ..host import register
 from ..meshes import Mesh, load_mesh, sample_surface, surface_colors
 from ..point_cloud import PointCloud
-from .base import Prior, chosen_colors, require_color, require_not_negative, require_path, require_positive
+from .base import Prior, chosen_colors, require_axes, require_color, require_not_negative, require_path, require_positive
 
 logger = logging.getLogger(__name__)
 
@@ -53,6 +54,7 @@ class MeshPrior(Prior):
         def check(cfg: Any) -> None:
             Prior.Config.check(cfg)
             require_path(cfg)
+            require_axes(cfg, Path(cfg.path).suffix.lower().lstrip("."))
             require_positive(cfg, "scale")
             require_not_negative(cfg, "num_points", "color_smoothing", "jitter")
             require_color(cfg)

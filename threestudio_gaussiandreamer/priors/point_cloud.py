@@ -32,7 +32,7 @@ from ..host import register
 from ..meshes import _pose
 from ..ply import read_points, unit_colors
 from ..point_cloud import PointCloud
-from .base import GREY, Prior, require_path, require_positive
+from .base import GREY, Prior, require_axes, require_path, require_positive
 
 logger = logging.getLogger(__name__)
 
@@ -53,6 +53,7 @@ class PointCloudPrior(Prior):
         def check(cfg: Any) -> None:
             Prior.Config.check(cfg)
             require_path(cfg)
+            require_axes(cfg, axes_kind(Path(cfg.path)))
             require_positive(cfg, "scale")
 
     cfg: Config
