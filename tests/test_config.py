@@ -11,6 +11,7 @@ import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.builtin.weights import save_file
 from threestudio_gaussiandreamer.config import dump_config, load_config, safe_name
 from threestudio_gaussiandreamer.config_check import check_config
@@ -348,3 +349,17 @@ def test_a_broken_extension_is_an_error_with_file_line_and_cause(folder, source,
     (folder / "custom" / "broken.py").write_text(source)
     with pytest.raises(UserError, match=f"the extension custom/broken.py can't be imported: .*{message}"):
         load_extensions()
+
+
+def test_another_part_forgets_the_options_that_only_the_earlier_one_has():
+    """Trying another prior or guidance takes one override; options of the new part are kept, a misspelt one is still an error."""
+    register_parts()
+    demo = Path(__file__).parent.parent / "configs" / "demo.yaml"
+    cfg = load_config(demo, cli_args=["system.geometry.prior_type=random-prior", "system.geometry.prior.size=0.5"])
+    assert dict(cfg.system.geometry.prior) == {"num_points": 8000, "size": 0.5}
+    check_config(cfg)
+    wrong = load_config(demo, cli_args=["system.geometry.prior_type=random-prior", "system.geometry.prior.sise=0.5"])
+    with pytest.raises(UserError, match="system.geometry.prior.size"):
+        check_config(wrong)
+    same = load_config(demo, cli_args=["system.geometry.prior_type=mesh-prior"])
+    assert "path" in same.system.geometry.prior

@@ -10,7 +10,7 @@ import os
 import re
 import unicodedata
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import datetime
 from glob import escape as glob_escape
 from itertools import combinations
@@ -26,6 +26,7 @@ from .builtin.schedule import C_max
 from .builtin.text import escape
 from .builtin.weights import newest_readable
 from .errors import UserError
+from .host import find, info, names
 from .prompts import read_prompt
 
 # keys whose value is the user's own words, never YAML
@@ -202,7 +203,10 @@ def _with_prompt_from_file(source: DictConfig) -> DictConfig:
 
 def _merge(sources: list[DictConfig]) -> DictConfig:
     try:
-        merged = OmegaConf.merge(*sources)
+        merged = OmegaConf.create({})
+        for source in sources:
+            _forget_replaced_parts(merged, source)
+            merged = OmegaConf.merge(merged, source)
     except OmegaConfBaseException as error:
         raise UserError(f"the configurations can't be merged: {_explain(error)}") from error
     except TypeError as error:
@@ -213,6 +217,32 @@ def _merge(sources: list[DictConfig]) -> DictConfig:
         if section in merged and merged._get_node(section)._is_none():
             merged[section] = {}
     return merged
+
+
+def _forget_replaced_parts(earlier: DictConfig, later: DictConfig, path: str = "") -> None:
+    """Where ``later`` names another part (``x_type``), drop the options of ``earlier``'s ``x`` that the new part doesn't have.
+
+    So ``system.geometry.prior_type=random-prior`` is all that it takes to try another prior; what ``later`` itself gives stays.
+    """
+    for key in later:
+        section = key.removesuffix("_type")
+        mine, theirs = earlier._get_node(key), later._get_node(key)
+        if isinstance(mine, DictConfig) and isinstance(theirs, DictConfig):
+            _forget_replaced_parts(mine, theirs, f"{path}{key}.")
+        elif section != key and mine is not None and mine._value() != theirs._value():
+            _keep_options_of(earlier._get_node(section), theirs._value(), f"{path}{section}")
+
+
+def _keep_options_of(section: Any, type_name: Any, path: str) -> None:
+    config_class = getattr(find(type_name), "Config", None) if type_name in names() else None
+    if config_class is None or not isinstance(section, DictConfig):
+        return
+    known = {field.name for field in fields(config_class)}
+    foreign = [key for key in section if key not in known]
+    for key in foreign:
+        section._content.pop(key)
+    if foreign:
+        info(f"{path}: {type_name} has no {', '.join(foreign)}; left out")
 
 
 def _clash(a: DictConfig, b: DictConfig, section: str = "") -> Optional[str]:

@@ -179,7 +179,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
     def truth(self, batch: dict[str, Any], out: dict[str, Any]) -> Optional[Float[Tensor, "B H W 3"]]:
         """What these views should look like, where the guidance knows it."""
         target = getattr(self.guidance, "target_rgb", None)
-        return None if target is None else target(batch, out["comp_rgb_bg"].detach())
+        return None if target is None else target(batch, out["comp_rgb_bg"].detach(), size=out["comp_rgb"].shape[1:3])
 
     def _log_now(self) -> bool:
         every = self.trainer.log_every_n_steps

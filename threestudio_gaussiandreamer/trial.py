@@ -242,7 +242,8 @@ def write_errors() -> Iterator[None]:
     except OSError as error:
         if error.errno not in WRITE_ERRORS:
             raise
-        raise UserError(f"cannot write {error.filename or 'the results'}: {error.strerror}; make room, or choose another exp_root_dir") from error
+        what = error.filename or "the results"
+        raise UserError(f"cannot write {what}: {error.strerror}; make room, or choose another exp_root_dir") from error
 
 
 def _raised_by_lightning(error: Exception) -> bool:

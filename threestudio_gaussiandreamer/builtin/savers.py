@@ -196,4 +196,4 @@ def _wandb_logger(options: Any) -> Any:
 
         return WandbLogger(project=options.get("project"), name=options.get("name"))
     except ModuleNotFoundError as error:
-        raise UserError(f"system.loggers.wandb.enable is true, but wandb isn't installed: pip install wandb") from error
+        raise UserError("system.loggers.wandb.enable is true, but wandb isn't installed: pip install wandb") from error

@@ -66,7 +66,7 @@ class ScoreDistillation(BaseObject, ABC):
             for name in ("min_step_percent", "max_step_percent"):
                 validate_schedule(cfg[name], f"system.guidance.{name}")
             if cfg.grad_clip is not None:
-                validate_schedule(cfg.grad_clip, "system.guidance.grad_clip")
+                validate_schedule(cfg.grad_clip, "system.guidance.grad_clip", minimum=0)
             for step in _knots(cfg.min_step_percent, cfg.max_step_percent):
                 sds.step_range(C(cfg.min_step_percent, step, step), C(cfg.max_step_percent, step, step))
             sds.weight(cfg.weighting_strategy, torch.full((1,), 0.5))

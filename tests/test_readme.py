@@ -1,0 +1,109 @@
+"""What README and docs/ name exists, and their commands and code run."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from threestudio_gaussiandreamer import experiment, register_parts
+from threestudio_gaussiandreamer.config import load_config
+from threestudio_gaussiandreamer.config_check import check_config
+from threestudio_gaussiandreamer.launch_options import find_config, parse_arguments
+
+register_parts()
+ROOT = Path(__file__).parent.parent
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+TEXTS = {str(path.relative_to(ROOT)): path.read_text() for path in DOCUMENTS}
+TINY = [
+    "data.width=16", "data.height=16", "data.eval_width=16", "data.eval_height=16", "data.n_test_views=2", "data.train_views=4",
+    "system.geometry.grow.num_candidates=200", "system.evaluation.size=16", "system.evaluation.views=2", "trainer.max_steps=2",
+    "trainer.enable_progress_bar=false", "use_timestamp=false", "tag=t",
+]  # fmt: skip
+
+
+def blocks(text: str, language: str) -> list[str]:
+    """The fenced blocks in this language; "" for those that name none."""
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+
+
+def launches() -> list[list[str]]:
+    """The arguments of every launch.py and gaussiandreamer in a block of commands."""
+    found = []
+    for text in TEXTS.values():
+        for block in blocks(text, "bash") + blocks(text, ""):
+            for line in block.replace("\\\n", " ").splitlines():
+                command = re.search(r"(?:^|python )(?:launch\.py|gaussiandreamer) (.*--config.*)", line)
+                found += [shlex.split(command[1], comments=True)] if command else []
+    return found
+
+
+def anchors(text: str) -> set[str]:
+    """The anchors of a document's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_links_lead_somewhere(name):
+    for target in re.findall(r"\]\(([^)\s]+)\)", TEXTS[name]):
+        if re.match(r"https?:|mailto:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        file = (ROOT / name).parent / path if path else ROOT / name
+        assert file.exists(), f"{name} links to {target}"
+        assert not anchor or anchor in anchors(file.read_text()), f"{name} links to {target}"
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_files_that_are_named_exist(name):
+    """Paths in backticks that begin with one of our folders; what a run writes or a user adds isn't ours."""
+    for path in re.findall(r"`((?:configs|tests|benchmarks|docs|threestudio_gaussiandreamer|custom/threestudio)[\w./-]*)`", TEXTS[name]):
+        assert (ROOT / path).exists(), f"{name} names {path}"
+
+
+def test_make_targets_exist():
+    makefile = (ROOT / "Makefile").read_text()
+    for name, text in TEXTS.items():
+        for target in re.findall(r"(?:^|`)make ([a-z][\w-]*)", text, re.MULTILINE):
+            assert re.search(rf"^{target}:", makefile, re.MULTILINE), f"{name} names make {target}"
+
+
+def test_the_readme_shows_launches():
+    assert len(launches()) >= 3
+
+
+@pytest.mark.parametrize("arguments", launches(), ids=" ".join)
+def test_a_launch_that_is_shown_is_accepted(arguments, tmp_path, monkeypatch):
+    """Configuration, options and names; what "..." stands for is the reader's."""
+    args = parse_arguments([word for word in arguments if word != "..."])
+    paths = [find_config(name).resolve() for name in args.config]
+    overrides = [override for override in args.overrides if "spiral-prior" not in override]  # an extension, tried below
+    monkeypatch.chdir(tmp_path)
+    check_config(load_config(*paths, cli_args=overrides))
+
+
+def python_blocks() -> list[tuple[str, str]]:
+    """(file name in the first line, source) of the extensions that docs/ shows."""
+    found = [(re.match(r"# (custom/\S+\.py)\n", block), block) for text in TEXTS.values() for block in blocks(text, "python")]
+    return [(match[1], block) for match, block in found if match]
+
+
+# what the demo has to be told for each of them
+PARTS = {
+    "custom/spiral.py": ["system.geometry.prior_type=spiral-prior"],
+    "custom/one_color.py": ["system.guidance_type=one-color-guidance", "system.geometry.prior.path=toy.glb"],
+}
+
+
+def test_every_extension_that_is_shown_is_tried():
+    assert {name for name, _ in python_blocks()} == set(PARTS)
+
+
+@pytest.mark.parametrize(("name", "source"), python_blocks())
+def test_an_extension_that_is_shown_trains(name, source, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("custom").mkdir()
+    Path(name).write_text(source)
+    code = experiment.main(["--config", "demo.yaml", "--train", "--gpu", "cpu", *TINY, *PARTS[name]])
+    assert code == 0 and Path("outputs/demo/t/save/it2-export/gaussians.ply").is_file()
