@@ -356,6 +356,15 @@ def test_backward_gives_the_memory_back(monkeypatch):
     assert len(states) == 0 and out.image.grad_fn is not None
 
 
+def test_hooks_on_saved_tensors_may_replace_them():
+    """As checkpointing and offloading do: what the kernel kept is then made again."""
+    cloud, camera = random_cloud(30, seed=13), cameras(1, 40, 12)
+    plain = native(cloud, camera, 40, 12)
+    with torch.autograd.graph.saved_tensors_hooks(torch.clone, lambda x: x):
+        hooked = native(cloud, camera, 40, 12)
+    assert equal(plain, hooked)
+
+
 def test_backward_twice_adds_up():
     cloud, camera = random_cloud(30, seed=11).to(torch.float32).leaves(), [x.to(torch.float32) for x in cameras(1, 12, 12)]
     out = rasterize(*cloud, *camera, 12, 12, backend="cpu", absgrad=True)

@@ -9,6 +9,7 @@ import ctypes
 import functools
 import os
 import pathlib
+from collections.abc import Sequence
 from typing import NamedTuple, Optional
 
 import torch
@@ -23,6 +24,7 @@ from .output import Rasterized
 FOLDER = pathlib.Path(__file__).parent / "native"
 BUILDS = ("v4", "v3", "base")  # best first
 CHANNELS = 3
+VIEWMATS = 4  # among the inputs of the kernel
 SMALLEST_ALPHA = 2.0**-100  # stands for alpha_min = 0: below it a float32 image can't tell
 
 
@@ -46,14 +48,14 @@ def rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, heig
     tracked = torch.is_grad_enabled() and any(x.requires_grad for x in (*inputs, colors, background))
     means2d = means.new_zeros(views, len(means), 2).requires_grad_(tracked)
     frame = Frame(width, height, options, tracked, torch.get_num_threads(), _library())
-    groups = (
-        [(colors, background)] if channels <= CHANNELS else zip(colors.split(CHANNELS, -1), background.split(CHANNELS, -1), strict=True)
-    )
-    images, alphas, depths, radii, contributions = zip(
-        *(_Rasterize.apply(*inputs, *group, means2d, Ks, frame) for group in groups), strict=True
-    )
-    image = images[0] if channels <= CHANNELS else torch.cat(images, -1)
-    return Rasterized(image, alphas[0], depths[0], means2d, radii[0], contributions[0])
+    if channels <= CHANNELS:
+        groups = [(colors, background)]
+    else:
+        groups = zip(colors.split(CHANNELS, -1), background.split(CHANNELS, -1), strict=True)
+    drawn = [_Rasterize.apply(*inputs, *group, means2d, Ks, frame) for group in groups]
+    image = drawn[0][0] if channels <= CHANNELS else torch.cat([group[0] for group in drawn], -1)
+    _, alpha, depth, radii, contribution = drawn[0]
+    return Rasterized(image, alpha, depth, means2d, radii, contribution)
 
 
 class Frame(NamedTuple):
@@ -73,17 +75,9 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, viewmats, colors, background, means2d, Ks, frame):
         inputs = (means, quats, scales, opacities, viewmats, _widen(colors), _widen(background), Ks)
-        scale = frame.options.downsample
-        size = (len(viewmats), frame.height // scale, frame.width // scale)
-        image, alpha, depth = (means.new_empty(*size, channels) for channels in (CHANNELS, 1, 1))
-        radii, contribution = (means.new_empty(size[0], len(means)) for _ in range(2))
-        pictures = _Pictures(*map(_pointer, (image, alpha, depth, means2d, radii, contribution)))
-        handle = ctypes.c_void_p()
-        _check(
-            frame.library.splat_forward(_scene(inputs, frame), _settings(frame), pictures, ctypes.byref(handle) if frame.tracked else None)
-        )
+        (image, alpha, depth, radii, contribution), state = _draw(inputs, means2d, frame)
         ctx.frame, ctx.means2d, ctx.channels = frame, means2d, colors.shape[-1]
-        ctx.save_for_backward(*inputs, _State(frame.library, handle).as_tensor())
+        ctx.save_for_backward(*inputs, state.as_tensor())
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii, contribution)
         return _narrow(image, ctx.channels), alpha, depth, radii, contribution
@@ -91,32 +85,46 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, d_image, d_alpha, d_depth, *_):
-        (*inputs, state), frame, means2d = ctx.saved_tensors, ctx.frame, ctx.means2d
-        d_inputs = [torch.empty_like(x) for x in inputs[:-1]]
-        if not ctx.needs_input_grad[VIEWMATS]:
-            d_inputs[VIEWMATS] = None
-        d_means2d, absgrad = torch.empty_like(means2d), torch.empty_like(means2d) if frame.options.absgrad else None
-        upstream = [
-            None if d is None else _widen(d, channels) for d, channels in zip((d_image, d_alpha, d_depth), (CHANNELS, 1, 1), strict=True)
-        ]
-        gradients = _Gradients(*map(_pointer, (*d_inputs, d_means2d, absgrad)))
-        _check(
-            frame.library.splat_backward(
-                state.owner.handle, _scene(inputs, frame), _settings(frame), _Upstream(*map(_pointer, upstream)), gradients
-            )
-        )
+        *inputs, saved = ctx.saved_tensors
+        state = getattr(saved, "owner", None)
+        if state is None:  # hooks on saved tensors (checkpointing, offloading) hand back other ones
+            _, state = _draw(inputs, ctx.means2d, ctx.frame)
+        upstream = (None if d_image is None else _widen(d_image), d_alpha, d_depth)
+        grads, d_means2d, absgrad = _draw_vjp(state, inputs, upstream, ctx.means2d, ctx.frame, ctx.needs_input_grad[VIEWMATS])
         if absgrad is not None:
-            means2d.absgrad = absgrad + getattr(means2d, "absgrad", 0)
-        *d_gaussians, d_colors, d_background = d_inputs
-        return *d_gaussians, _narrow(d_colors, ctx.channels), _narrow(d_background, ctx.channels), d_means2d, None, None
+            ctx.means2d.absgrad = absgrad + getattr(ctx.means2d, "absgrad", 0)
+        *grads, d_colors, d_background = grads
+        return *grads, _narrow(d_colors, ctx.channels), _narrow(d_background, ctx.channels), d_means2d, None, None
 
 
-VIEWMATS = 4  # among the inputs
+def _draw(inputs: Sequence[Tensor], means2d: Tensor, frame: Frame) -> tuple[tuple[Tensor, ...], "_State"]:
+    """Image, alpha, depth, radii and contribution, and what `_draw_vjp` needs; fills ``means2d``."""
+    means, views, scale = inputs[0], len(means2d), frame.options.downsample
+    size = (views, frame.height // scale, frame.width // scale)
+    pictures = [means.new_empty(*size, channels) for channels in (CHANNELS, 1, 1)]
+    per_gaussian = [means.new_empty(views, len(means)) for _ in range(2)]
+    handle = ctypes.c_void_p()
+    keep = ctypes.byref(handle) if frame.tracked else None
+    out = _Pictures(*map(_pointer, (*pictures, means2d, *per_gaussian)))
+    _check(frame.library.splat_forward(_scene(inputs, frame), _settings(frame), out, keep))
+    return (*pictures, *per_gaussian), _State(frame.library, handle)
 
 
-def _widen(x: Tensor, channels: int = CHANNELS) -> Tensor:
+def _draw_vjp(state: "_State", inputs: Sequence[Tensor], upstream, means2d: Tensor, frame: Frame, of_viewmats: bool):
+    """Gradients of ``inputs`` but for the last, of ``means2d``, and ``absgrad``; None for those that nobody wants."""
+    grads = [torch.empty_like(x) for x in inputs[:-1]]
+    if not of_viewmats:
+        grads[VIEWMATS] = None
+    d_means2d, absgrad = torch.empty_like(means2d), torch.empty_like(means2d) if frame.options.absgrad else None
+    upstream = [None if d is None else d.contiguous() for d in upstream]
+    out = _Gradients(*map(_pointer, (*grads, d_means2d, absgrad)))
+    _check(state.library.splat_backward(state.handle, _scene(inputs, frame), _settings(frame), _Upstream(*map(_pointer, upstream)), out))
+    return grads, d_means2d, absgrad
+
+
+def _widen(x: Tensor) -> Tensor:
     """Contiguous, with zeros for the channels that are missing."""
-    missing = channels - x.shape[-1]
+    missing = CHANNELS - x.shape[-1]
     return torch.nn.functional.pad(x, (0, missing)) if missing else x.contiguous()
 
 
@@ -165,7 +173,7 @@ class _State:
         self.library.splat_release(self.handle)
 
 
-def _scene(inputs: tuple[Tensor, ...], frame: Frame) -> _Scene:
+def _scene(inputs: Sequence[Tensor], frame: Frame) -> _Scene:
     means, viewmats, colors = inputs[0], inputs[VIEWMATS], inputs[VIEWMATS + 1]
     return _Scene(*map(_pointer, inputs), len(means), len(viewmats), frame.width, frame.height, colors.dim() == 3)
 
