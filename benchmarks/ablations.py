@@ -46,7 +46,9 @@ NO_ANNEALING = {"system.guidance.max_step_percent": 0.98}
 LATENT = {"system.guidance.space": "latent", "system.guidance.latent_size": 16}
 STRONG = {"system.guidance.guidance_scale": 101.0}  # threestudio's 100
 CLIPPED = {"system.guidance.grad_clip": [0, 1.5, 2.0, 1000]}
-PAPER_RATES = {f"system.geometry.lr_{name}": rate for name, rate in (("means", 5e-5), ("scales", 1e-3), ("quats", 1e-2), ("opacities", 1e-2))}
+PAPER_RATES = {
+    f"system.geometry.lr_{name}": rate for name, rate in (("means", 5e-5), ("scales", 1e-3), ("quats", 1e-2), ("opacities", 1e-2))
+}
 
 # Options replace what the demo's YAML has under their key, whole sections included.
 TABLES = {
@@ -157,7 +159,7 @@ def write(arguments: argparse.Namespace, rows: list[dict]) -> None:
     path = arguments.out or ROOT / f"benchmarks/results/{arguments.table}.csv"
     path.parent.mkdir(parents=True, exist_ok=True)
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT).stdout.strip()
-    about = f"{platform.machine()}, {platform.processor() or 'CPU'}, commit {commit or 'unknown'}, {time.strftime('%Y-%m-%d')}, {' '.join(sys.argv[1:])}"
+    about = ", ".join([platform.machine(), f"commit {commit or 'unknown'}", time.strftime("%Y-%m-%d"), *sys.argv[1:]])
     with open(path, "w", newline="") as file:
         file.write(f"# {about}\n")
         writer = csv.DictWriter(file, fieldnames=rows[0])

@@ -57,7 +57,11 @@ def test_rays_through_pixel_centres_agree_with_the_projection():
 
 def test_the_host_projection_matrix_puts_the_top_row_at_minus_one():
     orbit = view()
-    clip = cameras.projection(orbit.fovy, 2.0)[0] @ torch.linalg.inv(orbit.c2w)[0] @ torch.tensor([0.0, 0.0, 2 * math.tan(math.radians(30)), 1.0])
+    clip = (
+        cameras.projection(orbit.fovy, 2.0)[0]
+        @ torch.linalg.inv(orbit.c2w)[0]
+        @ torch.tensor([0.0, 0.0, 2 * math.tan(math.radians(30)), 1.0])
+    )
     assert (clip[1] / clip[3]).item() == pytest.approx(-1.0, abs=1e-5)
 
 

@@ -42,7 +42,11 @@ def test_the_papers_numbers_are_the_papers(tmp_path):
     assert (geometry.init_opacity, geometry.sh_degree, geometry.grow.radius, list(geometry.grow.color_range)) == (0.1, 0, 0.01, [0.0, 0.2])
     assert geometry.scale_rule == "nearest" and not geometry.densify.enabled
     assert (cfg.trainer.max_steps, data.batch_size, data.width, system.renderer.cfg.downsample) == (1200, 4, 1024, 2)
-    assert list(data.camera_distance_range) == [1.5, 4.0] and list(data.elevation_range) == [-10, 60] and list(data.azimuth_range) == [-180, 180]
+    assert (
+        list(data.camera_distance_range) == [1.5, 4.0]
+        and list(data.elevation_range) == [-10, 60]
+        and list(data.azimuth_range) == [-180, 180]
+    )
     steps = cfg.system.guidance.max_step_percent
     assert [host.C(steps, 0, step) for step in (0, 500, 501, 1199)] == [0.98, 0.98, 0.55, 0.55]
     assert cfg.system.guidance.guidance_scale == 101  # the host's 100
@@ -89,5 +93,7 @@ def names_that_are_read():
 
 def test_every_accepted_key_is_read_by_somebody():
     read = names_that_are_read()
-    unread = [f"{name}.{field.name}" for name, cls in config_classes().items() for field in dataclasses.fields(cls) if field.name not in read]
+    unread = [
+        f"{name}.{field.name}" for name, cls in config_classes().items() for field in dataclasses.fields(cls) if field.name not in read
+    ]
     assert not unread, unread

@@ -117,7 +117,11 @@ def test_moments_follow_their_gaussian_through_random_changes(seed):
         new = {name: nn.Parameter(value) for name, value in change.values.items()}
         densify.update_optimizer(optimizer, params, new, change)
         params, ids = new, torch.where(change.fresh, torch.zeros(()), ids[change.parents])
-        assert {id(p) for group in optimizer.param_groups for p in group["params"]} == {id(p) for p in params.values()} == {id(p) for p in optimizer.state}
+        assert (
+            {id(p) for group in optimizer.param_groups for p in group["params"]}
+            == {id(p) for p in params.values()}
+            == {id(p) for p in optimizer.state}
+        )
         for p in params.values():
             state = optimizer.state[p]
             expected = ids.reshape(-1, *[1] * (p.ndim - 1)).expand_as(p)

@@ -120,7 +120,10 @@ def test_densification_happens_at_its_steps_only_and_the_optimiser_follows(spher
 
 def test_a_densification_that_selects_nobody_changes_nothing(sphere_points):
     plain = started(sphere_points)
-    idle = started(sphere_points, densify={"enabled": True, "start": 1, "stop": 9, "every": 1, "min_opacity": 1e-9, "grad_threshold": 1e9, "max_scale": 1e9})
+    idle = started(
+        sphere_points,
+        densify={"enabled": True, "start": 1, "stop": 9, "every": 1, "min_opacity": 1e-9, "grad_threshold": 1e9, "max_scale": 1e9},
+    )
     for geometry in (plain, idle):
         optimizer = torch.optim.Adam(geometry.parameter_groups(), lr=1e-2)
         for step in range(1, 6):

@@ -7,10 +7,51 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parent.parent / "threestudio_gaussiandreamer"
 NAME = PACKAGE.name
-MATHS = {"errors", "streams", "distributed", "files", "point_cloud", "cameras", "sh", "splatting", "grow", "densify", "sds", "exact_score", "metrics", "ply", "nested"}
+MATHS = {
+    "errors",
+    "streams",
+    "distributed",
+    "files",
+    "point_cloud",
+    "cameras",
+    "sh",
+    "splatting",
+    "grow",
+    "densify",
+    "sds",
+    "exact_score",
+    "metrics",
+    "ply",
+    "nested",
+}
 HOST = {"host", "builtin"}
-ASSEMBLY = {"system", "evaluate", "experiment", "config", "config_check", "callbacks", "checkpoints", "extensions", "launch_options", "trial", "strategy", "parts"}
-HEAVY = {"lightning", "pytorch_lightning", "omegaconf", "trimesh", "embreex", "diffusers", "transformers", "threestudio", "imageio", "PIL", "smplx"}
+ASSEMBLY = {
+    "system",
+    "evaluate",
+    "experiment",
+    "config",
+    "config_check",
+    "callbacks",
+    "checkpoints",
+    "extensions",
+    "launch_options",
+    "trial",
+    "strategy",
+    "parts",
+}
+HEAVY = {
+    "lightning",
+    "pytorch_lightning",
+    "omegaconf",
+    "trimesh",
+    "embreex",
+    "diffusers",
+    "transformers",
+    "threestudio",
+    "imageio",
+    "PIL",
+    "smplx",
+}
 MATHS_MAY_USE = {"torch", "numpy", "scipy", "jaxtyping"} | set(sys.stdlib_module_names)
 
 

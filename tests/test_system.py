@@ -36,7 +36,12 @@ class MockGuidance(BaseObject):
 
     def __call__(self, rgb, prompt_utils, elevation, azimuth, camera_distances, rgb_as_latents=False, guidance_eval=False, **kwargs):
         target = torch.tensor(list(self.cfg.color)).expand_as(rgb)
-        return {"loss_sds": 0.5 * ((rgb - target) ** 2).sum() / len(rgb), "grad_norm": (rgb - target).norm().detach(), "min_step": 20, "max_step": 980}
+        return {
+            "loss_sds": 0.5 * ((rgb - target) ** 2).sum() / len(rgb),
+            "grad_norm": (rgb - target).norm().detach(),
+            "min_step": 20,
+            "max_step": 980,
+        }
 
 
 @pytest.fixture(scope="module")

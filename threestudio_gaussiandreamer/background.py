@@ -67,7 +67,9 @@ class FlatBackground(BaseBackground):
         if self.cfg.mode == "learned":
             return torch.sigmoid(self.logit).expand(batch_size, 3)
         if self.cfg.mode == "random" and self.training:
-            return torch.stack([torch.rand(3, generator=generator(item_seed(), "background", self.step, b)) for b in range(batch_size)]).to(self.fixed)
+            return torch.stack([torch.rand(3, generator=generator(item_seed(), "background", self.step, b)) for b in range(batch_size)]).to(
+                self.fixed
+            )
         return self.fixed.expand(batch_size, 3)
 
     def forward(self, dirs: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B H W 3"]:

@@ -34,7 +34,9 @@ class Orbit(NamedTuple):
         return orbit_c2w(self.elevation, self.azimuth, self.distance)
 
 
-def orbit_positions(elevation_deg: Float[Tensor, " B"], azimuth_deg: Float[Tensor, " B"], distance: Float[Tensor, " B"]) -> Float[Tensor, "B 3"]:
+def orbit_positions(
+    elevation_deg: Float[Tensor, " B"], azimuth_deg: Float[Tensor, " B"], distance: Float[Tensor, " B"]
+) -> Float[Tensor, "B 3"]:
     """Points at ``distance`` from the origin, in world units."""
     elevation, azimuth = torch.deg2rad(elevation_deg), torch.deg2rad(azimuth_deg)
     horizontal = distance * torch.cos(elevation)

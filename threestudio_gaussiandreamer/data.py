@@ -81,7 +81,9 @@ class CameraConfig:
             values = _plain(cfg[name])
             listed = isinstance(values, list)
             if listed and len(values) not in (1, len(cfg.resolution_milestones) + 1):
-                raise UserError(f"data.{name}: {len(values)} entries need {len(values) - 1} data.resolution_milestones, got {len(cfg.resolution_milestones)}")
+                raise UserError(
+                    f"data.{name}: {len(values)} entries need {len(values) - 1} data.resolution_milestones, got {len(cfg.resolution_milestones)}"
+                )
             if any(not isinstance(v, int) or isinstance(v, bool) or v < 1 for v in (values if listed else [values])):
                 raise UserError(f"data.{name}: expected whole numbers >= 1, got {values}")
         _check_milestones(cfg)
@@ -157,7 +159,11 @@ class TrainCameras(IterableDataset, Updateable):
         """The batch that trains ``step``: a function of (seed, step), different in each process that trains along."""
         height, width, batch_size = self.sizes[bisect.bisect_right(self.cfg.resolution_milestones, step)]
         rng = generator(item_seed(), "camera", step)
-        orbit = self._pick(batch_size, rng) if self.pool else cameras.sample_orbit(batch_size, self._ranges(step), rng, self.cfg.batch_uniform_azimuth)
+        orbit = (
+            self._pick(batch_size, rng)
+            if self.pool
+            else cameras.sample_orbit(batch_size, self._ranges(step), rng, self.cfg.batch_uniform_azimuth)
+        )
         c2w = self._perturbed(orbit, rng)
         return make_batch(orbit, c2w, self._lights(c2w, rng), height, width, self.cfg.rays, self.cfg.rays_d_normalize)
 

@@ -123,11 +123,15 @@ def rotate(quats: Float[Tensor, "N 4"], vectors: Float[Tensor, "N 3"]) -> Float[
     return vectors + 2 * torch.linalg.cross(u, torch.linalg.cross(u, vectors) + w * vectors)
 
 
-def update_optimizer(optimizer: torch.optim.Optimizer, old: Mapping[str, nn.Parameter], new: Mapping[str, nn.Parameter], change: Change) -> None:
+def update_optimizer(
+    optimizer: torch.optim.Optimizer, old: Mapping[str, nn.Parameter], new: Mapping[str, nn.Parameter], change: Change
+) -> None:
     """Put the ``new`` parameters in the place of the ``old``; moments follow their Gaussian, those of fresh ones are zero."""
     replaced = {id(old[name]): new[name] for name in new}
     for group in optimizer.param_groups:
-        group["params"] = [_moved(optimizer, param, replaced[id(param)], change) if id(param) in replaced else param for param in group["params"]]
+        group["params"] = [
+            _moved(optimizer, param, replaced[id(param)], change) if id(param) in replaced else param for param in group["params"]
+        ]
 
 
 def _moved(optimizer: torch.optim.Optimizer, old: nn.Parameter, new: nn.Parameter, change: Change) -> nn.Parameter:

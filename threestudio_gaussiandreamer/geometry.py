@@ -1,8 +1,8 @@
 """Geometry ``gaussiandreamer-cloud``: a cloud of 3D Gaussians that starts from a 3D prior.
 
 Parameters (the names say how they are stored): ``means`` (N, 3) world units, ``log_scales`` (N, 3), ``quats`` (N, 4) wxyz,
-``logit_opacities`` (N,), ``sh0`` (N, 1, 3) and ``sh_rest`` (N, K - 1, 3) with K = (sh_degree + 1)^2. The cloud is empty until :meth:`initialize` runs the
-prior or a checkpoint is loaded; it takes its size from the checkpoint, so the prior isn't needed again.
+``logit_opacities`` (N,), ``sh0`` (N, 1, 3) and ``sh_rest`` (N, K - 1, 3) with K = (sh_degree + 1)^2. The cloud is empty until
+:meth:`initialize` runs the prior or a checkpoint is loaded; it takes its size from the checkpoint, so the prior isn't needed again.
 
 ==================  =========================================================================================================
 option              meaning
@@ -226,7 +226,11 @@ class GaussianCloud(BaseGeometry):
         """At most ``max_gaussians`` points, a seeded uniform choice."""
         if len(points) <= self.cfg.max_gaussians:
             return points, colors
-        logger.warning("the prior and its growth give %d points; keeping %d of them (system.geometry.max_gaussians)", len(points), self.cfg.max_gaussians)
+        logger.warning(
+            "the prior and its growth give %d points; keeping %d of them (system.geometry.max_gaussians)",
+            len(points),
+            self.cfg.max_gaussians,
+        )
         rows = np.sort(numpy_generator(run_seed(), "cap").choice(len(points), self.cfg.max_gaussians, replace=False))
         return points[rows], colors[rows]
 

@@ -30,9 +30,7 @@ MOVED = {
 """Models that their makers took off the hub, and where people find them now."""
 WITHOUT_WEIGHTS = {"tokenizer": "tokenizer_config.json", "scheduler": "scheduler_config.json"}
 """Components that are all configuration, and the file that they can't be without."""
-WEIGHTS = re.compile(
-    r"(?:diffusion_pytorch_model|model)(?P<early>\.fp16)?(?:-\d{5}-of-(?P<shards>\d{5}))?(?P<late>\.fp16)?\.safetensors"
-)
+WEIGHTS = re.compile(r"(?:diffusion_pytorch_model|model)(?P<early>\.fp16)?(?:-\d{5}-of-(?P<shards>\d{5}))?(?P<late>\.fp16)?\.safetensors")
 SAMPLE = 1 << 16
 """Bytes of each of the sixteen places at which a weight file is sampled for its fingerprint."""
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS)

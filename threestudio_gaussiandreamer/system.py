@@ -63,7 +63,9 @@ class GaussianDreamerSystem(BaseLift3DSystem):
                 validate_schedule(weight, f"system.loss.{name}")
             _check_losses(cfg)
             if cfg.scheduler is not None:
-                raise UserError("system.scheduler isn't used: learning rates are schedules themselves, for instance system.geometry.lr_means")
+                raise UserError(
+                    "system.scheduler isn't used: learning rates are schedules themselves, for instance system.geometry.lr_means"
+                )
             for name in cfg.optimizer:
                 if name not in ("name", "args"):
                     raise unknown("key system.optimizer.", name, ("name", "args"))
@@ -225,7 +227,9 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             images.append(_rgb(truth[0]))
         if isinstance(self.guidance, ScoreDistillation):
             images += self.score_pictures(out, batch)
-        self.save_image_grid(f"it{self.true_global_step}-{int(batch['index'][0])}.png", images, name="validation_step", step=self.true_global_step)
+        self.save_image_grid(
+            f"it{self.true_global_step}-{int(batch['index'][0])}.png", images, name="validation_step", step=self.true_global_step
+        )
 
     def score_pictures(self, out: dict[str, Any], batch: dict[str, Any]) -> list[dict[str, Any]]:
         """What the score model sees and makes of this render: noisy, denoised in one step, denoised in many."""

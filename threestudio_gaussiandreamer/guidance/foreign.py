@@ -30,4 +30,3 @@ def trainable_groups(guidance: Any, lr: float) -> list[dict[str, Any]]:
     parameters = guidance.parameters() if isinstance(guidance, nn.Module) else ()
     learning = [parameter for parameter in parameters if parameter.requires_grad]
     return [{"params": learning, "name": "guidance", "lr": lr}] if learning else []
-
