@@ -1,19 +1,29 @@
-import builtins
+import logging
 import math
+import sys
 
 import numpy as np
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import cameras
+from threestudio_gaussiandreamer import cameras, raycast
 from threestudio_gaussiandreamer.errors import UserError
 from threestudio_gaussiandreamer.meshes import Mesh, load_mesh
 from threestudio_gaussiandreamer.raycast import MeshCaster, TargetCache, over_background
 
 trimesh = pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
 
 COLORS = {"+x": (1, 0, 0), "-x": (0, 1, 1), "+y": (0, 1, 0), "-y": (1, 0, 1), "+z": (0, 0, 1), "-z": (1, 1, 0)}
+
+
+@pytest.fixture(params=["embree", "zbuffer"], autouse=True)
+def caster_name(request, monkeypatch):
+    """Every test runs with both casters."""
+    if request.param == "zbuffer":
+        monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)  # importing it is an ImportError now
+    else:
+        pytest.importorskip("embreex")
+    return request.param
 
 
 def look(elevation, azimuth, distance):
@@ -165,16 +175,25 @@ def test_the_cache_is_bounded_and_drops_the_oldest_use():
     assert len(cache) == 3
 
 
-def test_sizes_and_missing_embree_are_named(monkeypatch):
+def test_sizes_are_checked():
     with pytest.raises(UserError, match="at least 1"):
         MeshCaster(cube()).render(look(0, 0, 3), 0.7, 0, 8)
-    real_import = builtins.__import__
 
-    def without_embreex(name, *args, **kwargs):
-        if name.startswith("embreex"):
-            raise ImportError("No module named 'embreex'")
-        return real_import(name, *args, **kwargs)
 
-    monkeypatch.setattr(builtins, "__import__", without_embreex)
-    with pytest.raises(UserError, match="pip install embreex"):
+def test_a_missing_embree_is_said_once(caster_name, caplog):
+    raycast._report_slow_caster.cache_clear()
+    with caplog.at_level(logging.WARNING, logger=raycast.__name__):
         MeshCaster(cube())
+        MeshCaster(cube())
+    lines = [record.getMessage() for record in caplog.records if "pip install embreex" in record.getMessage()]
+    assert len(lines) == (1 if caster_name == "zbuffer" else 0)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_the_progress_bar_is_for_terminals(terminal, capfd, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    views = [(look(0, 0, 3), 0.8)] * 2
+    MeshCaster(cube()).render_views(views, 4, 4, progress="bank of views")
+    assert ("bank of views" in capfd.readouterr().err) == terminal
+    MeshCaster(cube()).render_views(views, 4, 4)
+    assert not capfd.readouterr().err

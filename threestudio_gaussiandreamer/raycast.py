@@ -5,30 +5,33 @@ Colours are the mesh's own, without lights, from both sides of a face. Cameras a
 ``((j + 0.5 - W/2)/f, -(i + 0.5 - H/2)/f, -1)`` with ``f = H / (2 tan(fovy/2))``.
 """
 
+import functools
+import logging
 import math
 import os
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from .errors import UserError
 from .meshes import Mesh, surface_colors
+from .zbuffer import NEAR, ZBuffer
 
-NEAR = 1e-6
 RAYS_PER_CAST = 2**16
+log = logging.getLogger(__name__)
 
 
 class MeshCaster:
-    """Casts rays at one mesh with Embree; the scene is built once, ``render`` may be called from several threads."""
+    """Casts rays at one mesh; what that needs is built once, ``render`` may be called from several threads."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
-        self._scene = _embree_scene(mesh)
+        self._hits = _fastest_hits(mesh)
         self._vertices = mesh.vertices.astype(np.float32)
 
     def render(
@@ -45,18 +48,19 @@ class MeshCaster:
         c2w = np.asarray(c2w, dtype=np.float64)
         focal = height / (2 * math.tan(fovy / 2))
         top, bottom, left, right = self._bounds(c2w, focal, height, width)
-        rows, columns = np.arange(top, bottom) - height / 2, np.arange(left, right) - width / 2
+        columns = _samples(left, right, supersample) - width / 2
         image = np.zeros((height, width, 4), dtype=np.float32)
-        for offsets in _offset_groups(supersample, len(rows) * len(columns)):
-            image[top:bottom, left:right] += self._cast(c2w[:3, 3], _directions(c2w, focal, rows, columns, offsets)).sum(axis=0)
-        return image / supersample**2
+        for start, end in _bands(top, bottom, supersample * len(columns)):
+            colors = self._cast(c2w, focal, _samples(start, end, supersample) - height / 2, columns)
+            image[start:end, left:right] = colors.reshape(end - start, supersample, right - left, supersample, 4).mean(axis=(1, 3))
+        return image
 
     def render_views(
         self, cameras: Iterable[tuple[np.ndarray, float]], height: int, width: int, *, supersample: int = 2, progress: str = ""
     ) -> Float[np.ndarray, "N H W 4"]:
         """``render`` of several (c2w, fovy) on all cores (embree and numpy's gathers release the GIL).
 
-        ``progress`` names a progress bar; without it there is none.
+        ``progress`` names a progress bar, for terminals only; without it there is none.
         """
         from tqdm import tqdm
 
@@ -67,7 +71,7 @@ class MeshCaster:
             images[index] = self.render(*cameras[index], height, width, supersample=supersample)
 
         with ThreadPoolExecutor(max(1, min(len(cameras), os.cpu_count() or 1))) as pool:
-            list(tqdm(pool.map(fill, range(len(cameras))), progress, len(cameras), disable=not progress, leave=False))
+            list(tqdm(pool.map(fill, range(len(cameras))), progress, len(cameras), disable=None if progress else True, leave=False))
         return images
 
     def _bounds(self, c2w: np.ndarray, focal: float, height: int, width: int) -> tuple[int, int, int, int]:
@@ -80,20 +84,13 @@ class MeshCaster:
         left, right = np.clip([math.floor(columns.min()), math.ceil(columns.max())], 0, width)
         return int(top), int(bottom), int(left), int(right)
 
-    def _cast(self, origin: np.ndarray, directions: Float[np.ndarray, "S H W 3"]) -> Float[np.ndarray, "S H W 4"]:
-        """Colour and coverage 1 where a ray hits, zeros elsewhere."""
-        colors = np.zeros((*directions.shape[:-1], 4), dtype=np.float32)
-        if not directions.size:
-            return colors
-        directions = directions.reshape(-1, 3)
-        origins = np.ascontiguousarray(np.broadcast_to(origin.astype(np.float32), directions.shape))
-        hits = self._scene.run(origins, directions, output=True)
-        rows = np.flatnonzero(hits["primID"] >= 0)
-        u, v = hits["u"][rows], hits["v"][rows]
-        barycentric = np.stack([1 - u - v, u, v], axis=1)  # embree's u and v weigh the second and the third corner
-        flat = colors.reshape(-1, 4)
-        flat[rows, :3] = surface_colors(self.mesh, hits["primID"][rows], barycentric)
-        flat[rows, 3] = 1
+    def _cast(self, c2w: np.ndarray, focal: float, rows: np.ndarray, columns: np.ndarray) -> Float[np.ndarray, "H W 4"]:
+        """Colour and coverage 1 where a sample shows the mesh, zeros elsewhere."""
+        face_index, barycentric = self._hits(c2w, focal, rows, columns)
+        seen = face_index >= 0
+        colors = np.zeros((*seen.shape, 4), dtype=np.float32)
+        colors[seen, :3] = surface_colors(self.mesh, face_index[seen], barycentric[seen])
+        colors[seen, 3] = 1
         return colors
 
 
@@ -104,30 +101,55 @@ def over_background(
     return rgba[..., :3] + (1 - rgba[..., 3:]) * background
 
 
-def _offset_groups(supersample: int, pixels: int) -> list[Float[np.ndarray, "S 2"]]:
-    """The (row, column) places inside a pixel, in groups of at most RAYS_PER_CAST rays: memory doesn't grow with supersample."""
-    places = (np.arange(supersample) + 0.5) / supersample
-    offsets = np.stack(np.meshgrid(places, places, indexing="ij"), axis=-1).reshape(-1, 2)
-    size = max(1, RAYS_PER_CAST // max(pixels, 1))
-    return [offsets[start : start + size] for start in range(0, len(offsets), size)]
+def _samples(start: int, end: int, supersample: int) -> Float[np.ndarray, " S"]:
+    """The places of a regular grid in the pixels start ... end - 1."""
+    return start + (np.arange((end - start) * supersample) + 0.5) / supersample
 
 
-def _directions(c2w: np.ndarray, focal: float, rows: np.ndarray, columns: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """World directions (S, rows, columns, 3) float32, not normalised, at ``offsets`` in the pixels counted from the centre."""
-    x = ((columns + offsets[:, 1:]) / focal)[:, None, :, None] * c2w[:3, 0]
-    y = (-(rows + offsets[:, :1]) / focal)[:, :, None, None] * c2w[:3, 1]
-    return (x + y - c2w[:3, 2]).astype(np.float32)
+def _bands(top: int, bottom: int, rays_per_row: int) -> list[tuple[int, int]]:
+    """Groups of pixel rows with at most RAYS_PER_CAST rays, or one row: memory doesn't grow with size and supersample."""
+    if not rays_per_row:
+        return []
+    size = max(1, RAYS_PER_CAST // rays_per_row)
+    return [(start, min(start + size, bottom)) for start in range(top, bottom, size)]
+
+
+# Casters: functions (c2w (4, 4), focal, rows (H,), columns (W,)) -> nearest face (H, W), -1 = none, and barycentric (H, W, 3); rows and
+# columns are the places of the samples in pixels from the centre of the picture, rows downwards.
+Hits = Callable[[np.ndarray, float, np.ndarray, np.ndarray], tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]]
+
+
+def _fastest_hits(mesh: Mesh) -> Hits:
+    try:
+        return functools.partial(_embree_hits, _embree_scene(mesh))
+    except ImportError as error:
+        _report_slow_caster(str(error))
+        return ZBuffer(mesh.vertices, mesh.faces).hits
+
+
+@functools.cache
+def _report_slow_caster(reason: str) -> None:
+    log.warning("embreex is missing (%s): drawing the mesh with plain numpy, which is slower; `pip install embreex` for speed.", reason)
 
 
 def _embree_scene(mesh: Mesh):
-    try:
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-    except ImportError as error:
-        raise UserError(f"casting rays at a mesh needs embreex ({error}): run `pip install embreex`") from error
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
     scene = EmbreeScene()
     TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
     return scene
+
+
+def _embree_hits(scene, c2w: np.ndarray, focal: float, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    x, y = (columns / focal)[:, None] * c2w[:3, 0], (-rows / focal)[:, None, None] * c2w[:3, 1]
+    directions = (x + y - c2w[:3, 2]).astype(np.float32).reshape(-1, 3)
+    origins = np.ascontiguousarray(np.broadcast_to(c2w[:3, 3].astype(np.float32), directions.shape))
+    hits = scene.run(origins, directions, output=True)
+    u, v = hits["u"], hits["v"]
+    barycentric = np.stack([1 - u - v, u, v], axis=1)  # embree's u and v weigh the second and the third corner
+    shape = len(rows), len(columns)
+    return hits["primID"].reshape(shape), barycentric.reshape(*shape, 3)
 
 
 class TargetCache:
