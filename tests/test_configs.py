@@ -9,17 +9,28 @@ import pytest
 from threestudio_gaussiandreamer import host, register_parts
 from threestudio_gaussiandreamer.config import load_config
 from threestudio_gaussiandreamer.config_check import check_config
+from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.priors.base import Prior
 
 register_parts()
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "threestudio_gaussiandreamer"
 CONFIGS = sorted(path.name for path in (ROOT / "configs").glob("*.yaml"))
-OVERLAYS = {"demo-small.yaml": "demo.yaml"}
+OVERLAYS = {"demo-small.yaml": "demo.yaml"} | {
+    f"gaussiandreamer-{name}.yaml": "gaussiandreamer.yaml" for name in ("if", "pointe", "avatar", "ground", "lowmem")
+}
+"""What each is laid over."""
+MANDATORY = {
+    "gaussiandreamer-pointe.yaml": ["system.geometry.prior.checkpoint=base.pt", "system.geometry.prior.upsampler=upsample.pt"],
+    "gaussiandreamer-avatar.yaml": ["system.geometry.prior.motion=results.npz", "system.geometry.prior.body_model=body.npz"],
+}
+"""The user's files where a configuration leaves them open."""
 
 
 def loaded(name, tmp_path):
     paths = [ROOT / "configs" / part for part in (OVERLAYS.get(name), name) if part]
-    cfg = load_config(*paths, cli_args=["system.prompt_processor.prompt=a fox", f"exp_root_dir={tmp_path}"])
+    overrides = ["system.prompt_processor.prompt=a fox", f"exp_root_dir={tmp_path}", *MANDATORY.get(name, [])]
+    cfg = load_config(*paths, cli_args=overrides)
     check_config(cfg)
     return cfg
 
@@ -31,6 +42,40 @@ def test_a_shipped_configuration_is_valid_and_its_parts_can_be_built(name, tmp_p
     system = host.find(cfg.system_type)(cfg.system)
     assert len(system.geometry) == 0 and data.cfg.batch_size == 4
     assert system.cfg.exporter_type == "gaussiandreamer-exporter"
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_the_prior_of_a_shipped_configuration_can_be_built(name, tmp_path):
+    """Built, not run: its options are accepted, and it looks for its files only when it is asked to."""
+    geometry = loaded(name, tmp_path).system.geometry
+    assert isinstance(host.find(geometry.prior_type)(geometry.prior), Prior)
+
+
+@pytest.mark.parametrize("name", MANDATORY)
+def test_what_is_left_open_is_asked_for(name, tmp_path):
+    paths = [ROOT / "configs" / part for part in (OVERLAYS[name], name)]
+    keys = [override.partition("=")[0] for override in MANDATORY[name]]
+    with pytest.raises(UserError) as caught:
+        load_config(*paths, cli_args=["system.prompt_processor.prompt=a fox"])
+    assert all(key in str(caught.value) for key in keys)
+
+
+def test_a_body_may_be_chosen_among_meshes_instead(tmp_path):
+    prior = ["motion=''", "body_model=''", "candidates=[a.obj,b.obj]"]
+    paths = [ROOT / "configs" / name for name in ("gaussiandreamer.yaml", "gaussiandreamer-avatar.yaml")]
+    cfg = load_config(*paths, cli_args=["system.prompt_processor.prompt=a fox", *(f"system.geometry.prior.{o}" for o in prior)])
+    check_config(cfg)
+    assert list(host.find("motion-prior")(cfg.system.geometry.prior).cfg.candidates) == ["a.obj", "b.obj"]
+
+
+def test_overlays_add_up(tmp_path):
+    """An avatar on the ground in little memory: what belongs to another prior is left out, the rest stays."""
+    names = ["gaussiandreamer.yaml", "gaussiandreamer-lowmem.yaml", "gaussiandreamer-ground.yaml", "gaussiandreamer-avatar.yaml"]
+    overrides = ["system.prompt_processor.prompt=a fox", *MANDATORY["gaussiandreamer-avatar.yaml"]]
+    cfg = load_config(*(ROOT / "configs" / name for name in names), cli_args=overrides)
+    check_config(cfg)
+    prior = host.find(cfg.system.geometry.prior_type)(cfg.system.geometry.prior).cfg
+    assert prior.ground and prior.motion == "results.npz" and cfg.system.guidance.enable_vae_slicing
 
 
 def test_the_papers_numbers_are_the_papers(tmp_path):

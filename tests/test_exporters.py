@@ -48,8 +48,8 @@ class TestContract:
         assert len(set(paths)) == len(paths) and all(path.stat().st_size > 0 for path in paths)
 
     def test_an_empty_cloud_is_exported(self, name, tmp_path):
-        for output in build(name, geometry(count=0))():
-            write(output, tmp_path)
+        paths = [write(output, tmp_path) for output in build(name, geometry(count=0))()]
+        assert paths and all(path.is_file() for path in paths)
 
     def test_the_geometry_is_not_changed(self, name):
         source = geometry()

@@ -222,9 +222,13 @@ def _merge(sources: list[DictConfig]) -> DictConfig:
 def _forget_replaced_parts(earlier: DictConfig, later: DictConfig, path: str = "") -> None:
     """Where ``later`` names another part (``x_type``), drop the options of ``earlier``'s ``x`` that the new part doesn't have.
 
-    So ``system.geometry.prior_type=random-prior`` is all that it takes to try another prior; what ``later`` itself gives stays.
+    So ``system.geometry.prior_type=random-prior`` is all that it takes to try another prior; what ``later`` itself gives stays. What
+    ``later`` leaves open (``???``) has to be given anew, even if ``earlier`` has a value (OmegaConf would keep that).
     """
     for key in later:
+        if OmegaConf.is_missing(later, key):
+            earlier._content.pop(key, None)
+            continue
         section = key.removesuffix("_type")
         mine, theirs = earlier._get_node(key), later._get_node(key)
         if isinstance(mine, DictConfig) and isinstance(theirs, DictConfig):
