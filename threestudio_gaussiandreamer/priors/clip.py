@@ -63,21 +63,31 @@ def text_condition(tokenizer: Any, encoder: Any, text: str) -> Float[Tensor, "1 
     return features / features.norm(dim=-1, keepdim=True) * features.shape[-1] ** 0.5
 
 
-@torch.no_grad()
+class PictureText:
+    """A whole CLIP, loaded: how well pictures fit texts."""
+
+    def __init__(self, files: ClipFiles, device: torch.device) -> None:
+        require_extra("diffusion", "transformers")
+        from transformers import CLIPModel
+
+        folder = files.locate()
+        self._model = load_weights(CLIPModel, folder, files.weights(files_below(folder))).to(device)
+        self._tokenizer, self._device = load_tokenizer(folder), device
+
+    @torch.no_grad()
+    def similarities(self, pictures: Float[np.ndarray, "N H W 3"], text: str, *, batch: int = 32) -> Float[np.ndarray, "N"]:
+        """The cosine between each picture (values in [0, 1]) and ``text``."""
+        wanted = _unit(_features(self._model.get_text_features(token_ids(self._tokenizer, text).to(self._device))))
+        size = self._model.config.vision_config.image_size
+        chunks = [_preprocessed(pictures[start : start + batch], size).to(self._device) for start in range(0, len(pictures), batch)]
+        return torch.cat([_unit(_features(self._model.get_image_features(chunk))) @ wanted[0] for chunk in chunks]).cpu().numpy()
+
+
 def picture_similarities(
     files: ClipFiles, pictures: Float[np.ndarray, "N H W 3"], text: str, *, device: torch.device, batch: int = 32
 ) -> Float[np.ndarray, "N"]:
-    """The cosine between each picture (values in [0, 1]) and ``text``."""
-    require_extra("diffusion", "transformers")
-    from transformers import CLIPModel
-
-    folder = files.locate()
-    model = load_weights(CLIPModel, folder, files.weights(files_below(folder))).to(device)
-    wanted = _unit(_features(model.get_text_features(token_ids(load_tokenizer(folder), text).to(device))))
-    size = model.config.vision_config.image_size
-    chunks = [_preprocessed(pictures[start : start + batch], size).to(device) for start in range(0, len(pictures), batch)]
-    scores = torch.cat([_unit(_features(model.get_image_features(chunk))) @ wanted[0] for chunk in chunks]).cpu().numpy()
-    del model
+    """The cosine between each picture (values in [0, 1]) and ``text``; the model is loaded for this and freed."""
+    scores = PictureText(files, device).similarities(pictures, text, batch=batch)
     free_memory()
     return scores
 
