@@ -293,5 +293,5 @@ def _how_to_get(name: str) -> str:
     # '*/*' leaves out what lies beside the components: the same weights once more, as one file
     return (
         f"{moved} Where there is a network: `hf download {source} --include '*/*' --exclude '*.bin' --local-dir {local}`; "
-        f"then set {OPTION} to that folder."
+        f"then set {OPTION} to that folder. To run without any weights: --config demo.yaml."
     )

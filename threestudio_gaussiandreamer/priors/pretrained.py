@@ -206,7 +206,7 @@ def unreachable(model: str, revision: Optional[str], option: str, error: Excepti
     reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
     return UserError(
         f"{option}: {model!r} is not on this machine and the hub can't be reached ({reason}): run `{command}` where there is a network,"
-        f" or set {option} to a folder that holds the model"
+        f" or set {option} to a folder that holds the model. To run without any weights: --config demo.yaml"
     )
 
 
