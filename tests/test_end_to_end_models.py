@@ -110,7 +110,9 @@ def assert_trained(folder, rate):
     save = folder / "save"
     for name in (f"it{STEPS}-0.png", f"it{STEPS}-test.mp4", "prior/turntable.gif"):
         assert (save / name).is_file(), name
-    losses = [float(row["train/loss_sds"]) for path in folder.glob("csv_logs/**/metrics.csv") for row in rows(path) if row["train/loss_sds"]]
+    losses = [
+        float(row["train/loss_sds"]) for path in folder.glob("csv_logs/**/metrics.csv") for row in rows(path) if row["train/loss_sds"]
+    ]
     assert len(losses) == STEPS and all(np.isfinite(losses)) and min(losses) > 0
 
 

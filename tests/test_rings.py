@@ -28,6 +28,9 @@ HOST = {"host", "builtin"}
 ASSEMBLY = {
     "system",
     "evaluate",
+    "results",
+    "clip_evaluation",
+    "t3bench",
     "experiment",
     "config",
     "config_check",
