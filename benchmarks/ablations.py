@@ -47,7 +47,8 @@ LATENT = {"system.guidance.space": "latent", "system.guidance.latent_size": 16}
 STRONG = {"system.guidance.guidance_scale": 101.0}  # threestudio's 100
 CLIPPED = {"system.guidance.grad_clip": [0, 1.5, 2.0, 1000]}
 PAPER_RATES = {
-    f"system.geometry.lr_{name}": rate for name, rate in (("means", 5e-5), ("scales", 1e-3), ("quats", 1e-2), ("opacities", 1e-2))
+    f"system.geometry.lr_{name}": rate
+    for name, rate in (("means", 5e-5), ("scales", 1e-3), ("quats", 1e-2), ("opacities", 1e-2), ("sh", 1.25e-2))
 }
 
 # Options replace what the demo's YAML has under their key, whole sections included.

@@ -8,6 +8,8 @@ from torch import Tensor
 
 from threestudio_gaussiandreamer.splatting import Rasterized, rasterize
 
+# float32 against float64 without the worst 0.5 % of the rows (thresholds that fall the other way).
+SINGLE = 2e-5
 NO_CUTOFFS = {"alpha_min": 0.0, "alpha_max": 1.0, "stop": 0.0}
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 
@@ -39,6 +41,28 @@ def random_cloud(n: int, seed: int = 0, channels: int = 3, size: float = 0.15, s
     scales = size * torch.exp(stretch * torch.randn(n, 3, generator=g, dtype=torch.float64))
     opacities = 0.05 + 0.9 * torch.rand(n, generator=g, dtype=torch.float64)
     return Cloud(means, quats, scales, opacities, torch.rand(n, channels, generator=g, dtype=torch.float64))
+
+
+HOSTILE = {
+    "means": [0.0, 0.3, -0.7, 3.0, -3.0, 1e4, 1e30, math.nan, math.inf],
+    "quats": [0.0, 1.0, -1.0, 1e-20, 1e-40, 1e20, math.nan],
+    "scales": [1e-8, 1e-4, 1e-2, 0.3, 1.0, 100.0, 1e4, 0.0, math.inf],
+    "opacities": [0.0, 1 / 1024, 0.5, 0.9, 1.0, math.nan],
+    "colors": [0.0, 1.0, -2.0, math.nan],
+}
+
+
+def hostile_cloud(seed: int, n: int) -> Cloud:
+    """Half of the entries are picked from HOSTILE, the others are ordinary; the second half's means coincide with the first's."""
+    g = torch.Generator().manual_seed(seed)
+    cloud = random_cloud(n, seed)
+    for name, x in zip(NAMES, cloud, strict=True):
+        values = torch.tensor(HOSTILE[name], dtype=torch.float64)
+        picked = values[torch.randint(len(values), x.shape, generator=g)]
+        rare = picked.isfinite() | (torch.rand(x.shape, generator=g) < 0.1)
+        x.copy_(torch.where((torch.rand(x.shape, generator=g) < 0.5) & rare, picked, x))
+    cloud.means[n // 2 :] = cloud.means[: n - n // 2].clone()
+    return cloud
 
 
 def cameras(views: int, width: int, height: int, distance: float = 3.0, fov: float = 50.0, dtype=torch.float64) -> tuple[Tensor, Tensor]:
@@ -111,3 +135,22 @@ def trimmed_error(a: Tensor, b: Tensor, kept: float = 0.995) -> float:
 
 def psnr(a: Tensor, b: Tensor) -> float:
     return -10 * math.log10(max(((a.double() - b.double()) ** 2).mean().item(), 1e-30))
+
+
+def assert_close(ours: Run, truth: Run, tolerance: float = SINGLE, radii: bool = True) -> None:
+    """Pictures and gradients of a float32 kernel within rounding of the specification in float64."""
+    for name in ("image", "alpha", "depth", "means2d", "contribution"):
+        picture, true = getattr(ours.out, name), getattr(truth.out, name)
+        assert error(picture, true) < SINGLE or (picture - true).abs().max() < 1e-7, name
+    assert not radii or torch.allclose(ours.out.radii.double(), truth.out.radii, rtol=1e-5)
+    for name, grad in truth.grads.items():
+        by_gaussian = [x.transpose(0, 1) if name == "means2d" else x for x in (ours.grads[name], grad)]
+        assert trimmed_error(*by_gaussian) < tolerance or (ours.grads[name] - grad).abs().max() < 1e-7, name
+    if hasattr(truth.out.means2d, "absgrad"):
+        assert error(ours.out.means2d.absgrad, truth.out.means2d.absgrad) < SINGLE
+
+
+def equal(a: Run, b: Run) -> bool:
+    """To the bit."""
+    outputs = all(torch.equal(x, y) for x, y in zip(a.out, b.out, strict=True))
+    return outputs and all(torch.equal(grad, b.grads[name]) for name, grad in a.grads.items())

@@ -16,7 +16,7 @@ register_parts()
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "threestudio_gaussiandreamer"
 CONFIGS = sorted(path.name for path in (ROOT / "configs").glob("*.yaml"))
-OVERLAYS = {"demo-small.yaml": "demo.yaml"} | {
+OVERLAYS = {f"demo-{name}.yaml": "demo.yaml" for name in ("small", "draft", "best")} | {
     f"gaussiandreamer-{name}.yaml": "gaussiandreamer.yaml" for name in ("if", "pointe", "avatar", "ground", "lowmem")
 }
 """What each is laid over."""

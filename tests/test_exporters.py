@@ -10,11 +10,16 @@ import torch
 from threestudio_gaussiandreamer import exporters, ply
 from threestudio_gaussiandreamer.errors import UserError
 from threestudio_gaussiandreamer.host import BaseGeometry, ExporterOutput, find, names
+from threestudio_gaussiandreamer.surface import write_obj
 
 for module in pkgutil.iter_modules(exporters.__path__):
     importlib.import_module(f"{exporters.__name__}.{module.name}")
 
-WRITERS = {"ply": ply.write_gaussians, "points": lambda path, cloud: ply.write_points(path, cloud)}
+WRITERS = {
+    "ply": ply.write_gaussians,
+    "points": lambda path, cloud: ply.write_points(path, cloud),
+    "surface": lambda path, surface: write_obj(path, surface),
+}
 EXPORTERS = sorted(name for name in names() if name.endswith("-exporter") and find(name).__module__.startswith(exporters.__name__))
 
 

@@ -8,9 +8,10 @@ import torch
 import yaml
 from torch import nn
 
+from threestudio_gaussiandreamer.errors import UserError
 from threestudio_gaussiandreamer.experiment import main
-from threestudio_gaussiandreamer.guidance.foreign import call_guidance, trainable_groups
-from threestudio_gaussiandreamer.host import BaseObject, register
+from threestudio_gaussiandreamer.guidance.foreign import call_guidance, learnt_weights, own_randomness, restore_learnt, trainable_groups
+from threestudio_gaussiandreamer.host import BaseModule, BaseObject, register
 
 BATCH_KEYS = {"c2w", "fovy", "height", "width", "elevation", "azimuth", "camera_distances", "camera_positions", "mvp_mtx", "proj_mtx"}
 
@@ -55,6 +56,18 @@ class LearningDouble(nn.Module):
         return {"loss_vsd": rgb.sum(), "loss_lora": (self.lora(rgb.detach()) - self.frozen(rgb.detach())).square().mean()}
 
 
+@register("test-learning-guidance")
+class LearningPart(BaseModule):
+    """As VSD's: its first weights and its noise come from torch's global generator."""
+
+    def configure(self):
+        self.learner = LearningDouble()
+
+    def forward(self, rgb, prompt_utils, **batch):
+        noisy = rgb + 0.1 * torch.randn_like(rgb)
+        return self.learner(noisy, prompt_utils, **batch)
+
+
 def batch():
     numbers = {"elevation": torch.zeros(2), "azimuth": torch.zeros(2), "camera_distances": torch.ones(2), "height": 4, "width": 4}
     return numbers | {"c2w": torch.eye(4).expand(2, -1, -1), "mvp_mtx": torch.eye(4).expand(2, -1, -1)}
@@ -76,6 +89,31 @@ def test_what_a_guidance_learns_becomes_one_group():
     assert [id(parameter) for parameter in group["params"]] == [id(guidance.lora.weight)]
 
 
+def test_what_a_guidance_learnt_is_put_back():
+    guidance, other = LearningDouble(), LearningDouble()
+    weights = learnt_weights(guidance)
+    assert list(weights) == ["lora.weight"] and not weights["lora.weight"].requires_grad
+    restore_learnt(other, weights)
+    assert torch.equal(other.lora.weight, guidance.lora.weight) and other.lora.weight.requires_grad
+    assert learnt_weights(ImageDouble()) == {}
+    restore_learnt(ImageDouble(), {})
+    with pytest.raises(UserError, match="had learnt 1 tensors, and ImageDouble learns 0"):
+        restore_learnt(ImageDouble(), weights)
+
+
+def test_global_draws_are_functions_of_the_step_and_leave_no_trace():
+    def draw(step):
+        with own_randomness(step):
+            return torch.rand(3)
+
+    torch.manual_seed(5)
+    first, other = draw(1), draw(2)
+    after = torch.rand(3)
+    torch.manual_seed(5)
+    assert torch.equal(torch.rand(3), after)
+    assert torch.equal(draw(1), first) and not torch.equal(first, other)
+
+
 # Whole runs -----------------------------------------------------------------------------------------------------------------------
 
 
@@ -91,12 +129,75 @@ def config(path, **system):
     return path
 
 
-def run(path, folder):
-    return main(["--config", str(path), "--train", "--gpu", "cpu", f"exp_root_dir={folder}"])
+def diffusion(model, family="stable-diffusion"):
+    """What a user writes for the real weights."""
+    return {
+        "prompt_processor_type": f"{family}-prompt-processor",
+        "prompt_processor": {
+            "pretrained_model_name_or_path": "${system.guidance.pretrained_model_name_or_path}",
+            "prompt": "a fox",
+            "negative_prompt": "ugly",
+            "use_perp_neg": True,
+        },
+        "guidance_type": f"{family}-guidance",
+        "guidance": {
+            "pretrained_model_name_or_path": str(model),
+            "guidance_scale": 20.0,
+            "max_step_percent": [2, 0.98, 0.55, 3],
+            "grad_clip": [0, 1.5, 2.0, 1000],
+            "eval_steps": 2,
+        },
+    }
 
 
-def means_of(folder):
-    return torch.load(folder / "demo" / "t" / "ckpts" / "last.ckpt", weights_only=True)["state_dict"]["geometry.means"]
+def run(path, folder, *options):
+    return main(["--config", str(path), "--train", "--gpu", "cpu", f"exp_root_dir={folder}", *options])
+
+
+def checkpoint(folder):
+    return torch.load(folder / "demo" / "t" / "ckpts" / "last.ckpt", weights_only=True)
+
+
+def flat(content, name=""):
+    """Every tensor of a checkpoint's part by its place."""
+    if isinstance(content, torch.Tensor):
+        return {name: content}
+    entries = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, (list, tuple)) else ()
+    return {place: tensor for key, value in entries for place, tensor in flat(value, f"{name}/{key}").items()}
+
+
+def assert_resumes(path, folder, *options):
+    """Five steps at once, and three and two with more validation, end with the same checkpoint bit for bit."""
+    assert run(path, folder / "whole", *options, "trainer.max_steps=5") == 0
+    assert run(path, folder / "parts", *options, "trainer.val_check_interval=1") == 0
+    last = folder / "parts" / "demo" / "t" / "ckpts" / "last.ckpt"
+    assert run(path, folder / "parts", *options, "trainer.max_steps=5", f"resume={last}") == 0
+    whole, parts = ({key: checkpoint(folder / name)[key] for key in PARTS} for name in ("whole", "parts"))
+    whole, parts = flat(whole), flat(parts)
+    assert whole.keys() == parts.keys() and not [name for name in whole if not torch.equal(whole[name], parts[name])]
+    return whole
+
+
+PARTS = ("state_dict", "guidance", "optimizer_states")
+
+
+def test_a_guidance_that_learns_resumes_as_if_it_had_never_stopped(tmp_path):
+    system = {"guidance_type": "test-learning-guidance", "guidance": {}, "loss": {"lambda_vsd": 1.0, "lambda_lora": 1.0}}
+    found = assert_resumes(config(tmp_path / "run.yaml", **system), tmp_path)
+    assert [name for name in found if name.startswith("/guidance")] == ["/guidance/learner.lora.weight"]
+    weights = torch.load(tmp_path / "parts" / "demo" / "t" / "ckpts" / "last.ckpt", weights_only=True)["guidance"]
+    assert torch.equal(found["/guidance/learner.lora.weight"], weights["learner.lora.weight"])
+    assert not [name for name in found if "frozen" in name]
+
+
+@pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
+def test_a_diffusion_model_resumes_as_if_it_had_never_stopped(tmp_path, monkeypatch, prediction):
+    """The random draws of its guidance (timesteps, noise, the VAE's) belong to the step, and validation's pictures take none."""
+    pytest.importorskip("diffusers")
+    monkeypatch.chdir(tmp_path)
+    model = tiny_models.stable_diffusion(tmp_path / "model", prediction=prediction)
+    found = assert_resumes(config(tmp_path / "run.yaml", **diffusion(model)), tmp_path)
+    assert "/state_dict/geometry.means" in found and not [name for name in found if name.startswith("/guidance")]
 
 
 def test_a_guidance_by_name_gets_the_full_batch_and_all_its_losses_count(tmp_path):
@@ -126,27 +227,11 @@ def test_a_run_with_a_tiny_real_model(tmp_path, monkeypatch, kind):
         model, family = tiny_models.deep_floyd(tmp_path / "model"), "deep-floyd"
     else:
         model, family = tiny_models.stable_diffusion(tmp_path / "model", prediction=kind), "stable-diffusion"
-    system = {
-        "prompt_processor_type": f"{family}-prompt-processor",
-        "prompt_processor": {
-            "pretrained_model_name_or_path": "${system.guidance.pretrained_model_name_or_path}",
-            "prompt": "a fox",
-            "negative_prompt": "ugly",
-            "use_perp_neg": True,
-        },
-        "guidance_type": f"{family}-guidance",
-        "guidance": {
-            "pretrained_model_name_or_path": str(model),
-            "guidance_scale": 20.0,
-            "max_step_percent": [2, 0.98, 0.55, 3],
-            "grad_clip": [0, 1.5, 2.0, 1000],
-            "eval_steps": 2,
-        },
-    }
+    system = diffusion(model, family=family)
     assert run(config(tmp_path / "run.yaml", **system), tmp_path) == 0
     save = tmp_path / "demo" / "t" / "save"
     assert (save / "it3-0.png").is_file() and (save / "it3-export" / "gaussians.ply").is_file()
-    assert torch.isfinite(means_of(tmp_path)).all()
+    assert torch.isfinite(checkpoint(tmp_path)["state_dict"]["geometry.means"]).all()
 
 
 def test_a_missing_model_ends_the_run_before_the_prior(tmp_path, monkeypatch, capsys):

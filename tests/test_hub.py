@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import tiny_models
 
-from threestudio_gaussiandreamer import hub
+from threestudio_gaussiandreamer import extras, hub, model_files
 from threestudio_gaussiandreamer.errors import UserError
 
 huggingface_hub = pytest.importorskip("huggingface_hub")
@@ -64,7 +64,7 @@ class FakeHub(BaseHTTPRequestHandler):
             self.reply(401, b"", {"X-Error-Code": "RepoNotFound", "X-Error-Message": "Repository not found"}, body)
 
     def api(self, path):
-        names = hub.files_below(self.folder)
+        names = model_files.files_below(self.folder)
         if "/tree/" in path:
             entries = [{"type": "file", "path": name, "size": (self.folder / name).stat().st_size, "oid": "0" * 40} for name in names]
             return self.reply(200, json.dumps(entries).encode(), {})
@@ -124,7 +124,7 @@ def test_a_missing_folder_names_the_near_ones(model):
 
 
 def test_a_folder_that_is_no_model_says_what_is_missing(tmp_path):
-    with pytest.raises(UserError, match="unet/config.json is missing.*diffusers' format"):
+    with pytest.raises(UserError, match="unet/config.json is missing.*format of diffusers"):
         hub.find_model(str(tmp_path), ["unet"])
 
 
@@ -138,9 +138,9 @@ def test_pickled_weights_are_refused(model, tmp_path):
 def test_all_shards_must_be_there():
     shards = [f"text_encoder/model-0000{i}-of-00003.safetensors" for i in (1, 2, 3)]
     names = ["text_encoder/config.json", "text_encoder/model.safetensors.index.json", *shards]
-    assert hub.component_weights(names, "text_encoder", half=False) == (shards, None)
-    with pytest.raises(UserError, match="some of its safetensors"):
-        hub.component_weights(names[:-1], "text_encoder", half=False)
+    assert model_files.component_weights(names, "text_encoder", half=False) == (shards, None, True)
+    with pytest.raises(UserError, match=r"some of text_encoder/\*.safetensors are missing"):
+        model_files.component_weights(names[:-1], "text_encoder", half=False)
 
 
 @pytest.mark.parametrize(
@@ -148,20 +148,20 @@ def test_all_shards_must_be_there():
 )
 def test_the_wanted_precision_is_preferred_and_the_other_one_will_do(fp16):
     half, full = f"unet/{fp16}", "unet/model.safetensors"
-    assert hub.component_weights([half, full], "unet", half=True) == ([half], "fp16")
-    assert hub.component_weights([half, full], "unet", half=False) == ([full], None)
-    assert hub.component_weights([half], "unet", half=False) == ([half], "fp16")
-    assert hub.component_weights([full], "unet", half=True) == ([full], None)
+    assert model_files.component_weights([half, full], "unet", half=True) == ([half], "fp16", True)
+    assert model_files.component_weights([half, full], "unet", half=False) == ([full], None, True)
+    assert model_files.component_weights([half], "unet", half=False) == ([half], "fp16", True)
+    assert model_files.component_weights([full], "unet", half=True) == ([full], None, True)
 
 
 def test_the_fingerprint_is_of_the_content_not_of_the_place(model, tmp_path):
     moved = copied(model, tmp_path / "moved")
-    assert hub.fingerprint(moved, TEXT) == hub.fingerprint(model, TEXT)
-    assert hub.fingerprint(moved, IMAGE) != hub.fingerprint(moved, TEXT)
+    assert model_files.fingerprint(moved, TEXT) == model_files.fingerprint(model, TEXT)
+    assert model_files.fingerprint(moved, IMAGE) != model_files.fingerprint(moved, TEXT)
     weights = moved / "text_encoder" / "model.safetensors"
     *others, last = weights.read_bytes()
     weights.write_bytes(bytes([*others, last ^ 1]))
-    assert hub.fingerprint(moved, TEXT) != hub.fingerprint(model, TEXT)
+    assert model_files.fingerprint(moved, TEXT) != model_files.fingerprint(model, TEXT)
 
 
 def test_weights_that_are_missing_are_not_made_up(model, tmp_path):
@@ -174,7 +174,7 @@ def test_weights_that_are_missing_are_not_made_up(model, tmp_path):
     del tensors["conv_in.weight"]
     save_file(tensors, path, metadata={"format": "pt"})
     with pytest.raises(UserError, match="unet of the model .* lacks weights: conv_in.weight"):
-        hub.load(UNet2DConditionModel, folder, "unet")
+        model_files.load_network(UNet2DConditionModel, folder, "unet")
 
 
 # The hub ----------------------------------------------------------------------------------------------------------------------
@@ -184,7 +184,7 @@ def test_only_what_is_needed_is_downloaded_and_then_read_from_the_disk(online, m
     folder = hub.find_model("people/tiny", IMAGE)
     wanted = {"model_index.json", "unet/config.json", "unet/diffusion_pytorch_model.safetensors", "vae/config.json"}
     wanted |= {"vae/diffusion_pytorch_model.safetensors", "scheduler/scheduler_config.json"}
-    assert set(hub.files_below(folder)) == wanted
+    assert set(model_files.files_below(folder)) == wanted
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     online.asked.clear()
     assert hub.find_model("people/tiny", IMAGE) == folder
@@ -192,11 +192,11 @@ def test_only_what_is_needed_is_downloaded_and_then_read_from_the_disk(online, m
     with pytest.raises(UserError, match="HF_HUB_OFFLINE"):
         hub.find_model("people/tiny", TEXT)
     monkeypatch.setenv("HF_HUB_OFFLINE", "0")
-    assert set(hub.files_below(hub.find_model("people/tiny", TEXT))) > wanted
+    assert set(model_files.files_below(hub.find_model("people/tiny", TEXT))) > wanted
 
 
 def test_half_precision_downloads_the_small_files(online):
-    names = hub.files_below(hub.find_model("people/tiny", IMAGE, half=True))
+    names = model_files.files_below(hub.find_model("people/tiny", IMAGE, half=True))
     assert [name for name in names if name.endswith(".safetensors")] == [
         "unet/diffusion_pytorch_model.fp16.safetensors",
         "vae/diffusion_pytorch_model.fp16.safetensors",
@@ -246,12 +246,12 @@ def test_a_hub_that_never_answers_is_given_up(monkeypatch, tmp_path):
         hub.find_model("people/tiny", IMAGE)
 
 
-def test_a_full_disk_is_named(tmp_path):
-    assert "HF_HOME" in hub.explain("a/b", OSError(28, "No space left on device"))
+def test_a_full_disk_is_named():
+    assert "HF_HOME" in hub.explain(hub.Source("a/b", list), OSError(28, "No space left on device"))
 
 
 def test_without_the_libraries_the_extra_is_named(monkeypatch):
-    hub.require_diffusion("json")
+    extras.require("diffusion", "json")
     monkeypatch.setitem(sys.modules, "diffusers", None)
     with pytest.raises(UserError, match=r"needs diffusers .*pip install 'threestudio-gaussiandreamer\[diffusion\]'"):
-        hub.require_diffusion()
+        extras.require("diffusion", "json", "diffusers")

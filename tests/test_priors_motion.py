@@ -16,7 +16,7 @@ from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.meshes import Mesh
 from threestudio_gaussiandreamer.priors import motion as module
 from threestudio_gaussiandreamer.priors import motion_files
-from threestudio_gaussiandreamer.priors.clip import ClipFiles, picture_similarities
+from threestudio_gaussiandreamer.priors.clip import clip_source, picture_similarities
 from threestudio_gaussiandreamer.priors.motion import MotionPrior, body_pictures, facing, offered_frames, z_up
 from threestudio_gaussiandreamer.priors.motion_files import Motions, read_motions
 from threestudio_gaussiandreamer.priors.motion_text import reduced_prompt
@@ -245,7 +245,7 @@ def test_similarities_are_those_of_transformers(clip):
     pixels = (pictures - [0.48145466, 0.4578275, 0.40821073]) / [0.26862954, 0.26130258, 0.27577711]
     with torch.no_grad():
         output = model(**tokenizer("a fox", return_tensors="pt"), pixel_values=torch.from_numpy(pixels).float().permute(0, 3, 1, 2))
-    scores = picture_similarities(ClipFiles(clip, option="clip"), pictures, "a fox", device=torch.device("cpu"), batch=2)
+    scores = picture_similarities(clip_source(clip), pictures, "a fox", device=torch.device("cpu"), batch=2)
     np.testing.assert_allclose(scores, (output.logits_per_text[0] / model.logit_scale.exp()).detach().numpy(), atol=1e-5)
 
 
@@ -365,14 +365,14 @@ def test_preflight_checks_all_files(options, tmp_path, clip):
         MotionPrior(FAST | {"candidates": ["nothing.obj"]}).preflight()
     spoiled = shutil.copytree(clip, tmp_path / "clip")
     (spoiled / "model.safetensors").unlink()
-    with pytest.raises(UserError, match="model.safetensors"):
+    with pytest.raises(UserError, match="safetensors, the weights, are missing"):
         MotionPrior(options | {"clip": str(spoiled)}).preflight()
     MotionPrior(options | {"clip": str(spoiled), "frame": 0}).preflight()  # not needed
 
 
 def test_without_smplx_the_extra_is_named(options, monkeypatch):
     monkeypatch.setitem(sys.modules, "smplx", None)
-    with pytest.raises(UserError, match=r"pip install threestudio-gaussiandreamer\[body\]"):
+    with pytest.raises(UserError, match=r"pip install 'threestudio-gaussiandreamer\[body\]'"):
         MotionPrior(options | {"frame": 0})("a fox kicks")
 
 

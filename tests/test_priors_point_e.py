@@ -359,7 +359,7 @@ def test_missing_files_fail_before_any_work(files, option, monkeypatch):
 
 def test_a_missing_clip_fails_before_any_work(files, tmp_path):
     (tmp_path / "config.json").write_text("{}")
-    with pytest.raises(UserError, match="vocab.json"):
+    with pytest.raises(UserError, match="are missing"):
         make(files, clip=str(tmp_path)).preflight()
 
 

@@ -12,10 +12,9 @@ from prior_contract import PriorContract, assert_valid
 from threestudio_gaussiandreamer.errors import UserError
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.priors import shap_e as module
-from threestudio_gaussiandreamer.priors.clip import load_tokenizer, text_condition
+from threestudio_gaussiandreamer.priors.clip import load_text_encoder, load_tokenizer, text_condition
 from threestudio_gaussiandreamer.priors.karras import guided_denoiser, karras_sigmas, sample_heun
 from threestudio_gaussiandreamer.priors.point_e_model import PointTransformer
-from threestudio_gaussiandreamer.priors.pretrained import load_weights, pick_weights
 from threestudio_gaussiandreamer.priors.shap_e import ShapEPrior, prior_network, read_schedule
 from threestudio_gaussiandreamer.priors.shap_e_checkpoint import load_original_prior
 
@@ -134,19 +133,9 @@ def test_text_condition_is_the_pipelines_own(folder):
 
 
 def test_a_prompt_beyond_77_tokens_is_cut(folder):
-    encoder = load_weights(*_text_encoder(folder), "text_encoder")
+    encoder = load_text_encoder(folder, "text_encoder")
     tokenizer = load_tokenizer(folder, "tokenizer")
     torch.testing.assert_close(text_condition(tokenizer, encoder, "x" * 400), text_condition(tokenizer, encoder, "x" * 500))
-
-
-def _text_encoder(folder):
-    from transformers import CLIPTextModelWithProjection
-
-    return (
-        CLIPTextModelWithProjection,
-        folder,
-        pick_weights(["text_encoder/model.safetensors"], "text_encoder/", "model", allow_bin=False, model=""),
-    )
 
 
 def test_our_sampler_agrees_with_the_pipelines(copy):

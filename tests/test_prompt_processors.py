@@ -12,7 +12,7 @@ import torch
 
 pytest.importorskip("diffusers")
 
-from threestudio_gaussiandreamer import prompt_processors, text_encoders
+from threestudio_gaussiandreamer import model_files, prompt_processors, text_encoders
 from threestudio_gaussiandreamer.embedding_cache import EmbeddingCache
 from threestudio_gaussiandreamer.errors import UserError
 from threestudio_gaussiandreamer.host import NAME, find
@@ -35,7 +35,7 @@ def models(tmp_path_factory):
 def in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # with transformers imported a collection takes a third of a second
-    monkeypatch.setattr(text_encoders, "gc", SimpleNamespace(collect=lambda: 0))
+    monkeypatch.setattr(model_files, "gc", SimpleNamespace(collect=lambda: 0))
 
 
 def processor(models, kind="stable-diffusion", **options):
@@ -97,7 +97,7 @@ def test_a_prompt_that_is_too_long_is_cut_and_said(models, caplog):
 def test_the_encoder_is_freed(models, monkeypatch):
     from transformers import CLIPTextModel
 
-    monkeypatch.setattr(text_encoders, "gc", gc)
+    monkeypatch.setattr(model_files, "gc", gc)
     processor(models)
     assert not [thing for thing in gc.get_objects() if type(thing) is CLIPTextModel]
 

@@ -22,6 +22,7 @@ MATHS = {
     "exact_score",
     "metrics",
     "ply",
+    "surface",
     "nested",
 }
 HOST = {"host", "builtin"}

@@ -29,13 +29,10 @@ from .cameras import Orbit
 from .errors import UserError
 from .files import existing_file
 from .host import get_device
-from .hub import files_below
-from .priors.clip import ClipFiles, PictureText
-from .priors.pretrained import WeightFile, reading
+from .priors.clip import PictureText, clip_source
 from .results import Pictures, Result, find_result, read_result
 from .streams import numpy_generator
 
-WHOLE, INDEX = "model.safetensors", "model.safetensors.index.json"
 PERCENT = 100.0
 THUMBNAIL = 160
 
@@ -70,20 +67,6 @@ class Scored(NamedTuple):
     """The first seed's views, uint8."""
 
 
-class LocalClip(ClipFiles):
-    """A CLIP whose weights may be several files beside an index, as those of the largest are."""
-
-    def weights(self, files: Any) -> WeightFile:
-        if WHOLE in files or INDEX not in files:
-            return super().weights(files)
-        folder = Path(self.model).expanduser()
-        with reading(f"{self.model}/{INDEX}"):
-            parts = set(json.loads((folder / INDEX).read_text())["weight_map"].values())
-        if missing := sorted(parts - set(files)):
-            raise UserError(f"{self.model!r} has no {', '.join(missing)}, which its {INDEX} names: its files are not complete")
-        return WeightFile(WHOLE)  # transformers finds the index under this name
-
-
 def open_clip(folder: str) -> PictureText:
     """The CLIP in a local folder in transformers' format.
 
@@ -94,9 +77,7 @@ def open_clip(folder: str) -> PictureText:
         raise UserError(
             f"--clip {folder}: expected a folder, for instance after `hf download openai/clip-vit-large-patch14 --local-dir clip`"
         )
-    files = LocalClip(folder, option="--clip", allow_bin=True)
-    files.picks(files_below(Path(folder).expanduser()))
-    return PictureText(files, get_device())
+    return PictureText(clip_source(folder, option="--clip", allow_bin=True), get_device(), allow_bin=True)
 
 
 def score(result: Result, prompt: str, item: int, clip: PictureText, protocol: Protocol) -> Scored:

@@ -49,12 +49,13 @@ def check_config(cfg: Any) -> None:
     """
     if not 0 <= cfg.seed < 2**32:
         raise UserError(f"seed is {cfg.seed}; expected a whole number from 0 to 2^32 - 1")
+    # before the parts, whose schedules may end with the trainer's steps
+    _check_arguments("trainer", cfg.trainer, pl.Trainer)
+    _check_trainer_ranges(cfg.trainer)
     check_part("data", cfg.data_type, cfg.data)
     check_part("system", cfg.system_type, cfg.system)
     _check_loss(cfg.system.get("loss"), getattr(find(cfg.system_type), "LOSSES", None))
     _check_loggers(cfg.system.get("loggers"))
-    _check_arguments("trainer", cfg.trainer, pl.Trainer)
-    _check_trainer_ranges(cfg.trainer)
     _check_arguments("checkpoint", cfg.checkpoint, pl.callbacks.ModelCheckpoint)
     _check_file_name("checkpoint.filename", cfg.checkpoint.get("filename"))
     build("checkpoint", pl.callbacks.ModelCheckpoint, plain(cfg.checkpoint))

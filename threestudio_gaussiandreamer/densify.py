@@ -101,8 +101,9 @@ def grow(params: Mapping[str, Tensor], *, clone: Bool[Tensor, " N"], split: Bool
 
 def keep(change: Change, wanted: Bool[Tensor, " M"], contribution: Float[Tensor, " M"], rules: Rules) -> Change:
     """Drop the unwanted rows; at least ``min_gaussians`` and at most ``max_gaussians`` stay, those that contribute most."""
-    # a large bonus ranks every wanted row above every unwanted one, so the floor is filled from the best unwanted rows
-    rank = torch.argsort(contribution + 1e6 * wanted, descending=True, stable=True)
+    # two stable sorts: every wanted row before every unwanted one, so that the floor is filled from the best unwanted rows
+    rank = torch.argsort(contribution, descending=True, stable=True)
+    rank = rank[torch.argsort(wanted[rank].int(), descending=True, stable=True)]
     count = min(max(int(wanted.sum()), min(rules.min_gaussians, len(wanted))), rules.max_gaussians)
     rows = rank[:count].sort().values
     return Change(change.parents[rows], change.fresh[rows], {name: value[rows] for name, value in change.values.items()})

@@ -1,7 +1,8 @@
 """Held-out scoring: the cloud against ray-cast truth on views that no bank holds, with a picture to look at.
 
 The truth comes from a ray caster on the mesh, never from our splatting, and is composited on the background that the render
-has. Score: PSNR and SSIM, averaged over the views; share of views that show another side of the object (multi-face).
+has. Score: PSNR and SSIM, averaged over the views; share of views that show another side of the object (multi-face); share of
+the opacity that floats away from the surface (floater mass).
 """
 
 import json
@@ -19,7 +20,8 @@ from torch import Tensor
 from .cameras import Orbit, held_out_orbit
 from .data import make_batch
 from .errors import UserError
-from .metrics import multi_face_rate, psnr, ssim
+from .meshes import surface_distances
+from .metrics import floater_mass, multi_face_rate, psnr, ssim
 from .raycast import over_background
 
 
@@ -104,6 +106,13 @@ class HeldOut:
         return wrong / len(images)
 
 
+    def floaters(self, means: Float[Tensor, "N 3"], opacities: Float[Tensor, " N"]) -> float:
+        """The opacity-weighted share of Gaussians farther from the surface than 2 % of the longest side of its box."""
+        mesh = self.caster.mesh
+        distances = torch.from_numpy(surface_distances(mesh, means.double().cpu().numpy()))
+        return floater_mass(distances, opacities.double().cpu(), extent=float(np.ptp(mesh.vertices, axis=0).max()))
+
+
 class Measurements:
     """What a run measured, with the training seconds that led there; kept in ``metrics.json`` and continued on resume."""
 
@@ -123,15 +132,18 @@ class Measurements:
             self.seconds += time.perf_counter() - self._started
             self._started = None
 
-    def score(self, key: str, renderer: Any, step: int, gaussians: int) -> dict[str, Any]:
-        """Score the cloud under ``key`` ("prior", "result", or "curve", which collects); no time is counted while it runs."""
+    @torch.no_grad()
+    def score(self, key: str, renderer: Any, step: int) -> dict[str, Any]:
+        """Score the renderer's cloud under ``key`` ("prior", "result", or "curve", which collects); no time is counted while it runs."""
         running = self._started is not None
         self.stop_clock()
         images, backgrounds = self.held_out.render(renderer)
         truth = self.held_out.truth_on(backgrounds)
-        scores = {"step": step, "seconds": round(self.seconds, 3), "gaussians": gaussians}
+        scores = {"step": step, "seconds": round(self.seconds, 3), "gaussians": len(renderer.geometry)}
         scores |= {"psnr": round(float(psnr(images, truth).mean()), 3), "ssim": round(float(ssim(images, truth).mean()), 4)}
         scores["multi_face"] = round(self.held_out.multi_face(images, backgrounds), 4)
+        cloud = renderer.geometry
+        scores["floater_mass"] = round(self.held_out.floaters(cloud.means, cloud.opacities()), 5)
         if key == "curve":
             self.values.setdefault("curve", []).append(scores)
         else:

@@ -16,22 +16,29 @@ init_opacity        opacity of every Gaussian at the start
 sh_degree           0 to 3
 lr_*                learning rate of each attribute: a number or a schedule; lr_sh_rest for the bands above degree 0
 densify             enabled, start, stop, every (steps), grad_threshold, split_scale, min_opacity, max_scale (world units)
+budget              how many Gaussians a run ends with: a number, null (no limit but ``max_gaussians``), or ``auto``: each round
+                    drops as many as cost no more than ``prune.quality`` or, where no truth is known, ``prune.likeness``
+prune               how the budget is met (``parsimony.py``): start, stop, every (steps), keep (the least share that a round
+                    keeps), score (contribution; opacity, random: to compare with), quality (dB that a round may lose against
+                    the truth), likeness (dB between the renders before and after a round, at least)
 max_gaussians       exact cap, reached by dropping what contributes least; min_gaussians: the floor that pruning never passes
 keep_attributes     with gaussians-prior: start from all attributes of that cloud, not only from points and colours
 ==================  =========================================================================================================
 """
 
+import contextlib
 import logging
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, List
+from typing import Any, List, Optional
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from . import densify, sh
+from . import densify, parsimony, sh
 from .densify import PARAMETERS, Change, Rules, Statistics
 from .distributed import all_max, all_sum
 from .errors import UserError, unknown
@@ -53,6 +60,8 @@ LEARNING_RATES = {
     "sh_rest": "lr_sh_rest",
 }
 LOG_SCALE_RANGE = (-20.0, 10.0)
+AUTO = "auto"
+Holds = Callable[[Bool[Tensor, " N"]], bool]
 
 
 @dataclass
@@ -77,6 +86,17 @@ class DensifyConfig:
     max_scale: float = 0.4
 
 
+@dataclass
+class PruneConfig:
+    start: int = 100
+    stop: int = 900
+    every: int = 50
+    keep: float = 0.8
+    score: str = "contribution"
+    quality: float = 0.1
+    likeness: float = 40.0
+
+
 @register("gaussiandreamer-cloud")
 class GaussianCloud(BaseGeometry):
     @dataclass
@@ -96,6 +116,8 @@ class GaussianCloud(BaseGeometry):
         lr_sh: Any = 1.25e-2
         lr_sh_rest: Any = 6.25e-4
         densify: DensifyConfig = field(default_factory=DensifyConfig)
+        budget: Any = None
+        prune: PruneConfig = field(default_factory=PruneConfig)
         max_gaussians: int = 500_000
         min_gaussians: int = 64
 
@@ -122,6 +144,7 @@ class GaussianCloud(BaseGeometry):
                 value = _nested(cfg, name)
                 if value < 0:
                     raise UserError(f"{where}.{name}: expected 0 or more, got {value}")
+            _check_budget(cfg, where)
             if cfg.densify.enabled and cfg.densify.start >= cfg.densify.stop:
                 raise UserError(f"{where}.densify: expected start < stop, got {cfg.densify.start} and {cfg.densify.stop}")
             if not 0 <= cfg.densify.min_opacity < 1:
@@ -269,18 +292,55 @@ class GaussianCloud(BaseGeometry):
             self.gradient_count += all_sum((out.radii > 0).sum(0))
         torch.maximum(self.contribution, all_max(out.contribution.amax(0)), out=self.contribution)
 
-    def after_step(self, optimizer: torch.optim.Optimizer, step: int) -> bool:
-        """Densify and prune where the schedule says so; ``step`` counts finished optimiser steps. True if N may have changed."""
-        cfg = self.cfg.densify
-        if not cfg.enabled or not cfg.start <= step < cfg.stop or step % cfg.every:
-            return False
-        mean_gradient = self.gradient_sum / self.gradient_count.clamp_min(1)
-        rules = Rules(cfg.grad_threshold, cfg.split_scale, cfg.min_opacity, cfg.max_scale, self.cfg.max_gaussians, self.cfg.min_gaussians)
-        change = densify.densify_and_prune(
-            self.parameters_by_name(), Statistics(mean_gradient, self.contribution), rules, generator(run_seed(), "split", step)
-        )
-        self.apply_change(change, optimizer)
-        return True
+    def after_step(self, optimizer: torch.optim.Optimizer, step: int, holds: Optional[Holds] = None) -> bool:
+        """Densify and prune where their schedules say so; True if N may have changed.
+
+        Args:
+            step: finished optimiser steps.
+            holds: for ``budget: auto``: whether the quality holds when only the marked Gaussians are drawn.
+        """
+        change = None
+        if self.cfg.densify.enabled and is_due(self.cfg.densify, step):
+            change = self.densified(step)
+        if self.cfg.budget is not None and is_due(self.cfg.prune, step):
+            change = self.pruned(step, change, holds)
+        if change is not None:
+            self.apply_change(change, optimizer)
+        return change is not None
+
+    def densified(self, step: int) -> Change:
+        """Clone, split and drop; under a budget the cloud doesn't grow beyond it, or beyond what it still has."""
+        cfg, cap = self.cfg.densify, self.cfg.max_gaussians
+        if self.cfg.budget is not None:
+            cap = min(cap, len(self) if self.cfg.budget == AUTO else max(self.cfg.budget, len(self)))
+        rules = Rules(cfg.grad_threshold, cfg.split_scale, cfg.min_opacity, cfg.max_scale, cap, self.cfg.min_gaussians)
+        stats = Statistics(self.gradient_sum / self.gradient_count.clamp_min(1), self.contribution)
+        return densify.densify_and_prune(self.parameters_by_name(), stats, rules, generator(run_seed(), "split", step))
+
+    def pruned(self, step: int, first: Optional[Change], holds: Optional[Holds]) -> Change:
+        """One round towards the budget, after the change ``first`` if there is one."""
+        cfg, values = self.cfg.prune, self.parameters_by_name() if first is None else first.values
+        contribution = self.contribution if first is None else self.contribution[first.parents]
+        scores = parsimony.score(cfg.score, values["logit_opacities"], contribution, generator(run_seed(), "prune", step))
+        if self.cfg.budget != AUTO:
+            count = parsimony.next_count(len(scores), cfg.keep, max(self.cfg.budget, self.cfg.min_gaussians))
+        elif first is not None or holds is None:  # what densification made has been seen in no view yet
+            count = len(scores)
+        else:
+            count = max(parsimony.smallest_count(scores, contribution, cfg.keep, holds), min(self.cfg.min_gaussians, len(scores)))
+        return parsimony.pruned(values, scores, count, first)
+
+    @contextlib.contextmanager
+    def only(self, kept: Bool[Tensor, " N"]) -> Iterator[None]:
+        """Draws only the marked Gaussians: the others are too faint for any pixel."""
+        logits = self.logit_opacities.detach().clone()
+        with torch.no_grad():
+            self.logit_opacities[~kept] = -100.0
+        try:
+            yield
+        finally:
+            with torch.no_grad():
+                self.logit_opacities.copy_(logits)
 
     def apply_change(self, change: Change, optimizer: torch.optim.Optimizer) -> None:
         """Replace the cloud by ``change`` and move the optimiser's rows along; the statistics start anew."""
@@ -291,6 +351,27 @@ class GaussianCloud(BaseGeometry):
             setattr(self, name, parameter)
         for name in STATISTICS:
             self.register_buffer(name, torch.zeros(len(change.parents), device=self.means.device))
+
+
+def _check_budget(cfg: Any, where: str) -> None:
+    """Raises UserError for a budget or a pruning schedule that can't be met."""
+    budget, prune = cfg.budget, cfg.prune
+    if budget is not None and budget != AUTO and (isinstance(budget, bool) or not isinstance(budget, int) or budget < cfg.min_gaussians):
+        raise UserError(f"{where}.budget: expected null, auto or a number from min_gaussians ({cfg.min_gaussians}) on, got {budget!r}")
+    if prune.score not in parsimony.SCORES:
+        raise unknown(f"{where}.prune.score", prune.score, parsimony.SCORES)
+    if not 0 < prune.keep < 1:
+        raise UserError(f"{where}.prune.keep: expected a share between 0 and 1, got {prune.keep}")
+    for name, least in (("start", 0), ("every", 1), ("quality", 0), ("likeness", 0)):
+        if prune[name] < least:
+            raise UserError(f"{where}.prune.{name}: expected {least} or more, got {prune[name]}")
+    if prune.start >= prune.stop:
+        raise UserError(f"{where}.prune: expected start < stop, got {prune.start} and {prune.stop}")
+
+
+def is_due(schedule: Any, step: int) -> bool:
+    """Whether a schedule with ``start``, ``stop`` and ``every`` has a round at this step."""
+    return schedule.start <= step < schedule.stop and step % schedule.every == 0
 
 
 def _nested(cfg: Any, dotted: str) -> Any:

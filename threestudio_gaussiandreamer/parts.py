@@ -22,6 +22,7 @@ MODULES = (
     "prompt_processors",
     "exporters.ply",
     "exporters.points",
+    "exporters.surface",
     "exporters.bundle",
     "system",
 )

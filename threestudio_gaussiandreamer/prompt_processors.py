@@ -35,11 +35,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from . import extras
 from .embedding_cache import EmbeddingCache, Encode
 from .errors import UserError
 from .files import existing_file
 from .host import BaseObject, info, register, register_builtin
-from .hub import find_model, fingerprint, require_diffusion
+from .hub import find_model
+from .model_files import fingerprint
 from .prompts import read_prompt
 from .text_encoders import encode_clip, encode_t5
 from .view_prompts import PromptEmbeddings, view_directions
@@ -100,7 +102,7 @@ class TextEncoderPromptProcessor(BaseObject):
 
     def configure(self) -> None:
         self.Config.check(self.cfg)
-        require_diffusion()
+        extras.require("diffusion", "diffusers", "transformers")
         self.prompt = chosen_prompt(self.cfg)
         half = self.half and self.device.type == "cuda"
         folder = find_model(self.cfg.pretrained_model_name_or_path, COMPONENTS, half=half, revision=self.cfg.revision)

@@ -84,10 +84,13 @@ class Pictures:
         geometry.to(get_device())
         behind.to(get_device()).eval()
 
-    @torch.no_grad()
     def render(
         self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], size: int, *, chunk: int = 4
     ) -> Iterator[Float[np.ndarray, "B H W 3"]]:
         """The views in [0, 1], ``chunk`` at a time; ``fovy`` in radians, ``size`` pixels each way."""
         for views, angles in zip(c2w.split(chunk), fovy.split(chunk), strict=True):
-            yield self._renderer(views, angles, size, size)["comp_rgb"].clamp(0, 1).cpu().numpy()
+            yield self._render(views, angles, size)
+
+    @torch.no_grad()
+    def _render(self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], size: int) -> Float[np.ndarray, "B H W 3"]:
+        return self._renderer(c2w, fovy, size, size)["comp_rgb"].clamp(0, 1).cpu().numpy()

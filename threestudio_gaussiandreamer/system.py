@@ -23,21 +23,22 @@ from typing import Any, Optional
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .background import FlatBackground
-from .distributed import average_gradients
+from .distributed import all_sum, average_gradients
 from .errors import UserError, unknown
 from .evaluate import EvaluationConfig, HeldOut, Measurements
 from .guidance.base import ScoreDistillation
-from .guidance.foreign import call_guidance, trainable_groups
+from .guidance.foreign import call_guidance, learnt_weights, own_randomness, restore_learnt, trainable_groups
 from .host import BaseLift3DSystem, find, info, register, validate_schedule
 from .metrics import psnr
 from .nested import adopt_nested
 from .ply import write_gaussians, write_points
 from .point_cloud import PointCloud
 from .prior_cache import cached_cloud
+from .surface import Surface, write_obj
 
 REGULARISERS = ("sparsity", "opaque")
 GUIDANCE_LR = 1e-4  # of what a guidance trains itself, such as the LoRA of variational score distillation
@@ -80,6 +81,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         super().configure()
         self.automatic_optimization = False
         self.__dict__["guidance"] = self.measurements = None
+        self._learnt: Optional[dict[str, Tensor]] = None
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         self.preflight()
@@ -91,17 +93,30 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         return optimizer_of(self.cfg.optimizer, groups)
 
     def preflight(self) -> None:
-        """What the prior needs is looked for before models are loaded: what is missing shows in seconds."""
+        """What prior and guidance need is looked for before models are loaded: what is missing shows in seconds."""
         prior = None if len(self.geometry) else self.geometry.prior()
         if hasattr(prior, "preflight"):
             prior.preflight()
+        guidance = find(self.cfg.guidance_type)
+        if issubclass(guidance, ScoreDistillation):
+            guidance.preflight(self.cfg.guidance)
 
     def prepare_guidance(self) -> None:
         """Before the prior runs, since its weights may be missing too."""
         self.prompt_processor = find(self.cfg.prompt_processor_type)(self.cfg.prompt_processor)
         self.prompt_utils = self.prompt_processor()
-        # past nn.Module's registration: a guidance's weights belong neither into the checkpoint nor among the system's modules
+        # past nn.Module's registration: a guidance's frozen weights belong neither into the checkpoint nor among the system's modules
         self.__dict__["guidance"] = find(self.cfg.guidance_type)(self.cfg.guidance)
+        if self._learnt is not None:
+            restore_learnt(self.guidance, self._learnt)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_save_checkpoint(checkpoint)
+        checkpoint["guidance"] = learnt_weights(self.guidance)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_load_checkpoint(checkpoint)
+        self._learnt = checkpoint.get("guidance")
 
     def ensure_cloud(self) -> None:
         """Run the prior, unless a checkpoint brought the cloud."""
@@ -140,8 +155,24 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         # self.optimizers() wraps the torch optimiser, whose rows have to follow the Gaussians
-        self.geometry.after_step(optimizer.optimizer, self.global_step)
+        self.geometry.after_step(optimizer.optimizer, self.global_step, lambda kept: self.quality_holds(kept, batch))
         self.report(out, batch, losses, loss)
+
+    @torch.no_grad()
+    def quality_holds(self, kept: Bool[Tensor, " N"], batch: dict[str, Any]) -> bool:
+        """Whether this batch looks nearly the same with only the ``kept`` Gaussians: for ``system.geometry.budget=auto``.
+
+        Where the guidance knows the truth, the loss of dB against it is measured; elsewhere how like the renders are.
+        """
+        all_of_them = self(batch)
+        with self.geometry.only(kept):
+            fewer = self(batch)["comp_rgb"]
+        rules, truth = self.geometry.cfg.prune, self.truth(batch, all_of_them)
+        if truth is None:
+            margins = psnr(fewer, all_of_them["comp_rgb"]) - rules.likeness
+        else:
+            margins = rules.quality + psnr(fewer, truth) - psnr(all_of_them["comp_rgb"], truth)
+        return bool(all_sum(margins.mean()) >= 0)  # every process looks at other views, and all have to decide alike
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
         for part in (self.geometry, self.background):
@@ -160,7 +191,8 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     def guide(self, out: dict[str, Any], batch: dict[str, Any], **options: Any) -> dict[str, Any]:
         """What the guidance makes of these renders; it gets the whole batch, and the background that they lie on."""
-        return call_guidance(self.guidance, out["comp_rgb"], self.prompt_utils, batch, comp_rgb_bg=out["comp_rgb_bg"], **options)
+        with own_randomness(self.true_global_step):
+            return call_guidance(self.guidance, out["comp_rgb"], self.prompt_utils, batch, comp_rgb_bg=out["comp_rgb_bg"], **options)
 
     def loss_scale(self) -> float:
         """The factor that automatic mixed precision leaves on every gradient that isn't a parameter's."""
@@ -202,7 +234,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
     def score(self, key: str) -> None:
         """Score the cloud on the held-out views, where the truth is known."""
         if self.measurements:
-            scores = self.measurements.score(key, self.renderer, self.global_step, len(self.geometry))
+            scores = self.measurements.score(key, self.renderer, self.global_step)
             info(f"{key}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f} on {self.cfg.evaluation.views} held-out views")
 
     def on_train_end(self) -> None:
@@ -279,6 +311,11 @@ class GaussianDreamerSystem(BaseLift3DSystem):
     def save_points(self, filename: str, cloud: PointCloud) -> str:
         path = self.get_save_path(filename)
         write_points(path, cloud)
+        return path
+
+    def save_surface(self, filename: str, surface: Surface) -> str:
+        path = self.get_save_path(filename)
+        write_obj(path, surface)
         return path
 
 

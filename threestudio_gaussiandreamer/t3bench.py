@@ -1,10 +1,11 @@
-"""Results as T3Bench's own scripts take them: its views as pictures, in the folders that it looks into.
+"""Results as T3Bench's own scripts take them: a mesh, and its views as pictures, in the folders that it looks into.
 
 Its ``run_eval_quality.py`` and ``run_caption.py`` look for a mesh of each prompt of ``data/prompt_<group>.txt`` in
 ``outputs_mesh_t3/<method>_<group>/<prompt with _ for spaces>*/save/it*-export/model.obj``, have ``render/meshrender.py``
-or ``render/meshrender_cap.py`` draw it, and score the pictures ``<vertex>_<camera>.png`` and ``<vertex>.png``. Gaussians are no
-mesh: here the pictures are rendered beforehand, by our rasteriser with the same cameras, and the two scripts in the folder
-``render`` that is written beside them, which take the place of T3Bench's, copy them. Its evaluating scripts run as they are.
+or ``render/meshrender_cap.py`` draw it, and score the pictures ``<vertex>_<camera>.png`` and ``<vertex>.png``. The mesh written here
+is the surface of the Gaussians (``surface.py``), and that is all the published scripts need. What Gaussians show beyond their surface
+is in the pictures, rendered by our rasteriser with the same cameras: the two scripts in the folder ``render_gaussians``, put in
+the place of those in ``render``, hand them over.
 
 Quality: 162 vertices of an icosphere of radius 2.2, five fields of view each. Captions: the 12 vertices of an icosahedron at
 2.2^2, 60 degrees (its script multiplies by the radius twice). 512 pixels, black behind; the object centred on the mean of its points
@@ -22,8 +23,9 @@ from jaxtyping import Float
 from .builtin import pictures as files_of_pictures
 from .cameras import look_at
 from .errors import UserError
-from .ply import GaussianArrays, opaque, sh0_colors
+from .ply import GaussianArrays, opaque
 from .results import Pictures, Result, read_result
+from .surface import gaussian_surface, write_obj
 
 RADIUS = 2.2
 QUALITY_FOVY = tuple(math.pi / part for part in (3.0, 4.0, 5.0, 6.0, 7.5))
@@ -52,7 +54,7 @@ if not found:
 
 
 def write_t3bench(folder: Path, results: Sequence[Result], prompts: Sequence[str], *, method: str, group: str, size: int = 512) -> None:
-    """Write everything below ``folder``, to be copied over a checkout of T3Bench.
+    """Write everything below ``folder``, a checkout of T3Bench; none of its own files is touched.
 
     Raises:
         UserError: a prompt can't be the name of a folder, or nothing can be written.
@@ -60,7 +62,7 @@ def write_t3bench(folder: Path, results: Sequence[Result], prompts: Sequence[str
     if bad := [prompt for prompt in prompts if "/" in prompt]:
         raise UserError(f"T3Bench names folders after prompts, and {bad[0]!r} has a slash: leave it out, or reword it")
     try:
-        _write_stand_ins(folder / "render", size)
+        _write_stand_ins(folder / "render_gaussians", size)
         for result, prompt in zip(results, prompts, strict=True):
             save = folder / "outputs_mesh_t3" / f"{method}_{group}" / prompt.replace(" ", "_") / "save"
             _write_result(save, normalized(read_result(result)), size)
@@ -82,7 +84,7 @@ def _write_result(save: Path, arrays: GaussianArrays, size: int) -> None:
     _write_views(save / "t3bench" / "caption", pictures, caption_names(), icosphere(0, RADIUS) * RADIUS, (CAPTION_FOVY,), size)
     export = save / "it0-export"
     export.mkdir(parents=True, exist_ok=True)
-    write_centres(export / "model.obj", arrays)
+    write_obj(export / "model.obj", gaussian_surface(arrays))
 
 
 def _write_views(
@@ -126,10 +128,3 @@ def normalized(arrays: GaussianArrays) -> GaussianArrays:
     centre = means.mean(axis=0)
     half_side = np.abs(means - centre).max() or 1.0
     return arrays._replace(means=(arrays.means - centre) / half_side, log_scales=arrays.log_scales - np.log(half_side))
-
-
-def write_centres(path: Path, arrays: GaussianArrays) -> None:
-    """The visible centres with their colours as an OBJ without faces: T3Bench looks for the file, our stand-ins don't read it."""
-    visible = opaque(arrays, MIN_OPACITY)
-    rows = np.concatenate([arrays.means[visible], sh0_colors(arrays.sh[visible, 0])], axis=1)
-    np.savetxt(path, rows, fmt="v %.5f %.5f %.5f %.4f %.4f %.4f", header="centres of Gaussians, no faces: a place holder", comments="# ")

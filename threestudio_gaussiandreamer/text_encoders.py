@@ -3,7 +3,6 @@
 Both follow diffusers' own pipelines: padded to the model's length, too long texts cut with a warning, no gradients, float32 out.
 """
 
-import gc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from . import extras
 from .host import get_device, warn
-from .hub import load, require_diffusion
+from .model_files import free_memory, load_network, load_settings
 
 T5_LENGTH = 77
 """Tokens that DeepFloyd IF was trained with."""
@@ -23,11 +23,11 @@ def encode_clip(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
     """The last hidden states of Stable Diffusion's text encoder, float32 on the CPU, one (N, F) per text."""
     from transformers import AutoTokenizer, CLIPTextModel
 
-    tokenizer = load(AutoTokenizer, folder, "tokenizer")
+    tokenizer = load_settings(AutoTokenizer, folder, "tokenizer")
     tokens = _tokenize(tokenizer, texts, tokenizer.model_max_length)
 
     def run(device: torch.device) -> Tensor:
-        encoder = load(CLIPTextModel, folder, "text_encoder", dtype=torch.float32).eval().to(device)
+        encoder = load_network(CLIPTextModel, folder, "text_encoder", dtype=torch.float32).to(device)
         # some models were trained to ignore the padding, most (all of Stable Diffusion's) to see it
         mask = tokens.attention_mask.to(device) if getattr(encoder.config, "use_attention_mask", False) else None
         return encoder(tokens.input_ids.to(device), attention_mask=mask)[0].float().cpu()
@@ -40,16 +40,17 @@ def encode_t5(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
 
     In half precision on a GPU, where nothing else is loaded yet: IF's encoder then takes about 11 GB, in float32 19 GB.
     """
-    require_diffusion("sentencepiece", "google.protobuf")  # without them transformers takes the tokenizer for another kind
+    extras.require("diffusion", "sentencepiece", "google.protobuf")  # without them transformers takes the tokenizer for another kind
     from transformers import AutoTokenizer, T5EncoderModel
 
-    tokenizer = load(AutoTokenizer, folder, "tokenizer")
+    tokenizer = load_settings(AutoTokenizer, folder, "tokenizer")
     # as in diffusers' IFPipeline without caption cleaning
     tokens = _tokenize(tokenizer, [text.lower().strip() for text in texts], T5_LENGTH)
 
     def run(device: torch.device) -> Tensor:
         half = device.type == "cuda"
-        encoder = load(T5EncoderModel, folder, "text_encoder", half=half, dtype=torch.float16 if half else torch.float32).eval().to(device)
+        dtype = torch.float16 if half else torch.float32
+        encoder = load_network(T5EncoderModel, folder, "text_encoder", half=half, dtype=dtype).to(device)
         return encoder(tokens.input_ids.to(device), attention_mask=tokens.attention_mask.to(device))[0].float().cpu()
 
     return list(_freed(run))
@@ -73,6 +74,4 @@ def _freed(run: Callable[[torch.device], Tensor]) -> Tensor:
         warn("the text encoder doesn't fit into the GPU's memory and runs on the CPU, once: this can take minutes")
         return run(torch.device("cpu"))
     finally:
-        gc.collect()
-        if device.type == "cuda":
-            torch.cuda.empty_cache()
+        free_memory()

@@ -98,6 +98,14 @@ class ScoreDistillation(BaseObject, ABC):
     ) -> tuple[Float[Tensor, "B c h w"], Optional[Float[Tensor, "B c h w"]]]:
         """The noise in z, conditional and unconditional (None where no guidance is asked for); called without gradients."""
 
+    @classmethod
+    def preflight(cls, cfg: Any) -> None:
+        """Look in seconds whether a guidance of this configuration can have what it needs; called before any long work.
+
+        Raises:
+            UserError: what is missing, and what to do.
+        """
+
     def report(self) -> dict[str, float]:
         """More numbers to log about the last step."""
         return {}

@@ -1,10 +1,17 @@
 """Guidances that other packages register: called as threestudio's systems call them, whichever of its signatures they have."""
 
 import inspect
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from ..errors import UserError
+from ..host import item_seed
+from ..streams import derive_seed
 
 
 def call_guidance(guidance: Any, rgb: Float[Tensor, "B H W 3"], prompt_utils: Any, batch: dict[str, Any], **options: Any) -> dict[str, Any]:
@@ -21,12 +28,54 @@ def call_guidance(guidance: Any, rgb: Float[Tensor, "B H W 3"], prompt_utils: An
     return guidance(rgb, prompt_utils, **given) if "prompt_utils" in arguments else guidance(rgb, **given)
 
 
+@contextmanager
+def own_randomness(step: int) -> Iterator[None]:
+    """torch's global generators as a function of (seed, step), for guidances that draw from them; put back afterwards.
+
+    So a resumed run draws what the run that never stopped drew, and looking at pictures in between changes nothing.
+    """
+    devices = [torch.cuda.current_device()] if torch.cuda.is_available() else []
+    with torch.random.fork_rng(devices):
+        torch.manual_seed(derive_seed(item_seed(), "guidance", step))
+        yield
+
+
+# What a guidance itself learns, as VSD its LoRA ---------------------------------------------------------------------------------
+
+
+def trainable_parameters(guidance: Any) -> dict[str, nn.Parameter]:
+    """The parameters that a guidance trains, by name; none for most."""
+    named = guidance.named_parameters() if isinstance(guidance, nn.Module) else ()
+    return {name: parameter for name, parameter in named if parameter.requires_grad}
+
+
 def trainable_groups(guidance: Any, lr: float) -> list[dict[str, Any]]:
-    """The optimiser's group of what a guidance itself learns, as VSD its LoRA; none for most.
+    """The optimiser's group of what a guidance learns; none for most.
 
     Args:
         lr: its learning rate.
     """
-    parameters = guidance.parameters() if isinstance(guidance, nn.Module) else ()
-    learning = [parameter for parameter in parameters if parameter.requires_grad]
+    learning = list(trainable_parameters(guidance).values())
     return [{"params": learning, "name": "guidance", "lr": lr}] if learning else []
+
+
+def learnt_weights(guidance: Any) -> dict[str, Tensor]:
+    """For a checkpoint: what a guidance has learnt, without its frozen weights, which are the model's."""
+    return {name: parameter.detach() for name, parameter in trainable_parameters(guidance).items()}
+
+
+def restore_learnt(guidance: Any, weights: dict[str, Tensor]) -> None:
+    """Put back what :func:`learnt_weights` gave.
+
+    Raises:
+        UserError: the guidance learns something else.
+    """
+    own = trainable_parameters(guidance)
+    if {name: parameter.shape for name, parameter in own.items()} != {name: value.shape for name, value in weights.items()}:
+        raise UserError(
+            f"the checkpoint's guidance had learnt {len(weights)} tensors, and {type(guidance).__name__} learns {len(own)} of its own:"
+            " resume with the configuration that the run was started with"
+        )
+    with torch.no_grad():
+        for name, parameter in own.items():
+            parameter.copy_(weights[name])

@@ -28,10 +28,11 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from .. import sds
+from .. import extras, sds
 from ..errors import UserError, unknown
-from ..host import debug, info
-from ..hub import find_model, load, require_diffusion
+from ..host import debug, info, parse_structured
+from ..hub import find_model
+from ..model_files import load_network, load_settings
 from .base import ScoreDistillation
 from .half_precision import weights_type
 
@@ -78,9 +79,15 @@ class TextToImageDistillation(ScoreDistillation):
 
     # Loading --------------------------------------------------------------------------------------------------------------
 
+    @classmethod
+    def preflight(cls, cfg: Any) -> None:
+        cfg = parse_structured(cls.Config, cfg)
+        extras.require("diffusion", "diffusers", "transformers")
+        find_model(cfg.pretrained_model_name_or_path, cls.components, revision=cfg.revision, download=False)
+
     def configure(self) -> None:
         super().configure()
-        require_diffusion()
+        extras.require("diffusion", "diffusers", "transformers")
         self.dtype = weights_type(self.cfg.half_precision_weights, self.device)
         folder = find_model(
             self.cfg.pretrained_model_name_or_path, self.components, half=self.dtype == torch.float16, revision=self.cfg.revision
@@ -93,7 +100,7 @@ class TextToImageDistillation(ScoreDistillation):
         """The noise schedule that the model was trained with, in float64, and what its UNet predicts."""
         from diffusers import DDPMScheduler
 
-        scheduler = load(DDPMScheduler, folder, "scheduler")
+        scheduler = load_settings(DDPMScheduler, folder, "scheduler")
         self.prediction_type = scheduler.config.prediction_type
         if self.prediction_type not in PREDICTIONS:
             raise unknown("prediction_type of the model's scheduler", self.prediction_type, PREDICTIONS)
@@ -121,7 +128,7 @@ class TextToImageDistillation(ScoreDistillation):
     def network(self, network_class: Any, folder: Path, component: str, *, on_device: bool = True) -> nn.Module:
         """One frozen network of the model."""
         half = self.dtype == torch.float16
-        network = load(network_class, folder, component, half=half, torch_dtype=self.dtype).eval().requires_grad_(False)
+        network = load_network(network_class, folder, component, half=half, torch_dtype=self.dtype).requires_grad_(False)
         if self.cfg.enable_channels_last_format:
             network.to(memory_format=torch.channels_last)
         return network.to(self.device) if on_device else network

@@ -1,6 +1,6 @@
 """CLIP from transformers' files: the text features that Point-E and Shap-E are conditioned on, and how well pictures fit a text.
 
-Folders and model ids as in ``pretrained.py``. The published 3D models were trained with OpenAI's ViT-L/14
+Folders and model ids as in ``hub.py``. The published 3D models were trained with OpenAI's ViT-L/14
 (``openai/clip-vit-large-patch14``); pictures may be compared with any CLIP.
 """
 
@@ -13,41 +13,36 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..hub import files_below
-from .pretrained import WeightFile, free_memory, load_weights, locate, pick_weights, reading, require_extra, require_files, tokenizer_files
+from .. import extras
+from ..hub import Source, locate
+from ..model_files import component_files, free_memory, load_network, load_settings, require_vocabulary
 
 MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 """Of CLIP's training pictures, per channel; the same for all of OpenAI's and OpenCLIP's models."""
 
 
-class ClipFiles:
-    """Which files a CLIP in a folder or on the hub consists of."""
+def clip_source(model: str, *, option: str = "system.geometry.prior.clip", allow_bin: Optional[bool] = None) -> Source:
+    """A whole CLIP in a folder or on the hub, as an option names it."""
 
-    def __init__(self, model: str, *, option: str, allow_bin: bool = False) -> None:
-        self.model, self.option, self.allow_bin = model, option, allow_bin
+    def picks(names: Collection[str]) -> list[str]:
+        needed = component_files(names, "", allow_bin=allow_bin)
+        require_vocabulary(names, "")
+        return needed
 
-    def picks(self, files: Collection[str]) -> list[str]:
-        return [*require_files(files, ["config.json"], self.model), *tokenizer_files(files, "", self.model), self.weights(files).name]
-
-    def weights(self, files: Collection[str]) -> WeightFile:
-        return pick_weights(files, "", "model", allow_bin=self.allow_bin, model=self.model)
-
-    def locate(self, download: bool = True) -> Optional[Path]:
-        return locate(self.model, self.picks, option=self.option, download=download)
+    return Source(model, picks, option)
 
 
-def load_text_encoder(folder: Path, weights: WeightFile, subfolder: str = "") -> Any:
+def load_text_encoder(folder: Path, component: str = "", *, allow_bin: Optional[bool] = None) -> Any:
     """transformers' ``CLIPTextModelWithProjection`` in float32, in evaluation mode; also from the files of a whole CLIP."""
     from transformers import CLIPTextModelWithProjection
 
-    return load_weights(CLIPTextModelWithProjection, folder, weights, subfolder)
+    return load_network(CLIPTextModelWithProjection, folder, component, allow_bin=allow_bin).float()
 
 
-def load_tokenizer(folder: Path, subfolder: str = "") -> Any:
+def load_tokenizer(folder: Path, component: str = "") -> Any:
     from transformers import CLIPTokenizer
 
-    with reading(f"the tokenizer in {str(folder / subfolder)!r}"):
-        return CLIPTokenizer.from_pretrained(folder, subfolder=subfolder, local_files_only=True)
+    return load_settings(CLIPTokenizer, folder, component)
 
 
 def token_ids(tokenizer: Any, text: str) -> Tensor:
@@ -66,12 +61,12 @@ def text_condition(tokenizer: Any, encoder: Any, text: str) -> Float[Tensor, "1 
 class PictureText:
     """A whole CLIP, loaded: how well pictures fit texts."""
 
-    def __init__(self, files: ClipFiles, device: torch.device) -> None:
-        require_extra("diffusion", "transformers")
+    def __init__(self, source: Source, device: torch.device, *, allow_bin: Optional[bool] = None) -> None:
+        extras.require("diffusion", "transformers")
         from transformers import CLIPModel
 
-        folder = files.locate()
-        self._model = load_weights(CLIPModel, folder, files.weights(files_below(folder))).to(device)
+        folder = locate(source)
+        self._model = load_network(CLIPModel, folder, allow_bin=allow_bin).float().to(device)
         self._tokenizer, self._device = load_tokenizer(folder), device
 
     @torch.no_grad()
@@ -84,10 +79,10 @@ class PictureText:
 
 
 def picture_similarities(
-    files: ClipFiles, pictures: Float[np.ndarray, "N H W 3"], text: str, *, device: torch.device, batch: int = 32
+    source: Source, pictures: Float[np.ndarray, "N H W 3"], text: str, *, device: torch.device, batch: int = 32
 ) -> Float[np.ndarray, "N"]:
     """The cosine between each picture (values in [0, 1]) and ``text``; the model is loaded for this and freed."""
-    scores = PictureText(files, device).similarities(pictures, text, batch=batch)
+    scores = PictureText(source, device).similarities(pictures, text, batch=batch)
     free_memory()
     return scores
 

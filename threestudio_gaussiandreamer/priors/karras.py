@@ -87,13 +87,14 @@ def sample_heun(
         sigmas: falling, ending with 0 (:func:`karras_sigmas`).
         churn: noise added anew at each step, the paper's S_churn; 0 makes the sampler deterministic.
         generator: a CPU generator for that noise.
-        progress: names a progress bar; without it there is none.
+        progress: names a progress bar on a terminal; without it there is none.
     """
     from tqdm import tqdm
 
     gamma = min(churn / (len(sigmas) - 1), math.sqrt(2) - 1)
     x = noise * sigmas[0]
-    for sigma, following in tqdm(list(zip(sigmas[:-1], sigmas[1:], strict=True)), progress, disable=not progress, leave=False):
+    steps = list(zip(sigmas[:-1], sigmas[1:], strict=True))
+    for sigma, following in tqdm(steps, progress, disable=None if progress else True, leave=False):
         raised = sigma * (1 + gamma)
         if gamma > 0:
             fresh = torch.randn(x.shape, generator=generator).to(x)

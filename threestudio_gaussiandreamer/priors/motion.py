@@ -35,20 +35,21 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from .. import extras
 from ..cameras import orbit_c2w
 from ..errors import UserError
 from ..files import existing_file
 from ..host import info, register, warn
+from ..hub import Source, locate
 from ..meshes import Mesh, load_mesh
 from ..point_cloud import PointCloud
 from ..raycast import MeshCaster, over_background
 from .base import Prior, chosen_colors, require_color, require_not_negative, require_positive
-from .clip import ClipFiles, picture_similarities
+from .clip import clip_source, picture_similarities
 from .mesh import face_normals, mesh_cloud
 from .motion_files import Motions, read_motions
 from .motion_text import reduced_prompt
 from .placing import chosen_device
-from .pretrained import require_extra
 from .smpl_fit import BodyFit, BodyModel, fit_bodies, load_body_model, posed_vertices
 
 JOINTS = (
@@ -122,11 +123,11 @@ class MotionPrior(Prior):
         else:
             read_motions(self.cfg.motion)
             load_body_model(self.cfg.body_model)
-            require_extra("body", "smplx")
+            extras.require("body", "smplx")
         if self._needs_clip():
-            require_extra("diffusion", "transformers")
+            extras.require("diffusion", "transformers")
             chosen_device(self.cfg.device, self.device)
-            self._clip().locate(download=False)
+            locate(self._clip(), download=False)
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         self.preflight()
@@ -139,8 +140,8 @@ class MotionPrior(Prior):
     def _needs_clip(self) -> bool:
         return len(self.cfg.candidates) > 1 if self.cfg.candidates else self.cfg.frame == "clip"
 
-    def _clip(self) -> ClipFiles:
-        return ClipFiles(self.cfg.clip, option="clip")
+    def _clip(self) -> Source:
+        return clip_source(self.cfg.clip)
 
     def _chosen_candidate(self, prompt: str) -> Mesh:
         meshes = [load_mesh(path, scale=self.cfg.scale, up=self.cfg.up, front=self.cfg.front) for path in self.cfg.candidates]

@@ -36,17 +36,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .. import extras
 from ..errors import UserError
 from ..files import existing_file
 from ..host import info, register
-from ..hub import files_below
+from ..hub import Source, locate
+from ..model_files import free_memory
 from ..point_cloud import PointCloud
 from .base import Prior, is_number, require_positive
-from .clip import ClipFiles, load_text_encoder, load_tokenizer, text_condition
+from .clip import clip_source, load_text_encoder, load_tokenizer, text_condition
 from .karras import Network, cosine_alphas_cumprod, guided_denoiser, karras_sigmas, linear_alphas_cumprod, sample_heun
 from .placing import check_front, chosen_device, placed, torch_generator
 from .point_e_model import CHANNELS, HEAD_CHANNELS, BaseModel, Upsampler, sizes_of
-from .pretrained import free_memory, require_extra
 from .weights import load_exactly, read_state_dict
 
 SCALES = torch.tensor([2.0] * 3 + [2 / 255] * 3)[:, None]
@@ -111,9 +112,9 @@ class PointEPrior(Prior):
         existing_file(self.cfg.checkpoint, BASE.title)
         if self.cfg.upsampler:
             existing_file(self.cfg.upsampler, UPSAMPLER.title)
-        require_extra("diffusion", "transformers")
+        extras.require("diffusion", "transformers")
         chosen_device(self.cfg.device, self.device)
-        self._clip().locate(download=False)
+        locate(self._clip(), download=False)
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         self.preflight()
@@ -127,14 +128,12 @@ class PointEPrior(Prior):
         cloud = PointCloud(points=rows[:, :3], colors=rows[:, 3:].clip(0, 255).round() / np.float32(255))
         return placed(cloud, front=self.cfg.front, scale=self.cfg.scale, normalize=self.cfg.normalize)
 
-    def _clip(self) -> ClipFiles:
-        return ClipFiles(self.cfg.clip, option="clip")
+    def _clip(self) -> Source:
+        return clip_source(self.cfg.clip)
 
     def _condition(self, prompt: str, device: torch.device) -> Float[Tensor, "1 D"]:
-        files = self._clip()
-        folder = files.locate()
-        encoder = load_text_encoder(folder, files.weights(files_below(folder))).to(device)
-        return text_condition(load_tokenizer(folder), encoder, prompt)
+        folder = locate(self._clip())
+        return text_condition(load_tokenizer(folder), load_text_encoder(folder).to(device), prompt)
 
     def _coarse_points(self, condition: Float[Tensor, "1 D"], rng: torch.Generator) -> Float[Tensor, "1 6 N"]:
         model = load_network(BASE, self.cfg.checkpoint).to(condition.device)

@@ -43,21 +43,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .. import extras
 from ..errors import UserError, unknown
 from ..files import existing_file
 from ..host import info, register
-from ..hub import files_below
+from ..hub import Source, locate
+from ..model_files import free_memory, load_network, load_settings, needed_files
 from ..point_cloud import PointCloud
 from .base import Prior, require_positive
 from .clip import load_text_encoder, load_tokenizer, text_condition
 from .karras import Network, guided_denoiser, karras_sigmas, sample_heun
 from .placing import check_front, chosen_device, placed, torch_generator
-from .pretrained import WeightFile, free_memory, load_weights, locate, pick_weights, reading, require_extra, require_files, tokenizer_files
 from .shap_e_checkpoint import load_original_prior
 
-PARTS = {"prior": "diffusion_pytorch_model", "shap_e_renderer": "diffusion_pytorch_model", "text_encoder": "model"}
-"""The folders with weights, and what their files are called."""
-CONFIGS = ("prior/config.json", "shap_e_renderer/config.json", "text_encoder/config.json", "scheduler/scheduler_config.json")
+COMPONENTS = ("tokenizer", "text_encoder", "prior", "scheduler", "shap_e_renderer")
 COLORS = ("display", "linear")
 
 
@@ -105,15 +104,15 @@ class ShapEPrior(Prior):
         Raises:
             UserError: what is missing, and what to do.
         """
-        require_extra("diffusion", "diffusers", "transformers")
+        extras.require("diffusion", "diffusers", "transformers")
         chosen_device(self.cfg.device, self.device)
-        locate(self.cfg.model, self._picks, option="model", revision=self.cfg.revision, download=False)
+        locate(self._source(), download=False)
         if self.cfg.checkpoint:
             existing_file(self.cfg.checkpoint, "Shap-E checkpoint")
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         self.preflight()
-        folder = locate(self.cfg.model, self._picks, option="model", revision=self.cfg.revision)
+        folder = locate(self._source())
         device = chosen_device(self.cfg.device, self.device)
         info(f"Shap-E: {self.cfg.prompt or prompt!r} on {device}")
         latents = self._sample(folder, self.cfg.prompt or prompt, device, torch_generator(generator))
@@ -122,12 +121,12 @@ class ShapEPrior(Prior):
         info(f"Shap-E: a mesh of {len(cloud.points)} vertices and {len(cloud.faces)} faces")
         return placed(cloud, front=self.cfg.front, scale=self.cfg.scale, normalize=self.cfg.normalize)
 
-    def _picks(self, files: Collection[str]) -> list[str]:
-        names = require_files(files, CONFIGS, self.cfg.model) + tokenizer_files(files, "tokenizer/", self.cfg.model)
-        return names + [self._weights(files, part).name for part in PARTS]
+    def _source(self) -> Source:
+        def picks(names: Collection[str]) -> list[str]:
+            return needed_files(names, COMPONENTS, allow_bin=self.cfg.allow_bin)
 
-    def _weights(self, files: Collection[str], part: str) -> WeightFile:
-        return pick_weights(files, f"{part}/", PARTS[part], allow_bin=self.cfg.allow_bin, model=self.cfg.model)
+        # the folder renderer is that of another pipeline
+        return Source(self.cfg.model, picks, "system.geometry.prior.model", self.cfg.revision, "--include '*/*' --exclude 'renderer/*'")
 
     def _sample(self, folder: Path, prompt: str, device: torch.device, rng: torch.Generator) -> Float[Tensor, "1 N D"]:
         """Latents of the shape, from text features through the text-to-latent network; both are dropped on return."""
@@ -143,7 +142,7 @@ class ShapEPrior(Prior):
         return sample_heun(denoise, noise, sigmas, generator=rng, progress="Shap-E")
 
     def _condition(self, folder: Path, prompt: str, device: torch.device) -> Float[Tensor, "1 D"]:
-        encoder = load_text_encoder(folder, self._weights(files_below(folder), "text_encoder"), "text_encoder").to(device)
+        encoder = load_text_encoder(folder, "text_encoder", allow_bin=self.cfg.allow_bin).to(device)
         return text_condition(load_tokenizer(folder, "tokenizer"), encoder, prompt)
 
     def _decode(self, folder: Path, latents: Float[Tensor, "1 N D"], device: torch.device) -> PointCloud:
@@ -157,15 +156,14 @@ class ShapEPrior(Prior):
         from diffusers.pipelines.shap_e.renderer import ShapERenderer
 
         kind = {"prior": PriorTransformer, "shap_e_renderer": ShapERenderer}[part]
-        return load_weights(kind, folder, self._weights(files_below(folder), part), part).to(device)
+        return load_network(kind, folder, part, allow_bin=self.cfg.allow_bin).float().to(device)
 
 
 def read_schedule(folder: Path) -> tuple[Float[np.ndarray, "T"], str]:
     """The abar of each timestep, and what the network predicts ("sample" or "epsilon"), from the model's own scheduler."""
     from diffusers import HeunDiscreteScheduler
 
-    with reading(f"the scheduler in {str(folder)!r}"):
-        scheduler = HeunDiscreteScheduler.from_pretrained(folder, subfolder="scheduler", local_files_only=True)
+    scheduler = load_settings(HeunDiscreteScheduler, folder, "scheduler")
     prediction = scheduler.config.prediction_type
     if prediction not in ("sample", "epsilon"):
         raise UserError(f"the scheduler in {str(folder)!r} has the prediction type {prediction!r}: Shap-E's is 'sample'")

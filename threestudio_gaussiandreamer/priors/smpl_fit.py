@@ -23,9 +23,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from .. import extras
 from ..errors import UserError
 from ..files import existing_file
-from .pretrained import require_extra
 
 FIELDS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 """Arrays of a body model's file that are used."""
@@ -117,7 +117,7 @@ def fit_bodies(model: BodyModel, targets: Float[np.ndarray, "F K 3"], *, fit_sha
         fit_shape: the shape coefficients too; else the model's mean shape.
         iterations: the most of the last stage.
     """
-    require_extra("body", "smplx")
+    extras.require("body", "smplx")
     wanted = _tensor(targets)[:, : SMPL_JOINTS if len(model.parents) == SMPL_JOINTS else BODY_JOINTS]
     frames, joints = len(wanted), len(model.parents)
     pose = torch.zeros(frames, joints, 3, dtype=torch.float64)

@@ -42,6 +42,7 @@ class Backend:
 # In order of preference for "auto"; the specification is only used when it is asked for.
 BACKENDS = {
     "cpu": Backend("cpu", devices=("cpu",), dtypes=(torch.float32,)),
+    "cuda": Backend("cuda", devices=("cuda",), dtypes=(torch.float32,)),
     "torch": Backend("torch_backend"),
     "reference": Backend("reference"),
 }
@@ -98,7 +99,7 @@ def rasterize(
         stop: a pixel is finished with the Gaussian that brings its transmittance below this.
         downsample: 2 averages 2 x 2 pixels after rendering.
         absgrad: also collect ``means2d.absgrad``, the sum over pixels of the absolute gradient.
-        backend: "cpu", "torch", "reference", or "auto": the fastest for where the tensors are.
+        backend: "cpu", "cuda", "torch", "reference", or "auto": the fastest for where the tensors are.
         non_finite: "drop" ignores Gaussians that hold NaN or infinity; "error" names them.
 
     Returns:

@@ -18,14 +18,13 @@ from torch.autograd.function import once_differentiable
 
 from ..errors import UserError, unknown
 from . import torch_backend
-from .options import RasterizeOptions
+from .channels import CHANNELS, groups, narrow, widen
+from .options import SMALLEST_ALPHA, RasterizeOptions
 from .output import Rasterized
 
 FOLDER = pathlib.Path(__file__).parent / "native"
 BUILDS = ("v4", "v3", "base")  # best first
-CHANNELS = 3
 VIEWMATS = 4  # among the inputs of the kernel
-SMALLEST_ALPHA = 2.0**-100  # stands for alpha_min = 0: below it a float32 image can't tell
 
 
 def unavailable() -> Optional[str]:
@@ -48,11 +47,7 @@ def rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, heig
     tracked = torch.is_grad_enabled() and any(x.requires_grad for x in (*inputs, colors, background))
     means2d = means.new_zeros(views, len(means), 2).requires_grad_(tracked)
     frame = Frame(width, height, options, tracked, torch.get_num_threads(), _library())
-    if channels <= CHANNELS:
-        groups = [(colors, background)]
-    else:
-        groups = zip(colors.split(CHANNELS, -1), background.split(CHANNELS, -1), strict=True)
-    drawn = [_Rasterize.apply(*inputs, *group, means2d, Ks, frame) for group in groups]
+    drawn = [_Rasterize.apply(*inputs, *group, means2d, Ks, frame) for group in groups(colors, background)]
     image = drawn[0][0] if channels <= CHANNELS else torch.cat([group[0] for group in drawn], -1)
     _, alpha, depth, radii, contribution = drawn[0]
     return Rasterized(image, alpha, depth, means2d, radii, contribution)
@@ -74,13 +69,13 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, viewmats, colors, background, means2d, Ks, frame):
-        inputs = (means, quats, scales, opacities, viewmats, _widen(colors), _widen(background), Ks)
+        inputs = (means, quats, scales, opacities, viewmats, widen(colors), widen(background), Ks)
         (image, alpha, depth, radii, contribution), state = _draw(inputs, means2d, frame)
         ctx.frame, ctx.means2d, ctx.channels = frame, means2d, colors.shape[-1]
         ctx.save_for_backward(*inputs, state.as_tensor())
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii, contribution)
-        return _narrow(image, ctx.channels), alpha, depth, radii, contribution
+        return narrow(image, ctx.channels), alpha, depth, radii, contribution
 
     @staticmethod
     @once_differentiable
@@ -89,12 +84,12 @@ class _Rasterize(torch.autograd.Function):
         state = getattr(saved, "owner", None)
         if state is None:  # hooks on saved tensors (checkpointing, offloading) hand back other ones
             _, state = _draw(inputs, ctx.means2d, ctx.frame)
-        upstream = (None if d_image is None else _widen(d_image), d_alpha, d_depth)
+        upstream = (None if d_image is None else widen(d_image), d_alpha, d_depth)
         grads, d_means2d, absgrad = _draw_vjp(state, inputs, upstream, ctx.means2d, ctx.frame, ctx.needs_input_grad[VIEWMATS])
         if absgrad is not None:
             ctx.means2d.absgrad = absgrad + getattr(ctx.means2d, "absgrad", 0)
         *grads, d_colors, d_background = grads
-        return *grads, _narrow(d_colors, ctx.channels), _narrow(d_background, ctx.channels), d_means2d, None, None
+        return *grads, narrow(d_colors, ctx.channels), narrow(d_background, ctx.channels), d_means2d, None, None
 
 
 def _draw(inputs: Sequence[Tensor], means2d: Tensor, frame: Frame) -> tuple[tuple[Tensor, ...], "_State"]:
@@ -120,16 +115,6 @@ def _draw_vjp(state: "_State", inputs: Sequence[Tensor], upstream, means2d: Tens
     out = _Gradients(*map(_pointer, (*grads, d_means2d, absgrad)))
     _check(state.library.splat_backward(state.handle, _scene(inputs, frame), _settings(frame), _Upstream(*map(_pointer, upstream)), out))
     return grads, d_means2d, absgrad
-
-
-def _widen(x: Tensor) -> Tensor:
-    """Contiguous, with zeros for the channels that are missing."""
-    missing = CHANNELS - x.shape[-1]
-    return torch.nn.functional.pad(x, (0, missing)) if missing else x.contiguous()
-
-
-def _narrow(x: Tensor, channels: int) -> Tensor:
-    return x if channels == CHANNELS else x[..., :channels]
 
 
 # ---- the C interface: native/scene.h -------------------------------------------------------------------------------------------

@@ -7,12 +7,10 @@
 #pragma once
 
 #include "output.h"
+#include "splat_view.h"
 #include "tile.h"
 
 namespace splat {
-
-// Columns of a row of sums over the pixels of a tile, for one splat.
-enum Sum { U, U_Y1, U_Y2, U_Y1_Y1, U_Y1_Y2, U_Y2_Y2, RED, GREEN, BLUE, DEPTH, ABS_X, ABS_Y, SUMS };
 
 struct BackwardScratch {
   Staged staged;
@@ -26,12 +24,8 @@ struct PairRows {
   Floats u[LANES], weight[LANES], abs_x[LANES], abs_y[LANES];
 };
 
-// Moments of u over a strip, one splat per lane: sums of u x^i y^j with x, y counted from the strip's first pixel.
-struct Moments {
-  Floats m00, m10, m01, m20, m11, m02;
-};
-
-SPLAT_FN Moments moments_of(const Floats* u) {
+// Over a strip, one splat per lane, counted from the strip's first pixel.
+SPLAT_FN Moments<Floats> moments_of(const Floats* u) {
   constexpr int ROWS = LANES / BLOCK;
   Floats s0[4] = {}, s1[4] = {}, s2[4] = {};
   for (int y = 0; y < ROWS; y++) {
@@ -44,17 +38,9 @@ SPLAT_FN Moments moments_of(const Floats* u) {
           (s2[0] + s2[1]) + (s2[2] + s2[3]), s1[1] + 2.0f * s1[2] + 3.0f * s1[3], s0[1] + 4.0f * s0[2] + 9.0f * s0[3]};
 }
 
-// Sums of u, u y and u y y' with y = (y1, y2) at the strip's first pixel plus (a x + b y, c y).
-SPLAT_FN void whiten_moments(const Moments& m, const Floats* splat, const StripPixels& pixels, Floats* sums) {
+SPLAT_FN void whiten_moments(const Moments<Floats>& m, const Floats* splat, const StripPixels& pixels, Floats* sums) {
   const Floats a = splat[0], b = splat[1], c = splat[2];
-  const Floats y1 = a * pixels.left + (b * pixels.top + splat[3]), y2 = c * pixels.top + splat[4];
-  const Floats step1 = a * m.m10 + b * m.m01, step2 = c * m.m01;
-  sums[U] = m.m00;
-  sums[U_Y1] = y1 * m.m00 + step1;
-  sums[U_Y2] = y2 * m.m00 + step2;
-  sums[U_Y1_Y1] = y1 * (sums[U_Y1] + step1) + a * (a * m.m20 + 2.0f * b * m.m11) + b * b * m.m02;
-  sums[U_Y1_Y2] = y2 * sums[U_Y1] + y1 * step2 + c * (a * m.m11 + b * m.m02);
-  sums[U_Y2_Y2] = y2 * (sums[U_Y2] + step2) + c * c * m.m02;
+  whiten_moments(m, a, b, c, a * pixels.left + (b * pixels.top + splat[3]), c * pixels.top + splat[4], sums);
 }
 
 SPLAT_FN Floats sum_rows(const Floats* rows) {

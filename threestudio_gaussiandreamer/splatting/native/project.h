@@ -3,35 +3,15 @@
 
 #include "calls.h"
 #include "interleaved.h"
+#include "splat_view.h"
 
 namespace splat {
-
-inline Camera make_camera(const SplatScene& scene, int view) {
-  const float* v = scene.viewmats + 16 * view;
-  const float* k = scene.Ks + 9 * view;
-  const float width = scene.width, height = scene.height, margin_x = 0.15f * width / k[0], margin_y = 0.15f * height / k[4];
-  Camera c;
-  c.rotation = {{v[0], v[1], v[2]}, {v[4], v[5], v[6]}, {v[8], v[9], v[10]}};
-  c.translation = {v[3], v[7], v[11]};
-  c.focal = {k[0], k[4]};
-  c.centre = {k[2], k[5]};
-  c.slope_low = {-k[2] / k[0] - margin_x, -k[5] / k[4] - margin_y};
-  c.slope_high = {(width - k[2]) / k[0] + margin_x, (height - k[5]) / k[4] + margin_y};
-  c.size = {width, height};
-  return c;
-}
-
-struct Gaussians {
-  Vec3<Floats> means, scales;
-  Vec4<Floats> quats;
-  Floats opacities;
-};
 
 SPLAT_FN Vec3<Floats> load_vec3(const float* p, int count) { return load_items<3>(p, count, load3<Floats>); }
 
 SPLAT_FN Floats load_scalars(const float* p, int count) { return load_items<1>(p, count, load<Floats>); }
 
-SPLAT_FN Gaussians load_gaussians(const SplatScene& scene, Group group) {
+SPLAT_FN Gaussian<Floats> load_gaussians(const SplatScene& scene, Group group) {
   const auto [first, count] = group;
   return {load_vec3(scene.means + 3 * first, count), load_vec3(scene.scales + 3 * first, count),
           load_items<4>(scene.quats + 4 * first, count, load4), load_scalars(scene.opacities + first, count)};
@@ -40,52 +20,6 @@ SPLAT_FN Gaussians load_gaussians(const SplatScene& scene, Group group) {
 SPLAT_FN Vec3<Floats> load_colors(const SplatScene& scene, int view, Group group) {
   const int64_t offset = scene.colors_per_view ? scene.gaussians * view : 0;
   return load_vec3(scene.colors + 3 * (offset + group.first), group.count);
-}
-
-// Everything about one vector of Gaussians in one view; the backward pass computes it again.
-struct Projection {
-  Vec3<Floats> t;
-  Mat3<Floats> axes;
-  Screen<Floats> screen;
-  Whitening<Floats> whitening;
-};
-
-SPLAT_FN Projection project(const Camera& camera, const Vec3<Floats>& means, const Mat3<Floats>& axes_in_world, float eps2d) {
-  Projection p;
-  p.t = to_camera(camera, means);
-  p.axes = multiply(camera.rotation, axes_in_world);
-  p.screen = to_screen(camera, p.t, p.axes);
-  p.whitening = whiten(p.screen.u0, p.screen.u1, eps2d);
-  return p;
-}
-
-SPLAT_FN Ints all_finite(const Gaussians& g, const Vec3<Floats>& colors) {
-  const Vec3<Floats> sum = 0.0f * g.means + 0.0f * g.scales + 0.0f * colors;
-  return finite(sum.x + sum.y + sum.z + 0.0f * g.quats.w + 0.0f * g.quats.x + 0.0f * g.quats.y + 0.0f * g.quats.z +
-                0.0f * g.opacities);
-}
-
-// Where alpha >= alpha_min.
-struct Reach {
-  Floats log2_opacity, level;  // level = log2(opacity / alpha_min)
-  Vec2<Floats> extent;         // pixels, half the box
-};
-
-SPLAT_FN Reach reach_of(const SplatSettings& settings, const Projection& p, Floats opacity) {
-  const Floats compensated = settings.antialias ? opacity * p.whitening.compensation : opacity;
-  const Floats log2_opacity = log2(maximum(compensated, Floats{} + 1e-37f)), level = log2_opacity - std::log2(settings.alpha_min);
-  return {log2_opacity, level, extents(p.whitening, level)};
-}
-
-// In front of the camera, representable, opaque enough for a pixel, and with a box that meets the image.
-SPLAT_FN Ints visible_lanes(const Camera& camera, const SplatSettings& settings, const Projection& p, const Reach& reach) {
-  const Whitening<Floats>& w = p.whitening;
-  const Vec2<Floats>&mean = p.screen.mean, &extent = reach.extent;
-  const Ints in_range = (p.t.z > settings.near) & (p.t.z < settings.far) & (reach.level >= 0.0f);
-  const Ints drawable = finite(w.a) & finite(w.b) & finite(w.c) & finite(mean.x) & finite(mean.y) & (w.a > 0.0f) & (w.c > 0.0f);
-  const Ints in_columns = (mean.x + extent.x >= 0.0f) & (mean.x - extent.x <= camera.size.x);
-  const Ints in_rows = (mean.y + extent.y >= 0.0f) & (mean.y - extent.y <= camera.size.y);
-  return in_range & drawable & in_columns & in_rows;
 }
 
 // Tiles along one axis of the pixels whose centres lie within centre +- extent, a little more to be safe.
@@ -139,18 +73,14 @@ inline uint64_t depth_key(float depth, int64_t gaussian) {
   return uint64_t(bits) << 32 | uint64_t(gaussian);
 }
 
-SPLAT_FN void store_splats(const Projection& p, const Reach& reach, const Vec3<Floats>& colors, Splat* splats) {
-  const Whitening<Floats>& w = p.whitening;
-  const Floats a = w.a * WHITENING_SCALE, b = w.b * WHITENING_SCALE, c = w.c * WHITENING_SCALE;
-  const Floats tilt = w.xy / w.yy, slant = reach.extent.x * w.xy / w.xx;
-  Floats columns[ROW] = {
-      p.screen.mean.x, p.screen.mean.y, a,        b,    c,     reach.log2_opacity, p.t.z,          colors.x,
-      colors.y,        colors.z,        1.0f / a, tilt, slant, reach.extent.x,     reach.extent.y, reach.level};
+SPLAT_FN void store_splats(const Projection<Floats>& p, const Reach<Floats>& reach, const Vec3<Floats>& colors, Splat* splats) {
+  Floats columns[ROW];
+  splat_columns(p, reach, colors, columns);
   store_columns(columns, &splats->x);
 }
 
 // Means and radii of the visible lanes, zeros elsewhere; the contributions start at zero.
-SPLAT_FN void store_screen(const ForwardCall& call, int view, Group group, const Projection& p, const Reach& reach,
+SPLAT_FN void store_screen(const ForwardCall& call, int view, Group group, const Projection<Floats>& p, const Reach<Floats>& reach,
                            Ints visible) {
   const int64_t at = view * call.scene.gaussians + group.first;
   const Floats zero = {}, radius = select(visible, maximum(reach.extent.x, reach.extent.y), zero);
@@ -161,7 +91,7 @@ SPLAT_FN void store_screen(const ForwardCall& call, int view, Group group, const
 }
 
 // Notes the tiles and the depth of the visible lanes.
-inline void list_lanes(View& view, Slice& slice, Group group, const Projection& p, const Reach& reach, Ints visible) {
+inline void list_lanes(View& view, Slice& slice, Group group, const Projection<Floats>& p, const Reach<Floats>& reach, Ints visible) {
   const TileRange x = tile_range(p.screen.mean.x, reach.extent.x, view.camera.size.x);
   const TileRange y = tile_range(p.screen.mean.y, reach.extent.y, view.camera.size.y);
   uint64_t* keys = view.keys.data() + group.first / SLICE * SLICE;
@@ -174,12 +104,13 @@ inline void list_lanes(View& view, Slice& slice, Group group, const Projection& 
 }
 
 inline void project_group(const ForwardCall& call, View& view, Slice& slice, Group group) {
-  const Gaussians g = load_gaussians(call.scene, group);
+  const SplatSettings& settings = call.settings;
+  const Gaussian<Floats> g = load_gaussians(call.scene, group);
   const Vec3<Floats> colors = load_colors(call.scene, view.index, group);
-  const Mat3<Floats> axes = world_axes(quat_to_rotation(g.quats).matrix, g.scales);
-  const Projection p = project(view.camera, g.means, axes, call.settings.eps2d);
-  const Reach reach = reach_of(call.settings, p, g.opacities);
-  const Ints visible = all_finite(g, colors) & visible_lanes(view.camera, call.settings, p, reach);
+  const Mat3<Floats> axes = world_axes(quat_to_rotation(g.quat).matrix, g.scale);
+  const Projection<Floats> p = project(view.camera, g.mean, axes, settings.eps2d);
+  const Reach<Floats> reach = reach_of(p, g.opacity, settings.antialias, std::log2(settings.alpha_min));
+  const Ints visible = all_finite(g, colors) & is_visible(view.camera, p, reach, settings.near, settings.far);
   store_splats(p, reach, colors, view.splats.data() + group.first);
   store_screen(call, view.index, group, p, reach, visible);
   list_lanes(view, slice, group, p, reach, visible);

@@ -7,27 +7,10 @@
 
 namespace splat {
 
-constexpr float UNSCALE = 1.0f / WHITENING_SCALE;
-
 // d loss / d viewmat but for its last row, one sum per lane.
 struct ViewmatSums {
   Mat3<Floats> rotation;
   Vec3<Floats> translation;
-};
-
-// The gradients of LANES Gaussians, added up over the views.
-struct WorldGradients {
-  Vec3<Floats> means, colors;
-  Mat3<Floats> axes;  // in the world
-  Floats opacities;
-};
-
-// One view's gradients of LANES Gaussians; all zero where a Gaussian touches no tile.
-struct ViewGradients {
-  Vec3<Floats> t, colors;
-  Mat3<Floats> axes;  // in camera coordinates
-  Vec2<Floats> mean2d;
-  Floats opacities;
 };
 
 // Adds up each Gaussian's slots in their order, as LANES rows; says which of the Gaussians have any.
@@ -51,64 +34,30 @@ SPLAT_FN Mat3<Floats> keep(Ints mask, const Mat3<Floats>& m) { return {keep(mask
 
 // LANES Gaussians and what follows from them alone.
 struct Shapes {
-  Gaussians gaussians;
+  Gaussian<Floats> gaussians;
   Rotation<Floats> rotation;
   Mat3<Floats> axes;  // in the world
 };
 
 SPLAT_FN Shapes load_shapes(const SplatScene& scene, Group group) {
-  const Gaussians g = load_gaussians(scene, group);
-  const Rotation<Floats> rotation = quat_to_rotation(g.quats);
-  return {g, rotation, world_axes(rotation.matrix, g.scales)};
+  const Gaussian<Floats> g = load_gaussians(scene, group);
+  const Rotation<Floats> rotation = quat_to_rotation(g.quat);
+  return {g, rotation, world_axes(rotation.matrix, g.scale)};
 }
 
-SPLAT_FN Vec2<Floats> mean2d_gradient(const Whitening<Floats>& w, const Floats* sums) {
-  return {UNSCALE * (w.a * sums[U_Y1]), UNSCALE * (w.b * sums[U_Y1] + w.c * sums[U_Y2])};
+// From one view's sums to its gradients; all zero where a Gaussian touches no tile.
+SPLAT_FN ViewGradient<Floats> project_vjp(const Camera& camera, const SplatSettings& settings, const Shapes& shapes,
+                                          const Floats* sums, Ints drawn) {
+  const Gaussian<Floats>& g = shapes.gaussians;
+  const ViewGradient<Floats> d =
+      project_vjp(camera, project(camera, g.mean, shapes.axes, settings.eps2d), g.opacity, settings.antialias, sums);
+  const Vec2<Floats> mean2d = {keep(drawn, d.mean2d.x), keep(drawn, d.mean2d.y)};
+  return {keep(drawn, d.t), d.color, keep(drawn, d.axes), mean2d, keep(drawn, d.opacity)};
 }
 
-// Gradients of the rows of U; with the compensation, sums[U] also counts.
-SPLAT_FN void footprint_gradient(const Projection& p, const Floats* sums, bool antialias, Vec3<Floats>& d_u0,
-                                 Vec3<Floats>& d_u1) {
-  const Whitening<Floats>& w = p.whitening;
-  const float unscale = UNSCALE * UNSCALE;
-  const Floats xx = unscale * sums[U_Y1_Y1], xy = unscale * sums[U_Y1_Y2], yy = unscale * sums[U_Y2_Y2];
-  const Floats compensated = antialias ? sums[U] : Floats{};
-  whiten_vjp(w, p.screen.u0, p.screen.u1, xx - compensated, xy, yy - compensated, d_u0, d_u1);
-  if (antialias) compensation_vjp(w, p.screen.u0, compensated, d_u0, d_u1);
-}
-
-// From one view's sums to its gradients.
-SPLAT_FN ViewGradients project_vjp(const Camera& camera, const SplatSettings& settings, const Shapes& shapes, const Floats* sums,
-                                   Ints drawn) {
-  const Projection p = project(camera, shapes.gaussians.means, shapes.axes, settings.eps2d);
-  const Vec2<Floats> d_mean = mean2d_gradient(p.whitening, sums);
-  Vec3<Floats> d_u0, d_u1, d_t;
-  Mat3<Floats> d_axes;
-  footprint_gradient(p, sums, settings.antialias, d_u0, d_u1);
-  to_screen_vjp(camera, p.screen, p.axes, d_mean, sums[DEPTH], d_u0, d_u1, d_t, d_axes);
-  ViewGradients d;
-  d.t = keep(drawn, d_t), d.axes = keep(drawn, d_axes), d.mean2d = {keep(drawn, d_mean.x), keep(drawn, d_mean.y)};
-  d.opacities = keep(drawn, sums[U] / shapes.gaussians.opacities), d.colors = {sums[RED], sums[GREEN], sums[BLUE]};
-  return d;
-}
-
-SPLAT_FN void add_view(WorldGradients& sum, const Camera& camera, const ViewGradients& d) {
-  const Mat3<Floats> d_axes = multiply_transposed(camera.rotation, d.axes);
-  sum.axes = {sum.axes.x + d_axes.x, sum.axes.y + d_axes.y, sum.axes.z + d_axes.z};
-  sum.means = sum.means + to_camera_vjp(camera, d.t);
-  sum.colors = sum.colors + d.colors;
-  sum.opacities += d.opacities;
-}
-
-// t = R mean + T and axes = R axes_in_world.
-SPLAT_FN void add_viewmat(ViewmatSums& sum, const Shapes& shapes, const ViewGradients& d, Ints drawn) {
-  const Vec3<Floats> mean = keep(drawn, shapes.gaussians.means);
-  const Mat3<Floats> n = keep(drawn, shapes.axes);
-  const auto row = [&](const Floats& d_t, const Vec3<Floats>& d_axis) {
-    return Vec3<Floats>{d_t * mean.x + dot(d_axis, n.x), d_t * mean.y + dot(d_axis, n.y), d_t * mean.z + dot(d_axis, n.z)};
-  };
-  sum.rotation = {sum.rotation.x + row(d.t.x, d.axes.x), sum.rotation.y + row(d.t.y, d.axes.y),
-                  sum.rotation.z + row(d.t.z, d.axes.z)};
+SPLAT_FN void add_viewmat(ViewmatSums& sum, const Shapes& shapes, const ViewGradient<Floats>& d, Ints drawn) {
+  const Mat3<Floats> rotation = view_rotation_vjp(keep(drawn, shapes.gaussians.mean), keep(drawn, shapes.axes), d);
+  sum.rotation = {sum.rotation.x + rotation.x, sum.rotation.y + rotation.y, sum.rotation.z + rotation.z};
   sum.translation = sum.translation + d.t;
 }
 
@@ -120,29 +69,29 @@ SPLAT_FN void store_vec3(float* p, int count, const Vec3<Floats>& v) {
   store_items<3>(p, count, [&](float* q) { store3(q, v); });
 }
 
-SPLAT_FN void store_view(const BackwardCall& call, int view, Group group, const ViewGradients& d, const Floats* sums) {
+SPLAT_FN void store_view(const BackwardCall& call, int view, Group group, const ViewGradient<Floats>& d, const Floats* sums) {
   const SplatGradients& out = call.out;
   const int64_t at = view * call.scene.gaussians + group.first;
   const float unscale = UNSCALE * UNSCALE;
   store_vec2(out.means2d + 2 * at, group.count, d.mean2d);
   if (out.absgrad) store_vec2(out.absgrad + 2 * at, group.count, {unscale * sums[ABS_X], unscale * sums[ABS_Y]});
-  if (call.scene.colors_per_view) store_vec3(out.colors + 3 * at, group.count, d.colors);
+  if (call.scene.colors_per_view) store_vec3(out.colors + 3 * at, group.count, d.color);
 }
 
 // Through rotation and scale; nothing flows to a Gaussian that isn't drawn, finite or not.
-SPLAT_FN void store_world(const BackwardCall& call, Group group, const Shapes& shapes, const WorldGradients& d, Ints drawn) {
+SPLAT_FN void store_world(const BackwardCall& call, Group group, const Shapes& shapes, const WorldGradient<Floats>& d, Ints drawn) {
   const auto [first, count] = group;
   const SplatGradients& out = call.out;
   Mat3<Floats> d_rotation;
   Vec3<Floats> d_scales;
-  world_axes_vjp(shapes.rotation.matrix, shapes.gaussians.scales, d.axes, d_rotation, d_scales);
+  world_axes_vjp(shapes.rotation.matrix, shapes.gaussians.scale, d.axes, d_rotation, d_scales);
   const Vec4<Floats> q = quat_to_rotation_vjp(shapes.rotation, d_rotation);
   const Vec4<Floats> d_quats = {keep(drawn, q.w), keep(drawn, q.x), keep(drawn, q.y), keep(drawn, q.z)};
-  store_vec3(out.means + 3 * first, count, d.means);
+  store_vec3(out.means + 3 * first, count, d.mean);
   store_vec3(out.scales + 3 * first, count, keep(drawn, d_scales));
   store_items<4>(out.quats + 4 * first, count, [&](float* p) { store4(p, d_quats); });
-  store_items<1>(out.opacities + first, count, [&](float* p) { store(p, d.opacities); });
-  if (!call.scene.colors_per_view) store_vec3(out.colors + 3 * first, count, d.colors);
+  store_items<1>(out.opacities + first, count, [&](float* p) { store(p, d.opacity); });
+  if (!call.scene.colors_per_view) store_vec3(out.colors + 3 * first, count, d.color);
 }
 
 SPLAT_FN bool any_lane(Ints mask) { return any_at_least(select(mask, Floats{} + 1.0f, Floats{}), 1.0f); }
@@ -150,13 +99,13 @@ SPLAT_FN bool any_lane(Ints mask) { return any_at_least(select(mask, Floats{} + 
 // All gradients of a group; `viewmats` holds a sum per view, or none.
 inline void project_group_backward(const BackwardCall& call, Group group, std::vector<ViewmatSums>& viewmats) {
   const Shapes shapes = load_shapes(call.scene, group);
-  WorldGradients world = {};
+  WorldGradient<Floats> world = {};
   Ints drawn_anywhere = {};
   for (int v = 0; v < call.scene.views; v++) {
     const View& view = call.views[v];
     alignas(64) float rows[LANES * ROW];
     Floats sums[ROW] = {};
-    ViewGradients d = {};
+    ViewGradient<Floats> d = {};
     const Ints drawn = gather_slots(view, call.slots(view), group, rows);
     if (any_lane(drawn)) {
       load_columns<SUMS>([&](int l) { return rows + l * ROW; }, sums);

@@ -1,0 +1,148 @@
+"""Draws the run charts: docs/charts/<name>.csv, as `runs.py` measured it, becomes docs/charts/<name>.png.
+
+    python benchmarks/chart_runs.py                # all that have been measured
+    python benchmarks/chart_runs.py time count
+
+Lines are medians over the seeds, bands and bars the whole range; every panel is one object, and the first is the one that
+settings were tuned on.
+"""
+
+import argparse
+import statistics
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+from runs import CHARTS, rows_of
+
+Row = dict[str, str]
+TUNED_ON = "toy"
+
+
+class Chart(NamedTuple):
+    """How a CSV is drawn."""
+
+    title: str
+    x: str
+    """The column on the horizontal axis."""
+    x_label: str
+    curves: bool
+    """Whether each run is a curve over its steps, or the one point where it ended."""
+    per_variant: str = "variant"
+    """The column that tells one line from the next."""
+    log_x: bool = True
+
+
+DECIBEL = "held-out PSNR, dB"
+RUNS = {
+    "time": Chart("What each kind of score buys per second", "seconds", "seconds of training, one thread", curves=True),
+    "count": Chart("How many Gaussians a scene needs", "gaussians", "Gaussians at the end", curves=False),
+    "size": Chart("What rendering larger buys", "seconds", "seconds of training, one thread", curves=False),
+    "batch": Chart("Views per step, at equal rendered views", "seconds", "seconds of training, one thread", True, per_variant="x"),
+    "iterations": Chart("What more steps buy", "x", "steps", curves=False),
+    "preset": Chart("What the rasteriser's presets buy", "seconds", "seconds of training, one thread", curves=True),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("charts", nargs="*", help=f"of {', '.join(RUNS)}; default: all that have been measured")
+    for name in parser.parse_args().charts or RUNS:
+        rows = rows_of(name)
+        if rows:
+            print(draw(name, RUNS[name], rows))
+
+
+def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
+    """One figure, a panel for each object; returns the path."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    objects = sorted({row["object"] for row in rows}, key=lambda name: (name != TUNED_ON, name))
+    figure, panels = plt.subplots(1, len(objects), figsize=(1.2 + 4.2 * len(objects), 4.6), sharey=True, squeeze=False)
+    for panel, name_of_object in zip(panels[0], objects, strict=True):
+        draw_panel(panel, chart, [row for row in rows if row["object"] == name_of_object])
+        panel.set_title(name_of_object + ("" if name_of_object == TUNED_ON else " (held back from tuning)"), fontsize=10)
+    panels[0, 0].set_ylabel(DECIBEL)
+    figure.suptitle(chart.title, x=0.01, ha="left", fontweight="bold")
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower center", ncols=min(4, len(labels)), frameon=False, fontsize=9)
+    figure.text(0.01, 0.905, caption(rows), fontsize=8, color="0.35")
+    figure.tight_layout(rect=(0, 0.06 + 0.04 * ((len(labels) - 1) // 4), 1, 0.93))
+    path = CHARTS / f"{name}.png"
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return path
+
+
+def draw_panel(panel: Any, chart: Chart, rows: list[Row]) -> None:
+    """All lines of one object, in the order of the CSV."""
+    for index, (label, chosen) in enumerate(grouped(rows, lambda row: label_of(chart, row)).items()):
+        paper = "paper" in label
+        style: dict[str, Any] = {"color": "0.15" if paper else f"C{index}", "label": label}
+        (draw_curve if chart.curves else draw_points)(panel, chart, chosen, style, "*" if paper else "o")
+    if chart.log_x:
+        panel.set_xscale("log")
+    panel.set_xlabel(chart.x_label)
+    panel.grid(alpha=0.25)
+    panel.spines[["top", "right"]].set_visible(False)
+
+
+def label_of(chart: Chart, row: Row) -> str:
+    return row["variant"] if chart.per_variant == "variant" else f"{row['x']} views a step"
+
+
+def draw_curve(panel: Any, chart: Chart, rows: Iterable[Row], style: dict[str, Any], marker: str) -> None:
+    """Median over the seeds at each step, the range as a band, a marker at the end."""
+    steps = grouped((row for row in rows if float(row["seconds"]) > 0), lambda row: int(row["step"]))
+    points = [(median(at, chart.x), *spread(at)) for _, at in sorted(steps.items())]
+    x, low, middle, high = zip(*points, strict=True)
+    panel.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)
+    panel.plot(x, middle, linewidth=1.6, **style)
+    panel.plot(x[-1:], middle[-1:], marker, color=style["color"], markersize=10 if marker == "*" else 5)
+
+
+def draw_points(panel: Any, chart: Chart, rows: Iterable[Row], style: dict[str, Any], marker: str) -> None:
+    """One point for each place: median, and the range over the seeds as a bar."""
+    places = [ends(at) for at in grouped(rows, lambda row: float(row["x"])).values()]
+    points = sorted((median(at, chart.x), *spread(at)) for at in places)
+    x, low, middle, high = (list(column) for column in zip(*points, strict=True))
+    below = [m - b for m, b in zip(middle, low, strict=True)]
+    above = [t - m for m, t in zip(middle, high, strict=True)]
+    size = 11 if marker == "*" else 5
+    panel.errorbar(x, middle, [below, above], marker=marker, markersize=size, linewidth=1.4, capsize=2, **style)
+
+
+def ends(rows: Iterable[Row]) -> list[Row]:
+    """The last row of each run."""
+    return [max(run, key=lambda row: int(row["step"])) for run in grouped(rows, lambda row: row["seed"]).values()]
+
+
+def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Row]]:
+    groups: dict[Any, list[Row]] = defaultdict(list)
+    for row in rows:
+        groups[key(row)].append(row)
+    return groups
+
+
+def median(rows: list[Row], column: str) -> float:
+    return statistics.median(float(row[column]) for row in rows)
+
+
+def spread(rows: list[Row]) -> tuple[float, float, float]:
+    """Least, median and greatest dB."""
+    values = [float(row["psnr"]) for row in rows]
+    return min(values), statistics.median(values), max(values)
+
+
+def caption(rows: list[Row]) -> str:
+    """What a chart was made on."""
+    seeds = len({row["seed"] for row in rows})
+    machine, commits = (", ".join(sorted({row[column] for row in rows})) for column in ("machine", "commit"))
+    return f"exact score of a known object, configs/demo.yaml at 128², {seeds} seeds: median and range; {machine}; commit {commits}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,146 @@
+"""What is run for each chart and table: variants of configs/demo.yaml as lists of :class:`Job`; `runs.py` runs them."""
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+from ablations import CLIPPED, LATENT, NO_ANNEALING, PAPER_RATES, RANDOM_START, STRONG, VIEW_BLIND
+
+STEPS = 1200
+SECOND_STAGE = 500
+"""The step from which the demo draws smaller timesteps."""
+COUNTS = (5000, 2500, 1500, 1000)
+NO_BUDGET = {"system.geometry.budget": "null"}
+PAPER = PAPER_RATES | NO_BUDGET | {"system.geometry.init_opacity": 0.1}
+"""The recipe of the paper: its learning rates and start, and no pruning by contribution."""
+RATES = {
+    "lr_means": (2e-4, 2e-5),
+    "lr_scales": (6e-2, 1e-3),
+    "lr_quats": (6e-2, 2e-3),
+    "lr_opacities": (1e-1, 5e-3),
+    "lr_sh": (1e-1, 2e-3),
+}
+"""Learning rates of demo.yaml, at the start and the end of a run."""
+BINS = VIEW_BLIND | {"system.guidance.mode": "direction-bins"}
+GREY = {"system.geometry.prior.color": "grey"}
+BALL = {"system.geometry.prior_type": "random-prior", "system.geometry.prior": {"num_points": 8000, "shape": "sphere", "color": "grey"}}
+BLURRED = {"system.guidance.latent_size": 4}
+
+
+class Job(NamedTuple):
+    """One kind of training run and its place in a chart."""
+
+    chart: str
+    variant: str
+    x: float
+    """The place on the chart's horizontal axis, where that isn't measured; else 0."""
+    options: dict[str, Any]
+
+
+def steps(count: int) -> dict[str, Any]:
+    """A run of ``count`` steps with its schedules in proportion."""
+    second = SECOND_STAGE * count // STEPS
+    schedule = [second, 0.98, 0.55, second + 1]
+    rounds = {f"system.geometry.prune.{name}": step * count // STEPS for name, step in (("start", 100), ("every", 50), ("stop", 900))}
+    rates = {f"system.geometry.{name}": f"[0,{start},{end},{count}]" for name, (start, end) in RATES.items()}
+    return (
+        rounds
+        | rates
+        | {
+            "trainer.max_steps": count,
+            "system.evaluation.every": max(1, count // 12),
+            "system.guidance.max_step_percent": schedule,
+        }
+    )
+
+
+def scratch(count: int) -> dict[str, Any]:
+    """The start of the demo with ``count`` Gaussians: four fifths from the prior, one fifth grown."""
+    return NO_BUDGET | {
+        "system.geometry.prior.num_points": count * 4 // 5,
+        "system.geometry.grow.max_points": count // 5,
+        "system.geometry.max_gaussians": count,
+    }
+
+
+def time_jobs() -> Iterator[Job]:
+    """What each kind of score, and the prior, buys per second."""
+    yield Job("time", "view-exact, demo.yaml", 0, {})
+    yield Job("time", "view-exact, the paper's recipe", 0, PAPER)
+    yield Job("time", "direction bins", 0, BINS)
+    yield Job("time", "view-blind, prior", 0, VIEW_BLIND)
+    yield Job("time", "view-blind, random start", 0, VIEW_BLIND | RANDOM_START)
+
+
+def count_jobs() -> Iterator[Job]:
+    """What a number of Gaussians can do, by the way it was reached; all with the same steps."""
+    yield Job("count", "no pruning", 10000, NO_BUDGET)
+    yield Job("count", "the paper's recipe", 10000, PAPER)
+    yield Job("count", "by contribution, auto", 0, {"system.geometry.budget": "auto"})
+    for count in COUNTS:
+        budget = {"system.geometry.budget": count}
+        yield Job("count", "by contribution", count, budget)
+        yield Job("count", "from scratch", count, scratch(count))
+        yield Job("count", "by opacity", count, budget | {"system.geometry.prune.score": "opacity"})
+    for count in (2500, 1000):
+        yield Job("count", "at random", count, {"system.geometry.budget": count, "system.geometry.prune.score": "random"})
+
+
+def size_jobs() -> Iterator[Job]:
+    """Pixels rendered, and whether rendering twice as large and shrinking pays for its four times as many."""
+    for size in (64, 128, 256):
+        yield Job("size", "rendered and guided alike", size, {"data.width": size, "data.height": size})
+    for size in (64, 128):
+        large = {"data.width": 2 * size, "data.height": 2 * size, "system.renderer.downsample": 2}
+        yield Job("size", "rendered twice as large, shrunk", size, large)
+
+
+def batch_jobs() -> Iterator[Job]:
+    """The same number of rendered views, in fewer or more steps."""
+    for batch in (1, 2, 4, 8):
+        yield Job("batch", "equal views", batch, {"data.batch_size": batch} | steps(STEPS * 4 // batch))
+
+
+def iteration_jobs() -> Iterator[Job]:
+    """Runs of their own: a longer run is not the continuation of a shorter one."""
+    for rates, name in (({}, "demo.yaml"), (PAPER, "the paper's recipe")):
+        for count in (150, 300, 600, 1200, 2400):
+            yield Job("iterations", name, count, steps(count) | rates)
+
+
+def preset_jobs() -> Iterator[Job]:
+    for preset in ("fast", "balanced", "accurate"):
+        yield Job("preset", preset, 0, {"system.renderer.preset": preset})
+
+
+def failure_jobs() -> Iterator[Job]:
+    """How the method fails, and what each remedy buys: 96^2 and 600 steps, so that 15 runs of each are affordable."""
+    small = {"data.width": 96, "data.height": 96} | steps(600) | {"system.evaluation.every": 0}
+    plain_timesteps = LATENT | STRONG | NO_ANNEALING
+    variants = {
+        "multi-face: random start": VIEW_BLIND | RANDOM_START,
+        "multi-face: random start + view-dependent score": BINS | RANDOM_START,
+        "multi-face: prior": VIEW_BLIND,
+        "grey prior": VIEW_BLIND | GREY,
+        "grey prior + view-dependent score": BINS | GREY,
+        "blur: timesteps up to 0.98 throughout": VIEW_BLIND | NO_ANNEALING,
+        "blur: coarse latent": VIEW_BLIND | BLURRED,
+        "over-saturation: guidance 100": plain_timesteps,
+        "over-saturation: annealed": LATENT | STRONG,
+        "over-saturation: annealed, clipped": LATENT | STRONG | CLIPPED,
+        "over-saturation: guidance 7.5, annealed, clipped": LATENT | CLIPPED | {"system.guidance.guidance_scale": 8.5},
+        "wrong shape: a grey ball": BALL,
+        "right shape": {},
+    }
+    for name, options in variants.items():
+        yield Job("failures", name, 0, small | options)
+
+
+JOBS: dict[str, Callable[[], Iterator[Job]]] = {
+    "time": time_jobs,
+    "count": count_jobs,
+    "size": size_jobs,
+    "batch": batch_jobs,
+    "iterations": iteration_jobs,
+    "preset": preset_jobs,
+    "failures": failure_jobs,
+}

@@ -1,0 +1,136 @@
+"""Training runs for the charts: every run that a chart needs, side by side on the CPU, into one CSV per chart.
+
+    python benchmarks/runs.py                               # all that isn't measured yet: about an hour on 4 cores
+    python benchmarks/runs.py --charts count --seeds 0 1 2  # one chart, fewer seeds
+    python benchmarks/runs.py --list                        # what would run
+
+Each run is `launch.py` with configs/demo.yaml at 128^2 and a few options changed, on one thread, several side by side, and is
+scored on 24 held-out views that neither a bank nor a training camera holds, ray-cast from the mesh. Seconds are those of
+training, targets included and evaluation excluded. Rows are appended as runs end, seeds in turn, and what a CSV has is not run
+again: stop and go on at will. Settings were tuned on the bundled toy alone; other objects are given by path and held back.
+"""
+
+import argparse
+import csv
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from jobs import JOBS, STEPS, Job
+from tqdm import tqdm
+
+ROOT = Path(__file__).resolve().parent.parent
+CHARTS = ROOT / "docs/charts"
+SIZE, EVERY = 128, 100
+COLUMNS = "variant,x,object,seed,step,seconds,gaussians,psnr,ssim,multi_face,floater_mass,machine,commit".split(",")
+
+
+def main() -> None:
+    arguments = parse_arguments()
+    todo = [
+        (job, mesh, seed)
+        for seed in arguments.seeds
+        for chart in arguments.charts
+        for job in JOBS[chart]()
+        for mesh in arguments.objects
+        if not measured(job, mesh, seed)
+    ]
+    if arguments.list:
+        print("\n".join(f"{job.chart}: {job.variant}, {job.x:g}, {object_name(mesh)}, seed {seed}" for job, mesh, seed in todo))
+        return
+    with ThreadPoolExecutor(arguments.jobs) as pool:
+        running = {pool.submit(run, mesh, seed, job.options): (job, mesh, seed) for job, mesh, seed in todo}
+        for done in tqdm(as_completed(running), total=len(todo), unit="run", disable=None):
+            append(*running[done], done.result())
+
+
+def parse_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--charts", nargs="+", choices=JOBS, default=list(JOBS))
+    parser.add_argument("--objects", nargs="+", default=["toy.glb"], help="meshes; a bare name is a bundled one (default: toy.glb)")
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(5)))
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="runs side by side, one thread each")
+    parser.add_argument("--list", action="store_true", help="only print what would run")
+    return parser.parse_args()
+
+
+def run(mesh: str, seed: int, options: dict[str, Any]) -> dict[str, Any]:
+    """One training run in a process of its own; its metrics."""
+    common = {
+        "use_timestamp": "false", "tag": "run", "seed": seed, "data.width": SIZE, "data.height": SIZE,
+        "system.evaluation.size": SIZE, "system.evaluation.every": EVERY, "system.guidance.mesh": mesh,
+        "system.guidance.bank_seed": seed, "data.n_test_views": 1, "data.eval_width": 64, "data.eval_height": 64,
+        "trainer.max_steps": STEPS, "trainer.val_check_interval": 100000, "trainer.enable_progress_bar": "false",
+    }  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        overrides = [f"{key}={value}" for key, value in (common | options | {"exp_root_dir": folder}).items()]
+        command = [sys.executable, str(ROOT / "launch.py"), "--config", str(ROOT / "configs/demo.yaml"), "--train", *overrides]
+        environment = os.environ | {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+        finished = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment)
+        if finished.returncode:
+            raise RuntimeError(f"a run failed ({finished.returncode}): {' '.join(overrides)}\n{finished.stderr[-3000:]}")
+        return json.loads((Path(folder) / "demo/run/save/metrics.json").read_text())
+
+
+def object_name(mesh: str) -> str:
+    return Path(mesh).stem
+
+
+def measured(job: Job, mesh: str, seed: int) -> bool:
+    return (job.variant, f"{job.x:g}", object_name(mesh), str(seed)) in {
+        (row["variant"], row["x"], row["object"], row["seed"]) for row in rows_of(job.chart)
+    }
+
+
+def rows_of(chart: str) -> list[dict[str, str]]:
+    """The rows of a chart's CSV; none where it doesn't exist yet."""
+    path = CHARTS / f"{chart}.csv"
+    if not path.is_file():
+        return []
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def append(job: Job, mesh: str, seed: int, metrics: dict[str, Any]) -> None:
+    """The curve and the result of one run; a result's ``step`` is the last."""
+    path, new = CHARTS / f"{job.chart}.csv", not (CHARTS / f"{job.chart}.csv").is_file()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "a", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, restval="", extrasaction="ignore")
+        if new:
+            writer.writeheader()
+        start = metrics["prior"] | {"step": 0}
+        points = {scores["step"]: scores for scores in (start, *metrics.get("curve", ()), metrics["result"])}
+        place = {
+            "variant": job.variant,
+            "x": f"{job.x:g}",
+            "object": object_name(mesh),
+            "seed": seed,
+            "machine": machine(),
+            "commit": commit(),
+        }
+        writer.writerows(scores | place for scores in points.values())
+
+
+def machine() -> str:
+    """The processor's name, where the system tells it."""
+    try:
+        names = [line.partition(":")[2].strip() for line in open("/proc/cpuinfo") if line.startswith("model name")]
+    except OSError:
+        names = []
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def commit() -> str:
+    answer = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT)
+    return answer.stdout.strip() or "unknown"
+
+
+if __name__ == "__main__":
+    main()

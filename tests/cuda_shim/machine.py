@@ -1,0 +1,93 @@
+"""A stand-in for a GPU: runs the product's CUDA text on the host, so that the tests run kernels and glue as they are."""
+
+import ctypes
+import functools
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from itertools import pairwise
+from pathlib import Path
+from typing import Optional
+
+import torch
+from torch import Tensor
+
+from threestudio_gaussiandreamer.splatting import nvrtc
+from threestudio_gaussiandreamer.splatting.cuda_stages import NOWHERE
+
+FOLDER = Path(__file__).parent
+# Nothing is fused but what the kernels fuse on purpose; reading four floats as one is usual in CUDA, though not in C++; jumps
+# from stack to stack are meant.
+FLAGS = "-std=c++17 -O2 -fPIC -shared -ffp-contract=off -fno-math-errno -fno-strict-aliasing -U_FORTIFY_SOURCE".split()
+WARNINGS = ["-Wall", "-Wno-unknown-pragmas"]
+
+
+def unavailable() -> Optional[str]:
+    """Why the kernels can't be compiled for the host, or None."""
+    if not sys.platform.startswith("linux"):
+        return "the fibres and the sections of the stand-in are Linux's"
+    return None if shutil.which("g++") else "needs g++ to compile the kernels for the host"
+
+
+ORDERS = {"forward": 0, "backward": 1, "shuffled": 2}
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """The kernels compiled for the host, once per process."""
+    folder = tempfile.TemporaryDirectory()
+    includes = [f"-I{path}" for path in (FOLDER, nvrtc.KERNELS, nvrtc.NATIVE)]
+    target = os.path.join(folder.name, "kernels.so")
+    subprocess.run(["g++", *FLAGS, *WARNINGS, *includes, *map(str, FOLDER.glob("*.cpp")), "-o", target], check=True)
+    kernels = ctypes.CDLL(target)
+    kernels.folder = folder
+    kernels.shim_error.restype = ctypes.c_char_p
+    return kernels
+
+
+class Now:
+    """Numbers that are there, though the caller is told so only when the test says."""
+
+    def __init__(self, machine: "HostMachine", ends: Tensor):
+        self.machine, self.ends = machine, ends.clone()
+
+    def ready(self) -> bool:
+        return self.machine.arrived
+
+    def values(self) -> list[int]:
+        self.machine.waits += 1
+        return [end - begin for begin, end in pairwise([0, *self.ends.tolist()])]
+
+
+class HostMachine:
+    """Like `cuda_driver.Gpu`, for tensors on the CPU.
+
+    Args:
+        order: in which the threads of a block run between two barriers: "forward", "backward" or "shuffled".
+        most_entries: more than that, in lists or in rows, are answered as if memory were short.
+        arrived: whether numbers that are read later are said to be there.
+    """
+
+    def __init__(self, order: str = "forward", most_entries: int = NOWHERE, arrived: bool = True):
+        self.order, self.most_entries, self.arrived, self.waits = ORDERS[order], most_entries, arrived, 0
+        self.launched: list[str] = []
+
+    def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments) -> None:
+        self.launched.append(name)
+        if name in ("list_tiles", "blend_backward", "blend_backward_absolute") and max(map(_length, arguments)) > self.most_entries:
+            raise torch.cuda.OutOfMemoryError("no memory, says the test")
+        values = [ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else x for x in arguments]
+        pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(x) for x in values))
+        if library().shim_launch(name.encode(), *grid, threads, self.order, pointers):
+            raise AssertionError(f"{name}: {library().shim_error().decode()}")
+
+    def read_later(self, ends: Tensor) -> Now:
+        return Now(self, ends)
+
+
+def _length(argument) -> int:
+    """How many entries, or rows of entries, it has room for."""
+    entries = isinstance(argument, Tensor) and (argument.dim() == 1 or argument.dim() == 2 and argument.shape[1] == 12)
+    return len(argument) if entries else 0

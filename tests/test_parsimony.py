@@ -1,0 +1,150 @@
+"""Gradual pruning: exact counts, the top Gaussian of a pixel stays, ``auto`` stops where the quality would suffer."""
+
+import pytest
+import torch
+
+from threestudio_gaussiandreamer import parsimony
+from threestudio_gaussiandreamer.cameras import orbit_c2w, to_opencv
+from threestudio_gaussiandreamer.densify import Rules, Statistics, densify_and_prune
+from threestudio_gaussiandreamer.geometry import GaussianCloud
+from threestudio_gaussiandreamer.splatting import rasterize
+from threestudio_gaussiandreamer.streams import generator
+
+
+def cloud(n, **options):
+    geometry = GaussianCloud({"min_gaussians": 1, **options})
+    rng = torch.Generator().manual_seed(0)
+    geometry.set_arrays(
+        means=torch.rand(n, 3, generator=rng) - 0.5,
+        log_scales=torch.full((n, 3), -3.0),
+        quats=torch.randn(n, 4, generator=rng),
+        logit_opacities=torch.randn(n, generator=rng),
+        sh=torch.rand(n, 1, 3, generator=rng),
+    )
+    geometry.contribution += torch.rand(n, generator=rng)
+    return geometry
+
+
+def optimizer(geometry):
+    return torch.optim.Adam(geometry.parameter_groups())
+
+
+def rounds(geometry, steps, holds=None):
+    """The counts after each step of a schedule with a round at every one."""
+    adam, counts = optimizer(geometry), []
+    for step in range(steps):
+        geometry.after_step(adam, step, holds)
+        counts.append(len(geometry))
+        geometry.contribution += torch.rand(len(geometry))
+    return counts
+
+
+EVERY_STEP = {"start": 0, "stop": 100, "every": 1}
+
+
+def test_the_budget_is_reached_round_by_round_and_then_holds():
+    assert rounds(cloud(100, budget=50, prune=EVERY_STEP), 6) == [80, 64, 51, 50, 50, 50]
+
+
+def test_without_a_budget_nothing_goes():
+    assert rounds(cloud(100, prune=EVERY_STEP), 3) == [100, 100, 100]
+
+
+def test_a_budget_above_the_count_changes_nothing():
+    geometry = cloud(10, budget=50, prune=EVERY_STEP)
+    before = geometry.means.detach().clone()
+    assert rounds(geometry, 3) == [10, 10, 10] and torch.equal(geometry.means, before)
+
+
+def test_the_least_contributing_go_first():
+    geometry = cloud(100, budget=80, prune=EVERY_STEP)
+    best = geometry.contribution.topk(80).indices.sort().values
+    expected = geometry.means.detach()[best]
+    geometry.after_step(optimizer(geometry), 0)
+    assert torch.equal(geometry.means, expected)
+
+
+@pytest.mark.parametrize("name", parsimony.SCORES)
+def test_each_score_ranks_by_what_it_says(name):
+    logits, contribution = torch.tensor([3.0, 1.0, 2.0]), torch.tensor([0.1, 0.2, 0.3])
+    order = parsimony.score(name, logits, contribution, generator(0, "s")).argsort().tolist()
+    expected = {"opacity": [1, 2, 0], "contribution": [0, 1, 2]}
+    assert order == expected.get(name, order)
+    assert name != "random" or torch.equal(
+        parsimony.score(name, logits, contribution, generator(0, "s")), parsimony.score(name, logits, contribution, generator(0, "s"))
+    )
+
+
+def test_growth_stays_within_what_the_budget_leaves():
+    hot = {"enabled": True, "start": 0, "stop": 100, "every": 1, "grad_threshold": 0.0, "min_opacity": 0.0}
+    geometry = cloud(100, budget=50, prune=EVERY_STEP, densify=hot)
+    assert rounds(geometry, 6) == [80, 64, 51, 50, 50, 50]
+
+
+def test_a_budget_gives_room_to_grow_up_to_it():
+    hot = {"enabled": True, "start": 0, "stop": 100, "every": 1, "grad_threshold": 0.0, "min_opacity": 0.0}
+    assert max(rounds(cloud(40, budget=50, prune=EVERY_STEP | {"start": 99}, densify=hot), 3)) == 50
+
+
+def test_pruning_after_densifying_keeps_track_of_rows():
+    geometry = cloud(10)
+    params = geometry.parameters_by_name()
+    first = densify_and_prune(params, Statistics(torch.ones(10), geometry.contribution), Rules(min_opacity=0.0), generator(0, "s"))
+    both = parsimony.pruned(first.values, geometry.contribution[first.parents], 7, first)
+    assert len(both.parents) == len(both.fresh) == 7
+    untouched = ~both.fresh
+    assert torch.equal(both.values["sh0"][untouched], params["sh0"][both.parents[untouched]])
+    assert (both.parents[both.fresh] < 10).all()
+
+
+@pytest.mark.parametrize("needed", [1, 79, 80, 81, 90, 99, 100])
+def test_auto_finds_the_smallest_count_that_holds(needed):
+    contribution = torch.linspace(0.0, 0.4, 100)
+    asked = []
+
+    def holds(kept):
+        asked.append(int(kept.sum()))
+        assert kept[-asked[-1] :].all()  # the best ones
+        return asked[-1] >= needed
+
+    count = parsimony.smallest_count(contribution, contribution, 0.8, holds)
+    assert max(needed, 80) <= count <= max(needed, 80) + 20 / 2**parsimony.PROBES + 1
+    assert len(asked) <= parsimony.PROBES + 1
+
+
+def test_auto_never_drops_the_top_gaussian_of_a_pixel():
+    contribution = torch.cat([torch.full((95,), 0.6), torch.full((5,), 0.1)])
+    assert parsimony.smallest_count(contribution, contribution, 0.5, lambda kept: True) == 95
+
+
+def test_a_weight_above_one_half_is_the_largest_of_its_pixel():
+    geometry = cloud(60)
+    viewmats, Ks = to_opencv(orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])), torch.tensor([0.8]), 24, 24)
+    inputs = geometry.means, geometry.quats, geometry.scales(), geometry.opacities()
+    # a colour of its own for each Gaussian shows every weight of every pixel
+    weights = rasterize(*inputs, torch.eye(60), viewmats, Ks, 24, 24, backend="torch")
+    top = torch.zeros(60, dtype=torch.bool)
+    top[weights.image.argmax(-1).unique()] = True
+    above = weights.contribution[0] > parsimony.TOP_OF_A_PIXEL
+    assert above.any() and (top | ~above).all()
+
+
+def test_auto_in_the_loop_ends_where_the_quality_ends():
+    geometry = cloud(100, budget="auto", prune=EVERY_STEP | {"keep": 0.5})
+    geometry.contribution *= 0.1
+    counts = rounds(geometry, 1, lambda kept: int(kept.sum()) >= 70)
+    assert 70 <= counts[0] <= 74
+
+
+def test_hidden_gaussians_are_as_if_they_were_not_there_and_come_back():
+    geometry = cloud(50)
+    viewmats, Ks = to_opencv(orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])), torch.tensor([0.8]), 24, 24)
+
+    def image(rows=slice(None)):
+        inputs = (geometry.means, geometry.quats, geometry.scales(), geometry.opacities(), geometry.colors(torch.zeros(1, 3)))
+        return rasterize(*(value[rows].detach() for value in inputs), viewmats, Ks, 24, 24).image
+
+    kept, before = torch.arange(50) % 2 == 0, image()
+    with geometry.only(kept):
+        assert torch.equal(image(), image(kept))
+    assert torch.equal(image(), before)

@@ -1,0 +1,104 @@
+"""The mesh of a cloud: closed, outwards, where the Gaussians are, with their colours; and as a run exports it."""
+
+import numpy as np
+import pytest
+
+from threestudio_gaussiandreamer.ply import GaussianArrays
+from threestudio_gaussiandreamer.surface import gaussian_surface, surface_nets, write_obj
+
+trimesh = pytest.importorskip("trimesh")
+CENTER = np.array([0.3, 0.0, -0.2])
+
+
+def ball(count=4000, radius=0.5, scale=0.02, opacity=4.0, hollow=True):
+    """Gaussians on, or in, a sphere, coloured by their place."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(count, 3))
+    points *= radius * (1 if hollow else rng.random((count, 1)) ** (1 / 3)) / np.linalg.norm(points, axis=1, keepdims=True)
+    return GaussianArrays(
+        means=np.float32(points + CENTER),
+        sh=np.float32((points.clip(-0.5, 0.5)) / 0.28209479)[:, None],
+        logit_opacities=np.full(count, opacity, np.float32),
+        log_scales=np.full((count, 3), np.log(scale), np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+    )
+
+
+def as_mesh(surface):
+    return trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+
+
+def distances(surface):
+    return np.linalg.norm(surface.vertices - CENTER, axis=1)
+
+
+def test_surface_nets_of_a_sphere():
+    """Linear interpolation of a distance is exact to second order in the cell."""
+    axes = np.meshgrid(*[np.linspace(-1, 1, 33)] * 3, indexing="ij")
+    vertices, faces = surface_nets(0.7 - np.sqrt(sum(axis**2 for axis in axes)), 0.0)
+    mesh = trimesh.Trimesh(vertices / 16 - 1, faces, process=False)
+    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.euler_number == 2
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * 0.7**3, rel=0.02)
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 0.7, atol=0.01)
+
+
+@pytest.mark.parametrize("resolution", [32, 64])
+def test_a_solid_ball_is_one_closed_surface(resolution):
+    surface = gaussian_surface(ball(count=8000, scale=0.04, hollow=False), resolution=resolution)
+    mesh = as_mesh(surface)
+    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
+    # half of the density at the middle is at the ball's own radius, blurred by the Gaussians' size
+    assert distances(surface).mean() == pytest.approx(0.5, abs=0.03)
+
+
+@pytest.mark.parametrize(("count", "scale"), [(4000, 0.02), (16000, 0.02), (16000, 0.002)])
+def test_a_shell_lies_where_its_gaussians_are_however_many_overlap(count, scale):
+    """Of 1.2 standard deviations to each side, of the Gaussians and of a cell; unevenly spread points add a little."""
+    surface = gaussian_surface(ball(count, scale=scale), resolution=64)
+    spread = np.hypot(scale, 1 / 64)
+    away = np.abs(distances(surface) - 0.5)
+    assert 0.5 * spread < np.median(away) < 1.5 * spread and away.max() < 3 * spread
+    np.testing.assert_allclose(surface.colors, (surface.vertices - CENTER + 0.5).clip(0, 1), atol=0.08)
+
+
+def test_what_is_faint_is_no_surface():
+    arrays = ball()
+    far = arrays._replace(means=arrays.means + 5, logit_opacities=arrays.logit_opacities - 10)
+    both = GaussianArrays(*(np.concatenate(pair) for pair in zip(arrays, far, strict=True)))
+    np.testing.assert_array_equal(gaussian_surface(both, resolution=24).vertices, gaussian_surface(arrays, resolution=24).vertices)
+    assert len(gaussian_surface(far).faces) == 0
+
+
+def test_size_and_place_do_not_matter():
+    arrays = ball(count=500)
+    moved = arrays._replace(means=8 * arrays.means + 16, log_scales=arrays.log_scales + np.float32(np.log(8)))
+    first, second = gaussian_surface(arrays, resolution=24), gaussian_surface(moved, resolution=24)
+    # float32 means
+    np.testing.assert_allclose(8 * first.vertices + 16, second.vertices, atol=1e-3)
+
+
+def test_turned_and_flat_gaussians_lie_along_their_axes():
+    """One disc in the plane x = z, by a quarter turn of 45 degrees about y."""
+    half = np.deg2rad(45 / 2)
+    disc = GaussianArrays(
+        means=np.zeros((1, 3), np.float32),
+        sh=np.zeros((1, 1, 3), np.float32),
+        logit_opacities=np.float32([4.0]),
+        log_scales=np.log(np.float32([[0.5, 0.5, 0.02]])),
+        quats=np.float32([[np.cos(half), 0, -np.sin(half), 0]]),
+    )
+    vertices = gaussian_surface(disc, resolution=96).vertices
+    # as far as exp(-1/2 (r / s)^2) is a half, with s that of the disc and a cell
+    reach = np.sqrt(2 * np.log(2)) * np.hypot([0.5, 0.02], 1 / 96)
+    assert np.abs(vertices[:, 1]).max() == pytest.approx(reach[0], abs=0.02)
+    assert np.abs(vertices @ [np.sqrt(0.5), 0, np.sqrt(0.5)]).max() == pytest.approx(reach[0], abs=0.02)
+    assert np.abs(vertices @ [np.sqrt(0.5), 0, -np.sqrt(0.5)]).max() == pytest.approx(reach[1], abs=0.01)
+
+
+def test_other_programs_read_the_file(tmp_path):
+    surface = gaussian_surface(ball(count=500), resolution=16)
+    write_obj(tmp_path / "model.obj", surface)
+    mesh = trimesh.load(tmp_path / "model.obj", process=False)
+    assert isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) == len(surface.faces)
+    np.testing.assert_allclose(mesh.vertices, surface.vertices, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3] / 255, surface.colors, atol=1 / 255)

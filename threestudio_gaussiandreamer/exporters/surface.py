@@ -1,0 +1,53 @@
+"""``surface-exporter``: the cloud's surface as a mesh with coloured vertices, an OBJ.
+
+===========  ==================================================================================
+option       meaning
+===========  ==================================================================================
+save_name    name of the file in the export folder; T3Bench looks for ``model.obj``
+resolution   cells along the longest side of the object
+level        share of the summed opacity's median at the centres at which the surface is; lower is thicker
+save_video   also render the turntable
+===========  ==================================================================================
+
+The colours are those of the constant harmonic. A mesh loses what Gaussians show of hair, smoke and glass.
+"""
+
+from dataclasses import dataclass
+from typing import List
+
+from ..errors import UserError
+from ..host import BaseGeometry, Exporter, ExporterOutput, register, warn
+from ..surface import gaussian_surface
+from .base import gaussian_arrays, require_file_name
+
+
+@register("surface-exporter")
+class SurfaceExporter(Exporter):
+    """One file of save_type "surface"; its params are ``{"surface": Surface}``."""
+
+    @dataclass
+    class Config(Exporter.Config):
+        save_name: str = "model.obj"
+        resolution: int = 128
+        level: float = 0.5
+
+        @staticmethod
+        def check(cfg: "SurfaceExporter.Config") -> None:
+            """Raises UserError for a value out of range."""
+            require_file_name(cfg.save_name)
+            if not 8 <= cfg.resolution <= 512:
+                raise UserError(f"resolution: expected 8 to 512 cells, got {cfg.resolution}")
+            if not 0 < cfg.level <= 1:
+                raise UserError(f"level: expected a share in (0, 1], got {cfg.level}")
+
+    cfg: Config
+
+    def configure(self, geometry: BaseGeometry, *args: object, **kwargs: object) -> None:
+        self.Config.check(self.cfg)  # threestudio's own host doesn't
+        super().configure(geometry, *args, **kwargs)
+
+    def __call__(self) -> List[ExporterOutput]:
+        surface = gaussian_surface(gaussian_arrays(self.geometry), resolution=self.cfg.resolution, level=self.cfg.level)
+        if not len(surface.faces):
+            warn("no Gaussian is opaque enough to be seen: the exported surface is empty")
+        return [ExporterOutput(save_name=self.cfg.save_name, save_type="surface", params={"surface": surface})]

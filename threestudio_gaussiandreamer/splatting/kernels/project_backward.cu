@@ -1,0 +1,119 @@
+// The adjoints of stages 5 to 1: each splat adds up the rows of its entries, each Gaussian takes its splats' gradients through
+// the projection, view after view. Every sum has a fixed order.
+#include "launch.h"
+
+namespace splat {
+
+constexpr int THREADS = 128, CAMERA_SUMS = 12;  // d loss / d viewmat but for its last row
+
+// What a backward pass fills.
+struct Gradients {
+  float *means, *quats, *scales, *opacities, *colors;  // as in Scene
+  float* means2d;   // (B, N, 2)
+  float* absgrad;   // (B, N, 2) or null: sum over pixels of the absolute value
+  float* viewmats;  // (blocks, B, 12) or null: each block's part
+};
+
+// One Gaussian's part in d loss / d viewmat but for its last row.
+SPLAT_FN void viewmat_part(const Gaussian<float>& g, const Mat3<float>& axes, const ViewGradient<float>& d, float* part) {
+  const Mat3<float> rotation = view_rotation_vjp(g.mean, axes, d);
+  store3(part, rotation.x), part[3] = d.t.x;
+  store3(part + 4, rotation.y), part[7] = d.t.y;
+  store3(part + 8, rotation.z), part[11] = d.t.z;
+}
+
+// The block's sum of each column, in the order of the warps; called by all threads.
+SPLAT_FN void sum_block(const float* columns, float* out) {
+  __shared__ float parts[THREADS / WARP][CAMERA_SUMS];
+  for (int column = 0; column < CAMERA_SUMS; column++) {
+    float sum = columns[column];
+    for (int step = WARP / 2; step > 0; step /= 2) sum += __shfl_xor_sync(FULL, sum, step);
+    if (threadIdx.x % WARP == 0) parts[threadIdx.x / WARP][column] = sum;
+  }
+  __syncthreads();
+  if (threadIdx.x < CAMERA_SUMS) {
+    const int column = threadIdx.x;
+    out[column] = (parts[0][column] + parts[1][column]) + (parts[2][column] + parts[3][column]);
+  }
+  __syncthreads();
+}
+
+// Through rotation and scale; nothing flows to a Gaussian that no view draws, finite or not.
+SPLAT_FN void store_world(const Gradients& out, Index i, const Gaussian<float>& g, const Rotation<float>& rotation,
+                          const WorldGradient<float>& d, bool drawn) {
+  Mat3<float> d_rotation;
+  Vec3<float> d_scale = {};
+  Vec4<float> d_quat = {};
+  if (drawn) {
+    world_axes_vjp(rotation.matrix, g.scale, d.axes, d_rotation, d_scale);
+    d_quat = quat_to_rotation_vjp(rotation, d_rotation);
+  }
+  store3(out.means + 3 * i, d.mean), store3(out.scales + 3 * i, d_scale);
+  out.quats[4 * i] = d_quat.w, store3(out.quats + 4 * i + 1, {d_quat.x, d_quat.y, d_quat.z});
+  out.opacities[i] = d.opacity;
+}
+
+SPLAT_FN void store_screen(const Gradients& out, Index at, const Vec2<float>& mean2d, const Vec2<float>& absolute) {
+  out.means2d[2 * at] = mean2d.x, out.means2d[2 * at + 1] = mean2d.y;
+  if (out.absgrad) out.absgrad[2 * at] = absolute.x, out.absgrad[2 * at + 1] = absolute.y;
+}
+
+}  // namespace splat
+
+// Rows of the entries to sums (B, N) of rows; those of invisible Gaussians stay as they are. One warp per rank: 8 rows at a
+// time, a quad per lane, so that a Gaussian that covers the screen takes no thread thousands of steps.
+extern "C" __global__ void __launch_bounds__(128, 8)
+sum_rows(splat::Scene scene, const int* depth_keys, const splat::Index* order, const int* counts, const splat::Index* ends,
+         const splat::Row* rows, splat::Row* sums) {
+  using namespace splat;
+  constexpr int LANES_PER_ROW = 4, ROWS = WARP / LANES_PER_ROW;
+  const int lane = threadIdx.x % WARP, quad = lane % LANES_PER_ROW;
+  const Index rank = (Index(blockIdx.x) * blockDim.x + threadIdx.x) / WARP, at = Index(blockIdx.y) * scene.gaussians + rank;
+  if (rank >= scene.gaussians) return;
+  const Index index = at - rank + order[at], end = ends[at];
+  if (depth_keys[index] == CULLED) return;
+  Quad sum = {};
+  if (quad < ROW_QUADS)
+    for (Index i = end - counts[at] + lane / LANES_PER_ROW; i < end; i += ROWS)
+      sum = sum + reinterpret_cast<const Quad*>(rows + i)[quad];
+  for (int step = LANES_PER_ROW; step < WARP; step *= 2) {
+    const float x = __shfl_xor_sync(FULL, sum.x, step), y = __shfl_xor_sync(FULL, sum.y, step);
+    const float z = __shfl_xor_sync(FULL, sum.z, step), w = __shfl_xor_sync(FULL, sum.w, step);
+    sum = sum + Quad{x, y, z, w};
+  }
+  if (lane < ROW_QUADS) reinterpret_cast<Quad*>(sums + index)[quad] = sum;
+}
+
+extern "C" __global__ void __launch_bounds__(128, 3)
+project_backward(splat::Scene scene, splat::Settings settings, const int* depth_keys, const splat::Row* sums,
+                 splat::Gradients out) {
+  using namespace splat;
+  const int i = blockIdx.x * THREADS + threadIdx.x;
+  const bool exists = i < scene.gaussians;
+  const Gaussian<float> g = exists ? load_gaussian(scene, i) : Gaussian<float>{};
+  const Rotation<float> rotation = quat_to_rotation(g.quat);
+  const Mat3<float> axes = world_axes(rotation.matrix, g.scale);
+  WorldGradient<float> world = {};
+  bool drawn_anywhere = false;
+  for (int view = 0; view < scene.views; view++) {
+    const Camera camera = make_camera(scene, view);
+    const Index at = Index(view) * scene.gaussians + i;
+    const bool drawn = exists && depth_keys[at] != CULLED;
+    ViewGradient<float> d = {};
+    Vec2<float> absolute = {};
+    float viewmat[CAMERA_SUMS] = {};
+    if (drawn) {
+      const Row& row = sums[at];
+      d = project_vjp(camera, splat::project(camera, g.mean, axes, settings.eps2d), g.opacity, settings.antialias, row.sums);
+      absolute = {UNSCALE * UNSCALE * row.sums[ABS_X], UNSCALE * UNSCALE * row.sums[ABS_Y]};
+      add_view(world, camera, d);
+      viewmat_part(g, axes, d, viewmat);
+    }
+    drawn_anywhere |= drawn;
+    if (exists) store_screen(out, at, d.mean2d, absolute);
+    if (exists && scene.colors_per_view) store3(out.colors + 3 * at, d.color);
+    if (out.viewmats) sum_block(viewmat, out.viewmats + (Index(blockIdx.x) * scene.views + view) * CAMERA_SUMS);
+  }
+  if (exists) store_world(out, i, g, rotation, world, drawn_anywhere);
+  if (exists && !scene.colors_per_view) store3(out.colors + 3 * Index(i), world.color);
+}
