@@ -4,12 +4,15 @@ A torus shell with a sphere in its hole, seen once, at several sizes; forward, a
 attributes from image, depth and alpha). Every cell is a process of its own, so that its memory can be read; contenders take
 turns, so that all meet the same load. Prints a table and writes ``benchmarks/results/splatting.csv``.
 
-Contenders: ``cpu`` (the best build for this processor), ``cpu-v3`` and ``cpu-base`` (builds for older ones), ``torch``, and
-``prototype``, the AVX-512 program that shows what a CPU can reach (where $GAUSSIANDREAMER_SHARED or ``../shared`` has it).
+Contenders: ``cpu`` (the best build for this processor), ``cpu-v3`` and ``cpu-base`` (builds for older ones), ``torch``,
+``gsplat`` (its plain-torch twins, see gsplat_reference.py), and ``prototype``, the AVX-512 program that shows what a CPU can
+reach (where $GAUSSIANDREAMER_SHARED or ``../shared`` has it). gsplat's twins keep every pair of Gaussian and pixel
+(3 GB at 100,000 and 512^2), so that pictures larger than --gsplat-size are left to the others.
 """
 
 import argparse
 import csv
+import importlib.util
 import json
 import math
 import os
@@ -30,7 +33,7 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 SHARED = pathlib.Path(os.environ.get("GAUSSIANDREAMER_SHARED", ROOT.parent / "shared"))
 PROTOTYPE = SHARED / "prototype"
 PROTOTYPE_FLAGS = "-DTS=32 -DCH=512 -DDEG=4 -DPF=48"
-CONTENDERS = ("cpu", "cpu-v3", "cpu-base", "torch", "prototype")
+CONTENDERS = ("cpu", "cpu-v3", "cpu-base", "torch", "gsplat", "prototype")
 COLUMNS = ("gaussians", "size", "threads", "contender", "forward_ms", "both_ms", "memory_mb", "load")
 
 
@@ -101,6 +104,10 @@ def contender(name: str, size: int, preset: str, threads: int) -> Callable[[Scen
     viewmat, K = make_camera(size)
     if name == "prototype":
         return _prototype(viewmat, K, size, threads)
+    if name == "gsplat":
+        from gsplat_reference import drawer
+
+        return drawer(viewmat, K, size)
     if name.startswith("cpu-"):
         os.environ["GAUSSIANDREAMER_ISA"] = name.removeprefix("cpu-")
     sys.path.insert(0, str(ROOT))
@@ -179,10 +186,11 @@ def run_in_process(name: str, gaussians: int, size: int, threads: int, args: arg
 
 def run_row(gaussians: int, size: int, threads: int, args: argparse.Namespace) -> list[dict]:
     """All contenders, in turns; of each the faster turn."""
-    turns = [{name: run_in_process(name, gaussians, size, threads, args) for name in args.contenders} for _ in range(args.turns)]
+    names = [name for name in args.contenders if name != "gsplat" or size <= args.gsplat_size]
+    turns = [{name: run_in_process(name, gaussians, size, threads, args) for name in names} for _ in range(args.turns)]
     where = {"gaussians": gaussians, "size": size, "threads": threads}
-    best = {name: min((turn[name] for turn in turns), key=lambda cell: cell["both_ms"]) for name in args.contenders}
-    return [where | {"contender": name, "load": round(os.getloadavg()[0], 1)} | best[name] for name in args.contenders]
+    best = {name: min((turn[name] for turn in turns), key=lambda cell: cell["both_ms"]) for name in names}
+    return [where | {"contender": name, "load": round(os.getloadavg()[0], 1)} | best[name] for name in names]
 
 
 def print_row(rows: list[dict]) -> None:
@@ -218,6 +226,8 @@ def available(names: list[str]) -> list[str]:
     }
     if "prototype" in names and not ((PROTOTYPE / "proto.cpp").exists() and "v4" in builds):
         missing["prototype"] = f"needs AVX-512 and {PROTOTYPE}"
+    if "gsplat" in names and importlib.util.find_spec("gsplat") is None:
+        missing["gsplat"] = "pip install gsplat"
     if not builds:
         missing["cpu"] = cpu.unavailable()
     for name, reason in missing.items():
@@ -244,6 +254,7 @@ def parse(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--threads", type=numbers, default=[1, torch.get_num_threads()])
     parser.add_argument("--contenders", type=words, default=list(CONTENDERS), help="the first one is the unit of the ratios")
     parser.add_argument("--preset", default="fast", help="fast is what the prototype and every peer do")
+    parser.add_argument("--gsplat-size", type=int, default=512, help="the largest picture that gsplat's twins draw")
     parser.add_argument("--turns", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=2.0, help="per cell and turn, at least three steps")
     parser.add_argument("--cell", nargs=4, help=argparse.SUPPRESS)
@@ -262,8 +273,9 @@ def main(argv: list[str]) -> None:
     for gaussians in args.gaussians:
         for size in args.sizes:
             for threads in dict.fromkeys(args.threads):
-                rows += run_row(gaussians, size, threads, args)
-                print_row(rows[-len(args.contenders) :])
+                row = run_row(gaussians, size, threads, args)
+                print_row(row)
+                rows += row
     write_csv(rows, machine)
 
 

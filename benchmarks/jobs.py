@@ -47,7 +47,6 @@ def steps(count: int) -> dict[str, Any]:
         | rates
         | {
             "trainer.max_steps": count,
-            "system.evaluation.every": max(1, count // 12),
             "system.guidance.max_step_percent": schedule,
         }
     )
@@ -97,7 +96,8 @@ def size_jobs() -> Iterator[Job]:
 def batch_jobs() -> Iterator[Job]:
     """The same number of rendered views, in fewer or more steps."""
     for batch in (1, 2, 4, 8):
-        yield Job("batch", "equal views", batch, {"data.batch_size": batch} | steps(STEPS * 4 // batch))
+        count = STEPS * 4 // batch
+        yield Job("batch", "equal views", batch, {"data.batch_size": batch, "system.evaluation.every": count // 12} | steps(count))
 
 
 def iteration_jobs() -> Iterator[Job]:
@@ -114,7 +114,7 @@ def preset_jobs() -> Iterator[Job]:
 
 def failure_jobs() -> Iterator[Job]:
     """How the method fails, and what each remedy buys: 96^2 and 600 steps, so that 15 runs of each are affordable."""
-    small = {"data.width": 96, "data.height": 96} | steps(600) | {"system.evaluation.every": 0}
+    small = {"data.width": 96, "data.height": 96} | steps(600)
     plain_timesteps = LATENT | STRONG | NO_ANNEALING
     variants = {
         "multi-face: random start": VIEW_BLIND | RANDOM_START,

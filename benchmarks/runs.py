@@ -28,6 +28,7 @@ from tqdm import tqdm
 ROOT = Path(__file__).resolve().parent.parent
 CHARTS = ROOT / "docs/charts"
 SIZE, EVERY = 128, 100
+WITH_CURVES = ("time", "batch", "preset")
 COLUMNS = "variant,x,object,seed,step,seconds,gaussians,psnr,ssim,multi_face,floater_mass,machine,commit".split(",")
 
 
@@ -45,7 +46,7 @@ def main() -> None:
         print("\n".join(f"{job.chart}: {job.variant}, {job.x:g}, {object_name(mesh)}, seed {seed}" for job, mesh, seed in todo))
         return
     with ThreadPoolExecutor(arguments.jobs) as pool:
-        running = {pool.submit(run, mesh, seed, job.options): (job, mesh, seed) for job, mesh, seed in todo}
+        running = {pool.submit(run, mesh, seed, curve(job) | job.options): (job, mesh, seed) for job, mesh, seed in todo}
         for done in tqdm(as_completed(running), total=len(todo), unit="run", disable=None):
             append(*running[done], done.result())
 
@@ -64,7 +65,7 @@ def run(mesh: str, seed: int, options: dict[str, Any]) -> dict[str, Any]:
     """One training run in a process of its own; its metrics."""
     common = {
         "use_timestamp": "false", "tag": "run", "seed": seed, "data.width": SIZE, "data.height": SIZE,
-        "system.evaluation.size": SIZE, "system.evaluation.every": EVERY, "system.guidance.mesh": mesh,
+        "system.evaluation.size": SIZE, "system.guidance.mesh": mesh,
         "system.guidance.bank_seed": seed, "data.n_test_views": 1, "data.eval_width": 64, "data.eval_height": 64,
         "trainer.max_steps": STEPS, "trainer.val_check_interval": 100000, "trainer.enable_progress_bar": "false",
     }  # fmt: skip
@@ -76,6 +77,11 @@ def run(mesh: str, seed: int, options: dict[str, Any]) -> dict[str, Any]:
         if finished.returncode:
             raise RuntimeError(f"a run failed ({finished.returncode}): {' '.join(overrides)}\n{finished.stderr[-3000:]}")
         return json.loads((Path(folder) / "demo/run/save/metrics.json").read_text())
+
+
+def curve(job: Job) -> dict[str, Any]:
+    """How often a run is scored on its way, where its chart shows it."""
+    return {"system.evaluation.every": EVERY if job.chart in WITH_CURVES else 0}
 
 
 def object_name(mesh: str) -> str:

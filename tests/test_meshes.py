@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.meshes import Mesh, face_areas, find_mesh, load_mesh, sample_surface, surface_colors, surface_distances
+from threestudio_gaussiandreamer.meshes import Mesh, SurfaceDistance, face_areas, find_mesh, load_mesh, sample_surface, surface_colors
 
 trimesh = pytest.importorskip("trimesh")
 THIRDS = np.full((1, 3), 1 / 3)
@@ -211,7 +211,7 @@ def test_surface_distances_of_a_sphere(tmp_path):
     mesh = load_mesh(saved(trimesh.creation.icosphere(4), tmp_path / "a.ply"))
     points = np.array([[1.5, 0, 0], [0, 0, 0], [0, 1.0, 0]])
     # spacing of 2e5 samples on a sphere is 0.008; the icosphere's faces lie up to 0.002 inside
-    np.testing.assert_allclose(surface_distances(mesh, points), [0.5, 1.0, 0.0], atol=0.012)
+    np.testing.assert_allclose(SurfaceDistance(mesh)(points), [0.5, 1.0, 0.0], atol=0.012)
 
 
 # Bad input

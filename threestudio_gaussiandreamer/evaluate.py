@@ -20,7 +20,7 @@ from torch import Tensor
 from .cameras import Orbit, held_out_orbit
 from .data import make_batch
 from .errors import UserError
-from .meshes import surface_distances
+from .meshes import SurfaceDistance
 from .metrics import floater_mass, multi_face_rate, psnr, ssim
 from .raycast import over_background
 
@@ -61,6 +61,10 @@ class HeldOut:
     def truth(self) -> Float[Tensor, "V H W 4"]:
         """Premultiplied colour and coverage of the held-out views."""
         return self._cast(self.orbit, self.cfg.size, self.cfg.supersample)
+
+    @cached_property
+    def surface_distance(self) -> SurfaceDistance:
+        return SurfaceDistance(self.caster.mesh)
 
     @cached_property
     def rings(self) -> list[tuple[Tensor, Tensor, Tensor]]:
@@ -108,9 +112,8 @@ class HeldOut:
 
     def floaters(self, means: Float[Tensor, "N 3"], opacities: Float[Tensor, " N"]) -> float:
         """The opacity-weighted share of Gaussians farther from the surface than 2 % of the longest side of its box."""
-        mesh = self.caster.mesh
-        distances = torch.from_numpy(surface_distances(mesh, means.double().cpu().numpy()))
-        return floater_mass(distances, opacities.double().cpu(), extent=float(np.ptp(mesh.vertices, axis=0).max()))
+        distances = torch.from_numpy(self.surface_distance(means.double().cpu().numpy()))
+        return floater_mass(distances, opacities.double().cpu(), extent=float(np.ptp(self.caster.mesh.vertices, axis=0).max()))
 
 
 class Measurements:

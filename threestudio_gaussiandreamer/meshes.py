@@ -98,15 +98,20 @@ def sample_surface(mesh: Mesh, count: int, generator: np.random.Generator) -> tu
     return points, face_index, barycentric
 
 
-def surface_distances(mesh: Mesh, points: Float[np.ndarray, "N 3"], *, samples: int = 200_000) -> Float[np.ndarray, " N"]:
-    """Distance of each point from the surface, world units, by the nearest of ``samples`` points on it.
+class SurfaceDistance:
+    """Distances from a surface, by the nearest of ``samples`` points on it.
 
     Too large by about the spacing of the samples, sqrt(area / samples): some 0.5 % of the box.
     """
-    from scipy.spatial import cKDTree
 
-    surface, _, _ = sample_surface(mesh, samples, np.random.default_rng(0))
-    return cKDTree(surface).query(points)[0]
+    def __init__(self, mesh: Mesh, *, samples: int = 200_000) -> None:
+        from scipy.spatial import cKDTree
+
+        self._tree = cKDTree(sample_surface(mesh, samples, np.random.default_rng(0))[0])
+
+    def __call__(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
+        """The distance of each point, world units."""
+        return self._tree.query(points)[0]
 
 
 def face_areas(mesh: Mesh) -> Float[np.ndarray, " F"]:
