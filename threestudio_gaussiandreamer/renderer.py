@@ -4,7 +4,7 @@
 option         meaning
 =============  ==============================================================================================================
 backend        ``auto`` (by where the cloud is and what is built), ``cpu``, ``cuda``, ``torch``, ``reference``
-preset         ``fast`` | ``balanced`` | ``accurate``: the smallest alpha that is drawn, 1/255, 1/1024, 1/4096
+preset         ``fast`` | ``balanced`` | ``accurate``: the smallest alpha that is drawn, 1/255, 1/1024, 1/65536
 antialias      keep the energy of Gaussians smaller than a pixel
 eps2d          screen-space dilation in square pixels
 downsample     1, or 2: return the 2x2 box of the rendered size (the paper renders 1024^2 and guides at 512^2)

@@ -15,7 +15,7 @@ from ..errors import UserError, unknown
 from .options import RasterizeOptions
 from .output import Rasterized
 
-PRESETS = {"fast": 1 / 255, "balanced": 1 / 1024, "accurate": 1 / 4096}
+PRESETS = {"fast": 1 / 255, "balanced": 1 / 1024, "accurate": 1 / 65536}
 log = logging.getLogger(__name__)
 
 
@@ -93,7 +93,7 @@ def rasterize(
         near, far: a Gaussian whose mean isn't strictly between these depths is dropped.
         eps2d: added to both variances on screen, square pixels.
         antialias: make up for that dilation in the opacity, so that a small Gaussian keeps its energy at any distance.
-        preset: smallest alpha that counts: fast 1/255, balanced 1/1024, accurate 1/4096.
+        preset: smallest alpha that counts: fast 1/255, balanced 1/1024, accurate 1/65536.
         alpha_min: that number itself, instead of a preset.
         alpha_max: largest alpha of one Gaussian in one pixel; no gradient above it.
         stop: a pixel is finished with the Gaussian that brings its transmittance below this.

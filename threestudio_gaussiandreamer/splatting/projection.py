@@ -133,9 +133,17 @@ def _invert_covariance(u0, u1, eps2d) -> tuple[Tensor, Tensor, Tensor]:
     before_xx, before_yy = (u0 * u0).sum(-1), (u1 * u1).sum(-1)
     xx, xy, yy = before_xx + eps2d, (u0 * u1).sum(-1), before_yy + eps2d
     area = torch.linalg.vector_norm(torch.linalg.cross(u0, u1 / yy.sqrt()[..., None]), dim=-1)
-    conditional_xx = area * area + eps2d * (1 + before_xx / yy)
-    conics = torch.stack([1 / conditional_xx, xy / yy, 1 / yy], -1)
-    return conics, torch.stack([xx, yy], -1), area / conditional_xx.sqrt()
+    dilation = eps2d * (1 + before_xx / yy)
+    conics = torch.stack([1 / (area * area + dilation), xy / yy, 1 / yy], -1)
+    return conics, torch.stack([xx, yy], -1), _compensation(area, dilation)
+
+
+def _compensation(area, dilation) -> Tensor:
+    """``area / sqrt(area^2 + dilation)``, in two forms whose gradients don't cancel: below and above ``area^2 = dilation``."""
+    small = area * area < dilation
+    ratio = area * torch.where(small, dilation, 1).rsqrt()
+    inverse_square = dilation / torch.where(small, 1, area) ** 2
+    return torch.where(small, ratio * (1 + ratio * ratio).rsqrt(), (1 + inverse_square).rsqrt())
 
 
 def _extents(variances, opacities, alpha_min) -> Tensor:

@@ -183,6 +183,7 @@ template <class F> struct Whitening {
   Vec3<F> v, n;  // u1 / sqrt(yy), u0 x v
   F area;        // |n|^2
   F compensation;
+  F rest;  // 1 - |v|^2 = eps / yy
 };
 
 // By Lagrange's identity det(U U') = |u0 x u1|^2, so det(cov) / yy = |n|^2 + eps (1 + |u0|^2 / yy): a sum of squares, which
@@ -193,27 +194,30 @@ template <class F> SPLAT_FN Whitening<F> whiten(const Vec3<F>& u0, const Vec3<F>
   const Vec3<F> v = c * u1, n = cross(u0, v);
   const F area = dot(n, n);
   const F a = 1.0f / square_root(area + eps * (1.0f + xx * c * c));
-  return {a, -a * (xy * c * c), c, xx + eps, xy, yy, v, n, area, square_root(area) * a};
+  return {a, -a * (xy * c * c), c, xx + eps, xy, yy, v, n, area, square_root(area) * a, eps * c * c};
 }
 
 // From M = sum of u y y' over the pixels, where u = d loss / d ln(alpha): d loss / d cov = P' M P / 2 and
-// d loss / d U = P' M P U.
+// d loss / d U = P' M P U. The first row of P U, a (u0 - (xy / yy) u1), cancels for a needle; by v x (u0 x v) =
+// |v|^2 u0 - (u0 v) v it is a (v x n + (1 - |v|^2) u0), which doesn't.
 template <class F>
-SPLAT_FN void whiten_vjp(const Whitening<F>& w, const Vec3<F>& u0, const Vec3<F>& u1, const F& m_xx, const F& m_xy, const F& m_yy,
-                         Vec3<F>& d_u0, Vec3<F>& d_u1) {
-  const Vec3<F> p0 = w.a * u0 + w.b * u1, p1 = w.c * u1;
+SPLAT_FN void whiten_vjp(const Whitening<F>& w, const Vec3<F>& u0, const F& m_xx, const F& m_xy, const F& m_yy, Vec3<F>& d_u0,
+                         Vec3<F>& d_u1) {
+  const Vec3<F> p0 = w.a * (cross(w.v, w.n) + w.rest * u0), &p1 = w.v;
   const Vec3<F> q0 = m_xx * p0 + m_xy * p1, q1 = m_xy * p0 + m_yy * p1;
   d_u0 = w.a * q0;
   d_u1 = w.b * q0 + w.c * q1;
 }
 
-// What the compensation adds. Its log has the derivative (U U')^-1 U - P' P U, so with the sum `total` of u the first term is
-// added here, and for the second one M goes into `whiten_vjp` less total on its diagonal.
+// What the compensation adds. Its log has the derivative ((U U')^-1 - (U U' + eps I)^-1) U = eps P' P (U U')^-1 U, which unlike
+// that difference doesn't cancel for a Gaussian of many pixels; `total` is the sum of u.
 template <class F>
 SPLAT_FN void compensation_vjp(const Whitening<F>& w, const Vec3<F>& u0, const F& total, Vec3<F>& d_u0, Vec3<F>& d_u1) {
-  const F zero = {}, scale = select(w.area > zero, total / w.area, zero);
-  d_u0 = d_u0 + scale * cross(w.v, w.n);
-  d_u1 = d_u1 + (scale * w.c) * cross(w.n, u0);
+  const F zero = {}, scale = select(w.area > zero, total * w.rest * w.yy / w.area, zero);
+  const Vec3<F> g0 = scale * cross(w.v, w.n), g1 = (scale * w.c) * cross(w.n, u0);
+  const Vec3<F> p0 = w.a * g0 + w.b * g1, p1 = w.c * g1;
+  d_u0 = d_u0 + w.a * p0;
+  d_u1 = d_u1 + w.b * p0 + w.c * p1;
 }
 
 // Half the sides of the box around alpha >= alpha_min, in pixels; `level` is log2(opacity / alpha_min).

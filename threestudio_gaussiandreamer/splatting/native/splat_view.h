@@ -132,9 +132,8 @@ SPLAT_FN void footprint_gradient(const Projection<F>& p, const F* sums, bool ant
   const Whitening<F>& w = p.whitening;
   const float unscale = UNSCALE * UNSCALE;
   const F xx = unscale * sums[U_Y1_Y1], xy = unscale * sums[U_Y1_Y2], yy = unscale * sums[U_Y2_Y2];
-  const F compensated = antialias ? sums[U] : F{};
-  whiten_vjp(w, p.screen.u0, p.screen.u1, xx - compensated, xy, yy - compensated, d_u0, d_u1);
-  if (antialias) compensation_vjp(w, p.screen.u0, compensated, d_u0, d_u1);
+  whiten_vjp(w, p.screen.u0, xx, xy, yy, d_u0, d_u1);
+  if (antialias) compensation_vjp(w, p.screen.u0, sums[U], d_u0, d_u1);
 }
 
 // From a splat's sums to the gradients of the Gaussian in its view.
