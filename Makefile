@@ -6,7 +6,7 @@ ENVIRON = OMP_WAIT_POLICY=passive
 # without the CPU kernel (no C++ compiler) plain torch draws, and the demo is smaller
 SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import available_backends as b; print("--config configs/demo-small.yaml" if b()["cpu"] else "")')
 
-.PHONY: demo test ablations bench clean
+.PHONY: demo test ablations bench gpu-check charts measure-charts clean
 
 demo: $(VENV)/ready                ## train the bundled toy from a coarse prior, offline, on the CPU
 	$(ENVIRON) $(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
@@ -17,8 +17,20 @@ test: $(VENV)/ready-for-tests                ## the whole test suite, as CI runs
 ablations: $(VENV)/ready           ## the paper's ablations as a table, measured against a known truth
 	$(ENVIRON) $(BIN)/python benchmarks/ablations.py
 
-bench: $(VENV)/ready               ## the rasteriser's speed and memory on the benchmark scene
+bench: $(VENV)/ready-for-tests     ## the rasteriser's speed and memory, beside gsplat's torch functions
 	$(ENVIRON) $(BIN)/python benchmarks/bench_splatting.py
+
+gpu-check: $(VENV)/ready-for-tests ## everything that waits for an NVIDIA GPU: correctness, speed beside gsplat, a training step
+	$(ENVIRON) $(BIN)/python benchmarks/gpu_check.py
+
+charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbers beside them
+	$(ENVIRON) $(BIN)/python benchmarks/chart_splatting.py --from-csv
+	$(ENVIRON) $(BIN)/python benchmarks/chart_runs.py
+
+measure-charts: $(VENV)/ready-for-charts     ## the numbers anew, about an hour; runs that are in the CSVs are not repeated
+	$(ENVIRON) $(BIN)/python benchmarks/chart_splatting.py
+	$(ENVIRON) $(BIN)/python benchmarks/runs.py
+	$(ENVIRON) $(BIN)/python benchmarks/chart_runs.py
 
 # installed once; again when what is installed changes
 PACKAGE = pyproject.toml setup.py constraints.txt $(wildcard threestudio_gaussiandreamer/splatting/native/*.h threestudio_gaussiandreamer/splatting/native/*.cpp)
@@ -35,6 +47,10 @@ $(VENV)/ready: requirements.txt $(PACKAGE) | $(BIN)/python
 $(VENV)/ready-for-tests: requirements-dev.txt $(PACKAGE) | $(BIN)/python
 	$(PIP) -r requirements-dev.txt
 	touch $@ $(VENV)/ready
+
+$(VENV)/ready-for-charts: $(VENV)/ready
+	$(PIP) -c constraints.txt -e .[charts]
+	touch $@
 
 clean:                             ## remove what the others made
 	rm -rf $(VENV) build *.egg-info outputs

@@ -50,7 +50,7 @@ class Setting(NamedTuple):
 
 
 def settings() -> Iterator[Setting]:
-    for below in (4096, 16384, 65536, 1024, 255, 64):
+    for below in (64, 255, 1024, 4096, 16384, 65536):
         yield Setting("alpha_min", f"1/{below}", {"alpha_min": 1 / below})
     yield Setting("alpha_min", "0", {"alpha_min": 0.0})
     for stop in (0.0, 1e-6, 1e-2):
@@ -255,17 +255,17 @@ def draw(rows: list[dict[str, str]]) -> None:
 
 
 def draw_panel(panel: Any, axes: Axes, rows: list[dict[str, str]]) -> None:
-    """The smallest alpha as a line for each size, the presets and the peers' cut-offs on it, and the front."""
+    """For each size the smallest alpha as a line, the presets and other knobs as marks, and the front of all as a dashed line."""
     for index, size in enumerate(SIZES):
-        here = [row for row in rows if int(row["size"]) == size]
-        color = f"C{index}"
-        line = sorted(points(axes, here, "alpha_min"))
-        panel.plot(*zip(*line, strict=True), "o-", color=color, markersize=3, linewidth=1, alpha=0.6, label=f"alpha_min, {size}²")
-        for group, marker, label in (("preset", "D", "presets"), ("stop", "x", "stop"), ("peers' cut-offs", "^", "peers' cut-offs")):
-            style = {"color": color, "linestyle": "none", "markersize": 6, "label": label if index == 0 else None}
-            panel.plot(*zip(*points(axes, here, group), strict=True), marker, **style)
-        for (x, y), row in zip(points(axes, here, "preset"), (r for r in here if r["group"] == "preset"), strict=True):
-            panel.annotate(row["setting"][0], (x, y), textcoords="offset points", xytext=(5, -3), fontsize=7)
+        here, color = [row for row in rows if int(row["size"]) == size], f"C{index}"
+        line = sorted((row for row in here if row["group"] == "alpha_min"), key=lambda row: -smallest_alpha(row["setting"]))
+        panel.plot(*columns(axes, line), "o-", color=color, markersize=3, linewidth=1, alpha=0.6, label=f"alpha_min, {size}²")
+        panel.plot(*front(axes, here), "--", color=color, linewidth=0.8, label="front of all settings" if index == 2 else None)
+        for group, marker in (("preset", "D"), ("stop", "x"), ("peers' cut-offs", "^")):
+            marks = [row for row in here if row["group"] == group]
+            panel.plot(*columns(axes, marks), marker, color=color, markersize=6, label=group if index == 2 else None)
+            for row in marks if group == "preset" else ():
+                panel.annotate(row["setting"][0], place(axes, row), textcoords="offset points", xytext=(5, -3), fontsize=7)
     panel.set_xscale("log")
     if axes.log:
         panel.set_yscale("log")
@@ -273,12 +273,31 @@ def draw_panel(panel: Any, axes: Axes, rows: list[dict[str, str]]) -> None:
     panel.spines[["top", "right"]].set_visible(False)
 
 
-def points(axes: Axes, rows: list[dict[str, str]], group: str) -> list[tuple[float, float]]:
-    """(milliseconds, error) of one group of settings."""
-    chosen = [row for row in rows if row["group"] == group]
-    both = [(float(row["forward_ms"]), float(row["backward_ms"])) for row in chosen]
-    milliseconds = [forward + (backward if axes.x == "both_ms" else 0.0) for forward, backward in both]
-    return list(zip(milliseconds, (float(row[axes.y]) for row in chosen), strict=True))
+def smallest_alpha(setting: str) -> float:
+    """The number behind "1/255" or "0"."""
+    numerator, _, denominator = setting.partition("/")
+    return float(numerator) / float(denominator or 1)
+
+
+def place(axes: Axes, row: dict[str, str]) -> tuple[float, float]:
+    """(milliseconds, error) of one setting."""
+    backward = float(row["backward_ms"]) if axes.x == "both_ms" else 0.0
+    return float(row["forward_ms"]) + backward, float(row[axes.y])
+
+
+def columns(axes: Axes, rows: list[dict[str, str]]) -> tuple[list[float], list[float]]:
+    places = [place(axes, row) for row in rows]
+    return [x for x, _ in places], [y for _, y in places]
+
+
+def front(axes: Axes, rows: list[dict[str, str]]) -> tuple[list[float], list[float]]:
+    """The settings that no other one beats in both time and error."""
+    better = (lambda a, b: a < b) if axes.log else (lambda a, b: a > b)
+    best: list[dict[str, str]] = []
+    for row in sorted(rows, key=lambda row: place(axes, row)[0]):
+        if not best or better(float(row[axes.y]), float(best[-1][axes.y])):
+            best.append(row)
+    return columns(axes, best)
 
 
 def main() -> None:

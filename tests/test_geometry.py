@@ -125,7 +125,7 @@ def test_a_densification_that_selects_nobody_changes_nothing(sphere_points):
         densify={"enabled": True, "start": 1, "stop": 9, "every": 1, "min_opacity": 1e-9, "grad_threshold": 1e9, "max_scale": 1e9},
     )
     for geometry in (plain, idle):
-        optimizer = torch.optim.Adam(geometry.parameter_groups(), lr=1e-2)
+        optimizer = torch.optim.Adam([{**group, "lr": 1e-2} for group in geometry.parameter_groups()])
         for step in range(1, 6):
             sum((p**2).sum() for p in geometry.parameters()).backward()
             optimizer.step()

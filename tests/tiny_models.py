@@ -7,6 +7,7 @@ models), so what loads these is what loads the real ones. Only the sizes differ,
 import json
 from io import BytesIO
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 
@@ -23,35 +24,54 @@ def nothing_cached(monkeypatch, folder: Path) -> None:
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(folder / "empty"))
 
 
-def stable_diffusion(folder: Path, *, prediction: str = "epsilon", seed: int = 0) -> Path:
-    """Stable Diffusion 2.1: UNet on 8x8x4 latents, VAE 64x64 to 8x8, OpenCLIP-like text encoder; ``prediction``: epsilon, v_prediction."""
+class Sizes(NamedTuple):
+    """What tells a tiny Stable Diffusion from the published one."""
+
+    unet: dict[str, Any]
+    vae: dict[str, Any]
+    text_width: int
+
+
+TINY = Sizes(
+    unet={
+        "sample_size": 8,
+        "block_out_channels": (16, 32),
+        "layers_per_block": 1,
+        "down_block_types": ("CrossAttnDownBlock2D", "DownBlock2D"),
+        "up_block_types": ("UpBlock2D", "CrossAttnUpBlock2D"),
+        "attention_head_dim": (2, 4),
+        "norm_num_groups": 8,
+    },
+    vae={"sample_size": 64, "block_out_channels": (8, 8, 16, 16), "layers_per_block": 1, "norm_num_groups": 4},
+    text_width=TEXT_WIDTH,
+)
+STABLE_DIFFUSION_2_1 = Sizes(
+    unet={
+        "sample_size": 64,
+        "block_out_channels": (320, 640, 1280, 1280),
+        "layers_per_block": 2,
+        "down_block_types": ("CrossAttnDownBlock2D",) * 3 + ("DownBlock2D",),
+        "up_block_types": ("UpBlock2D",) + ("CrossAttnUpBlock2D",) * 3,
+        "attention_head_dim": (5, 10, 20, 20),
+    },
+    vae={"sample_size": 512, "block_out_channels": (128, 256, 512, 512), "layers_per_block": 2},
+    text_width=1024,
+)
+"""The published UNet and VAE; of its text encoder, which a run frees at once, the width alone."""
+
+
+def stable_diffusion(folder: Path, *, prediction: str = "epsilon", seed: int = 0, sizes: Sizes = TINY) -> Path:
+    """Stable Diffusion 2.1, tiny: UNet on 8x8x4 latents, VAE 64x64 to 8x8; ``prediction``: epsilon, v_prediction."""
     from diffusers import AutoencoderKL, DDIMScheduler, PNDMScheduler, UNet2DConditionModel
 
     torch.manual_seed(seed)
-    unet = UNet2DConditionModel(
-        sample_size=8,
-        block_out_channels=(16, 32),
-        layers_per_block=1,
-        down_block_types=("CrossAttnDownBlock2D", "DownBlock2D"),
-        up_block_types=("UpBlock2D", "CrossAttnUpBlock2D"),
-        cross_attention_dim=TEXT_WIDTH,
-        attention_head_dim=(2, 4),
-        use_linear_projection=True,
-        norm_num_groups=8,
-    )
+    unet = UNet2DConditionModel(**sizes.unet, cross_attention_dim=sizes.text_width, use_linear_projection=True)
     _listen_to_text(unet)
     unet.save_pretrained(folder / "unet")
-    AutoencoderKL(
-        sample_size=64,
-        block_out_channels=(8, 8, 16, 16),
-        layers_per_block=1,
-        down_block_types=("DownEncoderBlock2D",) * 4,
-        up_block_types=("UpDecoderBlock2D",) * 4,
-        latent_channels=4,
-        norm_num_groups=4,
-    ).save_pretrained(folder / "vae")
+    blocks = {"down_block_types": ("DownEncoderBlock2D",) * 4, "up_block_types": ("UpDecoderBlock2D",) * 4}
+    AutoencoderKL(**sizes.vae, **blocks, latent_channels=4).save_pretrained(folder / "vae")
     _rename(folder / "vae" / "diffusion_pytorch_model.safetensors", PUBLISHED_VAE_NAMES)
-    clip_text_encoder(folder)
+    clip_text_encoder(folder, sizes.text_width)
     trained = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear", "steps_offset": 1, "set_alpha_to_one": False}
     # as published: 2.1-base has the first, 2.1 (768, v-prediction) the second
     scheduler = PNDMScheduler(**trained, skip_prk_steps=True) if prediction == "epsilon" else DDIMScheduler(**trained, clip_sample=False)
@@ -122,7 +142,7 @@ def _listen_to_text(unet: torch.nn.Module) -> None:
             weight.data *= 10
 
 
-def clip_text_encoder(folder: Path) -> None:
+def clip_text_encoder(folder: Path, width: int = TEXT_WIDTH) -> None:
     """``text_encoder`` and ``tokenizer`` of Stable Diffusion 2.1: CLIP, padded with "!" (which one of its two files denies)."""
     from transformers import CLIPTextConfig, CLIPTextModel
 
@@ -130,7 +150,7 @@ def clip_text_encoder(folder: Path) -> None:
     start, end = vocabulary["<|startoftext|>"], vocabulary["<|endoftext|>"]
     config = CLIPTextConfig(
         vocab_size=len(vocabulary),
-        hidden_size=TEXT_WIDTH,
+        hidden_size=width,
         intermediate_size=48,
         num_hidden_layers=2,
         num_attention_heads=2,
