@@ -6,13 +6,17 @@ ENVIRON = OMP_WAIT_POLICY=passive
 # without the CPU kernel (no C++ compiler) plain torch draws, and the demo is smaller
 SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import available_backends as b; print("--config configs/demo-small.yaml" if b()["cpu"] else "")')
 
-.PHONY: demo test ablations bench gpu-check charts measure-charts clean
+.PHONY: demo test stability ablations bench gpu-check charts measure-charts clean
 
 demo: $(VENV)/ready                ## train the bundled toy from a coarse prior, offline, on the CPU
 	$(ENVIRON) $(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
 
 test: $(VENV)/ready-for-tests                ## the whole test suite, as CI runs it
 	$(ENVIRON) $(BIN)/python -m pytest
+
+stability: $(VENV)/ready-for-tests          ## every known way to fail, provoked and measured: docs/stability.md
+	$(ENVIRON) $(BIN)/python -m pytest tests/stability --stability-report stability.json; status=$$?; \
+	$(BIN)/python tests/stability/report.py stability.json docs/stability.md; rm -f stability.json; exit $$status
 
 ablations: $(VENV)/ready           ## the paper's ablations as a table, measured against a known truth
 	$(ENVIRON) $(BIN)/python benchmarks/ablations.py

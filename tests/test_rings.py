@@ -31,6 +31,7 @@ ASSEMBLY = {
     "evaluate",
     "results",
     "clip_evaluation",
+    "prune",
     "t3bench",
     "experiment",
     "config",

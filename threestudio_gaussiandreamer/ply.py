@@ -11,6 +11,7 @@ number type, unknown properties and elements, no ``f_rest``. It believes no coun
 import logging
 import os
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, NoReturn, Optional
 
@@ -94,6 +95,7 @@ def write_gaussians(
     log_scales: Float[np.ndarray, "N 3"],
     quats: Float[np.ndarray, "N 4"],
     pad_sh_degree: Optional[int] = None,
+    comments: Sequence[str] = (),
 ) -> None:
     """Write Gaussians as float32, whole or not at all.
 
@@ -101,6 +103,7 @@ def write_gaussians(
         path: the file; its folder must exist.
         means, sh, logit_opacities, log_scales, quats: as in :class:`GaussianArrays`; anything numpy takes as an array.
         pad_sh_degree: append zero harmonics up to this degree, for viewers that insist on degree 3.
+        comments: ASCII lines for the header.
 
     Raises:
         ValueError: arrays whose shapes don't agree.
@@ -111,7 +114,15 @@ def write_gaussians(
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), 3 * (sh.shape[1] - 1))  # channel by channel
     names = [*MEANS, *NORMALS, *SH_CONSTANT, *(f"f_rest_{i}" for i in range(rest.shape[1])), "opacity", *LOG_SCALES, *QUATS]
     columns = [arrays.means, np.zeros_like(arrays.means), sh[:, 0], rest, arrays.logit_opacities[:, None], arrays.log_scales, arrays.quats]
-    _write(path, [(name, "float") for name in names], np.concatenate(columns, axis=1))
+    _write(path, [(name, "float") for name in names], np.concatenate(columns, axis=1), comments)
+
+
+def read_comments(path: str | os.PathLike) -> list[str]:
+    """The comments in the header of a PLY file; none where it is no PLY file."""
+    with open(path, "rb") as file:
+        head = file.read(MAX_HEADER_BYTES).partition(b"end_header")[0].decode("latin-1")
+    lines = head.splitlines() if head.startswith("ply") else []
+    return [line.removeprefix("comment ").strip() for line in lines if line.startswith("comment ")]
 
 
 def padded_sh(sh: Float[np.ndarray, "N K 3"], degree: int) -> Float[np.ndarray, "N L 3"]:
@@ -141,9 +152,9 @@ def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
     _write(path, properties, rows)
 
 
-def _write(path: str | os.PathLike, properties: list[tuple[str, str]], rows: np.ndarray) -> None:
+def _write(path: str | os.PathLike, properties: list[tuple[str, str]], rows: np.ndarray, comments: Sequence[str] = ()) -> None:
     """Header and rows; ``rows`` is a packed little-endian record array, or (N, P) float32."""
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments), f"element vertex {len(rows)}"]
     lines += [f"property {kind} {name}" for name, kind in properties]
     with atomic_file(path) as file:
         file.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii"))

@@ -209,6 +209,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         if truth is not None:
             shown["dB"] = psnr(out["comp_rgb"].detach(), truth).mean()
         self.log_dict(shown, prog_bar=True)
+        self.geometry.warn_of_limits()
 
     def truth(self, batch: dict[str, Any], out: dict[str, Any]) -> Optional[Float[Tensor, "B H W 3"]]:
         """What these views should look like, where the guidance knows it."""

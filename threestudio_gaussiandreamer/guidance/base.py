@@ -185,7 +185,7 @@ class ScoreDistillation(BaseObject, ABC):
         eps = self.predict_noise(noised.z, noised.t, condition)
         weight = sds.weight(self.cfg.weighting_strategy, noised.abar)
         grad = sds.per_item(weight, eps) * (eps - noised.noise)
-        bad = ~torch.isfinite(grad).flatten(1).all(dim=1)
+        bad = _bad_items(grad)
         if bad.any():
             grad[bad] = 0
         return grad if self.grad_clip is None else grad.clamp(-self.grad_clip, self.grad_clip), bad
@@ -228,6 +228,13 @@ class ScoreDistillation(BaseObject, ABC):
         levels = (t / len(alphas_cumprod)).tolist()
         images = {name: self.decode(value).float().movedim(1, -1) for name, value in latents.items()}
         return {"bs": count, "noise_levels": levels, "texts": _captions(levels, batch), **images}
+
+
+def _bad_items(grad: Tensor) -> Tensor:
+    """(B,) bool: which items hold NaN or infinity. A sum is finite only if all its terms are, which settles the usual case."""
+    if grad.sum().isfinite():
+        return torch.zeros(len(grad), dtype=torch.bool, device=grad.device)
+    return ~torch.isfinite(grad).flatten(1).all(dim=1)
 
 
 def _masked_loss(images: Tensor, latents: Tensor, grad: Tensor, bad: Tensor) -> Tensor:

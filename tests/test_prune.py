@@ -1,0 +1,149 @@
+"""The prune command: budgets are met on unseen views, a second run changes nothing, and mistakes cost no work."""
+
+import json
+
+import pytest
+import torch
+
+from threestudio_gaussiandreamer import prune, simplify
+from threestudio_gaussiandreamer.ply import read_comments, read_gaussians, write_gaussians
+from threestudio_gaussiandreamer.simplify import Budget, Cloud
+
+FAST = ["--size", "48", "--steps", "8"]
+
+
+def ball(count=600, bands=1):
+    """A coloured ball of thin shells: what is inside is hidden."""
+    rng = torch.Generator().manual_seed(0)
+    means = torch.nn.functional.normalize(torch.randn(count, 3, generator=rng), dim=1)
+    means *= torch.where(torch.arange(count) % 3 == 0, 0.5, 1.0)[:, None]
+    sh = torch.zeros(count, bands, 3)
+    sh[:, 0] = means
+    quats = torch.randn(count, 4, generator=rng)
+    return Cloud(means, quats, torch.full((count, 3), -2.2), torch.full((count,), 3.0), sh)
+
+
+@pytest.fixture
+def source(tmp_path):
+    path = tmp_path / "in.ply"
+    write_gaussians(path, **prune.arrays_of(ball()))
+    return path
+
+
+def run(source, output, *options):
+    return prune.run(prune.parse([str(source), str(output), *options, *FAST]))
+
+
+def test_a_count_is_met_exactly(source, tmp_path):
+    report = run(source, tmp_path / "out.ply", "--count", "250")
+    assert report["after"]["gaussians"] == 250 == len(read_gaussians(tmp_path / "out.ply").means)
+    assert json.loads((tmp_path / "out.ply.json").read_text())["after"]["gaussians"] == 250
+    assert (tmp_path / "out.ply.png").stat().st_size > 0
+
+
+def test_a_size_is_kept(source, tmp_path):
+    run(source, tmp_path / "out.ply", "--bytes", "20kB")
+    assert 15_000 < (tmp_path / "out.ply").stat().st_size <= 20_000
+
+
+def test_a_quality_holds_on_views_that_nothing_was_fitted_to(source, tmp_path):
+    report = run(source, tmp_path / "out.ply", "--psnr", "32")
+    assert report["after"]["gaussians"] < 420 and report["psnr_on_unseen_views"] > 31.5
+
+
+def test_a_second_run_removes_nothing(source, tmp_path):
+    run(source, tmp_path / "once.ply", "--psnr", "32dB")
+    run(tmp_path / "once.ply", tmp_path / "twice.ply", "--psnr", "32")
+    assert (tmp_path / "once.ply").read_bytes() == (tmp_path / "twice.ply").read_bytes()
+    assert read_comments(tmp_path / "twice.ply") == [f"{prune.NOTE} 32"]
+
+
+def test_a_looser_budget_goes_on(source, tmp_path):
+    run(source, tmp_path / "once.ply", "--psnr", "55")
+    assert run(tmp_path / "once.ply", tmp_path / "twice.ply", "--psnr", "40")["after"]["gaussians"] < len(
+        read_gaussians(tmp_path / "once.ply").means
+    )
+
+
+def test_the_same_call_gives_the_same_bits(source, tmp_path):
+    for name in ("a.ply", "b.ply"):
+        run(source, tmp_path / name, "--count", "300")
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_hidden_gaussians_go_first():
+    cloud = ball()
+    views = simplify.views_around(cloud, 16, 48)
+    kept = simplify.only(cloud, simplify.look(cloud, views)[1], 400)
+    outside = kept.means.norm(dim=1) > 0.9
+    assert outside.double().mean() > 0.9  # two thirds of all; a few inner ones are seen through gaps
+
+
+def test_recovery_pays():
+    cloud = ball()
+    probes, judges = (simplify.views_around(cloud, count, 48, turn=turn) for count, turn in ((16, 0.0), (8, 45.0)))
+    pictures, scores = simplify.look(cloud, probes)
+    pruned = simplify.only(cloud, scores, 200)
+    recovered = simplify.recover(pruned, probes, pictures, 40, 0)
+    before = simplify.look(cloud, judges)[0]
+    assert simplify.likeness(recovered, judges, before) > simplify.likeness(pruned, judges, before) + 1.0
+
+
+def test_harmonics_are_kept(tmp_path):
+    write_gaussians(tmp_path / "in.ply", **prune.arrays_of(ball(bands=4)))
+    run(tmp_path / "in.ply", tmp_path / "out.ply", "--count", "400")
+    assert read_gaussians(tmp_path / "out.ply").sh.shape == (400, 4, 3)
+
+
+def test_a_checkpoint_is_read(tmp_path):
+    cloud = ball()
+    state = {f"geometry.{name}": value for name, value in cloud._asdict().items() if name != "sh"}
+    state |= {"geometry.sh0": cloud.sh, "geometry.sh_rest": torch.zeros(len(cloud.means), 0, 3)}
+    torch.save({"state_dict": state, "epoch": 0, "global_step": 1}, tmp_path / "last.ckpt")
+    assert run(tmp_path / "last.ckpt", tmp_path / "out.ply", "--count", "300")["before"]["gaussians"] == 600
+
+
+def test_a_count_above_what_is_there_changes_nothing(source, tmp_path):
+    assert run(source, tmp_path / "out.ply", "--count", "1000")["after"]["gaussians"] == 600
+
+
+def test_the_likeness_that_loses_a_tenth_of_a_decibel():
+    # two independent errors: their squares add
+    likeness = prune.likeness_within(0.1, 35.0)
+    assert 10 ** (-3.5) + 10 ** (-likeness / 10) == pytest.approx(10 ** (-3.49))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--count", "0"], "--count: expected a whole number from 1 on"),
+        (["--count", "1.5"], "--count: expected a whole number"),
+        (["--count", "many"], "--count: expected a number, got 'many'"),
+        (["--bytes", "2 potatoes"], "--bytes: expected a size such as"),
+        (["--bytes", "1"], "--bytes, in Gaussians,"),
+        (["--psnr", "nan"], "--psnr: expected a number"),
+        (["--psnr", "-3"], "--psnr: expected a number above 0"),
+        (["--within", "0"], "--within: expected a number above 0"),
+    ],
+)
+def test_a_wrong_budget_is_refused_before_any_work(source, tmp_path, capsys, options, said):
+    assert prune.main([str(source), str(tmp_path / "out.ply"), *options]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "out.ply").exists()
+
+
+def test_a_missing_file_and_a_wrong_name(source, tmp_path, capsys):
+    assert prune.main([str(tmp_path / "im.ply"), str(tmp_path / "out.ply"), "--count", "9"]) == 2
+    assert "in.ply" in capsys.readouterr().err  # the near name
+    assert prune.main([str(source), str(tmp_path / "out.obj"), "--count", "9"]) == 2
+    assert "expected the name of a .ply file" in capsys.readouterr().err
+
+
+def test_a_budget_is_needed_and_only_one(source, tmp_path, capsys):
+    assert prune.main([str(source), "out.ply"]) == 2
+    assert prune.main([str(source), "out.ply", "--count", "5", "--psnr", "40"]) == 2
+
+
+def test_the_search_ends_where_every_gaussian_is_the_top_of_a_pixel():
+    apart = ball(12)._replace(logit_opacities=torch.full((12,), 6.0), log_scales=torch.full((12, 3), -3.0))
+    probes, judges = (simplify.views_around(apart, 8, 48, turn=turn) for turn in (0.0, 45.0))
+    assert len(simplify.simplify(apart, probes, judges, Budget(psnr=1.0), steps=2).means) == 12

@@ -1,0 +1,190 @@
+"""Fewer Gaussians for the same pictures: prune by contribution, round by round, and recover by self-distillation.
+
+What the cloud looked like before is the only truth: no diffusion model, no prompt, so nothing can drift. A round keeps the best 0.8
+by the largest sigma_i T_i over the pixels of the probe views (RadSplat, Niemeyer et al. 2024), re-scored every round, and then
+fits what stays to the probe views' first pictures (mean squared error, Adam). One-shot pruning of more than that loses to training
+so few from scratch; rounds don't.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, Optional
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .cameras import Orbit, intrinsics, to_opencv
+from .metrics import psnr
+from .parsimony import TOP_OF_A_PIXEL
+from .sh import sh_to_colors
+from .splatting import rasterize
+from .streams import generator
+
+KEEP = 0.8
+"""The least share that a round keeps."""
+SMALLEST_DROP = 0.01
+"""A round that can't drop this share ends the search."""
+RATES = {"means": 2e-4, "quats": 4e-3, "log_scales": 1e-2, "logit_opacities": 2e-2, "sh": 5e-3}
+"""Adam's; that of the means in units of the cloud's radius."""
+FOVY = math.radians(50.0)
+
+
+class Cloud(NamedTuple):
+    """Gaussians as a PLY stores them, as tensors."""
+
+    means: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    log_scales: Float[Tensor, "N 3"]
+    logit_opacities: Float[Tensor, " N"]
+    sh: Float[Tensor, "N K 3"]
+
+
+class Views(NamedTuple):
+    """Square pictures from all around."""
+
+    viewmats: Float[Tensor, "V 4 4"]
+    Ks: Float[Tensor, "V 3 3"]
+    positions: Float[Tensor, "V 3"]
+    size: int
+
+
+class Budget(NamedTuple):
+    """Where to stop: at a count, or where views that nothing is fitted to would fall below a PSNR; one of both."""
+
+    count: Optional[int] = None
+    psnr: Optional[float] = None
+
+
+class Round(NamedTuple):
+    """What one round led to."""
+
+    count: int
+    psnr: float
+    """Of the judging views, to what they showed at the beginning."""
+
+
+def bounds(cloud: Cloud) -> tuple[Float[Tensor, "3"], float]:
+    """Centre and radius of what is visible: of the positions' opacity-weighted median, and 99 % of the opacity."""
+    weights = cloud.logit_opacities.sigmoid()
+    centre = torch.stack([_quantile(axis, weights, 0.5) for axis in cloud.means.unbind(1)])
+    distances = (cloud.means - centre).norm(dim=1) + cloud.log_scales.exp().amax(1)
+    return centre, float(_quantile(distances, weights, 0.99).clamp_min(1e-6))
+
+
+def _quantile(values: Float[Tensor, " N"], weights: Float[Tensor, " N"], share: float) -> Tensor:
+    order = values.argsort()
+    mass = weights[order].cumsum(0)
+    return values[order[int(torch.searchsorted(mass, share * mass[-1]).clamp_max(len(values) - 1))]]
+
+
+def views_around(cloud: Cloud, count: int, size: int, *, turn: float = 0.0) -> Views:
+    """``count`` views on a spiral of golden angles that starts at ``turn`` degrees, near and far in turns; other turns, other views."""
+    centre, radius = bounds(cloud)
+    index = torch.arange(count)
+    elevation = torch.rad2deg(torch.asin(torch.linspace(-0.5, 0.9, count)))
+    distance = radius / math.sin(FOVY / 2) * torch.tensor([1.0, 1.4])[index % 2]
+    azimuth = (turn + index * 137.50776) % 360.0
+    c2w = Orbit(elevation, azimuth, distance, torch.full((count,), FOVY)).c2w.to(centre)
+    c2w[:, :3, 3] += centre
+    fovy = torch.full((count,), FOVY, device=centre.device)
+    viewmats, _ = to_opencv(c2w, fovy, size, size)
+    return Views(viewmats, intrinsics(fovy, size, size), c2w[:, :3, 3], size)
+
+
+def draw(cloud: Cloud, views: Views, rows: Tensor, *, preset: str = "balanced") -> tuple[Tensor, Tensor]:
+    """Pictures (B, size, size, 3) of some of the views on grey, and each Gaussian's contribution to them (B, N)."""
+    dirs = torch.nn.functional.normalize(cloud.means.detach() - views.positions[rows, None], dim=-1)
+    colors = sh_to_colors(cloud.sh, dirs)
+    grey = torch.full((3,), 0.5, device=cloud.means.device)  # neither dark nor bright Gaussians vanish before it
+    out = rasterize(
+        cloud.means, cloud.quats, cloud.log_scales.exp(), cloud.logit_opacities.sigmoid(), colors, views.viewmats[rows], views.Ks[rows],
+        views.size, views.size, background=grey, preset=preset,
+    )  # fmt: skip
+    return out.image, out.contribution
+
+
+@torch.no_grad()
+def look(cloud: Cloud, views: Views, chunk: int = 4) -> tuple[Float[Tensor, "V H W 3"], Float[Tensor, " N"]]:
+    """All pictures, and the largest contribution of each Gaussian."""
+    parts = [draw(cloud, views, rows) for rows in torch.arange(len(views.viewmats)).split(chunk)]
+    return torch.cat([image for image, _ in parts]), torch.stack([contribution.amax(0) for _, contribution in parts]).amax(0)
+
+
+def likeness(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"]) -> float:
+    """PSNR of a cloud's views to other pictures of them, over all pixels."""
+    return float(psnr(look(cloud, views)[0].flatten(0, 1), pictures.flatten(0, 1)))
+
+
+def simplify(
+    cloud: Cloud,
+    probes: Views,
+    judges: Views,
+    budget: Budget,
+    *,
+    steps: int = 60,
+    seed: int = 0,
+    report: Callable[[Round], None] = lambda done: None,
+) -> Cloud:
+    """The smallest cloud of a series of rounds that meets the budget.
+
+    Args:
+        probes: what Gaussians are scored on and fitted to.
+        judges: other views, on which a budget of quality is measured: what is fitted to looks better than the rest.
+        steps: of self-distillation after each round; four views each.
+        report: called after each round that was kept.
+    """
+    pictures, contribution = look(cloud, probes)
+    before = look(cloud, judges)[0]
+    keep, done = KEEP, 0
+    while True:
+        count = _next_count(cloud, contribution, keep, budget)
+        if count >= (1 - SMALLEST_DROP) * len(cloud.means) and count != budget.count or count >= len(cloud.means):
+            return cloud
+        fewer = recover(only(cloud, contribution, count), probes, pictures, steps, seed + done)
+        reached = likeness(fewer, judges, before)
+        if budget.psnr is not None and reached < budget.psnr:
+            keep = 0.5 * (1 + keep)  # half as many
+            continue
+        cloud, contribution, done = fewer, look(fewer, probes)[1], done + 1
+        report(Round(count, reached))
+
+
+def _next_count(cloud: Cloud, contribution: Tensor, keep: float, budget: Budget) -> int:
+    """A count that is asked for is met; a quality is sought without dropping the top Gaussian of any pixel."""
+    count = int(keep * len(cloud.means))
+    if budget.count is not None:
+        return max(count, budget.count)
+    return max(1, count, int((contribution > TOP_OF_A_PIXEL).sum()))
+
+
+def only(cloud: Cloud, scores: Float[Tensor, " N"], count: int) -> Cloud:
+    """The ``count`` Gaussians with the highest scores, in their order."""
+    rows = torch.argsort(scores, descending=True, stable=True)[:count].sort().values
+    return Cloud(*(values[rows] for values in cloud))
+
+
+def recover(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"], steps: int, seed: int) -> Cloud:
+    """The cloud fitted to pictures of its former self."""
+    leaves = Cloud(*(values.detach().clone().requires_grad_() for values in cloud))
+    rates = RATES | {"means": RATES["means"] * bounds(cloud)[1]}
+    groups = [{"params": [leaf], "lr": rates[name]} for name, leaf in zip(Cloud._fields, leaves, strict=True)]
+    adam = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
+    for step, rows in enumerate(_batches(len(pictures), steps, seed)):
+        for group, name in zip(adam.param_groups, Cloud._fields, strict=True):
+            group["lr"] = rates[name] * (1 - step / steps)
+        image, _ = draw(leaves, views, rows)
+        ((image - pictures[rows]) ** 2).mean().backward()
+        adam.step()
+        adam.zero_grad(set_to_none=True)
+    return Cloud(*(leaf.detach() for leaf in leaves))
+
+
+def _batches(count: int, steps: int, seed: int, size: int = 4) -> Iterator[Tensor]:
+    """Rows of the views of each step: every view once before any comes twice."""
+    order, drawn = torch.empty(0, dtype=torch.long), 0
+    for _ in range(steps):
+        if len(order) < size:
+            order, drawn = torch.cat([order, torch.randperm(count, generator=generator(seed, "simplify", drawn))]), drawn + 1
+        rows, order = order[:size], order[size:]
+        yield rows
