@@ -1,0 +1,28 @@
+"""`launch.py` with one more geometry, ``round-cloud``: Gaussians with one size for all three axes, for `chart_attributes.py` alone.
+
+It is no part of the package since it doesn't pay: see docs/parsimony.md.
+"""
+
+import sys
+
+from jaxtyping import Float
+from torch import Tensor
+
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.experiment import main
+from threestudio_gaussiandreamer.geometry import LOG_SCALE_RANGE, GaussianCloud
+from threestudio_gaussiandreamer.host import register
+
+register_parts()
+
+
+@register("round-cloud")
+class RoundCloud(GaussianCloud):
+    """The three stored sizes start equal and get equal gradients, so that they stay equal."""
+
+    def scales(self) -> Float[Tensor, "N 3"]:
+        return self.log_scales.mean(1, keepdim=True).clamp(*LOG_SCALE_RANGE).exp().expand(-1, 3)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

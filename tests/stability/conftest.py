@@ -1,0 +1,117 @@
+"""What the tests of stability share: `measured` and `fault`, and the report of what they measured."""
+
+import inspect
+import json
+import math
+from pathlib import Path
+from typing import Any, Callable, Optional
+
+import pytest
+from backends import cuda_on_the_host
+from rows import ROWS
+
+REPORT = pytest.StashKey[list]()
+
+
+class Measured:
+    """Records what a test measured and holds it to the row's bar."""
+
+    def __init__(self, properties: list):
+        self.properties = properties
+
+    def __call__(
+        self, value: Any, unit: str = "", *, what: str = "", at_most: Optional[float] = None, at_least: Optional[float] = None
+    ) -> None:
+        """Record a number (of ``what``, in ``unit``) and assert its bound, or record a few words that were asserted before.
+
+        Of several values of the same ``what`` the report shows the worst: the smallest if it must be ``at_least``, else the largest.
+        """
+        worst = "min" if at_least is not None else "max"
+        value = value if isinstance(value, str) else float(getattr(value, "item", lambda: value)())
+        self.properties.append(("measured", {"value": value, "unit": unit, "what": what, "worst": worst}))
+        assert at_most is None or value <= at_most, f"{what or 'measured'} {value} {unit} > {at_most}"
+        assert at_least is None or value >= at_least, f"{what or 'measured'} {value} {unit} < {at_least}"
+
+
+@pytest.fixture(autouse=True)
+def stand_in_for_a_gpu(request, monkeypatch) -> None:
+    if "backend" in request.fixturenames and request.getfixturevalue("backend") == "cuda":
+        cuda_on_the_host(monkeypatch)
+
+
+@pytest.fixture
+def measured(request) -> Measured:
+    return Measured(request.node.user_properties)
+
+
+@pytest.fixture
+def fault(request):
+    """``fault(deviation, ours=..., emulation=..., at_most=...)``: ours holds the bar, and the fault in our own words breaks it.
+
+    ``deviation`` is a function of an implementation; ``at_least`` instead of ``at_most`` where more is better; ``raises`` names
+    the exception of an emulation that crashes instead of giving a wrong number.
+    """
+
+    def hold(
+        deviation: Callable[[Any], float],
+        *,
+        ours: Any,
+        emulation: Any,
+        at_most: float = 0.0,
+        at_least: Optional[float] = None,
+        unit: str = "",
+        raises: type[Exception] = AssertionError,
+    ) -> None:
+        bound = {"at_most": at_most} if at_least is None else {"at_least": at_least}
+        Measured(request.node.user_properties)(deviation(ours), unit, **bound)
+        emulated = Measured([])
+        with pytest.raises(raises) as caught:
+            emulated(deviation(emulation), unit, **bound)
+        crashed = {"value": caught.type.__name__, "unit": "", "what": "", "worst": "max"}
+        request.node.user_properties.append(("emulation", emulated.properties[0][1] if emulated.properties else crashed))
+
+    return hold
+
+
+def pytest_addoption(parser) -> None:
+    parser.addoption("--stability-report", metavar="FILE", type=Path, help="write what the rows measured as JSON")
+
+
+def pytest_configure(config) -> None:
+    config.addinivalue_line("markers", "stability(group, name, bar): the row of the stability tables that a test is")
+    config.stash[REPORT] = []
+
+
+def pytest_collection_modifyitems(items) -> None:
+    for item in items:
+        marker = item.get_closest_marker("stability")
+        if marker:
+            item.user_properties.append(("row", _describe(item, *marker.args)))
+
+
+def _describe(item: pytest.Item, group: str, name: str, bar: Optional[str]) -> dict:
+    reason = inspect.getdoc(item.function) or ""
+    if bar and not reason:
+        raise pytest.UsageError(f"{item.nodeid}: a changed bar needs a docstring that proves it")
+    return {**ROWS[group, name]._asdict(), "changed_bar": bar, "reason": reason, "file": item.path.name, "test": item.originalname}
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item):
+    report = (yield).get_result()
+    properties = dict(item.user_properties)
+    if report.when == "call" and "row" in properties:
+        values = {kind: [_plain(x) for key, x in item.user_properties if key == kind] for kind in ("measured", "emulation")}
+        item.config.stash[REPORT].append({**properties["row"], "outcome": report.outcome, **values})
+
+
+def _plain(entry: dict) -> dict:
+    """JSON knows neither infinity nor NaN."""
+    value = entry["value"]
+    return {**entry, "value": value if isinstance(value, str) or math.isfinite(value) else str(value)}
+
+
+def pytest_sessionfinish(session) -> None:
+    path = session.config.getoption("--stability-report", default=None)
+    if path:
+        path.write_text(json.dumps(session.config.stash[REPORT], indent=1) + "\n")

@@ -1,0 +1,39 @@
+"""No row is left out: every one has a test, and the table holds every row of the list that it was written from."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+from rows import FAULTS, OTHERS, ROWS
+
+FOLDER = Path(__file__).parent
+
+
+def rows_with_a_test() -> set[tuple[str, str]]:
+    """(group, name) of every ``@row(group, name)`` in this folder."""
+    trees = [ast.parse(path.read_text()) for path in FOLDER.glob("test_*.py")]
+    calls = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "row"]
+    return {tuple(ast.literal_eval(argument) for argument in call.args) for call in calls}
+
+
+NOT_YET = {"A2", "A3", "A4", "A5"}
+"""Groups whose rows have no test in this folder yet; the report names them as not run."""
+
+
+def test_every_row_has_a_test():
+    missing = set(ROWS) - rows_with_a_test()
+    assert {group for group, _ in missing} == NOT_YET, sorted(missing)
+
+
+def test_the_table_is_complete(shared_folder):
+    """Against the list of known failures, where it is at hand."""
+    path = shared_folder / "reference" / "stability.md"
+    if not path.exists():
+        pytest.skip("the list of known failures isn't here")
+    text = path.read_text()
+    assert {name for name, *_ in FAULTS} == set(re.findall(r"^\| (F\d+) \|", text, re.M))
+    for group, rows in OTHERS.items():
+        section = re.search(rf"^## {group}\..*?(?=^#|\Z)", text, re.M | re.S).group()
+        names = re.findall(r"^\| ([^|]+?) \|", section, re.M)
+        assert {name for name, *_ in rows} == set(names) - {"Failure mode"}

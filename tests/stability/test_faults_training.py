@@ -1,0 +1,411 @@
+"""A0: faults of the peers' training. Each test holds ours to the bar and shows that the fault, in our own words, breaks it."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from rows import row
+from torch import nn
+
+from threestudio_gaussiandreamer import densify, sds, streams
+from threestudio_gaussiandreamer.densify import PARAMETERS, Rules, Statistics
+from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.geometry import LEARNING_RATES, STATISTICS, GaussianCloud
+from threestudio_gaussiandreamer.grow import grow
+from threestudio_gaussiandreamer.guidance.base import NonFiniteScore, ScoreDistillation
+from threestudio_gaussiandreamer.point_cloud import PointCloud
+from threestudio_gaussiandreamer.streams import generator
+from threestudio_gaussiandreamer.system import GaussianDreamerSystem
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+def ball(n: int = 300) -> PointCloud:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(n, 3))
+    points *= 0.7 / np.linalg.norm(points, axis=1, keepdims=True)
+    return PointCloud(points.astype(np.float32), rng.random((n, 3), np.float32))
+
+
+def started(**options) -> GaussianCloud:
+    geometry = GaussianCloud({"grow": {"enabled": False}, **options})
+    geometry.start_from(ball())
+    return geometry
+
+
+# ---- state and memory ----------------------------------------------------------------------------------------------------------
+
+
+@row("A0", "F11")
+def test_f11_the_loss_scale_does_not_choose_who_is_densified(fault):
+    """Half of the gradients lie above the threshold; mixed precision multiplies all of them by 65 536 before they are read."""
+    g = torch.Generator().manual_seed(0)
+    true = torch.randn(2, 1000, 2, generator=g) * torch.tensor([2e-4 / 64, 2e-4 / 64])
+
+    def as_they_come(means2d_grad, width, height, loss_scale):
+        return densify.screen_gradients(means2d_grad, width, height)
+
+    def deviation(gradients):
+        selected = [gradients(true * scale, 128, 128, scale) > 2e-4 for scale in (1.0, 65536.0)]
+        return (selected[0] != selected[1]).float().mean() * 100
+
+    fault(deviation, ours=densify.screen_gradients, emulation=as_they_come, unit="% selected differently")
+
+
+@row("A0", "F12")
+def test_f12_a_checkpoint_holds_the_cloud_and_its_statistics(fault):
+    """The emulation keeps the cloud in a plain object, which a module's state doesn't reach. Ours asks no prior when loading."""
+
+    class PlainCloud(nn.Module):
+        def __init__(self, source=None):
+            super().__init__()
+            names = (*PARAMETERS, *STATISTICS)
+            self.cloud = SimpleNamespace(**{name: getattr(source, name) if source else torch.zeros(0) for name in names})
+
+        def __getattr__(self, name):
+            cloud = self.__dict__.get("cloud")
+            return getattr(cloud, name) if cloud is not None and hasattr(cloud, name) else super().__getattr__(name)
+
+    def trained():
+        geometry = started()
+        geometry.gradient_sum += 1
+        geometry.contribution += torch.rand(300, generator=torch.Generator().manual_seed(0))
+        return geometry
+
+    def deviation(pair):
+        saved, fresh = pair()
+        fresh.load_state_dict(saved.state_dict())
+        return sum(not torch.equal(getattr(saved, name), getattr(fresh, name)) for name in (*PARAMETERS, *STATISTICS))
+
+    ours = lambda: (trained(), GaussianCloud({"prior_type": "a-prior-that-does-not-exist"}))  # noqa: E731
+    fault(deviation, ours=ours, emulation=lambda: (PlainCloud(trained()), PlainCloud()), unit="tensors lost")
+
+
+@row("A0", "F16")
+def test_f16_growing_leaves_the_process_generators_alone(fault):
+    def reseeding(cloud):
+        np.random.seed(0)
+        return np.random.uniform(-1, 1, (1000, 3))
+
+    def deviation(grown):
+        np.random.seed(7)
+        expected, torch_state = np.random.RandomState(7).random(), torch.get_rng_state()
+        grown(ball())
+        return float(np.random.random() != expected) + float(not torch.equal(torch.get_rng_state(), torch_state))
+
+    ours = lambda cloud: grow(cloud, num_candidates=1000, generator=np.random.default_rng(0))  # noqa: E731
+    fault(deviation, ours=ours, emulation=reseeding, unit="generators moved")
+
+
+# ---- growing -------------------------------------------------------------------------------------------------------------------
+
+
+@row("A0", "F14")
+def test_f14_no_grown_point(fault):
+    """A cube of side 2 has eight corners, and none of 100 candidates lies near one."""
+    corners = np.float32([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+
+    def ours(points):
+        cloud = PointCloud(points, np.full((8, 3), 0.5, np.float32))
+        return grow(cloud, num_candidates=100, generator=np.random.default_rng(0)).points
+
+    def appended_to_an_empty_list(points):
+        candidates = np.random.default_rng(0).uniform(-1, 1, (100, 3))
+        kept = [c for c in candidates if np.linalg.norm(points - c, axis=1).min() < 0.01]
+        return np.concatenate((points, np.array(kept)))
+
+    fault(lambda grown: float(len(grown(corners)) != 8), ours=ours, emulation=appended_to_an_empty_list, raises=ValueError)
+
+
+@row("A0", "F15")
+def test_f15_growth_does_not_depend_on_the_unit(fault):
+    """Metres, millimetres, kilometres: the share of candidates that is accepted."""
+
+    def ours(points):
+        colors = np.zeros_like(points)
+        return len(grow(PointCloud(points, colors), num_candidates=20_000, radius=0.05, generator=np.random.default_rng(0)).points) - 300
+
+    def absolute_radius(points):
+        candidates = np.random.default_rng(0).uniform(points.min(0), points.max(0), (2000, 3))
+        return sum(np.linalg.norm(points - c, axis=1).min() < 0.05 for c in candidates)
+
+    def deviation(accepted):
+        counts = np.array([accepted(ball().points * unit) for unit in (1e-3, 1.0, 1e3)])
+        return np.ptp(counts) / counts.mean()
+
+    fault(deviation, ours=ours, emulation=absolute_radius, at_most=0.01, unit="relative")
+
+
+@row("A0", "F15")
+@pytest.mark.parametrize("axes", [(0, 1), (2,), ()], ids=["flat", "needle", "point"])
+def test_f15_a_degenerate_prior_does_not_explode(axes, fault):
+    """Every candidate in the box of a flat cloud lies near it, so only the cap holds; the emulation has none."""
+    points = np.zeros((300, 3), np.float32)
+    points[:, axes] = ball().points[:, axes]
+    options = {"enabled": True, "num_candidates": 20_000, "radius": 0.9, "max_points": 500}
+
+    def ours(points):
+        return len(GaussianCloud({"grow": options}).grown(PointCloud(points, np.zeros_like(points))).points)
+
+    def without_a_cap(points):
+        candidates = np.random.default_rng(0).uniform(points.min(0), points.max(0), (2000, 3))
+        return 300 + sum(np.linalg.norm(points - c, axis=1).min() < 0.9 for c in candidates)
+
+    fault(lambda count: count(points), ours=ours, emulation=without_a_cap, at_most=800, unit="points")
+
+
+# ---- densifying ----------------------------------------------------------------------------------------------------------------
+
+
+def parameters(n: int) -> dict[str, torch.Tensor]:
+    g = torch.Generator().manual_seed(0)
+    shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,), "sh0": (n, 1, 3), "sh_rest": (n, 0, 3)}
+    return {name: torch.randn(shape, generator=g) - 5.0 * (name == "log_scales") for name, shape in shapes.items()}
+
+
+@row("A0", "F13")
+def test_f13_one_gaussian_keeps_its_shape(fault):
+    """Pruning nobody. The emulation squeezes the (1, 1) mask to a single truth value, which adds a dimension to what it indexes."""
+
+    def ours(params):
+        stats = Statistics(torch.zeros(1), torch.ones(1))
+        rules = Rules(min_opacity=0.0, max_scale=1e9, min_gaussians=1)
+        return densify.densify_and_prune(params, stats, rules, generator(0, "s")).values["means"]
+
+    def squeezed(params):
+        faint = (torch.sigmoid(params["logit_opacities"])[:, None] < 0).squeeze()
+        return params["means"][~faint]
+
+    def deviation(pruned):
+        return float(pruned(parameters(1)).shape != (1, 3))
+
+    fault(deviation, ours=ours, emulation=squeezed, unit="wrong shapes")
+
+
+@row("A0", "F18")
+def test_f18_densification_loses_no_step(fault):
+    """Selecting nobody must change nothing. In the emulation the rows are replaced between backward and step."""
+    nobody = {"enabled": True, "start": 1, "stop": 9, "every": 2, "min_opacity": 1e-9, "grad_threshold": 1e9, "max_scale": 1e9}
+
+    def step_first(geometry, optimizer, step):
+        optimizer.step()
+        geometry.after_step(optimizer, step)
+
+    def densify_first(geometry, optimizer, step):
+        geometry.after_step(optimizer, step)
+        optimizer.step()
+
+    def trajectory(finish, **options):
+        geometry = started(**options)
+        optimizer = torch.optim.Adam([{**group, "lr": 1e-2} for group in geometry.parameter_groups()])
+        for step in range(1, 7):
+            sum((p**2).sum() for p in geometry.parameters()).backward()
+            finish(geometry, optimizer, step)
+            optimizer.zero_grad()
+        return geometry.means.detach()
+
+    plain = trajectory(step_first)
+    fault(lambda f: (trajectory(f, densify=nobody) - plain).abs().max(), ours=step_first, emulation=densify_first, unit="moved")
+
+
+@row("A0", "F21")
+def test_f21_the_cap_takes_what_contributes_least(fault):
+    contribution = torch.rand(500, generator=torch.Generator().manual_seed(1))
+    best = contribution.sort(descending=True).values[:200].sum()
+
+    def ours(params):
+        stats = Statistics(torch.zeros(500), contribution)
+        rules = Rules(max_gaussians=200, min_opacity=0.0, max_scale=1e9, min_gaussians=1)
+        return densify.densify_and_prune(params, stats, rules, generator(0, "s")).parents
+
+    def lottery(params):
+        return torch.randperm(500, generator=torch.Generator().manual_seed(0))[:200]
+
+    def deviation(capped):
+        kept = capped(parameters(500))
+        return 1e9 if len(kept) != 200 else (1 - contribution[kept].sum() / best) * 100
+
+    fault(deviation, ours=ours, emulation=lottery, unit="% of the contribution lost")
+
+
+# ---- losses and settings -------------------------------------------------------------------------------------------------------
+
+
+@row("A0", "F19")
+def test_f19_a_negative_loss_is_back_propagated(fault):
+    """A whole training step of the system on a loss of -p^2, with everything around it stubbed."""
+
+    def ours(parameter):
+        optimizer = torch.optim.SGD([parameter], lr=0.0)
+        optimizer.zero_grad = lambda set_to_none: None
+        wrapped = SimpleNamespace(
+            param_groups=optimizer.param_groups, step=lambda: None, optimizer=optimizer, zero_grad=optimizer.zero_grad
+        )
+        nothing = SimpleNamespace(observe=lambda *_: None, after_step=lambda *_: None)
+        system = SimpleNamespace(
+            optimizers=lambda: wrapped, set_learning_rates=lambda _: None, losses=lambda *_: {"x": -(parameter**2).sum()},
+            manual_backward=lambda loss: loss.backward(), geometry=nothing, loss_scale=lambda: 1.0, report=lambda *_: None, global_step=1,
+        )  # fmt: skip
+        stepping = type(
+            "System", (), {"__call__": lambda self, batch: {"rasterized": None}, "__getattr__": lambda _, n: getattr(system, n)}
+        )
+        GaussianDreamerSystem.training_step(stepping(), {"width": 1, "height": 1}, 0)
+
+    def if_positive(parameter):
+        loss = -(parameter**2).sum()
+        if loss > 0:
+            loss.backward()
+
+    def deviation(step):
+        parameter = torch.tensor([2.0, 3.0], requires_grad=True)
+        step(parameter)
+        gradient = torch.zeros(2) if parameter.grad is None else parameter.grad
+        return (gradient + 2 * parameter.detach()).abs().max()
+
+    fault(deviation, ours=ours, emulation=if_positive)
+
+
+@row("A0", "F20")
+def test_f20_every_learning_rate_in_the_config_reaches_the_optimiser(fault):
+    """The emulation reads ``scaling_lr`` from a config that says ``scale_lr``, and takes its default."""
+
+    def ours(rates):
+        geometry = started(sh_degree=1, **rates)
+        optimizer = torch.optim.Adam(geometry.parameter_groups())
+        geometry.set_learning_rates(optimizer, 0, 0)
+        return {LEARNING_RATES[group["name"]]: group["lr"] for group in optimizer.param_groups}
+
+    def misspelt(rates):
+        return {name: rates.get(name.replace("scales", "scaling"), 0.005) for name in rates}
+
+    def deviation(optimised):
+        rates = {name: 0.25 + 0.5**i for i, name in enumerate(LEARNING_RATES.values())}
+        found = optimised(rates)
+        return sum(found.get(name) != rate for name, rate in rates.items())
+
+    fault(deviation, ours=ours, emulation=misspelt, unit="dead keys")
+
+
+@row("A0", "F25")
+def test_f25_each_preset_holds_its_own_numbers(fault):
+    """Paper: scales 1e-3, rotations 1e-2, positions 5e-5. Released code: 5e-3, 1e-3, 5e-5 times the extent 4 = 2e-4."""
+    told = {"paper": (1e-3, 1e-2, 5e-5), "code": (5e-3, 1e-3, 2e-4)}
+    files = {"paper": "gaussiandreamer.yaml", "code": "gaussiandreamer-official.yaml"}
+
+    def rates(name):
+        geometry = yaml.safe_load((CONFIGS / name).read_text())["system"]["geometry"]
+        first = geometry["lr_means"][1] if isinstance(geometry["lr_means"], list) else geometry["lr_means"]
+        return geometry["lr_scales"], geometry["lr_quats"], first
+
+    def deviation(files):
+        return sum(a != b for who in told for a, b in zip(rates(files[who]), told[who], strict=True))
+
+    one_for_both = {"paper": files["code"], "code": files["code"]}
+    fault(deviation, ours=files, emulation=one_for_both, unit="of 6 numbers wrong")
+
+
+# ---- score distillation --------------------------------------------------------------------------------------------------------
+
+
+class Stub(ScoreDistillation):
+    """Its gradient is w x for latents x; NaN for the first item from step ``broken_from`` on."""
+
+    broken_from = 0
+
+    def encode(self, rgb, **batch):
+        return 2 * rgb - 1
+
+    def decode(self, latents):
+        return (latents + 1) / 2
+
+    def condition(self, prompt_utils, **batch):
+        return None
+
+    def predict(self, z, t, condition):
+        noise = streams.normal_per_item(tuple(z.shape), 0, "noise", self.step)
+        eps = noise + sds.predict_x0(z, noise, self.alphas_cumprod[t])
+        eps[0] = torch.where(torch.tensor(self.step >= self.broken_from), torch.nan, eps[0])
+        return eps, None
+
+
+@row("A0", "F22")
+def test_f22_a_broken_score_is_seen(fault):
+    """The first of three items is NaN in every step: how many steps of twenty go by with nothing said about it."""
+    rgb = torch.rand(3, 4, 4, 3, generator=torch.Generator().manual_seed(0))
+
+    def gradient(guidance, step):
+        guidance.update_step(0, step)
+        image = rgb.clone().requires_grad_()
+        out = guidance(image)
+        out["loss_sds"].backward()
+        return image.grad, out["bad_items"]
+
+    def ours(step):
+        broken, counted = gradient(guidance, step)
+        whole, _ = gradient(healthy, step)
+        assert (broken[0] == 0).all() and torch.equal(broken[1:], whole[1:])
+        return counted > 0
+
+    def nan_to_num(step):
+        torch.nan_to_num(torch.full((3, 4, 4, 3), torch.nan))  # zero from here on, and the step a success
+        return False
+
+    def deviation(said):
+        silent = 0
+        for step in range(20):
+            try:
+                silent += not said(step)
+            except NonFiniteScore:
+                assert step == 9  # the tenth
+                return silent
+        return silent
+
+    guidance, healthy = Stub({"guidance_scale": 1.0}), Stub({"guidance_scale": 1.0})
+    healthy.broken_from = 1000
+    fault(deviation, ours=ours, emulation=nan_to_num, unit="silent steps")
+
+
+@row("A0", "F23")
+@pytest.mark.parametrize("percents", [(0.02, 1.0), (1.0, 1.0), (0.0, 0.0)])
+def test_f23_every_timestep_has_its_entry(percents, fault):
+    """The emulation draws up to and including 1000 of 1000."""
+    table = sds.sd_alphas_cumprod()
+
+    def ours():
+        steps = [sds.timesteps(50, *sds.step_range(*percents), seed=0, step=step) for step in range(20)]
+        return torch.cat(steps)
+
+    def inclusive():
+        return torch.randint(int(1000 * percents[0]), 1001, (200_000,), generator=torch.Generator().manual_seed(0))
+
+    def deviation(draw):
+        t = draw()
+        table[t]  # IndexError on a CPU, a device assert on a GPU
+        return ((t < 1) | (t > 999)).sum()
+
+    fault(deviation, ours=ours, emulation=inclusive, raises=IndexError)
+
+
+@row("A0", "F23")
+def test_f23_an_empty_range_is_a_named_error(measured):
+    with pytest.raises(UserError, match="min"):
+        sds.step_range(0.98, 0.5)
+    measured("named error")
+
+
+@row("A0", "F24")
+def test_f24_the_guidance_scale_is_in_the_usual_convention(fault):
+    """s = 1 is no guidance, s = 100 is 100 differences from the unconditional score; the emulation starts at the conditional one."""
+    e_c, e_u = torch.randn(2, 4, 8, 8, generator=torch.Generator().manual_seed(0))
+
+    def from_the_conditional(e_c, e_u, scale):
+        return e_c + scale * (e_c - e_u)
+
+    def deviation(guided):
+        exact = {1.0: e_c, 100.0: e_u + 100 * (e_c - e_u)}
+        return max((guided(e_c, e_u, scale) - expected).abs().max() / expected.abs().max() for scale, expected in exact.items())
+
+    fault(deviation, ours=sds.classifier_free, emulation=from_the_conditional, at_most=1e-6, unit="relative")
