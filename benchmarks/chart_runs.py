@@ -35,12 +35,12 @@ class Chart(NamedTuple):
 
 DECIBEL = "held-out PSNR, dB"
 RUNS = {
-    "time": Chart("What each kind of score buys per second", "seconds", "seconds of training, one thread", curves=True),
+    "time": Chart("What each kind of score buys per second", "cpu_seconds", "CPU seconds of training, one thread", curves=True),
     "count": Chart("How many Gaussians a scene needs", "gaussians", "Gaussians at the end", curves=False),
-    "size": Chart("What rendering larger buys", "seconds", "seconds of training, one thread", curves=False),
-    "batch": Chart("Views per step, at equal rendered views", "seconds", "seconds of training, one thread", True, per_variant="x"),
+    "size": Chart("What rendering larger buys", "cpu_seconds", "CPU seconds of training, one thread", curves=False),
+    "batch": Chart("Views per step, at equal rendered views", "cpu_seconds", "CPU seconds of training, one thread", True, per_variant="x"),
     "iterations": Chart("What more steps buy", "x", "steps", curves=False),
-    "preset": Chart("What the rasteriser's presets buy", "seconds", "seconds of training, one thread", curves=True),
+    "preset": Chart("What the rasteriser's presets buy", "cpu_seconds", "CPU seconds of training, one thread", curves=True),
 }
 
 
@@ -96,7 +96,7 @@ def label_of(chart: Chart, row: Row) -> str:
 
 def draw_curve(panel: Any, chart: Chart, rows: Iterable[Row], style: dict[str, Any], marker: str) -> None:
     """Median over the seeds at each step, the range as a band, a marker at the end."""
-    steps = grouped((row for row in rows if float(row["seconds"]) > 0), lambda row: int(row["step"]))
+    steps = grouped((row for row in rows if float(row["cpu_seconds"]) > 0), lambda row: int(row["step"]))
     points = [(median(at, chart.x), *spread(at)) for _, at in sorted(steps.items())]
     x, low, middle, high = zip(*points, strict=True)
     panel.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)

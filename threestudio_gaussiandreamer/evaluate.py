@@ -2,7 +2,7 @@
 
 The truth comes from a ray caster on the mesh, never from our splatting, and is composited on the background that the render
 has. Score: PSNR and SSIM, averaged over the views; share of views that show another side of the object (multi-face); share of
-the opacity that floats away from the surface (floater mass).
+the opacity that floats away from the surface (floater mass); share of pixels with a colour that no screen shows (out of gamut).
 """
 
 import json
@@ -21,7 +21,7 @@ from .cameras import Orbit, held_out_orbit
 from .data import make_batch
 from .errors import UserError
 from .meshes import SurfaceDistance
-from .metrics import floater_mass, multi_face_rate, psnr, ssim
+from .metrics import floater_mass, multi_face_rate, out_of_gamut, psnr, ssim
 from .raycast import over_background
 
 
@@ -84,7 +84,7 @@ class HeldOut:
 
     @torch.no_grad()
     def render(self, renderer: Any, chunk: int = 4) -> tuple[Tensor, Tensor]:
-        """The cloud's pictures (V, H, W, 3) in [0, 1], and the background (V, 3) they lie on, on the CPU."""
+        """The cloud's pictures (V, H, W, 3), as they come out, and the background (V, 3) they lie on, on the CPU."""
         modes = [(module, module.training) for module in (renderer, renderer.background)]
         for module, _ in modes:
             module.eval()
@@ -92,7 +92,7 @@ class HeldOut:
         for start in range(0, self.cfg.views, chunk):
             part = Orbit(*(values[start : start + chunk] for values in self.orbit))
             out = renderer(**orbit_batch(part, self.cfg.size * renderer.cfg.downsample))
-            images.append(out["comp_rgb"].cpu().clamp(0, 1))
+            images.append(out["comp_rgb"].cpu())
             backgrounds.append(out["comp_rgb_bg"].cpu().mean((1, 2)))
         for module, training in modes:
             module.train(training)
@@ -109,30 +109,35 @@ class HeldOut:
             wrong += multi_face_rate(images[rows], bank, self.orbit.azimuth[rows], azimuth) * len(rows)
         return wrong / len(images)
 
-
     def floaters(self, means: Float[Tensor, "N 3"], opacities: Float[Tensor, " N"]) -> float:
         """The opacity-weighted share of Gaussians farther from the surface than 2 % of the longest side of its box."""
         distances = torch.from_numpy(self.surface_distance(means.double().cpu().numpy()))
         return floater_mass(distances, opacities.double().cpu(), extent=float(np.ptp(self.caster.mesh.vertices, axis=0).max()))
 
 
+CLOCKS = ("seconds", "cpu_seconds")
+
+
 class Measurements:
-    """What a run measured, with the training seconds that led there; kept in ``metrics.json`` and continued on resume."""
+    """What a run measured, with the training seconds that led there; kept in ``metrics.json`` and continued on resume.
+
+    ``cpu_seconds``, the processor time of all threads, doesn't grow when other programs hold the processor.
+    """
 
     def __init__(self, held_out: HeldOut, folder: Path) -> None:
         self.held_out, self.folder = held_out, folder
         self.path = folder / "metrics.json"
         self.values: dict[str, Any] = _read_json(self.path)
-        self.seconds = float(self.values.get("seconds", 0.0))
-        self._started: Optional[float] = None
+        self.seconds = np.array([self.values.get(name, 0.0) for name in CLOCKS], np.float64)
+        self._started: Optional[np.ndarray] = None
 
     def start_clock(self) -> None:
-        self._started = time.perf_counter()
+        self._started = _now()
 
     def stop_clock(self) -> None:
         """Add the time since the clock was started to the training seconds."""
         if self._started is not None:
-            self.seconds += time.perf_counter() - self._started
+            self.seconds += _now() - self._started
             self._started = None
 
     @torch.no_grad()
@@ -140,13 +145,15 @@ class Measurements:
         """Score the renderer's cloud under ``key`` ("prior", "result", or "curve", which collects); no time is counted while it runs."""
         running = self._started is not None
         self.stop_clock()
-        images, backgrounds = self.held_out.render(renderer)
+        rendered, backgrounds = self.held_out.render(renderer)
+        images = rendered.clamp(0, 1)
         truth = self.held_out.truth_on(backgrounds)
-        scores = {"step": step, "seconds": round(self.seconds, 3), "gaussians": len(renderer.geometry)}
+        scores = {"step": step, **self._elapsed(), "gaussians": len(renderer.geometry)}
         scores |= {"psnr": round(float(psnr(images, truth).mean()), 3), "ssim": round(float(ssim(images, truth).mean()), 4)}
         scores["multi_face"] = round(self.held_out.multi_face(images, backgrounds), 4)
         cloud = renderer.geometry
         scores["floater_mass"] = round(self.held_out.floaters(cloud.means, cloud.opacities()), 5)
+        scores["out_of_gamut"] = round(out_of_gamut(rendered), 5)
         if key == "curve":
             self.values.setdefault("curve", []).append(scores)
         else:
@@ -157,8 +164,11 @@ class Measurements:
             self.start_clock()
         return scores
 
+    def _elapsed(self) -> dict[str, float]:
+        return {name: round(float(value), 3) for name, value in zip(CLOCKS, self.seconds, strict=True)}
+
     def write(self) -> None:
-        self.values["seconds"] = round(self.seconds, 3)
+        self.values |= self._elapsed()
         self.folder.mkdir(parents=True, exist_ok=True)
         temporary = self.path.with_suffix(".tmp")
         temporary.write_text(json.dumps(self.values, indent=2))
@@ -185,6 +195,10 @@ class Measurements:
                 face = f"{100 * v['multi_face']:.0f} %"
                 lines.append(f"{key:<10}{v['psnr']:6.2f}   {v['ssim']:6.4f}   {face:>10}   {v['gaussians']:9d}   {v['seconds']:7.1f}")
         return "\n".join(lines)
+
+
+def _now() -> np.ndarray:
+    return np.array([time.perf_counter(), time.process_time()])
 
 
 def _read_json(path: Path) -> dict[str, Any]:
