@@ -40,6 +40,7 @@ RUNS = {
     "size": Chart("What rendering larger buys", "cpu_seconds", "CPU seconds of training, one thread", curves=False),
     "batch": Chart("Views per step, at equal rendered views", "cpu_seconds", "CPU seconds of training, one thread", True, per_variant="x"),
     "iterations": Chart("What more steps buy", "x", "steps", curves=False),
+    "quality": Chart("Draft, default and best", "cpu_seconds", "CPU seconds of training, one thread", curves=True),
     "preset": Chart("What the rasteriser's presets buy", "cpu_seconds", "CPU seconds of training, one thread", curves=True),
 }
 

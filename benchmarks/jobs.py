@@ -34,6 +34,8 @@ class Job(NamedTuple):
     x: float
     """The place on the chart's horizontal axis, where that isn't measured; else 0."""
     options: dict[str, Any]
+    overlay: str = ""
+    """The name of a file of configs/ that is laid over demo.yaml."""
 
 
 def steps(count: int) -> dict[str, Any]:
@@ -76,12 +78,11 @@ def count_jobs() -> Iterator[Job]:
     yield Job("count", "the paper's recipe", 10000, PAPER)
     yield Job("count", "by contribution, auto", 0, {"system.geometry.budget": "auto"})
     for count in COUNTS:
-        budget = {"system.geometry.budget": count}
-        yield Job("count", "by contribution", count, budget)
+        yield Job("count", "by contribution", count, {"system.geometry.budget": count})
+    for count in COUNTS[1:]:
         yield Job("count", "from scratch", count, scratch(count))
-        yield Job("count", "by opacity", count, budget | {"system.geometry.prune.score": "opacity"})
-    for count in (2500, 1000):
-        yield Job("count", "at random", count, {"system.geometry.budget": count, "system.geometry.prune.score": "random"})
+        for score in ("opacity", "random"):
+            yield Job("count", f"by {score}", count, {"system.geometry.budget": count, "system.geometry.prune.score": score})
 
 
 def size_jobs() -> Iterator[Job]:
@@ -103,13 +104,21 @@ def batch_jobs() -> Iterator[Job]:
 def iteration_jobs() -> Iterator[Job]:
     """Runs of their own: a longer run is not the continuation of a shorter one."""
     for rates, name in (({}, "demo.yaml"), (PAPER, "the paper's recipe")):
-        for count in (150, 300, 600, 1200, 2400):
+        for count in (150, 300, 600, 1200):
             yield Job("iterations", name, count, steps(count) | rates)
 
 
 def preset_jobs() -> Iterator[Job]:
     for preset in ("fast", "balanced", "accurate"):
         yield Job("preset", preset, 0, {"system.renderer.preset": preset})
+
+
+def quality_jobs() -> Iterator[Job]:
+    """The demo as it is, its quick and its good variant, at its own size."""
+    own_size = {"data.width": 256, "data.height": 256, "system.evaluation.size": 256}
+    for name, overlay, count in (("draft", "demo-draft", 200), ("default", "", STEPS), ("best", "demo-best", 3000)):
+        yield Job("quality", name, 0, own_size | {"trainer.max_steps": count, "system.evaluation.every": count // 20}, overlay)
+    yield Job("quality", "the paper's recipe", 0, own_size | {"system.evaluation.every": STEPS // 20} | PAPER)
 
 
 def failure_jobs() -> Iterator[Job]:
@@ -142,5 +151,6 @@ JOBS: dict[str, Callable[[], Iterator[Job]]] = {
     "batch": batch_jobs,
     "iterations": iteration_jobs,
     "preset": preset_jobs,
+    "quality": quality_jobs,
     "failures": failure_jobs,
 }

@@ -46,7 +46,7 @@ def main() -> None:
         print("\n".join(f"{job.chart}: {job.variant}, {job.x:g}, {object_name(mesh)}, seed {seed}" for job, mesh, seed in todo))
         return
     with ThreadPoolExecutor(arguments.jobs) as pool:
-        running = {pool.submit(run, mesh, seed, curve(job) | job.options): (job, mesh, seed) for job, mesh, seed in todo}
+        running = {pool.submit(run, mesh, seed, curve(job) | job.options, job.overlay): (job, mesh, seed) for job, mesh, seed in todo}
         for done in tqdm(as_completed(running), total=len(todo), unit="run", disable=None):
             append(*running[done], done.result())
 
@@ -61,7 +61,7 @@ def parse_arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def run(mesh: str, seed: int, options: dict[str, Any]) -> dict[str, Any]:
+def run(mesh: str, seed: int, options: dict[str, Any], overlay: str = "") -> dict[str, Any]:
     """One training run in a process of its own; its metrics."""
     with tempfile.TemporaryDirectory() as folder:
         return json.loads((train(Path(folder), mesh, seed, options) / "metrics.json").read_text())

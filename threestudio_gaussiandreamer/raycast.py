@@ -43,16 +43,10 @@ class MeshCaster:
             c2w: OpenGL camera to world.
             fovy: vertical field of view in radians, in (0, pi).
         """
-        if height < 1 or width < 1 or supersample < 1:
-            raise UserError(f"a picture needs a size and supersample of at least 1, not {height}x{width} and {supersample}")
-        c2w = np.asarray(c2w, dtype=np.float64)
-        focal = height / (2 * math.tan(fovy / 2))
-        top, bottom, left, right = self._bounds(c2w, focal, height, width)
-        columns = _samples(left, right, supersample) - width / 2
+        _require_size(height, width, supersample)
         image = np.zeros((height, width, 4), dtype=np.float32)
-        for start, end in _bands(top, bottom, supersample * len(columns)):
-            colors = self._cast(c2w, focal, _samples(start, end, supersample) - height / 2, columns)
-            image[start:end, left:right] = colors.reshape(end - start, supersample, right - left, supersample, 4).mean(axis=(1, 3))
+        for fill in self._bands(image, c2w, fovy, supersample):
+            fill()
         return image
 
     def render_views(
@@ -64,15 +58,30 @@ class MeshCaster:
         """
         from tqdm import tqdm
 
+        _require_size(height, width, supersample)
         cameras = list(cameras)
-        images = np.empty((len(cameras), height, width, 4), dtype=np.float32)
-
-        def fill(index: int) -> None:
-            images[index] = self.render(*cameras[index], height, width, supersample=supersample)
-
-        with ThreadPoolExecutor(max(1, min(len(cameras), os.cpu_count() or 1))) as pool:
-            list(tqdm(pool.map(fill, range(len(cameras))), progress, len(cameras), disable=None if progress else True, leave=False))
+        images = np.zeros((len(cameras), height, width, 4), dtype=np.float32)
+        # bands instead of pictures, so that one picture occupies all cores too
+        bands = [fill for image, camera in zip(images, cameras, strict=True) for fill in self._bands(image, *camera, supersample)]
+        if bands:
+            with ThreadPoolExecutor(min(len(bands), os.cpu_count() or 1)) as pool:
+                drawn = pool.map(lambda fill: fill(), bands)
+                list(tqdm(drawn, progress, len(bands), unit="band", disable=None if progress else True, leave=False))
         return images
+
+    def _bands(self, image: Float[np.ndarray, "H W 4"], c2w: np.ndarray, fovy: float, supersample: int) -> list[Callable[[], None]]:
+        """What has to be called to draw one picture, each a group of its rows, in any order."""
+        height, width = image.shape[:2]
+        c2w = np.asarray(c2w, dtype=np.float64)
+        focal = height / (2 * math.tan(fovy / 2))
+        top, bottom, left, right = self._bounds(c2w, focal, height, width)
+        columns = _samples(left, right, supersample) - width / 2
+
+        def fill(start: int, end: int) -> None:
+            colors = self._cast(c2w, focal, _samples(start, end, supersample) - height / 2, columns)
+            image[start:end, left:right] = colors.reshape(end - start, supersample, right - left, supersample, 4).mean(axis=(1, 3))
+
+        return [functools.partial(fill, start, end) for start, end in _row_groups(top, bottom, supersample * len(columns))]
 
     def _bounds(self, c2w: np.ndarray, focal: float, height: int, width: int) -> tuple[int, int, int, int]:
         """The pixel rectangle (top, bottom, left, right) outside which no ray can hit: the vertices' on the screen."""
@@ -101,12 +110,17 @@ def over_background(
     return rgba[..., :3] + (1 - rgba[..., 3:]) * background
 
 
+def _require_size(height: int, width: int, supersample: int) -> None:
+    if height < 1 or width < 1 or supersample < 1:
+        raise UserError(f"a picture needs a size and supersample of at least 1, not {height}x{width} and {supersample}")
+
+
 def _samples(start: int, end: int, supersample: int) -> Float[np.ndarray, " S"]:
     """The places of a regular grid in the pixels start ... end - 1."""
     return start + (np.arange((end - start) * supersample) + 0.5) / supersample
 
 
-def _bands(top: int, bottom: int, rays_per_row: int) -> list[tuple[int, int]]:
+def _row_groups(top: int, bottom: int, rays_per_row: int) -> list[tuple[int, int]]:
     """Groups of pixel rows with at most RAYS_PER_CAST rays, or one row: memory doesn't grow with size and supersample."""
     if not rays_per_row:
         return []
