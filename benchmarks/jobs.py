@@ -81,8 +81,8 @@ def count_jobs() -> Iterator[Job]:
         yield Job("count", "by contribution", count, {"system.geometry.budget": count})
     for count in COUNTS[1:]:
         yield Job("count", "from scratch", count, scratch(count))
-        for score in ("opacity", "random"):
-            yield Job("count", f"by {score}", count, {"system.geometry.budget": count, "system.geometry.prune.score": score})
+        for score, name in (("opacity", "by opacity"), ("random", "at random")):
+            yield Job("count", name, count, {"system.geometry.budget": count, "system.geometry.prune.score": score})
 
 
 def size_jobs() -> Iterator[Job]:
