@@ -23,6 +23,7 @@ RATES = {
 BINS = VIEW_BLIND | {"system.guidance.mode": "direction-bins"}
 GREY = {"system.geometry.prior.color": "grey"}
 BALL = {"system.geometry.prior_type": "random-prior", "system.geometry.prior": {"num_points": 8000, "shape": "sphere", "color": "grey"}}
+SMALL = {"data.width": 96, "data.height": 96}
 BLURRED = {"system.guidance.latent_size": 4}
 
 
@@ -123,7 +124,6 @@ def quality_jobs() -> Iterator[Job]:
 
 def failure_jobs() -> Iterator[Job]:
     """How the method fails, and what each remedy buys: 96^2 and 600 steps, so that 15 runs of each are affordable."""
-    small = {"data.width": 96, "data.height": 96} | steps(600)
     plain_timesteps = LATENT | STRONG | NO_ANNEALING
     variants = {
         "multi-face: random start": VIEW_BLIND | RANDOM_START,
@@ -141,7 +141,18 @@ def failure_jobs() -> Iterator[Job]:
         "right shape": {},
     }
     for name, options in variants.items():
-        yield Job("failures", name, 0, small | options)
+        yield Job("failures", name, 0, SMALL | steps(600) | options)
+
+
+def alike_jobs() -> Iterator[Job]:
+    """The paper's limit: an object whose front and back differ little in shape; for benchmarks/scenes/ball.ply."""
+    variants = {
+        "front and back alike: grey prior": VIEW_BLIND | GREY,
+        "front and back alike: grey prior + view-dependent score": BINS | GREY,
+        "front and back alike: coloured prior": VIEW_BLIND,
+    }
+    for name, options in variants.items():
+        yield Job("alike", name, 0, SMALL | steps(600) | options)
 
 
 JOBS: dict[str, Callable[[], Iterator[Job]]] = {
@@ -153,4 +164,5 @@ JOBS: dict[str, Callable[[], Iterator[Job]]] = {
     "preset": preset_jobs,
     "quality": quality_jobs,
     "failures": failure_jobs,
+    "alike": alike_jobs,
 }
