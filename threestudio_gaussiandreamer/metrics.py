@@ -1,4 +1,4 @@
-"""How good a result is: PSNR and SSIM against the truth, the multi-face meter, the floater meter."""
+"""How good a result is: PSNR and SSIM against the truth, the multi-face meter, the floater meter, the share out of gamut."""
 
 import torch
 import torch.nn.functional as F
@@ -67,6 +67,12 @@ def floater_mass(distances: Float[Tensor, " N"], opacities: Float[Tensor, " N"],
     """The opacity-weighted share of Gaussians farther than ``share`` of ``extent`` (the box's longest side) from the surface."""
     total = opacities.sum()
     return (opacities[distances > share * extent].sum() / total).item() if total > 0 else 0.0
+
+
+def out_of_gamut(images: Float[Tensor, "*batch 3"]) -> float:
+    """The share of pixels with a colour outside of [0, 1] by more than half a grey level: what no screen shows, and guidance overdoes."""
+    beyond = 0.5 / 255
+    return ((images < -beyond) | (images > 1 + beyond)).any(-1).double().mean().item()
 
 
 def _window_mean(images: Float[Tensor, "*batch H W C"]) -> Float[Tensor, "*batch H W C"]:
