@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parent.parent
 CHARTS = ROOT / "docs/charts"
 SIZE, EVERY = 128, 100
 WITH_CURVES = ("time", "batch", "preset")
-COLUMNS = "variant,x,object,seed,step,cpu_seconds,gaussians,psnr,ssim,multi_face,floater_mass,machine,commit".split(",")
+COLUMNS = "variant,x,object,seed,step,cpu_seconds,gaussians,psnr,ssim,multi_face,floater_mass,out_of_gamut,machine,commit".split(",")
 
 
 def main() -> None:
@@ -48,8 +48,14 @@ def main() -> None:
         return
     with ThreadPoolExecutor(arguments.jobs) as pool:
         running = {pool.submit(run, mesh, seed, curve(job) | job.options, job.overlay): (job, mesh, seed) for job, mesh, seed in todo}
+        failed = 0
         for done in tqdm(as_completed(running), total=len(todo), unit="run", disable=None):
-            append(*running[done], done.result())
+            if error := done.exception():
+                failed += 1
+                tqdm.write(str(error), file=sys.stderr)
+            else:
+                append(*running[done], done.result())
+    sys.exit(f"{failed} of {len(todo)} runs failed" if failed else 0)
 
 
 def parse_arguments() -> argparse.Namespace:
