@@ -6,7 +6,7 @@ ENVIRON = OMP_WAIT_POLICY=passive
 # without the CPU kernel (no C++ compiler) plain torch draws, and the demo is smaller
 SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import available_backends as b; print("--config configs/demo-small.yaml" if b()["cpu"] else "")')
 
-.PHONY: demo test stability ablations bench gpu-check charts measure-charts clean
+.PHONY: demo test stability fuzz ablations bench gpu-check charts measure-charts clean
 
 demo: $(VENV)/ready                ## train the bundled toy from a coarse prior, offline, on the CPU
 	$(ENVIRON) $(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
@@ -17,6 +17,9 @@ test: $(VENV)/ready-for-tests                ## the whole test suite, as CI runs
 stability: $(VENV)/ready-for-tests          ## every known way to fail, provoked and measured: docs/stability.md
 	$(ENVIRON) $(BIN)/python -m pytest tests/stability --stability-report stability.json; status=$$?; \
 	$(BIN)/python tests/stability/report.py stability.json docs/stability.md; rm -f stability.json; exit $$status
+
+fuzz: $(VENV)/ready-for-tests               ## damaged files at every door, hostile Gaussians, random lives of a cloud; about half an hour
+	$(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python benchmarks/fuzz.py
 
 ablations: $(VENV)/ready           ## the paper's ablations as a table, measured against a known truth
 	$(ENVIRON) $(BIN)/python benchmarks/ablations.py
@@ -30,11 +33,14 @@ gpu-check: $(VENV)/ready-for-tests ## everything that waits for an NVIDIA GPU: c
 charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbers beside them
 	$(ENVIRON) $(BIN)/python benchmarks/chart_splatting.py --from-csv
 	$(ENVIRON) $(BIN)/python benchmarks/chart_runs.py
+	$(ENVIRON) $(BIN)/python benchmarks/attributes.py --objects
 
 measure-charts: $(VENV)/ready-for-charts     ## the numbers anew, about an hour; runs that are in the CSVs are not repeated
 	$(ENVIRON) $(BIN)/python benchmarks/chart_splatting.py
 	$(ENVIRON) $(BIN)/python benchmarks/runs.py
 	$(ENVIRON) $(BIN)/python benchmarks/chart_runs.py
+	$(ENVIRON) $(BIN)/python benchmarks/attributes.py
+	$(ENVIRON) $(BIN)/python benchmarks/known_answer.py
 
 # installed once; again when what is installed changes
 PACKAGE = pyproject.toml setup.py constraints.txt $(wildcard threestudio_gaussiandreamer/splatting/native/*.h threestudio_gaussiandreamer/splatting/native/*.cpp)

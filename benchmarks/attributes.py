@@ -246,15 +246,18 @@ def draw(measurements: list[dict[str, str]]) -> Path:
 def draw_bytes(panel: Any, measurements: list[dict[str, str]]) -> None:
     """dB against bytes: float32 of each kind of cloud, and the compact file as a star."""
     trained = [row for row in measurements if row["experiment"] == "trained"]
-    for label, chosen in grouped(trained, lambda row: row["variant"]).items():
-        points = sorted((median(at, "bytes") / 1000, *spread(at)) for at in grouped(chosen, lambda row: row["x"]).values())
+    lines = grouped(trained, lambda row: row["variant"])
+    for index, label in enumerate(kind for kind in KINDS if kind in lines):
+        points = sorted((median(at, "bytes") / 1000, *spread(at)) for at in grouped(lines[label], lambda row: row["x"]).values())
         x, low, middle, high = zip(*points, strict=True)
-        panel.plot(x, middle, "o-", linewidth=1.4, markersize=4, label=f"{label}, float32")
-        panel.vlines(x, low, high, linewidth=1)
+        panel.plot(x, middle, "o-", color=f"C{index}", linewidth=1.4, markersize=4, label=f"{label}, float32")
+        panel.vlines(x, low, high, color=f"C{index}", linewidth=1)
     files = [row for row in measurements if (row["experiment"], row["variant"]) == ("file", "SPZ")]
     panel.plot(median(files, "bytes") / 1000, spread(files)[1], "*", color="0.15", markersize=12, label=f"{STRETCHED}, SPZ")
     finish(panel, "kB")
     panel.set_xscale("log")
+    panel.set_xticks([50, 100, 200, 500], ["50", "100", "200", "500"])
+    panel.minorticks_off()
 
 
 def draw_bits(panel: Any, measurements: list[dict[str, str]]) -> None:

@@ -18,6 +18,7 @@ import math
 import os
 import pathlib
 import platform
+import shutil
 import statistics
 import subprocess
 import sys
@@ -208,9 +209,16 @@ def describe_machine() -> str:
     """Processor, versions and commit, for the head of the table."""
     info = pathlib.Path("/proc/cpuinfo")
     names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")] if info.exists() else []
-    git = subprocess.run(["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
-    cpu, commit = names[0] if names else platform.processor(), git.stdout.strip() or "unknown"
+    cpu, commit = names[0] if names else platform.processor(), _commit() or "unknown"
     return f"{cpu}, {os.cpu_count()} threads; Python {platform.python_version()}, torch {torch.__version__}; commit {commit}"
+
+
+def _commit() -> str:
+    """Nothing where there is no git, or this isn't a checkout."""
+    git = shutil.which("git")
+    if git is None:
+        return ""
+    return subprocess.run([git, "-C", str(ROOT), "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
 
 
 def available(names: list[str]) -> list[str]:

@@ -150,6 +150,7 @@ def alike_jobs() -> Iterator[Job]:
         "front and back alike: grey prior": VIEW_BLIND | GREY,
         "front and back alike: grey prior + view-dependent score": BINS | GREY,
         "front and back alike: coloured prior": VIEW_BLIND,
+        "front and back alike: coloured prior + view-dependent score": BINS,
     }
     for name, options in variants.items():
         yield Job("alike", name, 0, SMALL | steps(600) | options)

@@ -254,6 +254,24 @@ class KernelContract:
             alone = draw(backend, cloud, (viewmats[view : view + 1], Ks[view : view + 1]), 40, 24).out
             assert all(torch.equal(ours[view], other[0]) for ours, other in zip(batch, alone, strict=True))
 
+    @pytest.mark.parametrize("channels", [2, 3])
+    def test_gradients_may_come_in_any_layout(self, backend, channels):
+        """As from a convolution: what follows the picture decides how the gradient of the picture lies in memory."""
+        cloud, camera = random_cloud(50, seed=14).to(torch.float32), [x.to(torch.float32) for x in cameras(2, 14, 12)]
+        cloud = cloud._replace(colors=cloud.colors[:, :channels])
+        weights, grads = torch.randn(2, 12, 14, channels), []
+        for layout in ((0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 2, 1)):
+            leaves = cloud.leaves()
+            image = rasterize(*leaves, *camera, 14, 12, backend=backend).image
+            (image.permute(layout).contiguous() * weights.permute(layout).contiguous()).sum().backward()
+            grads.append([leaf.grad for leaf in leaves])
+        assert all(torch.equal(a, b) for others in grads[1:] for a, b in zip(grads[0], others, strict=True))
+
+    def test_what_is_not_read_of_a_camera_does_not_matter(self, backend):
+        cloud, (viewmats, Ks) = random_cloud(30, seed=15), cameras(1, 12, 12)
+        viewmats[:, 3] = Ks[:, 2] = Ks[:, 0, 1] = math.nan
+        compare(backend, cloud, (viewmats, Ks), 12, 12)
+
     def test_several_forwards_before_their_backwards(self, backend):
         """Each graph owns what its backward needs, whatever was drawn in between and in whichever order they run."""
         clouds = [random_cloud(n, seed=n).to(torch.float32) for n in (300, 40, 900)]
@@ -283,6 +301,11 @@ class KernelContract:
         torch.autograd.backward([out.image, out.alpha, out.depth], gradients)
         for first, both in zip(once, (cloud.means.grad, out.means2d.grad, out.means2d.absgrad), strict=True):
             assert torch.equal(2 * first, both)
+
+    def test_absgrad_is_zero_before_anything_flowed_back(self, backend):
+        """A loss may leave out a picture that was drawn."""
+        cloud, camera = random_cloud(5).to(torch.float32).leaves(), cameras(2, 12, 12, dtype=torch.float32)
+        assert torch.equal(rasterize(*cloud, *camera, 12, 12, backend=backend, absgrad=True).means2d.absgrad, torch.zeros(2, 5, 2))
 
     @pytest.mark.parametrize("names", [("image",), ("alpha",), ("depth",), ("image", "depth")])
     def test_pictures_without_a_gradient_count_as_zero(self, backend, names):

@@ -93,3 +93,18 @@ def test_the_pool_covers_all_azimuths_and_both_elevation_rules():
     assert (pool.azimuth.diff() > -2).all() and pool.azimuth.min() < -175 and pool.azimuth.max() > 175
     assert torch.equal(pool.distance, cameras.camera_pool(200, OrbitRanges(), 3).distance)
     assert not torch.equal(pool.distance, cameras.camera_pool(200, OrbitRanges(), 4).distance)
+
+
+def test_the_inverse_of_a_camera_is_exact_and_of_a_broken_one_its_own_trouble():
+    c2w = cameras.orbit_c2w(torch.tensor([10.0, 90.0, 0.0]), torch.tensor([20.0, 0.0, 0.0]), torch.tensor([2.0, 3.0, 4.0]))
+    torch.testing.assert_close(cameras.world_to_camera(c2w), torch.linalg.inv(c2w), rtol=0, atol=1e-5)
+    whole = cameras.world_to_camera(c2w[:1])
+    c2w[1], c2w[2] = torch.nan, 0.0  # torch.linalg.inv raises, for all of them
+    assert torch.equal(cameras.world_to_camera(c2w)[:1], whole)
+
+
+def test_a_camera_in_the_centre_looks_as_one_in_front_does():
+    up = torch.tensor([[0.0, 0.0, 1.0]])
+    center = cameras.look_at(torch.zeros(1, 3), torch.zeros(1, 3), up)
+    front = cameras.look_at(torch.tensor([[2.0, 0.0, 0.0]]), torch.zeros(1, 3), up)
+    assert torch.equal(center[:, :3, :3], front[:, :3, :3])

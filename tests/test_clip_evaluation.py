@@ -162,6 +162,18 @@ def test_a_runs_folder_brings_its_prompt_and_background(clip, tmp_path, monkeypa
     assert found["results"][0]["prompt"] == "a {b} ${c} fox" and found["std"] is None
 
 
+def test_a_prompt_of_a_library_is_compared_as_its_text(tmp_path):
+    save(tmp_path / "save" / "it1-export" / "gaussians.ply", blob())
+    (tmp_path / "library.json").write_text('["a corgi in the snow", "a fox"]')
+    (tmp_path / "configs").mkdir()
+    processor = {"prompt": "lib:corgi", "prompt_library": str(tmp_path / "library.json")}
+    (tmp_path / "configs" / "parsed.yaml").write_text(json.dumps({"system": {"prompt_processor": processor}}))
+    assert results.find_result(str(tmp_path)).prompt == "a corgi in the snow"
+    (tmp_path / "library.json").unlink()
+    with pytest.raises(UserError, match="Give --prompt"):
+        module.prompts_for([results.find_result(str(tmp_path))], None, None)
+
+
 def test_the_last_export_is_taken(tmp_path):
     for step in (200, 1200, 30):
         save(tmp_path / "save" / f"it{step}-export" / "gaussians.ply", blob())

@@ -130,7 +130,11 @@ def test_missing_values_are_all_named(folder):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"a: [1", "isn't valid YAML: line 2, column 1: did not find"),
+        (b"a: " + 500 * b"[" + 500 * b"]", "at most 32 levels deep"),
+        (b"a: &a [*a]", "hold fewer than"),
+        (b"".join(b"a%d: &a%d [%s]\n" % (i, i, b", ".join(9 * [b"*a%d" % (i - 1) if i else b"x"])) for i in range(9)), "hold fewer than"),
+        (b"a: &a {b: 1}\nc: {<<: *a}\non: 3", "has the key True, which isn't a word"),
+        (b"a: [1", "isn't valid YAML: line 1, column 6: expected"),
         (b"name: a\nname: b", "isn't valid YAML: line 2"),
         (b"- a", "must hold sections and keys"),
         (b"\xff\xfe", "can't be read"),

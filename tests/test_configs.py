@@ -78,6 +78,17 @@ def test_overlays_add_up(tmp_path):
     assert prior.ground and prior.motion == "results.npz" and cfg.system.guidance.enable_vae_slicing
 
 
+@pytest.mark.parametrize("other", ["if", "pointe", "avatar", "ground"])
+@pytest.mark.parametrize("lowmem_first", [True, False])
+def test_little_memory_goes_with_every_other_overlay_in_either_order(other, lowmem_first, tmp_path):
+    names = ["gaussiandreamer-lowmem.yaml", f"gaussiandreamer-{other}.yaml"]
+    overrides = ["system.prompt_processor.prompt=a fox", *MANDATORY.get(names[1], [])]
+    paths = [ROOT / "configs" / name for name in ("gaussiandreamer.yaml", *(names if lowmem_first else names[::-1]))]
+    cfg = load_config(*paths, cli_args=overrides)
+    check_config(cfg)
+    assert cfg.data.width == 512 and cfg.system.renderer.downsample == 1
+
+
 def test_the_papers_numbers_are_the_papers(tmp_path):
     """Section 4.1 (implementation details) and 3.3 of the paper."""
     cfg = loaded("gaussiandreamer.yaml", tmp_path)

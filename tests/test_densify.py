@@ -133,3 +133,21 @@ def test_moments_follow_their_gaussian_through_random_changes(seed):
 def test_prune_to_keeps_the_best_in_their_order():
     change = densify.prune_to(cloud(5), torch.tensor([0.3, 0.9, 0.1, 0.5, 0.2]), 3)
     assert change.parents.tolist() == [0, 1, 3]
+
+
+def test_what_the_faint_leave_is_given_to_others_in_the_same_round():
+    """Ten at a cap of ten, three of them faint: the three hottest of the others grow."""
+    params, stats = cloud(10), Statistics(torch.linspace(1, 2, 10), torch.ones(10))
+    params["logit_opacities"].data[:3] = -5.0
+    change = densify.densify_and_prune(params, stats, Rules(max_gaussians=10, min_gaussians=1), generator(0, "s"))
+    assert sorted(change.parents.tolist()) == [3, 4, 5, 6, 7, 7, 8, 8, 9, 9]
+
+
+def test_the_floor_is_said_only_where_it_holds_something_back(caplog, monkeypatch):
+    monkeypatch.setattr(densify.logger.parent, "propagate", True)  # the launcher stops it
+    params = cloud(50)
+    densify.densify_and_prune(params, statistics(50), Rules(), generator(0, "s"))
+    assert not caplog.records
+    params["logit_opacities"].data[5:] = -10.0
+    densify.densify_and_prune(params, statistics(50), Rules(min_gaussians=20), generator(0, "s"))
+    assert "only 5 of 50 Gaussians would be left: the 20 that contribute most stay" in caplog.text

@@ -10,6 +10,7 @@ import torch
 from threestudio_gaussiandreamer import exporters, ply
 from threestudio_gaussiandreamer.errors import UserError
 from threestudio_gaussiandreamer.host import BaseGeometry, ExporterOutput, find, names
+from threestudio_gaussiandreamer.spz import read_spz, write_spz
 from threestudio_gaussiandreamer.surface import write_obj
 
 for module in pkgutil.iter_modules(exporters.__path__):
@@ -17,6 +18,7 @@ for module in pkgutil.iter_modules(exporters.__path__):
 
 WRITERS = {
     "ply": ply.write_gaussians,
+    "spz": lambda path, **arrays: write_spz(path, **arrays),
     "points": lambda path, cloud: ply.write_points(path, cloud),
     "surface": lambda path, surface: write_obj(path, surface),
 }
@@ -101,10 +103,18 @@ def test_harmonics_can_be_padded():
         build("ply-exporter", pad_sh_degree=4)
 
 
+def test_a_compact_file_leaves_out_what_it_cant_hold(tmp_path):
+    source = geometry(degree=1)
+    with torch.no_grad():
+        source.means[3] = float("nan")
+    (output,) = build("spz-exporter", source)()
+    assert len(read_spz(write(output, tmp_path)).means) == 39
+
+
 class TestBundle:
     def test_gives_the_files_of_every_format_in_order(self):
         outputs = build("gaussiandreamer-exporter")()
-        assert [output.save_type for output in outputs] == ["ply", "points"]
+        assert [output.save_type for output in outputs] == ["ply", "spz", "points"]
         assert [output.save_type for output in build("gaussiandreamer-exporter", formats=["points"])()] == ["points"]
 
     def test_hands_options_on(self):

@@ -27,7 +27,8 @@ class MultiviewDouble(BaseObject):
     ):
         self.seen.append((prompt_utils, {"elevation", "azimuth", "camera_distances", "c2w", "fovy", *kwargs}))
         assert elevation.shape == azimuth.shape == camera_distances.shape == fovy.shape == (len(rgb),) and c2w.shape == (len(rgb), 4, 4)
-        return {"loss_sds": (rgb - 0.2).square().sum(), "loss_recon": rgb.mean(), "grad_norm": rgb.detach().norm()}
+        looks = {"timesteps": torch.full((len(rgb),), 400), "rgb": rgb.detach(), "eval": {"bs": 1}}  # as threestudio's unified guidance
+        return {"loss_sds": (rgb - 0.2).square().sum(), "loss_recon": rgb.mean(), "grad_norm": rgb.detach().norm(), **looks}
 
 
 class ImageDouble:
@@ -42,6 +43,20 @@ class StrictDouble:
 
     def __call__(self, rgb, prompt_utils, elevation, azimuth, camera_distances):
         return {"loss_sds": rgb.sum(), "prompt_utils": prompt_utils}
+
+
+class WrappedDouble:
+    """Passes everything on, so that its signature says nothing."""
+
+    def __call__(self, *args, **kwargs):
+        return OtherNameDouble()(*args, **{"prompt": kwargs.pop("prompt_utils"), **kwargs})
+
+
+class OtherNameDouble:
+    """Calls the prompt something else, which threestudio, passing it by place, doesn't notice."""
+
+    def __call__(self, rgb, prompt, elevation, azimuth, camera_distances, **kwargs):
+        return {"loss_sds": rgb.sum(), "prompt": prompt}
 
 
 class LearningDouble(nn.Module):
@@ -76,9 +91,33 @@ def batch():
 def test_each_signature_gets_what_it_takes():
     rgb, options = torch.rand(2, 4, 4, 3), {"rgb_as_latents": False, "comp_rgb_bg": torch.zeros(2, 1, 1, 3)}
     image = call_guidance(ImageDouble(), rgb, "prompts", batch(), **options)
-    assert set(image["kwargs"]) == {"height", "width", "c2w", "mvp_mtx", "comp_rgb_bg"}
+    assert set(image["kwargs"]) == {"height", "width", "c2w", "mvp_mtx", "comp_rgb_bg", "prompt_utils"}
     assert call_guidance(StrictDouble(), rgb, "prompts", batch(), **options)["prompt_utils"] == "prompts"
+    for double in (OtherNameDouble(), WrappedDouble()):
+        assert call_guidance(double, rgb, "prompts", batch(), **options)["prompt"] == "prompts"
     assert set(call_guidance(LearningDouble(), rgb, "prompts", batch(), **options)) == {"loss_vsd", "loss_lora"}
+
+
+@pytest.mark.parametrize(
+    "returned, message",
+    [(torch.zeros(3), "returned Tensor"), ({"loss_sds": torch.zeros(4)}, r"returned loss_sds of shape \(4,\)"), (None, "returned NoneType")],
+)
+def test_what_no_run_could_use_is_named(returned, message):
+    class Odd:
+        def __call__(self, rgb):
+            return returned
+
+    with pytest.raises(UserError, match=f"Odd {message}"):
+        call_guidance(Odd(), torch.zeros(1, 2, 2, 3), None, {})
+
+
+def test_a_loss_that_is_off_may_be_a_plain_number():
+    class Partly:
+        def __call__(self, rgb):
+            return {"loss_sds": rgb.sum(), "loss_off": 0.0, "note": 1.5}
+
+    out = call_guidance(Partly(), torch.ones(1, 2, 2, 3), None, {})
+    assert torch.stack([out["loss_sds"], out["loss_off"]]).tolist() == [12.0, 0.0] and out["note"] == 1.5
 
 
 def test_what_a_guidance_learns_becomes_one_group():

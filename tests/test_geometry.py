@@ -4,14 +4,18 @@ import numpy as np
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import sh
+from threestudio_gaussiandreamer import register_parts, sh
+from threestudio_gaussiandreamer.cameras import orbit_c2w
+from threestudio_gaussiandreamer.densify import screen_gradients
 from threestudio_gaussiandreamer.errors import UserError
 from threestudio_gaussiandreamer.geometry import GaussianCloud
 from threestudio_gaussiandreamer.grow import nearest_distance_scales
-from threestudio_gaussiandreamer.host import register
+from threestudio_gaussiandreamer.host import find, register
+from threestudio_gaussiandreamer.ply import write_gaussians
 from threestudio_gaussiandreamer.point_cloud import PointCloud
 from threestudio_gaussiandreamer.splatting import Rasterized
 
+register_parts()
 NO_GROWTH = {"enabled": False}
 
 
@@ -132,6 +136,32 @@ def test_a_densification_that_selects_nobody_changes_nothing(sphere_points):
             optimizer.zero_grad()
             geometry.after_step(optimizer, step)
     assert all(torch.equal(a, b) for a, b in zip(plain.parameters(), idle.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_the_rasteriser_collects_absolute_gradients_where_they_decide(sphere_points, absgrad):
+    geometry = started(sphere_points, densify={"enabled": True, "absgrad": absgrad}, init_opacity=0.5)
+    background = find("gaussiandreamer-background")({"mode": "fixed", "color": [1.0, 1.0, 1.0]})
+    renderer = find("gaussiandreamer-splatting")({}, geometry=geometry, material=None, background=background)
+    out = renderer(orbit_c2w(torch.zeros(2), torch.tensor([0.0, 90.0]), torch.full((2,), 2.5)), torch.full((2,), 0.8), 40, 24)
+    (out["comp_rgb"] ** 2).mean().backward()
+    geometry.observe(out["rasterized"], 40, 24)
+    means2d = out["rasterized"].means2d
+    assert hasattr(means2d, "absgrad") == absgrad
+    expected = screen_gradients(means2d.absgrad if absgrad else means2d.grad, 40, 24).sum(0)
+    assert torch.equal(geometry.gradient_sum, expected) and expected.max() > 0
+
+
+def test_a_trained_cloud_above_the_cap_keeps_what_contributes(sphere_points, tmp_path):
+    """All attributes of the best are kept bit for bit; every fourth is faint and goes."""
+    trained = started(sphere_points, init_opacity=0.9)
+    trained.logit_opacities.data[::4] = -5.0
+    names = ("means", "log_scales", "quats", "logit_opacities")
+    write_gaussians(tmp_path / "a.ply", **{name: getattr(trained, name).detach().numpy() for name in names}, sh=trained.sh.detach().numpy())
+    geometry = GaussianCloud({"prior_type": "gaussians-prior", "prior": {"path": str(tmp_path / "a.ply")}, "max_gaussians": 300})
+    assert len(geometry.initialize("anything").points) == 400
+    bright = torch.arange(400) % 4 != 0
+    assert all(torch.equal(getattr(geometry, name), getattr(trained, name)[bright]) for name in (*names, "sh0"))
 
 
 @register("test-two-points-prior")

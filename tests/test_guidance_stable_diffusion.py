@@ -1,5 +1,6 @@
 """Stable Diffusion's guidance: Perp-Neg's pairing, schedules, failures of the model, options, pictures."""
 
+import json
 import math
 
 import pytest
@@ -216,6 +217,14 @@ def test_memory_savers_change_nothing_but_memory(models, prompts, options):
     assert relative(saving, plain.double()) < 1e-5
 
 
+@pytest.mark.parametrize("slicing, passes", [(False, [4]), (True, [1] * 4)])
+def test_the_images_are_encoded_together_unless_sliced(models, slicing, passes):
+    guide = guidance(models, enable_vae_slicing=slicing)
+    guide.vae.encoder = recorder = Recorder(guide.vae.encoder)
+    guide.encode(renders().movedim(-1, 1))
+    assert [len(args[0]) for args, _ in recorder.calls] == passes
+
+
 def test_slicing_keeps_the_activations_of_one_image(models, prompts):
     kept = []
 
@@ -249,6 +258,16 @@ def test_the_size_is_the_models_unless_given(models, prompts):
         guidance(models, image_size=100)
 
 
+@pytest.mark.parametrize("trained", [None, [8, 8]])
+def test_a_model_without_one_size_is_asked_for(tmp_path, trained):
+    folder = tiny_models.stable_diffusion(tmp_path / "model")
+    config = json.loads((folder / "unet" / "config.json").read_text())
+    (folder / "unet" / "config.json").write_text(json.dumps(config | {"sample_size": trained}))
+    with pytest.raises(UserError, match="set system.guidance.image_size"):
+        guidance({"epsilon": folder})
+    assert guidance({"epsilon": folder}, image_size=64).image_size == 64
+
+
 def test_halving_is_the_mean_of_four_pixels_and_more_loses_none(models):
     guide = guidance(models)
     images = renders(2, 128).detach().movedim(-1, 1)
@@ -274,6 +293,31 @@ def test_a_missing_model_is_said_at_once(tmp_path, monkeypatch):
         stable_diffusion.StableDiffusionGuidance({})
 
 
+XL = {"addition_embed_type": "text_time", "addition_time_embed_dim": 8, "projection_class_embeddings_input_dim": 80}
+INPAINTING = {"in_channels": 9}
+SECOND_STAGE = {"class_embed_type": "timestep"}
+
+
+@pytest.mark.parametrize("other, said", [(INPAINTING, "in_channels 9"), (XL, "text_time"), (SECOND_STAGE, "class_embed_type timestep")])
+def test_a_model_of_another_task_is_refused_before_the_prior(tmp_path, other, said):
+    from diffusers import UNet2DConditionModel
+
+    folder = tiny_models.stable_diffusion(tmp_path / "other")
+    config = UNet2DConditionModel.load_config(folder / "unet")
+    UNet2DConditionModel.from_config(config | other).save_pretrained(folder / "unet")
+    with pytest.raises(UserError, match=f"isn't text to image alone .*{said}"):
+        guidance({"epsilon": folder})
+
+
+def test_a_scheduler_of_another_process_is_refused(tmp_path):
+    from diffusers import FlowMatchEulerDiscreteScheduler
+
+    folder = tiny_models.stable_diffusion(tmp_path / "flow")
+    FlowMatchEulerDiscreteScheduler().save_pretrained(folder / "scheduler")
+    with pytest.raises(UserError, match="no beta_schedule"):
+        guidance({"epsilon": folder})
+
+
 def test_an_unknown_prediction_type(models, tmp_path):
     folder = tiny_models.stable_diffusion(tmp_path / "flow", prediction="flow_prediction")
     with pytest.raises(UserError, match="prediction_type.*did you mean 'v_prediction'"):
@@ -286,6 +330,12 @@ def test_threestudios_name_finds_ours():
 
 
 # Looking --------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("items, shown", [(3, 3), (9, 4), (0, 4), (-1, 4)])
+def test_so_many_items_are_shown(models, prompts, items, shown):
+    out = guidance(models, max_items_eval=items, eval_steps=1)(renders(), prompts[False], **BATCH, guidance_eval=True)["eval"]
+    assert out["bs"] == len(out["imgs_final"]) == shown
 
 
 @pytest.mark.parametrize("perp", [False, True])

@@ -123,6 +123,17 @@ def test_a_missing_folder_names_the_near_ones(model):
             hub.find_model(name, TEXT)
 
 
+def test_a_mistyped_folder_is_not_taken_for_someones_model(model, monkeypatch, tmp_path):
+    """For "models/tini" could be a model of the owner "models" too."""
+    tiny_models.nothing_cached(monkeypatch, tmp_path)
+    (tmp_path / "models").mkdir()
+    copied(model, tmp_path / "models" / "tiny")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    with pytest.raises(UserError, match=r"The folder 'models' has no 'tini' \(near: models/tiny\)"):
+        hub.find_model("models/tini", IMAGE)
+
+
 def test_a_folder_that_is_no_model_says_what_is_missing(tmp_path):
     with pytest.raises(UserError, match="unet/config.json is missing.*format of diffusers"):
         hub.find_model(str(tmp_path), ["unet"])

@@ -229,6 +229,24 @@ def test_a_few_bad_vertices_are_dropped_with_a_count(tmp_path, caplog):
     np.testing.assert_allclose(np.abs(mesh.vertices).max(), 1, atol=1e-6)
 
 
+def test_objects_as_programs_write_them_are_read(tmp_path):
+    """Blanks, tabs, carriage returns, continued lines, exponents, colours, texture coordinates of three, polygons, other statements."""
+    text = (
+        "# made by hand\r\nmtllib none.mtl\no box\nv 0 0.0 -.0 1 0 0\nv  1e0\t0 0 0 1 0 \nv 1 1.5E-0 0 0 0 1\nv +0 1 0 1 1 1\n"
+        "vt 0 0 0\nvt 1 0 0\nvt 1 1 0\nvt 0 1 0\nvn 0 0 1\ng a b\ns off\nusemtl m\nf 1/1/1 2/2/1 \\\n3/3/1 4/4/1\nvp 1 2\nl 1 2\n"
+    )
+    (tmp_path / "a.obj").write_bytes(text.encode())
+    assert len(load_mesh(tmp_path / "a.obj").faces) == 2
+    (tmp_path / "b.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nf 1//1 2//1 3//1\nvn 0 0 1\n")
+    assert len(load_mesh(tmp_path / "b.obj").faces) == 2
+
+
+def test_a_texture_that_fills_the_memory_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("threestudio_gaussiandreamer.meshes.MOST_TEXELS", 3)
+    with pytest.raises(UserError, match="texture of 2 x 2 is too large"):
+        load_mesh(saved(textured_quad(IMAGE), tmp_path / "a.glb"))
+
+
 def test_many_bad_vertices_are_an_error(tmp_path):
     source = trimesh.creation.icosphere(2)
     vertices = source.vertices.copy()
@@ -251,6 +269,12 @@ def test_many_bad_vertices_are_an_error(tmp_path):
         ),
         ("flat.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "zero area"),
         ("line.obj", b"v 0 0 0\nv 1 1 1\nv 2 2 2\nf 1 2 3\n", "zero area"),
+        ("zero.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 2 3\n", "line 4 is no vertex or face: 'f 0 2 3'"),
+        ("two.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "line 1 is no vertex or face"),
+        ("relative.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 0 0 1\n", "absolute indices"),
+        ("accessor.gltf", b'{"accessors": [{"count": 1000000000, "type": "VEC3", "componentType": 5126}]}', "aren't in the file"),
+        ("list.gltf", b"[]", "isn't that of a glTF"),
+        ("chunk.glb", b"glTF\2\0\0\0\x20\0\0\0\xff\xff\xff\x7fJSON{}", "chunks"),
         ("range.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "names vertex 7|can't read"),
     ],
 )

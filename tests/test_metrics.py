@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.metrics import azimuth_difference, floater_mass, multi_face_rate, psnr, ssim
+from threestudio_gaussiandreamer.metrics import azimuth_difference, floater_mass, multi_face_rate, out_of_gamut, psnr, ssim
 
 
 def images(*shape, seed=0):
@@ -57,3 +57,11 @@ def test_floater_mass_is_weighted_by_opacity():
     distances, opacities = torch.tensor([0.0, 0.03, 0.05, 0.1]), torch.tensor([0.5, 0.5, 0.2, 0.8])
     assert math.isclose(floater_mass(distances, opacities, extent=2.0), 0.5)  # farther than 0.04
     assert floater_mass(distances, torch.zeros(4), extent=2.0) == 0
+
+
+def test_out_of_gamut_counts_pixels_beyond_what_a_screen_shows():
+    shown = images(2, 5, 10, 3)
+    shown[0, 0, :5, 0] = 1.01
+    shown[1, 0, :5, 2] = -0.01
+    shown[0, 1, 0] = 1 + 1e-4  # rounding of white isn't beyond it
+    assert out_of_gamut(shown) == 10 / 100

@@ -33,6 +33,8 @@ def rounds(geometry, steps, holds=None):
     """The counts after each step of a schedule with a round at every one."""
     adam, counts = optimizer(geometry), []
     for step in range(steps):
+        geometry.gradient_sum += 1.0
+        geometry.gradient_count += 1
         geometry.after_step(adam, step, holds)
         counts.append(len(geometry))
         geometry.contribution += torch.rand(len(geometry))

@@ -212,6 +212,15 @@ class TestPoints:
 
 class TestDamage:
     @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+    def test_more_than_was_announced_is_said(self, tmp_path, encoding, caplog):
+        data = b"1 2 3\n4 5 6\n7 8 9\n" if encoding == "ascii" else bytes(range(36))
+        assert len(ply.read_points(saved(tmp_path, header(encoding, 2).encode() + data)).points) == 2
+        assert "6 bytes follow the 2 vertices" in caplog.text if encoding == "ascii" else "12 bytes follow" in caplog.text
+        caplog.clear()
+        ply.read_points(saved(tmp_path, header(encoding, 3).encode() + data + b"\n\n"))
+        assert not [record for record in caplog.records if "follow" in record.message]
+
+    @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
     @pytest.mark.parametrize("count", [3, 10**12, 10**18])
     def test_a_lying_count_allocates_nothing(self, tmp_path, encoding, count):
         import tracemalloc
@@ -234,6 +243,10 @@ class TestDamage:
             ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\n", "no end"),
             (header("binary_middle_endian"), "binary_middle_endian"),
             (header().replace("format ascii 1.0\n", ""), "format None"),
+            (header().replace("format ascii 1.0\n", "format ascii 1.0\n" * 2), "two formats"),
+            (header(count=1, before="element vertex 1\nproperty float x"), "two elements of vertices"),
+            (header(count=1, properties=["float x", "float y", "uchar z"]) + "1 2 256\n", "range of its type"),
+            (header(count=1, before="element face 1\nproperty list uchar int i") + "3 0 1\n2 1 2 3\n", "a line of 'face'"),
             (header(count=-1), "NAME COUNT"),
             (header(count="many"), "NAME COUNT"),
             (header(count="1" * 30), "NAME COUNT"),

@@ -83,9 +83,12 @@ def test_bodies_with_hands_are_read(tmp_path, body):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda arrays: arrays.pop("posedirs"), "no posedirs"),
+        (lambda arrays: arrays.pop("posedirs"), "no array 'posedirs'"),
         (lambda arrays: arrays.update(weights=arrays["weights"][:, :20]), "don't fit"),
-        (lambda arrays: arrays.update(J_regressor=np.array(Evil(), dtype=object)), "can't be read"),
+        (lambda arrays: arrays.update(J_regressor=np.array(Evil(), dtype=object)), "could run code"),
+        (lambda arrays: arrays["v_template"].__setitem__(0, np.nan), "damaged"),
+        (lambda arrays: arrays["kintree_table"].__setitem__((0, 5), 5), "damaged"),
+        (lambda arrays: arrays["f"].__setitem__((0, 0), 10**6), "damaged"),
     ],
 )
 def test_other_body_files_are_refused(tmp_path, change, message):

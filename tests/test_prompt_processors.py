@@ -94,6 +94,15 @@ def test_a_prompt_that_is_too_long_is_cut_and_said(models, caplog):
     assert torch.equal(out.text_embeddings, processor(models, prompt=long + "two")().text_embeddings)
 
 
+def test_a_tokenizer_that_names_no_length_takes_what_clip_was_trained_with(models, tmp_path):
+    folder = tmp_path / "endless"
+    tiny_models.stable_diffusion(folder)
+    settings = json.loads((folder / "tokenizer" / "tokenizer_config.json").read_text())
+    del settings["model_max_length"]
+    (folder / "tokenizer" / "tokenizer_config.json").write_text(json.dumps(settings))
+    assert torch.equal(processor({"stable-diffusion": folder})().text_embeddings, processor(models)().text_embeddings)
+
+
 def test_the_encoder_is_freed(models, monkeypatch):
     from transformers import CLIPTextModel
 
@@ -125,6 +134,18 @@ def test_a_damaged_model_is_said(tmp_path):
     tiny_models.stable_diffusion(folder)
     (folder / "text_encoder" / "model.safetensors").write_bytes(b"not safetensors")
     with pytest.raises(UserError, match="text_encoder of the model in .* can't be loaded.*download it again"):
+        processor({"stable-diffusion": folder})
+
+
+def test_code_in_the_models_folder_is_not_offered_to_be_run(tmp_path, monkeypatch):
+    folder = tmp_path / "custom"
+    tiny_models.stable_diffusion(folder)
+    settings = json.loads((folder / "tokenizer" / "tokenizer_config.json").read_text())
+    settings |= {"tokenizer_class": "Mine", "auto_map": {"AutoTokenizer": ["mine.Mine", None]}}
+    (folder / "tokenizer" / "tokenizer_config.json").write_text(json.dumps(settings))
+    (folder / "mine.py").write_text("import os\nos._exit(7)\n")
+    monkeypatch.setattr("builtins.input", lambda *args: "y")
+    with pytest.raises(UserError, match="tokenizer of the model in .* can't be loaded"):
         processor({"stable-diffusion": folder})
 
 

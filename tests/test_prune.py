@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer import prune, simplify
+from threestudio_gaussiandreamer.cloud_files import PRUNED, read_cloud
 from threestudio_gaussiandreamer.ply import read_comments, read_gaussians, write_gaussians
 from threestudio_gaussiandreamer.simplify import Budget, Cloud
 
@@ -23,10 +24,14 @@ def ball(count=600, bands=1):
     return Cloud(means, quats, torch.full((count, 3), -2.2), torch.full((count,), 3.0), sh)
 
 
+def arrays_of(cloud):
+    return {name: values.numpy() for name, values in cloud._asdict().items()}
+
+
 @pytest.fixture
 def source(tmp_path):
     path = tmp_path / "in.ply"
-    write_gaussians(path, **prune.arrays_of(ball()))
+    write_gaussians(path, **arrays_of(ball()))
     return path
 
 
@@ -55,7 +60,7 @@ def test_a_second_run_removes_nothing(source, tmp_path):
     run(source, tmp_path / "once.ply", "--psnr", "32dB")
     run(tmp_path / "once.ply", tmp_path / "twice.ply", "--psnr", "32")
     assert (tmp_path / "once.ply").read_bytes() == (tmp_path / "twice.ply").read_bytes()
-    assert read_comments(tmp_path / "twice.ply") == [f"{prune.NOTE} 32"]
+    assert f"{PRUNED} 32" in read_comments(tmp_path / "twice.ply")
 
 
 def test_a_looser_budget_goes_on(source, tmp_path):
@@ -90,7 +95,7 @@ def test_recovery_pays():
 
 
 def test_harmonics_are_kept(tmp_path):
-    write_gaussians(tmp_path / "in.ply", **prune.arrays_of(ball(bands=4)))
+    write_gaussians(tmp_path / "in.ply", **arrays_of(ball(bands=4)))
     run(tmp_path / "in.ply", tmp_path / "out.ply", "--count", "400")
     assert read_gaussians(tmp_path / "out.ply").sh.shape == (400, 4, 3)
 
@@ -101,6 +106,60 @@ def test_a_checkpoint_is_read(tmp_path):
     state |= {"geometry.sh0": cloud.sh, "geometry.sh_rest": torch.zeros(len(cloud.means), 0, 3)}
     torch.save({"state_dict": state, "epoch": 0, "global_step": 1}, tmp_path / "last.ckpt")
     assert run(tmp_path / "last.ckpt", tmp_path / "out.ply", "--count", "300")["before"]["gaussians"] == 600
+
+
+def test_gsplats_checkpoints_are_read(source, tmp_path):
+    cloud = ball()
+    splats = {"means": cloud.means, "quats": cloud.quats, "scales": cloud.log_scales, "opacities": cloud.logit_opacities}
+    torch.save({"step": 7, "splats": splats | {"sh0": cloud.sh, "shN": torch.zeros(600, 0, 3)}}, tmp_path / "ckpt.pt")
+    for name, path in (("a.ply", tmp_path / "ckpt.pt"), ("b.ply", source)):
+        run(path, tmp_path / name, "--count", "300", "--up", "z")
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_a_checkpoint_without_gaussians_is_refused(tmp_path, capsys):
+    torch.save({"state_dict": {"weight": torch.zeros(3)}}, tmp_path / "a.ckpt")
+    assert prune.main([str(tmp_path / "a.ckpt"), str(tmp_path / "out.ply"), "--count", "9"]) == 2
+    assert "holds no cloud of Gaussians" in capsys.readouterr().err
+
+
+def test_a_compact_file_is_written_within_its_size_and_read_again(source, tmp_path):
+    report = run(source, tmp_path / "out.spz", "--bytes", "7kB")
+    assert 6_000 < (tmp_path / "out.spz").stat().st_size <= 7_000 and report["after"]["gaussians"] > 300
+    assert run(tmp_path / "out.spz", tmp_path / "again.spz", "--count", "200")["after"]["gaussians"] == 200
+    assert read_cloud(str(tmp_path / "again.spz")).up == "y"
+
+
+def test_a_quality_holds_in_the_compact_file(source, tmp_path):
+    report = run(source, tmp_path / "once.spz", "--psnr", "32")
+    assert report["after"]["gaussians"] < 450 and report["psnr_on_unseen_views"] > 31.5
+    run(tmp_path / "once.spz", tmp_path / "twice.spz", "--psnr", "32")
+    assert len(read_cloud(str(tmp_path / "twice.spz")).arrays.means) == report["after"]["gaussians"]
+
+
+def test_colours_beyond_the_compact_formats_reach_are_fitted_within_it(tmp_path):
+    cloud = ball()
+    cloud.sh[::7] *= 12  # thin ones, which others hide in part
+    cloud.logit_opacities[::7] = -1
+    write_gaussians(tmp_path / "in.ply", **arrays_of(cloud))
+    assert float(cloud.sh.abs().max()) > 2 * prune.COLOR_REACH
+    source = read_cloud(str(tmp_path / "in.ply"))
+    reports = []
+    for steps in ("1", "60"):
+        path = str(tmp_path / f"{steps}.spz")
+        reports.append(prune.run(prune.parse([str(tmp_path / "in.ply"), path, "--count", "600", "--size", "48", "--steps", steps])))
+    assert len(source.arrays.means) == reports[1]["after"]["gaussians"] == 600
+    assert reports[1]["psnr_on_unseen_views"] > reports[0]["psnr_on_unseen_views"] + 1
+
+
+def test_views_turn_with_the_axes_of_the_file(tmp_path):
+    source = tmp_path / "in.ply"
+    write_gaussians(source, **arrays_of(ball()))
+    views = {up: prune.views_of(read_cloud(str(source), up=up), 48)[0] for up in ("z", "y", "-y")}
+    top = {"z": 2, "y": 1, "-y": 1}
+    heights = {up: views[up].positions[:, top[up]] * (-1 if up == "-y" else 1) for up in views}
+    assert torch.allclose(heights["z"], heights["y"], atol=0.05) and torch.allclose(heights["y"], heights["-y"], atol=0.05)
+    assert heights["z"].max() > 1 > -1 > heights["z"].min()
 
 
 def test_a_count_above_what_is_there_changes_nothing(source, tmp_path):
@@ -135,7 +194,7 @@ def test_a_missing_file_and_a_wrong_name(source, tmp_path, capsys):
     assert prune.main([str(tmp_path / "im.ply"), str(tmp_path / "out.ply"), "--count", "9"]) == 2
     assert "in.ply" in capsys.readouterr().err  # the near name
     assert prune.main([str(source), str(tmp_path / "out.obj"), "--count", "9"]) == 2
-    assert "expected the name of a .ply file" in capsys.readouterr().err
+    assert "expected the name of a .ply or .spz file" in capsys.readouterr().err
 
 
 def test_a_budget_is_needed_and_only_one(source, tmp_path, capsys):
@@ -143,7 +202,8 @@ def test_a_budget_is_needed_and_only_one(source, tmp_path, capsys):
     assert prune.main([str(source), "out.ply", "--count", "5", "--psnr", "40"]) == 2
 
 
-def test_the_search_ends_where_every_gaussian_is_the_top_of_a_pixel():
+def test_any_quality_ends_the_search():
     apart = ball(12)._replace(logit_opacities=torch.full((12,), 6.0), log_scales=torch.full((12, 3), -3.0))
     probes, judges = (simplify.views_around(apart, 8, 48, turn=turn) for turn in (0.0, 45.0))
-    assert len(simplify.simplify(apart, probes, judges, Budget(psnr=1.0), steps=2).means) == 12
+    assert len(simplify.simplify(apart, probes, judges, Budget(psnr=1.0), steps=2).means) == 1
+    assert len(simplify.simplify(apart, probes, judges, Budget(psnr=99.0), steps=2).means) == 12

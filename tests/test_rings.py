@@ -22,6 +22,10 @@ MATHS = {
     "exact_score",
     "metrics",
     "ply",
+    "array_files",
+    "spz",
+    "cloud_files",
+    "merging",
     "surface",
     "nested",
 }

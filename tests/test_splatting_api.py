@@ -4,6 +4,7 @@ import logging
 import typing
 
 import jaxtyping
+import numpy as np
 import pytest
 import torch
 from splatting_scenes import NAMES, cameras, random_cloud, run
@@ -56,6 +57,11 @@ def test_annotations_hold_for_every_backend(per_view):
         check_shapes(out._asdict(), typing.get_type_hints(splatting.Rasterized))
 
 
+def test_a_size_may_be_numpys():
+    sizes = {name: np.int64(arguments()[name]) for name in ("width", "height")}
+    assert torch.equal(call(**sizes).image, call().image)
+
+
 @pytest.mark.parametrize(
     "changes, words",
     [
@@ -77,13 +83,17 @@ def test_annotations_hold_for_every_backend(per_view):
         ({"width": 0}, ["width", "at least 1", "0"]),
         ({"height": 8.0}, ["height", "8.0"]),
         ({"width": True}, ["width", "True"]),
+        ({"height": 2_100_000}, ["height", "at most 1048576"]),
         ({"width": 9, "downsample": 2}, ["downsample", "9"]),
         ({"downsample": 3}, ["downsample", "3"]),
+        ({"downsample": 2.0}, ["downsample", "2.0"]),
         ({"preset": "balancd"}, ["preset", "'balanced'"]),
         ({"backend": "torhc"}, ["backend", "'torch'"]),
         ({"non_finite": "ignore"}, ["non_finite", "drop", "error"]),
         ({"near": 0.0}, ["near", "0 < near"]),
         ({"near": 2.0, "far": 1.0}, ["near", "far"]),
+        ({"far": None}, ["far", "number", "None"]),
+        ({"alpha_min": "small"}, ["alpha_min", "number", "small"]),
         ({"eps2d": -0.1}, ["eps2d", "-0.1"]),
         ({"alpha_min": 1.5}, ["alpha_min", "1.5"]),
         ({"alpha_max": 1e-4}, ["alpha_max", "0.0001"]),

@@ -1,8 +1,11 @@
 """The native kernel against the float64 specification, in every build this machine can run: same pictures, same gradients, same bits."""
 
+import os
 import pathlib
 import shutil
 import subprocess
+import sys
+import textwrap
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 
@@ -79,6 +82,53 @@ def test_the_library_is_used_from_several_threads_at_once():
         for _ in range(5):
             together = pool.map(lambda cloud: draw("cpu", cloud, cameras(2, 60, 40), 60, 40), clouds)
             assert all(equal(a, b) for a, b in zip(alone, together, strict=True))
+
+
+def run_python(text):
+    """Whatever can end a process, or forbid it something, happens in another one."""
+    scene = """
+        import os, resource, signal, sys, torch
+        from splatting_scenes import cameras, random_cloud
+        from threestudio_gaussiandreamer.splatting import rasterize
+
+        def draw():
+            return rasterize(*cloud, *cameras(1, 96, 96, dtype=torch.float32), 96, 96, backend="cpu").image
+
+        cloud = random_cloud(3000).to(torch.float32)
+        torch.set_num_threads(1)
+        alone = draw()
+        torch.set_num_threads(4)
+    """
+    code = textwrap.dedent(scene) + textwrap.dedent(text)
+    folders = os.pathsep.join(map(str, (pathlib.Path(__file__).parents[1], pathlib.Path(__file__).parent)))
+    return subprocess.run([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": folders}, capture_output=True, text=True)
+
+
+def test_a_forked_process_draws_with_threads_of_its_own():
+    """The parent's threads aren't in it, and what they held at that moment nobody lets go."""
+    done = run_python("""
+        for _ in range(100):
+            draw()
+            child = os.fork()
+            if child == 0:
+                signal.alarm(10)
+                os._exit(not all(torch.equal(draw(), alone) for _ in range(5)))
+            if os.waitpid(child, 0)[1]:
+                sys.exit("a child hung, or drew something else")
+    """)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_without_more_threads_those_that_there_are_do_the_work():
+    """A limit on processes or on address space, which a thread's stack takes."""
+    done = run_python("""
+        pages = int(open("/proc/self/statm").read().split()[0])
+        resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 6 * 2**20,) * 2)
+        if not torch.equal(draw(), alone):
+            sys.exit("another picture")
+    """)
+    assert done.returncode == 0, done.stderr
 
 
 def test_denormals_of_the_process_are_not_flushed(isa):

@@ -193,6 +193,8 @@ def test_more_entries_than_can_be_numbered_is_short_memory():
 def test_more_splats_than_can_be_numbered_are_refused():
     with pytest.raises(UserError, match="fewer views"):
         cuda._check_count(5000, 500_000)
+    with pytest.raises(UserError, match="fewer views"):
+        cuda._check_count(70_000, 1)
 
 
 def test_without_gradients_nothing_is_kept(machine):

@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import logging
+import os
 import re
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
@@ -151,6 +152,17 @@ def test_a_cache_that_cannot_be_written_costs_time_only(tmp_path, monkeypatch, c
     with caplog.at_level(logging.WARNING):
         assert nvrtc.machine_code("bin", "sm_80")[:4] == b"\x7fELF"
     assert "can't be kept" in caplog.text and "file" in caplog.text
+
+
+@needs_nvrtc
+def test_a_user_without_a_home_compiles_at_every_start(monkeypatch, compiled, caplog):
+    """In a container whose number of a user nobody knows."""
+    for variable in ("GAUSSIANDREAMER_CACHE", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr(os, "getuid", lambda: 2**31 - 7)
+    with caplog.at_level(logging.WARNING):
+        assert nvrtc.machine_code("bin", "sm_80") == nvrtc.machine_code("bin", "sm_80")
+    assert compiled == ["bin", "bin"] and "can't be kept" in caplog.text
 
 
 @needs_nvrtc

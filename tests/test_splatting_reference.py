@@ -320,6 +320,17 @@ def test_a_camera_that_is_not_finite_spoils_its_own_view_only():
     assert all(g.isfinite().all() for g in bad.grads.values())
 
 
+@pytest.mark.parametrize("backend", ["reference", "torch"])
+@pytest.mark.parametrize("place", [(0, 0), (0, 2)])
+def test_a_camera_whose_numbers_overflow_spoils_its_own_view_only(place, backend):
+    cloud, (viewmats, Ks) = random_cloud(10, seed=13).to(torch.float32), cameras(2, 6, 5, dtype=torch.float32)
+    elsewhere, absurd = Ks.clone(), Ks.clone()
+    elsewhere[0, 0, 2], absurd[0][place] = 1e6, 1e30
+    good, bad = (run(cloud, viewmats, K, 6, 5, antialias=True, backend=backend) for K in (elsewhere, absurd))
+    assert torch.equal(bad.out.image, good.out.image)
+    assert all(torch.equal(bad.grads[name], good.grads[name]) for name in NAMES)
+
+
 @pytest.mark.parametrize("cloud", [random_cloud(0), random_cloud(5)._replace(means=torch.full((5, 3), 100.0, dtype=torch.float64))])
 def test_nothing_to_see_is_the_background_with_zero_gradients(cloud):
     background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import yaml
 from threestudio_gaussiandreamer.experiment import main
 from threestudio_gaussiandreamer.host import BaseObject, register
 from threestudio_gaussiandreamer.ply import read_gaussians
+from threestudio_gaussiandreamer.spz import read_spz
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 SMALL = [
@@ -106,6 +108,35 @@ def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, pai
     assert "compare.png" in printed and "test.mp4" in printed and ".ply" in printed and "multi-face" in printed
     rows = list(csv.DictReader(open(trial(tmp_path) / "csv_logs" / "version_0" / "metrics.csv")))
     assert {"loss", "gaussians", "dB", "train/loss_sds", "train/grad_norm"} <= set(rows[0])
+
+
+def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted_box):
+    options = ["system.prune.count=90", "system.prune.size=32", "system.prune.steps=3", "system.exporter.formats=[ply,spz]"]
+    assert launch(tmp_path, painted_box, *options, "trainer.max_steps=4", "trainer.val_check_interval=4") == 0
+    export = trial(tmp_path) / "save" / "it4-export"
+    assert len(read_gaussians(export / "gaussians.ply").means) == 200
+    first = read_gaussians(export / "pruned" / "gaussians.ply")
+    assert len(first.means) == len(read_spz(export / "pruned" / "gaussians.spz").means) == 90
+    report = json.loads((export / "pruned" / "report.json").read_text())
+    assert report["after"]["gaussians"] == 90 and (export / "pruned" / "report.png").stat().st_size > 0
+    shutil.rmtree(export)
+    resume = [f"resume={trial(tmp_path) / 'ckpts' / 'last.ckpt'}", "system.exporter.save_video=false"]
+    assert launch(tmp_path, painted_box, *options, *resume, stage="--export") == 0
+    (again,) = trial(tmp_path).parent.glob("*/save/it4-export/pruned/gaussians.ply")
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(read_gaussians(again), first, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["system.prune.count=0"], "system.prune.count: expected a whole number from 1 on"),
+        (["system.prune.count=9", "system.prune.psnr=40"], "system.prune.count and system.prune.psnr: give one budget"),
+        (["system.prune.bytes=lots"], "system.prune.bytes: expected a size such as 500kB"),
+    ],
+)
+def test_a_wrong_pruning_budget_is_found_before_the_run(tmp_path, painted_box, capsys, options, said):
+    assert launch(tmp_path, painted_box, *options) == 2
+    assert said in capsys.readouterr().err
 
 
 DENSIFY = ["system.geometry.densify.enabled=true", "system.geometry.densify.start=2", "system.geometry.densify.stop=8",

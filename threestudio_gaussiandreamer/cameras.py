@@ -44,16 +44,24 @@ def orbit_positions(
 
 
 def look_at(position: Float[Tensor, "B 3"], center: Float[Tensor, "B 3"], up: Float[Tensor, "B 3"]) -> Float[Tensor, "B 4 4"]:
-    """OpenGL ``c2w`` of cameras at ``position`` that look at ``center``; straight up or down takes +x as the picture's top."""
-    forward = F.normalize(center - position, dim=-1)
+    """OpenGL ``c2w`` of cameras at ``position`` that look at ``center``; straight up or down takes +x as the picture's top.
+
+    A camera in the centre itself looks along -x, as one in front of it does.
+    """
+    offset = center - position
+    nowhere = offset.norm(dim=-1, keepdim=True) < 1e-12
+    forward = F.normalize(torch.where(nowhere, _x_axis(offset).neg(), offset), dim=-1)
     right = torch.linalg.cross(forward, up)
     degenerate = right.norm(dim=-1, keepdim=True) < 1e-6
-    fallback = torch.linalg.cross(forward, torch.tensor([1.0, 0.0, 0.0], dtype=up.dtype, device=up.device).expand_as(up))
-    right = F.normalize(torch.where(degenerate, fallback, right), dim=-1)
+    right = F.normalize(torch.where(degenerate, torch.linalg.cross(forward, _x_axis(up)), right), dim=-1)
     up = torch.linalg.cross(right, forward)
     c2w = torch.eye(4, dtype=position.dtype, device=position.device).repeat(len(position), 1, 1)
     c2w[:, :3] = torch.stack([right, up, -forward, position], -1)
     return c2w
+
+
+def _x_axis(like: Float[Tensor, "B 3"]) -> Float[Tensor, "B 3"]:
+    return torch.tensor([1.0, 0.0, 0.0], dtype=like.dtype, device=like.device).expand_as(like)
 
 
 def orbit_c2w(
@@ -87,13 +95,18 @@ def to_opencv(
     c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int
 ) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 3 3"]]:
     """The host's OpenGL cameras as ``(viewmats, Ks)``: flip the camera's y and z axes, invert the rigid motion."""
-    flip = torch.tensor([1.0, -1.0, -1.0], dtype=c2w.dtype, device=c2w.device)
-    rotation = (c2w[:, :3, :3] * flip).transpose(1, 2)
-    viewmats = torch.zeros_like(c2w)
-    viewmats[:, :3, :3] = rotation
-    viewmats[:, :3, 3:] = -rotation @ c2w[:, :3, 3:]
-    viewmats[:, 3, 3] = 1.0
-    return viewmats, intrinsics(fovy, height, width)
+    flip = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=c2w.dtype, device=c2w.device)
+    return world_to_camera(c2w * flip), intrinsics(fovy, height, width)
+
+
+def world_to_camera(c2w: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 4 4"]:
+    """The inverse of rigid motions, each by its transpose: one that is no rotation spoils itself alone, and raises nothing."""
+    rotation = c2w[:, :3, :3].transpose(1, 2)
+    inverse = torch.zeros_like(c2w)
+    inverse[:, :3, :3] = rotation
+    inverse[:, :3, 3:] = -rotation @ c2w[:, :3, 3:]
+    inverse[:, 3, 3] = 1.0
+    return inverse
 
 
 def ray_directions(

@@ -9,7 +9,7 @@ import hashlib
 import os
 import re
 import unicodedata
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from glob import escape as glob_escape
@@ -26,6 +26,7 @@ from .builtin.schedule import C_max
 from .builtin.text import escape
 from .builtin.weights import newest_readable
 from .errors import UserError
+from .files import atomic_file
 from .host import find, info, names
 from .prompts import read_prompt
 
@@ -36,6 +37,8 @@ PROMPT_TEXT = ("prompt", "negative_prompt", "prompt_front", "prompt_side", "prom
 PATH_ENDINGS = ("path", "mesh", "_file", "_dir", "resume", "weights")
 # stands for "${" of a text while interpolations are resolved; a character of Unicode's private use area
 PROTECTED = "$\ue000{"
+MOST_DEPTH = 32
+MOST_NODES = 10_000
 SLUG_BYTES = 64
 SLUG_CHARACTERS = "-_.,+=()'! "
 WINDOWS_DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{i}" for port in ("com", "lpt") for i in range(1, 10))}
@@ -93,7 +96,8 @@ def dump_config(path: str | os.PathLike, cfg: Any) -> None:
     plain = OmegaConf.create(OmegaConf.to_container(cfg, resolve=False))
     if "resume" in plain:
         plain.resume = None
-    OmegaConf.save(plain, path)
+    with atomic_file(path) as file:
+        file.write(OmegaConf.to_yaml(plain).encode())
 
 
 def read_yaml(path: str | os.PathLike) -> DictConfig:
@@ -104,14 +108,16 @@ def read_yaml(path: str | os.PathLike) -> DictConfig:
     """
     try:
         source = Path(path).read_text(encoding="utf-8-sig")
-        content = OmegaConf.create(source)
+        require_modest(source, f"the configuration {path}")
+        content, node = OmegaConf.create(source), yaml.compose(source, Loader=yaml.SafeLoader)
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"the configuration {path} can't be read: {error}") from error
     except (yaml.YAMLError, OmegaConfBaseException) as error:
         raise UserError(f"the configuration {path} isn't valid YAML: {_yaml_problem(error)}") from error
     if not isinstance(content, DictConfig):
         raise UserError(f"the configuration {path} must hold sections and keys, such as 'name: demo'")
-    _restore_text(content, yaml.compose(source, Loader=yaml.SafeLoader))
+    _require_words(content, f"the configuration {path}")
+    _restore_text(content, node)
     _map_strings(content, _protect_escaped)
     return content
 
@@ -128,9 +134,10 @@ def parse_overrides(arguments: Iterable[str]) -> DictConfig:
         if not equals or not key or not (key[0].isalpha() or key[0] == "_"):
             raise UserError(f"{argument!r} isn't an override: expected key=value, such as trainer.max_steps=1200")
         try:
-            _override(overrides, key, value)
+            _override(overrides, key, _valid_text(key, value))
         except (yaml.YAMLError, OmegaConfBaseException) as error:
             raise UserError(f"the value of {key} isn't valid YAML: {_yaml_problem(error)}") from error
+    _require_words(overrides, "the command line")
     return overrides
 
 
@@ -154,19 +161,61 @@ def is_text(key: str) -> bool:
 
 def _override(overrides: DictConfig, key: str, value: str) -> None:
     if is_text(key):
-        OmegaConf.update(overrides, key, protect(_valid_text(key, value)), force_add=True)
+        OmegaConf.update(overrides, key, protect(value), force_add=True)
     elif key.endswith(PATH_ENDINGS):
         OmegaConf.update(overrides, key, None if value in ("", "null", "~") else value, force_add=True)
     else:
+        require_modest(value, f"the value of {key}")
         overrides.merge_with_dotlist([f"{key}={value}"])
 
 
 def _valid_text(key: str, value: str) -> str:
+    """The value of a key, which is to be written into ``parsed.yaml``; Python takes other bytes than UTF-8 for lone surrogates."""
     try:
-        value.encode()
+        (key + value).encode()
     except UnicodeEncodeError as error:
-        raise UserError(f"{key} isn't valid UTF-8 text: {error}") from error
+        raise UserError(f"{key!r} or its value isn't valid UTF-8 text: {error}") from error
+    if key.count(".") >= MOST_DEPTH:
+        raise UserError(f"{key[:80]!r}... is no key: sections lie at most {MOST_DEPTH} deep")
     return value
+
+
+def require_modest(source: str, what: str) -> None:
+    """Raise UserError where YAML is nested so deeply, or by aliases of aliases stands for so much, that reading it ends in a crash.
+
+    The parser's events come one by one, so nothing is built to find out; libyaml's own recursion would end the process.
+    """
+    for depth, values in _extent(source):
+        if depth > MOST_DEPTH or values >= MOST_NODES:
+            raise UserError(f"{what} must be at most {MOST_DEPTH} levels deep and hold fewer than {MOST_NODES} values")
+
+
+def _extent(source: str) -> Iterator[tuple[int, int]]:
+    """At each event of the parser: how deep it is, also in interpolations, and for how many values the innermost section stands so far."""
+    sections: list[tuple[Optional[str], int]] = [(None, 0)]
+    anchored: dict[Optional[str], int] = {}
+    for event in yaml.parse(source, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.CollectionStartEvent):
+            sections.append((event.anchor, 1))
+        elif isinstance(event, (yaml.CollectionEndEvent, yaml.ScalarEvent, yaml.AliasEvent)):
+            anchor, count = sections.pop() if isinstance(event, yaml.CollectionEndEvent) else (event.anchor, 1)
+            if isinstance(event, yaml.AliasEvent):
+                count = anchored.get(anchor, MOST_NODES)  # of itself, which never ends
+            anchored[anchor] = count
+            sections[-1] = (sections[-1][0], sections[-1][1] + count)
+        yield max(len(sections), getattr(event, "value", "").count("${")), sections[-1][1]
+
+
+def _require_words(content: DictConfig | ListConfig, what: str) -> None:
+    """Raise UserError for a key that isn't a text, such as ``on``, which is ``true`` in YAML."""
+    if content._is_none() or content._is_missing() or content._is_interpolation():
+        return
+    for key in content if isinstance(content, DictConfig) else range(len(content)):
+        if isinstance(content, DictConfig) and not isinstance(key, str):
+            raise UserError(f"{what} has the key {key!r}, which isn't a word: put it in quotes if it is meant so")
+        child = content._get_node(key)
+        if isinstance(child, (DictConfig, ListConfig)):
+            _require_words(child, what)
 
 
 def _yaml_problem(error: Exception) -> str:
@@ -285,8 +334,10 @@ def _resolve(cfg: DictConfig) -> None:
         OmegaConf.resolve(cfg)
     except OmegaConfBaseException as error:
         raise UserError(f"an interpolation can't be resolved: {_explain(error)}") from error
-    except (TypeError, ValueError, ZeroDivisionError, AttributeError) as error:
+    except (TypeError, ValueError, ArithmeticError, AttributeError) as error:
         raise UserError(f"a resolver failed: {error}") from error
+    except RecursionError as error:
+        raise UserError("an interpolation leads to itself") from error
     _map_strings(cfg, _unprotect)
 
 
@@ -386,14 +437,17 @@ def _new_timestamp(prefix: str) -> str:
 def _resume_newest(cfg: Any, tag: str) -> None:
     """``resume=auto``: go on with this run if it was started before, else with the newest of its tag, else start.
 
-    Where the last checkpoint is damaged, the one before it is taken.
+    In its folder it is the readable checkpoint with most steps: where the last one is damaged, the one before it.
     """
     cfg.resume = None
     newest_first = sorted(Path(cfg.exp_dir).glob(f"{glob_escape(tag)}@*"), reverse=True)
     for run in [Path(cfg.trial_dir), *newest_first]:
-        found = newest_readable(run / "ckpts" / "last.ckpt")
+        found = newest_readable(run / "ckpts")
         if found:
             cfg.timestamp = run.name.removeprefix(tag)
             _set_trial(cfg, run.name)
-            cfg.resume = escape(str(found))
+            path, step = found
+            cfg.resume = escape(str(path))
+            info(f"resume=auto: going on from {path} (step {step})")
             return
+    info(f"resume=auto: no checkpoint of {os.path.join(cfg.exp_dir, tag)} to go on from; starting anew")

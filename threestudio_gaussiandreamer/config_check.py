@@ -17,7 +17,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from .builtin.base import fill
-from .errors import UserError
+from .errors import UserError, unknown
 from .host import find, pl, validate_schedule
 
 MisconfigurationException = pl.utilities.exceptions.MisconfigurationException
@@ -58,6 +58,7 @@ def check_config(cfg: Any) -> None:
     _check_loggers(cfg.system.get("loggers"))
     _check_arguments("checkpoint", cfg.checkpoint, pl.callbacks.ModelCheckpoint)
     _check_file_name("checkpoint.filename", cfg.checkpoint.get("filename"))
+    _check_monitor(cfg)
     build("checkpoint", pl.callbacks.ModelCheckpoint, plain(cfg.checkpoint))
     options = {key: value for key, value in plain(cfg.trainer).items() if key not in NEEDS_PROCESSES}
     build("trainer", pl.Trainer, {**options, "devices": 1, "logger": False})
@@ -190,6 +191,22 @@ def _check_trainer_ranges(trainer: Any) -> None:
 def _check_file_name(path: str, name: Any) -> None:
     if name is not None and (os.path.isabs(name) or os.path.normpath(name).startswith(os.pardir)):
         raise UserError(f"{path} is {name!r}; expected a name below the folder of the checkpoints")
+
+
+def _check_monitor(cfg: Any) -> None:
+    """Lightning misses a quantity that nobody logs only when it is to be compared, after the first validation.
+
+    A system that knows what it logs has a function ``logged`` from its configuration to those names.
+    """
+    monitor, system = cfg.checkpoint.get("monitor"), find(cfg.system_type)
+    logged = getattr(system, "logged", None)
+    if monitor is None or logged is None:
+        return
+    names = logged(_typed("system", cfg.system, system.Config))
+    if names is not None and monitor not in names | {"epoch", "step"}:
+        raise unknown("checkpoint.monitor", monitor, names)
+    if not cfg.trainer.get("log_every_n_steps", 1):
+        raise UserError(f"checkpoint.monitor is {monitor!r}, but with trainer.log_every_n_steps=0 nothing is logged")
 
 
 def build(section: str, owner: type, arguments: dict) -> Any:

@@ -81,9 +81,8 @@ class CameraConfig:
             values = _plain(cfg[name])
             listed = isinstance(values, list)
             if listed and len(values) not in (1, len(cfg.resolution_milestones) + 1):
-                raise UserError(
-                    f"data.{name}: {len(values)} entries need {len(values) - 1} data.resolution_milestones, got {len(cfg.resolution_milestones)}"
-                )
+                milestones = f"{len(values) - 1} data.resolution_milestones, got {len(cfg.resolution_milestones)}"
+                raise UserError(f"data.{name}: {len(values)} entries need {milestones}")
             if any(not isinstance(v, int) or isinstance(v, bool) or v < 1 for v in (values if listed else [values])):
                 raise UserError(f"data.{name}: expected whole numbers >= 1, got {values}")
         _check_milestones(cfg)
@@ -122,7 +121,7 @@ def make_batch(
     batch = {
         "c2w": c2w,
         "proj_mtx": proj,
-        "mvp_mtx": proj @ torch.linalg.inv(c2w),
+        "mvp_mtx": proj @ cameras.world_to_camera(c2w),
         "camera_positions": c2w[:, :3, 3].clone(),
         "light_positions": light_positions,
         "elevation": orbit.elevation,

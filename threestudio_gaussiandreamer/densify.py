@@ -9,17 +9,23 @@ normalised device units (half the image is 1), of the loss of one view (not divi
 saw the Gaussian: its meaning doesn't depend on resolution, batch size or a loss scale. ``contribution`` is the largest
 sigma_i T_i over the pixels of recent views (RadSplat, Niemeyer et al. 2024).
 
-Clone and split rules: Kerbl et al. 2023, section 5.2.
+Clone and split rules: Kerbl et al. 2023, section 5.2. There is no opacity reset (their section 5.2 sets all opacities near zero
+now and then to find floaters): score distillation doesn't rebuild what a reset erases, and pruning by contribution does its work.
 """
 
+import logging
 from typing import Mapping, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+logger = logging.getLogger(__name__)
+
 PARAMETERS = ("means", "log_scales", "quats", "logit_opacities", "sh0", "sh_rest")
 SPLIT_SHRINK = 1.6  # the two children of a split are this much smaller
+LOG_SCALE_RANGE = (-20.0, 10.0)
+"""Where the exponential and its square are well within float32: sizes beyond are drawn, and split, as if at these bounds."""
 
 
 class Change(NamedTuple):
@@ -64,15 +70,18 @@ def screen_gradients(means2d_grad: Float[Tensor, "B N 2"], width: int, height: i
 
 
 def densify_and_prune(params: Mapping[str, Tensor], stats: Statistics, rules: Rules, rng: torch.Generator) -> Change:
-    """Clone small and split large Gaussians whose centre wants to move, drop the faint and the huge, respect cap and floor."""
-    hot = stats.gradient >= rules.grad_threshold
+    """Clone small and split large Gaussians whose centre wants to move, drop the faint and the huge, respect cap and floor.
+
+    A Gaussian that no view has seen has no gradient and is never selected, whatever the threshold. Faint ones don't grow, and the
+    room that they leave under the cap is given to others in the same round.
+    """
+    faint = torch.sigmoid(params["logit_opacities"].detach()) < rules.min_opacity
+    hot = (stats.gradient > rules.grad_threshold) & ~faint
+    hot &= _affordable(hot, stats.gradient, rules.max_gaussians - int((~faint).sum()))
     large = params["log_scales"].exp().amax(-1) > rules.split_scale
-    hot &= _affordable(hot, stats.gradient, rules.max_gaussians - len(hot))
     grown = grow(params, clone=hot & ~large, split=hot & large, rng=rng)
-    contribution = stats.contribution[grown.parents]
-    faint = grown.values["logit_opacities"] < torch.logit(torch.tensor(rules.min_opacity))
     huge = grown.values["log_scales"].exp().amax(-1) > rules.max_scale
-    return keep(grown, ~(faint | huge), contribution, rules)
+    return keep(grown, ~(faint[grown.parents] | huge), stats.contribution[grown.parents], rules)
 
 
 def _affordable(hot: Bool[Tensor, " N"], gradient: Float[Tensor, " N"], room: int) -> Bool[Tensor, " N"]:
@@ -93,7 +102,7 @@ def grow(params: Mapping[str, Tensor], *, clone: Bool[Tensor, " N"], split: Bool
     fresh = torch.arange(len(parents), device=clone.device) >= len(stay)
     values = {name: value.detach()[parents].clone() for name, value in params.items()}
     children = slice(len(stay) + len(clones), None)
-    offsets = torch.randn(2 * len(splits), 3, generator=rng).to(clone.device) * values["log_scales"][children].exp()
+    offsets = torch.randn(2 * len(splits), 3, generator=rng).to(clone.device) * values["log_scales"][children].clamp(*LOG_SCALE_RANGE).exp()
     values["means"][children] += rotate(values["quats"][children], offsets)
     values["log_scales"][children] -= torch.log(torch.tensor(SPLIT_SHRINK))
     return Change(parents, fresh, values)
@@ -104,7 +113,10 @@ def keep(change: Change, wanted: Bool[Tensor, " M"], contribution: Float[Tensor,
     # two stable sorts: every wanted row before every unwanted one, so that the floor is filled from the best unwanted rows
     rank = torch.argsort(contribution, descending=True, stable=True)
     rank = rank[torch.argsort(wanted[rank].int(), descending=True, stable=True)]
-    count = min(max(int(wanted.sum()), min(rules.min_gaussians, len(wanted))), rules.max_gaussians)
+    left, floor = int(wanted.sum()), min(rules.min_gaussians, len(wanted))
+    if left < floor:
+        logger.warning("only %d of %d Gaussians would be left: the %d that contribute most stay (min_gaussians)", left, len(wanted), floor)
+    count = min(max(left, floor), rules.max_gaussians)
     rows = rank[:count].sort().values
     return Change(change.parents[rows], change.fresh[rows], {name: value[rows] for name, value in change.values.items()})
 

@@ -11,6 +11,10 @@ class UserError(ValueError):
     """
 
 
+class Terminated(SystemExit):
+    """A signal asked the process to end: unlike a ``sys.exit()`` of somebody's module this is no mistake of theirs."""
+
+
 def unknown(kind: str, name: str, choices: Iterable[str]) -> UserError:
     """The error for a name that isn't among ``choices``: lists the nearest ones, or all when none is near."""
     choices = sorted(map(str, choices))

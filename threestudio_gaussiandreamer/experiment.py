@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, Optional
 
-from .errors import UserError
+from .errors import Terminated, UserError
 from .launch_options import PROGRAM, announce_device, choose_gpu, find_config, parse_arguments
 
 NOISE = (
@@ -58,9 +58,14 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
             traceback.print_exc()
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except (KeyboardInterrupt, SystemExit) as stop:
+    except (KeyboardInterrupt, Terminated) as stop:
         print("stopped", file=sys.stderr)
-        return stop.code if isinstance(stop, SystemExit) else 128 + signal.SIGINT
+        return stop.code if isinstance(stop, Terminated) else 128 + signal.SIGINT
+    except SystemExit as stop:
+        # nothing of ours does so, and its own code may say that all went well
+        *_, place = traceback.extract_tb(stop.__traceback__)
+        print(f"error: {place.filename}:{place.lineno} ended the run with sys.exit({stop.code!r})", file=sys.stderr)
+        return 2
 
 
 def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
@@ -116,7 +121,7 @@ def _signals() -> Iterator[None]:
     """SIGTERM ends the process through ``finally`` blocks, with code 143; afterwards all handlers are what they were."""
 
     def end(signum: int, frame: Any) -> None:
-        sys.exit(128 + signum)
+        raise Terminated(128 + signum)
 
     if threading.current_thread() is not threading.main_thread():
         yield

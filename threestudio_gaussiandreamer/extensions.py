@@ -9,7 +9,7 @@ import sys
 import traceback
 from pathlib import Path
 
-from .errors import UserError
+from .errors import Terminated, UserError
 from .host import info
 
 
@@ -43,13 +43,15 @@ def _load(entry: Path) -> str:
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[name]
+        if isinstance(error, Terminated):
+            raise
         raise UserError(f"the extension {entry} can't be imported: {_cause(error, entry)}") from error
     return name
 
 
-def _cause(error: Exception, entry: Path) -> str:
+def _cause(error: BaseException, entry: Path) -> str:
     """``file:line: what``, the line being the innermost one inside the extension."""
     what = f"{type(error).__name__}: {error}"
     if isinstance(error, SyntaxError) and error.lineno:

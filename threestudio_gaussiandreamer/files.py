@@ -39,10 +39,13 @@ def near_names(path: Path) -> str:
 
 
 @contextmanager
-def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
+def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[BinaryIO]:
     """A binary file that appears under ``path`` whole, on success, or not at all; what was there stays until then.
 
-    The content goes to a temporary file beside it, which is flushed to the disk before it takes the name.
+    The content goes to a temporary file beside it, which takes the name when it is whole.
+
+    Args:
+        durable: wait until it is on the disk, so that it is whole also after a loss of power.
 
     Raises:
         UserError: the folder is missing or unwritable, the disk is full, ...
@@ -53,9 +56,11 @@ def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
         with open(temporary, "wb") as file:
             yield file
             file.flush()
-            os.fsync(file.fileno())
+            if durable:
+                os.fsync(file.fileno())
         os.replace(temporary, path)
-        _sync_folder(path.parent)
+        if durable:
+            _sync_folder(path.parent)
     except OSError as error:
         raise UserError(f"cannot write {str(path)!r}: {error.strerror or error}. An earlier file of this name is untouched.") from error
     finally:

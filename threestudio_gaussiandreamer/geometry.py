@@ -15,13 +15,17 @@ scale_factor        multiplies it
 init_opacity        opacity of every Gaussian at the start
 sh_degree           0 to 3
 lr_*                learning rate of each attribute: a number or a schedule; lr_sh_rest for the bands above degree 0
-densify             enabled, start, stop, every (steps), grad_threshold, split_scale, min_opacity, max_scale (world units)
+densify             enabled, start, stop, every (steps), grad_threshold, split_scale, min_opacity, max_scale (world units);
+                    absgrad: judge by the sum of the pixels' absolute gradients, in which opposite pulls don't cancel
+                    (AbsGS, Ye et al. 2024; several times larger, so give a threshold to match)
 budget              how many Gaussians a run ends with: a number, null (no limit but ``max_gaussians``), or ``auto``: each round
-                    drops as many as cost no more than ``prune.quality`` or, where no truth is known, ``prune.likeness``
+                    drops as many as cost no more than ``prune.quality`` or, where no truth is known, ``prune.likeness``; under a
+                    budget, duplicates in the start are merged (``merging.py``)
 prune               how the budget is met (``parsimony.py``): start, stop, every (steps), keep (the least share that a round
                     keeps), score (contribution; opacity, random: to compare with), quality (dB that a round may lose against
                     the truth), likeness (dB between the renders before and after a round, at least)
-max_gaussians       exact cap, reached by dropping what contributes least; min_gaussians: the floor that pruning never passes
+max_gaussians       exact cap, reached by dropping what contributes least (of untrained points: any, evenly); min_gaussians: the
+                    floor that pruning never passes
 keep_attributes     with gaussians-prior: start from all attributes of that cloud, not only from points and colours
 ==================  =========================================================================================================
 """
@@ -38,12 +42,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from . import densify, parsimony, sh
-from .densify import PARAMETERS, Change, Rules, Statistics
+from . import densify, parsimony, sh, simplify
+from .densify import LOG_SCALE_RANGE, PARAMETERS, Change, Rules, Statistics
 from .distributed import all_max, all_sum
 from .errors import UserError, unknown
 from .grow import SCALE_RULES, grow, nearest_distance_scales
 from .host import BaseGeometry, C, find, register, run_seed, validate_schedule
+from .merging import merge_duplicates
 from .nested import adopt_nested
 from .point_cloud import PointCloud
 from .splatting import Rasterized
@@ -59,8 +64,9 @@ LEARNING_RATES = {
     "sh0": "lr_sh",
     "sh_rest": "lr_sh_rest",
 }
-LOG_SCALE_RANGE = (-20.0, 10.0)
 AUTO = "auto"
+CAP_VIEWS = (32, 256)
+"""How many views a trained cloud that is too large is judged by, and their pixels each way."""
 Holds = Callable[[Bool[Tensor, " N"]], bool]
 
 
@@ -84,6 +90,7 @@ class DensifyConfig:
     split_scale: float = 0.04
     min_opacity: float = 0.05
     max_scale: float = 0.4
+    absgrad: bool = False
 
 
 @dataclass
@@ -180,7 +187,7 @@ class GaussianCloud(BaseGeometry):
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Take the size from the checkpoint before its tensors are copied in."""
         means = state_dict.get(prefix + "means")
-        if means is not None and len(means) != len(self):
+        if isinstance(means, Tensor) and means.dim() and len(means) != len(self):  # otherwise torch says what is wrong with it
             self._allocate(len(means), self.means.device)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
@@ -219,11 +226,23 @@ class GaussianCloud(BaseGeometry):
         prior = self.prior()
         if self.cfg.keep_attributes and hasattr(prior, "gaussians"):
             arrays = prior.gaussians(prompt)
-            self.set_arrays(**arrays._asdict())
-            return prior.cloud(arrays)
-        cloud = make_cloud(prior, prompt) if make_cloud else prior(prompt)
-        self.start_from(self.grown(cloud))
+            trained = simplify.Cloud(*(torch.as_tensor(getattr(arrays, name)) for name in simplify.Cloud._fields))
+            self.set_arrays(**self._capped_trained(trained)._asdict())
+            cloud = prior.cloud(arrays)
+        else:
+            cloud = make_cloud(prior, prompt) if make_cloud else prior(prompt)
+            self.start_from(self.grown(cloud))
+        if self.cfg.budget is not None:
+            self.merge_duplicates()
         return cloud
+
+    def merge_duplicates(self) -> None:
+        """One Gaussian in the place of those that show the same, as far as the budget asks for fewer."""
+        least = max(self.cfg.min_gaussians, 0 if self.cfg.budget == AUTO else self.cfg.budget)
+        merged = merge_duplicates(self.parameters_by_name(), at_least=least).values
+        if len(merged["means"]) < len(self):
+            logger.info("%d of %d Gaussians are duplicates of others: merged", len(self) - len(merged["means"]), len(self))
+            self.set_arrays(sh=torch.cat([merged.pop("sh0"), merged.pop("sh_rest")], 1), **merged)
 
     def grown(self, cloud: PointCloud) -> PointCloud:
         """Noisy point growing and colour perturbation (the paper's Algorithm 1), within the cap."""
@@ -247,16 +266,27 @@ class GaussianCloud(BaseGeometry):
         )
 
     def _capped(self, points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """At most ``max_gaussians`` points, a seeded uniform choice."""
+        """At most ``max_gaussians`` points, a seeded uniform choice.
+
+        None of them is trained and all are equally opaque, so none is worth more than another: a choice by contribution to first
+        renders would only prefer what lies outside, and leave holes (tests/stability measures both).
+        """
         if len(points) <= self.cfg.max_gaussians:
             return points, colors
-        logger.warning(
-            "the prior and its growth give %d points; keeping %d of them (system.geometry.max_gaussians)",
-            len(points),
-            self.cfg.max_gaussians,
-        )
+        logger.warning("the prior and its growth give %d points; keeping %d, evenly (max_gaussians)", len(points), self.cfg.max_gaussians)
         rows = np.sort(numpy_generator(run_seed(), "cap").choice(len(points), self.cfg.max_gaussians, replace=False))
         return points[rows], colors[rows]
+
+    def _capped_trained(self, cloud: simplify.Cloud) -> simplify.Cloud:
+        """At most ``max_gaussians`` of trained Gaussians: those that contribute most to views from all around."""
+        if len(cloud.means) <= self.cfg.max_gaussians:
+            return cloud
+        logger.warning(
+            "the prior has %d Gaussians; keeping the %d that contribute most (max_gaussians)", len(cloud.means), self.cfg.max_gaussians
+        )
+        cloud = simplify.Cloud(*(values.to(self.means.device) for values in cloud))
+        _, contribution = simplify.look(cloud, simplify.views_around(cloud, *CAP_VIEWS))
+        return simplify.only(cloud, contribution, self.cfg.max_gaussians)
 
     def set_arrays(self, *, sh: Any, **arrays: Any) -> None:
         """Replace the cloud; spherical harmonics ``sh`` (N, K', 3) are padded with zeros or cut to ``sh_degree``."""
@@ -303,15 +333,24 @@ class GaussianCloud(BaseGeometry):
             if group.get("name") in LEARNING_RATES:
                 group["lr"] = C(self.cfg[LEARNING_RATES[group["name"]]], epoch, step)
 
+    @property
+    def wants_absgrad(self) -> bool:
+        """Whether :meth:`observe` reads absolute gradients, which the rasteriser then has to collect."""
+        return self.cfg.densify.enabled and self.cfg.densify.absgrad
+
     def observe(self, out: Rasterized, width: int, height: int, loss_scale: float = 1.0) -> None:
         """Add one step's screen-space gradients and contributions to the statistics."""
         if out.means2d.grad is not None:
-            self.gradient_sum += all_sum(densify.screen_gradients(out.means2d.grad, width, height, loss_scale).sum(0))
+            pixels = out.means2d.absgrad if self.wants_absgrad else out.means2d.grad
+            self.gradient_sum += all_sum(densify.screen_gradients(pixels, width, height, loss_scale).sum(0))
             self.gradient_count += all_sum((out.radii > 0).sum(0))
         torch.maximum(self.contribution, all_max(out.contribution.amax(0)), out=self.contribution)
 
     def after_step(self, optimizer: torch.optim.Optimizer, step: int, holds: Optional[Holds] = None) -> bool:
-        """Densify and prune where their schedules say so; True if N may have changed.
+        """Densify and prune where their schedules say so; True if the cloud was replaced.
+
+        A densification that neither makes nor drops a Gaussian only begins its statistics anew: the next pruning ranks by what it
+        would have seen without it.
 
         Args:
             step: finished optimiser steps.
@@ -320,6 +359,10 @@ class GaussianCloud(BaseGeometry):
         change = None
         if self.cfg.densify.enabled and is_due(self.cfg.densify, step):
             change = self.densified(step)
+            if not change.fresh.any() and len(change.parents) == len(self):
+                change = None
+            self.gradient_sum.zero_()
+            self.gradient_count.zero_()
         if self.cfg.budget is not None and is_due(self.cfg.prune, step):
             change = self.pruned(step, change, holds)
         if change is not None:

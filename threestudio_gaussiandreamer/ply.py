@@ -261,7 +261,9 @@ class _Table:
             with open(path, "rb") as file:
                 header = _read_header(file, str(path))
                 vertices = _seek_vertices(file, header, str(path))
-                return cls(path, vertices, _read_rows(file, vertices, header.encoding, str(path)))
+                columns = _read_rows(file, vertices, header.encoding, str(path))
+                _report_what_follows(file, header, vertices, path)
+                return cls(path, vertices, columns)
         except OSError as error:
             raise UserError(f"cannot read {str(path)!r}: {error.strerror or error}.") from error
 
@@ -353,6 +355,8 @@ def _read_header(file: BinaryIO, path: str) -> _Header:
         if words == ["end_header"]:
             break
         if words[:1] == ["format"]:
+            if encoding is not None:
+                _fail(path, "the header states two formats.")
             encoding = words[1] if len(words) > 1 else ""
         elif words[:1] == ["element"]:
             elements.append(_parse_element(words, path))
@@ -362,6 +366,8 @@ def _read_header(file: BinaryIO, path: str) -> _Header:
             _fail(path, f"the header has an unknown line {' '.join(words)[:80]!r}.")
     if encoding not in BYTE_ORDERS:
         _fail(path, f"format {encoding!r} is unknown: {', '.join(BYTE_ORDERS)} were expected.")
+    if sum(element.name == "vertex" for element in elements) > 1:
+        _fail(path, "it has two elements of vertices.")
     for element in elements:
         if len({entry.name for entry in element.properties}) < len(element.properties):
             _fail(path, f"element {element.name!r} has two properties of the same name.")
@@ -399,17 +405,31 @@ def _skip(file: BinaryIO, element: _Element, encoding: str, path: str) -> None:
     if element.count > remaining and element.properties:  # each row has a byte at least
         _fail(path, f"{element.count} rows of {element.name!r} are announced, but {remaining} bytes follow: the file is truncated.")
     if encoding == "ascii":
-        _skip_lines(file, element.count if element.properties else 0)
+        _skip_lines(file, element, path)
     elif element.has_lists:
         _skip_lists(file, element, BYTE_ORDERS[encoding], path)
     else:
         file.seek(element.count * element.row_type("<").itemsize, os.SEEK_CUR)
 
 
-def _skip_lines(file: BinaryIO, count: int) -> None:
-    """Skip ``count`` lines that are not blank; at the end of the file the missing vertices are reported."""
+def _skip_lines(file: BinaryIO, element: _Element, path: str) -> None:
+    """Skip the lines of an element but for blank ones; their numbers must be as many as announced, or the vertices begin elsewhere."""
+    count = element.count if element.properties else 0
     while count and (line := file.readline()):
-        count -= bool(line.strip())
+        words = line.split()
+        if words and not _is_row(words, element):
+            _fail(path, f"a line of {element.name!r} holds other numbers than its properties: {line[:80].decode('latin-1')!r}.")
+        count -= bool(words)
+
+
+def _is_row(words: list[bytes], element: _Element) -> bool:
+    try:
+        numbers, at = [float(word) for word in words], 0
+        for entry in element.properties:
+            at += 1 + int(numbers[at]) if entry.count_type else 1
+        return at == len(numbers)
+    except (ValueError, IndexError, OverflowError):
+        return False
 
 
 def _skip_lists(file: BinaryIO, element: _Element, order: str, path: str) -> None:
@@ -451,6 +471,10 @@ def _read_text_rows(file: BinaryIO, vertices: _Element, path: str) -> dict[str, 
     rows = _parse_text(file, vertices.count, path) if vertices.count else np.empty((0, width))
     if rows.shape != (vertices.count, width):
         _fail(path, f"{vertices.count} vertices of {width} numbers are announced, but {rows.shape[0]} of {rows.shape[1]} are there.")
+    for entry, values in zip(vertices.properties, rows.T, strict=True):
+        limits = None if entry.type[0] == "f" else np.iinfo(entry.type)
+        if limits and ((values < limits.min) | (values > limits.max)).any():
+            _fail(path, f"{entry.name} is beyond the range of its type, {limits.min} to {limits.max}.")
     return {entry.name: column for entry, column in zip(vertices.properties, rows.T, strict=True)}
 
 
@@ -461,6 +485,12 @@ def _parse_text(file: BinaryIO, count: int, path: str) -> Float[np.ndarray, "N C
             return np.loadtxt(file, np.float64, comments=None, max_rows=count, ndmin=2, encoding="latin-1")
     except ValueError as error:
         _fail(path, f"a vertex is not readable: {error}.")
+
+
+def _report_what_follows(file: BinaryIO, header: _Header, vertices: _Element, path: Path) -> None:
+    """Say when there is more than the header announces, since then its count may be wrong."""
+    if header.elements[-1] is vertices and (rest := _remaining(file)) and file.read(4096).strip():
+        logger.warning("PLY file %r: %d bytes follow the %d vertices that its header announces", str(path), rest, vertices.count)
 
 
 def _require_room(file: BinaryIO, vertices: _Element, size: int, path: str) -> None:

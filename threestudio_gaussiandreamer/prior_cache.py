@@ -2,14 +2,14 @@
 
 import hashlib
 import json
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any, Optional
 
 import numpy as np
 from omegaconf import OmegaConf
 
+from .array_files import read_arrays
+from .errors import UserError
 from .files import atomic_file
 from .host import info, run_seed
 from .ply import write_points
@@ -50,9 +50,7 @@ def read_cache(path: Path, key: str) -> Optional[PointCloud]:
     if not path.is_file():
         return None
     try:
-        with np.load(path, allow_pickle=False) as data:
-            if str(data["key"]) != key:
-                return None
-            return PointCloud(**{name: data[name] for name in data.files if name != "key"})
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error):
+        data = read_arrays(path, "cache", ["key", "points", "colors"], ["normals", "faces"])
+    except UserError:
         return None
+    return None if str(data.pop("key")) != key else PointCloud(**data)

@@ -54,6 +54,7 @@ NEGATIVE_PROMPT = (
     "artifacts, duplicate, morbid, mutilated, poorly drawn face, deformed, dehydrated, bad proportions, unfocused"
 )
 """The negative prompt of the released GaussianDreamer's configuration."""
+PROMPT_LIBRARY = "load/prompt_library.json"
 COMPONENTS = ("tokenizer", "text_encoder")
 
 
@@ -66,7 +67,7 @@ class TextEncoderPromptProcessor(BaseObject):
         revision: Optional[str] = None
         prompt: str = ""
         prompt_file: Optional[str] = None
-        prompt_library: str = "load/prompt_library.json"
+        prompt_library: str = PROMPT_LIBRARY
         prompt_front: Optional[str] = None
         prompt_side: Optional[str] = None
         prompt_back: Optional[str] = None
@@ -177,7 +178,12 @@ def chosen_prompt(cfg: Any) -> str:
     prompt = cfg.prompt if cfg.prompt_file is None else read_prompt(cfg.prompt_file)
     if not prompt.strip():
         raise UserError('no prompt: give one, for instance system.prompt_processor.prompt="a corgi"')
-    return from_library(prompt[4:], cfg.prompt_library) if prompt.startswith("lib:") else prompt
+    return spelt_out(prompt, cfg.prompt_library)
+
+
+def spelt_out(prompt: str, library: str) -> str:
+    """``prompt``, or the text of the library that ``lib:...`` stands for; raises as :func:`from_library`."""
+    return from_library(prompt[4:], library) if prompt.startswith("lib:") else prompt
 
 
 def from_library(words: str, path: str) -> str:

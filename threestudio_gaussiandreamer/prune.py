@@ -1,10 +1,12 @@
 """Prune a finished cloud to a budget: ``python -m threestudio_gaussiandreamer.prune IN OUT --psnr 40``.
 
-IN is a PLY of Gaussians, ours or any other tool's, or a checkpoint of ours; OUT a PLY. Beside OUT are written OUT.json, the report,
-and OUT.png, before (top) and after. The method: ``simplify.py``. Three sets of views, none in another: what Gaussians are scored on
-and fitted to, what decides whether a budget of quality is met, and what the report says.
+IN is a PLY or SPZ file of Gaussians, ours or any other tool's, or a checkpoint, ours or gsplat's; OUT a PLY or SPZ file. Beside OUT
+are written OUT.json, the report, and OUT.png, before (top) and after. The method: ``simplify.py``. Three sets of views, none in
+another: what Gaussians are scored on and fitted to, what decides whether a budget of quality is met (a standard error on the safe
+side), and what the report says. Both of the latter look at what OUT gives back, rounding included. The views are from around and
+outside: right for an object, not for a room.
 
-A budget of quality is spent once: it is noted in the PLY, and a second run with the same or a stricter one has nothing to do, since
+A budget of quality is spent once: it is noted in OUT, and a second run with the same or a stricter one has nothing to do, since
 it would measure against the pruned cloud.
 """
 
@@ -16,6 +18,7 @@ import statistics
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
@@ -23,23 +26,61 @@ import torch
 from torch import Tensor
 
 from .builtin.pictures import write as write_picture
-from .builtin.weights import load_checkpoint
+from .builtin.weights import load_file
+from .cloud_files import AXES, OUR_UP, StoredCloud, as_stored, file_size, read_cloud, require_format, rotation_between, write_cloud
 from .errors import UserError
 from .files import existing_file
 from .host import get_device
-from .ply import read_comments, read_gaussians, write_gaussians
+from .ply import GaussianArrays
 from .simplify import Budget, Cloud, Round, Views, likeness, look, simplify, views_around
+from .spz import COLOR_REACH
 
-NOTE = "pruned to the likeness, dB:"
-PROBES, JUDGES, TESTS = 64, 16, 16
-HEADER_BYTES = 2048
-"""More than the header of the PLY takes."""
+PROBES, JUDGES, TESTS = 64, 32, 16
 TURNS = (0.0, 45.0, 60.0)
 """Where the three spirals of views start, degrees."""
-CLOUD_KEYS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "sh_rest")
+CHECKPOINTS = {
+    "state_dict": {name: f"geometry.{name}" for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "sh_rest")},
+    "splats": {"means": "means", "quats": "quats", "log_scales": "scales", "logit_opacities": "opacities", "sh0": "sh0", "sh_rest": "shN"},
+}
+"""Where the cloud is in a checkpoint of ours, and of gsplat's trainer."""
+BUDGETS = ("count", "bytes", "psnr", "within")
 
 
-class Report(NamedTuple):
+@dataclass
+class PruneOptions:
+    """A budget, at most one of the first four, and how it is met."""
+
+    count: Any = None
+    bytes: Any = None
+    psnr: Any = None
+    within: Any = None
+    quality: float = 35.0
+    size: int = 256
+    steps: int = 60
+
+    @property
+    def asked_for(self) -> bool:
+        return any(getattr(self, name) is not None for name in BUDGETS)
+
+    def check(self, where: str) -> None:
+        """Raises UserError for a number that makes no sense; ``where`` is what the names of options begin with."""
+        given = [name for name in BUDGETS if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise UserError(f"{where}{given[0]} and {where}{given[1]}: give one budget")
+        if self.size < 16 or self.steps < 1:
+            raise UserError(f"{where}size and {where}steps: expected at least 16 and 1, got {self.size} and {self.steps}")
+        budget_of(self, where)
+
+
+class Pruned(NamedTuple):
+    """A cloud before and after, and the seconds between."""
+
+    before: StoredCloud
+    after: StoredCloud
+    seconds: float
+
+
+class Cost(NamedTuple):
     """What a cloud is, and what it costs."""
 
     gaussians: int
@@ -63,8 +104,8 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m threestudio_gaussiandreamer.prune", description=__doc__.splitlines()[0])
-    parser.add_argument("source", metavar="IN", help="a PLY of Gaussians or a checkpoint")
-    parser.add_argument("output", metavar="OUT", help="the PLY to write")
+    parser.add_argument("source", metavar="IN", help="a PLY or SPZ file of Gaussians, or a checkpoint")
+    parser.add_argument("output", metavar="OUT", help="the PLY or SPZ file to write")
     budget = parser.add_mutually_exclusive_group(required=True)
     budget.add_argument("--count", help="how many Gaussians to keep")
     budget.add_argument("--bytes", help="the largest size of OUT, such as 500kB or 2MB")
@@ -73,78 +114,77 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     parser.add_argument("--quality", type=float, default=35.0, help="dB of the unpruned cloud to the truth, for --within (default: 35)")
     parser.add_argument("--size", type=int, default=256, help="pixels of the views each way (default: 256)")
     parser.add_argument("--steps", type=int, default=60, help="of recovery after each round (default: 60)")
+    parser.add_argument("--up", choices=AXES, help="which axis of IN is up (default: what the file says, else the custom of its format)")
     return parser.parse_args(argv)
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     """Everything, in the order in which mistakes show; returns the report."""
-    cloud, spent = read(args.source)
-    budget = budget_of(args, cloud)
-    if args.size < 16 or args.steps < 1:
-        raise UserError(f"--size and --steps: expected at least 16 and 1, got {args.size} and {args.steps}")
-    require_writable(Path(args.output))
-    probes, judges, tests = (views_around(cloud, n, args.size, turn=turn) for n, turn in zip((PROBES, JUDGES, TESTS), TURNS, strict=True))
-    enough = budget.psnr is not None and spent is not None and budget.psnr >= spent
-    started = time.perf_counter()
-    pruned = cloud if enough else pruned_with_progress(cloud, probes, judges, budget, args.steps)
-    seconds = time.perf_counter() - started
-    if enough:
-        print(f"nothing to do: {args.source} has been pruned to {spent:g} dB already")
-    note = budget.psnr if not enough else spent
-    write_gaussians(args.output, **arrays_of(pruned), comments=[] if note is None else [f"{NOTE} {note:g}"])
-    return write_report(args, cloud, pruned, tests, seconds)
+    options = PruneOptions(**{field.name: getattr(args, field.name) for field in fields(PruneOptions)})
+    options.check("--")
+    suffix = require_format(args.output, "OUT")
+    if not Path(args.output).parent.is_dir():
+        raise UserError(f"OUT: there is no folder {str(Path(args.output).parent)!r}")
+    done = pruned(read(args.source, args.up), options, suffix, "--")
+    write_cloud(args.output, done.after)
+    return write_report(args.output, done, suffix, options)
 
 
 # ---- reading ---------------------------------------------------------------------------------------------------------------
 
 
-def read(path: str) -> tuple[Cloud, Optional[float]]:
-    """The cloud on the device that renders, and the likeness in dB that it has been pruned to before, if it has.
+def read(path: str, up: Optional[str] = None) -> StoredCloud:
+    """The cloud in a file or checkpoint.
 
     Raises:
         UserError: there is no file, it holds no Gaussians, or fewer than two.
     """
-    file = existing_file(path, "PLY of Gaussians or checkpoint")
-    values = from_checkpoint(file) if file.suffix == ".ckpt" else read_gaussians(file)._asdict()
-    cloud = Cloud(*(torch.as_tensor(values[name]).float().to(get_device()) for name in Cloud._fields))
-    if len(cloud.means) < 2:
-        raise UserError(f"{path} holds {len(cloud.means)} Gaussians: there is nothing to prune")
-    notes = [] if file.suffix == ".ckpt" else [line for line in read_comments(file) if line.startswith(NOTE)]
-    return cloud, number(notes[-1].removeprefix(NOTE), "the note in the PLY") if notes else None
+    file = existing_file(path, "file of Gaussians or checkpoint")
+    stored = StoredCloud(from_checkpoint(file), up or OUR_UP) if file.suffix in (".ckpt", ".pt") else read_cloud(path, up=up)
+    if len(stored.arrays.means) < 2:
+        raise UserError(f"{path} holds {len(stored.arrays.means)} Gaussians that can be drawn: there is nothing to prune")
+    return stored
 
 
-def from_checkpoint(file: Path) -> dict[str, Tensor]:
+def from_checkpoint(file: Path) -> GaussianArrays:
     """The cloud in a training checkpoint."""
-    state = load_checkpoint(file)["state_dict"]
-    values = {name: state.get(f"geometry.{name}") for name in CLOUD_KEYS}
-    if missing := [name for name, value in values.items() if value is None]:
-        raise UserError(f"{file} holds no cloud of Gaussians: it has no geometry.{missing[0]}")
-    return values | {"sh": torch.cat([values["sh0"], values["sh_rest"]], 1)}
+    content = load_file(file)
+    for key, names in CHECKPOINTS.items():
+        state = content.get(key, {}) if isinstance(content, dict) else {}
+        if all(isinstance(state.get(stored), Tensor) for stored in names.values()):
+            values = {name: state[stored].detach().float().cpu().numpy() for name, stored in names.items()}
+            harmonics = torch.cat([torch.from_numpy(values.pop(name)) for name in ("sh0", "sh_rest")], 1).numpy()
+            return GaussianArrays(sh=harmonics, **values)
+    raise UserError(f"{file} holds no cloud of Gaussians: neither our {CHECKPOINTS['state_dict']['means']} nor gsplat's splats are there")
 
 
-def budget_of(args: argparse.Namespace, cloud: Cloud) -> Budget:
-    """What the options ask for.
+def budget_of(options: PruneOptions, where: str, each: float = 1.0, header: int = 0) -> Budget:
+    """What the options ask for, of Gaussians that take ``each`` bytes in the file, besides its header.
 
     Raises:
         UserError: a number that makes no sense.
     """
-    if args.count is not None:
-        return Budget(count=counted(number(args.count, "--count"), "--count"))
-    if args.bytes is not None:
-        return Budget(count=counted((size_in_bytes(args.bytes) - HEADER_BYTES) // bytes_of(cloud, 1), "--bytes, in Gaussians,"))
-    if args.psnr is not None:
-        return Budget(psnr=positive(number(args.psnr, "--psnr", "dB"), "--psnr"))
-    return Budget(psnr=likeness_within(positive(number(args.within, "--within", "dB"), "--within"), args.quality))
+    if options.count is not None:
+        return Budget(count=counted(number(options.count, f"{where}count"), f"{where}count"))
+    if options.bytes is not None:
+        count = (size_in_bytes(options.bytes, f"{where}bytes") - header) // each
+        return Budget(count=counted(count, f"{where}bytes, in Gaussians,"))
+    if options.psnr is not None:
+        return Budget(psnr=positive(number(options.psnr, f"{where}psnr", "dB"), f"{where}psnr"))
+    if options.within is not None:
+        return Budget(psnr=likeness_within(positive(number(options.within, f"{where}within", "dB"), f"{where}within"), options.quality))
+    return Budget()
 
 
-def number(text: str, option: str, unit: str = "") -> float:
+def number(value: Any, option: str, unit: str = "") -> float:
+    text = str(value).strip()
     try:
-        value = float(re.sub(rf"\s*{unit}$", "", text.strip(), flags=re.IGNORECASE))
+        found = float(re.sub(rf"\s*{unit}$", "", text, flags=re.IGNORECASE))
     except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise UserError(f"{option}: expected a number, got {text.strip()!r}")
-    return value
+        found = math.nan
+    if not math.isfinite(found):
+        raise UserError(f"{option}: expected a number, got {text!r}")
+    return found
 
 
 def positive(value: float, option: str) -> float:
@@ -159,16 +199,11 @@ def counted(value: float, option: str) -> int:
     return int(value)
 
 
-def size_in_bytes(text: str) -> int:
-    found = re.fullmatch(r"\s*([\d.]+)\s*(k|m|g)?b?\s*", text.lower())
+def size_in_bytes(value: Any, option: str) -> int:
+    found = re.fullmatch(r"\s*([\d.]+)\s*(k|m|g)?b?\s*", str(value).lower())
     if not found:
-        raise UserError(f"--bytes: expected a size such as 500kB or 2MB, got {text!r}")
-    return int(number(found[1], "--bytes") * 1000 ** ("kmg".index(found[2]) + 1 if found[2] else 0))
-
-
-def bytes_of(cloud: Cloud, count: int) -> int:
-    """The size of a PLY of ``count`` of these Gaussians, without its header: float32 of all attributes and of three unused normals."""
-    return 4 * (3 + sum(values[0].numel() for values in cloud)) * count
+        raise UserError(f"{option}: expected a size such as 500kB or 2MB, got {str(value)!r}")
+    return int(number(found[1], option) * 1000 ** ("kmg".index(found[2]) + 1 if found[2] else 0))
 
 
 def likeness_within(loss: float, quality: float) -> float:
@@ -179,46 +214,90 @@ def likeness_within(loss: float, quality: float) -> float:
     return quality - 10 * math.log10(10 ** (loss / 10) - 1)
 
 
-def require_writable(output: Path) -> None:
-    if output.suffix != ".ply":
-        raise UserError(f"OUT: expected the name of a .ply file, got {str(output)!r}")
-    if not output.parent.is_dir():
-        raise UserError(f"OUT: there is no folder {str(output.parent)!r}")
+# ---- working ---------------------------------------------------------------------------------------------------------------
 
 
-# ---- working and telling ---------------------------------------------------------------------------------------------------
+def pruned(stored: StoredCloud, options: PruneOptions, suffix: str, where: str) -> Pruned:
+    """The cloud within its budget as a file of the format ``suffix``; as it is where an earlier run has spent the budget.
+
+    Raises:
+        UserError: a budget that can't be met, or values that the format can't hold.
+    """
+    nothing = stored._replace(arrays=GaussianArrays(*(values[:0] for values in stored.arrays)))
+    header, size = file_size(nothing, suffix), file_size(stored, suffix)
+    budget = budget_of(options, where, (size - header) / len(stored.arrays.means), header)
+    started = time.perf_counter()
+    if budget.psnr is not None and stored.pruned_to is not None and budget.psnr >= stored.pruned_to:
+        print(f"nothing to do: this cloud has been pruned to {stored.pruned_to:g} dB already")
+        return Pruned(stored, stored, 0.0)
+    after = _simplified(stored, budget, options, suffix)
+    while options.bytes is not None and (size := file_size(after, suffix)) > (limit := size_in_bytes(options.bytes, f"{where}bytes")):
+        # fewer Gaussians pack a little worse
+        fewer = min(int(len(after.arrays.means) * limit / size), len(after.arrays.means) - 1)
+        after = _simplified(after, Budget(count=counted(fewer, f"{where}bytes, in Gaussians,")), options, suffix)
+    return Pruned(stored, after, time.perf_counter() - started)
 
 
-def pruned_with_progress(cloud: Cloud, probes: Views, judges: Views, budget: Budget, steps: int) -> Cloud:
+def _simplified(stored: StoredCloud, budget: Budget, options: PruneOptions, suffix: str) -> StoredCloud:
     from tqdm import tqdm
 
+    cloud = tensors_of(stored)
+    probes, judges, _ = views_of(stored, options.size)
+    sh_reach = COLOR_REACH if suffix == ".spz" else math.inf
     with tqdm(desc="pruning", unit="round", disable=None) as bar:
 
         def report(done: Round) -> None:
             bar.set_postfix_str(f"{done.count} Gaussians, {done.psnr:.2f} dB")
             bar.update()
 
-        return simplify(cloud, probes, judges, budget, steps=steps, report=report)
+        def written(fewer: Cloud) -> Cloud:
+            return tensors_of(as_stored(stored_cloud(fewer, stored), suffix))
+
+        fewer = simplify(cloud, probes, judges, budget, steps=options.steps, report=report, stored=written, sh_reach=sh_reach)
+    return stored_cloud(fewer, stored)._replace(pruned_to=budget.psnr)
 
 
-def arrays_of(cloud: Cloud) -> dict[str, Any]:
-    return {name: values.detach().cpu().numpy() for name, values in cloud._asdict().items()}
+def views_of(stored: StoredCloud, size: int) -> list[Views]:
+    """What is fitted to, what decides, what is reported."""
+    cloud, to_z_up = tensors_of(stored), torch.from_numpy(rotation_between(stored.up, "z"))
+    return [views_around(cloud, n, size, turn=turn, to_z_up=to_z_up) for n, turn in zip((PROBES, JUDGES, TESTS), TURNS, strict=True)]
 
 
-def write_report(args: argparse.Namespace, before: Cloud, after: Cloud, tests: Views, seconds: float) -> dict[str, Any]:
-    """The table on the screen, OUT.json and OUT.png."""
-    pictures = [look(cloud, tests)[0] for cloud in (before, after)]
-    costs = [Report(len(cloud.means), bytes_of(cloud, len(cloud.means)), frame_time(cloud, tests)) for cloud in (before, after)]
-    reached = likeness(after, tests, pictures[0])
-    report = {"before": costs[0]._asdict(), "after": costs[1]._asdict(), "psnr_on_unseen_views": reached, "seconds": round(seconds, 1)}
-    Path(f"{args.output}.json").write_text(json.dumps(report | {"command": vars(args)}, indent=2))
-    shown = [torch.cat(list(images[:: max(1, len(images) // 6)][:6]), 1) for images in pictures]
-    sheet = torch.cat(shown, 0).clamp(0, 1)
-    write_picture(Path(f"{args.output}.png"), (sheet.cpu().numpy() * 255).round().astype("uint8"))
+def tensors_of(stored: StoredCloud) -> Cloud:
+    """The cloud on the device that renders."""
+    return Cloud(*(torch.as_tensor(getattr(stored.arrays, name)).float().to(get_device()) for name in Cloud._fields))
+
+
+def stored_cloud(cloud: Cloud, like: Optional[StoredCloud] = None) -> StoredCloud:
+    """A cloud to be written, with the axes of another one or our own."""
+    arrays = GaussianArrays(**{name: values.detach().cpu().numpy() for name, values in cloud._asdict().items()})
+    return StoredCloud(arrays) if like is None else like._replace(arrays=arrays)
+
+
+# ---- telling ---------------------------------------------------------------------------------------------------------------
+
+
+def write_report(path: str, done: Pruned, suffix: str, options: PruneOptions) -> dict[str, Any]:
+    """The table on the screen, ``path``.json and ``path``.png; returns what the JSON holds."""
+    tests = views_of(done.before, options.size)[-1]
+    clouds = [tensors_of(done.before), tensors_of(as_stored(done.after, suffix))]
+    pictures = [look(cloud, tests)[0] for cloud in clouds]
+    sizes = [file_size(done.before, suffix), file_size(done.after, suffix)]
+    costs = [Cost(len(cloud.means), size, frame_time(cloud, tests)) for cloud, size in zip(clouds, sizes, strict=True)]
+    reached = likeness(clouds[1], tests, pictures[0])
+    report = {"before": costs[0]._asdict(), "after": costs[1]._asdict(), "psnr_on_unseen_views": reached, "seconds": round(done.seconds, 1)}
+    Path(f"{path}.json").write_text(json.dumps(report | {"options": asdict(options)}, indent=2))
+    write_picture(Path(f"{path}.png"), sheet(pictures))
     for name, cost in zip(("before", "after"), costs, strict=True):
         print(f"{name:7} {cost.gaussians:8d} Gaussians {cost.bytes / 1e6:8.2f} MB {cost.ms_per_frame:8.2f} ms a frame")
-    print(f"{reached:.2f} dB to the unpruned cloud on views that nothing was fitted to; {args.output}, .json, .png")
+    print(f"{reached:.2f} dB to the unpruned cloud on views that nothing was fitted to; {path}, .json, .png")
     return report
+
+
+def sheet(pictures: list[Tensor]) -> Any:
+    """Six views in a row, a row for each cloud, as bytes."""
+    rows = [torch.cat(list(images[:: max(1, len(images) // 6)][:6]), 1) for images in pictures]
+    return (torch.cat(rows, 0).clamp(0, 1).cpu().numpy() * 255).round().astype("uint8")
 
 
 def frame_time(cloud: Cloud, views: Views) -> float:

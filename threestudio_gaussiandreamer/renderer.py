@@ -60,15 +60,19 @@ class SplattingRenderer(Rasterizer):
         super().configure(geometry, material, background)
         self.Config.check(self.cfg)
 
-    def forward(self, c2w: Tensor, fovy: Tensor, height: int, width: int, absgrad: bool = False, **batch: Any) -> dict[str, Any]:
-        """Render B views.
+    def forward(self, c2w: Tensor, fovy: Tensor, height: int, width: int, **batch: Any) -> dict[str, Any]:
+        """Render B views, in float32 whatever the trainer's precision is: half of it would move cameras by thousandths.
 
         Args: ``c2w`` (B, 4, 4) OpenGL, ``fovy`` (B,) radians, ``height`` and ``width`` in pixels, before ``downsample``.
         Returns: ``comp_rgb`` (B, H, W, 3), ``opacity`` and ``depth`` (B, H, W, 1), ``comp_normal`` (B, H, W, 3) in [0, 1],
         ``comp_rgb_bg``, the background, (B, 1, 1, 3) or (B, H, W, 3), and ``rasterized`` with what densification needs.
         """
-        cfg, device = self.cfg, self.geometry.means.device
-        c2w, fovy = c2w.to(device, torch.float32), fovy.to(device, torch.float32)
+        device = self.geometry.means.device
+        with torch.autocast(device.type, enabled=False):
+            return self._render(c2w.to(device, torch.float32), fovy.to(device, torch.float32), height, width, batch)
+
+    def _render(self, c2w: Tensor, fovy: Tensor, height: int, width: int, batch: dict[str, Any]) -> dict[str, Any]:
+        cfg = self.cfg
         viewmats, Ks = cameras.to_opencv(c2w, fovy, height, width)
         flat = self.background.color(len(c2w)) if isinstance(self.background, FlatBackground) else None
         out = rasterize(
@@ -89,7 +93,7 @@ class SplattingRenderer(Rasterizer):
             preset=cfg.preset,
             downsample=cfg.downsample,
             backend=cfg.backend,
-            absgrad=absgrad,
+            absgrad=self.training and getattr(self.geometry, "wants_absgrad", False),
         )
         image, background = (out.image, flat[:, None, None]) if flat is not None else self._composite(out, c2w, fovy, batch)
         depth = out.depth / out.alpha.clamp_min(1e-6)

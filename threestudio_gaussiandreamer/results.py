@@ -2,9 +2,9 @@
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple, Optional
+from typing import Any, NamedTuple, Optional
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from .errors import UserError
 from .files import existing_file
 from .host import find, get_device
 from .ply import GaussianArrays, is_gaussian_ply
+from .prompt_processors import PROMPT_LIBRARY, spelt_out
 
 BLACK = (0.0, 0.0, 0.0)
 
@@ -64,7 +65,14 @@ def _asked_for(parsed: Path) -> tuple[Optional[str], tuple[float, float, float]]
         return None, BLACK
     system = load_config(parsed).system
     color = (system.get("background") or {}).get("color") or BLACK
-    return (system.get("prompt_processor") or {}).get("prompt") or None, tuple(float(value) for value in color)
+    return _prompt_of(system.get("prompt_processor") or {}), tuple(float(value) for value in color)
+
+
+def _prompt_of(processor: Mapping[str, Any]) -> Optional[str]:
+    try:
+        return spelt_out(processor.get("prompt") or "", processor.get("prompt_library", PROMPT_LIBRARY)) or None
+    except UserError:  # its library isn't there any more: who needs the text has to give it
+        return None
 
 
 def read_result(result: Result) -> GaussianArrays:

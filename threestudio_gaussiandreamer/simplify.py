@@ -1,9 +1,9 @@
 """Fewer Gaussians for the same pictures: prune by contribution, round by round, and recover by self-distillation.
 
-What the cloud looked like before is the only truth: no diffusion model, no prompt, so nothing can drift. A round keeps the best 0.8
-by the largest sigma_i T_i over the pixels of the probe views (RadSplat, Niemeyer et al. 2024), re-scored every round, and then
-fits what stays to the probe views' first pictures (mean squared error, Adam). One-shot pruning of more than that loses to training
-so few from scratch; rounds don't.
+What the cloud looked like before is the only truth: no diffusion model, no prompt, so nothing can drift. First duplicates become one
+(``merging.py``). Then each round keeps the best 0.8 by the largest sigma_i T_i over the pixels of the probe views (RadSplat, Niemeyer
+et al. 2024), re-scored every round, and fits what stays to the probe views' first pictures (mean squared error, Adam). One-shot
+pruning of more than that loses to training so few from scratch; rounds don't.
 """
 
 import math
@@ -15,8 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .cameras import Orbit, intrinsics, to_opencv
+from .merging import merge_duplicates
 from .metrics import psnr
-from .parsimony import TOP_OF_A_PIXEL
 from .sh import sh_to_colors
 from .splatting import rasterize
 from .streams import generator
@@ -61,7 +61,7 @@ class Round(NamedTuple):
 
     count: int
     psnr: float
-    """Of the judging views, to what they showed at the beginning."""
+    """To what the judging views showed at the beginning: :func:`assured_likeness`."""
 
 
 def bounds(cloud: Cloud) -> tuple[Float[Tensor, "3"], float]:
@@ -78,14 +78,19 @@ def _quantile(values: Float[Tensor, " N"], weights: Float[Tensor, " N"], share: 
     return values[order[int(torch.searchsorted(mass, share * mass[-1]).clamp_max(len(values) - 1))]]
 
 
-def views_around(cloud: Cloud, count: int, size: int, *, turn: float = 0.0) -> Views:
-    """``count`` views on a spiral of golden angles that starts at ``turn`` degrees, near and far in turns; other turns, other views."""
+def views_around(cloud: Cloud, count: int, size: int, *, turn: float = 0.0, to_z_up: Optional[Float[Tensor, "3 3"]] = None) -> Views:
+    """``count`` views on a spiral of golden angles that starts at ``turn`` degrees, near and far in turns; other turns, other views.
+
+    ``to_z_up`` is the rotation from the cloud's axes to some with z up.
+    """
     centre, radius = bounds(cloud)
     index = torch.arange(count)
     elevation = torch.rad2deg(torch.asin(torch.linspace(-0.5, 0.9, count)))
     distance = radius / math.sin(FOVY / 2) * torch.tensor([1.0, 1.4])[index % 2]
     azimuth = (turn + index * 137.50776) % 360.0
     c2w = Orbit(elevation, azimuth, distance, torch.full((count,), FOVY)).c2w.to(centre)
+    if to_z_up is not None:
+        c2w[:, :3] = to_z_up.T.to(c2w) @ c2w[:, :3]
     c2w[:, :3, 3] += centre
     fovy = torch.full((count,), FOVY, device=centre.device)
     viewmats, _ = to_opencv(c2w, fovy, size, size)
@@ -116,6 +121,12 @@ def likeness(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"]) -> 
     return float(psnr(look(cloud, views)[0].flatten(0, 1), pictures.flatten(0, 1)))
 
 
+def assured_likeness(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"]) -> float:
+    """The PSNR that other views will have too: with the standard error over these views added to their mean squared error."""
+    errors = (look(cloud, views)[0] - pictures).square().mean((1, 2, 3))
+    return -10 * math.log10(max(float(errors.mean() + errors.std() / math.sqrt(len(errors))), 1e-10))
+
+
 def simplify(
     cloud: Cloud,
     probes: Views,
@@ -125,6 +136,8 @@ def simplify(
     steps: int = 60,
     seed: int = 0,
     report: Callable[[Round], None] = lambda done: None,
+    stored: Callable[[Cloud], Cloud] = lambda cloud: cloud,
+    sh_reach: float = math.inf,
 ) -> Cloud:
     """The smallest cloud of a series of rounds that meets the budget.
 
@@ -133,29 +146,39 @@ def simplify(
         judges: other views, on which a budget of quality is measured: what is fitted to looks better than the rest.
         steps: of self-distillation after each round; four views each.
         report: called after each round that was kept.
+        stored: what the file to be written makes of a cloud, which is what a budget of quality is measured on.
+        sh_reach: the largest constant harmonic, either way, that the file holds.
     """
-    pictures, contribution = look(cloud, probes)
-    before = look(cloud, judges)[0]
+    (pictures, contribution), before = look(cloud, probes), look(cloud, judges)[0]
+
+    def refitted(cloud: Cloud) -> tuple[Cloud, Round]:
+        cloud = recover(cloud, probes, pictures, steps, seed + done, sh_reach)
+        return cloud, Round(len(cloud.means), assured_likeness(stored(cloud), judges, before))
+
     keep, done = KEEP, 0
+    if float(cloud.sh[:, 0].abs().amax()) > sh_reach:
+        cloud, _ = refitted(cloud)
+    fewer = Cloud(**merge_duplicates(cloud._asdict(), at_least=budget.count or 1).values)
     while True:
-        count = _next_count(cloud, contribution, keep, budget)
-        if count >= (1 - SMALLEST_DROP) * len(cloud.means) and count != budget.count or count >= len(cloud.means):
+        if len(fewer.means) < len(cloud.means):
+            fewer, reached = refitted(fewer)
+            if budget.psnr is None or reached.psnr >= budget.psnr:
+                cloud, contribution, done = fewer, look(fewer, probes)[1], done + 1
+                report(reached)
+            else:
+                keep = 0.5 * (1 + keep)  # half as many
+        count = _next_count(len(cloud.means), keep, budget)
+        if count == len(cloud.means):
             return cloud
-        fewer = recover(only(cloud, contribution, count), probes, pictures, steps, seed + done)
-        reached = likeness(fewer, judges, before)
-        if budget.psnr is not None and reached < budget.psnr:
-            keep = 0.5 * (1 + keep)  # half as many
-            continue
-        cloud, contribution, done = fewer, look(fewer, probes)[1], done + 1
-        report(Round(count, reached))
+        fewer = only(cloud, contribution, count)
 
 
-def _next_count(cloud: Cloud, contribution: Tensor, keep: float, budget: Budget) -> int:
-    """A count that is asked for is met; a quality is sought without dropping the top Gaussian of any pixel."""
-    count = int(keep * len(cloud.means))
+def _next_count(here: int, keep: float, budget: Budget) -> int:
+    """How many a round leaves; all that are ``here`` where nothing is left to do, or too little for a round."""
     if budget.count is not None:
-        return max(count, budget.count)
-    return max(1, count, int((contribution > TOP_OF_A_PIXEL).sum()))
+        return min(here, max(int(keep * here), budget.count))
+    count = max(1, int(keep * here))
+    return here if count >= (1 - SMALLEST_DROP) * here else count
 
 
 def only(cloud: Cloud, scores: Float[Tensor, " N"], count: int) -> Cloud:
@@ -164,8 +187,9 @@ def only(cloud: Cloud, scores: Float[Tensor, " N"], count: int) -> Cloud:
     return Cloud(*(values[rows] for values in cloud))
 
 
-def recover(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"], steps: int, seed: int) -> Cloud:
-    """The cloud fitted to pictures of its former self."""
+@torch.enable_grad()
+def recover(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"], steps: int, seed: int, sh_reach: float = math.inf) -> Cloud:
+    """The cloud fitted to pictures of its former self, its constant harmonics within ``sh_reach``."""
     leaves = Cloud(*(values.detach().clone().requires_grad_() for values in cloud))
     rates = RATES | {"means": RATES["means"] * bounds(cloud)[1]}
     groups = [{"params": [leaf], "lr": rates[name]} for name, leaf in zip(Cloud._fields, leaves, strict=True)]
@@ -177,6 +201,7 @@ def recover(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"], step
         ((image - pictures[rows]) ** 2).mean().backward()
         adam.step()
         adam.zero_grad(set_to_none=True)
+        leaves.sh.data[:, 0].clamp_(-sh_reach, sh_reach)
     return Cloud(*(leaf.detach() for leaf in leaves))
 
 

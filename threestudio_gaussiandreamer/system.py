@@ -12,6 +12,8 @@ loss.lambda_*  weight of each loss, a number or a schedule: ``sds`` and every ot
                ``sparsity`` mean sqrt(alpha^2 + 0.01); ``opaque`` entropy of alpha, which pushes it to 0 or 1
 optimizer      name (a torch optimiser) and args; the learning rates belong to the geometry and the background
 evaluation     views, size (pixels), supersample, every (steps; 0: only at start and end): PSNR and SSIM on held-out views
+prune          a budget that the export is made for once more: count, bytes (of the SPZ file where that is exported, else of the
+               PLY), psnr (dB to the cloud before) or within (dB lost of quality); quality, size, steps: as the prune command
 =============  ==============================================================================================================
 """
 
@@ -27,17 +29,21 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .background import FlatBackground
+from .cloud_files import OUR_UP, UP, StoredCloud, in_axes
 from .distributed import all_sum, average_gradients
 from .errors import UserError, unknown
 from .evaluate import EvaluationConfig, HeldOut, Measurements
+from .exporters.base import gaussian_arrays
 from .guidance.base import ScoreDistillation
 from .guidance.foreign import call_guidance, learnt_weights, own_randomness, restore_learnt, trainable_groups
-from .host import BaseLift3DSystem, find, info, register, validate_schedule
+from .host import BaseLift3DSystem, find, info, register, validate_schedule, warn
 from .metrics import psnr
 from .nested import adopt_nested
-from .ply import write_gaussians, write_points
+from .ply import GaussianArrays, write_gaussians, write_points
 from .point_cloud import PointCloud
 from .prior_cache import cached_cloud
+from .prune import PruneOptions, pruned, write_report
+from .spz import write_spz
 from .surface import Surface, write_obj
 
 REGULARISERS = ("sparsity", "opaque")
@@ -50,6 +56,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
     class Config(BaseLift3DSystem.Config):
         exporter_type: str = "gaussiandreamer-exporter"
         evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+        prune: PruneOptions = field(default_factory=PruneOptions)
 
         def __post_init__(self) -> None:
             adopt_nested(self)
@@ -57,6 +64,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         @staticmethod
         def check(cfg: Any) -> None:
             EvaluationConfig.check(cfg.evaluation)
+            PruneOptions.check(cfg.prune, "system.prune.")
             for name in ("geometry", "renderer", "guidance", "prompt_processor"):
                 if not cfg[f"{name}_type"]:
                     raise UserError(f"system.{name}_type is empty: name a registered part")
@@ -74,6 +82,17 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     cfg: Config
 
+    @staticmethod
+    def logged(cfg: Any) -> Optional[set[str]]:
+        """The names that a run of this configuration logs; None where its guidance doesn't say before it runs."""
+        guidance = find(cfg.guidance_type)
+        if not issubclass(guidance, ScoreDistillation):
+            return None
+        losses = [name.replace("lambda_", "loss_", 1) for name in cfg.loss]
+        guided = [*losses, "grad_norm", "min_step", "max_step", "bad_items", *guidance.REPORTS]
+        known = {"loss", "gaussians", *(f"train/{name}" for name in guided)}
+        return known | {"dB"} if hasattr(guidance, "target_rgb") else known
+
     # -- start ---------------------------------------------------------------------------------------------------------------
 
     def configure(self) -> None:
@@ -81,6 +100,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         super().configure()
         self.automatic_optimization = False
         self.__dict__["guidance"] = self.measurements = None
+        self.skipped_steps = 0
         self._learnt: Optional[dict[str, Tensor]] = None
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -151,8 +171,11 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         loss = torch.stack(list(losses.values())).sum()
         self.manual_backward(loss)
         average_gradients(parameter for group in optimizer.param_groups for parameter in group["params"])
-        self.geometry.observe(out["rasterized"], batch["width"], batch["height"], self.loss_scale())
+        loss_scale = self.loss_scale()
+        self.geometry.observe(out["rasterized"], batch["width"], batch["height"], loss_scale)
         optimizer.step()
+        if self.loss_scale() < loss_scale:
+            self.count_skipped_step(loss_scale)
         optimizer.zero_grad(set_to_none=True)
         # self.optimizers() wraps the torch optimiser, whose rows have to follow the Gaussians
         self.geometry.after_step(optimizer.optimizer, self.global_step, lambda kept: self.quality_holds(kept, batch))
@@ -182,7 +205,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
     def losses(self, out: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         """The weighted losses: every ``loss_*`` that the guidance returns, and our regularisers on the real alpha."""
         guided = self.guide(out, batch)
-        self._log_sometimes({f"train/{k}": v for k, v in guided.items() if not k.startswith("loss_") and k != "eval"})
+        self._log_sometimes({f"train/{k}": v for k, v in guided.items() if not k.startswith("loss_") and is_one_number(v)})
         raw = {k.removeprefix("loss_"): v for k, v in guided.items() if k.startswith("loss_")}
         weights = {name.removeprefix("lambda_"): self.C(weight) for name, weight in self.cfg.loss.items()}
         check_weights(weights, raw)
@@ -198,6 +221,15 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         """The factor that automatic mixed precision leaves on every gradient that isn't a parameter's."""
         scaler = getattr(self.trainer.precision_plugin, "scaler", None)
         return 1.0 if scaler is None else float(scaler.get_scale())
+
+    def count_skipped_step(self, loss_scale: float) -> None:
+        """Mixed precision halves its scale where it found infinite gradients and left the optimiser's step out."""
+        self.skipped_steps += 1
+        self.log("train/skipped_steps", float(self.skipped_steps))
+        warn(
+            f"step {self.global_step}: gradients overflowed at the loss scale {loss_scale:g}, so nothing was learnt in it;"
+            f" schedules go on ({self.skipped_steps} such steps so far)"
+        )
 
     def report(self, out: dict[str, Any], batch: dict[str, Any], losses: dict[str, Tensor], loss: Tensor) -> None:
         """Loss, count and, where it is known, dB: to the progress bar and the loggers, every ``log_every_n_steps``."""
@@ -246,7 +278,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
     def summary(self) -> str:
         """Where the pictures, the video and the clouds are, and what was measured; printed when a run has ended."""
         folder = Path(self._save_dir or ".")
-        found = [path for pattern in ("held_out/compare.png", "it*-test.mp4", "it*-export/*.ply") for path in sorted(folder.glob(pattern))]
+        found = [path for pattern in ("held_out/compare.png", "it*-test.mp4", "it*-export/*.*") for path in sorted(folder.glob(pattern))]
         lines = [str(path) for path in found]
         return "\n".join([*lines, *(["", self.measurements.table()] if self.measurements else [])])
 
@@ -287,10 +319,27 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     def export(self) -> None:
         """Write what the exporter makes, as ``--export`` does; a training run ends with it."""
-        parts = {"geometry": self.geometry, "material": self.material, "background": self.background}
+        self.export_cloud(self.geometry, f"it{self.true_global_step}-export")
+        self.export_pruned()
+
+    def export_cloud(self, geometry: Any, folder: str) -> None:
+        parts = {"geometry": geometry, "material": self.material, "background": self.background}
         exporter = find(self.cfg.exporter_type)(self.cfg.exporter, **parts)
         for out in exporter():
-            getattr(self, f"save_{out.save_type}")(f"it{self.true_global_step}-export/{out.save_name}", **out.params)
+            getattr(self, f"save_{out.save_type}")(f"{folder}/{out.save_name}", **out.params)
+
+    def export_pruned(self) -> None:
+        """The same files of the cloud pruned to ``system.prune``, in the folder ``pruned`` beside them, with prune's report."""
+        options = PruneOptions(**dict(self.cfg.prune))
+        if not options.asked_for:
+            return
+        folder = f"it{self.true_global_step}-export/pruned"
+        suffix = ".spz" if "spz" in self.cfg.exporter.get("formats", ()) else ".ply"
+        done = pruned(StoredCloud(gaussian_arrays(self.geometry)), options, suffix, "system.prune.")
+        geometry = find(self.cfg.geometry_type)(self.cfg.geometry)
+        geometry.set_arrays(**done.after.arrays._asdict())
+        self.export_cloud(geometry, folder)
+        write_report(self.get_save_path(f"{folder}/report"), done, suffix, options)
 
     def on_validation_start(self) -> None:
         self.ensure_cloud()
@@ -302,11 +351,20 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         self.ensure_cloud()
         super().on_predict_start()
 
+    def on_predict_epoch_end(self) -> None:
+        super().on_predict_epoch_end()
+        self.export_pruned()
+
     # -- savers that the exporters name --------------------------------------------------------------------------------------
 
     def save_ply(self, filename: str, **arrays: Any) -> str:
         path = self.get_save_path(filename)
-        write_gaussians(path, **arrays)
+        write_gaussians(path, **{"comments": [f"{UP} {OUR_UP}"]} | arrays)
+        return path
+
+    def save_spz(self, filename: str, **arrays: Any) -> str:
+        path = self.get_save_path(filename)
+        write_spz(path, **in_axes(StoredCloud(GaussianArrays(**arrays)), "y")._asdict())
         return path
 
     def save_points(self, filename: str, cloud: PointCloud) -> str:
@@ -337,7 +395,9 @@ def _check_optimizer(options: Any) -> None:
     try:
         optimizer_of(options, [{"params": [torch.zeros(1, requires_grad=True)], "lr": 0.0} for _ in range(2)])
     except (TypeError, ValueError, AssertionError) as error:
-        raise UserError(f"system.optimizer: {name} doesn't accept this: {error}") from error
+        accepted = inspect.signature(getattr(torch.optim, name)).parameters.keys() - {"params", "lr"}
+        strange = [unknown("argument", key, accepted) for key in arguments if key not in accepted]
+        raise UserError(f"system.optimizer: {name} doesn't accept this: {strange[0] if strange else error}") from error
 
 
 def _check_losses(cfg: Any) -> None:
@@ -349,6 +409,11 @@ def _check_losses(cfg: Any) -> None:
     known = getattr(guidance, "LOSSES", ("sds",) if issubclass(guidance, ScoreDistillation) else None)
     if known is not None:
         check_weights([name.removeprefix("lambda_") for name in cfg.loss], known)
+
+
+def is_one_number(value: Any) -> bool:
+    """What can be logged; guidances also return pictures, latents and the timestep of each view."""
+    return isinstance(value, (int, float)) or isinstance(value, Tensor) and value.numel() == 1
 
 
 def check_weights(weights: Iterable[str], losses: Iterable[str]) -> None:
@@ -366,7 +431,8 @@ def regulariser(name: str, alpha: Float[Tensor, "B H W 1"]) -> Tensor:
     if name == "sparsity":
         return (alpha**2 + 0.01).sqrt().mean()
     clamped = alpha.clamp(1e-3, 1 - 1e-3)
-    return F.binary_cross_entropy(clamped, clamped)
+    # written out, since torch forbids its function under mixed precision
+    return -(clamped * clamped.log() + (1 - clamped) * (1 - clamped).log()).mean()
 
 
 def picture_row(out: dict[str, Any]) -> list[dict[str, Any]]:

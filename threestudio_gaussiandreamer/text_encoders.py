@@ -15,16 +15,16 @@ from . import extras
 from .host import get_device, warn
 from .model_files import free_memory, load_network, load_settings
 
-T5_LENGTH = 77
-"""Tokens that DeepFloyd IF was trained with."""
+LENGTH = 77
+"""Tokens that CLIP, and DeepFloyd IF with its T5, were trained with."""
 
 
 def encode_clip(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
     """The last hidden states of Stable Diffusion's text encoder, float32 on the CPU, one (N, F) per text."""
-    from transformers import AutoTokenizer, CLIPTextModel
+    from transformers import CLIPTextModel
 
-    tokenizer = load_settings(AutoTokenizer, folder, "tokenizer")
-    tokens = _tokenize(tokenizer, texts, tokenizer.model_max_length)
+    tokenizer = _tokenizer(folder)
+    tokens = _tokenize(tokenizer, texts, min(tokenizer.model_max_length, LENGTH))
 
     def run(device: torch.device) -> Tensor:
         encoder = load_network(CLIPTextModel, folder, "text_encoder", dtype=torch.float32).to(device)
@@ -41,11 +41,11 @@ def encode_t5(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
     In half precision on a GPU, where nothing else is loaded yet: IF's encoder then takes about 11 GB, in float32 19 GB.
     """
     extras.require("diffusion", "sentencepiece", "google.protobuf")  # without them transformers takes the tokenizer for another kind
-    from transformers import AutoTokenizer, T5EncoderModel
+    from transformers import T5EncoderModel
 
-    tokenizer = load_settings(AutoTokenizer, folder, "tokenizer")
+    tokenizer = _tokenizer(folder)
     # as in diffusers' IFPipeline without caption cleaning
-    tokens = _tokenize(tokenizer, [text.lower().strip() for text in texts], T5_LENGTH)
+    tokens = _tokenize(tokenizer, [text.lower().strip() for text in texts], LENGTH)
 
     def run(device: torch.device) -> Tensor:
         half = device.type == "cuda"
@@ -54,6 +54,13 @@ def encode_t5(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
         return encoder(tokens.input_ids.to(device), attention_mask=tokens.attention_mask.to(device))[0].float().cpu()
 
     return list(_freed(run))
+
+
+def _tokenizer(folder: Path) -> Any:
+    from transformers import AutoTokenizer
+
+    # unless told not to, transformers would offer to run code that lies in the folder
+    return load_settings(AutoTokenizer, folder, "tokenizer", trust_remote_code=False)
 
 
 def _tokenize(tokenizer: Any, texts: list[str], length: int) -> Any:

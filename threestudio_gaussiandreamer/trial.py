@@ -9,6 +9,7 @@ import errno
 import shlex
 import shutil
 import tempfile
+import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -28,8 +29,9 @@ WRITE_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM),
     *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG),
 )
-# without it Lightning refuses to read a checkpoint
+# without the first Lightning refuses to read a checkpoint; without the others it would train on from step 0, or with a fresh optimiser
 LIGHTNINGS_KEY = "pytorch-lightning_version"
+TRAINING_KEYS = (LIGHTNINGS_KEY, "loops", "optimizer_states")
 
 
 class Trial:
@@ -59,7 +61,7 @@ class Trial:
         """
         try:
             self.start()
-            with lightning_errors(self.cfg.resume), write_errors():
+            with lightning_errors(self.cfg.resume), write_errors(self.folder):
                 getattr(self, self.args.stage)()
             self.summarize()
         except (UserError, KeyboardInterrupt, SystemExit) as stop:
@@ -94,8 +96,9 @@ class Trial:
                 warn(f"no checkpoint given (resume=...): --{self.args.stage} shows what training would start from")
             return None
         checkpoint = load_checkpoint(self.cfg.resume)
-        if LIGHTNINGS_KEY not in checkpoint:
-            raise UserError(f"{self.cfg.resume} isn't a training checkpoint: it has no {LIGHTNINGS_KEY}, which Lightning writes")
+        missing = [key for key in (TRAINING_KEYS if self.args.stage == "train" else (LIGHTNINGS_KEY,)) if key not in checkpoint]
+        if missing:
+            raise UserError(f"{self.cfg.resume} isn't a training checkpoint: it has no {', '.join(missing)}, which Lightning writes")
         self.resumed_step = checkpoint["global_step"]
         return checkpoint["epoch"], self.resumed_step
 
@@ -170,7 +173,8 @@ class Trial:
 
     def discard_if_unused(self) -> None:
         """Remove the folder again if this run made it and has nothing to show for it."""
-        if self.made is None or (self.trainer is not None and self.trainer.global_step) or any(self.folder.glob("save/it*")):
+        trained = self.trainer is not None and self.trainer.global_step > max(self.resumed_step, 0)
+        if self.made is None or trained or any(self.folder.glob("save/it*")):
             return
         shutil.rmtree(self.folder, ignore_errors=True)
         # parents are removed as long as they are this run's and empty
@@ -231,19 +235,33 @@ def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def write_errors() -> Iterator[None]:
-    """What the system says while results are written, as a message.
+def write_errors(folder: Path) -> Iterator[None]:
+    """What the system says while results are written below ``folder``, as a message, also where a logger's thread writes.
 
     Raises:
         UserError: the disk is full, or something else is where a file or folder is to be made.
     """
+
+    def said(error: OSError) -> str:
+        return f"cannot write {error.filename or f'the results in {folder}'}: {error.strerror}; make room, or choose another exp_root_dir"
+
+    def in_a_thread(failure: Any) -> None:
+        # the logger raises it anew at its next line
+        warn(said(failure.exc_value)) if _is_write_error(failure.exc_value) else earlier(failure)
+
+    earlier, threading.excepthook = threading.excepthook, in_a_thread
     try:
         yield
     except OSError as error:
-        if error.errno not in WRITE_ERRORS:
+        if not _is_write_error(error):
             raise
-        what = error.filename or "the results"
-        raise UserError(f"cannot write {what}: {error.strerror}; make room, or choose another exp_root_dir") from error
+        raise UserError(said(error)) from error
+    finally:
+        threading.excepthook = earlier
+
+
+def _is_write_error(error: Optional[BaseException]) -> bool:
+    return isinstance(error, OSError) and error.errno in WRITE_ERRORS
 
 
 def _raised_by_lightning(error: Exception) -> bool:

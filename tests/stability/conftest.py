@@ -2,7 +2,9 @@
 
 import inspect
 import json
+import logging
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Callable, Optional
 
@@ -42,6 +44,20 @@ def stand_in_for_a_gpu(request, monkeypatch) -> None:
 @pytest.fixture
 def measured(request) -> Measured:
     return Measured(request.node.user_properties)
+
+
+@pytest.fixture
+def said() -> Iterator[list[str]]:
+    """What the package says to the user, from the beginning of the test on; also where the launcher has its own handler."""
+    messages: list[str] = []
+    listener, logger = logging.Handler(), logging.getLogger("threestudio_gaussiandreamer")
+    listener.emit = lambda record: messages.append(record.getMessage())
+    level = logger.level
+    logger.addHandler(listener)
+    logger.setLevel(logging.INFO)
+    yield messages
+    logger.removeHandler(listener)
+    logger.setLevel(level)
 
 
 @pytest.fixture

@@ -310,7 +310,7 @@ OTHERS = {
     "A5": [
         ("Crash mid checkpoint", "always a loadable last or previous", "Lightning #688, #19970, #1150"),
         ("Disk full, read-only", "named error, exit != 0, earlier file untouched, no temporary left", "Lightning #21800: success reported"),
-        ("Corrupted checkpoint", "checksum mismatch with path; never a partial load; fallback only with `--resume auto`", "-"),
+        ("Corrupted checkpoint", "checksum mismatch with path; never a partial load; fallback only with `resume=auto`", "-"),
         (
             "Corrupted/foreign PLY",
             "clean error or correct load; no allocation beyond the file",

@@ -17,7 +17,7 @@ def rows_with_a_test() -> set[tuple[str, str]]:
     return {tuple(ast.literal_eval(argument) for argument in call.args) for call in calls}
 
 
-NOT_YET = {"A2", "A3", "A4", "A5"}
+NOT_YET: set[str] = set()
 """Groups whose rows have no test in this folder yet; the report names them as not run."""
 
 

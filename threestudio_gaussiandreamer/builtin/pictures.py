@@ -1,12 +1,14 @@
 """Arrays to 8 bit RGB pictures, and pictures to files: colour maps, grids, captions, videos."""
 
 import os
+import struct
 from pathlib import Path
 from typing import Any, Optional
 
 import numpy as np
 
 from ..errors import UserError
+from ..files import atomic_file
 
 # knots of the colour maps at equal distances over [0,1]
 _COLOR_MAPS = {
@@ -74,10 +76,9 @@ def write(path: str | os.PathLike, image: np.ndarray) -> None:
     """
     import imageio.v3 as iio
 
-    try:
-        iio.imwrite(path, image)
-    except OSError as error:
-        raise UserError(f"the picture {path} could not be written: {error}") from error
+    content = iio.imwrite("<bytes>", image, extension=Path(path).suffix)
+    with atomic_file(path, durable=False) as file:
+        file.write(content)
 
 
 def write_video(path: str, frames: list[Path], *, fps: int) -> None:
@@ -88,15 +89,35 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
     """
     import imageio.v2 as imageio
 
-    mp4 = path.endswith(".mp4")
+    mp4, part = path.endswith(".mp4"), Path(path).with_name(f".part-{Path(path).name}")
     options = {"fps": fps, "macro_block_size": 1} if mp4 else {"duration": 1000 / fps, "loop": 0}
     try:
-        with imageio.get_writer(path, mode="I", **options) as writer:
+        with imageio.get_writer(part, mode="I", **options) as writer:
             for frame in frames:
                 image = imageio.imread(frame)[..., :3]
                 writer.append_data(_even(image) if mp4 else image)
+        if mp4:
+            _require_whole_mp4(part)
+        os.replace(part, path)
     except (OSError, RuntimeError) as error:
         raise UserError(f"the video {path} could not be written: {error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _require_whole_mp4(path: Path) -> None:
+    """Raise OSError unless ffmpeg came to its end, which nobody asks it: its boxes fill the file, and the index is among them."""
+    names, place, size = [], 0, path.stat().st_size
+    with open(path, "rb") as file:
+        while place + 8 <= size:
+            file.seek(place)
+            length, name = struct.unpack(">I4s", file.read(8))
+            if length == 1:  # the length of a large box follows
+                (length,) = struct.unpack(">Q", file.read(8))
+            names.append(name)
+            place += length or size - place  # 0: to the end
+    if place != size or b"moov" not in names:
+        raise OSError("ffmpeg ended in the middle of it; is the disk full?")
 
 
 def _normalize(image: np.ndarray, data_range: tuple[float, float]) -> np.ndarray:

@@ -67,6 +67,8 @@ def _check_sequence(path: str, value: Any, kind: type, items: tuple) -> None:
             raise UserError(f"{path}: expected a list of {len(items)}, got {list(value)}")
         for i, (item, annotation) in enumerate(zip(value, items, strict=True)):
             _check(f"{path}[{i}]", item, annotation)
+            if annotation in (int, float) and isinstance(item, str):  # of a tuple's items OmegaConf checks and converts none
+                raise UserError(f"{path}[{i}]: expected {SCALARS[annotation]}, got {item!r}")
 
 
 def _is_container(value: Any) -> bool:

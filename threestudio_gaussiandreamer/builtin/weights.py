@@ -6,12 +6,13 @@ Plain ``torch.load`` reads it.
 
 import hashlib
 import io
+import math
 import os
 import pickle
 import re
 import shutil
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from glob import escape as glob_escape
 from pathlib import Path
 from typing import Any, Optional
@@ -55,14 +56,32 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
         raise UserError(f"there is no checkpoint {path}" + _siblings(path))
     _verify(path)
     try:
-        return torch.load(path, map_location=map_location, weights_only=True)
+        content = torch.load(path, map_location=map_location, weights_only=True)
     except pickle.UnpicklingError as error:
         # torch's own first line advises to read it all the same
         found = re.search(r"GLOBAL (\S+)", str(error))
         what = f": {found[1]}" if found else ""
         raise UserError(f"{path} holds Python objects that could run code when read, so it isn't read{what}") from error
-    except (RuntimeError, OSError, ValueError, KeyError, EOFError) as error:
+    except Exception as error:  # where a pickle is damaged, torch's reader of it raises what it likes
         raise UserError(f"{path} isn't a checkpoint, or is damaged: {_reason(error)}") from error
+    _require_stored(content, path)
+    return content
+
+
+def _require_stored(content: Any, path: Path) -> None:
+    """Raise UserError for a tensor that repeats a few numbers to more than the file could hold: whoever copies it fills the memory."""
+    size = os.path.getsize(path)
+    for tensor in _tensors(content):
+        if tensor.numel() * tensor.element_size() > size:
+            raise UserError(f"{path} is damaged: it announces a tensor of the shape {tuple(tensor.shape)}, which {size} bytes can't hold")
+
+
+def _tensors(content: Any) -> Iterator[torch.Tensor]:
+    if isinstance(content, torch.Tensor):
+        yield content
+    elif isinstance(content, (Mapping, list, tuple, set)):
+        for item in content.values() if isinstance(content, Mapping) else content:
+            yield from _tensors(item)
 
 
 def previous_of(path: str | os.PathLike) -> Path:
@@ -71,16 +90,23 @@ def previous_of(path: str | os.PathLike) -> Path:
     return path.with_name(f"{path.stem}-prev{path.suffix}")
 
 
-def newest_readable(path: str | os.PathLike) -> Optional[Path]:
-    """``path`` if it is a whole checkpoint, else the file that it replaced if that one is, else None; says what is damaged."""
-    for candidate in (Path(path), previous_of(path)):
-        if candidate.is_file():
-            try:
-                load_checkpoint(candidate)
-                return candidate
-            except UserError as error:
-                warn(str(error))
+def newest_readable(folder: str | os.PathLike) -> Optional[tuple[Path, int]]:
+    """The whole checkpoint with most steps among a folder's, of equal ones ``last.ckpt``, and its step; says what is damaged."""
+    by_step = sorted(Path(folder).glob("*.ckpt"), key=lambda path: (_claimed_step(path), path.stem == "last"), reverse=True)
+    for candidate in by_step:
+        try:
+            return candidate, load_checkpoint(candidate)["global_step"]
+        except UserError as error:
+            warn(str(error))
     return None
+
+
+def _claimed_step(path: Path) -> float:
+    """The step that a checkpoint says it is from, its tensors unread and its checksum unchecked; infinity where it says none."""
+    try:
+        return int(torch.load(path, map_location="cpu", weights_only=True, mmap=True)["global_step"])
+    except Exception:  # whatever is wrong with it, who reads it whole will say
+        return math.inf
 
 
 def load_module_weights(
@@ -173,6 +199,8 @@ def _keep_previous(path: Path) -> None:
     if not path.exists():
         return
     kept = previous_of(path)
+    if kept.exists() and kept.samefile(path):
+        return  # a kill fell after this, the last time; renaming one name of a file to another would leave both
     temporary = kept.with_name(f".{kept.name}.tmp")
     temporary.unlink(missing_ok=True)
     try:

@@ -3,7 +3,7 @@
 ============  ==============================================================================================
 option        meaning
 ============  ==============================================================================================
-formats       names of registered exporters without their ``-exporter``: ``ply``, ``points``, ...
+formats       names of registered exporters without their ``-exporter``: ``ply``, ``spz``, ``points``, ``surface``, ...
 options       options of some of them: ``{ply: {pad_sh_degree: 3}}``
 save_video    also render the turntable
 ============  ==============================================================================================
@@ -25,7 +25,7 @@ class BundleExporter(Exporter):
 
     @dataclass
     class Config(Exporter.Config):
-        formats: List[str] = field(default_factory=lambda: ["ply", "points"])
+        formats: List[str] = field(default_factory=lambda: ["ply", "spz", "points"])
         options: Dict[str, Any] = field(default_factory=dict)
         save_video: bool = True
 

@@ -15,7 +15,7 @@ max_step_percent    largest timestep, likewise (the paper: [500, 0.98, 0.55, 501
 grad_clip           clamp each element of the latent's gradient to +- this; none, a number or a schedule
 weighting_strategy  w(t): sds (1 - abar), uniform (1), fantasia3d (sqrt(abar) (1 - abar))
 max_bad_steps       stop after this many steps in a row in which the score of some item was NaN or infinite
-max_items_eval      how many items ``guidance_eval`` shows; -1 = all
+max_items_eval      how many items ``guidance_eval`` shows; 0 or less = all, as in threestudio
 eval_steps          DDIM steps from the noise to ``imgs_final``
 ==================  ===================================================================================================
 """
@@ -106,6 +106,9 @@ class ScoreDistillation(BaseObject, ABC):
             UserError: what is missing, and what to do.
         """
 
+    REPORTS: tuple[str, ...] = ()
+    """The names of what :meth:`report` returns, so that ``checkpoint.monitor`` may be one of them."""
+
     def report(self) -> dict[str, float]:
         """More numbers to log about the last step."""
         return {}
@@ -147,7 +150,8 @@ class ScoreDistillation(BaseObject, ABC):
             batch: the host's batch, and ``comp_rgb_bg``.
 
         Returns:
-            ``loss_sds``, ``grad_norm``, ``min_step``, ``max_step``, ``bad_items`` of this step [, ``eval``] and :meth:`report`'s.
+            ``loss_sds``, ``grad_norm`` and that of each item, ``grad_norm_0`` ..., ``min_step``, ``max_step``, ``bad_items`` of this
+            step [, ``eval``] and :meth:`report`'s.
 
         Raises:
             NonFiniteScore: some item's score wasn't finite in each of the last ``max_bad_steps`` steps.
@@ -159,9 +163,12 @@ class ScoreDistillation(BaseObject, ABC):
                 noised = self.add_noise(latents)
                 condition = self.condition(prompt_utils, **batch)
                 grad, bad = self._gradient(noised, condition)
-            self._count_bad(bad)
+            if not guidance_eval:  # looking at pictures is no step
+                self._count_bad(bad)
             loss = _masked_loss(images, latents, grad, bad)
-            out = {"loss_sds": loss, "grad_norm": grad.norm(), "min_step": self.min_step, "max_step": self.max_step}
+            norms = grad.flatten(1).norm(dim=1)
+            out = {"loss_sds": loss, "grad_norm": norms.norm(), "min_step": self.min_step, "max_step": self.max_step}
+            out |= {f"grad_norm_{i}": norm for i, norm in enumerate(norms)}
             out |= {"bad_items": float(bad.sum()), **self.report()}
             if guidance_eval:
                 out["eval"] = self.evaluate(noised, prompt_utils, **batch)
@@ -212,7 +219,7 @@ class ScoreDistillation(BaseObject, ABC):
         ``imgs_noisy`` the noisy latents; ``imgs_1step`` denoised at once with guidance; ``imgs_1orig`` denoised at once by the
         conditional score alone; ``imgs_final`` denoised in ``eval_steps`` steps; with ``texts``, ``noise_levels`` and ``bs``.
         """
-        count = len(noised.t) if self.cfg.max_items_eval < 0 else min(self.cfg.max_items_eval, len(noised.t))
+        count = len(noised.t) if self.cfg.max_items_eval < 1 else min(self.cfg.max_items_eval, len(noised.t))
         batch = _first_items(batch, len(noised.t), count)
         t, abar, _, z = (values[:count] for values in noised)
         condition = self.condition(prompt_utils, **batch)

@@ -1,7 +1,8 @@
 """Guidance ``gaussiandreamer-deep-floyd-guidance``: score distillation in the pixels of DeepFloyd IF's first stage, 64 x 64.
 
-Options: those of ``guidance/text_to_image.py``; ``guidance_scale`` is 20 unless given, as in threestudio. The UNet also predicts
-the variance of its reverse step, which distillation doesn't need.
+Options: those of ``guidance/text_to_image.py``; ``guidance_scale`` is 20 unless given, as in threestudio; ``enable_vae_slicing`` is
+accepted, so that configurations that save memory fit any model, and there is no VAE here. The UNet also predicts the variance of its
+reverse step, which distillation doesn't need.
 """
 
 from dataclasses import dataclass
@@ -23,12 +24,14 @@ class DeepFloydGuidance(TextToImageDistillation):
     class Config(TextToImageDistillation.Config):
         pretrained_model_name_or_path: str = DEEP_FLOYD
         guidance_scale: float = 20.0
+        enable_vae_slicing: bool = False
 
     cfg: Config
 
     def load(self, folder: Path) -> None:
         super().load(folder)
-        self.image_size = self.cfg.image_size or self.sample_size
+        self.require_text_to_image(3)
+        self.image_size = self.size_of_images()
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B 3 s s"]:
         """The pixels themselves, in [-1, 1]."""

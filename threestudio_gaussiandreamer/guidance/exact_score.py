@@ -102,6 +102,7 @@ class ExactScoreGuidance(ScoreDistillation):
             _check_numbers(cfg)
 
     cfg: Config
+    REPORTS = ("perplexity",)
 
     def configure(self) -> None:
         super().configure()

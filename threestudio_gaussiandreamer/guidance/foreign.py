@@ -1,6 +1,7 @@
 """Guidances that other packages register: called as threestudio's systems call them, whichever of its signatures they have."""
 
 import inspect
+import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -17,15 +18,32 @@ from ..streams import derive_seed
 def call_guidance(guidance: Any, rgb: Float[Tensor, "B H W 3"], prompt_utils: Any, batch: dict[str, Any], **options: Any) -> dict[str, Any]:
     """What ``guidance`` returns for these renders.
 
-    A guidance by text (Stable Diffusion, MVDream, VSD) gets ``prompt_utils``; one by an image (zero123) has no such argument. All get
-    the whole batch and the options, or as much of them as they take.
+    All get ``prompt_utils``, the whole batch and the options, or as much of them as they take: one by an image (zero123) knows no
+    prompt. threestudio passes the prompt as the second argument, which may thus have any name.
+
+    Raises:
+        UserError: it returns no dict, or a ``loss_*`` that isn't one number.
     """
     call = guidance.forward if isinstance(guidance, nn.Module) else guidance.__call__
     arguments = inspect.signature(call).parameters
-    given = {**batch, **options}
+    given = {"prompt_utils": prompt_utils, **batch, **options}
+    second = next(itertools.islice(arguments.values(), 1, None), None)
+    if second is not None and second.kind is second.POSITIONAL_OR_KEYWORD and second.default is second.empty and second.name not in given:
+        given[second.name] = given.pop("prompt_utils")
     if not any(argument.kind is argument.VAR_KEYWORD for argument in arguments.values()):
         given = {name: value for name, value in given.items() if name in arguments}
-    return guidance(rgb, prompt_utils, **given) if "prompt_utils" in arguments else guidance(rgb, **given)
+    return _checked(guidance(rgb, **given), type(guidance).__name__, rgb.device)
+
+
+def _checked(out: Any, name: str, device: torch.device) -> dict[str, Any]:
+    """What a guidance returned, every ``loss_*`` in it a tensor of one number: plain numbers are what some give for a loss that is off."""
+    if not isinstance(out, dict):
+        raise UserError(f"{name} returned {type(out).__name__}: a guidance returns a dict with its losses as loss_*")
+    losses = {key: torch.as_tensor(value, device=device) for key, value in out.items() if key.startswith("loss_")}
+    for key, loss in losses.items():
+        if loss.numel() != 1:
+            raise UserError(f"{name} returned {key} of shape {tuple(loss.shape)}: one number was expected, as from .mean()")
+    return out | {key: loss.reshape(()) for key, loss in losses.items()}
 
 
 @contextmanager

@@ -46,11 +46,11 @@ class StableDiffusionGuidance(TextToImageDistillation):
 
         super().load(folder)
         self.vae = self.network(AutoencoderKL, folder, "vae")
-        self.vae.enable_slicing()  # of pictures that are decoded to be looked at
         if self.cfg.enable_vae_tiling:
             self.vae.enable_tiling()
+        self.require_text_to_image(self.vae.config.latent_channels)
         factor = 2 ** (len(self.vae.config.block_out_channels) - 1)
-        self.image_size = self.cfg.image_size or self.sample_size * factor
+        self.image_size = self.size_of_images(factor)
         if self.image_size % factor:
             raise UserError(f"system.guidance.image_size: expected a multiple of {factor}, got {self.image_size}")
         self._bad_backwards = 0
@@ -78,7 +78,9 @@ class StableDiffusionGuidance(TextToImageDistillation):
         return posterior.mean, posterior.std
 
     def decode(self, latents: Float[Tensor, "B 4 h w"]) -> Float[Tensor, "B 3 s s"]:
-        images = self.vae.decode((latents / self.vae.config.scaling_factor).to(self.dtype)).sample.float()
+        latents = (latents / self.vae.config.scaling_factor).to(self.dtype)
+        # one at a time: the memory is needed elsewhere, and this is only looked at
+        images = torch.cat([self.vae.decode(latent).sample for latent in latents.split(1)]).float()
         return (images / 2 + 0.5).clamp(0, 1)
 
     def _count_bad_backwards(self, bad: Bool[Tensor, " B"]) -> None:

@@ -101,6 +101,8 @@ class TextToImageDistillation(ScoreDistillation):
         from diffusers import DDPMScheduler
 
         scheduler = load_settings(DDPMScheduler, folder, "scheduler")
+        if not {"beta_schedule", "trained_betas"} & DDPMScheduler.load_config(folder, subfolder="scheduler").keys():
+            raise UserError(f"{self.cfg.pretrained_model_name_or_path} is no diffusion model of betas: its scheduler has no beta_schedule")
         self.prediction_type = scheduler.config.prediction_type
         if self.prediction_type not in PREDICTIONS:
             raise unknown("prediction_type of the model's scheduler", self.prediction_type, PREDICTIONS)
@@ -115,7 +117,6 @@ class TextToImageDistillation(ScoreDistillation):
         cfg = self.cfg
         self.unet = self.network(UNet2DConditionModel, folder, "unet", on_device=not cfg.enable_sequential_cpu_offload)
         self.text_width = self.unet.config.encoder_hid_dim or self.unet.config.cross_attention_dim
-        self.sample_size = self.unet.config.sample_size
         if cfg.enable_memory_efficient_attention:
             debug("enable_memory_efficient_attention: torch's attention is memory efficient already")
         if cfg.enable_attention_slicing:
@@ -124,6 +125,27 @@ class TextToImageDistillation(ScoreDistillation):
             self._offload()
         if cfg.enable_torch_compile:
             self.unet = torch.compile(self.unet)
+
+    def size_of_images(self, factor: int = 1) -> int:
+        """Height and width that the model sees, pixels: what is asked for, or what it was trained with, ``factor`` times its latents.
+
+        Raises:
+            UserError: neither is known.
+        """
+        trained = self.unet.config.sample_size
+        if self.cfg.image_size is None and not isinstance(trained, int):
+            raise UserError(f"{self.cfg.pretrained_model_name_or_path} has sample_size {trained}: set system.guidance.image_size, pixels")
+        return self.cfg.image_size or trained * factor
+
+    def require_text_to_image(self, channels: int) -> None:
+        """Raise UserError unless the UNet takes a picture of so many channels and a text, and nothing else."""
+        config = self.unet.config
+        wanted = {"in_channels": (channels,), "class_embed_type": (None,), "addition_embed_type": (None, "text")}
+        if other := [f"{name} {config[name]}" for name, values in wanted.items() if config[name] not in values]:
+            raise UserError(
+                f"{self.cfg.pretrained_model_name_or_path} isn't text to image alone ({', '.join(other)}), as Stable Diffusion XL and"
+                " models for inpainting, depth or upscaling aren't: take Stable Diffusion 1.x or 2.x, or the first stage of DeepFloyd IF"
+            )
 
     def network(self, network_class: Any, folder: Path, component: str, *, on_device: bool = True) -> nn.Module:
         """One frozen network of the model."""

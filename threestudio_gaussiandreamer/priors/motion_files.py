@@ -9,13 +9,12 @@ it into an NPZ on the user's own machine. What is read:
 J is 22 (HumanML3D) or 24 joints in SMPL's order; metres, y up, as HumanML3D has them.
 """
 
-import zipfile
-from pathlib import Path
 from typing import NamedTuple, Optional
 
 import numpy as np
 from jaxtyping import Float
 
+from ..array_files import PickledArray, read_arrays
 from ..errors import UserError
 from ..files import existing_file
 
@@ -44,9 +43,10 @@ def read_motions(path: str) -> Motions:
         UserError: missing, pickled, of another layout, without frames, or not finite; the message says what to do.
     """
     file = existing_file(path, "motion file")
-    arrays = _arrays(file)
-    if "motion" not in arrays:
-        raise UserError(f"motion file {path!r} has no array 'motion', only {', '.join(arrays) or 'none'}: {EXPECTED}")
+    try:
+        arrays = read_arrays(file, "motion file", ["motion"], ["text", "lengths"])
+    except PickledArray as error:
+        raise UserError(f"{error}; if it is yours, convert it:\n{CONVERT}") from error
     positions = _sample_frame_joint(arrays["motion"], path)
     lengths = _lengths(arrays.get("lengths"), positions, path)
     texts = None if "text" not in arrays else [str(text) for text in np.atleast_1d(arrays["text"])]
@@ -54,23 +54,6 @@ def read_motions(path: str) -> Motions:
         if not np.isfinite(sample[:length]).all():
             raise UserError(f"motion file {path!r} has positions that are NaN or infinite: make it again")
     return Motions(positions, texts, lengths)
-
-
-def _arrays(file: Path) -> dict[str, np.ndarray]:
-    try:
-        content = np.load(file, allow_pickle=False)
-        if isinstance(content, np.ndarray):
-            return {"motion": content}
-        with content:
-            return {name: content[name] for name in content.files}
-    except ValueError as error:
-        if "pickle" in str(error):
-            raise UserError(
-                f"motion file {str(file)!r} is a pickle, which could run code, and isn't opened; if it is yours, convert it:\n{CONVERT}"
-            ) from error
-        raise UserError(f"motion file {str(file)!r} can't be read: {error}") from error
-    except (OSError, EOFError, zipfile.BadZipFile) as error:
-        raise UserError(f"motion file {str(file)!r} can't be read: {error}; NPZ and NPY are") from error
 
 
 def _sample_frame_joint(motion: np.ndarray, path: str) -> Float[np.ndarray, "S F J 3"]:

@@ -16,7 +16,6 @@ Colours are integers up to 255, or numbers up to 1; without any, the points are 
 """
 
 import logging
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from typing import Any, Optional
 import numpy as np
 from jaxtyping import Float
 
+from ..array_files import read_arrays
 from ..errors import UserError, unknown
 from ..files import existing_file
 from ..grow import half_longest_side
@@ -80,14 +80,15 @@ def load_points(path: Path) -> PointCloud:
         return READERS.get(path.suffix.lower(), read_with_trimesh)(path)
     except UserError:
         raise
-    except (OSError, ValueError, KeyError, MemoryError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, MemoryError) as error:
         raise UserError(f"point cloud {str(path)!r} is not readable: {error}") from error
 
 
 def rotated(cloud: PointCloud, rotation: Float[np.ndarray, "3 3"]) -> PointCloud:
     """Points and normals turned by ``rotation``."""
     normals = None if cloud.normals is None else cloud.normals @ rotation.T
-    return cloud._replace(points=cloud.points @ rotation.T, normals=normals)
+    with np.errstate(invalid="ignore"):  # infinity times zero: such rows are dropped later
+        return cloud._replace(points=cloud.points @ rotation.T, normals=normals)
 
 
 def normalized(cloud: PointCloud, scale: float) -> PointCloud:
@@ -109,14 +110,12 @@ def read_ply(path: Path) -> PointCloud:
 
 def read_npz(path: Path) -> PointCloud:
     """Arrays ``points`` (P, 3), ``colors`` (P, 3) and ``normals`` (P, 3), of which only the first must be there."""
-    with np.load(path, allow_pickle=False) as arrays:
-        if "points" not in arrays:
-            raise UserError(f"point cloud {str(path)!r} has no array 'points' (P, 3), only {', '.join(arrays.files) or 'none'}")
-        return _cloud(path, arrays["points"], arrays.get("colors"), arrays.get("normals"))
+    arrays = read_arrays(path, "point cloud", ["points"], ["colors", "normals"])
+    return _cloud(path, arrays["points"], arrays.get("colors"), arrays.get("normals"))
 
 
 def read_npy(path: Path) -> PointCloud:
-    return _from_columns(path, np.load(path, allow_pickle=False))
+    return _from_columns(path, read_arrays(path, "point cloud", ["rows"])["rows"])
 
 
 def read_text(path: Path) -> PointCloud:
@@ -176,7 +175,7 @@ def _cloud(path: Path, points: np.ndarray, colors: Optional[np.ndarray], normals
         if values is not None and np.shape(values) != (len(points), 3):
             raise UserError(f"point cloud {str(path)!r}: {name} has shape {np.shape(values)}, ({len(points)}, 3) was expected")
     return PointCloud(
-        points=np.asarray(points, np.float32),
+        points=np.asarray(points, np.float64),  # as the file has them: far from the origin float32 would round before they are centred
         colors=unit_colors(colors.astype(np.float32), colors.dtype),
         normals=None if normals is None else np.asarray(normals, np.float32),
     )

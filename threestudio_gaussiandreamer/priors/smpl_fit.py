@@ -12,7 +12,6 @@ the pose under a strong prior, then under the final one.
 """
 
 import math
-import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +23,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from .. import extras
+from ..array_files import read_arrays
 from ..errors import UserError
 from ..files import existing_file
 
@@ -95,6 +95,7 @@ def load_body_model(path: str, *, num_shape: int = 10) -> BodyModel:
         raise UserError(f"body model {path!r} is a pickle, which could run code, and isn't opened; if it is yours, convert it:\n{CONVERT}")
     arrays = _arrays(file)
     _check_shapes(arrays, path)
+    _check_values(arrays, path)
     vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
     parents = torch.from_numpy(arrays["kintree_table"][0].astype(np.int64))
     parents[0] = -1
@@ -230,17 +231,10 @@ def _minimise(moved: list[Tensor], loss: Callable[[], Tensor], iterations: int) 
 
 def _arrays(file: Path) -> dict[str, np.ndarray]:
     try:
-        with np.load(file, allow_pickle=False) as content:
-            missing = [name for name in FIELDS if name not in content.files]
-            if missing:
-                raise UserError(f"body model {str(file)!r} has no {', '.join(missing)}: an NPZ of SMPL, SMPL-H or SMPL-X was expected")
-            return {name: content[name] for name in FIELDS}
-    except (ValueError, OSError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
-        if isinstance(error, UserError):
-            raise
-        raise UserError(
-            f"body model {str(file)!r} can't be read ({error}): an NPZ of plain arrays was expected; from a PKL it is made by\n{CONVERT}"
-        ) from error
+        return read_arrays(file, "body model", FIELDS)
+    except UserError as error:
+        expected = "an NPZ of SMPL, SMPL-H or SMPL-X with plain arrays was expected"
+        raise UserError(f"{error}: {expected}; from a PKL it is made by\n{CONVERT}") from error
 
 
 def _check_shapes(arrays: dict[str, np.ndarray], path: str) -> None:
@@ -258,6 +252,18 @@ def _check_shapes(arrays: dict[str, np.ndarray], path: str) -> None:
     if not fits or joints < BODY_JOINTS:
         shapes = ", ".join(f"{name} {arrays[name].shape}" for name in FIELDS)
         raise UserError(f"body model {path!r} has arrays that don't fit each other or too few joints ({BODY_JOINTS} are needed): {shapes}")
+
+
+def _check_values(arrays: dict[str, np.ndarray], path: str) -> None:
+    """Raise UserError unless all are finite numbers, faces name vertices, and each joint hangs on an earlier one."""
+    parents, faces = arrays["kintree_table"][0, 1:].astype(np.int64), arrays["f"].astype(np.int64)
+    sound = (
+        all(np.isfinite(values).all() for values in arrays.values())
+        and ((parents >= 0) & (parents <= np.arange(len(parents)))).all()
+        and ((faces >= 0) & (faces < len(arrays["v_template"]))).all()
+    )
+    if not sound:
+        raise UserError(f"body model {path!r} is damaged: numbers that aren't finite, or joints or faces that don't exist; get it again")
 
 
 def _tensor(values: np.ndarray) -> Tensor:

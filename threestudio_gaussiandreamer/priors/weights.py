@@ -33,7 +33,7 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
             f"{kind} {path!r} holds more than tensors, or is no file of PyTorch, and is not unpickled, since that could run code:"
             f" {str(error).strip().splitlines()[0][:200]}"
         ) from error
-    except (OSError, RuntimeError, EOFError, ValueError) as error:
+    except Exception as error:  # where a pickle is damaged, torch's reader of it raises what it likes
         raise UserError(f"{kind} {path!r} can't be read: {type(error).__name__}: {str(error).strip()[:200]}") from error
     state = content.get(WRAPPER, content) if isinstance(content, Mapping) else {}
     if not state or not all(isinstance(value, Tensor) for value in state.values()):

@@ -4,6 +4,7 @@ import functools
 import importlib
 import logging
 from dataclasses import dataclass
+from numbers import Integral, Real
 from types import ModuleType
 from typing import Optional
 
@@ -16,6 +17,7 @@ from .options import RasterizeOptions
 from .output import Rasterized
 
 PRESETS = {"fast": 1 / 255, "balanced": 1 / 1024, "accurate": 1 / 65536}
+LARGEST_SIDE = 2**20  # pixels; kernels number the columns of their tiles with 16 bits
 log = logging.getLogger(__name__)
 
 
@@ -87,7 +89,7 @@ def rasterize(
         opacities: in [0, 1].
         colors: any number of channels, of the Gaussians (N, C) or of each view (B, N, C).
         viewmats: world to camera, OpenCV (x right, y down, z forward).
-        Ks: intrinsics in pixels of the size below, centres at +0.5; without gradient.
+        Ks: intrinsics in pixels of the size below, centres at +0.5; without skew and without gradient.
         width, height: pixels to render, before downsampling.
         background: colour behind everything, (C,) or (B, C); None is black.
         near, far: a Gaussian whose mean isn't strictly between these depths is dropped.
@@ -123,13 +125,13 @@ def rasterize(
         background = cameras.get("background")
         if background is not None:
             background = background.expand(len(viewmats), -1).contiguous()
-        return run(*gaussians.values(), cameras["viewmats"], cameras["Ks"].detach(), width, height, background, options)
+        return run(*gaussians.values(), cameras["viewmats"], cameras["Ks"].detach(), int(width), int(height), background, options)
 
 
 def _alpha_min(preset: str, alpha_min: Optional[float]) -> float:
     if preset not in PRESETS:
         raise unknown("preset", preset, PRESETS)
-    return PRESETS[preset] if alpha_min is None else float(alpha_min)
+    return PRESETS[preset] if alpha_min is None else alpha_min
 
 
 def _check_tensors(tensors: dict[str, Tensor]) -> None:
@@ -179,10 +181,13 @@ def _shape(tensor: Tensor) -> str:
 
 def _check_numbers(width: int, height: int, options: RasterizeOptions) -> None:
     for name, size in (("width", width), ("height", height)):
-        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
-            raise UserError(f"{name} must be a whole number of pixels, at least 1; got {size!r}.")
-        if options.downsample not in (1, 2) or size % options.downsample:
+        if not _is_whole(size) or not 1 <= size <= LARGEST_SIDE:
+            raise UserError(f"{name} must be a whole number of pixels, at least 1 and at most {LARGEST_SIDE}; got {size!r}.")
+        if not _is_whole(options.downsample) or options.downsample not in (1, 2) or size % options.downsample:
             raise UserError(f"downsample must be 1 or 2 and divide the size; got downsample={options.downsample!r} with {name}={size}.")
+    for name in ("near", "far", "eps2d", "alpha_min", "alpha_max", "stop"):
+        if not isinstance(getattr(options, name), Real):
+            raise UserError(f"{name} must be a number; got {getattr(options, name)!r}.")
     ranges = {
         "near, far": (0 < options.near < options.far, "0 < near < far", (options.near, options.far)),
         "eps2d": (0 <= options.eps2d < float("inf"), "a finite number >= 0", options.eps2d),
@@ -193,6 +198,10 @@ def _check_numbers(width: int, height: int, options: RasterizeOptions) -> None:
     for name, (holds, wanted, got) in ranges.items():
         if not holds:
             raise UserError(f"{name} must be {wanted}; got {got}.")
+
+
+def _is_whole(number) -> bool:
+    return isinstance(number, Integral) and not isinstance(number, bool)
 
 
 def _check_finite(policy: str, tensors: dict[str, Tensor]) -> None:

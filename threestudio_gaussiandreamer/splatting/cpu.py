@@ -46,6 +46,8 @@ def rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, heig
     inputs = (means, quats, scales, opacities, viewmats)
     tracked = torch.is_grad_enabled() and any(x.requires_grad for x in (*inputs, colors, background))
     means2d = means.new_zeros(views, len(means), 2).requires_grad_(tracked)
+    if tracked and options.absgrad:
+        means2d.absgrad = torch.zeros_like(means2d, requires_grad=False)
     frame = Frame(width, height, options, tracked, torch.get_num_threads(), _library())
     drawn = [_Rasterize.apply(*inputs, *group, means2d, Ks, frame) for group in groups(colors, background)]
     image = drawn[0][0] if channels <= CHANNELS else torch.cat([group[0] for group in drawn], -1)
@@ -87,7 +89,7 @@ class _Rasterize(torch.autograd.Function):
         upstream = (None if d_image is None else widen(d_image), d_alpha, d_depth)
         grads, d_means2d, absgrad = _draw_vjp(state, inputs, upstream, ctx.means2d, ctx.frame, ctx.needs_input_grad[VIEWMATS])
         if absgrad is not None:
-            ctx.means2d.absgrad = absgrad + getattr(ctx.means2d, "absgrad", 0)
+            ctx.means2d.absgrad += absgrad
         *grads, d_colors, d_background = grads
         return *grads, narrow(d_colors, ctx.channels), narrow(d_background, ctx.channels), d_means2d, None, None
 

@@ -44,6 +44,7 @@ from .options import RasterizeOptions
 from .output import Rasterized
 
 MOST_SPLATS = 2**31 - 1  # views times Gaussians; kernels number them with 32 bits
+MOST_VIEWS = 2**16 - 1  # the second side of a grid
 VIEWMATS, BACKGROUND = 4, 6  # among the arguments of `_Rasterize`
 _demands: dict[tuple, Demand] = {}
 log = logging.getLogger(__name__)
@@ -76,7 +77,7 @@ def rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, heig
 
 
 def _check_count(views: int, gaussians: int) -> None:
-    if views * gaussians > MOST_SPLATS:
+    if views * gaussians > MOST_SPLATS or views > MOST_VIEWS:
         raise UserError(f"{views} views of {gaussians} Gaussians are too many for one call: draw fewer views at a time.")
 
 

@@ -83,12 +83,12 @@ def target_for(capability: tuple[int, int]) -> str:
 
 def machine_code(unit: str, target: str) -> bytes:
     """``kernels/<unit>.cu`` compiled for a target of `target_for`, from the disk if it has been compiled before."""
-    path = cache_folder() / f"{unit}-{target}-{_key(unit, target)}"
-    found = _read(path)
+    name = f"{unit}-{target}-{_key(unit, target)}"
+    found = _read(name)
     if found is None:
         log.info("compiling the CUDA kernels of %s.cu for %s", unit, target)
         found = compile_unit(unit, target).code
-        _write(path, found)
+        _write(name, found)
     return found
 
 
@@ -133,6 +133,11 @@ def options_of(unit: str, target: str) -> tuple[str, ...]:
 
 
 def cache_folder() -> Path:
+    """Where compiled kernels are kept.
+
+    Raises:
+        RuntimeError: neither the variables nor the system say where the user's home is, as in some containers.
+    """
     folder = os.environ.get("GAUSSIANDREAMER_CACHE")
     if folder:
         return Path(folder).expanduser()
@@ -145,23 +150,24 @@ def _key(unit: str, target: str) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 
 
-def _read(path: Path) -> Optional[bytes]:
+def _read(name: str) -> Optional[bytes]:
     """The content if it is whole: the file ends with a digest of what comes before."""
     try:
-        data = path.read_bytes()
-    except OSError:
+        data = (cache_folder() / name).read_bytes()
+    except (OSError, RuntimeError):
         return None
     content, digest = data[:-DIGEST], data[-DIGEST:]
     return content if hashlib.sha256(content).digest() == digest else None
 
 
-def _write(path: Path, content: bytes) -> None:
+def _write(name: str, content: bytes) -> None:
     """A cache that can't be written costs the next start some seconds, nothing else."""
     try:
+        path = cache_folder() / name
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(path) as file:
             file.write(content + hashlib.sha256(content).digest())
-    except (OSError, UserError) as error:
+    except (OSError, RuntimeError, UserError) as error:
         log.warning("compiled CUDA kernels can't be kept for the next start: %s", error)
 
 

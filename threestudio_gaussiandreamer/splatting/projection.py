@@ -59,7 +59,7 @@ def project(
     """
     finite = torch.stack([_finite(x) for x in (means, quats, scales, opacities)]).all(0)
     means, quats, scales, opacities = (_keep(finite, x) for x in (means, quats, scales, opacities))
-    cameras_finite = _finite(viewmats) & _finite(Ks)
+    cameras_finite = _finite(viewmats[:, :3]) & _finite(Ks[:, [0, 1, 0, 1], [0, 1, 2, 2]])  # what is read of them
     viewmats, Ks = _keep(cameras_finite, viewmats, torch.eye(4)), _keep(cameras_finite, Ks, torch.eye(3))
 
     t, axes = _to_camera(means, quats, scales, viewmats)
@@ -67,6 +67,7 @@ def project(
         candidates = _to_screen(t, axes, opacities, Ks, width, height, options)
         visible = finite & colors.isfinite().all(-1) & cameras_finite[:, None] & _visible(*candidates, width, height, options)
     t, axes = _keep(visible, t, torch.tensor([0.0, 0.0, 1.0])), _keep(visible, axes, torch.eye(3))
+    Ks = _keep(visible.any(1), Ks, torch.eye(3))  # one that shows nothing may overflow whatever it is given
     splats = _to_screen(t, axes, opacities, Ks, width, height, options)
     return Splats(*(_keep(visible, x) for x in splats), visible)
 

@@ -8,6 +8,7 @@
 #include <mutex>
 #include <vector>
 
+#include <pthread.h>
 #if defined(__linux__)
 #include <sys/mman.h>
 #include <unistd.h>
@@ -66,6 +67,16 @@ template <class T> class Buffer {
   T* data_ = nullptr;
   size_t capacity_ = 0;
 };
+
+// The one T of this process. Never destroyed, since threads outlive main(). A forked child has none of its parent's threads,
+// and a lock that one of them held would stay locked: it gets a T of its own.
+template <class T> T& of_process() {
+  static T* instance = [] {
+    pthread_atfork(nullptr, nullptr, [] { instance = new T; });
+    return new T;
+  }();
+  return *instance;
+}
 
 // Hands out objects whose buffers have already grown; keeps at most two idle ones.
 template <class T> class Pool {

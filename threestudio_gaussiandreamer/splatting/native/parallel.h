@@ -9,7 +9,10 @@
 #include <cstdint>
 #include <exception>
 #include <mutex>
+#include <system_error>
 #include <thread>
+
+#include "buffer.h"
 
 namespace splat {
 
@@ -52,9 +55,15 @@ class Team {
 
   static constexpr int SPINS = 4000;  // some tens of microseconds: the pause between two stages
 
+  // Where the system grants no more threads, those that there are do the work.
+  void hire(int helpers) try {
+    for (; workers_ < helpers; workers_++) std::thread([this] { help(); }).detach();
+  } catch (const std::system_error&) {
+  }
+
   void open(Job& job, int helpers) {
     std::lock_guard<std::mutex> lock(mutex_);
-    for (; workers_ < helpers; workers_++) std::thread([this] { help(); }).detach();
+    hire(helpers);
     job_ = &job;
     seats_ = helpers;
     for (int i = 0; i < std::min(helpers, sleeping_); i++) wake_.notify_one();
@@ -104,14 +113,8 @@ class Team {
   int workers_ = 0, sleeping_ = 0;
 };
 
-// Never destroyed: its threads outlive main().
-inline Team& team() {
-  static Team& instance = *new Team;
-  return instance;
-}
-
 template <class Body> void parallel_for(int64_t count, int threads, int grain, const Body& body) {
-  team().run(count, threads, grain, body);
+  of_process<Team>().run(count, threads, grain, body);
 }
 
 }  // namespace splat

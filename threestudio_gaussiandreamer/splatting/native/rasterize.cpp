@@ -16,9 +16,8 @@ namespace splat {
 constexpr int TILE_GRAIN = 4;        // neighbours share splats, and so cache lines
 constexpr int BACKWARD_SLICE = 512;  // Gaussians per task, and per partial sum of d loss / d viewmats
 
-// Never destroyed: a thread may still be at work when the process ends.
-static Pool<SplatState>& states = *new Pool<SplatState>;
-static Pool<Workspace>& workspaces = *new Pool<Workspace>;
+static Pool<SplatState>& states() { return of_process<Pool<SplatState>>(); }
+static Pool<Workspace>& workspaces() { return of_process<Pool<Workspace>>(); }
 
 static void blend_views(const ForwardCall& call, Views& views) {
   const int tiles = views[0].tiles();
@@ -105,26 +104,26 @@ extern "C" {
 
 int64_t splat_forward(const SplatScene* scene, const SplatSettings* settings, const SplatPictures* out, SplatState** state) {
   return splat::guarded([&] {
-    std::unique_ptr<SplatState> own = splat::states.take();
+    std::unique_ptr<SplatState> own = splat::states().take();
     splat::forward({*scene, *settings, *out, state != nullptr}, own->views);
     if (state)
       *state = own.release();
     else
-      splat::states.give(std::move(own));
+      splat::states().give(std::move(own));
   });
 }
 
 int64_t splat_backward(SplatState* state, const SplatScene* scene, const SplatSettings* settings, const SplatUpstream* upstream,
                        const SplatGradients* out) {
   return splat::guarded([&] {
-    std::unique_ptr<splat::Workspace> work = splat::workspaces.take();
+    std::unique_ptr<splat::Workspace> work = splat::workspaces().take();
     splat::backward({*scene, *settings, *upstream, *out, state->views, {}, *work});
-    splat::workspaces.give(std::move(work));
+    splat::workspaces().give(std::move(work));
   });
 }
 
 void splat_release(SplatState* state) {
-  if (state) splat::states.give(std::unique_ptr<SplatState>(state));
+  if (state) splat::states().give(std::unique_ptr<SplatState>(state));
 }
 
 const char* splat_best_isa() {

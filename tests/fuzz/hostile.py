@@ -1,0 +1,254 @@
+"""Hostile scenes for the rasteriser, drawn from a seed, and what every backend must hold on them."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Optional
+
+import torch
+from splatting_scenes import NAMES, Cloud, cotangents
+from torch import Tensor
+
+from threestudio_gaussiandreamer.sh import sh_to_colors
+from threestudio_gaussiandreamer.splatting import Rasterized, rasterize
+
+MAX = 3.4028235e38
+DENORMAL = 1e-42
+PIXELS_TIMES_GAUSSIANS = 2_000_000
+"""The most that one scene asks of the specification, which looks at every Gaussian in every pixel."""
+ROUNDING = 2e-5
+"""How far apart depths must be for float32 to tell their order, of means up to 50."""
+FLIPS = 4 / 1024
+"""How far pixels may differ: float32 rounding may put the faintest contribution (1/1024) of a few Gaussians on either side."""
+GRADIENTS = 1e-2
+"""Relative distance of gradients without the worst hundredth of the Gaussians: those at a threshold (flips of alpha_min, the cap)."""
+
+SIZES = (0.0, DENORMAL, 1e-30, 1e-8, 1e-4, 0.05, 1.0, 1e2, 1e4, 1e10, 1e30, MAX)
+PLACES = (0.0, -0.0, DENORMAL, 0.01, -0.01, 0.3, 1.0, -1.0, 10.0, -1e4, 1e8, 1e20, -1e30, MAX)
+LENGTHS = (0.0, DENORMAL, 1e-30, 1e-13, 1e-12, 1e-3, 1.0, 5.0, 1e10, 1e20, 1e30, MAX)
+OPACITIES = (0.0, -0.0, DENORMAL, 1 / 1024, 1 / 255, 0.5, 1 - 2**-10, 1.0, 1.5, -1.0, 100.0)
+HARMONICS = (0.0, -0.0, DENORMAL, -1.0, 1.0, 1e4, -1e10)
+DAZZLING = (1e30, -1e30, MAX, -MAX)
+"""Harmonics whose pictures float32 can hold, though not the gradients: those of a colour c grow with c times focal length / depth."""
+NOT_FINITE = (math.nan, math.inf, -math.inf)
+FOVS_DEG = (1e-3, 0.1, 1.0, 30.0, 60.0, 120.0, 179.0, 179.999)
+
+
+class Scene(NamedTuple):
+    """The arguments of `rasterize`, colours as spherical harmonics."""
+
+    cloud: Cloud
+    """float32; ``colors`` are harmonics (N, K, 3)."""
+    viewmats: Tensor
+    Ks: Tensor
+    size: tuple[int, int]
+    """Width and height."""
+    background: Optional[Tensor]
+    options: dict[str, Any]
+
+
+class Drawn(NamedTuple):
+    """A picture and its gradients by the name of the argument."""
+
+    out: Rasterized
+    grads: dict[str, Tensor]
+
+
+# ---- scenes --------------------------------------------------------------------------------------------------------------------
+
+
+def hostile_scene(seed: int, most: int = 4000) -> Scene:
+    """A scene of up to ``most`` Gaussians; a tenth of the scenes also holds NaN and infinity."""
+    g = torch.Generator().manual_seed(seed)
+    count = _count(g, most)
+    views = int(torch.randint(1, 5, (), generator=g))
+    size = _size(g, max(count * views, 1))
+    cloud = _cloud(g, count, poisoned=bool(_chance(g, 0.1)))
+    viewmats, Ks = _cameras(g, views, *size)
+    background = torch.randn(3, generator=g) if _chance(g, 0.5) else None
+    return Scene(cloud, viewmats, Ks, size, background, _options(g, size))
+
+
+def well_posed(scene: Scene) -> Scene:
+    """The part on which float32 backends must agree: finite, of moderate size and place, clear of every plane and threshold.
+
+    Under a field of view of less than a degree or more than 150, neither rounding nor the clamped Jacobian is moderate.
+    """
+    cloud, near = scene.cloud, scene.options["near"]
+    lengths = torch.linalg.vector_norm(cloud.quats, dim=1)
+    keep = (cloud.means.abs() <= 50).all(1) & (lengths >= 1e-3) & (lengths <= 1e3)
+    keep &= ((cloud.scales >= 1e-3) & (cloud.scales <= 10)).all(1) & (cloud.opacities >= 0) & (cloud.opacities <= 1)
+    keep &= (cloud.colors.abs() <= 10).flatten(1).all(1)
+    depths = scene.viewmats[:, 2, :3].double() @ cloud.means.double().T + scene.viewmats[:, 2, 3:].double()
+    keep &= ((depths - near).abs() > 0.05).all(0)
+    for view in depths:
+        keep[keep.nonzero()[:, 0][_of_mixed_depth(cloud.means[keep], view[keep])]] = False
+    focal, width = scene.Ks[:, 0, 0], scene.size[0]
+    moderate = bool(((focal > 0.13 * width) & (focal < 57 * width)).all())
+    return scene._replace(cloud=cloud.pick(keep if moderate else slice(0, 0)))
+
+
+def _of_mixed_depth(means: Tensor, depths: Tensor) -> Tensor:
+    """Marks Gaussians whose order by depth is a matter of rounding; those in the very same place go by index everywhere."""
+    order = depths.argsort(stable=True)
+    near = depths[order].diff() < ROUNDING
+    groups = torch.cat([near.new_zeros(len(order[:1]), dtype=torch.long), (~near).cumsum(0)])
+    mixed = torch.zeros_like(groups, dtype=torch.bool)
+    mixed[groups[1:][near & (means[order].diff(dim=0) != 0).any(1)]] = True
+    marked = torch.zeros_like(mixed)
+    marked[order] = mixed[groups]
+    return marked
+
+
+def _chance(g: torch.Generator, share: float) -> bool:
+    return bool(torch.rand((), generator=g) < share)
+
+
+def _count(g: torch.Generator, most: int) -> int:
+    """Few or many: uniform in the logarithm, from 0."""
+    return int(math.exp(torch.rand((), generator=g).item() * math.log(most + 1))) - 1 if _chance(g, 0.4) else most
+
+
+def _size(g: torch.Generator, work: int) -> tuple[int, int]:
+    """1 x 1, odd, long or square, as large as the specification can bear."""
+    area = min(max(PIXELS_TIMES_GAUSSIANS // work, 1), 48 * 48)
+    width = min(int(math.exp(torch.rand((), generator=g).item() * math.log(area + 1))), 200)
+    width = max(round(math.sqrt(area)) if _chance(g, 0.5) else width, 1)
+    return width, max(min(area // width, 200), 1)
+
+
+def _picked(g: torch.Generator, values: tuple[float, ...], shape: tuple[int, ...]) -> Tensor:
+    return torch.tensor(values)[torch.randint(len(values), shape, generator=g)]
+
+
+def _cloud(g: torch.Generator, count: int, poisoned: bool) -> Cloud:
+    """Ordinary Gaussians with hostile rows and entries among them; some rows are copies of others."""
+    degree = int(torch.randint(0, 4, (), generator=g))
+    cloud = Cloud(
+        means=0.5 * torch.randn(count, 3, generator=g),
+        quats=torch.randn(count, 4, generator=g),
+        scales=torch.exp(torch.randn(count, 3, generator=g) - 3),
+        opacities=torch.rand(count, generator=g),
+        colors=torch.randn(count, (degree + 1) ** 2, 3, generator=g),
+    )
+    hostility = torch.rand((), generator=g).item() ** 2
+    for name, values in zip(NAMES, (PLACES, LENGTHS, SIZES, OPACITIES, HARMONICS), strict=True):
+        _poison(g, getattr(cloud, name), values, 0.3 * hostility)
+        if poisoned:
+            _poison(g, getattr(cloud, name), NOT_FINITE, 0.02)
+    if _chance(g, 0.1):
+        _poison(g, cloud.colors, DAZZLING, 0.3 * hostility)
+    if count:
+        copies = torch.rand(count, generator=g) < 0.3 * hostility
+        rows = torch.where(copies, torch.randint(count, (count,), generator=g), torch.arange(count))
+        cloud = cloud.pick(rows)
+    return cloud
+
+
+def _poison(g: torch.Generator, values: Tensor, hostile: tuple[float, ...], share: float) -> None:
+    """Put hostile numbers into single entries, and one and the same into whole rows."""
+    rows = torch.rand(len(values), generator=g) < share / 2
+    same = _picked(g, hostile, (len(values),)).reshape(-1, *[1] * (values.dim() - 1)).expand(values.shape)
+    values[rows] = same[rows]
+    entries = torch.rand(values.shape, generator=g) < share / 4
+    values[entries] = _picked(g, hostile, tuple(values.shape))[entries]
+
+
+def _cameras(g: torch.Generator, views: int, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Around the cloud; in two scenes of five odd ones: inside of it or behind, any field of view, the principal point anywhere."""
+    q = torch.nn.functional.normalize(torch.randn(views, 4, generator=g, dtype=torch.float64), dim=-1)
+    w, x, y, z = q.unbind(-1)
+    rotation = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    viewmats = torch.eye(4).repeat(views, 1, 1)
+    viewmats[:, :3, :3] = torch.stack([torch.stack(row, -1) for row in rotation], -2).float()
+    odd = torch.rand(views, generator=g) < (0.7 if _chance(g, 0.4) else 0.0)
+    viewmats[:, 2, 3] = torch.where(odd, _picked(g, (3.0, 0.5, 0.0, 100.0, -3.0), (views,)), torch.tensor(3.0))
+    fov = torch.where(odd, _picked(g, FOVS_DEG, (views,)), _picked(g, (40.0, 60.0), (views,)))
+    focal = 0.5 * height / torch.tan(torch.deg2rad(fov) / 2)
+    Ks = torch.eye(3).repeat(views, 1, 1)
+    Ks[:, 0, 0], Ks[:, 1, 1] = focal * (2.0 if _chance(g, 0.1) else 1.0), focal
+    centre = torch.where(odd, _picked(g, (0.5, 0.5, 0.0, -3.0, 20.0), (views,)), torch.tensor(0.5))
+    Ks[:, 0, 2], Ks[:, 1, 2] = centre * width, centre * height
+    return viewmats, Ks
+
+
+def _options(g: torch.Generator, size: tuple[int, int]) -> dict[str, Any]:
+    options: dict[str, Any] = {"preset": ("fast", "balanced", "accurate")[int(torch.randint(3, (), generator=g))]}
+    options |= {"antialias": _chance(g, 0.3), "absgrad": _chance(g, 0.3)}
+    options |= {"near": _picked(g, (0.01, 0.01, 1e-6, 0.5), ()).item()}
+    if size[0] % 2 == size[1] % 2 == 0 and _chance(g, 0.3):
+        options["downsample"] = 2
+    return options
+
+
+# ---- drawing and judging -------------------------------------------------------------------------------------------------------
+
+
+def draw(scene: Scene, backend: str, dtype: torch.dtype = torch.float32) -> Drawn:
+    """Forward and backward with fixed cotangents; gradients of the harmonics pass through the colours, those of the cameras too."""
+    leaves = scene.cloud.to(dtype).leaves()
+    viewmats, background = scene.viewmats.to(dtype, copy=True).requires_grad_(), scene.background
+    background = None if background is None else background.to(dtype, copy=True).requires_grad_()
+    positions = -(viewmats.detach()[:, :3, :3].transpose(1, 2) @ viewmats.detach()[:, :3, 3:])[..., 0]
+    directions = torch.nn.functional.normalize(leaves.means.detach()[None] - positions[:, None], dim=-1)
+    colors = sh_to_colors(leaves.colors, directions)
+    out = rasterize(*leaves[:4], colors, viewmats, scene.Ks.to(dtype), *scene.size, background=background, backend=backend, **scene.options)
+    torch.autograd.backward([out.image, out.alpha, out.depth], cotangents(out))
+    grads = dict(zip(NAMES, (leaf.grad for leaf in leaves), strict=True)) | {"viewmats": viewmats.grad, "means2d": out.means2d.grad}
+    return Drawn(out, grads if background is None else grads | {"background": background.grad})
+
+
+def fault(scene: Scene, drawn: Drawn) -> Optional[str]:
+    """What is wrong with a picture of any scene, in words: a value or gradient that isn't finite, or alpha outside of [0, 1].
+
+    Two exceptions: radii may be infinite, of a Gaussian that is larger than float32 can say; and the gradient of harmonics may be
+    NaN where the mean is, since no direction leads there.
+    """
+    for name in ("image", "alpha", "depth", "means2d", "contribution"):
+        if not getattr(drawn.out, name).isfinite().all():
+            return f"{name} isn't finite"
+    if drawn.out.radii.isnan().any():
+        return "radii are NaN"
+    if not ((drawn.out.alpha >= 0) & (drawn.out.alpha <= 1 + 1e-5)).all():
+        return "alpha isn't in [0, 1]"
+    placed = scene.cloud.means.isfinite().all(1)
+    if (scene.cloud.colors.abs() >= DAZZLING[0]).any():
+        return None
+    for name, grad in drawn.grads.items():
+        if not (grad[placed] if name == "colors" else grad).isfinite().all():
+            return f"the gradient of {name} isn't finite"
+    return None
+
+
+def disagreement(pictures: dict[str, Drawn]) -> Optional[str]:
+    """Which picture of one well-posed scene differs by more than rounding may from the last one, in words."""
+    *others, (first, one) = pictures.items()
+    for name, other in others:
+        for part in ("image", "alpha"):
+            difference = (getattr(one.out, part).double() - getattr(other.out, part).double()).abs().max()
+            scale = max(getattr(one.out, part).abs().max().item(), 1.0)
+            if difference > FLIPS * scale:
+                return f"{part} of {first} and {name} differ by {difference:.2g}"
+        for part, grad in one.grads.items():
+            if (distance := _distance(other.grads[part], grad)) > GRADIENTS:
+                return f"gradients of {part} of {first} and {name} differ by {distance:.2g} of their length"
+    return None
+
+
+def fault_of(scene: Scene, backend: str) -> Optional[str]:
+    return fault(scene, draw(scene, backend))
+
+
+def disagreement_on(scene: Scene, backends: Sequence[str]) -> Optional[str]:
+    """The specification is asked last, in float64."""
+    return disagreement({name: draw(scene, name) for name in backends} | {"float64": draw(scene, "reference", torch.float64)})
+
+
+def _distance(a: Tensor, b: Tensor) -> float:
+    a, b = (x.double().reshape(len(x), math.prod(x.shape[1:])) for x in (a, b))
+    rows = (a - b).norm(dim=1)
+    kept = rows.argsort()[: max(len(rows) * 99 // 100, len(rows) - 3 if len(rows) < 300 else 0)]
+    return ((a - b)[kept].norm() / b.norm().clamp(min=1e-6)).item()

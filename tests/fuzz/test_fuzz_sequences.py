@@ -1,0 +1,44 @@
+"""Random lives of a cloud, a few of what `make fuzz` tries."""
+
+import pytest
+from hypothesis import HealthCheck, Phase, settings
+from hypothesis.stateful import run_state_machine_as_test
+from sequences import CloudLife
+
+from threestudio_gaussiandreamer import densify
+
+
+def live(lives: int, **options) -> None:
+    health = list(HealthCheck)
+    run_state_machine_as_test(
+        CloudLife,
+        settings=settings(
+            max_examples=lives,
+            stateful_step_count=20,
+            derandomize=True,
+            deadline=None,
+            database=None,
+            suppress_health_check=health,
+            **options,
+        ),
+    )
+
+
+def test_no_life_breaks_a_cloud():
+    live(30)
+
+
+def test_a_split_beyond_floats_is_found(monkeypatch):
+    """As it was: a Gaussian of infinite size has its children infinitely far away, and the floor keeps them."""
+    monkeypatch.setattr(densify, "LOG_SCALE_RANGE", (-1e30, 1e30))
+    with pytest.raises(AssertionError, match="isn't finite"):
+        live(200, phases=[Phase.generate])
+
+
+def test_moments_that_go_astray_are_found(monkeypatch):
+    def rows(value, old, change):
+        return value[change.parents.roll(1)] if getattr(value, "shape", None) == old.shape else value
+
+    monkeypatch.setattr(densify, "_rows", rows)
+    with pytest.raises(AssertionError):
+        live(200, phases=[Phase.generate])

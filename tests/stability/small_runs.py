@@ -1,0 +1,85 @@
+"""Runs of a few steps through the launcher, in this process: what the rows about training and files are provoked in."""
+
+import contextlib
+import csv
+import io
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest import mock
+
+import torch
+from torch import Tensor
+
+from threestudio_gaussiandreamer import experiment
+
+DEMO = Path(__file__).parents[2] / "configs" / "demo.yaml"
+SMALL = [
+    "data.width=24", "data.height=24", "data.eval_width=24", "data.eval_height=24", "data.n_test_views=2", "data.train_views=8",
+    "data.batch_size=2", "system.geometry.prior.num_points=120", "system.geometry.prior.color_smoothing=0",
+    "system.geometry.grow.num_candidates=2000", "system.geometry.budget=null", "system.evaluation.size=16", "system.evaluation.views=2",
+    "system.evaluation.supersample=1", "trainer.enable_progress_bar=false", "trainer.log_every_n_steps=1",
+    "trainer.limit_val_batches=0", "use_timestamp=false", "tag=t",
+]  # fmt: skip
+
+
+class Ended(NamedTuple):
+    code: int
+    out: str
+    err: str
+    folder: Path
+    """Of the trial."""
+
+    @property
+    def last(self) -> Path:
+        return self.folder / "ckpts" / "last.ckpt"
+
+    def checkpoint(self, path: Path | None = None) -> dict[str, Any]:
+        return torch.load(path or self.last, weights_only=True, map_location="cpu")
+
+    def metrics(self) -> dict[str, Any]:
+        return json.loads((self.folder / "save" / "metrics.json").read_text())
+
+    def logged(self, name: str) -> list[float]:
+        """What the run logged under a name, in order."""
+        files = sorted(self.folder.glob("csv_logs/version_*/metrics.csv"), key=lambda path: int(path.parent.name.removeprefix("version_")))
+        rows = [row for path in files for row in csv.DictReader(open(path))]
+        return [float(row[name]) for row in rows if row.get(name)]
+
+
+def launch(folder: Path, *overrides: str, stage: str = "--train", config: Path = DEMO) -> Ended:
+    """One run of the small demo below ``folder``; the environment is afterwards what it was.
+
+    Without the prior's turntable, a picture for people that takes longer than all the rest.
+    """
+    out, err = io.StringIO(), io.StringIO()
+    small = [option for option in SMALL if not (other_prior(overrides) and option.startswith("system.geometry.prior."))]
+    arguments = ["--config", str(config), stage, "--gpu", "cpu", f"exp_root_dir={folder}", *small, *overrides]
+    with (
+        mock.patch.dict(os.environ),
+        mock.patch("threestudio_gaussiandreamer.prior_cache.save_turntable"),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        code = experiment.main(arguments)
+    return Ended(code, out.getvalue(), err.getvalue(), Path(folder) / "demo" / "t")
+
+
+def other_prior(overrides: Sequence[str]) -> bool:
+    """Whether the demo's prior, and so its options, is replaced."""
+    return any(option.startswith("system.geometry.prior_type=") for option in overrides)
+
+
+def training_state(checkpoint: dict[str, Any]) -> dict[str, Tensor]:
+    """Everything that the next step depends on: parameters, statistics, moments, and the step."""
+    moments = checkpoint["optimizer_states"][0]["state"]
+    found = {f"{i}.{name}": torch.as_tensor(value) for i, state in moments.items() for name, value in state.items()}
+    return {**checkpoint["state_dict"], **found, "step": torch.tensor(checkpoint["global_step"])}
+
+
+def differences(a: dict[str, Any], b: dict[str, Any]) -> int:
+    """How many tensors of two checkpoints' training states aren't the same to the bit."""
+    one, other = training_state(a), training_state(b)
+    return len(one.keys() ^ other.keys()) + sum(not torch.equal(one[name], other[name]) for name in one.keys() & other.keys())

@@ -1,0 +1,347 @@
+"""A5: what comes from outside. Point clouds of others, pickles at every door, modules that fail, and no network."""
+
+import ast
+import os
+import pickle
+import re
+import socket
+import sys
+import time
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from rows import row
+from small_runs import launch
+
+import threestudio_gaussiandreamer
+from threestudio_gaussiandreamer import hub, model_files, register_parts
+from threestudio_gaussiandreamer.embedding_cache import EmbeddingCache
+from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.ply import read_gaussians, read_points, write_gaussians
+from threestudio_gaussiandreamer.prior_cache import read_cache
+from threestudio_gaussiandreamer.priors.motion_files import read_motions
+from threestudio_gaussiandreamer.priors.point_cloud import load_points
+from threestudio_gaussiandreamer.priors.smpl_fit import load_body_model
+from threestudio_gaussiandreamer.priors.weights import read_state_dict
+from threestudio_gaussiandreamer.system import GaussianDreamerSystem
+
+register_parts()
+PACKAGE = Path(threestudio_gaussiandreamer.__file__).parent
+
+
+# ---- PLY -----------------------------------------------------------------------------------------------------------------------
+
+GAUSSIAN = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+
+
+def ply(rows: np.ndarray, names=GAUSSIAN, encoding="binary_little_endian", count=None) -> bytes:
+    count = len(rows) if count is None else count
+    header = ["ply", f"format {encoding} 1.0", f"element vertex {count}", *(f"property float {name}" for name in names), "end_header\n"]
+    if encoding == "ascii":
+        body = "".join(" ".join(map(repr, row.tolist())) + "\n" for row in rows).encode()
+    else:
+        body = rows.astype("<f4" if encoding.endswith("little_endian") else ">f4").tobytes()
+    return "\n".join(header).encode() + body
+
+
+def numbers(count: int, columns: int = len(GAUSSIAN)) -> np.ndarray:
+    return np.random.default_rng(0).normal(size=(count, columns)).astype(np.float32)
+
+
+FOREIGN = {
+    "ascii": ply(numbers(9), encoding="ascii"),
+    "big-endian": ply(numbers(9), encoding="binary_big_endian"),
+    "extra properties": ply(np.hstack([numbers(9), numbers(9, 2)]), [*GAUSSIAN, "nx", "mine"]),
+    "in another order": ply(numbers(9)[:, ::-1], GAUSSIAN[::-1]),
+    "degree 0, so no f_rest": ply(numbers(9)),
+}
+BROKEN = {
+    "rotations missing": ply(numbers(9)[:, :10], GAUSSIAN[:10]),
+    "NaN rows": ply(numbers(9) * [[np.nan]] * 9),
+    "a count of 1e12": ply(numbers(9), count=10**12),
+    "a count of 1e12, ascii": ply(numbers(9), encoding="ascii", count=10**12),
+    "a negative count": ply(numbers(9), count=-1),
+    "cut short": ply(numbers(9))[:-20],
+    "no header": b"solid nothing\n",
+    "empty": b"",
+}
+
+
+@row("A5", "Corrupted/foreign PLY")
+@pytest.mark.parametrize("what", FOREIGN)
+def test_a_ply_of_others_is_read_right(what, tmp_path, measured):
+    (tmp_path / "a.ply").write_bytes(FOREIGN[what])
+    arrays, expected = read_gaussians(tmp_path / "a.ply"), numbers(9)
+    assert np.array_equal(read_points(tmp_path / "a.ply").points, expected[:, :3])
+    wrong = (arrays.means != expected[:, :3]).sum() + (arrays.quats != expected[:, 10:]).sum() + (arrays.sh[:, 0] != expected[:, 3:6]).sum()
+    measured(wrong, "numbers", what="read wrong", at_most=0)
+
+
+@row("A5", "Corrupted/foreign PLY")
+@pytest.mark.parametrize("what", BROKEN)
+def test_a_broken_ply_is_a_clean_error_in_little_memory(what, tmp_path, measured):
+    (tmp_path / "a.ply").write_bytes(BROKEN[what])
+    tracemalloc.start()
+    with pytest.raises(UserError, match="a.ply"):
+        read_gaussians(tmp_path / "a.ply")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    measured(peak / 1e6, "MB", what="peak memory for a file that lies", at_most=1.0)
+
+
+@row("A5", "Corrupted/foreign PLY")
+def test_an_empty_cloud_is_read_as_one(tmp_path, measured):
+    write_gaussians(tmp_path / "a.ply", means=np.zeros((0, 3)), sh=np.zeros((0, 1, 3)), logit_opacities=np.zeros(0),
+                    log_scales=np.zeros((0, 3)), quats=np.zeros((0, 4)))  # fmt: skip
+    assert len(read_gaussians(tmp_path / "a.ply").means) == 0
+    measured("N = 0 read")
+
+
+# ---- no network ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def empty_cache(monkeypatch, tmp_path):
+    constants = pytest.importorskip("huggingface_hub").constants
+    monkeypatch.setenv("HF_HUB_OFFLINE", "0")
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+
+
+def refuse(*args, **kwargs):
+    raise OSError(101, "Network is unreachable")
+
+
+def hang(*args, **kwargs):
+    time.sleep(30)
+
+
+@row("A5", "Hub offline")
+@pytest.mark.parametrize("what", ["sockets blocked", "no answer to connecting", "no answer to a name", "HF_HUB_OFFLINE"])
+def test_a_model_that_is_not_here_is_named_within_seconds(what, empty_cache, monkeypatch, measured):
+    """The message says what to place where. A name that nobody resolves is the long one: that call knows no timeout."""
+    if what == "HF_HUB_OFFLINE":
+        monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    elif what == "no answer to a name":
+        monkeypatch.setattr(socket, "getaddrinfo", hang)
+    elif what == "no answer to connecting":
+        silent = socket.create_server(("127.0.0.1", 0))
+        monkeypatch.setenv("HF_ENDPOINT", f"http://127.0.0.1:{silent.getsockname()[1]}")
+    monkeypatch.setattr(socket.socket, "connect", refuse) if what == "sockets blocked" else None
+    if what != "HF_HUB_OFFLINE":
+        assert hub.TIMEOUT <= 4.5
+        if what != "sockets blocked":
+            monkeypatch.setattr(hub, "TIMEOUT", 0.5)  # what users wait is 8 times as long
+    start = time.monotonic()
+    with pytest.raises(UserError, match="hf download .*--local-dir models/model`; then set .*pretrained_model_name_or_path to that folder"):
+        hub.find_model("nobody/model", ("unet", "vae"))
+    seconds = time.monotonic() - start
+    scale = 1.0 if what in ("sockets blocked", "HF_HUB_OFFLINE") else hub_seconds() / 0.5
+    measured(seconds * scale, "s", what="until the message", at_most=5.0)
+
+
+def hub_seconds() -> float:
+    """The timeout as users have it, whatever a test has made of it."""
+    tree = ast.parse((PACKAGE / "hub.py").read_text())
+    return next(node.value.value for node in tree.body if isinstance(node, ast.Assign) and node.targets[0].id == "TIMEOUT")
+
+
+@row("A5", "Hub offline")
+def test_the_guidance_without_weights_asks_no_network(tmp_path, monkeypatch, measured):
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    monkeypatch.setattr(socket, "getaddrinfo", refuse)
+    ended = launch(tmp_path, "trainer.max_steps=2")
+    assert ended.code == 0, ended.err
+    measured("a whole run without a socket")
+
+
+# ---- hostile files -------------------------------------------------------------------------------------------------------------
+
+
+class Bomb:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, path: Path):
+        self.path = str(path)
+
+    def __reduce__(self):
+        return os.mkdir, (self.path,)
+
+
+def bomb_checkpoint(path: Path, bomb: Bomb) -> Path:
+    torch.save({"state_dict": {}, "epoch": 0, "global_step": 0, "pytorch-lightning_version": "2.6.6", "hparams": bomb}, path)
+    return path
+
+
+def bomb_numpy(path: Path, bomb: Bomb, **names) -> Path:
+    array = np.array([bomb], object)
+    np.savez(path, **{name: array for name in names}) if path.suffix == ".npz" else np.save(path, array)
+    return path
+
+
+def refused(door) -> None:
+    with pytest.raises(UserError):
+        door()
+
+
+def tiny_text_model(folder: Path) -> Path:
+    transformers = pytest.importorskip("transformers")
+    config = transformers.CLIPTextConfig(hidden_size=8, intermediate_size=8, num_hidden_layers=1, num_attention_heads=1, vocab_size=50)
+    config.save_pretrained(folder / "text_encoder")
+    return folder
+
+
+def open_bin(folder: Path, bomb: Bomb) -> None:
+    transformers = pytest.importorskip("transformers")
+    torch.save({"text_model.embeddings.position_embedding.weight": bomb}, tiny_text_model(folder) / "text_encoder" / "pytorch_model.bin")
+    refused(lambda: model_files.load_network(transformers.CLIPTextModel, folder, "text_encoder", allow_bin=True))
+
+
+def open_embedding(folder: Path, bomb: Bomb) -> None:
+    pytest.importorskip("safetensors")
+    cache = EmbeddingCache(str(folder), "a model")
+    cache.path("a fox").write_bytes(pickle.dumps(bomb))
+    assert cache.read("a fox") is None  # made anew
+
+
+def open_prior_cache(folder: Path, bomb: Bomb) -> None:
+    assert read_cache(bomb_numpy(folder / "points.npz", bomb, key=1, points=1), "key") is None
+
+
+def open_yaml(folder: Path, bomb: Bomb) -> None:
+    (folder / "a.yaml").write_text(f"name: !!python/object/apply:os.mkdir ['{bomb.path}']\n")
+    assert launch(folder, config=folder / "a.yaml").code == 2
+
+
+def launched(option: str, stage: str = "--train"):
+    def door(folder: Path, bomb: Bomb) -> None:
+        path = bomb_checkpoint(folder / "bomb.ckpt", bomb)
+        ended = launch(folder / "out", option.format(path), "trainer.max_steps=1", stage=stage)
+        assert ended.code == 2 and "could run code" in ended.err and "Traceback" not in ended.err, ended.err
+
+    return door
+
+
+def renamed_pickle(folder: Path, bomb: Bomb) -> None:
+    (folder / "body.npz").write_bytes(pickle.dumps(bomb))
+    refused(lambda: load_body_model(str(folder / "body.npz")))
+
+
+DOORS = {
+    "resume": launched("resume={}"),
+    "resume to export": launched("resume={}", "--export"),
+    "system.weights": launched("system.weights={}"),
+    "system.geometry.weights": launched("system.geometry.weights={}:geometry"),
+    "weights of Shap-E, Point-E": lambda folder, bomb: refused(
+        lambda: read_state_dict(str(bomb_checkpoint(folder / "a.pt", bomb)), "Shap-E")
+    ),
+    "a bare pickle as .pt": lambda folder, bomb: refused(
+        lambda: [(folder / "a.pt").write_bytes(pickle.dumps(bomb)), read_state_dict(str(folder / "a.pt"), "Shap-E")]
+    ),
+    "pytorch_model.bin": open_bin,
+    "points .npy": lambda folder, bomb: refused(lambda: load_points(bomb_numpy(folder / "a.npy", bomb))),
+    "points .npz": lambda folder, bomb: refused(lambda: load_points(bomb_numpy(folder / "a.npz", bomb, points=1))),
+    "motion .npy": lambda folder, bomb: refused(lambda: read_motions(str(bomb_numpy(folder / "a.npy", bomb)))),
+    "motion .npz": lambda folder, bomb: refused(lambda: read_motions(str(bomb_numpy(folder / "a.npz", bomb, motion=1)))),
+    "body model .npz": lambda folder, bomb: refused(lambda: load_body_model(str(bomb_numpy(folder / "a.npz", bomb, v_template=1)))),
+    "body model, a pickle called .npz": renamed_pickle,
+    "body model .pkl": lambda folder, bomb: refused(
+        lambda: [(folder / "a.pkl").write_bytes(pickle.dumps(bomb)), load_body_model(str(folder / "a.pkl"))]
+    ),
+    "cached prior": open_prior_cache,
+    "cached text embedding": open_embedding,
+    "configuration": open_yaml,
+}
+
+
+@row("A5", "Untrusted pickle")
+@pytest.mark.parametrize("door", DOORS)
+def test_nothing_that_is_opened_runs_code(door, tmp_path, measured):
+    bomb = Bomb(tmp_path / "exploded")
+    DOORS[door](tmp_path, bomb)
+    assert not (tmp_path / "exploded").exists()
+    pickle.loads(pickle.dumps(bomb))
+    assert (tmp_path / "exploded").exists()  # it would have been noticed
+    measured("nothing executed")
+
+
+SAFE = {"torch.load": ("weights_only", True), "np.load": ("allow_pickle", False), "npy.read_array": ("allow_pickle", False)}
+NEVER = ("pickle.load", "pickle.loads", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "torch.hub.load", "marshal.loads", "joblib.load",
+         "shelve.open", "eval", "exec", "os.system", "dill.load")  # fmt: skip
+
+
+def calls(path: Path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call):
+            yield ast.unparse(node.func), {keyword.arg: keyword.value for keyword in node.keywords}, node.lineno
+
+
+@row("A5", "Untrusted pickle")
+def test_every_load_in_the_package_is_the_safe_one(measured):
+    """Named ``torch.load`` and ``np.load``, so that none hides behind another name; benchmarks and the launcher included."""
+    unsafe, found = [], 0
+    root = PACKAGE.parent
+    for path in [*PACKAGE.rglob("*.py"), *(root / "benchmarks").glob("*.py"), root / "launch.py"]:
+        source = path.read_text()
+        assert not re.search(r"from (torch|numpy|numpy\.lib\.format) import .*(load|read_array)\b", source)
+        for name, keywords, line in calls(path):
+            if name in SAFE:
+                found += 1
+                keyword, value = SAFE[name]
+                given = keywords.get(keyword)
+                if not (isinstance(given, ast.Constant) and given.value is value):
+                    unsafe.append(f"{path.name}:{line}: {name}")
+            if name in NEVER:
+                unsafe.append(f"{path.name}:{line}: {name}")
+    assert found >= 4 and not unsafe, unsafe
+    measured(len(unsafe), f"of {found} loads", what="unsafe", at_most=0)
+
+
+# ---- modules of the user -------------------------------------------------------------------------------------------------------
+
+MODULES = {
+    "ImportError": ("import nothing_of_this_name", "custom/part.py:1: ModuleNotFoundError"),
+    "syntax": ("def f(:", "custom/part.py:1: "),
+    "an exception": ("\n\nraise RuntimeError('broken')", "custom/part.py:3: RuntimeError: broken"),
+    "sys.exit()": ("import sys\nsys.exit()", "custom/part.py:2: SystemExit"),
+    "sys.exit(0)": ("import sys\nsys.exit(0)", "custom/part.py:2: SystemExit: 0"),
+    "a name that is taken": (
+        "from threestudio_gaussiandreamer.host import register\n@register('mesh-prior')\nclass Mine: pass",
+        "custom/part.py:2",
+    ),
+}
+
+
+@row("A5", "Failed custom module")
+@pytest.mark.parametrize("what", MODULES)
+def test_a_module_that_fails_is_named_with_its_line(what, tmp_path, monkeypatch, measured):
+    source, message = MODULES[what]
+    monkeypatch.chdir(tmp_path)
+    Path("custom").mkdir()
+    Path("custom/part.py").write_text(source)
+    ended = launch(tmp_path / "out", "trainer.max_steps=1")
+    assert ended.code == 2 and "can't be imported" in ended.err and message in ended.err, ended.err
+    assert "Traceback" not in ended.err and not (tmp_path / "out").exists()
+    measured("named error at load")
+
+
+@row("A5", "Failed custom module")
+def test_a_signal_while_a_module_is_imported_is_not_its_fault(tmp_path, monkeypatch, measured):
+    monkeypatch.chdir(tmp_path)
+    Path("custom").mkdir()
+    Path("custom/part.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGTERM)")
+    ended = launch(tmp_path / "out", "trainer.max_steps=1")
+    assert ended.code == 143 and "can't be imported" not in ended.err
+    measured("SIGTERM stays SIGTERM")
+
+
+@row("A5", "Failed custom module")
+def test_a_part_that_calls_sys_exit_in_the_middle_of_a_run_is_named(tmp_path, monkeypatch, measured):
+    """``sys.exit()`` means success, which a run that somebody else has ended isn't."""
+    monkeypatch.setattr(GaussianDreamerSystem, "training_step", lambda *args: sys.exit())
+    ended = launch(tmp_path, "trainer.max_steps=1")
+    assert ended.code == 2 and f"{Path(__file__).name}:" in ended.err and "ended the run with sys.exit(None)" in ended.err
+    measured("named, exit code 2")

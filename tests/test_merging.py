@@ -1,0 +1,119 @@
+"""Duplicates become one Gaussian that looks like both; what is no duplicate stays as it is, bit for bit."""
+
+import pytest
+import torch
+
+from threestudio_gaussiandreamer import simplify
+from threestudio_gaussiandreamer.merging import merge_duplicates
+from threestudio_gaussiandreamer.simplify import Cloud
+
+
+def shell(count=60, seed=0):
+    """Coloured flat Gaussians on a sphere, far enough apart."""
+    rng = torch.Generator().manual_seed(seed)
+    index = torch.arange(count) + 0.5
+    up = 1 - 2 * index / count
+    angle = index * 2.399963
+    means = torch.stack([(1 - up**2).sqrt() * angle.cos(), (1 - up**2).sqrt() * angle.sin(), up], 1)
+    log_scales = torch.tensor([-2.0, -2.3, -4.0]) + 0.2 * torch.randn(count, 3, generator=rng)
+    opacities = torch.rand(count, generator=rng) * 0.3 + 0.5
+    return {
+        "means": means,
+        "log_scales": log_scales,
+        "quats": torch.randn(count, 4, generator=rng),
+        "logit_opacities": opacities.logit(),
+        "sh0": torch.randn(count, 1, 3, generator=rng),
+        "sh_rest": 0.1 * torch.randn(count, 3, 3, generator=rng),
+    }
+
+
+def copies(params, times):
+    """Each Gaussian ``times`` times in the same place, which together let through what it did."""
+    through = 1 - params["logit_opacities"].sigmoid()
+    split = params | {"logit_opacities": (1 - through ** (1 / times)).logit()}
+    return {name: value.repeat(times, *[1] * (value.dim() - 1)) for name, value in split.items()}
+
+
+def picture(params):
+    sh = torch.cat([params["sh0"], params["sh_rest"]], 1)
+    cloud = Cloud(*(params[name] for name in Cloud._fields[:-1]), sh)
+    around = Cloud(shell()["means"], shell()["quats"], shell()["log_scales"], shell()["logit_opacities"], shell()["sh0"])
+    return simplify.look(cloud, simplify.views_around(around, 6, 48))[0]
+
+
+def test_a_pair_keeps_its_peak_and_its_light():
+    a, b, one = 0.6, 0.8, {name: value[:1] for name, value in shell().items()}
+    pair = {name: torch.cat([value, value]) for name, value in one.items()} | {"logit_opacities": torch.tensor([a, b]).logit()}
+    merged = merge_duplicates(pair).values
+    peak, size = merged["logit_opacities"].sigmoid().item(), (merged["log_scales"].mean() - one["log_scales"].mean()).exp().item()
+    r = torch.linspace(0, 8, 4001, dtype=torch.float64)
+    g = (-0.5 * r**2).exp()
+    light = torch.trapezoid((1 - (1 - a * g) * (1 - b * g)) * r, r).item()
+    assert peak == pytest.approx(1 - (1 - a) * (1 - b), abs=1e-6)
+    assert peak * size**2 == pytest.approx(light, rel=1e-4)
+
+
+@pytest.mark.parametrize("times", [2, 3, 5])
+def test_copies_in_one_place_become_one(times):
+    params = shell()
+    change = merge_duplicates(copies(params, times))
+    assert len(change.parents) == 60 and change.fresh.all()
+    order = change.values["means"] @ torch.tensor([1.0, 10.0, 100.0])
+    for name in ("means", "logit_opacities", "sh0", "sh_rest"):
+        expected = params[name][(params["means"] @ torch.tensor([1.0, 10.0, 100.0])).argsort()]
+        torch.testing.assert_close(change.values[name][order.argsort()], expected, atol=1e-4, rtol=1e-4)  # float32 logits
+    growth = (change.values["log_scales"] - params["log_scales"][change.parents % 60]).mean(1)
+    assert (growth > 0).all() and (growth < 0.4).all()  # together they fall off more slowly
+    assert simplify.psnr(picture(change.values), picture(copies(params, times))) > 40
+
+
+def test_copies_a_little_apart_become_one_that_looks_like_both():
+    params = shell()
+    both = copies(params, 2)
+    away = torch.randn(120, 3, generator=torch.Generator().manual_seed(1)).clamp(-1.5, 1.5)
+    both["means"] = both["means"] + 0.2 * both["log_scales"].exp().amin(1, keepdim=True) * away
+    change = merge_duplicates(both)
+    assert len(change.parents) == 60
+    assert simplify.psnr(picture(change.values), picture(both)) > 28  # where neighbours overlap, another one is in front
+
+
+def test_what_is_no_duplicate_stays_bit_for_bit():
+    params = shell()
+    change = merge_duplicates(params)
+    assert not change.fresh.any() and torch.equal(change.parents, torch.arange(60))
+    assert all(torch.equal(change.values[name], params[name]) for name in params)
+
+
+@pytest.mark.parametrize(
+    ("name", "offset"), [("sh0", 1.5), ("log_scales", torch.tensor([0.0, 1.0, 0.0])), ("means", torch.tensor([0.1, 0.0, 0.1]))]
+)
+def test_another_colour_size_or_place_is_no_duplicate(name, offset):
+    params = {key: value[:1].repeat(2, *[1] * (value.dim() - 1)) for key, value in shell().items()}
+    assert len(merge_duplicates(params).parents) == 1
+    params[name][1] += offset
+    assert len(merge_duplicates(params).parents) == 2
+
+
+def test_a_floor_holds_and_the_cheapest_go_first():
+    params = copies(shell(), 2)
+    params["sh0"][60:90] += 0.2  # duplicates still, but dearer ones
+    change = merge_duplicates(params, at_least=90)
+    assert len(merge_duplicates(params, at_least=200).parents) == 120
+    assert len(change.parents) == 90 and set(change.parents[change.fresh].tolist()) == set(range(30, 60))
+
+
+def test_a_chain_of_neighbours_does_not_become_one():
+    """Each is like the next, but the first isn't like the last."""
+    one = {name: value[:1].repeat(40, *[1] * (value.dim() - 1)) for name, value in shell().items()}
+    one["quats"], one["log_scales"][:] = torch.tensor([[1.0, 0, 0, 0]]).repeat(40, 1), -2.0
+    one["means"] = torch.arange(40)[:, None] * torch.tensor([[0.05, 0.0, 0.0]])
+    assert 10 <= len(merge_duplicates(one).parents) <= 20
+
+
+def test_few_and_unusable_gaussians():
+    params = shell(2)
+    assert len(merge_duplicates({name: value[:1] for name, value in params.items()}).parents) == 1
+    assert len(merge_duplicates({name: value[:0] for name, value in params.items()}, at_least=0).parents) == 0
+    same = copies(shell(3), 2)
+    same["means"][0], same["quats"][4], same["log_scales"][2] = float("nan"), float("nan"), torch.tensor([-30.0, -30, 3])
+    assert len(merge_duplicates(same).parents) == 6
