@@ -6,7 +6,7 @@ ENVIRON = OMP_WAIT_POLICY=passive
 # without the CPU kernel (no C++ compiler) plain torch draws, and the demo is smaller
 SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import available_backends as b; print("--config configs/demo-small.yaml" if b()["cpu"] else "")')
 
-.PHONY: demo test stability fuzz ablations bench gpu-check charts measure-charts clean
+.PHONY: demo test stability fuzz long-run ablations bench gpu-check charts measure-charts clean
 
 demo: $(VENV)/ready                ## train the bundled toy from a coarse prior, offline, on the CPU
 	$(ENVIRON) $(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
@@ -20,6 +20,9 @@ stability: $(VENV)/ready-for-tests          ## every known way to fail, provoked
 
 fuzz: $(VENV)/ready-for-tests               ## damaged files at every door, hostile Gaussians, random lives of a cloud; about half an hour
 	$(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python benchmarks/fuzz.py
+
+long-run: $(VENV)/ready            ## 20,000 steps with 50 random kills, against the undisturbed run; a quarter of an hour
+	$(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python benchmarks/long_run.py
 
 ablations: $(VENV)/ready           ## the paper's ablations as a table, measured against a known truth
 	$(ENVIRON) $(BIN)/python benchmarks/ablations.py

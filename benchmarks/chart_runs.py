@@ -17,6 +17,7 @@ from runs import CHARTS, rows_of
 
 Row = dict[str, str]
 TUNED_ON = "toy"
+PAPER = "the paper's recipe"
 
 
 class Chart(NamedTuple):
@@ -31,17 +32,28 @@ class Chart(NamedTuple):
     per_variant: str = "variant"
     """The column that tells one line from the next."""
     log_x: bool = True
+    marks_paper: bool = False
+    """Whether the end of the paper's recipe is drawn from the chart ``count``."""
 
 
 DECIBEL = "held-out PSNR, dB"
+SECONDS = "CPU seconds of training, one thread"
 RUNS = {
-    "time": Chart("What each kind of score buys per second", "cpu_seconds", "CPU seconds of training, one thread", curves=True),
+    "time": Chart("What each kind of score buys per second", "cpu_seconds", SECONDS, curves=True),
     "count": Chart("How many Gaussians a scene needs", "gaussians", "Gaussians at the end", curves=False),
-    "size": Chart("What rendering larger buys", "cpu_seconds", "CPU seconds of training, one thread", curves=False),
-    "batch": Chart("Views per step, at equal rendered views", "cpu_seconds", "CPU seconds of training, one thread", True, per_variant="x"),
+    "size": Chart("What rendering larger buys", "cpu_seconds", SECONDS, curves=False, marks_paper=True),
+    "batch": Chart(
+        "Views per step, at equal rendered views",
+        "cpu_seconds",
+        "CPU seconds of training, one thread",
+        True,
+        per_variant="x",
+        marks_paper=True,
+    ),
     "iterations": Chart("What more steps buy", "x", "steps", curves=False),
-    "quality": Chart("Draft, default and best", "cpu_seconds", "CPU seconds of training, one thread", curves=True),
-    "preset": Chart("What the rasteriser's presets buy", "cpu_seconds", "CPU seconds of training, one thread", curves=True),
+    "dilation": Chart("What a smaller screen-space dilation buys", "x", "dilation, square pixels", curves=False),
+    "quality": Chart("Draft, default and best", "cpu_seconds", SECONDS, curves=True),
+    "preset": Chart("What the rasteriser's presets buy", "cpu_seconds", SECONDS, curves=True, marks_paper=True),
 }
 
 
@@ -51,7 +63,12 @@ def main() -> None:
     for name in parser.parse_args().charts or RUNS:
         rows = rows_of(name)
         if rows:
-            print(draw(name, RUNS[name], rows))
+            print(draw(name, RUNS[name], rows + papers_own(RUNS[name])))
+
+
+def papers_own(chart: Chart) -> list[Row]:
+    """Where the paper's recipe ends, for charts that have no runs of it."""
+    return [row for row in rows_of("count") if row["variant"] == PAPER and row["step"] != "0"] if chart.marks_paper else []
 
 
 def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
@@ -80,19 +97,24 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
 
 def draw_panel(panel: Any, chart: Chart, rows: list[Row]) -> None:
     """All lines of one object, in the order of the CSV."""
+    from matplotlib import ticker
+
     for index, (label, chosen) in enumerate(grouped(rows, lambda row: label_of(chart, row)).items()):
-        paper = "paper" in label
+        paper = PAPER in label
         style: dict[str, Any] = {"color": "0.15" if paper else f"C{index}", "label": label}
         (draw_curve if chart.curves else draw_points)(panel, chart, chosen, style, "*" if paper else "o")
     if chart.log_x:
         panel.set_xscale("log")
+        panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+        panel.xaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+        panel.xaxis.set_minor_formatter(ticker.NullFormatter())
     panel.set_xlabel(chart.x_label)
     panel.grid(alpha=0.25)
     panel.spines[["top", "right"]].set_visible(False)
 
 
 def label_of(chart: Chart, row: Row) -> str:
-    return row["variant"] if chart.per_variant == "variant" else f"{row['x']} views a step"
+    return row["variant"] if chart.per_variant == "variant" or row["variant"] == PAPER else f"{row['x']} views a step"
 
 
 def draw_curve(panel: Any, chart: Chart, rows: Iterable[Row], style: dict[str, Any], marker: str) -> None:

@@ -1,6 +1,7 @@
 """Wrong input as a stranger gives it: one message, exit code 2, before any long work, nothing left behind, no traceback."""
 
 import dataclasses
+import json
 import os
 import shutil
 import signal
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import evaluate, experiment, host, register_parts
+from threestudio_gaussiandreamer import evaluate, experiment, host, register_parts, trial
 from threestudio_gaussiandreamer.builtin.types import check_types
 from threestudio_gaussiandreamer.config import load_config
 from threestudio_gaussiandreamer.config_check import check_part
@@ -92,7 +93,12 @@ def assert_refused(code: int, err: str, message: str) -> None:
         ("system.geometry.lr_means=-1", "system.geometry.lr_means: expected values of 0 or more"),
         ("system.geometry.densify={enabled: true, start: 9, stop: 9}", "expected start < stop"),
         ("system.geometry.densify.min_opacity=1", "system.geometry.densify.min_opacity"),
+        ("system.geometry.max_gaussians=1", "error: system.geometry: expected 0 < min_gaussians <= max_gaussians"),
         ("system.geometry.prior.up=+w", "unknown up axis '+w'"),
+        ("system.geometry.prior.scale=0", "system.geometry.prior.scale: expected a number above 0"),
+        ("system.guidance.up=w", "unknown system.guidance.up 'w'"),
+        ("system.guidance.front=x", "unknown system.guidance.front 'x': did you mean"),
+        ("system.guidance.scale=0", "system.guidance.scale: expected more than 0"),
         ("system.renderer.eps2d=-1", "system.renderer.eps2d: expected 0 or more"),
         ("system.renderer.radius=0", "system.renderer.radius: expected a positive number"),
         ("system.material.color_activation=relu", "unknown system.material.color_activation 'relu'"),
@@ -302,3 +308,37 @@ def test_a_signal_while_the_test_views_are_rendered_leaves_a_checkpoint_and_says
     shutil.rmtree(TRIAL / "save")
     assert launch(f"resume={last}")[0] == 0
     assert (TRIAL / "save" / "it2-export" / "gaussians.ply").is_file()
+
+
+# -- runs that meet --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_second_run_in_a_folder_is_refused_while_the_first_one_trains(launch):
+    TRIAL.mkdir(parents=True)
+    with trial.sole_run(TRIAL):
+        code, err = launch()
+    assert code == 2 and f"another run is training in {TRIAL}" in err and not list(TRIAL.iterdir())
+    assert launch()[0] == 0
+
+
+def test_a_run_that_is_resumed_at_its_end_is_measured(launch):
+    """Also where the result's numbers aren't: in another folder, or because the first run was killed before it had them."""
+    assert launch()[0] == 0
+    code, err = launch(f"resume={TRIAL}/ckpts/last.ckpt", "tag=other")
+    assert code == 0 and "nothing is left to train" in err
+    first, other = (json.loads((folder / "save/metrics.json").read_text())["result"] for folder in (TRIAL, TRIAL.with_name("other")))
+    assert (other["step"], other["psnr"]) == (first["step"], first["psnr"])
+
+
+@pytest.mark.parametrize("stage", ["validate", "test", "export"])
+def test_nothing_to_resume_is_nothing_to_show(stage, launch):
+    """Only training can start anew; an untrained cloud would pass for the result."""
+    assert_refused(*launch("resume=auto", stage=f"--{stage}"), f"resume=auto: there is no checkpoint to --{stage}")
+
+
+def test_a_closed_pipe_is_no_traceback(monkeypatch, capsys):
+    closed = []
+    monkeypatch.setattr(experiment, "run", lambda *args: (_ for _ in ()).throw(BrokenPipeError(32, "Broken pipe")))
+    monkeypatch.setattr(os, "dup2", lambda _, to: closed.append(to))
+    assert experiment.main(["--config", str(DEMO), "--train"]) == 128 + signal.SIGPIPE
+    assert closed == [1] and "nobody reads this run's output any more" in capsys.readouterr().err

@@ -282,7 +282,7 @@ def test_every_misspelt_key_is_rejected_with_the_right_one(folder, key):
         ("system.geometry.sise=3", "unknown key 'system.geometry.sise': did you mean 'system.geometry.size'?"),
         ("system.geometry.prior.cuont=3", "unknown key 'system.geometry.prior.cuont': did you mean 'system.geometry.prior.count'?"),
         ("system.geometry.size=big", "system.geometry.size: Value 'big'"),
-        ("system.geometry.prior.count=0", "system.geometry.prior: count: expected at least 1, got 0"),
+        ("system.geometry.prior.count=0", "system.geometry.prior.count: expected at least 1, got 0"),
         ("system.geometry.prior_type=tiny-piror", "system.geometry.prior_type: unknown part 'tiny-piror': did you mean 'tiny-prior'"),
         ("system.geometry_type=tiny-geomerty", "system.geometry_type: unknown part"),
         ("system_type=tiny-sistem", "system_type: unknown part 'tiny-sistem': did you mean 'tiny-system'"),

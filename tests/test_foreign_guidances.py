@@ -100,7 +100,11 @@ def test_each_signature_gets_what_it_takes():
 
 @pytest.mark.parametrize(
     "returned, message",
-    [(torch.zeros(3), "returned Tensor"), ({"loss_sds": torch.zeros(4)}, r"returned loss_sds of shape \(4,\)"), (None, "returned NoneType")],
+    [
+        (torch.zeros(3), "returned Tensor"),
+        ({"loss_sds": torch.zeros(4)}, r"returned loss_sds of shape \(4,\)"),
+        (None, "returned NoneType"),
+    ],
 )
 def test_what_no_run_could_use_is_named(returned, message):
     class Odd:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import simplify
+from threestudio_gaussiandreamer import merging, simplify
 from threestudio_gaussiandreamer.merging import merge_duplicates
 from threestudio_gaussiandreamer.simplify import Cloud
 
@@ -100,6 +100,14 @@ def test_a_floor_holds_and_the_cheapest_go_first():
     change = merge_duplicates(params, at_least=90)
     assert len(merge_duplicates(params, at_least=200).parents) == 120
     assert len(change.parents) == 90 and set(change.parents[change.fresh].tolist()) == set(range(30, 60))
+
+
+def test_many_copies_in_one_place_take_few_rounds(monkeypatch):
+    """All have the same nearest: pairs of these alone would be one or two a round."""
+    rounds = []
+    monkeypatch.setattr(merging, "_merged", lambda *args, once=merging._merged: rounds.append(len(args[2])) or once(*args))
+    one = {name: value[:1] for name, value in shell().items()}
+    assert len(merge_duplicates(copies(one, 400)).parents) <= 4 and len(rounds) <= 20
 
 
 def test_a_chain_of_neighbours_does_not_become_one():

@@ -311,6 +311,16 @@ def test_the_bundled_toy_is_found_by_its_name_and_faces_the_front(tmp_path, monk
     assert len(load_mesh("toy.glb").faces) == 12  # a file of that name comes first
 
 
+@pytest.mark.parametrize("name", ["toyy.glb", "to.glb", "Toy.glb", "nowhere/toy.glb"])
+def test_a_bundled_mesh_is_suggested_for_a_misspelt_one(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="did you mean the bundled 'toy.glb'"):
+        load_mesh(name)
+    saved(box(), tmp_path / "toys.glb")
+    with pytest.raises(UserError, match="bundled" if "/" in name else "near names in '.': toys.glb"):
+        load_mesh(name)
+
+
 @pytest.mark.parametrize(("name", "front", "faces"), [("spot", "-z", 5856), ("duck", "+x", 4212)])
 def test_shared_meshes(shared_folder, name, front, faces):
     mesh = load_mesh(shared_folder / "assets" / f"{name}.glb", front=front)

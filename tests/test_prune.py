@@ -1,6 +1,7 @@
 """The prune command: budgets are met on unseen views, a second run changes nothing, and mistakes cost no work."""
 
 import json
+import math
 
 import pytest
 import torch
@@ -117,6 +118,41 @@ def test_gsplats_checkpoints_are_read(source, tmp_path):
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
+def test_gaussians_that_cannot_be_drawn_are_left_out(tmp_path, caplog):
+    cloud = ball()
+    cloud.means[3], cloud.sh[5] = float("nan"), float("inf")
+    write_gaussians(tmp_path / "in.ply", **arrays_of(cloud))
+    splats = {"means": cloud.means, "quats": cloud.quats, "scales": cloud.log_scales, "opacities": cloud.logit_opacities}
+    torch.save({"splats": splats | {"sh0": cloud.sh, "shN": torch.zeros(600, 0, 3)}}, tmp_path / "in.pt")
+    for name in ("in.ply", "in.pt"):
+        assert run(tmp_path / name, tmp_path / "out.ply", "--count", "300", "--up", "z")["before"]["gaussians"] == 598
+    assert caplog.text.count("2 of 600 Gaussians hold NaN or infinity: left out") == 2
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3])
+def test_clouds_in_other_units_look_alike(unit):
+    """No plane of the camera cuts a cloud in millimetres away."""
+    cloud = ball()
+    other = cloud._replace(means=cloud.means * unit, log_scales=cloud.log_scales + math.log(unit))
+    ours, theirs = (simplify.look(each, simplify.views_around(each, 6, 48))[0] for each in (cloud, other))
+    assert simplify.psnr(theirs, ours) > 60
+
+
+def test_a_cloud_that_shows_nothing_is_refused(tmp_path, capsys):
+    write_gaussians(tmp_path / "in.ply", **arrays_of(ball()._replace(logit_opacities=torch.full((600,), -20.0))))
+    assert prune.main([str(tmp_path / "in.ply"), str(tmp_path / "out.ply"), "--psnr", "40", *FAST]) == 2
+    assert "none of the 600 Gaussians is to be seen" in capsys.readouterr().err
+
+
+def test_ctrl_c_leaves_nothing_behind(source, tmp_path, monkeypatch, capsys):
+    def interrupted(*args, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(simplify, "recover", interrupted)
+    assert prune.main([str(source), str(tmp_path / "out.ply"), "--count", "300", *FAST]) == 130
+    assert "stopped" in capsys.readouterr().err and [path.name for path in tmp_path.iterdir()] == ["in.ply"]
+
+
 def test_a_checkpoint_without_gaussians_is_refused(tmp_path, capsys):
     torch.save({"state_dict": {"weight": torch.zeros(3)}}, tmp_path / "a.ckpt")
     assert prune.main([str(tmp_path / "a.ckpt"), str(tmp_path / "out.ply"), "--count", "9"]) == 2
@@ -182,7 +218,9 @@ def test_the_likeness_that_loses_a_tenth_of_a_decibel():
         (["--bytes", "1"], "--bytes, in Gaussians,"),
         (["--psnr", "nan"], "--psnr: expected a number"),
         (["--psnr", "-3"], "--psnr: expected a number above 0"),
-        (["--within", "0"], "--within: expected a number above 0"),
+        (["--within", "0"], "--within: expected a loss from 0.001 to 30 dB, got 0"),
+        (["--within", "5000"], "--within: expected a loss"),
+        (["--within", "0.1", "--quality", "nan"], "--quality: expected a number"),
     ],
 )
 def test_a_wrong_budget_is_refused_before_any_work(source, tmp_path, capsys, options, said):
@@ -195,6 +233,13 @@ def test_a_missing_file_and_a_wrong_name(source, tmp_path, capsys):
     assert "in.ply" in capsys.readouterr().err  # the near name
     assert prune.main([str(source), str(tmp_path / "out.obj"), "--count", "9"]) == 2
     assert "expected the name of a .ply or .spz file" in capsys.readouterr().err
+
+
+def test_a_folder_in_the_place_of_the_output_costs_no_work(source, tmp_path, capsys, monkeypatch):
+    monkeypatch.delattr(prune, "read")
+    (tmp_path / "out.ply").mkdir()
+    assert prune.main([str(source), str(tmp_path / "out.ply"), "--count", "9"]) == 2
+    assert "out.ply' can't be written" in capsys.readouterr().err
 
 
 def test_a_budget_is_needed_and_only_one(source, tmp_path, capsys):

@@ -139,8 +139,10 @@ def test_a_wrong_pruning_budget_is_found_before_the_run(tmp_path, painted_box, c
     assert said in capsys.readouterr().err
 
 
-DENSIFY = ["system.geometry.densify.enabled=true", "system.geometry.densify.start=2", "system.geometry.densify.stop=8",
-           "system.geometry.densify.every=2", "system.geometry.densify.grad_threshold=1e-4", "system.geometry.densify.min_opacity=0.01"]  # fmt: skip
+DENSIFY = [
+    f"system.geometry.densify.{option}"
+    for option in ("enabled=true", "start=2", "stop=8", "every=2", "grad_threshold=1e-4", "min_opacity=0.01")
+]
 
 
 @pytest.mark.parametrize("stop", [3, 4, 5])

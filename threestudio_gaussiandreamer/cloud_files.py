@@ -4,6 +4,7 @@ A PLY keeps the cloud's own axes and says in a comment which of them is up; SPZ 
 doesn't say, the custom of its format holds: in an SPZ file y is up, in a PLY -y.
 """
 
+import logging
 import re
 from math import isqrt
 from pathlib import Path
@@ -19,6 +20,7 @@ from .ply import GaussianArrays, read_comments, read_gaussians, usable, write_ga
 from .sh import sh_basis
 from .spz import read_spz, read_spz_comment, spz_arrays, spz_bytes, write_spz
 
+logger = logging.getLogger(__name__)
 UP, PRUNED = "up:", "pruned to the likeness, dB:"
 OUR_UP = "z"
 CUSTOMARY_UP = {".ply": "-y", ".spz": "y"}
@@ -71,8 +73,15 @@ def read_cloud(path: str, *, up: Optional[str] = None) -> StoredCloud:
     up = up or (stated if stated in AXES else CUSTOMARY_UP[suffix])
     if up not in AXES:
         raise unknown("axis", up, AXES)
+    return StoredCloud(drawable(arrays), up, _number(_note(notes, PRUNED)))
+
+
+def drawable(arrays: GaussianArrays) -> GaussianArrays:
+    """The Gaussians that can be drawn; says how many can't."""
     keep = usable(arrays)
-    return StoredCloud(GaussianArrays(*(values[keep] for values in arrays)), up, _number(_note(notes, PRUNED)))
+    if not keep.all():
+        logger.warning("%d of %d Gaussians hold NaN or infinity: left out", (~keep).sum(), len(keep))
+    return GaussianArrays(*(values[keep] for values in arrays))
 
 
 def _note(notes: list[str], key: str) -> str:

@@ -113,8 +113,11 @@ def _typed(path: str, values: Any, config_class: type) -> DictConfig:
         try:
             config_class.check(cfg)
         except UserError as error:
-            # a part may know its path in the configuration or not
-            raise error if str(error).startswith(f"{path}.") else UserError(f"{path}: {error}") from error
+            # a part may know its path in the configuration or not; some begin with the key
+            if str(error).startswith((f"{path}.", f"{path}:")):
+                raise
+            joint = "." if str(error).partition(": ")[0] in cfg else ": "
+            raise UserError(f"{path}{joint}{error}") from error
     return cfg
 
 

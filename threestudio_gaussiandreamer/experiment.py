@@ -41,7 +41,7 @@ def console() -> None:
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run one command line (default: this process's); returns the exit code.
 
-    0 done; 2 something the user can mend, said in one message; 130 and 143 stopped by Ctrl-C and SIGTERM.
+    0 done; 2 something the user can mend, said in one message; 130, 141 and 143 stopped by Ctrl-C, a closed pipe and SIGTERM.
     """
     # idle OpenMP threads that spin make a busy machine many times slower; torch reads this when it is imported
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -58,6 +58,13 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
             traceback.print_exc()
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError as error:
+        # who read our output has gone, as `| head` does; what is still in its buffer would fail anew at the end
+        if args.verbose:
+            traceback.print_exc()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        print(f"stopped: nobody reads this run's output any more ({error.strerror})", file=sys.stderr)
+        return 128 + signal.SIGPIPE
     except (KeyboardInterrupt, Terminated) as stop:
         print("stopped", file=sys.stderr)
         return stop.code if isinstance(stop, Terminated) else 128 + signal.SIGINT

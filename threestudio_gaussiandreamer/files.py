@@ -2,7 +2,7 @@
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
@@ -11,8 +11,11 @@ from typing import BinaryIO
 from .errors import UserError
 
 
-def existing_file(path: str | os.PathLike, kind: str) -> Path:
+def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] = ()) -> Path:
     """``path`` as a :class:`Path` when a file is there; ``kind`` ("mesh", "PLY file") names it in the message.
+
+    Args:
+        bundled: bare names of files that come along, for the message only.
 
     Raises:
         UserError: nothing, or no file, is there; the message lists the files of that folder with near names.
@@ -22,19 +25,22 @@ def existing_file(path: str | os.PathLike, kind: str) -> Path:
         if path.is_file():
             return path
         reason = "is a folder, not a file" if path.is_dir() else "does not exist"
-        neighbours = near_names(path)
+        neighbours = near_names(path, bundled)
     except (OSError, ValueError, RuntimeError) as error:  # a name too long, a NUL inside, a "~stranger"
         raise UserError(f"{kind} {str(path)!r}: not a usable file name ({error}).") from error
     raise UserError(f"{kind} {str(path)!r} {reason}{neighbours}")
 
 
-def near_names(path: Path) -> str:
-    """The end of a "missing" message: the files beside ``path`` with near names or of its kind."""
+def near_names(path: Path, bundled: Collection[str] = ()) -> str:
+    """The end of a "missing" message: the files beside ``path`` with near names or of its kind, or a bundled one that may be meant."""
     folder = path.parent
+    names = sorted(entry.name for entry in folder.iterdir() if entry.is_file()) if folder.is_dir() else []
+    near = get_close_matches(path.name, names, n=3, cutoff=0.5)
+    if not near and (meant := get_close_matches(path.name, bundled, n=1, cutoff=0.5)):
+        return f"; did you mean the bundled {meant[0]!r}?"
     if not folder.is_dir():
         return f": there is no folder {str(folder)!r} either."
-    names = sorted(entry.name for entry in folder.iterdir() if entry.is_file())
-    near = get_close_matches(path.name, names, n=3, cutoff=0.5) or [name for name in names if Path(name).suffix == path.suffix][:3]
+    near = near or [name for name in names if Path(name).suffix == path.suffix][:3]
     return f"; near names in {str(folder)!r}: {', '.join(near)}." if near else f"; no file in {str(folder)!r} has a near name."
 
 

@@ -66,7 +66,7 @@ def load_mesh(path: str | Path, *, scale: float = 1.0, up: str = "auto", front: 
     Raises:
         UserError: missing, unreadable, unknown format, no faces, > 5 % non-finite vertices, no extent, bad ``up``/``front``.
     """
-    path = existing_file(find_mesh(path), "mesh")
+    path = existing_file(find_mesh(path), "mesh", bundled_meshes())
     if not scale > 0:
         raise UserError(f"the scale of a mesh must be greater than 0, not {scale}")
     rotation = _pose(_extension(path), up, front)
@@ -141,6 +141,11 @@ def find_mesh(path: str | Path) -> Path:
     """The path itself, or the bundled mesh of that bare name where there is no such file."""
     bundled = ASSETS / Path(path).name
     return bundled if str(path) == bundled.name and bundled.is_file() and not Path(path).exists() else Path(path)
+
+
+def bundled_meshes() -> list[str]:
+    """The bare names of the meshes that come along."""
+    return sorted(file.name for file in ASSETS.glob("*.glb"))
 
 
 # Reading -------------------------------------------------------------------------------------------------------------

@@ -13,7 +13,9 @@ it would measure against the pruned cloud.
 import argparse
 import json
 import math
+import os
 import re
+import signal
 import statistics
 import sys
 import time
@@ -27,7 +29,18 @@ from torch import Tensor
 
 from .builtin.pictures import write as write_picture
 from .builtin.weights import load_file
-from .cloud_files import AXES, OUR_UP, StoredCloud, as_stored, file_size, read_cloud, require_format, rotation_between, write_cloud
+from .cloud_files import (
+    AXES,
+    OUR_UP,
+    StoredCloud,
+    as_stored,
+    drawable,
+    file_size,
+    read_cloud,
+    require_format,
+    rotation_between,
+    write_cloud,
+)
 from .errors import UserError
 from .files import existing_file
 from .host import get_device
@@ -44,6 +57,8 @@ CHECKPOINTS = {
 }
 """Where the cloud is in a checkpoint of ours, and of gsplat's trainer."""
 BUDGETS = ("count", "bytes", "psnr", "within")
+LOSSES = (1e-3, 30.0)
+"""What may be asked of ``within``, dB."""
 
 
 @dataclass
@@ -69,6 +84,7 @@ class PruneOptions:
             raise UserError(f"{where}{given[0]} and {where}{given[1]}: give one budget")
         if self.size < 16 or self.steps < 1:
             raise UserError(f"{where}size and {where}steps: expected at least 16 and 1, got {self.size} and {self.steps}")
+        number(self.quality, f"{where}quality", "dB")
         budget_of(self, where)
 
 
@@ -89,7 +105,7 @@ class Cost(NamedTuple):
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line; returns the exit code: 0 done, 2 something the user can mend."""
+    """Run one command line; returns the exit code: 0 done, 2 something the user can mend, 130 Ctrl-C."""
     try:
         args = parse(argv)
     except SystemExit as stop:
@@ -99,6 +115,9 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 128 + signal.SIGINT
     return 0
 
 
@@ -123,8 +142,11 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     options = PruneOptions(**{field.name: getattr(args, field.name) for field in fields(PruneOptions)})
     options.check("--")
     suffix = require_format(args.output, "OUT")
-    if not Path(args.output).parent.is_dir():
-        raise UserError(f"OUT: there is no folder {str(Path(args.output).parent)!r}")
+    folder = Path(args.output).parent
+    if not folder.is_dir():
+        raise UserError(f"OUT: there is no folder {str(folder)!r}")
+    if Path(args.output).is_dir() or not os.access(folder, os.W_OK):
+        raise UserError(f"OUT: {args.output!r} can't be written")
     done = pruned(read(args.source, args.up), options, suffix, "--")
     write_cloud(args.output, done.after)
     return write_report(args.output, done, suffix, options)
@@ -140,7 +162,7 @@ def read(path: str, up: Optional[str] = None) -> StoredCloud:
         UserError: there is no file, it holds no Gaussians, or fewer than two.
     """
     file = existing_file(path, "file of Gaussians or checkpoint")
-    stored = StoredCloud(from_checkpoint(file), up or OUR_UP) if file.suffix in (".ckpt", ".pt") else read_cloud(path, up=up)
+    stored = StoredCloud(drawable(from_checkpoint(file)), up or OUR_UP) if file.suffix in (".ckpt", ".pt") else read_cloud(path, up=up)
     if len(stored.arrays.means) < 2:
         raise UserError(f"{path} holds {len(stored.arrays.means)} Gaussians that can be drawn: there is nothing to prune")
     return stored
@@ -172,7 +194,10 @@ def budget_of(options: PruneOptions, where: str, each: float = 1.0, header: int 
     if options.psnr is not None:
         return Budget(psnr=positive(number(options.psnr, f"{where}psnr", "dB"), f"{where}psnr"))
     if options.within is not None:
-        return Budget(psnr=likeness_within(positive(number(options.within, f"{where}within", "dB"), f"{where}within"), options.quality))
+        loss = number(options.within, f"{where}within", "dB")
+        if not LOSSES[0] <= loss <= LOSSES[1]:
+            raise UserError(f"{where}within: expected a loss from {LOSSES[0]:g} to {LOSSES[1]:g} dB, got {loss:g}")
+        return Budget(psnr=likeness_within(loss, options.quality))
     return Budget()
 
 
@@ -295,8 +320,8 @@ def write_report(path: str, done: Pruned, suffix: str, options: PruneOptions) ->
 
 
 def sheet(pictures: list[Tensor]) -> Any:
-    """Six views in a row, a row for each cloud, as bytes."""
-    rows = [torch.cat(list(images[:: max(1, len(images) // 6)][:6]), 1) for images in pictures]
+    """Six views from below to above in a row, a row for each cloud, as bytes."""
+    rows = [torch.cat(list(images[torch.linspace(0, len(images) - 1, 6).long()]), 1) for images in pictures]
     return (torch.cat(rows, 0).clamp(0, 1).cpu().numpy() * 255).round().astype("uint8")
 
 
@@ -304,7 +329,8 @@ def frame_time(cloud: Cloud, views: Views) -> float:
     """Milliseconds of one view, the median."""
     times = []
     for view in range(min(5, len(views.viewmats))):
-        one = Views(views.viewmats[view : view + 1], views.Ks[view : view + 1], views.positions[view : view + 1], views.size)
+        row = slice(view, view + 1)
+        one = views._replace(viewmats=views.viewmats[row], Ks=views.Ks[row], positions=views.positions[row])
         started = time.perf_counter()
         look(cloud, one)[0].sum().item()
         times.append(time.perf_counter() - started)

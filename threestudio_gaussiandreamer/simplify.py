@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .cameras import Orbit, intrinsics, to_opencv
+from .errors import UserError
 from .merging import merge_duplicates
 from .metrics import psnr
 from .sh import sh_to_colors
@@ -28,6 +29,8 @@ SMALLEST_DROP = 0.01
 RATES = {"means": 2e-4, "quats": 4e-3, "log_scales": 1e-2, "logit_opacities": 2e-2, "sh": 5e-3}
 """Adam's; that of the means in units of the cloud's radius."""
 FOVY = math.radians(50.0)
+NEAR = 0.01
+"""The nearest depth that is drawn, in units of the cloud's radius: clouds come in millimetres and in kilometres."""
 
 
 class Cloud(NamedTuple):
@@ -47,6 +50,8 @@ class Views(NamedTuple):
     Ks: Float[Tensor, "V 3 3"]
     positions: Float[Tensor, "V 3"]
     size: int
+    near: float = NEAR
+    """The nearest depth that is drawn."""
 
 
 class Budget(NamedTuple):
@@ -69,7 +74,7 @@ def bounds(cloud: Cloud) -> tuple[Float[Tensor, "3"], float]:
     weights = cloud.logit_opacities.sigmoid()
     centre = torch.stack([_quantile(axis, weights, 0.5) for axis in cloud.means.unbind(1)])
     distances = (cloud.means - centre).norm(dim=1) + cloud.log_scales.exp().amax(1)
-    return centre, float(_quantile(distances, weights, 0.99).clamp_min(1e-6))
+    return centre, float(_quantile(distances, weights, 0.99).clamp_min(1e-12))
 
 
 def _quantile(values: Float[Tensor, " N"], weights: Float[Tensor, " N"], share: float) -> Tensor:
@@ -94,7 +99,7 @@ def views_around(cloud: Cloud, count: int, size: int, *, turn: float = 0.0, to_z
     c2w[:, :3, 3] += centre
     fovy = torch.full((count,), FOVY, device=centre.device)
     viewmats, _ = to_opencv(c2w, fovy, size, size)
-    return Views(viewmats, intrinsics(fovy, size, size), c2w[:, :3, 3], size)
+    return Views(viewmats, intrinsics(fovy, size, size), c2w[:, :3, 3], size, NEAR * radius)
 
 
 def draw(cloud: Cloud, views: Views, rows: Tensor, *, preset: str = "balanced") -> tuple[Tensor, Tensor]:
@@ -104,7 +109,7 @@ def draw(cloud: Cloud, views: Views, rows: Tensor, *, preset: str = "balanced") 
     grey = torch.full((3,), 0.5, device=cloud.means.device)  # neither dark nor bright Gaussians vanish before it
     out = rasterize(
         cloud.means, cloud.quats, cloud.log_scales.exp(), cloud.logit_opacities.sigmoid(), colors, views.viewmats[rows], views.Ks[rows],
-        views.size, views.size, background=grey, preset=preset,
+        views.size, views.size, background=grey, near=views.near, preset=preset,
     )  # fmt: skip
     return out.image, out.contribution
 
@@ -148,8 +153,13 @@ def simplify(
         report: called after each round that was kept.
         stored: what the file to be written makes of a cloud, which is what a budget of quality is measured on.
         sh_reach: the largest constant harmonic, either way, that the file holds.
+
+    Raises:
+        UserError: nothing of the cloud is to be seen, so that nothing says which Gaussians to keep.
     """
     (pictures, contribution), before = look(cloud, probes), look(cloud, judges)[0]
+    if not contribution.any():
+        raise UserError(f"none of the {len(cloud.means)} Gaussians is to be seen from around: nothing says which ones to keep")
 
     def refitted(cloud: Cloud) -> tuple[Cloud, Round]:
         cloud = recover(cloud, probes, pictures, steps, seed + done, sh_reach)

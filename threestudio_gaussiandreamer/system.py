@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .background import FlatBackground
-from .cloud_files import OUR_UP, UP, StoredCloud, in_axes
+from .cloud_files import OUR_UP, UP, StoredCloud, drawable, in_axes
 from .distributed import all_sum, average_gradients
 from .errors import UserError, unknown
 from .evaluate import EvaluationConfig, HeldOut, Measurements
@@ -273,6 +273,10 @@ class GaussianDreamerSystem(BaseLift3DSystem):
     def on_train_end(self) -> None:
         if self.measurements:
             self.measurements.stop_clock()
+
+    def on_fit_end(self) -> None:
+        # also of a run that was resumed at its last step, which has no training to end
+        super().on_fit_end()
         self.score("result")
 
     def summary(self) -> str:
@@ -335,7 +339,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             return
         folder = f"it{self.true_global_step}-export/pruned"
         suffix = ".spz" if "spz" in self.cfg.exporter.get("formats", ()) else ".ply"
-        done = pruned(StoredCloud(gaussian_arrays(self.geometry)), options, suffix, "system.prune.")
+        done = pruned(StoredCloud(drawable(gaussian_arrays(self.geometry))), options, suffix, "system.prune.")
         geometry = find(self.cfg.geometry_type)(self.cfg.geometry)
         geometry.set_arrays(**done.after.arrays._asdict())
         self.export_cloud(geometry, folder)

@@ -6,6 +6,7 @@
 import argparse
 import contextlib
 import errno
+import os
 import shlex
 import shutil
 import tempfile
@@ -15,6 +16,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Optional
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+from .builtin.logs import get_rank
 from .builtin.weights import load_checkpoint
 from .callbacks import GracefulStop, ProgressBar, RunRecord, Stopped
 from .checkpoints import AtomicCheckpointIO
@@ -61,7 +68,8 @@ class Trial:
         """
         try:
             self.start()
-            with lightning_errors(self.cfg.resume), write_errors(self.folder):
+            alone = sole_run(self.folder) if self.args.stage == "train" else contextlib.nullcontext()
+            with alone, lightning_errors(self.cfg.resume), write_errors(self.folder):
                 getattr(self, self.args.stage)()
             self.summarize()
         except (UserError, KeyboardInterrupt, SystemExit) as stop:
@@ -93,6 +101,8 @@ class Trial:
         """The epoch and step of the checkpoint to resume from, which is read whole here so that damage shows early."""
         if self.cfg.resume is None:
             if self.args.stage != "train":
+                if "resume=auto" in self.args.overrides:
+                    raise UserError(f"resume=auto: there is no checkpoint to --{self.args.stage}; train first, or look at name and tag")
                 warn(f"no checkpoint given (resume=...): --{self.args.stage} shows what training would start from")
             return None
         checkpoint = load_checkpoint(self.cfg.resume)
@@ -207,6 +217,30 @@ def require_writable(folder: Path) -> None:
 def _unwritable(folder: Path, error: Exception, where: str = "") -> UserError:
     why = getattr(error, "strerror", None) or str(error)
     return UserError(f"the output folder {folder} can't be written: {why}{where}; choose another exp_root_dir")
+
+
+@contextlib.contextmanager
+def sole_run(folder: Path) -> Iterator[None]:
+    """Keeps other runs from training in a folder; the system lets go of it when this process ends, however it ends.
+
+    Raises:
+        UserError: another run trains in it.
+    """
+    if fcntl is None or get_rank():
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(descriptor)
+        raise UserError(f"another run is training in {folder}: wait until it ends, or choose another tag") from error
+    except OSError:
+        pass  # a file system without locks
+    try:
+        yield
+    finally:
+        os.close(descriptor)
 
 
 @contextlib.contextmanager

@@ -263,12 +263,10 @@ def test_the_table_of_five_seeds(measured):
     measured(100 * float(rows["random start"]["multi_face"]), "% multi-face", what="random start, five seeds of 1200 steps", at_least=50)
 
 
-@row("A4", "Colour drift, background shortcut", bar="alpha error mean <= 0.02; PSNR spread over 3 backgrounds <= 1.5 dB")
+@row("A4", "Colour drift, background shortcut")
 def test_the_cloud_is_the_same_thing_on_any_background(tmp_path, measured):
-    """The two bars contradict each other. On a background c the error is that of the colours minus c times that of alpha, so what differs
-    between backgrounds is the alpha error alone, mostly at the outline, weighed by how far the object's colour lies from c. The bundled
-    toy is light: with an alpha error of 0.015, well within the bar, white is 1.1 dB better than black, at 48 and at 128 pixels alike. A
-    run that is trained on black alone, as the paper's code, has 2 to 3 dB."""
+    """What differs between backgrounds is the alpha error alone, mostly at the outline: with the customary dilation of 0.3 square pixels
+    instead of the demo's 0.1 the spread is 1.1 dB, and 2 to 3 dB where a run is trained on black alone, as the paper's code is."""
     ended = trained(tmp_path, 300, 96, "system.geometry.prior.num_points=3000", "data.train_views=60")
     state = ended.checkpoint()["state_dict"]
     cloud = find("gaussiandreamer-cloud")({})
@@ -281,7 +279,7 @@ def test_the_cloud_is_the_same_thing_on_any_background(tmp_path, measured):
     truths = {name: over_background(held_out.truth, torch.tensor(color)) for name, color in backgrounds.items()}
     scores = [float(psnr(images[name].clamp(0, 1), truths[name])) for name in backgrounds]
     assert min(scores) > 25
-    measured(max(scores) - min(scores), "dB", what="spread over three backgrounds", at_most=1.5)
+    measured(max(scores) - min(scores), "dB", what="spread over three backgrounds", at_most=1.0)
 
 
 @torch.no_grad()
@@ -289,7 +287,7 @@ def drawn_on(cloud, orbit, background):
     c2w = orbit.c2w
     viewmats, Ks = cameras.to_opencv(c2w, orbit.fovy, 96, 96)
     gaussians = cloud.means, cloud.quats, cloud.scales(), cloud.opacities(), cloud.colors(c2w[:, :3, 3])
-    return rasterize(*gaussians, viewmats, Ks, 96, 96, background=background).image
+    return rasterize(*gaussians, viewmats, Ks, 96, 96, background=background, eps2d=0.1).image  # as demo.yaml draws
 
 
 # ---- cameras -------------------------------------------------------------------------------------------------------------------

@@ -53,6 +53,8 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
     """
     path = Path(path)
     if not path.is_file():
+        if path.is_dir():
+            raise UserError(f"{path} is a folder, not a checkpoint" + _siblings(path / "*"))
         raise UserError(f"there is no checkpoint {path}" + _siblings(path))
     _verify(path)
     try:

@@ -41,7 +41,7 @@ from ..cameras import OrbitRanges, camera_pool
 from ..errors import UserError, unknown
 from ..exact_score import LinearLatent, color_matrix, denoise, squared_distances
 from ..host import register
-from ..meshes import load_mesh
+from ..meshes import AXES, load_mesh
 from ..raycast import MeshCaster, TargetCache, over_background
 from ..view_prompts import view_directions
 from .base import ScoreDistillation
@@ -305,8 +305,8 @@ def _resized(images: Float[Tensor, "B c H W"], size: tuple[int, int]) -> Float[T
 
 
 def _check_choices(cfg: Any) -> None:
-    for name, choices in (("mode", MODES), ("space", SPACES)):
-        if cfg[name] not in choices:
+    for name, choices in (("mode", MODES), ("space", SPACES), ("up", ("auto", *AXES)), ("front", AXES)):
+        if cfg[name] is not None and cfg[name] not in choices:
             raise unknown(f"system.guidance.{name}", cfg[name], choices)
     if not cfg.mesh:
         raise UserError("system.guidance.mesh: give the path of the mesh whose pictures are the truth")
@@ -321,8 +321,9 @@ def _check_numbers(cfg: Any) -> None:
             raise UserError(f"system.guidance.{name}: expected 0 or more, got {cfg[name]}")
     if cfg.latent_channels < 3:
         raise UserError(f"system.guidance.latent_channels: expected at least 3, got {cfg.latent_channels}")
-    if not cfg.temperature > 0:
-        raise UserError(f"system.guidance.temperature: expected more than 0, got {cfg.temperature}")
+    for name in ("temperature", "scale"):
+        if not cfg[name] > 0:
+            raise UserError(f"system.guidance.{name}: expected more than 0, got {cfg[name]}")
     for name in ("bank_elevation_range", "bank_distance_range", "bank_fovy_range"):
         low, high = cfg[name]
         if not low <= high or (name != "bank_elevation_range" and low <= 0):
