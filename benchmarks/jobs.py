@@ -10,8 +10,9 @@ SECOND_STAGE = 500
 """The step from which the demo draws smaller timesteps."""
 COUNTS = (2500, 1500, 1000)
 NO_BUDGET = {"system.geometry.budget": "null"}
-PAPER = PAPER_RATES | NO_BUDGET | {"system.geometry.init_opacity": 0.1}
-"""The recipe of the paper: its learning rates and start, and no pruning by contribution."""
+SHARP_PAPER = PAPER_RATES | NO_BUDGET | {"system.geometry.init_opacity": 0.1}
+PAPER = SHARP_PAPER | {"system.renderer.eps2d": 0.3}
+"""The recipe of the paper: its learning rates, start and screen-space dilation, and no pruning. Sharp: with the demo's dilation, 0.1."""
 RATES = {
     "lr_means": (2e-4, 2e-5),
     "lr_scales": (6e-2, 1e-3),
@@ -77,13 +78,16 @@ def count_jobs() -> Iterator[Job]:
     """What a number of Gaussians can do, by the way it was reached; all with the same steps."""
     yield Job("count", "no pruning", 10000, NO_BUDGET)
     yield Job("count", "the paper's recipe", 10000, PAPER)
-    yield Job("count", "by contribution, auto", 0, {"system.geometry.budget": "auto"})
+    yield Job("count", "the paper's recipe, dilation 0.1", 10000, SHARP_PAPER)
+    yield Job("count", "by removal error, auto", 0, {"system.geometry.budget": "auto"})
     for count in COUNTS:
-        yield Job("count", "by contribution", count, {"system.geometry.budget": count})
+        yield Job("count", "by removal error", count, {"system.geometry.budget": count})
     for count in COUNTS[-2:]:
         yield Job("count", "from scratch", count, scratch(count))
-        yield Job("count", "by opacity", count, {"system.geometry.budget": count, "system.geometry.prune.score": "opacity"})
+        for score in ("contribution", "opacity"):
+            yield Job("count", f"by {score}", count, {"system.geometry.budget": count, "system.geometry.prune.score": score})
     yield Job("count", "at random", COUNTS[-2], {"system.geometry.budget": COUNTS[-2], "system.geometry.prune.score": "random"})
+    yield Job("count", "the paper's recipe, by removal error", COUNTS[-2], PAPER | {"system.geometry.budget": COUNTS[-2]})
 
 
 def size_jobs() -> Iterator[Job]:
@@ -119,16 +123,15 @@ def dilation_jobs() -> Iterator[Job]:
     for dilation in (0.03, 0.1, 0.3):
         for antialias, name in ((False, "plain"), (True, "antialiased")):
             yield Job("dilation", name, dilation, {"system.renderer.eps2d": dilation, "system.renderer.antialias": str(antialias).lower()})
-        yield Job("dilation", "the paper's recipe", dilation, PAPER | {"system.renderer.eps2d": dilation})
+        yield Job("dilation", "the paper's recipe", dilation, SHARP_PAPER | {"system.renderer.eps2d": dilation})
 
 
 def quality_jobs() -> Iterator[Job]:
     """The demo as it is, its quick and its good variant, at its own size."""
-    own_size = {"data.width": 256, "data.height": 256, "system.evaluation.size": 256}
-    own = own_size | {"system.renderer.eps2d": 0.1}
+    own = {"data.width": 256, "data.height": 256, "system.evaluation.size": 256}
     for name, overlay, count in (("draft", "demo-draft", 210), ("default", "", STEPS), ("best", "demo-best", 3000)):
         yield Job("quality", name, 0, own | {"trainer.max_steps": count, "system.evaluation.every": count // 20}, overlay)
-    yield Job("quality", "the paper's recipe", 0, own_size | {"system.evaluation.every": STEPS // 20} | PAPER)
+    yield Job("quality", "the paper's recipe", 0, own | {"system.evaluation.every": STEPS // 20} | PAPER)
 
 
 def failure_jobs() -> Iterator[Job]:

@@ -29,8 +29,6 @@ from tqdm import tqdm
 ROOT = Path(__file__).resolve().parent.parent
 CHARTS = ROOT / "docs/charts"
 SIZE, EVERY = 128, 100
-DILATION = 0.3
-"""Square pixels, as the paper and everybody have it; what the demo's 0.1 buys is the chart of that name."""
 WITH_CURVES = ("time", "batch", "preset")
 COLUMNS = "variant,x,object,seed,step,cpu_seconds,gaussians,psnr,ssim,multi_face,floater_mass,out_of_gamut,machine,commit".split(",")
 
@@ -84,7 +82,7 @@ def train(folder: Path, mesh: str, seed: int, options: dict[str, Any], *, progra
     """
     common = {
         "use_timestamp": "false", "tag": "run", "seed": seed, "data.width": SIZE, "data.height": SIZE,
-        "system.evaluation.size": SIZE, "system.guidance.mesh": mesh, "system.renderer.eps2d": DILATION,
+        "system.evaluation.size": SIZE, "system.guidance.mesh": mesh,
         "system.guidance.bank_seed": seed, "data.n_test_views": 1, "data.eval_width": 64, "data.eval_height": 64,
         "trainer.max_steps": STEPS, "trainer.val_check_interval": 100000, "trainer.enable_progress_bar": "false",
     }  # fmt: skip

@@ -22,7 +22,7 @@ budget              how many Gaussians a run ends with: a number, null (no limit
                     drops as many as cost no more than ``prune.quality`` or, where no truth is known, ``prune.likeness``; under a
                     budget, duplicates in the start are merged (``merging.py``)
 prune               how the budget is met (``parsimony.py``): start, stop, every (steps), keep (the least share that a round
-                    keeps), score (contribution; opacity, random: to compare with), quality (dB that a round may lose against
+                    keeps), score (removal, contribution; opacity, random: to compare with), quality (dB that a round may lose against
                     the truth), likeness (dB between the renders before and after a round, at least)
 max_gaussians       exact cap, reached by dropping what contributes least (of untrained points: any, evenly); min_gaussians: the
                     floor that pruning never passes
@@ -55,7 +55,7 @@ from .splatting import Rasterized
 from .streams import generator, numpy_generator
 
 logger = logging.getLogger(__name__)
-STATISTICS = ("gradient_sum", "gradient_count", "contribution")
+STATISTICS = ("gradient_sum", "gradient_count", "contribution", "removal")
 LEARNING_RATES = {
     "means": "lr_means",
     "log_scales": "lr_scales",
@@ -99,7 +99,7 @@ class PruneConfig:
     stop: int = 900
     every: int = 50
     keep: float = 0.8
-    score: str = "contribution"
+    score: str = "removal"
     quality: float = 0.1
     likeness: float = 40.0
 
@@ -189,6 +189,8 @@ class GaussianCloud(BaseGeometry):
         means = state_dict.get(prefix + "means")
         if isinstance(means, Tensor) and means.dim() and len(means) != len(self):  # otherwise torch says what is wrong with it
             self._allocate(len(means), self.means.device)
+        if prefix + "means" in state_dict:
+            state_dict.setdefault(prefix + "removal", torch.zeros(len(self)))  # older checkpoints have none
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     # -- derived quantities --------------------------------------------------------------------------------------------------
@@ -238,8 +240,7 @@ class GaussianCloud(BaseGeometry):
 
     def merge_duplicates(self) -> None:
         """One Gaussian in the place of those that show the same, as far as the budget asks for fewer."""
-        least = max(self.cfg.min_gaussians, 0 if self.cfg.budget == AUTO else self.cfg.budget)
-        merged = merge_duplicates(self.parameters_by_name(), at_least=least).values
+        merged = merge_duplicates(self.parameters_by_name(), at_least=self._fewest()).values
         if len(merged["means"]) < len(self):
             logger.info("%d of %d Gaussians are duplicates of others: merged", len(self) - len(merged["means"]), len(self))
             self.set_arrays(sh=torch.cat([merged.pop("sh0"), merged.pop("sh_rest")], 1), **merged)
@@ -346,6 +347,22 @@ class GaussianCloud(BaseGeometry):
             self.gradient_count += all_sum((out.radii > 0).sum(0))
         torch.maximum(self.contribution, all_max(out.contribution.amax(0)), out=self.contribution)
 
+    def _samples_removal(self, step: int) -> bool:
+        """Whether a round of pruning to come asks for a sample of the removal error, after ``step`` finished steps."""
+        cfg = self.cfg.prune
+        if self.cfg.budget is None or cfg.score != "removal" or not cfg.start - cfg.every <= step < cfg.stop:
+            return False
+        return len(self) > self._fewest() and step % max(1, cfg.every // parsimony.SAMPLES) == 0
+
+    def sample_removal(self, pictures: dict[str, Any], step: int) -> None:
+        """Add a sample of the removal error in these renders, before their losses, where a round of pruning will ask for it."""
+        if not self._samples_removal(step):
+            return
+        rng = generator(run_seed(), "removal", step)
+        self.removal += all_sum(parsimony.removal_error(pictures["comp_rgb"], pictures["opacities"], rng))
+        if self.wants_absgrad:
+            pictures["rasterized"].means2d.absgrad.zero_()  # what this backward pass has added isn't the loss's
+
     def after_step(self, optimizer: torch.optim.Optimizer, step: int, holds: Optional[Holds] = None) -> bool:
         """Densify and prune where their schedules say so; True if the cloud was replaced.
 
@@ -381,15 +398,20 @@ class GaussianCloud(BaseGeometry):
     def pruned(self, step: int, first: Optional[Change], holds: Optional[Holds]) -> Change:
         """One round towards the budget, after the change ``first`` if there is one."""
         cfg, values = self.cfg.prune, self.parameters_by_name() if first is None else first.values
-        contribution = self.contribution if first is None else self.contribution[first.parents]
-        scores = parsimony.score(cfg.score, values["logit_opacities"], contribution, generator(run_seed(), "prune", step))
-        if self.cfg.budget != AUTO:
-            count = parsimony.next_count(len(scores), cfg.keep, max(self.cfg.budget, self.cfg.min_gaussians))
-        elif first is not None or holds is None:  # what densification made has been seen in no view yet
-            count = len(scores)
-        else:
-            count = max(parsimony.smallest_count(scores, contribution, cfg.keep, holds), min(self.cfg.min_gaussians, len(scores)))
+        rows = slice(None) if first is None else first.parents
+        seen = parsimony.Seen(self.contribution[rows], self.removal[rows])
+        scores = parsimony.score(cfg.score, values["logit_opacities"], seen, generator(run_seed(), "prune", step))
+        count = parsimony.next_count(len(scores), cfg.keep, self._fewest())
+        if self.cfg.budget == AUTO and (first is not None or holds is None):
+            count = len(scores)  # what densification made has been seen in no view yet
+        elif self.cfg.budget == AUTO:
+            tops = parsimony.top_count(seen.contribution) if cfg.score == "contribution" else 0
+            count = parsimony.smallest_count(scores, max(count, tops), holds)
         return parsimony.pruned(values, scores, count, first)
+
+    def _fewest(self) -> int:
+        """How many Gaussians pruning leaves at least."""
+        return max(self.cfg.min_gaussians, 0 if self.cfg.budget == AUTO else self.cfg.budget)
 
     @contextlib.contextmanager
     def only(self, kept: Bool[Tensor, " N"]) -> Iterator[None]:

@@ -167,6 +167,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         optimizer = self.optimizers()
         self.set_learning_rates(optimizer)
         out = self(batch)
+        self.geometry.sample_removal(out, self.global_step)
         losses = self.losses(out, batch)
         loss = torch.stack(list(losses.values())).sum()
         self.manual_backward(loss)

@@ -245,7 +245,7 @@ def test_f19_a_negative_loss_is_back_propagated(fault):
         wrapped = SimpleNamespace(
             param_groups=optimizer.param_groups, step=lambda: None, optimizer=optimizer, zero_grad=optimizer.zero_grad
         )
-        nothing = SimpleNamespace(observe=lambda *_: None, after_step=lambda *_: None)
+        nothing = SimpleNamespace(sample_removal=lambda *_: None, observe=lambda *_: None, after_step=lambda *_: None)
         system = SimpleNamespace(
             optimizers=lambda: wrapped, set_learning_rates=lambda _: None, losses=lambda *_: {"x": -(parameter**2).sum()},
             manual_backward=lambda loss: loss.backward(), geometry=nothing, loss_scale=lambda: 1.0, report=lambda *_: None, global_step=1,
