@@ -153,7 +153,7 @@ def found_by_auto(true: Cloud, seed: int, steps: int, folder: Path) -> tuple[int
     if launch(["--config", str(folder / "known.yaml"), "--train", *(f"{key}={value}" for key, value in overrides.items())]):
         raise SystemExit("the training run failed")
     found = prune.tensors_of(read_cloud(str(folder / f"demo/run/save/it{steps}-export/gaussians.ply")))
-    return len(start.means), len(found.means), likeness(found, held_out(), look(true, held_out())[0])
+    return len(start.means), len(found.means), likeness(found, held_out(), look(true, held_out()))
 
 
 def found_by_prune(true: Cloud, seed: int, folder: Path) -> tuple[int, int, float]:

@@ -38,7 +38,7 @@ def picture(params):
     sh = torch.cat([params["sh0"], params["sh_rest"]], 1)
     cloud = Cloud(*(params[name] for name in Cloud._fields[:-1]), sh)
     around = Cloud(shell()["means"], shell()["quats"], shell()["log_scales"], shell()["logit_opacities"], shell()["sh0"])
-    return simplify.look(cloud, simplify.views_around(around, 6, 48))[0]
+    return simplify.look(cloud, simplify.views_around(around, 6, 48))
 
 
 def test_a_pair_keeps_its_peak_and_its_light():

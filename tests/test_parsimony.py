@@ -42,6 +42,7 @@ def rounds(geometry, steps, holds=None):
 
 
 EVERY_STEP = {"start": 0, "stop": 100, "every": 1}
+ONE_ROUND = {"start": 0, "stop": 1, "every": 1}
 
 
 def test_the_budget_is_reached_round_by_round_and_then_holds():
@@ -117,6 +118,14 @@ def test_a_gaussian_that_hides_its_own_colour_shows_nothing():
     assert removal[0] < 1e-3 * removal[2]
 
 
+def test_auto_leaves_out_the_first_half_of_its_rounds():
+    schedule = {"start": 100, "stop": 900, "every": 50}
+    assert list(cloud(1, prune=schedule).prune_rounds) == list(range(100, 900, 50))
+    auto = cloud(1, budget="auto", prune=schedule | {"quality": 0.4})
+    assert list(auto.prune_rounds) == list(range(500, 900, 50)) and auto.affordable == pytest.approx(0.05)
+    assert list(cloud(1, budget="auto", prune={"start": 1, "stop": 50, "every": 50}).prune_rounds) == []
+
+
 def test_growth_stays_within_what_the_budget_leaves():
     hot = {"enabled": True, "start": 0, "stop": 100, "every": 1, "grad_threshold": 0.0, "min_opacity": 0.0}
     geometry = cloud(100, budget=50, prune=EVERY_STEP, densify=hot)
@@ -155,7 +164,7 @@ def test_auto_finds_the_smallest_count_that_holds(needed):
 
 
 def test_auto_by_contribution_never_drops_the_top_gaussian_of_a_pixel():
-    geometry = cloud(100, budget="auto", prune=EVERY_STEP | {"score": "contribution"})
+    geometry = cloud(100, budget="auto", prune=ONE_ROUND | {"score": "contribution"})
     geometry.contribution.copy_(torch.cat([torch.full((95,), 0.6), torch.full((5,), 0.1)]))
     assert rounds(geometry, 1, lambda kept: True) == [95]
 
@@ -173,7 +182,7 @@ def test_a_weight_above_one_half_is_the_largest_of_its_pixel():
 
 
 def test_auto_in_the_loop_ends_where_the_quality_ends():
-    geometry = cloud(100, budget="auto", prune=EVERY_STEP | {"keep": 0.5})
+    geometry = cloud(100, budget="auto", prune=ONE_ROUND | {"keep": 0.5})
     geometry.contribution *= 0.1
     counts = rounds(geometry, 1, lambda kept: int(kept.sum()) >= 70)
     assert 70 <= counts[0] <= 74

@@ -80,7 +80,7 @@ def test_the_same_call_gives_the_same_bits(source, tmp_path):
 def test_hidden_gaussians_go_first():
     cloud = ball()
     views = simplify.views_around(cloud, 16, 48)
-    kept = simplify.only(cloud, simplify.look(cloud, views)[1], 400)
+    kept = simplify.only(cloud, simplify.worth(cloud, views), 400)
     outside = kept.means.norm(dim=1) > 0.9
     assert outside.double().mean() > 0.9  # two thirds of all; a few inner ones are seen through gaps
 
@@ -88,10 +88,10 @@ def test_hidden_gaussians_go_first():
 def test_recovery_pays():
     cloud = ball()
     probes, judges = (simplify.views_around(cloud, count, 48, turn=turn) for count, turn in ((16, 0.0), (8, 45.0)))
-    pictures, scores = simplify.look(cloud, probes)
-    pruned = simplify.only(cloud, scores, 200)
+    pictures = simplify.look(cloud, probes)
+    pruned = simplify.only(cloud, simplify.worth(cloud, probes), 200)
     recovered = simplify.recover(pruned, probes, pictures, 40, 0)
-    before = simplify.look(cloud, judges)[0]
+    before = simplify.look(cloud, judges)
     assert simplify.likeness(recovered, judges, before) > simplify.likeness(pruned, judges, before) + 1.0
 
 
@@ -134,7 +134,7 @@ def test_clouds_in_other_units_look_alike(unit):
     """No plane of the camera cuts a cloud in millimetres away."""
     cloud = ball()
     other = cloud._replace(means=cloud.means * unit, log_scales=cloud.log_scales + math.log(unit))
-    ours, theirs = (simplify.look(each, simplify.views_around(each, 6, 48))[0] for each in (cloud, other))
+    ours, theirs = (simplify.look(each, simplify.views_around(each, 6, 48)) for each in (cloud, other))
     assert simplify.psnr(theirs, ours) > 60
 
 

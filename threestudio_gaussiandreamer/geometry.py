@@ -19,11 +19,12 @@ densify             enabled, start, stop, every (steps), grad_threshold, split_s
                     absgrad: judge by the sum of the pixels' absolute gradients, in which opposite pulls don't cancel
                     (AbsGS, Ye et al. 2024; several times larger, so give a threshold to match)
 budget              how many Gaussians a run ends with: a number, null (no limit but ``max_gaussians``), or ``auto``: each round
-                    drops as many as cost no more than ``prune.quality`` or, where no truth is known, ``prune.likeness``; under a
-                    budget, duplicates in the start are merged (``merging.py``)
+                    drops as many as cost no more than its share of ``prune.quality`` or, where no truth is known,
+                    ``prune.likeness``; under a budget, duplicates in the start are merged (``merging.py``)
 prune               how the budget is met (``parsimony.py``): start, stop, every (steps), keep (the least share that a round
-                    keeps), score (removal, contribution; opacity, random: to compare with), quality (dB that a round may lose against
-                    the truth), likeness (dB between the renders before and after a round, at least)
+                    keeps), score (removal, contribution; opacity, random: to compare with), quality (dB that all rounds may lose against
+                    the truth), likeness (dB between the renders before and after a round, at least); ``auto`` leaves out the first
+                    half of the rounds: what looks superfluous early may be needed later
 max_gaussians       exact cap, reached by dropping what contributes least (of untrained points: any, evenly); min_gaussians: the
                     floor that pruning never passes
 keep_attributes     with gaussians-prior: start from all attributes of that cloud, not only from points and colours
@@ -286,8 +287,8 @@ class GaussianCloud(BaseGeometry):
             "the prior has %d Gaussians; keeping the %d that contribute most (max_gaussians)", len(cloud.means), self.cfg.max_gaussians
         )
         cloud = simplify.Cloud(*(values.to(self.means.device) for values in cloud))
-        _, contribution = simplify.look(cloud, simplify.views_around(cloud, *CAP_VIEWS))
-        return simplify.only(cloud, contribution, self.cfg.max_gaussians)
+        shown = simplify.worth(cloud, simplify.views_around(cloud, *CAP_VIEWS))
+        return simplify.only(cloud, shown, self.cfg.max_gaussians)
 
     def set_arrays(self, *, sh: Any, **arrays: Any) -> None:
         """Replace the cloud; spherical harmonics ``sh`` (N, K', 3) are padded with zeros or cut to ``sh_degree``."""
@@ -349,8 +350,8 @@ class GaussianCloud(BaseGeometry):
 
     def _samples_removal(self, step: int) -> bool:
         """Whether a round of pruning to come asks for a sample of the removal error, after ``step`` finished steps."""
-        cfg = self.cfg.prune
-        if self.cfg.budget is None or cfg.score != "removal" or not cfg.start - cfg.every <= step < cfg.stop:
+        cfg, rounds = self.cfg.prune, self.prune_rounds
+        if self.cfg.budget is None or cfg.score != "removal" or not rounds or not rounds[0] - cfg.every <= step < rounds[-1]:
             return False
         return len(self) > self._fewest() and step % max(1, cfg.every // parsimony.SAMPLES) == 0
 
@@ -380,7 +381,7 @@ class GaussianCloud(BaseGeometry):
                 change = None
             self.gradient_sum.zero_()
             self.gradient_count.zero_()
-        if self.cfg.budget is not None and is_due(self.cfg.prune, step):
+        if self.cfg.budget is not None and step in self.prune_rounds:
             change = self.pruned(step, change, holds)
         if change is not None:
             self.apply_change(change, optimizer)
@@ -408,6 +409,18 @@ class GaussianCloud(BaseGeometry):
             tops = parsimony.top_count(seen.contribution) if cfg.score == "contribution" else 0
             count = parsimony.smallest_count(scores, max(count, tops), holds)
         return parsimony.pruned(values, scores, count, first)
+
+    @property
+    def prune_rounds(self) -> range:
+        """The numbers of finished steps after which a round of pruning is due."""
+        cfg = self.cfg.prune
+        rounds = range(math.ceil(cfg.start / cfg.every) * cfg.every, cfg.stop, cfg.every)
+        return rounds[len(rounds) // 2 :] if self.cfg.budget == AUTO else rounds
+
+    @property
+    def affordable(self) -> float:
+        """dB that one round of ``auto`` may lose: none is sure to be won back, so all together lose ``prune.quality`` at most."""
+        return self.cfg.prune.quality / len(self.prune_rounds)
 
     def _fewest(self) -> int:
         """How many Gaussians pruning leaves at least."""

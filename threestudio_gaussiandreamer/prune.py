@@ -47,6 +47,7 @@ from .host import get_device
 from .ply import GaussianArrays
 from .simplify import Budget, Cloud, Round, Views, likeness, look, simplify, views_around
 from .spz import COLOR_REACH
+from .streams import generator
 
 PROBES, JUDGES, TESTS = 64, 32, 16
 TURNS = (0.0, 45.0, 60.0)
@@ -283,9 +284,12 @@ def _simplified(stored: StoredCloud, budget: Budget, options: PruneOptions, suff
 
 
 def views_of(stored: StoredCloud, size: int) -> list[Views]:
-    """What is fitted to, what decides, what is reported."""
+    """What is fitted to and what decides, each view before a colour of its own, so that none of a Gaussian's can hide it; what is
+    reported, all on grey."""
     cloud, to_z_up = tensors_of(stored), torch.from_numpy(rotation_between(stored.up, "z"))
-    return [views_around(cloud, n, size, turn=turn, to_z_up=to_z_up) for n, turn in zip((PROBES, JUDGES, TESTS), TURNS, strict=True)]
+    around = [views_around(cloud, n, size, turn=turn, to_z_up=to_z_up) for n, turn in zip((PROBES, JUDGES, TESTS), TURNS, strict=True)]
+    colors = [torch.rand(n, 3, generator=generator(0, "backgrounds", n)).to(cloud.means) for n in (PROBES, JUDGES)]
+    return [*(views._replace(backgrounds=color) for views, color in zip(around, colors, strict=False)), around[-1]]
 
 
 def tensors_of(stored: StoredCloud) -> Cloud:
@@ -306,7 +310,7 @@ def write_report(path: str, done: Pruned, suffix: str, options: PruneOptions) ->
     """The table on the screen, ``path``.json and ``path``.png; returns what the JSON holds."""
     tests = views_of(done.before, options.size)[-1]
     clouds = [tensors_of(done.before), tensors_of(as_stored(done.after, suffix))]
-    pictures = [look(cloud, tests)[0] for cloud in clouds]
+    pictures = [look(cloud, tests) for cloud in clouds]
     sizes = [file_size(done.before, suffix), file_size(done.after, suffix)]
     costs = [Cost(len(cloud.means), size, frame_time(cloud, tests)) for cloud, size in zip(clouds, sizes, strict=True)]
     reached = likeness(clouds[1], tests, pictures[0])
@@ -332,7 +336,7 @@ def frame_time(cloud: Cloud, views: Views) -> float:
         row = slice(view, view + 1)
         one = views._replace(viewmats=views.viewmats[row], Ks=views.Ks[row], positions=views.positions[row])
         started = time.perf_counter()
-        look(cloud, one)[0].sum().item()
+        look(cloud, one).sum().item()
         times.append(time.perf_counter() - started)
     return round(1e3 * statistics.median(times), 3)
 

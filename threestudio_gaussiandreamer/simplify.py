@@ -1,9 +1,9 @@
 """Fewer Gaussians for the same pictures: prune by contribution, round by round, and recover by self-distillation.
 
 What the cloud looked like before is the only truth: no diffusion model, no prompt, so nothing can drift. First duplicates become one
-(``merging.py``). Then each round keeps the best 0.8 by the largest sigma_i T_i over the pixels of the probe views (RadSplat, Niemeyer
-et al. 2024), re-scored every round, and fits what stays to the probe views' first pictures (mean squared error, Adam). One-shot
-pruning of more than that loses to training so few from scratch; rounds don't.
+(``merging.py``). Then each round keeps the best 0.8 by what they show in the probe views (the score ``removal`` of ``parsimony.py``),
+re-scored every round, and fits what stays to the probe views' first pictures (mean squared error, Adam). One-shot pruning of more than
+that loses to training so few from scratch; rounds don't.
 """
 
 import math
@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from . import parsimony
 from .cameras import Orbit, intrinsics, to_opencv
 from .errors import UserError
 from .merging import merge_duplicates
@@ -27,7 +28,9 @@ KEEP = 0.8
 SMALLEST_DROP = 0.01
 """A round that can't drop this share ends the search."""
 RATES = {"means": 2e-4, "quats": 4e-3, "log_scales": 1e-2, "logit_opacities": 2e-2, "sh": 5e-3}
-"""Adam's; that of the means in units of the cloud's radius."""
+"""Adam's for a cloud that has just lost a fifth; that of the means in units of the cloud's radius."""
+SLOWEST = 1 / 32
+"""Of these rates. What is nearly right needs small ones: Adam's steps are as long where the gradient is mostly noise."""
 FOVY = math.radians(50.0)
 NEAR = 0.01
 """The nearest depth that is drawn, in units of the cloud's radius: clouds come in millimetres and in kilometres."""
@@ -52,6 +55,8 @@ class Views(NamedTuple):
     size: int
     near: float = NEAR
     """The nearest depth that is drawn."""
+    backgrounds: Optional[Float[Tensor, "V 3"]] = None
+    """What lies behind; None is grey, before which neither dark nor bright Gaussians vanish."""
 
 
 class Budget(NamedTuple):
@@ -102,33 +107,53 @@ def views_around(cloud: Cloud, count: int, size: int, *, turn: float = 0.0, to_z
     return Views(viewmats, intrinsics(fovy, size, size), c2w[:, :3, 3], size, NEAR * radius)
 
 
-def draw(cloud: Cloud, views: Views, rows: Tensor, *, preset: str = "balanced") -> tuple[Tensor, Tensor]:
-    """Pictures (B, size, size, 3) of some of the views on grey, and each Gaussian's contribution to them (B, N)."""
+def draw(cloud: Cloud, views: Views, rows: Tensor, opacities: Optional[Float[Tensor, " N"]] = None) -> tuple[Tensor, Tensor]:
+    """Pictures (B, size, size, 3) of some of the views on grey, and each Gaussian's contribution to them (B, N).
+
+    ``opacities`` stand for the cloud's own, to be differentiated by.
+    """
+    opacities = cloud.logit_opacities.sigmoid() if opacities is None else opacities
     dirs = torch.nn.functional.normalize(cloud.means.detach() - views.positions[rows, None], dim=-1)
     colors = sh_to_colors(cloud.sh, dirs)
-    grey = torch.full((3,), 0.5, device=cloud.means.device)  # neither dark nor bright Gaussians vanish before it
+    background = torch.full((3,), 0.5, device=cloud.means.device) if views.backgrounds is None else views.backgrounds[rows]
     out = rasterize(
-        cloud.means, cloud.quats, cloud.log_scales.exp(), cloud.logit_opacities.sigmoid(), colors, views.viewmats[rows], views.Ks[rows],
-        views.size, views.size, background=grey, near=views.near, preset=preset,
+        cloud.means, cloud.quats, cloud.log_scales.exp(), opacities, colors, views.viewmats[rows], views.Ks[rows],
+        views.size, views.size, background=background, near=views.near,
     )  # fmt: skip
     return out.image, out.contribution
 
 
 @torch.no_grad()
-def look(cloud: Cloud, views: Views, chunk: int = 4) -> tuple[Float[Tensor, "V H W 3"], Float[Tensor, " N"]]:
-    """All pictures, and the largest contribution of each Gaussian."""
-    parts = [draw(cloud, views, rows) for rows in torch.arange(len(views.viewmats)).split(chunk)]
-    return torch.cat([image for image, _ in parts]), torch.stack([contribution.amax(0) for _, contribution in parts]).amax(0)
+def look(cloud: Cloud, views: Views) -> Float[Tensor, "V H W 3"]:
+    """All pictures."""
+    return torch.cat([draw(cloud, views, rows)[0] for rows in _chunks(views)])
+
+
+@torch.enable_grad()
+def worth(cloud: Cloud, views: Views, seed: int = 0) -> Float[Tensor, " N"]:
+    """What each Gaussian shows in all views, by which they are ranked; 0 for one that isn't to be seen."""
+    opacities, rng = cloud.logit_opacities.detach().sigmoid().requires_grad_(), generator(seed, "worth")
+    contribution, removal = torch.zeros(2, len(opacities), device=opacities.device)
+    for rows in _chunks(views):
+        image, contributed = draw(cloud, views, rows, opacities)
+        contribution = torch.maximum(contribution, contributed.amax(0))
+        removal = removal + parsimony.removal_error(image, opacities, rng)
+    return parsimony.score("removal", cloud.logit_opacities, parsimony.Seen(contribution, removal), rng)
+
+
+def _chunks(views: Views) -> tuple[Tensor, ...]:
+    """Rows of the views that are drawn together."""
+    return torch.arange(len(views.viewmats)).split(4)
 
 
 def likeness(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"]) -> float:
     """PSNR of a cloud's views to other pictures of them, over all pixels."""
-    return float(psnr(look(cloud, views)[0].flatten(0, 1), pictures.flatten(0, 1)))
+    return float(psnr(look(cloud, views).flatten(0, 1), pictures.flatten(0, 1)))
 
 
 def assured_likeness(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"]) -> float:
     """The PSNR that other views will have too: with the standard error over these views added to their mean squared error."""
-    errors = (look(cloud, views)[0] - pictures).square().mean((1, 2, 3))
+    errors = (look(cloud, views) - pictures).square().mean((1, 2, 3))
     return -10 * math.log10(max(float(errors.mean() + errors.std() / math.sqrt(len(errors))), 1e-10))
 
 
@@ -157,15 +182,24 @@ def simplify(
     Raises:
         UserError: nothing of the cloud is to be seen, so that nothing says which Gaussians to keep.
     """
-    (pictures, contribution), before = look(cloud, probes), look(cloud, judges)[0]
-    if not contribution.any():
+    pictures, before, scores = look(cloud, probes), look(cloud, judges), worth(cloud, probes, seed)
+    if not scores.any():
         raise UserError(f"none of the {len(cloud.means)} Gaussians is to be seen from around: nothing says which ones to keep")
 
     def refitted(cloud: Cloud) -> tuple[Cloud, Round]:
-        cloud = recover(cloud, probes, pictures, steps, seed + done, sh_reach)
-        return cloud, Round(len(cloud.means), assured_likeness(stored(cloud), judges, before))
+        """Recovered at the fastest pace that makes it more like the pictures; as it is where none does."""
+        nonlocal pace
+        pace = min(1.0, 4 * pace)
+        cloud = cloud._replace(sh=torch.cat([cloud.sh[:, :1].clamp(-sh_reach, sh_reach), cloud.sh[:, 1:]], 1))
+        unfitted = likeness(cloud, probes, pictures)
+        while likeness(found := recover(cloud, probes, pictures, steps, seed + done, sh_reach, pace), probes, pictures) < unfitted:
+            if pace <= SLOWEST:
+                found = cloud
+                break
+            pace /= 4
+        return found, Round(len(found.means), assured_likeness(stored(found), judges, before))
 
-    keep, done = KEEP, 0
+    keep, done, pace = KEEP, 0, 1.0
     if float(cloud.sh[:, 0].abs().amax()) > sh_reach:
         cloud, _ = refitted(cloud)
     fewer = Cloud(**merge_duplicates(cloud._asdict(), at_least=budget.count or 1).values)
@@ -173,14 +207,14 @@ def simplify(
         if len(fewer.means) < len(cloud.means):
             fewer, reached = refitted(fewer)
             if budget.psnr is None or reached.psnr >= budget.psnr:
-                cloud, contribution, done = fewer, look(fewer, probes)[1], done + 1
+                cloud, scores, done = fewer, worth(fewer, probes, seed), done + 1
                 report(reached)
             else:
                 keep = 0.5 * (1 + keep)  # half as many
         count = _next_count(len(cloud.means), keep, budget)
         if count == len(cloud.means):
             return cloud
-        fewer = only(cloud, contribution, count)
+        fewer = only(cloud, scores, count)
 
 
 def _next_count(here: int, keep: float, budget: Budget) -> int:
@@ -198,10 +232,19 @@ def only(cloud: Cloud, scores: Float[Tensor, " N"], count: int) -> Cloud:
 
 
 @torch.enable_grad()
-def recover(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"], steps: int, seed: int, sh_reach: float = math.inf) -> Cloud:
-    """The cloud fitted to pictures of its former self, its constant harmonics within ``sh_reach``."""
+def recover(
+    cloud: Cloud,
+    views: Views,
+    pictures: Float[Tensor, "V H W 3"],
+    steps: int,
+    seed: int,
+    sh_reach: float = math.inf,
+    pace: float = 1.0,
+) -> Cloud:
+    """The cloud fitted to pictures of its former self at ``pace`` times ``RATES``, its constant harmonics within ``sh_reach``."""
     leaves = Cloud(*(values.detach().clone().requires_grad_() for values in cloud))
-    rates = RATES | {"means": RATES["means"] * bounds(cloud)[1]}
+    rates = {name: pace * rate for name, rate in RATES.items()}
+    rates["means"] *= bounds(cloud)[1]
     groups = [{"params": [leaf], "lr": rates[name]} for name, leaf in zip(Cloud._fields, leaves, strict=True)]
     adam = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
     for step, rows in enumerate(_batches(len(pictures), steps, seed)):

@@ -179,24 +179,34 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             self.count_skipped_step(loss_scale)
         optimizer.zero_grad(set_to_none=True)
         # self.optimizers() wraps the torch optimiser, whose rows have to follow the Gaussians
-        self.geometry.after_step(optimizer.optimizer, self.global_step, lambda kept: self.quality_holds(kept, batch))
+        before, price = len(self.geometry), {}
+        self.geometry.after_step(optimizer.optimizer, self.global_step, lambda kept: self.quality_holds(kept, batch, price))
+        if price:  # of the last step of a search, which is the one that was made
+            self.log_dict(price)
+            told = ", ".join(f"{name.partition('/')[2]} {value:.3g}" for name, value in price.items())
+            info(f"step {self.global_step}: {before} -> {len(self.geometry)} Gaussians; dB on the views of this step: {told}")
         self.report(out, batch, losses, loss)
 
     @torch.no_grad()
-    def quality_holds(self, kept: Bool[Tensor, " N"], batch: dict[str, Any]) -> bool:
+    def quality_holds(self, kept: Bool[Tensor, " N"], batch: dict[str, Any], price: dict[str, float]) -> bool:
         """Whether this batch looks nearly the same with only the ``kept`` Gaussians: for ``system.geometry.budget=auto``.
 
-        Where the guidance knows the truth, the loss of dB against it is measured; elsewhere how like the renders are.
+        Where the guidance knows the truth, the loss of dB against it is measured; elsewhere how like the renders are. If it holds,
+        what was measured goes into ``price``.
         """
         all_of_them = self(batch)
         with self.geometry.only(kept):
             fewer = self(batch)["comp_rgb"]
-        rules, truth = self.geometry.cfg.prune, self.truth(batch, all_of_them)
+        truth = self.truth(batch, all_of_them)
         if truth is None:
-            margins = psnr(fewer, all_of_them["comp_rgb"]) - rules.likeness
+            likeness, asked = psnr(fewer, all_of_them["comp_rgb"]).mean(), self.geometry.cfg.prune.likeness
+            margin, found = likeness - asked, {"prune/likeness": float(likeness), "prune/asked_for": asked}
         else:
-            margins = rules.quality + psnr(fewer, truth) - psnr(all_of_them["comp_rgb"], truth)
-        return bool(all_sum(margins.mean()) >= 0)  # every process looks at other views, and all have to decide alike
+            loss, affordable = (psnr(all_of_them["comp_rgb"], truth) - psnr(fewer, truth)).mean(), self.geometry.affordable
+            margin, found = affordable - loss, {"prune/lost": float(loss), "prune/affordable": affordable}
+        holds = bool(all_sum(margin) >= 0)  # every process looks at other views, and all have to decide alike
+        price.update(found if holds else {})
+        return holds
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
         for part in (self.geometry, self.background):

@@ -22,7 +22,7 @@ from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.ply import write_gaussians
 from threestudio_gaussiandreamer.point_cloud import PointCloud
-from threestudio_gaussiandreamer.simplify import Cloud, look, views_around
+from threestudio_gaussiandreamer.simplify import Cloud, look, views_around, worth
 from threestudio_gaussiandreamer.streams import generator
 
 register_parts()
@@ -136,7 +136,7 @@ def test_a_trained_cloud_that_is_too_large_keeps_what_contributes(tmp_path, meas
     views = views_around(drawn(trained), 4, 64, turn=30)
 
     def likeness(cloud: Cloud) -> float:
-        return psnr(look(cloud, views)[0], look(drawn(trained), views)[0]).mean().item()
+        return psnr(look(cloud, views), look(drawn(trained), views)).mean().item()
 
     lots = [torch.randperm(400, generator=generator(seed, "lottery"))[:150] for seed in range(5)]
     luckiest = max(likeness(Cloud(*(values[rows] for values in drawn(trained)))) for rows in lots)
@@ -156,10 +156,10 @@ def test_a_first_cloud_that_is_too_large_is_thinned_evenly(measured, said):
         geometry.initialize("a prompt")
     assert len(capped) == 2500 and any("give 10000 points; keeping 2500" in message for message in said)
     ranked = GaussianCloud(prior)
-    rows = look(drawn(whole), views_around(drawn(whole), 8, 128))[1].topk(2500).indices
+    rows = worth(drawn(whole), views_around(drawn(whole), 8, 128)).topk(2500).indices
     ranked.start_from(PointCloud(whole.means.detach()[rows].numpy(), whole.colors(torch.zeros(1, 3)).detach()[rows].numpy()))
     views = views_around(drawn(whole), 4, 96, turn=30)
-    pictures = [look(drawn(geometry), views)[0] for geometry in (whole, capped, ranked)]
+    pictures = [look(drawn(geometry), views) for geometry in (whole, capped, ranked)]
     holes = [cKDTree(geometry.means.detach()).query(whole.means.detach())[0].max() for geometry in (capped, ranked)]
     measured(holes[0] / holes[1], "of the largest hole by contribution", at_most=0.6)
     measured(psnr(pictures[1], pictures[0]).mean() - psnr(pictures[2], pictures[0]).mean(), "dB over by contribution", at_least=0.0)

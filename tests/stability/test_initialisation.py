@@ -47,7 +47,7 @@ def started(cloud: PointCloud, **options) -> GaussianCloud:
 def picture(geometry: GaussianCloud, frame: GaussianCloud | None = None) -> torch.Tensor:
     """Three views of a cloud, from where they would show ``frame``."""
     cloud, seen = (Cloud(*(getattr(g, name).detach() for name in Cloud._fields)) for g in (geometry, frame or geometry))
-    return look(cloud, views_around(seen, 3, 64))[0]
+    return look(cloud, views_around(seen, 3, 64))
 
 
 # ---- distances ---------------------------------------------------------------------------------------------------------------
