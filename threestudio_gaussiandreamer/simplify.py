@@ -168,6 +168,7 @@ def simplify(
     report: Callable[[Round], None] = lambda done: None,
     stored: Callable[[Cloud], Cloud] = lambda cloud: cloud,
     sh_reach: float = math.inf,
+    rank: Callable[[Cloud, Views, int], Float[Tensor, " N"]] = worth,
 ) -> Cloud:
     """The smallest cloud of a series of rounds that meets the budget.
 
@@ -178,11 +179,12 @@ def simplify(
         report: called after each round that was kept.
         stored: what the file to be written makes of a cloud, which is what a budget of quality is measured on.
         sh_reach: the largest constant harmonic, either way, that the file holds.
+        rank: what each Gaussian is worth in some views, given a seed.
 
     Raises:
         UserError: nothing of the cloud is to be seen, so that nothing says which Gaussians to keep.
     """
-    pictures, before, scores = look(cloud, probes), look(cloud, judges), worth(cloud, probes, seed)
+    pictures, before, scores = look(cloud, probes), look(cloud, judges), rank(cloud, probes, seed)
     if not scores.any():
         raise UserError(f"none of the {len(cloud.means)} Gaussians is to be seen from around: nothing says which ones to keep")
 
@@ -207,7 +209,7 @@ def simplify(
         if len(fewer.means) < len(cloud.means):
             fewer, reached = refitted(fewer)
             if budget.psnr is None or reached.psnr >= budget.psnr:
-                cloud, scores, done = fewer, worth(fewer, probes, seed), done + 1
+                cloud, scores, done = fewer, rank(fewer, probes, seed), done + 1
                 report(reached)
             else:
                 keep = 0.5 * (1 + keep)  # half as many

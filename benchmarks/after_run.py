@@ -1,0 +1,105 @@
+"""After the run: what ranks best, and what rounds and recovery buy, in dB to the unpruned cloud on views that nothing was fitted to.
+
+    python benchmarks/after_run.py                                       # the toy, one seed: three minutes
+    python benchmarks/after_run.py --objects toy.glb spot.glb duck.glb --seeds 0 1 2
+
+A cloud of 10,000, trained as the demo is at 128^2 on one thread (`runs.py`), goes to a count in one shot; in one shot and as many steps
+of recovery as the rounds have together; and in rounds, as the prune command does it, by removal and otherwise. Results go to docs/charts/after_run.csv.
+"""
+
+import argparse
+import csv
+import math
+import statistics
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from jobs import NO_BUDGET
+from runs import CHARTS, STEPS, commit, machine, object_name, rows_of, train
+from torch import Tensor
+
+from threestudio_gaussiandreamer import parsimony, prune, register_parts
+from threestudio_gaussiandreamer.cloud_files import read_cloud
+from threestudio_gaussiandreamer.simplify import KEEP, Budget, Cloud, Views, draw, likeness, look, only, recover, simplify, worth
+
+COUNTS, STEPS_A_ROUND = (2500, 1500), 60
+COLUMNS = "variant,x,object,seed,psnr,machine,commit".split(",")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--objects", nargs="+", default=["toy.glb"])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    arguments = parser.parse_args()
+    register_parts()
+    for seed in arguments.seeds:
+        for mesh in arguments.objects:
+            if not any(row["object"] == object_name(mesh) and row["seed"] == str(seed) for row in rows_of("after_run")):
+                append(mesh, seed, measured(mesh, seed))
+    print(table())
+
+
+def measured(mesh: str, seed: int) -> list[tuple[str, int, float]]:
+    """What was done, to how many, and the dB that it led to."""
+    with tempfile.TemporaryDirectory() as folder:
+        stored = read_cloud(str(train(Path(folder), mesh, seed, NO_BUDGET) / f"it{STEPS}-export/gaussians.ply"))
+    cloud = prune.tensors_of(stored)
+    probes, judges, tests = prune.views_of(stored, 256)
+    pictures = look(cloud, tests)
+    return [
+        (variant, count, likeness(fewer, tests, pictures)) for count in COUNTS for variant, fewer in variants(cloud, count, probes, judges)
+    ]
+
+
+def variants(cloud: Cloud, count: int, probes: Views, judges: Views) -> Iterator[tuple[str, Cloud]]:
+    """The ways from a cloud to ``count`` Gaussians, and where they lead."""
+    for name in parsimony.SCORES:
+        yield f"one shot, by {name}", only(cloud, RANKS[name](cloud, probes, 0), count)
+    steps = STEPS_A_ROUND * math.ceil(math.log(count / len(cloud.means), KEEP))
+    yield "one shot, by removal, recovered", recover(only(cloud, worth(cloud, probes), count), probes, look(cloud, probes), steps, 0)
+    for name in parsimony.SCORES:
+        yield f"in rounds, by {name}", simplify(cloud, probes, judges, Budget(count=count), steps=STEPS_A_ROUND, rank=RANKS[name])
+
+
+@torch.no_grad()
+def contribution(cloud: Cloud, views: Views, seed: int) -> Tensor:
+    """The largest weight in any pixel."""
+    return draw(cloud, views, torch.arange(len(views.viewmats)))[1].amax(0)
+
+
+RANKS = {
+    "removal": worth,
+    "contribution": contribution,
+    "opacity": lambda cloud, views, seed: cloud.logit_opacities.detach(),
+    "random": lambda cloud, views, seed: torch.rand(len(cloud.means), generator=torch.Generator().manual_seed(seed)),
+}
+
+
+def append(mesh: str, seed: int, results: list[tuple[str, int, float]]) -> None:
+    path = CHARTS / "after_run.csv"
+    new = not path.is_file()
+    with open(path, "a", newline="") as file:
+        writer = csv.writer(file)
+        if new:
+            writer.writerow(COLUMNS)
+        for variant, count, psnr in results:
+            writer.writerow([variant, count, object_name(mesh), seed, round(psnr, 3), machine(), commit()])
+
+
+def table() -> str:
+    """Medians over the seeds, as Markdown."""
+    rows = rows_of("after_run")
+    objects = list(dict.fromkeys(row["object"] for row in rows))
+    lines = [f"| to | {' | '.join(objects)} |", f"| --- |{' ---: |' * len(objects)}"]
+    for variant, count in dict.fromkeys((row["variant"], row["x"]) for row in rows):
+        same = [row for row in rows if (row["variant"], row["x"]) == (variant, count)]
+        values = [statistics.median(float(row["psnr"]) for row in same if row["object"] == name) for name in objects]
+        lines.append(f"| {count}, {variant} | {' | '.join(f'{value:.1f}' for value in values)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
