@@ -4,7 +4,8 @@
     python benchmarks/after_run.py --objects toy.glb spot.glb duck.glb --seeds 0 1 2
 
 A cloud of 10,000, trained as the demo is at 128^2 on one thread (`runs.py`), goes to a count in one shot; in one shot and as many steps
-of recovery as the rounds have together; and in rounds, as the prune command does it, by removal and otherwise. Results go to docs/charts/after_run.csv.
+of recovery as the rounds have together; and in rounds, as the prune command does it, ranked as it does and otherwise. Results go to
+docs/charts/after_run.csv.
 """
 
 import argparse
