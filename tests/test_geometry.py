@@ -74,6 +74,15 @@ def test_the_cloud_takes_its_size_from_the_checkpoint_and_never_asks_the_prior(s
     assert other.gradient_sum.sum() > 0
 
 
+def test_a_checkpoint_from_before_the_removal_error_loads(sphere_points):
+    geometry = started(sphere_points)
+    state = geometry.state_dict()
+    del state["removal"]
+    other = GaussianCloud({})
+    other.load_state_dict(state)
+    assert torch.equal(other.means, geometry.means) and torch.equal(other.removal, torch.zeros(len(geometry)))
+
+
 def test_spherical_harmonics_are_padded_and_cut(sphere_points):
     third = started(sphere_points, sh_degree=3)
     assert third.sh.shape == (400, 16, 3) and third.sh_rest.abs().sum() == 0

@@ -101,6 +101,27 @@ def test_the_removal_error_is_that_of_leaving_each_gaussian_out():
     assert (samples.mean(0) / exact - 1).abs().amax() < 0.15
 
 
+@pytest.mark.parametrize("backend", ["auto", "torch", "reference"])
+def test_sampling_leaves_the_gradients_of_the_loss_alone(backend):
+    viewmats, Ks = to_opencv(orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])), torch.tensor([0.8]), 32, 32)
+    left = []
+    for budget in (None, 5):
+        geometry = cloud(12, budget=budget, densify={"enabled": True, "absgrad": True})
+        opacities = geometry.opacities()
+        inputs = geometry.means, geometry.quats, geometry.scales(), opacities, geometry.colors(viewmats[:, 3, :3])
+        out = rasterize(*inputs, viewmats, Ks, 32, 32, absgrad=True, backend=backend)
+        geometry.sample_removal({"comp_rgb": out.image, "opacities": opacities, "rasterized": out}, 60)
+        assert geometry.removal.any() == (budget is not None)
+        (out.image**2).sum().backward()
+        left.append([out.means2d.grad, out.means2d.absgrad, *(p.grad for p in geometry.parameters() if p.numel())])
+    assert all(torch.equal(plain, sampled) for plain, sampled in zip(*left, strict=True))
+
+
+@pytest.mark.parametrize(("step", "due"), [(48, False), (51, False), (52, True), (848, True), (849, False), (852, False)])
+def test_samples_are_taken_where_a_round_will_ask_for_them(step, due):
+    assert cloud(10, budget=5, prune={"start": 100, "stop": 900, "every": 50})._samples_removal(step) == due
+
+
 def test_a_gaussian_that_hides_its_own_colour_shows_nothing():
     """The front one of two of one colour contributes most, and is missed by nobody."""
     geometry = GaussianCloud({"min_gaussians": 1})

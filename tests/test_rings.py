@@ -26,6 +26,8 @@ MATHS = {
     "spz",
     "cloud_files",
     "merging",
+    "parsimony",
+    "simplify",
     "surface",
     "nested",
 }
