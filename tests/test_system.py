@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -143,19 +144,38 @@ DENSIFY = [
     f"system.geometry.densify.{option}"
     for option in ("enabled=true", "start=2", "stop=8", "every=2", "grad_threshold=1e-4", "min_opacity=0.01")
 ]
+PRUNE = ["system.geometry.budget=130", *(f"system.geometry.prune.{option}" for option in ("start=3", "stop=8", "every=3"))]
 
 
-@pytest.mark.parametrize("stop", [3, 4, 5])
-def test_a_stopped_and_resumed_run_equals_the_run_that_never_stopped(tmp_path, painted_box, stop):
-    """Bit for bit: Gaussians, moments, statistics; the stops lie before, at and after a densification, with more validation."""
-    options = [*DENSIFY, "checkpoint.every_n_train_steps=1"]
+@pytest.mark.parametrize("known", [True, False])
+def test_auto_says_what_it_measured(tmp_path, painted_box, capsys, known):
+    """The loss against the truth; where a guidance knows none, how like the renders before and after are."""
+    options = ["system.geometry.budget=auto", "system.geometry.min_gaussians=20", "trainer.max_steps=6", "trainer.val_check_interval=6"]
+    options += [f"system.geometry.prune.{rule}" for rule in ("start=0", "stop=6", "every=2", "quality=60", "likeness=1")]
+    config = CONFIGS / "demo.yaml" if known else mocked_config(tmp_path, painted_box)
+    options += [f"system.guidance.mesh={painted_box}"] if known else []
+    assert main(["--config", str(config), "--train", "--gpu", "cpu", f"exp_root_dir={tmp_path}", *SMALL, *options]) == 0
+    said = [line for line in "".join(capsys.readouterr()).splitlines() if "Gaussians; dB" in line]
+    measured = r"lost -?[\d.e-]+, affordable 30" if known else r"likeness [\d.]+, asked_for 1"
+    pattern = r"step (2|4): (\d+) -> (\d+) Gaussians; dB on the views of this step: " + measured
+    rounds = [re.search(pattern, line) for line in said]
+    assert len(rounds) == 2 and all(int(found[3]) == int(0.8 * int(found[2])) for found in rounds)
+    rows = list(csv.DictReader(open(trial(tmp_path) / "csv_logs" / "version_0" / "metrics.csv")))
+    assert any(row.get("prune/lost" if known else "prune/likeness") for row in rows)
+
+
+@pytest.mark.parametrize(("changes", "stop"), [(DENSIFY, 3), (DENSIFY, 4), (DENSIFY, 5), (PRUNE, 2), (PRUNE, 4)])
+def test_a_stopped_and_resumed_run_equals_the_run_that_never_stopped(tmp_path, painted_box, changes, stop):
+    """Bit for bit: Gaussians, moments, statistics; the stops lie before, at and after a change of the cloud, with more validation."""
+    options = [*changes, "checkpoint.every_n_train_steps=1"]
     assert launch(tmp_path / "whole", painted_box, *options, "trainer.max_steps=9", "trainer.val_check_interval=9") == 0
     assert launch(tmp_path / "parts", painted_box, *options, f"trainer.max_steps={stop}", "trainer.val_check_interval=1") == 0
     last = trial(tmp_path / "parts") / "ckpts" / "last.ckpt"
     assert launch(tmp_path / "parts", painted_box, *options, "trainer.max_steps=9", "trainer.val_check_interval=2", f"resume={last}") == 0
     whole, parts = (torch.load(trial(tmp_path / name) / "ckpts" / "last.ckpt", weights_only=True) for name in ("whole", "parts"))
     assert whole["global_step"] == parts["global_step"] == 9
-    assert len(whole["state_dict"]["geometry.means"]) > 250  # it did densify
+    count = len(whole["state_dict"]["geometry.means"])
+    assert count > 250 if changes is DENSIFY else count == 130
     assert same(whole["state_dict"], parts["state_dict"])
     states = [c["optimizer_states"][0]["state"] for c in (whole, parts)]
     assert all(torch.equal(states[0][i][k], states[1][i][k]) for i in states[0] for k in ("exp_avg", "exp_avg_sq", "step"))
