@@ -28,16 +28,21 @@ RATES = {
 def trained(geometry, views, pictures):
     """The cloud after a short run towards the pictures: what the system does, without its host."""
     adam = torch.optim.Adam(geometry.parameter_groups(), betas=(0.9, 0.99), eps=1e-15)
-    rng, grey = torch.Generator().manual_seed(0), torch.full((3,), 0.5)
+    rng = torch.Generator().manual_seed(0)
 
-    def draw(rows):
-        shape = geometry.means, geometry.quats, geometry.scales(), geometry.opacities(), geometry.colors(views.positions[rows])
-        return rasterize(*shape, views.viewmats[rows], views.Ks[rows], SIZE, SIZE, background=grey)
+    def draw(rows, opacities=None):
+        opacities = geometry.opacities() if opacities is None else opacities
+        shape = geometry.means, geometry.quats, geometry.scales(), opacities, geometry.colors(views.positions[rows])
+        return rasterize(*shape, views.viewmats[rows], views.Ks[rows], SIZE, SIZE, background=views.backgrounds[rows])
 
     for step in range(1, STEPS + 1):
         geometry.set_learning_rates(adam, 0, step)
         rows = torch.randperm(len(pictures), generator=rng)[:4]
-        out = draw(rows)
+        opacities = geometry.opacities()
+        out = draw(rows, opacities)
+        behind = views.backgrounds[rows][:, None, None]
+        pictures_now = {"comp_rgb": out.image, "opacity": out.alpha, "comp_rgb_bg": behind, "gaussian_opacities": opacities}
+        geometry.sample_removal(pictures_now, step - 1)
         (0.5 * (out.image - pictures[rows]).square().sum() / 4).backward()
         geometry.observe(out, SIZE, SIZE)
         adam.step()

@@ -1,4 +1,4 @@
-"""Gradual pruning: exact counts, the top Gaussian of a pixel stays, ``auto`` stops where the quality would suffer."""
+"""Gradual pruning: exact counts, what nobody would miss goes first, ``auto`` stops where the quality would suffer."""
 
 import pytest
 import torch
@@ -59,9 +59,13 @@ def test_a_budget_above_the_count_changes_nothing():
     assert rounds(geometry, 3) == [10, 10, 10] and torch.equal(geometry.means, before)
 
 
-def test_the_least_contributing_go_first():
+@pytest.mark.parametrize("sampled", [False, True])
+def test_those_with_the_lowest_scores_go_first(sampled):
     geometry = cloud(100, budget=80, prune=EVERY_STEP)
-    best = geometry.contribution.topk(80).indices.sort().values
+    if sampled:
+        geometry.removal += torch.rand(100, generator=torch.Generator().manual_seed(1))
+    scores = geometry.removal.sqrt() * geometry.contribution if sampled else geometry.contribution
+    best = scores.topk(80).indices.sort().values
     expected = geometry.means.detach()[best]
     geometry.after_step(optimizer(geometry), 0)
     assert torch.equal(geometry.means, expected)
@@ -69,11 +73,12 @@ def test_the_least_contributing_go_first():
 
 @pytest.mark.parametrize("name", parsimony.SCORES)
 def test_each_score_ranks_by_what_it_says(name):
-    logits, seen = torch.tensor([3.0, 1.0, 2.0]), parsimony.Seen(torch.tensor([0.1, 0.2, 0.3]), torch.tensor([1.0, 0.04, 0.09]))
-    order = parsimony.score(name, logits, seen, generator(0, "s")).argsort().tolist()
-    expected = {"opacity": [1, 2, 0], "contribution": [0, 1, 2], "removal": [1, 2, 0]}
-    assert order == expected.get(name, order)
-    assert name != "random" or order == parsimony.score(name, logits, seen, generator(0, "s")).argsort().tolist()
+    contribution, removal = torch.tensor([0.1, 0.2, 0.3]), torch.tensor([4.0, 0.25, 0.36])  # roots: 2, 0.5, 0.6
+    logits, seen = torch.tensor([3.0, 1.0, 2.0]), parsimony.Seen(contribution, removal)
+    scores = [parsimony.score(name, logits, seen, generator(0, "s", step)) for step in (0, 0, 1)]
+    expected = {"opacity": logits, "contribution": contribution, "removal": torch.tensor([0.2, 0.1, 0.18]), "random": scores[1]}
+    assert torch.allclose(scores[0], expected[name])
+    assert torch.equal(scores[0], scores[2]) == (name != "random")
 
 
 def test_unsampled_the_contribution_ranks():
@@ -101,6 +106,29 @@ def test_the_removal_error_is_that_of_leaving_each_gaussian_out():
     assert (samples.mean(0) / exact - 1).abs().amax() < 0.15
 
 
+def pictures(out, opacities, background=(0.0, 0.0, 0.0)):
+    """What the renderer gives, as far as sampling reads it."""
+    behind = torch.tensor(background).reshape(1, 1, 1, 3)
+    return {
+        "comp_rgb": out.image + (1 - out.alpha) * behind,
+        "opacity": out.alpha,
+        "comp_rgb_bg": behind,
+        "gaussian_opacities": opacities,
+        "rasterized": out,
+    }
+
+
+def test_the_colour_of_the_background_hides_nobody():
+    geometry = cloud(12, budget=5)
+    geometry.sh0.data[0] = -0.5 / 0.28209479177387814  # black, as the background
+    viewmats, Ks = to_opencv(orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])), torch.tensor([0.8]), 32, 32)
+    opacities = geometry.opacities()
+    inputs = geometry.means, geometry.quats, geometry.scales(), opacities, geometry.colors(viewmats[:, 3, :3])
+    out = rasterize(*inputs, viewmats, Ks, 32, 32)
+    geometry.sample_removal(pictures(out, opacities), 60)
+    assert out.contribution[0, 0] > 0.1 and geometry.removal[0] > 0.01 * geometry.removal.median()
+
+
 @pytest.mark.parametrize("backend", ["auto", "torch", "reference"])
 def test_sampling_leaves_the_gradients_of_the_loss_alone(backend):
     viewmats, Ks = to_opencv(orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])), torch.tensor([0.8]), 32, 32)
@@ -110,7 +138,7 @@ def test_sampling_leaves_the_gradients_of_the_loss_alone(backend):
         opacities = geometry.opacities()
         inputs = geometry.means, geometry.quats, geometry.scales(), opacities, geometry.colors(viewmats[:, 3, :3])
         out = rasterize(*inputs, viewmats, Ks, 32, 32, absgrad=True, backend=backend)
-        geometry.sample_removal({"comp_rgb": out.image, "opacities": opacities, "rasterized": out}, 60)
+        geometry.sample_removal(pictures(out, opacities), 60)
         assert geometry.removal.any() == (budget is not None)
         (out.image**2).sum().backward()
         left.append([out.means2d.grad, out.means2d.absgrad, *(p.grad for p in geometry.parameters() if p.numel())])

@@ -252,3 +252,40 @@ def test_any_quality_ends_the_search():
     probes, judges = (simplify.views_around(apart, 8, 48, turn=turn) for turn in (0.0, 45.0))
     assert len(simplify.simplify(apart, probes, judges, Budget(psnr=1.0), steps=2).means) == 1
     assert len(simplify.simplify(apart, probes, judges, Budget(psnr=99.0), steps=2).means) == 12
+
+
+@pytest.mark.parametrize("bearable", [1.0, 1 / 16, 0.0])
+def test_a_recovery_makes_nothing_worse(monkeypatch, bearable):
+    """It is done anew at smaller rates, and left out where none is small enough."""
+    cloud, paces = ball(), []
+    probes, judges = (simplify.views_around(cloud, count, 48, turn=turn) for count, turn in ((16, 0.0), (8, 45.0)))
+
+    def recover(cloud, views, pictures, steps, seed, sh_reach, pace):
+        paces.append(pace)
+        return cloud if pace <= bearable else cloud._replace(sh=cloud.sh + 1)
+
+    monkeypatch.setattr(simplify, "recover", recover)
+    found = simplify.simplify(cloud, probes, judges, simplify.Budget(count=580), steps=1)
+    kept = simplify.only(cloud, simplify.worth(cloud, probes), 580)
+    assert all(torch.equal(a, b) for a, b in zip(found, kept, strict=True))
+    assert paces == [pace for pace in simplify.PACES if pace >= bearable]
+
+
+def test_a_round_that_failed_is_not_tried_again(monkeypatch):
+    """Below a hundred Gaussians a round of one can't become smaller."""
+    cloud, tried = ball()._replace(), []
+    few = simplify.only(cloud, torch.arange(600.0), 20)
+    recover = simplify.recover
+    monkeypatch.setattr(simplify, "recover", lambda cloud, *rest: tried.append(len(cloud.means)) or recover(cloud, *rest))
+    probes, judges = (simplify.views_around(few, 8, 32, turn=turn) for turn in (0.0, 45.0))
+    assert len(simplify.simplify(few, probes, judges, simplify.Budget(psnr=99.0), steps=2).means) == 20
+    assert len(tried) <= 5 * len(simplify.PACES) and tried.count(19) <= len(simplify.PACES)
+
+
+def test_grey_gaussians_are_not_lost_before_grey():
+    cloud = ball()
+    cloud.sh[::2] = 0.0
+    kept = simplify.only(cloud, simplify.worth(cloud, simplify.views_around(cloud, 16, 48)), 300)
+    outside = kept.means.norm(dim=1) > 0.9
+    grey = (kept.sh == 0).all(-1)[:, 0] & outside
+    assert 0.3 < grey.double().sum() / outside.double().sum() < 0.7

@@ -10,7 +10,7 @@ saw the Gaussian: its meaning doesn't depend on resolution, batch size or a loss
 sigma_i T_i over the pixels of recent views (RadSplat, Niemeyer et al. 2024).
 
 Clone and split rules: Kerbl et al. 2023, section 5.2. There is no opacity reset (their section 5.2 sets all opacities near zero
-now and then to find floaters): score distillation doesn't rebuild what a reset erases, and pruning by contribution does its work.
+now and then to find floaters): score distillation doesn't rebuild what a reset erases, and pruning by what shows does its work.
 """
 
 import logging
@@ -121,12 +121,12 @@ def keep(change: Change, wanted: Bool[Tensor, " M"], contribution: Float[Tensor,
     return Change(change.parents[rows], change.fresh[rows], {name: value[rows] for name, value in change.values.items()})
 
 
-def prune_to(params: Mapping[str, Tensor], contribution: Float[Tensor, " N"], count: int) -> Change:
-    """Keep the ``count`` Gaussians that contribute most, in their order."""
-    rows = torch.arange(len(contribution), device=contribution.device)
+def prune_to(params: Mapping[str, Tensor], scores: Float[Tensor, " N"], count: int) -> Change:
+    """Keep the ``count`` Gaussians with the highest scores, in their order."""
+    rows = torch.arange(len(scores), device=scores.device)
     everything = Change(rows, torch.zeros_like(rows, dtype=torch.bool), {name: value.detach().clone() for name, value in params.items()})
     rules = Rules(max_gaussians=count, min_gaussians=min(count, len(rows)))
-    return keep(everything, torch.ones_like(everything.fresh), contribution, rules)
+    return keep(everything, torch.ones_like(everything.fresh), scores, rules)
 
 
 def rotate(quats: Float[Tensor, "N 4"], vectors: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:

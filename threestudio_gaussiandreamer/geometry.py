@@ -25,7 +25,7 @@ prune               how the budget is met (``parsimony.py``): start, stop, every
                     keeps), score (removal, contribution; opacity, random: to compare with), quality (dB that all rounds may lose against
                     the truth), likeness (dB between the renders before and after a round, at least); ``auto`` leaves out the first
                     half of the rounds: what looks superfluous early may be needed later
-max_gaussians       exact cap, reached by dropping what contributes least (of untrained points: any, evenly); min_gaussians: the
+max_gaussians       exact cap, reached by dropping what shows least (of untrained points: any, evenly); min_gaussians: the
                     floor that pruning never passes
 keep_attributes     with gaussians-prior: start from all attributes of that cloud, not only from points and colours
 ==================  =========================================================================================================
@@ -280,11 +280,11 @@ class GaussianCloud(BaseGeometry):
         return points[rows], colors[rows]
 
     def _capped_trained(self, cloud: simplify.Cloud) -> simplify.Cloud:
-        """At most ``max_gaussians`` of trained Gaussians: those that contribute most to views from all around."""
+        """At most ``max_gaussians`` of trained Gaussians: those that show most in views from all around."""
         if len(cloud.means) <= self.cfg.max_gaussians:
             return cloud
         logger.warning(
-            "the prior has %d Gaussians; keeping the %d that contribute most (max_gaussians)", len(cloud.means), self.cfg.max_gaussians
+            "the prior has %d Gaussians; keeping the %d that show most (max_gaussians)", len(cloud.means), self.cfg.max_gaussians
         )
         cloud = simplify.Cloud(*(values.to(self.means.device) for values in cloud))
         shown = simplify.worth(cloud, simplify.views_around(cloud, *CAP_VIEWS))
@@ -353,14 +353,17 @@ class GaussianCloud(BaseGeometry):
         cfg, rounds = self.cfg.prune, self.prune_rounds
         if self.cfg.budget is None or cfg.score != "removal" or not rounds or not rounds[0] - cfg.every <= step < rounds[-1]:
             return False
-        return len(self) > self._fewest() and step % max(1, cfg.every // parsimony.SAMPLES) == 0
+        return len(self) > self._fewest() and step % max(1, round(cfg.every / parsimony.SAMPLES)) == 0
 
     def sample_removal(self, pictures: dict[str, Any], step: int) -> None:
         """Add a sample of the removal error in these renders, before their losses, where a round of pruning will ask for it."""
         if not self._samples_removal(step):
             return
         rng = generator(run_seed(), "removal", step)
-        self.removal += all_sum(parsimony.removal_error(pictures["comp_rgb"], pictures["opacities"], rng))
+        behind = torch.rand(len(pictures["comp_rgb"]), 1, 1, 3, generator=rng).to(pictures["comp_rgb"])
+        # before a colour of its own each view shows those too that have the colour of the run's background
+        images = pictures["comp_rgb"] + (1 - pictures["opacity"]) * (behind - pictures["comp_rgb_bg"].detach())
+        self.removal += all_sum(parsimony.removal_error(images, pictures["gaussian_opacities"], rng))
         if self.wants_absgrad:
             pictures["rasterized"].means2d.absgrad.zero_()  # what this backward pass has added isn't the loss's
 
@@ -420,7 +423,7 @@ class GaussianCloud(BaseGeometry):
     @property
     def affordable(self) -> float:
         """dB that one round of ``auto`` may lose: none is sure to be won back, so all together lose ``prune.quality`` at most."""
-        return self.cfg.prune.quality / len(self.prune_rounds)
+        return self.cfg.prune.quality / max(1, len(self.prune_rounds))
 
     def _fewest(self) -> int:
         """How many Gaussians pruning leaves at least."""

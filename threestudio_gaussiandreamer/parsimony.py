@@ -55,8 +55,9 @@ def score(name: str, logit_opacities: Float[Tensor, " N"], seen: Seen, rng: torc
 def removal_error(images: Float[Tensor, "B H W C"], opacities: Float[Tensor, " N"], rng: torch.Generator) -> Float[Tensor, " N"]:
     """An unbiased sample of what each Gaussian shows: the squared change of the views without it, summed over pixels and channels.
 
-    A pixel I_p is linear in the opacity o of each Gaussian, so that d_p = o dI_p/do is exactly what it alone adds. With signs z_p drawn
-    at random, the mean of (sum_p z_p d_p)^2 is sum_p d_p^2 (Hutchinson 1989): one backward pass for all Gaussians.
+    A pixel I_p is linear in the opacity o of each Gaussian, so that d_p = o dI_p/do is exactly what it alone adds (but for pixels in which
+    its alpha is capped, and has no gradient). With signs z_p drawn at random, the mean of (sum_p z_p d_p)^2 is sum_p d_p^2 (Hutchinson
+    1989): one backward pass for all Gaussians.
 
     Args:
         images: rendered views, whose graph is kept.

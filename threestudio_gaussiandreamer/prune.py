@@ -47,7 +47,6 @@ from .host import get_device
 from .ply import GaussianArrays
 from .simplify import Budget, Cloud, Round, Views, likeness, look, simplify, views_around
 from .spz import COLOR_REACH
-from .streams import generator
 
 PROBES, JUDGES, TESTS = 64, 32, 16
 TURNS = (0.0, 45.0, 60.0)
@@ -284,12 +283,9 @@ def _simplified(stored: StoredCloud, budget: Budget, options: PruneOptions, suff
 
 
 def views_of(stored: StoredCloud, size: int) -> list[Views]:
-    """What is fitted to and what decides, each view before a colour of its own, so that none of a Gaussian's can hide it; what is
-    reported, all on grey."""
+    """What is fitted to, what decides, what is reported."""
     cloud, to_z_up = tensors_of(stored), torch.from_numpy(rotation_between(stored.up, "z"))
-    around = [views_around(cloud, n, size, turn=turn, to_z_up=to_z_up) for n, turn in zip((PROBES, JUDGES, TESTS), TURNS, strict=True)]
-    colors = [torch.rand(n, 3, generator=generator(0, "backgrounds", n)).to(cloud.means) for n in (PROBES, JUDGES)]
-    return [*(views._replace(backgrounds=color) for views, color in zip(around, colors, strict=False)), around[-1]]
+    return [views_around(cloud, n, size, turn=turn, to_z_up=to_z_up) for n, turn in zip((PROBES, JUDGES, TESTS), TURNS, strict=True)]
 
 
 def tensors_of(stored: StoredCloud) -> Cloud:
@@ -310,13 +306,13 @@ def write_report(path: str, done: Pruned, suffix: str, options: PruneOptions) ->
     """The table on the screen, ``path``.json and ``path``.png; returns what the JSON holds."""
     tests = views_of(done.before, options.size)[-1]
     clouds = [tensors_of(done.before), tensors_of(as_stored(done.after, suffix))]
-    pictures = [look(cloud, tests) for cloud in clouds]
+    grey = tests._replace(backgrounds=None)
     sizes = [file_size(done.before, suffix), file_size(done.after, suffix)]
-    costs = [Cost(len(cloud.means), size, frame_time(cloud, tests)) for cloud, size in zip(clouds, sizes, strict=True)]
-    reached = likeness(clouds[1], tests, pictures[0])
+    costs = [Cost(len(cloud.means), size, frame_time(cloud, grey)) for cloud, size in zip(clouds, sizes, strict=True)]
+    reached = likeness(clouds[1], tests, look(clouds[0], tests))
     report = {"before": costs[0]._asdict(), "after": costs[1]._asdict(), "psnr_on_unseen_views": reached, "seconds": round(done.seconds, 1)}
     Path(f"{path}.json").write_text(json.dumps(report | {"options": asdict(options)}, indent=2))
-    write_picture(Path(f"{path}.png"), sheet(pictures))
+    write_picture(Path(f"{path}.png"), sheet([look(cloud, grey) for cloud in clouds]))
     for name, cost in zip(("before", "after"), costs, strict=True):
         print(f"{name:7} {cost.gaussians:8d} Gaussians {cost.bytes / 1e6:8.2f} MB {cost.ms_per_frame:8.2f} ms a frame")
     print(f"{reached:.2f} dB to the unpruned cloud on views that nothing was fitted to; {path}, .json, .png")

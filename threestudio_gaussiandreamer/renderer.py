@@ -65,8 +65,8 @@ class SplattingRenderer(Rasterizer):
 
         Args: ``c2w`` (B, 4, 4) OpenGL, ``fovy`` (B,) radians, ``height`` and ``width`` in pixels, before ``downsample``.
         Returns: ``comp_rgb`` (B, H, W, 3), ``opacity`` and ``depth`` (B, H, W, 1), ``comp_normal`` (B, H, W, 3) in [0, 1],
-        ``comp_rgb_bg``, the background, (B, 1, 1, 3) or (B, H, W, 3), ``rasterized`` with what densification needs, and ``opacities``
-        (N,), of the Gaussians, which pruning differentiates by.
+        ``comp_rgb_bg``, the background, (B, 1, 1, 3) or (B, H, W, 3), ``rasterized`` with what densification needs, and
+        ``gaussian_opacities`` (N,), which pruning differentiates by.
         """
         device = self.geometry.means.device
         with torch.autocast(device.type, enabled=False):
@@ -100,7 +100,7 @@ class SplattingRenderer(Rasterizer):
         image, background = (out.image, flat[:, None, None]) if flat is not None else self._composite(out, c2w, fovy, batch)
         depth = out.depth / out.alpha.clamp_min(1e-6)
         pictures = {"comp_rgb": image, "opacity": out.alpha, "depth": depth, "comp_rgb_bg": background, "rasterized": out}
-        pictures["opacities"] = opacities
+        pictures["gaussian_opacities"] = opacities
         if cfg.train_normals or not self.training:
             pictures["comp_normal"] = normals_from_depth(depth, out.alpha, c2w, fovy)
         return pictures

@@ -1,4 +1,4 @@
-"""Fewer Gaussians for the same pictures: prune by contribution, round by round, and recover by self-distillation.
+"""Fewer Gaussians for the same pictures: prune by what each shows, round by round, and recover by self-distillation.
 
 What the cloud looked like before is the only truth: no diffusion model, no prompt, so nothing can drift. First duplicates become one
 (``merging.py``). Then each round keeps the best 0.8 by what they show in the probe views (the score ``removal`` of ``parsimony.py``),
@@ -29,7 +29,7 @@ SMALLEST_DROP = 0.01
 """A round that can't drop this share ends the search."""
 RATES = {"means": 2e-4, "quats": 4e-3, "log_scales": 1e-2, "logit_opacities": 2e-2, "sh": 5e-3}
 """Adam's for a cloud that has just lost a fifth; that of the means in units of the cloud's radius."""
-SLOWEST = 1 / 32
+PACES = (1.0, 1 / 4, 1 / 16, 1 / 64)
 """Of these rates. What is nearly right needs small ones: Adam's steps are as long where the gradient is mostly noise."""
 FOVY = math.radians(50.0)
 NEAR = 0.01
@@ -56,7 +56,7 @@ class Views(NamedTuple):
     near: float = NEAR
     """The nearest depth that is drawn."""
     backgrounds: Optional[Float[Tensor, "V 3"]] = None
-    """What lies behind; None is grey, before which neither dark nor bright Gaussians vanish."""
+    """What lies behind; None is grey."""
 
 
 class Budget(NamedTuple):
@@ -91,6 +91,7 @@ def _quantile(values: Float[Tensor, " N"], weights: Float[Tensor, " N"], share: 
 def views_around(cloud: Cloud, count: int, size: int, *, turn: float = 0.0, to_z_up: Optional[Float[Tensor, "3 3"]] = None) -> Views:
     """``count`` views on a spiral of golden angles that starts at ``turn`` degrees, near and far in turns; other turns, other views.
 
+    Each has a background of its own, so that no colour of a Gaussian can hide it, and its opacity shows.
     ``to_z_up`` is the rotation from the cloud's axes to some with z up.
     """
     centre, radius = bounds(cloud)
@@ -104,11 +105,12 @@ def views_around(cloud: Cloud, count: int, size: int, *, turn: float = 0.0, to_z
     c2w[:, :3, 3] += centre
     fovy = torch.full((count,), FOVY, device=centre.device)
     viewmats, _ = to_opencv(c2w, fovy, size, size)
-    return Views(viewmats, intrinsics(fovy, size, size), c2w[:, :3, 3], size, NEAR * radius)
+    backgrounds = torch.rand(count, 3, generator=generator(0, "backgrounds", count, round(turn))).to(centre)
+    return Views(viewmats, intrinsics(fovy, size, size), c2w[:, :3, 3], size, NEAR * radius, backgrounds)
 
 
 def draw(cloud: Cloud, views: Views, rows: Tensor, opacities: Optional[Float[Tensor, " N"]] = None) -> tuple[Tensor, Tensor]:
-    """Pictures (B, size, size, 3) of some of the views on grey, and each Gaussian's contribution to them (B, N).
+    """Pictures (B, size, size, 3) of some of the views, and each Gaussian's contribution to them (B, N).
 
     ``opacities`` stand for the cloud's own, to be differentiated by.
     """
@@ -184,39 +186,42 @@ def simplify(
     Raises:
         UserError: nothing of the cloud is to be seen, so that nothing says which Gaussians to keep.
     """
-    pictures, before, scores = look(cloud, probes), look(cloud, judges), rank(cloud, probes, seed)
-    if not scores.any():
+    pictures, before = look(cloud, probes), look(cloud, judges)
+    if not rank(cloud, probes, seed).any():
         raise UserError(f"none of the {len(cloud.means)} Gaussians is to be seen from around: nothing says which ones to keep")
 
-    def refitted(cloud: Cloud) -> tuple[Cloud, Round]:
-        """Recovered at the fastest pace that makes it more like the pictures; as it is where none does."""
-        nonlocal pace
-        pace = min(1.0, 4 * pace)
-        cloud = cloud._replace(sh=torch.cat([cloud.sh[:, :1].clamp(-sh_reach, sh_reach), cloud.sh[:, 1:]], 1))
+    def refitted(cloud: Cloud, done: int) -> tuple[Cloud, Round]:
+        """Recovered at the fastest pace that makes it more like the pictures; as it was where none does."""
+        found = cloud = cloud._replace(sh=torch.cat([cloud.sh[:, :1].clamp(-sh_reach, sh_reach), cloud.sh[:, 1:]], 1))
         unfitted = likeness(cloud, probes, pictures)
-        while likeness(found := recover(cloud, probes, pictures, steps, seed + done, sh_reach, pace), probes, pictures) < unfitted:
-            if pace <= SLOWEST:
-                found = cloud
+        for pace in PACES:
+            recovered = recover(cloud, probes, pictures, steps, seed + done, sh_reach, pace)
+            if likeness(recovered, probes, pictures) >= unfitted:
+                found = recovered
                 break
-            pace /= 4
         return found, Round(len(found.means), assured_likeness(stored(found), judges, before))
 
-    keep, done, pace = KEEP, 0, 1.0
+    def holds(reached: Round) -> bool:
+        return budget.psnr is None or reached.psnr >= budget.psnr
+
+    done = 0
     if float(cloud.sh[:, 0].abs().amax()) > sh_reach:
-        cloud, _ = refitted(cloud)
+        cloud, _ = refitted(cloud, done)
     fewer = Cloud(**merge_duplicates(cloud._asdict(), at_least=budget.count or 1).values)
-    while True:
-        if len(fewer.means) < len(cloud.means):
-            fewer, reached = refitted(fewer)
-            if budget.psnr is None or reached.psnr >= budget.psnr:
-                cloud, scores, done = fewer, rank(fewer, probes, seed), done + 1
-                report(reached)
-            else:
-                keep = 0.5 * (1 + keep)  # half as many
-        count = _next_count(len(cloud.means), keep, budget)
-        if count == len(cloud.means):
-            return cloud
-        fewer = only(cloud, scores, count)
+    if len(fewer.means) < len(cloud.means):
+        fewer, reached = refitted(fewer, done)
+        if holds(reached):
+            cloud, done = fewer, 1
+            report(reached)
+    keep, scores, failed = KEEP, rank(cloud, probes, seed), 0
+    while failed < (count := _next_count(len(cloud.means), keep, budget)) < len(cloud.means):
+        fewer, reached = refitted(only(cloud, scores, count), done)
+        if holds(reached):
+            cloud, scores, done, failed = fewer, rank(fewer, probes, seed), done + 1, 0
+            report(reached)
+        else:
+            keep, failed = 0.5 * (1 + keep), count  # half as many
+    return cloud
 
 
 def _next_count(here: int, keep: float, budget: Budget) -> int:

@@ -21,7 +21,7 @@ import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Optional
+from typing import Any, NamedTuple, Optional
 
 import torch
 import torch.nn.functional as F
@@ -48,6 +48,14 @@ from .surface import Surface, write_obj
 
 REGULARISERS = ("sparsity", "opaque")
 GUIDANCE_LR = 1e-4  # of what a guidance trains itself, such as the LoRA of variational score distillation
+
+
+class Price(NamedTuple):
+    """What a round of ``auto`` costs: Gaussians before and after, and dB by their name in the logs."""
+
+    before: int
+    after: int
+    measured: dict[str, float]
 
 
 @register("gaussiandreamer-system")
@@ -153,10 +161,21 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             self.measurements = Measurements(HeldOut(self.cfg.evaluation, caster), Path(self._save_dir))
 
     def on_train_start(self) -> None:
+        self.warn_of_rounds_too_late()
         if self.global_step == 0:
             self.score("prior")
         if self.measurements:
             self.measurements.start_clock()
+
+    def warn_of_rounds_too_late(self) -> None:
+        """Say that a budget won't be met because its schedule is made for a longer run."""
+        rounds, end = self.geometry.prune_rounds, self.trainer.max_steps
+        late = sum(step > end for step in rounds) if self.geometry.cfg.budget is not None and end > 0 else 0
+        if late:
+            warn(
+                f"{late} of the {len(rounds)} rounds of pruning would come after step {end}, the last:"
+                " give system.geometry.prune.start, stop and every to match"
+            )
 
     # -- one step ------------------------------------------------------------------------------------------------------------
 
@@ -179,20 +198,17 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             self.count_skipped_step(loss_scale)
         optimizer.zero_grad(set_to_none=True)
         # self.optimizers() wraps the torch optimiser, whose rows have to follow the Gaussians
-        before, price = len(self.geometry), {}
-        self.geometry.after_step(optimizer.optimizer, self.global_step, lambda kept: self.quality_holds(kept, batch, price))
-        if price:  # of the last step of a search, which is the one that was made
-            self.log_dict(price)
-            told = ", ".join(f"{name.partition('/')[2]} {value:.3g}" for name, value in price.items())
-            info(f"step {self.global_step}: {before} -> {len(self.geometry)} Gaussians; dB on the views of this step: {told}")
+        prices: list[Price] = []
+        self.geometry.after_step(optimizer.optimizer, self.global_step, lambda kept: self.quality_holds(kept, batch, prices))
+        self.tell(prices)
         self.report(out, batch, losses, loss)
 
     @torch.no_grad()
-    def quality_holds(self, kept: Bool[Tensor, " N"], batch: dict[str, Any], price: dict[str, float]) -> bool:
+    def quality_holds(self, kept: Bool[Tensor, " N"], batch: dict[str, Any], prices: list[Price]) -> bool:
         """Whether this batch looks nearly the same with only the ``kept`` Gaussians: for ``system.geometry.budget=auto``.
 
-        Where the guidance knows the truth, the loss of dB against it is measured; elsewhere how like the renders are. If it holds,
-        what was measured goes into ``price``.
+        Where the guidance knows the truth, the loss of dB against it is measured; elsewhere how like the renders are. What was measured
+        of those with which it holds goes to ``prices``.
         """
         all_of_them = self(batch)
         with self.geometry.only(kept):
@@ -205,8 +221,15 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             loss, affordable = (psnr(all_of_them["comp_rgb"], truth) - psnr(fewer, truth)).mean(), self.geometry.affordable
             margin, found = affordable - loss, {"prune/lost": float(loss), "prune/affordable": affordable}
         holds = bool(all_sum(margin) >= 0)  # every process looks at other views, and all have to decide alike
-        price.update(found if holds else {})
+        prices += [Price(len(kept), int(kept.sum()), found)] if holds else []
         return holds
+
+    def tell(self, prices: list[Price]) -> None:
+        """Log and print what a round of ``auto`` cost: the last of a search is the one that was made."""
+        for before, after, measured in prices[-1:]:
+            self.log_dict(measured)
+            told = ", ".join(f"{name.partition('/')[2]} {value:.3g}" for name, value in measured.items())
+            info(f"step {self.global_step}: {before} -> {after} Gaussians; dB on the views of this step: {told}")
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
         for part in (self.geometry, self.background):
