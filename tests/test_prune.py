@@ -2,13 +2,13 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from threestudio_gaussiandreamer import prune, simplify
 from threestudio_gaussiandreamer.cloud_files import PRUNED, read_cloud
-from threestudio_gaussiandreamer.merging import merge_duplicates
 from threestudio_gaussiandreamer.ply import read_comments, read_gaussians, write_gaussians
 from threestudio_gaussiandreamer.simplify import Budget, Cloud
 
@@ -258,7 +258,7 @@ def test_any_quality_ends_the_search():
 @pytest.mark.parametrize("bearable", [1.0, 1 / 16, 0.0])
 def test_a_recovery_makes_nothing_worse(monkeypatch, bearable):
     """It is done anew at smaller rates, and left out where none is small enough."""
-    cloud, paces = simplify.Cloud(**merge_duplicates(ball()._asdict()).values), []
+    cloud, paces = ball(), []
     probes, judges = (simplify.views_around(cloud, count, 48, turn=turn) for count, turn in ((16, 0.0), (8, 45.0)))
 
     def recover(cloud, views, pictures, steps, seed, sh_reach, pace):
@@ -266,6 +266,7 @@ def test_a_recovery_makes_nothing_worse(monkeypatch, bearable):
         return cloud if pace <= bearable else cloud._replace(sh=cloud.sh + 1)
 
     monkeypatch.setattr(simplify, "recover", recover)
+    monkeypatch.setattr(simplify, "merge_duplicates", lambda values, at_least: SimpleNamespace(values=values))
     found = simplify.simplify(cloud, probes, judges, simplify.Budget(count=len(cloud.means) - 20), steps=1)
     kept = simplify.only(cloud, simplify.worth(cloud, probes), len(cloud.means) - 20)
     assert all(torch.equal(a, b) for a, b in zip(found, kept, strict=True))
