@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-from runs import CHARTS, rows_of
+from runs import CHARTS, SIZE, rows_of
 
 Row = dict[str, str]
 TUNED_ON = "toy"
@@ -34,6 +34,8 @@ class Chart(NamedTuple):
     log_x: bool = True
     marks_paper: bool = False
     """Whether the end of the paper's recipe is drawn from the chart ``count``."""
+    size: int = SIZE
+    """Pixels of the renders each way."""
 
 
 DECIBEL = "held-out PSNR, dB"
@@ -52,7 +54,7 @@ RUNS = {
     ),
     "iterations": Chart("What more steps buy", "x", "steps", curves=False),
     "dilation": Chart("What a smaller screen-space dilation buys", "x", "dilation, square pixels", curves=False),
-    "quality": Chart("Draft, default and best", "cpu_seconds", SECONDS, curves=True),
+    "quality": Chart("Draft, default and best", "cpu_seconds", SECONDS, curves=True, size=256),
     "preset": Chart("What the rasteriser's presets buy", "cpu_seconds", SECONDS, curves=True, marks_paper=True),
 }
 
@@ -87,7 +89,7 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
     figure.suptitle(chart.title, x=0.01, ha="left", fontweight="bold")
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=min(4, len(labels)), frameon=False, fontsize=9)
-    figure.text(0.01, 0.905, caption(rows), fontsize=8, color="0.35")
+    figure.text(0.01, 0.905, caption(rows, chart.size), fontsize=8, color="0.35")
     figure.tight_layout(rect=(0, 0.06 + 0.04 * ((len(labels) - 1) // 4), 1, 0.93))
     path = CHARTS / f"{name}.png"
     figure.savefig(path, dpi=110)
@@ -160,11 +162,11 @@ def spread(rows: list[Row]) -> tuple[float, float, float]:
     return min(values), statistics.median(values), max(values)
 
 
-def caption(rows: list[Row]) -> str:
+def caption(rows: list[Row], size: int = SIZE) -> str:
     """What a chart was made on."""
     seeds = len({row["seed"] for row in rows})
     machine, commits = (", ".join(sorted({row[column] for row in rows})) for column in ("machine", "commit"))
-    return f"exact score of a known object, configs/demo.yaml at 128², {seeds} seeds: median and range; {machine}; commit {commits}"
+    return f"exact score of a known object, configs/demo.yaml at {size}², {seeds} seeds: median and range; {machine}; commit {commits}"
 
 
 if __name__ == "__main__":
