@@ -9,17 +9,17 @@ docs/charts/after_run.csv.
 """
 
 import argparse
-import csv
 import math
 import statistics
 import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 from jobs import NO_BUDGET
-from runs import CHARTS, STEPS, commit, machine, object_name, rows_of, train
+from runs import STEPS, append_rows, object_name, rows_of, train
 from torch import Tensor
 
 from threestudio_gaussiandreamer import parsimony, prune, register_parts
@@ -39,19 +39,22 @@ def main() -> None:
     for seed in arguments.seeds:
         for mesh in arguments.objects:
             if not any(row["object"] == object_name(mesh) and row["seed"] == str(seed) for row in rows_of("after_run")):
-                append(mesh, seed, measured(mesh, seed))
+                append_rows("after_run", COLUMNS, measured(mesh, seed))
     print(table())
 
 
-def measured(mesh: str, seed: int) -> list[tuple[str, int, float]]:
-    """What was done, to how many, and the dB that it led to."""
+def measured(mesh: str, seed: int) -> list[dict[str, Any]]:
+    """Rows of the CSV: what was done, to how many, and the dB that it led to."""
     with tempfile.TemporaryDirectory() as folder:
         stored = read_cloud(str(train(Path(folder), mesh, seed, NO_BUDGET) / f"it{STEPS}-export/gaussians.ply"))
     cloud = prune.tensors_of(stored)
     probes, judges, tests = prune.views_of(stored, 256)
     pictures = look(cloud, tests)
+    place = {"object": object_name(mesh), "seed": seed}
     return [
-        (variant, count, likeness(fewer, tests, pictures)) for count in COUNTS for variant, fewer in variants(cloud, count, probes, judges)
+        place | {"variant": variant, "x": count, "psnr": round(likeness(fewer, tests, pictures), 3)}
+        for count in COUNTS
+        for variant, fewer in variants(cloud, count, probes, judges)
     ]
 
 
@@ -77,17 +80,6 @@ RANKS = {
     "opacity": lambda cloud, views, seed: cloud.logit_opacities.detach(),
     "random": lambda cloud, views, seed: torch.rand(len(cloud.means), generator=torch.Generator().manual_seed(seed)),
 }
-
-
-def append(mesh: str, seed: int, results: list[tuple[str, int, float]]) -> None:
-    path = CHARTS / "after_run.csv"
-    new = not path.is_file()
-    with open(path, "a", newline="") as file:
-        writer = csv.writer(file)
-        if new:
-            writer.writerow(COLUMNS)
-        for variant, count, psnr in results:
-            writer.writerow([variant, count, object_name(mesh), seed, round(psnr, 3), machine(), commit()])
 
 
 def table() -> str:

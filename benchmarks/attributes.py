@@ -12,7 +12,6 @@ Trained clouds are kept in outputs/attributes; what the CSV has is not run again
 """
 
 import argparse
-import csv
 import json
 import os
 import tempfile
@@ -25,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from chart_runs import TUNED_ON, caption, grouped, median, spread
-from runs import CHARTS, ROOT, SIZE, STEPS, commit, machine, object_name, rows_of, train
+from runs import CHARTS, ROOT, SIZE, STEPS, append_rows, object_name, rows_of, train
 from tqdm import tqdm
 
 from threestudio_gaussiandreamer import register_parts
@@ -155,14 +154,7 @@ def measured(kind: str, count: int, mesh: str, seed: int) -> bool:
 
 
 def append(job: tuple[str, int, str, int], measurements: list[dict[str, Any]]) -> None:
-    path = CHARTS / "attributes.csv"
-    new = not path.is_file()
-    with open(path, "a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, restval="", extrasaction="ignore")
-        if new:
-            writer.writeheader()
-        place = {"object": object_name(job[2]), "seed": job[3], "machine": machine(), "commit": commit()}
-        writer.writerows(row | place for row in measurements)
+    append_rows("attributes", COLUMNS, [row | {"object": object_name(job[2]), "seed": job[3]} for row in measurements])
 
 
 # ---- rounding, in the steps of SPZ where the number of bits is SPZ's ----------------------------------------------------------

@@ -10,7 +10,6 @@ the prune command's input, on views that nothing was fitted to. Results go to do
 """
 
 import argparse
-import csv
 import math
 import sys
 import tempfile
@@ -21,7 +20,7 @@ from typing import Any
 import torch
 import yaml
 from jaxtyping import Float
-from runs import CHARTS, ROOT, commit, machine
+from runs import ROOT, append_rows
 from torch import Tensor
 
 from threestudio_gaussiandreamer import prune, register_parts
@@ -166,13 +165,8 @@ def found_by_prune(true: Cloud, seed: int, folder: Path) -> tuple[int, int, floa
 
 def append(method: str, truth: int, seed: int, start: int, found: int, psnr: float) -> None:
     print(f"{method}: {truth} are true, {start} at the start, {found} found ({found / truth:.2f} M), {psnr:.1f} dB", flush=True)
-    path = CHARTS / "known_answer.csv"
-    new = not path.is_file()
-    with open(path, "a", newline="") as file:
-        writer = csv.writer(file)
-        if new:
-            writer.writerow(COLUMNS)
-        writer.writerow([method, truth, start, seed, found, round(psnr, 2), machine(), commit()])
+    values = (method, truth, start, seed, found, round(psnr, 2))
+    append_rows("known_answer", COLUMNS, [dict(zip(COLUMNS, values, strict=False))])
 
 
 if __name__ == "__main__":

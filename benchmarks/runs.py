@@ -122,23 +122,22 @@ def rows_of(chart: str) -> list[dict[str, str]]:
 
 def append(job: Job, mesh: str, seed: int, metrics: dict[str, Any]) -> None:
     """The curve and the result of one run; a result's ``step`` is the last."""
-    path, new = CHARTS / f"{job.chart}.csv", not (CHARTS / f"{job.chart}.csv").is_file()
+    start = metrics["prior"] | {"step": 0}
+    points = {scores["step"]: scores for scores in (start, *metrics.get("curve", ()), metrics["result"])}
+    place = {"variant": job.variant, "x": f"{job.x:g}", "object": object_name(mesh), "seed": seed}
+    append_rows(job.chart, COLUMNS, [scores | place for scores in points.values()])
+
+
+def append_rows(chart: str, columns: list[str], rows: list[dict[str, Any]]) -> None:
+    """Rows at the end of a chart's CSV, with the machine and the commit that they were measured on."""
+    path, here = CHARTS / f"{chart}.csv", {"machine": machine(), "commit": commit()}
     path.parent.mkdir(parents=True, exist_ok=True)
+    new = not path.is_file()
     with open(path, "a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, restval="", extrasaction="ignore")
+        writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
         if new:
             writer.writeheader()
-        start = metrics["prior"] | {"step": 0}
-        points = {scores["step"]: scores for scores in (start, *metrics.get("curve", ()), metrics["result"])}
-        place = {
-            "variant": job.variant,
-            "x": f"{job.x:g}",
-            "object": object_name(mesh),
-            "seed": seed,
-            "machine": machine(),
-            "commit": commit(),
-        }
-        writer.writerows(scores | place for scores in points.values())
+        writer.writerows(row | here for row in rows)
 
 
 def machine() -> str:

@@ -378,7 +378,7 @@ class GaussianCloud(BaseGeometry):
             holds: for ``budget: auto``: whether the quality holds when only the marked Gaussians are drawn.
         """
         change = None
-        if self.cfg.densify.enabled and is_due(self.cfg.densify, step):
+        if self.cfg.densify.enabled and step in rounds_of(self.cfg.densify):
             change = self.densified(step)
             if not change.fresh.any() and len(change.parents) == len(self):
                 change = None
@@ -416,8 +416,7 @@ class GaussianCloud(BaseGeometry):
     @property
     def prune_rounds(self) -> range:
         """The numbers of finished steps after which a round of pruning is due."""
-        cfg = self.cfg.prune
-        rounds = range(math.ceil(cfg.start / cfg.every) * cfg.every, cfg.stop, cfg.every)
+        rounds = rounds_of(self.cfg.prune)
         return rounds[len(rounds) // 2 :] if self.cfg.budget == AUTO else rounds
 
     @property
@@ -475,9 +474,9 @@ def _finite_rows(parameter: Tensor) -> Bool[Tensor, " N"]:
     return finite
 
 
-def is_due(schedule: Any, step: int) -> bool:
-    """Whether a schedule with ``start``, ``stop`` and ``every`` has a round at this step."""
-    return schedule.start <= step < schedule.stop and step % schedule.every == 0
+def rounds_of(schedule: Any) -> range:
+    """The steps at which a schedule with ``start``, ``stop`` and ``every`` has a round: the multiples of ``every``."""
+    return range(math.ceil(schedule.start / schedule.every) * schedule.every, schedule.stop, schedule.every)
 
 
 def _nested(cfg: Any, dotted: str) -> Any:

@@ -186,8 +186,8 @@ def simplify(
     Raises:
         UserError: nothing of the cloud is to be seen, so that nothing says which Gaussians to keep.
     """
-    pictures, before = look(cloud, probes), look(cloud, judges)
-    if not rank(cloud, probes, seed).any():
+    pictures, before, scores = look(cloud, probes), look(cloud, judges), rank(cloud, probes, seed)
+    if not scores.any():
         raise UserError(f"none of the {len(cloud.means)} Gaussians is to be seen from around: nothing says which ones to keep")
 
     def refitted(cloud: Cloud, done: int) -> tuple[Cloud, Round]:
@@ -207,13 +207,14 @@ def simplify(
     done = 0
     if float(cloud.sh[:, 0].abs().amax()) > sh_reach:
         cloud, _ = refitted(cloud, done)
+        scores = rank(cloud, probes, seed)
     fewer = Cloud(**merge_duplicates(cloud._asdict(), at_least=budget.count or 1).values)
     if len(fewer.means) < len(cloud.means):
         fewer, reached = refitted(fewer, done)
         if holds(reached):
-            cloud, done = fewer, 1
+            cloud, scores, done = fewer, rank(fewer, probes, seed), 1
             report(reached)
-    keep, scores, failed = KEEP, rank(cloud, probes, seed), 0
+    keep, failed = KEEP, 0
     while failed < (count := _next_count(len(cloud.means), keep, budget)) < len(cloud.means):
         fewer, reached = refitted(only(cloud, scores, count), done)
         if holds(reached):

@@ -8,14 +8,15 @@ import pytest
 import torch
 import yaml
 from rows import row
+from small_runs import TowardsGrey
 from torch import nn
 
-from threestudio_gaussiandreamer import densify, sds, streams
+from threestudio_gaussiandreamer import densify, sds
 from threestudio_gaussiandreamer.densify import PARAMETERS, Rules, Statistics
 from threestudio_gaussiandreamer.errors import UserError
 from threestudio_gaussiandreamer.geometry import LEARNING_RATES, STATISTICS, GaussianCloud
 from threestudio_gaussiandreamer.grow import grow
-from threestudio_gaussiandreamer.guidance.base import NonFiniteScore, ScoreDistillation
+from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
 from threestudio_gaussiandreamer.point_cloud import PointCloud
 from threestudio_gaussiandreamer.streams import generator
 from threestudio_gaussiandreamer.system import GaussianDreamerSystem
@@ -312,23 +313,13 @@ def test_f25_each_preset_holds_its_own_numbers(fault):
 # ---- score distillation --------------------------------------------------------------------------------------------------------
 
 
-class Stub(ScoreDistillation):
-    """Its gradient is w x for latents x; NaN for the first item from step ``broken_from`` on."""
+class Stub(TowardsGrey):
+    """NaN for the first item from step ``broken_from`` on."""
 
     broken_from = 0
 
-    def encode(self, rgb, **batch):
-        return 2 * rgb - 1
-
-    def decode(self, latents):
-        return (latents + 1) / 2
-
-    def condition(self, prompt_utils, **batch):
-        return None
-
     def predict(self, z, t, condition):
-        noise = streams.normal_per_item(tuple(z.shape), 0, "noise", self.step)
-        eps = noise + sds.predict_x0(z, noise, self.alphas_cumprod[t])
+        eps, _ = super().predict(z, t, condition)
         eps[0] = torch.where(torch.tensor(self.step >= self.broken_from), torch.nan, eps[0])
         return eps, None
 

@@ -10,15 +10,14 @@ import pytest
 import torch
 from lightning.pytorch.plugins import MixedPrecision
 from rows import row
-from small_runs import Ended, differences, launch
+from small_runs import Ended, TowardsGrey, differences, launch
 
-from threestudio_gaussiandreamer import cameras, register_parts, sds, streams, trial
+from threestudio_gaussiandreamer import cameras, register_parts, sds, trial
 from threestudio_gaussiandreamer.cameras import Orbit
 from threestudio_gaussiandreamer.config_check import check_part
 from threestudio_gaussiandreamer.data import TrainCameras, make_batch
 from threestudio_gaussiandreamer.errors import UserError
 from threestudio_gaussiandreamer.evaluate import EvaluationConfig, HeldOut
-from threestudio_gaussiandreamer.guidance.base import ScoreDistillation
 from threestudio_gaussiandreamer.host import C, find, register
 from threestudio_gaussiandreamer.meshes import load_mesh
 from threestudio_gaussiandreamer.metrics import psnr
@@ -34,23 +33,13 @@ RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 
 
 @register("stability-spoilt-guidance")
-class Spoilt(ScoreDistillation):
-    """Pulls every picture towards grey; at the steps in ``spoilt`` the score of those items is that value."""
+class Spoilt(TowardsGrey):
+    """At the steps in ``spoilt`` the score of those items is that value."""
 
     spoilt: dict[int, dict[int, float]] = {}
 
-    def encode(self, rgb, **batch):
-        return 2 * rgb - 1
-
-    def decode(self, latents):
-        return (latents + 1) / 2
-
-    def condition(self, prompt_utils, **batch):
-        return None
-
     def predict(self, z, t, condition):
-        noise = streams.normal_per_item(tuple(z.shape), 0, "noise", self.step)
-        eps = noise + sds.predict_x0(z, noise, self.alphas_cumprod[t])
+        eps, _ = super().predict(z, t, condition)
         for item, value in self.spoilt.get(self.step, {}).items():
             eps[item] = value
         return eps, None

@@ -5,10 +5,30 @@ of ``ExporterOutput(save_name, save_type, params)``; the system writes each with
 """
 
 import os
+from dataclasses import dataclass
 
 from ..errors import UserError
-from ..host import BaseGeometry
+from ..host import BaseGeometry, Exporter
 from ..ply import GaussianArrays
+
+
+class FileExporter(Exporter):
+    """An exporter of one file; its options are checked before anything else, also by threestudio's own host, which doesn't."""
+
+    @dataclass
+    class Config(Exporter.Config):
+        save_name: str = ""
+
+        @staticmethod
+        def check(cfg: "FileExporter.Config") -> None:
+            """Raises UserError for a name that isn't that of a file."""
+            require_file_name(cfg.save_name)
+
+    cfg: Config
+
+    def configure(self, geometry: BaseGeometry, *args: object, **kwargs: object) -> None:
+        self.Config.check(self.cfg)
+        super().configure(geometry, *args, **kwargs)
 
 
 def require_file_name(name: str) -> None:

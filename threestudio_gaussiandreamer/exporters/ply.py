@@ -15,32 +15,28 @@ from typing import List, Optional
 import numpy as np
 
 from ..errors import UserError
-from ..host import BaseGeometry, Exporter, ExporterOutput, register
+from ..host import ExporterOutput, register
 from ..ply import padded_sh
-from .base import gaussian_arrays, require_file_name
+from .base import FileExporter, gaussian_arrays
 
 
 @register("ply-exporter")
-class PlyExporter(Exporter):
+class PlyExporter(FileExporter):
     """One file of save_type "ply"; its params are the arguments of ``ply.write_gaussians``."""
 
     @dataclass
-    class Config(Exporter.Config):
+    class Config(FileExporter.Config):
         save_name: str = "gaussians.ply"
         pad_sh_degree: Optional[int] = None
 
         @staticmethod
         def check(cfg: "PlyExporter.Config") -> None:
             """Raises UserError for a degree that no viewer knows."""
-            require_file_name(cfg.save_name)
+            FileExporter.Config.check(cfg)
             if cfg.pad_sh_degree not in (None, 0, 1, 2, 3):
                 raise UserError(f"pad_sh_degree: expected null, 0, 1, 2 or 3, got {cfg.pad_sh_degree}")
 
     cfg: Config
-
-    def configure(self, geometry: BaseGeometry, *args: object, **kwargs: object) -> None:
-        self.Config.check(self.cfg)  # threestudio's own host doesn't
-        super().configure(geometry, *args, **kwargs)
 
     def __call__(self) -> List[ExporterOutput]:
         arrays = gaussian_arrays(self.geometry)

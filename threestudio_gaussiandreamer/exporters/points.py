@@ -13,33 +13,29 @@ from dataclasses import dataclass
 from typing import List
 
 from ..errors import UserError
-from ..host import BaseGeometry, Exporter, ExporterOutput, register
+from ..host import ExporterOutput, register
 from ..ply import opaque, sh0_colors
 from ..point_cloud import PointCloud
-from .base import gaussian_arrays, require_file_name
+from .base import FileExporter, gaussian_arrays
 
 
 @register("points-exporter")
-class PointsExporter(Exporter):
+class PointsExporter(FileExporter):
     """One file of save_type "points"; its params are ``{"cloud": PointCloud}``."""
 
     @dataclass
-    class Config(Exporter.Config):
+    class Config(FileExporter.Config):
         save_name: str = "points.ply"
         min_opacity: float = 0.0
 
         @staticmethod
         def check(cfg: "PointsExporter.Config") -> None:
             """Raises UserError for a value out of range."""
-            require_file_name(cfg.save_name)
+            FileExporter.Config.check(cfg)
             if not 0 <= cfg.min_opacity <= 1:
                 raise UserError(f"min_opacity: expected a number in [0, 1], got {cfg.min_opacity}")
 
     cfg: Config
-
-    def configure(self, geometry: BaseGeometry, *args: object, **kwargs: object) -> None:
-        self.Config.check(self.cfg)  # threestudio's own host doesn't
-        super().configure(geometry, *args, **kwargs)
 
     def __call__(self) -> List[ExporterOutput]:
         arrays = gaussian_arrays(self.geometry)

@@ -13,28 +13,20 @@ About 17 bytes a Gaussian; what its rounding costs is in docs/parsimony.md. The 
 from dataclasses import dataclass
 from typing import List
 
-from ..host import BaseGeometry, Exporter, ExporterOutput, register, warn
+from ..host import ExporterOutput, register, warn
 from ..ply import usable
-from .base import gaussian_arrays, require_file_name
+from .base import FileExporter, gaussian_arrays
 
 
 @register("spz-exporter")
-class SpzExporter(Exporter):
+class SpzExporter(FileExporter):
     """One file of save_type "spz"; its params are the arrays of the Gaussians, z up."""
 
     @dataclass
-    class Config(Exporter.Config):
+    class Config(FileExporter.Config):
         save_name: str = "gaussians.spz"
 
-        @staticmethod
-        def check(cfg: "SpzExporter.Config") -> None:
-            require_file_name(cfg.save_name)
-
     cfg: Config
-
-    def configure(self, geometry: BaseGeometry, *args: object, **kwargs: object) -> None:
-        self.Config.check(self.cfg)  # threestudio's own host doesn't
-        super().configure(geometry, *args, **kwargs)
 
     def __call__(self) -> List[ExporterOutput]:
         arrays = gaussian_arrays(self.geometry)

@@ -16,17 +16,17 @@ from dataclasses import dataclass
 from typing import List
 
 from ..errors import UserError
-from ..host import BaseGeometry, Exporter, ExporterOutput, register, warn
+from ..host import ExporterOutput, register, warn
 from ..surface import gaussian_surface
-from .base import gaussian_arrays, require_file_name
+from .base import FileExporter, gaussian_arrays
 
 
 @register("surface-exporter")
-class SurfaceExporter(Exporter):
+class SurfaceExporter(FileExporter):
     """One file of save_type "surface"; its params are ``{"surface": Surface}``."""
 
     @dataclass
-    class Config(Exporter.Config):
+    class Config(FileExporter.Config):
         save_name: str = "model.obj"
         resolution: int = 128
         level: float = 0.5
@@ -34,17 +34,13 @@ class SurfaceExporter(Exporter):
         @staticmethod
         def check(cfg: "SurfaceExporter.Config") -> None:
             """Raises UserError for a value out of range."""
-            require_file_name(cfg.save_name)
+            FileExporter.Config.check(cfg)
             if not 8 <= cfg.resolution <= 512:
                 raise UserError(f"resolution: expected 8 to 512 cells, got {cfg.resolution}")
             if not 0 < cfg.level <= 1:
                 raise UserError(f"level: expected a share in (0, 1], got {cfg.level}")
 
     cfg: Config
-
-    def configure(self, geometry: BaseGeometry, *args: object, **kwargs: object) -> None:
-        self.Config.check(self.cfg)  # threestudio's own host doesn't
-        super().configure(geometry, *args, **kwargs)
 
     def __call__(self) -> List[ExporterOutput]:
         surface = gaussian_surface(gaussian_arrays(self.geometry), resolution=self.cfg.resolution, level=self.cfg.level)
