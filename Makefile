@@ -9,7 +9,7 @@ SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import
 .PHONY: demo test stability fuzz long-run ablations bench gpu-check charts measure-charts clean
 
 demo: $(VENV)/ready                ## train the bundled toy from a coarse prior, offline, on the CPU
-	$(ENVIRON) $(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
+	$(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
 
 test: $(VENV)/ready-for-tests                ## the whole test suite, as CI runs it
 	$(ENVIRON) $(BIN)/python -m pytest

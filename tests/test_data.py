@@ -80,6 +80,15 @@ def test_a_pool_repeats_its_cameras_and_still_covers_the_circle():
     assert all(sorted((b["azimuth"] // 90).tolist()) == [-2, -1, 0, 1] for b in batches(data, 5))
 
 
+def test_the_views_of_a_pool_are_known_beforehand_unless_cameras_move():
+    data = module(train_views=8)
+    views = data.pool_views()
+    assert (len(views["fovy"]), views["height"], views["width"]) == (8, 32, 48)
+    known = {tuple(c2w) for c2w in views["c2w"].flatten(1).tolist()}
+    assert {tuple(c2w) for b in batches(data, 20) for c2w in b["c2w"].flatten(1).tolist()} == known
+    assert module().pool_views() is None and module(train_views=8, up_perturb=0.1).pool_views() is None
+
+
 def test_progressive_views_widen_from_the_evaluation_view():
     first, last = batches(module(progressive_until=100), 1)[0], batches(module(progressive_until=100), 1, start=100)[0]
     assert first["azimuth"].abs().max() == 0 and torch.allclose(first["elevation"], torch.tensor(15.0), atol=1e-4)

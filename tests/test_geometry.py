@@ -64,7 +64,7 @@ def test_the_cap_holds_at_the_start(sphere_points):
 
 
 def test_the_cloud_takes_its_size_from_the_checkpoint_and_never_asks_the_prior(sphere_points, tmp_path):
-    geometry = started(sphere_points, sh_degree=2)
+    geometry = started(sphere_points, sh_degree=2, densify={"enabled": True})
     geometry.observe(seen(geometry), 64, 64)
     torch.save(geometry.state_dict(), tmp_path / "c.pt")
     other = GaussianCloud({"sh_degree": 2, "prior_type": "no-such-prior"})

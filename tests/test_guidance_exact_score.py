@@ -242,6 +242,18 @@ def test_it_is_registered():
     assert find("exact-score-guidance").__qualname__ == "ExactScoreGuidance"
 
 
+def test_pictures_cast_beforehand_are_not_cast_again(mesh_path, monkeypatch):
+    views, ahead, now = batch(*VIEWS), guidance(mesh_path, max_cached_targets=2), guidance(mesh_path)
+    truth = now.target_rgb(views)
+    ahead.cast_targets(views["c2w"], views["fovy"], 16, 16)  # as many as are kept
+    cast = []
+    render = ahead.caster.render_views
+    monkeypatch.setattr(ahead.caster, "render_views", lambda cameras, *size, **o: cast.append(len(cameras)) or render(cameras, *size, **o))
+    assert torch.equal(ahead.target_rgb({name: v[:2] if torch.is_tensor(v) else v for name, v in views.items()}), truth[:2])
+    assert torch.equal(ahead.target_rgb(views), truth)
+    assert cast == [0, 1]
+
+
 def test_the_target_is_the_mesh_on_the_renders_background(mesh_path):
     exact = guidance(mesh_path)
     target = exact.target_rgb(batch(*VIEWS), BACKGROUNDS)

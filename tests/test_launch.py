@@ -23,6 +23,13 @@ def test_help_imports_neither_torch_nor_lightning():
     assert done.stdout.startswith("usage:") and done.stdout.endswith("False False\n"), done.stderr
 
 
+@pytest.mark.parametrize("said", [{}, {"OMP_WAIT_POLICY": "passive"}, {"GOMP_SPINCOUNT": "7"}])
+def test_idle_threads_wait_as_the_user_says(monkeypatch, said):
+    monkeypatch.setattr(os, "environ", dict(said))
+    experiment.spin_briefly()
+    assert os.environ == (said or {"GOMP_SPINCOUNT": "10000"})
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

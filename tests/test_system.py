@@ -12,10 +12,13 @@ import pytest
 import torch
 import yaml
 
+from threestudio_gaussiandreamer import evaluate
 from threestudio_gaussiandreamer.experiment import main
+from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance
 from threestudio_gaussiandreamer.host import BaseObject, register
 from threestudio_gaussiandreamer.ply import read_gaussians
 from threestudio_gaussiandreamer.spz import read_spz
+from threestudio_gaussiandreamer.system import GaussianDreamerSystem
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 SMALL = [
@@ -109,6 +112,25 @@ def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, pai
     assert "compare.png" in printed and "test.mp4" in printed and ".ply" in printed and "multi-face" in printed
     rows = list(csv.DictReader(open(trial(tmp_path) / "csv_logs" / "version_0" / "metrics.csv")))
     assert {"loss", "gaussians", "dB", "train/loss_sds", "train/grad_norm"} <= set(rows[0])
+
+
+@pytest.mark.parametrize(("steps", "times"), [(11, 0), (12, 1)])
+def test_a_run_long_enough_for_its_pool_has_the_pictures_cast_at_once(tmp_path, painted_box, monkeypatch, steps, times):
+    cast = []
+    monkeypatch.setattr(ExactScoreGuidance, "cast_targets", lambda self, *views: cast.append((len(views[0]), *views[2:])))
+    options = ["data.width=48", "data.height=48", "system.renderer.downsample=2"]
+    assert launch(tmp_path, painted_box, *options, f"trainer.max_steps={steps}", "system.exporter.save_video=false") == 0
+    assert cast == [(12, 24, 24)] * times
+
+
+def test_looking_at_pictures_is_no_training_time(tmp_path, painted_box, monkeypatch):
+    clock = np.zeros(2)
+    monkeypatch.setattr(evaluate, "_now", clock.copy)
+    for name, hours in (("training_step", 1), ("show", 100)):
+        body = getattr(GaussianDreamerSystem, name)
+        monkeypatch.setattr(GaussianDreamerSystem, name, lambda *args, body=body, hours=hours: (clock.__iadd__(hours), body(*args))[1])
+    assert launch(tmp_path, painted_box, "trainer.max_steps=2", "trainer.val_check_interval=1", "system.exporter.save_video=false") == 0
+    assert json.loads((trial(tmp_path) / "save" / "metrics.json").read_text())["seconds"] == 2
 
 
 def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted_box):

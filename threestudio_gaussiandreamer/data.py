@@ -23,7 +23,7 @@ rays                      add rays_o and rays_d (B, H, W, 3) to every batch
 import bisect
 import math
 from dataclasses import dataclass, field
-from typing import Any, List, Tuple
+from typing import Any, List, Optional, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -181,10 +181,15 @@ class TrainCameras(IterableDataset, Updateable):
             elevation=tuple((1 - r) * start + r * e for e in self.ranges.elevation), azimuth=tuple(r * a for a in self.ranges.azimuth)
         )
 
+    @property
+    def moves(self) -> bool:
+        """Whether cameras are shifted at random."""
+        return bool(self.cfg.camera_perturb or self.cfg.center_perturb or self.cfg.up_perturb)
+
     def _perturbed(self, orbit: Orbit, rng: torch.Generator) -> Tensor:
-        cfg = self.cfg
-        if not (cfg.camera_perturb or cfg.center_perturb or cfg.up_perturb):
+        if not self.moves:
             return orbit.c2w
+        cfg = self.cfg
         shape = (len(orbit.elevation), 3)
         position = cameras.orbit_positions(orbit.elevation, orbit.azimuth, orbit.distance)
         position = position + (torch.rand(shape, generator=rng) * 2 - 1) * cfg.camera_perturb
@@ -242,6 +247,14 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         # Lightning asks for the loader after it restored the loops and before it fetches the first batch
         self.train_dataset.start_step = self.trainer.global_step if self.trainer is not None else self.train_dataset.start_step
         return DataLoader(self.train_dataset, batch_size=None, collate_fn=self.train_dataset.collate)
+
+    def pool_views(self) -> Optional[dict[str, Any]]:
+        """``c2w``, ``fovy``, ``height``, ``width`` of all views of a fixed pool; None where cameras are continuous, or move."""
+        cameras = self.train_dataset
+        if cameras.pool is None or cameras.moves:
+            return None
+        height, width, _ = cameras.sizes[0]
+        return {"c2w": cameras.pool.c2w, "fovy": cameras.pool.fovy, "height": height, "width": width}
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(self.val_dataset, batch_size=1, collate_fn=self.val_dataset.collate)

@@ -7,6 +7,8 @@ the opacity that floats away from the surface (floater mass); share of pixels wi
 
 import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -140,11 +142,22 @@ class Measurements:
             self.seconds += _now() - self._started
             self._started = None
 
+    @contextmanager
+    def paused_clock(self) -> Iterator[None]:
+        """No time is counted in here: looking isn't training."""
+        running = self._started is not None
+        self.stop_clock()
+        yield
+        if running:
+            self.start_clock()
+
     @torch.no_grad()
     def score(self, key: str, renderer: Any, step: int) -> dict[str, Any]:
         """Score the renderer's cloud under ``key`` ("prior", "result", or "curve", which collects); no time is counted while it runs."""
-        running = self._started is not None
-        self.stop_clock()
+        with self.paused_clock():
+            return self._score(key, renderer, step)
+
+    def _score(self, key: str, renderer: Any, step: int) -> dict[str, Any]:
         rendered, backgrounds = self.held_out.render(renderer)
         images = rendered.clamp(0, 1)
         truth = self.held_out.truth_on(backgrounds)
@@ -160,8 +173,6 @@ class Measurements:
             self.values[key] = scores
             self._save_pictures(key, images, truth)
         self.write()
-        if running:
-            self.start_clock()
         return scores
 
     def _elapsed(self) -> dict[str, float]:

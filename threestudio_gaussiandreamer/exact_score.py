@@ -91,10 +91,11 @@ def denoise(
         alone = bank.shape[-2] == 1  # then its responsibility is 1 wherever z is
         distances = z.new_zeros((len(z), 1), dtype=torch.float64) if alone else squared_distances(z, bank, abar)
     gamma = responsibilities(distances, variance, log_prior=log_prior, temperature=temperature)
-    mean = torch.einsum("bk,bkd->bd", gamma.to(z), bank.expand(len(z), -1, -1).to(z))
+    bank = bank.expand(len(z), -1, -1).to(z)
+    mean = bank[:, 0] if bank.shape[1] == 1 else torch.einsum("bk,bkd->bd", gamma.to(z), bank)
     residual = z - sds.per_item(abar.double().sqrt(), z) * mean
     eps = sds.per_item((1 - abar.double()).sqrt() / variance, z) * residual
-    denoised = mean + sds.per_item(abar.double().sqrt() * std**2 / variance, z) * residual
+    denoised = mean + sds.per_item(abar.double().sqrt() * std**2 / variance, z) * residual if std else mean
     entropy = -torch.special.xlogy(gamma, gamma).sum(1)
     return Denoised(eps, denoised, gamma, entropy.exp())
 
@@ -142,7 +143,8 @@ class LinearLatent(NamedTuple):
 
     def encode_pooled(self, rgb: Float[Tensor, "B 3 h w"]) -> Float[Tensor, "B c h w"]:
         """Latents of images that are pooled already."""
-        return self.scale * _recolored(2 * rgb - 1, self.matrix)
+        latents = _recolored(2 * rgb - 1, self.matrix)
+        return latents if self.scale == 1 else self.scale * latents
 
     def decode(self, latents: Float[Tensor, "B c h w"]) -> Float[Tensor, "B 3 H W"]:
         """The least-squares image in [0, 1]: pseudo-inverse of the colours, each pooled pixel repeated."""

@@ -341,8 +341,8 @@ class GaussianCloud(BaseGeometry):
         return self.cfg.densify.enabled and self.cfg.densify.absgrad
 
     def observe(self, out: Rasterized, width: int, height: int, loss_scale: float = 1.0) -> None:
-        """Add one step's screen-space gradients and contributions to the statistics."""
-        if out.means2d.grad is not None:
+        """Add one step's contributions, and for densification its screen-space gradients, to the statistics."""
+        if out.means2d.grad is not None and self.cfg.densify.enabled:
             pixels = out.means2d.absgrad if self.wants_absgrad else out.means2d.grad
             self.gradient_sum += all_sum(densify.screen_gradients(pixels, width, height, loss_scale).sum(0))
             self.gradient_count += all_sum((out.radii > 0).sum(0))

@@ -22,7 +22,7 @@ from .errors import UserError
 from .meshes import Mesh, surface_colors
 from .zbuffer import NEAR, ZBuffer
 
-RAYS_PER_CAST = 2**16
+RAYS_PER_CAST = 2**15
 log = logging.getLogger(__name__)
 
 

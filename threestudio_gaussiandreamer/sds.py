@@ -12,6 +12,7 @@ from collections.abc import Callable
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from . import streams
 from .errors import UserError, unknown
@@ -91,9 +92,22 @@ def weight(name: str, abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
 
 
 def sds_loss(x: Float[Tensor, "B *d"], grad: Float[Tensor, "B *d"]) -> Float[Tensor, ""]:
-    """0.5 sum |x - stop(x - grad)|^2 / B: a loss whose gradient at x is grad / B (threestudio's form of SDS)."""
-    target = (x - grad).detach()
-    return 0.5 * (x - target).square().sum() / max(len(x), 1)
+    """0.5 sum grad^2 / B, with the gradient grad / B at x: threestudio's 0.5 sum |x - stop(x - grad)|^2 / B without its rounding."""
+    return _GivenGradient.apply(x, grad.detach())
+
+
+class _GivenGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x, grad):
+        ctx.save_for_backward(grad)
+        flat = grad.flatten()
+        return 0.5 * torch.dot(flat, flat) / max(len(grad), 1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream):
+        (grad,) = ctx.saved_tensors
+        return upstream / max(len(grad), 1) * grad, None
 
 
 def ddim_step(

@@ -30,5 +30,7 @@ def numpy_generator(seed: int, stream: str, step: int = 0, item: int = 0) -> np.
 
 def normal_per_item(shape: tuple[int, ...], seed: int, stream: str, step: int, device: torch.device | str = "cpu") -> Tensor:
     """Standard normal float32 of ``shape`` (B, ...); item b has its own stream, so it doesn't depend on B."""
-    items = [torch.randn(shape[1:], generator=generator(seed, stream, step, b)) for b in range(shape[0])]
-    return torch.stack(items).to(device) if items else torch.empty(shape, device=device)
+    items = torch.empty(shape)
+    for b, item in enumerate(items):
+        item.normal_(generator=generator(seed, stream, step, b))
+    return items.to(device)

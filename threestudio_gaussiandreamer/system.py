@@ -17,6 +17,7 @@ prune          a budget that the export is made for once more: count, bytes (of 
 =============  ==============================================================================================================
 """
 
+import contextlib
 import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -166,6 +167,15 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             self.score("prior")
         if self.measurements:
             self.measurements.start_clock()
+        self.cast_targets()
+
+    def cast_targets(self) -> None:
+        """Let a guidance that looks at a truth look at all views of a fixed pool at once, if this run will come to most of them."""
+        views, cast = getattr(self.trainer.datamodule, "pool_views", lambda: None)(), getattr(self.guidance, "cast_targets", None)
+        if cast is None or views is None or 0 < self.trainer.max_steps - self.global_step < len(views["c2w"]):
+            return
+        downsample = self.renderer.cfg.get("downsample", 1)
+        cast(views["c2w"], views["fovy"], views["height"] // downsample, views["width"] // downsample)
 
     def warn_of_rounds_too_late(self) -> None:
         """Say that a budget won't be met because its schedule is made for a longer run."""
@@ -323,6 +333,11 @@ class GaussianDreamerSystem(BaseLift3DSystem):
     # -- looking -------------------------------------------------------------------------------------------------------------
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
+        with self.measurements.paused_clock() if self.measurements else contextlib.nullcontext():
+            self.show(batch)
+
+    def show(self, batch: dict[str, Any]) -> None:
+        """Write a row of pictures: the render, its depth and normals, the truth where it is known, what the score model sees."""
         out = self(batch)
         images = picture_row(out)
         truth = self.truth(batch, out) if self.guidance is not None else None

@@ -245,12 +245,10 @@ def _bad_items(grad: Tensor) -> Tensor:
 
 
 def _masked_loss(images: Tensor, latents: Tensor, grad: Tensor, bad: Tensor) -> Tensor:
-    """The loss without the bad items, which get a gradient of exactly zero while the others' isn't touched."""
-    if bad.any():
-        latents = torch.where(bad.reshape(-1, 1, 1, 1), 0.0, latents)
-        if images.requires_grad:
-            # Zero times an infinite derivative of the encoder would be NaN on its way to the render.
-            images.register_hook(lambda gradient: gradient.masked_fill(bad.reshape(-1, 1, 1, 1), 0.0))
+    """The loss without the bad items, whose ``grad`` is zero, and whose render gets a gradient of exactly zero."""
+    if bad.any() and images.requires_grad:
+        # Zero times an infinite derivative of the encoder would be NaN on its way to the render.
+        images.register_hook(lambda gradient: gradient.masked_fill(bad.reshape(-1, 1, 1, 1), 0.0))
     return sds.sds_loss(latents, grad)
 
 
