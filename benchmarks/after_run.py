@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jobs import NO_BUDGET
+from jobs import NO_BUDGET, STEPS_A_ROUND
 from runs import STEPS, append_rows, object_name, rows_of, train
 from torch import Tensor
 
@@ -26,7 +26,7 @@ from threestudio_gaussiandreamer import parsimony, prune, register_parts
 from threestudio_gaussiandreamer.cloud_files import read_cloud
 from threestudio_gaussiandreamer.simplify import KEEP, Budget, Cloud, Views, draw, likeness, look, only, recover, simplify, worth
 
-COUNTS, STEPS_A_ROUND = (2500, 1500), 60
+COUNTS = (2500, 1500)
 COLUMNS = "variant,x,object,seed,psnr,machine,commit".split(",")
 
 

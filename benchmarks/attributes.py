@@ -137,7 +137,7 @@ def score(mesh: str, arrays: GaussianArrays) -> float:
     geometry = find("gaussiandreamer-cloud")({})
     geometry.set_arrays(**arrays._asdict())
     background = find("gaussiandreamer-background")({"color": [1.0, 1.0, 1.0]})
-    renderer = find("gaussiandreamer-splatting")({"preset": "fast"}, geometry=geometry, material=None, background=background)
+    renderer = find("gaussiandreamer-splatting")({"preset": "fast", "eps2d": 0.1}, geometry=geometry, material=None, background=background)
     held_out = held_out_views(mesh)
     images, backgrounds = held_out.render(renderer)
     return round(float(psnr(images.clamp(0, 1), held_out.truth_on(backgrounds))), 4)

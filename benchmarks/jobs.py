@@ -1,14 +1,19 @@
 """What is run for each chart and table: variants of configs/demo.yaml as lists of :class:`Job`; `runs.py` runs them."""
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 from ablations import CLIPPED, LATENT, NO_ANNEALING, PAPER_RATES, RANDOM_START, STRONG, VIEW_BLIND
 
+from threestudio_gaussiandreamer.simplify import KEEP
+
 STEPS = 1200
 SECOND_STAGE = 500
 """The step from which the demo draws smaller timesteps."""
 COUNTS = (2500, 1500, 1000)
+STEPS_A_ROUND = 60
+"""Of recovery in the prune command."""
 NO_BUDGET = {"system.geometry.budget": "null"}
 SHARP_PAPER = PAPER_RATES | NO_BUDGET | {"system.geometry.init_opacity": 0.1}
 PAPER = SHARP_PAPER | {"system.renderer.eps2d": 0.3}
@@ -86,6 +91,9 @@ def count_jobs() -> Iterator[Job]:
         yield Job("count", "from scratch", count, scratch(count))
         for score in ("contribution", "opacity"):
             yield Job("count", f"by {score}", count, {"system.geometry.budget": count, "system.geometry.prune.score": score})
+        rounds = math.ceil(math.log(count / 10000, KEEP))
+        pruned = NO_BUDGET | {"system.prune.count": count, "system.prune.steps": STEPS_A_ROUND}
+        yield Job("count", "after the run, with recovery", count, steps(STEPS - rounds * STEPS_A_ROUND) | pruned)
     yield Job("count", "at random", COUNTS[-2], {"system.geometry.budget": COUNTS[-2], "system.geometry.prune.score": "random"})
     yield Job("count", "the paper's recipe, by removal error", COUNTS[-2], PAPER | {"system.geometry.budget": COUNTS[-2]})
 

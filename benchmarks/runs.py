@@ -69,9 +69,21 @@ def parse_arguments() -> argparse.Namespace:
 
 
 def run(mesh: str, seed: int, options: dict[str, Any], overlay: str = "") -> dict[str, Any]:
-    """One training run in a process of its own; its metrics."""
+    """One training run in a process of its own; its metrics, at the end those of the pruned cloud where ``system.prune`` asks for one."""
     with tempfile.TemporaryDirectory() as folder:
-        return json.loads((train(Path(folder), mesh, seed, options, overlay=overlay) / "metrics.json").read_text())
+        save = train(Path(folder), mesh, seed, options, overlay=overlay)
+        metrics = json.loads((save / "metrics.json").read_text())
+        for pruned in save.glob("it*-export/pruned/gaussians.ply"):
+            start = {
+                "system.geometry.prior_type": "gaussians-prior",
+                "system.geometry.prior": {"path": str(pruned)},
+                "trainer.max_steps": 1,
+            }
+            again = train(Path(folder) / "again", mesh, seed, start | {"system.geometry.budget": "null"})
+            scores = json.loads((again / "metrics.json").read_text())["prior"]
+            # the seconds of pruning aren't among those of training
+            metrics["result"] |= {name: value for name, value in scores.items() if name not in ("step", "seconds", "cpu_seconds")}
+        return metrics
 
 
 def train(folder: Path, mesh: str, seed: int, options: dict[str, Any], *, program: str = "launch.py", overlay: str = "") -> Path:
