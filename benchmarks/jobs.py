@@ -26,6 +26,8 @@ RATES = {
     "lr_sh": (1e-1, 2e-3),
 }
 """Learning rates of demo.yaml, at the start and the end of a run."""
+SLOWER_MEANS = {"system.geometry.lr_means": f"[0,1e-4,2e-5,{STEPS}]"}
+"""Half the rate of the positions: Gaussians stay on the surface."""
 BINS = VIEW_BLIND | {"system.guidance.mode": "direction-bins"}
 GREY = {"system.geometry.prior.color": "grey"}
 BALL = {"system.geometry.prior_type": "random-prior", "system.geometry.prior": {"num_points": 8000, "shape": "sphere", "color": "grey"}}
@@ -91,6 +93,7 @@ def count_jobs() -> Iterator[Job]:
         yield Job("count", "from scratch", count, scratch(count))
         for score in ("contribution", "opacity"):
             yield Job("count", f"by {score}", count, {"system.geometry.budget": count, "system.geometry.prune.score": score})
+        yield Job("count", "by removal error, slower means", count, {"system.geometry.budget": count} | SLOWER_MEANS)
         rounds = math.ceil(math.log(count / 10000, KEEP))
         pruned = NO_BUDGET | {"system.prune.count": count, "system.prune.steps": STEPS_A_ROUND}
         yield Job("count", "after the run, with recovery", count, steps(STEPS - rounds * STEPS_A_ROUND) | pruned)

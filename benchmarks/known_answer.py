@@ -3,10 +3,11 @@
     python benchmarks/known_answer.py                   # M = 200, three seeds: minutes
     python benchmarks/known_answer.py --count 1000 --seeds 0
 
-*auto*: a training run of configs/demo.yaml at 128^2, at a quarter of its rates, with `budget: auto`, from the M true Gaussians, two copies of each a little
-beside it, and M floaters anywhere, against pictures of the truth. *prune*: the prune command with `--psnr 40`, which knows nothing but
-its input: three copies of each in one place, which share its opacity, and M floaters too faint to be seen. dB are to the truth, or to
-the prune command's input, on views that nothing was fitted to. Results go to docs/charts/known_answer.csv.
+*auto*: a training run of configs/demo.yaml at 128^2 with `budget: auto`, at a quarter of its rates and with a shorter memory, from the M
+true Gaussians, two copies of each a little beside it, and M floaters anywhere, against pictures of the truth. *prune*: the prune
+command with `--psnr 40`, which knows nothing but its input: three copies of each in one place, which share its opacity, and M floaters
+too faint to be seen. dB are to the truth, or to the prune command's input, on views that nothing was fitted to. Results go to
+docs/charts/known_answer.csv.
 """
 
 import argparse
