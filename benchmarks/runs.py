@@ -74,12 +74,9 @@ def run(mesh: str, seed: int, options: dict[str, Any], overlay: str = "") -> dic
         save = train(Path(folder), mesh, seed, options, overlay=overlay)
         metrics = json.loads((save / "metrics.json").read_text())
         for pruned in save.glob("it*-export/pruned/gaussians.ply"):
-            start = {
-                "system.geometry.prior_type": "gaussians-prior",
-                "system.geometry.prior": {"path": str(pruned)},
-                "trainer.max_steps": 1,
-            }
-            again = train(Path(folder) / "again", mesh, seed, start | {"system.geometry.budget": "null"})
+            start = {"system.geometry.prior_type": "gaussians-prior", "system.geometry.prior": {"path": str(pruned)}}
+            same = {name: value for name, value in options.items() if not name.startswith(("system.prune.", "system.geometry."))}
+            again = train(Path(folder) / "again", mesh, seed, same | start | {"system.geometry.budget": "null", "trainer.max_steps": 1})
             scores = json.loads((again / "metrics.json").read_text())["prior"]
             # the seconds of pruning aren't among those of training
             metrics["result"] |= {name: value for name, value in scores.items() if name not in ("step", "seconds", "cpu_seconds")}

@@ -83,10 +83,11 @@ def test_a_pool_repeats_its_cameras_and_still_covers_the_circle():
 def test_the_views_of_a_pool_are_known_beforehand_unless_cameras_move():
     data = module(train_views=8)
     views = data.pool_views()
-    assert (len(views["fovy"]), views["height"], views["width"]) == (8, 32, 48)
+    assert (len(views["fovy"]), views["height"], views["width"], views["batch_size"]) == (8, 32, 48, 4)
     known = {tuple(c2w) for c2w in views["c2w"].flatten(1).tolist()}
     assert {tuple(c2w) for b in batches(data, 20) for c2w in b["c2w"].flatten(1).tolist()} == known
     assert module().pool_views() is None and module(train_views=8, up_perturb=0.1).pool_views() is None
+    assert module(train_views=8, height=[16, 32], resolution_milestones=[3]).pool_views() is None
 
 
 def test_progressive_views_widen_from_the_evaluation_view():

@@ -12,6 +12,7 @@ from threestudio_gaussiandreamer.errors import UserError
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore, ScoreDistillation
 from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance, direction_indices
 from threestudio_gaussiandreamer.host import find
+from threestudio_gaussiandreamer.raycast import MeshCaster
 
 trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("embreex")
@@ -243,15 +244,22 @@ def test_it_is_registered():
 
 
 def test_pictures_cast_beforehand_are_not_cast_again(mesh_path, monkeypatch):
-    views, ahead, now = batch(*VIEWS), guidance(mesh_path, max_cached_targets=2), guidance(mesh_path)
-    truth = now.target_rgb(views)
-    ahead.cast_targets(views["c2w"], views["fovy"], 16, 16)  # as many as are kept
-    cast = []
-    render = ahead.caster.render_views
-    monkeypatch.setattr(ahead.caster, "render_views", lambda cameras, *size, **o: cast.append(len(cameras)) or render(cameras, *size, **o))
-    assert torch.equal(ahead.target_rgb({name: v[:2] if torch.is_tensor(v) else v for name, v in views.items()}), truth[:2])
-    assert torch.equal(ahead.target_rgb(views), truth)
-    assert cast == [0, 1]
+    views, cast, render = batch(*VIEWS), [], MeshCaster.render_views
+    monkeypatch.setattr(MeshCaster, "render_views", lambda self, c, *size, **o: cast.append(len(c)) or render(self, c, *size, **o))
+
+    def cast_and_seen(**options):
+        ahead, now = guidance(mesh_path, **options), guidance(mesh_path)
+        ahead.cast_targets(views["c2w"], views["fovy"], 16, 16)
+        before = sum(cast)
+        seen = ahead.target_rgb(views)
+        counts = before, sum(cast) - before
+        assert torch.equal(seen, now.target_rgb(views))
+        cast.clear()
+        return counts
+
+    assert cast_and_seen() == (3, 0)
+    assert cast_and_seen(max_cached_targets=2) == (0, 3)  # the first would be gone when the last is there
+    assert cast_and_seen(mode="view-agnostic", bank_includes_view=False) == (0, 3)  # which compares with the bank alone
 
 
 def test_the_target_is_the_mesh_on_the_renders_background(mesh_path):

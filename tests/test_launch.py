@@ -27,7 +27,7 @@ def test_help_imports_neither_torch_nor_lightning():
 def test_idle_threads_wait_as_the_user_says(monkeypatch, said):
     monkeypatch.setattr(os, "environ", dict(said))
     experiment.spin_briefly()
-    assert os.environ == (said or {"GOMP_SPINCOUNT": "10000"})
+    assert os.environ == (said or {"GOMP_SPINCOUNT": "10000", "KMP_BLOCKTIME": "0"})
 
 
 @pytest.mark.parametrize(

@@ -249,12 +249,12 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         return DataLoader(self.train_dataset, batch_size=None, collate_fn=self.train_dataset.collate)
 
     def pool_views(self) -> Optional[dict[str, Any]]:
-        """``c2w``, ``fovy``, ``height``, ``width`` of all views of a fixed pool; None where cameras are continuous, or move."""
+        """``c2w``, ``fovy``, ``height``, ``width``, ``batch_size`` of all views of a fixed pool; None where those change."""
         cameras = self.train_dataset
-        if cameras.pool is None or cameras.moves:
+        if cameras.pool is None or cameras.moves or len(cameras.sizes) > 1:
             return None
-        height, width, _ = cameras.sizes[0]
-        return {"c2w": cameras.pool.c2w, "fovy": cameras.pool.fovy, "height": height, "width": width}
+        sizes = dict(zip(("height", "width", "batch_size"), cameras.sizes[0], strict=True))
+        return {"c2w": cameras.pool.c2w, "fovy": cameras.pool.fovy, **sizes}
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(self.val_dataset, batch_size=1, collate_fn=self.val_dataset.collate)

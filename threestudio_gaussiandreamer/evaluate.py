@@ -147,9 +147,11 @@ class Measurements:
         """No time is counted in here: looking isn't training."""
         running = self._started is not None
         self.stop_clock()
-        yield
-        if running:
-            self.start_clock()
+        try:
+            yield
+        finally:
+            if running:
+                self.start_clock()
 
     @torch.no_grad()
     def score(self, key: str, renderer: Any, step: int) -> dict[str, Any]:

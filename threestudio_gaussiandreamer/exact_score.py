@@ -35,7 +35,7 @@ class Denoised(NamedTuple):
     eps: Float[Tensor, "B d"]
     """The optimal prediction of the noise."""
     denoised: Float[Tensor, "B d"]
-    """E[x0 | z]."""
+    """E[x0 | z]; may be a view of the bank."""
     responsibilities: Float[Tensor, "B K"]
     """float64, rows sum to 1."""
     perplexity: Float[Tensor, " B"]

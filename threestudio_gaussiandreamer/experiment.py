@@ -126,10 +126,11 @@ def spin_briefly() -> None:
     """Let idle OpenMP threads wait for about 0.1 ms before they sleep, unless the user said how; before torch is imported.
 
     At once asleep, they are woken for each small operation (a fifth of the demo's time); for milliseconds awake, as is their default,
-    they hold the cores that our own threads, or other programs, wait for.
+    they hold the cores that our own threads, or other programs, wait for. LLVM's and Intel's OpenMP know milliseconds only: none there.
     """
-    if not os.environ.keys() & {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"}:
-        os.environ["GOMP_SPINCOUNT"] = "10000"
+    waits = {"GOMP_SPINCOUNT": "10000", "KMP_BLOCKTIME": "0"}
+    if not os.environ.keys() & {"OMP_WAIT_POLICY", *waits}:
+        os.environ.update(waits)
 
 
 @contextlib.contextmanager

@@ -100,8 +100,7 @@ class _GivenGradient(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, grad):
         ctx.save_for_backward(grad)
-        flat = grad.flatten()
-        return 0.5 * torch.dot(flat, flat) / max(len(grad), 1)
+        return 0.5 * grad.square().sum() / max(len(grad), 1)
 
     @staticmethod
     @once_differentiable

@@ -172,10 +172,13 @@ class GaussianDreamerSystem(BaseLift3DSystem):
     def cast_targets(self) -> None:
         """Let a guidance that looks at a truth look at all views of a fixed pool at once, if this run will come to most of them."""
         views, cast = getattr(self.trainer.datamodule, "pool_views", lambda: None)(), getattr(self.guidance, "cast_targets", None)
-        if cast is None or views is None or 0 < self.trainer.max_steps - self.global_step < len(views["c2w"]):
+        if cast is None or views is None:
             return
-        downsample = self.renderer.cfg.get("downsample", 1)
-        cast(views["c2w"], views["fovy"], views["height"] // downsample, views["width"] // downsample)
+        drawn = (self.trainer.max_steps - self.global_step) * views["batch_size"]
+        if self.trainer.max_steps < 0 or drawn >= len(views["c2w"]):
+            downsample = getattr(self.renderer.cfg, "downsample", 1)
+            size = views["height"] // downsample, views["width"] // downsample
+            cast(views["c2w"].to(self.device), views["fovy"].to(self.device), *size)
 
     def warn_of_rounds_too_late(self) -> None:
         """Say that a budget won't be met because its schedule is made for a longer run."""

@@ -49,7 +49,7 @@ from .base import ScoreDistillation
 MODES = ("view-exact", "direction-bins", "view-agnostic")
 SPACES = ("pixel", "latent")
 MAX_MODE_BYTES = 2**31
-VIEWS_PER_CAST = 16
+PIXELS_PER_CAST = 2**20
 
 
 class Bank(NamedTuple):
@@ -194,13 +194,13 @@ class ExactScoreGuidance(ScoreDistillation):
 
     @torch.no_grad()
     def cast_targets(self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int) -> None:
-        """Cast the pictures of these cameras, of which training will show many, beforehand: all cores at work on many at once take a
-        third of the time."""
-        if not self._needs_own_view:
+        """Cast the pictures that training will show most of beforehand, if all can be kept: many at once take a third of the time."""
+        if not self._needs_own_view or len(c2w) > self.cfg.max_cached_targets:
             return
-        size, count = self._picture_size(height, width), min(len(c2w), self.cfg.max_cached_targets)
-        for rows in torch.arange(count).split(VIEWS_PER_CAST):
-            self._targets(c2w[rows], fovy[rows], *size)
+        height, width = self._picture_size(height, width)
+        views = max(1, PIXELS_PER_CAST // (height * width))
+        for some in zip(c2w.split(views), fovy.split(views), strict=True):
+            self._targets(*some, height, width)
 
     def bank(self, height: int, width: int) -> Bank:
         """The bank at a picture size; that of the last size is kept."""

@@ -54,11 +54,9 @@ def own_randomness(step: int) -> Iterator[None]:
     """
     devices = [torch.cuda.current_device()] if torch.cuda.is_available() else []
     with torch.random.fork_rng(devices):
-        # torch.manual_seed would note a stack trace for every kind of device that isn't there, a millisecond each step
-        seed = derive_seed(item_seed(), "guidance", step)
-        torch.default_generator.manual_seed(seed)
-        if devices:
-            torch.cuda.manual_seed(seed)
+        # without a GPU torch.manual_seed notes a stack trace for each kind that isn't there: a millisecond each step
+        gpu = devices or torch.backends.mps.is_available()
+        (torch.manual_seed if gpu else torch.default_generator.manual_seed)(derive_seed(item_seed(), "guidance", step))
         yield
 
 
