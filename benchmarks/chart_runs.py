@@ -104,6 +104,7 @@ def draw_panel(panel: Any, chart: Chart, rows: list[Row]) -> None:
     for index, (label, chosen) in enumerate(grouped(rows, lambda row: label_of(chart, row)).items()):
         paper = PAPER in label
         style: dict[str, Any] = {"color": "0.15" if label == PAPER else f"C{index % 10}", "label": label}
+        style["linestyle"] = "-" if index < 10 else "--"  # the eleventh line has the colour of the first
         (draw_curve if chart.curves else draw_points)(panel, chart, chosen, style, "*" if paper else "o")
     if chart.log_x:
         panel.set_xscale("log")
