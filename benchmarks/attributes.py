@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import yaml
 from chart_runs import TUNED_ON, caption, grouped, median, spread
 from runs import CHARTS, ROOT, SIZE, STEPS, append_rows, object_name, rows_of, train
 from tqdm import tqdm
@@ -134,10 +135,11 @@ def written(arrays: GaussianArrays) -> Iterator[tuple[str, int, GaussianArrays]]
 
 def score(mesh: str, arrays: GaussianArrays) -> float:
     """PSNR on the held-out views of :mod:`evaluate`, as a run ends with it."""
+    demo = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())  # drawn as it was trained
     geometry = find("gaussiandreamer-cloud")({})
     geometry.set_arrays(**arrays._asdict())
     background = find("gaussiandreamer-background")({"color": [1.0, 1.0, 1.0]})
-    renderer = find("gaussiandreamer-splatting")({"preset": "fast", "eps2d": 0.1}, geometry=geometry, material=None, background=background)
+    renderer = find("gaussiandreamer-splatting")(demo["system"]["renderer"], geometry=geometry, material=None, background=background)
     held_out = held_out_views(mesh)
     images, backgrounds = held_out.render(renderer)
     return round(float(psnr(images.clamp(0, 1), held_out.truth_on(backgrounds))), 4)

@@ -6,13 +6,14 @@ from typing import Any, NamedTuple
 
 from ablations import CLIPPED, LATENT, NO_ANNEALING, PAPER_RATES, RANDOM_START, STRONG, VIEW_BLIND
 
+from threestudio_gaussiandreamer.prune import PruneOptions
 from threestudio_gaussiandreamer.simplify import KEEP
 
 STEPS = 1200
 SECOND_STAGE = 500
 """The step from which the demo draws smaller timesteps."""
 COUNTS = (2500, 1500, 1000)
-STEPS_A_ROUND = 60
+STEPS_A_ROUND = PruneOptions.steps
 """Of recovery in the prune command."""
 NO_BUDGET = {"system.geometry.budget": "null"}
 SHARP_PAPER = PAPER_RATES | NO_BUDGET | {"system.geometry.init_opacity": 0.1}
@@ -95,7 +96,7 @@ def count_jobs() -> Iterator[Job]:
             yield Job("count", f"by {score}", count, {"system.geometry.budget": count, "system.geometry.prune.score": score})
         yield Job("count", "by removal error, slower means", count, {"system.geometry.budget": count} | SLOWER_MEANS)
         rounds = math.ceil(math.log(count / 10000, KEEP))
-        pruned = NO_BUDGET | {"system.prune.count": count, "system.prune.steps": STEPS_A_ROUND}
+        pruned = NO_BUDGET | {"system.prune.count": count}
         yield Job("count", "after the run, with recovery", count, steps(STEPS - rounds * STEPS_A_ROUND) | pruned)
     yield Job("count", "at random", COUNTS[-2], {"system.geometry.budget": COUNTS[-2], "system.geometry.prune.score": "random"})
     yield Job("count", "the paper's recipe, by removal error", COUNTS[-2], PAPER | {"system.geometry.budget": COUNTS[-2]})
