@@ -141,7 +141,7 @@ def dilation_jobs() -> Iterator[Job]:
 def quality_jobs() -> Iterator[Job]:
     """The demo as it is, its quick and its good variant, at its own size."""
     own = {"data.width": 256, "data.height": 256, "system.evaluation.size": 256}
-    for name, overlay, count in (("draft", "demo-draft", 270), ("default", "", STEPS), ("best", "demo-best", 3000)):
+    for name, overlay, count in (("draft", "demo-draft", 255), ("default", "", STEPS), ("best", "demo-best", 3000)):
         yield Job("quality", name, 0, own | {"trainer.max_steps": count, "system.evaluation.every": count // 20}, overlay)
     yield Job("quality", "the paper's recipe", 0, own | {"system.evaluation.every": STEPS // 20} | PAPER)
 
