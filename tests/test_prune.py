@@ -273,6 +273,20 @@ def test_a_recovery_makes_nothing_worse(monkeypatch, bearable):
     assert paces == [pace for pace in simplify.PACES if pace >= bearable]
 
 
+def test_a_recovery_begins_near_the_pace_of_the_one_before(monkeypatch):
+    cloud, paces, bearable = ball(), [], iter([1 / 16] * 5 + [1.0] * 3)
+    probes, judges = (simplify.views_around(cloud, count, 32, turn=turn) for count, turn in ((8, 0.0), (4, 45.0)))
+
+    def recover(cloud, views, pictures, steps, seed, sh_reach, pace):
+        paces.append(pace)
+        return cloud if pace <= next(bearable) else cloud._replace(sh=cloud.sh + 1)
+
+    monkeypatch.setattr(simplify, "recover", recover)
+    monkeypatch.setattr(simplify, "merge_duplicates", lambda values, at_least: SimpleNamespace(values=values))
+    simplify.simplify(cloud, probes, judges, simplify.Budget(count=200), steps=1)
+    assert paces == [1, 1 / 4, 1 / 16, 1 / 4, 1 / 16, 1 / 4, 1, 1]
+
+
 def test_a_round_that_failed_is_not_tried_again(monkeypatch):
     """Below a hundred Gaussians a round of one can't become smaller."""
     cloud, tried = ball()._replace(), []
