@@ -38,7 +38,7 @@ charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbe
 	$(ENVIRON) $(BIN)/python benchmarks/chart_runs.py
 	$(ENVIRON) $(BIN)/python benchmarks/attributes.py --objects
 
-measure-charts: $(VENV)/ready-for-charts     ## the numbers anew, about an hour; runs that are in the CSVs are not repeated
+measure-charts: $(VENV)/ready-for-charts     ## the numbers anew, about two hours; runs that are in the CSVs are not repeated
 	$(ENVIRON) $(BIN)/python benchmarks/chart_splatting.py
 	$(ENVIRON) $(BIN)/python benchmarks/runs.py
 	$(ENVIRON) $(BIN)/python benchmarks/chart_runs.py

@@ -44,6 +44,7 @@ RUNS = {
     "time": Chart("What each kind of score buys per second", "cpu_seconds", SECONDS, curves=True),
     "count": Chart("How many Gaussians a scene needs", "gaussians", "Gaussians at the end", curves=False),
     "size": Chart("What rendering larger buys", "cpu_seconds", SECONDS, curves=False, marks_paper=True),
+    "large": Chart("What rendering at 1024² and shrinking to 512² buys", "cpu_seconds", SECONDS, curves=False, size=512),
     "batch": Chart(
         "Views per step, at equal rendered views",
         "cpu_seconds",

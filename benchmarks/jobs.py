@@ -111,6 +111,16 @@ def size_jobs() -> Iterator[Job]:
         yield Job("size", "rendered twice as large, shrunk", size, large)
 
 
+def large_jobs() -> Iterator[Job]:
+    """The same at 512^2, with as many Gaussians as that needs, and the seconds that shrinking costs spent on steps instead."""
+    own = {"data.width": 512, "data.height": 512, "system.evaluation.size": 512}
+    many = own | scratch(20000)
+    yield Job("large", "rendered at 512²", 0, many)
+    yield Job("large", "rendered at 512², 2,000 steps", 0, many | steps(2000))
+    yield Job("large", "rendered at 1024², shrunk", 0, many | {"data.width": 1024, "data.height": 1024, "system.renderer.downsample": 2})
+    yield Job("large", "the paper's recipe", 0, own | PAPER)
+
+
 def batch_jobs() -> Iterator[Job]:
     """The same number of rendered views, in fewer or more steps."""
     for batch in (1, 2, 4, 8):
@@ -184,6 +194,7 @@ JOBS: dict[str, Callable[[], Iterator[Job]]] = {
     "time": time_jobs,
     "count": count_jobs,
     "size": size_jobs,
+    "large": large_jobs,
     "batch": batch_jobs,
     "iterations": iteration_jobs,
     "preset": preset_jobs,

@@ -1,6 +1,6 @@
 """Training runs for the charts: every run that a chart needs, side by side on the CPU, into one CSV per chart.
 
-    python benchmarks/runs.py                               # all that isn't measured yet: about an hour on 4 cores
+    python benchmarks/runs.py                               # all that isn't measured yet: about two hours on 4 cores
     python benchmarks/runs.py --charts count --seeds 0 1 2  # one chart, fewer seeds
     python benchmarks/runs.py --list                        # what would run
 
