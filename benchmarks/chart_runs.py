@@ -36,6 +36,8 @@ class Chart(NamedTuple):
     """Whether the end of the paper's recipe is drawn from the chart ``count``."""
     size: int = SIZE
     """Pixels of the renders each way."""
+    common: str = ""
+    """The variant that is a point of every line that has none at its place."""
 
 
 DECIBEL = "held-out PSNR, dB"
@@ -54,6 +56,14 @@ RUNS = {
         marks_paper=True,
     ),
     "iterations": Chart("What more steps buy", "x", "steps", curves=False),
+    "rates": Chart(
+        "What the learning rates buy",
+        "x",
+        "times the learning rates of demo.yaml",
+        curves=False,
+        marks_paper=True,
+        common="demo.yaml",
+    ),
     "dilation": Chart("What a smaller screen-space dilation buys", "x", "dilation, square pixels", curves=False),
     "quality": Chart("Draft, default and best", "cpu_seconds", SECONDS, curves=True, size=256),
     "preset": Chart("What the rasteriser's presets buy", "cpu_seconds", SECONDS, curves=True, marks_paper=True),
@@ -70,8 +80,8 @@ def main() -> None:
 
 
 def papers_own(chart: Chart) -> list[Row]:
-    """Where the paper's recipe ends, for charts that have no runs of it."""
-    return [row for row in rows_of("count") if row["variant"] == PAPER and row["step"] != "0"] if chart.marks_paper else []
+    """Where the paper's recipe ends, for charts that have no runs of it; at 1 where the axis counts times something of the demo's."""
+    return [row | {"x": "1"} for row in rows_of("count") if row["variant"] == PAPER and row["step"] != "0"] if chart.marks_paper else []
 
 
 def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
@@ -102,7 +112,10 @@ def draw_panel(panel: Any, chart: Chart, rows: list[Row]) -> None:
     """All lines of one object, in the order of the CSV."""
     from matplotlib import ticker
 
-    for index, (label, chosen) in enumerate(grouped(rows, lambda row: label_of(chart, row)).items()):
+    lines = grouped(rows, lambda row: label_of(chart, row))
+    common = lines.get(chart.common, [])
+    for index, (label, chosen) in enumerate(lines.items()):
+        chosen = chosen + [row for row in common if row["x"] not in {own["x"] for own in chosen}]
         paper = PAPER in label
         style: dict[str, Any] = {"color": "0.15" if label == PAPER else f"C{index % 10}", "label": label}
         style["linestyle"] = "-" if index < 10 else "--"  # the eleventh line has the colour of the first

@@ -1,7 +1,7 @@
 """What is run for each chart and table: variants of configs/demo.yaml as lists of :class:`Job`; `runs.py` runs them."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 from ablations import CLIPPED, LATENT, NO_ANNEALING, PAPER_RATES, RANDOM_START, STRONG, VIEW_BLIND
@@ -53,15 +53,13 @@ def steps(count: int) -> dict[str, Any]:
     second = SECOND_STAGE * count // STEPS
     schedule = [second, 0.98, 0.55, second + 1]
     rounds = {f"system.geometry.prune.{name}": step * count // STEPS for name, step in (("start", 100), ("every", 50), ("stop", 900))}
-    rates = {f"system.geometry.{name}": f"[0,{start},{end},{count}]" for name, (start, end) in RATES.items()}
-    return (
-        rounds
-        | rates
-        | {
-            "trainer.max_steps": count,
-            "system.guidance.max_step_percent": schedule,
-        }
-    )
+    return rounds | falling(RATES, count) | {"trainer.max_steps": count, "system.guidance.max_step_percent": schedule}
+
+
+def falling(names: Iterable[str], count: int, factor: float = 1.0) -> dict[str, str]:
+    """Some of the demo's learning rates, ``factor`` times as high, for a run of ``count`` steps."""
+    rates = {name: [factor * rate for rate in RATES[name]] for name in names}
+    return {f"system.geometry.{name}": f"[0,{start:g},{end:g},{count}]" for name, (start, end) in rates.items()}
 
 
 def scratch(count: int) -> dict[str, Any]:
@@ -135,6 +133,19 @@ def iteration_jobs() -> Iterator[Job]:
             yield Job("iterations", name, count, steps(count) | rates)
 
 
+def rate_jobs() -> Iterator[Job]:
+    """Each learning rate of the demo a third and three times as high, all of them, and all held instead of falling."""
+    yield Job("rates", "demo.yaml", 1, {})
+    for names in (*([name] for name in RATES), list(RATES)):
+        line = names[0].removeprefix("lr_") if len(names) == 1 else "all"
+        for factor in (0.3, 3):
+            yield Job("rates", line, factor, falling(names, STEPS, factor))
+    for factor in (0.1, 0.3, 1):
+        held = {f"system.geometry.{name}": factor * start for name, (start, _) in RATES.items()}
+        yield Job("rates", "all, held at their start", factor, held)
+    yield Job("rates", "the paper's rates", 1, PAPER_RATES)
+
+
 def preset_jobs() -> Iterator[Job]:
     for preset in ("fast", "balanced", "accurate"):
         yield Job("preset", preset, 0, {"system.renderer.preset": preset})
@@ -197,6 +208,7 @@ JOBS: dict[str, Callable[[], Iterator[Job]]] = {
     "large": large_jobs,
     "batch": batch_jobs,
     "iterations": iteration_jobs,
+    "rates": rate_jobs,
     "preset": preset_jobs,
     "dilation": dilation_jobs,
     "quality": quality_jobs,
