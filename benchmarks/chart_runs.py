@@ -48,7 +48,7 @@ RUNS = {
     "size": Chart("What rendering larger buys", "cpu_seconds", SECONDS, curves=False, marks_paper=True),
     "large": Chart("What rendering at 1024² and shrinking to 512² buys", "cpu_seconds", SECONDS, curves=False, size=512),
     "batch": Chart(
-        "Views per step, at equal rendered views",
+        "Views per step, at equal seconds",
         "cpu_seconds",
         "CPU seconds of training, one thread",
         True,

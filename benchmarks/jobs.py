@@ -12,7 +12,7 @@ from threestudio_gaussiandreamer.simplify import KEEP
 STEPS = 1200
 SECOND_STAGE = 500
 """The step from which the demo draws smaller timesteps."""
-COUNTS = (2500, 1500, 1000)
+COUNTS = (5000, 2500, 1500, 1000)
 STEPS_A_ROUND = PruneOptions.steps
 """Of recovery in the prune command."""
 NO_BUDGET = {"system.geometry.budget": "null"}
@@ -88,8 +88,10 @@ def count_jobs() -> Iterator[Job]:
     yield Job("count", "by removal error, auto", 0, {"system.geometry.budget": "auto"})
     for count in COUNTS:
         yield Job("count", "by removal error", count, {"system.geometry.budget": count})
-    for count in COUNTS[-2:]:
         yield Job("count", "from scratch", count, scratch(count))
+    ungrown = {"system.geometry.prior.num_points": 10000, "system.geometry.grow.enabled": "false"}
+    yield Job("count", "by removal error, nothing grown", COUNTS[-2], ungrown | {"system.geometry.budget": COUNTS[-2]})
+    for count in COUNTS[-2:]:
         for score in ("contribution", "opacity"):
             yield Job("count", f"by {score}", count, {"system.geometry.budget": count, "system.geometry.prune.score": score})
         yield Job("count", "by removal error, slower means", count, {"system.geometry.budget": count} | SLOWER_MEANS)
@@ -110,20 +112,20 @@ def size_jobs() -> Iterator[Job]:
 
 
 def large_jobs() -> Iterator[Job]:
-    """The same at 512^2, with as many Gaussians as that needs, and the seconds that shrinking costs spent on steps instead."""
+    """The same at 512^2 with 20,000 Gaussians; what shrinking does to the dilation, and its seconds spent on steps, each alone."""
     own = {"data.width": 512, "data.height": 512, "system.evaluation.size": 512}
     many = own | scratch(20000)
     yield Job("large", "rendered at 512²", 0, many)
+    yield Job("large", "rendered at 512², dilation 0.025", 0, many | {"system.renderer.eps2d": 0.025})
     yield Job("large", "rendered at 512², 2,000 steps", 0, many | steps(2000))
     yield Job("large", "rendered at 1024², shrunk", 0, many | {"data.width": 1024, "data.height": 1024, "system.renderer.downsample": 2})
     yield Job("large", "the paper's recipe", 0, own | PAPER)
 
 
 def batch_jobs() -> Iterator[Job]:
-    """The same number of rendered views, in fewer or more steps."""
-    for batch in (1, 2, 4, 8):
-        count = STEPS * 4 // batch
-        yield Job("batch", "equal views", batch, {"data.batch_size": batch, "system.evaluation.every": count // 12} | steps(count))
+    """Views per step, with as many steps as fit into the demo's seconds."""
+    for batch, count in ((1, 2200), (2, 1650), (4, STEPS), (8, 750)):
+        yield Job("batch", "equal seconds", batch, {"data.batch_size": batch, "system.evaluation.every": count // 12} | steps(count))
 
 
 def iteration_jobs() -> Iterator[Job]:
@@ -164,6 +166,8 @@ def quality_jobs() -> Iterator[Job]:
     own = {"data.width": 256, "data.height": 256, "system.evaluation.size": 256}
     for name, overlay, count in (("draft", "demo-draft", 255), ("default", "", STEPS), ("best", "demo-best", 3000)):
         yield Job("quality", name, 0, own | {"trainer.max_steps": count, "system.evaluation.every": count // 20}, overlay)
+    beginning = {"trainer.max_steps": 160, "system.evaluation.every": 10}
+    yield Job("quality", "best, its beginning", 0, own | beginning, "demo-best")
     yield Job("quality", "the paper's recipe", 0, own | {"system.evaluation.every": STEPS // 20} | PAPER)
 
 
