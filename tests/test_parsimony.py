@@ -49,8 +49,18 @@ def test_the_budget_is_reached_round_by_round_and_then_holds():
     assert rounds(cloud(100, budget=50, prune=EVERY_STEP), 6) == [80, 64, 51, 50, 50, 50]
 
 
+def test_a_budget_is_met_though_there_are_few_rounds():
+    """In equal shares, each smaller than the usual one."""
+    assert rounds(cloud(100, budget=10, prune={"start": 0, "stop": 3, "every": 1}), 4) == [46, 21, 10, 10]
+
+
 def test_without_a_budget_nothing_goes():
     assert rounds(cloud(100, prune=EVERY_STEP), 3) == [100, 100, 100]
+
+
+@pytest.mark.parametrize(("given", "taken"), [("none", None), ("None", None), (None, None), (5e3, 5000), ("auto", "auto")])
+def test_a_budget_may_be_written_as_people_do(given, taken):
+    assert GaussianCloud({"budget": given}).cfg.budget == taken
 
 
 def test_a_budget_above_the_count_changes_nothing():

@@ -186,6 +186,14 @@ def test_auto_says_what_it_measured(tmp_path, painted_box, capsys, known):
     assert any(row.get("prune/lost" if known else "prune/likeness") for row in rows)
 
 
+def test_a_budget_that_needs_larger_rounds_is_met_and_says_so(tmp_path, painted_box, capsys):
+    options = [*PRUNE, "system.geometry.budget=70", "trainer.max_steps=8", "trainer.val_check_interval=8"]
+    assert launch(tmp_path, painted_box, *options) == 0
+    told = r"2 rounds of pruning have to lead from \d+ Gaussians to 70: each keeps 0.[56]\d instead of 0.8"
+    assert re.search(told, "".join(capsys.readouterr()))
+    assert len(cloud_of(trial(tmp_path) / "ckpts" / "last.ckpt")["geometry.means"]) == 70
+
+
 @pytest.mark.parametrize(("changes", "stop"), [(DENSIFY, 3), (DENSIFY, 4), (DENSIFY, 5), (PRUNE, 2), (PRUNE, 4)])
 def test_a_stopped_and_resumed_run_equals_the_run_that_never_stopped(tmp_path, painted_box, changes, stop):
     """Bit for bit: Gaussians, moments, statistics; the stops lie before, at and after a change of the cloud, with more validation."""

@@ -18,11 +18,11 @@ lr_*                learning rate of each attribute: a number or a schedule; lr_
 densify             enabled, start, stop, every (steps), grad_threshold, split_scale, min_opacity, max_scale (world units);
                     absgrad: judge by the sum of the pixels' absolute gradients, in which opposite pulls don't cancel
                     (AbsGS, Ye et al. 2024; several times larger, so give a threshold to match)
-budget              how many Gaussians a run ends with: a number, null (no limit but ``max_gaussians``), or ``auto``: each round
+budget              how many Gaussians a run ends with: a number, null or none (no limit but ``max_gaussians``), or ``auto``: each round
                     drops as many as cost no more than its share of ``prune.quality`` or, where no truth is known,
                     ``prune.likeness``; under a budget, duplicates in the start are merged (``merging.py``)
-prune               how the budget is met (``parsimony.py``): start, stop, every (steps), keep (the least share that a round
-                    keeps), score (removal, contribution; opacity, random: to compare with), quality (dB that all rounds may lose against
+prune               how the budget is met (``parsimony.py``): start, stop, every (steps), keep (the share that a round keeps; less
+                    only where there are too few rounds for a budget that is a number), score (removal, contribution; opacity, random: to compare with), quality (dB that all rounds may lose against
                     the truth), likeness (dB between the renders before and after a round, at least); ``auto`` leaves out the first
                     half of the rounds: what looks superfluous early may be needed later
 max_gaussians       exact cap, reached by dropping what shows least (of untrained points: any, evenly); min_gaussians: the
@@ -131,6 +131,7 @@ class GaussianCloud(BaseGeometry):
 
         def __post_init__(self) -> None:
             adopt_nested(self)
+            self.budget = _as_budget(self.budget)
 
         @staticmethod
         def check(cfg: Any) -> None:
@@ -405,7 +406,7 @@ class GaussianCloud(BaseGeometry):
         rows = slice(None) if first is None else first.parents
         seen = parsimony.Seen(self.contribution[rows], self.removal[rows])
         scores = parsimony.score(cfg.score, values["logit_opacities"], seen, generator(run_seed(), "prune", step))
-        count = parsimony.next_count(len(scores), cfg.keep, self._fewest())
+        count = parsimony.next_count(len(scores), self.kept_share(len(scores), step), self._fewest())
         if self.cfg.budget == AUTO and (first is not None or holds is None):
             count = len(scores)  # what densification made has been seen in no view yet
         elif self.cfg.budget == AUTO:
@@ -418,6 +419,13 @@ class GaussianCloud(BaseGeometry):
         """The numbers of finished steps after which a round of pruning is due."""
         rounds = rounds_of(self.cfg.prune)
         return rounds[len(rounds) // 2 :] if self.cfg.budget == AUTO else rounds
+
+    def kept_share(self, count: int, step: int) -> float:
+        """The share of ``count`` Gaussians that the round at ``step`` keeps: ``prune.keep``, or what meets the budget with the last one."""
+        left = sum(later >= step for later in self.prune_rounds)
+        if self.cfg.budget in (None, AUTO) or not left:
+            return self.cfg.prune.keep
+        return min(self.cfg.prune.keep, (self._fewest() / max(count, 1)) ** (1 / left))
 
     @property
     def affordable(self) -> float:
@@ -451,11 +459,18 @@ class GaussianCloud(BaseGeometry):
             self.register_buffer(name, torch.zeros(len(change.parents), device=self.means.device))
 
 
+def _as_budget(given: Any) -> Any:
+    """What was given for a budget, with ``none`` as None and whole numbers as such, however they are written."""
+    if isinstance(given, str) and given.lower() == "none":
+        return None
+    return int(given) if isinstance(given, float) and given.is_integer() else given
+
+
 def _check_budget(cfg: Any, where: str) -> None:
     """Raises UserError for a budget or a pruning schedule that can't be met."""
     budget, prune = cfg.budget, cfg.prune
     if budget is not None and budget != AUTO and (isinstance(budget, bool) or not isinstance(budget, int) or budget < cfg.min_gaussians):
-        raise UserError(f"{where}.budget: expected null, auto or a number from min_gaussians ({cfg.min_gaussians}) on, got {budget!r}")
+        raise UserError(f"{where}.budget: expected none, auto or a number from min_gaussians ({cfg.min_gaussians}) on, got {budget!r}")
     if prune.score not in parsimony.SCORES:
         raise unknown(f"{where}.prune.score", prune.score, parsimony.SCORES)
     if not 0 < prune.keep < 1:

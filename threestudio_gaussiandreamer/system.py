@@ -162,7 +162,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             self.measurements = Measurements(HeldOut(self.cfg.evaluation, caster), Path(self._save_dir))
 
     def on_train_start(self) -> None:
-        self.warn_of_rounds_too_late()
+        self.warn_of_a_tight_schedule()
         if self.global_step == 0:
             self.score("prior")
         if self.measurements:
@@ -180,9 +180,16 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             size = views["height"] // downsample, views["width"] // downsample
             cast(views["c2w"].to(self.device), views["fovy"].to(self.device), *size)
 
-    def warn_of_rounds_too_late(self) -> None:
-        """Say that a budget won't be met because its schedule is made for a longer run."""
+    def warn_of_a_tight_schedule(self) -> None:
+        """Say that a budget won't be met because its schedule is made for a longer run, or only in rounds that drop more than they should."""
         rounds, end = self.geometry.prune_rounds, self.trainer.max_steps
+        to_come = [step for step in rounds if step > self.global_step]
+        share, usual = self.geometry.kept_share(len(self.geometry), to_come[0]) if to_come else 1.0, self.geometry.cfg.prune.keep
+        if share < usual:
+            warn(
+                f"{len(to_come)} rounds of pruning have to lead from {len(self.geometry)} Gaussians to {self.geometry.cfg.budget}: each keeps"
+                f" {share:.2f} instead of {usual:g}, which costs more; give more rounds (system.geometry.prune.every) or start with fewer"
+            )
         late = sum(step > end for step in rounds) if self.geometry.cfg.budget is not None and end > 0 else 0
         if late:
             warn(
