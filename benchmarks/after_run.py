@@ -9,7 +9,6 @@ docs/charts/after_run.csv.
 """
 
 import argparse
-import math
 import statistics
 import sys
 import tempfile
@@ -19,14 +18,16 @@ from typing import Any
 
 import torch
 from jobs import NO_BUDGET, STEPS_A_ROUND
-from runs import STEPS, append_rows, object_name, rows_of, train
+from runs import SIZE, STEPS, append_rows, object_name, rows_of, train
 from torch import Tensor
 
 from threestudio_gaussiandreamer import parsimony, prune, register_parts
 from threestudio_gaussiandreamer.cloud_files import read_cloud
-from threestudio_gaussiandreamer.simplify import KEEP, Budget, Cloud, Views, draw, likeness, look, only, recover, simplify, worth
+from threestudio_gaussiandreamer.simplify import Budget, Cloud, Views, draw, likeness, look, only, recover, rounds_to, simplify, worth
 
 COUNTS = (2500, 1500)
+DRAWN = prune.PruneOptions(size=SIZE, eps2d=0.1)
+"""As the cloud was in training."""
 COLUMNS = "variant,x,object,seed,psnr,machine,commit".split(",")
 
 
@@ -48,7 +49,7 @@ def measured(mesh: str, seed: int) -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         stored = read_cloud(str(train(Path(folder), mesh, seed, NO_BUDGET) / f"it{STEPS}-export/gaussians.ply"))
     cloud = prune.tensors_of(stored)
-    probes, judges, tests = prune.views_of(stored, 256)
+    probes, judges, tests = prune.views_of(stored, DRAWN)
     pictures = look(cloud, tests)
     place = {"object": object_name(mesh), "seed": seed}
     return [
@@ -62,7 +63,7 @@ def variants(cloud: Cloud, count: int, probes: Views, judges: Views) -> Iterator
     """The ways from a cloud to ``count`` Gaussians, and where they lead."""
     for name in parsimony.SCORES:
         yield f"one shot, by {name}", only(cloud, RANKS[name](cloud, probes, 0), count)
-    steps = STEPS_A_ROUND * math.ceil(math.log(count / len(cloud.means), KEEP))
+    steps = STEPS_A_ROUND * rounds_to(count, len(cloud.means))
     yield "one shot, by removal, recovered", recover(only(cloud, worth(cloud, probes), count), probes, look(cloud, probes), steps, 0)
     for name in parsimony.SCORES:
         yield f"in rounds, by {name}", simplify(cloud, probes, judges, Budget(count=count), steps=STEPS_A_ROUND, rank=RANKS[name])

@@ -1,13 +1,12 @@
 """What is run for each chart and table: variants of configs/demo.yaml as lists of :class:`Job`; `runs.py` runs them."""
 
-import math
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 from ablations import CLIPPED, LATENT, NO_ANNEALING, PAPER_RATES, RANDOM_START, STRONG, VIEW_BLIND
 
 from threestudio_gaussiandreamer.prune import PruneOptions
-from threestudio_gaussiandreamer.simplify import KEEP
+from threestudio_gaussiandreamer.simplify import rounds_to
 
 STEPS = 1200
 SECOND_STAGE = 500
@@ -95,8 +94,8 @@ def count_jobs() -> Iterator[Job]:
         for score in ("contribution", "opacity"):
             yield Job("count", f"by {score}", count, {"system.geometry.budget": count, "system.geometry.prune.score": score})
         yield Job("count", "by removal error, slower means", count, {"system.geometry.budget": count} | SLOWER_MEANS)
-        rounds = math.ceil(math.log(count / 10000, KEEP))
-        pruned = NO_BUDGET | {"system.prune.count": count}
+        rounds = rounds_to(count, 10000)
+        pruned = NO_BUDGET | {"system.prune.count": count, "system.prune.size": 128}
         yield Job("count", "after the run, with recovery", count, steps(STEPS - rounds * STEPS_A_ROUND) | pruned)
     yield Job("count", "at random", COUNTS[-2], {"system.geometry.budget": COUNTS[-2], "system.geometry.prune.score": "random"})
     yield Job("count", "the paper's recipe, by removal error", COUNTS[-2], PAPER | {"system.geometry.budget": COUNTS[-2]})

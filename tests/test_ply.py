@@ -110,6 +110,14 @@ class TestGaussians:
         text = "\n".join(" ".join(repr(float(value)) for value in row) for row in rows)
         assert_same(ply.read_gaussians(saved(tmp_path, header("ascii", 3, [f"float {n}" for n in ply.GAUSSIAN]) + text)), expected)
 
+    def test_what_is_not_known_is_named(self, tmp_path, caplog):
+        ply.write_gaussians(tmp_path / "a.ply", **gaussians()._asdict())
+        ply.read_gaussians(tmp_path / "a.ply")
+        assert not caplog.text
+        (tmp_path / "b.ply").write_bytes((tmp_path / "a.ply").read_bytes().replace(b"property float nx", b"property float filter_3D"))
+        ply.read_gaussians(tmp_path / "b.ply")
+        assert "b.ply: not known here, and left out: filter_3D" in caplog.text
+
     def test_what_is_missing_is_named(self, tmp_path):
         ply.write_points(tmp_path / "points.ply", cloud())
         with pytest.raises(UserError, match="lack f_dc_0.*plain points"):

@@ -10,7 +10,9 @@ import torch
 from threestudio_gaussiandreamer import prune, simplify
 from threestudio_gaussiandreamer.cloud_files import PRUNED, read_cloud
 from threestudio_gaussiandreamer.ply import read_comments, read_gaussians, write_gaussians
+from threestudio_gaussiandreamer.sh import sh_to_colors
 from threestudio_gaussiandreamer.simplify import Budget, Cloud
+from threestudio_gaussiandreamer.splatting import rasterize
 
 FAST = ["--size", "48", "--steps", "8"]
 
@@ -63,6 +65,46 @@ def test_a_second_run_removes_nothing(source, tmp_path):
     run(tmp_path / "once.ply", tmp_path / "twice.ply", "--psnr", "32")
     assert (tmp_path / "once.ply").read_bytes() == (tmp_path / "twice.ply").read_bytes()
     assert f"{PRUNED} 32" in read_comments(tmp_path / "twice.ply")
+
+
+def test_a_second_run_of_nearly_the_same_budget_has_nearly_nothing_to_spend(source, tmp_path):
+    once = run(source, tmp_path / "once.ply", "--psnr", "32")["after"]["gaussians"]
+    assert run(tmp_path / "once.ply", tmp_path / "twice.ply", "--psnr", "31.999")["after"]["gaussians"] >= 0.98 * once
+    assert f"{PRUNED} 32" in read_comments(tmp_path / "twice.ply")
+
+
+@pytest.mark.parametrize(("asked", "spent", "left"), [(37.0, 40.0, 40.02), (30.0, 60.0, 30.004), (40.0, 40.0, None), (41.0, 40.0, None)])
+def test_what_is_left_of_a_budget(asked, spent, left):
+    assert prune.unspent(asked, spent) == (left and pytest.approx(left, abs=5e-3))
+
+
+def test_a_count_that_changes_nothing_keeps_the_note(source, tmp_path):
+    once = run(source, tmp_path / "once.ply", "--psnr", "32")["after"]["gaussians"]
+    run(tmp_path / "once.ply", tmp_path / "same.ply", "--count", str(once))
+    run(tmp_path / "once.ply", tmp_path / "fewer.ply", "--count", str(once - 50))
+    assert read_cloud(str(tmp_path / "same.ply")).pruned_to == 32 and read_cloud(str(tmp_path / "fewer.ply")).pruned_to is None
+
+
+def test_a_quality_that_the_format_cannot_give_is_not_said_to_be_met(source, tmp_path, caplog):
+    assert run(source, tmp_path / "fine.ply", "--psnr", "30")["met"]
+    report = run(source, tmp_path / "out.spz", "--psnr", "90")
+    assert not report["met"] and report["after"]["gaussians"] == 600 and "the budget isn't met" in caplog.text
+    assert read_cloud(str(tmp_path / "out.spz")).pruned_to is None
+
+
+@pytest.mark.parametrize(("drawn", "eps2d"), [({}, 0.3), ({"eps2d": 0.05}, 0.05), ({"antialias": True}, 0.3)])
+def test_a_cloud_is_judged_as_the_viewer_draws_it(source, drawn, eps2d):
+    for views in prune.views_of(read_cloud(str(source)), prune.PruneOptions(size=48, **drawn)):
+        cloud, rgb = ball(), sh_to_colors(ball().sh, ball().means)
+        shape = cloud.means, cloud.quats, cloud.log_scales.exp(), cloud.logit_opacities.sigmoid(), rgb, views.viewmats[:1], views.Ks[:1]
+        options = {"background": views.backgrounds[:1], "near": views.near, "eps2d": eps2d, "antialias": "antialias" in drawn}
+        assert torch.equal(simplify.look(cloud, views)[0], rasterize(*shape, 48, 48, **options).image[0])
+
+
+def test_the_input_is_not_overwritten(source, tmp_path, capsys):
+    before = source.read_bytes()
+    assert prune.main([str(source), str(source), "--count", "10"]) == 2
+    assert "OUT is IN" in capsys.readouterr().err and source.read_bytes() == before
 
 
 def test_a_looser_budget_goes_on(source, tmp_path):
@@ -162,7 +204,8 @@ def test_a_checkpoint_without_gaussians_is_refused(tmp_path, capsys):
 
 def test_a_compact_file_is_written_within_its_size_and_read_again(source, tmp_path):
     report = run(source, tmp_path / "out.spz", "--bytes", "7kB")
-    assert 6_000 < (tmp_path / "out.spz").stat().st_size <= 7_000 and report["after"]["gaussians"] > 300
+    assert 6_600 < (tmp_path / "out.spz").stat().st_size == report["after"]["bytes"] <= 7_000 and report["after"]["gaussians"] > 300
+    assert 900 < run(source, tmp_path / "small.spz", "--bytes", "1kB")["after"]["bytes"] <= 1_000
     assert run(tmp_path / "out.spz", tmp_path / "again.spz", "--count", "200")["after"]["gaussians"] == 200
     assert read_cloud(str(tmp_path / "again.spz")).up == "y"
 
@@ -192,7 +235,7 @@ def test_colours_beyond_the_compact_formats_reach_are_fitted_within_it(tmp_path)
 def test_views_turn_with_the_axes_of_the_file(tmp_path):
     source = tmp_path / "in.ply"
     write_gaussians(source, **arrays_of(ball()))
-    views = {up: prune.views_of(read_cloud(str(source), up=up), 48)[0] for up in ("z", "y", "-y")}
+    views = {up: prune.views_of(read_cloud(str(source), up=up), prune.PruneOptions(size=48))[0] for up in ("z", "y", "-y")}
     top = {"z": 2, "y": 1, "-y": 1}
     heights = {up: views[up].positions[:, top[up]] * (-1 if up == "-y" else 1) for up in views}
     assert torch.allclose(heights["z"], heights["y"], atol=0.05) and torch.allclose(heights["y"], heights["-y"], atol=0.05)

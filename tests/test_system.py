@@ -13,6 +13,7 @@ import torch
 import yaml
 
 from threestudio_gaussiandreamer import evaluate
+from threestudio_gaussiandreamer.cloud_files import read_cloud
 from threestudio_gaussiandreamer.experiment import main
 from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance
 from threestudio_gaussiandreamer.host import BaseObject, register
@@ -141,12 +142,21 @@ def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted
     first = read_gaussians(export / "pruned" / "gaussians.ply")
     assert len(first.means) == len(read_spz(export / "pruned" / "gaussians.spz").means) == 90
     report = json.loads((export / "pruned" / "report.json").read_text())
+    assert report["options"]["eps2d"] == 0.1 and not report["options"]["antialias"]  # as the demo draws
     assert report["after"]["gaussians"] == 90 and (export / "pruned" / "report.png").stat().st_size > 0
     shutil.rmtree(export)
     resume = [f"resume={trial(tmp_path) / 'ckpts' / 'last.ckpt'}", "system.exporter.save_video=false"]
     assert launch(tmp_path, painted_box, *options, *resume, stage="--export") == 0
     (again,) = trial(tmp_path).parent.glob("*/save/it4-export/pruned/gaussians.ply")
     assert all(a.tobytes() == b.tobytes() for a, b in zip(read_gaussians(again), first, strict=True))
+
+
+def test_pruned_exports_note_what_they_have_spent(tmp_path, painted_box, capsys):
+    options = ["system.prune.psnr=25", "system.prune.size=32", "system.prune.steps=3", "system.exporter.formats=[ply,spz]"]
+    assert launch(tmp_path, painted_box, *options, "trainer.max_steps=2", "trainer.val_check_interval=2") == 0
+    files = trial(tmp_path) / "save" / "it2-export" / "pruned"
+    for name in ("gaussians.ply", "gaussians.spz"):
+        assert read_cloud(str(files / name)).pruned_to == 25
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from .errors import UserError, unknown
 from .files import existing_file
-from .ply import GaussianArrays, read_comments, read_gaussians, usable, write_gaussians
+from .ply import GaussianArrays, gaussians_size, read_comments, read_gaussians, usable, write_gaussians
 from .sh import sh_basis
 from .spz import read_spz, read_spz_comment, spz_arrays, spz_bytes, write_spz
 
@@ -31,8 +31,6 @@ AXES = {
     "z": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
 }
 """From coordinates with this axis up to right, up, back, the axes of SPZ: ``z`` is ours (front +x), ``-y`` the custom of PLY files."""
-PLY_HEADER_BYTES = 2048
-"""More than the header of a PLY takes."""
 
 
 class StoredCloud(NamedTuple):
@@ -101,19 +99,27 @@ def write_cloud(path: str, cloud: StoredCloud) -> None:
         UserError: an unknown format, values that it can't hold, or the file can't be written.
     """
     suffix = require_format(path, "OUT")
-    notes = [] if cloud.pruned_to is None else [f"{PRUNED} {cloud.pruned_to:.6g}"]
     if suffix == ".ply":
-        write_gaussians(path, **cloud.arrays._asdict(), comments=[f"{UP} {cloud.up}", *notes])
+        write_gaussians(path, **cloud.arrays._asdict(), comments=ply_notes(cloud.up, cloud.pruned_to))
     else:
-        write_spz(path, **in_axes(cloud, "y")._asdict(), comment="; ".join(notes))
+        write_spz(path, **in_axes(cloud, "y")._asdict(), comment=spz_note(cloud.pruned_to))
+
+
+def ply_notes(up: str, pruned_to: Optional[float]) -> list[str]:
+    """What a PLY says about a cloud in its comments."""
+    return [f"{UP} {up}", *filter(None, [spz_note(pruned_to)])]
+
+
+def spz_note(pruned_to: Optional[float]) -> str:
+    """What an SPZ file says about a cloud; its axes go without saying."""
+    return "" if pruned_to is None else f"{PRUNED} {pruned_to:.6g}"
 
 
 def file_size(cloud: StoredCloud, suffix: str) -> int:
-    """The bytes of the file that :func:`write_cloud` makes; of a PLY up to a header more."""
+    """The bytes of the file that :func:`write_cloud` makes."""
     if suffix == ".spz":
-        return len(spz_bytes(in_axes(cloud, "y")))
-    floats = 3 + sum(values[0].size for values in cloud.arrays) if len(cloud.arrays.means) else 0  # three are normals, unused
-    return PLY_HEADER_BYTES + 4 * floats * len(cloud.arrays.means)
+        return len(spz_bytes(in_axes(cloud, "y"), comment=spz_note(cloud.pruned_to)))
+    return gaussians_size(*cloud.arrays.sh.shape[:2], ply_notes(cloud.up, cloud.pruned_to))
 
 
 def as_stored(cloud: StoredCloud, suffix: str) -> StoredCloud:

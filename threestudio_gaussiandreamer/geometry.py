@@ -22,9 +22,10 @@ budget              how many Gaussians a run ends with: a number, null or none (
                     drops as many as cost no more than its share of ``prune.quality`` or, where no truth is known,
                     ``prune.likeness``; under a budget, duplicates in the start are merged (``merging.py``)
 prune               how the budget is met (``parsimony.py``): start, stop, every (steps), keep (the share that a round keeps; less
-                    only where there are too few rounds for a budget that is a number), score (removal, contribution; opacity, random: to compare with), quality (dB that all rounds may lose against
-                    the truth), likeness (dB between the renders before and after a round, at least); ``auto`` leaves out the first
-                    half of the rounds: what looks superfluous early may be needed later
+                    only where there are too few rounds for a budget that is a number), score (removal, contribution;
+                    opacity, random: to compare with), quality (dB that all rounds may lose against the truth), likeness
+                    (dB between the renders before and after a round, at least); ``auto`` leaves out the first half of the
+                    rounds: what looks superfluous early may be needed later
 max_gaussians       exact cap, reached by dropping what shows least (of untrained points: any, evenly); min_gaussians: the
                     floor that pruning never passes
 keep_attributes     with gaussians-prior: start from all attributes of that cloud, not only from points and colours

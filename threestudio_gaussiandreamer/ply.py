@@ -112,9 +112,19 @@ def write_gaussians(
     arrays = _as_float32(GaussianArrays(means, sh, logit_opacities, log_scales, quats))
     sh = arrays.sh if pad_sh_degree is None else padded_sh(arrays.sh, pad_sh_degree)
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), 3 * (sh.shape[1] - 1))  # channel by channel
-    names = [*MEANS, *NORMALS, *SH_CONSTANT, *(f"f_rest_{i}" for i in range(rest.shape[1])), "opacity", *LOG_SCALES, *QUATS]
     columns = [arrays.means, np.zeros_like(arrays.means), sh[:, 0], rest, arrays.logit_opacities[:, None], arrays.log_scales, arrays.quats]
-    _write(path, [(name, "float") for name in names], np.concatenate(columns, axis=1), comments)
+    _write(path, _gaussian_properties(sh.shape[1]), np.concatenate(columns, axis=1), comments)
+
+
+def gaussians_size(count: int, harmonics: int, comments: Sequence[str] = ()) -> int:
+    """The bytes of the file that :func:`write_gaussians` makes of ``count`` Gaussians with (degree + 1)^2 ``harmonics`` each."""
+    properties = _gaussian_properties(harmonics)
+    return len(_header_bytes(properties, count, comments)) + 4 * len(properties) * count
+
+
+def _gaussian_properties(harmonics: int) -> list[tuple[str, str]]:
+    rest = (f"f_rest_{i}" for i in range(3 * (harmonics - 1)))
+    return [(name, "float") for name in (*MEANS, *NORMALS, *SH_CONSTANT, *rest, "opacity", *LOG_SCALES, *QUATS)]
 
 
 def read_comments(path: str | os.PathLike) -> list[str]:
@@ -154,12 +164,16 @@ def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
 
 def _write(path: str | os.PathLike, properties: list[tuple[str, str]], rows: np.ndarray, comments: Sequence[str] = ()) -> None:
     """Header and rows; ``rows`` is a packed little-endian record array, or (N, P) float32."""
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments), f"element vertex {len(rows)}"]
-    lines += [f"property {kind} {name}" for name, kind in properties]
     with atomic_file(path) as file:
-        file.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii"))
+        file.write(_header_bytes(properties, len(rows), comments))
         little_endian = rows if rows.dtype.names else rows.astype("<f4", copy=False)
         file.write(np.ascontiguousarray(little_endian).data if len(rows) else b"")
+
+
+def _header_bytes(properties: list[tuple[str, str]], count: int, comments: Sequence[str]) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments), f"element vertex {count}"]
+    lines += [f"property {kind} {name}" for name, kind in properties]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
 def _as_float32(arrays: GaussianArrays) -> GaussianArrays:
@@ -196,6 +210,9 @@ def read_gaussians(path: str | os.PathLike, *, allow_non_finite: bool = False) -
     if missing := [name for name in GAUSSIAN if name not in table]:
         hint = " It holds plain points: read it as a point cloud." if not set(SH_CONSTANT) & set(table.names) else ""
         table.fail(f"the Gaussians lack {', '.join(missing)}.{hint}")
+    known = {*GAUSSIAN, *NORMALS, *COLORS}
+    if unknown := [name for name in table.names if name not in known and not name.startswith("f_rest_")]:
+        logger.warning("%s: not known here, and left out: %s", path, ", ".join(unknown))
     arrays = GaussianArrays(table[MEANS], _read_sh(table), table["opacity"], table[LOG_SCALES], table[QUATS])
     if not allow_non_finite:
         table.require_valid(usable(arrays), "values")

@@ -6,12 +6,14 @@ another: what Gaussians are scored on and fitted to, what decides whether a budg
 side), and what the report says. Both of the latter look at what OUT gives back, rounding included. The views are from around and
 outside: right for an object, not for a room.
 
-A budget of quality is spent once: it is noted in OUT, and a second run with the same or a stricter one has nothing to do, since
-it would measure against the pruned cloud.
+A budget of quality is spent once: it is noted in OUT, and a second run has what is left of it, since it measures against the
+pruned cloud: nothing of the same budget or a stricter one.
 """
 
 import argparse
+import bisect
 import json
+import logging
 import math
 import os
 import re
@@ -19,11 +21,12 @@ import signal
 import statistics
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -45,9 +48,10 @@ from .errors import UserError
 from .files import existing_file
 from .host import get_device
 from .ply import GaussianArrays
-from .simplify import Budget, Cloud, Round, Views, likeness, look, simplify, views_around
+from .simplify import EPS2D, Budget, Cloud, Round, Views, assured_likeness, likeness, look, rounds_to, simplify, views_around
 from .spz import COLOR_REACH
 
+logger = logging.getLogger(__name__)
 PROBES, JUDGES, TESTS = 64, 32, 16
 TURNS = (0.0, 45.0, 60.0)
 """Where the three spirals of views start, degrees."""
@@ -72,6 +76,8 @@ class PruneOptions:
     quality: float = 35.0
     size: int = 256
     steps: int = 60
+    eps2d: Optional[float] = None
+    antialias: Optional[bool] = None
 
     @property
     def asked_for(self) -> bool:
@@ -84,6 +90,8 @@ class PruneOptions:
             raise UserError(f"{where}{given[0]} and {where}{given[1]}: give one budget")
         if self.size < 16 or self.steps < 1:
             raise UserError(f"{where}size and {where}steps: expected at least 16 and 1, got {self.size} and {self.steps}")
+        if self.eps2d is not None and not 0 <= self.eps2d < math.inf:
+            raise UserError(f"{where}eps2d: expected 0 or more square pixels, got {self.eps2d:g}")
         number(self.quality, f"{where}quality", "dB")
         budget_of(self, where)
 
@@ -94,6 +102,8 @@ class Pruned(NamedTuple):
     before: StoredCloud
     after: StoredCloud
     seconds: float
+    met: bool = True
+    """Whether the budget is."""
 
 
 class Cost(NamedTuple):
@@ -133,6 +143,8 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     parser.add_argument("--quality", type=float, default=35.0, help="dB of the unpruned cloud to the truth, for --within (default: 35)")
     parser.add_argument("--size", type=int, default=256, help="pixels of the views each way (default: 256)")
     parser.add_argument("--steps", type=int, default=60, help="of recovery after each round (default: 60)")
+    parser.add_argument("--eps2d", type=float, help=f"square pixels by which the viewer widens Gaussians (default: {EPS2D:g})")
+    parser.add_argument("--antialias", action="store_true", default=None, help="the viewer keeps the energy of small Gaussians")
     parser.add_argument("--up", choices=AXES, help="which axis of IN is up (default: what the file says, else the custom of its format)")
     return parser.parse_args(argv)
 
@@ -147,6 +159,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         raise UserError(f"OUT: there is no folder {str(folder)!r}")
     if Path(args.output).is_dir() or not os.access(folder, os.W_OK):
         raise UserError(f"OUT: {args.output!r} can't be written")
+    if Path(args.output).exists() and Path(args.source).exists() and os.path.samefile(args.source, args.output):
+        raise UserError("OUT is IN: give it another name, so that the unpruned cloud is kept")
     done = pruned(read(args.source, args.up), options, suffix, "--")
     write_cloud(args.output, done.after)
     return write_report(args.output, done, suffix, options)
@@ -162,7 +176,9 @@ def read(path: str, up: Optional[str] = None) -> StoredCloud:
         UserError: there is no file, it holds no Gaussians, or fewer than two.
     """
     file = existing_file(path, "file of Gaussians or checkpoint")
-    stored = StoredCloud(drawable(from_checkpoint(file)), up or OUR_UP) if file.suffix in (".ckpt", ".pt") else read_cloud(path, up=up)
+    stored = (
+        StoredCloud(drawable(from_checkpoint(file)), up or OUR_UP) if file.suffix in (".ckpt", ".pt", ".pth") else read_cloud(path, up=up)
+    )
     if len(stored.arrays.means) < 2:
         raise UserError(f"{path} holds {len(stored.arrays.means)} Gaussians that can be drawn: there is nothing to prune")
     return stored
@@ -180,8 +196,8 @@ def from_checkpoint(file: Path) -> GaussianArrays:
     raise UserError(f"{file} holds no cloud of Gaussians: neither our {CHECKPOINTS['state_dict']['means']} nor gsplat's splats are there")
 
 
-def budget_of(options: PruneOptions, where: str, each: float = 1.0, header: int = 0) -> Budget:
-    """What the options ask for, of Gaussians that take ``each`` bytes in the file, besides its header.
+def budget_of(options: PruneOptions, where: str, fitting: Callable[[int], int] = lambda size: size) -> Budget:
+    """What the options ask for; ``fitting`` tells how many Gaussians go into so many bytes.
 
     Raises:
         UserError: a number that makes no sense.
@@ -189,8 +205,7 @@ def budget_of(options: PruneOptions, where: str, each: float = 1.0, header: int 
     if options.count is not None:
         return Budget(count=counted(number(options.count, f"{where}count"), f"{where}count"))
     if options.bytes is not None:
-        count = (size_in_bytes(options.bytes, f"{where}bytes") - header) // each
-        return Budget(count=counted(count, f"{where}bytes, in Gaussians,"))
+        return Budget(count=counted(fitting(size_in_bytes(options.bytes, f"{where}bytes")), f"{where}bytes, in Gaussians,"))
     if options.psnr is not None:
         return Budget(psnr=positive(number(options.psnr, f"{where}psnr", "dB"), f"{where}psnr"))
     if options.within is not None:
@@ -239,6 +254,15 @@ def likeness_within(loss: float, quality: float) -> float:
     return quality - 10 * math.log10(10 ** (loss / 10) - 1)
 
 
+def unspent(asked: float, spent: float) -> Optional[float]:
+    """The PSNR to a cloud pruned to ``spent`` dB at which that is still ``asked`` dB like the first; None where nothing is left.
+
+    Both errors are taken to be independent, so their squares add.
+    """
+    left = 10 ** (-asked / 10) - 10 ** (-spent / 10)
+    return -10 * math.log10(left) if left > 0 else None
+
+
 # ---- working ---------------------------------------------------------------------------------------------------------------
 
 
@@ -248,28 +272,43 @@ def pruned(stored: StoredCloud, options: PruneOptions, suffix: str, where: str) 
     Raises:
         UserError: a budget that can't be met, or values that the format can't hold.
     """
-    nothing = stored._replace(arrays=GaussianArrays(*(values[:0] for values in stored.arrays)))
-    header, size = file_size(nothing, suffix), file_size(stored, suffix)
-    budget = budget_of(options, where, (size - header) / len(stored.arrays.means), header)
     started = time.perf_counter()
-    if budget.psnr is not None and stored.pruned_to is not None and budget.psnr >= stored.pruned_to:
-        print(f"nothing to do: this cloud has been pruned to {stored.pruned_to:g} dB already")
-        return Pruned(stored, stored, 0.0)
-    after = _simplified(stored, budget, options, suffix)
+    budget = asked = budget_of(options, where, lambda size: _most_within(size, stored, suffix))
+    if budget.psnr is not None and stored.pruned_to is not None:
+        budget = Budget(psnr=unspent(budget.psnr, stored.pruned_to))
+        if budget.psnr is None:
+            print(f"nothing to do: this cloud has been pruned to {stored.pruned_to:g} dB already")
+            return Pruned(stored, stored, 0.0)
+    after, met = _simplified(stored, budget, options, suffix)
     while options.bytes is not None and (size := file_size(after, suffix)) > (limit := size_in_bytes(options.bytes, f"{where}bytes")):
-        # fewer Gaussians pack a little worse
+        # what is left packs worse than it did among the others
         fewer = min(int(len(after.arrays.means) * limit / size), len(after.arrays.means) - 1)
-        after = _simplified(after, Budget(count=counted(fewer, f"{where}bytes, in Gaussians,")), options, suffix)
-    return Pruned(stored, after, time.perf_counter() - started)
+        after, met = _simplified(after, Budget(count=counted(fewer, f"{where}bytes, in Gaussians,")), options, suffix)
+    if len(after.arrays.means) < len(stored.arrays.means):
+        after = after._replace(pruned_to=asked.psnr)
+    return Pruned(stored, after, time.perf_counter() - started, met)
 
 
-def _simplified(stored: StoredCloud, budget: Budget, options: PruneOptions, suffix: str) -> StoredCloud:
+def _most_within(size: int, stored: StoredCloud, suffix: str) -> int:
+    """How many Gaussians make a file of at most ``size`` bytes: the most whose every so manyth, as they are, does."""
+    whole = len(stored.arrays.means)
+
+    def too_large(count: int) -> bool:
+        rows = np.arange(count) * whole // count
+        return file_size(stored._replace(arrays=GaussianArrays(*(values[rows] for values in stored.arrays))), suffix) > size
+
+    return bisect.bisect_left(range(1, whole + 1), True, key=too_large)
+
+
+def _simplified(stored: StoredCloud, budget: Budget, options: PruneOptions, suffix: str) -> tuple[StoredCloud, bool]:
+    """The cloud within a budget, and whether it is: no cloud is, if the file's rounding alone costs more."""
     from tqdm import tqdm
 
     cloud = tensors_of(stored)
-    probes, judges, _ = views_of(stored, options.size)
+    probes, judges, _ = views_of(stored, options)
     sh_reach = COLOR_REACH if suffix == ".spz" else math.inf
-    with tqdm(desc="pruning", unit="round", disable=None) as bar:
+    rounds = None if budget.count is None else rounds_to(budget.count, len(cloud.means))
+    with tqdm(desc="pruning", unit="round", total=rounds, disable=None) as bar:
 
         def report(done: Round) -> None:
             bar.set_postfix_str(f"{done.count} Gaussians, {done.psnr:.2f} dB")
@@ -279,13 +318,21 @@ def _simplified(stored: StoredCloud, budget: Budget, options: PruneOptions, suff
             return tensors_of(as_stored(stored_cloud(fewer, stored), suffix))
 
         fewer = simplify(cloud, probes, judges, budget, steps=options.steps, report=report, stored=written, sh_reach=sh_reach)
-    return stored_cloud(fewer, stored)._replace(pruned_to=budget.psnr)
+    met = True
+    if budget.psnr is not None and len(fewer.means) == len(cloud.means):
+        reached = assured_likeness(written(fewer), judges, look(cloud, judges))
+        met = reached >= budget.psnr
+        if not met:
+            logger.warning("the budget isn't met: even all Gaussians, as %s stores them, are only %.2f dB like the cloud", suffix, reached)
+    return stored_cloud(fewer, stored), met
 
 
-def views_of(stored: StoredCloud, size: int) -> list[Views]:
-    """What is fitted to, what decides, what is reported."""
+def views_of(stored: StoredCloud, options: PruneOptions) -> list[Views]:
+    """What is fitted to, what decides, what is reported; drawn as the options say that viewers draw."""
     cloud, to_z_up = tensors_of(stored), torch.from_numpy(rotation_between(stored.up, "z"))
-    return [views_around(cloud, n, size, turn=turn, to_z_up=to_z_up) for n, turn in zip((PROBES, JUDGES, TESTS), TURNS, strict=True)]
+    drawn = {"eps2d": EPS2D if options.eps2d is None else options.eps2d, "antialias": bool(options.antialias)}
+    series = zip((PROBES, JUDGES, TESTS), TURNS, strict=True)
+    return [views_around(cloud, n, options.size, turn=turn, to_z_up=to_z_up)._replace(**drawn) for n, turn in series]
 
 
 def tensors_of(stored: StoredCloud) -> Cloud:
@@ -304,18 +351,24 @@ def stored_cloud(cloud: Cloud, like: Optional[StoredCloud] = None) -> StoredClou
 
 def write_report(path: str, done: Pruned, suffix: str, options: PruneOptions) -> dict[str, Any]:
     """The table on the screen, ``path``.json and ``path``.png; returns what the JSON holds."""
-    tests = views_of(done.before, options.size)[-1]
+    tests = views_of(done.before, options)[-1]
     clouds = [tensors_of(done.before), tensors_of(as_stored(done.after, suffix))]
     grey = tests._replace(backgrounds=None)
     sizes = [file_size(done.before, suffix), file_size(done.after, suffix)]
     costs = [Cost(len(cloud.means), size, frame_time(cloud, grey)) for cloud, size in zip(clouds, sizes, strict=True)]
     reached = likeness(clouds[1], tests, look(clouds[0], tests))
-    report = {"before": costs[0]._asdict(), "after": costs[1]._asdict(), "psnr_on_unseen_views": reached, "seconds": round(done.seconds, 1)}
+    report = {
+        "before": costs[0]._asdict(),
+        "after": costs[1]._asdict(),
+        "psnr_on_unseen_views": reached,
+        "met": done.met,
+        "seconds": round(done.seconds, 1),
+    }
     Path(f"{path}.json").write_text(json.dumps(report | {"options": asdict(options)}, indent=2))
     write_picture(Path(f"{path}.png"), sheet([look(cloud, grey) for cloud in clouds]))
     for name, cost in zip(("before", "after"), costs, strict=True):
-        print(f"{name:7} {cost.gaussians:8d} Gaussians {cost.bytes / 1e6:8.2f} MB {cost.ms_per_frame:8.2f} ms a frame")
-    print(f"{reached:.2f} dB to the unpruned cloud on views that nothing was fitted to; {path}, .json, .png")
+        print(f"{name:7} {cost.gaussians:8d} Gaussians {cost.bytes / 1e6:8.2f} MB as {suffix} {cost.ms_per_frame:8.2f} ms a frame")
+    print(f"{reached:.2f} dB to the unpruned cloud on views that nothing was fitted to; {path}.json, {path}.png")
     return report
 
 

@@ -32,6 +32,8 @@ RATES = {"means": 2e-4, "quats": 4e-3, "log_scales": 1e-2, "logit_opacities": 2e
 PACES = (1.0, 1 / 4, 1 / 16, 1 / 64)
 """Of these rates. What is nearly right needs small ones: Adam's steps are as long where the gradient is mostly noise."""
 FOVY = math.radians(50.0)
+EPS2D = 0.3
+"""The screen-space dilation of viewers, square pixels."""
 NEAR = 0.01
 """The nearest depth that is drawn, in units of the cloud's radius: clouds come in millimetres and in kilometres."""
 
@@ -57,6 +59,9 @@ class Views(NamedTuple):
     """The nearest depth that is drawn."""
     backgrounds: Optional[Float[Tensor, "V 3"]] = None
     """What lies behind; None is grey."""
+    eps2d: float = EPS2D
+    """Screen-space dilation, square pixels."""
+    antialias: bool = False
 
 
 class Budget(NamedTuple):
@@ -120,7 +125,7 @@ def draw(cloud: Cloud, views: Views, rows: Tensor, opacities: Optional[Float[Ten
     background = torch.full((3,), 0.5, device=cloud.means.device) if views.backgrounds is None else views.backgrounds[rows]
     out = rasterize(
         cloud.means, cloud.quats, cloud.log_scales.exp(), opacities, colors, views.viewmats[rows], views.Ks[rows],
-        views.size, views.size, background=background, near=views.near,
+        views.size, views.size, background=background, near=views.near, eps2d=views.eps2d, antialias=views.antialias,
     )  # fmt: skip
     return out.image, out.contribution
 
@@ -230,6 +235,11 @@ def simplify(
         else:
             keep, failed = 0.5 * (1 + keep), count  # half as many
     return cloud
+
+
+def rounds_to(count: int, here: int) -> int:
+    """How many rounds lead from ``here`` Gaussians to ``count``."""
+    return max(0, math.ceil(math.log(count / here, KEEP)))
 
 
 def _next_count(here: int, keep: float, budget: Budget) -> int:

@@ -30,7 +30,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .background import FlatBackground
-from .cloud_files import OUR_UP, UP, StoredCloud, drawable, in_axes
+from .cloud_files import OUR_UP, StoredCloud, drawable, in_axes, ply_notes, spz_note
 from .distributed import all_sum, average_gradients
 from .errors import UserError, unknown
 from .evaluate import EvaluationConfig, HeldOut, Measurements
@@ -181,14 +181,15 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             cast(views["c2w"].to(self.device), views["fovy"].to(self.device), *size)
 
     def warn_of_a_tight_schedule(self) -> None:
-        """Say that a budget won't be met because its schedule is made for a longer run, or only in rounds that drop more than they should."""
+        """Say that a budget won't be met because its schedule is made for a longer run, or only in rounds larger than they should be."""
         rounds, end = self.geometry.prune_rounds, self.trainer.max_steps
         to_come = [step for step in rounds if step > self.global_step]
         share, usual = self.geometry.kept_share(len(self.geometry), to_come[0]) if to_come else 1.0, self.geometry.cfg.prune.keep
         if share < usual:
             warn(
-                f"{len(to_come)} rounds of pruning have to lead from {len(self.geometry)} Gaussians to {self.geometry.cfg.budget}: each keeps"
-                f" {share:.2f} instead of {usual:g}, which costs more; give more rounds (system.geometry.prune.every) or start with fewer"
+                f"{len(to_come)} rounds of pruning have to lead from {len(self.geometry)} Gaussians to {self.geometry.cfg.budget}:"
+                f" each keeps {share:.2f} instead of {usual:g}, which costs more;"
+                " give more rounds (system.geometry.prune.every) or start with fewer"
             )
         late = sum(step > end for step in rounds) if self.geometry.cfg.budget is not None and end > 0 else 0
         if late:
@@ -385,23 +386,28 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         self.export_cloud(self.geometry, f"it{self.true_global_step}-export")
         self.export_pruned()
 
-    def export_cloud(self, geometry: Any, folder: str) -> None:
+    def export_cloud(self, geometry: Any, folder: str, pruned_to: Optional[float] = None) -> None:
+        """Write what the exporter makes of a geometry; files of Gaussians note the dB that it has been pruned to."""
         parts = {"geometry": geometry, "material": self.material, "background": self.background}
         exporter = find(self.cfg.exporter_type)(self.cfg.exporter, **parts)
         for out in exporter():
-            getattr(self, f"save_{out.save_type}")(f"{folder}/{out.save_name}", **out.params)
+            noted = {"pruned_to": pruned_to} if out.save_type in ("ply", "spz") else {}
+            getattr(self, f"save_{out.save_type}")(f"{folder}/{out.save_name}", **noted, **out.params)
 
     def export_pruned(self) -> None:
         """The same files of the cloud pruned to ``system.prune``, in the folder ``pruned`` beside them, with prune's report."""
         options = PruneOptions(**dict(self.cfg.prune))
         if not options.asked_for:
             return
+        for name in ("eps2d", "antialias"):
+            if getattr(options, name) is None:
+                setattr(options, name, getattr(self.renderer.cfg, name, None))  # a renderer of another extension has no such options
         folder = f"it{self.true_global_step}-export/pruned"
         suffix = ".spz" if "spz" in self.cfg.exporter.get("formats", ()) else ".ply"
         done = pruned(StoredCloud(drawable(gaussian_arrays(self.geometry))), options, suffix, "system.prune.")
         geometry = find(self.cfg.geometry_type)(self.cfg.geometry)
         geometry.set_arrays(**done.after.arrays._asdict())
-        self.export_cloud(geometry, folder)
+        self.export_cloud(geometry, folder, done.after.pruned_to)
         write_report(self.get_save_path(f"{folder}/report"), done, suffix, options)
 
     def on_validation_start(self) -> None:
@@ -420,14 +426,14 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     # -- savers that the exporters name --------------------------------------------------------------------------------------
 
-    def save_ply(self, filename: str, **arrays: Any) -> str:
+    def save_ply(self, filename: str, pruned_to: Optional[float] = None, **arrays: Any) -> str:
         path = self.get_save_path(filename)
-        write_gaussians(path, **{"comments": [f"{UP} {OUR_UP}"]} | arrays)
+        write_gaussians(path, **{"comments": ply_notes(OUR_UP, pruned_to)} | arrays)
         return path
 
-    def save_spz(self, filename: str, **arrays: Any) -> str:
+    def save_spz(self, filename: str, pruned_to: Optional[float] = None, **arrays: Any) -> str:
         path = self.get_save_path(filename)
-        write_spz(path, **in_axes(StoredCloud(GaussianArrays(**arrays)), "y")._asdict())
+        write_spz(path, **in_axes(StoredCloud(GaussianArrays(**arrays)), "y")._asdict(), comment=spz_note(pruned_to))
         return path
 
     def save_points(self, filename: str, cloud: PointCloud) -> str:
