@@ -36,16 +36,21 @@ class Chart(NamedTuple):
     """Whether the end of the paper's recipe is drawn from the chart ``count``."""
     size: int = SIZE
     """Pixels of the renders each way."""
+    chosen_on: tuple[str, ...] = (TUNED_ON,)
+    """The objects that settings were chosen on."""
+    labels_x: bool = False
+    """Whether the points are labelled with the column ``x``."""
     common: str = ""
     """The variant that is a point of every line that has none at its place."""
 
 
 DECIBEL = "held-out PSNR, dB"
+COLOURS = [f"C{index}" for index in range(7)] + ["C8", "C9", "navy", "gold", "lime", "indigo", "salmon"]
 SECONDS = "CPU seconds of training, one thread"
 RUNS = {
     "time": Chart("What each kind of score buys per second", "cpu_seconds", SECONDS, curves=True),
     "count": Chart("How many Gaussians a scene needs", "gaussians", "Gaussians at the end", curves=False),
-    "size": Chart("What rendering larger buys", "cpu_seconds", SECONDS, curves=False, marks_paper=True),
+    "size": Chart("What rendering larger buys", "cpu_seconds", SECONDS, curves=False, marks_paper=True, labels_x=True),
     "large": Chart("What rendering at 1024² and shrinking to 512² buys", "cpu_seconds", SECONDS, curves=False, size=512),
     "batch": Chart(
         "Views per step, at equal seconds",
@@ -65,7 +70,7 @@ RUNS = {
         common="demo.yaml",
     ),
     "dilation": Chart("What a smaller screen-space dilation buys", "x", "dilation, square pixels", curves=False),
-    "quality": Chart("Draft, default and best", "cpu_seconds", SECONDS, curves=True, size=256),
+    "quality": Chart("Draft, default and best", "cpu_seconds", SECONDS, curves=True, size=256, chosen_on=(TUNED_ON, "duck")),
     "preset": Chart("What the rasteriser's presets buy", "cpu_seconds", SECONDS, curves=True, marks_paper=True),
 }
 
@@ -95,7 +100,7 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
     figure, panels = plt.subplots(1, len(objects), figsize=(1.2 + 4.2 * len(objects), 4.6), sharey=True, squeeze=False)
     for panel, name_of_object in zip(panels[0], objects, strict=True):
         draw_panel(panel, chart, [row for row in rows if row["object"] == name_of_object])
-        panel.set_title(name_of_object + ("" if name_of_object == TUNED_ON else " (held back from tuning)"), fontsize=10)
+        panel.set_title(name_of_object + ("" if name_of_object in chart.chosen_on else " (held back from tuning)"), fontsize=10)
     panels[0, 0].set_ylabel(DECIBEL)
     figure.suptitle(chart.title, x=0.01, ha="left", fontweight="bold")
     handles, labels = panels[0, 0].get_legend_handles_labels()
@@ -116,10 +121,9 @@ def draw_panel(panel: Any, chart: Chart, rows: list[Row]) -> None:
     common = lines.get(chart.common, [])
     for index, (label, chosen) in enumerate(lines.items()):
         chosen = chosen + [row for row in common if row["x"] not in {own["x"] for own in chosen}]
-        paper = PAPER in label
-        style: dict[str, Any] = {"color": "0.15" if label == PAPER else f"C{index % 10}", "label": label}
-        style["linestyle"] = "-" if index < 10 else "--"  # the eleventh line has the colour of the first
-        (draw_curve if chart.curves else draw_points)(panel, chart, chosen, style, "*" if paper else "o")
+        paper = label.endswith(PAPER)
+        style = {"color": "0.15" if paper else COLOURS[index % len(COLOURS)], "label": label}
+        (draw_curve if chart.curves else draw_points)(panel, chart, chosen, style, "*" if PAPER in label else "o")
     if chart.log_x:
         panel.set_xscale("log")
         panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
@@ -153,6 +157,12 @@ def draw_points(panel: Any, chart: Chart, rows: Iterable[Row], style: dict[str, 
     above = [t - m for m, t in zip(middle, high, strict=True)]
     size = 11 if marker == "*" else 5
     panel.errorbar(x, middle, [below, above], marker=marker, markersize=size, linewidth=1.4, capsize=2, **style)
+    for at in places:
+        values = [float(row[chart.x]) for row in at]
+        panel.hlines(spread(at)[1], min(values), max(values), color=style["color"], linewidth=1.4)
+        if chart.labels_x and PAPER not in at[0]["variant"]:
+            place = median(at, chart.x), spread(at)[1]
+            panel.annotate(f"{at[0]['x']}²", place, xytext=(4, -11), textcoords="offset points", fontsize=8, color=style["color"])
 
 
 def ends(rows: Iterable[Row]) -> list[Row]:
