@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import yaml
-from chart_runs import TUNED_ON, caption, grouped, median, spread
+from chart_runs import PAPER, TUNED_ON, caption, grouped, median, spread
 from runs import CHARTS, ROOT, SIZE, STEPS, append_rows, object_name, rows_of, train
 from tqdm import tqdm
 
@@ -226,11 +226,11 @@ def draw(measurements: list[dict[str, str]]) -> Path:
         panels[0, column].set_title(name + ("" if name == TUNED_ON else " (held back from tuning)"), fontsize=10)
     panels[0, 0].set_ylabel("held-out PSNR, dB")
     panels[1, 0].set_ylabel("dB lost by rounding one attribute")
-    for panel, (x, y) in zip(panels[:, -1], ((1.0, 0.0), (1.0, 1.0)), strict=True):
-        panel.legend(loc="lower right" if y == 0 else "upper right", bbox_to_anchor=(x, y), frameon=False, fontsize=8)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="center", bbox_to_anchor=(0.5, 0.45), ncols=7, frameon=False, fontsize=8)
+    panels[1, -1].legend(loc="upper right", frameon=False, fontsize=8)
     figure.suptitle("Which attributes a scene needs", x=0.01, ha="left", fontweight="bold")
     figure.text(0.01, 0.945, caption(measurements), fontsize=8, color="0.35")
-    figure.tight_layout(rect=(0, 0, 1, 0.95))
+    figure.tight_layout(rect=(0, 0, 1, 0.95), h_pad=4)
     path = CHARTS / "attributes.png"
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -247,7 +247,12 @@ def draw_bytes(panel: Any, measurements: list[dict[str, str]]) -> None:
         panel.plot(x, middle, "o-", color=f"C{index}", linewidth=1.4, markersize=4, label=f"{label}, float32")
         panel.vlines(x, low, high, color=f"C{index}", linewidth=1)
     files = [row for row in measurements if (row["experiment"], row["variant"]) == ("file", "SPZ")]
-    panel.plot(median(files, "bytes") / 1000, spread(files)[1], "*", color="0.15", markersize=12, label=f"{STRETCHED}, SPZ")
+    panel.plot(median(files, "bytes") / 1000, spread(files)[1], "D", color="C9", markersize=7, label=f"{STRETCHED}, SPZ")
+    papers = [
+        row for row in rows_of("count") if (row["variant"], row["object"]) == (PAPER, measurements[0]["object"]) and row["step"] != "0"
+    ]
+    paper_bytes = 4 * KINDS[STRETCHED].floats * median(papers, "gaussians")
+    panel.plot(paper_bytes / 1000, spread(papers)[1], "*", color="0.15", markersize=12, label=PAPER)
     finish(panel, "kB")
     panel.set_xscale("log")
     panel.set_xticks([50, 100, 200, 500], ["50", "100", "200", "500"])
