@@ -38,12 +38,18 @@ charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbe
 	$(ENVIRON) $(BIN)/python benchmarks/chart_runs.py
 	$(ENVIRON) $(BIN)/python benchmarks/attributes.py --objects
 
-measure-charts: $(VENV)/ready-for-charts     ## the numbers anew, about two hours; runs that are in the CSVs are not repeated
+# the meshes to measure on: make measure-charts OBJECTS="toy.glb path/to/spot.glb path/to/duck.glb"
+OBJECTS = toy.glb
+
+measure-charts: $(VENV)/ready-for-charts     ## the numbers anew, about two hours a mesh; runs that are in the CSVs are not repeated
 	$(ENVIRON) $(BIN)/python benchmarks/chart_splatting.py
-	$(ENVIRON) $(BIN)/python benchmarks/runs.py
+	$(ENVIRON) $(BIN)/python benchmarks/runs.py --objects $(OBJECTS)
 	$(ENVIRON) $(BIN)/python benchmarks/chart_runs.py
-	$(ENVIRON) $(BIN)/python benchmarks/attributes.py
+	$(ENVIRON) $(BIN)/python benchmarks/attributes.py --objects $(OBJECTS) --seeds 0 1 2 3 4
+	$(ENVIRON) $(BIN)/python benchmarks/after_run.py --objects $(OBJECTS) --seeds 0 1 2 3 4
 	$(ENVIRON) $(BIN)/python benchmarks/known_answer.py
+	$(ENVIRON) $(BIN)/python benchmarks/known_answer.py --count 1000
+	$(ENVIRON) $(BIN)/python benchmarks/bench_prune.py
 
 # installed once; again when what is installed changes
 PACKAGE = pyproject.toml setup.py constraints.txt $(wildcard threestudio_gaussiandreamer/splatting/native/*.h threestudio_gaussiandreamer/splatting/native/*.cpp)
