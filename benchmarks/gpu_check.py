@@ -11,13 +11,14 @@ correct   image and all gradients against plain torch in float64, on small and l
 sanitize  compute-sanitizer (memcheck, racecheck) on a small picture, where that tool exists
 bench     4 views of 1024^2, 100,000 Gaussians, forward and backward, beside gsplat (as installed, else its wheel is fetched;
           it builds here, which takes nvcc)
+prune     the prune command on a cloud of 100,000, to a quarter: seconds, dB, and the same bits again
 train     steps of configs/gaussiandreamer.yaml with a UNet and VAE of Stable Diffusion 2.1's size and random weights
 ========  ==================================================================================================================
 
 Whatever touches the GPU runs in a process of its own, with a limit of its own and within --minutes: a kernel that hangs or ruins
 its context costs that part alone. What fails is recorded with the end of what it printed, and the others go on. The numbers go to
-benchmarks/results/gpu-<device>.json (or --out) after each section. All but `train` needs no more than torch, NumPy, SciPy and
-jaxtyping, so on a machine without a network `python benchmarks/gpu_check.py` does where `make` can't install the rest.
+benchmarks/results/gpu-<device>.json (or --out) after each section. All but `prune` and `train` needs no more than torch, NumPy, SciPy
+and jaxtyping, so on a machine without a network `python benchmarks/gpu_check.py` does where `make` can't install the rest.
 """
 
 import argparse
@@ -48,7 +49,7 @@ TRIMMED = 0.005
 GRADIENT_ERROR, IMAGE_ERROR = 2e-5, 1e-4
 STEPS_OF_A_RUN = 1200
 SECONDS = {"about": 60, "first_picture": 60, "errors": 120, "sanitize": 90, "speed": 60, "pip": 90, "gsplat_steps": 240}
-SECONDS |= {"make_model": 100, "train_steps": 150}
+SECONDS |= {"prune_twice": 90, "make_model": 100, "train_steps": 150}
 """The most that each part may take."""
 GSPLAT = ("gsplat", "ninja", "rich", "jaxtyping", "markdown-it-py", "mdurl", "pygments")
 """It and what it needs; without pip's own search for dependencies, which would fetch another torch."""
@@ -399,6 +400,31 @@ def gsplat_steps(args: argparse.Namespace) -> dict[str, Any]:
     return timed(args, step, 50)
 
 
+# ---- pruning ---------------------------------------------------------------------------------------------------------------
+
+
+def prune(args: argparse.Namespace) -> dict[str, Any]:
+    return in_process("prune_twice", args)
+
+
+def prune_twice(args: argparse.Namespace) -> dict[str, Any]:
+    from bench_prune import torus_and_sphere
+
+    from threestudio_gaussiandreamer import prune, simplify
+
+    stored = prune.stored_cloud(torus_and_sphere(800 if args.small else 100_000))
+    options = prune.PruneOptions(count=len(stored.arrays.means) // 4, size=48 if args.small else 256, steps=4 if args.small else 60)
+    first, second = (prune.pruned(stored, options, ".ply", "") for _ in range(2))
+    before, after = (prune.tensors_of(cloud) for cloud in (stored, first.after))
+    views = prune.views_of(stored, options)[-1]
+    same = all(a.tobytes() == b.tobytes() for a, b in zip(first.after.arrays, second.after.arrays, strict=True))
+    return {
+        "gaussians": [len(before.means), len(after.means)],
+        "psnr": round(simplify.likeness(after, views, simplify.look(before, views)), 2),
+        "seconds": [round(done.seconds, 2) for done in (first, second)],
+    } | ({} if same else {"failed": "pruning the same cloud again gave other bits"})
+
+
 # ---- a training step -------------------------------------------------------------------------------------------------------
 
 
@@ -472,6 +498,7 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "correct": correct,
     "sanitize": sanitize,
     "bench": bench,
+    "prune": prune,
     "train": train,
 }
 PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
@@ -480,6 +507,7 @@ PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "errors": errors,
     "speed": speed,
     "gsplat_steps": gsplat_steps,
+    "prune_twice": prune_twice,
     "make_model": make_model,
     "train_steps": train_steps,
 }

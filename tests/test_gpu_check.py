@@ -25,6 +25,7 @@ def test_every_section_runs_and_reports(tmp_path):
     report = json.loads((tmp_path / "report.json").read_text())
     assert all(cell["gradient"] < 2e-5 for cell in report["correct"]["relative_errors"].values())
     assert report["train"]["default"]["seconds_per_step"] > 0 and report["train"]["lowmem"]["seconds_per_step"] > 0
+    assert report["prune"]["gaussians"] == [800, 200] and report["prune"]["psnr"] > 20
     assert report["compile"]["first"] > 0 and report["bench"]["fast"]["ms"] > 0
 
 
