@@ -7,8 +7,8 @@
 Each run is `launch.py` with configs/demo.yaml at 128^2 and a few options changed, on one thread, several side by side, and is
 scored on 24 held-out views that neither a bank nor a training camera holds, ray-cast from the mesh. Seconds are the processor's
 while training, targets included and evaluation excluded: what else the machine does counts little. Rows are appended as runs
-end, seeds in turn, and what a CSV has is not run again: stop and go on at will. Settings were tuned on the bundled toy alone;
-other objects are given by path and held back.
+end, seeds in turn, and what a CSV has is not run again: stop and go on at will. Settings were tuned on the bundled toy alone
+(the draft's steps and views on the duck too); other objects are given by path and held back.
 """
 
 import argparse

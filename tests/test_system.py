@@ -155,7 +155,9 @@ def test_pruned_exports_note_what_they_have_spent(tmp_path, painted_box, capsys)
     options = ["system.prune.psnr=25", "system.prune.size=32", "system.prune.steps=3", "system.exporter.formats=[ply,spz]"]
     assert launch(tmp_path, painted_box, *options, "trainer.max_steps=2", "trainer.val_check_interval=2") == 0
     files = trial(tmp_path) / "save" / "it2-export" / "pruned"
+    said = capsys.readouterr().out
     for name in ("gaussians.ply", "gaussians.spz"):
+        assert str(files / name) in said  # where everything is
         assert read_cloud(str(files / name)).pruned_to == 25
 
 

@@ -337,7 +337,8 @@ class GaussianDreamerSystem(BaseLift3DSystem):
     def summary(self) -> str:
         """Where the pictures, the video and the clouds are, and what was measured; printed when a run has ended."""
         folder = Path(self._save_dir or ".")
-        found = [path for pattern in ("held_out/compare.png", "it*-test.mp4", "it*-export/*.*") for path in sorted(folder.glob(pattern))]
+        patterns = "held_out/compare.png", "it*-test.mp4", "it*-export/*.*", "it*-export/pruned/*.*"
+        found = [path for pattern in patterns for path in sorted(folder.glob(pattern))]
         lines = [str(path) for path in found]
         return "\n".join([*lines, *(["", self.measurements.table()] if self.measurements else [])])
 
