@@ -13,7 +13,8 @@ loss.lambda_*  weight of each loss, a number or a schedule: ``sds`` and every ot
 optimizer      name (a torch optimiser) and args; the learning rates belong to the geometry and the background
 evaluation     views, size (pixels), supersample, every (steps; 0: only at start and end): PSNR and SSIM on held-out views
 prune          a budget that the export is made for once more: count, bytes (of the SPZ file where that is exported, else of the
-               PLY), psnr (dB to the cloud before) or within (dB lost of quality); quality, size, steps: as the prune command
+               PLY), psnr (dB to the cloud before) or within (dB lost of quality); quality, size, steps: as the prune command;
+               eps2d, antialias: the renderer's, unless given
 =============  ==============================================================================================================
 """
 
