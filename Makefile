@@ -47,6 +47,7 @@ measure-charts: $(VENV)/ready-for-charts     ## the numbers anew, about two hour
 	$(ENVIRON) $(BIN)/python benchmarks/chart_runs.py
 	$(ENVIRON) $(BIN)/python benchmarks/attributes.py --objects $(OBJECTS) --seeds 0 1 2 3 4
 	$(ENVIRON) $(BIN)/python benchmarks/after_run.py --objects $(OBJECTS) --seeds 0 1 2 3 4
+	$(ENVIRON) $(BIN)/python benchmarks/viewers.py --objects $(OBJECTS)
 	$(ENVIRON) $(BIN)/python benchmarks/known_answer.py
 	$(ENVIRON) $(BIN)/python benchmarks/known_answer.py --count 1000
 	$(ENVIRON) $(BIN)/python benchmarks/bench_prune.py

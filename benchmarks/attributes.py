@@ -133,21 +133,22 @@ def written(arrays: GaussianArrays) -> Iterator[tuple[str, int, GaussianArrays]]
             yield path.suffix[1:].upper(), path.stat().st_size, in_axes(read_cloud(str(path)), OUR_UP)
 
 
-def score(mesh: str, arrays: GaussianArrays) -> float:
-    """PSNR on the held-out views of :mod:`evaluate`, as a run ends with it."""
-    demo = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())  # drawn as it was trained
+def score(mesh: str, arrays: GaussianArrays, size: int = SIZE, **drawn: Any) -> float:
+    """PSNR on the held-out views of :mod:`evaluate`, as a run ends with it; drawn as the demo draws, but for ``drawn``."""
+    demo = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())
     geometry = find("gaussiandreamer-cloud")({})
     geometry.set_arrays(**arrays._asdict())
     background = find("gaussiandreamer-background")({"color": [1.0, 1.0, 1.0]})
-    renderer = find("gaussiandreamer-splatting")(demo["system"]["renderer"], geometry=geometry, material=None, background=background)
-    held_out = held_out_views(mesh)
+    options = demo["system"]["renderer"] | drawn
+    renderer = find("gaussiandreamer-splatting")(options, geometry=geometry, material=None, background=background)
+    held_out = held_out_views(mesh, size)
     images, backgrounds = held_out.render(renderer)
     return round(float(psnr(images.clamp(0, 1), held_out.truth_on(backgrounds))), 4)
 
 
 @cache
-def held_out_views(mesh: str) -> HeldOut:
-    return HeldOut(EvaluationConfig(size=SIZE), MeshCaster(load_mesh(mesh)))
+def held_out_views(mesh: str, size: int) -> HeldOut:
+    return HeldOut(EvaluationConfig(size=size), MeshCaster(load_mesh(mesh)))
 
 
 def measured(kind: str, count: int, mesh: str, seed: int) -> bool:
