@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from bench_splatting import make_scene
 from known_answer import torus
-from runs import append_rows
+from runs import append_rows, rows_of
 
 from threestudio_gaussiandreamer import prune, register_parts
 from threestudio_gaussiandreamer.cloud_files import write_cloud
@@ -33,18 +33,20 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=100_000, help="Gaussians at the start (default: 100000)")
     arguments = parser.parse_args()
     register_parts()
-    for row in rows(arguments.count):
+    for row in rows(arguments.count, {(row["scene"], row["x"], row["budget"]) for row in rows_of("prune")}):
         print("{scene}, {x} Gaussians, {budget}: {gaussians} left, {psnr} dB, {seconds} s".format(**row), flush=True)
         append_rows("prune", COLUMNS, [row])
 
 
-def rows(count: int) -> Iterator[dict[str, Any]]:
-    """The CSV's, one by one."""
+def rows(count: int, measured: set[tuple[str, ...]]) -> Iterator[dict[str, Any]]:
+    """The CSV's that aren't among those ``measured``, one by one."""
     with tempfile.TemporaryDirectory() as folder:
         for scene, make in SCENES.items():
             source = Path(folder) / "source.ply"
             write_cloud(str(source), prune.stored_cloud(make(count)))
             for budget in (["--count", str(count // 4)], ["--psnr", "40"]):
+                if (scene, str(count), " ".join(budget)) in measured:
+                    continue
                 load = round(os.getloadavg()[0], 1)
                 report = prune.run(prune.parse([str(source), str(Path(folder) / "pruned.ply"), *budget]))
                 found = {

@@ -58,7 +58,7 @@ def test_without_a_budget_nothing_goes():
     assert rounds(cloud(100, prune=EVERY_STEP), 3) == [100, 100, 100]
 
 
-@pytest.mark.parametrize(("given", "taken"), [("none", None), ("None", None), (None, None), (5e3, 5000), ("auto", "auto")])
+@pytest.mark.parametrize(("given", "taken"), [("none", None), ("None", None), (None, None), (5e3, 5000), ("5e3", 5000), ("Auto", "auto")])
 def test_a_budget_may_be_written_as_people_do(given, taken):
     assert GaussianCloud({"budget": given}).cfg.budget == taken
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer import prune, simplify
-from threestudio_gaussiandreamer.cloud_files import PRUNED, read_cloud
-from threestudio_gaussiandreamer.ply import read_comments, read_gaussians, write_gaussians
+from threestudio_gaussiandreamer.cloud_files import PRUNED, StoredCloud, in_axes, read_cloud
+from threestudio_gaussiandreamer.ply import GaussianArrays, read_comments, read_gaussians, write_gaussians
 from threestudio_gaussiandreamer.sh import sh_to_colors
 from threestudio_gaussiandreamer.simplify import Budget, Cloud
 from threestudio_gaussiandreamer.splatting import rasterize
@@ -70,12 +70,16 @@ def test_a_second_run_removes_nothing(source, tmp_path):
 def test_a_second_run_of_nearly_the_same_budget_has_nearly_nothing_to_spend(source, tmp_path):
     once = run(source, tmp_path / "once.ply", "--psnr", "32")["after"]["gaussians"]
     assert run(tmp_path / "once.ply", tmp_path / "twice.ply", "--psnr", "31.999")["after"]["gaussians"] >= 0.98 * once
-    assert f"{PRUNED} 32" in read_comments(tmp_path / "twice.ply")
+    assert read_cloud(str(tmp_path / "twice.ply")).pruned_to == 31.999
 
 
-@pytest.mark.parametrize(("asked", "spent", "left"), [(37.0, 40.0, 40.02), (30.0, 60.0, 30.004), (40.0, 40.0, None), (41.0, 40.0, None)])
+@pytest.mark.parametrize(
+    ("asked", "spent", "left"),
+    [(37.0, 40.0, 40.02), (30.0, 60.0, 30.004), (40.0, 40.0, None), (41.0, 40.0, None), (39.99999999, 40.0, None)],
+)
 def test_what_is_left_of_a_budget(asked, spent, left):
     assert prune.unspent(asked, spent) == (left and pytest.approx(left, abs=5e-3))
+    assert left is None or prune.spent_together(spent, left) == pytest.approx(asked, abs=2e-3)
 
 
 def test_a_count_that_changes_nothing_keeps_the_note(source, tmp_path):
@@ -89,7 +93,39 @@ def test_a_quality_that_the_format_cannot_give_is_not_said_to_be_met(source, tmp
     assert run(source, tmp_path / "fine.ply", "--psnr", "30")["met"]
     report = run(source, tmp_path / "out.spz", "--psnr", "90")
     assert not report["met"] and report["after"]["gaussians"] == 600 and "the budget isn't met" in caplog.text
-    assert read_cloud(str(tmp_path / "out.spz")).pruned_to is None
+    assert 30 < read_cloud(str(tmp_path / "out.spz")).pruned_to < 80  # what the format has cost
+    assert run(source, tmp_path / "out.ply", "--psnr", "120")["met"]
+
+
+def test_what_a_format_costs_is_spent_too(tmp_path):
+    """Also where the budget has been spent already, and where a count drops nothing."""
+    bright = ball()
+    bright.sh[:] *= 6
+    write_gaussians(tmp_path / "in.ply", **arrays_of(bright))
+    assert run(tmp_path / "in.ply", tmp_path / "once.ply", "--psnr", "35")["met"]
+    assert not run(tmp_path / "once.ply", tmp_path / "twice.spz", "--psnr", "35")["met"]
+    run(tmp_path / "once.ply", tmp_path / "count.spz", "--count", "600")
+    first = read_cloud(str(tmp_path / "in.ply"))
+    views = prune.views_of(first, prune.PruneOptions(size=48))[-1]
+    pictures = simplify.look(prune.tensors_of(first), views)
+    for name in ("twice.spz", "count.spz"):
+        found = read_cloud(str(tmp_path / name))
+        turned = prune.tensors_of(StoredCloud(GaussianArrays(*in_axes(found, first.up)), first.up))
+        assert found.pruned_to < 34.9 and simplify.likeness(turned, views, pictures) > found.pruned_to - 0.5
+
+
+def test_a_stricter_budget_than_what_is_spent_is_not_met(source, tmp_path, capsys):
+    run(source, tmp_path / "once.ply", "--psnr", "30")
+    report = run(tmp_path / "once.ply", tmp_path / "twice.ply", "--psnr", "45")
+    assert not report["met"] and "has been pruned to 30 dB already" in capsys.readouterr().out
+    assert read_cloud(str(tmp_path / "twice.ply")).pruned_to == 30
+
+
+@pytest.mark.parametrize(
+    ("here", "count", "rounds"), [(100, 100, 0), (10, 20, 0), (10000, 6400, 2), (10000, 1500, 9), (2, 1, 1), (600, 1, 24)]
+)
+def test_how_many_rounds_it_takes(here, count, rounds):
+    assert simplify.rounds_to(count, here) == rounds
 
 
 @pytest.mark.parametrize(("drawn", "eps2d"), [({}, 0.3), ({"eps2d": 0.05}, 0.05), ({"antialias": True}, 0.3)])
@@ -259,7 +295,7 @@ def test_the_likeness_that_loses_a_tenth_of_a_decibel():
         (["--count", "1.5"], "--count: expected a whole number"),
         (["--count", "many"], "--count: expected a number, got 'many'"),
         (["--bytes", "2 potatoes"], "--bytes: expected a size such as"),
-        (["--bytes", "1"], "--bytes, in Gaussians,"),
+        (["--bytes", "1"], "--bytes: 1 are too few for one Gaussian, which takes"),
         (["--psnr", "nan"], "--psnr: expected a number"),
         (["--psnr", "-3"], "--psnr: expected a number above 0"),
         (["--within", "0"], "--within: expected a loss from 0.001 to 30 dB, got 0"),

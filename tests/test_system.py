@@ -151,6 +151,17 @@ def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted
     assert all(a.tobytes() == b.tobytes() for a, b in zip(read_gaussians(again), first, strict=True))
 
 
+def test_a_budget_without_a_round_to_come_says_so(tmp_path, painted_box, capsys):
+    """Also of a run that goes on where its rounds are over."""
+    steps = ["trainer.max_steps=7", "trainer.val_check_interval=7"]
+    assert launch(tmp_path, painted_box, *PRUNE, *steps) == 0
+    assert "no round of pruning" not in "".join(capsys.readouterr())
+    resume = f"resume={trial(tmp_path) / 'ckpts' / 'last.ckpt'}"
+    options = [*PRUNE, "system.geometry.budget=100", "trainer.max_steps=9", "trainer.val_check_interval=9"]
+    assert launch(tmp_path, painted_box, *options, resume) == 0
+    assert "no round of pruning is to come, so that 130 Gaussians stay, not 100" in "".join(capsys.readouterr())
+
+
 def test_pruned_exports_note_what_they_have_spent(tmp_path, painted_box, capsys):
     options = ["system.prune.psnr=25", "system.prune.size=32", "system.prune.steps=3", "system.exporter.formats=[ply,spz]"]
     assert launch(tmp_path, painted_box, *options, "trainer.max_steps=2", "trainer.val_check_interval=2") == 0

@@ -462,7 +462,11 @@ class GaussianCloud(BaseGeometry):
 
 def _as_budget(given: Any) -> Any:
     """What was given for a budget, with ``none`` as None and whole numbers as such, however they are written."""
-    if isinstance(given, str) and given.lower() == "none":
+    if isinstance(given, str):
+        given = given.lower()
+        with contextlib.suppress(ValueError):
+            given = float(given)  # 5e3 is text to PyYAML
+    if given == "none":
         return None
     return int(given) if isinstance(given, float) and given.is_integer() else given
 

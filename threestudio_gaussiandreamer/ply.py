@@ -212,7 +212,8 @@ def read_gaussians(path: str | os.PathLike, *, allow_non_finite: bool = False) -
         table.fail(f"the Gaussians lack {', '.join(missing)}.{hint}")
     known = {*GAUSSIAN, *NORMALS, *COLORS}
     if unknown := [name for name in table.names if name not in known and not name.startswith("f_rest_")]:
-        logger.warning("%s: not known here, and left out: %s", path, ", ".join(unknown))
+        more = f" and {len(unknown) - 5} more" if len(unknown) > 5 else ""
+        logger.warning("%s: not known here, and left out: %s%s", path, ", ".join(unknown[:5]), more)
     arrays = GaussianArrays(table[MEANS], _read_sh(table), table["opacity"], table[LOG_SCALES], table[QUATS])
     if not allow_non_finite:
         table.require_valid(usable(arrays), "values")

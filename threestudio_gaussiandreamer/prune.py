@@ -48,7 +48,7 @@ from .errors import UserError
 from .files import existing_file
 from .host import get_device
 from .ply import GaussianArrays
-from .simplify import EPS2D, Budget, Cloud, Round, Views, assured_likeness, likeness, look, rounds_to, simplify, views_around
+from .simplify import EPS2D, LEAST_ERROR, Budget, Cloud, Round, Views, assured_likeness, likeness, look, rounds_to, simplify, views_around
 from .spz import COLOR_REACH
 
 logger = logging.getLogger(__name__)
@@ -132,19 +132,24 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
 
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m threestudio_gaussiandreamer.prune", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m threestudio_gaussiandreamer.prune",
+        description="Prune a finished cloud of Gaussians to a budget; beside OUT: OUT.json, the report, and OUT.png, before and after.",
+    )
     parser.add_argument("source", metavar="IN", help="a PLY or SPZ file of Gaussians, or a checkpoint")
     parser.add_argument("output", metavar="OUT", help="the PLY or SPZ file to write")
-    budget = parser.add_mutually_exclusive_group(required=True)
+    budget = parser.add_argument_group("the budget, one of").add_mutually_exclusive_group(required=True)
     budget.add_argument("--count", help="how many Gaussians to keep")
     budget.add_argument("--bytes", help="the largest size of OUT, such as 500kB or 2MB")
     budget.add_argument("--psnr", help="how like the pruned cloud has to look, dB to the views of the unpruned one, such as 40")
     budget.add_argument("--within", help="what the pruned cloud may lose against the truth, such as 0.1dB: see --quality")
     parser.add_argument("--quality", type=float, default=35.0, help="dB of the unpruned cloud to the truth, for --within (default: 35)")
-    parser.add_argument("--size", type=int, default=256, help="pixels of the views each way (default: 256)")
+    parser.add_argument("--size", type=int, default=256, help="pixels each way of the views, for which all dB hold (default: 256)")
     parser.add_argument("--steps", type=int, default=60, help="of recovery after each round (default: 60)")
-    parser.add_argument("--eps2d", type=float, help=f"square pixels by which the viewer widens Gaussians (default: {EPS2D:g})")
-    parser.add_argument("--antialias", action="store_true", default=None, help="the viewer keeps the energy of small Gaussians")
+    parser.add_argument(
+        "--eps2d", type=float, default=EPS2D, help=f"judge as viewers that widen Gaussians by so many square pixels ({EPS2D:g})"
+    )
+    parser.add_argument("--antialias", action="store_true", help="judge as viewers that keep the energy of small Gaussians")
     parser.add_argument("--up", choices=AXES, help="which axis of IN is up (default: what the file says, else the custom of its format)")
     return parser.parse_args(argv)
 
@@ -259,49 +264,68 @@ def unspent(asked: float, spent: float) -> Optional[float]:
 
     Both errors are taken to be independent, so their squares add.
     """
-    left = 10 ** (-asked / 10) - 10 ** (-spent / 10)
-    return -10 * math.log10(left) if left > 0 else None
+    left = _error(asked) - _error(spent)
+    return -10 * math.log10(left) if left > LEAST_ERROR else None
+
+
+def spent_together(*likenesses: float) -> float:
+    """The PSNR after several losses, taken to be independent."""
+    return -10 * math.log10(sum(map(_error, likenesses)))
+
+
+def _error(likeness: float) -> float:
+    """The mean squared error of a PSNR, the least that is measured or more."""
+    return max(10 ** (-likeness / 10), LEAST_ERROR)
 
 
 # ---- working ---------------------------------------------------------------------------------------------------------------
 
 
 def pruned(stored: StoredCloud, options: PruneOptions, suffix: str, where: str) -> Pruned:
-    """The cloud within its budget as a file of the format ``suffix``; as it is where an earlier run has spent the budget.
+    """The cloud within its budget as a file of the format ``suffix``; what an earlier run has spent of a quality isn't spent again.
 
     Raises:
         UserError: a budget that can't be met, or values that the format can't hold.
     """
-    started = time.perf_counter()
-    budget = asked = budget_of(options, where, lambda size: _most_within(size, stored, suffix))
-    if budget.psnr is not None and stored.pruned_to is not None:
-        budget = Budget(psnr=unspent(budget.psnr, stored.pruned_to))
-        if budget.psnr is None:
-            print(f"nothing to do: this cloud has been pruned to {stored.pruned_to:g} dB already")
-            return Pruned(stored, stored, 0.0)
-    after, met = _simplified(stored, budget, options, suffix)
+    started, whole = time.perf_counter(), len(stored.arrays.means)
+    file_size(stored, suffix)  # says what the format can't hold before any work
+    budget = asked = budget_of(options, where, lambda size: _most_within(size, stored, suffix, where))
+    if asked.psnr is not None and stored.pruned_to is not None:
+        left = unspent(asked.psnr, stored.pruned_to)
+        budget = Budget(count=whole) if left is None else Budget(psnr=left)
+        if left is None:
+            print(f"no Gaussian goes: this cloud has been pruned to {stored.pruned_to:g} dB already, as it was judged then")
+    after, reached = _simplified(stored, budget, options, suffix)
     while options.bytes is not None and (size := file_size(after, suffix)) > (limit := size_in_bytes(options.bytes, f"{where}bytes")):
         # what is left packs worse than it did among the others
         fewer = min(int(len(after.arrays.means) * limit / size), len(after.arrays.means) - 1)
-        after, met = _simplified(after, Budget(count=counted(fewer, f"{where}bytes, in Gaussians,")), options, suffix)
-    if len(after.arrays.means) < len(stored.arrays.means):
-        after = after._replace(pruned_to=asked.psnr)
-    return Pruned(stored, after, time.perf_counter() - started, met)
+        after, reached = _simplified(after, Budget(count=counted(fewer, f"{where}bytes, in Gaussians,")), options, suffix)
+    spent = reached if stored.pruned_to is None else spent_together(stored.pruned_to, reached)
+    met = asked.psnr is None or _error(spent) <= _error(asked.psnr) + 2 * LEAST_ERROR
+    if not met:
+        logger.warning("the budget isn't met: as a %s file no cloud of these Gaussians is more than %.2f dB like the first", suffix, spent)
+    if asked.psnr is not None:
+        note = asked.psnr if met else spent
+    else:
+        note = spent if stored.pruned_to is not None and len(after.arrays.means) == whole else None
+    return Pruned(stored, after._replace(pruned_to=note), time.perf_counter() - started, met)
 
 
-def _most_within(size: int, stored: StoredCloud, suffix: str) -> int:
+def _most_within(size: int, stored: StoredCloud, suffix: str, where: str) -> int:
     """How many Gaussians make a file of at most ``size`` bytes: the most whose every so manyth, as they are, does."""
     whole = len(stored.arrays.means)
 
-    def too_large(count: int) -> bool:
+    def bytes_of(count: int) -> int:
         rows = np.arange(count) * whole // count
-        return file_size(stored._replace(arrays=GaussianArrays(*(values[rows] for values in stored.arrays))), suffix) > size
+        return file_size(StoredCloud(GaussianArrays(*(values[rows] for values in stored.arrays)), stored.up), suffix)
 
-    return bisect.bisect_left(range(1, whole + 1), True, key=too_large)
+    if bytes_of(1) > size:
+        raise UserError(f"{where}bytes: {size} are too few for one Gaussian, which takes {bytes_of(1)} as a {suffix} file")
+    return bisect.bisect_left(range(1, whole + 1), True, key=lambda count: bytes_of(count) > size)
 
 
-def _simplified(stored: StoredCloud, budget: Budget, options: PruneOptions, suffix: str) -> tuple[StoredCloud, bool]:
-    """The cloud within a budget, and whether it is: no cloud is, if the file's rounding alone costs more."""
+def _simplified(stored: StoredCloud, budget: Budget, options: PruneOptions, suffix: str) -> tuple[StoredCloud, float]:
+    """The cloud within a budget, and how like the given one it is as a file, in views that nothing was fitted to."""
     from tqdm import tqdm
 
     cloud = tensors_of(stored)
@@ -318,13 +342,7 @@ def _simplified(stored: StoredCloud, budget: Budget, options: PruneOptions, suff
             return tensors_of(as_stored(stored_cloud(fewer, stored), suffix))
 
         fewer = simplify(cloud, probes, judges, budget, steps=options.steps, report=report, stored=written, sh_reach=sh_reach)
-    met = True
-    if budget.psnr is not None and len(fewer.means) == len(cloud.means):
-        reached = assured_likeness(written(fewer), judges, look(cloud, judges))
-        met = reached >= budget.psnr
-        if not met:
-            logger.warning("the budget isn't met: even all Gaussians, as %s stores them, are only %.2f dB like the cloud", suffix, reached)
-    return stored_cloud(fewer, stored), met
+    return stored_cloud(fewer, stored), assured_likeness(written(fewer), judges, look(cloud, judges))
 
 
 def views_of(stored: StoredCloud, options: PruneOptions) -> list[Views]:
@@ -368,7 +386,7 @@ def write_report(path: str, done: Pruned, suffix: str, options: PruneOptions) ->
     write_picture(Path(f"{path}.png"), sheet([look(cloud, grey) for cloud in clouds]))
     for name, cost in zip(("before", "after"), costs, strict=True):
         print(f"{name:7} {cost.gaussians:8d} Gaussians {cost.bytes / 1e6:8.2f} MB as {suffix} {cost.ms_per_frame:8.2f} ms a frame")
-    print(f"{reached:.2f} dB to the unpruned cloud on views that nothing was fitted to; {path}.json, {path}.png")
+    print(f"{reached:.2f} dB to what it was before, on views that nothing was fitted to; {path}.json, {path}.png")
     return report
 
 

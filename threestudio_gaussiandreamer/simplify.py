@@ -31,6 +31,8 @@ RATES = {"means": 2e-4, "quats": 4e-3, "log_scales": 1e-2, "logit_opacities": 2e
 """Adam's for a cloud that has just lost a fifth; that of the means in units of the cloud's radius."""
 PACES = (1.0, 1 / 4, 1 / 16, 1 / 64)
 """Of these rates. What is nearly right needs small ones: Adam's steps are as long where the gradient is mostly noise."""
+LEAST_ERROR = 1e-10
+"""Mean squared; what is less can't be told from the rounding of float32."""
 FOVY = math.radians(50.0)
 EPS2D = 0.3
 """The screen-space dilation of viewers, square pixels."""
@@ -161,7 +163,7 @@ def likeness(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"]) -> 
 def assured_likeness(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"]) -> float:
     """The PSNR that other views will have too: with the standard error over these views added to their mean squared error."""
     errors = (look(cloud, views) - pictures).square().mean((1, 2, 3))
-    return -10 * math.log10(max(float(errors.mean() + errors.std() / math.sqrt(len(errors))), 1e-10))
+    return -10 * math.log10(max(float(errors.mean() + errors.std() / math.sqrt(len(errors))), LEAST_ERROR))
 
 
 def simplify(
@@ -239,7 +241,10 @@ def simplify(
 
 def rounds_to(count: int, here: int) -> int:
     """How many rounds lead from ``here`` Gaussians to ``count``."""
-    return max(0, math.ceil(math.log(count / here, KEEP)))
+    rounds = 0
+    while here > count:
+        here, rounds = max(int(KEEP * here), count), rounds + 1
+    return rounds
 
 
 def _next_count(here: int, keep: float, budget: Budget) -> int:

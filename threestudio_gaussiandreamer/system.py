@@ -20,6 +20,7 @@ prune          a budget that the export is made for once more: count, bytes (of 
 
 import contextlib
 import inspect
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,6 +46,7 @@ from .ply import GaussianArrays, write_gaussians, write_points
 from .point_cloud import PointCloud
 from .prior_cache import cached_cloud
 from .prune import PruneOptions, pruned, write_report
+from .simplify import EPS2D
 from .spz import write_spz
 from .surface import Surface, write_obj
 
@@ -182,21 +184,29 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             cast(views["c2w"].to(self.device), views["fovy"].to(self.device), *size)
 
     def warn_of_a_tight_schedule(self) -> None:
-        """Say that a budget won't be met because its schedule is made for a longer run, or only in rounds larger than they should be."""
-        rounds, end = self.geometry.prune_rounds, self.trainer.max_steps
-        to_come = [step for step in rounds if step > self.global_step]
-        share, usual = self.geometry.kept_share(len(self.geometry), to_come[0]) if to_come else 1.0, self.geometry.cfg.prune.keep
-        if share < usual:
-            warn(
-                f"{len(to_come)} rounds of pruning have to lead from {len(self.geometry)} Gaussians to {self.geometry.cfg.budget}:"
-                f" each keeps {share:.2f} instead of {usual:g}, which costs more;"
-                " give more rounds (system.geometry.prune.every) or start with fewer"
-            )
-        late = sum(step > end for step in rounds) if self.geometry.cfg.budget is not None and end > 0 else 0
+        """Say that a budget won't be met by the rounds of pruning that this run has, or only in larger ones than they should be."""
+        geometry, end = self.geometry, self.trainer.max_steps if self.trainer.max_steps > 0 else math.inf
+        budget, rounds = geometry.cfg.budget, geometry.prune_rounds
+        if budget is None:
+            return
+        to_come = [step for step in rounds if self.global_step < step <= end]
+        late = sum(step > end for step in rounds)
+        too_many = isinstance(budget, int) and len(geometry) > budget
         if late:
             warn(
                 f"{late} of the {len(rounds)} rounds of pruning would come after step {end}, the last:"
                 " give system.geometry.prune.start, stop and every to match"
+            )
+        elif too_many and not to_come:
+            warn(
+                f"no round of pruning is to come, so that {len(geometry)} Gaussians stay, not {budget}:"
+                " give system.geometry.prune.start, stop and every to match"
+            )
+        elif too_many and (share := geometry.kept_share(len(geometry), to_come[0])) < geometry.cfg.prune.keep - 0.005:
+            warn(
+                f"{len(to_come)} rounds of pruning have to lead from {len(geometry)} Gaussians to {budget}:"
+                f" each keeps {share:.2f} instead of {geometry.cfg.prune.keep:g}, which costs more;"
+                " give more rounds (system.geometry.prune.every) or start with fewer"
             )
 
     # -- one step ------------------------------------------------------------------------------------------------------------
@@ -401,11 +411,14 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         options = PruneOptions(**dict(self.cfg.prune))
         if not options.asked_for:
             return
-        for name in ("eps2d", "antialias"):
-            if getattr(options, name) is None:
-                setattr(options, name, getattr(self.renderer.cfg, name, None))  # a renderer of another extension has no such options
+        drawn = self.renderer.cfg  # that of another extension has no such options
+        if options.eps2d is None:  # which counts pixels before they are shrunk
+            options.eps2d = getattr(drawn, "eps2d", EPS2D) / getattr(drawn, "downsample", 1) ** 2
+        if options.antialias is None:
+            options.antialias = bool(getattr(drawn, "antialias", False))
         folder = f"it{self.true_global_step}-export/pruned"
-        suffix = ".spz" if "spz" in self.cfg.exporter.get("formats", ()) else ".ply"
+        packed = self.cfg.exporter_type == "spz-exporter" or "spz" in self.cfg.exporter.get("formats", ())
+        suffix = ".spz" if packed else ".ply"
         done = pruned(StoredCloud(drawable(gaussian_arrays(self.geometry))), options, suffix, "system.prune.")
         geometry = find(self.cfg.geometry_type)(self.cfg.geometry)
         geometry.set_arrays(**done.after.arrays._asdict())
