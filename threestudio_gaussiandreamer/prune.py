@@ -289,13 +289,8 @@ def pruned(stored: StoredCloud, options: PruneOptions, suffix: str, where: str) 
     """
     started, whole = time.perf_counter(), len(stored.arrays.means)
     file_size(stored, suffix)  # says what the format can't hold before any work
-    budget = asked = budget_of(options, where, lambda size: _most_within(size, stored, suffix, where))
-    if asked.psnr is not None and stored.pruned_to is not None:
-        left = unspent(asked.psnr, stored.pruned_to)
-        budget = Budget(count=whole) if left is None else Budget(psnr=left)
-        if left is None:
-            print(f"no Gaussian goes: this cloud has been pruned to {stored.pruned_to:g} dB already, as it was judged then")
-    after, reached = _simplified(stored, budget, options, suffix)
+    asked = budget_of(options, where, lambda size: _most_within(size, stored, suffix, where))
+    after, reached = _simplified(stored, _rest_of(asked, stored), options, suffix)
     while options.bytes is not None and (size := file_size(after, suffix)) > (limit := size_in_bytes(options.bytes, f"{where}bytes")):
         # what is left packs worse than it did among the others
         fewer = min(int(len(after.arrays.means) * limit / size), len(after.arrays.means) - 1)
@@ -309,6 +304,17 @@ def pruned(stored: StoredCloud, options: PruneOptions, suffix: str, where: str) 
     else:
         note = spent if stored.pruned_to is not None and len(after.arrays.means) == whole else None
     return Pruned(stored, after._replace(pruned_to=note), time.perf_counter() - started, met)
+
+
+def _rest_of(asked: Budget, stored: StoredCloud) -> Budget:
+    """What an earlier run has left of a budget of quality: maybe nothing, so that all Gaussians stay."""
+    if asked.psnr is None or stored.pruned_to is None:
+        return asked
+    left = unspent(asked.psnr, stored.pruned_to)
+    if left is not None:
+        return Budget(psnr=left)
+    print(f"no Gaussian goes: this cloud has been pruned to {stored.pruned_to:g} dB already, as it was judged then")
+    return Budget(count=len(stored.arrays.means))
 
 
 def _most_within(size: int, stored: StoredCloud, suffix: str, where: str) -> int:
