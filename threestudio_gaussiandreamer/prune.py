@@ -2,7 +2,7 @@
 
 IN is a PLY or SPZ file of Gaussians, ours or any other tool's, or a checkpoint, ours or gsplat's; OUT a PLY or SPZ file. Beside OUT
 are written OUT.json, the report, and OUT.png, before (top) and after. The method: ``simplify.py``. Three sets of views, none in
-another: what Gaussians are scored on and fitted to, what decides whether a budget of quality is met (a standard error on the safe
+another: what Gaussians are scored on and fitted to, what decides whether a budget of quality is met (two standard errors on the safe
 side), and what the report says. Both of the latter look at what OUT gives back, rounding included. The views are from around and
 outside: right for an object, not for a room.
 

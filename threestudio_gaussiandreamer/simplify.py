@@ -161,9 +161,9 @@ def likeness(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"]) -> 
 
 
 def assured_likeness(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"]) -> float:
-    """The PSNR that other views will have too: with the standard error over these views added to their mean squared error."""
+    """The PSNR that other views will have too: with two standard errors over these views added to their mean squared error."""
     errors = (look(cloud, views) - pictures).square().mean((1, 2, 3))
-    return -10 * math.log10(max(float(errors.mean() + errors.std() / math.sqrt(len(errors))), LEAST_ERROR))
+    return -10 * math.log10(max(float(errors.mean() + 2 * errors.std() / math.sqrt(len(errors))), LEAST_ERROR))
 
 
 def simplify(
