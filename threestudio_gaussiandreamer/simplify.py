@@ -183,7 +183,7 @@ def simplify(
 
     Args:
         probes: what Gaussians are scored on and fitted to.
-        judges: other views, on which a budget of quality is measured: what is fitted to looks better than the rest.
+        judges: other views, on which a recovery and a budget of quality are measured: what is fitted to looks better than the rest.
         steps: of self-distillation after each round; four views each.
         report: called after each round that was kept.
         stored: what the file to be written makes of a cloud, which is what a budget of quality is measured on.
@@ -199,21 +199,25 @@ def simplify(
 
     fastest = 0
 
-    def refitted(cloud: Cloud, done: int) -> tuple[Cloud, Round]:
-        """Recovered at the fastest pace that makes it more like the pictures; as it was where none does.
+    def judged(cloud: Cloud) -> float:
+        return assured_likeness(stored(cloud), judges, before)
 
-        A round needs about the pace of the one before: the search begins one faster than that.
+    def refitted(cloud: Cloud, done: int) -> tuple[Cloud, Round]:
+        """Recovered at the fastest pace that makes it no worse; as it was where none does.
+
+        The judges say so: what is fitted to looks better while they may lose a dB. A round needs about the pace of the one before: the
+        search begins one faster than that.
         """
         nonlocal fastest
         found = cloud = cloud._replace(sh=torch.cat([cloud.sh[:, :1].clamp(-sh_reach, sh_reach), cloud.sh[:, 1:]], 1))
-        unfitted = likeness(cloud, probes, pictures)
+        reached = judged(cloud)
         for tried in range(fastest, len(PACES)):
             fastest = max(0, tried - 1)
             recovered = recover(cloud, probes, pictures, steps, seed + done, sh_reach, PACES[tried])
-            if likeness(recovered, probes, pictures) >= unfitted:
-                found = recovered
+            if (now := judged(recovered)) >= reached:
+                found, reached = recovered, now
                 break
-        return found, Round(len(found.means), assured_likeness(stored(found), judges, before))
+        return found, Round(len(found.means), reached)
 
     def holds(reached: Round) -> bool:
         return budget.psnr is None or reached.psnr >= budget.psnr
