@@ -80,5 +80,5 @@ def test_prune_finds_the_true_number_with_shared_opacity_and_faint_floaters():
     views = [views_around(true, count, SIZE, turn=turn) for count, turn in ((48, 0.0), (32, 45.0), (16, 60.0))]
     found = simplify(start, *views[:2], Budget(psnr=40.0), steps=40)
     assert len(found.means) <= 1.2 * M
-    # on other views than those that decide, which are one standard error on the safe side: 39.1 to 44.1 dB with seeds 0 to 3
-    assert likeness(found, views[2], look(start, views[2])) >= 39
+    # on other views than those that decide, which are two standard errors on the safe side: 40.1 to 41.5 dB with seeds 0 to 3
+    assert likeness(found, views[2], look(start, views[2])) >= 40
