@@ -98,12 +98,13 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
 
     objects = sorted({row["object"] for row in rows}, key=lambda name: (name != TUNED_ON, name))
     figure, panels = plt.subplots(1, len(objects), figsize=(1.2 + 4.2 * len(objects), 4.6), sharey=True, squeeze=False)
+    labels = list(dict.fromkeys(label_of(chart, row) for row in rows))
     for panel, name_of_object in zip(panels[0], objects, strict=True):
-        draw_panel(panel, chart, [row for row in rows if row["object"] == name_of_object])
+        draw_panel(panel, chart, labels, [row for row in rows if row["object"] == name_of_object])
         panel.set_title(name_of_object + ("" if name_of_object in chart.chosen_on else " (held back from tuning)"), fontsize=10)
     panels[0, 0].set_ylabel(DECIBEL)
     figure.suptitle(chart.title, x=0.01, ha="left", fontweight="bold")
-    handles, labels = panels[0, 0].get_legend_handles_labels()
+    handles, _ = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=min(4, len(labels)), frameon=False, fontsize=9)
     figure.text(0.01, 0.905, caption(rows, chart.size), fontsize=8, color="0.35")
     figure.tight_layout(rect=(0, 0.06 + 0.04 * ((len(labels) - 1) // 4), 1, 0.93))
@@ -113,13 +114,14 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
     return path
 
 
-def draw_panel(panel: Any, chart: Chart, rows: list[Row]) -> None:
-    """All lines of one object, in the order of the CSV."""
+def draw_panel(panel: Any, chart: Chart, labels: list[str], rows: list[Row]) -> None:
+    """All lines of one object, in the order and the colours of their labels."""
     from matplotlib import ticker
 
     lines = grouped(rows, lambda row: label_of(chart, row))
     common = lines.get(chart.common, [])
-    for index, (label, chosen) in enumerate(lines.items()):
+    for index, label in enumerate(labels):
+        chosen = lines.get(label, [])
         chosen = chosen + [row for row in common if row["x"] not in {own["x"] for own in chosen}]
         paper = label.endswith(PAPER)
         style = {"color": "0.15" if paper else COLOURS[index % len(COLOURS)], "label": label}
@@ -189,7 +191,8 @@ def spread(rows: list[Row]) -> tuple[float, float, float]:
 
 def caption(rows: list[Row], size: int = SIZE) -> str:
     """What a chart was made on."""
-    seeds = len({row["seed"] for row in rows})
+    counts = sorted({len({row["seed"] for row in same}) for same in grouped(rows, lambda row: (row["variant"], row["object"])).values()})
+    seeds = " to ".join(map(str, dict.fromkeys([counts[0], counts[-1]])))
     machine, commits = (", ".join(sorted({row[column] for row in rows})) for column in ("machine", "commit"))
     return f"exact score of a known object, configs/demo.yaml at {size}², {seeds} seeds: median and range; {machine}; commit {commits}"
 

@@ -204,7 +204,7 @@ def test_very_few_keep_their_shapes(n, absgrad, measured):
     """Cloned, split and pruned after steps of training; the counts say that each happened."""
     for split_scale, expected in ((1e9, 2 * n), (1e-9, 2 * n)):
         rules = EVERY_STEP | NO_LIMITS | {"grad_threshold": 0.0, "split_scale": split_scale, "absgrad": absgrad}
-        geometry = started(n, min_gaussians=1, densify=rules, prune={"start": 2, "stop": 3, "every": 2}, budget=2 * n)
+        geometry = started(n, min_gaussians=1, densify=rules, prune={"start": 2, "stop": 100, "every": 2}, budget=2 * n)
         training = Training(geometry)
         assert training.run(1) == [expected]
         geometry.cfg.budget, geometry.cfg.densify.grad_threshold = 1, 1e9
