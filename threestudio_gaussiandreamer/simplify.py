@@ -25,8 +25,8 @@ from .streams import generator
 
 KEEP = 0.8
 """The least share that a round keeps."""
-SMALLEST_DROP = 0.01
-"""A round that can't drop this share ends the search."""
+SMALLEST_DROP = 0.02
+"""A round that can't drop this share isn't worth its recovery, and ends the search."""
 RATES = {"means": 2e-4, "quats": 4e-3, "log_scales": 1e-2, "logit_opacities": 2e-2, "sh": 5e-3}
 """Adam's for a cloud that has just lost a fifth; that of the means in units of the cloud's radius."""
 PACES = (1.0, 1 / 4, 1 / 16, 1 / 64)
@@ -227,7 +227,7 @@ def simplify(
         cloud, _ = refitted(cloud, done)
         scores = rank(cloud, probes, seed)
     fewer = Cloud(**merge_duplicates(cloud._asdict(), at_least=budget.count or 1).values)
-    if len(fewer.means) < len(cloud.means):
+    if len(fewer.means) <= (1 - SMALLEST_DROP) * len(cloud.means):
         fewer, reached = refitted(fewer, done)
         if holds(reached):
             cloud, scores, done = fewer, rank(fewer, probes, seed), 1
