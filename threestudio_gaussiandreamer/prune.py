@@ -52,7 +52,7 @@ from .simplify import EPS2D, LEAST_ERROR, Budget, Cloud, Round, Views, assured_l
 from .spz import COLOR_REACH
 
 logger = logging.getLogger(__name__)
-PROBES, JUDGES, TESTS = 64, 32, 16
+PROBES, JUDGES, TESTS = 64, 32, 48
 TURNS = (0.0, 45.0, 60.0)
 """Where the three spirals of views start, degrees."""
 CHECKPOINTS = {
