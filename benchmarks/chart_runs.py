@@ -194,7 +194,8 @@ def caption(rows: list[Row], size: int = SIZE) -> str:
     counts = sorted({len({row["seed"] for row in same}) for same in grouped(rows, lambda row: (row["variant"], row["object"])).values()})
     seeds = " to ".join(map(str, dict.fromkeys([counts[0], counts[-1]])))
     machine, commits = (", ".join(sorted({row[column] for row in rows})) for column in ("machine", "commit"))
-    return f"exact score of a known object, configs/demo.yaml at {size}², {seeds} seeds: median and range; {machine}; commit {commits}"
+    spread_over = "one seed" if seeds == "1" else f"{seeds} seeds: median and range"
+    return f"exact score of a known object, configs/demo.yaml at {size}², {spread_over}; {machine}; commit {commits}"
 
 
 if __name__ == "__main__":
