@@ -181,9 +181,8 @@ def read(path: str, up: Optional[str] = None) -> StoredCloud:
         UserError: there is no file, it holds no Gaussians, or fewer than two.
     """
     file = existing_file(path, "file of Gaussians or checkpoint")
-    stored = (
-        StoredCloud(drawable(from_checkpoint(file)), up or OUR_UP) if file.suffix in (".ckpt", ".pt", ".pth") else read_cloud(path, up=up)
-    )
+    checkpoint = file.suffix in (".ckpt", ".pt", ".pth")
+    stored = StoredCloud(drawable(from_checkpoint(file)), up or OUR_UP) if checkpoint else read_cloud(path, up=up)
     if len(stored.arrays.means) < 2:
         raise UserError(f"{path} holds {len(stored.arrays.means)} Gaussians that can be drawn: there is nothing to prune")
     return stored
