@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 from jobs import NO_BUDGET, STEPS_A_ROUND
-from runs import SIZE, STEPS, append_rows, object_name, rows_of, train
+from runs import RENDERER, SIZE, STEPS, append_rows, object_name, rows_of, train
 from torch import Tensor
 
 from threestudio_gaussiandreamer import parsimony, prune, register_parts
@@ -26,7 +26,7 @@ from threestudio_gaussiandreamer.cloud_files import read_cloud
 from threestudio_gaussiandreamer.simplify import Budget, Cloud, Views, draw, likeness, look, only, recover, rounds_to, simplify, worth
 
 COUNTS = (2500, 1500)
-DRAWN = prune.PruneOptions(size=SIZE, eps2d=0.1)
+DRAWN = prune.PruneOptions(size=SIZE, eps2d=RENDERER["eps2d"])
 """As the cloud was in training."""
 COLUMNS = "variant,x,object,seed,psnr,machine,commit".split(",")
 

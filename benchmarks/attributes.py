@@ -23,9 +23,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import yaml
-from chart_runs import PAPER, TUNED_ON, caption, grouped, median, spread
-from runs import CHARTS, ROOT, SIZE, STEPS, append_rows, object_name, rows_of, train
+from chart_runs import PAPER, TUNED_ON, caption, grouped, median, papers_ends, spread
+from runs import CHARTS, RENDERER, ROOT, SIZE, STEPS, append_rows, object_name, rows_of, train
 from tqdm import tqdm
 
 from threestudio_gaussiandreamer import register_parts
@@ -135,12 +134,10 @@ def written(arrays: GaussianArrays) -> Iterator[tuple[str, int, GaussianArrays]]
 
 def score(mesh: str, arrays: GaussianArrays, size: int = SIZE, **drawn: Any) -> float:
     """PSNR on the held-out views of :mod:`evaluate`, as a run ends with it; drawn as the demo draws, but for ``drawn``."""
-    demo = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())
     geometry = find("gaussiandreamer-cloud")({})
     geometry.set_arrays(**arrays._asdict())
     background = find("gaussiandreamer-background")({"color": [1.0, 1.0, 1.0]})
-    options = demo["system"]["renderer"] | drawn
-    renderer = find("gaussiandreamer-splatting")(options, geometry=geometry, material=None, background=background)
+    renderer = find("gaussiandreamer-splatting")(RENDERER | drawn, geometry=geometry, material=None, background=background)
     held_out = held_out_views(mesh, size)
     images, backgrounds = held_out.render(renderer)
     return round(float(psnr(images.clamp(0, 1), held_out.truth_on(backgrounds))), 4)
@@ -249,9 +246,7 @@ def draw_bytes(panel: Any, measurements: list[dict[str, str]]) -> None:
         panel.vlines(x, low, high, color=f"C{index}", linewidth=1)
     files = [row for row in measurements if (row["experiment"], row["variant"]) == ("file", "SPZ")]
     panel.plot(median(files, "bytes") / 1000, spread(files)[1], "D", color="C9", markersize=7, label=f"{STRETCHED}, SPZ")
-    papers = [
-        row for row in rows_of("count") if (row["variant"], row["object"]) == (PAPER, measurements[0]["object"]) and row["step"] != "0"
-    ]
+    papers = [row for row in papers_ends() if row["object"] == measurements[0]["object"]]
     paper_bytes = 4 * KINDS[STRETCHED].floats * median(papers, "gaussians")
     panel.plot(paper_bytes / 1000, spread(papers)[1], "*", color="0.15", markersize=12, label=PAPER)
     finish(panel, "kB")

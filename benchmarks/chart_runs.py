@@ -86,7 +86,11 @@ def main() -> None:
 
 def papers_own(chart: Chart) -> list[Row]:
     """Where the paper's recipe ends, for charts that have no runs of it; at 1 where the axis counts times something of the demo's."""
-    return [row | {"x": "1"} for row in rows_of("count") if row["variant"] == PAPER and row["step"] != "0"] if chart.marks_paper else []
+    return [row | {"x": "1"} for row in papers_ends()] if chart.marks_paper else []
+
+
+def papers_ends() -> list[Row]:
+    return [row for row in rows_of("count") if row["variant"] == PAPER and row["step"] != "0"]
 
 
 def draw(name: str, chart: Chart, rows: list[Row]) -> Any:

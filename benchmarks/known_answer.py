@@ -15,6 +15,7 @@ import math
 import sys
 import tempfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +50,9 @@ def main() -> None:
     for seed in arguments.seeds:
         true = torus(arguments.count, seed)
         with tempfile.TemporaryDirectory() as folder:
-            if ("auto", str(arguments.count), str(seed)) not in measured:
-                append("auto", arguments.count, seed, *found_by_auto(true, seed, arguments.steps, Path(folder)))
-            if ("prune", str(arguments.count), str(seed)) not in measured:
-                append("prune", arguments.count, seed, *found_by_prune(true, seed, Path(folder)))
+            for method, find in {"auto": partial(found_by_auto, steps=arguments.steps), "prune": found_by_prune}.items():
+                if (method, str(arguments.count), str(seed)) not in measured:
+                    append(method, arguments.count, seed, *find(true, seed, folder=Path(folder)))
 
 
 # ---- scenes ----------------------------------------------------------------------------------------------------------------

@@ -23,11 +23,14 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
+import yaml
 from jobs import JOBS, STEPS, Job
 from tqdm import tqdm
 
 ROOT = Path(__file__).resolve().parent.parent
 CHARTS = ROOT / "docs/charts"
+RENDERER = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())["system"]["renderer"]
+"""How the demo draws."""
 SIZE, EVERY = 128, 100
 WITH_CURVES = ("time", "batch", "preset")
 COLUMNS = "variant,x,object,seed,step,cpu_seconds,gaussians,psnr,ssim,multi_face,floater_mass,out_of_gamut,machine,commit".split(",")

@@ -18,7 +18,7 @@ from . import parsimony
 from .cameras import Orbit, intrinsics, to_opencv
 from .errors import UserError
 from .merging import merge_duplicates
-from .metrics import psnr
+from .metrics import MAX_PSNR, psnr
 from .sh import sh_to_colors
 from .splatting import rasterize
 from .streams import generator
@@ -31,7 +31,7 @@ RATES = {"means": 2e-4, "quats": 4e-3, "log_scales": 1e-2, "logit_opacities": 2e
 """Adam's for a cloud that has just lost a fifth; that of the means in units of the cloud's radius."""
 PACES = (1.0, 1 / 4, 1 / 16, 1 / 64)
 """Of these rates. What is nearly right needs small ones: Adam's steps are as long where the gradient is mostly noise."""
-LEAST_ERROR = 1e-10
+LEAST_ERROR = 10 ** (-MAX_PSNR / 10)
 """Mean squared; what is less can't be told from the rounding of float32."""
 FOVY = math.radians(50.0)
 EPS2D = 0.3
