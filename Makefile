@@ -45,6 +45,7 @@ measure-charts: $(VENV)/ready-for-charts     ## the numbers anew, about two hour
 	$(ENVIRON) $(BIN)/python benchmarks/chart_splatting.py
 	$(ENVIRON) $(BIN)/python benchmarks/runs.py --objects $(OBJECTS)
 	$(ENVIRON) $(BIN)/python benchmarks/chart_runs.py
+	$(ENVIRON) $(BIN)/python benchmarks/failure_table.py
 	$(ENVIRON) $(BIN)/python benchmarks/attributes.py --objects $(OBJECTS) --seeds 0 1 2 3 4
 	$(ENVIRON) $(BIN)/python benchmarks/after_run.py --objects $(OBJECTS) --seeds 0 1 2 3 4
 	$(ENVIRON) $(BIN)/python benchmarks/viewers.py --objects $(OBJECTS)

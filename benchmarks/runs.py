@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from jobs import JOBS, STEPS, Job
+from jobs import JOBS, OWN_OBJECTS, STEPS, Job
 from tqdm import tqdm
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -43,7 +43,7 @@ def main() -> None:
         for seed in arguments.seeds
         for chart in arguments.charts
         for job in JOBS[chart]()
-        for mesh in arguments.objects
+        for mesh in OWN_OBJECTS.get(chart, arguments.objects)
         if not measured(job, mesh, seed)
     ]
     if arguments.list:
