@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from chart_runs import PAPER, TUNED_ON, caption, grouped, median, papers_ends, spread
+from chart_runs import PAPER, TUNED_ON, caption, grouped, median, objects_of, papers_ends, spread
 from runs import CHARTS, RENDERER, ROOT, SIZE, STEPS, append_rows, object_name, rows_of, train
 from tqdm import tqdm
 
@@ -215,7 +215,7 @@ def draw(measurements: list[dict[str, str]]) -> Path:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    objects = sorted({row["object"] for row in measurements}, key=lambda name: (name != TUNED_ON, name))
+    objects = objects_of(measurements)
     figure, panels = plt.subplots(2, len(objects), figsize=(1.2 + 4.2 * len(objects), 8.4), sharey="row", squeeze=False)
     for column, name in enumerate(objects):
         chosen = [row for row in measurements if row["object"] == name]

@@ -100,7 +100,7 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    objects = sorted({row["object"] for row in rows}, key=lambda name: (name != TUNED_ON, name))
+    objects = objects_of(rows)
     figure, panels = plt.subplots(1, len(objects), figsize=(1.2 + 4.2 * len(objects), 4.6), sharey=True, squeeze=False)
     labels = list(dict.fromkeys(label_of(chart, row) for row in rows))
     for panel, name_of_object in zip(panels[0], objects, strict=True):
@@ -116,6 +116,11 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
     figure.savefig(path, dpi=110)
     plt.close(figure)
     return path
+
+
+def objects_of(rows: list[dict[str, str]]) -> list[str]:
+    """Their order in charts and tables: the one that settings were chosen on is the first."""
+    return sorted({row["object"] for row in rows}, key=lambda name: (name != TUNED_ON, name))
 
 
 def draw_panel(panel: Any, chart: Chart, labels: list[str], rows: list[Row]) -> None:

@@ -8,7 +8,7 @@ A cell is the median dB over the seeds, its range, and the share that belongs to
 import statistics
 from typing import NamedTuple
 
-from chart_runs import ends, grouped
+from chart_runs import ends, grouped, objects_of
 from runs import ROOT, rows_of
 
 PAGE = ROOT / "docs/failures.md"
@@ -110,7 +110,7 @@ def main() -> None:
 
 def table(failure: Failure) -> str:
     """One table, a column for each object; empty where nothing is measured."""
-    objects = list(dict.fromkeys(row["object"] for row in rows_of(failure.chart)))
+    objects = objects_of(rows_of(failure.chart))
     if not objects:
         return ""
     worst = {name: measured(failure, failure.without, name) for name in objects}
