@@ -105,6 +105,15 @@ def count_jobs() -> Iterator[Job]:
     yield Job("count", "the paper's recipe, by removal error", COUNTS[-2], PAPER | {"system.geometry.budget": COUNTS[-2]})
 
 
+def grown_jobs() -> Iterator[Job]:
+    """Half of COUNTS[1] grown to all of it by gradients; thresholds were chosen on the toy."""
+    few = scratch(COUNTS[1] // 2) | {"system.geometry.max_gaussians": 10000, "system.geometry.budget": COUNTS[1]}
+    rounds = {"enabled": "true", "start": 100, "stop": 800, "every": 50}
+    for absgrad, threshold, name in (("false", 3, "plain gradients"), ("true", 5, "absolute gradients")):
+        densify = rounds | {"absgrad": absgrad, "grad_threshold": threshold}
+        yield Job("grown", name, COUNTS[1], few | {f"system.geometry.densify.{key}": value for key, value in densify.items()})
+
+
 def size_jobs() -> Iterator[Job]:
     """Pixels rendered, and whether rendering twice as large and shrinking pays for its four times as many."""
     for size in (64, 128, 256):
@@ -211,6 +220,7 @@ def alike_jobs() -> Iterator[Job]:
 JOBS: dict[str, Callable[[], Iterator[Job]]] = {
     "time": time_jobs,
     "count": count_jobs,
+    "grown": grown_jobs,
     "size": size_jobs,
     "large": large_jobs,
     "batch": batch_jobs,
