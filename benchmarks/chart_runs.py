@@ -118,7 +118,7 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
     return path
 
 
-def objects_of(rows: list[dict[str, str]]) -> list[str]:
+def objects_of(rows: list[Row]) -> list[str]:
     """Their order in charts and tables: the one that settings were chosen on is the first."""
     return sorted({row["object"] for row in rows}, key=lambda name: (name != TUNED_ON, name))
 
