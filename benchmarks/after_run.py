@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 from jobs import NO_BUDGET, STEPS_A_ROUND
-from runs import RENDERER, SIZE, STEPS, append_rows, object_name, rows_of, train
+from runs import RENDERER, SIZE, STEPS, append_rows, measured_in, object_name, rows_of, train
 from torch import Tensor
 
 from threestudio_gaussiandreamer import parsimony, prune, register_parts
@@ -37,9 +37,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     arguments = parser.parse_args()
     register_parts()
+    done = measured_in("after_run", "object", "seed")
     for seed in arguments.seeds:
         for mesh in arguments.objects:
-            if not any(row["object"] == object_name(mesh) and row["seed"] == str(seed) for row in rows_of("after_run")):
+            if (object_name(mesh), str(seed)) not in done:
                 append_rows("after_run", COLUMNS, measured(mesh, seed))
     print(table())
 

@@ -23,8 +23,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from chart_runs import PAPER, TUNED_ON, caption, grouped, median, objects_of, papers_ends, spread
-from runs import CHARTS, RENDERER, ROOT, SIZE, STEPS, append_rows, object_name, rows_of, train
+from chart_runs import PAPER, caption, grouped, median, objects_of, papers_ends, spread, title_of
+from runs import CHARTS, RENDERER, ROOT, SIZE, STEPS, append_rows, measured_in, object_name, rows_of, train
 from tqdm import tqdm
 
 from threestudio_gaussiandreamer import register_parts
@@ -72,14 +72,15 @@ def main() -> None:
     arguments = parse_arguments()
     register_parts()
     torch.set_num_threads(1)
+    measured = measured_in("attributes", "experiment", "variant", "x", "object", "seed")
     todo = [
         (kind, count, mesh, seed)
         for seed in arguments.seeds
         for kind in KINDS
         for count in KINDS[kind].counts
         for mesh in arguments.objects
+        if ("trained", kind, str(count), object_name(mesh), str(seed)) not in measured
     ]
-    todo = [job for job in todo if not measured(*job)]
     with ThreadPoolExecutor(arguments.jobs) as pool:
         running = {pool.submit(folder_of, *job): job for job in todo}
         for done in tqdm(as_completed(running), total=len(todo), unit="cloud", disable=None):
@@ -146,11 +147,6 @@ def score(mesh: str, arrays: GaussianArrays, size: int = SIZE, **drawn: Any) -> 
 @cache
 def held_out_views(mesh: str, size: int) -> HeldOut:
     return HeldOut(EvaluationConfig(size=size), MeshCaster(load_mesh(mesh)))
-
-
-def measured(kind: str, count: int, mesh: str, seed: int) -> bool:
-    wanted = ("trained", kind, str(count), object_name(mesh), str(seed))
-    return wanted in {tuple(row[name] for name in ("experiment", "variant", "x", "object", "seed")) for row in rows_of("attributes")}
 
 
 def append(job: tuple[str, int, str, int], measurements: list[dict[str, Any]]) -> None:
@@ -221,7 +217,7 @@ def draw(measurements: list[dict[str, str]]) -> Path:
         chosen = [row for row in measurements if row["object"] == name]
         draw_bytes(panels[0, column], chosen)
         draw_bits(panels[1, column], chosen)
-        panels[0, column].set_title(name + ("" if name == TUNED_ON else " (held back from tuning)"), fontsize=10)
+        panels[0, column].set_title(title_of(name), fontsize=10)
     panels[0, 0].set_ylabel("held-out PSNR, dB")
     panels[1, 0].set_ylabel("dB lost by rounding one attribute")
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="center", bbox_to_anchor=(0.5, 0.45), ncols=7, frameon=False, fontsize=8)

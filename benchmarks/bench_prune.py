@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from bench_splatting import make_scene
 from known_answer import torus
-from runs import append_rows, rows_of
+from runs import append_rows, measured_in
 
 from threestudio_gaussiandreamer import prune, register_parts
 from threestudio_gaussiandreamer.cloud_files import write_cloud
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=100_000, help="Gaussians at the start (default: 100000)")
     arguments = parser.parse_args()
     register_parts()
-    for row in rows(arguments.count, {(row["scene"], row["x"], row["budget"]) for row in rows_of("prune")}):
+    for row in rows(arguments.count, measured_in("prune", "scene", "x", "budget")):
         print("{scene}, {x} Gaussians, {budget}: {gaussians} left, {psnr} dB, {seconds} s".format(**row), flush=True)
         append_rows("prune", COLUMNS, [row])
 

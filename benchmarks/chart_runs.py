@@ -105,7 +105,7 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
     labels = list(dict.fromkeys(label_of(chart, row) for row in rows))
     for panel, name_of_object in zip(panels[0], objects, strict=True):
         draw_panel(panel, chart, labels, [row for row in rows if row["object"] == name_of_object])
-        panel.set_title(name_of_object + ("" if name_of_object in chart.chosen_on else " (held back from tuning)"), fontsize=10)
+        panel.set_title(title_of(name_of_object, chart.chosen_on), fontsize=10)
     panels[0, 0].set_ylabel(DECIBEL)
     figure.suptitle(chart.title, x=0.01, ha="left", fontweight="bold")
     handles, _ = panels[0, 0].get_legend_handles_labels()
@@ -121,6 +121,11 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
 def objects_of(rows: list[Row]) -> list[str]:
     """Their order in charts and tables: the one that settings were chosen on is the first."""
     return sorted({row["object"] for row in rows}, key=lambda name: (name != TUNED_ON, name))
+
+
+def title_of(name: str, chosen_on: tuple[str, ...] = (TUNED_ON,)) -> str:
+    """An object, and whether settings were chosen on it."""
+    return name if name in chosen_on else f"{name} (held back from tuning)"
 
 
 def draw_panel(panel: Any, chart: Chart, labels: list[str], rows: list[Row]) -> None:

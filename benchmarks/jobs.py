@@ -26,11 +26,8 @@ RATES = {
     "lr_sh": (1e-1, 2e-3),
 }
 """Learning rates of demo.yaml, at the start and the end of a run."""
-SLOWER_MEANS = {
-    "slower means": {"system.geometry.lr_means": f"[0,1e-4,2e-5,{STEPS}]"},
-    "means at 0.8": {"system.geometry.lr_means": f"[0,1.6e-4,2e-5,{STEPS}]"},
-}
-"""Positions begin at half or 0.8 of their rate: more Gaussians stay on the surface."""
+SLOWER_MEANS = {"slower means": 0.5, "means at 0.8": 0.8}
+"""The share of their rate that positions begin with: the smaller, the more Gaussians stay on the surface."""
 BINS = VIEW_BLIND | {"system.guidance.mode": "direction-bins"}
 GREY = {"system.geometry.prior.color": "grey"}
 BALL = {"system.geometry.prior_type": "random-prior", "system.geometry.prior": {"num_points": 8000, "shape": "sphere", "color": "grey"}}
@@ -60,8 +57,12 @@ def steps(count: int) -> dict[str, Any]:
 
 def falling(names: Iterable[str], count: int, factor: float = 1.0) -> dict[str, str]:
     """Some of the demo's learning rates, ``factor`` times as high, for a run of ``count`` steps."""
-    rates = {name: [factor * rate for rate in RATES[name]] for name in names}
-    return {f"system.geometry.{name}": f"[0,{start:g},{end:g},{count}]" for name, (start, end) in rates.items()}
+    return {f"system.geometry.{name}": falling_rate(*(factor * rate for rate in RATES[name]), count) for name in names}
+
+
+def falling_rate(start: float, end: float, count: int) -> str:
+    """A learning rate that falls over ``count`` steps."""
+    return f"[0,{start:g},{end:g},{count}]"
 
 
 def scratch(count: int) -> dict[str, Any]:
@@ -96,8 +97,10 @@ def count_jobs() -> Iterator[Job]:
     for count in COUNTS[-2:]:
         for score in ("contribution", "opacity"):
             yield Job("count", f"by {score}", count, {"system.geometry.budget": count, "system.geometry.prune.score": score})
-        for name, rate in SLOWER_MEANS.items():
-            yield Job("count", f"by removal error, {name}", count, {"system.geometry.budget": count} | rate)
+        for name, share in SLOWER_MEANS.items():
+            start, end = RATES["lr_means"]
+            slower = {"system.geometry.budget": count, "system.geometry.lr_means": falling_rate(share * start, end, STEPS)}
+            yield Job("count", f"by removal error, {name}", count, slower)
         rounds = rounds_to(count, 10000)
         pruned = NO_BUDGET | {"system.prune.count": count, "system.prune.size": 128}
         yield Job("count", "after the run, with recovery", count, steps(STEPS - rounds * STEPS_A_ROUND) | pruned)

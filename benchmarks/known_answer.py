@@ -23,7 +23,7 @@ import torch
 import yaml
 from jaxtyping import Float
 from jobs import RATES
-from runs import ROOT, append_rows, rows_of
+from runs import ROOT, append_rows, measured_in
 from torch import Tensor
 
 from threestudio_gaussiandreamer import prune, register_parts
@@ -46,7 +46,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1200, help="of the training run (default: 1200)")
     arguments = parser.parse_args()
     register_parts()
-    measured = {(row["method"], row["truth"], row["seed"]) for row in rows_of("known_answer")}
+    measured = measured_in("known_answer", "method", "truth", "seed")
     for seed in arguments.seeds:
         true = torus(arguments.count, seed)
         with tempfile.TemporaryDirectory() as folder:

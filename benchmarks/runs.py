@@ -38,13 +38,14 @@ COLUMNS = "variant,x,object,seed,step,cpu_seconds,gaussians,psnr,ssim,multi_face
 
 def main() -> None:
     arguments = parse_arguments()
+    measured = {chart: measured_in(chart, "variant", "x", "object", "seed") for chart in arguments.charts}
     todo = [
         (job, mesh, seed)
         for seed in arguments.seeds
         for chart in arguments.charts
         for job in JOBS[chart]()
         for mesh in OWN_OBJECTS.get(chart, arguments.objects)
-        if not measured(job, mesh, seed)
+        if (job.variant, f"{job.x:g}", object_name(mesh), str(seed)) not in measured[chart]
     ]
     if arguments.list:
         print("\n".join(f"{job.chart}: {job.variant}, {job.x:g}, {object_name(mesh)}, seed {seed}" for job, mesh, seed in todo))
@@ -117,10 +118,9 @@ def object_name(mesh: str) -> str:
     return Path(mesh).stem
 
 
-def measured(job: Job, mesh: str, seed: int) -> bool:
-    return (job.variant, f"{job.x:g}", object_name(mesh), str(seed)) in {
-        (row["variant"], row["x"], row["object"], row["seed"]) for row in rows_of(job.chart)
-    }
+def measured_in(chart: str, *columns: str) -> set[tuple[str, ...]]:
+    """What a chart's CSV has, by these columns."""
+    return {tuple(row[column] for column in columns) for row in rows_of(chart)}
 
 
 def rows_of(chart: str) -> list[dict[str, str]]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from attributes import score
-from runs import append_rows, object_name, rows_of, train
+from runs import append_rows, measured_in, object_name, train
 
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.ply import read_gaussians
@@ -30,12 +30,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     arguments = parser.parse_args()
     register_parts()
-    measured = {(row["object"], row["seed"]) for row in rows_of("viewers")}
+    measured = measured_in("viewers", "object", "seed")
     for seed in arguments.seeds:
         for mesh in arguments.objects:
-            if (object_name(mesh), str(seed)) in measured:
-                continue
-            append_rows("viewers", COLUMNS, list(rows(mesh, seed)))
+            if (object_name(mesh), str(seed)) not in measured:
+                append_rows("viewers", COLUMNS, list(rows(mesh, seed)))
 
 
 def rows(mesh: str, seed: int) -> Iterator[dict[str, Any]]:
