@@ -54,7 +54,7 @@ measure-charts: $(VENV)/ready-for-charts     ## the numbers anew, about two hour
 	$(ENVIRON) $(BIN)/python benchmarks/bench_prune.py
 
 # installed once; again when what is installed changes
-PACKAGE = pyproject.toml setup.py constraints.txt $(wildcard threestudio_gaussiandreamer/splatting/native/*.h threestudio_gaussiandreamer/splatting/native/*.cpp)
+PACKAGE = pyproject.toml setup.py constraints.txt $(wildcard threestudio_gaussiandreamer/splatting/cpu/*.h threestudio_gaussiandreamer/splatting/cpu/*.cpp threestudio_gaussiandreamer/splatting/shared/*.h)
 PIP     = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 $(BIN)/python:

@@ -11,8 +11,9 @@ from pathlib import Path
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
-PACKAGE = "threestudio_gaussiandreamer.splatting.native"
+PACKAGE = "threestudio_gaussiandreamer.splatting.cpu"
 NATIVE = Path(*PACKAGE.split("."))
+SHARED = NATIVE.parent / "shared"
 # Not -ffast-math: linking with it makes the whole process flush denormals.
 FLAGS = "-std=c++17 -O3 -g0 -fno-math-errno -fno-trapping-math -ffp-contract=fast -fvisibility=hidden -pthread".split()
 X86_BUILDS = {"v4": ["-march=x86-64-v4", "-mprefer-vector-width=512"], "v3": ["-march=x86-64-v3"], "base": ["-Wno-psabi"]}
@@ -25,7 +26,8 @@ def extensions() -> list[Extension]:
         Extension(
             f"{PACKAGE}.libsplat_{name}",
             sources=[str(NATIVE / "rasterize.cpp")],
-            depends=sorted(map(str, NATIVE.glob("*.h"))),
+            include_dirs=[str(SHARED)],
+            depends=sorted(map(str, (*NATIVE.glob("*.h"), *SHARED.glob("*.h")))),
             extra_compile_args=FLAGS + flags,
             extra_link_args=["-pthread"],
             language="c++",
@@ -45,7 +47,7 @@ class BuildLibraries(build_ext):
     def build_extension(self, extension):
         """One folder of objects per build: they all come from the same source."""
         folder = os.path.join(self.build_temp, extension.name)
-        flags = {"extra_postargs": extension.extra_compile_args, "depends": extension.depends}
+        flags = {"extra_postargs": extension.extra_compile_args, "depends": extension.depends, "include_dirs": extension.include_dirs}
         objects = self.compiler.compile(extension.sources, output_dir=folder, **flags)
         library = self.get_ext_fullpath(extension.name)
         self.compiler.link_shared_object(objects, library, extra_postargs=extension.extra_link_args, target_lang="c++")

@@ -21,9 +21,23 @@ from jobs import NO_BUDGET, STEPS_A_ROUND
 from runs import RENDERER, SIZE, STEPS, append_rows, measured_in, object_name, rows_of, train
 from torch import Tensor
 
-from threestudio_gaussiandreamer import parsimony, prune, register_parts
-from threestudio_gaussiandreamer.cloud_files import read_cloud
-from threestudio_gaussiandreamer.simplify import Budget, Cloud, Views, draw, likeness, look, only, recover, rounds_to, simplify, worth
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
+from threestudio_gaussiandreamer.gaussians import importance as parsimony
+from threestudio_gaussiandreamer.gaussians.simplify import (
+    Budget,
+    Cloud,
+    Views,
+    draw,
+    likeness,
+    look,
+    only,
+    recover,
+    rounds_to,
+    simplify,
+    worth,
+)
+from threestudio_gaussiandreamer.prune import command as prune
 
 COUNTS = (2500, 1500)
 DRAWN = prune.PruneOptions(size=SIZE, eps2d=RENDERER["eps2d"])

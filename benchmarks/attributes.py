@@ -28,14 +28,14 @@ from runs import CHARTS, RENDERER, ROOT, SIZE, STEPS, append_rows, measured_in, 
 from tqdm import tqdm
 
 from threestudio_gaussiandreamer import register_parts
-from threestudio_gaussiandreamer.cloud_files import OUR_UP, StoredCloud, in_axes, read_cloud, write_cloud
-from threestudio_gaussiandreamer.evaluate import EvaluationConfig, HeldOut
+from threestudio_gaussiandreamer.formats.gaussian_files import OUR_UP, StoredCloud, in_axes, read_cloud, write_cloud
+from threestudio_gaussiandreamer.formats.ply import GaussianArrays, read_gaussians
+from threestudio_gaussiandreamer.formats.spz import COLOR_SCALE
 from threestudio_gaussiandreamer.host import find
-from threestudio_gaussiandreamer.meshes import load_mesh
+from threestudio_gaussiandreamer.meshes.load import load_mesh
+from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
 from threestudio_gaussiandreamer.metrics import psnr
-from threestudio_gaussiandreamer.ply import GaussianArrays, read_gaussians
-from threestudio_gaussiandreamer.raycast import MeshCaster
-from threestudio_gaussiandreamer.spz import COLOR_SCALE
+from threestudio_gaussiandreamer.training.held_out import EvaluationConfig, HeldOut
 
 CLOUDS = ROOT / "outputs/attributes"
 COLUMNS = "experiment,variant,x,object,seed,gaussians,bytes,psnr,machine,commit".split(",")

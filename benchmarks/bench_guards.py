@@ -17,10 +17,10 @@ from typing import Callable
 import torch
 from bench_splatting import make_camera, make_scene
 
-from threestudio_gaussiandreamer.geometry import LOG_SCALE_RANGE, GaussianCloud
+from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0
 from threestudio_gaussiandreamer.guidance.base import ScoreDistillation, _bad_items
-from threestudio_gaussiandreamer.sh import rgb_to_sh0
 from threestudio_gaussiandreamer.splatting import RasterizeOptions, api, rasterize
+from threestudio_gaussiandreamer.training.geometry import LOG_SCALE_RANGE, GaussianCloud
 
 RESULTS = Path(__file__).parent / "results/guards.csv"
 LOG_EVERY = 10  # steps between two looks at the cloud's limits, as in configs/demo.yaml

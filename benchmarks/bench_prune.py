@@ -20,10 +20,11 @@ from bench_splatting import make_scene
 from known_answer import torus
 from runs import append_rows, measured_in
 
-from threestudio_gaussiandreamer import prune, register_parts
-from threestudio_gaussiandreamer.cloud_files import write_cloud
-from threestudio_gaussiandreamer.sh import rgb_to_sh0
-from threestudio_gaussiandreamer.simplify import Cloud
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.formats.gaussian_files import write_cloud
+from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0
+from threestudio_gaussiandreamer.gaussians.simplify import Cloud
+from threestudio_gaussiandreamer.prune import command as prune
 
 COLUMNS = "scene,x,budget,gaussians,psnr,seconds,threads,load,machine,commit".split(",")
 

@@ -224,7 +224,7 @@ def _commit() -> str:
 def available(names: list[str]) -> list[str]:
     """Those that can run here; says why not of the others."""
     sys.path.insert(0, str(ROOT))
-    from threestudio_gaussiandreamer.splatting import cpu
+    from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 
     builds = cpu.usable_builds()
     missing = {

@@ -24,9 +24,9 @@ import torch
 from bench_splatting import Scene, describe_machine, make_camera, make_scene
 from torch import Tensor
 
-from threestudio_gaussiandreamer.grow import nearest_distance_scales
-from threestudio_gaussiandreamer.ply import read_gaussians
-from threestudio_gaussiandreamer.sh import sh0_to_rgb
+from threestudio_gaussiandreamer.formats.ply import read_gaussians
+from threestudio_gaussiandreamer.gaussians.grow import nearest_distance_scales
+from threestudio_gaussiandreamer.gaussians.sh import sh0_to_rgb
 from threestudio_gaussiandreamer.splatting import rasterize, reference
 from threestudio_gaussiandreamer.splatting.options import RasterizeOptions
 from threestudio_gaussiandreamer.splatting.projection import project

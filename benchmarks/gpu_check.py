@@ -175,7 +175,9 @@ def about(args: argparse.Namespace) -> dict[str, Any]:
 
 def describe_device(args: argparse.Namespace) -> dict[str, Any]:
     """The GPU, the releases that have to fit one another, and why our kernels can't run, or None."""
-    from threestudio_gaussiandreamer.splatting import available_backends, cuda_driver, nvrtc
+    from threestudio_gaussiandreamer.splatting import available_backends
+    from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver
+    from threestudio_gaussiandreamer.splatting.cuda import nvrtc
 
     if args.device == "cpu":
         return {"device": "cpu"}
@@ -410,7 +412,8 @@ def prune(args: argparse.Namespace) -> dict[str, Any]:
 def prune_twice(args: argparse.Namespace) -> dict[str, Any]:
     from bench_prune import torus_and_sphere
 
-    from threestudio_gaussiandreamer import prune, simplify
+    from threestudio_gaussiandreamer.gaussians import simplify
+    from threestudio_gaussiandreamer.prune import command as prune
 
     stored = prune.stored_cloud(torus_and_sphere(800 if args.small else 100_000))
     options = prune.PruneOptions(count=len(stored.arrays.means) // 4, size=48 if args.small else 256, steps=4 if args.small else 60)
@@ -449,7 +452,8 @@ def make_model(args: argparse.Namespace) -> dict[str, Any]:
 
 def train_steps(args: argparse.Namespace) -> dict[str, Any]:
     """A short run of the launcher itself; the first steps, which warm up, aren't counted."""
-    from threestudio_gaussiandreamer import experiment, system
+    from threestudio_gaussiandreamer.launch import experiment
+    from threestudio_gaussiandreamer.training import system
 
     seconds, original = [], system.GaussianDreamerSystem.training_step
 

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 from ablations import CLIPPED, LATENT, NO_ANNEALING, PAPER_RATES, RANDOM_START, STRONG, VIEW_BLIND
 
-from threestudio_gaussiandreamer.prune import PruneOptions
-from threestudio_gaussiandreamer.simplify import rounds_to
+from threestudio_gaussiandreamer.gaussians.simplify import rounds_to
+from threestudio_gaussiandreamer.prune.command import PruneOptions
 
 STEPS = 1200
 SECOND_STAGE = 500

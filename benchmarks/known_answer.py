@@ -26,13 +26,14 @@ from jobs import RATES
 from runs import ROOT, append_rows, measured_in
 from torch import Tensor
 
-from threestudio_gaussiandreamer import prune, register_parts
+from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.cameras import held_out_orbit, to_opencv
-from threestudio_gaussiandreamer.cloud_files import read_cloud, write_cloud
-from threestudio_gaussiandreamer.experiment import main as launch
+from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud, write_cloud
+from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0, sh_to_colors
+from threestudio_gaussiandreamer.gaussians.simplify import Cloud, Views, likeness, look
 from threestudio_gaussiandreamer.host import BaseObject, register
-from threestudio_gaussiandreamer.sh import rgb_to_sh0, sh_to_colors
-from threestudio_gaussiandreamer.simplify import Cloud, Views, likeness, look
+from threestudio_gaussiandreamer.launch.experiment import main as launch
+from threestudio_gaussiandreamer.prune import command as prune
 from threestudio_gaussiandreamer.splatting import rasterize
 
 SIZE = 128

@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from runs import commit, machine
 
-from threestudio_gaussiandreamer.builtin.weights import load_checkpoint, newest_readable
+from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, newest_readable
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = [

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from threestudio_gaussiandreamer import register_parts
-from threestudio_gaussiandreamer.experiment import main
-from threestudio_gaussiandreamer.geometry import LOG_SCALE_RANGE, GaussianCloud
 from threestudio_gaussiandreamer.host import register
+from threestudio_gaussiandreamer.launch.experiment import main
+from threestudio_gaussiandreamer.training.geometry import LOG_SCALE_RANGE, GaussianCloud
 
 register_parts()
 

@@ -17,7 +17,7 @@ from attributes import score
 from runs import append_rows, measured_in, object_name, train
 
 from threestudio_gaussiandreamer import register_parts
-from threestudio_gaussiandreamer.ply import read_gaussians
+from threestudio_gaussiandreamer.formats.ply import read_gaussians
 
 DILATIONS = (0.1, 0.3)
 SIZES = (256, 512)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from threestudio_gaussiandreamer.point_cloud import PointCloud
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 
 
 @pytest.fixture(autouse=True, scope="session")

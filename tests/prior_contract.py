@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.point_cloud import PointCloud
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.priors.base import Prior
 
 

@@ -7,8 +7,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from threestudio_gaussiandreamer.array_files import PickledArray, read_arrays
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats.array_files import PickledArray, read_arrays
 
 ARRAYS = {
     "a": np.arange(12.0).reshape(3, 4),

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.background import FlatBackground
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.training.background import FlatBackground
 
 
 def test_fixed_is_the_colour_in_training_and_evaluation():

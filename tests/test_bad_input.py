@@ -10,12 +10,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import evaluate, experiment, host, register_parts, trial
-from threestudio_gaussiandreamer.builtin.types import check_types
-from threestudio_gaussiandreamer.config import load_config
-from threestudio_gaussiandreamer.config_check import check_part
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.system import GaussianDreamerSystem
+from threestudio_gaussiandreamer import host, register_parts
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.host.builtin.types import check_types
+from threestudio_gaussiandreamer.launch import experiment, trial
+from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.config_check import check_part
+from threestudio_gaussiandreamer.training import held_out as evaluate
+from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 register_parts()
 DEMO = Path(__file__).parent.parent / "configs" / "demo.yaml"

@@ -7,7 +7,7 @@ import torch
 
 from threestudio_gaussiandreamer import cameras
 from threestudio_gaussiandreamer.cameras import Orbit, OrbitRanges
-from threestudio_gaussiandreamer.streams import generator
+from threestudio_gaussiandreamer.core.streams import generator
 
 
 def view(elevation=0.0, azimuth=0.0, distance=2.0, fovy=60.0):

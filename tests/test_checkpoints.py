@@ -8,9 +8,9 @@ import resource
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.builtin.weights import load_checkpoint, load_file, newest_readable, previous_of, save_file
-from threestudio_gaussiandreamer.checkpoints import AtomicCheckpointIO
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, load_file, newest_readable, previous_of, save_file
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch.checkpoints import AtomicCheckpointIO
 
 
 def content(step: int = 7, size: int = 2000) -> dict:

@@ -13,12 +13,13 @@ import pytest
 import tiny_3d_models as tiny
 import torch
 
-from threestudio_gaussiandreamer import clip_evaluation as module
-from threestudio_gaussiandreamer import register_parts, results, t3bench
-from threestudio_gaussiandreamer.clip_evaluation import Protocol, main
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.experiment import main as launch
-from threestudio_gaussiandreamer.ply import GaussianArrays, write_gaussians
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.evaluation import clip_similarity as module
+from threestudio_gaussiandreamer.evaluation import results, t3bench
+from threestudio_gaussiandreamer.evaluation.clip_similarity import Protocol, main
+from threestudio_gaussiandreamer.formats.ply import GaussianArrays, write_gaussians
+from threestudio_gaussiandreamer.launch.experiment import main as launch
 
 register_parts()
 FAST = ["--size", "24", "--seeds", "0", "1", "2"]
@@ -190,7 +191,7 @@ def test_one_line_of_the_list_for_each_result(plys, tmp_path):
 
 
 def test_it_is_a_command(plys, tmp_path):
-    command = [sys.executable, "-m", "threestudio_gaussiandreamer.clip_evaluation", plys[0], "--clip", "nowhere", "--prompt", "a fox"]
+    command = [sys.executable, "-m", "threestudio_gaussiandreamer.evaluation.clip_similarity", plys[0], "--clip", "nowhere", "--prompt", "a fox"]
     ended = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
     assert ended.returncode == 2 and ended.stderr.strip().startswith("error: --clip nowhere: expected a folder")
 
@@ -202,7 +203,7 @@ def test_shapes_and_types_hold(clip, plys, tmp_path):
     code = f"""
 from threestudio_gaussiandreamer import typecheck
 typecheck.install()
-from threestudio_gaussiandreamer.clip_evaluation import main
+from threestudio_gaussiandreamer.evaluation.clip_similarity import main
 raise SystemExit(main({arguments!r}))
 """
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}

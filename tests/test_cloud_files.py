@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import cloud_files
-from threestudio_gaussiandreamer.cloud_files import AXES, StoredCloud, file_size, in_axes, read_cloud, turned, write_cloud
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.ply import GaussianArrays, read_comments, write_gaussians
-from threestudio_gaussiandreamer.sh import sh_to_colors
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats import gaussian_files as cloud_files
+from threestudio_gaussiandreamer.formats.gaussian_files import AXES, StoredCloud, file_size, in_axes, read_cloud, turned, write_cloud
+from threestudio_gaussiandreamer.formats.ply import GaussianArrays, read_comments, write_gaussians
+from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
 from threestudio_gaussiandreamer.splatting import rasterize
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from threestudio_gaussiandreamer import host, register_parts
-from threestudio_gaussiandreamer.config import load_config
-from threestudio_gaussiandreamer.config_check import check_config
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.config_check import check_config
 from threestudio_gaussiandreamer.priors.base import Prior
 
 register_parts()

@@ -6,8 +6,8 @@ import math
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.data import GaussianDreamerDataModule
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.training.data import GaussianDreamerDataModule
 
 KEYS = {
     "c2w": (4, 4, 4),

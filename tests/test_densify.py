@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import nn
 
-from threestudio_gaussiandreamer import densify
-from threestudio_gaussiandreamer.densify import Rules, Statistics
-from threestudio_gaussiandreamer.streams import generator
+from threestudio_gaussiandreamer.core.streams import generator
+from threestudio_gaussiandreamer.gaussians import densify
+from threestudio_gaussiandreamer.gaussians.densify import Rules, Statistics
 
 
 def cloud(n, seed=0, log_scale=-4.0):

@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import distributed
+from threestudio_gaussiandreamer.core import distributed
 
 SCRIPT = """
     import sys, torch
     sys.path[:0] = [{tests!r}, {root!r}]
     from threestudio_gaussiandreamer import register_parts
-    from threestudio_gaussiandreamer.config import load_config
+    from threestudio_gaussiandreamer.launch.config import load_config
     from threestudio_gaussiandreamer.host import find, pl
-    from threestudio_gaussiandreamer.strategy import ReplicatedStrategy
+    from threestudio_gaussiandreamer.launch.ddp import ReplicatedStrategy
     import test_system
 
     register_parts()

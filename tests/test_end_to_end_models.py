@@ -12,9 +12,9 @@ import tiny_3d_models
 import tiny_models
 import torch
 
-from threestudio_gaussiandreamer.experiment import main
+from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.guidance.text_to_image import TextToImageDistillation
-from threestudio_gaussiandreamer.ply import read_gaussians
+from threestudio_gaussiandreamer.launch.experiment import main
 
 pytest.importorskip("diffusers")
 pytestmark = pytest.mark.slow

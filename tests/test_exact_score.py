@@ -6,9 +6,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from threestudio_gaussiandreamer import sds
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.exact_score import (
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.diffusion import sds
+from threestudio_gaussiandreamer.diffusion.exact_score import (
     LinearLatent,
     color_matrix,
     denoise,
@@ -138,7 +138,7 @@ def test_a_batch_is_its_items_with_shared_and_with_own_banks():
 def test_distances_in_chunks_are_the_distances(monkeypatch):
     z, bank, abar = randn(2, 30), randn(11, 30, seed=1), ABAR[torch.tensor([50, 700])]
     whole = squared_distances(z, bank, abar)
-    monkeypatch.setattr("threestudio_gaussiandreamer.exact_score.CHUNK_ELEMENTS", 150)
+    monkeypatch.setattr("threestudio_gaussiandreamer.diffusion.exact_score.CHUNK_ELEMENTS", 150)
     torch.testing.assert_close(squared_distances(z, bank, abar), whole, rtol=1e-15, atol=0)
 
 

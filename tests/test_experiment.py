@@ -16,9 +16,9 @@ import tiny_parts
 import torch
 
 import threestudio_gaussiandreamer
-from threestudio_gaussiandreamer.builtin.weights import load_file, save_file
-from threestudio_gaussiandreamer.config import load_config
-from threestudio_gaussiandreamer.experiment import main
+from threestudio_gaussiandreamer.core.checkpoint_file import load_file, save_file
+from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.experiment import main
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -62,7 +62,7 @@ def test_training_leaves_the_tree_of_threestudio(launch):
         "configs/raw.yaml",
         "configs/parsed.yaml",
         "cmd.txt",
-        "code/threestudio_gaussiandreamer/trial.py",
+        "code/threestudio_gaussiandreamer/launch/trial.py",
         "csv_logs/version_0/metrics.csv",
         "save/it3-0.png",
         "save/it6-1.png",
@@ -353,7 +353,7 @@ def test_launch_py_with_parts_dropped_into_custom(tmp_path):
 PRIOR_FILE = """
 from dataclasses import dataclass
 from threestudio_gaussiandreamer.host import register
-from threestudio_gaussiandreamer.point_cloud import PointCloud
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.priors.base import Prior
 
 @register("ring-prior")

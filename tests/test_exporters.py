@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import exporters, ply
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer import exporters
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats import ply
+from threestudio_gaussiandreamer.formats.spz import read_spz, write_spz
+from threestudio_gaussiandreamer.gaussians.surface import write_obj
 from threestudio_gaussiandreamer.host import BaseGeometry, ExporterOutput, find, names
-from threestudio_gaussiandreamer.spz import read_spz, write_spz
-from threestudio_gaussiandreamer.surface import write_obj
 
 for module in pkgutil.iter_modules(exporters.__path__):
     importlib.import_module(f"{exporters.__name__}.{module.name}")

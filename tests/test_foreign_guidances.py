@@ -8,10 +8,10 @@ import torch
 import yaml
 from torch import nn
 
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.experiment import main
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.guidance.foreign import call_guidance, learnt_weights, own_randomness, restore_learnt, trainable_groups
 from threestudio_gaussiandreamer.host import BaseModule, BaseObject, register
+from threestudio_gaussiandreamer.launch.experiment import main
 
 BATCH_KEYS = {"c2w", "fovy", "height", "width", "elevation", "azimuth", "camera_distances", "camera_positions", "mvp_mtx", "proj_mtx"}
 
@@ -262,8 +262,8 @@ def test_a_loss_without_a_weight_is_an_error(tmp_path, capsys):
 def test_a_run_with_a_tiny_real_model(tmp_path, monkeypatch, kind):
     """Prompt, text encoder, VAE, UNet, SDS, test and export, through the configuration that a user writes for the real weights."""
     pytest.importorskip("diffusers")
-    from threestudio_gaussiandreamer import prompt_processors  # noqa: F401
     from threestudio_gaussiandreamer.guidance import deep_floyd, stable_diffusion  # noqa: F401
+    from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
 
     monkeypatch.chdir(tmp_path)
     if kind == "deep-floyd":
@@ -279,8 +279,8 @@ def test_a_run_with_a_tiny_real_model(tmp_path, monkeypatch, kind):
 
 def test_a_missing_model_ends_the_run_before_the_prior(tmp_path, monkeypatch, capsys):
     pytest.importorskip("diffusers")
-    from threestudio_gaussiandreamer import prompt_processors  # noqa: F401
     from threestudio_gaussiandreamer.guidance import stable_diffusion  # noqa: F401
+    from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
 
     monkeypatch.chdir(tmp_path)
     tiny_models.nothing_cached(monkeypatch, tmp_path)

@@ -4,16 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import register_parts, sh
+from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.cameras import orbit_c2w
-from threestudio_gaussiandreamer.densify import screen_gradients
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.geometry import GaussianCloud
-from threestudio_gaussiandreamer.grow import nearest_distance_scales
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats.ply import write_gaussians
+from threestudio_gaussiandreamer.gaussians import sh
+from threestudio_gaussiandreamer.gaussians.densify import screen_gradients
+from threestudio_gaussiandreamer.gaussians.grow import nearest_distance_scales
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.host import find, register
-from threestudio_gaussiandreamer.ply import write_gaussians
-from threestudio_gaussiandreamer.point_cloud import PointCloud
 from threestudio_gaussiandreamer.splatting import Rasterized
+from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 register_parts()
 NO_GROWTH = {"enabled": False}

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as np_strategies
 
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.grow import grow, growing_box, half_longest_side, nearest_distance_scales
-from threestudio_gaussiandreamer.point_cloud import PointCloud
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.gaussians.grow import grow, growing_box, half_longest_side, nearest_distance_scales
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 
 FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False)
 

@@ -6,8 +6,8 @@ import torch
 
 pytest.importorskip("diffusers")
 
-from threestudio_gaussiandreamer import streams
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core import streams
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.guidance import deep_floyd
 from threestudio_gaussiandreamer.host import NAME, find
 

@@ -7,12 +7,14 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from threestudio_gaussiandreamer import cameras, sds, streams
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer import cameras
+from threestudio_gaussiandreamer.core import streams
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore, ScoreDistillation
 from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance, direction_indices
 from threestudio_gaussiandreamer.host import find
-from threestudio_gaussiandreamer.raycast import MeshCaster
+from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
 
 trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("embreex")

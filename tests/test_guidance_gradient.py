@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from tiny_guidance import BATCH, PREDICTIONS, Recorder, gradient, guidance, make_models, make_prompts, relative, renders
 from torch import nn
 
-from threestudio_gaussiandreamer import streams
+from threestudio_gaussiandreamer.core import streams
 from threestudio_gaussiandreamer.guidance import text_to_image
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
 from threestudio_gaussiandreamer.guidance.half_precision import GradientBorder, weights_type
@@ -90,7 +90,7 @@ class ExactUNet(nn.Module):
         self.config = SimpleNamespace(encoder_hid_dim=None, cross_attention_dim=5, sample_size=bank.shape[-1])
 
     def forward(self, sample, timestep, encoder_hidden_states):
-        from threestudio_gaussiandreamer.exact_score import denoise
+        from threestudio_gaussiandreamer.diffusion.exact_score import denoise
 
         abar = self.alphas[timestep]
         modes = self.bank.flatten(1).to(sample)

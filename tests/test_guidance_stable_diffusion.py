@@ -10,12 +10,12 @@ import torch.nn.functional as F
 from tiny_guidance import BATCH, TIMESTEPS, Recorder, gradient, guidance, make_models, make_prompts, relative, renders
 from torch import nn
 
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.guidance import stable_diffusion
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
 from threestudio_gaussiandreamer.guidance.text_to_image import perp_neg, rescaled, view_of_row
 from threestudio_gaussiandreamer.host import NAME, find
-from threestudio_gaussiandreamer.prompts import PlainPrompt
+from threestudio_gaussiandreamer.prompts.prompts import PlainPrompt
 
 pytest.importorskip("diffusers")
 

@@ -17,15 +17,16 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from threestudio_gaussiandreamer import host
-from threestudio_gaussiandreamer.builtin import pictures, registry
-from threestudio_gaussiandreamer.builtin.base import BaseModule, BaseObject, Updateable, parse_structured
-from threestudio_gaussiandreamer.builtin.models import BaseGeometry, NoMaterial, Renderer, SolidColorBackground
-from threestudio_gaussiandreamer.builtin.savers import SaverMixin
-from threestudio_gaussiandreamer.builtin.schedule import C, C_max, validate_schedule
-from threestudio_gaussiandreamer.builtin.system import BaseLift3DSystem, BaseSystem, optimizer_from
-from threestudio_gaussiandreamer.builtin.text import escape
-from threestudio_gaussiandreamer.builtin.weights import save_file
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core import images as pictures
+from threestudio_gaussiandreamer.core.checkpoint_file import save_file
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.interpolation import escape
+from threestudio_gaussiandreamer.core.schedule import C, C_max, validate_schedule
+from threestudio_gaussiandreamer.host.builtin import registry
+from threestudio_gaussiandreamer.host.builtin.base import BaseModule, BaseObject, Updateable, parse_structured
+from threestudio_gaussiandreamer.host.builtin.models import BaseGeometry, NoMaterial, Renderer, SolidColorBackground
+from threestudio_gaussiandreamer.host.builtin.savers import SaverMixin
+from threestudio_gaussiandreamer.host.builtin.system import BaseLift3DSystem, BaseSystem, optimizer_from
 
 # -- registry ----------------------------------------------------------------------------------------------------------------
 
@@ -287,7 +288,7 @@ def test_the_step_of_a_resumed_checkpoint_is_the_true_one():
 
 
 def test_an_exporter_output_that_nobody_can_save_is_named(own_registry, tmp_path):
-    from threestudio_gaussiandreamer.builtin.models import Exporter, ExporterOutput
+    from threestudio_gaussiandreamer.host.builtin.models import Exporter, ExporterOutput
 
     class System(BaseLift3DSystem):
         def configure(self) -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 import tiny_models
 
-from threestudio_gaussiandreamer import extras, hub, model_files
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.models import extras, hub, model_files
 
 huggingface_hub = pytest.importorskip("huggingface_hub")
 pytest.importorskip("diffusers")

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.geometry import GaussianCloud
+from threestudio_gaussiandreamer.gaussians.simplify import Budget, Cloud, likeness, look, simplify, views_around
 from threestudio_gaussiandreamer.metrics import psnr
-from threestudio_gaussiandreamer.simplify import Budget, Cloud, likeness, look, simplify, views_around
 from threestudio_gaussiandreamer.splatting import rasterize
+from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 known_answer = pytest.importorskip("known_answer", reason="needs tqdm and the benchmarks beside the tests")

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from threestudio_gaussiandreamer import experiment
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.launch_options import announce_device, choose_gpu, find_config, parse_arguments
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch import experiment
+from threestudio_gaussiandreamer.launch.options import announce_device, choose_gpu, find_config, parse_arguments
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 def test_help_imports_neither_torch_nor_lightning():
     code = (
-        "import sys; from threestudio_gaussiandreamer.experiment import main; assert main(['--help']) == 0; "
+        "import sys; from threestudio_gaussiandreamer.launch.experiment import main; assert main(['--help']) == 0; "
         "print('torch' in sys.modules, 'omegaconf' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True)
@@ -66,11 +66,11 @@ def test_a_configuration_is_found_by_path_or_name(tmp_path, monkeypatch):
 
 
 def test_the_installed_package_brings_its_configurations(tmp_path, monkeypatch):
-    from threestudio_gaussiandreamer import launch_options
+    from threestudio_gaussiandreamer.launch import options as launch_options
 
     (tmp_path / "package" / "configs").mkdir(parents=True)
     (tmp_path / "package" / "configs" / "demo.yaml").touch()
-    monkeypatch.setattr(launch_options, "__file__", str(tmp_path / "package" / "launch_options.py"))
+    monkeypatch.setattr(launch_options, "__file__", str(tmp_path / "package" / "launch" / "options.py"))
     monkeypatch.chdir(tmp_path)
     assert find_config("demo") == tmp_path / "package" / "configs" / "demo.yaml"
 

@@ -3,9 +3,10 @@
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import merging, simplify
-from threestudio_gaussiandreamer.merging import merge_duplicates
-from threestudio_gaussiandreamer.simplify import Cloud
+from threestudio_gaussiandreamer.gaussians import merge as merging
+from threestudio_gaussiandreamer.gaussians import simplify
+from threestudio_gaussiandreamer.gaussians.merge import merge_duplicates
+from threestudio_gaussiandreamer.gaussians.simplify import Cloud
 
 
 def shell(count=60, seed=0):

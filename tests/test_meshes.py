@@ -3,8 +3,8 @@ import logging
 import numpy as np
 import pytest
 
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.meshes import Mesh, SurfaceDistance, face_areas, find_mesh, load_mesh, sample_surface, surface_colors
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.meshes.load import Mesh, SurfaceDistance, face_areas, find_mesh, load_mesh, sample_surface, surface_colors
 
 trimesh = pytest.importorskip("trimesh")
 THIRDS = np.full((1, 3), 1 / 3)
@@ -87,7 +87,7 @@ def test_z_up_files_keep_their_axes(tmp_path, name):
 
 @pytest.mark.parametrize(("up", "front"), [("+y", "-x"), ("-z", "+y"), ("+x", None), ("-y", "+z")])
 def test_up_and_front_can_be_given_and_nothing_is_mirrored(tmp_path, up, front):
-    from threestudio_gaussiandreamer.meshes import AXES
+    from threestudio_gaussiandreamer.meshes.load import AXES
 
     path = saved(arrow((1, 0, 0), (0, 1, 0)), tmp_path / "a.ply")
     mesh, plain = load_mesh(path, up=up, front=front), load_mesh(path, up="+z", front="+x")
@@ -242,7 +242,7 @@ def test_objects_as_programs_write_them_are_read(tmp_path):
 
 
 def test_a_texture_that_fills_the_memory_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("threestudio_gaussiandreamer.meshes.MOST_TEXELS", 3)
+    monkeypatch.setattr("threestudio_gaussiandreamer.meshes.load.MOST_TEXELS", 3)
     with pytest.raises(UserError, match="texture of 2 x 2 is too large"):
         load_mesh(saved(textured_quad(IMAGE), tmp_path / "a.glb"))
 

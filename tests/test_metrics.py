@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.metrics import azimuth_difference, floater_mass, multi_face_rate, out_of_gamut, psnr, ssim
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import pytest
 from omegaconf import OmegaConf
 
-from threestudio_gaussiandreamer.nested import adopt_nested
+from threestudio_gaussiandreamer.core.nested import adopt_nested
 
 
 @dataclass

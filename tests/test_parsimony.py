@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import parsimony
 from threestudio_gaussiandreamer.cameras import orbit_c2w, to_opencv
-from threestudio_gaussiandreamer.densify import Rules, Statistics, densify_and_prune
-from threestudio_gaussiandreamer.geometry import GaussianCloud
+from threestudio_gaussiandreamer.core.streams import generator
+from threestudio_gaussiandreamer.gaussians import importance as parsimony
+from threestudio_gaussiandreamer.gaussians.densify import Rules, Statistics, densify_and_prune
 from threestudio_gaussiandreamer.splatting import rasterize
-from threestudio_gaussiandreamer.streams import generator
+from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 
 def cloud(n, **options):

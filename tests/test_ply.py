@@ -6,9 +6,9 @@ import struct
 import numpy as np
 import pytest
 
-from threestudio_gaussiandreamer import ply
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.point_cloud import PointCloud
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats import ply
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 
 
 def rng(seed=0):

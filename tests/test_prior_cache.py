@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from threestudio_gaussiandreamer.formats.ply import read_points
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.host import BaseObject
-from threestudio_gaussiandreamer.ply import read_points
-from threestudio_gaussiandreamer.point_cloud import PointCloud
-from threestudio_gaussiandreamer.prior_cache import cached_cloud
+from threestudio_gaussiandreamer.priors.cache import cached_cloud
 
 
 class CountingPrior(BaseObject):

@@ -10,10 +10,11 @@ import pytest
 import trimesh
 from prior_contract import PriorContract, assert_valid
 
-from threestudio_gaussiandreamer import ply, priors
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer import priors
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats import ply
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.host import find, names
-from threestudio_gaussiandreamer.point_cloud import PointCloud
 from threestudio_gaussiandreamer.priors.base import Prior, validated
 
 for module in pkgutil.iter_modules(priors.__path__):

@@ -9,8 +9,8 @@ import pytest
 import tiny_3d_models as tiny
 import torch
 
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.hub import locate
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.models.hub import locate
 from threestudio_gaussiandreamer.priors.shap_e import ShapEPrior
 
 FAST = {"num_inference_steps": 2, "grid_size": 24}

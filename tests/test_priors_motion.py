@@ -11,12 +11,12 @@ import torch
 import trimesh
 from prior_contract import PriorContract, assert_valid
 
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
-from threestudio_gaussiandreamer.meshes import Mesh
+from threestudio_gaussiandreamer.meshes.load import Mesh
+from threestudio_gaussiandreamer.models.clip import clip_source, picture_similarities
 from threestudio_gaussiandreamer.priors import motion as module
 from threestudio_gaussiandreamer.priors import motion_files
-from threestudio_gaussiandreamer.priors.clip import clip_source, picture_similarities
 from threestudio_gaussiandreamer.priors.motion import MotionPrior, body_pictures, facing, offered_frames, z_up
 from threestudio_gaussiandreamer.priors.motion_files import Motions, read_motions
 from threestudio_gaussiandreamer.priors.motion_text import reduced_prompt

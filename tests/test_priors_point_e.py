@@ -10,7 +10,7 @@ import tiny_3d_models as tiny
 import torch
 from prior_contract import PriorContract, assert_valid
 
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.priors import karras
 from threestudio_gaussiandreamer.priors.point_e import BASE, UPSAMPLER, PointEPrior, load_network

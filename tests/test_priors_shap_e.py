@@ -9,10 +9,10 @@ import tiny_3d_models as tiny
 import torch
 from prior_contract import PriorContract, assert_valid
 
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
+from threestudio_gaussiandreamer.models.clip import load_text_encoder, load_tokenizer, text_condition
 from threestudio_gaussiandreamer.priors import shap_e as module
-from threestudio_gaussiandreamer.priors.clip import load_text_encoder, load_tokenizer, text_condition
 from threestudio_gaussiandreamer.priors.karras import guided_denoiser, karras_sigmas, sample_heun
 from threestudio_gaussiandreamer.priors.point_e_model import PointTransformer
 from threestudio_gaussiandreamer.priors.shap_e import ShapEPrior, prior_network, read_schedule

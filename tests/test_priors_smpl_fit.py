@@ -9,7 +9,7 @@ import pytest
 import tiny_3d_models as tiny
 import torch
 
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.priors import smpl_fit
 from threestudio_gaussiandreamer.priors.smpl_fit import beyond_limits, fit_bodies, load_body_model, posed_joints, posed_vertices
 

@@ -12,11 +12,12 @@ import torch
 
 pytest.importorskip("diffusers")
 
-from threestudio_gaussiandreamer import model_files, prompt_processors, text_encoders
-from threestudio_gaussiandreamer.embedding_cache import EmbeddingCache
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import NAME, find
-from threestudio_gaussiandreamer.view_prompts import PromptEmbeddings, decay, view_directions
+from threestudio_gaussiandreamer.models import model_files, text_encoders
+from threestudio_gaussiandreamer.models.embedding_cache import EmbeddingCache
+from threestudio_gaussiandreamer.prompts import prompt_processors
+from threestudio_gaussiandreamer.prompts.view_prompts import PromptEmbeddings, decay, view_directions
 
 KINDS = ("stable-diffusion", "deep-floyd")
 

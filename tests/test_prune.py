@@ -7,11 +7,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import prune, simplify
-from threestudio_gaussiandreamer.cloud_files import PRUNED, StoredCloud, in_axes, read_cloud
-from threestudio_gaussiandreamer.ply import GaussianArrays, read_comments, read_gaussians, write_gaussians
-from threestudio_gaussiandreamer.sh import sh_to_colors
-from threestudio_gaussiandreamer.simplify import Budget, Cloud
+from threestudio_gaussiandreamer.formats.gaussian_files import PRUNED, StoredCloud, in_axes, read_cloud
+from threestudio_gaussiandreamer.formats.ply import GaussianArrays, read_comments, read_gaussians, write_gaussians
+from threestudio_gaussiandreamer.gaussians import simplify
+from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
+from threestudio_gaussiandreamer.gaussians.simplify import Budget, Cloud
+from threestudio_gaussiandreamer.prune import command as prune
 from threestudio_gaussiandreamer.splatting import rasterize
 
 FAST = ["--size", "48", "--steps", "8"]

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import cameras, raycast
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.meshes import Mesh, load_mesh
-from threestudio_gaussiandreamer.raycast import MeshCaster, TargetCache, over_background
+from threestudio_gaussiandreamer import cameras
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.meshes import raycast
+from threestudio_gaussiandreamer.meshes.load import Mesh, load_mesh
+from threestudio_gaussiandreamer.meshes.raycast import MeshCaster, TargetCache, over_background
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -120,7 +121,7 @@ def test_casting_in_parts_changes_nothing(monkeypatch):
     caster = MeshCaster(cube())
     view = look(30, 40, 2.5), math.radians(50), 20, 20, 4
     whole = caster.render(*view)
-    monkeypatch.setattr("threestudio_gaussiandreamer.raycast.RAYS_PER_CAST", 1)
+    monkeypatch.setattr("threestudio_gaussiandreamer.meshes.raycast.RAYS_PER_CAST", 1)
     np.testing.assert_allclose(caster.render(*view), whole, atol=1e-6)  # sums in another order
 
 

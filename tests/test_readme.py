@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from threestudio_gaussiandreamer import experiment, register_parts
-from threestudio_gaussiandreamer.config import load_config
-from threestudio_gaussiandreamer.config_check import check_config
-from threestudio_gaussiandreamer.launch_options import find_config, parse_arguments
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.launch import experiment
+from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.config_check import check_config
+from threestudio_gaussiandreamer.launch.options import find_config, parse_arguments
 
 register_parts()
 ROOT = Path(__file__).parent.parent

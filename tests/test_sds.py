@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import sds
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.diffusion import sds
 
 ABAR = sds.sd_alphas_cumprod()
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy import special
 
-from threestudio_gaussiandreamer import sh
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.gaussians import sh
 
 
 def directions(n=50, seed=0):

@@ -10,8 +10,9 @@ import torch
 from splatting_scenes import NAMES, cameras, random_cloud, run
 
 from threestudio_gaussiandreamer import splatting
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.splatting import PRESETS, api, available_backends, cpu, rasterize, torch_backend
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.splatting import PRESETS, api, available_backends, rasterize, torch_backend
+from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 
 
 def arguments(n=6, views=2, dtype=torch.float32):

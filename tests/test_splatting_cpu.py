@@ -14,8 +14,9 @@ import torch
 from splatting_contract import KernelContract, draw
 from splatting_scenes import cameras, equal, random_cloud
 
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.splatting import cpu, rasterize
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.splatting import rasterize
+from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 
 pytestmark = pytest.mark.skipif(cpu.unavailable() is not None, reason=str(cpu.unavailable()))
 
@@ -171,7 +172,7 @@ def test_the_formulas_need_no_standard_header_and_work_on_single_floats(tmp_path
     source.write_text(
         '#include "splat_math.h"\nfloat f(splat::Vec3<float> u, splat::Vec3<float> v) { return splat::whiten(u, v, 0.3f).a; }\n'
     )
-    folder = pathlib.Path(cpu.__file__).parent / "native"
+    folder = pathlib.Path(cpu.__file__).parents[1] / "shared"
     subprocess.run(
         ["g++", "-std=c++17", "-nostdinc", "-nostdinc++", "-Wall", "-Werror", "-fsyntax-only", f"-I{folder}", "-c", str(source)], check=True
     )

@@ -9,8 +9,11 @@ from cuda_shim.machine import ORDERS, HostMachine, unavailable
 from splatting_contract import BACKGROUND, KernelContract, draw
 from splatting_scenes import NAMES, Cloud, cameras, cotangents, equal, random_cloud
 
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.splatting import api, cuda, cuda_driver, cuda_memory, rasterize
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.splatting import api, rasterize
+from threestudio_gaussiandreamer.splatting.cuda import backend as cuda
+from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver
+from threestudio_gaussiandreamer.splatting.cuda import memory as cuda_memory
 
 pytestmark = pytest.mark.skipif(unavailable() is not None, reason=str(unavailable()))
 
@@ -19,7 +22,7 @@ pytestmark = pytest.mark.skipif(unavailable() is not None, reason=str(unavailabl
 def machine(monkeypatch):
     """The backend on tensors of the CPU, on a machine that tests may exchange; nothing learnt from earlier calls."""
     machines = [HostMachine()]
-    monkeypatch.setitem(api.BACKENDS, "cuda", api.Backend("cuda", devices=("cpu",), dtypes=(torch.float32,)))
+    monkeypatch.setitem(api.BACKENDS, "cuda", api.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,)))
     monkeypatch.setattr(cuda_driver, "unavailable", lambda: None)
     monkeypatch.setattr(cuda_driver, "machine", lambda device: machines[-1])
     monkeypatch.setattr(cuda, "_demands", {})

@@ -13,8 +13,11 @@ import torch
 from cuda_shim.machine import library, unavailable
 from splatting_scenes import cameras, equal, random_cloud, run
 
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.splatting import api, available_backends, cuda, cuda_driver, nvrtc
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.splatting import api, available_backends
+from threestudio_gaussiandreamer.splatting.cuda import backend as cuda
+from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver
+from threestudio_gaussiandreamer.splatting.cuda import nvrtc
 
 needs_nvrtc = pytest.mark.skipif(nvrtc.unavailable() is not None, reason=str(nvrtc.unavailable()))
 ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
@@ -232,7 +235,7 @@ def driver(monkeypatch, cache):
 @needs_nvrtc
 def test_a_picture_by_way_of_the_driver(driver, monkeypatch, compiled):
     """Compiled, loaded, launched in autograd's thread too: the same bits as the torch backend's within rounding."""
-    monkeypatch.setitem(api.BACKENDS, "cuda", api.Backend("cuda", devices=("cpu",), dtypes=(torch.float32,)))
+    monkeypatch.setitem(api.BACKENDS, "cuda", api.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,)))
     monkeypatch.setattr(cuda, "_demands", {})
     assert available_backends()["cuda"] is None
     cloud, camera = random_cloud(60).to(torch.float32), cameras(2, 20, 20, dtype=torch.float32)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.ply import GaussianArrays
-from threestudio_gaussiandreamer.sh import sh_to_colors
-from threestudio_gaussiandreamer.spz import read_spz, read_spz_comment, spz_bytes, write_spz
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats.ply import GaussianArrays
+from threestudio_gaussiandreamer.formats.spz import read_spz, read_spz_comment, spz_bytes, write_spz
+from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
 
 
 def cloud(count=300, degree=0, seed=0):

@@ -4,7 +4,7 @@ import itertools
 
 import torch
 
-from threestudio_gaussiandreamer import streams
+from threestudio_gaussiandreamer.core import streams
 
 
 def test_the_same_key_gives_the_same_draw_whatever_happened_before():

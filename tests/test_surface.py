@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from threestudio_gaussiandreamer.ply import GaussianArrays
-from threestudio_gaussiandreamer.surface import gaussian_surface, surface_nets, write_obj
+from threestudio_gaussiandreamer.formats.ply import GaussianArrays
+from threestudio_gaussiandreamer.gaussians.surface import gaussian_surface, surface_nets, write_obj
 
 trimesh = pytest.importorskip("trimesh")
 CENTER = np.array([0.3, 0.0, -0.2])

@@ -12,14 +12,14 @@ import pytest
 import torch
 import yaml
 
-from threestudio_gaussiandreamer import evaluate
-from threestudio_gaussiandreamer.cloud_files import read_cloud
-from threestudio_gaussiandreamer.experiment import main
+from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
+from threestudio_gaussiandreamer.formats.ply import read_gaussians
+from threestudio_gaussiandreamer.formats.spz import read_spz
 from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance
 from threestudio_gaussiandreamer.host import BaseObject, register
-from threestudio_gaussiandreamer.ply import read_gaussians
-from threestudio_gaussiandreamer.spz import read_spz
-from threestudio_gaussiandreamer.system import GaussianDreamerSystem
+from threestudio_gaussiandreamer.launch.experiment import main
+from threestudio_gaussiandreamer.training import held_out as evaluate
+from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 SMALL = [

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int, jaxtyped
 from torch import Tensor
 
-from threestudio_gaussiandreamer.typecheck import check, matches
+from threestudio_gaussiandreamer.core.typecheck import check, matches
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 POINTS = torch.zeros(5, 3)
@@ -67,10 +67,10 @@ def test_named_tuples_and_classes_pass_through():
 @pytest.mark.slow
 def test_the_hook_watches_the_package():
     code = """
-import threestudio_gaussiandreamer.typecheck as typecheck
+import threestudio_gaussiandreamer.core.typecheck as typecheck
 typecheck.install()
 import torch
-from threestudio_gaussiandreamer.sds import add_noise
+from threestudio_gaussiandreamer.diffusion.sds import add_noise
 try:
     add_noise("not a tensor", torch.ones(1), torch.ones(1))
 except TypeError as error:

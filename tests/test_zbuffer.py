@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import cameras, raycast, zbuffer
-from threestudio_gaussiandreamer.meshes import Mesh, load_mesh
-from threestudio_gaussiandreamer.zbuffer import ZBuffer
+from threestudio_gaussiandreamer import cameras
+from threestudio_gaussiandreamer.meshes import raycast, zbuffer
+from threestudio_gaussiandreamer.meshes.load import Mesh, load_mesh
+from threestudio_gaussiandreamer.meshes.zbuffer import ZBuffer
 
 FOCAL = 20.0
 PLACES = np.arange(-16, 16) + 0.5

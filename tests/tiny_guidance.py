@@ -4,9 +4,9 @@ import tiny_models
 import torch
 from torch import nn
 
-from threestudio_gaussiandreamer import prompt_processors  # noqa: F401
 from threestudio_gaussiandreamer.guidance import stable_diffusion  # noqa: F401
 from threestudio_gaussiandreamer.host import find
+from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
 
 PREDICTIONS = ("epsilon", "v_prediction")
 BATCH = {

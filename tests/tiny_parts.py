@@ -9,7 +9,8 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader, IterableDataset
 
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.streams import generator
 from threestudio_gaussiandreamer.host import (
     BaseGeometry,
     BaseLift3DSystem,
@@ -23,7 +24,6 @@ from threestudio_gaussiandreamer.host import (
     register,
     run_seed,
 )
-from threestudio_gaussiandreamer.streams import generator
 
 
 @register("tiny-prior")

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from .streams import generator
+from .core.streams import generator
 
 
 class Orbit(NamedTuple):

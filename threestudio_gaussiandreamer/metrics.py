@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from .errors import UserError
+from .core.errors import UserError
 
 MAX_PSNR = 100.0
 SSIM_WINDOW = 11

@@ -14,8 +14,8 @@ from typing import Optional
 import torch
 from torch import Tensor
 
-from threestudio_gaussiandreamer.splatting import nvrtc
-from threestudio_gaussiandreamer.splatting.cuda_stages import NOWHERE
+from threestudio_gaussiandreamer.splatting.cuda import nvrtc
+from threestudio_gaussiandreamer.splatting.cuda.stages import NOWHERE
 
 FOLDER = Path(__file__).parent
 # Nothing is fused but what the kernels fuse on purpose; reading four floats as one is usual in CUDA, though not in C++; jumps
@@ -38,7 +38,7 @@ ORDERS = {"forward": 0, "backward": 1, "shuffled": 2}
 def library() -> ctypes.CDLL:
     """The kernels compiled for the host, once per process."""
     folder = tempfile.TemporaryDirectory()
-    includes = [f"-I{path}" for path in (FOLDER, nvrtc.KERNELS, nvrtc.NATIVE)]
+    includes = [f"-I{path}" for path in (FOLDER, nvrtc.KERNELS, nvrtc.SHARED)]
     target = os.path.join(folder.name, "kernels.so")
     subprocess.run(["g++", *FLAGS, *WARNINGS, *includes, *map(str, FOLDER.glob("*.cpp")), "-o", target], check=True)
     kernels = ctypes.CDLL(target)

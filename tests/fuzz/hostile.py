@@ -8,7 +8,7 @@ import torch
 from splatting_scenes import NAMES, Cloud, cotangents
 from torch import Tensor
 
-from threestudio_gaussiandreamer.sh import sh_to_colors
+from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
 from threestudio_gaussiandreamer.splatting import Rasterized, rasterize
 
 MAX = 3.4028235e38

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from targets import TARGETS, Misread, Target, mutant
 
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
 
 SECONDS = 10.0
 """Of processor time that one file may take; the slowest good one takes a tenth of a second."""

@@ -11,9 +11,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from targets import require_picture
 from torch import Tensor
 
-from threestudio_gaussiandreamer.densify import Change
-from threestudio_gaussiandreamer.geometry import STATISTICS, GaussianCloud
+from threestudio_gaussiandreamer.gaussians.densify import Change
 from threestudio_gaussiandreamer.splatting import Rasterized
+from threestudio_gaussiandreamer.training.geometry import STATISTICS, GaussianCloud
 
 HOSTILE = {
     "means": [0.0, 1e4, -1e30, 3e38],

@@ -21,21 +21,23 @@ import torch
 from mutations import BINARY, TEXT, Mutator, Packing
 from oracles import Illegal
 
-from threestudio_gaussiandreamer import config, experiment, ply, register_parts
-from threestudio_gaussiandreamer.builtin.weights import load_checkpoint, save_file
-from threestudio_gaussiandreamer.config_check import check_config
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.geometry import GaussianCloud
-from threestudio_gaussiandreamer.meshes import load_mesh
-from threestudio_gaussiandreamer.point_cloud import PointCloud
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, save_file
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats import ply
+from threestudio_gaussiandreamer.formats.spz import read_spz, spz_bytes
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
+from threestudio_gaussiandreamer.launch import config, experiment
+from threestudio_gaussiandreamer.launch.config_check import check_config
+from threestudio_gaussiandreamer.launch.trial import Trial, lightning_errors
+from threestudio_gaussiandreamer.meshes.load import load_mesh
+from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
 from threestudio_gaussiandreamer.priors.gaussians import GaussiansPrior
 from threestudio_gaussiandreamer.priors.mesh import MeshPrior
 from threestudio_gaussiandreamer.priors.motion_files import read_motions
 from threestudio_gaussiandreamer.priors.point_cloud import PointCloudPrior
-from threestudio_gaussiandreamer.raycast import MeshCaster
 from threestudio_gaussiandreamer.splatting import rasterize
-from threestudio_gaussiandreamer.spz import read_spz, spz_bytes
-from threestudio_gaussiandreamer.trial import Trial, lightning_errors
+from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 ROOT = Path(__file__).parents[2]
 register_parts()

@@ -9,7 +9,7 @@ from judge import judged, outcomes
 from mutations import BINARY, TEXT, mutant
 from targets import TARGETS, Misread, Target, seeds
 
-from threestudio_gaussiandreamer.errors import UserError
+from threestudio_gaussiandreamer.core.errors import UserError
 
 CORPUS = sorted(path for path in Path(__file__).with_name("corpus").rglob("*") if path.is_file())
 INPUTS = {"configuration": 25, "command-line": 15, "checkpoint": 30}

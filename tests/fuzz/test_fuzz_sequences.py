@@ -5,7 +5,7 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis.stateful import run_state_machine_as_test
 from sequences import CloudLife
 
-from threestudio_gaussiandreamer import densify
+from threestudio_gaussiandreamer.gaussians import densify
 
 
 def live(lives: int, **options) -> None:

@@ -13,8 +13,10 @@ from unittest import mock
 import torch
 from torch import Tensor
 
-from threestudio_gaussiandreamer import experiment, sds, streams
+from threestudio_gaussiandreamer.core import streams
+from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.guidance.base import ScoreDistillation
+from threestudio_gaussiandreamer.launch import experiment
 
 DEMO = Path(__file__).parents[2] / "configs" / "demo.yaml"
 SMALL = [
@@ -77,7 +79,7 @@ def launch(folder: Path, *overrides: str, stage: str = "--train", config: Path =
     arguments = ["--config", str(config), stage, "--gpu", "cpu", f"exp_root_dir={folder}", *small, *overrides]
     with (
         mock.patch.dict(os.environ),
-        mock.patch("threestudio_gaussiandreamer.prior_cache.save_turntable"),
+        mock.patch("threestudio_gaussiandreamer.priors.cache.save_turntable"),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):

@@ -11,19 +11,20 @@ from rows import row
 from scipy.spatial import cKDTree
 from small_runs import DEMO, Ended, differences, launch
 
-from threestudio_gaussiandreamer import densify, register_parts
+from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.cameras import orbit_c2w
-from threestudio_gaussiandreamer.config import load_config
-from threestudio_gaussiandreamer.config_check import check_config
-from threestudio_gaussiandreamer.densify import PARAMETERS, Rules, Statistics
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.geometry import STATISTICS, GaussianCloud
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.streams import generator
+from threestudio_gaussiandreamer.formats.ply import write_gaussians
+from threestudio_gaussiandreamer.gaussians import densify
+from threestudio_gaussiandreamer.gaussians.densify import PARAMETERS, Rules, Statistics
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
+from threestudio_gaussiandreamer.gaussians.simplify import Cloud, look, views_around, worth
 from threestudio_gaussiandreamer.host import find
+from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.config_check import check_config
 from threestudio_gaussiandreamer.metrics import psnr
-from threestudio_gaussiandreamer.ply import write_gaussians
-from threestudio_gaussiandreamer.point_cloud import PointCloud
-from threestudio_gaussiandreamer.simplify import Cloud, look, views_around, worth
-from threestudio_gaussiandreamer.streams import generator
+from threestudio_gaussiandreamer.training.geometry import STATISTICS, GaussianCloud
 
 register_parts()
 NO_LIMITS = {"min_opacity": 0.0, "max_scale": 1e9}

@@ -11,7 +11,7 @@ from scenes import clamped_alpha, clamped_slope, joined, plain_image, stack
 from splatting_scenes import NO_CUTOFFS, Cloud, cameras, front_camera, one_gaussian, psnr, random_cloud
 
 from threestudio_gaussiandreamer import cameras as host_cameras
-from threestudio_gaussiandreamer.grow import nearest_distance_scales
+from threestudio_gaussiandreamer.gaussians.grow import nearest_distance_scales
 from threestudio_gaussiandreamer.splatting import rasterize, tiles
 from threestudio_gaussiandreamer.splatting.projection import quats_to_rotations
 

@@ -11,15 +11,16 @@ from rows import row
 from small_runs import TowardsGrey
 from torch import nn
 
-from threestudio_gaussiandreamer import densify, sds
-from threestudio_gaussiandreamer.densify import PARAMETERS, Rules, Statistics
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.geometry import LEARNING_RATES, STATISTICS, GaussianCloud
-from threestudio_gaussiandreamer.grow import grow
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.streams import generator
+from threestudio_gaussiandreamer.diffusion import sds
+from threestudio_gaussiandreamer.gaussians import densify
+from threestudio_gaussiandreamer.gaussians.densify import PARAMETERS, Rules, Statistics
+from threestudio_gaussiandreamer.gaussians.grow import grow
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
-from threestudio_gaussiandreamer.point_cloud import PointCloud
-from threestudio_gaussiandreamer.streams import generator
-from threestudio_gaussiandreamer.system import GaussianDreamerSystem
+from threestudio_gaussiandreamer.training.geometry import LEARNING_RATES, STATISTICS, GaussianCloud
+from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

@@ -12,13 +12,13 @@ from rows import row
 from small_runs import launch
 
 from threestudio_gaussiandreamer import register_parts
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.geometry import GaussianCloud
-from threestudio_gaussiandreamer.grow import SCALE_RULES, grow, half_longest_side, nearest_distance_scales
-from threestudio_gaussiandreamer.meshes import face_areas, load_mesh, sample_surface
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.gaussians.grow import SCALE_RULES, grow, half_longest_side, nearest_distance_scales
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
+from threestudio_gaussiandreamer.gaussians.simplify import Cloud, look, views_around
+from threestudio_gaussiandreamer.meshes.load import face_areas, load_mesh, sample_surface
 from threestudio_gaussiandreamer.metrics import psnr
-from threestudio_gaussiandreamer.point_cloud import PointCloud
-from threestudio_gaussiandreamer.simplify import Cloud, look, views_around
+from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 register_parts()
 CUBE = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))

@@ -25,9 +25,9 @@ from splatting_scenes import (
     run,
 )
 
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.geometry import GaussianCloud
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import PRESETS, rasterize
+from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 

@@ -20,12 +20,12 @@ from rows import row
 from small_runs import DEMO, Ended, differences, launch
 
 from threestudio_gaussiandreamer import register_parts
-from threestudio_gaussiandreamer.builtin import pictures
-from threestudio_gaussiandreamer.builtin.weights import load_checkpoint, load_file, previous_of, save_file
-from threestudio_gaussiandreamer.config import dump_config, load_config
-from threestudio_gaussiandreamer.config_check import check_config, check_part
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.system import GaussianDreamerSystem
+from threestudio_gaussiandreamer.core import images as pictures
+from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, load_file, previous_of, save_file
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch.config import dump_config, load_config
+from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
+from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 register_parts()
 EVERY_STEP = ["checkpoint.every_n_train_steps=1", "trainer.max_steps=5"]

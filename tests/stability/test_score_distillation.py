@@ -12,18 +12,20 @@ from lightning.pytorch.plugins import MixedPrecision
 from rows import row
 from small_runs import Ended, TowardsGrey, differences, launch
 
-from threestudio_gaussiandreamer import cameras, register_parts, sds, trial
+from threestudio_gaussiandreamer import cameras, register_parts
 from threestudio_gaussiandreamer.cameras import Orbit
-from threestudio_gaussiandreamer.config_check import check_part
-from threestudio_gaussiandreamer.data import TrainCameras, make_batch
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.evaluate import EvaluationConfig, HeldOut
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.host import C, find, register
-from threestudio_gaussiandreamer.meshes import load_mesh
+from threestudio_gaussiandreamer.launch import trial
+from threestudio_gaussiandreamer.launch.config_check import check_part
+from threestudio_gaussiandreamer.meshes.load import load_mesh
+from threestudio_gaussiandreamer.meshes.raycast import MeshCaster, over_background
 from threestudio_gaussiandreamer.metrics import psnr
-from threestudio_gaussiandreamer.raycast import MeshCaster, over_background
 from threestudio_gaussiandreamer.splatting import rasterize
-from threestudio_gaussiandreamer.system import GaussianDreamerSystem
+from threestudio_gaussiandreamer.training.data import TrainCameras, make_batch
+from threestudio_gaussiandreamer.training.held_out import EvaluationConfig, HeldOut
+from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 register_parts()
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"

@@ -17,16 +17,17 @@ from rows import row
 from small_runs import launch
 
 import threestudio_gaussiandreamer
-from threestudio_gaussiandreamer import hub, model_files, register_parts
-from threestudio_gaussiandreamer.embedding_cache import EmbeddingCache
-from threestudio_gaussiandreamer.errors import UserError
-from threestudio_gaussiandreamer.ply import read_gaussians, read_points, write_gaussians
-from threestudio_gaussiandreamer.prior_cache import read_cache
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats.ply import read_gaussians, read_points, write_gaussians
+from threestudio_gaussiandreamer.models import hub, model_files
+from threestudio_gaussiandreamer.models.embedding_cache import EmbeddingCache
+from threestudio_gaussiandreamer.priors.cache import read_cache
 from threestudio_gaussiandreamer.priors.motion_files import read_motions
 from threestudio_gaussiandreamer.priors.point_cloud import load_points
 from threestudio_gaussiandreamer.priors.smpl_fit import load_body_model
 from threestudio_gaussiandreamer.priors.weights import read_state_dict
-from threestudio_gaussiandreamer.system import GaussianDreamerSystem
+from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 register_parts()
 PACKAGE = Path(threestudio_gaussiandreamer.__file__).parent

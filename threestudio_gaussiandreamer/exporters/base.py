@@ -7,9 +7,9 @@ of ``ExporterOutput(save_name, save_type, params)``; the system writes each with
 import os
 from dataclasses import dataclass
 
-from ..errors import UserError
+from ..core.errors import UserError
+from ..formats.ply import GaussianArrays
 from ..host import BaseGeometry, Exporter
-from ..ply import GaussianArrays
 
 
 class FileExporter(Exporter):

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional
 
-from ..errors import UserError, unknown
+from ..core.errors import UserError, unknown
 from ..host import BaseBackground, BaseGeometry, BaseMaterial, Exporter, ExporterOutput, find, names, parse_structured, register
 
 SUFFIX = "-exporter"

@@ -14,9 +14,9 @@ from typing import List, Optional
 
 import numpy as np
 
-from ..errors import UserError
+from ..core.errors import UserError
+from ..formats.ply import padded_sh
 from ..host import ExporterOutput, register
-from ..ply import padded_sh
 from .base import FileExporter, gaussian_arrays
 
 

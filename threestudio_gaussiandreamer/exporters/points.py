@@ -12,10 +12,10 @@ save_video   also render the turntable
 from dataclasses import dataclass
 from typing import List
 
-from ..errors import UserError
+from ..core.errors import UserError
+from ..formats.ply import opaque, sh0_colors
+from ..gaussians.point_cloud import PointCloud
 from ..host import ExporterOutput, register
-from ..ply import opaque, sh0_colors
-from ..point_cloud import PointCloud
 from .base import FileExporter, gaussian_arrays
 
 

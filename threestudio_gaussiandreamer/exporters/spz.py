@@ -13,8 +13,8 @@ About 17 bytes a Gaussian; what its rounding costs is in docs/parsimony.md. The 
 from dataclasses import dataclass
 from typing import List
 
+from ..formats.ply import usable
 from ..host import ExporterOutput, register, warn
-from ..ply import usable
 from .base import FileExporter, gaussian_arrays
 
 

@@ -15,9 +15,9 @@ The colours are those of the constant harmonic. A mesh loses what Gaussians show
 from dataclasses import dataclass
 from typing import List
 
-from ..errors import UserError
+from ..core.errors import UserError
+from ..gaussians.surface import gaussian_surface
 from ..host import ExporterOutput, register, warn
-from ..surface import gaussian_surface
 from .base import FileExporter, gaussian_arrays
 
 

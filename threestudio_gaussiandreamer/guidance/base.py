@@ -28,8 +28,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .. import sds, streams
-from ..errors import UserError
+from ..core import streams
+from ..core.errors import UserError
+from ..diffusion import sds
 from ..host import BaseObject, C, item_seed, validate_schedule, warn
 
 

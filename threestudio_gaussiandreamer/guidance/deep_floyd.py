@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..host import register, register_builtin
-from ..prompt_processors import DEEP_FLOYD
+from ..prompts.prompt_processors import DEEP_FLOYD
 from .text_to_image import TextToImageDistillation
 
 

@@ -38,12 +38,12 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from ..cameras import OrbitRanges, camera_pool
-from ..errors import UserError, unknown
-from ..exact_score import LinearLatent, color_matrix, denoise, squared_distances
+from ..core.errors import UserError, unknown
+from ..diffusion.exact_score import LinearLatent, color_matrix, denoise, squared_distances
 from ..host import register
-from ..meshes import AXES, load_mesh
-from ..raycast import MeshCaster, TargetCache, over_background
-from ..view_prompts import view_directions
+from ..meshes.load import AXES, load_mesh
+from ..meshes.raycast import MeshCaster, TargetCache, over_background
+from ..prompts.view_prompts import view_directions
 from .base import ScoreDistillation
 
 MODES = ("view-exact", "direction-bins", "view-agnostic")

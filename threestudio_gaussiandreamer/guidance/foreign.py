@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ..errors import UserError
+from ..core.errors import UserError
+from ..core.streams import derive_seed
 from ..host import item_seed
-from ..streams import derive_seed
 
 
 def call_guidance(guidance: Any, rgb: Float[Tensor, "B H W 3"], prompt_utils: Any, batch: dict[str, Any], **options: Any) -> dict[str, Any]:

@@ -20,10 +20,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from ..errors import UserError
+from ..core.errors import UserError
+from ..core.streams import normal_per_item
 from ..host import item_seed, register, register_builtin, warn
-from ..prompt_processors import STABLE_DIFFUSION
-from ..streams import normal_per_item
+from ..prompts.prompt_processors import STABLE_DIFFUSION
 from .base import NonFiniteScore
 from .half_precision import GradientBorder
 from .text_to_image import TextToImageDistillation

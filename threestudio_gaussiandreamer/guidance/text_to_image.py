@@ -28,11 +28,12 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from .. import extras, sds
-from ..errors import UserError, unknown
+from ..core.errors import UserError, unknown
+from ..diffusion import sds
 from ..host import debug, info, parse_structured
-from ..hub import find_model
-from ..model_files import load_network, load_settings
+from ..models import extras
+from ..models.hub import find_model
+from ..models.model_files import load_network, load_settings
 from .base import ScoreDistillation
 from .half_precision import weights_type
 

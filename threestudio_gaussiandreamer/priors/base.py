@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..errors import UserError
+from ..core.errors import UserError
+from ..core.streams import numpy_generator
+from ..gaussians.point_cloud import PointCloud
 from ..host import BaseObject, run_seed
-from ..meshes import _pose
-from ..point_cloud import PointCloud
-from ..streams import numpy_generator
+from ..meshes.load import _pose
 
 logger = logging.getLogger(__name__)
 

@@ -25,10 +25,10 @@ from typing import Any, Optional
 
 import numpy as np
 
-from ..files import existing_file
+from ..core.files import existing_file
+from ..gaussians.point_cloud import PointCloud
 from ..host import register
-from ..meshes import load_mesh
-from ..point_cloud import PointCloud
+from ..meshes.load import load_mesh
 from .base import Prior, chosen_colors, require_axes, require_color, require_not_negative, require_path, require_positive
 from .mesh import mesh_cloud
 

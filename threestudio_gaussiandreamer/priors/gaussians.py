@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import UserError
-from ..files import existing_file
+from ..core.errors import UserError
+from ..core.files import existing_file
+from ..formats.ply import GaussianArrays, opaque, read_gaussians, sh0_colors, usable
+from ..gaussians.point_cloud import PointCloud
 from ..host import register
-from ..ply import GaussianArrays, opaque, read_gaussians, sh0_colors, usable
-from ..point_cloud import PointCloud
 from .base import Prior, is_number, report_non_finite, require_path
 
 

@@ -24,9 +24,9 @@ from typing import Any, Optional
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..gaussians.point_cloud import PointCloud
 from ..host import register
-from ..meshes import Mesh, load_mesh, sample_surface, surface_colors
-from ..point_cloud import PointCloud
+from ..meshes.load import Mesh, load_mesh, sample_surface, surface_colors
 from .base import Prior, chosen_colors, require_axes, require_color, require_not_negative, require_path, require_positive
 
 logger = logging.getLogger(__name__)

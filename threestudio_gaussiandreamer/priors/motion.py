@@ -35,17 +35,17 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from .. import extras
 from ..cameras import orbit_c2w
-from ..errors import UserError
-from ..files import existing_file
+from ..core.errors import UserError
+from ..core.files import existing_file
+from ..gaussians.point_cloud import PointCloud
 from ..host import info, register, warn
-from ..hub import Source, locate
-from ..meshes import Mesh, load_mesh
-from ..point_cloud import PointCloud
-from ..raycast import MeshCaster, over_background
+from ..meshes.load import Mesh, load_mesh
+from ..meshes.raycast import MeshCaster, over_background
+from ..models import extras
+from ..models.clip import clip_source, picture_similarities
+from ..models.hub import Source, locate
 from .base import Prior, chosen_colors, require_color, require_not_negative, require_positive
-from .clip import clip_source, picture_similarities
 from .mesh import face_normals, mesh_cloud
 from .motion_files import Motions, read_motions
 from .motion_text import reduced_prompt

@@ -14,9 +14,9 @@ from typing import NamedTuple, Optional
 import numpy as np
 from jaxtyping import Float
 
-from ..array_files import PickledArray, read_arrays
-from ..errors import UserError
-from ..files import existing_file
+from ..core.errors import UserError
+from ..core.files import existing_file
+from ..formats.array_files import PickledArray, read_arrays
 
 JOINT_COUNTS = (22, 24)
 CONVERT = (

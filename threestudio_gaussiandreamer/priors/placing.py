@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 
-from ..errors import UserError, unknown
-from ..grow import half_longest_side
-from ..meshes import AXES
-from ..point_cloud import PointCloud
+from ..core.errors import UserError, unknown
+from ..gaussians.grow import half_longest_side
+from ..gaussians.point_cloud import PointCloud
+from ..meshes.load import AXES
 
 HORIZONTAL = ("+x", "-x", "+y", "-y")
 

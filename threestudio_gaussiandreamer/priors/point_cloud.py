@@ -24,14 +24,14 @@ from typing import Any, Optional
 import numpy as np
 from jaxtyping import Float
 
-from ..array_files import read_arrays
-from ..errors import UserError, unknown
-from ..files import existing_file
-from ..grow import half_longest_side
+from ..core.errors import UserError, unknown
+from ..core.files import existing_file
+from ..formats.array_files import read_arrays
+from ..formats.ply import read_points, unit_colors
+from ..gaussians.grow import half_longest_side
+from ..gaussians.point_cloud import PointCloud
 from ..host import register
-from ..meshes import _pose
-from ..ply import read_points, unit_colors
-from ..point_cloud import PointCloud
+from ..meshes.load import _pose
 from .base import GREY, Prior, require_axes, require_path, require_positive
 
 logger = logging.getLogger(__name__)

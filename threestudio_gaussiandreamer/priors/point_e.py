@@ -36,15 +36,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .. import extras
-from ..errors import UserError
-from ..files import existing_file
+from ..core.errors import UserError
+from ..core.files import existing_file
+from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
-from ..hub import Source, locate
-from ..model_files import free_memory
-from ..point_cloud import PointCloud
+from ..models import extras
+from ..models.clip import clip_source, load_text_encoder, load_tokenizer, text_condition
+from ..models.hub import Source, locate
+from ..models.model_files import free_memory
 from .base import Prior, is_number, require_positive
-from .clip import clip_source, load_text_encoder, load_tokenizer, text_condition
 from .karras import Network, cosine_alphas_cumprod, guided_denoiser, karras_sigmas, linear_alphas_cumprod, sample_heun
 from .placing import check_front, chosen_device, placed, torch_generator
 from .point_e_model import CHANNELS, HEAD_CHANNELS, BaseModel, Upsampler, sizes_of

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import UserError, unknown
+from ..core.errors import UserError, unknown
+from ..gaussians.point_cloud import PointCloud
 from ..host import register
-from ..point_cloud import PointCloud
 from .base import Prior, chosen_colors, require_color, require_positive
 
 

@@ -43,15 +43,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .. import extras
-from ..errors import UserError, unknown
-from ..files import existing_file
+from ..core.errors import UserError, unknown
+from ..core.files import existing_file
+from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
-from ..hub import Source, locate
-from ..model_files import free_memory, load_network, load_settings, needed_files
-from ..point_cloud import PointCloud
+from ..models import extras
+from ..models.clip import load_text_encoder, load_tokenizer, text_condition
+from ..models.hub import Source, locate
+from ..models.model_files import free_memory, load_network, load_settings, needed_files
 from .base import Prior, require_positive
-from .clip import load_text_encoder, load_tokenizer, text_condition
 from .karras import Network, guided_denoiser, karras_sigmas, sample_heun
 from .placing import check_front, chosen_device, placed, torch_generator
 from .shap_e_checkpoint import load_original_prior

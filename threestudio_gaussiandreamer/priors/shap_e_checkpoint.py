@@ -10,7 +10,7 @@ import re
 import torch
 from torch import Tensor, nn
 
-from ..errors import UserError
+from ..core.errors import UserError
 from .weights import load_exactly, named, read_state_dict
 
 PREFIX = "wrapped."

@@ -22,10 +22,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .. import extras
-from ..array_files import read_arrays
-from ..errors import UserError
-from ..files import existing_file
+from ..core.errors import UserError
+from ..core.files import existing_file
+from ..formats.array_files import read_arrays
+from ..models import extras
 
 FIELDS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 """Arrays of a body model's file that are used."""

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import UInt8
 
 from ..cameras import orbit_c2w, to_opencv
-from ..files import atomic_file
-from ..grow import nearest_distance_scales
-from ..point_cloud import PointCloud
+from ..core.files import atomic_file
+from ..gaussians.grow import nearest_distance_scales
+from ..gaussians.point_cloud import PointCloud
 from ..splatting import rasterize
 
 ELEVATION, FOVY = 15.0, math.radians(40)

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 import torch
 from torch import Tensor, nn
 
-from ..errors import UserError
-from ..files import existing_file
+from ..core.errors import UserError
+from ..core.files import existing_file
 
 WRAPPER = "model_state_dict"
 """The key of the weights where a file of training holds more than them."""

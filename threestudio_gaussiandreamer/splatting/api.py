@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..errors import UserError, unknown
+from ..core.errors import UserError, unknown
 from .options import RasterizeOptions
 from .output import Rasterized
 
@@ -43,8 +43,8 @@ class Backend:
 
 # In order of preference for "auto"; the specification is only used when it is asked for.
 BACKENDS = {
-    "cpu": Backend("cpu", devices=("cpu",), dtypes=(torch.float32,)),
-    "cuda": Backend("cuda", devices=("cuda",), dtypes=(torch.float32,)),
+    "cpu": Backend("cpu.backend", devices=("cpu",), dtypes=(torch.float32,)),
+    "cuda": Backend("cuda.backend", devices=("cuda",), dtypes=(torch.float32,)),
     "torch": Backend("torch_backend"),
     "reference": Backend("reference"),
 }

@@ -1,0 +1,152 @@
+"""Arrays to 8 bit RGB pictures, and pictures to files: colour maps, grids, captions, videos."""
+
+import os
+import struct
+from pathlib import Path
+from typing import Any, Optional
+
+import numpy as np
+
+from .errors import UserError
+from .files import atomic_file
+
+# knots of the colour maps at equal distances over [0,1]
+_COLOR_MAPS = {
+    "jet": "000080 0000ff 0080ff 00ffff 80ff80 ffff00 ff8000 ff0000 800000",
+    "magma": "000004 1c1044 4f127b 812581 b5367a e55064 fb8761 fec287 fcfdbf",
+}
+
+
+def rgb(image: np.ndarray, *, data_format: str = "HWC", data_range: tuple[float, float] = (0, 1)) -> np.ndarray:
+    """(H,W,C) or (C,H,W) to uint8 (H, W*ceil(C/3), 3): channels three by three side by side, missing ones black."""
+    if data_format not in ("HWC", "CHW"):
+        raise ValueError(f"data_format is {data_format!r}; expected 'HWC' or 'CHW'")
+    if data_format == "CHW":
+        image = image.transpose(1, 2, 0)
+    image = image if image.dtype == np.uint8 else _to_bytes(_normalize(image, data_range))
+    missing = -image.shape[-1] % 3
+    image = np.concatenate([image, np.zeros((*image.shape[:-1], missing), np.uint8)], axis=-1)
+    return np.concatenate(np.split(image, image.shape[-1] // 3, axis=-1), axis=1)
+
+
+def grayscale(image: np.ndarray, *, data_range: Optional[tuple[float, float]] = None, cmap: Optional[str] = "jet") -> np.ndarray:
+    """(H,W) to uint8 (H,W,3); without ``data_range`` from the smallest value to the largest."""
+    image = np.nan_to_num(image)
+    values = _normalize(image, data_range or (image.min(), image.max()))
+    if cmap is None:
+        return np.repeat(_to_bytes(values)[..., None], 3, axis=-1)
+    if cmap not in _COLOR_MAPS:
+        raise ValueError(f"unknown colour map {cmap!r}; expected None or one of {', '.join(_COLOR_MAPS)}")
+    knots = np.array([list(bytes.fromhex(knot)) for knot in _COLOR_MAPS[cmap].split()], dtype=np.float64)
+    positions = np.linspace(0, 1, len(knots))
+    return np.stack([np.interp(values, positions, knots[:, c]) for c in range(3)], axis=-1).round().astype(np.uint8)
+
+
+def grid(cells: list, *, align: Any = "max") -> np.ndarray:
+    """A row of ``{"type", "img", "kwargs"}``, or a list of rows, as one picture.
+
+    ``align`` is the size of every cell: "max" or "min" of the cells, a number of pixels, or (height, width).
+    """
+    if isinstance(cells[0], list):
+        rows = [grid(row, align=align) for row in cells]
+        width = max(row.shape[1] for row in rows)
+        return np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows], axis=0)
+    makers = {"rgb": rgb, "grayscale": grayscale}
+    images = [makers[cell["type"]](cell["img"], **cell.get("kwargs", {})) for cell in cells]
+    height, width = _cell_size(images, align)
+    return np.concatenate([_resize(image, height, width) for image in images], axis=1)
+
+
+def with_texts(image: np.ndarray, texts: list) -> np.ndarray:
+    """The picture with one line of text at the top of each of ``len(texts)`` equal bands."""
+    from PIL import Image, ImageDraw
+
+    canvas = Image.fromarray(image)
+    draw = ImageDraw.Draw(canvas)
+    for row, text in enumerate(texts):
+        draw.text((2, row * (image.shape[0] // len(texts))), str(text), fill=(0, 0, 0), stroke_width=1, stroke_fill=(255, 255, 255))
+    return np.asarray(canvas)
+
+
+def write(path: str | os.PathLike, image: np.ndarray) -> None:
+    """One picture, uint8 or uint16, in the format of the extension.
+
+    Raises:
+        UserError: the disk is full or the folder can't be written.
+    """
+    import imageio.v3 as iio
+
+    content = iio.imwrite("<bytes>", image, extension=Path(path).suffix)
+    with atomic_file(path, durable=False) as file:
+        file.write(content)
+
+
+def write_video(path: str, frames: list[Path], *, fps: int) -> None:
+    """The pictures as an mp4 (H.264) or gif; odd sizes are padded to even ones, which H.264 asks for.
+
+    Raises:
+        UserError: the disk is full, or there is no ffmpeg.
+    """
+    import imageio.v2 as imageio
+
+    mp4, part = path.endswith(".mp4"), Path(path).with_name(f".part-{Path(path).name}")
+    options = {"fps": fps, "macro_block_size": 1} if mp4 else {"duration": 1000 / fps, "loop": 0}
+    try:
+        with imageio.get_writer(part, mode="I", **options) as writer:
+            for frame in frames:
+                image = imageio.imread(frame)[..., :3]
+                writer.append_data(_even(image) if mp4 else image)
+        if mp4:
+            _require_whole_mp4(part)
+        os.replace(part, path)
+    except (OSError, RuntimeError) as error:
+        raise UserError(f"the video {path} could not be written: {error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _require_whole_mp4(path: Path) -> None:
+    """Raise OSError unless ffmpeg came to its end, which nobody asks it: its boxes fill the file, and the index is among them."""
+    names, place, size = [], 0, path.stat().st_size
+    with open(path, "rb") as file:
+        while place + 8 <= size:
+            file.seek(place)
+            length, name = struct.unpack(">I4s", file.read(8))
+            if length == 1:  # the length of a large box follows
+                (length,) = struct.unpack(">Q", file.read(8))
+            names.append(name)
+            place += length or size - place  # 0: to the end
+    if place != size or b"moov" not in names:
+        raise OSError("ffmpeg ended in the middle of it; is the disk full?")
+
+
+def _normalize(image: np.ndarray, data_range: tuple[float, float]) -> np.ndarray:
+    low, high = data_range
+    # a constant picture is black, not 0/0
+    return (np.clip(np.nan_to_num(image), low, high) - low) / ((high - low) or 1)
+
+
+def _to_bytes(values: np.ndarray) -> np.ndarray:
+    return (values * 255).round().astype(np.uint8)
+
+
+def _even(image: np.ndarray) -> np.ndarray:
+    height, width = image.shape[:2]
+    return np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
+def _cell_size(images: list[np.ndarray], align: Any) -> tuple[int, int]:
+    heights, widths = np.array([image.shape[:2] for image in images]).T
+    if align == "max":
+        return int(heights.max()), int(widths.max())
+    if align == "min":
+        return int(heights.min()), int(widths.min())
+    return (align, align) if isinstance(align, int) else tuple(align)
+
+
+def _resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    if image.shape[:2] == (height, width):
+        return image
+    from PIL import Image
+
+    return np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BILINEAR))

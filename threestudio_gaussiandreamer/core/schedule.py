@@ -1,0 +1,124 @@
+"""Values that change during training: ``C(value, epoch, global_step)`` and the check of what may be written for one.
+
+==========================================  ==================================================================
+``5`` or ``0.5``                            constant
+``[v0, v1, end]``                           the same as ``[0, v0, v1, end]``
+``[s0, v0, v1, s1]``                        v0 until s0, linear to v1 at s1, then v1
+``[s0, v0, v1, s1, v2, s2, ...]``           piecewise linear through (s0, v0), (s1, v1), (s2, v2), ...
+==========================================  ==================================================================
+
+Integer end steps count optimiser steps, fractional ones (``10.0``) epochs.
+"""
+
+import math
+from numbers import Real
+from typing import Any, NamedTuple
+
+from .errors import UserError
+
+FORMS = "a number, [v0, v1, end], [s0, v0, v1, s1] or [s0, v0, v1, s1, v2, s2, ...]"
+
+
+class Schedule(NamedTuple):
+    """Knots of a piecewise linear function; ``steps`` strictly increasing, counted in epochs or in optimiser steps."""
+
+    steps: list[float]
+    values: list[float]
+    in_epochs: bool
+
+
+def C(value: Any, epoch: int, global_step: int, interpolation: str = "linear") -> float:
+    """The value of a schedule at this moment of training; ``interpolation`` is "linear" or "exp" (between positive values).
+
+    Raises:
+        UserError: ``value`` is no schedule.
+    """
+    if _is_number(value):
+        return _finite(value, "the schedule")
+    schedule = parse_schedule(value)
+    return _interpolate(schedule, epoch if schedule.in_epochs else global_step, interpolation)
+
+
+def C_max(value: Any) -> float:
+    """The largest value that a schedule takes."""
+    return max(parse_schedule(value).values)
+
+
+def validate_schedule(value: Any, name: str = "the schedule", minimum: float = -math.inf) -> Any:
+    """``value`` itself when it can be given to :func:`C` and never falls below ``minimum``.
+
+    Raises:
+        UserError: it can't, or does; the message names it by ``name``.
+    """
+    lowest = min(parse_schedule(value, name).values)
+    if lowest < minimum:
+        raise UserError(f"{name}: expected values of {minimum:g} or more, got {lowest:g}")
+    return value
+
+
+def parse_schedule(value: Any, name: str = "the schedule") -> Schedule:
+    """The knots that ``value`` (a number, list, tuple or ListConfig) stands for.
+
+    Raises:
+        UserError: wrong length, something that isn't a finite number, or steps that don't increase.
+    """
+    if _is_number(value):
+        return Schedule([0], [_finite(value, name)], in_epochs=False)
+    knots = _as_list(value, name)
+    if len(knots) == 3:
+        knots = [0, *knots]
+    if len(knots) < 4 or len(knots) % 2:
+        raise UserError(f"{name} has {len(knots)} elements: {value}; expected {FORMS}")
+    knots = [_finite(knot, name) for knot in knots]
+    # the first pair is (step, value), all later ones (value, step)
+    steps, values, ends = [knots[0], *knots[3::2]], [knots[1], *knots[2::2]], knots[3::2]
+    return Schedule(_increasing(steps, name), values, in_epochs=_in_epochs(ends, name))
+
+
+def _interpolate(schedule: Schedule, now: float, interpolation: str) -> float:
+    steps, values, _ = schedule
+    if now <= steps[0]:
+        return values[0]
+    for i in range(1, len(steps)):
+        if now < steps[i]:
+            t = (now - steps[i - 1]) / (steps[i] - steps[i - 1])
+            return _between(values[i - 1], values[i], t, interpolation)
+    return values[-1]
+
+
+def _between(start: float, end: float, t: float, interpolation: str) -> float:
+    if interpolation == "linear":
+        return start + (end - start) * t
+    if interpolation == "exp":
+        return math.exp(math.log(start) * (1 - t) + math.log(end) * t)
+    raise UserError(f"unknown interpolation {interpolation!r}: expected 'linear' or 'exp'")
+
+
+def _as_list(value: Any, name: str) -> list:
+    # a ListConfig is neither list nor tuple, but a sequence of plain numbers when iterated
+    if isinstance(value, (str, bytes, dict)) or not hasattr(value, "__len__") or hasattr(value, "keys"):
+        raise UserError(f"{name} is {value!r}; expected {FORMS}")
+    return list(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _finite(value: Any, name: str) -> float:
+    if not _is_number(value) or not math.isfinite(value):
+        raise UserError(f"{name} contains {value!r}, which isn't a finite number; expected {FORMS}")
+    return value
+
+
+def _increasing(steps: list[float], name: str) -> list[float]:
+    if any(later <= earlier for earlier, later in zip(steps, steps[1:], strict=False)):
+        raise UserError(f"{name}: its steps {steps} must increase (for a hard switch write [500, v0, v1, 501])")
+    return steps
+
+
+def _in_epochs(ends: list[float], name: str) -> bool:
+    fractional = [isinstance(end, float) for end in ends]
+    if any(fractional) and not all(fractional):
+        raise UserError(f"{name} mixes integer end steps (optimiser steps) and fractional ones (epochs): {ends}")
+    return all(fractional)

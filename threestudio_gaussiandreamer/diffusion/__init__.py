@@ -1,0 +1,1 @@
+"""Formulas of score distillation and of the exact score."""

@@ -1,0 +1,1 @@
+"""Measure finished runs."""

@@ -1,0 +1,130 @@
+"""Results as T3Bench's own scripts take them: a mesh, and its views as pictures, in the folders that it looks into.
+
+Its ``run_eval_quality.py`` and ``run_caption.py`` look for a mesh of each prompt of ``data/prompt_<group>.txt`` in
+``outputs_mesh_t3/<method>_<group>/<prompt with _ for spaces>*/save/it*-export/model.obj``, have ``render/meshrender.py``
+or ``render/meshrender_cap.py`` draw it, and score the pictures ``<vertex>_<camera>.png`` and ``<vertex>.png``. The mesh written here
+is the surface of the Gaussians (``surface.py``), and that is all the published scripts need. What Gaussians show beyond their surface
+is in the pictures, rendered by our rasteriser with the same cameras: the two scripts in the folder ``render_gaussians``, put in
+the place of those in ``render``, hand them over.
+
+Quality: 162 vertices of an icosphere of radius 2.2, five fields of view each. Captions: the 12 vertices of an icosahedron at
+2.2^2, 60 degrees (its script multiplies by the radius twice). 512 pixels, black behind; the object centred on the mean of its points
+and scaled to [-1, 1]. Of a mesh that means the vertices; of Gaussians the centres of those that are at least ``MIN_OPACITY`` opaque.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from ..cameras import look_at
+from ..core import images as files_of_pictures
+from ..core.errors import UserError
+from ..formats.ply import GaussianArrays, opaque
+from ..gaussians.surface import gaussian_surface, write_obj
+from .results import Pictures, Result, read_result
+
+RADIUS = 2.2
+QUALITY_FOVY = tuple(math.pi / part for part in (3.0, 4.0, 5.0, 6.0, 7.5))
+CAPTION_FOVY = math.pi / 3
+MIN_OPACITY = 0.1
+NEAR_POLE = 0.99
+STAND_IN = '''"""In place of T3Bench's script of this name: copies pictures rendered beforehand, black ones where there are none."""
+
+import argparse
+import shutil
+from pathlib import Path
+
+from PIL import Image
+
+parser = argparse.ArgumentParser()
+parser.add_argument("--path", type=str, required=True)
+parser.add_argument("--name", type=str)
+args = parser.parse_args()
+found = sorted((Path(args.path).parent.parent / "t3bench" / "{kind}").glob("*.png"))
+for picture in found:
+    shutil.copy(picture, args.name)
+if not found:
+    for name in {names}:
+        Image.new("RGB", ({size}, {size})).save(Path(args.name) / name)
+'''
+
+
+def write_t3bench(folder: Path, results: Sequence[Result], prompts: Sequence[str], *, method: str, group: str, size: int = 512) -> None:
+    """Write everything below ``folder``, a checkout of T3Bench; none of its own files is touched.
+
+    Raises:
+        UserError: a prompt can't be the name of a folder, or nothing can be written.
+    """
+    if bad := [prompt for prompt in prompts if "/" in prompt]:
+        raise UserError(f"T3Bench names folders after prompts, and {bad[0]!r} has a slash: leave it out, or reword it")
+    try:
+        _write_stand_ins(folder / "render_gaussians", size)
+        for result, prompt in zip(results, prompts, strict=True):
+            save = folder / "outputs_mesh_t3" / f"{method}_{group}" / prompt.replace(" ", "_") / "save"
+            _write_result(save, normalized(read_result(result)), size)
+            print(f"T3Bench: {save}", flush=True)
+    except OSError as error:
+        raise UserError(f"--t3bench {folder} can't be written: {error.strerror or error}") from error
+
+
+def _write_stand_ins(folder: Path, size: int) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for script, kind, names in (("meshrender.py", "quality", quality_names()), ("meshrender_cap.py", "caption", caption_names())):
+        (folder / script).write_text(STAND_IN.format(kind=kind, names=names, size=size), encoding="utf-8")
+
+
+def _write_result(save: Path, arrays: GaussianArrays, size: int) -> None:
+    pictures = Pictures(arrays)
+    quality = icosphere(2, RADIUS)
+    _write_views(save / "t3bench" / "quality", pictures, quality_names(), np.repeat(quality, len(QUALITY_FOVY), 0), QUALITY_FOVY, size)
+    _write_views(save / "t3bench" / "caption", pictures, caption_names(), icosphere(0, RADIUS) * RADIUS, (CAPTION_FOVY,), size)
+    export = save / "it0-export"
+    export.mkdir(parents=True, exist_ok=True)
+    write_obj(export / "model.obj", gaussian_surface(arrays))
+
+
+def _write_views(
+    folder: Path, pictures: Pictures, names: list[str], positions: Float[np.ndarray, "V 3"], fovy: Sequence[float], size: int
+) -> None:
+    """The pictures ``names``, from ``positions`` to the origin; the fields of view take turns."""
+    folder.mkdir(parents=True, exist_ok=True)
+    angles, remaining = torch.tensor(fovy).repeat(len(positions) // len(fovy)), iter(names)
+    for images in pictures.render(towards_origin(positions), angles, size, chunk=8):
+        for image in images:
+            files_of_pictures.write(folder / next(remaining), (image * 255).round().astype(np.uint8))
+
+
+def quality_names() -> list[str]:
+    return [f"{vertex:03d}_{camera}.png" for vertex in range(162) for camera in range(len(QUALITY_FOVY))]
+
+
+def caption_names() -> list[str]:
+    return [f"{vertex:03d}.png" for vertex in range(12)]
+
+
+def icosphere(subdivisions: int, radius: float) -> Float[np.ndarray, "V 3"]:
+    """The vertices in trimesh's order, which T3Bench's script also takes for neighbours."""
+    import trimesh
+
+    return np.asarray(trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius).vertices)
+
+
+def towards_origin(positions: Float[np.ndarray, "V 3"]) -> Float[torch.Tensor, "V 4 4"]:
+    """OpenGL ``c2w`` with +z up in the picture; +y near the poles, as in T3Bench."""
+    place = torch.from_numpy(positions).float()
+    at_pole = (place[:, 2] / place.norm(dim=1)).abs() >= NEAR_POLE
+    up = torch.where(at_pole[:, None], torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 0.0, 1.0]))
+    return look_at(place, torch.zeros_like(place), up)
+
+
+def normalized(arrays: GaussianArrays) -> GaussianArrays:
+    """The cloud moved and scaled so that the centres of its visible Gaussians have mean 0 and lie in [-1, 1]^3."""
+    visible = opaque(arrays, MIN_OPACITY)
+    means = arrays.means[visible] if visible.any() else arrays.means
+    centre = means.mean(axis=0)
+    half_side = np.abs(means - centre).max() or 1.0
+    return arrays._replace(means=(arrays.means - centre) / half_side, log_scales=arrays.log_scales - np.log(half_side))

@@ -1,0 +1,269 @@
+"""SPZ, the compact file of Gaussians that web viewers read: about 17 bytes for a Gaussian of degree 0, where a PLY takes 68.
+
+The format is Niantic's (github.com/nianticlabs/spz, MIT). Version 3 is written, 2 and 3 are read; both are gzip around a header and
+one block for each attribute. Integers are little-endian, quaternions in the order xyzw, axes right, up, back:
+
+==========  ==========================================================================================================
+header      ``NGSP``, version u32, N u32, degree of the harmonics u8, fractional bits u8, flags u8 (1: antialiased), 0
+positions   N x 3 fixed point of 24 bit, signed
+alphas      N u8: 255 opacity
+colors      N x 3 u8: 255 (0.15 sh + 0.5)
+scales      N x 3 u8: 16 (log scale + 10), so sizes from e^-10 to e^5.9 world units
+rotations   N u32: the number of the largest component, and sign and 9 bit of each other (version 2: x y z u8)
+harmonics   N x (K - 1) x 3 u8: 128 sh + 128, of which 5 bit are used at degree 1, 4 above
+==========  ==========================================================================================================
+
+The reader believes no count that the file's size can't hold. What rounding costs: docs/parsimony.md.
+"""
+
+import os
+import struct
+import zlib
+from math import ceil, isqrt, log, log2, sqrt
+from typing import NamedTuple, NoReturn
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..core.errors import UserError
+from ..core.files import atomic_file, existing_file
+from .ply import GaussianArrays, usable
+
+HEADER = struct.Struct("<4sIIBBBB")
+MAGIC, VERSION = b"NGSP", 3
+STEPS_PER_SIZE = 32
+"""Positions are kept to this part, at least, of the median Gaussian's size: where the curve of docs/parsimony.md has become flat."""
+MOST_DEFLATE_SAVES = 1032
+"""Bytes that one byte of a deflate stream stands for at most (zlib's technical notes)."""
+COLOR_SCALE = 0.15
+COLOR_REACH = 0.5 / COLOR_SCALE
+"""The largest constant harmonic that is stored, either way: colours from -0.44 to 1.44."""
+SH_BITS = (5, 4, 4)
+"""By degree from 1 on."""
+OPACITY_MARGIN = 1 / 2040
+"""Opacities are read no closer to 0 and 1, an eighth of a step, where the logit is infinite."""
+
+
+class SpzHeader(NamedTuple):
+    """The header of an SPZ file."""
+
+    magic: bytes
+    version: int
+    count: int
+    degree: int
+    fractional_bits: int
+    flags: int
+    reserved: int
+
+    @property
+    def blocks(self) -> list[int]:
+        """Bytes per Gaussian: positions, alphas, colours, scales, rotations, harmonics."""
+        return [9, 1, 3, 3, 4 if self.version == 3 else 3, 3 * ((self.degree + 1) ** 2 - 1)]
+
+
+def write_spz(path: str | os.PathLike, *, comment: str = "", **arrays: np.ndarray) -> None:
+    """Write :func:`spz_bytes`, whole or not at all.
+
+    Raises:
+        UserError: the Gaussians can't be stored, or the file can't be written.
+    """
+    data = spz_bytes(GaussianArrays(**arrays), comment=comment)
+    with atomic_file(path) as file:
+        file.write(data)
+
+
+def spz_bytes(arrays: GaussianArrays, *, comment: str = "") -> bytes:
+    """Gaussians as an SPZ file of version 3, their order along a Morton curve, in which neighbours resemble each other.
+
+    Args:
+        arrays: in the axes right, up, back.
+        comment: kept in the header of gzip, where no reader minds it; ASCII.
+
+    Raises:
+        UserError: NaN or infinite values, positions too large for the format, or harmonics above degree 3.
+    """
+    if not usable(arrays).all():
+        raise UserError("an SPZ file can't hold Gaussians with NaN or infinite values")
+    if arrays.sh.shape[1] > 16:
+        raise UserError(f"an SPZ file holds harmonics up to degree 3, not {isqrt(arrays.sh.shape[1]) - 1}")
+    order = _morton_order(arrays.means)
+    arrays = GaussianArrays(*(values[order] for values in arrays))
+    fractional = _fractional_bits(arrays)
+    header = HEADER.pack(MAGIC, VERSION, len(arrays.means), isqrt(arrays.sh.shape[1]) - 1, fractional, 0, 0)
+    fixed = np.rint(arrays.means.astype(np.float64) * 2.0**fractional).astype("<i4")
+    blocks = [
+        fixed[..., None].view("u1")[..., :3],
+        _to_byte(255 * _opacities(arrays.logit_opacities)),
+        _to_byte(255 * (COLOR_SCALE * arrays.sh[:, 0] + 0.5)),
+        _to_byte(16 * (arrays.log_scales + 10)),
+        _smallest_three(arrays.quats),
+        _harmonic_bytes(arrays.sh[:, 1:]),
+    ]
+    return _gzip(header + b"".join(np.ascontiguousarray(block).tobytes() for block in blocks), comment)
+
+
+def read_spz(path: str | os.PathLike) -> GaussianArrays:
+    """The Gaussians of an SPZ file of version 2 or 3, in its axes: right, up, back.
+
+    Raises:
+        UserError: no such file, not an SPZ file of these versions, or damaged.
+    """
+    path = existing_file(path, "SPZ file")
+    try:
+        return spz_arrays(path.read_bytes(), str(path))
+    except OSError as error:
+        raise UserError(f"cannot read {str(path)!r}: {error.strerror or error}.") from error
+
+
+def spz_arrays(packed: bytes, name: str = "") -> GaussianArrays:
+    """The Gaussians in the bytes of an SPZ file, which messages call by its ``name``; see :func:`read_spz`."""
+    header, data = _unpacked(packed, name)
+    ends = np.cumsum([size * header.count for size in header.blocks])
+    parts = [part.reshape(header.count, size) for part, size in zip(np.split(data, ends[:-1]), header.blocks, strict=True)]
+    positions, alphas, colors, scales, rotations, harmonics = parts
+    constant = (colors / np.float32(255) - np.float32(0.5)) / np.float32(COLOR_SCALE)
+    rest = (harmonics.reshape(header.count, header.blocks[-1] // 3, 3).astype(np.float32) - 128) / 128
+    return GaussianArrays(
+        means=_positions(positions, header.fractional_bits),
+        sh=np.concatenate([constant[:, None], rest], axis=1),
+        logit_opacities=_logits(alphas[:, 0]),
+        log_scales=scales / np.float32(16) - 10,
+        quats=_from_smallest_three(rotations) if header.version == 3 else _from_first_three(rotations),
+    )
+
+
+def read_spz_comment(path: str | os.PathLike) -> str:
+    """The comment that :func:`spz_bytes` kept; empty where there is none."""
+    with open(path, "rb") as file:
+        head = file.read(4096)
+    has_comment_alone = head[:2] == b"\x1f\x8b" and head[3:4] == b"\x10"
+    return head[10:].partition(b"\0")[0].decode("latin-1") if has_comment_alone else ""
+
+
+def _unpacked(packed: bytes, name: str) -> tuple[SpzHeader, Int[np.ndarray, " B"]]:
+    """Header and blocks; no more is unpacked than the header announces, and it may announce no more than deflate can pack."""
+    if packed[:4] == MAGIC:
+        _fail(name, "version 4, packed with Zstandard, isn't known here: versions 2 and 3 are. Niantic's tools write version 3 too.")
+    stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
+    try:
+        header = SpzHeader._make(HEADER.unpack(stream.decompress(packed, HEADER.size)))
+        _check_header(header, len(packed), name)
+        size = sum(header.blocks) * header.count
+        data = stream.decompress(stream.unconsumed_tail, size) if size else b""
+        while not stream.eof and stream.decompress(stream.unconsumed_tail, 1 << 16):
+            pass  # to the end, where the checksum is: extensions may follow what the header announces
+    except (zlib.error, struct.error) as error:
+        _fail(name, f"it isn't an SPZ file, or damaged ({error}).")
+    if len(data) < size or not stream.eof:
+        _fail(name, f"{header.count} Gaussians need {size} bytes, but {len(data)} are there: it is truncated or damaged.")
+    return header, np.frombuffer(data, "u1")
+
+
+def _check_header(header: SpzHeader, packed_size: int, name: str) -> None:
+    if header.magic != MAGIC or header.version not in (2, 3):
+        _fail(name, "it isn't an SPZ file of version 2 or 3.")
+    if header.degree > 3:
+        _fail(name, f"harmonics of degree {header.degree} are announced: 0 to 3 were expected.")
+    if sum(header.blocks) * header.count > MOST_DEFLATE_SAVES * packed_size:
+        _fail(name, f"{header.count} Gaussians are announced, but {packed_size} bytes can't hold them.")
+
+
+def _gzip(data: bytes, comment: str) -> bytes:
+    """The bytes as one gzip member (RFC 1952) without a time, so that equal clouds give equal files."""
+    deflate = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
+    note = comment.encode("ascii") + b"\0" if comment else b""
+    head = struct.pack("<4BIBB", 0x1F, 0x8B, 8, 16 if comment else 0, 0, 2, 255)
+    return head + note + deflate.compress(data) + deflate.flush() + struct.pack("<II", zlib.crc32(data), len(data) & 0xFFFFFFFF)
+
+
+# ---- the attributes as SPZ stores them -------------------------------------------------------------------------------------
+
+
+def _morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
+    """Rows in the order of the interleaved bits of their positions, 10 bits an axis."""
+    low, high = means.min(axis=0, initial=np.inf), means.max(axis=0, initial=-np.inf)
+    cells = ((means - low) / np.maximum(high - low, 1e-12) * 1023).astype(np.int64)
+    bits = cells[:, :, None] >> np.arange(10) & 1
+    return (bits << (3 * np.arange(10) + np.arange(3)[:, None])).sum(axis=(1, 2)).argsort(kind="stable")
+
+
+def _fractional_bits(arrays: GaussianArrays) -> int:
+    """Bits behind the point: by the size of the Gaussians, as far as 23 bits hold the largest coordinate.
+
+    Raises:
+        UserError: not even whole numbers can be stored.
+    """
+    if not len(arrays.means):
+        return 0
+    reach = max(float(np.abs(arrays.means).max()), 2.0**-40)
+    room = 23 - ceil(log2(reach * (1 + 1e-6)))
+    if room < 0:
+        raise UserError(f"an SPZ file can't hold positions as large as {reach:g}: 8388607 at most")
+    log_size = float(np.median(arrays.log_scales.clip(-50, 50).mean(axis=1)))
+    return min(room, max(0, ceil(log2(STEPS_PER_SIZE) - log_size / log(2))), 30)
+
+
+def _positions(block: Int[np.ndarray, "N 9"], fractional_bits: int) -> Float[np.ndarray, "N 3"]:
+    low, middle, high = block.reshape(-1, 3, 3).transpose(2, 0, 1).astype(np.int32)
+    fixed = low | middle << 8 | (high ^ 0x80) - 0x80 << 16
+    return (fixed * 2.0**-fractional_bits).astype(np.float32)
+
+
+def _smallest_three(quats: Float[np.ndarray, "N 4"]) -> Int[np.ndarray, " N"]:
+    xyzw = _unit(quats)[:, [1, 2, 3, 0]]
+    largest = np.abs(xyzw).argmax(axis=1)
+    xyzw *= np.where(xyzw[np.arange(len(xyzw)), largest] < 0, -1, 1)[:, None]
+    others = xyzw[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    fields = np.rint(np.abs(others) * (511 * sqrt(2))).astype(np.int64).clip(0, 511) | (others < 0) << 9
+    return (largest << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]).astype("<u4")
+
+
+def _from_smallest_three(block: Int[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
+    word = np.ascontiguousarray(block).view("<u4").astype(np.int64)
+    fields = word >> np.array([20, 10, 0]) & 1023
+    others = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / (511 * sqrt(2))
+    xyzw = np.empty((len(block), 4))
+    missing = np.arange(4) == word >> 30
+    xyzw[~missing] = others.ravel()
+    xyzw[missing] = np.sqrt(np.clip(1 - (others**2).sum(axis=1), 0, 1))
+    return xyzw[:, [3, 0, 1, 2]].astype(np.float32)
+
+
+def _from_first_three(block: Int[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4"]:
+    xyz = block / 127.5 - 1
+    w = np.sqrt(np.clip(1 - (xyz**2).sum(axis=1, keepdims=True), 0, 1))
+    return np.concatenate([w, xyz], axis=1).astype(np.float32)
+
+
+def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Int[np.ndarray, "N K 3"]:
+    """128 is zero; only multiples of the step of its degree are used, which pack better."""
+    degrees = np.sqrt(np.arange(1, rest.shape[1] + 1)).astype(int) - 1
+    steps = 2 ** (8 - np.array(SH_BITS))[degrees][:, None]
+    return _to_byte(np.floor((np.rint(128 * rest) + 128 + steps // 2) / steps) * steps)
+
+
+def _unit(quats: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
+    """Quaternions of length 1 in float64; one without length turns nothing."""
+    quats = np.array(quats, np.float64)
+    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+    return np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1), [1.0, 0, 0, 0])
+
+
+def _opacities(logits: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    from scipy.special import expit
+
+    return expit(logits.astype(np.float64))
+
+
+def _logits(alphas: Int[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    from scipy.special import logit
+
+    return logit(np.clip(alphas / 255, OPACITY_MARGIN, 1 - OPACITY_MARGIN)).astype(np.float32)
+
+
+def _to_byte(values: Float[np.ndarray, "*shape"]) -> Int[np.ndarray, "*shape"]:
+    return np.rint(np.clip(values, 0, 255)).astype("u1")
+
+
+def _fail(name: str, problem: str) -> NoReturn:
+    raise UserError(f"SPZ file {name!r}: {problem}")

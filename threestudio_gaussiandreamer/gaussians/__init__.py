@@ -1,0 +1,1 @@
+"""Operations on clouds of points and Gaussians: grow, densify, rank, merge, simplify, extract a surface."""

@@ -1,0 +1,143 @@
+"""Base classes of parts: a typed ``Config``, a device, and ``update_step`` on everything below."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Optional
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from torch import nn
+
+from ...core.checkpoint_file import load_module_weights
+from ...core.errors import UserError, unknown
+from ...core.interpolation import escape
+from .types import check_types
+
+
+def parse_structured(config_class: Any, values: Any = None) -> Any:
+    """The typed configuration of a part: ``config_class`` filled with ``values``, then checked by its ``check``, if any.
+
+    Raises:
+        UserError: an unknown key, a value of the wrong type or a missing one; or what ``config_class.check(cfg)`` finds.
+    """
+    cfg = fill(config_class, values)
+    if hasattr(config_class, "check"):
+        config_class.check(cfg)
+    return cfg
+
+
+def fill(config_class: Any, values: Any = None) -> DictConfig:
+    """``config_class`` filled with ``values`` and typed. A ``${`` in a string is text: interpolations are resolved by now.
+
+    Raises:
+        UserError: an unknown key, a value of the wrong type or a missing one; the message begins with the key.
+    """
+    if values is not None and not isinstance(values, Mapping):
+        raise UserError(f"expected keys and values, got {values!r}")
+    known = [field.name for field in fields(config_class)]
+    for key in values or {}:
+        if key not in known:
+            raise unknown("key", key, known)
+    try:
+        check_types(config_class, values or {})
+        return OmegaConf.structured(config_class(**{key: escape(value) for key, value in (values or {}).items()}))
+    except OmegaConfBaseException as error:
+        raise UserError(f"{error.full_key or error.key}: {str(error).splitlines()[0]}") from error
+    except TypeError as error:
+        raise UserError(f"{config_class.__qualname__}: {error}") from error
+
+
+def get_device() -> torch.device:
+    """Where parts are built: this process's GPU, or the CPU when none is visible."""
+    if not torch.cuda.is_available():
+        return torch.device("cpu")
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
+
+
+class Updateable:
+    """Something that changes with the step: it and all its public attributes are told before and after each batch."""
+
+    def do_update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
+        for part in self._updateables():
+            part.do_update_step(epoch, global_step, on_load_weights=on_load_weights)
+        self.update_step(epoch, global_step, on_load_weights=on_load_weights)
+
+    def do_update_step_end(self, epoch: int, global_step: int) -> None:
+        for part in self._updateables():
+            part.do_update_step_end(epoch, global_step)
+        self.update_step_end(epoch, global_step)
+
+    def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
+        """Called before each batch; must be idempotent, since a part can be reached by more than one way."""
+
+    def update_step_end(self, epoch: int, global_step: int) -> None:
+        """Called after each batch."""
+
+    def _updateables(self) -> list["Updateable"]:
+        attributes = {**vars(self), **getattr(self, "_modules", {})}
+        return [part for name, part in attributes.items() if not name.startswith("_") and isinstance(part, Updateable)]
+
+
+def update_if_possible(part: Any, epoch: int, global_step: int) -> None:
+    """``part.do_update_step`` when it has one."""
+    if isinstance(part, Updateable):
+        part.do_update_step(epoch, global_step)
+
+
+def update_end_if_possible(part: Any, epoch: int, global_step: int) -> None:
+    """``part.do_update_step_end`` when it has one."""
+    if isinstance(part, Updateable):
+        part.do_update_step_end(epoch, global_step)
+
+
+class BaseObject(Updateable):
+    """A part without parameters: guidance, prompt processor, prior, exporter."""
+
+    @dataclass
+    class Config:
+        pass
+
+    cfg: Config
+
+    def __init__(self, cfg: Any = None, *args: Any, **kwargs: Any) -> None:
+        super().__init__()
+        self.cfg = parse_structured(self.Config, cfg)
+        self.device = get_device()
+        self.configure(*args, **kwargs)
+
+    def configure(self, *args: Any, **kwargs: Any) -> None:
+        """Build the part from ``self.cfg``; gets what the constructor got after the configuration."""
+
+
+class BaseModule(nn.Module, Updateable):
+    """A part with parameters: geometry, material, background, renderer.
+
+    ``weights`` is ``path:module``: the entries of a checkpoint under ``module.`` are loaded after ``configure``.
+    """
+
+    @dataclass
+    class Config:
+        weights: Optional[str] = None
+
+    cfg: Config
+
+    def __init__(self, cfg: Any = None, *args: Any, **kwargs: Any) -> None:
+        super().__init__()
+        self.cfg = parse_structured(self.Config, cfg)
+        self.device = get_device()
+        self.configure(*args, **kwargs)
+        if self.cfg.weights is not None:
+            self._load_weights(self.cfg.weights)
+
+    def configure(self, *args: Any, **kwargs: Any) -> None:
+        """Build the part from ``self.cfg``; gets what the constructor got after the configuration."""
+
+    def _load_weights(self, source: str) -> None:
+        path, _, module_name = source.rpartition(":")
+        if not path:
+            raise UserError(f"weights: expected <checkpoint>:<module>, such as last.ckpt:geometry, got {source!r}")
+        state_dict, epoch, global_step = load_module_weights(path, module_name=module_name)
+        self.load_state_dict(state_dict)
+        self.do_update_step(epoch, global_step, on_load_weights=True)

@@ -1,0 +1,196 @@
+"""Base classes of the parts that a system is made of, and the host's own smallest ones."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Optional, Tuple
+
+import torch
+from torch import Tensor, nn
+
+from ...core.errors import unknown
+from .base import BaseModule, BaseObject
+from .registry import register
+
+
+class BaseGeometry(BaseModule):
+    """What is optimised: the Gaussians."""
+
+    @dataclass
+    class Config(BaseModule.Config):
+        pass
+
+    cfg: Config
+
+    @staticmethod
+    def create_from(other: "BaseGeometry", cfg: Any = None, **kwargs: Any) -> "BaseGeometry":
+        """A geometry made from another one; those that can't be raise a TypeError."""
+        raise TypeError(f"a {type(other).__name__} can't be converted to this geometry")
+
+    def export(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        return {}
+
+
+class BaseMaterial(BaseModule):
+    """Turns features into colours; Gaussians carry their colours themselves."""
+
+    @dataclass
+    class Config(BaseModule.Config):
+        pass
+
+    cfg: Config
+
+    def forward(self, *args: Any, **kwargs: Any) -> Tensor:
+        raise NotImplementedError(f"{type(self).__name__}.forward")
+
+    def export(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        return {}
+
+
+COLOR_ACTIVATIONS = {"sigmoid": torch.sigmoid, "none": lambda x: x}
+
+
+@register("no-material")
+class NoMaterial(BaseMaterial):
+    """Passes colours through a sigmoid; without ``input_feature_dims`` there is nothing to learn."""
+
+    @dataclass
+    class Config(BaseMaterial.Config):
+        n_output_dims: int = 3
+        color_activation: str = "sigmoid"
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            if cfg.color_activation not in COLOR_ACTIVATIONS:
+                raise unknown("system.material.color_activation", cfg.color_activation, COLOR_ACTIVATIONS)
+
+    cfg: Config
+
+    def forward(self, features: Tensor, **kwargs: Any) -> Tensor:
+        return COLOR_ACTIVATIONS[self.cfg.color_activation](features)
+
+
+class BaseBackground(BaseModule):
+    """Colour behind the Gaussians: ray directions (B,H,W,3) to colours (B,H,W,C) in [0,1]."""
+
+    @dataclass
+    class Config(BaseModule.Config):
+        pass
+
+    cfg: Config
+
+    def forward(self, dirs: Tensor) -> Tensor:
+        raise NotImplementedError(f"{type(self).__name__}.forward")
+
+
+@register("solid-color-background")
+class SolidColorBackground(BaseBackground):
+    """One colour for all pixels, fixed or learned; ``random_aug`` replaces it by a random one with some probability."""
+
+    @dataclass
+    class Config(BaseBackground.Config):
+        n_output_dims: int = 3
+        color: Tuple = (1.0, 1.0, 1.0)
+        learned: bool = False
+        random_aug: bool = False
+        random_aug_prob: float = 0.5
+
+    cfg: Config
+
+    def configure(self) -> None:
+        color = torch.tensor(list(self.cfg.color), dtype=torch.float32)
+        if self.cfg.learned:
+            self.env_color = nn.Parameter(color)
+        else:
+            self.register_buffer("env_color", color)
+
+    def forward(self, dirs: Tensor) -> Tensor:
+        shape = (*dirs.shape[:-1], self.cfg.n_output_dims)
+        if self.training and self.cfg.random_aug and torch.rand(()) < self.cfg.random_aug_prob:
+            return torch.rand(dirs.shape[0], 1, 1, self.cfg.n_output_dims, device=dirs.device).expand(shape)
+        return self.env_color.to(dirs).expand(shape)
+
+
+class SubModules(NamedTuple):
+    """References to parts that belong to the system, kept out of ``nn.Module``'s registration."""
+
+    geometry: BaseGeometry
+    material: Optional[BaseMaterial]
+    background: Optional[BaseBackground]
+
+
+class Renderer(BaseModule):
+    """Cameras to pictures: ``renderer(**batch)`` gives a dict with ``comp_rgb`` (B,H,W,3), ``opacity`` (B,H,W,1), ..."""
+
+    @dataclass
+    class Config(BaseModule.Config):
+        radius: float = 1.0
+
+    cfg: Config
+
+    def configure(self, geometry: BaseGeometry, material: BaseMaterial, background: BaseBackground) -> None:
+        self.sub_modules = SubModules(geometry, material, background)
+        self.register_buffer("bbox", self.cfg.radius * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+
+    def forward(self, *args: Any, **kwargs: Any) -> Mapping[str, Any]:
+        raise NotImplementedError(f"{type(self).__name__}.forward")
+
+    @property
+    def geometry(self) -> BaseGeometry:
+        return self.sub_modules.geometry
+
+    @property
+    def material(self) -> Optional[BaseMaterial]:
+        return self.sub_modules.material
+
+    @property
+    def background(self) -> Optional[BaseBackground]:
+        return self.sub_modules.background
+
+
+class Rasterizer(Renderer):
+    """A renderer that projects primitives."""
+
+
+@dataclass
+class ExporterOutput:
+    """One file to write: the system calls ``save_<save_type>(save_name, **params)``."""
+
+    save_name: str
+    save_type: str
+    params: dict[str, Any]
+
+
+class Exporter(BaseObject):
+    """The trained parts to a list of files."""
+
+    @dataclass
+    class Config(BaseObject.Config):
+        save_video: bool = False
+
+    cfg: Config
+
+    def configure(self, geometry: BaseGeometry, material: BaseMaterial, background: BaseBackground) -> None:
+        self.sub_modules = SubModules(geometry, material, background)
+
+    @property
+    def geometry(self) -> BaseGeometry:
+        return self.sub_modules.geometry
+
+    @property
+    def material(self) -> Optional[BaseMaterial]:
+        return self.sub_modules.material
+
+    @property
+    def background(self) -> Optional[BaseBackground]:
+        return self.sub_modules.background
+
+    def __call__(self, *args: Any, **kwargs: Any) -> list[ExporterOutput]:
+        raise NotImplementedError(f"{type(self).__name__}.__call__")
+
+
+@register("dummy-exporter")
+class DummyExporter(Exporter):
+    """Writes nothing."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> list[ExporterOutput]:
+        return []

@@ -1,0 +1,53 @@
+"""The registry: parts are entered under a name by a decorator and found by that name."""
+
+from collections.abc import Callable
+
+from ...core.errors import UserError, unknown
+
+_parts: dict[str, type] = {}
+
+
+def register(name: str) -> Callable[[type], type]:
+    """A class decorator that enters the class under ``name``; entering the same class again is harmless.
+
+    Raises:
+        UserError: another class has that name already.
+    """
+
+    def enter(cls: type) -> type:
+        taken = _parts.get(name)
+        if taken is not None and _identity(taken) != _identity(cls):
+            raise UserError(f"the name {name!r} is taken by {_identity(taken)}: register {_identity(cls)} under another name")
+        _parts[name] = cls
+        return cls
+
+    return enter
+
+
+def find(name: str) -> type:
+    """The class registered as ``name``; ``"main:mixin1,mixin2"`` makes a class of ``main`` with the mixins before it.
+
+    Raises:
+        UserError: no part has that name; the message lists the near ones.
+    """
+    main, _, mixins = name.partition(":")
+    if not mixins:
+        return _lookup(main)
+    bases = [_lookup(part) for part in [*mixins.split(","), main]]
+    return type(f"{main}.{mixins}", tuple(bases), {})
+
+
+def names() -> list[str]:
+    """All registered names, sorted."""
+    return sorted(_parts)
+
+
+def _lookup(name: str) -> type:
+    if name not in _parts:
+        raise unknown("part", name, _parts)
+    return _parts[name]
+
+
+def _identity(cls: type) -> str:
+    # a module that is executed again makes new class objects of the same name: still the same part
+    return f"{cls.__module__}.{cls.__qualname__}"

@@ -1,0 +1,199 @@
+"""Writing results into the ``save`` folder of a run, by the host's method names."""
+
+import json
+import os
+import re
+import shutil
+from pathlib import Path
+from typing import Any, Optional
+
+import numpy as np
+from torch import Tensor
+
+from ...core import images as pictures
+from ...core.checkpoint_file import save_file as save_checked
+from ...core.errors import UserError
+
+
+class SaverMixin:
+    """``save_*`` methods; each takes a file name below the save folder, makes its folder, and returns the full path."""
+
+    _save_dir: Optional[str] = None
+    _wandb_logger: Any = None
+
+    def set_save_dir(self, save_dir: str) -> None:
+        self._save_dir = str(save_dir)
+
+    def get_save_dir(self) -> str:
+        if self._save_dir is None:
+            raise ValueError("the save folder isn't set yet: call set_save_dir first")
+        return self._save_dir
+
+    def get_save_path(self, filename: str) -> str:
+        path = os.path.join(self.get_save_dir(), filename)
+        if os.path.relpath(path, self.get_save_dir()).startswith(os.pardir):
+            raise UserError(f"the file name {filename!r} leads out of the folder of results {self.get_save_dir()}")
+        os.makedirs(os.path.dirname(path), exist_ok=True)
+        return path
+
+    def create_loggers(self, loggers: Any) -> None:
+        """Make the Weights & Biases logger if ``loggers.wandb.enable``; needs the package wandb."""
+        wandb = loggers.get("wandb")
+        if wandb and wandb.get("enable"):
+            self._wandb_logger = _wandb_logger(wandb)
+
+    def get_loggers(self) -> list:
+        return [self._wandb_logger] if self._wandb_logger else []
+
+    def convert_data(self, data: Any) -> Any:
+        """Tensors to numpy arrays, also inside lists and dicts."""
+        if isinstance(data, Tensor):
+            return data.detach().cpu().numpy()
+        if isinstance(data, list):
+            return [self.convert_data(item) for item in data]
+        if isinstance(data, dict):
+            return {key: self.convert_data(item) for key, item in data.items()}
+        if data is None or isinstance(data, np.ndarray):
+            return data
+        raise TypeError(f"expected an array, a tensor, or a list or dict of them, got {type(data).__name__}")
+
+    def save_rgb_image(
+        self,
+        filename: str,
+        img: Any,
+        data_format: str = "HWC",
+        data_range: tuple[float, float] = (0, 1),
+        name: Optional[str] = None,
+        step: Optional[int] = None,
+    ) -> str:
+        """(H,W,C) or (C,H,W) values in ``data_range``; more than three channels are laid side by side, three by three."""
+        picture = pictures.rgb(self.convert_data(img), data_format=data_format, data_range=data_range)
+        return self._save_picture(filename, picture, name, step)
+
+    def save_grayscale_image(
+        self,
+        filename: str,
+        img: Any,
+        data_range: Optional[tuple[float, float]] = None,
+        cmap: Optional[str] = "jet",
+        name: Optional[str] = None,
+        step: Optional[int] = None,
+    ) -> str:
+        """(H,W) values; without ``data_range`` from their smallest to their largest. ``cmap``: None, "jet", "magma"."""
+        picture = pictures.grayscale(self.convert_data(img), data_range=data_range, cmap=cmap)
+        return self._save_picture(filename, picture, name, step)
+
+    def save_image_grid(
+        self,
+        filename: str,
+        imgs: list,
+        align: Any = "max",
+        name: Optional[str] = None,
+        step: Optional[int] = None,
+        texts: Optional[list] = None,
+    ) -> str:
+        """A row of ``{"type": "rgb"|"grayscale", "img": ..., "kwargs": {...}}``, or a list of rows; resized to ``align``."""
+        picture = pictures.grid(self._converted(imgs), align=align)
+        if texts:
+            picture = pictures.with_texts(picture, texts)
+        return self._save_picture(filename, picture, name, step)
+
+    def save_image(self, filename: str, img: Any) -> str:
+        """An 8 bit or 16 bit picture as it is: (H,W), (H,W,3) or (H,W,4)."""
+        return self._save_picture(filename, self.convert_data(img), None, None)
+
+    def save_img_sequence(
+        self,
+        filename: str,
+        img_dir: str,
+        matcher: str,
+        save_format: str = "mp4",
+        fps: int = 30,
+        name: Optional[str] = None,
+        step: Optional[int] = None,
+    ) -> str:
+        """The pictures in ``img_dir`` (below the save folder) whose name matches, by the number in the first group, as a video."""
+        if save_format not in ("mp4", "gif"):
+            raise UserError(f"unknown video format {save_format!r}: expected 'mp4' or 'gif'")
+        if not filename.endswith(save_format):
+            filename += f".{save_format}"
+        path = self.get_save_path(filename)
+        frames = _matching(Path(self.get_save_dir(), img_dir), re.compile(matcher))
+        pictures.write_video(path, frames, fps=fps)
+        self._log_file("Video", path, name, step)
+        return path
+
+    def save_data(self, filename: str, data: Any) -> str:
+        """A dict of arrays as npz, anything else as npy."""
+        data = self.convert_data(data)
+        extension = ".npz" if isinstance(data, dict) else ".npy"
+        path = self.get_save_path(filename if filename.endswith(extension) else filename + extension)
+        np.savez(path, **data) if isinstance(data, dict) else np.save(path, data)
+        return path
+
+    def save_state_dict(self, filename: str, data: Any) -> str:
+        path = self.get_save_path(filename)
+        save_checked(path, data)
+        return path
+
+    def save_mesh(self, filename: str, v_pos: Any, t_pos_idx: Any, v_tex: Any = None, t_tex_idx: Any = None) -> str:
+        """Vertices (V,3) and triangles (F,3) in the format of the file name's extension."""
+        import trimesh
+
+        path = self.get_save_path(filename)
+        trimesh.Trimesh(vertices=self.convert_data(v_pos), faces=self.convert_data(t_pos_idx), process=False).export(path)
+        return path
+
+    def save_obj(self, filename: str, mesh: Any, save_vertex_color: bool = False, **unused: Any) -> list[str]:
+        """``mesh.v_pos`` (V,3), ``mesh.t_pos_idx`` (F,3) and, if asked, ``mesh.v_rgb`` (V,3) as a Wavefront OBJ without material."""
+        path = self.get_save_path(filename if filename.endswith(".obj") else f"{filename}.obj")
+        vertices, faces = self.convert_data(mesh.v_pos), self.convert_data(mesh.t_pos_idx)
+        if save_vertex_color:
+            vertices = np.concatenate([vertices, self.convert_data(mesh.v_rgb)], axis=1)
+        with open(path, "w") as file:
+            np.savetxt(file, vertices, fmt="v" + " %.9g" * vertices.shape[1])
+            np.savetxt(file, faces + 1, fmt="f %d %d %d")
+        return [path]
+
+    def save_file(self, filename: str, src_path: str) -> str:
+        path = self.get_save_path(filename)
+        shutil.copyfile(src_path, path)
+        return path
+
+    def save_json(self, filename: str, payload: Any) -> str:
+        path = self.get_save_path(filename)
+        Path(path).write_text(json.dumps(payload))
+        return path
+
+    def _converted(self, imgs: list) -> list:
+        if imgs and isinstance(imgs[0], list):
+            return [self._converted(row) for row in imgs]
+        return [{**cell, "img": self.convert_data(cell["img"])} for cell in imgs]
+
+    def _save_picture(self, filename: str, picture: np.ndarray, name: Optional[str], step: Optional[int]) -> str:
+        path = self.get_save_path(filename)
+        pictures.write(path, picture)
+        self._log_file("Image", path, name, step)
+        return path
+
+    def _log_file(self, kind: str, path: str, name: Optional[str], step: Optional[int]) -> None:
+        if name and self._wandb_logger:
+            import wandb
+
+            self._wandb_logger.experiment.log({name: getattr(wandb, kind)(path), "trainer/global_step": step})
+
+
+def _matching(folder: Path, matcher: re.Pattern) -> list[Path]:
+    found = [(int(match[1]), path) for path in folder.iterdir() if (match := matcher.search(path.name))]
+    if not found:
+        raise FileNotFoundError(f"no picture in {folder} matches {matcher.pattern}")
+    return [path for _, path in sorted(found)]
+
+
+def _wandb_logger(options: Any) -> Any:
+    try:
+        from lightning.pytorch.loggers import WandbLogger
+
+        return WandbLogger(project=options.get("project"), name=options.get("name"))
+    except ModuleNotFoundError as error:
+        raise UserError("system.loggers.wandb.enable is true, but wandb isn't installed: pip install wandb") from error

@@ -1,0 +1,230 @@
+"""The LightningModule that holds the parts, and when it makes, updates, renders and exports them."""
+
+from dataclasses import dataclass, field
+from typing import Any, List, Optional
+
+import lightning.pytorch as pl
+import torch
+
+from ...core.checkpoint_file import load_module_weights
+from ...core.errors import UserError
+from ...core.logs import info, warn
+from ...core.schedule import C
+from .base import Updateable, parse_structured, update_end_if_possible, update_if_possible
+from .models import Exporter
+from .registry import find
+from .savers import SaverMixin
+
+
+class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
+    """Parses its configuration, calls ``configure``, tells dataset and parts the step before and after every batch.
+
+    Its data loaders must have a ``dataset``.
+    """
+
+    @dataclass
+    class Config:
+        loggers: dict = field(default_factory=dict)
+        loss: dict = field(default_factory=dict)
+        optimizer: dict = field(default_factory=dict)
+        scheduler: Optional[dict] = None
+        weights: Optional[str] = None
+        weights_ignore_modules: Optional[List[str]] = None
+        cleanup_after_validation_step: bool = False
+        cleanup_after_test_step: bool = False
+
+    cfg: Config
+
+    def __init__(self, cfg: Any, resumed: bool = False) -> None:
+        super().__init__()
+        self.cfg = parse_structured(self.Config, cfg)
+        self._save_dir = None
+        self._resumed = resumed
+        self._resumed_eval: Optional[tuple[int, int]] = None
+        self.create_loggers(self.cfg.loggers)
+        self.configure()
+        if self.cfg.weights is not None:
+            self.load_weights(self.cfg.weights, self.cfg.weights_ignore_modules)
+        self.post_configure()
+
+    def configure(self) -> None:
+        """Build the parts."""
+
+    def post_configure(self) -> None:
+        """Called after ``weights`` are loaded."""
+
+    def load_weights(self, weights: str, ignore_modules: Optional[List[str]] = None) -> None:
+        """Take over the parameters of a checkpoint, except those of ``ignore_modules``; names that don't exist here are skipped."""
+        state_dict, epoch, global_step = load_module_weights(weights, ignore_modules=ignore_modules)
+        self.load_state_dict(state_dict, strict=False)
+        self.do_update_step(epoch, global_step, on_load_weights=True)
+
+    def set_resume_status(self, current_epoch: int, global_step: int) -> None:
+        """The epoch and step of the checkpoint that is validated, tested or exported: Lightning's own stay 0 there."""
+        self._resumed_eval = current_epoch, global_step
+
+    @property
+    def resumed(self) -> bool:
+        """Whether a checkpoint will be loaded after construction."""
+        return self._resumed
+
+    @property
+    def true_current_epoch(self) -> int:
+        return self._resumed_eval[0] if self._resumed_eval else self.current_epoch
+
+    @property
+    def true_global_step(self) -> int:
+        return self._resumed_eval[1] if self._resumed_eval else self.global_step
+
+    def C(self, value: Any) -> float:
+        """The value of a schedule now."""
+        return C(value, self.true_current_epoch, self.true_global_step)
+
+    def configure_optimizers(self) -> Any:
+        """``optimizer: {name, args, params}`` from ``torch.optim``; ``params`` names attributes, each with its own options."""
+        return optimizer_from(self.cfg.optimizer, self)
+
+    def training_step(self, batch: dict, batch_idx: int) -> Any:
+        raise NotImplementedError(f"{type(self).__name__}.training_step")
+
+    def validation_step(self, batch: dict, batch_idx: int) -> Any:
+        raise NotImplementedError(f"{type(self).__name__}.validation_step")
+
+    def test_step(self, batch: dict, batch_idx: int) -> Any:
+        raise NotImplementedError(f"{type(self).__name__}.test_step")
+
+    def predict_step(self, batch: dict, batch_idx: int) -> Any:
+        raise NotImplementedError(f"{type(self).__name__}.predict_step")
+
+    def on_validation_epoch_end(self) -> None:
+        """Nothing to gather."""
+
+    def preprocess_data(self, batch: dict, stage: str) -> None:
+        """Change a batch in place before it is used; ``stage`` is "train", "validation", "test" or "predict"."""
+
+    def on_train_batch_start(self, batch: dict, batch_idx: int, unused: int = 0) -> None:
+        self._before_batch(batch, "train", self.trainer.train_dataloader)
+
+    def on_validation_batch_start(self, batch: dict, batch_idx: int, dataloader_idx: int = 0) -> None:
+        self._before_batch(batch, "validation", self.trainer.val_dataloaders)
+
+    def on_test_batch_start(self, batch: dict, batch_idx: int, dataloader_idx: int = 0) -> None:
+        self._before_batch(batch, "test", self.trainer.test_dataloaders)
+
+    def on_predict_batch_start(self, batch: dict, batch_idx: int, dataloader_idx: int = 0) -> None:
+        self._before_batch(batch, "predict", self.trainer.predict_dataloaders)
+
+    def on_train_batch_end(self, outputs: Any, batch: dict, batch_idx: int) -> None:
+        self._after_batch(self.trainer.train_dataloader)
+
+    def on_validation_batch_end(self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0) -> None:
+        self._after_batch(self.trainer.val_dataloaders, cleanup=self.cfg.cleanup_after_validation_step)
+
+    def on_test_batch_end(self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0) -> None:
+        self._after_batch(self.trainer.test_dataloaders, cleanup=self.cfg.cleanup_after_test_step)
+
+    def on_predict_batch_end(self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0) -> None:
+        self._after_batch(self.trainer.predict_dataloaders, cleanup=self.cfg.cleanup_after_test_step)
+
+    def _before_batch(self, batch: dict, stage: str, loader: Any) -> None:
+        self.preprocess_data(batch, stage)
+        self.dataset = loader.dataset
+        update_if_possible(self.dataset, self.true_current_epoch, self.true_global_step)
+        self.do_update_step(self.true_current_epoch, self.true_global_step)
+
+    def _after_batch(self, loader: Any, cleanup: bool = False) -> None:
+        self.dataset = loader.dataset
+        update_end_if_possible(self.dataset, self.true_current_epoch, self.true_global_step)
+        self.do_update_step_end(self.true_current_epoch, self.true_global_step)
+        if cleanup and torch.cuda.is_available():
+            torch.cuda.empty_cache()
+
+
+class BaseLift3DSystem(BaseSystem):
+    """Builds geometry, material, background and renderer by their names in the registry; exports through an exporter.
+
+    Guidance and prompt processor are left to the subclass, best in ``on_fit_start``: testing and exporting need neither.
+    """
+
+    @dataclass
+    class Config(BaseSystem.Config):
+        geometry_type: str = ""
+        geometry: dict = field(default_factory=dict)
+        material_type: str = "no-material"
+        material: dict = field(default_factory=dict)
+        background_type: str = "solid-color-background"
+        background: dict = field(default_factory=dict)
+        renderer_type: str = ""
+        renderer: dict = field(default_factory=dict)
+        guidance_type: str = ""
+        guidance: dict = field(default_factory=dict)
+        prompt_processor_type: str = ""
+        prompt_processor: dict = field(default_factory=dict)
+        exporter_type: str = "dummy-exporter"
+        exporter: dict = field(default_factory=dict)
+
+    cfg: Config
+
+    def configure(self) -> None:
+        self.geometry = find(self.cfg.geometry_type)(self.cfg.geometry)
+        self.material = find(self.cfg.material_type)(self.cfg.material)
+        self.background = find(self.cfg.background_type)(self.cfg.background)
+        self.renderer = find(self.cfg.renderer_type)(
+            self.cfg.renderer, geometry=self.geometry, material=self.material, background=self.background
+        )
+
+    def on_fit_start(self) -> None:
+        if self._save_dir is None:
+            warn("the save folder isn't set: no picture will be saved")
+        else:
+            info(f"Validation results will be saved to {self._save_dir}")
+
+    def on_test_end(self) -> None:
+        if self._save_dir is not None:
+            info(f"Test results saved to {self._save_dir}")
+
+    def on_predict_start(self) -> None:
+        self.exporter: Exporter = find(self.cfg.exporter_type)(
+            self.cfg.exporter, geometry=self.geometry, material=self.material, background=self.background
+        )
+
+    def predict_step(self, batch: dict, batch_idx: int) -> None:
+        if self.exporter.cfg.save_video:
+            self.test_step(batch, batch_idx)
+
+    def on_predict_epoch_end(self) -> None:
+        if self.exporter.cfg.save_video:
+            self.on_test_epoch_end()
+        for output in self.exporter():
+            save = getattr(self, f"save_{output.save_type}", None)
+            if save is None:
+                raise UserError(f"{type(self).__name__} has no save_{output.save_type}, which {type(self.exporter).__name__} asks for")
+            save(f"it{self.true_global_step}-export/{output.save_name}", **output.params)
+
+    def on_predict_end(self) -> None:
+        if self._save_dir is not None:
+            info(f"Export assets saved to {self._save_dir}")
+
+
+def optimizer_from(config: Any, module: torch.nn.Module) -> torch.optim.Optimizer:
+    """``{name, args, params}``: an optimiser of ``torch.optim`` over all parameters, or over the named attributes with own options.
+
+    Raises:
+        UserError: no such optimiser, or no such attribute.
+    """
+    optimizer_class = getattr(torch.optim, config.get("name", ""), None)
+    if optimizer_class is None:
+        raise UserError(f"system.optimizer.name is {config.get('name')!r}; expected an optimiser of torch.optim, such as Adam")
+    params = module.parameters()
+    if "params" in config:
+        params = [{"params": _parameters(module, name), "name": name, **options} for name, options in config["params"].items()]
+    return optimizer_class(params, **config.get("args", {}))
+
+
+def _parameters(module: Any, name: str) -> list[torch.nn.Parameter]:
+    found = module
+    for attribute in name.split("."):
+        if not hasattr(found, attribute):
+            raise UserError(f"system.optimizer.params.{name}: {type(found).__name__} has no {attribute!r}")
+        found = getattr(found, attribute)
+    return list(found.parameters()) if isinstance(found, torch.nn.Module) else [found]

@@ -1,0 +1,147 @@
+"""What the launcher does around training: the record of the run, the progress bar, and stopping without losing a step."""
+
+import os
+import shutil
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..host import pl
+from .checkpoints import AtomicCheckpointIO
+from .config import dump_config
+
+SOURCE_ENDINGS = (".py", ".yaml", ".h", ".cpp", ".cu")
+
+
+class Stopped(BaseException):
+    """Training was asked to stop by a signal and has written a checkpoint. Not an Exception: nobody on the way may swallow it."""
+
+    def __init__(self, signum: int, step: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(signum).name} at step {step}")
+        self.signum, self.step = signum, step
+
+
+class RunRecord(pl.Callback):
+    """Writes ``configs/raw.yaml``, ``configs/parsed.yaml``, ``code/`` and ``cmd.txt`` when training starts.
+
+    Args:
+        folder: the trial's folder.
+        cfg: the configuration as it runs.
+        config_paths: the YAML files it was made of.
+        command: the command line.
+    """
+
+    def __init__(self, folder: Path, cfg: Any, config_paths: Sequence[Path], command: str) -> None:
+        self.folder, self.cfg, self.config_paths, self.command = folder, cfg, config_paths, command
+
+    def on_fit_start(self, trainer: Any, pl_module: Any) -> None:
+        if trainer.is_global_zero:
+            self.save_configs()
+            self.save_code()
+            # a run that is resumed has more than one
+            with open(self.folder / "cmd.txt", "a") as file:
+                file.write(self.command + "\n")
+
+    def save_configs(self) -> None:
+        configs = self.folder / "configs"
+        configs.mkdir(parents=True, exist_ok=True)
+        for i, path in enumerate(self.config_paths):
+            # resumed from its own parsed.yaml, the run keeps the file that it was started with
+            if path.resolve().parent != configs.resolve():
+                shutil.copyfile(path, configs / (f"raw-{i}.yaml" if i else "raw.yaml"))
+        dump_config(configs / "parsed.yaml", self.cfg)
+
+    def save_code(self) -> None:
+        """The sources of this package and of the extensions, as they ran."""
+        package = Path(__file__).parents[1]
+        copy_sources(package, self.folder / "code" / package.name)
+        if Path("custom").is_dir():
+            copy_sources(Path("custom"), self.folder / "code" / "custom")
+
+
+def copy_sources(source: Path, destination: Path) -> None:
+    """Copy the source files below a folder, leaving out hidden folders and everything that isn't source."""
+    for folder, folders, names in os.walk(source):
+        folders[:] = [name for name in folders if not name.startswith((".", "__pycache__"))]
+        for name in names:
+            if name.endswith(SOURCE_ENDINGS):
+                copy = destination / Path(folder).relative_to(source) / name
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(Path(folder, name), copy)
+
+
+class ProgressBar(pl.callbacks.TQDMProgressBar):
+    """Lightning's bar without the version number; where nobody watches, redrawn now and then instead of every step."""
+
+    def __init__(self) -> None:
+        super().__init__(refresh_rate=1 if sys.stderr.isatty() else 100)
+
+    def get_metrics(self, trainer: Any, pl_module: Any) -> dict[str, Any]:
+        metrics = super().get_metrics(trainer, pl_module)
+        metrics.pop("v_num", None)
+        if "gaussians" in metrics:
+            metrics["gaussians"] = int(metrics["gaussians"])  # Lightning logs floats: 1e+4
+        return metrics
+
+    def on_exception(self, trainer: Any, pl_module: Any, exception: BaseException) -> None:
+        # what is said next begins on its own line
+        print(file=sys.stderr)
+
+
+class GracefulStop(pl.callbacks.Checkpoint):
+    """Ctrl-C and SIGTERM during training finish the step, write ``last.ckpt`` and raise :class:`Stopped`; so does the last step.
+
+    A second signal stops at once. As a ``Checkpoint`` it comes after all other callbacks, exactly where ModelCheckpoint saves,
+    so its file is an ordinary one from the middle of a run.
+    """
+
+    def __init__(self, last: Path, checkpoint_io: AtomicCheckpointIO) -> None:
+        self.last, self.checkpoint_io = last, checkpoint_io
+        self.signum = 0
+        self._earlier: dict[int, Any] = {}
+
+    def on_train_start(self, trainer: Any, pl_module: Any) -> None:
+        # only the main thread may set handlers; elsewhere signals don't arrive either
+        if threading.current_thread() is threading.main_thread():
+            self._earlier = {signum: signal.signal(signum, self._ask) for signum in (signal.SIGINT, signal.SIGTERM)}
+
+    def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        if trainer.global_step == trainer.max_steps:
+            self._save(trainer)
+        self._stop_if_asked(trainer)
+
+    def on_validation_end(self, trainer: Any, pl_module: Any) -> None:
+        if trainer.state.fn == "fit" and not trainer.sanity_checking:
+            self._stop_if_asked(trainer)
+
+    def on_train_end(self, trainer: Any, pl_module: Any) -> None:
+        self._restore_handlers()
+        self._stop_if_asked(trainer)
+
+    def on_exception(self, trainer: Any, pl_module: Any, exception: BaseException) -> None:
+        self._restore_handlers()
+
+    def _ask(self, signum: int, frame: Any) -> None:
+        if self.signum:
+            self._restore_handlers()
+            raise KeyboardInterrupt
+        self.signum = signum
+        # print() may not be entered again from a handler
+        os.write(2, b"\nstopping after this step and writing a checkpoint; once more to stop at once\n")
+
+    def _stop_if_asked(self, trainer: Any) -> None:
+        if trainer.strategy.reduce_boolean_decision(bool(self.signum), all=False):
+            self._save(trainer)
+            raise Stopped(self.signum or signal.SIGTERM, trainer.global_step)
+
+    def _save(self, trainer: Any) -> None:
+        if self.checkpoint_io.saved_step(self.last) != trainer.global_step:
+            trainer.save_checkpoint(self.last)
+
+    def _restore_handlers(self) -> None:
+        for signum, handler in self._earlier.items():
+            signal.signal(signum, handler)
+        self._earlier = {}

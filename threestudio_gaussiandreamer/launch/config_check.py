@@ -1,0 +1,229 @@
+"""The check of a whole configuration before any work: every key at every depth, every type, every registered name.
+
+A section ``x`` belongs to the part that the key ``x_type`` beside it names: ``data_type`` and ``data``, ``system.geometry_type``
+and ``system.geometry``, ``system.geometry.prior_type`` and ``system.geometry.prior``. The keys of a section are the fields of its
+part's ``Config``.
+"""
+
+import dataclasses
+import difflib
+import inspect
+import os
+import types
+import typing
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from ..core.errors import UserError, unknown
+from ..host import find, pl, validate_schedule
+from ..host.builtin.base import fill
+
+MisconfigurationException = pl.utilities.exceptions.MisconfigurationException
+
+LAUNCHER_SETS = {
+    "accelerator": "--gpu",
+    "devices": "--gpu",
+    "callbacks": "the launcher",
+    "logger": "the launcher and system.loggers",
+    "plugins": "the launcher",
+    "inference_mode": "the launcher",
+    "enable_checkpointing": "the launcher",
+    "default_root_dir": "exp_root_dir",
+    "dirpath": "exp_root_dir, name and tag",
+}
+# what would start or look for other processes
+NEEDS_PROCESSES = ("strategy", "num_nodes", "sync_batchnorm")
+# what Lightning takes and fails on later
+AT_LEAST = {"log_every_n_steps": 0, "num_sanity_val_steps": -1, "max_steps": -1}
+LOGGER_KEYS = ("enable", "project", "name")
+
+
+def check_config(cfg: Any) -> None:
+    """Check what :func:`config.load_config` returned against the registered parts and Lightning's signatures.
+
+    Raises:
+        UserError: the first mistake: an unknown key or name (with the nearest valid one), a value of the wrong type or out of
+            range; the message begins with the full dotted path.
+    """
+    if not 0 <= cfg.seed < 2**32:
+        raise UserError(f"seed is {cfg.seed}; expected a whole number from 0 to 2^32 - 1")
+    # before the parts, whose schedules may end with the trainer's steps
+    _check_arguments("trainer", cfg.trainer, pl.Trainer)
+    _check_trainer_ranges(cfg.trainer)
+    check_part("data", cfg.data_type, cfg.data)
+    check_part("system", cfg.system_type, cfg.system)
+    _check_loss(cfg.system.get("loss"), getattr(find(cfg.system_type), "LOSSES", None))
+    _check_loggers(cfg.system.get("loggers"))
+    _check_arguments("checkpoint", cfg.checkpoint, pl.callbacks.ModelCheckpoint)
+    _check_file_name("checkpoint.filename", cfg.checkpoint.get("filename"))
+    _check_monitor(cfg)
+    build("checkpoint", pl.callbacks.ModelCheckpoint, plain(cfg.checkpoint))
+    options = {key: value for key, value in plain(cfg.trainer).items() if key not in NEEDS_PROCESSES}
+    build("trainer", pl.Trainer, {**options, "devices": 1, "logger": False})
+
+
+def check_part(path: str, type_name: Any, values: Any) -> None:
+    """Check one section against the part ``type_name``, and the sections of parts inside it."""
+    part = _find(f"{path}_type", type_name)
+    config_class = getattr(part, "Config", None)
+    if config_class is None:
+        return
+    _check_keys(path, values, config_class)
+    typed = _typed(path, values, config_class)
+    for key in typed:
+        section = key.removesuffix("_type")
+        if section == key or section not in typed:
+            continue
+        if not typed[key] and _default(config_class, key):
+            raise UserError(f"{path}.{key} is empty: name a registered part, such as {_default(config_class, key)!r}")
+        if typed[key]:
+            check_part(f"{path}.{section}", typed[key], typed[section])
+
+
+def _default(config_class: type, key: str) -> Any:
+    return next(field.default for field in dataclasses.fields(config_class) if field.name == key)
+
+
+def _find(path: str, type_name: Any) -> type:
+    if not type_name:
+        raise UserError(f"{path} is empty: name a registered part")
+    try:
+        return find(type_name)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+
+
+def _check_keys(path: str, values: Any, config_class: type) -> None:
+    fields = {field.name: field.type for field in dataclasses.fields(config_class)}
+    for key in _mapping(path, values):
+        if key not in fields:
+            raise _unknown_key(path, key, fields)
+        if dataclasses.is_dataclass(fields[key]):
+            _check_keys(f"{path}.{key}", values[key], fields[key])
+
+
+def _typed(path: str, values: Any, config_class: type) -> DictConfig:
+    try:
+        cfg = fill(config_class, values)
+    except UserError as error:
+        raise UserError(f"{path}.{error}") from error
+    if hasattr(config_class, "check"):
+        try:
+            config_class.check(cfg)
+        except UserError as error:
+            # a part may know its path in the configuration or not; some begin with the key
+            if str(error).startswith((f"{path}.", f"{path}:")):
+                raise
+            joint = "." if str(error).partition(": ")[0] in cfg else ": "
+            raise UserError(f"{path}{joint}{error}") from error
+    return cfg
+
+
+def _mapping(path: str, values: Any) -> Any:
+    if not isinstance(values, Mapping):
+        raise UserError(f"{path} is {values!r}; expected keys and values (for none, write {path.rpartition('.')[2]}: {{}})")
+    return values
+
+
+def _unknown_key(path: str, key: str, choices: Collection[str]) -> UserError:
+    """As ``errors.unknown``, but near by the last name alone: whole paths are always alike."""
+    near = difflib.get_close_matches(key, choices, n=3, cutoff=0.6)
+    hint = f"did you mean {' or '.join(repr(f'{path}.{name}') for name in near)}?" if near else f"choose from {', '.join(sorted(choices))}"
+    return UserError(f"unknown key '{path}.{key}': {hint}")
+
+
+def _check_loss(loss: Any, known: Any) -> None:
+    for key, weight in (loss or {}).items():
+        if not key.startswith("lambda_"):
+            raise UserError(f"unknown key 'system.loss.{key}': weights of losses are called lambda_<loss>, such as lambda_sds")
+        if known is not None:
+            names = [name if name.startswith("lambda_") else f"lambda_{name}" for name in known]
+            if key not in names:
+                raise _unknown_key("system.loss", key, names)
+        validate_schedule(weight, f"system.loss.{key}")
+
+
+def _check_loggers(loggers: Any) -> None:
+    for name, options in (loggers or {}).items():
+        if name != "wandb":
+            raise _unknown_key("system.loggers", name, ["wandb"])
+        for key in _mapping(f"system.loggers.{name}", options):
+            if key not in LOGGER_KEYS:
+                raise _unknown_key("system.loggers.wandb", key, LOGGER_KEYS)
+
+
+def _check_arguments(section: str, values: Any, owner: type) -> None:
+    parameters = dict(inspect.signature(owner.__init__).parameters)
+    parameters.pop("self")
+    for key, value in _mapping(section, values).items():
+        if key in LAUNCHER_SETS:
+            raise UserError(f"{section}.{key} is set by {LAUNCHER_SETS[key]}: remove it")
+        if key not in parameters:
+            raise _unknown_key(section, key, [name for name in parameters if name not in LAUNCHER_SETS])
+        _check_type(f"{section}.{key}", value, parameters[key].annotation)
+
+
+def _check_type(path: str, value: Any, annotation: Any) -> None:
+    """Plain types only: what else Lightning accepts (objects, literals) it checks itself when it is built."""
+    accepted = _plain_types(annotation)
+    if not accepted or (isinstance(value, int) and not isinstance(value, bool) and float in accepted):
+        return
+    if type(value) not in accepted:
+        names = ", ".join(sorted("null" if kind is type(None) else kind.__name__ for kind in accepted))
+        raise UserError(f"{path} is {value!r} ({type(value).__name__}); expected one of: {names}")
+
+
+def _plain_types(annotation: Any) -> set[type]:
+    """The types of an annotation like ``Optional[Union[int, float]]``; empty when it holds anything but plain ones."""
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        inner = [_plain_types(argument) for argument in typing.get_args(annotation)]
+        return set().union(*inner) if all(inner) else set()
+    return {annotation} if annotation in (int, float, bool, str, type(None)) else set()
+
+
+def _check_trainer_ranges(trainer: Any) -> None:
+    for key, lowest in AT_LEAST.items():
+        if (trainer.get(key) if trainer.get(key) is not None else lowest) < lowest:
+            raise UserError(f"trainer.{key}: expected {lowest} or more, got {trainer[key]}")
+    if trainer.get("val_check_interval") in (0, 0.0):
+        raise UserError("trainer.val_check_interval: expected a number of steps above 0 (for no validation: trainer.limit_val_batches=0)")
+
+
+def _check_file_name(path: str, name: Any) -> None:
+    if name is not None and (os.path.isabs(name) or os.path.normpath(name).startswith(os.pardir)):
+        raise UserError(f"{path} is {name!r}; expected a name below the folder of the checkpoints")
+
+
+def _check_monitor(cfg: Any) -> None:
+    """Lightning misses a quantity that nobody logs only when it is to be compared, after the first validation.
+
+    A system that knows what it logs has a function ``logged`` from its configuration to those names.
+    """
+    monitor, system = cfg.checkpoint.get("monitor"), find(cfg.system_type)
+    logged = getattr(system, "logged", None)
+    if monitor is None or logged is None:
+        return
+    names = logged(_typed("system", cfg.system, system.Config))
+    if names is not None and monitor not in names | {"epoch", "step"}:
+        raise unknown("checkpoint.monitor", monitor, names)
+    if not cfg.trainer.get("log_every_n_steps", 1):
+        raise UserError(f"checkpoint.monitor is {monitor!r}, but with trainer.log_every_n_steps=0 nothing is logged")
+
+
+def build(section: str, owner: type, arguments: dict) -> Any:
+    """``owner(**arguments)``: Lightning checks combinations and literals only then.
+
+    Raises:
+        UserError: it doesn't accept them.
+    """
+    try:
+        return owner(**arguments)
+    except (MisconfigurationException, TypeError, ValueError) as error:
+        raise UserError(f"{section}: {error}") from error
+
+
+def plain(section: Any) -> dict:
+    """A section as plain Python values, for a call with ``**``."""
+    return typing.cast(dict, OmegaConf.to_container(section, resolve=True))

@@ -1,0 +1,61 @@
+"""Extensions of the user: every module in ``./custom`` is imported, so that its ``@register`` decorators run.
+
+As in threestudio a folder with an ``__init__.py`` is loaded under its own name (hyphens are fine, relative imports work), a single
+``part.py`` as ``custom/part``; names that end in ``_disabled`` or begin with a dot are left out.
+"""
+
+import importlib.util
+import sys
+import traceback
+from pathlib import Path
+
+from ..core.errors import Terminated, UserError
+from ..host import info
+
+
+def load_extensions(folder: Path = Path("custom")) -> list[str]:
+    """Import all extensions in ``folder``, by name; returns their module names.
+
+    Raises:
+        UserError: one fails to import; the message names the file, the line and the cause.
+    """
+    if not folder.is_dir():
+        return []
+    return [_load(entry) for entry in sorted(folder.iterdir()) if _is_extension(entry)]
+
+
+def _is_extension(entry: Path) -> bool:
+    if entry.name.startswith((".", "__")) or entry.stem.endswith("_disabled"):
+        return False
+    if entry.is_dir() and not (entry / "__init__.py").is_file():
+        info(f"{entry} has no __init__.py: not an extension")
+        return False
+    return entry.is_dir() or entry.suffix == ".py"
+
+
+def _load(entry: Path) -> str:
+    name, file = (entry.name, entry / "__init__.py") if entry.is_dir() else (f"custom/{entry.stem}", entry)
+    loaded = sys.modules.get(name)
+    if loaded is not None and Path(loaded.__file__ or "").resolve() == file.resolve():
+        return name
+    spec = importlib.util.spec_from_file_location(name, file.resolve())
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        del sys.modules[name]
+        if isinstance(error, Terminated):
+            raise
+        raise UserError(f"the extension {entry} can't be imported: {_cause(error, entry)}") from error
+    return name
+
+
+def _cause(error: BaseException, entry: Path) -> str:
+    """``file:line: what``, the line being the innermost one inside the extension."""
+    what = f"{type(error).__name__}: {error}"
+    if isinstance(error, SyntaxError) and error.lineno:
+        return f"{error.filename}:{error.lineno}: {error.msg}"
+    root = str(entry.resolve())
+    inside = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(root)]
+    return f"{inside[-1].filename}:{inside[-1].lineno}: {what}" if inside else what

@@ -1,0 +1,120 @@
+"""Arguments of the launcher, and what they mean before torch is imported: which GPUs, which configuration files."""
+
+import argparse
+import os
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Optional
+
+from ..core.errors import UserError, unknown
+
+# how this process was started, for the lines that say how to go on
+PROGRAM = {
+    "launch.py": ["python", sys.argv[0]],
+    "gaussiandreamer": ["gaussiandreamer"],
+}.get(Path(sys.argv[0]).name, ["python", "-m", f"{__package__}.experiment"])
+
+
+def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
+    """The arguments as threestudio users know them; what isn't an option is an override ``key=value``."""
+    parser = argparse.ArgumentParser(
+        prog=" ".join(PROGRAM),
+        description="Turn a prior into a cloud of 3D Gaussians by score distillation.",
+        epilog="Everything else is an override of the configuration: trainer.max_steps=1200 'system.prompt_processor.prompt=a fox'",
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "--config",
+        action="append",
+        required=True,
+        help="a YAML file, or the name of one in the current folder, in configs/ or among those that come along; "
+        "given several times, later ones win",
+    )
+    stage = parser.add_mutually_exclusive_group(required=True)
+    stage.add_argument("--train", dest="stage", action="store_const", const="train", help="train, then render the test views")
+    stage.add_argument("--validate", dest="stage", action="store_const", const="validate", help="render the validation views")
+    stage.add_argument("--test", dest="stage", action="store_const", const="test", help="render the test views and the video")
+    stage.add_argument("--export", dest="stage", action="store_const", const="export", help="write the cloud in the exporter's formats")
+    parser.add_argument("--gpu", help="0, or 0,1, or cpu; default: GPU 0 if there is one. Ignored where CUDA_VISIBLE_DEVICES is set")
+    parser.add_argument("--verbose", action="store_true", help="more messages, and tracebacks of errors")
+    parser.add_argument("--typecheck", action="store_true", help="check shapes and types of all calls (slow; for development)")
+    args, args.overrides = parser.parse_known_args(argv)
+    for override in args.overrides:
+        if override.startswith("-"):
+            parser.error(f"unrecognized option {override}")
+    return args
+
+
+def choose_gpu(gpu: Optional[str]) -> None:
+    """Set what CUDA shows to this process, before torch looks.
+
+    Raises:
+        UserError: ``gpu`` is neither "cpu" nor a list of numbers.
+    """
+    if gpu is not None and not re.fullmatch(r"cpu|\d+(,\d+)*", gpu):
+        raise UserError(f"--gpu {gpu}: expected cpu, or numbers of GPUs such as 0 or 0,1")
+    os.environ.setdefault("CUDA_DEVICE_ORDER", "PCI_BUS_ID")
+    if gpu == "cpu":
+        os.environ["CUDA_VISIBLE_DEVICES"] = ""
+    elif "CUDA_VISIBLE_DEVICES" not in os.environ:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpu or "0"
+    elif gpu is not None:
+        print(f"CUDA_VISIBLE_DEVICES={os.environ['CUDA_VISIBLE_DEVICES']} is set: --gpu {gpu} is ignored", file=sys.stderr)
+
+
+def announce_device(gpu: Optional[str]) -> int:
+    """The number of GPUs that this process sees; says when it runs on the CPU without having been asked to.
+
+    Raises:
+        UserError: GPUs were asked for that aren't there.
+    """
+    import torch
+
+    from ..host import info
+
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if gpu is None and not count:
+        info("no GPU found: running on the CPU")
+    if gpu not in (None, "cpu"):
+        _require_gpus(gpu, count, torch.__version__, built_for=torch.version.cuda)
+    return count
+
+
+def _require_gpus(gpu: str, count: int, version: str, built_for: Optional[str]) -> None:
+    visible = os.environ["CUDA_VISIBLE_DEVICES"]
+    if not count:
+        why = "sees no CUDA device" if built_for else "is a build without CUDA"
+        raise UserError(f"--gpu {gpu}: torch {version} {why}; run with --gpu cpu")
+    if count < len(visible.split(",")):
+        raise UserError(f"--gpu {gpu}: only {count} of the GPUs {visible} can be used")
+
+
+def find_config(name: str) -> Path:
+    """The YAML file that ``--config name`` means: a path, else a bare name in ``configs/`` here or among the packaged ones.
+
+    Raises:
+        UserError: there is none; the message names the near ones.
+    """
+    try:
+        path = Path(name).expanduser()
+        candidates = [path]
+        if path.name == name:
+            candidates += [folder / file for folder in config_folders() for file in (name, f"{name}.yaml")]
+        found = next((candidate for candidate in candidates if candidate.is_file()), None)
+    except (OSError, ValueError, RuntimeError) as error:  # a name too long, a NUL inside, a "~stranger"
+        raise UserError(f"configuration {name[:200]!r}: not a usable file name ({error})") from error
+    if found:
+        return found
+    known = sorted({file.name for folder in config_folders() for file in folder.glob("*.yaml")})
+    raise unknown("configuration", name, known)
+
+
+def config_folders() -> list[Path]:
+    """Where bare names are looked up: ``./configs``, the checkout's ``configs/``, the installed package's ``configs/``."""
+    package = Path(__file__).resolve().parents[1]
+    folders = [Path("configs"), package / "configs"]
+    if (package.parent / "launch.py").is_file():
+        folders.insert(1, package.parent / "configs")
+    return [folder for folder in folders if folder.is_dir()]

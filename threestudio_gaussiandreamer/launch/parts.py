@@ -1,0 +1,32 @@
+"""Every module that registers a part, in the order of the rings; importing this module imports them all."""
+
+from importlib import import_module
+
+MODULES = (
+    "training.data",
+    "training.background",
+    "training.renderer",
+    "training.geometry",
+    "priors.mesh",
+    "priors.point_cloud",
+    "priors.gaussians",
+    "priors.random",
+    "priors.body",
+    "priors.shap_e",
+    "priors.point_e",
+    "priors.motion",
+    "guidance.exact_score",
+    "guidance.stable_diffusion",
+    "guidance.deep_floyd",
+    "prompts.prompts",
+    "prompts.prompt_processors",
+    "exporters.ply",
+    "exporters.spz",
+    "exporters.points",
+    "exporters.surface",
+    "exporters.bundle",
+    "training.system",
+)
+
+for module in MODULES:
+    import_module(f"..{module}", __package__)

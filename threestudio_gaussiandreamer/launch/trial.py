@@ -1,0 +1,310 @@
+"""One trial: its folder, its parts, its trainer, and the stage that was asked for.
+
+``outputs/<name>/<tag>@<time>/{ckpts, configs/{raw,parsed}.yaml, code, save, tb_logs, csv_logs, cmd.txt}``
+"""
+
+import argparse
+import contextlib
+import errno
+import os
+import shlex
+import shutil
+import tempfile
+import threading
+import traceback
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Optional
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+from ..core.checkpoint_file import load_checkpoint
+from ..core.errors import UserError
+from ..core.logs import get_rank
+from ..host import find, info, pl, warn
+from .callbacks import GracefulStop, ProgressBar, RunRecord, Stopped
+from .checkpoints import AtomicCheckpointIO
+from .config_check import MisconfigurationException, build, plain
+from .ddp import ReplicatedStrategy
+from .options import PROGRAM
+
+# what ends a run that can't write its results
+WRITE_ERRORS = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM),
+    *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG),
+)
+# without the first Lightning refuses to read a checkpoint; without the others it would train on from step 0, or with a fresh optimiser
+LIGHTNINGS_KEY = "pytorch-lightning_version"
+TRAINING_KEYS = (LIGHTNINGS_KEY, "loops", "optimizer_states")
+
+
+class Trial:
+    """A checked configuration and the stage to run on it.
+
+    Args:
+        cfg: what ``config.load_config`` returned and ``config_check.check_config`` accepted.
+        args: the parsed arguments; ``stage`` is "train", "validate", "test" or "export".
+        config_paths: the YAML files, to be kept beside the results.
+        command: the command line, to be kept too.
+        n_gpus: GPUs to use; 0 for the CPU.
+    """
+
+    def __init__(self, cfg: Any, args: argparse.Namespace, config_paths: Sequence[Path], command: str, n_gpus: int) -> None:
+        self.cfg, self.args, self.config_paths, self.command, self.n_gpus = cfg, args, config_paths, command, n_gpus
+        self.folder = Path(cfg.trial_dir)
+        self.last = self.folder / "ckpts" / "last.ckpt"
+        self.made: Optional[Path] = None
+        self.resumed_step = -1
+        self.trainer: Any = None
+
+    def run(self) -> int:
+        """Build everything, then run the stage; returns the exit code.
+
+        Raises:
+            UserError: something the user can mend; a folder that was made for this run and holds no result is removed again.
+        """
+        try:
+            self.start()
+            alone = sole_run(self.folder) if self.args.stage == "train" else contextlib.nullcontext()
+            with alone, lightning_errors(self.cfg.resume), write_errors(self.folder):
+                getattr(self, self.args.stage)()
+            self.summarize()
+        except (UserError, KeyboardInterrupt, SystemExit) as stop:
+            self.discard_if_unused()
+            # between training and its end, while the test views are rendered
+            if self.args.stage == "train" and not isinstance(stop, UserError) and self.last.is_file():
+                print(f"to go on: {self.resume_command()}", flush=True)
+            raise
+        except Stopped as stop:
+            print(f"stopped at step {stop.step}; to go on: {self.resume_command()}", flush=True)
+            return 128 + stop.signum
+        return 0
+
+    def start(self) -> None:
+        """Everything before the first long work: checks first, the folder last."""
+        checkpoint = self.read_resume()
+        require_writable(self.folder)
+        # one seed for all processes: what they draw differently, they draw by their rank
+        pl.seed_everything(self.cfg.seed, workers=True)
+        self.data = find(self.cfg.data_type)(self.cfg.data)
+        self.system = find(self.cfg.system_type)(self.cfg.system, resumed=self.cfg.resume is not None)
+        if checkpoint is not None and self.args.stage != "train":
+            self.system.set_resume_status(*checkpoint)
+        self.make_folder()
+        self.system.set_save_dir(str(self.folder / "save"))
+        self.trainer = self.build_trainer()
+
+    def read_resume(self) -> Optional[tuple[int, int]]:
+        """The epoch and step of the checkpoint to resume from, which is read whole here so that damage shows early."""
+        if self.cfg.resume is None:
+            if self.args.stage != "train":
+                if "resume=auto" in self.args.overrides:
+                    raise UserError(f"resume=auto: there is no checkpoint to --{self.args.stage}; train first, or look at name and tag")
+                warn(f"no checkpoint given (resume=...): --{self.args.stage} shows what training would start from")
+            return None
+        checkpoint = load_checkpoint(self.cfg.resume)
+        missing = [key for key in (TRAINING_KEYS if self.args.stage == "train" else (LIGHTNINGS_KEY,)) if key not in checkpoint]
+        if missing:
+            raise UserError(f"{self.cfg.resume} isn't a training checkpoint: it has no {', '.join(missing)}, which Lightning writes")
+        self.resumed_step = checkpoint["global_step"]
+        return checkpoint["epoch"], self.resumed_step
+
+    # -- the stages ----------------------------------------------------------------------------------------------------------
+
+    def train(self) -> None:
+        if 0 <= self.cfg.trainer.get("max_steps", -1) <= self.resumed_step:
+            info(f"the checkpoint is at step {self.resumed_step} of {self.cfg.trainer.max_steps}: nothing is left to train")
+        self.trainer.fit(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
+        self.trainer.test(self.system, datamodule=self.data)
+
+    def validate(self) -> None:
+        self.trainer.validate(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
+
+    def test(self) -> None:
+        self.trainer.test(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
+
+    def export(self) -> None:
+        self.trainer.predict(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
+
+    def summarize(self) -> None:
+        """What the system has to say about where its results are."""
+        summary = self.system.summary() if hasattr(self.system, "summary") else None
+        if summary and self.trainer.is_global_zero:
+            print(summary, flush=True)
+
+    # -- the trainer ---------------------------------------------------------------------------------------------------------
+
+    def build_trainer(self) -> Any:
+        """Lightning's Trainer on the chosen device."""
+        options = {"enable_model_summary": False, "enable_progress_bar": True, **plain(self.cfg.trainer)}
+        checkpoint_io = AtomicCheckpointIO()
+        training = self.args.stage == "train"
+        callbacks = [ProgressBar()] if options["enable_progress_bar"] else []
+        ours = {
+            "accelerator": "gpu" if self.n_gpus else "cpu",
+            "devices": self.n_gpus or 1,
+            "logger": self.build_loggers() if training else False,
+            "callbacks": callbacks + (self.training_callbacks(checkpoint_io) if training else []),
+            "plugins": [checkpoint_io],
+            "inference_mode": False,
+            "default_root_dir": str(self.folder),
+        }
+        if self.n_gpus > 1:
+            options.setdefault("strategy", ReplicatedStrategy())
+        return build("trainer", pl.Trainer, options | ours)
+
+    def build_loggers(self) -> list:
+        folder = str(self.folder)
+        loggers = [pl.loggers.TensorBoardLogger(folder, name="tb_logs"), pl.loggers.CSVLogger(folder, name="csv_logs")]
+        return loggers + list(self.system.get_loggers())
+
+    def training_callbacks(self, checkpoint_io: AtomicCheckpointIO) -> list:
+        # a resumed run goes on writing last.ckpt, instead of last-v1.ckpt beside a stale one
+        checkpointing = {"enable_version_counter": False, **plain(self.cfg.checkpoint)}
+        return [
+            pl.callbacks.ModelCheckpoint(dirpath=str(self.last.parent), **checkpointing),
+            pl.callbacks.LearningRateMonitor(logging_interval="step"),
+            RunRecord(self.folder, self.cfg, self.config_paths, self.command),
+            GracefulStop(self.last, checkpoint_io),
+        ]
+
+    # -- the folder ----------------------------------------------------------------------------------------------------------
+
+    def make_folder(self) -> None:
+        missing = [folder for folder in (self.folder, *self.folder.parents) if not folder.exists()]
+        self.made = missing[-1] if missing else None
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise _unwritable(self.folder, error) from error
+
+    def discard_if_unused(self) -> None:
+        """Remove the folder again if this run made it and has nothing to show for it."""
+        trained = self.trainer is not None and self.trainer.global_step > max(self.resumed_step, 0)
+        if self.made is None or trained or any(self.folder.glob("save/it*")):
+            return
+        shutil.rmtree(self.folder, ignore_errors=True)
+        # parents are removed as long as they are this run's and empty
+        for parent in self.folder.parents:
+            if parent == self.made.parent or any(parent.iterdir()):
+                break
+            parent.rmdir()
+
+    def resume_command(self) -> str:
+        device = ["--gpu", self.args.gpu] if self.args.gpu else []
+        parsed = str(self.folder / "configs" / "parsed.yaml")
+        return shlex.join([*PROGRAM, "--config", parsed, "--train", *device, f"resume={self.last}"])
+
+
+def require_writable(folder: Path) -> None:
+    """Try to write into the nearest existing folder above.
+
+    Raises:
+        UserError: it isn't a folder, or nothing can be written there.
+    """
+    existing: Optional[Path] = None
+    try:
+        existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+        with tempfile.TemporaryFile(dir=existing) as file:
+            file.write(b"0")
+    except OSError as error:
+        raise _unwritable(folder, error, f" ({existing})" if existing else "") from error
+
+
+def _unwritable(folder: Path, error: Exception, where: str = "") -> UserError:
+    why = getattr(error, "strerror", None) or str(error)
+    return UserError(f"the output folder {folder} can't be written: {why}{where}; choose another exp_root_dir")
+
+
+@contextlib.contextmanager
+def sole_run(folder: Path) -> Iterator[None]:
+    """Keeps other runs from training in a folder; the system lets go of it when this process ends, however it ends.
+
+    Raises:
+        UserError: another run trains in it.
+    """
+    if fcntl is None or get_rank():
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(descriptor)
+        raise UserError(f"another run is training in {folder}: wait until it ends, or choose another tag") from error
+    except OSError:
+        pass  # a file system without locks
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
+    """Lightning's ways of ending, translated.
+
+    Raises:
+        UserError: the checkpoint's parameters or optimiser aren't those of this configuration, or the trainer's options don't
+            go together with what is to be run.
+        KeyboardInterrupt: Ctrl-C outside of training, of which Lightning makes a SystemExit(1).
+    """
+    try:
+        yield
+    except SystemExit as stop:
+        if isinstance(stop.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from None
+        raise
+    except MisconfigurationException as error:
+        raise UserError(f"trainer: {error}") from error
+    except (RuntimeError, ValueError, KeyError) as error:
+        if isinstance(error, ValueError) and _raised_by_lightning(error):
+            raise UserError(f"trainer: {str(error).strip()}") from error
+        if checkpoint is None or isinstance(error, UserError) or not (is_mismatch(error) or _raised_by_lightning(error)):
+            raise
+        raise UserError(f"the checkpoint {checkpoint} was made by another configuration: {str(error).strip()}") from error
+
+
+@contextlib.contextmanager
+def write_errors(folder: Path) -> Iterator[None]:
+    """What the system says while results are written below ``folder``, as a message, also where a logger's thread writes.
+
+    Raises:
+        UserError: the disk is full, or something else is where a file or folder is to be made.
+    """
+
+    def said(error: OSError) -> str:
+        return f"cannot write {error.filename or f'the results in {folder}'}: {error.strerror}; make room, or choose another exp_root_dir"
+
+    def in_a_thread(failure: Any) -> None:
+        # the logger raises it anew at its next line
+        warn(said(failure.exc_value)) if _is_write_error(failure.exc_value) else earlier(failure)
+
+    earlier, threading.excepthook = threading.excepthook, in_a_thread
+    try:
+        yield
+    except OSError as error:
+        if not _is_write_error(error):
+            raise
+        raise UserError(said(error)) from error
+    finally:
+        threading.excepthook = earlier
+
+
+def _is_write_error(error: Optional[BaseException]) -> bool:
+    return isinstance(error, OSError) and error.errno in WRITE_ERRORS
+
+
+def _raised_by_lightning(error: Exception) -> bool:
+    """Whether Lightning itself refused, as against something that it called."""
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    return frame.f_globals.get("__name__", "").startswith(pl.__name__)
+
+
+def is_mismatch(error: Exception) -> bool:
+    """Whether this is how torch and Lightning say that a state doesn't fit."""
+    said = str(error)
+    return any(part in said for part in ("loading state_dict", "loaded state dict", "optimizer_states", "restore training state"))

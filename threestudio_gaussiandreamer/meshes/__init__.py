@@ -1,0 +1,1 @@
+"""Load, check and ray cast triangle meshes."""

@@ -1,0 +1,197 @@
+"""Target images by ray casting a mesh: what training is scored against, made without our own splatting.
+
+Colours are the mesh's own, without lights, from both sides of a face. Cameras are the host's (OpenGL ``c2w``; see
+``cameras.py``): the ray through pixel (i, j) of an H x W image has the camera direction
+``((j + 0.5 - W/2)/f, -(i + 0.5 - H/2)/f, -1)`` with ``f = H / (2 tan(fovy/2))``.
+"""
+
+import functools
+import logging
+import math
+import os
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from ..core.errors import UserError
+from .load import Mesh, surface_colors
+from .zbuffer import NEAR, ZBuffer
+
+RAYS_PER_CAST = 2**15
+log = logging.getLogger(__name__)
+
+
+class MeshCaster:
+    """Casts rays at one mesh; what that needs is built once, ``render`` may be called from several threads."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        self._hits = _fastest_hits(mesh)
+        self._vertices = mesh.vertices.astype(np.float32)
+
+    def render(
+        self, c2w: Float[np.ndarray, "4 4"], fovy: float, height: int, width: int, supersample: int = 2
+    ) -> Float[np.ndarray, "H W 4"]:
+        """Premultiplied colour and coverage in [0, 1], float32, each pixel the mean of a regular supersample^2 grid.
+
+        Args:
+            c2w: OpenGL camera to world.
+            fovy: vertical field of view in radians, in (0, pi).
+        """
+        _require_size(height, width, supersample)
+        image = np.zeros((height, width, 4), dtype=np.float32)
+        for fill in self._bands(image, c2w, fovy, supersample):
+            fill()
+        return image
+
+    def render_views(
+        self, cameras: Iterable[tuple[np.ndarray, float]], height: int, width: int, *, supersample: int = 2, progress: str = ""
+    ) -> Float[np.ndarray, "N H W 4"]:
+        """``render`` of several (c2w, fovy) on all cores (embree and numpy's gathers release the GIL).
+
+        ``progress`` names a progress bar, for terminals only; without it there is none.
+        """
+        from tqdm import tqdm
+
+        _require_size(height, width, supersample)
+        cameras = list(cameras)
+        images = np.zeros((len(cameras), height, width, 4), dtype=np.float32)
+        # bands instead of pictures, so that one picture occupies all cores too
+        bands = [fill for image, camera in zip(images, cameras, strict=True) for fill in self._bands(image, *camera, supersample)]
+        if bands:
+            with ThreadPoolExecutor(min(len(bands), os.cpu_count() or 1)) as pool:
+                drawn = pool.map(lambda fill: fill(), bands)
+                list(tqdm(drawn, progress, len(bands), unit="band", disable=None if progress else True, leave=False))
+        return images
+
+    def _bands(self, image: Float[np.ndarray, "H W 4"], c2w: np.ndarray, fovy: float, supersample: int) -> list[Callable[[], None]]:
+        """What has to be called to draw one picture, each a group of its rows, in any order."""
+        height, width = image.shape[:2]
+        c2w = np.asarray(c2w, dtype=np.float64)
+        focal = height / (2 * math.tan(fovy / 2))
+        top, bottom, left, right = self._bounds(c2w, focal, height, width)
+        columns = _samples(left, right, supersample) - width / 2
+
+        def fill(start: int, end: int) -> None:
+            colors = self._cast(c2w, focal, _samples(start, end, supersample) - height / 2, columns)
+            image[start:end, left:right] = colors.reshape(end - start, supersample, right - left, supersample, 4).mean(axis=(1, 3))
+
+        return [functools.partial(fill, start, end) for start, end in _row_groups(top, bottom, supersample * len(columns))]
+
+    def _bounds(self, c2w: np.ndarray, focal: float, height: int, width: int) -> tuple[int, int, int, int]:
+        """The pixel rectangle (top, bottom, left, right) outside which no ray can hit: the vertices' on the screen."""
+        x, y, z = ((self._vertices - c2w[:3, 3]) @ c2w[:3, :3]).T
+        if (-z).min() < NEAR:
+            return 0, height, 0, width
+        columns, rows = width / 2 + focal * x / -z, height / 2 + focal * y / z
+        top, bottom = np.clip([math.floor(rows.min()), math.ceil(rows.max())], 0, height)
+        left, right = np.clip([math.floor(columns.min()), math.ceil(columns.max())], 0, width)
+        return int(top), int(bottom), int(left), int(right)
+
+    def _cast(self, c2w: np.ndarray, focal: float, rows: np.ndarray, columns: np.ndarray) -> Float[np.ndarray, "H W 4"]:
+        """Colour and coverage 1 where a sample shows the mesh, zeros elsewhere."""
+        face_index, barycentric = self._hits(c2w, focal, rows, columns)
+        seen = face_index >= 0
+        colors = np.zeros((*seen.shape, 4), dtype=np.float32)
+        colors[seen, :3] = surface_colors(self.mesh, face_index[seen], barycentric[seen])
+        colors[seen, 3] = 1
+        return colors
+
+
+def over_background(
+    rgba: Float[np.ndarray | Tensor, "... 4"], background: Float[np.ndarray | Tensor, "... 3"]
+) -> Float[np.ndarray | Tensor, "... 3"]:
+    """Premultiplied ``rgba`` over ``background``: C + (1 - coverage) background. Takes numpy arrays and tensors alike."""
+    return rgba[..., :3] + (1 - rgba[..., 3:]) * background
+
+
+def _require_size(height: int, width: int, supersample: int) -> None:
+    if height < 1 or width < 1 or supersample < 1:
+        raise UserError(f"a picture needs a size and supersample of at least 1, not {height}x{width} and {supersample}")
+
+
+def _samples(start: int, end: int, supersample: int) -> Float[np.ndarray, " S"]:
+    """The places of a regular grid in the pixels start ... end - 1."""
+    return start + (np.arange((end - start) * supersample) + 0.5) / supersample
+
+
+def _row_groups(top: int, bottom: int, rays_per_row: int) -> list[tuple[int, int]]:
+    """Groups of pixel rows with at most RAYS_PER_CAST rays, or one row: memory doesn't grow with size and supersample."""
+    if not rays_per_row:
+        return []
+    size = max(1, RAYS_PER_CAST // rays_per_row)
+    return [(start, min(start + size, bottom)) for start in range(top, bottom, size)]
+
+
+# Casters: functions (c2w (4, 4), focal, rows (H,), columns (W,)) -> nearest face (H, W), -1 = none, and barycentric (H, W, 3); rows and
+# columns are the places of the samples in pixels from the centre of the picture, rows downwards.
+Hits = Callable[[np.ndarray, float, np.ndarray, np.ndarray], tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]]
+
+
+def _fastest_hits(mesh: Mesh) -> Hits:
+    try:
+        return functools.partial(_embree_hits, _embree_scene(mesh))
+    except ImportError as error:
+        _report_slow_caster(str(error))
+        return ZBuffer(mesh.vertices, mesh.faces).hits
+
+
+@functools.cache
+def _report_slow_caster(reason: str) -> None:
+    log.warning("embreex is missing (%s): drawing the mesh with plain numpy, which is slower; `pip install embreex` for speed.", reason)
+
+
+def _embree_scene(mesh: Mesh):
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene()
+    TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
+    return scene
+
+
+def _embree_hits(scene, c2w: np.ndarray, focal: float, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    x, y = (columns / focal)[:, None] * c2w[:3, 0], (-rows / focal)[:, None, None] * c2w[:3, 1]
+    directions = (x + y - c2w[:3, 2]).astype(np.float32).reshape(-1, 3)
+    origins = np.ascontiguousarray(np.broadcast_to(c2w[:3, 3].astype(np.float32), directions.shape))
+    hits = scene.run(origins, directions, output=True)
+    u, v = hits["u"], hits["v"]
+    barycentric = np.stack([1 - u - v, u, v], axis=1)  # embree's u and v weigh the second and the third corner
+    shape = len(rows), len(columns)
+    return hits["primID"].reshape(shape), barycentric.reshape(*shape, 3)
+
+
+class TargetCache:
+    """Pictures of a mesh from cameras seen before, as bytes; the one not asked for the longest makes room."""
+
+    def __init__(self, caster: MeshCaster, supersample: int, capacity: int) -> None:
+        self.caster, self.supersample, self.capacity = caster, supersample, capacity
+        self._pictures: OrderedDict[tuple, Tensor] = OrderedDict()
+
+    def __call__(self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int) -> UInt8[Tensor, "B H W 4"]:
+        """Premultiplied colour and coverage of each camera, on the cameras' device."""
+        cameras = list(zip(c2w.detach().float().cpu().numpy(), fovy.detach().tolist(), strict=True))
+        keys = [(matrix.tobytes(), angle, height, width) for matrix, angle in cameras]
+        missing = {key: camera for key, camera in zip(keys, cameras, strict=True) if key not in self._pictures}
+        images = self.caster.render_views(missing.values(), height, width, supersample=self.supersample)
+        found = {key: self._pictures[key] for key in keys if key not in missing}
+        found |= {
+            key: torch.from_numpy(np.round(image * 255).astype(np.uint8)).to(c2w.device) for key, image in zip(missing, images, strict=True)
+        }
+        self._remember(found)
+        return torch.stack([found[key] for key in keys])
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    def _remember(self, pictures: dict[tuple, Tensor]) -> None:
+        for key, picture in pictures.items():
+            self._pictures[key] = picture
+            self._pictures.move_to_end(key)
+        while len(self._pictures) > self.capacity:
+            self._pictures.popitem(last=False)

@@ -1,0 +1,1 @@
+"""Find, download and load pretrained models; embed text."""

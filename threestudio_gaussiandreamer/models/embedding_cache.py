@@ -1,0 +1,77 @@
+"""Text embeddings on the disk: one safetensors file per (model, text), whole or absent."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Optional
+
+from jaxtyping import Float
+from torch import Tensor
+
+from ..core.errors import UserError
+from ..core.files import atomic_file
+from ..host import debug
+
+FORMAT = 1
+"""Goes into the key: raise it when what is stored for the same model and text changes."""
+
+Encode = Callable[[list[str]], list[Float[Tensor, "N F"]]]
+
+
+class EmbeddingCache:
+    """The embeddings of one model's text encoder in ``folder``.
+
+    Args:
+        folder: where the files are; made when first written to.
+        model: what the embeddings depend on beside the text, ``hub.fingerprint`` of tokenizer and text encoder.
+    """
+
+    def __init__(self, folder: str, model: str) -> None:
+        self.folder, self.model = Path(folder).expanduser(), model
+
+    def path(self, text: str) -> Path:
+        key = json.dumps([FORMAT, self.model, text])
+        return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()}.safetensors"
+
+    def read(self, text: str) -> Optional[Float[Tensor, "N F"]]:
+        """The embedding of ``text``; None when it isn't there or its file is damaged."""
+        from safetensors import SafetensorError
+        from safetensors.torch import load
+
+        path = self.path(text)
+        try:
+            return load(path.read_bytes())["embedding"]
+        except FileNotFoundError:
+            return None
+        except (OSError, SafetensorError, KeyError, ValueError) as error:
+            debug(f"the cached text embedding {path} can't be read and is made again: {error}")
+            return None
+
+    def write(self, text: str, embedding: Float[Tensor, "N F"]) -> None:
+        """Keep one embedding; after a crash in the middle the file is as before.
+
+        Raises:
+            UserError: the folder can't be made or written.
+        """
+        from safetensors.torch import save
+
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(
+                f"the folder of text embeddings {str(self.folder)!r} can't be made ({error.strerror}): "
+                "set system.prompt_processor.cache_dir to another one, or use_cache=false"
+            ) from error
+        with atomic_file(self.path(text)) as file:
+            file.write(save({"embedding": embedding.float().cpu().contiguous()}, metadata={"text": text}))
+
+    def embed(self, texts: list[str], encode: Encode) -> list[Float[Tensor, "N F"]]:
+        """The embeddings of ``texts``; only those that aren't here yet are encoded, and kept."""
+        found = {text: self.read(text) for text in texts}
+        missing = [text for text, embedding in found.items() if embedding is None]
+        if missing:
+            found |= zip(missing, encode(missing), strict=True)
+        for text in missing:
+            self.write(text, found[text])
+        return [found[text] for text in texts]

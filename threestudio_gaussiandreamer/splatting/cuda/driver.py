@@ -1,0 +1,166 @@
+"""Kernels on an NVIDIA GPU: loads what `nvrtc` compiled and launches it on torch's current stream, through the driver's C interface.
+
+ctypes is all it takes: a few functions of a library that every driver brings, so neither cuda-bindings nor a toolkit is needed.
+"""
+
+import ctypes
+import functools
+import sys
+from itertools import pairwise
+from typing import Optional
+
+import torch
+from torch import Tensor
+
+from ...core.errors import UserError
+from . import nvrtc
+from .stages import Argument
+
+# The unit that each kernel stands in.
+UNITS = {
+    "project": "project",
+    "count_tiles": "bin",
+    "list_tiles": "bin",
+    "find_tiles": "bin",
+    "blend": "blend",
+    "blend_backward": "blend_backward",
+    "blend_backward_absolute": "blend_backward",
+    "sum_rows": "project_backward",
+    "project_backward": "project_backward",
+}
+LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+
+
+@functools.cache
+def unavailable() -> Optional[str]:
+    """Why no GPU can be used, or None; found out once."""
+    if torch.version.cuda is None:
+        return f"this torch ({torch.__version__}) is built without CUDA; install a CUDA build of it"
+    if not torch.cuda.is_available():
+        return f"torch finds no NVIDIA GPU, or no driver that its CUDA {torch.version.cuda} can use"
+    return nvrtc.unavailable() or _unsuitable()
+
+
+def machine(device: torch.device) -> "Gpu":
+    """The GPU that holds tensors of this device."""
+    return _gpu(torch.cuda.current_device() if device.index is None else device.index)
+
+
+class Gpu:
+    """One device. Its kernels are compiled, or read from the cache, when they are first launched."""
+
+    def __init__(self, index: int):
+        self.index = index
+        self.target = nvrtc.target_for(torch.cuda.get_device_capability(index))
+        self.context = _primary_context(index)
+        self.modules: dict[str, ctypes.c_void_p] = {}
+        self.functions: dict[str, ctypes.c_void_p] = {}
+
+    def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Argument) -> None:
+        """Queues a kernel on torch's current stream of the device; ``arguments`` are tensors, structures and C numbers."""
+        values = [ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else x for x in arguments]
+        pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(x) for x in values))
+        with torch.cuda.device(self.index):
+            function, stream = self._function(name), ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
+            status = _driver().cuLaunchKernel(function, *grid, 1, threads, 1, 1, 0, stream, pointers, None)
+        _check(status, f"launching the kernel {name}")
+
+    def read_later(self, ends: Tensor) -> "Later":
+        with torch.cuda.device(self.index):
+            return Later(ends)
+
+    def _function(self, name: str) -> ctypes.c_void_p:
+        """The kernel, with the context in which it lives made current: a thread that torch hasn't used yet, such as autograd's,
+        has none."""
+        _check(_driver().cuCtxSetCurrent(self.context), "using the GPU")
+        if name not in self.functions:
+            function = ctypes.c_void_p()
+            status = _driver().cuModuleGetFunction(ctypes.byref(function), self._module(UNITS[name]), name.encode())
+            _check(status, f"finding the kernel {name}")
+            self.functions[name] = function
+        return self.functions[name]
+
+    def _module(self, unit: str) -> ctypes.c_void_p:
+        if unit not in self.modules:
+            module = ctypes.c_void_p()
+            status = _driver().cuModuleLoadData(ctypes.byref(module), nvrtc.machine_code(unit, self.target))
+            releases = f"NVRTC of CUDA {_release(nvrtc.version())}, driver of CUDA {_release(driver_version())}"
+            _check(status, f"loading {unit}.cu for {self.target} ({releases})")
+            self.modules[unit] = module
+        return self.modules[unit]
+
+
+class Later:
+    """Whole numbers on their way from the GPU, without making anybody wait for them."""
+
+    def __init__(self, ends: Tensor):
+        """``ends`` are running sums; what is asked for are their steps."""
+        self.ends = torch.empty(len(ends), dtype=ends.dtype, pin_memory=True)
+        self.ends.copy_(ends.contiguous(), non_blocking=True)
+        self.arrived = torch.cuda.Event()
+        self.arrived.record()
+
+    def ready(self) -> bool:
+        return self.arrived.query()
+
+    def values(self) -> list[int]:
+        """Waits if it must."""
+        self.arrived.synchronize()
+        return [end - begin for begin, end in pairwise([0, *self.ends.tolist()])]
+
+
+@functools.cache
+def _gpu(index: int) -> Gpu:
+    return Gpu(index)
+
+
+def driver_version() -> tuple[int, int]:
+    """Major and minor of the newest CUDA release that the driver knows."""
+    release = ctypes.c_int()
+    _check(_driver().cuDriverGetVersion(ctypes.byref(release)), "asking for the driver's version")
+    return release.value // 1000, release.value % 1000 // 10
+
+
+def _unsuitable() -> Optional[str]:
+    """What is wrong with GPU or driver. Machine code runs on every driver of its major release or a later one."""
+    try:
+        nvrtc.target_for(torch.cuda.get_device_capability())
+        knows, compiler = driver_version(), nvrtc.version()
+    except (OSError, UserError) as error:
+        return str(error)
+    if knows[0] < compiler[0]:
+        advice = f"update the driver, or install a torch built for CUDA {knows[0]}"
+        return f"the NVIDIA driver knows CUDA up to {_release(knows)}, the compiler is of CUDA {_release(compiler)}: {advice}"
+
+
+def _release(version: tuple[int, int]) -> str:
+    return ".".join(map(str, version))
+
+
+def _primary_context(index: int) -> ctypes.c_void_p:
+    """The context that torch works in."""
+    torch.cuda.init()
+    device, context = ctypes.c_int(), ctypes.c_void_p()
+    _check(_driver().cuInit(0), "starting the driver")
+    _check(_driver().cuDeviceGet(ctypes.byref(device), index), "finding the GPU")  # both number what CUDA_VISIBLE_DEVICES shows
+    _check(_driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), device), "using the GPU")
+    return context
+
+
+@functools.cache
+def _driver() -> ctypes.CDLL:
+    driver = ctypes.CDLL(LIBRARY)
+    unsigned, pointer = ctypes.c_uint, ctypes.c_void_p
+    driver.cuCtxSetCurrent.argtypes = [pointer]
+    driver.cuDevicePrimaryCtxRetain.argtypes = [pointer, ctypes.c_int]
+    driver.cuLaunchKernel.argtypes = [pointer, *[unsigned] * 7, pointer, pointer, pointer]
+    driver.cuModuleLoadData.argtypes = [pointer, ctypes.c_char_p]
+    driver.cuModuleGetFunction.argtypes = [pointer, pointer, ctypes.c_char_p]
+    return driver
+
+
+def _check(status: int, doing: str) -> None:
+    if status:
+        text = ctypes.c_char_p()
+        _driver().cuGetErrorString(status, ctypes.byref(text))
+        raise UserError(f"CUDA failed at {doing}: {(text.value or b'unknown error').decode()} ({status}).")

@@ -1,0 +1,225 @@
+"""CUDA text to machine code at run time: NVIDIA's run-time compiler through ctypes, and a cache on the disk of what it made.
+
+Neither a compiler nor a CUDA toolkit is needed. The library libnvrtc comes with every CUDA build of torch; the variable
+GAUSSIANDREAMER_NVRTC names another one. Compiled kernels are kept in GAUSSIANDREAMER_CACHE, else in the user's cache folder, by a
+hash of everything that goes into them.
+"""
+
+import ctypes
+import functools
+import glob
+import hashlib
+import logging
+import os
+import re
+import sys
+import sysconfig
+from pathlib import Path
+from typing import NamedTuple, Optional
+
+import torch
+
+from ...core.errors import UserError
+from ...core.files import atomic_file
+
+KERNELS = Path(__file__).parent
+SHARED = KERNELS.parent / "shared"  # the formulas: the very files that the CPU kernel includes
+OPTIONS = ("--std=c++17", "--ptxas-options=-v", "--generate-line-info")  # lines are for profilers and sanitizers
+# Blending divides by 1 - alpha and takes powers once per pair of splat and pixel; denormals can't be seen there.
+UNIT_OPTIONS = {name: ("--ftz=true", "--prec-div=false") for name in ("blend", "blend_backward")}
+OLDEST_ARCHITECTURE = 75
+DIGEST = hashlib.sha256().digest_size
+log = logging.getLogger(__name__)
+
+
+class Compiled(NamedTuple):
+    code: bytes  # cubin, or PTX with its NUL
+    log: str  # registers, shared memory and spills of each kernel
+
+
+def unavailable() -> Optional[str]:
+    """Why nothing can be compiled, or None."""
+    try:
+        _library()
+    except OSError as error:
+        return str(error)
+
+
+def version() -> tuple[int, int]:
+    """Major and minor of the CUDA release that the compiler belongs to."""
+    major, minor = ctypes.c_int(), ctypes.c_int()
+    _check(_library().nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)))
+    return major.value, minor.value
+
+
+def architectures() -> list[int]:
+    """Compute capabilities that the compiler knows, times ten: 75, 80, ..."""
+    count = ctypes.c_int()
+    _check(_library().nvrtcGetNumSupportedArchs(ctypes.byref(count)))
+    known = (ctypes.c_int * count.value)()
+    _check(_library().nvrtcGetSupportedArchs(known))
+    return list(known)
+
+
+def target_for(capability: tuple[int, int]) -> str:
+    """What to compile for: "sm_90", machine code, for an architecture that the compiler knows.
+
+    For a newer one "compute_..." of the newest that it knows: that is PTX, an assembly text which the driver finishes.
+
+    Raises:
+        UserError: the device is older than what the kernels, or the compiler, can do.
+    """
+    device, known = 10 * capability[0] + capability[1], architectures()
+    older = [architecture for architecture in known if OLDEST_ARCHITECTURE <= architecture <= device]
+    if not older:
+        oldest = max(OLDEST_ARCHITECTURE, min(known))
+        raise UserError(
+            f"this GPU has compute capability {capability[0]}.{capability[1]}; the CUDA backend, compiled by the NVRTC of CUDA "
+            f"{'.'.join(map(str, version()))}, needs {oldest // 10}.{oldest % 10} or later: use backend='torch'."
+        )
+    return f"sm_{device}" if device in known else f"compute_{max(older)}"
+
+
+def machine_code(unit: str, target: str) -> bytes:
+    """``<unit>.cu`` compiled for a target of `target_for`, from the disk if it has been compiled before."""
+    name = f"{unit}-{target}-{_key(unit, target)}"
+    found = _read(name)
+    if found is None:
+        log.info("compiling the CUDA kernels of %s.cu for %s", unit, target)
+        found = compile_unit(unit, target).code
+        _write(name, found)
+    return found
+
+
+def compile_unit(unit: str, target: str) -> Compiled:
+    """Compiles ``<unit>.cu``.
+
+    Raises:
+        UserError: the compiler rejects it.
+    """
+    nvrtc, program, texts = _library(), ctypes.c_void_p(), headers()
+    sources = (source(unit).encode(), f"{unit}.cu".encode(), len(texts), _strings(texts.values()), _strings(texts))
+    _check(nvrtc.nvrtcCreateProgram(ctypes.byref(program), *sources))
+    try:
+        options = options_of(unit, target)
+        status = nvrtc.nvrtcCompileProgram(program, len(options), _strings(options))
+        messages = _bytes(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program).rstrip(b"\0").decode()
+        if status:
+            release = ".".join(map(str, version()))
+            raise UserError(f"the NVRTC of CUDA {release} can't compile {unit}.cu for {target}: {_error(status)}\n{messages}")
+        kind = "CUBIN" if target.startswith("sm_") else "PTX"
+        code = _bytes(getattr(nvrtc, f"nvrtcGet{kind}Size"), getattr(nvrtc, f"nvrtcGet{kind}"), program)
+        return Compiled(code, messages)
+    finally:
+        nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
+
+
+def source(unit: str) -> str:
+    return (KERNELS / f"{unit}.cu").read_text()
+
+
+@functools.cache
+def headers() -> dict[str, str]:
+    """Name to text of whatever a unit may include."""
+    return {path.name: path.read_text() for path in (*sorted(KERNELS.glob("*.h")), *sorted(SHARED.glob("*.h")))}
+
+
+def options_of(unit: str, target: str) -> tuple[str, ...]:
+    return (f"--gpu-architecture={target}", *OPTIONS, *UNIT_OPTIONS.get(unit, ()))
+
+
+# ---- the cache -----------------------------------------------------------------------------------------------------------------
+
+
+def cache_folder() -> Path:
+    """Where compiled kernels are kept.
+
+    Raises:
+        RuntimeError: neither the variables nor the system say where the user's home is, as in some containers.
+    """
+    folder = os.environ.get("GAUSSIANDREAMER_CACHE")
+    if folder:
+        return Path(folder).expanduser()
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gaussiandreamer" / "cubins"
+
+
+def _key(unit: str, target: str) -> str:
+    """Changes with whatever changes the machine code."""
+    parts = [source(unit), *headers(), *headers().values(), *options_of(unit, target), str(version())]
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
+
+
+def _read(name: str) -> Optional[bytes]:
+    """The content if it is whole: the file ends with a digest of what comes before."""
+    try:
+        data = (cache_folder() / name).read_bytes()
+    except (OSError, RuntimeError):
+        return None
+    content, digest = data[:-DIGEST], data[-DIGEST:]
+    return content if hashlib.sha256(content).digest() == digest else None
+
+
+def _write(name: str, content: bytes) -> None:
+    """A cache that can't be written costs the next start some seconds, nothing else."""
+    try:
+        path = cache_folder() / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_file(path) as file:
+            file.write(content + hashlib.sha256(content).digest())
+    except (OSError, RuntimeError, UserError) as error:
+        log.warning("compiled CUDA kernels can't be kept for the next start: %s", error)
+
+
+# ---- the library ---------------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def _library() -> ctypes.CDLL:
+    """The first candidate that loads."""
+    failures = []
+    for candidate in _candidates():
+        try:
+            library = ctypes.CDLL(candidate)
+        except OSError as error:
+            failures.append(str(error))
+            continue
+        library.nvrtcGetErrorString.restype = ctypes.c_char_p
+        return library
+    raise OSError(f"NVRTC, CUDA's run-time compiler, isn't there: install a CUDA build of torch, or nvidia-cuda-nvrtc ({failures[-1]})")
+
+
+def _candidates() -> list[str]:
+    """What the variable names; else what pip installed, the release that torch was built with first; else what the loader finds."""
+    named = os.environ.get("GAUSSIANDREAMER_NVRTC")
+    if named:
+        return [named]
+    release = (torch.version.cuda or "13").split(".")[0]
+    pattern = "nvrtc64_*.dll" if sys.platform == "win32" else "libnvrtc*.so*"
+    folders = [Path(torch.__file__).parent / "lib"]
+    for root in dict.fromkeys([sysconfig.get_paths()["purelib"], *sys.path]):
+        folders += [Path(root) / "nvidia" / place for place in (f"cu{release}/lib", "cuda_nvrtc/lib", "cuda_nvrtc/bin", "cu13/lib")]
+    toolkit = os.environ.get("CUDA_HOME")
+    folders += [Path(toolkit) / "lib64"] if toolkit else []
+    found = [path for folder in folders for path in sorted(glob.glob(str(folder / pattern))) if not re.search(r"builtins|\.alt\.", path)]
+    return [*dict.fromkeys(found), f"libnvrtc.so.{release}", "libnvrtc.so.12", "libnvrtc.so"]
+
+
+def _bytes(size_of, get, program: ctypes.c_void_p) -> bytes:
+    size = ctypes.c_size_t()
+    _check(size_of(program, ctypes.byref(size)))
+    buffer = ctypes.create_string_buffer(size.value)
+    _check(get(program, buffer))
+    return buffer.raw
+
+
+def _strings(texts) -> ctypes.Array:
+    return (ctypes.c_char_p * len(texts))(*(text.encode() for text in texts))
+
+
+def _check(status: int) -> None:
+    if status:
+        raise UserError(f"NVRTC failed: {_error(status)}")
+
+
+def _error(status: int) -> str:
+    return _library().nvrtcGetErrorString(status).decode()

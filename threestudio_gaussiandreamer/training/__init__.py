@@ -1,0 +1,1 @@
+"""Geometry, renderer, background, data and the system that trains them."""

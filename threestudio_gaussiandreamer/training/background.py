@@ -1,0 +1,76 @@
+"""Background ``gaussiandreamer-background``: one colour per view, composited inside the rasteriser.
+
+======  =====================================================================================================================
+option  meaning
+======  =====================================================================================================================
+mode    ``fixed``: always ``color``; ``random``: in training a random colour per view, otherwise ``color``; ``learned``
+color   RGB in [0, 1]
+lr      learning rate of the learned colour: a number or a schedule
+======  =====================================================================================================================
+"""
+
+from dataclasses import dataclass
+from typing import Any, Tuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ..core.errors import UserError, unknown
+from ..core.streams import generator
+from ..host import BaseBackground, C, item_seed, register, validate_schedule
+
+MODES = ("fixed", "random", "learned")
+
+
+@register("gaussiandreamer-background")
+class FlatBackground(BaseBackground):
+    @dataclass
+    class Config(BaseBackground.Config):
+        mode: str = "fixed"
+        color: Tuple[float, float, float] = (0.0, 0.0, 0.0)
+        lr: Any = 1e-2
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            if cfg.mode not in MODES:
+                raise unknown("system.background.mode", cfg.mode, MODES)
+            if not all(0.0 <= c <= 1.0 for c in cfg.color):
+                raise UserError(f"system.background.color: expected three numbers in [0, 1], got {list(cfg.color)}")
+            validate_schedule(cfg.lr, "system.background.lr", minimum=0)
+
+    cfg: Config
+
+    def configure(self) -> None:
+        self.Config.check(self.cfg)
+        color = torch.tensor(list(self.cfg.color), dtype=torch.float32)
+        if self.cfg.mode == "learned":
+            self.logit = nn.Parameter(torch.logit(color.clamp(1e-3, 1 - 1e-3)))
+        else:
+            self.register_buffer("fixed", color, persistent=False)
+        self.step = 0
+
+    def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
+        self.step = global_step
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """The optimiser's group of the learned colour; none for the other modes."""
+        return [{"params": [self.logit], "name": "background", "lr": 0.0}] if self.cfg.mode == "learned" else []
+
+    def set_learning_rates(self, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
+        for group in optimizer.param_groups:
+            if group.get("name") == "background":
+                group["lr"] = C(self.cfg.lr, epoch, step)
+
+    def color(self, batch_size: int) -> Float[Tensor, "B 3"]:
+        """One colour per view, in [0, 1]; random ones are a function of (seed, step, view)."""
+        if self.cfg.mode == "learned":
+            return torch.sigmoid(self.logit).expand(batch_size, 3)
+        if self.cfg.mode == "random" and self.training:
+            return torch.stack([torch.rand(3, generator=generator(item_seed(), "background", self.step, b)) for b in range(batch_size)]).to(
+                self.fixed
+            )
+        return self.fixed.expand(batch_size, 3)
+
+    def forward(self, dirs: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B H W 3"]:
+        return self.color(len(dirs))[:, None, None].expand(*dirs.shape[:-1], 3)

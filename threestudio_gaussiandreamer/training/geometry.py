@@ -1,0 +1,506 @@
+"""Geometry ``gaussiandreamer-cloud``: a cloud of 3D Gaussians that starts from a 3D prior.
+
+Parameters (the names say how they are stored): ``means`` (N, 3) world units, ``log_scales`` (N, 3), ``quats`` (N, 4) wxyz,
+``logit_opacities`` (N,), ``sh0`` (N, 1, 3) and ``sh_rest`` (N, K - 1, 3) with K = (sh_degree + 1)^2. The cloud is empty until
+:meth:`initialize` runs the prior or a checkpoint is loaded; it takes its size from the checkpoint, so the prior isn't needed again.
+
+==================  =========================================================================================================
+option              meaning
+==================  =========================================================================================================
+prior_type, prior   the registered prior and its options
+grow                Algorithm 1 of the paper: enabled, num_candidates, radius (in half box sides), color_range, clamp, max_points
+scale_rule          first standard deviation: ``nearest`` (the paper: distance to the nearest point) or ``rms3`` (the released
+                    code: root mean square distance to the three nearest)
+scale_factor        multiplies it
+init_opacity        opacity of every Gaussian at the start
+sh_degree           0 to 3
+lr_*                learning rate of each attribute: a number or a schedule; lr_sh_rest for the bands above degree 0
+densify             enabled, start, stop, every (steps), grad_threshold, split_scale, min_opacity, max_scale (world units);
+                    absgrad: judge by the sum of the pixels' absolute gradients, in which opposite pulls don't cancel
+                    (AbsGS, Ye et al. 2024; several times larger, so give a threshold to match)
+budget              how many Gaussians a run ends with: a number, null or none (no limit but ``max_gaussians``), or ``auto``: each round
+                    drops as many as cost no more than its share of ``prune.quality`` or, where no truth is known,
+                    ``prune.likeness``; under a budget, duplicates in the start are merged (``merging.py``)
+prune               how the budget is met (``importance.py``): start, stop, every (steps), keep (the share that a round keeps; less
+                    only where there are too few rounds for a budget that is a number), score (removal, contribution;
+                    opacity, random: to compare with), quality (dB that all rounds may lose against the truth), likeness
+                    (dB between the renders before and after a round, at least); ``auto`` leaves out the first half of the
+                    rounds: what looks superfluous early may be needed later
+max_gaussians       exact cap, reached by dropping what shows least (of untrained points: any, evenly); min_gaussians: the
+                    floor that pruning never passes
+keep_attributes     with gaussians-prior: start from all attributes of that cloud, not only from points and colours
+==================  =========================================================================================================
+"""
+
+import contextlib
+import logging
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, List, Optional
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from ..core.distributed import all_max, all_sum
+from ..core.errors import UserError, unknown
+from ..core.nested import adopt_nested
+from ..core.streams import generator, numpy_generator
+from ..gaussians import densify, sh, simplify
+from ..gaussians import importance as parsimony
+from ..gaussians.densify import LOG_SCALE_RANGE, PARAMETERS, Change, Rules, Statistics
+from ..gaussians.grow import SCALE_RULES, grow, nearest_distance_scales
+from ..gaussians.merge import merge_duplicates
+from ..gaussians.point_cloud import PointCloud
+from ..host import BaseGeometry, C, find, register, run_seed, validate_schedule
+from ..splatting import Rasterized
+
+logger = logging.getLogger(__name__)
+STATISTICS = ("gradient_sum", "gradient_count", "contribution", "removal")
+LEARNING_RATES = {
+    "means": "lr_means",
+    "log_scales": "lr_scales",
+    "quats": "lr_quats",
+    "logit_opacities": "lr_opacities",
+    "sh0": "lr_sh",
+    "sh_rest": "lr_sh_rest",
+}
+AUTO = "auto"
+CAP_VIEWS = (32, 256)
+"""How many views a trained cloud that is too large is judged by, and their pixels each way."""
+Holds = Callable[[Bool[Tensor, " N"]], bool]
+
+
+@dataclass
+class GrowConfig:
+    enabled: bool = True
+    num_candidates: int = 1_000_000
+    radius: float = 0.01
+    color_range: List[float] = field(default_factory=lambda: [0.0, 0.2])
+    clamp: bool = True
+    max_points: int = 400_000
+
+
+@dataclass
+class DensifyConfig:
+    enabled: bool = False
+    start: int = 400
+    stop: int = 900
+    every: int = 100
+    grad_threshold: float = 2e-4
+    split_scale: float = 0.04
+    min_opacity: float = 0.05
+    max_scale: float = 0.4
+    absgrad: bool = False
+
+
+@dataclass
+class PruneConfig:
+    start: int = 100
+    stop: int = 900
+    every: int = 50
+    keep: float = 0.8
+    score: str = "removal"
+    quality: float = 0.1
+    likeness: float = 40.0
+
+
+@register("gaussiandreamer-cloud")
+class GaussianCloud(BaseGeometry):
+    @dataclass
+    class Config(BaseGeometry.Config):
+        prior_type: str = "random-prior"
+        prior: dict = field(default_factory=dict)
+        grow: GrowConfig = field(default_factory=GrowConfig)
+        scale_rule: str = "nearest"
+        scale_factor: float = 1.0
+        init_opacity: float = 0.1
+        sh_degree: int = 0
+        keep_attributes: bool = True
+        lr_means: Any = 5e-5
+        lr_scales: Any = 1e-3
+        lr_quats: Any = 1e-2
+        lr_opacities: Any = 1e-2
+        lr_sh: Any = 1.25e-2
+        lr_sh_rest: Any = 6.25e-4
+        densify: DensifyConfig = field(default_factory=DensifyConfig)
+        budget: Any = None
+        prune: PruneConfig = field(default_factory=PruneConfig)
+        max_gaussians: int = 500_000
+        min_gaussians: int = 64
+
+        def __post_init__(self) -> None:
+            adopt_nested(self)
+            self.budget = _as_budget(self.budget)
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            """Raises UserError for a value out of range, before any long work."""
+            where = "system.geometry"
+            if cfg.scale_rule not in SCALE_RULES:
+                raise unknown(f"{where}.scale_rule", cfg.scale_rule, SCALE_RULES)
+            if not 0 < cfg.init_opacity < 1:
+                raise UserError(f"{where}.init_opacity: expected a number between 0 and 1, got {cfg.init_opacity}")
+            if cfg.sh_degree not in (0, 1, 2, 3):
+                raise UserError(f"{where}.sh_degree: expected 0, 1, 2 or 3, got {cfg.sh_degree}")
+            if not 0 < cfg.min_gaussians <= cfg.max_gaussians:
+                raise UserError(f"{where}: expected 0 < min_gaussians <= max_gaussians, got {cfg.min_gaussians} and {cfg.max_gaussians}")
+            for name in ("scale_factor", "grow.radius", "densify.every", "densify.split_scale", "densify.max_scale"):
+                value = _nested(cfg, name)
+                if not value > 0:
+                    raise UserError(f"{where}.{name}: expected a positive number, got {value}")
+            for name in ("grow.num_candidates", "grow.max_points", "densify.start", "densify.stop", "densify.grad_threshold"):
+                value = _nested(cfg, name)
+                if value < 0:
+                    raise UserError(f"{where}.{name}: expected 0 or more, got {value}")
+            _check_budget(cfg, where)
+            if cfg.densify.enabled and cfg.densify.start >= cfg.densify.stop:
+                raise UserError(f"{where}.densify: expected start < stop, got {cfg.densify.start} and {cfg.densify.stop}")
+            if not 0 <= cfg.densify.min_opacity < 1:
+                raise UserError(f"{where}.densify.min_opacity: expected a number from 0 to 1, got {cfg.densify.min_opacity}")
+            if len(cfg.grow.color_range) != 2 or cfg.grow.color_range[0] > cfg.grow.color_range[1]:
+                raise UserError(f"{where}.grow.color_range: expected [low, high], got {list(cfg.grow.color_range)}")
+            for name in LEARNING_RATES.values():
+                validate_schedule(cfg[name], f"{where}.{name}", minimum=0)
+
+    cfg: Config
+
+    def configure(self) -> None:
+        self.Config.check(self.cfg)
+        self.bands = (self.cfg.sh_degree + 1) ** 2
+        self._warned: set[str] = set()
+        self._allocate(0)
+
+    # -- size ----------------------------------------------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def _shapes(self, n: int) -> dict[str, tuple[int, ...]]:
+        harmonics = {"sh0": (n, 1, 3), "sh_rest": (n, self.bands - 1, 3)}
+        return {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,), **harmonics}
+
+    def _allocate(self, n: int, device: torch.device | str = "cpu") -> None:
+        for name, shape in self._shapes(n).items():
+            setattr(self, name, nn.Parameter(torch.zeros(shape, device=device)))
+        for name in STATISTICS:
+            self.register_buffer(name, torch.zeros(n, device=device))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """Take the size from the checkpoint before its tensors are copied in."""
+        means = state_dict.get(prefix + "means")
+        if isinstance(means, Tensor) and means.dim() and len(means) != len(self):  # otherwise torch says what is wrong with it
+            self._allocate(len(means), self.means.device)
+        if prefix + "means" in state_dict:
+            state_dict.setdefault(prefix + "removal", torch.zeros(len(self)))  # older checkpoints have none
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    # -- derived quantities --------------------------------------------------------------------------------------------------
+
+    def scales(self) -> Float[Tensor, "N 3"]:
+        """Standard deviations along the axes, world units; clamped where exp would over- or underflow float32."""
+        return self.log_scales.clamp(*LOG_SCALE_RANGE).exp()
+
+    def opacities(self) -> Float[Tensor, " N"]:
+        return torch.sigmoid(self.logit_opacities)
+
+    @property
+    def sh(self) -> Float[Tensor, "N K 3"]:
+        """All bands of the spherical harmonics."""
+        return torch.cat([self.sh0, self.sh_rest], 1)
+
+    def colors(self, camera_positions: Float[Tensor, "B 3"]) -> Float[Tensor, "N 3"] | Float[Tensor, "B N 3"]:
+        """RGB, not negative; per view when the spherical harmonics have more than the constant band."""
+        if self.bands == 1:
+            return sh.sh0_to_rgb(self.sh0[:, 0]).clamp_min(0.0)
+        dirs = torch.nn.functional.normalize(self.means.detach()[None] - camera_positions[:, None], dim=-1)
+        return sh.sh_to_colors(self.sh, dirs)
+
+    # -- start ---------------------------------------------------------------------------------------------------------------
+
+    def prior(self) -> Any:
+        """The prior of the configuration, which hasn't run yet."""
+        return find(self.cfg.prior_type)(self.cfg.prior)
+
+    def initialize(self, prompt: str, make_cloud: Any = None) -> PointCloud:
+        """Run the prior, grow and perturb its points, and start one Gaussian on each; returns the prior's points.
+
+        ``make_cloud(prior, prompt)`` may stand in for ``prior(prompt)``, for instance to read a cached result.
+        """
+        prior = self.prior()
+        if self.cfg.keep_attributes and hasattr(prior, "gaussians"):
+            arrays = prior.gaussians(prompt)
+            trained = simplify.Cloud(*(torch.as_tensor(getattr(arrays, name)) for name in simplify.Cloud._fields))
+            self.set_arrays(**self._capped_trained(trained)._asdict())
+            cloud = prior.cloud(arrays)
+        else:
+            cloud = make_cloud(prior, prompt) if make_cloud else prior(prompt)
+            self.start_from(self.grown(cloud))
+        if self.cfg.budget is not None:
+            self.merge_duplicates()
+        return cloud
+
+    def merge_duplicates(self) -> None:
+        """One Gaussian in the place of those that show the same, as far as the budget asks for fewer."""
+        merged = merge_duplicates(self.parameters_by_name(), at_least=self._fewest()).values
+        if len(merged["means"]) < len(self):
+            logger.info("%d of %d Gaussians are duplicates of others: merged", len(self) - len(merged["means"]), len(self))
+            self.set_arrays(sh=torch.cat([merged.pop("sh0"), merged.pop("sh_rest")], 1), **merged)
+
+    def grown(self, cloud: PointCloud) -> PointCloud:
+        """Noisy point growing and colour perturbation (the paper's Algorithm 1), within the cap."""
+        if not self.cfg.grow.enabled:
+            return cloud
+        options = {k: v for k, v in dict(self.cfg.grow).items() if k not in ("enabled", "color_range")}
+        return grow(cloud, color_range=tuple(self.cfg.grow.color_range), **options, generator=numpy_generator(run_seed(), "grow"))
+
+    def start_from(self, cloud: PointCloud) -> None:
+        """One Gaussian on each point: its colour, opacity ``init_opacity``, an isotropic scale from the nearest distances."""
+        points, colors = self._capped(cloud.points, cloud.colors)
+        n, scales = len(points), nearest_distance_scales(points, self.cfg.scale_rule) * self.cfg.scale_factor
+        harmonics = np.zeros((n, self.bands, 3), np.float32)
+        harmonics[:, 0] = sh.rgb_to_sh0(torch.from_numpy(np.ascontiguousarray(colors, np.float32))).numpy()
+        self.set_arrays(
+            means=points,
+            log_scales=np.repeat(np.log(scales)[:, None], 3, 1),
+            quats=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+            logit_opacities=np.full(n, math.log(self.cfg.init_opacity / (1 - self.cfg.init_opacity))),
+            sh=harmonics,
+        )
+
+    def _capped(self, points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """At most ``max_gaussians`` points, a seeded uniform choice.
+
+        None of them is trained and all are equally opaque, so none is worth more than another: a choice by contribution to first
+        renders would only prefer what lies outside, and leave holes (tests/stability measures both).
+        """
+        if len(points) <= self.cfg.max_gaussians:
+            return points, colors
+        logger.warning("the prior and its growth give %d points; keeping %d, evenly (max_gaussians)", len(points), self.cfg.max_gaussians)
+        rows = np.sort(numpy_generator(run_seed(), "cap").choice(len(points), self.cfg.max_gaussians, replace=False))
+        return points[rows], colors[rows]
+
+    def _capped_trained(self, cloud: simplify.Cloud) -> simplify.Cloud:
+        """At most ``max_gaussians`` of trained Gaussians: those that show most in views from all around."""
+        if len(cloud.means) <= self.cfg.max_gaussians:
+            return cloud
+        logger.warning(
+            "the prior has %d Gaussians; keeping the %d that show most (max_gaussians)", len(cloud.means), self.cfg.max_gaussians
+        )
+        cloud = simplify.Cloud(*(values.to(self.means.device) for values in cloud))
+        shown = simplify.worth(cloud, simplify.views_around(cloud, *CAP_VIEWS))
+        return simplify.only(cloud, shown, self.cfg.max_gaussians)
+
+    def set_arrays(self, *, sh: Any, **arrays: Any) -> None:
+        """Replace the cloud; spherical harmonics ``sh`` (N, K', 3) are padded with zeros or cut to ``sh_degree``."""
+        device = self.means.device
+        self._allocate(len(arrays["means"]), device)
+        with torch.no_grad():
+            for name, value in arrays.items():
+                getattr(self, name).copy_(torch.as_tensor(value))
+            bands = torch.as_tensor(sh)[:, : self.bands].to(device)
+            self.sh0.copy_(bands[:, :1])
+            self.sh_rest[:, : bands.shape[1] - 1] = bands[:, 1:]
+            self.logit_opacities.clamp_(-15.0, 15.0)
+            self.log_scales.clamp_(*LOG_SCALE_RANGE)
+
+    @torch.no_grad()
+    def warn_of_limits(self) -> None:
+        """Say once that Gaussians aren't drawn since a number of theirs isn't finite, and once that sizes are beyond their bounds."""
+        (low, high), named = LOG_SCALE_RANGE, self.parameters_by_name().values()
+        usual = self.log_scales.clamp(low, high).equal(self.log_scales) and all(parameter.sum().isfinite() for parameter in named)
+        if usual:  # a sum is finite only if all its terms are
+            return
+        finite = torch.stack([_finite_rows(parameter) for parameter in named]).all(0)
+        clamped = ((self.log_scales < low) | (self.log_scales > high)).any(-1)
+        for name, rows in (
+            ("hold NaN or infinity and aren't drawn", ~finite),
+            (f"are drawn at e^{low:g} or e^{high:g}, their bounds", clamped),
+        ):
+            if name not in self._warned and rows.any():
+                self._warned.add(name)
+                logger.warning("%d of %d Gaussians %s; the first is number %d", rows.sum(), len(self), name, rows.nonzero()[0])
+
+    def parameters_by_name(self) -> dict[str, nn.Parameter]:
+        return {name: getattr(self, name) for name in PARAMETERS}
+
+    # -- optimisation --------------------------------------------------------------------------------------------------------
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """One optimiser group per attribute, named after it; the rates are set every step by :meth:`set_learning_rates`."""
+        named = self.parameters_by_name().items()
+        return [{"params": [parameter], "name": name, "lr": 0.0} for name, parameter in named if parameter.numel() or name != "sh_rest"]
+
+    def set_learning_rates(self, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
+        for group in optimizer.param_groups:
+            if group.get("name") in LEARNING_RATES:
+                group["lr"] = C(self.cfg[LEARNING_RATES[group["name"]]], epoch, step)
+
+    @property
+    def wants_absgrad(self) -> bool:
+        """Whether :meth:`observe` reads absolute gradients, which the rasteriser then has to collect."""
+        return self.cfg.densify.enabled and self.cfg.densify.absgrad
+
+    def observe(self, out: Rasterized, width: int, height: int, loss_scale: float = 1.0) -> None:
+        """Add one step's contributions, and for densification its screen-space gradients, to the statistics."""
+        if out.means2d.grad is not None and self.cfg.densify.enabled:
+            pixels = out.means2d.absgrad if self.wants_absgrad else out.means2d.grad
+            self.gradient_sum += all_sum(densify.screen_gradients(pixels, width, height, loss_scale).sum(0))
+            self.gradient_count += all_sum((out.radii > 0).sum(0))
+        torch.maximum(self.contribution, all_max(out.contribution.amax(0)), out=self.contribution)
+
+    def _samples_removal(self, step: int) -> bool:
+        """Whether a round of pruning to come asks for a sample of the removal error, after ``step`` finished steps."""
+        cfg, rounds = self.cfg.prune, self.prune_rounds
+        if self.cfg.budget is None or cfg.score != "removal" or not rounds or not rounds[0] - cfg.every <= step < rounds[-1]:
+            return False
+        return len(self) > self._fewest() and step % max(1, round(cfg.every / parsimony.SAMPLES)) == 0
+
+    def sample_removal(self, pictures: dict[str, Any], step: int) -> None:
+        """Add a sample of the removal error in these renders, before their losses, where a round of pruning will ask for it."""
+        if not self._samples_removal(step):
+            return
+        rng = generator(run_seed(), "removal", step)
+        behind = torch.rand(len(pictures["comp_rgb"]), 1, 1, 3, generator=rng).to(pictures["comp_rgb"])
+        # before a colour of its own each view shows those too that have the colour of the run's background
+        images = pictures["comp_rgb"] + (1 - pictures["opacity"]) * (behind - pictures["comp_rgb_bg"].detach())
+        self.removal += all_sum(parsimony.removal_error(images, pictures["gaussian_opacities"], rng))
+        if self.wants_absgrad:
+            pictures["rasterized"].means2d.absgrad.zero_()  # what this backward pass has added isn't the loss's
+
+    def after_step(self, optimizer: torch.optim.Optimizer, step: int, holds: Optional[Holds] = None) -> bool:
+        """Densify and prune where their schedules say so; True if the cloud was replaced.
+
+        A densification that neither makes nor drops a Gaussian only begins its statistics anew: the next pruning ranks by what it
+        would have seen without it.
+
+        Args:
+            step: finished optimiser steps.
+            holds: for ``budget: auto``: whether the quality holds when only the marked Gaussians are drawn.
+        """
+        change = None
+        if self.cfg.densify.enabled and step in rounds_of(self.cfg.densify):
+            change = self.densified(step)
+            if not change.fresh.any() and len(change.parents) == len(self):
+                change = None
+            self.gradient_sum.zero_()
+            self.gradient_count.zero_()
+        if self.cfg.budget is not None and step in self.prune_rounds:
+            change = self.pruned(step, change, holds)
+        if change is not None:
+            self.apply_change(change, optimizer)
+        return change is not None
+
+    def densified(self, step: int) -> Change:
+        """Clone, split and drop; under a budget the cloud doesn't grow beyond it, or beyond what it still has."""
+        cfg, cap = self.cfg.densify, self.cfg.max_gaussians
+        if self.cfg.budget is not None:
+            cap = min(cap, len(self) if self.cfg.budget == AUTO else max(self.cfg.budget, len(self)))
+        rules = Rules(cfg.grad_threshold, cfg.split_scale, cfg.min_opacity, cfg.max_scale, cap, self.cfg.min_gaussians)
+        stats = Statistics(self.gradient_sum / self.gradient_count.clamp_min(1), self.contribution)
+        return densify.densify_and_prune(self.parameters_by_name(), stats, rules, generator(run_seed(), "split", step))
+
+    def pruned(self, step: int, first: Optional[Change], holds: Optional[Holds]) -> Change:
+        """One round towards the budget, after the change ``first`` if there is one."""
+        cfg, values = self.cfg.prune, self.parameters_by_name() if first is None else first.values
+        rows = slice(None) if first is None else first.parents
+        seen = parsimony.Seen(self.contribution[rows], self.removal[rows])
+        scores = parsimony.score(cfg.score, values["logit_opacities"], seen, generator(run_seed(), "prune", step))
+        count = parsimony.next_count(len(scores), self.kept_share(len(scores), step), self._fewest())
+        if self.cfg.budget == AUTO and (first is not None or holds is None):
+            count = len(scores)  # what densification made has been seen in no view yet
+        elif self.cfg.budget == AUTO:
+            tops = parsimony.top_count(seen.contribution) if cfg.score == "contribution" else 0
+            count = parsimony.smallest_count(scores, max(count, tops), holds)
+        return parsimony.pruned(values, scores, count, first)
+
+    @property
+    def prune_rounds(self) -> range:
+        """The numbers of finished steps after which a round of pruning is due."""
+        rounds = rounds_of(self.cfg.prune)
+        return rounds[len(rounds) // 2 :] if self.cfg.budget == AUTO else rounds
+
+    def kept_share(self, count: int, step: int) -> float:
+        """The share of ``count`` Gaussians that the round at ``step`` keeps: ``prune.keep``, or what meets the budget with the last one."""
+        left = sum(later >= step for later in self.prune_rounds)
+        if self.cfg.budget in (None, AUTO) or not left:
+            return self.cfg.prune.keep
+        return min(self.cfg.prune.keep, (self._fewest() / max(count, 1)) ** (1 / left))
+
+    @property
+    def affordable(self) -> float:
+        """dB that one round of ``auto`` may lose: none is sure to be won back, so all together lose ``prune.quality`` at most."""
+        return self.cfg.prune.quality / max(1, len(self.prune_rounds))
+
+    def _fewest(self) -> int:
+        """How many Gaussians pruning leaves at least."""
+        return max(self.cfg.min_gaussians, 0 if self.cfg.budget == AUTO else self.cfg.budget)
+
+    @contextlib.contextmanager
+    def only(self, kept: Bool[Tensor, " N"]) -> Iterator[None]:
+        """Draws only the marked Gaussians: the others are too faint for any pixel."""
+        logits = self.logit_opacities.detach().clone()
+        with torch.no_grad():
+            self.logit_opacities[~kept] = -100.0
+        try:
+            yield
+        finally:
+            with torch.no_grad():
+                self.logit_opacities.copy_(logits)
+
+    def apply_change(self, change: Change, optimizer: torch.optim.Optimizer) -> None:
+        """Replace the cloud by ``change`` and move the optimiser's rows along; the statistics start anew."""
+        old = self.parameters_by_name()
+        new = {name: nn.Parameter(value) for name, value in change.values.items()}
+        densify.update_optimizer(optimizer, old, new, change)
+        for name, parameter in new.items():
+            setattr(self, name, parameter)
+        for name in STATISTICS:
+            self.register_buffer(name, torch.zeros(len(change.parents), device=self.means.device))
+
+
+def _as_budget(given: Any) -> Any:
+    """What was given for a budget, with ``none`` as None and whole numbers as such, however they are written."""
+    if isinstance(given, str):
+        given = given.lower()
+        with contextlib.suppress(ValueError):
+            given = float(given)  # 5e3 is text to PyYAML
+    if given == "none":
+        return None
+    return int(given) if isinstance(given, float) and given.is_integer() else given
+
+
+def _check_budget(cfg: Any, where: str) -> None:
+    """Raises UserError for a budget or a pruning schedule that can't be met."""
+    budget, prune = cfg.budget, cfg.prune
+    if budget is not None and budget != AUTO and (isinstance(budget, bool) or not isinstance(budget, int) or budget < cfg.min_gaussians):
+        raise UserError(f"{where}.budget: expected none, auto or a number from min_gaussians ({cfg.min_gaussians}) on, got {budget!r}")
+    if prune.score not in parsimony.SCORES:
+        raise unknown(f"{where}.prune.score", prune.score, parsimony.SCORES)
+    if not 0 < prune.keep < 1:
+        raise UserError(f"{where}.prune.keep: expected a share between 0 and 1, got {prune.keep}")
+    for name, least in (("start", 0), ("every", 1), ("quality", 0), ("likeness", 0)):
+        if prune[name] < least:
+            raise UserError(f"{where}.prune.{name}: expected {least} or more, got {prune[name]}")
+    if prune.start >= prune.stop:
+        raise UserError(f"{where}.prune: expected start < stop, got {prune.start} and {prune.stop}")
+
+
+def _finite_rows(parameter: Tensor) -> Bool[Tensor, " N"]:
+    finite = parameter.isfinite()
+    while finite.dim() > 1:
+        finite = finite.all(-1)
+    return finite
+
+
+def rounds_of(schedule: Any) -> range:
+    """The steps at which a schedule with ``start``, ``stop`` and ``every`` has a round: the multiples of ``every``."""
+    return range(math.ceil(schedule.start / schedule.every) * schedule.every, schedule.stop, schedule.every)
+
+
+def _nested(cfg: Any, dotted: str) -> Any:
+    for key in dotted.split("."):
+        cfg = cfg[key]
+    return cfg

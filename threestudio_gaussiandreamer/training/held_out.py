@@ -1,0 +1,241 @@
+"""Held-out scoring: the cloud against ray-cast truth on views that no bank holds, with a picture to look at.
+
+The truth comes from a ray caster on the mesh, never from our splatting, and is composited on the background that the render
+has. Score: PSNR and SSIM, averaged over the views; share of views that show another side of the object (multi-face); share of
+the opacity that floats away from the surface (floater mass); share of pixels with a colour that no screen shows (out of gamut).
+"""
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Optional
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..cameras import Orbit, held_out_orbit
+from ..core.errors import UserError
+from ..meshes.load import SurfaceDistance
+from ..meshes.raycast import over_background
+from ..metrics import floater_mass, multi_face_rate, out_of_gamut, psnr, ssim
+from .data import make_batch
+
+
+@dataclass
+class EvaluationConfig:
+    views: int = 24
+    size: int = 256
+    supersample: int = 3
+    every: int = 0
+
+    @staticmethod
+    def check(cfg: Any) -> None:
+        for name in ("views", "size", "supersample"):
+            if cfg[name] < 1:
+                raise UserError(f"system.evaluation.{name}: expected at least 1, got {cfg[name]}")
+        if cfg.every < 0:
+            raise UserError(f"system.evaluation.every: expected 0 (never) or a number of steps, got {cfg.every}")
+
+
+def orbit_batch(orbit: Orbit, size: int) -> dict[str, Any]:
+    """The host's batch of the views of ``orbit``, square pictures of ``size`` pixels."""
+    c2w = orbit.c2w
+    return make_batch(orbit, c2w, c2w[:, :3, 3].clone(), size, size)
+
+
+class HeldOut:
+    """The held-out views and their truth, cast at first use by ``caster`` (a :class:`raycast.MeshCaster`)."""
+
+    RING = 24  # azimuths that the multi-face meter compares with
+    RING_SIZE = 32
+
+    def __init__(self, cfg: EvaluationConfig, caster: Any) -> None:
+        self.cfg, self.caster = cfg, caster
+        self.orbit = held_out_orbit(cfg.views)
+
+    @cached_property
+    def truth(self) -> Float[Tensor, "V H W 4"]:
+        """Premultiplied colour and coverage of the held-out views."""
+        return self._cast(self.orbit, self.cfg.size, self.cfg.supersample)
+
+    @cached_property
+    def surface_distance(self) -> SurfaceDistance:
+        return SurfaceDistance(self.caster.mesh)
+
+    @cached_property
+    def rings(self) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """For each height and distance that occurs: the views (rows), all-around azimuths, and their truth (R, h, w, 4)."""
+        azimuth, rings = 360.0 * torch.arange(self.RING) / self.RING, []
+        places = torch.stack([self.orbit.elevation, self.orbit.distance], 1)
+        for place in places.unique(dim=0):
+            rows = (places == place).all(1).nonzero()[:, 0]
+            same = torch.ones(self.RING)
+            ring = Orbit(same * place[0], azimuth, same * place[1], same * self.orbit.fovy[0])
+            rings.append((rows, azimuth, self._cast(ring, self.RING_SIZE, 4)))
+        return rings
+
+    def _cast(self, orbit: Orbit, size: int, supersample: int) -> Float[Tensor, "V H W 4"]:
+        cameras = zip(orbit.c2w.numpy(), orbit.fovy.tolist(), strict=True)
+        return torch.from_numpy(self.caster.render_views(cameras, size, size, supersample=supersample))
+
+    @torch.no_grad()
+    def render(self, renderer: Any, chunk: int = 4) -> tuple[Tensor, Tensor]:
+        """The cloud's pictures (V, H, W, 3), as they come out, and the background (V, 3) they lie on, on the CPU."""
+        modes = [(module, module.training) for module in (renderer, renderer.background)]
+        for module, _ in modes:
+            module.eval()
+        images, backgrounds = [], []
+        for start in range(0, self.cfg.views, chunk):
+            part = Orbit(*(values[start : start + chunk] for values in self.orbit))
+            out = renderer(**orbit_batch(part, self.cfg.size * renderer.cfg.downsample))
+            images.append(out["comp_rgb"].cpu())
+            backgrounds.append(out["comp_rgb_bg"].cpu().mean((1, 2)))
+        for module, training in modes:
+            module.train(training)
+        return torch.cat(images), torch.cat(backgrounds)
+
+    def truth_on(self, backgrounds: Float[Tensor, "V 3"]) -> Float[Tensor, "V H W 3"]:
+        return over_background(self.truth, backgrounds[:, None, None])
+
+    def multi_face(self, images: Float[Tensor, "V H W 3"], backgrounds: Float[Tensor, "V 3"]) -> float:
+        """The share of views that look like another side of the object, more than 45 degrees of azimuth away."""
+        wrong = 0.0
+        for rows, azimuth, ring in self.rings:
+            bank = over_background(ring, backgrounds[rows[0]])
+            wrong += multi_face_rate(images[rows], bank, self.orbit.azimuth[rows], azimuth) * len(rows)
+        return wrong / len(images)
+
+    def floaters(self, means: Float[Tensor, "N 3"], opacities: Float[Tensor, " N"]) -> float:
+        """The opacity-weighted share of Gaussians farther from the surface than 2 % of the longest side of its box."""
+        distances = torch.from_numpy(self.surface_distance(means.double().cpu().numpy()))
+        return floater_mass(distances, opacities.double().cpu(), extent=float(np.ptp(self.caster.mesh.vertices, axis=0).max()))
+
+
+CLOCKS = ("seconds", "cpu_seconds")
+
+
+class Measurements:
+    """What a run measured, with the training seconds that led there; kept in ``metrics.json`` and continued on resume.
+
+    ``cpu_seconds``, the processor time of all threads, doesn't grow when other programs hold the processor.
+    """
+
+    def __init__(self, held_out: HeldOut, folder: Path) -> None:
+        self.held_out, self.folder = held_out, folder
+        self.path = folder / "metrics.json"
+        self.values: dict[str, Any] = _read_json(self.path)
+        self.seconds = np.array([self.values.get(name, 0.0) for name in CLOCKS], np.float64)
+        self._started: Optional[np.ndarray] = None
+
+    def start_clock(self) -> None:
+        self._started = _now()
+
+    def stop_clock(self) -> None:
+        """Add the time since the clock was started to the training seconds."""
+        if self._started is not None:
+            self.seconds += _now() - self._started
+            self._started = None
+
+    @contextmanager
+    def paused_clock(self) -> Iterator[None]:
+        """No time is counted in here: looking isn't training."""
+        running = self._started is not None
+        self.stop_clock()
+        try:
+            yield
+        finally:
+            if running:
+                self.start_clock()
+
+    @torch.no_grad()
+    def score(self, key: str, renderer: Any, step: int) -> dict[str, Any]:
+        """Score the renderer's cloud under ``key`` ("prior", "result", or "curve", which collects); no time is counted while it runs."""
+        with self.paused_clock():
+            return self._score(key, renderer, step)
+
+    def _score(self, key: str, renderer: Any, step: int) -> dict[str, Any]:
+        rendered, backgrounds = self.held_out.render(renderer)
+        images = rendered.clamp(0, 1)
+        truth = self.held_out.truth_on(backgrounds)
+        scores = {"step": step, **self._elapsed(), "gaussians": len(renderer.geometry)}
+        scores |= {"psnr": round(float(psnr(images, truth).mean()), 3), "ssim": round(float(ssim(images, truth).mean()), 4)}
+        scores["multi_face"] = round(self.held_out.multi_face(images, backgrounds), 4)
+        cloud = renderer.geometry
+        scores["floater_mass"] = round(self.held_out.floaters(cloud.means, cloud.opacities()), 5)
+        scores["out_of_gamut"] = round(out_of_gamut(rendered), 5)
+        if key == "curve":
+            self.values.setdefault("curve", []).append(scores)
+        else:
+            self.values[key] = scores
+            self._save_pictures(key, images, truth)
+        self.write()
+        return scores
+
+    def _elapsed(self) -> dict[str, float]:
+        return {name: round(float(value), 3) for name, value in zip(CLOCKS, self.seconds, strict=True)}
+
+    def write(self) -> None:
+        self.values |= self._elapsed()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        temporary = self.path.with_suffix(".tmp")
+        temporary.write_text(json.dumps(self.values, indent=2))
+        temporary.replace(self.path)
+
+    def _save_pictures(self, key: str, renders: Tensor, truth: Tensor) -> None:
+        """Rows of six views: ``held_out/<key>.png``, ``truth.png``, and ``compare.png`` with prior, result and truth."""
+        folder = self.folder / "held_out"
+        folder.mkdir(parents=True, exist_ok=True)
+        rows = {key: _row(renders), "truth": _row(truth)}
+        for name, row in rows.items():
+            _write_png(folder / f"{name}.png", row)
+        shown = [folder / f"{name}.png" for name in ("prior", "result", "truth")]
+        pictures = [_read_png(path) for path in shown if path.is_file()]
+        if len({picture.shape for picture in pictures}) == 1:
+            _write_png(folder / "compare.png", np.concatenate(pictures, 0))
+
+    def table(self) -> str:
+        """Prior against result: dB, SSIM, Gaussians, seconds."""
+        lines = ["              dB     SSIM   multi-face   Gaussians   seconds"]
+        for key in ("prior", "result"):
+            if key in self.values:
+                v = self.values[key]
+                face = f"{100 * v['multi_face']:.0f} %"
+                lines.append(f"{key:<10}{v['psnr']:6.2f}   {v['ssim']:6.4f}   {face:>10}   {v['gaussians']:9d}   {v['seconds']:7.1f}")
+        return "\n".join(lines)
+
+
+def _now() -> np.ndarray:
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """The mapping in a JSON file; empty when there is none, or a damaged one, whose numbers are measured anew."""
+    try:
+        values = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return values if isinstance(values, dict) else {}
+
+
+def _row(images: Float[Tensor, "V H W 3"], count: int = 6) -> np.ndarray:
+    """``count`` views spread around the object, side by side, as bytes."""
+    chosen = images[:: max(1, len(images) // count)][:count]
+    return (torch.cat(list(chosen), 1).clamp(0, 1) * 255).round().byte().numpy()
+
+
+def _write_png(path: Path, pixels: np.ndarray) -> None:
+    from PIL import Image
+
+    Image.fromarray(pixels).save(path)
+
+
+def _read_png(path: Path) -> np.ndarray:
+    from PIL import Image
+
+    return np.asarray(Image.open(path).convert("RGB"))

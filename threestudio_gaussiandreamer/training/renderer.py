@@ -1,0 +1,141 @@
+"""Renderer ``gaussiandreamer-splatting``: the host's batch in, the host's pictures out, our rasteriser between.
+
+=============  ==============================================================================================================
+option         meaning
+=============  ==============================================================================================================
+backend        ``auto`` (by where the cloud is and what is built), ``cpu``, ``cuda``, ``torch``, ``reference``
+preset         ``fast`` | ``balanced`` | ``accurate``: the smallest alpha that is drawn, 1/255, 1/1024, 1/65536
+antialias      keep the energy of Gaussians smaller than a pixel
+eps2d          screen-space dilation in square pixels
+downsample     1, or 2: return the 2x2 box of the rendered size (the paper renders 1024^2 and guides at 512^2)
+train_normals  normals in training too; otherwise only in validation, test and export
+=============  ==============================================================================================================
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from .. import cameras
+from ..core.errors import UserError, unknown
+from ..host import Rasterizer, register
+from ..splatting import PRESETS, Rasterized, available_backends, rasterize
+from .background import FlatBackground
+
+
+@register("gaussiandreamer-splatting")
+class SplattingRenderer(Rasterizer):
+    @dataclass
+    class Config(Rasterizer.Config):
+        backend: str = "auto"
+        preset: str = "balanced"
+        antialias: bool = False
+        eps2d: float = 0.3
+        near: float = 0.01
+        far: float = 1e10
+        downsample: int = 1
+        train_normals: bool = False
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            if cfg.preset not in PRESETS:
+                raise unknown("system.renderer.preset", cfg.preset, PRESETS)
+            _check_backend(cfg.backend)
+            if cfg.downsample not in (1, 2):
+                raise UserError(f"system.renderer.downsample: expected 1 or 2, got {cfg.downsample}")
+            if not cfg.radius > 0:
+                raise UserError(f"system.renderer.radius: expected a positive number, got {cfg.radius}")
+            if cfg.eps2d < 0:
+                raise UserError(f"system.renderer.eps2d: expected 0 or more square pixels, got {cfg.eps2d}")
+            if not 0 < cfg.near < cfg.far:
+                raise UserError(f"system.renderer: expected 0 < near < far, got near={cfg.near}, far={cfg.far}")
+
+    cfg: Config
+
+    def configure(self, geometry: Any, material: Any, background: Any) -> None:
+        super().configure(geometry, material, background)
+        self.Config.check(self.cfg)
+
+    def forward(self, c2w: Tensor, fovy: Tensor, height: int, width: int, **batch: Any) -> dict[str, Any]:
+        """Render B views, in float32 whatever the trainer's precision is: half of it would move cameras by thousandths.
+
+        Args: ``c2w`` (B, 4, 4) OpenGL, ``fovy`` (B,) radians, ``height`` and ``width`` in pixels, before ``downsample``.
+        Returns: ``comp_rgb`` (B, H, W, 3), ``opacity`` and ``depth`` (B, H, W, 1), ``comp_normal`` (B, H, W, 3) in [0, 1],
+        ``comp_rgb_bg``, the background, (B, 1, 1, 3) or (B, H, W, 3), ``rasterized`` with what densification needs, and
+        ``gaussian_opacities`` (N,), which pruning differentiates by.
+        """
+        device = self.geometry.means.device
+        with torch.autocast(device.type, enabled=False):
+            return self._render(c2w.to(device, torch.float32), fovy.to(device, torch.float32), height, width, batch)
+
+    def _render(self, c2w: Tensor, fovy: Tensor, height: int, width: int, batch: dict[str, Any]) -> dict[str, Any]:
+        cfg = self.cfg
+        viewmats, Ks = cameras.to_opencv(c2w, fovy, height, width)
+        flat = self.background.color(len(c2w)) if isinstance(self.background, FlatBackground) else None
+        opacities = self.geometry.opacities()
+        out = rasterize(
+            self.geometry.means,
+            self.geometry.quats,
+            self.geometry.scales(),
+            opacities,
+            self.geometry.colors(c2w[:, :3, 3]),
+            viewmats,
+            Ks,
+            width,
+            height,
+            background=flat,
+            near=cfg.near,
+            far=cfg.far,
+            eps2d=cfg.eps2d,
+            antialias=cfg.antialias,
+            preset=cfg.preset,
+            downsample=cfg.downsample,
+            backend=cfg.backend,
+            absgrad=self.training and getattr(self.geometry, "wants_absgrad", False),
+        )
+        image, background = (out.image, flat[:, None, None]) if flat is not None else self._composite(out, c2w, fovy, batch)
+        depth = out.depth / out.alpha.clamp_min(1e-6)
+        pictures = {"comp_rgb": image, "opacity": out.alpha, "depth": depth, "comp_rgb_bg": background, "rasterized": out}
+        pictures["gaussian_opacities"] = opacities
+        if cfg.train_normals or not self.training:
+            pictures["comp_normal"] = normals_from_depth(depth, out.alpha, c2w, fovy)
+        return pictures
+
+    def _composite(self, out: Rasterized, c2w: Tensor, fovy: Tensor, batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
+        """Another extension's background, which wants a direction per pixel."""
+        height, width = out.image.shape[1:3]
+        rays = batch.get("rays_d")
+        if rays is None or rays.shape[1:3] != (height, width):
+            rays = cameras.ray_directions(c2w, fovy, height, width)
+        background = self.background(dirs=rays.to(out.image))
+        return out.image + (1 - out.alpha) * background, background
+
+
+def _check_backend(name: str) -> None:
+    """A named backend has to exist and to run here; ``auto`` always finds one."""
+    if name == "auto":
+        return
+    reasons = available_backends()
+    if name not in reasons:
+        raise unknown("system.renderer.backend", name, ["auto", *reasons])
+    if reasons[name] is not None:
+        raise UserError(f"system.renderer.backend={name} can't be used here: {reasons[name]} (backend=auto takes the fastest that can)")
+
+
+def normals_from_depth(
+    depth: Float[Tensor, "B H W 1"], alpha: Float[Tensor, "B H W 1"], c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"]
+) -> Float[Tensor, "B H W 3"]:
+    """World-space normals of the depth surface, mapped from [-1, 1] to [0, 1]; 0.5 where nothing is drawn.
+
+    ``depth`` is along the optical axis; the normal is the cross product of the surface's differences along rows and columns.
+    """
+    height, width = depth.shape[1:3]
+    points = c2w[:, None, None, :3, 3] + depth * cameras.ray_directions(c2w, fovy, height, width, normalize=False)
+    padded = F.pad(points.permute(0, 3, 1, 2), (1, 1, 1, 1), mode="replicate").permute(0, 2, 3, 1)
+    down, right = padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1], padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]
+    normal = F.normalize(torch.linalg.cross(down, right), dim=-1)
+    return 0.5 + 0.5 * normal * (alpha > 0.5)
