@@ -1,4 +1,6 @@
-"""The command line of a checkout: ``python launch.py --config demo.yaml --train``; see threestudio_gaussiandreamer/launch/experiment.py."""
+"""The command line of a checkout: ``python launch.py --config demo.yaml --train``; see
+threestudio_gaussiandreamer/launch/experiment.py.
+"""
 
 from threestudio_gaussiandreamer.launch.experiment import console
 

@@ -1,8 +1,9 @@
-"""Builds the native splatting library, once per instruction set; everything else is in pyproject.toml.
+"""Builds the native splatting library, once per instruction set; everything else is in
+pyproject.toml.
 
-The library is plain C++ behind a C interface: neither Python's headers nor torch are needed. Without a C++ compiler, or with one
-that doesn't know an instruction set, the package installs all the same and draws with what there is.
-"""
+The library is plain C++ behind a C interface: neither Python's headers nor torch are needed.
+Without a C++ compiler, or with one that doesn't know an instruction set, the package installs all
+the same and draws with what there is."""
 
 import os
 import platform
@@ -15,8 +16,15 @@ PACKAGE = "threestudio_gaussiandreamer.splatting.cpu"
 NATIVE = Path(*PACKAGE.split("."))
 SHARED = NATIVE.parent / "shared"
 # Not -ffast-math: linking with it makes the whole process flush denormals.
-FLAGS = "-std=c++17 -O3 -g0 -fno-math-errno -fno-trapping-math -ffp-contract=fast -fvisibility=hidden -pthread".split()
-X86_BUILDS = {"v4": ["-march=x86-64-v4", "-mprefer-vector-width=512"], "v3": ["-march=x86-64-v3"], "base": ["-Wno-psabi"]}
+FLAGS = (
+    "-std=c++17 -O3 -g0 -fno-math-errno -fno-trapping-math -ffp-contract=fast "
+    "-fvisibility=hidden -pthread"
+).split()
+X86_BUILDS = {
+    "v4": ["-march=x86-64-v4", "-mprefer-vector-width=512"],
+    "v3": ["-march=x86-64-v3"],
+    "base": ["-Wno-psabi"],
+}
 
 
 def extensions() -> list[Extension]:
@@ -38,7 +46,9 @@ def extensions() -> list[Extension]:
 
 
 class BuildLibraries(build_ext):
-    """Compiles the builds side by side and names them plainly, since ctypes loads them and not Python's import."""
+    """Compiles the builds side by side and names them plainly, since ctypes loads them and not
+    Python's import.
+    """
 
     def finalize_options(self):
         super().finalize_options()
@@ -47,10 +57,16 @@ class BuildLibraries(build_ext):
     def build_extension(self, extension):
         """One folder of objects per build: they all come from the same source."""
         folder = os.path.join(self.build_temp, extension.name)
-        flags = {"extra_postargs": extension.extra_compile_args, "depends": extension.depends, "include_dirs": extension.include_dirs}
+        flags = {
+            "extra_postargs": extension.extra_compile_args,
+            "depends": extension.depends,
+            "include_dirs": extension.include_dirs,
+        }
         objects = self.compiler.compile(extension.sources, output_dir=folder, **flags)
         library = self.get_ext_fullpath(extension.name)
-        self.compiler.link_shared_object(objects, library, extra_postargs=extension.extra_link_args, target_lang="c++")
+        self.compiler.link_shared_object(
+            objects, library, extra_postargs=extension.extra_link_args, target_lang="c++"
+        )
 
     def get_ext_filename(self, fullname):
         return os.path.join(*fullname.split(".")) + ".so"

@@ -1,15 +1,18 @@
-"""The paper's ablations and claims as tables, measured in dB against a known truth; one command, minutes on a CPU.
+"""The paper's ablations and claims as tables, measured in dB against a known truth; one command,
+minutes on a CPU.
 
     python benchmarks/ablations.py                          # the paper's ablations
-    python benchmarks/ablations.py --table faces            # prior against random start under a view-blind score, five seeds
-    python benchmarks/ablations.py --table guidance         # guidance scale 100: plain, annealed, clipped
+    python benchmarks/ablations.py --table faces            # prior against random start under a
+                                                            view-blind score, five seeds
+    python benchmarks/ablations.py --table guidance         # guidance scale 100: plain, annealed,
+                                                            clipped
     python benchmarks/ablations.py --mesh spot.glb --seeds 0 1 2 --size 128
 
-Each row is an ordinary run of configs/demo.yaml with a few options changed; its score is the PSNR on held-out views that no bank
-holds. `view-exact` knows the picture from every camera (an upper bound: reconstruction). `view-blind` knows only pictures from
-anywhere, in a low-dimensional linear latent, as a real diffusion model does: that is where a prior matters. Neither says
-anything about the quality of a real diffusion model.
-"""
+Each row is an ordinary run of configs/demo.yaml with a few options changed; its score is the PSNR
+on held-out views that no bank holds. `view-exact` knows the picture from every camera (an upper
+bound: reconstruction). `view-blind` knows only pictures from anywhere, in a low-dimensional linear
+latent, as a real diffusion model does: that is where a prior matters. Neither says anything about
+the quality of a real diffusion model."""
 
 import argparse
 import csv
@@ -31,7 +34,8 @@ RANDOM_START = {
     "system.geometry.prior": {"num_points": 10000, "shape": "sphere"},
     "system.geometry.grow.enabled": False,
 }
-# One distance for cameras and bank: otherwise a nearer view is one more mode to drift to, and zoom hides what the faces do.
+# One distance for cameras and bank: otherwise a nearer view is one more mode to drift to, and zoom
+# hides what the faces do.
 VIEW_BLIND = {
     "system.guidance.mode": "view-agnostic",
     "system.guidance.space": "latent",
@@ -48,7 +52,13 @@ STRONG = {"system.guidance.guidance_scale": 101.0}  # threestudio's 100
 CLIPPED = {"system.guidance.grad_clip": [0, 1.5, 2.0, 1000]}
 PAPER_RATES = {
     f"system.geometry.lr_{name}": rate
-    for name, rate in (("means", 5e-5), ("scales", 1e-3), ("quats", 1e-2), ("opacities", 1e-2), ("sh", 1.25e-2))
+    for name, rate in (
+        ("means", 5e-5),
+        ("scales", 1e-3),
+        ("quats", 1e-2),
+        ("opacities", 1e-2),
+        ("sh", 1.25e-2),
+    )
 }
 
 # Options replace what the demo's YAML has under their key, whole sections included.
@@ -72,7 +82,11 @@ TABLES = {
         "scale 100, annealed, clipped": LATENT | STRONG | CLIPPED,
     },
 }
-SCORES = {"ablations": ("view-exact", "view-blind"), "faces": ("view-blind",), "guidance": ("view-exact",)}
+SCORES = {
+    "ablations": ("view-exact", "view-blind"),
+    "faces": ("view-blind",),
+    "guidance": ("view-exact",),
+}
 
 
 def main() -> None:
@@ -92,9 +106,13 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--table", choices=TABLES, default="ablations")
     parser.add_argument("--mesh", default="", help="another object than the bundled one")
     parser.add_argument("--seeds", type=int, nargs="+", help="default: 0, or 0 to 4 for faces")
-    parser.add_argument("--size", type=int, default=128, help="width and height of the training renders")
+    parser.add_argument(
+        "--size", type=int, default=128, help="width and height of the training renders"
+    )
     parser.add_argument("--steps", type=int, default=1200)
-    parser.add_argument("--out", type=Path, help="CSV file; default: benchmarks/results/<table>.csv")
+    parser.add_argument(
+        "--out", type=Path, help="CSV file; default: benchmarks/results/<table>.csv"
+    )
     parser.add_argument("overrides", nargs="*", help="more key=value options for every run")
     arguments = parser.parse_args()
     arguments.seeds = arguments.seeds or (list(range(5)) if arguments.table == "faces" else [0])
@@ -115,7 +133,14 @@ def run(arguments: argparse.Namespace, seed: int, options: dict[str, Any]) -> di
         cfg = changed_demo({**common, **mesh, **options, "exp_root_dir": folder})
         path = Path(folder) / "run.yaml"
         path.write_text(yaml.safe_dump(cfg))
-        command = [sys.executable, str(ROOT / "launch.py"), "--config", str(path), "--train", *arguments.overrides]
+        command = [
+            sys.executable,
+            str(ROOT / "launch.py"),
+            "--config",
+            str(path),
+            "--train",
+            *arguments.overrides,
+        ]
         finished = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
         if finished.returncode:
             sys.exit(f"a run failed ({finished.returncode}): {options}\n{finished.stderr[-3000:]}")
@@ -135,7 +160,10 @@ def changed_demo(options: dict[str, Any]) -> dict:
 
 
 def summary(variant: str, score: str, runs: list[dict]) -> dict:
-    values = {key: [r["result"][key] for r in runs] for key in ("psnr", "ssim", "multi_face", "gaussians", "seconds")}
+    values = {
+        key: [r["result"][key] for r in runs]
+        for key in ("psnr", "ssim", "multi_face", "gaussians", "seconds")
+    }
     return {
         "variant": variant,
         "score": score,
@@ -150,8 +178,10 @@ def summary(variant: str, score: str, runs: list[dict]) -> dict:
 def print_row(row: dict) -> None:
     spread = f" ({row['psnr_min']:.2f}..{row['psnr_max']:.2f})" if row["seeds"] > 1 else ""
     print(
-        f"{row['variant']:<30}{row['score']:<12}{row['start_psnr']:6.2f} -> {row['psnr']:6.2f} dB{spread}  SSIM {row['ssim']:.3f}"
-        f"  multi-face {100 * row['multi_face']:3.0f} %  {row['gaussians']:.0f} Gaussians  {row['seconds']:.0f} s",
+        f"{row['variant']:<30}{row['score']:<12}{row['start_psnr']:6.2f} -> {row['psnr']:6.2f} "
+        f"dB{spread}  SSIM {row['ssim']:.3f}"
+        f"  multi-face {100 * row['multi_face']:3.0f} %  {row['gaussians']:.0f} Gaussians  "
+        f"{row['seconds']:.0f} s",
         flush=True,
     )
 
@@ -159,8 +189,17 @@ def print_row(row: dict) -> None:
 def write(arguments: argparse.Namespace, rows: list[dict]) -> None:
     path = arguments.out or ROOT / f"benchmarks/results/{arguments.table}.csv"
     path.parent.mkdir(parents=True, exist_ok=True)
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT).stdout.strip()
-    about = ", ".join([platform.machine(), f"commit {commit or 'unknown'}", time.strftime("%Y-%m-%d"), *sys.argv[1:]])
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT
+    ).stdout.strip()
+    about = ", ".join(
+        [
+            platform.machine(),
+            f"commit {commit or 'unknown'}",
+            time.strftime("%Y-%m-%d"),
+            *sys.argv[1:],
+        ]
+    )
     with open(path, "w", newline="") as file:
         file.write(f"# {about}\n")
         writer = csv.DictWriter(file, fieldnames=rows[0])

@@ -1,12 +1,13 @@
-"""After the run: what ranks best, and what rounds and recovery buy, in dB to the unpruned cloud on views that nothing was fitted to.
+"""After the run: what ranks best, and what rounds and recovery buy, in dB to the unpruned cloud on
+views that nothing was fitted to.
 
-    python benchmarks/after_run.py                                       # the toy, one seed: three minutes
+    python benchmarks/after_run.py                                       # the toy, one seed: three
+                                                                         minutes
     python benchmarks/after_run.py --objects toy.glb spot.glb duck.glb --seeds 0 1 2
 
-A cloud of 10,000, trained as the demo is at 128^2 on one thread (`runs.py`), goes to a count in one shot; in one shot and as many steps
-of recovery as the rounds have together; and in rounds, as the prune command does it, ranked as it does and otherwise. Results go to
-docs/charts/after_run.csv.
-"""
+A cloud of 10,000, trained as the demo is at 128^2 on one thread (`runs.py`), goes to a count in one
+shot; in one shot and as many steps of recovery as the rounds have together; and in rounds, as the
+prune command does it, ranked as it does and otherwise. Results go to docs/charts/after_run.csv."""
 
 import argparse
 import statistics
@@ -62,7 +63,9 @@ def main() -> None:
 def measured(mesh: str, seed: int) -> list[dict[str, Any]]:
     """Rows of the CSV: what was done, to how many, and the dB that it led to."""
     with tempfile.TemporaryDirectory() as folder:
-        stored = read_cloud(str(train(Path(folder), mesh, seed, NO_BUDGET) / f"it{STEPS}-export/gaussians.ply"))
+        stored = read_cloud(
+            str(train(Path(folder), mesh, seed, NO_BUDGET) / f"it{STEPS}-export/gaussians.ply")
+        )
     cloud = prune.tensors_of(stored)
     probes, judges, tests = prune.views_of(stored, DRAWN)
     pictures = look(cloud, tests)
@@ -79,9 +82,17 @@ def variants(cloud: Cloud, count: int, probes: Views, judges: Views) -> Iterator
     for name in parsimony.SCORES:
         yield f"one shot, by {name}", only(cloud, RANKS[name](cloud, probes, 0), count)
     steps = STEPS_A_ROUND * rounds_to(count, len(cloud.means))
-    yield "one shot, by removal, recovered", recover(only(cloud, worth(cloud, probes), count), probes, look(cloud, probes), steps, 0)
+    yield (
+        "one shot, by removal, recovered",
+        recover(only(cloud, worth(cloud, probes), count), probes, look(cloud, probes), steps, 0),
+    )
     for name in parsimony.SCORES:
-        yield f"in rounds, by {name}", simplify(cloud, probes, judges, Budget(count=count), steps=STEPS_A_ROUND, rank=RANKS[name])
+        yield (
+            f"in rounds, by {name}",
+            simplify(
+                cloud, probes, judges, Budget(count=count), steps=STEPS_A_ROUND, rank=RANKS[name]
+            ),
+        )
 
 
 @torch.no_grad()
@@ -94,7 +105,9 @@ RANKS = {
     "removal": worth,
     "contribution": contribution,
     "opacity": lambda cloud, views, seed: cloud.logit_opacities.detach(),
-    "random": lambda cloud, views, seed: torch.rand(len(cloud.means), generator=torch.Generator().manual_seed(seed)),
+    "random": lambda cloud, views, seed: torch.rand(
+        len(cloud.means), generator=torch.Generator().manual_seed(seed)
+    ),
 }
 
 
@@ -105,7 +118,10 @@ def table() -> str:
     lines = [f"| to | {' | '.join(objects)} |", f"| --- |{' ---: |' * len(objects)}"]
     for variant, count in dict.fromkeys((row["variant"], row["x"]) for row in rows):
         same = [row for row in rows if (row["variant"], row["x"]) == (variant, count)]
-        values = [statistics.median(float(row["psnr"]) for row in same if row["object"] == name) for name in objects]
+        values = [
+            statistics.median(float(row["psnr"]) for row in same if row["object"] == name)
+            for name in objects
+        ]
         lines.append(f"| {count}, {variant} | {' | '.join(f'{value:.1f}' for value in values)} |")
     return "\n".join(lines)
 

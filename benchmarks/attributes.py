@@ -1,12 +1,17 @@
-"""Which attributes a scene needs: dB per byte of harmonics, anisotropy and precision, into docs/charts/attributes.csv and .png.
+"""Which attributes a scene needs: dB per byte of harmonics, anisotropy and precision, into
+docs/charts/attributes.csv and .png.
 
-    python benchmarks/attributes.py                                                  # what isn't measured yet, then the chart
+    python benchmarks/attributes.py                                                  # what isn't
+                                                                                     measured yet,
+                                                                                     then the chart
     python benchmarks/attributes.py --objects toy.glb spot.glb duck.glb --seeds 0 1 2
 
-*trained*: clouds of other attributes, trained as the demo is at 128^2 on one thread (`runs.py`), equal in steps and views, at counts
-that give round and stretched Gaussians the same number of floats. *rounded*: the trained cloud of 2,500 with one attribute rounded to
-so many bits and the others exact. *file*: the same cloud as the files that it is written to. All scored on 24 held-out views against
-ray-cast truth. The truth is unlit, so nothing here looks different from elsewhere: a glossy scene may need its harmonics.
+*trained*: clouds of other attributes, trained as the demo is at 128^2 on one thread (`runs.py`),
+equal in steps and views, at counts that give round and stretched Gaussians the same number of
+floats. *rounded*: the trained cloud of 2,500 with one attribute rounded to so many bits and the
+others exact. *file*: the same cloud as the files that it is written to. All scored on 24 held-out
+views against ray-cast truth. The truth is unlit, so nothing here looks different from elsewhere: a
+glossy scene may need its harmonics.
 
 Trained clouds are kept in outputs/attributes; what the CSV has is not run again.
 """
@@ -24,11 +29,28 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from chart_runs import PAPER, caption, grouped, median, objects_of, papers_ends, spread, title_of
-from runs import CHARTS, RENDERER, ROOT, SIZE, STEPS, append_rows, measured_in, object_name, rows_of, train
+from runs import (
+    CHARTS,
+    RENDERER,
+    ROOT,
+    SIZE,
+    STEPS,
+    append_rows,
+    measured_in,
+    object_name,
+    rows_of,
+    train,
+)
 from tqdm import tqdm
 
 from threestudio_gaussiandreamer import register_parts
-from threestudio_gaussiandreamer.formats.gaussian_files import OUR_UP, StoredCloud, in_axes, read_cloud, write_cloud
+from threestudio_gaussiandreamer.formats.gaussian_files import (
+    OUR_UP,
+    StoredCloud,
+    in_axes,
+    read_cloud,
+    write_cloud,
+)
 from threestudio_gaussiandreamer.formats.ply import GaussianArrays, read_gaussians
 from threestudio_gaussiandreamer.formats.spz import COLOR_SCALE
 from threestudio_gaussiandreamer.host import find
@@ -42,7 +64,9 @@ COLUMNS = "experiment,variant,x,object,seed,gaussians,bytes,psnr,machine,commit"
 ROUNDED_COUNT = 2500
 BITS = (4, 5, 6, 7, 8, 9, 10, 12, 14, 16)
 SPZ_BITS = {"opacity": 8, "colour": 8, "scales": 8, "rotation": 10, "positions": 12}
-"""How our SPZ files store them; positions by the size of the Gaussians, which is about this along the longest side."""
+"""How our SPZ files store them; positions by the size of the Gaussians, which is about this along
+the longest side.
+"""
 
 
 class Kind(NamedTuple):
@@ -62,7 +86,10 @@ KINDS = {
         11 + 3 * (degree + 1) ** 2,
         (1000, 2500),
         # a twentieth of the rate of the constant harmonic, the custom of 3D Gaussian splatting
-        {"system.geometry.sh_degree": degree, "system.geometry.lr_sh_rest": f"[0,5e-3,1e-4,{STEPS}]"},
+        {
+            "system.geometry.sh_degree": degree,
+            "system.geometry.lr_sh_rest": f"[0,5e-3,1e-4,{STEPS}]",
+        },
     )
     for degree in (1, 2, 3)
 }
@@ -91,37 +118,72 @@ def main() -> None:
 
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--objects", nargs="*", default=["toy.glb"], help="meshes; a bare name is a bundled one (default: toy.glb)")
+    parser.add_argument(
+        "--objects",
+        nargs="*",
+        default=["toy.glb"],
+        help="meshes; a bare name is a bundled one (default: toy.glb)",
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="runs side by side, one thread each")
+    parser.add_argument(
+        "--jobs", type=int, default=os.cpu_count(), help="runs side by side, one thread each"
+    )
     return parser.parse_args()
 
 
-# ---- measuring -------------------------------------------------------------------------------------------------------------
+# ---- measuring -----------------------------------------------------------------------------------
 
 
 def folder_of(kind: str, count: int, mesh: str, seed: int) -> Path:
     """The results of one training run, which is made unless it is there."""
-    folder = CLOUDS / f"{kind.replace(', ', '-').replace(' ', '')}-{count}-{object_name(mesh)}-{seed}"
+    folder = (
+        CLOUDS / f"{kind.replace(', ', '-').replace(' ', '')}-{count}-{object_name(mesh)}-{seed}"
+    )
     results = folder / "demo/run/save"
     if not list(results.glob("it*-export/gaussians.ply")):
-        train(folder, mesh, seed, KINDS[kind].options | {"system.geometry.budget": count}, program="benchmarks/round_gaussians.py")
+        train(
+            folder,
+            mesh,
+            seed,
+            KINDS[kind].options | {"system.geometry.budget": count},
+            program="benchmarks/round_gaussians.py",
+        )
     return results
 
 
 def rows(kind: str, count: int, mesh: str, seed: int, results: Path) -> Iterator[dict[str, Any]]:
     """The row of a training run, and those of its cloud rounded."""
     scores = json.loads((results / "metrics.json").read_text())["result"]
-    yield {"experiment": "trained", "variant": kind, "x": count, "bytes": 4 * KINDS[kind].floats * count, **scores}
+    yield {
+        "experiment": "trained",
+        "variant": kind,
+        "x": count,
+        "bytes": 4 * KINDS[kind].floats * count,
+        **scores,
+    }
     if kind != STRETCHED or count != ROUNDED_COUNT:
         return
     arrays = read_gaussians(next(results.glob("it*-export/gaussians.ply")))
     for name, size, cloud in written(arrays):
-        yield {"experiment": "file", "variant": name, "x": 0, "gaussians": count, "bytes": size, "psnr": score(mesh, cloud)}
+        yield {
+            "experiment": "file",
+            "variant": name,
+            "x": 0,
+            "gaussians": count,
+            "bytes": size,
+            "psnr": score(mesh, cloud),
+        }
     for name, rounded in ROUNDED.items():
         for bits in BITS:
             cloud = rounded(arrays, bits)
-            yield {"experiment": "rounded", "variant": name, "x": bits, "gaussians": count, "bytes": "", "psnr": score(mesh, cloud)}
+            yield {
+                "experiment": "rounded",
+                "variant": name,
+                "x": bits,
+                "gaussians": count,
+                "bytes": "",
+                "psnr": score(mesh, cloud),
+            }
 
 
 def written(arrays: GaussianArrays) -> Iterator[tuple[str, int, GaussianArrays]]:
@@ -130,15 +192,23 @@ def written(arrays: GaussianArrays) -> Iterator[tuple[str, int, GaussianArrays]]
         for name in ("a.ply", "a.spz"):
             path = Path(folder) / name
             write_cloud(str(path), StoredCloud(arrays))
-            yield path.suffix[1:].upper(), path.stat().st_size, in_axes(read_cloud(str(path)), OUR_UP)
+            yield (
+                path.suffix[1:].upper(),
+                path.stat().st_size,
+                in_axes(read_cloud(str(path)), OUR_UP),
+            )
 
 
 def score(mesh: str, arrays: GaussianArrays, size: int = SIZE, **drawn: Any) -> float:
-    """PSNR on the held-out views of :mod:`evaluate`, as a run ends with it; drawn as the demo draws, but for ``drawn``."""
+    """PSNR on the held-out views of :mod:`evaluate`, as a run ends with it; drawn as the demo
+    draws, but for ``drawn``.
+    """
     geometry = find("gaussiandreamer-cloud")({})
     geometry.set_arrays(**arrays._asdict())
     background = find("gaussiandreamer-background")({"color": [1.0, 1.0, 1.0]})
-    renderer = find("gaussiandreamer-splatting")(RENDERER | drawn, geometry=geometry, material=None, background=background)
+    renderer = find("gaussiandreamer-splatting")(
+        RENDERER | drawn, geometry=geometry, material=None, background=background
+    )
     held_out = held_out_views(mesh, size)
     images, backgrounds = held_out.render(renderer)
     return round(float(psnr(images.clamp(0, 1), held_out.truth_on(backgrounds))), 4)
@@ -150,10 +220,14 @@ def held_out_views(mesh: str, size: int) -> HeldOut:
 
 
 def append(job: tuple[str, int, str, int], measurements: list[dict[str, Any]]) -> None:
-    append_rows("attributes", COLUMNS, [row | {"object": object_name(job[2]), "seed": job[3]} for row in measurements])
+    append_rows(
+        "attributes",
+        COLUMNS,
+        [row | {"object": object_name(job[2]), "seed": job[3]} for row in measurements],
+    )
 
 
-# ---- rounding, in the steps of SPZ where the number of bits is SPZ's ----------------------------------------------------------
+# ---- rounding, in the steps of SPZ where the number of bits is SPZ's -----------------------------
 
 
 def steps_of(values: np.ndarray, low: float, high: float, levels: float) -> np.ndarray:
@@ -164,7 +238,11 @@ def steps_of(values: np.ndarray, low: float, high: float, levels: float) -> np.n
 
 def with_positions(arrays: GaussianArrays, bits: int) -> GaussianArrays:
     low = float(arrays.means.min())
-    return arrays._replace(means=steps_of(arrays.means, low, low + float(np.ptp(arrays.means, axis=0).max()) * 2, 2 ** (bits + 1)))
+    return arrays._replace(
+        means=steps_of(
+            arrays.means, low, low + float(np.ptp(arrays.means, axis=0).max()) * 2, 2 ** (bits + 1)
+        )
+    )
 
 
 def with_scales(arrays: GaussianArrays, bits: int) -> GaussianArrays:
@@ -176,14 +254,18 @@ def with_rotation(arrays: GaussianArrays, bits: int) -> GaussianArrays:
     quats = arrays.quats / np.linalg.norm(arrays.quats, axis=1, keepdims=True)
     largest = np.arange(4) == np.abs(quats).argmax(1)[:, None]
     quats *= np.sign(quats[largest])[:, None]
-    rounded = np.where(largest, 0, steps_of(quats, -np.sqrt(0.5), np.sqrt(0.5), 2 * (2 ** (bits - 1) - 1)))
+    rounded = np.where(
+        largest, 0, steps_of(quats, -np.sqrt(0.5), np.sqrt(0.5), 2 * (2 ** (bits - 1) - 1))
+    )
     rest = np.sqrt((1 - (rounded**2).sum(1, keepdims=True)).clip(0))
     return arrays._replace(quats=np.where(largest, rest, rounded).astype(np.float32))
 
 
 def with_opacity(arrays: GaussianArrays, bits: int) -> GaussianArrays:
     levels, half_step = 2**bits - 1, 0.125 / (2**bits - 1)
-    alphas = steps_of(1 / (1 + np.exp(-arrays.logit_opacities.astype(np.float64))), 0, 1, levels).clip(half_step, 1 - half_step)
+    alphas = steps_of(
+        1 / (1 + np.exp(-arrays.logit_opacities.astype(np.float64))), 0, 1, levels
+    ).clip(half_step, 1 - half_step)
     return arrays._replace(logit_opacities=np.log(alphas / (1 - alphas)).astype(np.float32))
 
 
@@ -201,18 +283,22 @@ ROUNDED: dict[str, Callable[[GaussianArrays, int], GaussianArrays]] = {
 }
 
 
-# ---- drawing ---------------------------------------------------------------------------------------------------------------
+# ---- drawing -------------------------------------------------------------------------------------
 
 
 def draw(measurements: list[dict[str, str]]) -> Path:
-    """One column per object: what attributes buy per byte above, what rounding costs below; returns the path."""
+    """One column per object: what attributes buy per byte above, what rounding costs below; returns
+    the path.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     objects = objects_of(measurements)
-    figure, panels = plt.subplots(2, len(objects), figsize=(1.2 + 4.2 * len(objects), 8.4), sharey="row", squeeze=False)
+    figure, panels = plt.subplots(
+        2, len(objects), figsize=(1.2 + 4.2 * len(objects), 8.4), sharey="row", squeeze=False
+    )
     for column, name in enumerate(objects):
         chosen = [row for row in measurements if row["object"] == name]
         draw_bytes(panels[0, column], chosen)
@@ -220,7 +306,14 @@ def draw(measurements: list[dict[str, str]]) -> Path:
         panels[0, column].set_title(title_of(name), fontsize=10)
     panels[0, 0].set_ylabel("held-out PSNR, dB")
     panels[1, 0].set_ylabel("dB lost by rounding one attribute")
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="center", bbox_to_anchor=(0.5, 0.45), ncols=7, frameon=False, fontsize=8)
+    figure.legend(
+        *panels[0, 0].get_legend_handles_labels(),
+        loc="center",
+        bbox_to_anchor=(0.5, 0.45),
+        ncols=7,
+        frameon=False,
+        fontsize=8,
+    )
     panels[1, -1].legend(loc="upper right", frameon=False, fontsize=8)
     figure.suptitle("Which attributes a scene needs", x=0.01, ha="left", fontweight="bold")
     figure.text(0.01, 0.945, caption(measurements), fontsize=8, color="0.35")
@@ -236,12 +329,30 @@ def draw_bytes(panel: Any, measurements: list[dict[str, str]]) -> None:
     trained = [row for row in measurements if row["experiment"] == "trained"]
     lines = grouped(trained, lambda row: row["variant"])
     for index, label in enumerate(kind for kind in KINDS if kind in lines):
-        points = sorted((median(at, "bytes") / 1000, *spread(at)) for at in grouped(lines[label], lambda row: row["x"]).values())
+        points = sorted(
+            (median(at, "bytes") / 1000, *spread(at))
+            for at in grouped(lines[label], lambda row: row["x"]).values()
+        )
         x, low, middle, high = zip(*points, strict=True)
-        panel.plot(x, middle, "o-", color=f"C{index}", linewidth=1.4, markersize=4, label=f"{label}, float32")
+        panel.plot(
+            x,
+            middle,
+            "o-",
+            color=f"C{index}",
+            linewidth=1.4,
+            markersize=4,
+            label=f"{label}, float32",
+        )
         panel.vlines(x, low, high, color=f"C{index}", linewidth=1)
     files = [row for row in measurements if (row["experiment"], row["variant"]) == ("file", "SPZ")]
-    panel.plot(median(files, "bytes") / 1000, spread(files)[1], "D", color="C9", markersize=7, label=f"{STRETCHED}, SPZ")
+    panel.plot(
+        median(files, "bytes") / 1000,
+        spread(files)[1],
+        "D",
+        color="C9",
+        markersize=7,
+        label=f"{STRETCHED}, SPZ",
+    )
     papers = [row for row in papers_ends() if row["object"] == measurements[0]["object"]]
     paper_bytes = 4 * KINDS[STRETCHED].floats * median(papers, "gaussians")
     panel.plot(paper_bytes / 1000, spread(papers)[1], "*", color="0.15", markersize=12, label=PAPER)
@@ -253,14 +364,28 @@ def draw_bytes(panel: Any, measurements: list[dict[str, str]]) -> None:
 
 def draw_bits(panel: Any, measurements: list[dict[str, str]]) -> None:
     """dB lost against bits, attribute by attribute; a ring where SPZ is."""
-    exact = {row["seed"]: float(row["psnr"]) for row in measurements if (row["experiment"], row["variant"]) == ("file", "PLY")}
+    exact = {
+        row["seed"]: float(row["psnr"])
+        for row in measurements
+        if (row["experiment"], row["variant"]) == ("file", "PLY")
+    }
     rounded = [row for row in measurements if row["experiment"] == "rounded"]
     for index, (label, chosen) in enumerate(grouped(rounded, lambda row: row["variant"]).items()):
         lost = grouped(chosen, lambda row: int(row["x"]))
         x = sorted(lost)
-        y = [float(np.median([exact[row["seed"]] - float(row["psnr"]) for row in lost[bits]])) for bits in x]
+        y = [
+            float(np.median([exact[row["seed"]] - float(row["psnr"]) for row in lost[bits]]))
+            for bits in x
+        ]
         panel.plot(x, y, "o-", color=f"C{index}", linewidth=1.4, markersize=3, label=label)
-        panel.plot(SPZ_BITS[label], y[x.index(SPZ_BITS[label])], "o", color=f"C{index}", markersize=9, fillstyle="none")
+        panel.plot(
+            SPZ_BITS[label],
+            y[x.index(SPZ_BITS[label])],
+            "o",
+            color=f"C{index}",
+            markersize=9,
+            fillstyle="none",
+        )
     panel.set_ylim(-0.02, 1.0)
     finish(panel, "bits (rings: SPZ)")
 

@@ -1,11 +1,12 @@
-"""What the guards cost: each one's time next to that of the training step, and the finite check's next to the forward pass.
+"""What the guards cost: each one's time next to that of the training step, and the finite check's
+next to the forward pass.
 
     python benchmarks/bench_guards.py [--gaussians 10000 --size 256 --views 4 --threads 4]
 
-A step is what the demo's is: four views drawn and differentiated, the shared path of score distillation on their pixels, Adam.
-Guards are timed on their own, since a difference of two steps drowns in their noise. Prints a table and writes
-``benchmarks/results/guards.csv``. The bars: all guards of a step <= 2 % of it, ``non_finite="error"`` <= 2 % of a forward pass.
-"""
+A step is what the demo's is: four views drawn and differentiated, the shared path of score
+distillation on their pixels, Adam. Guards are timed on their own, since a difference of two steps
+drowns in their noise. Prints a table and writes ``benchmarks/results/guards.csv``. The bars: all
+guards of a step <= 2 % of it, ``non_finite="error"`` <= 2 % of a forward pass."""
 
 import argparse
 import csv
@@ -27,7 +28,9 @@ LOG_EVERY = 10  # steps between two looks at the cloud's limits, as in configs/d
 
 
 class Pixels(ScoreDistillation):
-    """The shared path without a score model: the noise that was added comes back with the picture's difference from grey."""
+    """The shared path without a score model: the noise that was added comes back with the picture's
+    difference from grey.
+    """
 
     def encode(self, rgb, **batch):
         return 2 * rgb - 1
@@ -48,12 +51,20 @@ class Bench:
     def __init__(self, gaussians: int, size: int, views: int):
         self.size, self.scene = size, make_scene(gaussians)
         self.geometry = GaussianCloud({})
-        arrays = {"means": self.scene.means, "log_scales": self.scene.scales.log(), "quats": self.scene.quats}
+        arrays = {
+            "means": self.scene.means,
+            "log_scales": self.scene.scales.log(),
+            "quats": self.scene.quats,
+        }
         logits = torch.logit(self.scene.opacities)
-        self.geometry.set_arrays(**arrays, logit_opacities=logits, sh=rgb_to_sh0(self.scene.colors)[:, None])
+        self.geometry.set_arrays(
+            **arrays, logit_opacities=logits, sh=rgb_to_sh0(self.scene.colors)[:, None]
+        )
         cameras = [make_camera(size, azimuth=360.0 / views * view) for view in range(views)]
         self.cameras = [torch.stack(x) for x in zip(*cameras, strict=True)]
-        self.optimizer = torch.optim.Adam([{**group, "lr": 1e-5} for group in self.geometry.parameter_groups()])
+        self.optimizer = torch.optim.Adam(
+            [{**group, "lr": 1e-5} for group in self.geometry.parameter_groups()]
+        )
         self.guidance = Pixels({"guidance_scale": 1.0, "max_step_percent": 0.5})
         self.noised = self.guidance.add_noise(torch.rand(views, 3, size, size))
         self.grad = torch.randn(views, 3, size, size)
@@ -76,11 +87,14 @@ class Bench:
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
 
-    # -- the guards, as the step runs them -----------------------------------------------------------------------------------
+    # -- the guards, as the step runs them ---------------------------------------------------------
 
     def tensors(self) -> tuple[dict, dict]:
         names = ("means", "quats", "scales", "opacities", "colors")
-        return dict(zip(names, self.scene, strict=True)), {"viewmats": self.cameras[0], "Ks": self.cameras[1]}
+        return dict(zip(names, self.scene, strict=True)), {
+            "viewmats": self.cameras[0],
+            "Ks": self.cameras[1],
+        }
 
     def arguments_are_checked(self) -> None:
         gaussians, cameras = self.tensors()
@@ -125,10 +139,17 @@ def milliseconds(function: Callable[[], None], seconds: float) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     for name, default in (("gaussians", 10_000), ("size", 256), ("views", 4), ("threads", 4)):
         parser.add_argument(f"--{name}", type=int, default=default)
-    parser.add_argument("--seconds", type=float, default=5.0, help="for each of the two things that guards are compared with")
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=5.0,
+        help="for each of the two things that guards are compared with",
+    )
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     bench = Bench(options.gaussians, options.size, options.views)
@@ -137,22 +158,41 @@ def main() -> None:
         bench.arguments_are_checked: 1, bench.log_scales_are_clamped: 1, bench.bad_items_are_counted: 1,
         bench.gradients_of_the_statistics_are_finite: 1, bench.limits_are_looked_at: LOG_EVERY,
     }  # fmt: skip
-    rows = [(f.__name__.replace("_", " "), milliseconds(f, 0.5) / every, step) for f, every in guards.items()]
+    rows = [
+        (f.__name__.replace("_", " "), milliseconds(f, 0.5) / every, step)
+        for f, every in guards.items()
+    ]
     rows.append(("all guards of a training step", sum(time for _, time, _ in rows), step))
-    rows.append(('non_finite="error" in a forward pass', milliseconds(bench.everything_is_finite, 0.5), forward))
+    rows.append(
+        (
+            'non_finite="error" in a forward pass',
+            milliseconds(bench.everything_is_finite, 0.5),
+            forward,
+        )
+    )
     report(rows, options)
 
 
 def report(rows: list[tuple[str, float, float]], options: argparse.Namespace) -> None:
-    print(f"{options.gaussians:,} Gaussians, {options.views} views of {options.size}^2, {options.threads} threads")
+    print(
+        f"{options.gaussians:,} Gaussians, {options.views} views of {options.size}^2, "
+        f"{options.threads} threads"
+    )
     for name, time_of_guard, whole in rows:
-        print(f"{name:42} {time_of_guard:8.3f} ms of {whole:8.2f} ms: {100 * time_of_guard / whole:5.2f} %")
+        print(
+            f"{name:42} {time_of_guard:8.3f} ms of {whole:8.2f} ms: "
+            f"{100 * time_of_guard / whole:5.2f} %"
+        )
     with RESULTS.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["gaussians", "size", "views", "threads", "guard", "guard_ms", "whole_ms", "percent"])
+        writer.writerow(
+            ["gaussians", "size", "views", "threads", "guard", "guard_ms", "whole_ms", "percent"]
+        )
         for name, time_of_guard, whole in rows:
             figures = (f"{time_of_guard:.4f}", f"{whole:.3f}", f"{100 * time_of_guard / whole:.3f}")
-            writer.writerow([options.gaussians, options.size, options.views, options.threads, name, *figures])
+            writer.writerow(
+                [options.gaussians, options.size, options.views, options.threads, name, *figures]
+            )
 
 
 if __name__ == "__main__":

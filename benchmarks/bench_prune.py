@@ -1,12 +1,13 @@
-"""How long the prune command takes: clouds of 100,000 to a count and to a quality, into docs/charts/prune.csv.
+"""How long the prune command takes: clouds of 100,000 to a count and to a quality, into
+docs/charts/prune.csv.
 
     python benchmarks/bench_prune.py                    # some minutes on 4 cores
     python benchmarks/bench_prune.py --count 10000
 
-*torus*: `known_answer.py`'s, of random colours, every Gaussian to be seen. *torus and sphere*: `bench_splatting.py`'s shells of 2 %
-thickness, whose inside is hidden. Seconds are the pruning's, on all cores, reading and the report's pictures left out; dB are to the
-unpruned cloud, on views that nothing was fitted to.
-"""
+*torus*: `known_answer.py`'s, of random colours, every Gaussian to be seen. *torus and sphere*:
+`bench_splatting.py`'s shells of 2 % thickness, whose inside is hidden. Seconds are the pruning's,
+on all cores, reading and the report's pictures left out; dB are to the unpruned cloud, on views
+that nothing was fitted to."""
 
 import argparse
 import os
@@ -31,11 +32,18 @@ COLUMNS = "scene,x,budget,gaussians,psnr,seconds,threads,load,machine,commit".sp
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=100_000, help="Gaussians at the start (default: 100000)")
+    parser.add_argument(
+        "--count", type=int, default=100_000, help="Gaussians at the start (default: 100000)"
+    )
     arguments = parser.parse_args()
     register_parts()
     for row in rows(arguments.count, measured_in("prune", "scene", "x", "budget")):
-        print("{scene}, {x} Gaussians, {budget}: {gaussians} left, {psnr} dB, {seconds} s".format(**row), flush=True)
+        print(
+            "{scene}, {x} Gaussians, {budget}: {gaussians} left, {psnr} dB, {seconds} s".format(
+                **row
+            ),
+            flush=True,
+        )
         append_rows("prune", COLUMNS, [row])
 
 
@@ -49,13 +57,21 @@ def rows(count: int, measured: set[tuple[str, ...]]) -> Iterator[dict[str, Any]]
                 if (scene, str(count), " ".join(budget)) in measured:
                     continue
                 load = round(os.getloadavg()[0], 1)
-                report = prune.run(prune.parse([str(source), str(Path(folder) / "pruned.ply"), *budget]))
+                report = prune.run(
+                    prune.parse([str(source), str(Path(folder) / "pruned.ply"), *budget])
+                )
                 found = {
                     "gaussians": report["after"]["gaussians"],
                     "psnr": round(report["psnr_on_unseen_views"], 2),
                     "seconds": report["seconds"],
                 }
-                yield found | {"scene": scene, "x": count, "budget": " ".join(budget), "threads": torch.get_num_threads(), "load": load}
+                yield found | {
+                    "scene": scene,
+                    "x": count,
+                    "budget": " ".join(budget),
+                    "threads": torch.get_num_threads(),
+                    "load": load,
+                }
 
 
 def torus_and_sphere(count: int) -> Cloud:
@@ -63,7 +79,10 @@ def torus_and_sphere(count: int) -> Cloud:
     return Cloud(means, quats, scales.log(), opacities.logit(), rgb_to_sh0(colors[:, None]))
 
 
-SCENES: dict[str, Callable[[int], Cloud]] = {"torus": lambda count: torus(count, 0), "torus and sphere": torus_and_sphere}
+SCENES: dict[str, Callable[[int], Cloud]] = {
+    "torus": lambda count: torus(count, 0),
+    "torus and sphere": torus_and_sphere,
+}
 
 
 if __name__ == "__main__":

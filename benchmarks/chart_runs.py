@@ -1,11 +1,11 @@
-"""Draws the run charts: docs/charts/<name>.csv, as `runs.py` measured it, becomes docs/charts/<name>.png.
+"""Draws the run charts: docs/charts/<name>.csv, as `runs.py` measured it, becomes
+docs/charts/<name>.png.
 
     python benchmarks/chart_runs.py                # all that have been measured
     python benchmarks/chart_runs.py time count
 
-Lines are medians over the seeds, bands and bars the whole range; every panel is one object, and the first is the one that
-settings were tuned on.
-"""
+Lines are medians over the seeds, bands and bars the whole range; every panel is one object, and the
+first is the one that settings were tuned on."""
 
 import argparse
 import statistics
@@ -45,13 +45,36 @@ class Chart(NamedTuple):
 
 
 DECIBEL = "held-out PSNR, dB"
-COLOURS = [f"C{index}" for index in range(7)] + ["C8", "C9", "navy", "gold", "lime", "indigo", "salmon"]
+COLOURS = [f"C{index}" for index in range(7)] + [
+    "C8",
+    "C9",
+    "navy",
+    "gold",
+    "lime",
+    "indigo",
+    "salmon",
+]
 SECONDS = "CPU seconds of training, one thread"
 RUNS = {
     "time": Chart("What each kind of score buys per second", "cpu_seconds", SECONDS, curves=True),
-    "count": Chart("How many Gaussians a scene needs", "gaussians", "Gaussians at the end", curves=False),
-    "size": Chart("What rendering larger buys", "cpu_seconds", SECONDS, curves=False, marks_paper=True, labels_x=True),
-    "large": Chart("What rendering at 1024² and shrinking to 512² buys", "cpu_seconds", SECONDS, curves=False, size=512),
+    "count": Chart(
+        "How many Gaussians a scene needs", "gaussians", "Gaussians at the end", curves=False
+    ),
+    "size": Chart(
+        "What rendering larger buys",
+        "cpu_seconds",
+        SECONDS,
+        curves=False,
+        marks_paper=True,
+        labels_x=True,
+    ),
+    "large": Chart(
+        "What rendering at 1024² and shrinking to 512² buys",
+        "cpu_seconds",
+        SECONDS,
+        curves=False,
+        size=512,
+    ),
     "batch": Chart(
         "Views per step, at equal seconds",
         "cpu_seconds",
@@ -69,15 +92,28 @@ RUNS = {
         marks_paper=True,
         common="demo.yaml",
     ),
-    "dilation": Chart("What a smaller screen-space dilation buys", "x", "dilation, square pixels", curves=False),
-    "quality": Chart("Draft, default and best", "cpu_seconds", SECONDS, curves=True, size=256, chosen_on=(TUNED_ON, "duck")),
-    "preset": Chart("What the rasteriser's presets buy", "cpu_seconds", SECONDS, curves=True, marks_paper=True),
+    "dilation": Chart(
+        "What a smaller screen-space dilation buys", "x", "dilation, square pixels", curves=False
+    ),
+    "quality": Chart(
+        "Draft, default and best",
+        "cpu_seconds",
+        SECONDS,
+        curves=True,
+        size=256,
+        chosen_on=(TUNED_ON, "duck"),
+    ),
+    "preset": Chart(
+        "What the rasteriser's presets buy", "cpu_seconds", SECONDS, curves=True, marks_paper=True
+    ),
 }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("charts", nargs="*", help=f"of {', '.join(RUNS)}; default: all that have been measured")
+    parser.add_argument(
+        "charts", nargs="*", help=f"of {', '.join(RUNS)}; default: all that have been measured"
+    )
     for name in parser.parse_args().charts or RUNS:
         rows = rows_of(name)
         if rows:
@@ -85,7 +121,9 @@ def main() -> None:
 
 
 def papers_own(chart: Chart) -> list[Row]:
-    """Where the paper's recipe ends, for charts that have no runs of it; at 1 where the axis counts times something of the demo's."""
+    """Where the paper's recipe ends, for charts that have no runs of it; at 1 where the axis counts
+    times something of the demo's.
+    """
     return [row | {"x": "1"} for row in papers_ends()] if chart.marks_paper else []
 
 
@@ -101,7 +139,9 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
     import matplotlib.pyplot as plt
 
     objects = objects_of(rows)
-    figure, panels = plt.subplots(1, len(objects), figsize=(1.2 + 4.2 * len(objects), 4.6), sharey=True, squeeze=False)
+    figure, panels = plt.subplots(
+        1, len(objects), figsize=(1.2 + 4.2 * len(objects), 4.6), sharey=True, squeeze=False
+    )
     labels = list(dict.fromkeys(label_of(chart, row) for row in rows))
     for panel, name_of_object in zip(panels[0], objects, strict=True):
         draw_panel(panel, chart, labels, [row for row in rows if row["object"] == name_of_object])
@@ -109,7 +149,9 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
     panels[0, 0].set_ylabel(DECIBEL)
     figure.suptitle(chart.title, x=0.01, ha="left", fontweight="bold")
     handles, _ = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=min(4, len(labels)), frameon=False, fontsize=9)
+    figure.legend(
+        handles, labels, loc="lower center", ncols=min(4, len(labels)), frameon=False, fontsize=9
+    )
     figure.text(0.01, 0.905, caption(rows, chart.size), fontsize=8, color="0.35")
     figure.tight_layout(rect=(0, 0.06 + 0.04 * ((len(labels) - 1) // 4), 1, 0.93))
     path = CHARTS / f"{name}.png"
@@ -139,7 +181,9 @@ def draw_panel(panel: Any, chart: Chart, labels: list[str], rows: list[Row]) -> 
         chosen = chosen + [row for row in common if row["x"] not in {own["x"] for own in chosen}]
         paper = label.endswith(PAPER)
         style = {"color": "0.15" if paper else COLOURS[index % len(COLOURS)], "label": label}
-        (draw_curve if chart.curves else draw_points)(panel, chart, chosen, style, "*" if PAPER in label else "o")
+        (draw_curve if chart.curves else draw_points)(
+            panel, chart, chosen, style, "*" if PAPER in label else "o"
+        )
     if chart.log_x:
         panel.set_xscale("log")
         panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
@@ -151,20 +195,32 @@ def draw_panel(panel: Any, chart: Chart, labels: list[str], rows: list[Row]) -> 
 
 
 def label_of(chart: Chart, row: Row) -> str:
-    return row["variant"] if chart.per_variant == "variant" or row["variant"] == PAPER else f"{row['x']} views a step"
+    return (
+        row["variant"]
+        if chart.per_variant == "variant" or row["variant"] == PAPER
+        else f"{row['x']} views a step"
+    )
 
 
-def draw_curve(panel: Any, chart: Chart, rows: Iterable[Row], style: dict[str, Any], marker: str) -> None:
+def draw_curve(
+    panel: Any, chart: Chart, rows: Iterable[Row], style: dict[str, Any], marker: str
+) -> None:
     """Median over the seeds at each step, the range as a band, a marker at the end."""
-    steps = grouped((row for row in rows if float(row["cpu_seconds"]) > 0), lambda row: int(row["step"]))
+    steps = grouped(
+        (row for row in rows if float(row["cpu_seconds"]) > 0), lambda row: int(row["step"])
+    )
     points = [(median(at, chart.x), *spread(at)) for _, at in sorted(steps.items())]
     x, low, middle, high = zip(*points, strict=True)
     panel.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)
     panel.plot(x, middle, linewidth=1.6, **style)
-    panel.plot(x[-1:], middle[-1:], marker, color=style["color"], markersize=10 if marker == "*" else 5)
+    panel.plot(
+        x[-1:], middle[-1:], marker, color=style["color"], markersize=10 if marker == "*" else 5
+    )
 
 
-def draw_points(panel: Any, chart: Chart, rows: Iterable[Row], style: dict[str, Any], marker: str) -> None:
+def draw_points(
+    panel: Any, chart: Chart, rows: Iterable[Row], style: dict[str, Any], marker: str
+) -> None:
     """One point for each place: median, and the range over the seeds as a bar."""
     places = [ends(at) for at in grouped(rows, lambda row: float(row["x"])).values()]
     points = sorted((median(at, chart.x), *spread(at)) for at in places)
@@ -172,18 +228,30 @@ def draw_points(panel: Any, chart: Chart, rows: Iterable[Row], style: dict[str, 
     below = [m - b for m, b in zip(middle, low, strict=True)]
     above = [t - m for m, t in zip(middle, high, strict=True)]
     size = 11 if marker == "*" else 5
-    panel.errorbar(x, middle, [below, above], marker=marker, markersize=size, linewidth=1.4, capsize=2, **style)
+    panel.errorbar(
+        x, middle, [below, above], marker=marker, markersize=size, linewidth=1.4, capsize=2, **style
+    )
     for at in places:
         values = [float(row[chart.x]) for row in at]
         panel.hlines(spread(at)[1], min(values), max(values), color=style["color"], linewidth=1.4)
         if chart.labels_x and PAPER not in at[0]["variant"]:
             place = median(at, chart.x), spread(at)[1]
-            panel.annotate(f"{at[0]['x']}²", place, xytext=(4, -11), textcoords="offset points", fontsize=8, color=style["color"])
+            panel.annotate(
+                f"{at[0]['x']}²",
+                place,
+                xytext=(4, -11),
+                textcoords="offset points",
+                fontsize=8,
+                color=style["color"],
+            )
 
 
 def ends(rows: Iterable[Row]) -> list[Row]:
     """The last row of each run."""
-    return [max(run, key=lambda row: int(row["step"])) for run in grouped(rows, lambda row: row["seed"]).values()]
+    return [
+        max(run, key=lambda row: int(row["step"]))
+        for run in grouped(rows, lambda row: row["seed"]).values()
+    ]
 
 
 def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Row]]:
@@ -205,11 +273,21 @@ def spread(rows: list[Row]) -> tuple[float, float, float]:
 
 def caption(rows: list[Row], size: int = SIZE) -> str:
     """What a chart was made on."""
-    counts = sorted({len({row["seed"] for row in same}) for same in grouped(rows, lambda row: (row["variant"], row["object"])).values()})
+    counts = sorted(
+        {
+            len({row["seed"] for row in same})
+            for same in grouped(rows, lambda row: (row["variant"], row["object"])).values()
+        }
+    )
     seeds = " to ".join(map(str, dict.fromkeys([counts[0], counts[-1]])))
-    machine, commits = (", ".join(sorted({row[column] for row in rows})) for column in ("machine", "commit"))
+    machine, commits = (
+        ", ".join(sorted({row[column] for row in rows})) for column in ("machine", "commit")
+    )
     spread_over = "one seed" if seeds == "1" else f"{seeds} seeds: median and range"
-    return f"exact score of a known object, configs/demo.yaml at {size}², {spread_over}; {machine}; commit {commits}"
+    return (
+        f"exact score of a known object, configs/demo.yaml at {size}², {spread_over}; "
+        f"{machine}; commit {commits}"
+    )
 
 
 if __name__ == "__main__":

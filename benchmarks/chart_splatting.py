@@ -1,12 +1,14 @@
-"""Error against milliseconds of the rasteriser, forward and gradients: docs/charts/rasteriser.csv and two pictures.
+"""Error against milliseconds of the rasteriser, forward and gradients: docs/charts/rasteriser.csv
+and two pictures.
 
     python benchmarks/chart_splatting.py              # measure (some ten minutes) and draw
     python benchmarks/chart_splatting.py --from-csv   # draw what was measured
 
-Truth is the specification in float64 with every cut-off off (no smallest alpha, no early stop, no tiles: every pixel against
-every Gaussian), at random pixels of the picture; gradients are those of a random cotangent on the same pixels. The cap of alpha
-belongs to the image model and stays on. Knobs are turned one at a time; peers' cut-offs are drawn as settings of our kernel,
-which says nothing about the peers' speed. Times are medians over 20 pictures, with the quartiles in the CSV.
+Truth is the specification in float64 with every cut-off off (no smallest alpha, no early stop, no
+tiles: every pixel against every Gaussian), at random pixels of the picture; gradients are those of
+a random cotangent on the same pixels. The cap of alpha belongs to the image model and stays on.
+Knobs are turned one at a time; peers' cut-offs are drawn as settings of our kernel, which says
+nothing about the peers' speed. Times are medians over 20 pictures, with the quartiles in the CSV.
 """
 
 import argparse
@@ -57,37 +59,70 @@ def settings() -> Iterator[Setting]:
         yield Setting("stop", f"{stop:g}", {"preset": "accurate", "stop": stop})
     for preset in ("fast", "balanced", "accurate"):
         yield Setting("preset", preset, {"preset": preset})
-    yield Setting("peers' cut-offs", "alpha 1/255 to 0.99", {"alpha_min": 1 / 255, "alpha_max": 0.99})
-    yield Setting("peers' cut-offs", "alpha 1/255 to 0.999", {"alpha_min": 1 / 255, "alpha_max": 0.999})
+    yield Setting(
+        "peers' cut-offs", "alpha 1/255 to 0.99", {"alpha_min": 1 / 255, "alpha_max": 0.99}
+    )
+    yield Setting(
+        "peers' cut-offs", "alpha 1/255 to 0.999", {"alpha_min": 1 / 255, "alpha_max": 0.999}
+    )
 
 
-# ---- the scenes ------------------------------------------------------------------------------------------------------------
+# ---- the scenes ----------------------------------------------------------------------------------
 
 
 def scenes() -> dict[str, Scene]:
-    return {"initial": initial(), "trained": trained(), "fog": fog(), "needles": needles(), "deep": deep(), "near plane": near()}
+    return {
+        "initial": initial(),
+        "trained": trained(),
+        "fog": fog(),
+        "needles": needles(),
+        "deep": deep(),
+        "near plane": near(),
+    }
 
 
 def initial(count: int = 4000) -> Scene:
-    """A cloud as a prior leaves it: points on a surface, opacity 0.1, isotropic, as large as the distance to the next."""
+    """A cloud as a prior leaves it: points on a surface, opacity 0.1, isotropic, as large as the
+    distance to the next.
+    """
     scene = make_scene(count)
     sizes = torch.from_numpy(nearest_distance_scales(scene.means.numpy(), "nearest"))
-    return scene._replace(scales=sizes[:, None].repeat(1, 3).float(), opacities=torch.full((count,), 0.1))
+    return scene._replace(
+        scales=sizes[:, None].repeat(1, 3).float(), opacities=torch.full((count,), 0.1)
+    )
 
 
 def trained() -> Scene:
     """The bundled toy after `make demo` at 128^2 with 2,500 Gaussians."""
     cloud = read_gaussians(TRAINED)
-    tensors = {name: torch.as_tensor(getattr(cloud, name)).float() for name in ("means", "quats", "log_scales", "logit_opacities", "sh")}
+    tensors = {
+        name: torch.as_tensor(getattr(cloud, name)).float()
+        for name in ("means", "quats", "log_scales", "logit_opacities", "sh")
+    }
     colors = sh0_to_rgb(tensors["sh"][:, 0]).clamp_min(0)
-    return Scene(tensors["means"], tensors["quats"], tensors["log_scales"].exp(), tensors["logit_opacities"].sigmoid(), colors)
+    return Scene(
+        tensors["means"],
+        tensors["quats"],
+        tensors["log_scales"].exp(),
+        tensors["logit_opacities"].sigmoid(),
+        colors,
+    )
 
 
 def blob(count: int, spread: float, size: float, opacity: float, seed: int) -> Scene:
     """Gaussians of one size and opacity in a ball."""
     rng = torch.Generator().manual_seed(seed)
-    means, quats = torch.randn(count, 3, generator=rng) * spread, torch.randn(count, 4, generator=rng)
-    return Scene(means, quats, torch.full((count, 3), size), torch.full((count,), opacity), torch.rand(count, 3, generator=rng))
+    means, quats = (
+        torch.randn(count, 3, generator=rng) * spread,
+        torch.randn(count, 4, generator=rng),
+    )
+    return Scene(
+        means,
+        quats,
+        torch.full((count, 3), size),
+        torch.full((count,), opacity),
+        torch.rand(count, 3, generator=rng),
+    )
 
 
 def fog() -> Scene:
@@ -97,14 +132,20 @@ def fog() -> Scene:
 
 def needles() -> Scene:
     """100 times longer than thick."""
-    return blob(3000, 0.4, 0.002, 0.8, 2)._replace(scales=torch.tensor([0.2, 0.002, 0.002]).repeat(3000, 1))
+    return blob(3000, 0.4, 0.002, 0.8, 2)._replace(
+        scales=torch.tensor([0.2, 0.002, 0.002]).repeat(3000, 1)
+    )
 
 
 def deep() -> Scene:
     """10,000 behind each other, opacities from 0.01 to 0.9."""
     scene = blob(10_000, 0.05, 0.05, 0.5, 3)
     scene.means[:, 0] = torch.linspace(-1, 1, 10_000)
-    return scene._replace(opacities=torch.linspace(0.01, 0.9, 10_000)[torch.randperm(10_000, generator=torch.Generator().manual_seed(3))])
+    return scene._replace(
+        opacities=torch.linspace(0.01, 0.9, 10_000)[
+            torch.randperm(10_000, generator=torch.Generator().manual_seed(3))
+        ]
+    )
 
 
 def near() -> Scene:
@@ -112,7 +153,7 @@ def near() -> Scene:
     return blob(3000, 1.5, 0.03, 0.5, 4)
 
 
-# ---- measuring -------------------------------------------------------------------------------------------------------------
+# ---- measuring -----------------------------------------------------------------------------------
 
 
 class Truth(NamedTuple):
@@ -128,7 +169,9 @@ class Truth(NamedTuple):
 
 
 def truth(scene: Scene, size: int) -> Truth:
-    """Colours and gradients at ``PIXELS`` random pixels, in float64, without any cut-off but the cap."""
+    """Colours and gradients at ``PIXELS`` random pixels, in float64, without any cut-off but the
+    cap.
+    """
     rng = torch.Generator().manual_seed(size)
     pixels = torch.randperm(size * size, generator=rng)[:PIXELS].sort().values
     cotangent = torch.randn(len(pixels), 3, generator=rng, dtype=torch.float64) / len(pixels)
@@ -139,7 +182,12 @@ def truth(scene: Scene, size: int) -> Truth:
     ordered = reference.sort(splats, leaves[4][None], 0)
     centres = reference.pixel_centres(size, size, splats.depths)[pixels]
     chunks = centres.split(64)
-    image = torch.cat([reference._blend_in_bounded_memory(True, chunk, ordered, options, None)[0] for chunk in chunks])[:, :3]
+    image = torch.cat(
+        [
+            reference._blend_in_bounded_memory(True, chunk, ordered, options, None)[0]
+            for chunk in chunks
+        ]
+    )[:, :3]
     image.backward(cotangent)
     return Truth(pixels, image.detach(), cotangent, [x.grad for x in leaves])
 
@@ -148,7 +196,11 @@ def measured(scene: Scene, size: int, setting: Setting, true: Truth) -> dict[str
     """Errors and times of one setting."""
     leaves = [x.clone().requires_grad_() for x in scene]
     viewmat, K = (x[None] for x in make_camera(size))
-    cotangent = torch.zeros(size * size, 3).index_copy(0, true.pixels, true.cotangent.float()).reshape(1, size, size, 3)
+    cotangent = (
+        torch.zeros(size * size, 3)
+        .index_copy(0, true.pixels, true.cotangent.float())
+        .reshape(1, size, size, 3)
+    )
 
     def step() -> tuple[float, float, Tensor]:
         for leaf in leaves:
@@ -162,7 +214,12 @@ def measured(scene: Scene, size: int, setting: Setting, true: Truth) -> dict[str
     step()
     forward, backward, images = zip(*(step() for _ in range(REPETITIONS)), strict=True)
     picture = images[-1].reshape(-1, 3)[true.pixels].double()
-    return forward_errors(picture, true.image) | gradient_errors(leaves, true) | times("forward", forward) | times("backward", backward)
+    return (
+        forward_errors(picture, true.image)
+        | gradient_errors(leaves, true)
+        | times("forward", forward)
+        | times("backward", backward)
+    )
 
 
 def forward_errors(image: Tensor, true: Tensor) -> dict[str, float]:
@@ -184,7 +241,9 @@ def gradient_errors(leaves: list[Tensor], true: Truth) -> dict[str, float]:
             continue  # a round Gaussian can be turned as one likes: the gradient is zero
         found = leaf.grad.double()
         errors[f"l2_{name}"] = float((found - exact).norm() / exact.norm())
-        cosines[f"cos_{name}"] = float(torch.nn.functional.cosine_similarity(found.flatten(), exact.flatten(), dim=0))
+        cosines[f"cos_{name}"] = float(
+            torch.nn.functional.cosine_similarity(found.flatten(), exact.flatten(), dim=0)
+        )
     return errors | cosines | {"l2": max(errors.values()), "cos": min(cosines.values())}
 
 
@@ -202,12 +261,15 @@ def measure() -> list[dict[str, Any]]:
         true = truth(scene, size)
         for setting in settings():
             where = {"scene": name, "size": size, "group": setting.group, "setting": setting.name}
-            values = {key: float(f"{value:.6g}") for key, value in measured(scene, size, setting, true).items()}
+            values = {
+                key: float(f"{value:.6g}")
+                for key, value in measured(scene, size, setting, true).items()
+            }
             rows.append(where | values | {"load": round(os.getloadavg()[0], 1), "machine": about})
     return rows
 
 
-# ---- drawing ---------------------------------------------------------------------------------------------------------------
+# ---- drawing -------------------------------------------------------------------------------------
 
 
 class Axes(NamedTuple):
@@ -222,8 +284,22 @@ class Axes(NamedTuple):
 
 
 PICTURES = (
-    Axes("rasteriser_forward.png", "Forward error against time", "forward_ms", "psnr", "PSNR to the exact picture, dB", False),
-    Axes("rasteriser_gradient.png", "Gradient error against time", "both_ms", "l2", "worst relative L2 error of an attribute", True),
+    Axes(
+        "rasteriser_forward.png",
+        "Forward error against time",
+        "forward_ms",
+        "psnr",
+        "PSNR to the exact picture, dB",
+        False,
+    ),
+    Axes(
+        "rasteriser_gradient.png",
+        "Gradient error against time",
+        "both_ms",
+        "l2",
+        "worst relative L2 error of an attribute",
+        True,
+    ),
 )
 
 
@@ -242,10 +318,19 @@ def draw(rows: list[dict[str, str]]) -> None:
         for panel in panels[:, 0]:
             panel.set_ylabel(axes.label)
         for panel in panels[1]:
-            panel.set_xlabel("milliseconds a picture" + (", forward" if axes.x == "forward_ms" else ", forward and backward"))
+            panel.set_xlabel(
+                "milliseconds a picture"
+                + (", forward" if axes.x == "forward_ms" else ", forward and backward")
+            )
         figure.suptitle(axes.title, x=0.01, ha="left", fontweight="bold")
         loads = [float(row["load"]) for row in rows]
-        figure.text(0.01, 0.945, f"{rows[0]['machine']}; load {min(loads)} to {max(loads)}", fontsize=8, color="0.35")
+        figure.text(
+            0.01,
+            0.945,
+            f"{rows[0]['machine']}; load {min(loads)} to {max(loads)}",
+            fontsize=8,
+            color="0.35",
+        )
         handles, labels = panels.flat[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="lower center", ncols=6, frameon=False, fontsize=9)
         figure.tight_layout(rect=(0, 0.04, 1, 0.95))
@@ -255,17 +340,48 @@ def draw(rows: list[dict[str, str]]) -> None:
 
 
 def draw_panel(panel: Any, axes: Axes, rows: list[dict[str, str]]) -> None:
-    """For each size the smallest alpha as a line, the presets and other knobs as marks, and the front of all as a dashed line."""
+    """For each size the smallest alpha as a line, the presets and other knobs as marks, and the
+    front of all as a dashed line.
+    """
     for index, size in enumerate(SIZES):
         here, color = [row for row in rows if int(row["size"]) == size], f"C{index}"
-        line = sorted((row for row in here if row["group"] == "alpha_min"), key=lambda row: -smallest_alpha(row["setting"]))
-        panel.plot(*columns(axes, line), "o-", color=color, markersize=3, linewidth=1, alpha=0.6, label=f"alpha_min, {size}²")
-        panel.plot(*front(axes, here), "--", color=color, linewidth=0.8, label="front of all settings" if index == 2 else None)
+        line = sorted(
+            (row for row in here if row["group"] == "alpha_min"),
+            key=lambda row: -smallest_alpha(row["setting"]),
+        )
+        panel.plot(
+            *columns(axes, line),
+            "o-",
+            color=color,
+            markersize=3,
+            linewidth=1,
+            alpha=0.6,
+            label=f"alpha_min, {size}²",
+        )
+        panel.plot(
+            *front(axes, here),
+            "--",
+            color=color,
+            linewidth=0.8,
+            label="front of all settings" if index == 2 else None,
+        )
         for group, marker in (("preset", "D"), ("stop", "x"), ("peers' cut-offs", "^")):
             marks = [row for row in here if row["group"] == group]
-            panel.plot(*columns(axes, marks), marker, color=color, markersize=6, label=group if index == 2 else None)
+            panel.plot(
+                *columns(axes, marks),
+                marker,
+                color=color,
+                markersize=6,
+                label=group if index == 2 else None,
+            )
             for row in marks if group == "preset" else ():
-                panel.annotate(row["setting"][0], place(axes, row), textcoords="offset points", xytext=(5, -3), fontsize=7)
+                panel.annotate(
+                    row["setting"][0],
+                    place(axes, row),
+                    textcoords="offset points",
+                    xytext=(5, -3),
+                    fontsize=7,
+                )
     panel.set_xscale("log")
     if axes.log:
         panel.set_yscale("log")

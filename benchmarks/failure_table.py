@@ -1,9 +1,10 @@
-"""How the method fails and what each remedy buys, from docs/charts/*.csv as `runs.py` measured them: the tables of docs/failures.md.
+"""How the method fails and what each remedy buys, from docs/charts/*.csv as `runs.py` measured
+them: the tables of docs/failures.md.
 
     python benchmarks/failure_table.py
 
-A cell is the median dB over the seeds, its range, and the share that belongs to the failure; gains are against the failure itself.
-"""
+A cell is the median dB over the seeds, its range, and the share that belongs to the failure; gains
+are against the failure itself."""
 
 import statistics
 from typing import NamedTuple
@@ -53,10 +54,16 @@ FAILURES = [
         "Prior without colours",
         "multi_face",
         "grey prior",
-        {"a view-dependent score": "grey prior + view-dependent score", "a prior with colours": "multi-face: prior"},
+        {
+            "a view-dependent score": "grey prior + view-dependent score",
+            "a prior with colours": "multi-face: prior",
+        },
     ),
     Failure(
-        "Prior of the wrong shape (a grey ball)", "floater_mass", "wrong shape: a grey ball", {"another prior or sample": "right shape"}
+        "Prior of the wrong shape (a grey ball)",
+        "floater_mass",
+        "wrong shape: a grey ball",
+        {"another prior or sample": "right shape"},
     ),
     Failure(
         "Over-saturation at guidance 100",
@@ -74,7 +81,12 @@ FAILURES = [
         "blur: timesteps up to 0.98 throughout",
         {"`max_step_percent` that falls to 0.55 (the default)": "multi-face: prior"},
     ),
-    Failure("Blur, from a coarse latent (4²)", "multi_face", "blur: coarse latent", {"a fine one (16²)": "multi-face: prior"}),
+    Failure(
+        "Blur, from a coarse latent (4²)",
+        "multi_face",
+        "blur: coarse latent",
+        {"a fine one (16²)": "multi-face: prior"},
+    ),
     Failure(
         "Blur and floaters, from a screen-space dilation of 0.3 square pixels",
         "floater_mass",
@@ -124,9 +136,15 @@ def table(failure: Failure) -> str:
 
 def measured(failure: Failure, variant: str, name: str) -> Ends:
     """``variant`` may end with the place on the chart's axis, where it has several."""
-    rows = [row for row in rows_of(failure.chart) if row["object"] == name and variant in (row["variant"], f"{row['variant']} {row['x']}")]
+    rows = [
+        row
+        for row in rows_of(failure.chart)
+        if row["object"] == name and variant in (row["variant"], f"{row['variant']} {row['x']}")
+    ]
     last = [end for place in grouped(rows, lambda row: row["x"]).values() for end in ends(place)]
-    return Ends(*([float(row[column]) for row in last] for column in ("psnr", failure.share, "gaussians")))
+    return Ends(
+        *([float(row[column]) for row in last] for column in ("psnr", failure.share, "gaussians"))
+    )
 
 
 def cell(here: Ends, failure: Failure, worst: Ends | None = None) -> str:

@@ -1,12 +1,14 @@
-"""Fuzzing, the long version: damaged files at every door, hostile Gaussians through every backend, random lives of a cloud.
+"""Fuzzing, the long version: damaged files at every door, hostile Gaussians through every backend,
+random lives of a cloud.
 
-    python benchmarks/fuzz.py                                   # `make fuzz`; about half an hour on one core
+    python benchmarks/fuzz.py                                   # `make fuzz`; about half an hour on
+                                                                one core
     python benchmarks/fuzz.py --only glb checkpoint --inputs 500 --seed 7
 
-Every kind runs in a process of its own, with a limit of memory, which is killed when nothing comes from it for a minute; it goes on
-with the next input then. An input that failed is kept in ``--keep`` under its target's name and number: what it is made from is
-(seed, number) alone. Prints a table and writes ``benchmarks/results/fuzz.csv``. Exit code 1 if anything failed.
-"""
+Every kind runs in a process of its own, with a limit of memory, which is killed when nothing comes
+from it for a minute; it goes on with the next input then. An input that failed is kept in
+``--keep`` under its target's name and number: what it is made from is (seed, number) alone. Prints
+a table and writes ``benchmarks/results/fuzz.csv``. Exit code 1 if anything failed."""
 
 import argparse
 import csv
@@ -22,7 +24,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT), str(ROOT / "tests"), str(ROOT / "tests/fuzz"), str(ROOT / "tests/stability")]
+sys.path[:0] = [
+    str(ROOT / "benchmarks"),
+    str(ROOT),
+    str(ROOT / "tests"),
+    str(ROOT / "tests/fuzz"),
+    str(ROOT / "tests/stability"),
+]
 
 RESULTS = ROOT / "benchmarks/results/fuzz.csv"
 SILENCE = 60
@@ -44,10 +52,12 @@ class Row(NamedTuple):
     seconds: float
 
 
-# ---- in a process of its own ---------------------------------------------------------------------------------------------------
+# ---- in a process of its own ---------------------------------------------------------------------
 
 Report = Iterator[tuple[int, dict[str, Any]]]
-"""Of each number that was tried what came of it, by the name of a row: counts of "inputs", and "failures" in words."""
+"""Of each number that was tried what came of it, by the name of a row: counts of "inputs", and
+"failures" in words.
+"""
 
 
 def try_files(name: str, seed: int, first: int, last: int) -> Report:
@@ -55,7 +65,14 @@ def try_files(name: str, seed: int, first: int, last: int) -> Report:
 
     for index, outcome in outcomes(name, range(first, last), seed):
         failures = [outcome.detail] if outcome.kind == "failed" else []
-        yield index, {"inputs": {name: 1}, "refused": {name: int(outcome.kind == "refused")}, "failures": {name: failures}}
+        yield (
+            index,
+            {
+                "inputs": {name: 1},
+                "refused": {name: int(outcome.kind == "refused")},
+                "failures": {name: failures},
+            },
+        )
 
 
 def try_scenes(name: str, seed: int, first: int, last: int) -> Report:
@@ -78,8 +95,17 @@ def try_scenes(name: str, seed: int, first: int, last: int) -> Report:
             seconds[backend] = time.perf_counter() - started
         started = time.perf_counter()
         failures["agreement"] = _faults(disagreement_on, part, BACKENDS)
-        counts = dict.fromkeys(BACKENDS, len(scene.cloud.means)) | {"agreement": len(part.cloud.means)}
-        yield index, {"inputs": counts, "failures": failures, "seconds": seconds | {"agreement": time.perf_counter() - started}}
+        counts = dict.fromkeys(BACKENDS, len(scene.cloud.means)) | {
+            "agreement": len(part.cloud.means)
+        }
+        yield (
+            index,
+            {
+                "inputs": counts,
+                "failures": failures,
+                "seconds": seconds | {"agreement": time.perf_counter() - started},
+            },
+        )
 
 
 def _faults(judge: Callable[..., str | None], *arguments: Any) -> list[str]:
@@ -97,12 +123,20 @@ def try_lives(name: str, seed: int, first: int, last: int) -> Report:
     from sequences import CloudLife
 
     torch.set_num_threads(1)
-    options = {"deadline": None, "database": None, "suppress_health_check": list(hypothesis.HealthCheck)}
+    options = {
+        "deadline": None,
+        "database": None,
+        "suppress_health_check": list(hypothesis.HealthCheck),
+    }
     for index in range(first, last, LIVES_AT_ONCE):
         CloudLife.steps, failures = 0, []
-        settings = hypothesis.settings(max_examples=LIVES_AT_ONCE, stateful_step_count=STEPS_OF_A_LIFE, **options)
+        settings = hypothesis.settings(
+            max_examples=LIVES_AT_ONCE, stateful_step_count=STEPS_OF_A_LIFE, **options
+        )
         try:
-            run_state_machine_as_test(hypothesis.seed(seed * 1_000_000 + index)(CloudLife), settings=settings)
+            run_state_machine_as_test(
+                hypothesis.seed(seed * 1_000_000 + index)(CloudLife), settings=settings
+            )
         except Exception as error:
             failures.append(f"{type(error).__name__}: {error}")
         yield index, {"inputs": {name: CloudLife.steps}, "failures": {name: failures}}
@@ -116,7 +150,11 @@ def work(name: str, seed: int, first: int, last: int) -> None:
     os.dup2(nothing, 2)
     report = kind_of(name)(name, seed, first, last)
     print(json.dumps({"ready": True}), file=spoken)
-    libraries = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() if Path("/proc/self/statm").exists() else 0
+    libraries = (
+        int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        if Path("/proc/self/statm").exists()
+        else 0
+    )
     if libraries:
         resource.setrlimit(resource.RLIMIT_AS, (libraries + ROOM, resource.RLIM_INFINITY))
     for index, counts in report:
@@ -127,7 +165,7 @@ def kind_of(name: str) -> Callable[[str, int, int, int], Report]:
     return {"rasteriser": try_scenes, "densify and prune": try_lives}.get(name, try_files)
 
 
-# ---- watching it ---------------------------------------------------------------------------------------------------------------
+# ---- watching it ---------------------------------------------------------------------------------
 
 
 class Watched:
@@ -140,41 +178,77 @@ class Watched:
         self.failures: dict[str, int] = {}
         self.seconds: dict[str, float] = {}
 
-    def run(self, count: int, enough: Callable[["Watched"], bool], tick: Callable[[int], None]) -> None:
-        """Numbers 0 to ``count``, or until there are enough; a process that ends before is followed by one for the rest."""
+    def run(
+        self, count: int, enough: Callable[["Watched"], bool], tick: Callable[[int], None]
+    ) -> None:
+        """Numbers 0 to ``count``, or until there are enough; a process that ends before is followed
+        by one for the rest.
+        """
         first, started = 0, time.perf_counter()
         while first < count and not enough(self):
             first = self._watch(first, count, enough, tick)
         self.seconds.setdefault(self.name, time.perf_counter() - started)
 
-    def _watch(self, first: int, count: int, enough: Callable[["Watched"], bool], tick: Callable[[int], None]) -> int:
+    def _watch(
+        self,
+        first: int,
+        count: int,
+        enough: Callable[["Watched"], bool],
+        tick: Callable[[int], None],
+    ) -> int:
         """The number to go on with."""
-        command = [sys.executable, __file__, "--worker", self.name, str(self.seed), str(first), str(count)]
+        command = [
+            sys.executable,
+            __file__,
+            "--worker",
+            self.name,
+            str(self.seed),
+            str(first),
+            str(count),
+        ]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
         try:
             while not enough(self):
-                line = process.stdout.readline() if select.select([process.stdout], [], [], SILENCE)[0] else "hang"
+                line = (
+                    process.stdout.readline()
+                    if select.select([process.stdout], [], [], SILENCE)[0]
+                    else "hang"
+                )
                 if line in ("", "hang"):
-                    return count if not line and process.wait() == 0 else self._lost(first, line, process, tick)
+                    return (
+                        count
+                        if not line and process.wait() == 0
+                        else self._lost(first, line, process, tick)
+                    )
                 said = json.loads(line)
                 if "index" in said:
                     self._add(said)
                     tick(said["index"] + 1 - first)
-                    first = said["index"] + (LIVES_AT_ONCE if self.name == "densify and prune" else 1)
+                    first = said["index"] + (
+                        LIVES_AT_ONCE if self.name == "densify and prune" else 1
+                    )
             return count
         finally:
             process.kill()
             process.wait()
 
-    def _lost(self, index: int, line: str, process: subprocess.Popen, tick: Callable[[int], None]) -> int:
-        problem = f"nothing for {SILENCE} s" if line else f"the process ended with {process.returncode}"
+    def _lost(
+        self, index: int, line: str, process: subprocess.Popen, tick: Callable[[int], None]
+    ) -> int:
+        problem = (
+            f"nothing for {SILENCE} s" if line else f"the process ended with {process.returncode}"
+        )
         self._add({"index": index, "inputs": {self.name: 1}, "failures": {self.name: [problem]}})
         tick(1)
         return index + 1
 
     def _add(self, said: dict[str, Any]) -> None:
-        for kind, sums in (("inputs", self.inputs), ("refused", self.refused), ("seconds", self.seconds)):
+        for kind, sums in (
+            ("inputs", self.inputs),
+            ("refused", self.refused),
+            ("seconds", self.seconds),
+        ):
             for row, value in said.get(kind, {}).items():
                 sums[row] = sums.get(row, 0) + value
         for row, failures in said["failures"].items():
@@ -190,11 +264,18 @@ class Watched:
         if kind_of(self.name) is try_files:
             from targets import TARGETS, mutant
 
-            name.with_suffix(TARGETS[self.name].suffix).write_bytes(mutant(self.name, self.seed, index))
+            name.with_suffix(TARGETS[self.name].suffix).write_bytes(
+                mutant(self.name, self.seed, index)
+            )
 
     def rows(self) -> list[Row]:
-        units = {"rasteriser": "Gaussians, forward and backward", "densify and prune": "steps of a life"}
-        named = {row: f"{self.name}: {row}" if self.name == "rasteriser" else row for row in self.inputs}
+        units = {
+            "rasteriser": "Gaussians, forward and backward",
+            "densify and prune": "steps of a life",
+        }
+        named = {
+            row: f"{self.name}: {row}" if self.name == "rasteriser" else row for row in self.inputs
+        }
         return [
             Row(
                 named[row],
@@ -208,7 +289,7 @@ class Watched:
         ]
 
 
-# ---- the table -----------------------------------------------------------------------------------------------------------------
+# ---- the table -----------------------------------------------------------------------------------
 
 
 def main() -> int:
@@ -218,7 +299,9 @@ def main() -> int:
     rows, names = [], options.only or [*file_targets(), "rasteriser", "densify and prune"]
     for name in names:
         watched, count = Watched(name, options.seed, Path(options.keep)), how_many(name, options)
-        with tqdm(desc=name, total=None if name == "rasteriser" else count, unit="input", disable=None) as bar:
+        with tqdm(
+            desc=name, total=None if name == "rasteriser" else count, unit="input", disable=None
+        ) as bar:
             watched.run(count, enough_of(name, options), bar.update)
         rows += watched.rows()
         print("\n".join(map(line_of, watched.rows())), flush=True)
@@ -227,13 +310,29 @@ def main() -> int:
 
 
 def parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--inputs", type=int, default=2500, help="damaged files of each kind")
-    parser.add_argument("--gaussians", type=int, default=1_000_000, help="hostile Gaussians through each backend; 'agreement' has fewer")
-    parser.add_argument("--lives", type=int, default=1000, help=f"random lives of a cloud, each of {STEPS_OF_A_LIFE} steps at most")
+    parser.add_argument(
+        "--gaussians",
+        type=int,
+        default=1_000_000,
+        help="hostile Gaussians through each backend; 'agreement' has fewer",
+    )
+    parser.add_argument(
+        "--lives",
+        type=int,
+        default=1000,
+        help=f"random lives of a cloud, each of {STEPS_OF_A_LIFE} steps at most",
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="+", help="these targets alone; the CSV's other rows stay")
-    parser.add_argument("--keep", default="outputs/fuzz-failures", help="folder for inputs that failed; made when there is one")
+    parser.add_argument(
+        "--keep",
+        default="outputs/fuzz-failures",
+        help="folder for inputs that failed; made when there is one",
+    )
     parser.add_argument("--worker", nargs=4, help=argparse.SUPPRESS)
     return parser.parse_args()
 
@@ -245,7 +344,9 @@ def file_targets() -> list[str]:
 
 
 def enough_of(name: str, options: argparse.Namespace) -> Callable[[Watched], bool]:
-    """Of scenes there are enough when every backend has had its Gaussians; of the others all are tried."""
+    """Of scenes there are enough when every backend has had its Gaussians; of the others all are
+    tried.
+    """
 
     def enough(watched: Watched) -> bool:
         drawn = [count for row, count in watched.inputs.items() if row != "agreement"]
@@ -255,11 +356,16 @@ def enough_of(name: str, options: argparse.Namespace) -> Callable[[Watched], boo
 
 
 def how_many(name: str, options: argparse.Namespace) -> int:
-    return {"rasteriser": options.gaussians // 100, "densify and prune": options.lives}.get(name, options.inputs)
+    return {"rasteriser": options.gaussians // 100, "densify and prune": options.lives}.get(
+        name, options.inputs
+    )
 
 
 def line_of(row: Row) -> str:
-    return f"{row.target:24} {row.inputs:>11,} {row.unit:32} {row.failures:4} failures {row.refused:6} refused {row.seconds:8.1f} s"
+    return (
+        f"{row.target:24} {row.inputs:>11,} {row.unit:32} {row.failures:4} failures "
+        f"{row.refused:6} refused {row.seconds:8.1f} s"
+    )
 
 
 def write(rows: list[Row], seed: int) -> None:
@@ -271,7 +377,10 @@ def write(rows: list[Row], seed: int) -> None:
     if RESULTS.exists():
         with RESULTS.open(newline="") as file:
             table = {row[0]: row for row in list(csv.reader(file))[1:]}
-    table |= {row.target: [*row._replace(seconds=round(row.seconds, 1)), seed, commit, device] for row in rows}
+    table |= {
+        row.target: [*row._replace(seconds=round(row.seconds, 1)), seed, commit, device]
+        for row in rows
+    }
     with RESULTS.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow([*Row._fields, "seed", "commit", "device"])

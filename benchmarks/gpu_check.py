@@ -1,25 +1,31 @@
 """Everything that waits for an NVIDIA GPU, in one command of under ten minutes: `make gpu-check`.
 
-    python benchmarks/gpu_check.py                          # exit 0: all well; 1: something failed; 2: no GPU
-    python benchmarks/gpu_check.py --device cpu --small     # the same flow, tiny, on the CPU: does this script work?
+    python benchmarks/gpu_check.py                          # exit 0: all well; 1: something failed;
+                                                            2: no GPU
+    python benchmarks/gpu_check.py --device cpu --small     # the same flow, tiny, on the CPU: does
+                                                            this script work?
 
-========  ==================================================================================================================
+========  ==========================================================================================
 section   what it does
-========  ==================================================================================================================
+========  ==========================================================================================
 compile   first use of the kernels with an empty cache, and a later start
-correct   image and all gradients against plain torch in float64, on small and large clouds; the same bits again
+correct   image and all gradients against plain torch in float64, on small and large clouds; the
+          same bits again
 sanitize  compute-sanitizer (memcheck, racecheck) on a small picture, where that tool exists
-bench     4 views of 1024^2, 100,000 Gaussians, forward and backward, beside gsplat (as installed, else its wheel is fetched;
-          it builds here, which takes nvcc)
-prune     the prune command on a cloud of 100,000, to a quarter: seconds, dB, and the same bits again
-train     steps of configs/gaussiandreamer.yaml with a UNet and VAE of Stable Diffusion 2.1's size and random weights
-========  ==================================================================================================================
+bench     4 views of 1024^2, 100,000 Gaussians, forward and backward, beside gsplat (as installed,
+          else its wheel is fetched; it builds here, which takes nvcc)
+prune     the prune command on a cloud of 100,000, to a quarter: seconds, dB, and the same bits
+          again
+train     steps of configs/gaussiandreamer.yaml with a UNet and VAE of Stable Diffusion 2.1's size
+          and random weights
+========  ==========================================================================================
 
-Whatever touches the GPU runs in a process of its own, with a limit of its own and within --minutes: a kernel that hangs or ruins
-its context costs that part alone. What fails is recorded with the end of what it printed, and the others go on. The numbers go to
-benchmarks/results/gpu-<device>.json (or --out) after each section. All but `prune` and `train` needs no more than torch, NumPy, SciPy
-and jaxtyping, so on a machine without a network `python benchmarks/gpu_check.py` does where `make` can't install the rest.
-"""
+Whatever touches the GPU runs in a process of its own, with a limit of its own and within --minutes:
+a kernel that hangs or ruins its context costs that part alone. What fails is recorded with the end
+of what it printed, and the others go on. The numbers go to benchmarks/results/gpu-<device>.json (or
+--out) after each section. All but `prune` and `train` needs no more than torch, NumPy, SciPy and
+jaxtyping, so on a machine without a network `python benchmarks/gpu_check.py` does where `make`
+can't install the rest."""
 
 import argparse
 import importlib.util
@@ -45,15 +51,29 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 TRIMMED = 0.005
-"""The share of Gaussians, those with the worst gradients, that is left out: a rounding turns a pixel's alpha over the cut."""
+"""The share of Gaussians, those with the worst gradients, that is left out: a rounding turns a
+pixel's alpha over the cut.
+"""
 GRADIENT_ERROR, IMAGE_ERROR = 2e-5, 1e-4
 STEPS_OF_A_RUN = 1200
-SECONDS = {"about": 60, "first_picture": 60, "errors": 120, "sanitize": 90, "speed": 60, "pip": 90, "gsplat_steps": 240}
+SECONDS = {
+    "about": 60,
+    "first_picture": 60,
+    "errors": 120,
+    "sanitize": 90,
+    "speed": 60,
+    "pip": 90,
+    "gsplat_steps": 240,
+}
 SECONDS |= {"prune_twice": 90, "make_model": 100, "train_steps": 150}
 """The most that each part may take."""
 GSPLAT = ("gsplat", "ninja", "rich", "jaxtyping", "markdown-it-py", "mdurl", "pygments")
-"""It and what it needs; without pip's own search for dependencies, which would fetch another torch."""
-SANITIZERS = {"memcheck": ("--report-api-errors", "no"), "racecheck": ()}  # torch asks for functions that a driver may not have
+"""It and what it needs; without pip's own search for dependencies, which would fetch another torch.
+"""
+SANITIZERS = {
+    "memcheck": ("--report-api-errors", "no"),
+    "racecheck": (),
+}  # torch asks for functions that a driver may not have
 SANITIZER_FOUND = 99
 
 
@@ -63,7 +83,11 @@ def main(argv: list[str]) -> int:
         args.out.write_text(json.dumps(PARTS[args.only](args)))
         return 0
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that parts end with this process
-    report: dict[str, Any] = {"machine": describe_machine(), "small": args.small, "device": args.device}
+    report: dict[str, Any] = {
+        "machine": describe_machine(),
+        "small": args.small,
+        "device": args.device,
+    }
     if args.device == "cuda" and not torch.cuda.is_available():
         report["failed"] = f"nothing was checked: {reason_without_gpu()}"
         print(report["failed"], file=sys.stderr)
@@ -73,17 +97,30 @@ def main(argv: list[str]) -> int:
     report |= guarded(about, args)
     for name, section in SECTIONS.items():
         started = time.monotonic()
-        report[name] = guarded(section, args) | {"section_seconds": round(time.monotonic() - started, 1)}
+        report[name] = guarded(section, args) | {
+            "section_seconds": round(time.monotonic() - started, 1)
+        }
         print(f"{name:9} {json.dumps(report[name])}", flush=True)
         write(args, report)
     return int(any(failures(report)))
 
 
 def parse_arguments(argv: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
-    parser.add_argument("--small", action="store_true", help="tiny clouds, pictures and models, and nothing is fetched")
-    parser.add_argument("--minutes", type=float, default=9.0, help="for everything; what comes too late is recorded as such")
+    parser.add_argument(
+        "--small",
+        action="store_true",
+        help="tiny clouds, pictures and models, and nothing is fetched",
+    )
+    parser.add_argument(
+        "--minutes",
+        type=float,
+        default=9.0,
+        help="for everything; what comes too late is recorded as such",
+    )
     parser.add_argument("--out", type=Path, help="default: benchmarks/results/gpu-<device>.json")
     parser.add_argument("--only", choices=PARTS, help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
@@ -91,7 +128,9 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     return args
 
 
-def guarded(section: Callable[[argparse.Namespace], dict[str, Any]], args: argparse.Namespace) -> dict[str, Any]:
+def guarded(
+    section: Callable[[argparse.Namespace], dict[str, Any]], args: argparse.Namespace
+) -> dict[str, Any]:
     """What a section found, or why it failed."""
     try:
         return section(args)
@@ -114,10 +153,12 @@ def write(args: argparse.Namespace, report: dict[str, Any]) -> None:
     print(f"written to {path}", flush=True)
 
 
-# ---- parts in processes of their own ---------------------------------------------------------------------------------------
+# ---- parts in processes of their own -------------------------------------------------------------
 
 
-def run(command: list[str], args: argparse.Namespace, limit: float, environment: dict[str, str]) -> tuple[int, str]:
+def run(
+    command: list[str], args: argparse.Namespace, limit: float, environment: dict[str, str]
+) -> tuple[int, str]:
     """Exit status and output of a command. Neither it nor whatever it started outlives the limit.
 
     Raises:
@@ -127,7 +168,12 @@ def run(command: list[str], args: argparse.Namespace, limit: float, environment:
     if limit <= 0:
         raise RuntimeError(f"the {args.minutes:g} minutes were over before {' '.join(command)}")
     with tempfile.TemporaryFile() as output:  # a pipe would stay open in a grandchild
-        options = {"env": os.environ | environment, "stdout": output, "stderr": subprocess.STDOUT, "start_new_session": True}
+        options = {
+            "env": os.environ | environment,
+            "stdout": output,
+            "stderr": subprocess.STDOUT,
+            "start_new_session": True,
+        }
         process = subprocess.Popen(command, **options)
         try:
             status = process.wait(limit)
@@ -150,7 +196,9 @@ def end_group(process: subprocess.Popen) -> None:
     process.wait()
 
 
-def in_process(name: str, args: argparse.Namespace, environment: dict[str, str] | None = None) -> dict[str, Any]:
+def in_process(
+    name: str, args: argparse.Namespace, environment: dict[str, str] | None = None
+) -> dict[str, Any]:
     """What a part found.
 
     Raises:
@@ -166,7 +214,18 @@ def in_process(name: str, args: argparse.Namespace, environment: dict[str, str] 
 
 def part_command(name: str, args: argparse.Namespace, out: Path) -> list[str]:
     size = ["--small"] if args.small else []
-    return [sys.executable, "-u", __file__, "--only", name, "--device", args.device, "--out", str(out), *size]
+    return [
+        sys.executable,
+        "-u",
+        __file__,
+        "--only",
+        name,
+        "--device",
+        args.device,
+        "--out",
+        str(out),
+        *size,
+    ]
 
 
 def about(args: argparse.Namespace) -> dict[str, Any]:
@@ -188,7 +247,9 @@ def describe_device(args: argparse.Namespace) -> dict[str, Any]:
         "memory_gb": round(properties.total_memory / 2**30, 1),
         "torch_cuda": torch.version.cuda,
         "driver_cuda": guarded(lambda _: {"release": cuda_driver.driver_version()}, args),
-        "nvrtc": guarded(lambda _: {"release": nvrtc.version(), "library": nvrtc._library()._name}, args),
+        "nvrtc": guarded(
+            lambda _: {"release": nvrtc.version(), "library": nvrtc._library()._name}, args
+        ),
         "kernels_unavailable": available_backends()["cuda"],
     }
 
@@ -199,7 +260,7 @@ def reason_without_gpu() -> str:
     return available_backends()["cuda"] or "torch.cuda.is_available() is false"
 
 
-# ---- the rasteriser --------------------------------------------------------------------------------------------------------
+# ---- the rasteriser ------------------------------------------------------------------------------
 
 
 def on(device: str, scene: Scene, dtype: torch.dtype = torch.float32) -> Scene:
@@ -208,7 +269,10 @@ def on(device: str, scene: Scene, dtype: torch.dtype = torch.float32) -> Scene:
 
 
 def cameras(size: int, views: int, scene: Scene) -> tuple[Tensor, Tensor]:
-    viewmats, Ks = zip(*(make_camera(size, azimuth=30.0 + 360.0 * view / views) for view in range(views)), strict=True)
+    viewmats, Ks = zip(
+        *(make_camera(size, azimuth=30.0 + 360.0 * view / views) for view in range(views)),
+        strict=True,
+    )
     return torch.stack(viewmats).to(scene.means), torch.stack(Ks).to(scene.means)
 
 
@@ -218,8 +282,12 @@ def cotangents(size: int, views: int, scene: Scene) -> tuple[Tensor, Tensor, Ten
     return tuple(x.contiguous() for x in noise.to(scene.means).split([3, 1, 1], -1))
 
 
-def drawer(scene: Scene, size: int, views: int, backend: str, **options: Any) -> Callable[[], tuple[Tensor, ...]]:
-    """A function that gives image, depth, alpha and the gradients of all attributes, for a fixed cotangent."""
+def drawer(
+    scene: Scene, size: int, views: int, backend: str, **options: Any
+) -> Callable[[], tuple[Tensor, ...]]:
+    """A function that gives image, depth, alpha and the gradients of all attributes, for a fixed
+    cotangent.
+    """
     from threestudio_gaussiandreamer.splatting import rasterize
 
     viewmats, Ks = cameras(size, views, scene)
@@ -228,7 +296,10 @@ def drawer(scene: Scene, size: int, views: int, backend: str, **options: Any) ->
     def draw() -> tuple[Tensor, ...]:
         out = rasterize(*scene, viewmats, Ks, size, size, backend=backend, **options)
         pictures = (out.image, out.depth, out.alpha)
-        return (*(x.detach() for x in pictures), *torch.autograd.grad(pictures, list(scene), upstream))
+        return (
+            *(x.detach() for x in pictures),
+            *torch.autograd.grad(pictures, list(scene), upstream),
+        )
 
     return draw
 
@@ -254,17 +325,30 @@ def complaints(case: dict[str, Any]) -> Iterator[str]:
 
 
 def errors(args: argparse.Namespace) -> dict[str, Any]:
-    cases = [(300, 33, 2, {}), (2000, 64, 2, {"antialias": True}), (2000, 64, 1, {"downsample": 2, "preset": "accurate"})]
+    cases = [
+        (300, 33, 2, {}),
+        (2000, 64, 2, {"antialias": True}),
+        (2000, 64, 1, {"downsample": 2, "preset": "accurate"}),
+    ]
     cases += [] if args.small else [(20_000, 256, 2, {}), (100_000, 512, 1, {"preset": "fast"})]
     found = {}
     for count, size, views, options in cases:
-        name = " ".join([f"{count} at {size}^2 x {views}", *(f"{key}={value}" for key, value in options.items())])
-        found[name] = guarded(lambda _, case=(count, size, views, options): errors_of(args, *case), args)
+        name = " ".join(
+            [
+                f"{count} at {size}^2 x {views}",
+                *(f"{key}={value}" for key, value in options.items()),
+            ]
+        )
+        found[name] = guarded(
+            lambda _, case=(count, size, views, options): errors_of(args, *case), args
+        )
         print(name, found[name])
     return found
 
 
-def errors_of(args: argparse.Namespace, count: int, size: int, views: int, options: dict[str, Any]) -> dict[str, Any]:
+def errors_of(
+    args: argparse.Namespace, count: int, size: int, views: int, options: dict[str, Any]
+) -> dict[str, Any]:
     scene = make_scene(count)
     draw = drawer(on(args.device, scene), size, views, args.device, **options)
     once, again = draw(), draw()
@@ -282,15 +366,24 @@ def relative(value: Tensor, exact: Tensor) -> float:
 
 def trimmed(value: Tensor, exact: Tensor) -> float:
     """The relative error without the worst Gaussians."""
-    errors = (value.double() - exact).flatten(1).norm(dim=1) if value.ndim > 1 else (value.double() - exact).abs()
+    errors = (
+        (value.double() - exact).flatten(1).norm(dim=1)
+        if value.ndim > 1
+        else (value.double() - exact).abs()
+    )
     kept = errors.sort().values[: max(1, int((1 - TRIMMED) * len(errors)))]
     return float(kept.norm() / exact.norm())
 
 
 def compile_kernels(args: argparse.Namespace) -> dict[str, Any]:
-    """Seconds from the first call to its picture, in new processes: with an empty cache, and with what that left."""
+    """Seconds from the first call to its picture, in new processes: with an empty cache, and with
+    what that left.
+    """
     with tempfile.TemporaryDirectory() as cache:
-        return {name: in_process("first_picture", args, {"GAUSSIANDREAMER_CACHE": cache})["seconds"] for name in ("first", "later")}
+        return {
+            name: in_process("first_picture", args, {"GAUSSIANDREAMER_CACHE": cache})["seconds"]
+            for name in ("first", "later")
+        }
 
 
 def first_picture(args: argparse.Namespace) -> dict[str, Any]:
@@ -303,15 +396,24 @@ def first_picture(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def sanitize(args: argparse.Namespace) -> dict[str, Any]:
-    tool = shutil.which("compute-sanitizer") or next((p for p in ["/usr/local/cuda/bin/compute-sanitizer"] if os.path.exists(p)), None)
+    tool = shutil.which("compute-sanitizer") or next(
+        (p for p in ["/usr/local/cuda/bin/compute-sanitizer"] if os.path.exists(p)), None
+    )
     if args.device != "cuda" or tool is None:
         return {"skipped": "there is no compute-sanitizer on the path"}
-    return {kind: guarded(lambda _, kind=kind: sanitize_with(tool, kind, args), args) for kind in SANITIZERS}
+    return {
+        kind: guarded(lambda _, kind=kind: sanitize_with(tool, kind, args), args)
+        for kind in SANITIZERS
+    }
 
 
 def sanitize_with(tool: str, kind: str, args: argparse.Namespace) -> dict[str, Any]:
-    """What one of its tools says of a first picture; a machine where the tool can't run is no failure of ours."""
-    uncached = {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}  # torch's own allocator would hide what lies outside of a tensor
+    """What one of its tools says of a first picture; a machine where the tool can't run is no
+    failure of ours.
+    """
+    uncached = {
+        "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"
+    }  # torch's own allocator would hide what lies outside of a tensor
     prefix = [tool, "--tool", kind, "--error-exitcode", str(SANITIZER_FOUND), *SANITIZERS[kind]]
     with tempfile.TemporaryDirectory() as folder:
         part = part_command("first_picture", args, Path(folder) / "found.json")
@@ -320,7 +422,7 @@ def sanitize_with(tool: str, kind: str, args: argparse.Namespace) -> dict[str, A
     return {verdict: text[-1500:] if status else True}
 
 
-# ---- speed -----------------------------------------------------------------------------------------------------------------
+# ---- speed ---------------------------------------------------------------------------------------
 
 
 def synchronize(args: argparse.Namespace) -> None:
@@ -329,7 +431,9 @@ def synchronize(args: argparse.Namespace) -> None:
 
 
 def timed(args: argparse.Namespace, call: Callable[[], Any], repetitions: int) -> dict[str, float]:
-    """Milliseconds of a call, its quartiles, and the most memory that it took beyond what was there."""
+    """Milliseconds of a call, its quartiles, and the most memory that it took beyond what was
+    there.
+    """
     for _ in range(3):
         call()
     synchronize(args)
@@ -343,7 +447,11 @@ def timed(args: argparse.Namespace, call: Callable[[], Any], repetitions: int) -
         synchronize(args)
         seconds.append(time.perf_counter() - started)
     low, middle, high = (round(1e3 * x, 3) for x in statistics.quantiles(seconds, n=4))
-    memory = {"mb": round((torch.cuda.max_memory_allocated() - before) / 2**20, 1)} if args.device == "cuda" else {}
+    memory = (
+        {"mb": round((torch.cuda.max_memory_allocated() - before) / 2**20, 1)}
+        if args.device == "cuda"
+        else {}
+    )
     return {"ms": middle, "q1": low, "q3": high} | memory
 
 
@@ -365,22 +473,39 @@ def speed(args: argparse.Namespace) -> dict[str, Any]:
     scene, repetitions = on(args.device, make_scene(count)), 4 if args.small else 50
     found: dict[str, Any] = {"gaussians": count, "size": size, "views": views}
     for preset in ("fast", "balanced", "accurate"):
-        found[preset] = timed(args, drawer(scene, size, views, args.device, preset=preset), repetitions)
+        found[preset] = timed(
+            args, drawer(scene, size, views, args.device, preset=preset), repetitions
+        )
         print(preset, found[preset])
     return found
 
 
 def gsplat(args: argparse.Namespace) -> dict[str, Any]:
-    """gsplat as it is installed, else of PyPI in a folder of its own; its kernels are built at first use, for this GPU alone."""
+    """gsplat as it is installed, else of PyPI in a folder of its own; its kernels are built at
+    first use, for this GPU alone.
+    """
     with tempfile.TemporaryDirectory() as folder:
         if importlib.util.find_spec("gsplat") is None:
-            pip = [sys.executable, "-m", "pip", "install", "--quiet", "--retries", "1", "--no-deps", "--target", folder]
+            pip = [
+                sys.executable,
+                "-m",
+                "pip",
+                "install",
+                "--quiet",
+                "--retries",
+                "1",
+                "--no-deps",
+                "--target",
+                folder,
+            ]
             status, text = run([*pip, *GSPLAT], args, SECONDS["pip"], {})
             if status:
                 raise RuntimeError(f"gsplat isn't installed and can't be: {text[-1000:]}")
         paths = {
             "PYTHONPATH": os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), folder])),
-            "PATH": os.pathsep.join([f"{folder}/bin", str(Path(sys.executable).parent), os.environ.get("PATH", "")]),  # ninja
+            "PATH": os.pathsep.join(
+                [f"{folder}/bin", str(Path(sys.executable).parent), os.environ.get("PATH", "")]
+            ),  # ninja
             "MAX_JOBS": str(os.cpu_count()),
         }
         return in_process("gsplat_steps", args, paths)
@@ -396,13 +521,15 @@ def gsplat_steps(args: argparse.Namespace) -> dict[str, Any]:
     upstream = torch.cat([image, depth], -1), alpha
 
     def step() -> None:
-        pictures, alphas, _ = rasterization(*scene, viewmats, Ks, 1024, 1024, render_mode="RGB+D", packed=False)
+        pictures, alphas, _ = rasterization(
+            *scene, viewmats, Ks, 1024, 1024, render_mode="RGB+D", packed=False
+        )
         torch.autograd.grad((pictures, alphas), list(scene), upstream)
 
     return timed(args, step, 50)
 
 
-# ---- pruning ---------------------------------------------------------------------------------------------------------------
+# ---- pruning -------------------------------------------------------------------------------------
 
 
 def prune(args: argparse.Namespace) -> dict[str, Any]:
@@ -416,11 +543,18 @@ def prune_twice(args: argparse.Namespace) -> dict[str, Any]:
     from threestudio_gaussiandreamer.prune import command as prune
 
     stored = prune.stored_cloud(torus_and_sphere(800 if args.small else 100_000))
-    options = prune.PruneOptions(count=len(stored.arrays.means) // 4, size=48 if args.small else 256, steps=4 if args.small else 60)
+    options = prune.PruneOptions(
+        count=len(stored.arrays.means) // 4,
+        size=48 if args.small else 256,
+        steps=4 if args.small else 60,
+    )
     first, second = (prune.pruned(stored, options, ".ply", "") for _ in range(2))
     before, after = (prune.tensors_of(cloud) for cloud in (stored, first.after))
     views = prune.views_of(stored, options)[-1]
-    same = all(a.tobytes() == b.tobytes() for a, b in zip(first.after.arrays, second.after.arrays, strict=True))
+    same = all(
+        a.tobytes() == b.tobytes()
+        for a, b in zip(first.after.arrays, second.after.arrays, strict=True)
+    )
     return {
         "gaussians": [len(before.means), len(after.means)],
         "psnr": round(simplify.likeness(after, views, simplify.look(before, views)), 2),
@@ -428,7 +562,7 @@ def prune_twice(args: argparse.Namespace) -> dict[str, Any]:
     } | ({} if same else {"failed": "pruning the same cloud again gave other bits"})
 
 
-# ---- a training step -------------------------------------------------------------------------------------------------------
+# ---- a training step -----------------------------------------------------------------------------
 
 
 def train(args: argparse.Namespace) -> dict[str, Any]:
@@ -438,7 +572,12 @@ def train(args: argparse.Namespace) -> dict[str, Any]:
         in_process("make_model", args, environment)
         overlays = {"default": "", "lowmem": "gaussiandreamer-lowmem.yaml"}
         return {
-            name: guarded(lambda _, overlay=overlay: in_process("train_steps", args, environment | {"GPU_CHECK_OVERLAY": overlay}), args)
+            name: guarded(
+                lambda _, overlay=overlay: in_process(
+                    "train_steps", args, environment | {"GPU_CHECK_OVERLAY": overlay}
+                ),
+                args,
+            )
             for name, overlay in overlays.items()
         }
 
@@ -447,7 +586,11 @@ def make_model(args: argparse.Namespace) -> dict[str, Any]:
     import tiny_models
 
     sizes = tiny_models.TINY if args.small else tiny_models.STABLE_DIFFUSION_2_1
-    return {"folder": str(tiny_models.stable_diffusion(Path(os.environ["GPU_CHECK_MODEL"]), sizes=sizes))}
+    return {
+        "folder": str(
+            tiny_models.stable_diffusion(Path(os.environ["GPU_CHECK_MODEL"]), sizes=sizes)
+        )
+    }
 
 
 def train_steps(args: argparse.Namespace) -> dict[str, Any]:
@@ -471,7 +614,11 @@ def train_steps(args: argparse.Namespace) -> dict[str, Any]:
     if code:
         raise RuntimeError(f"the launcher ended with {code}")
     per_step = statistics.median(seconds[len(seconds) // 2 :])
-    memory = {"peak_gb": round(torch.cuda.max_memory_allocated() / 2**30, 2)} if args.device == "cuda" else {}
+    memory = (
+        {"peak_gb": round(torch.cuda.max_memory_allocated() / 2**30, 2)}
+        if args.device == "cuda"
+        else {}
+    )
     return {
         "seconds_per_step": round(per_step, 4),
         "extrapolated_minutes_for_1200_steps": round(per_step * STEPS_OF_A_RUN / 60, 2),
@@ -480,9 +627,18 @@ def train_steps(args: argparse.Namespace) -> dict[str, Any]:
 
 def training_arguments(args: argparse.Namespace, folder: str) -> list[str]:
     """The paper's configuration from a mesh in the place of Shap-E, which has no part in a step."""
-    overlays = [part for name in ("gaussiandreamer.yaml", os.environ["GPU_CHECK_OVERLAY"]) if name for part in ("--config", name)]
+    overlays = [
+        part
+        for name in ("gaussiandreamer.yaml", os.environ["GPU_CHECK_OVERLAY"])
+        if name
+        for part in ("--config", name)
+    ]
     steps = 4 if args.small else 16
-    sizes = {"data.width": 64, "data.height": 64, "system.geometry.grow.num_candidates": 2000} if args.small else {}
+    sizes = (
+        {"data.width": 64, "data.height": 64, "system.geometry.grow.num_candidates": 2000}
+        if args.small
+        else {}
+    )
     options = sizes | {
         "exp_root_dir": folder, "system.prompt_processor.prompt": "a fox",
         "system.prompt_processor.pretrained_model_name_or_path": os.environ["GPU_CHECK_MODEL"],

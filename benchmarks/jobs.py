@@ -1,4 +1,6 @@
-"""What is run for each chart and table: variants of configs/demo.yaml as lists of :class:`Job`; `runs.py` runs them."""
+"""What is run for each chart and table: variants of configs/demo.yaml as lists of :class:`Job`;
+`runs.py` runs them.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
@@ -17,7 +19,9 @@ STEPS_A_ROUND = PruneOptions.steps
 NO_BUDGET = {"system.geometry.budget": "null"}
 SHARP_PAPER = PAPER_RATES | NO_BUDGET | {"system.geometry.init_opacity": 0.1}
 PAPER = SHARP_PAPER | {"system.renderer.eps2d": 0.3}
-"""The recipe of the paper: its learning rates, start and screen-space dilation, and no pruning. Sharp: with the demo's dilation, 0.1."""
+"""The recipe of the paper: its learning rates, start and screen-space dilation, and no pruning.
+Sharp: with the demo's dilation, 0.1.
+"""
 RATES = {
     "lr_means": (2e-4, 2e-5),
     "lr_scales": (6e-2, 1e-3),
@@ -27,10 +31,15 @@ RATES = {
 }
 """Learning rates of demo.yaml, at the start and the end of a run."""
 SLOWER_MEANS = {"slower means": 0.5, "means at 0.8": 0.8}
-"""The share of their rate that positions begin with: the smaller, the more Gaussians stay on the surface."""
+"""The share of their rate that positions begin with: the smaller, the more Gaussians stay on the
+surface.
+"""
 BINS = VIEW_BLIND | {"system.guidance.mode": "direction-bins"}
 GREY = {"system.geometry.prior.color": "grey"}
-BALL = {"system.geometry.prior_type": "random-prior", "system.geometry.prior": {"num_points": 8000, "shape": "sphere", "color": "grey"}}
+BALL = {
+    "system.geometry.prior_type": "random-prior",
+    "system.geometry.prior": {"num_points": 8000, "shape": "sphere", "color": "grey"},
+}
 SMALL = {"data.width": 96, "data.height": 96}
 BLURRED = {"system.guidance.latent_size": 4}
 
@@ -51,13 +60,23 @@ def steps(count: int) -> dict[str, Any]:
     """A run of ``count`` steps with its schedules in proportion."""
     second = SECOND_STAGE * count // STEPS
     schedule = [second, 0.98, 0.55, second + 1]
-    rounds = {f"system.geometry.prune.{name}": step * count // STEPS for name, step in (("start", 100), ("every", 50), ("stop", 900))}
-    return rounds | falling(RATES, count) | {"trainer.max_steps": count, "system.guidance.max_step_percent": schedule}
+    rounds = {
+        f"system.geometry.prune.{name}": step * count // STEPS
+        for name, step in (("start", 100), ("every", 50), ("stop", 900))
+    }
+    return (
+        rounds
+        | falling(RATES, count)
+        | {"trainer.max_steps": count, "system.guidance.max_step_percent": schedule}
+    )
 
 
 def falling(names: Iterable[str], count: int, factor: float = 1.0) -> dict[str, str]:
     """Some of the demo's learning rates, ``factor`` times as high, for a run of ``count`` steps."""
-    return {f"system.geometry.{name}": falling_rate(*(factor * rate for rate in RATES[name]), count) for name in names}
+    return {
+        f"system.geometry.{name}": falling_rate(*(factor * rate for rate in RATES[name]), count)
+        for name in names
+    }
 
 
 def falling_rate(start: float, end: float, count: int) -> str:
@@ -93,54 +112,111 @@ def count_jobs() -> Iterator[Job]:
         yield Job("count", "by removal error", count, {"system.geometry.budget": count})
         yield Job("count", "from scratch", count, scratch(count))
     ungrown = {"system.geometry.prior.num_points": 10000, "system.geometry.grow.enabled": "false"}
-    yield Job("count", "by removal error, nothing grown", COUNTS[-2], ungrown | {"system.geometry.budget": COUNTS[-2]})
+    yield Job(
+        "count",
+        "by removal error, nothing grown",
+        COUNTS[-2],
+        ungrown | {"system.geometry.budget": COUNTS[-2]},
+    )
     for count in COUNTS[-2:]:
         for score in ("contribution", "opacity"):
-            yield Job("count", f"by {score}", count, {"system.geometry.budget": count, "system.geometry.prune.score": score})
+            yield Job(
+                "count",
+                f"by {score}",
+                count,
+                {"system.geometry.budget": count, "system.geometry.prune.score": score},
+            )
         for name, share in SLOWER_MEANS.items():
             start, end = RATES["lr_means"]
-            slower = {"system.geometry.budget": count, "system.geometry.lr_means": falling_rate(share * start, end, STEPS)}
+            slower = {
+                "system.geometry.budget": count,
+                "system.geometry.lr_means": falling_rate(share * start, end, STEPS),
+            }
             yield Job("count", f"by removal error, {name}", count, slower)
         rounds = rounds_to(count, 10000)
         pruned = NO_BUDGET | {"system.prune.count": count, "system.prune.size": 128}
-        yield Job("count", "after the run, with recovery", count, steps(STEPS - rounds * STEPS_A_ROUND) | pruned)
-    yield Job("count", "at random", COUNTS[-2], {"system.geometry.budget": COUNTS[-2], "system.geometry.prune.score": "random"})
-    yield Job("count", "the paper's recipe, by removal error", COUNTS[-2], PAPER | {"system.geometry.budget": COUNTS[-2]})
+        yield Job(
+            "count",
+            "after the run, with recovery",
+            count,
+            steps(STEPS - rounds * STEPS_A_ROUND) | pruned,
+        )
+    yield Job(
+        "count",
+        "at random",
+        COUNTS[-2],
+        {"system.geometry.budget": COUNTS[-2], "system.geometry.prune.score": "random"},
+    )
+    yield Job(
+        "count",
+        "the paper's recipe, by removal error",
+        COUNTS[-2],
+        PAPER | {"system.geometry.budget": COUNTS[-2]},
+    )
 
 
 def grown_jobs() -> Iterator[Job]:
     """Half of COUNTS[1] grown to all of it by gradients; thresholds were chosen on the toy."""
-    few = scratch(COUNTS[1] // 2) | {"system.geometry.max_gaussians": 10000, "system.geometry.budget": COUNTS[1]}
+    few = scratch(COUNTS[1] // 2) | {
+        "system.geometry.max_gaussians": 10000,
+        "system.geometry.budget": COUNTS[1],
+    }
     rounds = {"enabled": "true", "start": 100, "stop": 800, "every": 50}
-    for absgrad, threshold, name in (("false", 3, "plain gradients"), ("true", 5, "absolute gradients")):
+    for absgrad, threshold, name in (
+        ("false", 3, "plain gradients"),
+        ("true", 5, "absolute gradients"),
+    ):
         densify = rounds | {"absgrad": absgrad, "grad_threshold": threshold}
-        yield Job("grown", name, COUNTS[1], few | {f"system.geometry.densify.{key}": value for key, value in densify.items()})
+        yield Job(
+            "grown",
+            name,
+            COUNTS[1],
+            few | {f"system.geometry.densify.{key}": value for key, value in densify.items()},
+        )
 
 
 def size_jobs() -> Iterator[Job]:
-    """Pixels rendered, and whether rendering twice as large and shrinking pays for its four times as many."""
+    """Pixels rendered, and whether rendering twice as large and shrinking pays for its four times
+    as many.
+    """
     for size in (64, 128, 256):
-        yield Job("size", "rendered and guided alike", size, {"data.width": size, "data.height": size})
+        yield Job(
+            "size", "rendered and guided alike", size, {"data.width": size, "data.height": size}
+        )
     for size in (64, 128):
         large = {"data.width": 2 * size, "data.height": 2 * size, "system.renderer.downsample": 2}
         yield Job("size", "rendered twice as large, shrunk", size, large)
 
 
 def large_jobs() -> Iterator[Job]:
-    """The same at 512^2 with 20,000 Gaussians; what shrinking does to the dilation, and its seconds spent on steps, each alone."""
+    """The same at 512^2 with 20,000 Gaussians; what shrinking does to the dilation, and its seconds
+    spent on steps, each alone.
+    """
     own = {"data.width": 512, "data.height": 512, "system.evaluation.size": 512}
     many = own | scratch(20000)
     yield Job("large", "rendered at 512²", 0, many)
-    yield Job("large", "rendered at 512², dilation 0.025", 0, many | {"system.renderer.eps2d": 0.025})
+    yield Job(
+        "large", "rendered at 512², dilation 0.025", 0, many | {"system.renderer.eps2d": 0.025}
+    )
     yield Job("large", "rendered at 512², 2,000 steps", 0, many | steps(2000))
-    yield Job("large", "rendered at 1024², shrunk", 0, many | {"data.width": 1024, "data.height": 1024, "system.renderer.downsample": 2})
+    yield Job(
+        "large",
+        "rendered at 1024², shrunk",
+        0,
+        many | {"data.width": 1024, "data.height": 1024, "system.renderer.downsample": 2},
+    )
     yield Job("large", "the paper's recipe", 0, own | PAPER)
 
 
 def batch_jobs() -> Iterator[Job]:
     """Views per step, with as many steps as fit into the demo's seconds."""
     for batch, count in ((1, 2200), (2, 1650), (4, STEPS), (8, 750)):
-        yield Job("batch", "equal seconds", batch, {"data.batch_size": batch, "system.evaluation.every": count // 12} | steps(count))
+        yield Job(
+            "batch",
+            "equal seconds",
+            batch,
+            {"data.batch_size": batch, "system.evaluation.every": count // 12} | steps(count),
+        )
 
 
 def iteration_jobs() -> Iterator[Job]:
@@ -151,7 +227,9 @@ def iteration_jobs() -> Iterator[Job]:
 
 
 def rate_jobs() -> Iterator[Job]:
-    """Each learning rate of the demo a third and three times as high, all of them, and all held instead of falling."""
+    """Each learning rate of the demo a third and three times as high, all of them, and all held
+    instead of falling.
+    """
     yield Job("rates", "demo.yaml", 1, {})
     for names in (*([name] for name in RATES), list(RATES)):
         line = names[0].removeprefix("lr_") if len(names) == 1 else "all"
@@ -169,25 +247,54 @@ def preset_jobs() -> Iterator[Job]:
 
 
 def dilation_jobs() -> Iterator[Job]:
-    """Gaussians are widened on the screen by 0.3 square pixels nearly everywhere; a pixel's own box has a twelfth."""
+    """Gaussians are widened on the screen by 0.3 square pixels nearly everywhere; a pixel's own box
+    has a twelfth.
+    """
     for dilation in (0.03, 0.1, 0.3):
         for antialias, name in ((False, "plain"), (True, "antialiased")):
-            yield Job("dilation", name, dilation, {"system.renderer.eps2d": dilation, "system.renderer.antialias": str(antialias).lower()})
-        yield Job("dilation", "the paper's recipe", dilation, SHARP_PAPER | {"system.renderer.eps2d": dilation})
+            yield Job(
+                "dilation",
+                name,
+                dilation,
+                {
+                    "system.renderer.eps2d": dilation,
+                    "system.renderer.antialias": str(antialias).lower(),
+                },
+            )
+        yield Job(
+            "dilation",
+            "the paper's recipe",
+            dilation,
+            SHARP_PAPER | {"system.renderer.eps2d": dilation},
+        )
 
 
 def quality_jobs() -> Iterator[Job]:
     """The demo as it is, its quick and its good variant, at its own size."""
     own = {"data.width": 256, "data.height": 256, "system.evaluation.size": 256}
-    for name, overlay, count in (("draft", "demo-draft", 255), ("default", "", STEPS), ("best", "demo-best", 3000)):
-        yield Job("quality", name, 0, own | {"trainer.max_steps": count, "system.evaluation.every": count // 20}, overlay)
+    for name, overlay, count in (
+        ("draft", "demo-draft", 255),
+        ("default", "", STEPS),
+        ("best", "demo-best", 3000),
+    ):
+        yield Job(
+            "quality",
+            name,
+            0,
+            own | {"trainer.max_steps": count, "system.evaluation.every": count // 20},
+            overlay,
+        )
     beginning = {"trainer.max_steps": 160, "system.evaluation.every": 10}
     yield Job("quality", "best, its beginning", 0, own | beginning, "demo-best")
-    yield Job("quality", "the paper's recipe", 0, own | {"system.evaluation.every": STEPS // 20} | PAPER)
+    yield Job(
+        "quality", "the paper's recipe", 0, own | {"system.evaluation.every": STEPS // 20} | PAPER
+    )
 
 
 def failure_jobs() -> Iterator[Job]:
-    """How the method fails, and what each remedy buys: 96^2 and 600 steps, so that 15 runs of each are affordable."""
+    """How the method fails, and what each remedy buys: 96^2 and 600 steps, so that 15 runs of each
+    are affordable.
+    """
     plain_timesteps = LATENT | STRONG | NO_ANNEALING
     variants = {
         "multi-face: random start": VIEW_BLIND | RANDOM_START,
@@ -200,7 +307,9 @@ def failure_jobs() -> Iterator[Job]:
         "over-saturation: guidance 100": plain_timesteps,
         "over-saturation: annealed": LATENT | STRONG,
         "over-saturation: annealed, clipped": LATENT | STRONG | CLIPPED,
-        "over-saturation: guidance 7.5, annealed, clipped": LATENT | CLIPPED | {"system.guidance.guidance_scale": 8.5},
+        "over-saturation: guidance 7.5, annealed, clipped": LATENT
+        | CLIPPED
+        | {"system.guidance.guidance_scale": 8.5},
         "wrong shape: a grey ball": BALL,
         "right shape": {},
     }

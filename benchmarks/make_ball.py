@@ -1,9 +1,10 @@
-"""Make benchmarks/scenes/ball.ply: a ball with a face in front and stripes behind, so that shape alone tells no side from another.
+"""Make benchmarks/scenes/ball.ply: a ball with a face in front and stripes behind, so that shape
+alone tells no side from another.
 
     python benchmarks/make_ball.py
 
-The paper names such objects as a limit of the method. Front = +x, z up, radius 1. Deterministic; no input.
-"""
+The paper names such objects as a limit of the method. Front = +x, z up, radius 1. Deterministic; no
+input."""
 
 from pathlib import Path
 
@@ -11,7 +12,13 @@ import numpy as np
 import trimesh
 
 PATH = Path(__file__).resolve().parent / "scenes/ball.ply"
-SKIN, EYE, MOUTH, STRIPE, CAP = (240, 200, 120), (25, 25, 40), (200, 50, 60), (50, 90, 190), (60, 140, 80)
+SKIN, EYE, MOUTH, STRIPE, CAP = (
+    (240, 200, 120),
+    (25, 25, 40),
+    (200, 50, 60),
+    (50, 90, 190),
+    (60, 140, 80),
+)
 
 
 def main() -> None:

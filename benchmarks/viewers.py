@@ -1,11 +1,12 @@
-"""What viewers make of a cloud: trained with one screen-space dilation, drawn with another, at the size of training and larger.
+"""What viewers make of a cloud: trained with one screen-space dilation, drawn with another, at the
+size of training and larger.
 
     python benchmarks/viewers.py                                       # the toy: two minutes
     python benchmarks/viewers.py --objects toy.glb spot.glb duck.glb
 
-The demo at its own 256^2 with dilations of 0.1 and of 0.3 square pixels; each result drawn with both at 256^2 and at 512^2, in dB to the
-ray-cast truth on 24 held-out views. Results go to docs/charts/viewers.csv; what that has is not run again.
-"""
+The demo at its own 256^2 with dilations of 0.1 and of 0.3 square pixels; each result drawn with
+both at 256^2 and at 512^2, in dB to the ray-cast truth on 24 held-out views. Results go to
+docs/charts/viewers.csv; what that has is not run again."""
 
 import argparse
 import tempfile
@@ -26,7 +27,12 @@ COLUMNS = "variant,x,size,object,seed,psnr,machine,commit".split(",")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--objects", nargs="+", default=["toy.glb"], help="meshes; a bare name is a bundled one (default: toy.glb)")
+    parser.add_argument(
+        "--objects",
+        nargs="+",
+        default=["toy.glb"],
+        help="meshes; a bare name is a bundled one (default: toy.glb)",
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     arguments = parser.parse_args()
     register_parts()
@@ -46,7 +52,11 @@ def rows(mesh: str, seed: int) -> Iterator[dict[str, Any]]:
         for size in SIZES:
             for drawn in DILATIONS:
                 found = score(mesh, arrays, size, eps2d=drawn)
-                print(f"{object_name(mesh)}: trained with {trained:g}, drawn with {drawn:g} at {size}^2: {found:.2f} dB", flush=True)
+                print(
+                    f"{object_name(mesh)}: trained with {trained:g}, drawn with {drawn:g} at "
+                    f"{size}^2: {found:.2f} dB",
+                    flush=True,
+                )
                 yield {
                     "variant": f"trained with {trained:g}",
                     "x": drawn,

@@ -2,7 +2,9 @@
 
 import os
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning barriers are slow on a busy machine
+os.environ.setdefault(
+    "OMP_WAIT_POLICY", "passive"
+)  # before torch: spinning barriers are slow on a busy machine
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
 import signal
@@ -16,7 +18,9 @@ from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 
 @pytest.fixture(autouse=True, scope="session")
 def heard_ctrl_c():
-    """A shell's background job starts with Ctrl-C ignored; the tests that send one need Python's own answer to it."""
+    """A shell's background job starts with Ctrl-C ignored; the tests that send one need Python's
+    own answer to it.
+    """
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -37,7 +41,9 @@ def sphere_points() -> PointCloud:
 
 @pytest.fixture
 def shared_folder() -> Path:
-    """A folder with real meshes beside the repository; a test that uses it skips where it isn't there."""
+    """A folder with real meshes beside the repository; a test that uses it skips where it isn't
+    there.
+    """
     folder = Path(os.environ.get("GAUSSIANDREAMER_SHARED", Path(__file__).parents[2] / "shared"))
     if not (folder / "assets").is_dir():
         pytest.skip("set GAUSSIANDREAMER_SHARED to a folder with assets/*.glb")

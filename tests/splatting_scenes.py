@@ -33,14 +33,20 @@ class Cloud(NamedTuple):
         return Cloud(*(x.detach().clone().requires_grad_() for x in self))
 
 
-def random_cloud(n: int, seed: int = 0, channels: int = 3, size: float = 0.15, stretch: float = 0.6) -> Cloud:
-    """float64; in a ball of radius 1 around the origin, moderately stretched, of any opacity below the cap."""
+def random_cloud(
+    n: int, seed: int = 0, channels: int = 3, size: float = 0.15, stretch: float = 0.6
+) -> Cloud:
+    """float64; in a ball of radius 1 around the origin, moderately stretched, of any opacity below
+    the cap.
+    """
     g = torch.Generator().manual_seed(seed)
     means = torch.randn(n, 3, generator=g, dtype=torch.float64) * 0.4
     quats = torch.randn(n, 4, generator=g, dtype=torch.float64)
     scales = size * torch.exp(stretch * torch.randn(n, 3, generator=g, dtype=torch.float64))
     opacities = 0.05 + 0.9 * torch.rand(n, generator=g, dtype=torch.float64)
-    return Cloud(means, quats, scales, opacities, torch.rand(n, channels, generator=g, dtype=torch.float64))
+    return Cloud(
+        means, quats, scales, opacities, torch.rand(n, channels, generator=g, dtype=torch.float64)
+    )
 
 
 HOSTILE = {
@@ -53,7 +59,9 @@ HOSTILE = {
 
 
 def hostile_cloud(seed: int, n: int) -> Cloud:
-    """Half of the entries are picked from HOSTILE, the others are ordinary; the second half's means coincide with the first's."""
+    """Half of the entries are picked from HOSTILE, the others are ordinary; the second half's means
+    coincide with the first's.
+    """
     g = torch.Generator().manual_seed(seed)
     cloud = random_cloud(n, seed)
     for name, x in zip(NAMES, cloud, strict=True):
@@ -65,14 +73,28 @@ def hostile_cloud(seed: int, n: int) -> Cloud:
     return cloud
 
 
-def cameras(views: int, width: int, height: int, distance: float = 3.0, fov: float = 50.0, dtype=torch.float64) -> tuple[Tensor, Tensor]:
-    """Viewmats and Ks on a circle around the origin, each looking at it; ``fov`` vertical, degrees; square pixels."""
+def cameras(
+    views: int,
+    width: int,
+    height: int,
+    distance: float = 3.0,
+    fov: float = 50.0,
+    dtype=torch.float64,
+) -> tuple[Tensor, Tensor]:
+    """Viewmats and Ks on a circle around the origin, each looking at it; ``fov`` vertical, degrees;
+    square pixels.
+    """
     focal = 0.5 * height / math.tan(math.radians(fov) / 2)
-    Ks = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=dtype).expand(views, 3, 3)
+    Ks = torch.tensor(
+        [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=dtype
+    ).expand(views, 3, 3)
     viewmats = torch.eye(4, dtype=dtype).repeat(views, 1, 1)
     for view in range(views):
         angle, tilt = 0.3 + 2 * math.pi * view / views, 0.4
-        back = torch.tensor([math.cos(angle) * math.cos(tilt), math.sin(angle) * math.cos(tilt), math.sin(tilt)], dtype=dtype)
+        back = torch.tensor(
+            [math.cos(angle) * math.cos(tilt), math.sin(angle) * math.cos(tilt), math.sin(tilt)],
+            dtype=dtype,
+        )
         right = torch.linalg.cross(-back, torch.tensor([0.0, 0, 1], dtype=dtype))
         right /= right.norm()
         viewmats[view, :3, :3] = torch.stack([right, torch.linalg.cross(-back, right), -back])
@@ -80,7 +102,9 @@ def cameras(views: int, width: int, height: int, distance: float = 3.0, fov: flo
     return viewmats, Ks.contiguous()
 
 
-def front_camera(width: int, height: int, focal: float, dtype=torch.float64) -> tuple[Tensor, Tensor]:
+def front_camera(
+    width: int, height: int, focal: float, dtype=torch.float64
+) -> tuple[Tensor, Tensor]:
     """At the origin, looking along +z: camera coordinates are world coordinates."""
     Ks = torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], dtype=dtype)
     return torch.eye(4, dtype=dtype)[None], Ks
@@ -96,23 +120,41 @@ def one_gaussian(mean=(0.0, 0.0, 2.0), scale=0.1, opacity=0.5, color=(1.0, 0.5, 
 def cotangents(out: Rasterized, seed: int = 1) -> tuple[Tensor, ...]:
     """Fixed random gradients of image, alpha and depth, the same numbers for every float type."""
     g = torch.Generator().manual_seed(seed)
-    return tuple(torch.randn(x.shape, generator=g, dtype=torch.float64).to(x.dtype) for x in (out.image, out.alpha, out.depth))
+    return tuple(
+        torch.randn(x.shape, generator=g, dtype=torch.float64).to(x.dtype)
+        for x in (out.image, out.alpha, out.depth)
+    )
 
 
 class Run(NamedTuple):
     out: Rasterized
-    grads: dict[str, Tensor]  # of the five attributes, means2d, and of background and viewmats where given
+    grads: dict[
+        str, Tensor
+    ]  # of the five attributes, means2d, and of background and viewmats where given
 
 
-def run(cloud: Cloud, viewmats: Tensor, Ks: Tensor, width: int, height: int, background=None, camera_gradient=False, **options) -> Run:
+def run(
+    cloud: Cloud,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    background=None,
+    camera_gradient=False,
+    **options,
+) -> Run:
     """Forward and backward in the cloud's float type with fixed cotangents."""
     dtype = cloud.means.dtype
     leaves = cloud.leaves()
     viewmats = viewmats.detach().to(dtype).requires_grad_(camera_gradient)
     background = None if background is None else background.detach().to(dtype).requires_grad_()
-    out = rasterize(*leaves, viewmats, Ks.to(dtype), width, height, background=background, **options)
+    out = rasterize(
+        *leaves, viewmats, Ks.to(dtype), width, height, background=background, **options
+    )
     torch.autograd.backward([out.image, out.alpha, out.depth], cotangents(out))
-    grads = {name: leaf.grad for name, leaf in zip(NAMES, leaves, strict=True)} | {"means2d": out.means2d.grad}
+    grads = {name: leaf.grad for name, leaf in zip(NAMES, leaves, strict=True)} | {
+        "means2d": out.means2d.grad
+    }
     if background is not None:
         grads["background"] = background.grad
     if camera_gradient:
@@ -126,7 +168,9 @@ def error(a: Tensor, b: Tensor) -> float:
 
 
 def trimmed_error(a: Tensor, b: Tensor, kept: float = 0.995) -> float:
-    """The same without the worst rows: a Gaussian at a threshold may fall on its other side in another float type."""
+    """The same without the worst rows: a Gaussian at a threshold may fall on its other side in
+    another float type.
+    """
     a, b = a.double().reshape(len(a), -1), b.double().reshape(len(b), -1)
     distance = (a - b).norm(dim=1)
     rows = distance <= distance.quantile(kept)
@@ -144,8 +188,12 @@ def assert_close(ours: Run, truth: Run, tolerance: float = SINGLE, radii: bool =
         assert error(picture, true) < SINGLE or (picture - true).abs().max() < 1e-7, name
     assert not radii or torch.allclose(ours.out.radii.double(), truth.out.radii, rtol=1e-5)
     for name, grad in truth.grads.items():
-        by_gaussian = [x.transpose(0, 1) if name == "means2d" else x for x in (ours.grads[name], grad)]
-        assert trimmed_error(*by_gaussian) < tolerance or (ours.grads[name] - grad).abs().max() < 1e-7, name
+        by_gaussian = [
+            x.transpose(0, 1) if name == "means2d" else x for x in (ours.grads[name], grad)
+        ]
+        assert (
+            trimmed_error(*by_gaussian) < tolerance or (ours.grads[name] - grad).abs().max() < 1e-7
+        ), name
     if hasattr(truth.out.means2d, "absgrad"):
         assert error(ours.out.means2d.absgrad, truth.out.means2d.absgrad) < SINGLE
 

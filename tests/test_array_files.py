@@ -30,12 +30,17 @@ def test_what_numpy_wrote_is_read(tmp_path, save):
 
 def test_the_one_array_of_an_npy_has_the_name_that_is_wanted(tmp_path):
     np.save(tmp_path / "x.npy", ARRAYS["a"])
-    assert np.array_equal(read_arrays(tmp_path / "x.npy", "file", ["points"])["points"], ARRAYS["a"])
+    assert np.array_equal(
+        read_arrays(tmp_path / "x.npy", "file", ["points"])["points"], ARRAYS["a"]
+    )
 
 
 def test_what_is_missing_is_named(tmp_path):
     np.savez(tmp_path / "x.npz", **ARRAYS)
-    with pytest.raises(UserError, match="motion file .*x.npz' has no array 'points', 'c', only a, b, text, none, one"):
+    with pytest.raises(
+        UserError,
+        match="motion file .*x.npz' has no array 'points', 'c', only a, b, text, none, one",
+    ):
         read_arrays(tmp_path / "x.npz", "motion file", ["a", "points", "c"])
 
 
@@ -50,7 +55,9 @@ def test_objects_are_not_unpickled_unless_nobody_asked_for_them(tmp_path):
 
 
 def npy(header: str, body: bytes) -> bytes:
-    return b"\x93NUMPY\1\0" + (len(header) + 1).to_bytes(2, "little") + header.encode() + b"\n" + body
+    return (
+        b"\x93NUMPY\1\0" + (len(header) + 1).to_bytes(2, "little") + header.encode() + b"\n" + body
+    )
 
 
 def zipped(content: bytes, **changes: int) -> bytes:

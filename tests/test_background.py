@@ -26,7 +26,9 @@ def test_random_depends_on_the_step_alone_and_rests_in_evaluation():
 
 
 def test_learned_starts_at_the_colour_stays_in_range_and_learns():
-    background = FlatBackground({"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": [0, 0.1, 0.2, 10]})
+    background = FlatBackground(
+        {"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": [0, 0.1, 0.2, 10]}
+    )
     optimizer = torch.optim.Adam(background.parameter_groups())
     for step in range(400):
         background.set_learning_rates(optimizer, 0, step)
@@ -38,7 +40,10 @@ def test_learned_starts_at_the_colour_stays_in_range_and_learns():
     assert color[0] > 0.95 and color[1] < 0.05 and color.min() >= 0 and color.max() <= 1
 
 
-@pytest.mark.parametrize("wrong, named", [({"mode": "randm"}, "random"), ({"color": [0, 0, 2]}, "color"), ({"lr": "fast"}, "lr")])
+@pytest.mark.parametrize(
+    "wrong, named",
+    [({"mode": "randm"}, "random"), ({"color": [0, 0, 2]}, "color"), ({"lr": "fast"}, "lr")],
+)
 def test_wrong_options_are_named(wrong, named):
     with pytest.raises(UserError, match=named):
         FlatBackground(wrong)

@@ -1,4 +1,6 @@
-"""Wrong input as a stranger gives it: one message, exit code 2, before any long work, nothing left behind, no traceback."""
+"""Wrong input as a stranger gives it: one message, exit code 2, before any long work, nothing left
+behind, no traceback.
+"""
 
 import dataclasses
 import json
@@ -50,7 +52,7 @@ def assert_refused(code: int, err: str, message: str) -> None:
     assert "the cloud starts" not in err
 
 
-# -- values ------------------------------------------------------------------------------------------------------------------
+# -- values ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -65,37 +67,73 @@ def assert_refused(code: int, err: str, message: str) -> None:
         ("system.loss.lamda_sds=1", "weights of losses are called lambda_<loss>"),
         ("system.exporter.formats=[plly]", "did you mean 'ply'"),
         ("system.exporter.options.ply.pad_sh_degre=3", "did you mean 'pad_sh_degree'"),
-        ("system.exporter.options.ply.pad_sh_degree=9", "pad_sh_degree: expected null, 0, 1, 2 or 3"),
-        ("system.exporter.options.ply.save_name=../x.ply", "save_name: expected the name of a file"),
+        (
+            "system.exporter.options.ply.pad_sh_degree=9",
+            "pad_sh_degree: expected null, 0, 1, 2 or 3",
+        ),
+        (
+            "system.exporter.options.ply.save_name=../x.ply",
+            "save_name: expected the name of a file",
+        ),
         ("system.exporter.options.ply=3", "options.ply: expected keys and values"),
         ("system.loggers.wandb=true", "system.loggers.wandb is True; expected keys and values"),
-        ("data.camera_distance_range.0=4", "data.camera_distance_range is a list in one and a section in another"),
+        (
+            "data.camera_distance_range.0=4",
+            "data.camera_distance_range is a list in one and a section in another",
+        ),
         # names
         ("system.geometry.prior_type=msh-prior", "did you mean 'mesh-prior'"),
-        ("system.material_type=''", "system.material_type is empty: name a registered part, such as 'no-material'"),
+        (
+            "system.material_type=''",
+            "system.material_type is empty: name a registered part, such as 'no-material'",
+        ),
         ("system.guidance_type=''", "system.guidance_type is empty"),
         # kinds and lengths
         ("data.elevation_range=[1]", "data.elevation_range: expected a list of 2, got [1]"),
         ("data.n_test_views=[1]", "data.n_test_views: expected a whole number, got [1]"),
         ("data.rays=-1", "data.rays: expected true or false, got -1"),
         ("system.background.color=[1]", "system.background.color: expected a list of 3"),
-        ("system.background.color=[.nan,0,0]", "system.background.color[0]: expected a finite number"),
-        ("system.geometry.grow.radius=[1]", "system.geometry.grow.radius: expected a number, got [1]"),
-        ("system.geometry.densify.max_scale=.inf", "system.geometry.densify.max_scale: expected a finite number"),
-        ("system.geometry.prior.color=3", "color: expected null, 'grey', 'random' or [red, green, blue]"),
+        (
+            "system.background.color=[.nan,0,0]",
+            "system.background.color[0]: expected a finite number",
+        ),
+        (
+            "system.geometry.grow.radius=[1]",
+            "system.geometry.grow.radius: expected a number, got [1]",
+        ),
+        (
+            "system.geometry.densify.max_scale=.inf",
+            "system.geometry.densify.max_scale: expected a finite number",
+        ),
+        (
+            "system.geometry.prior.color=3",
+            "color: expected null, 'grey', 'random' or [red, green, blue]",
+        ),
         ("system.optimizer=[1]", "system.optimizer is a list in one and a section in another"),
         # ranges
         ("data.camera_perturb=-1", "data.camera_perturb: expected 0 or more"),
         ("data.eval_camera_distance=0", "data.eval_camera_distance: expected a positive distance"),
         ("data.eval_fovy_deg=180", "data.eval_fovy_deg: expected degrees between 0 and 180"),
         ("data.elevation_range=[-100,0]", "expected degrees from -90 to 90"),
-        ("data.resolution_milestones=[2,1]", "data.resolution_milestones: expected increasing steps"),
-        ("data.resolution_milestones=[5]", "give data.height, data.width or data.batch_size 2 entries"),
-        ("system.geometry.grow.max_points=-1", "system.geometry.grow.max_points: expected 0 or more"),
+        (
+            "data.resolution_milestones=[2,1]",
+            "data.resolution_milestones: expected increasing steps",
+        ),
+        (
+            "data.resolution_milestones=[5]",
+            "give data.height, data.width or data.batch_size 2 entries",
+        ),
+        (
+            "system.geometry.grow.max_points=-1",
+            "system.geometry.grow.max_points: expected 0 or more",
+        ),
         ("system.geometry.lr_means=-1", "system.geometry.lr_means: expected values of 0 or more"),
         ("system.geometry.densify={enabled: true, start: 9, stop: 9}", "expected start < stop"),
         ("system.geometry.densify.min_opacity=1", "system.geometry.densify.min_opacity"),
-        ("system.geometry.max_gaussians=1", "error: system.geometry: expected 0 < min_gaussians <= max_gaussians"),
+        (
+            "system.geometry.max_gaussians=1",
+            "error: system.geometry: expected 0 < min_gaussians <= max_gaussians",
+        ),
         ("system.geometry.prior.up=+w", "unknown up axis '+w'"),
         ("system.geometry.prior.scale=0", "system.geometry.prior.scale: expected a number above 0"),
         ("system.guidance.up=w", "unknown system.guidance.up 'w'"),
@@ -103,18 +141,36 @@ def assert_refused(code: int, err: str, message: str) -> None:
         ("system.guidance.scale=0", "system.guidance.scale: expected more than 0"),
         ("system.renderer.eps2d=-1", "system.renderer.eps2d: expected 0 or more"),
         ("system.renderer.radius=0", "system.renderer.radius: expected a positive number"),
-        ("system.material.color_activation=relu", "unknown system.material.color_activation 'relu'"),
-        ("system.guidance.min_step_percent=[0,0.02,0.9,100]", "min_step_percent 0.9 is above max_step_percent"),
-        ("system.optimizer.args.bets=[0.9,0.9]", "Adam doesn't accept this: unknown argument 'bets': did you mean 'betas'?"),
+        (
+            "system.material.color_activation=relu",
+            "unknown system.material.color_activation 'relu'",
+        ),
+        (
+            "system.guidance.min_step_percent=[0,0.02,0.9,100]",
+            "min_step_percent 0.9 is above max_step_percent",
+        ),
+        (
+            "system.optimizer.args.bets=[0.9,0.9]",
+            "Adam doesn't accept this: unknown argument 'bets': did you mean 'betas'?",
+        ),
         ("system.optimizer.args.eps=-1", "Adam doesn't accept this: Invalid epsilon value"),
         ("system.optimizer.args=3", "system.optimizer.args: expected keys and values"),
         ("system.optimizer.name=Optimizer", "Optimizer doesn't accept this"),
         ("trainer.max_steps=-5", "trainer.max_steps: expected -1 or more"),
-        ("trainer.val_check_interval=0", "trainer.val_check_interval: expected a number of steps above 0"),
+        (
+            "trainer.val_check_interval=0",
+            "trainer.val_check_interval: expected a number of steps above 0",
+        ),
         ("trainer.log_every_n_steps=-1", "trainer.log_every_n_steps: expected 0 or more"),
-        ("trainer.accumulate_grad_batches=2", "trainer: Automatic gradient accumulation is not supported"),
+        (
+            "trainer.accumulate_grad_batches=2",
+            "trainer: Automatic gradient accumulation is not supported",
+        ),
         ("trainer.strategy=foo", "trainer: You selected an invalid strategy name"),
-        ("trainer.enable_checkpointing=false", "trainer.enable_checkpointing is set by the launcher"),
+        (
+            "trainer.enable_checkpointing=false",
+            "trainer.enable_checkpointing is set by the launcher",
+        ),
         ("checkpoint.filename=../../x", "checkpoint.filename is '../../x'"),
         # folders and texts
         ("exp_root_dir=a\0b", "no folder's name has a NUL"),
@@ -130,9 +186,18 @@ def test_a_wrong_value_is_refused_before_any_work(launch, override, message):
 BAD_VALUES = ([1, 2, 3, 4, 5, 6, 7], {"a": 1}, float("nan"), None, "abc", -1)
 
 
-@pytest.mark.parametrize("name", [name for name in host.names() if host.find(name).__module__.startswith("threestudio_gaussiandreamer")])
+@pytest.mark.parametrize(
+    "name",
+    [
+        name
+        for name in host.names()
+        if host.find(name).__module__.startswith("threestudio_gaussiandreamer")
+    ],
+)
 def test_no_option_of_any_part_ends_in_a_traceback(name):
-    """Whatever is written for an option, the check takes it or names it; what is no number or text is never taken for one."""
+    """Whatever is written for an option, the check takes it or names it; what is no number or text
+    is never taken for one.
+    """
     config = getattr(host.find(name), "Config", None)
     for field in dataclasses.fields(config) if config else ():
         for value in BAD_VALUES:
@@ -140,11 +205,17 @@ def test_no_option_of_any_part_ends_in_a_traceback(name):
                 check_part("part", name, {field.name: value})
             except UserError as error:
                 # as it begins, or quoted: unknown key 'part.prior.a'
-                assert str(error).startswith(("part", "system.", "data.", "unknown key 'part.")), error
+                assert str(error).startswith(("part", "system.", "data.", "unknown key 'part.")), (
+                    error
+                )
             else:
                 single = field.type in (int, float, bool, str)
-                assert not (single and (value is None or isinstance(value, (list, dict)))), f"{name}.{field.name} takes {value!r}"
-                assert not (field.type is float and value != value), f"{name}.{field.name} takes NaN"
+                assert not (single and (value is None or isinstance(value, (list, dict)))), (
+                    f"{name}.{field.name} takes {value!r}"
+                )
+                assert not (field.type is float and value != value), (
+                    f"{name}.{field.name} takes NaN"
+                )
 
 
 @dataclasses.dataclass
@@ -162,16 +233,36 @@ class Outer:
 
 
 def test_types_that_fit_are_taken():
-    check_types(Outer, {"maybe": None, "names": ["a"], "pair": [1, 2], "inner": {"size": 2}, "whatever": [1], "unknown": 3})
+    check_types(
+        Outer,
+        {
+            "maybe": None,
+            "names": ["a"],
+            "pair": [1, 2],
+            "inner": {"size": 2},
+            "whatever": [1],
+            "unknown": 3,
+        },
+    )
     pairs = ({"pair": [1]}, {"pair": [1, float("inf")]})
-    for wrong in ({"maybe": [1]}, {"names": "a"}, {"names": [["a"]]}, *pairs, {"inner": {"size": [1]}}, {"inner": 3}):
+    for wrong in (
+        {"maybe": [1]},
+        {"names": "a"},
+        {"names": [["a"]]},
+        *pairs,
+        {"inner": {"size": [1]}},
+        {"inner": 3},
+    ):
         with pytest.raises(UserError):
             check_types(Outer, wrong)
 
 
-# -- files -------------------------------------------------------------------------------------------------------------------
+# -- files -----------------------------------------------------------------------------------------
 
-PLY = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+PLY = (
+    b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty "
+    b"float z\nend_header\n"
+)
 FILES = {
     "empty.glb": b"",
     "text.glb": b"hello there, this is no mesh",
@@ -191,10 +282,20 @@ def test_a_mesh_that_is_none_is_refused(launch, name):
     assert_refused(code, err, name or "path")
 
 
-@pytest.mark.parametrize("prior", ["gaussians-prior", "point-cloud-prior", "mesh-prior", "body-prior"])
+@pytest.mark.parametrize(
+    "prior", ["gaussians-prior", "point-cloud-prior", "mesh-prior", "body-prior"]
+)
 @pytest.mark.parametrize(
     "content",
-    [None, b"", b"hello", b"ply\nformat asc", PLY + b"nan nan nan\n", PLY + b"a b c\n", PLY.replace(b" 1\n", b" 99999999999\n")],
+    [
+        None,
+        b"",
+        b"hello",
+        b"ply\nformat asc",
+        PLY + b"nan nan nan\n",
+        PLY + b"a b c\n",
+        PLY.replace(b" 1\n", b" 99999999999\n"),
+    ],
 )
 def test_a_file_that_no_prior_can_read_is_refused(tmp_path, prior, content):
     path = tmp_path / "start.ply"
@@ -214,7 +315,10 @@ def checkpoint(**changes: object) -> dict:
     [
         (checkpoint(state_dict=[1]), "its state_dict is of type list"),
         (checkpoint(global_step=None), "its global_step is of type NoneType"),
-        ({k: v for k, v in checkpoint().items() if k != "pytorch-lightning_version"}, "which Lightning writes"),
+        (
+            {k: v for k, v in checkpoint().items() if k != "pytorch-lightning_version"},
+            "which Lightning writes",
+        ),
         (checkpoint(state_dict={"other": torch.ones(3)}), "was made by another configuration"),
         (checkpoint(loops={"x": 1}), "was made by another configuration"),
         (checkpoint(optimizer=os.system), "could run code when read, so it isn't read: "),
@@ -248,7 +352,11 @@ def test_a_full_disk_is_named(launch, monkeypatch):
 
     monkeypatch.setattr(evaluate, "_write_png", full)
     code, err = launch()
-    assert code == 2 and "cannot write picture.png: No space left on device" in err and "Traceback" not in err
+    assert (
+        code == 2
+        and "cannot write picture.png: No space left on device" in err
+        and "Traceback" not in err
+    )
 
 
 @pytest.mark.parametrize(
@@ -268,20 +376,27 @@ def test_a_configuration_that_is_none_is_refused(launch, content, message):
     assert not Path("pwned").exists()
 
 
-# -- prompts -----------------------------------------------------------------------------------------------------------------
+# -- prompts ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("prompt", ["1984", "a fox: red", "${x}", "../../x", "-x", "🦊" * 1000, "two\nlines", " "])
+@pytest.mark.parametrize(
+    "prompt", ["1984", "a fox: red", "${x}", "../../x", "-x", "🦊" * 1000, "two\nlines", " "]
+)
 def test_a_prompt_arrives_verbatim_and_stays_in_the_output_root(launch, prompt):
     tagged_by_the_prompt = [option for option in SMALL if not option.startswith("tag=")]
-    options = [*tagged_by_the_prompt, f"system.prompt_processor.prompt={prompt}", "trainer.max_steps=0", "trainer.limit_test_batches=0"]
+    options = [
+        *tagged_by_the_prompt,
+        f"system.prompt_processor.prompt={prompt}",
+        "trainer.max_steps=0",
+        "trainer.limit_test_batches=0",
+    ]
     assert experiment.main(["--config", str(DEMO), "--train", "--gpu", "cpu", *options]) == 0
     assert os.listdir() == ["outputs"]
     (parsed,) = Path("outputs").glob("demo/*/configs/parsed.yaml")
     assert load_config(parsed).system.prompt_processor.prompt == prompt
 
 
-# -- extensions and signals --------------------------------------------------------------------------------------------------
+# -- extensions and signals ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -300,9 +415,13 @@ def test_an_extension_that_fails_is_named(launch, source, message):
     assert "custom/part.py" in err
 
 
-def test_a_signal_while_the_test_views_are_rendered_leaves_a_checkpoint_and_says_how_to_go_on(launch, monkeypatch, capsys):
+def test_a_signal_while_the_test_views_are_rendered_leaves_a_checkpoint_and_says_how_to_go_on(
+    launch, monkeypatch, capsys
+):
     with monkeypatch.context() as patch:
-        patch.setattr(GaussianDreamerSystem, "test_step", lambda *args: os.kill(os.getpid(), signal.SIGINT))
+        patch.setattr(
+            GaussianDreamerSystem, "test_step", lambda *args: os.kill(os.getpid(), signal.SIGINT)
+        )
         code = experiment.main(["--config", str(DEMO), "--train", "--gpu", "cpu", *SMALL])
     out = capsys.readouterr().out
     last = TRIAL / "ckpts" / "last.ckpt"
@@ -312,7 +431,7 @@ def test_a_signal_while_the_test_views_are_rendered_leaves_a_checkpoint_and_says
     assert (TRIAL / "save" / "it2-export" / "gaussians.ply").is_file()
 
 
-# -- runs that meet --------------------------------------------------------------------------------------------------------------
+# -- runs that meet --------------------------------------------------------------------------------
 
 
 def test_a_second_run_in_a_folder_is_refused_while_the_first_one_trains(launch):
@@ -324,23 +443,33 @@ def test_a_second_run_in_a_folder_is_refused_while_the_first_one_trains(launch):
 
 
 def test_a_run_that_is_resumed_at_its_end_is_measured(launch):
-    """Also where the result's numbers aren't: in another folder, or because the first run was killed before it had them."""
+    """Also where the result's numbers aren't: in another folder, or because the first run was
+    killed before it had them.
+    """
     assert launch()[0] == 0
     code, err = launch(f"resume={TRIAL}/ckpts/last.ckpt", "tag=other")
     assert code == 0 and "nothing is left to train" in err
-    first, other = (json.loads((folder / "save/metrics.json").read_text())["result"] for folder in (TRIAL, TRIAL.with_name("other")))
+    first, other = (
+        json.loads((folder / "save/metrics.json").read_text())["result"]
+        for folder in (TRIAL, TRIAL.with_name("other"))
+    )
     assert (other["step"], other["psnr"]) == (first["step"], first["psnr"])
 
 
 @pytest.mark.parametrize("stage", ["validate", "test", "export"])
 def test_nothing_to_resume_is_nothing_to_show(stage, launch):
     """Only training can start anew; an untrained cloud would pass for the result."""
-    assert_refused(*launch("resume=auto", stage=f"--{stage}"), f"resume=auto: there is no checkpoint to --{stage}")
+    assert_refused(
+        *launch("resume=auto", stage=f"--{stage}"),
+        f"resume=auto: there is no checkpoint to --{stage}",
+    )
 
 
 def test_a_closed_pipe_is_no_traceback(monkeypatch, capsys):
     closed = []
-    monkeypatch.setattr(experiment, "run", lambda *args: (_ for _ in ()).throw(BrokenPipeError(32, "Broken pipe")))
+    monkeypatch.setattr(
+        experiment, "run", lambda *args: (_ for _ in ()).throw(BrokenPipeError(32, "Broken pipe"))
+    )
     monkeypatch.setattr(os, "dup2", lambda _, to: closed.append(to))
     assert experiment.main(["--config", str(DEMO), "--train"]) == 128 + signal.SIGPIPE
     assert closed == [1] and "nobody reads this run's output any more" in capsys.readouterr().err

@@ -8,17 +8,30 @@ import resource
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, load_file, newest_readable, previous_of, save_file
+from threestudio_gaussiandreamer.core.checkpoint_file import (
+    load_checkpoint,
+    load_file,
+    newest_readable,
+    previous_of,
+    save_file,
+)
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch.checkpoints import AtomicCheckpointIO
 
 
 def content(step: int = 7, size: int = 2000) -> dict:
-    return {"state_dict": {"means": torch.arange(float(size)) + step}, "epoch": 0, "global_step": step, "note": "text"}
+    return {
+        "state_dict": {"means": torch.arange(float(size)) + step},
+        "epoch": 0,
+        "global_step": step,
+        "note": "text",
+    }
 
 
 def same(a: dict, b: dict) -> bool:
-    return a["global_step"] == b["global_step"] and torch.equal(a["state_dict"]["means"], b["state_dict"]["means"])
+    return a["global_step"] == b["global_step"] and torch.equal(
+        a["state_dict"]["means"], b["state_dict"]["means"]
+    )
 
 
 def test_plain_torch_reads_it_and_so_do_we(tmp_path):
@@ -38,11 +51,16 @@ def test_the_file_that_is_replaced_is_kept(tmp_path):
     for step in (1, 2, 3):
         save_file(path, content(step))
     assert load_file(path)["global_step"] == 3
-    assert previous_of(path).name == "last-prev.ckpt" and load_file(previous_of(path))["global_step"] == 2
+    assert (
+        previous_of(path).name == "last-prev.ckpt"
+        and load_file(previous_of(path))["global_step"] == 2
+    )
 
 
 def test_a_kill_between_keeping_and_replacing_leaves_nothing_behind(tmp_path):
-    """Then the kept file and the last one are one file with two names, and renaming one to the other does nothing at all."""
+    """Then the kept file and the last one are one file with two names, and renaming one to the
+    other does nothing at all.
+    """
     path = tmp_path / "last.ckpt"
     save_file(path, content(1))
     os.link(path, previous_of(path))
@@ -56,7 +74,12 @@ def test_truncation_anywhere_is_noticed(tmp_path):
     save_file(path, content())
     whole = path.read_bytes()
     rng = random.Random(0)
-    for cut in [0, 1, *range(len(whole) - 100, len(whole)), *(rng.randrange(len(whole)) for _ in range(50))]:
+    for cut in [
+        0,
+        1,
+        *range(len(whole) - 100, len(whole)),
+        *(rng.randrange(len(whole)) for _ in range(50)),
+    ]:
         path.write_bytes(whole[:cut])
         with pytest.raises(UserError, match="a.ckpt"):
             load_file(path)
@@ -95,7 +118,9 @@ def test_a_damaged_file_names_its_neighbours(tmp_path):
 
 
 def test_the_newest_of_a_folder_is_the_one_with_most_steps(tmp_path):
-    """Not by its name or time: a copy of a folder has neither in order, and a kill may fall between two files of one save."""
+    """Not by its name or time: a copy of a folder has neither in order, and a kill may fall between
+    two files of one save.
+    """
     for name, step in (("last", 4), ("epoch=0-step=6", 6), ("epoch=0-step=2", 2)):
         save_file(tmp_path / f"{name}.ckpt", content(step))
     (tmp_path / "foreign.ckpt").write_bytes(b"no checkpoint at all")
@@ -113,7 +138,10 @@ def test_code_in_a_pickle_is_not_executed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     torch.save({"state_dict": {}, "epoch": 0, "global_step": 0, "x": Bomb()}, "bomb.ckpt")
     (tmp_path / "bare.ckpt").write_bytes(pickle.dumps(Bomb()))
-    for name, message in (("bomb.ckpt", "could run code"), ("bare.ckpt", "doesn't end as torch.save")):
+    for name, message in (
+        ("bomb.ckpt", "could run code"),
+        ("bare.ckpt", "doesn't end as torch.save"),
+    ):
         with pytest.raises(UserError, match=message):
             AtomicCheckpointIO().load_checkpoint(name, weights_only=False)
     assert not (tmp_path / "exploded").exists()
@@ -128,7 +156,10 @@ def test_a_foreign_file_is_not_a_checkpoint(tmp_path, foreign):
 
 def test_a_missing_file_lists_what_is_there(tmp_path):
     save_file(tmp_path / "last.ckpt", content())
-    with pytest.raises(UserError, match="there is no checkpoint .*lst.ckpt; in the same folder there are .*last.ckpt"):
+    with pytest.raises(
+        UserError,
+        match="there is no checkpoint .*lst.ckpt; in the same folder there are .*last.ckpt",
+    ):
         load_file(tmp_path / "lst.ckpt")
 
 
@@ -141,7 +172,10 @@ def test_a_full_disk_leaves_the_earlier_file_and_no_temporary_one(tmp_path):
             save_file(tmp_path / "last.ckpt", content(2, size=200_000))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert os.listdir(tmp_path) == ["last.ckpt"] and load_file(tmp_path / "last.ckpt")["global_step"] == 1
+    assert (
+        os.listdir(tmp_path) == ["last.ckpt"]
+        and load_file(tmp_path / "last.ckpt")["global_step"] == 1
+    )
 
 
 def test_a_folder_that_is_a_file_is_named(tmp_path):
@@ -155,7 +189,9 @@ def test_lightnings_door(tmp_path):
     path = tmp_path / "ckpts" / "last.ckpt"
     assert door.saved_step(path) == -1
     door.save_checkpoint(content(9), path)
-    assert door.saved_step(path) == 9 and same(door.load_checkpoint(path, map_location=lambda storage, place: storage), content(9))
+    assert door.saved_step(path) == 9 and same(
+        door.load_checkpoint(path, map_location=lambda storage, place: storage), content(9)
+    )
     door.remove_checkpoint(path)
     door.remove_checkpoint(path)
     assert not path.exists()

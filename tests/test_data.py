@@ -46,7 +46,11 @@ def test_rays_are_there_when_asked_for():
     assert batch["rays_o"].shape == batch["rays_d"].shape == (4, 32, 48, 3)
     assert torch.allclose(batch["rays_d"].norm(dim=-1), torch.ones(4, 32, 48), atol=1e-6)
     (plain,) = batches(module(rays=True, rays_d_normalize=False), 1)
-    assert torch.allclose((plain["rays_d"] @ -plain["c2w"][:, None, :3, 2:3])[..., 0], torch.ones(4, 32, 48), atol=1e-5)
+    assert torch.allclose(
+        (plain["rays_d"] @ -plain["c2w"][:, None, :3, 2:3])[..., 0],
+        torch.ones(4, 32, 48),
+        atol=1e-5,
+    )
 
 
 def test_validation_and_test_batches_hold_one_view_and_its_index():
@@ -54,11 +58,18 @@ def test_validation_and_test_batches_hold_one_view_and_its_index():
     val, test = list(data.val_dataloader()), list(data.test_dataloader())
     assert [b["azimuth"].item() for b in val] == [0, 90, 180, 270]
     assert [b["azimuth"].item() for b in test] == [0, 90, 180, 270, 360]
-    assert val[2]["index"].tolist() == [2] and val[2]["c2w"].shape == (1, 4, 4) and val[2]["height"] == 20
+    assert (
+        val[2]["index"].tolist() == [2]
+        and val[2]["c2w"].shape == (1, 4, 4)
+        and val[2]["height"] == 20
+    )
 
 
 def test_a_stream_that_starts_at_step_3_continues_the_one_that_never_stopped():
-    whole, rest = batches(module(camera_perturb=0.1, up_perturb=0.1), 5), batches(module(camera_perturb=0.1, up_perturb=0.1), 2, start=3)
+    whole, rest = (
+        batches(module(camera_perturb=0.1, up_perturb=0.1), 5),
+        batches(module(camera_perturb=0.1, up_perturb=0.1), 2, start=3),
+    )
     for a, b in zip(whole[3:], rest, strict=True):
         assert torch.equal(a["c2w"], b["c2w"]) and torch.equal(a["fovy"], b["fovy"])
 
@@ -83,16 +94,28 @@ def test_a_pool_repeats_its_cameras_and_still_covers_the_circle():
 def test_the_views_of_a_pool_are_known_beforehand_unless_cameras_move():
     data = module(train_views=8)
     views = data.pool_views()
-    assert (len(views["fovy"]), views["height"], views["width"], views["batch_size"]) == (8, 32, 48, 4)
+    assert (len(views["fovy"]), views["height"], views["width"], views["batch_size"]) == (
+        8,
+        32,
+        48,
+        4,
+    )
     known = {tuple(c2w) for c2w in views["c2w"].flatten(1).tolist()}
     assert {tuple(c2w) for b in batches(data, 20) for c2w in b["c2w"].flatten(1).tolist()} == known
-    assert module().pool_views() is None and module(train_views=8, up_perturb=0.1).pool_views() is None
+    assert (
+        module().pool_views() is None and module(train_views=8, up_perturb=0.1).pool_views() is None
+    )
     assert module(train_views=8, height=[16, 32], resolution_milestones=[3]).pool_views() is None
 
 
 def test_progressive_views_widen_from_the_evaluation_view():
-    first, last = batches(module(progressive_until=100), 1)[0], batches(module(progressive_until=100), 1, start=100)[0]
-    assert first["azimuth"].abs().max() == 0 and torch.allclose(first["elevation"], torch.tensor(15.0), atol=1e-4)
+    first, last = (
+        batches(module(progressive_until=100), 1)[0],
+        batches(module(progressive_until=100), 1, start=100)[0],
+    )
+    assert first["azimuth"].abs().max() == 0 and torch.allclose(
+        first["elevation"], torch.tensor(15.0), atol=1e-4
+    )
     assert last["azimuth"].abs().max() > 90
 
 

@@ -22,52 +22,79 @@ def cloud(n, seed=0, log_scale=-4.0):
 
 
 def statistics(n, gradient=0.0, contribution=None):
-    return Statistics(torch.full((n,), float(gradient)), torch.linspace(0, 1, n) if contribution is None else contribution)
+    return Statistics(
+        torch.full((n,), float(gradient)),
+        torch.linspace(0, 1, n) if contribution is None else contribution,
+    )
 
 
 def test_small_hot_gaussians_are_cloned_and_large_ones_split():
     params = cloud(4)
     params["log_scales"].data[2:] = -1.0  # larger than split_scale
     stats = Statistics(torch.tensor([1.0, 0.0, 1.0, 0.0]), torch.ones(4))
-    change = densify.densify_and_prune(params, stats, Rules(split_scale=0.04, max_scale=10, min_gaussians=1), generator(0, "s"))
+    change = densify.densify_and_prune(
+        params, stats, Rules(split_scale=0.04, max_scale=10, min_gaussians=1), generator(0, "s")
+    )
     assert sorted(change.parents.tolist()) == [0, 0, 1, 2, 2, 3]
     assert change.fresh.sum() == 3  # one clone, two children; the split one itself is gone
     children = (change.parents == 2).nonzero()[:, 0]
     expected = params["log_scales"][2] - torch.log(torch.tensor(densify.SPLIT_SHRINK))
     assert torch.allclose(change.values["log_scales"][children], expected.expand(2, 3))
-    assert not torch.allclose(change.values["means"][children[0]], change.values["means"][children[1]])
+    assert not torch.allclose(
+        change.values["means"][children[0]], change.values["means"][children[1]]
+    )
 
 
 def test_split_samples_follow_the_gaussian():
     n = 4000
-    params = {name: nn.Parameter(value[:1].repeat(n, *[1] * (value.ndim - 1)).detach()) for name, value in cloud(1).items()}
+    params = {
+        name: nn.Parameter(value[:1].repeat(n, *[1] * (value.ndim - 1)).detach())
+        for name, value in cloud(1).items()
+    }
     params["log_scales"].data[:] = torch.log(torch.tensor([0.5, 0.1, 0.02]))
-    change = densify.grow(params, clone=torch.zeros(n, dtype=torch.bool), split=torch.ones(n, dtype=torch.bool), rng=generator(0, "s"))
+    change = densify.grow(
+        params,
+        clone=torch.zeros(n, dtype=torch.bool),
+        split=torch.ones(n, dtype=torch.bool),
+        rng=generator(0, "s"),
+    )
     offsets = change.values["means"] - params["means"][0]
     axes = torch.stack([densify.rotate(params["quats"][:1], e[None])[0] for e in torch.eye(3)])
     deviation = (offsets @ axes.T).std(0)
-    assert torch.allclose(deviation, torch.tensor([0.5, 0.1, 0.02]), rtol=0.05)  # 8000 samples: 6 standard errors
+    assert torch.allclose(
+        deviation, torch.tensor([0.5, 0.1, 0.02]), rtol=0.05
+    )  # 8000 samples: 6 standard errors
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_very_few_gaussians_keep_their_shapes(n):
-    change = densify.densify_and_prune(cloud(n), statistics(n, gradient=1.0), Rules(min_gaussians=1), generator(0, "s"))
-    assert change.values["means"].shape == (2 * n, 3) and change.values["logit_opacities"].shape == (2 * n,)
+    change = densify.densify_and_prune(
+        cloud(n), statistics(n, gradient=1.0), Rules(min_gaussians=1), generator(0, "s")
+    )
+    assert change.values["means"].shape == (2 * n, 3) and change.values[
+        "logit_opacities"
+    ].shape == (2 * n,)
 
 
 @pytest.mark.parametrize("cap", [1, 7, 10, 13, 19])
 def test_the_cap_is_exact_and_drops_what_contributes_least(cap):
     params, stats = cloud(10), statistics(10, gradient=1.0)
-    change = densify.densify_and_prune(params, stats, Rules(max_gaussians=cap, min_gaussians=1), generator(0, "s"))
+    change = densify.densify_and_prune(
+        params, stats, Rules(max_gaussians=cap, min_gaussians=1), generator(0, "s")
+    )
     assert len(change.parents) == cap
     if cap < 10:
-        assert change.parents.tolist() == list(range(10 - cap, 10))  # contribution grows with the index
+        assert change.parents.tolist() == list(
+            range(10 - cap, 10)
+        )  # contribution grows with the index
 
 
 def test_the_floor_holds_when_everything_is_faint_and_keeps_the_best():
     params = cloud(50)
     params["logit_opacities"].data[:] = -10.0
-    change = densify.densify_and_prune(params, statistics(50), Rules(min_gaussians=20), generator(0, "s"))
+    change = densify.densify_and_prune(
+        params, statistics(50), Rules(min_gaussians=20), generator(0, "s")
+    )
     assert change.parents.tolist() == list(range(30, 50))
 
 
@@ -75,7 +102,9 @@ def test_faint_and_huge_gaussians_go():
     params = cloud(6)
     params["logit_opacities"].data[0] = -5.0
     params["log_scales"].data[1, 2] = 0.0
-    change = densify.densify_and_prune(params, statistics(6), Rules(min_gaussians=1), generator(0, "s"))
+    change = densify.densify_and_prune(
+        params, statistics(6), Rules(min_gaussians=1), generator(0, "s")
+    )
     assert change.parents.tolist() == [2, 3, 4, 5]
 
 
@@ -86,7 +115,9 @@ def test_never_seen_gaussians_are_not_selected():
 
 
 def test_the_threshold_means_the_same_at_any_resolution_batch_and_loss_scale():
-    """The loss of a view doesn't change with these; its gradient in pixels, averaged and scaled, does."""
+    """The loss of a view doesn't change with these; its gradient in pixels, averaged and scaled,
+    does.
+    """
     device_units = torch.rand(1, 20, 2)
     for width, height, batch, scale in [(128, 128, 1, 1.0), (512, 256, 4, 65536.0)]:
         pixels = device_units / torch.tensor([width / 2, height / 2]) / batch * scale
@@ -97,7 +128,9 @@ def test_the_threshold_means_the_same_at_any_resolution_batch_and_loss_scale():
 
 @pytest.mark.parametrize("seed", range(20))
 def test_moments_follow_their_gaussian_through_random_changes(seed):
-    """Every parameter carries its Gaussian's id in the moments; after any change they are where the id is, fresh rows are zero."""
+    """Every parameter carries its Gaussian's id in the moments; after any change they are where the
+    id is, fresh rows are zero.
+    """
     g = torch.Generator().manual_seed(seed)
     params = cloud(30, seed)
     optimizer = torch.optim.Adam([{"params": [p], "name": name} for name, p in params.items()])
@@ -125,7 +158,9 @@ def test_moments_follow_their_gaussian_through_random_changes(seed):
         for p in params.values():
             state = optimizer.state[p]
             expected = ids.reshape(-1, *[1] * (p.ndim - 1)).expand_as(p)
-            assert torch.equal(state["exp_avg"], expected) and torch.equal(state["exp_avg_sq"], 2 * expected)
+            assert torch.equal(state["exp_avg"], expected) and torch.equal(
+                state["exp_avg_sq"], 2 * expected
+            )
             assert float(state["step"]) == 1.0
             p.grad = None
 
@@ -139,7 +174,9 @@ def test_what_the_faint_leave_is_given_to_others_in_the_same_round():
     """Ten at a cap of ten, three of them faint: the three hottest of the others grow."""
     params, stats = cloud(10), Statistics(torch.linspace(1, 2, 10), torch.ones(10))
     params["logit_opacities"].data[:3] = -5.0
-    change = densify.densify_and_prune(params, stats, Rules(max_gaussians=10, min_gaussians=1), generator(0, "s"))
+    change = densify.densify_and_prune(
+        params, stats, Rules(max_gaussians=10, min_gaussians=1), generator(0, "s")
+    )
     assert sorted(change.parents.tolist()) == [3, 4, 5, 6, 7, 7, 8, 8, 9, 9]
 
 

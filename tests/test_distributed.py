@@ -1,4 +1,6 @@
-"""Two processes that train one cloud together stay equal through densification, and see different cameras."""
+"""Two processes that train one cloud together stay equal through densification, and see different
+cameras.
+"""
 
 import subprocess
 import sys
@@ -58,8 +60,16 @@ def test_two_processes_hold_the_same_cloud_and_see_different_cameras(tmp_path):
     tests = Path(__file__).parent
     config = test_system.mocked_config(tmp_path, mesh)
     script = tmp_path / "train.py"
-    script.write_text(textwrap.dedent(SCRIPT.format(tests=str(tests), root=str(tests.parent), folder=tmp_path, mesh=mesh, config=config)))
-    finished = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=300)
+    script.write_text(
+        textwrap.dedent(
+            SCRIPT.format(
+                tests=str(tests), root=str(tests.parent), folder=tmp_path, mesh=mesh, config=config
+            )
+        )
+    )
+    finished = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=300
+    )
     assert finished.returncode == 0, finished.stderr[-3000:]
     first, second = (torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1))
     assert not torch.equal(first.pop("cameras"), second.pop("cameras"))

@@ -1,4 +1,5 @@
-"""The shipped configurations, trained from the first stage to the last with tiny random models in the real ones' files.
+"""The shipped configurations, trained from the first stage to the last with tiny random models in
+the real ones' files.
 
 Nothing of the path is replaced: only the models and the sizes are smaller than what a user runs.
 """
@@ -35,16 +36,43 @@ def models(tmp_path_factory):
     base, upsampler = tiny_3d_models.point_e(folder / "point-e")
     clip = tiny_3d_models.clip(folder / "clip")
     return {
-        "epsilon": {"system.guidance.pretrained_model_name_or_path": tiny_models.stable_diffusion(folder / "epsilon")},
-        "v_prediction": {
-            "system.guidance.pretrained_model_name_or_path": tiny_models.stable_diffusion(folder / "v", prediction="v_prediction")
+        "epsilon": {
+            "system.guidance.pretrained_model_name_or_path": tiny_models.stable_diffusion(
+                folder / "epsilon"
+            )
         },
-        "deep_floyd": {"system.guidance.pretrained_model_name_or_path": tiny_models.deep_floyd(folder / "if")},
-        "shap_e": prior(model=tiny_3d_models.shap_e(folder / "shap-e"), num_inference_steps=2, grid_size=24),
-        "point_e": prior(checkpoint=base, upsampler=upsampler, clip=clip, num_steps=2, num_points=64, num_upsampled=96),
-        "motion": prior(motion=motion(folder), body_model=tiny_3d_models.body_model(folder / "body.npz"), clip=clip)
+        "v_prediction": {
+            "system.guidance.pretrained_model_name_or_path": tiny_models.stable_diffusion(
+                folder / "v", prediction="v_prediction"
+            )
+        },
+        "deep_floyd": {
+            "system.guidance.pretrained_model_name_or_path": tiny_models.deep_floyd(folder / "if")
+        },
+        "shap_e": prior(
+            model=tiny_3d_models.shap_e(folder / "shap-e"), num_inference_steps=2, grid_size=24
+        ),
+        "point_e": prior(
+            checkpoint=base,
+            upsampler=upsampler,
+            clip=clip,
+            num_steps=2,
+            num_points=64,
+            num_upsampled=96,
+        ),
+        "motion": prior(
+            motion=motion(folder),
+            body_model=tiny_3d_models.body_model(folder / "body.npz"),
+            clip=clip,
+        )
         | prior(num_frames=2, num_points=400),
-        "candidates": prior(candidates=f"[{bodies(folder)}]", motion="''", body_model="''", clip=clip, num_points=400),
+        "candidates": prior(
+            candidates=f"[{bodies(folder)}]",
+            motion="''",
+            body_model="''",
+            clip=clip,
+            num_points=400,
+        ),
     }
 
 
@@ -56,7 +84,12 @@ def motion(folder):
     """A motion of MDM's layout (samples, joints, 3, frames): the body raises an arm, in metres."""
     frames = np.repeat(tiny_3d_models.JOINTS[None, :22, :, None], 4, axis=3)
     frames[0, 20, 1] += np.linspace(0, 0.1, 4)
-    np.savez(folder / "results.npz", motion=frames, text=np.array(["Someone waves"]), lengths=np.array([4]))
+    np.savez(
+        folder / "results.npz",
+        motion=frames,
+        text=np.array(["Someone waves"]),
+        lengths=np.array([4]),
+    )
     return folder / "results.npz"
 
 
@@ -66,7 +99,9 @@ def bodies(folder):
 
     arrays = tiny_3d_models.body_arrays()
     for name, width in (("a.obj", 1.0), ("b.obj", 0.5)):
-        trimesh.Trimesh(arrays["v_template"] * [width, 1, 1], arrays["f"].astype(np.int64), process=False).export(folder / name)
+        trimesh.Trimesh(
+            arrays["v_template"] * [width, 1, 1], arrays["f"].astype(np.int64), process=False
+        ).export(folder / name)
     return ",".join(str(folder / name) for name in ("a.obj", "b.obj"))
 
 
@@ -100,18 +135,24 @@ def trained(folder):
 
 
 def assert_trained(folder, rate):
-    """All pictures, files and losses are there; every point of the prior moved, by what Adam takes at this rate."""
+    """All pictures, files and losses are there; every point of the prior moved, by what Adam takes
+    at this rate.
+    """
     cloud, points = trained(folder)
     assert all(np.isfinite(values).all() for values in cloud)
     assert len(cloud.means) > len(points)  # Algorithm 1 added some, after the prior's own
     moved = np.abs(cloud.means[: len(points)] - points)
-    # a step of Adam is at most lr (1 - b1) / sqrt(1 - b2) = lr for betas 0.9 and 0.99, 3.2 lr for 0.999; float32 rounds at 1e-7
+    # a step of Adam is at most lr (1 - b1) / sqrt(1 - b2) = lr for betas 0.9 and 0.99, 3.2 lr for
+    # 0.999; float32 rounds at 1e-7
     assert 0.5 * rate < moved.max() < 3.2 * STEPS * rate + 1e-6
     save = folder / "save"
     for name in (f"it{STEPS}-0.png", f"it{STEPS}-test.mp4", "prior/turntable.gif"):
         assert (save / name).is_file(), name
     losses = [
-        float(row["train/loss_sds"]) for path in folder.glob("csv_logs/**/metrics.csv") for row in rows(path) if row["train/loss_sds"]
+        float(row["train/loss_sds"])
+        for path in folder.glob("csv_logs/**/metrics.csv")
+        for row in rows(path)
+        if row["train/loss_sds"]
     ]
     assert len(losses) == STEPS and all(np.isfinite(losses)) and min(losses) > 0
 
@@ -128,7 +169,10 @@ RUNS = {
     "if": (["gaussiandreamer.yaml", "gaussiandreamer-if.yaml"], ["shap_e", "deep_floyd"]),
     "pointe": (["gaussiandreamer.yaml", "gaussiandreamer-pointe.yaml"], ["point_e", "epsilon"]),
     "avatar": (["gaussiandreamer.yaml", "gaussiandreamer-avatar.yaml"], ["motion", "epsilon"]),
-    "avatar of candidates": (["gaussiandreamer.yaml", "gaussiandreamer-avatar.yaml"], ["candidates", "epsilon"]),
+    "avatar of candidates": (
+        ["gaussiandreamer.yaml", "gaussiandreamer-avatar.yaml"],
+        ["candidates", "epsilon"],
+    ),
     "ground": (["gaussiandreamer.yaml", "gaussiandreamer-ground.yaml"], ["shap_e", "epsilon"]),
     "lowmem": (["gaussiandreamer.yaml", "gaussiandreamer-lowmem.yaml"], ["shap_e", "epsilon"]),
 }
@@ -141,12 +185,15 @@ def test_a_configuration_trains(name, models, seen, tmp_path, monkeypatch):
     if "avatar" in name:
         pytest.importorskip("smplx")
     folder = train(configs, {key: value for part in used for key, value in models[part].items()})
-    # four views with and without the prompt, in one forward pass a step; what validation draws has one view
+    # four views with and without the prompt, in one forward pass a step; what validation draws has
+    # one view
     assert [call for call in seen if call[0] == 4] == [(4, 8)] * STEPS
     assert_trained(folder, 2e-4 if name == "official" else 5e-5)
     if name == "ground":
         points = trained(folder)[1]
-        assert (points[-20000:, 2] == points[-1, 2]).all() and points[:-20000, 2].min() == pytest.approx(points[-1, 2])
+        assert (points[-20000:, 2] == points[-1, 2]).all() and points[
+            :-20000, 2
+        ].min() == pytest.approx(points[-1, 2])
 
 
 def test_every_configuration_for_models_is_trained():
@@ -155,13 +202,21 @@ def test_every_configuration_for_models_is_trained():
 
 
 def test_perp_neg_doubles_the_rows_and_the_run_repeats(models, seen, tmp_path, monkeypatch):
-    """Twice the same command gives the same Gaussians bit for bit, with Perp-Neg's two more rows for each view."""
+    """Twice the same command gives the same Gaussians bit for bit, with Perp-Neg's two more rows
+    for each view.
+    """
     options = models["shap_e"] | models["epsilon"]
     clouds = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         monkeypatch.chdir(tmp_path / name)
-        clouds.append(trained(train(["gaussiandreamer.yaml"], options, "system.prompt_processor.use_perp_neg=true"))[0])
+        clouds.append(
+            trained(
+                train(
+                    ["gaussiandreamer.yaml"], options, "system.prompt_processor.use_perp_neg=true"
+                )
+            )[0]
+        )
     assert [call for call in seen if call[0] == 4] == [(4, 16)] * (2 * STEPS)
     for first, again in zip(*clouds, strict=True):
         torch.testing.assert_close(torch.from_numpy(first), torch.from_numpy(again), rtol=0, atol=0)

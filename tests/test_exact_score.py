@@ -26,16 +26,26 @@ def randn(*shape, seed=0, dtype=torch.float64):
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.integers(1, 6), st.integers(1, 8), st.integers(0, 999), st.sampled_from([0.0, 0.1, 0.7]), st.integers(0, 10**6))
+@given(
+    st.integers(1, 6),
+    st.integers(1, 8),
+    st.integers(0, 999),
+    st.sampled_from([0.0, 0.1, 0.7]),
+    st.integers(0, 10**6),
+)
 def test_eps_is_the_score_of_the_density(modes, dims, t, std, seed):
     """eps_hat = -sigma grad log p_t, against autograd, to 1e-10 relative to the gradient's size."""
     bank, z = randn(modes, dims, seed=seed), randn(3, dims, seed=seed + 1).requires_grad_()
     abar = ABAR[t].expand(3)
     log_prior = randn(modes, seed=seed + 2)
-    (score,) = torch.autograd.grad(log_density(z, abar, bank, std=std, log_prior=log_prior).sum(), z)
+    (score,) = torch.autograd.grad(
+        log_density(z, abar, bank, std=std, log_prior=log_prior).sum(), z
+    )
     out = denoise(z.detach(), abar, bank, std=std, log_prior=log_prior)
     expected = -(1 - abar).sqrt()[:, None] * score
-    torch.testing.assert_close(out.eps, expected, rtol=1e-10, atol=1e-10 * (1 + expected.abs().max().item()))
+    torch.testing.assert_close(
+        out.eps, expected, rtol=1e-10, atol=1e-10 * (1 + expected.abs().max().item())
+    )
 
 
 @pytest.mark.parametrize("name", sorted(sds.WEIGHTS))
@@ -58,10 +68,18 @@ def test_the_denoised_is_the_posterior_mean_by_quadrature(std):
     a, variance = math.sqrt(abar), 1 - abar
 
     def joint(x0, z, k):
-        return prior[k] * math.exp(-((x0 - centers[k]) ** 2) / (2 * std**2) - (z - a * x0) ** 2 / (2 * variance)) / std
+        return (
+            prior[k]
+            * math.exp(
+                -((x0 - centers[k]) ** 2) / (2 * std**2) - (z - a * x0) ** 2 / (2 * variance)
+            )
+            / std
+        )
 
     def integral(power, z, k):
-        return quad(lambda x0: x0**power * joint(x0, z, k), -15, 15, epsabs=1e-14, epsrel=1e-12, limit=400)[0]
+        return quad(
+            lambda x0: x0**power * joint(x0, z, k), -15, 15, epsabs=1e-14, epsrel=1e-12, limit=400
+        )[0]
 
     for z in (-2.0, -0.1, 0.4, 1.7):
         integrals = [[integral(power, z, k) for k in (0, 1)] for power in (0, 1)]
@@ -73,8 +91,12 @@ def test_the_denoised_is_the_posterior_mean_by_quadrature(std):
             std=std,
             log_prior=torch.tensor(prior).log(),
         )
-        np.testing.assert_allclose(out.denoised.item(), moment.sum() / mass.sum(), rtol=0, atol=1e-8)
-        np.testing.assert_allclose(out.responsibilities[0].numpy(), mass / mass.sum(), rtol=0, atol=1e-8)
+        np.testing.assert_allclose(
+            out.denoised.item(), moment.sum() / mass.sum(), rtol=0, atol=1e-8
+        )
+        np.testing.assert_allclose(
+            out.responsibilities[0].numpy(), mass / mass.sum(), rtol=0, atol=1e-8
+        )
 
 
 def test_ddim_from_noise_lands_on_an_image_of_the_bank():
@@ -96,7 +118,9 @@ def test_denoised_and_eps_agree():
 def test_responsibilities_sum_to_one_even_when_all_modes_are_far():
     z, bank, abar = 1e4 * randn(3, 6), randn(7, 6, seed=1), ABAR[torch.tensor([0, 400, 999])]
     out = denoise(z, abar, bank)
-    torch.testing.assert_close(out.responsibilities.sum(1), torch.ones(3, dtype=torch.float64), rtol=0, atol=1e-14)
+    torch.testing.assert_close(
+        out.responsibilities.sum(1), torch.ones(3, dtype=torch.float64), rtol=0, atol=1e-14
+    )
     assert torch.isfinite(out.eps).all()
 
 
@@ -104,12 +128,21 @@ def test_perplexity_counts_the_modes_that_share_z():
     bank = torch.eye(4, dtype=torch.float64)
     middle = denoise(torch.zeros(1, 4, dtype=torch.float64), ABAR[500:501], bank)
     corner = denoise(1e3 * bank[:1], ABAR[0:1], bank)
-    assert math.isclose(middle.perplexity, 4, abs_tol=1e-12) and math.isclose(corner.perplexity, 1, abs_tol=1e-12)
+    assert math.isclose(middle.perplexity, 4, abs_tol=1e-12) and math.isclose(
+        corner.perplexity, 1, abs_tol=1e-12
+    )
 
 
 def test_classifier_free_guidance_acts_on_the_means():
-    """eps_u + s (eps_c - eps_u) is the eps of the mean m_u + s (m_c - m_u) (equal widths), and D likewise."""
-    bank, z, abar, scale = randn(6, 10), randn(3, 10, seed=1), ABAR[torch.tensor([100, 500, 800])], 7.5
+    """eps_u + s (eps_c - eps_u) is the eps of the mean m_u + s (m_c - m_u) (equal widths), and D
+    likewise.
+    """
+    bank, z, abar, scale = (
+        randn(6, 10),
+        randn(3, 10, seed=1),
+        ABAR[torch.tensor([100, 500, 800])],
+        7.5,
+    )
     only_two = torch.tensor([0.0, 0.0] + [-torch.inf] * 4)
     distances = squared_distances(z, bank, abar)
     cond = denoise(z, abar, bank, std=0.3, log_prior=only_two, distances=distances)
@@ -117,9 +150,18 @@ def test_classifier_free_guidance_acts_on_the_means():
     means = [out.responsibilities @ bank for out in (cond, uncond)]
     guided_mean = means[1] + scale * (means[0] - means[1])
     expected = denoise(z, abar, guided_mean[:, None], std=0.3)
-    torch.testing.assert_close(sds.classifier_free(cond.eps, uncond.eps, scale), expected.eps, rtol=0, atol=1e-11)
-    torch.testing.assert_close(sds.classifier_free(cond.denoised, uncond.denoised, scale), expected.denoised, rtol=0, atol=1e-11)
-    torch.testing.assert_close(cond.eps, denoise(z, abar, bank[:2], std=0.3).eps, rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        sds.classifier_free(cond.eps, uncond.eps, scale), expected.eps, rtol=0, atol=1e-11
+    )
+    torch.testing.assert_close(
+        sds.classifier_free(cond.denoised, uncond.denoised, scale),
+        expected.denoised,
+        rtol=0,
+        atol=1e-11,
+    )
+    torch.testing.assert_close(
+        cond.eps, denoise(z, abar, bank[:2], std=0.3).eps, rtol=0, atol=1e-12
+    )
 
 
 def test_a_batch_is_its_items_with_shared_and_with_own_banks():
@@ -129,7 +171,9 @@ def test_a_batch_is_its_items_with_shared_and_with_own_banks():
         together = denoise(z, abar, bank, std=0.2, log_prior=log_prior)
         for i in range(3):
             part = bank[i : i + 1] if bank.dim() == 3 else bank
-            alone = denoise(z[i : i + 1], abar[i : i + 1], part, std=0.2, log_prior=log_prior[i : i + 1])
+            alone = denoise(
+                z[i : i + 1], abar[i : i + 1], part, std=0.2, log_prior=log_prior[i : i + 1]
+            )
             for whole, single in zip(together, alone, strict=True):
                 # matrix products of different shapes may sum in another order
                 torch.testing.assert_close(whole[i : i + 1], single, rtol=0, atol=1e-12)
@@ -143,10 +187,14 @@ def test_distances_in_chunks_are_the_distances(monkeypatch):
 
 
 def test_logits_in_float32_at_512_are_stable():
-    """Differences keep the logits of float32 images within 0.01 nat of the exact ones; expanding the square does not."""
+    """Differences keep the logits of float32 images within 0.01 nat of the exact ones; expanding
+    the square does not.
+    """
     size = 3 * 512 * 512
     bank = torch.rand(2, size, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    bank[1] = bank[0] + 1e-3 * randn(size, seed=1, dtype=torch.float32)  # near twins: the logits nearly cancel
+    bank[1] = bank[0] + 1e-3 * randn(
+        size, seed=1, dtype=torch.float32
+    )  # near twins: the logits nearly cancel
     abar = ABAR[20:21]
     z = sds.add_noise(bank[:1], randn(1, size, seed=2, dtype=torch.float32), abar)
     variance = 2 * mode_variance(abar, 0.0)
@@ -164,9 +212,16 @@ def test_logits_in_float32_at_512_are_stable():
 
 
 def test_temperature_smooths():
-    distances, variance = torch.tensor([[0.0, 10.0]], dtype=torch.float64), torch.tensor([0.5], dtype=torch.float64)
-    sharp, smooth = (responsibilities(distances, variance, temperature=value)[0, 1] for value in (1.0, 10.0))
-    assert math.isclose(sharp, 1 / (1 + math.exp(10)), rel_tol=1e-9) and math.isclose(smooth, 1 / (1 + math.exp(1)), rel_tol=1e-9)
+    distances, variance = (
+        torch.tensor([[0.0, 10.0]], dtype=torch.float64),
+        torch.tensor([0.5], dtype=torch.float64),
+    )
+    sharp, smooth = (
+        responsibilities(distances, variance, temperature=value)[0, 1] for value in (1.0, 10.0)
+    )
+    assert math.isclose(sharp, 1 / (1 + math.exp(10)), rel_tol=1e-9) and math.isclose(
+        smooth, 1 / (1 + math.exp(1)), rel_tol=1e-9
+    )
 
 
 # The linear latent
@@ -174,20 +229,32 @@ def test_temperature_smooths():
 
 def test_the_latent_is_linear_and_its_adjoint_exact():
     latent = LinearLatent(4, color_matrix(4), 1.7)
-    x, direction, y = randn(2, 3, 16, 8).requires_grad_(), randn(2, 3, 16, 8, seed=1), randn(2, 4, 4, 2, seed=2)
+    x, direction, y = (
+        randn(2, 3, 16, 8).requires_grad_(),
+        randn(2, 3, 16, 8, seed=1),
+        randn(2, 4, 4, 2, seed=2),
+    )
     latents = latent.encode(x)
     (adjoint,) = torch.autograd.grad((latents * y).sum(), x)
     change = latent.encode(x.detach() + direction) - latents.detach()
-    torch.testing.assert_close((adjoint * direction).sum(), (change * y).sum(), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        (adjoint * direction).sum(), (change * y).sum(), rtol=1e-12, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("channels", [3, 4, 6])
 def test_decode_inverts_encode_on_what_the_latent_holds(channels):
     latent = LinearLatent(4, color_matrix(channels), 2.5)
-    rgb = torch.rand(2, 3, 4, 4, generator=torch.Generator().manual_seed(0)).repeat_interleave(4, 2).repeat_interleave(4, 3)
+    rgb = (
+        torch.rand(2, 3, 4, 4, generator=torch.Generator().manual_seed(0))
+        .repeat_interleave(4, 2)
+        .repeat_interleave(4, 3)
+    )
     latents = latent.encode(rgb)
     assert latents.shape == (2, channels, 4, 4)
-    torch.testing.assert_close(latent.decode(latents), rgb, rtol=0, atol=1e-5)  # float32 through a pseudo-inverse
+    torch.testing.assert_close(
+        latent.decode(latents), rgb, rtol=0, atol=1e-5
+    )  # float32 through a pseudo-inverse
 
 
 @pytest.mark.parametrize("channels", [4, 5, 8])

@@ -1,4 +1,6 @@
-"""The launcher from arguments to results, with a system of a few parameters: stages, folders, mistakes, signals, resuming."""
+"""The launcher from arguments to results, with a system of a few parameters: stages, folders,
+mistakes, signals, resuming.
+"""
 
 import os
 import re
@@ -49,7 +51,7 @@ def files(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-# -- the stages --------------------------------------------------------------------------------------------------------------
+# -- the stages ------------------------------------------------------------------------------------
 
 
 def test_training_leaves_the_tree_of_threestudio(launch):
@@ -84,7 +86,9 @@ def trained(launch):
 
 def evaluate(launch, trained, stage: str) -> set[str]:
     before = files(trained)
-    code, _, _ = launch(stage, f"resume={trained}/ckpts/last.ckpt", config=f"{trained}/configs/parsed.yaml")
+    code, _, _ = launch(
+        stage, f"resume={trained}/ckpts/last.ckpt", config=f"{trained}/configs/parsed.yaml"
+    )
     assert code == 0 and trial() == trained
     return files(trained) - before
 
@@ -97,14 +101,20 @@ def test_validation_test_and_export_of_a_checkpoint_write_under_its_step(launch,
     assert evaluate(launch, trained, "--export") == {"save/it6-export/means.npz"}
     # the cloud of the checkpoint, not the one that training starts from
     means = load_file(trained / "ckpts/last.ckpt")["state_dict"]["geometry.means"]
-    assert iio.imread(trained / "save/it6-0.png")[0, 0].tolist() == (means.sigmoid() * 255).round().int().tolist()
+    assert (
+        iio.imread(trained / "save/it6-0.png")[0, 0].tolist()
+        == (means.sigmoid() * 255).round().int().tolist()
+    )
 
 
 def test_export_with_video_renders_the_test_views(launch, trained):
     for path in (trained / "save").glob("it6-test*"):
         path.rename(trained / path.name)
     code, _, _ = launch(
-        "--export", f"resume={trained}/ckpts/last.ckpt", "system.exporter.save_video=true", config=f"{trained}/configs/parsed.yaml"
+        "--export",
+        f"resume={trained}/ckpts/last.ckpt",
+        "system.exporter.save_video=true",
+        config=f"{trained}/configs/parsed.yaml",
     )
     assert code == 0 and {"save/it6-export/means.npz", "save/it6-test.mp4"} <= files(trained)
 
@@ -117,7 +127,9 @@ def test_evaluating_without_a_checkpoint_says_so(launch):
 def test_parts_are_told_every_step(launch, monkeypatch):
     systems = []
     original = tiny_parts.TinySystem.configure
-    monkeypatch.setattr(tiny_parts.TinySystem, "configure", lambda self: (original(self), systems.append(self))[0])
+    monkeypatch.setattr(
+        tiny_parts.TinySystem, "configure", lambda self: (original(self), systems.append(self))[0]
+    )
     assert launch("--train", "trainer.limit_val_batches=0")[0] == 0
     # six training batches, then two test views at the last step
     assert systems[0].geometry.updates == [0, 1, 2, 3, 4, 5, 6, 6]
@@ -132,13 +144,16 @@ def test_the_seed_decides(launch):
     assert torch.equal(results[0], results[1]) and not torch.equal(results[0], results[2])
 
 
-# -- mistakes ----------------------------------------------------------------------------------------------------------------
+# -- mistakes --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--train", "system.geometry.sise=3"], "unknown key 'system.geometry.sise': did you mean 'system.geometry.size'?"),
+        (
+            ["--train", "system.geometry.sise=3"],
+            "unknown key 'system.geometry.sise': did you mean 'system.geometry.size'?",
+        ),
         (["--train", "system.fail_in=configure"], "failed in configure, as asked"),
         (["--train", "system.fail_in=on_fit_start"], "failed in on_fit_start, as asked"),
         (["--train", "system.fail_in=step 0"], "failed in step 0, as asked"),
@@ -200,14 +215,16 @@ def test_a_bug_keeps_its_traceback(launch, monkeypatch):
         launch("--train")
 
 
-# -- resuming ----------------------------------------------------------------------------------------------------------------
+# -- resuming --------------------------------------------------------------------------------------
 
 
 def assert_same_training(a: Path, b: Path) -> None:
     """Bit for bit the same parameters and optimiser at the same step."""
     one, other = load_file(a), load_file(b)
     assert one["global_step"] == other["global_step"] and one["epoch"] == other["epoch"]
-    assert all(torch.equal(one["state_dict"][key], other["state_dict"][key]) for key in one["state_dict"])
+    assert all(
+        torch.equal(one["state_dict"][key], other["state_dict"][key]) for key in one["state_dict"]
+    )
     state, other_state = one["optimizer_states"][0]["state"], other["optimizer_states"][0]["state"]
     assert all(torch.equal(state[i][key], other_state[i][key]) for i in state for key in state[i])
 
@@ -234,7 +251,11 @@ def test_stopped_and_resumed_equals_never_stopped(launch, name, code, step):
 def test_stopped_during_validation_and_resumed_equals_never_stopped(launch, monkeypatch):
     assert launch("--train", "name=whole")[0] == 0
     with monkeypatch.context() as patch:
-        patch.setattr(tiny_parts.TinySystem, "validation_step", lambda self, batch, batch_idx: os.kill(os.getpid(), signal.SIGTERM))
+        patch.setattr(
+            tiny_parts.TinySystem,
+            "validation_step",
+            lambda self, batch, batch_idx: os.kill(os.getpid(), signal.SIGTERM),
+        )
         # the second view brings the second signal, which would end it at once
         code, out, _ = launch("--train", "data.views=1")
     assert code == 143 and "stopped at step 3" in out
@@ -247,18 +268,27 @@ def test_stopped_during_validation_and_resumed_equals_never_stopped(launch, monk
 @pytest.mark.parametrize("where", ["configure", "on_fit_start"])
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
 def test_before_training_a_signal_ends_it_at_once(launch, monkeypatch, where, name, code):
-    monkeypatch.setattr(tiny_parts.TinySystem, where, lambda self: os.kill(os.getpid(), getattr(signal, name)))
+    monkeypatch.setattr(
+        tiny_parts.TinySystem, where, lambda self: os.kill(os.getpid(), getattr(signal, name))
+    )
     assert launch("--train")[0] == code and os.listdir() == ["tiny.yaml"]
 
 
 def test_a_resumed_run_keeps_its_first_configuration_and_adds_its_command(launch, trained):
-    code, _, _ = launch("--train", f"resume={trained}/ckpts/last.ckpt", "trainer.max_steps=8", config=f"{trained}/configs/parsed.yaml")
+    code, _, _ = launch(
+        "--train",
+        f"resume={trained}/ckpts/last.ckpt",
+        "trainer.max_steps=8",
+        config=f"{trained}/configs/parsed.yaml",
+    )
     assert code == 0 and trial() == trained
     assert (trained / "configs/raw.yaml").read_text() == tiny_parts.CONFIG
     assert load_config(trained / "configs/parsed.yaml").trainer.max_steps == 8
     assert len((trained / "cmd.txt").read_text().splitlines()) == 2
     # every_n_train_steps is still 6 there, but the last step is always kept
-    assert load_file(trained / "ckpts/last.ckpt")["global_step"] == 8 and not list(trained.glob("ckpts/last-v*"))
+    assert load_file(trained / "ckpts/last.ckpt")["global_step"] == 8 and not list(
+        trained.glob("ckpts/last-v*")
+    )
 
 
 def test_resume_auto_goes_on_where_the_last_run_stopped(launch):
@@ -278,11 +308,17 @@ def test_a_full_disk_is_named_and_the_earlier_checkpoint_stays(launch, monkeypat
     monkeypatch.setattr(os, "fsync", fsync)
     code, _, err = launch("--train", "checkpoint.every_n_train_steps=2")
     assert code == 2 and "No space left on device" in err and "Traceback" not in err
-    assert load_file(trial() / "ckpts/last.ckpt")["global_step"] == 2 and not list(trial().glob("ckpts/.*"))
+    assert load_file(trial() / "ckpts/last.ckpt")["global_step"] == 2 and not list(
+        trial().glob("ckpts/.*")
+    )
 
 
 def test_ctrl_c_during_the_test_ends_with_130(launch, monkeypatch):
-    monkeypatch.setattr(tiny_parts.TinySystem, "test_step", lambda self, batch, batch_idx: os.kill(os.getpid(), signal.SIGINT))
+    monkeypatch.setattr(
+        tiny_parts.TinySystem,
+        "test_step",
+        lambda self, batch, batch_idx: os.kill(os.getpid(), signal.SIGINT),
+    )
     code, _, err = launch("--train")
     assert code == 130 and "Traceback" not in err
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -315,18 +351,36 @@ def test_it_runs_outside_of_the_main_thread(launch):
     assert codes == [0]
 
 
-# -- as a command ------------------------------------------------------------------------------------------------------------
+# -- as a command ----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_launch_py_with_parts_dropped_into_custom(tmp_path):
-    """A real process: parts come from one file in custom/; the process gets a real Ctrl-C, and the printed line goes on."""
+    """A real process: parts come from one file in custom/; the process gets a real Ctrl-C, and the
+    printed line goes on.
+    """
     (tmp_path / "custom").mkdir()
     (tmp_path / "custom" / "tiny_parts.py").write_text(Path(tiny_parts.__file__).read_text())
-    (tmp_path / "tiny.yaml").write_text(tiny_parts.CONFIG.replace("max_steps: 6", "max_steps: 100000000"))
+    (tmp_path / "tiny.yaml").write_text(
+        tiny_parts.CONFIG.replace("max_steps: 6", "max_steps: 100000000")
+    )
     environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": ""}
-    command = [sys.executable, str(REPOSITORY / "launch.py"), "--config", "tiny.yaml", "--train", "trainer.limit_val_batches=0"]
-    process = subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    command = [
+        sys.executable,
+        str(REPOSITORY / "launch.py"),
+        "--config",
+        "tiny.yaml",
+        "--train",
+        "trainer.limit_val_batches=0",
+    ]
+    process = subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     deadline = time.monotonic() + 120
     # the TensorBoard file appears when training begins
     while not list(tmp_path.glob("outputs/tiny/*/csv_logs/version_0/metrics.csv")):
@@ -408,7 +462,11 @@ def test_a_prior_and_a_guidance_of_one_file_each_dropped_into_custom(tmp_path, m
     (tmp_path / "own.yaml").write_text(OWN_CONFIG)
     assert main(["--config", "own.yaml", "--train"]) == 0, capsys.readouterr().err
     (run,) = Path("outputs/own").iterdir()
-    assert {"code/custom/ring_prior.py", "code/custom/red_guidance.py", "save/it3-test.mp4"} <= files(run)
+    assert {
+        "code/custom/ring_prior.py",
+        "code/custom/red_guidance.py",
+        "save/it3-test.mp4",
+    } <= files(run)
     # misspelt keys of parts that come from custom/ are found too
     assert main(["--config", "own.yaml", "--train", "system.guidance.strenght=2"]) == 2
     assert "did you mean 'system.guidance.strength'" in capsys.readouterr().err

@@ -1,4 +1,6 @@
-"""Every registered exporter of ours keeps the same contract; what is written reads back bit for bit."""
+"""Every registered exporter of ours keeps the same contract; what is written reads back bit for
+bit.
+"""
 
 import importlib
 import pkgutil
@@ -23,7 +25,11 @@ WRITERS = {
     "points": lambda path, cloud: ply.write_points(path, cloud),
     "surface": lambda path, surface: write_obj(path, surface),
 }
-EXPORTERS = sorted(name for name in names() if name.endswith("-exporter") and find(name).__module__.startswith(exporters.__name__))
+EXPORTERS = sorted(
+    name
+    for name in names()
+    if name.endswith("-exporter") and find(name).__module__.startswith(exporters.__name__)
+)
 
 
 class Cloud(BaseGeometry):
@@ -32,7 +38,9 @@ class Cloud(BaseGeometry):
 
 def geometry(count=40, degree=1):
     generator, cloud = torch.Generator().manual_seed(0), Cloud({})
-    for name, shape in dict(means=(3,), sh=((degree + 1) ** 2, 3), logit_opacities=(), log_scales=(3,), quats=(4,)).items():
+    for name, shape in dict(
+        means=(3,), sh=((degree + 1) ** 2, 3), logit_opacities=(), log_scales=(3,), quats=(4,)
+    ).items():
         setattr(cloud, name, torch.nn.Parameter(torch.randn(count, *shape, generator=generator)))
     return cloud
 
@@ -73,25 +81,36 @@ class TestContract:
 def test_gaussians_read_back_bit_for_bit(tmp_path, degree):
     source = geometry(degree=degree)
     (output,) = build("ply-exporter", source)()
-    assert all(isinstance(values, np.ndarray) and values.dtype == np.float32 for values in output.params.values())
+    assert all(
+        isinstance(values, np.ndarray) and values.dtype == np.float32
+        for values in output.params.values()
+    )
     read = ply.read_gaussians(write(output, tmp_path))
     for name in ply.GaussianArrays._fields:
-        assert getattr(read, name).tobytes() == getattr(source, name).detach().numpy().tobytes(), name
+        assert getattr(read, name).tobytes() == getattr(source, name).detach().numpy().tobytes(), (
+            name
+        )
 
 
 def test_points_read_back_bit_for_bit(tmp_path):
     source = geometry()
     (output,) = build("points-exporter", source)()
     read, cloud = ply.read_points(write(output, tmp_path)), output.params["cloud"]
-    assert read.points.tobytes() == cloud.points.tobytes() == source.means.detach().numpy().tobytes()
+    assert (
+        read.points.tobytes() == cloud.points.tobytes() == source.means.detach().numpy().tobytes()
+    )
     assert read.colors.tobytes() == cloud.colors.tobytes()
-    np.testing.assert_allclose(cloud.colors, (0.5 + 0.28209479 * source.sh[:, 0].detach().numpy()).clip(0, 1), atol=1e-6)
+    np.testing.assert_allclose(
+        cloud.colors, (0.5 + 0.28209479 * source.sh[:, 0].detach().numpy()).clip(0, 1), atol=1e-6
+    )
 
 
 def test_faint_points_can_be_left_out():
     source = geometry()
     (output,) = build("points-exporter", source, min_opacity=0.5)()
-    np.testing.assert_array_equal(output.params["cloud"].points, source.means.detach()[source.logit_opacities >= 0].numpy())
+    np.testing.assert_array_equal(
+        output.params["cloud"].points, source.means.detach()[source.logit_opacities >= 0].numpy()
+    )
     with pytest.raises(UserError, match="min_opacity"):
         build("points-exporter", min_opacity=1.5)
 
@@ -116,10 +135,16 @@ class TestBundle:
     def test_gives_the_files_of_every_format_in_order(self):
         outputs = build("gaussiandreamer-exporter")()
         assert [output.save_type for output in outputs] == ["ply", "spz", "points"]
-        assert [output.save_type for output in build("gaussiandreamer-exporter", formats=["points"])()] == ["points"]
+        assert [
+            output.save_type for output in build("gaussiandreamer-exporter", formats=["points"])()
+        ] == ["points"]
 
     def test_hands_options_on(self):
-        (output,) = build("gaussiandreamer-exporter", formats=["ply"], options={"ply": {"pad_sh_degree": 2, "save_name": "x.ply"}})()
+        (output,) = build(
+            "gaussiandreamer-exporter",
+            formats=["ply"],
+            options={"ply": {"pad_sh_degree": 2, "save_name": "x.ply"}},
+        )()
         assert output.params["sh"].shape == (40, 9, 3) and output.save_name == "x.ply"
 
     def test_mistakes_are_named_when_built(self):

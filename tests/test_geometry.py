@@ -32,7 +32,9 @@ def seen(geometry, gradient=1.0, contribution=0.5, size=64):
     means2d = torch.zeros(1, n, 2, requires_grad=True)
     means2d.grad = torch.full((1, n, 2), gradient)
     empty = torch.zeros(1, 1, 1, 1)
-    return Rasterized(empty, empty, empty, means2d, torch.ones(1, n), torch.full((1, n), contribution))
+    return Rasterized(
+        empty, empty, empty, means2d, torch.ones(1, n), torch.full((1, n), contribution)
+    )
 
 
 def test_each_point_becomes_one_gaussian_as_the_paper_says(sphere_points):
@@ -40,7 +42,9 @@ def test_each_point_becomes_one_gaussian_as_the_paper_says(sphere_points):
     assert len(geometry) == 400
     assert torch.equal(geometry.means, torch.from_numpy(sphere_points.points))
     assert torch.allclose(geometry.opacities(), torch.tensor(0.1))
-    assert torch.allclose(geometry.colors(torch.zeros(1, 3)), torch.from_numpy(sphere_points.colors), atol=1e-6)
+    assert torch.allclose(
+        geometry.colors(torch.zeros(1, 3)), torch.from_numpy(sphere_points.colors), atol=1e-6
+    )
     nearest = torch.from_numpy(nearest_distance_scales(sphere_points.points, "nearest"))
     assert torch.allclose(geometry.scales(), nearest[:, None].expand(-1, 3), rtol=1e-5)
     assert torch.equal(geometry.quats, torch.tensor([1.0, 0, 0, 0]).expand(400, 4))
@@ -64,7 +68,9 @@ def test_the_cap_holds_at_the_start(sphere_points):
     assert len(started(sphere_points, max_gaussians=123)) == 123
 
 
-def test_the_cloud_takes_its_size_from_the_checkpoint_and_never_asks_the_prior(sphere_points, tmp_path):
+def test_the_cloud_takes_its_size_from_the_checkpoint_and_never_asks_the_prior(
+    sphere_points, tmp_path
+):
     geometry = started(sphere_points, sh_degree=2, densify={"enabled": True})
     geometry.observe(seen(geometry), 64, 64)
     torch.save(geometry.state_dict(), tmp_path / "c.pt")
@@ -81,7 +87,9 @@ def test_a_checkpoint_from_before_the_removal_error_loads(sphere_points):
     del state["removal"]
     other = GaussianCloud({})
     other.load_state_dict(state)
-    assert torch.equal(other.means, geometry.means) and torch.equal(other.removal, torch.zeros(len(geometry)))
+    assert torch.equal(other.means, geometry.means) and torch.equal(
+        other.removal, torch.zeros(len(geometry))
+    )
 
 
 def test_spherical_harmonics_are_padded_and_cut(sphere_points):
@@ -89,7 +97,13 @@ def test_spherical_harmonics_are_padded_and_cut(sphere_points):
     assert third.sh.shape == (400, 16, 3) and third.sh_rest.abs().sum() == 0
     third.sh_rest.data.normal_()
     first = GaussianCloud({"sh_degree": 1})
-    first.set_arrays(**{k: getattr(third, k).detach() for k in ("means", "log_scales", "quats", "logit_opacities")}, sh=third.sh.detach())
+    first.set_arrays(
+        **{
+            k: getattr(third, k).detach()
+            for k in ("means", "log_scales", "quats", "logit_opacities")
+        },
+        sh=third.sh.detach(),
+    )
     assert torch.equal(first.sh, third.sh[:, :4])
     assert third.colors(torch.randn(2, 3)).shape == (2, 400, 3)
 
@@ -107,7 +121,11 @@ def test_learning_rates_follow_their_schedules(sphere_points):
     optimizer = torch.optim.Adam(geometry.parameter_groups())
     geometry.set_learning_rates(optimizer, 0, 50)
     rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
-    assert rates["means"] == pytest.approx(1.5e-4) and rates["sh_rest"] == 0.5 and rates["log_scales"] == 1e-3
+    assert (
+        rates["means"] == pytest.approx(1.5e-4)
+        and rates["sh_rest"] == 0.5
+        and rates["log_scales"] == 1e-3
+    )
     assert len(rates) == 6
 
 
@@ -116,7 +134,14 @@ def test_degree_zero_has_no_group_for_bands_it_does_not_have(sphere_points):
 
 
 def test_densification_happens_at_its_steps_only_and_the_optimiser_follows(sphere_points):
-    densify = {"enabled": True, "start": 4, "stop": 9, "every": 4, "min_opacity": 0.01, "grad_threshold": 1.0}
+    densify = {
+        "enabled": True,
+        "start": 4,
+        "stop": 9,
+        "every": 4,
+        "min_opacity": 0.01,
+        "grad_threshold": 1.0,
+    }
     geometry = started(sphere_points, densify=densify)
     optimizer = torch.optim.Adam(geometry.parameter_groups())
     sizes = []
@@ -136,24 +161,45 @@ def test_a_densification_that_selects_nobody_changes_nothing(sphere_points):
     plain = started(sphere_points)
     idle = started(
         sphere_points,
-        densify={"enabled": True, "start": 1, "stop": 9, "every": 1, "min_opacity": 1e-9, "grad_threshold": 1e9, "max_scale": 1e9},
+        densify={
+            "enabled": True,
+            "start": 1,
+            "stop": 9,
+            "every": 1,
+            "min_opacity": 1e-9,
+            "grad_threshold": 1e9,
+            "max_scale": 1e9,
+        },
     )
     for geometry in (plain, idle):
-        optimizer = torch.optim.Adam([{**group, "lr": 1e-2} for group in geometry.parameter_groups()])
+        optimizer = torch.optim.Adam(
+            [{**group, "lr": 1e-2} for group in geometry.parameter_groups()]
+        )
         for step in range(1, 6):
             sum((p**2).sum() for p in geometry.parameters()).backward()
             optimizer.step()
             optimizer.zero_grad()
             geometry.after_step(optimizer, step)
-    assert all(torch.equal(a, b) for a, b in zip(plain.parameters(), idle.parameters(), strict=True))
+    assert all(
+        torch.equal(a, b) for a, b in zip(plain.parameters(), idle.parameters(), strict=True)
+    )
 
 
 @pytest.mark.parametrize("absgrad", [False, True])
 def test_the_rasteriser_collects_absolute_gradients_where_they_decide(sphere_points, absgrad):
-    geometry = started(sphere_points, densify={"enabled": True, "absgrad": absgrad}, init_opacity=0.5)
+    geometry = started(
+        sphere_points, densify={"enabled": True, "absgrad": absgrad}, init_opacity=0.5
+    )
     background = find("gaussiandreamer-background")({"mode": "fixed", "color": [1.0, 1.0, 1.0]})
-    renderer = find("gaussiandreamer-splatting")({}, geometry=geometry, material=None, background=background)
-    out = renderer(orbit_c2w(torch.zeros(2), torch.tensor([0.0, 90.0]), torch.full((2,), 2.5)), torch.full((2,), 0.8), 40, 24)
+    renderer = find("gaussiandreamer-splatting")(
+        {}, geometry=geometry, material=None, background=background
+    )
+    out = renderer(
+        orbit_c2w(torch.zeros(2), torch.tensor([0.0, 90.0]), torch.full((2,), 2.5)),
+        torch.full((2,), 0.8),
+        40,
+        24,
+    )
     (out["comp_rgb"] ** 2).mean().backward()
     geometry.observe(out["rasterized"], 40, 24)
     means2d = out["rasterized"].means2d
@@ -167,11 +213,24 @@ def test_a_trained_cloud_above_the_cap_keeps_what_contributes(sphere_points, tmp
     trained = started(sphere_points, init_opacity=0.9)
     trained.logit_opacities.data[::4] = -5.0
     names = ("means", "log_scales", "quats", "logit_opacities")
-    write_gaussians(tmp_path / "a.ply", **{name: getattr(trained, name).detach().numpy() for name in names}, sh=trained.sh.detach().numpy())
-    geometry = GaussianCloud({"prior_type": "gaussians-prior", "prior": {"path": str(tmp_path / "a.ply")}, "max_gaussians": 300})
+    write_gaussians(
+        tmp_path / "a.ply",
+        **{name: getattr(trained, name).detach().numpy() for name in names},
+        sh=trained.sh.detach().numpy(),
+    )
+    geometry = GaussianCloud(
+        {
+            "prior_type": "gaussians-prior",
+            "prior": {"path": str(tmp_path / "a.ply")},
+            "max_gaussians": 300,
+        }
+    )
     assert len(geometry.initialize("anything").points) == 400
     bright = torch.arange(400) % 4 != 0
-    assert all(torch.equal(getattr(geometry, name), getattr(trained, name)[bright]) for name in (*names, "sh0"))
+    assert all(
+        torch.equal(getattr(geometry, name), getattr(trained, name)[bright])
+        for name in (*names, "sh0")
+    )
 
 
 @register("test-two-points-prior")

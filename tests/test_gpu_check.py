@@ -14,7 +14,9 @@ SCRIPT = Path(__file__).parents[1] / "benchmarks" / "gpu_check.py"
 
 
 def check(*arguments):
-    return subprocess.run([sys.executable, SCRIPT, *map(str, arguments)], capture_output=True, text=True)
+    return subprocess.run(
+        [sys.executable, SCRIPT, *map(str, arguments)], capture_output=True, text=True
+    )
 
 
 @pytest.mark.slow
@@ -24,7 +26,10 @@ def test_every_section_runs_and_reports(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((tmp_path / "report.json").read_text())
     assert all(cell["gradient"] < 2e-5 for cell in report["correct"]["relative_errors"].values())
-    assert report["train"]["default"]["seconds_per_step"] > 0 and report["train"]["lowmem"]["seconds_per_step"] > 0
+    assert (
+        report["train"]["default"]["seconds_per_step"] > 0
+        and report["train"]["lowmem"]["seconds_per_step"] > 0
+    )
     assert report["prune"]["gaussians"] == [800, 200] and report["prune"]["psnr"] > 20
     assert report["compile"]["first"] > 0 and report["bench"]["fast"]["ms"] > 0
 
@@ -38,26 +43,40 @@ def gpu_check(monkeypatch):
 @pytest.mark.slow
 def test_what_fails_is_recorded_and_the_rest_goes_on(gpu_check, monkeypatch, tmp_path):
     monkeypatch.setattr(gpu_check, "GRADIENT_ERROR", 0.0)
-    monkeypatch.setattr(gpu_check, "SECTIONS", {name: gpu_check.SECTIONS[name] for name in ("correct", "bench")})
+    monkeypatch.setattr(
+        gpu_check, "SECTIONS", {name: gpu_check.SECTIONS[name] for name in ("correct", "bench")}
+    )
     status = gpu_check.main(["--device", "cpu", "--small", "--out", str(tmp_path / "report.json")])
     report = json.loads((tmp_path / "report.json").read_text())
-    assert status == 1 and len(report["correct"]["failed"]) == len(report["correct"]["relative_errors"]) == 3
-    assert all("gradient by" in words for words in report["correct"]["failed"]) and report["bench"]["fast"]["ms"] > 0
+    assert (
+        status == 1
+        and len(report["correct"]["failed"]) == len(report["correct"]["relative_errors"]) == 3
+    )
+    assert (
+        all("gradient by" in words for words in report["correct"]["failed"])
+        and report["bench"]["fast"]["ms"] > 0
+    )
 
 
-def test_each_section_leaves_its_numbers_whatever_the_next_one_does(gpu_check, monkeypatch, tmp_path):
+def test_each_section_leaves_its_numbers_whatever_the_next_one_does(
+    gpu_check, monkeypatch, tmp_path
+):
     def crash(args):
         raise SystemExit("as if somebody had ended the process")
 
     monkeypatch.setattr(gpu_check, "about", lambda args: {"device": "cpu"})
-    monkeypatch.setattr(gpu_check, "SECTIONS", {"compile": lambda args: {"first": 1.0}, "correct": crash})
+    monkeypatch.setattr(
+        gpu_check, "SECTIONS", {"compile": lambda args: {"first": 1.0}, "correct": crash}
+    )
     with pytest.raises(SystemExit):
         gpu_check.main(["--device", "cpu", "--out", str(tmp_path / "report.json")])
     assert json.loads((tmp_path / "report.json").read_text())["compile"]["first"] == 1.0
 
 
 def test_a_part_that_hangs_ends_with_all_that_it_started(gpu_check):
-    """As a compiler of a compiler does, or a program under compute-sanitizer: they hold the pipes, and nobody waits for them."""
+    """As a compiler of a compiler does, or a program under compute-sanitizer: they hold the pipes,
+    and nobody waits for them.
+    """
     args = gpu_check.parse_arguments([])
     started = time.monotonic()
     with pytest.raises(RuntimeError, match=r"more than 1 s: so far"):

@@ -1,4 +1,6 @@
-"""Algorithm 1 of the paper: growing, colour perturbation and the first sizes, also where the cloud is degenerate."""
+"""Algorithm 1 of the paper: growing, colour perturbation and the first sizes, also where the cloud
+is degenerate.
+"""
 
 import numpy as np
 import pytest
@@ -7,7 +9,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as np_strategies
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.gaussians.grow import grow, growing_box, half_longest_side, nearest_distance_scales
+from threestudio_gaussiandreamer.gaussians.grow import (
+    grow,
+    growing_box,
+    half_longest_side,
+    nearest_distance_scales,
+)
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 
 FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False)
@@ -21,7 +28,9 @@ def sphere(count=2000, seed=1):
     """A coloured unit sphere with its normals."""
     normals = rng(seed).normal(size=(count, 3))
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
-    return PointCloud(points=normals, colors=(normals * 0.3 + 0.4).astype(np.float32), normals=normals)
+    return PointCloud(
+        points=normals, colors=(normals * 0.3 + 0.4).astype(np.float32), normals=normals
+    )
 
 
 def moved(cloud, scale, shift=0.0):
@@ -46,8 +55,17 @@ class TestGrow:
     def test_equals_the_pseudocode_of_the_paper(self):
         cloud = sphere(300)
         unit = half_longest_side(cloud.points)
-        points, colors = algorithm_1(cloud.points.astype(np.float64), cloud.colors, 2000, 0.1 * unit, rng(3))
-        grown = grow(cloud, num_candidates=2000, radius=0.1, color_range=(0.0, 0.2), clamp=False, generator=rng(3))
+        points, colors = algorithm_1(
+            cloud.points.astype(np.float64), cloud.colors, 2000, 0.1 * unit, rng(3)
+        )
+        grown = grow(
+            cloud,
+            num_candidates=2000,
+            radius=0.1,
+            color_range=(0.0, 0.2),
+            clamp=False,
+            generator=rng(3),
+        )
         assert len(grown.points) > 350
         np.testing.assert_allclose(grown.points, points, atol=1e-7)  # one rounding to float32
         np.testing.assert_allclose(grown.colors, colors, atol=1e-7)
@@ -64,9 +82,15 @@ class TestGrow:
 
     def test_grown_points_lie_within_the_radius(self):
         cloud = sphere()
-        grown = grow(cloud, num_candidates=20_000, radius=0.05, generator=rng()).points[2000:].astype(np.float64)
+        grown = (
+            grow(cloud, num_candidates=20_000, radius=0.05, generator=rng())
+            .points[2000:]
+            .astype(np.float64)
+        )
         distances = np.linalg.norm(grown[:, None] - cloud.points[None], axis=2).min(axis=1)
-        assert distances.max() < 0.05 * half_longest_side(cloud.points) + 1e-6  # the point was rounded to float32
+        assert (
+            distances.max() < 0.05 * half_longest_side(cloud.points) + 1e-6
+        )  # the point was rounded to float32
 
     @pytest.mark.parametrize("scale, shift", [(1e-3, 0.0), (1e3, 0.0), (1.0, 1e4), (1e3, -1e7)])
     def test_unit_and_position_do_not_matter(self, scale, shift):
@@ -85,16 +109,22 @@ class TestGrow:
     def test_no_candidates_means_no_growing(self):
         assert len(grow(sphere(), num_candidates=0, radius=0.1, generator=rng()).points) == 2000
 
-    @pytest.mark.parametrize("flat_axes", [(2,), (0, 1), (0, 1, 2)], ids=["plane", "needle", "point"])
+    @pytest.mark.parametrize(
+        "flat_axes", [(2,), (0, 1), (0, 1, 2)], ids=["plane", "needle", "point"]
+    )
     def test_a_flat_cloud_grows_a_slab_up_to_the_cap(self, flat_axes):
         points = rng(1).uniform(-1, 1, (500, 3)).astype(np.float32)
         points[:, flat_axes] = 0.25
         cloud = PointCloud(points=points, colors=np.full((500, 3), 0.5, np.float32))
-        grown = grow(cloud, num_candidates=20_000, radius=0.05, max_points=1000, generator=rng()).points[500:]
+        grown = grow(
+            cloud, num_candidates=20_000, radius=0.05, max_points=1000, generator=rng()
+        ).points[500:]
         reach = 0.05 * (half_longest_side(points) or 1.0)
         assert len(grown) == 1000
         assert np.abs(grown[:, flat_axes] - 0.25).max() < reach * 1.0001
-        assert (grown[:, flat_axes].std(axis=0) > reach / 4).all()  # a uniform slab has reach / sqrt(3)
+        assert (
+            grown[:, flat_axes].std(axis=0) > reach / 4
+        ).all()  # a uniform slab has reach / sqrt(3)
 
     def test_the_box_of_a_solid_cloud_is_not_padded(self):
         points = sphere().points.astype(np.float64)
@@ -108,12 +138,17 @@ class TestGrow:
         kept = grow(sphere(), **options, max_points=1000, generator=rng()).points[2000:]
         assert len(kept) == 1000 < len(everything)
         # Three standard errors of the mean of 1000 draws: no side of the cloud is preferred.
-        np.testing.assert_allclose(kept.mean(0), everything.mean(0), atol=3 * everything.std() / np.sqrt(1000))
+        np.testing.assert_allclose(
+            kept.mean(0), everything.mean(0), atol=3 * everything.std() / np.sqrt(1000)
+        )
         assert len(grow(sphere(), **options, max_points=0, generator=rng()).points) == 2000
 
     def test_same_generator_same_cloud_and_the_global_one_is_untouched(self):
         before = np.random.get_state()[1].copy()
-        first, again, other = (grow(sphere(), num_candidates=5000, radius=0.05, generator=rng(seed)) for seed in (7, 7, 8))
+        first, again, other = (
+            grow(sphere(), num_candidates=5000, radius=0.05, generator=rng(seed))
+            for seed in (7, 7, 8)
+        )
         np.testing.assert_array_equal(first.points, again.points)
         np.testing.assert_array_equal(first.colors, again.colors)
         assert not np.array_equal(first.points[2000:2010], other.points[2000:2010])
@@ -122,25 +157,42 @@ class TestGrow:
     @pytest.mark.parametrize("color_range, mean", [((0.0, 0.2), 0.1), ((-0.1, 0.1), 0.0)])
     def test_colour_noise_is_uniform_in_its_range(self, color_range, mean):
         cloud = sphere()._replace(colors=np.full((2000, 3), 0.5, np.float32))
-        grown = grow(cloud, num_candidates=50_000, radius=0.05, color_range=color_range, generator=rng())
+        grown = grow(
+            cloud, num_candidates=50_000, radius=0.05, color_range=color_range, generator=rng()
+        )
         noise = grown.colors[2000:] - 0.5
         assert noise.min() >= color_range[0] - 1e-6 and noise.max() <= color_range[1] + 1e-6
-        assert noise.mean() == pytest.approx(mean, abs=4 * 0.0577 / np.sqrt(noise.size))  # std of U(0, 0.2): 0.0577
+        assert noise.mean() == pytest.approx(
+            mean, abs=4 * 0.0577 / np.sqrt(noise.size)
+        )  # std of U(0, 0.2): 0.0577
         assert noise.std() == pytest.approx(0.0577, rel=0.02)
 
     def test_clamp_is_an_option(self):
         cloud = sphere()._replace(colors=np.full((2000, 3), 0.95, np.float32))
-        clamped, free = (grow(cloud, num_candidates=20_000, radius=0.05, clamp=clamp, generator=rng()).colors for clamp in (True, False))
+        clamped, free = (
+            grow(cloud, num_candidates=20_000, radius=0.05, clamp=clamp, generator=rng()).colors
+            for clamp in (True, False)
+        )
         assert clamped.max() == 1.0 and free.max() > 1.1
 
     def test_copies_in_the_cloud_cost_nothing(self):
-        cloud = PointCloud(points=np.zeros((50_000, 3), np.float32), colors=np.full((50_000, 3), 0.5, np.float32))
-        grown = grow(cloud, num_candidates=20_000, radius=0.1, generator=rng())  # copy by copy: 1e9 distances
+        cloud = PointCloud(
+            points=np.zeros((50_000, 3), np.float32), colors=np.full((50_000, 3), 0.5, np.float32)
+        )
+        grown = grow(
+            cloud, num_candidates=20_000, radius=0.1, generator=rng()
+        )  # copy by copy: 1e9 distances
         assert len(grown.points) > 55_000
 
     @pytest.mark.parametrize(
         "option",
-        [dict(radius=0.0), dict(radius=float("nan")), dict(color_range=(0.2, 0.0)), dict(num_candidates=-1), dict(max_points=-1)],
+        [
+            dict(radius=0.0),
+            dict(radius=float("nan")),
+            dict(color_range=(0.2, 0.0)),
+            dict(num_candidates=-1),
+            dict(max_points=-1),
+        ],
     )
     def test_bad_options_are_named(self, option):
         with pytest.raises(UserError, match="radius|color_range|num_candidates|max_points"):
@@ -160,7 +212,9 @@ class TestNearestDistanceScales:
     @pytest.mark.parametrize("rule, neighbours", [("nearest", 1), ("rms3", 3)])
     def test_equals_brute_force(self, rule, neighbours):
         points = rng().uniform(-1, 1, (200, 3))
-        distances = np.sort(np.linalg.norm(points[:, None] - points[None], axis=2), axis=1)[:, 1 : neighbours + 1]
+        distances = np.sort(np.linalg.norm(points[:, None] - points[None], axis=2), axis=1)[
+            :, 1 : neighbours + 1
+        ]
         scales = nearest_distance_scales(points, rule)
         np.testing.assert_allclose(scales, np.sqrt((distances**2).mean(1)), rtol=1e-6)  # float32
         assert scales.dtype == np.float32
@@ -199,7 +253,9 @@ class TestNearestDistanceScales:
 
     @pytest.mark.parametrize("rule", ["nearest", "rms3"])
     def test_all_equal_points(self, rule):
-        scales = nearest_distance_scales(np.ones((100_000, 3)), rule)  # with a quadratic search: hours
+        scales = nearest_distance_scales(
+            np.ones((100_000, 3)), rule
+        )  # with a quadratic search: hours
         assert np.isfinite(scales).all() and (scales == scales[0]).all() and scales[0] > 0
 
     def test_half_copies_of_one_place(self):
@@ -209,7 +265,9 @@ class TestNearestDistanceScales:
 
     @settings(max_examples=60, deadline=None)
     @given(
-        points=np_strategies.arrays(np.float32, st.tuples(st.integers(1, 12), st.just(3)), elements=FINITE),
+        points=np_strategies.arrays(
+            np.float32, st.tuples(st.integers(1, 12), st.just(3)), elements=FINITE
+        ),
         rule=st.sampled_from(["nearest", "rms3"]),
     )
     def test_always_positive_and_finite(self, points, rule):
@@ -218,7 +276,11 @@ class TestNearestDistanceScales:
 
     def test_scales_follow_the_unit(self):
         points = rng().uniform(-1, 1, (100, 3))
-        np.testing.assert_allclose(nearest_distance_scales(points * 1e-3), nearest_distance_scales(points) * 1e-3, rtol=1e-5)
+        np.testing.assert_allclose(
+            nearest_distance_scales(points * 1e-3),
+            nearest_distance_scales(points) * 1e-3,
+            rtol=1e-5,
+        )
 
     def test_mistakes_are_named(self):
         with pytest.raises(UserError, match="'nearst': did you mean 'nearest'"):

@@ -1,4 +1,6 @@
-"""DeepFloyd IF's guidance: pixels, six output channels, T5 embeddings; its gradient against float64 by hand."""
+"""DeepFloyd IF's guidance: pixels, six output channels, T5 embeddings; its gradient against float64
+by hand.
+"""
 
 import pytest
 import tiny_models
@@ -25,13 +27,20 @@ def model(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def prompts(model):
-    options = {"pretrained_model_name_or_path": str(model), "prompt": "a fox", "negative_prompt": "ugly", "use_cache": False}
+    options = {
+        "pretrained_model_name_or_path": str(model),
+        "prompt": "a fox",
+        "negative_prompt": "ugly",
+        "use_cache": False,
+    }
     processor = find("gaussiandreamer-deep-floyd-prompt-processor")
     return {perp: processor({**options, "use_perp_neg": perp})() for perp in (False, True)}
 
 
 def guidance(model, **options):
-    return find("gaussiandreamer-deep-floyd-guidance")({"pretrained_model_name_or_path": str(model), **options})
+    return find("gaussiandreamer-deep-floyd-guidance")(
+        {"pretrained_model_name_or_path": str(model), **options}
+    )
 
 
 def renders(size=16):
@@ -48,7 +57,9 @@ def reference_gradient(model, prompt_utils, rgb, *, scale):
     from diffusers import DDPMScheduler, UNet2DConditionModel
 
     unet = UNet2DConditionModel.from_pretrained(model, subfolder="unet").double().eval()
-    alphas = torch.cumprod(1 - DDPMScheduler.from_pretrained(model, subfolder="scheduler").betas.double(), 0)
+    alphas = torch.cumprod(
+        1 - DDPMScheduler.from_pretrained(model, subfolder="scheduler").betas.double(), 0
+    )
     cond, uncond = prompt_utils.get_text_embeddings(**BATCH).double().chunk(2)
     total = torch.zeros_like(rgb, dtype=torch.float64)
     for i, image in enumerate(rgb.detach().double()):
@@ -57,7 +68,10 @@ def reference_gradient(model, prompt_utils, rgb, *, scale):
         x = image.permute(2, 0, 1)[None] * 2 - 1
         z = alphas[t].sqrt() * x + (1 - alphas[t]).sqrt() * eps
         with torch.no_grad():
-            c, u = (unet(z, t, encoder_hidden_states=text[i : i + 1]).sample[:, :3] for text in (cond, uncond))
+            c, u = (
+                unet(z, t, encoder_hidden_states=text[i : i + 1]).sample[:, :3]
+                for text in (cond, uncond)
+            )
         grad = (1 - alphas[t]) * (u + scale * (c - u) - eps)
         total[i] = 2 * grad[0].permute(1, 2, 0) / len(rgb)
     return total
@@ -88,7 +102,9 @@ def test_perp_neg_of_four_views_is_that_of_each_alone(model, prompts):
     with torch.no_grad():
         together = guide.predict_noise(z, t, guide.condition(prompts[True], **BATCH))
         for i in range(4):
-            alone = guide.condition(prompts[True], **{name: values[i : i + 1] for name, values in BATCH.items()})
+            alone = guide.condition(
+                prompts[True], **{name: values[i : i + 1] for name, values in BATCH.items()}
+            )
             error = guide.predict_noise(z[i : i + 1], t[i : i + 1], alone) - together[i : i + 1]
             # another batch size rounds differently
             assert error.norm() / together[i].norm() < 1e-5
@@ -111,7 +127,9 @@ def test_encode_and_decode_are_inverse(model):
 
 
 def test_the_pictures_of_the_evaluation(model, prompts):
-    out = gradient(guidance(model, eval_steps=2), prompts[True], renders(), guidance_eval=True)[1]["eval"]
+    out = gradient(guidance(model, eval_steps=2), prompts[True], renders(), guidance_eval=True)[1][
+        "eval"
+    ]
     for name in ("imgs_noisy", "imgs_1step", "imgs_1orig", "imgs_final"):
         assert out[name].shape == (4, 16, 16, 3)
         assert 0 <= out[name].min() <= out[name].max() <= 1
@@ -119,7 +137,9 @@ def test_the_pictures_of_the_evaluation(model, prompts):
 
 def test_embeddings_of_another_model_are_refused(model, prompts):
     guide = guidance(model)
-    assert guide.text_width == tiny_models.TEXT_WIDTH  # of T5, not of the cross-attention behind its projection
+    assert (
+        guide.text_width == tiny_models.TEXT_WIDTH
+    )  # of T5, not of the cross-attention behind its projection
     guide.text_width = 4096
     with pytest.raises(UserError, match="takes 4096"):
         guide(renders(), prompts[False], **BATCH)

@@ -1,4 +1,6 @@
-"""The shared path of score distillation, on a stub that misbehaves on request, and the guidance with the exact score."""
+"""The shared path of score distillation, on a stub that misbehaves on request, and the guidance
+with the exact score.
+"""
 
 import math
 
@@ -28,7 +30,9 @@ def uniform(*shape, seed=0):
 
 
 class Stub(ScoreDistillation):
-    """Predicts the noise plus the latent (so that the gradient is w x), or what ``spoil`` makes of it."""
+    """Predicts the noise plus the latent (so that the gradient is w x), or what ``spoil`` makes of
+    it.
+    """
 
     spoil = staticmethod(lambda eps, step: eps)
     unconditional = None
@@ -47,7 +51,9 @@ class Stub(ScoreDistillation):
         noise = streams.normal_per_item(tuple(z.shape), 0, "noise", self.step)
         abar = self.alphas_cumprod[t]
         x = sds.predict_x0(z, noise, abar)
-        return self.spoil(noise + x, self.step), None if self.unconditional is None else noise + self.unconditional * x
+        return self.spoil(
+            noise + x, self.step
+        ), None if self.unconditional is None else noise + self.unconditional * x
 
 
 def step(guidance, rgb, **batch):
@@ -91,13 +97,21 @@ def test_draws_are_a_function_of_step_and_item(monkeypatch):
 
 
 def test_schedules_are_evaluated_at_every_step():
-    cfg = OmegaConf.create({"max_step_percent": [500, 0.98, 0.55, 501], "grad_clip": [0, 1.5, 2.0, 1000]})
+    cfg = OmegaConf.create(
+        {"max_step_percent": [500, 0.98, 0.55, 501], "grad_clip": [0, 1.5, 2.0, 1000]}
+    )
     guidance = Stub(cfg)
     seen = {}
     for at in (0, 500, 501, 1000, 2000):
         guidance.update_step(0, at)
         seen[at] = (guidance.min_step, guidance.max_step, guidance.grad_clip)
-    assert seen == {0: (20, 980, 1.5), 500: (20, 980, 1.75), 501: (20, 550, 1.7505), 1000: (20, 550, 2.0), 2000: (20, 550, 2.0)}
+    assert seen == {
+        0: (20, 980, 1.5),
+        500: (20, 980, 1.75),
+        501: (20, 550, 1.7505),
+        1000: (20, 550, 2.0),
+        2000: (20, 550, 2.0),
+    }
 
 
 def test_clipping_is_elementwise_on_the_latents_gradient():
@@ -124,7 +138,11 @@ def test_bad_items_are_masked_and_the_others_keep_their_gradient_bit_for_bit(val
     out, grad = step(guidance, rgb)
     assert out["bad_items"] == 1 and guidance.bad_items == 1
     assert torch.equal(grad[[0, 2, 3]], expected[[0, 2, 3]])
-    assert (grad[1] == 0).all() and torch.isfinite(out["loss_sds"]) and torch.isfinite(out["grad_norm"])
+    assert (
+        (grad[1] == 0).all()
+        and torch.isfinite(out["loss_sds"])
+        and torch.isfinite(out["grad_norm"])
+    )
 
 
 def test_an_encoder_that_overflows_spoils_only_its_item():
@@ -175,19 +193,29 @@ def test_latents_can_be_given_directly():
 
 def test_evaluation_has_what_the_hosts_saver_reads():
     guidance = Stub({"max_items_eval": 2, "eval_steps": 3})
-    batch = {"elevation": torch.zeros(3), "azimuth": torch.tensor([0.0, 90, 180]), "camera_distances": torch.full((3,), 2.5)}
+    batch = {
+        "elevation": torch.zeros(3),
+        "azimuth": torch.tensor([0.0, 90, 180]),
+        "camera_distances": torch.full((3,), 2.5),
+    }
     out = guidance(uniform(3, 8, 6, 3), None, guidance_eval=True, **batch)["eval"]
     for name in ("imgs_noisy", "imgs_1step", "imgs_1orig", "imgs_final"):
         assert out[name].shape == (2, 8, 6, 3)
     assert out["bs"] == 2 and len(out["noise_levels"]) == 2
-    assert [text.split("\n")[1:] for text in out["texts"]] == [["e0.0", "a0.0", "c2.50"], ["e0.0", "a90.0", "c2.50"]]
+    assert [text.split("\n")[1:] for text in out["texts"]] == [
+        ["e0.0", "a0.0", "c2.50"],
+        ["e0.0", "a90.0", "c2.50"],
+    ]
 
 
 @pytest.mark.parametrize(
     ("cfg", "message"),
     [
         ({"min_step_percent": 0.6, "max_step_percent": 0.5}, "above max_step_percent"),
-        ({"min_step_percent": 0.6, "max_step_percent": [500, 0.98, 0.55, 501]}, "above max_step_percent"),
+        (
+            {"min_step_percent": 0.6, "max_step_percent": [500, 0.98, 0.55, 501]},
+            "above max_step_percent",
+        ),
         ({"max_step_percent": 1.5}, "must lie in"),
         ({"grad_clip": [0, 1, 2, 3, 4]}, "system.guidance.grad_clip"),
         ({"weighting_strategy": "sdss"}, "did you mean 'sds'"),
@@ -224,7 +252,11 @@ def guidance(mesh_path, **options):
 
 
 def batch(*azimuths, elevation=10.0, height=16, width=16):
-    values = (torch.full((len(azimuths),), elevation), torch.tensor(azimuths), torch.full((len(azimuths),), 2.7))
+    values = (
+        torch.full((len(azimuths),), elevation),
+        torch.tensor(azimuths),
+        torch.full((len(azimuths),), 2.7),
+    )
     fovy = torch.full((len(azimuths),), math.radians(50))
     return {
         "c2w": cameras.orbit_c2w(*values),
@@ -247,7 +279,11 @@ def test_it_is_registered():
 
 def test_pictures_cast_beforehand_are_not_cast_again(mesh_path, monkeypatch):
     views, cast, render = batch(*VIEWS), [], MeshCaster.render_views
-    monkeypatch.setattr(MeshCaster, "render_views", lambda self, c, *size, **o: cast.append(len(c)) or render(self, c, *size, **o))
+    monkeypatch.setattr(
+        MeshCaster,
+        "render_views",
+        lambda self, c, *size, **o: cast.append(len(c)) or render(self, c, *size, **o),
+    )
 
     def cast_and_seen(**options):
         ahead, now = guidance(mesh_path, **options), guidance(mesh_path)
@@ -260,8 +296,14 @@ def test_pictures_cast_beforehand_are_not_cast_again(mesh_path, monkeypatch):
         return counts
 
     assert cast_and_seen() == (3, 0)
-    assert cast_and_seen(max_cached_targets=2) == (0, 3)  # the first would be gone when the last is there
-    assert cast_and_seen(mode="view-agnostic", bank_includes_view=False) == (0, 3)  # which compares with the bank alone
+    assert cast_and_seen(max_cached_targets=2) == (
+        0,
+        3,
+    )  # the first would be gone when the last is there
+    assert cast_and_seen(mode="view-agnostic", bank_includes_view=False) == (
+        0,
+        3,
+    )  # which compares with the bank alone
 
 
 def test_the_target_is_the_mesh_on_the_renders_background(mesh_path):
@@ -286,7 +328,12 @@ def test_view_exact_without_width_is_a_weighted_squared_error(mesh_path):
     expected = 2 * weight * 2 * (rgb - exact.target_rgb(batch(*VIEWS), BACKGROUNDS)) / 3
     torch.testing.assert_close(grad, expected, rtol=0, atol=1e-5)
     assert out["perplexity"] == 1
-    _, none = step(exact, exact.target_rgb(batch(*VIEWS), BACKGROUNDS), **batch(*VIEWS), comp_rgb_bg=BACKGROUNDS)
+    _, none = step(
+        exact,
+        exact.target_rgb(batch(*VIEWS), BACKGROUNDS),
+        **batch(*VIEWS),
+        comp_rgb_bg=BACKGROUNDS,
+    )
     assert none.abs().max() < 1e-5  # float32 rounding of z against noise of size 1
 
 
@@ -305,13 +352,18 @@ def test_a_batch_is_its_items(mesh_path):
 @pytest.mark.parametrize("space", ["pixel", "latent"])
 @pytest.mark.parametrize("scale", [1.0, 7.5])
 def test_every_mode_runs_on_constant_and_on_pixel_backgrounds_alike(mesh_path, mode, space, scale):
-    exact = guidance(mesh_path, mode=mode, space=space, guidance_scale=scale, latent_size=4, std=0.1)
+    exact = guidance(
+        mesh_path, mode=mode, space=space, guidance_scale=scale, latent_size=4, std=0.1
+    )
     rgb = uniform(3, 16, 16, 3)
     _, constant = step(exact, rgb, **batch(*VIEWS), comp_rgb_bg=BACKGROUNDS)
     _, pixels = step(exact, rgb, **batch(*VIEWS), comp_rgb_bg=BACKGROUNDS.expand(3, 16, 16, 3))
     assert torch.isfinite(constant).all() and constant.abs().max() > 0
-    # the pooled bank is float32, the bank of pixel backgrounds bytes: 0.5/255, magnified by the scale and the latent's
-    torch.testing.assert_close(pixels, constant, rtol=0, atol=0.02 * scale * constant.abs().max().item())
+    # the pooled bank is float32, the bank of pixel backgrounds bytes: 0.5/255, magnified by the
+    # scale and the latent's
+    torch.testing.assert_close(
+        pixels, constant, rtol=0, atol=0.02 * scale * constant.abs().max().item()
+    )
 
 
 def descend(exact, rgb, views, steps=60):
@@ -330,10 +382,14 @@ def test_view_exact_descends_to_the_truth_and_agnostic_to_some_view(mesh_path):
     exact = guidance(mesh_path)
     found, _ = descend(exact, start, views)
     torch.testing.assert_close(found, exact.target_rgb(views), rtol=0, atol=1e-3)
-    blind = guidance(mesh_path, mode="view-agnostic", max_step_percent=0.4)  # where the posterior is one view
+    blind = guidance(
+        mesh_path, mode="view-agnostic", max_step_percent=0.4
+    )  # where the posterior is one view
     bank = blind.bank_images(16)
     found, out = descend(blind, bank[3:4], batch(float(blind.bank_azimuths[3] + 180)))
-    torch.testing.assert_close(found, bank[3:4], rtol=0, atol=0.01)  # it stays the view that it is, whatever the camera
+    torch.testing.assert_close(
+        found, bank[3:4], rtol=0, atol=0.01
+    )  # it stays the view that it is, whatever the camera
     assert out["perplexity"] >= 1
 
 
@@ -350,7 +406,10 @@ def test_guidance_between_mixtures_extrapolates_from_the_bank_mean(mesh_path):
     """At high noise a scale above 1 moves away from what the bank has in common."""
     views, rgb = batch(0.0), uniform(1, 16, 16, 3)
     options = {"space": "latent", "latent_size": 4, "min_step_percent": 0.98}
-    plain, strong = (step(guidance(mesh_path, guidance_scale=scale, **options), rgb, **views)[1] for scale in (1.0, 30.0))
+    plain, strong = (
+        step(guidance(mesh_path, guidance_scale=scale, **options), rgb, **views)[1]
+        for scale in (1.0, 30.0)
+    )
     assert strong.norm() > 3 * plain.norm()
 
 
@@ -365,20 +424,27 @@ def test_the_latent_has_unit_variance_on_the_bank(mesh_path):
 def test_renders_are_resized_to_the_guidance_size(mesh_path, size):
     exact = guidance(mesh_path, image_size=16, mode="view-agnostic", space="latent", latent_size=8)
     height, width = size
-    _, grad = step(exact, uniform(2, height, width, 3), **batch(0.0, 50.0, height=height, width=width))
+    _, grad = step(
+        exact, uniform(2, height, width, 3), **batch(0.0, 50.0, height=height, width=width)
+    )
     assert grad.shape == (2, height, width, 3) and torch.isfinite(grad).all()
 
 
 def test_directions_follow_threestudios_rules():
     elevation = torch.tensor([0.0, 0, 0, 0, 0, 61, 0, 0])
     azimuth = torch.tensor([0.0, 44, 46, 134, 136, 0, -170, 350])
-    names = [("side", "front", "back", "overhead")[i] for i in direction_indices(elevation, azimuth)]
+    names = [
+        ("side", "front", "back", "overhead")[i] for i in direction_indices(elevation, azimuth)
+    ]
     assert names == ["front", "front", "side", "side", "back", "overhead", "back", "front"]
 
 
 def test_a_direction_without_bank_views_takes_all(mesh_path):
     exact = guidance(mesh_path, mode="direction-bins", bank_elevation_range=[0.0, 20.0])
-    views = {"elevation": torch.tensor([70.0, 10.0, 10.0]), "azimuth": torch.tensor([0.0, 0.0, 180.0])}
+    views = {
+        "elevation": torch.tensor([70.0, 10.0, 10.0]),
+        "azimuth": torch.tensor([0.0, 0.0, 180.0]),
+    }
     overhead, front, back = exact._members(views, 3)
     assert overhead.all() and 0 < front.sum() < 24 and not (front & back).any()
 
@@ -398,10 +464,14 @@ def test_the_cameras_own_view_is_one_of_the_modes_unless_it_is_left_out(mesh_pat
 def test_evaluation_shows_the_truth(mesh_path):
     exact = guidance(mesh_path)
     views = batch(*VIEWS)
-    out = exact(uniform(3, 16, 16, 3), None, guidance_eval=True, **views, comp_rgb_bg=BACKGROUNDS)["eval"]
+    out = exact(uniform(3, 16, 16, 3), None, guidance_eval=True, **views, comp_rgb_bg=BACKGROUNDS)[
+        "eval"
+    ]
     target = exact.target_rgb(views, BACKGROUNDS)
     for name in ("imgs_1step", "imgs_1orig", "imgs_final"):
-        torch.testing.assert_close(out[name], target, rtol=0, atol=1e-4)  # float32 noise times sigma/a
+        torch.testing.assert_close(
+            out[name], target, rtol=0, atol=1e-4
+        )  # float32 noise times sigma/a
 
 
 @pytest.mark.parametrize(
@@ -425,8 +495,14 @@ def test_bad_options_of_the_exact_score_are_named(mesh_path, options, message):
 
 def test_sizes_that_do_not_fit_are_named(mesh_path):
     with pytest.raises(UserError, match="latent_size"):
-        step(guidance(mesh_path, space="latent", latent_size=5), uniform(1, 16, 16, 3), **batch(0.0))
+        step(
+            guidance(mesh_path, space="latent", latent_size=5), uniform(1, 16, 16, 3), **batch(0.0)
+        )
     with pytest.raises(UserError, match="GiB"):
-        step(guidance(mesh_path, mode="view-agnostic", bank_views=2000), uniform(1, 512, 512, 3), **batch(0.0))
+        step(
+            guidance(mesh_path, mode="view-agnostic", bank_views=2000),
+            uniform(1, 512, 512, 3),
+            **batch(0.0),
+        )
     with pytest.raises(UserError, match="rgb_as_latents"):
         guidance(mesh_path)(uniform(1, 16, 16, 3), None, rgb_as_latents=True, **batch(0.0))

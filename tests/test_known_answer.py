@@ -1,4 +1,6 @@
-"""Pictures of exactly M Gaussians: from 4 M, with duplicates and floaters, `budget: auto` and the prune command find no more than 1.2 M."""
+"""Pictures of exactly M Gaussians: from 4 M, with duplicates and floaters, `budget: auto` and the
+prune command find no more than 1.2 M.
+"""
 
 import sys
 from pathlib import Path
@@ -6,13 +8,22 @@ from pathlib import Path
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.gaussians.simplify import Budget, Cloud, likeness, look, simplify, views_around
+from threestudio_gaussiandreamer.gaussians.simplify import (
+    Budget,
+    Cloud,
+    likeness,
+    look,
+    simplify,
+    views_around,
+)
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.splatting import rasterize
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-known_answer = pytest.importorskip("known_answer", reason="needs tqdm and the benchmarks beside the tests")
+known_answer = pytest.importorskip(
+    "known_answer", reason="needs tqdm and the benchmarks beside the tests"
+)
 
 M, SIZE, STEPS = 80, 64, 600
 RATES = {
@@ -32,8 +43,21 @@ def trained(geometry, views, pictures):
 
     def draw(rows, opacities=None):
         opacities = geometry.opacities() if opacities is None else opacities
-        shape = geometry.means, geometry.quats, geometry.scales(), opacities, geometry.colors(views.positions[rows])
-        return rasterize(*shape, views.viewmats[rows], views.Ks[rows], SIZE, SIZE, background=views.backgrounds[rows])
+        shape = (
+            geometry.means,
+            geometry.quats,
+            geometry.scales(),
+            opacities,
+            geometry.colors(views.positions[rows]),
+        )
+        return rasterize(
+            *shape,
+            views.viewmats[rows],
+            views.Ks[rows],
+            SIZE,
+            SIZE,
+            background=views.backgrounds[rows],
+        )
 
     for step in range(1, STEPS + 1):
         geometry.set_learning_rates(adam, 0, step)
@@ -41,7 +65,12 @@ def trained(geometry, views, pictures):
         opacities = geometry.opacities()
         out = draw(rows, opacities)
         behind = views.backgrounds[rows][:, None, None]
-        pictures_now = {"comp_rgb": out.image, "opacity": out.alpha, "comp_rgb_bg": behind, "gaussian_opacities": opacities}
+        pictures_now = {
+            "comp_rgb": out.image,
+            "opacity": out.alpha,
+            "comp_rgb_bg": behind,
+            "gaussian_opacities": opacities,
+        }
         geometry.sample_removal(pictures_now, step - 1)
         (0.5 * (out.image - pictures[rows]).square().sum() / 4).backward()
         geometry.observe(out, SIZE, SIZE)
@@ -55,13 +84,17 @@ def trained(geometry, views, pictures):
                 return bool(psnr(draw(rows).image, pictures[rows]) >= whole - geometry.affordable)
 
         geometry.after_step(adam, step, holds)
-    return Cloud(geometry.means, geometry.quats, geometry.log_scales, geometry.logit_opacities, geometry.sh)
+    return Cloud(
+        geometry.means, geometry.quats, geometry.log_scales, geometry.logit_opacities, geometry.sh
+    )
 
 
 def test_auto_finds_the_true_number_with_visible_floaters_and_copies():
     true = known_answer.torus(M, 0)
     start = known_answer.with_copies_and_floaters(true, 0)
-    views, unseen = (views_around(true, count, SIZE, turn=turn) for count, turn in ((48, 0.0), (16, 60.0)))
+    views, unseen = (
+        views_around(true, count, SIZE, turn=turn) for count, turn in ((48, 0.0), (16, 60.0))
+    )
     truth = look(true, unseen)
     assert len(start.means) == 4 * M and likeness(start, unseen, truth) < 24
     schedule = {"start": STEPS // 12, "stop": STEPS * 3 // 4, "every": STEPS // 24}
@@ -77,8 +110,12 @@ def test_auto_finds_the_true_number_with_visible_floaters_and_copies():
 def test_prune_finds_the_true_number_with_shared_opacity_and_faint_floaters():
     true = known_answer.torus(M, 0)
     start = known_answer.with_shares_and_faint_floaters(true, 0)
-    views = [views_around(true, count, SIZE, turn=turn) for count, turn in ((48, 0.0), (32, 45.0), (16, 60.0))]
+    views = [
+        views_around(true, count, SIZE, turn=turn)
+        for count, turn in ((48, 0.0), (32, 45.0), (16, 60.0))
+    ]
     found = simplify(start, *views[:2], Budget(psnr=40.0), steps=40)
     assert len(found.means) <= 1.2 * M
-    # on other views than those that decide, which are two standard errors on the safe side: 40.1 to 41.5 dB with seeds 0 to 3
+    # on other views than those that decide, which are two standard errors on the safe side: 40.1 to
+    # 41.5 dB with seeds 0 to 3
     assert likeness(found, views[2], look(start, views[2])) >= 40

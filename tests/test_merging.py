@@ -1,4 +1,6 @@
-"""Duplicates become one Gaussian that looks like both; what is no duplicate stays as it is, bit for bit."""
+"""Duplicates become one Gaussian that looks like both; what is no duplicate stays as it is, bit for
+bit.
+"""
 
 import pytest
 import torch
@@ -38,15 +40,26 @@ def copies(params, times):
 def picture(params):
     sh = torch.cat([params["sh0"], params["sh_rest"]], 1)
     cloud = Cloud(*(params[name] for name in Cloud._fields[:-1]), sh)
-    around = Cloud(shell()["means"], shell()["quats"], shell()["log_scales"], shell()["logit_opacities"], shell()["sh0"])
+    around = Cloud(
+        shell()["means"],
+        shell()["quats"],
+        shell()["log_scales"],
+        shell()["logit_opacities"],
+        shell()["sh0"],
+    )
     return simplify.look(cloud, simplify.views_around(around, 6, 48))
 
 
 def test_a_pair_keeps_its_peak_and_its_light():
     a, b, one = 0.6, 0.8, {name: value[:1] for name, value in shell().items()}
-    pair = {name: torch.cat([value, value]) for name, value in one.items()} | {"logit_opacities": torch.tensor([a, b]).logit()}
+    pair = {name: torch.cat([value, value]) for name, value in one.items()} | {
+        "logit_opacities": torch.tensor([a, b]).logit()
+    }
     merged = merge_duplicates(pair).values
-    peak, size = merged["logit_opacities"].sigmoid().item(), (merged["log_scales"].mean() - one["log_scales"].mean()).exp().item()
+    peak, size = (
+        merged["logit_opacities"].sigmoid().item(),
+        (merged["log_scales"].mean() - one["log_scales"].mean()).exp().item(),
+    )
     r = torch.linspace(0, 8, 4001, dtype=torch.float64)
     g = (-0.5 * r**2).exp()
     light = torch.trapezoid((1 - (1 - a * g) * (1 - b * g)) * r, r).item()
@@ -62,7 +75,9 @@ def test_copies_in_one_place_become_one(times):
     order = change.values["means"] @ torch.tensor([1.0, 10.0, 100.0])
     for name in ("means", "logit_opacities", "sh0", "sh_rest"):
         expected = params[name][(params["means"] @ torch.tensor([1.0, 10.0, 100.0])).argsort()]
-        torch.testing.assert_close(change.values[name][order.argsort()], expected, atol=1e-4, rtol=1e-4)  # float32 logits
+        torch.testing.assert_close(
+            change.values[name][order.argsort()], expected, atol=1e-4, rtol=1e-4
+        )  # float32 logits
     growth = (change.values["log_scales"] - params["log_scales"][change.parents % 60]).mean(1)
     assert (growth > 0).all() and (growth < 0.4).all()  # together they fall off more slowly
     assert simplify.psnr(picture(change.values), picture(copies(params, times))) > 40
@@ -75,7 +90,9 @@ def test_copies_a_little_apart_become_one_that_looks_like_both():
     both["means"] = both["means"] + 0.2 * both["log_scales"].exp().amin(1, keepdim=True) * away
     change = merge_duplicates(both)
     assert len(change.parents) == 60
-    assert simplify.psnr(picture(change.values), picture(both)) > 28  # where neighbours overlap, another one is in front
+    assert (
+        simplify.psnr(picture(change.values), picture(both)) > 28
+    )  # where neighbours overlap, another one is in front
 
 
 def test_what_is_no_duplicate_stays_bit_for_bit():
@@ -86,7 +103,12 @@ def test_what_is_no_duplicate_stays_bit_for_bit():
 
 
 @pytest.mark.parametrize(
-    ("name", "offset"), [("sh0", 1.5), ("log_scales", torch.tensor([0.0, 1.0, 0.0])), ("means", torch.tensor([0.1, 0.0, 0.1]))]
+    ("name", "offset"),
+    [
+        ("sh0", 1.5),
+        ("log_scales", torch.tensor([0.0, 1.0, 0.0])),
+        ("means", torch.tensor([0.1, 0.0, 0.1])),
+    ],
 )
 def test_another_colour_size_or_place_is_no_duplicate(name, offset):
     params = {key: value[:1].repeat(2, *[1] * (value.dim() - 1)) for key, value in shell().items()}
@@ -100,13 +122,19 @@ def test_a_floor_holds_and_the_cheapest_go_first():
     params["sh0"][60:90] += 0.2  # duplicates still, but dearer ones
     change = merge_duplicates(params, at_least=90)
     assert len(merge_duplicates(params, at_least=200).parents) == 120
-    assert len(change.parents) == 90 and set(change.parents[change.fresh].tolist()) == set(range(30, 60))
+    assert len(change.parents) == 90 and set(change.parents[change.fresh].tolist()) == set(
+        range(30, 60)
+    )
 
 
 def test_many_copies_in_one_place_take_few_rounds(monkeypatch):
     """All have the same nearest: pairs of these alone would be one or two a round."""
     rounds = []
-    monkeypatch.setattr(merging, "_merged", lambda *args, once=merging._merged: rounds.append(len(args[2])) or once(*args))
+    monkeypatch.setattr(
+        merging,
+        "_merged",
+        lambda *args, once=merging._merged: rounds.append(len(args[2])) or once(*args),
+    )
     one = {name: value[:1] for name, value in shell().items()}
     assert len(merge_duplicates(copies(one, 400)).parents) <= 4 and len(rounds) <= 20
 
@@ -122,7 +150,18 @@ def test_a_chain_of_neighbours_does_not_become_one():
 def test_few_and_unusable_gaussians():
     params = shell(2)
     assert len(merge_duplicates({name: value[:1] for name, value in params.items()}).parents) == 1
-    assert len(merge_duplicates({name: value[:0] for name, value in params.items()}, at_least=0).parents) == 0
+    assert (
+        len(
+            merge_duplicates(
+                {name: value[:0] for name, value in params.items()}, at_least=0
+            ).parents
+        )
+        == 0
+    )
     same = copies(shell(3), 2)
-    same["means"][0], same["quats"][4], same["log_scales"][2] = float("nan"), float("nan"), torch.tensor([-30.0, -30, 3])
+    same["means"][0], same["quats"][4], same["log_scales"][2] = (
+        float("nan"),
+        float("nan"),
+        torch.tensor([-30.0, -30, 3]),
+    )
     assert len(merge_duplicates(same).parents) == 6

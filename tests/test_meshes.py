@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.meshes.load import Mesh, SurfaceDistance, face_areas, find_mesh, load_mesh, sample_surface, surface_colors
+from threestudio_gaussiandreamer.meshes.load import (
+    Mesh,
+    SurfaceDistance,
+    face_areas,
+    find_mesh,
+    load_mesh,
+    sample_surface,
+    surface_colors,
+)
 
 trimesh = pytest.importorskip("trimesh")
 THIRDS = np.full((1, 3), 1 / 3)
@@ -26,7 +34,9 @@ def textured_quad(image, uv=((0, 0), (1, 0), (1, 1), (0, 1)), y=0.0, size=1.0):
     from PIL import Image
 
     corners = np.array([[0, y, 0], [1, y, 0], [1, y, 1], [0, y, 1]]) * [size, 1, size]
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(np.asarray(image, dtype=np.uint8)))
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.fromarray(np.asarray(image, dtype=np.uint8))
+    )
     visual = trimesh.visual.TextureVisuals(uv=np.array(uv, dtype=float), material=material)
     return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False)
 
@@ -56,14 +66,19 @@ def test_units_do_not_matter(tmp_path, scale):
     mesh = box((2, 5, 1))
     plain = load_mesh(saved(mesh, tmp_path / "a.ply"))
     mesh.apply_scale(scale)
-    np.testing.assert_allclose(load_mesh(saved(mesh, tmp_path / "b.ply")).vertices, plain.vertices, atol=1e-6)
+    np.testing.assert_allclose(
+        load_mesh(saved(mesh, tmp_path / "b.ply")).vertices, plain.vertices, atol=1e-6
+    )
 
 
 def arrow(direction, side):
-    """A mesh whose farthest vertex along x, y, z tells the axes apart: long along ``direction``, short along ``side``."""
+    """A mesh whose farthest vertex along x, y, z tells the axes apart: long along ``direction``,
+    short along ``side``.
+    """
     third = np.cross(direction, side)
     return trimesh.Trimesh(
-        [3 * np.array(direction, float), 2 * np.array(side, float), third, [0.0, 0, 0]], [[0, 1, 2], [0, 1, 3], [1, 2, 3]]
+        [3 * np.array(direction, float), 2 * np.array(side, float), third, [0.0, 0, 0]],
+        [[0, 1, 2], [0, 1, 3], [1, 2, 3]],
     )
 
 
@@ -73,7 +88,9 @@ def test_y_up_files_face_plus_z(tmp_path, name):
     mesh = load_mesh(saved(arrow((0, 0, 1), (0, 1, 0)), tmp_path / name), scale=1.5)
     corner = mesh.vertices[mesh.vertices[:, 0].argmax()] - mesh.vertices.min(axis=0)
     top = mesh.vertices[mesh.vertices[:, 2].argmax()] - mesh.vertices.min(axis=0)
-    np.testing.assert_allclose(corner, [3, 1, 0], atol=1e-5)  # third = z cross y = -x, so y starts at -1
+    np.testing.assert_allclose(
+        corner, [3, 1, 0], atol=1e-5
+    )  # third = z cross y = -x, so y starts at -1
     np.testing.assert_allclose(top, [0, 1, 2], atol=1e-5)
 
 
@@ -81,7 +98,9 @@ def test_y_up_files_face_plus_z(tmp_path, name):
 def test_z_up_files_keep_their_axes(tmp_path, name):
     mesh = arrow((1, 0, 0), (0, 0, 1))
     loaded = load_mesh(saved(mesh, tmp_path / name), scale=1.5)
-    np.testing.assert_allclose(np.ptp(loaded.vertices, axis=0), np.ptp(mesh.vertices, axis=0), atol=1e-5)
+    np.testing.assert_allclose(
+        np.ptp(loaded.vertices, axis=0), np.ptp(mesh.vertices, axis=0), atol=1e-5
+    )
     assert loaded.vertices[:, 0].argmax() == 0
 
 
@@ -93,7 +112,9 @@ def test_up_and_front_can_be_given_and_nothing_is_mirrored(tmp_path, up, front):
     mesh, plain = load_mesh(path, up=up, front=front), load_mesh(path, up="+z", front="+x")
     front = front or "+y"  # the axis after x
     side = np.cross(AXES[up], AXES[front])
-    np.testing.assert_allclose(mesh.vertices, plain.vertices @ np.stack([AXES[front], side, AXES[up]]).T, atol=1e-12)
+    np.testing.assert_allclose(
+        mesh.vertices, plain.vertices @ np.stack([AXES[front], side, AXES[up]]).T, atol=1e-12
+    )
     assert np.isclose(np.linalg.det(np.stack([AXES[front], side, AXES[up]])), 1)
 
 
@@ -116,7 +137,11 @@ def test_a_mesh_without_colours_is_grey(tmp_path):
 
 
 def test_vertex_colours_are_interpolated(tmp_path):
-    source = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], vertex_colors=np.eye(3, 4) * 255 + [0, 0, 0, 255])
+    source = trimesh.Trimesh(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0]],
+        [[0, 1, 2]],
+        vertex_colors=np.eye(3, 4) * 255 + [0, 0, 0, 255],
+    )
     mesh = load_mesh(saved(source, tmp_path / "a.ply"))
     assert mesh.has_colors
     weights = np.array([[0.2, 0.3, 0.5]])
@@ -128,15 +153,21 @@ def test_face_colours(tmp_path):
     source.visual.face_colors = np.random.default_rng(0).integers(0, 255, (12, 4))
     mesh = load_mesh(saved(source, tmp_path / "a.ply"))
     expected = source.visual.face_colors[:, :3] / 255
-    np.testing.assert_allclose([center_color(mesh, face) for face in range(12)], expected, atol=1e-6)
+    np.testing.assert_allclose(
+        [center_color(mesh, face) for face in range(12)], expected, atol=1e-6
+    )
 
 
 def test_a_material_without_texture_colours_the_mesh_in_srgb(tmp_path):
     source = box()
-    source.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 55, 255]))
+    source.visual = trimesh.visual.TextureVisuals(
+        material=trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 55, 255])
+    )
     mesh = load_mesh(saved(source, tmp_path / "a.glb"))
     linear = 55 / 255
-    np.testing.assert_allclose(center_color(mesh), [1, 0, 1.055 * linear ** (1 / 2.4) - 0.055], atol=1e-6)
+    np.testing.assert_allclose(
+        center_color(mesh), [1, 0, 1.055 * linear ** (1 / 2.4) - 0.055], atol=1e-6
+    )
 
 
 IMAGE = [[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]]  # red green / blue white
@@ -146,44 +177,71 @@ def test_the_textures_first_row_is_at_v_1(tmp_path):
     mesh = load_mesh(saved(textured_quad(IMAGE), tmp_path / "a.glb"))
     near_corners = surface_colors(mesh, np.array([0, 0, 0]), np.eye(3) * 0.75 + 0.25 / 3)
     blue, white, green = near_corners  # at uv (0, 0), (1, 0), (1, 1)
-    assert blue.argmax() == 2 and green.argmax() == 1 and white.min() > blue.min() and white.min() > 0.3
+    assert (
+        blue.argmax() == 2
+        and green.argmax() == 1
+        and white.min() > blue.min()
+        and white.min() > 0.3
+    )
 
 
 def test_texels_are_bilinear_and_repeat():
-    """Values at texel centres are the texels', halfway between two their mean; outside [0, 1] the texture repeats."""
+    """Values at texel centres are the texels', halfway between two their mean; outside [0, 1] the
+    texture repeats.
+    """
     texture = np.array(IMAGE, dtype=np.float32) / 255
     places = np.array([[0.25, 0.75], [0.5, 0.75], [0.75, 0.25], [1.25, -0.25], [0.0, 0.75]])
     expected = [[1, 0, 0], [0.5, 0.5, 0], [1, 1, 1], [1, 0, 0], [0.5, 0.5, 0]]
     for place, color in zip(places, expected, strict=True):
-        mesh = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]), uv=np.repeat(place[None], 3, axis=0).astype(np.float32), texture=texture)
+        mesh = Mesh(
+            np.zeros((3, 3)),
+            np.array([[0, 1, 2]]),
+            uv=np.repeat(place[None], 3, axis=0).astype(np.float32),
+            texture=texture,
+        )
         np.testing.assert_allclose(center_color(mesh), color, atol=1e-6)
 
 
 def test_a_texture_is_tinted_by_its_material(tmp_path):
     quad = textured_quad(np.full((2, 2, 3), 255))
     quad.visual.material.baseColorFactor = [255, 0, 255, 255]
-    np.testing.assert_allclose(center_color(load_mesh(saved(quad, tmp_path / "a.glb"))), [1, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(
+        center_color(load_mesh(saved(quad, tmp_path / "a.glb"))), [1, 0, 1], atol=1e-6
+    )
     quad.visual.material.baseColorFactor = [102, 102, 102, 255]  # trimesh's "no colour given"
-    np.testing.assert_allclose(center_color(load_mesh(saved(quad, tmp_path / "b.glb"))), 1, atol=1e-6)
+    np.testing.assert_allclose(
+        center_color(load_mesh(saved(quad, tmp_path / "b.glb"))), 1, atol=1e-6
+    )
 
 
 def test_a_scene_of_textures_and_colours_keeps_them_apart(tmp_path):
     """Two textures of different sizes (one of them repeating), vertex colours and a plain part."""
-    red, checks = np.tile([[[255, 0, 0]]], (3, 5, 1)), np.tile([[[0, 0, 255], [0, 255, 0]]], (1, 1, 1))
+    red, checks = (
+        np.tile([[[255, 0, 0]]], (3, 5, 1)),
+        np.tile([[[0, 0, 255], [0, 255, 0]]], (1, 1, 1)),
+    )
     repeated = textured_quad(checks, uv=((0, 0), (4, 0), (4, 1), (0, 1)), y=1.0)
     coloured = box(center=(5, 0, 0))
     coloured.visual.vertex_colors = [255, 255, 0, 255]
     scene = trimesh.Scene([textured_quad(red), repeated, coloured, box(center=(9, 0, 0))])
     mesh = load_mesh(saved(scene, tmp_path / "a.glb"))
     assert len(mesh.faces) == 28 and mesh.tiles.shape == (28, 4)
-    order = np.lexsort(mesh.vertices[mesh.faces].mean(axis=1)[:, 1:].T[::-1])  # by the file's x, then y
+    order = np.lexsort(
+        mesh.vertices[mesh.faces].mean(axis=1)[:, 1:].T[::-1]
+    )  # by the file's x, then y
     red_face, striped_face = sorted(
-        (face for face in range(28) if mesh.tiles[face, 2]), key=lambda f: mesh.vertices[mesh.faces[f], 2].mean()
+        (face for face in range(28) if mesh.tiles[face, 2]),
+        key=lambda f: mesh.vertices[mesh.faces[f], 2].mean(),
     )[::2]
     np.testing.assert_allclose(center_color(mesh, red_face), [1, 0, 0], atol=1e-6)
     across = mesh.uv[mesh.faces[striped_face], 0]
-    weights = [np.linalg.lstsq(np.stack([across, np.ones(3)]), [4 * u, 1], rcond=None)[0] for u in (0.0625, 0.1875, 0.3125, 0.8125)]
-    stripes = surface_colors(mesh, np.full(4, striped_face), np.array(weights))  # at u = 1/4, 3/4, 5/4 and 13/4 of the texture
+    weights = [
+        np.linalg.lstsq(np.stack([across, np.ones(3)]), [4 * u, 1], rcond=None)[0]
+        for u in (0.0625, 0.1875, 0.3125, 0.8125)
+    ]
+    stripes = surface_colors(
+        mesh, np.full(4, striped_face), np.array(weights)
+    )  # at u = 1/4, 3/4, 5/4 and 13/4 of the texture
     np.testing.assert_allclose(stripes, [[0, 0, 1], [0, 1, 0], [0, 0, 1], [0, 0, 1]], atol=1e-5)
     np.testing.assert_allclose(center_color(mesh, order[-13]), [1, 1, 0], atol=1e-6)
     np.testing.assert_allclose(center_color(mesh, order[-1]), 0.5, atol=1e-6)
@@ -203,7 +261,9 @@ def test_samples_are_uniform_over_the_area_and_ignore_empty_faces():
     assert not (faces == 1).any()
     assert stats.binomtest(int((faces == 0).sum()), 20000, 0.25).pvalue > 0.01
     first = points[faces == 0]
-    assert stats.kstest(1 - (1 - first[:, 0]) ** 2, "uniform").pvalue > 0.01  # the marginal of a uniform right triangle
+    assert (
+        stats.kstest(1 - (1 - first[:, 0]) ** 2, "uniform").pvalue > 0.01
+    )  # the marginal of a uniform right triangle
     np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-12)
 
 
@@ -230,14 +290,20 @@ def test_a_few_bad_vertices_are_dropped_with_a_count(tmp_path, caplog):
 
 
 def test_objects_as_programs_write_them_are_read(tmp_path):
-    """Blanks, tabs, carriage returns, continued lines, exponents, colours, texture coordinates of three, polygons, other statements."""
+    """Blanks, tabs, carriage returns, continued lines, exponents, colours, texture coordinates of
+    three, polygons, other statements.
+    """
     text = (
-        "# made by hand\r\nmtllib none.mtl\no box\nv 0 0.0 -.0 1 0 0\nv  1e0\t0 0 0 1 0 \nv 1 1.5E-0 0 0 0 1\nv +0 1 0 1 1 1\n"
-        "vt 0 0 0\nvt 1 0 0\nvt 1 1 0\nvt 0 1 0\nvn 0 0 1\ng a b\ns off\nusemtl m\nf 1/1/1 2/2/1 \\\n3/3/1 4/4/1\nvp 1 2\nl 1 2\n"
+        "# made by hand\r\nmtllib none.mtl\no box\nv 0 0.0 -.0 1 0 0\nv  1e0\t0 0 0 1 0 \nv 1 "
+        "1.5E-0 0 0 0 1\nv +0 1 0 1 1 1\n"
+        "vt 0 0 0\nvt 1 0 0\nvt 1 1 0\nvt 0 1 0\nvn 0 0 1\ng a b\ns off\nusemtl m\nf 1/1/1 "
+        "2/2/1 \\\n3/3/1 4/4/1\nvp 1 2\nl 1 2\n"
     )
     (tmp_path / "a.obj").write_bytes(text.encode())
     assert len(load_mesh(tmp_path / "a.obj").faces) == 2
-    (tmp_path / "b.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nf 1//1 2//1 3//1\nvn 0 0 1\n")
+    (tmp_path / "b.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nf 1//1 2//1 3//1\nvn 0 0 1\n"
+    )
     assert len(load_mesh(tmp_path / "b.obj").faces) == 2
 
 
@@ -264,15 +330,24 @@ def test_many_bad_vertices_are_an_error(tmp_path):
         ("empty.obj", b"", "no faces|can't read"),
         (
             "points.ply",
-            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n",
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float "
+            b"y\nproperty float z\nend_header\n0 0 0\n",
             "no faces",
         ),
         ("flat.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "zero area"),
         ("line.obj", b"v 0 0 0\nv 1 1 1\nv 2 2 2\nf 1 2 3\n", "zero area"),
-        ("zero.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 2 3\n", "line 4 is no vertex or face: 'f 0 2 3'"),
+        (
+            "zero.obj",
+            b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 2 3\n",
+            "line 4 is no vertex or face: 'f 0 2 3'",
+        ),
         ("two.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "line 1 is no vertex or face"),
         ("relative.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 0 0 1\n", "absolute indices"),
-        ("accessor.gltf", b'{"accessors": [{"count": 1000000000, "type": "VEC3", "componentType": 5126}]}', "aren't in the file"),
+        (
+            "accessor.gltf",
+            b'{"accessors": [{"count": 1000000000, "type": "VEC3", "componentType": 5126}]}',
+            "aren't in the file",
+        ),
         ("list.gltf", b"[]", "isn't that of a glTF"),
         ("chunk.glb", b"glTF\2\0\0\0\x20\0\0\0\xff\xff\xff\x7fJSON{}", "chunks"),
         ("range.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "names vertex 7|can't read"),
@@ -287,7 +362,12 @@ def test_what_cannot_be_used_is_named(tmp_path, name, content, message):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"up": "z"}, "up axis 'z'"), ({"front": "+w"}, "front axis"), ({"up": "+z", "front": "-z"}, "along"), ({"scale": 0}, "scale")],
+    [
+        ({"up": "z"}, "up axis 'z'"),
+        ({"front": "+w"}, "front axis"),
+        ({"up": "+z", "front": "-z"}, "along"),
+        ({"scale": 0}, "scale"),
+    ],
 )
 def test_bad_options_are_named(tmp_path, options, message):
     with pytest.raises(UserError, match=message):
@@ -317,7 +397,9 @@ def test_a_bundled_mesh_is_suggested_for_a_misspelt_one(name, tmp_path, monkeypa
     with pytest.raises(UserError, match="did you mean the bundled 'toy.glb'"):
         load_mesh(name)
     saved(box(), tmp_path / "toys.glb")
-    with pytest.raises(UserError, match="bundled" if "/" in name else "near names in '.': toys.glb"):
+    with pytest.raises(
+        UserError, match="bundled" if "/" in name else "near names in '.': toys.glb"
+    ):
         load_mesh(name)
 
 
@@ -331,5 +413,9 @@ def test_shared_meshes(shared_folder, name, front, faces):
     assert colors.min() >= 0 and colors.max() <= 1
     red, green, blue = colors.T
     # the duck's orange beak, the cow's pink snout: in front
-    nose = (red > 0.9) & (green < 0.6) & (blue < 0.3) if name == "duck" else (red > 0.9) & (blue > 0.5) & (blue < 0.75)
+    nose = (
+        (red > 0.9) & (green < 0.6) & (blue < 0.3)
+        if name == "duck"
+        else (red > 0.9) & (blue > 0.5) & (blue < 0.75)
+    )
     assert nose.sum() > 200 and points[nose, 0].mean() > 0.5

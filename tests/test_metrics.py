@@ -4,7 +4,14 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.metrics import azimuth_difference, floater_mass, multi_face_rate, out_of_gamut, psnr, ssim
+from threestudio_gaussiandreamer.metrics import (
+    azimuth_difference,
+    floater_mass,
+    multi_face_rate,
+    out_of_gamut,
+    psnr,
+    ssim,
+)
 
 
 def images(*shape, seed=0):
@@ -28,7 +35,9 @@ def test_ssim_agrees_with_torchmetrics(noise):
     reference = pytest.importorskip("torchmetrics.functional.image")
     a = images(3, 6, 6, 3).repeat_interleave(8, 1).repeat_interleave(8, 2)
     b = (a + noise * torch.randn(a.shape, generator=torch.Generator().manual_seed(1))).clamp(0, 1)
-    expected = reference.structural_similarity_index_measure(b.movedim(-1, 1), a.movedim(-1, 1), data_range=1.0, reduction="none")
+    expected = reference.structural_similarity_index_measure(
+        b.movedim(-1, 1), a.movedim(-1, 1), data_range=1.0, reduction="none"
+    )
     # both are float32 with E[x^2] - E[x]^2 against a constant of 9e-4
     torch.testing.assert_close(ssim(a, b), expected, rtol=0, atol=2e-4)
     torch.testing.assert_close(ssim(a[0], b[0]), ssim(a, b)[0], rtol=0, atol=1e-6)
@@ -50,7 +59,9 @@ def test_multi_face_rate_counts_views_of_the_wrong_side():
     bank, azimuths = images(8, 32, 32, 3), torch.arange(8) * 45.0
     assert multi_face_rate(bank, bank, azimuths, azimuths) == 0
     everywhere_the_back = bank[4].expand(8, -1, -1, -1)
-    assert multi_face_rate(everywhere_the_back, bank, azimuths, azimuths) == 5 / 8  # 180 and its two neighbours at 45 are right
+    assert (
+        multi_face_rate(everywhere_the_back, bank, azimuths, azimuths) == 5 / 8
+    )  # 180 and its two neighbours at 45 are right
 
 
 def test_floater_mass_is_weighted_by_opacity():

@@ -1,4 +1,6 @@
-"""Gradual pruning: exact counts, what nobody would miss goes first, ``auto`` stops where the quality would suffer."""
+"""Gradual pruning: exact counts, what nobody would miss goes first, ``auto`` stops where the
+quality would suffer.
+"""
 
 import pytest
 import torch
@@ -51,14 +53,22 @@ def test_the_budget_is_reached_round_by_round_and_then_holds():
 
 def test_a_budget_is_met_though_there_are_few_rounds():
     """In equal shares, each smaller than the usual one."""
-    assert rounds(cloud(100, budget=10, prune={"start": 0, "stop": 3, "every": 1}), 4) == [46, 21, 10, 10]
+    assert rounds(cloud(100, budget=10, prune={"start": 0, "stop": 3, "every": 1}), 4) == [
+        46,
+        21,
+        10,
+        10,
+    ]
 
 
 def test_without_a_budget_nothing_goes():
     assert rounds(cloud(100, prune=EVERY_STEP), 3) == [100, 100, 100]
 
 
-@pytest.mark.parametrize(("given", "taken"), [("none", None), ("None", None), (None, None), (5e3, 5000), ("5e3", 5000), ("Auto", "auto")])
+@pytest.mark.parametrize(
+    ("given", "taken"),
+    [("none", None), ("None", None), (None, None), (5e3, 5000), ("5e3", 5000), ("Auto", "auto")],
+)
 def test_a_budget_may_be_written_as_people_do(given, taken):
     assert GaussianCloud({"budget": given}).cfg.budget == taken
 
@@ -83,24 +93,46 @@ def test_those_with_the_lowest_scores_go_first(sampled):
 
 @pytest.mark.parametrize("name", parsimony.SCORES)
 def test_each_score_ranks_by_what_it_says(name):
-    contribution, removal = torch.tensor([0.1, 0.2, 0.3]), torch.tensor([4.0, 0.25, 0.36])  # roots: 2, 0.5, 0.6
+    contribution, removal = (
+        torch.tensor([0.1, 0.2, 0.3]),
+        torch.tensor([4.0, 0.25, 0.36]),
+    )  # roots: 2, 0.5, 0.6
     logits, seen = torch.tensor([3.0, 1.0, 2.0]), parsimony.Seen(contribution, removal)
     scores = [parsimony.score(name, logits, seen, generator(0, "s", step)) for step in (0, 0, 1)]
-    expected = {"opacity": logits, "contribution": contribution, "removal": torch.tensor([0.2, 0.1, 0.18]), "random": scores[1]}
+    expected = {
+        "opacity": logits,
+        "contribution": contribution,
+        "removal": torch.tensor([0.2, 0.1, 0.18]),
+        "random": scores[1],
+    }
     assert torch.allclose(scores[0], expected[name])
     assert torch.equal(scores[0], scores[2]) == (name != "random")
 
 
 def test_unsampled_the_contribution_ranks():
     seen = parsimony.Seen(torch.tensor([0.1, 0.3, 0.2]), torch.zeros(3))
-    assert parsimony.score("removal", torch.zeros(3), seen, generator(0, "s")).argsort().tolist() == [0, 2, 1]
+    assert parsimony.score(
+        "removal", torch.zeros(3), seen, generator(0, "s")
+    ).argsort().tolist() == [0, 2, 1]
 
 
 def drawn(geometry, opacities, preset="accurate"):
-    c2w = orbit_c2w(torch.tensor([20.0, -10.0]), torch.tensor([30.0, 200.0]), torch.tensor([2.0, 2.0]))
+    c2w = orbit_c2w(
+        torch.tensor([20.0, -10.0]), torch.tensor([30.0, 200.0]), torch.tensor([2.0, 2.0])
+    )
     viewmats, Ks = to_opencv(c2w, torch.tensor([0.8, 0.8]), 32, 32)
     shape = geometry.means.double(), geometry.quats.double(), geometry.scales().double()
-    return rasterize(*shape, opacities, geometry.colors(c2w[:, :3, 3]).double(), viewmats, Ks, 32, 32, backend="torch", alpha_min=0.0).image
+    return rasterize(
+        *shape,
+        opacities,
+        geometry.colors(c2w[:, :3, 3]).double(),
+        viewmats,
+        Ks,
+        32,
+        32,
+        backend="torch",
+        alpha_min=0.0,
+    ).image
 
 
 def test_the_removal_error_is_that_of_leaving_each_gaussian_out():
@@ -110,7 +142,9 @@ def test_the_removal_error_is_that_of_leaving_each_gaussian_out():
     with torch.no_grad():
         without = [drawn(geometry, opacities * (torch.arange(12) != row)) for row in range(12)]
         exact = torch.stack([(image - images).square().sum() for image in without])
-    samples = torch.stack([parsimony.removal_error(images, opacities, generator(0, "r", i)) for i in range(3000)])
+    samples = torch.stack(
+        [parsimony.removal_error(images, opacities, generator(0, "r", i)) for i in range(3000)]
+    )
     error = (samples.mean(0) - exact).abs() / (samples.std(0) / 3000**0.5 + 1e-12)
     assert exact.amin() > 1e-4 and error.amax() < 4  # standard errors
     assert (samples.mean(0) / exact - 1).abs().amax() < 0.15
@@ -131,9 +165,20 @@ def pictures(out, opacities, background=(0.0, 0.0, 0.0)):
 def test_the_colour_of_the_background_hides_nobody():
     geometry = cloud(12, budget=5)
     geometry.sh0.data[0] = -0.5 / 0.28209479177387814  # black, as the background
-    viewmats, Ks = to_opencv(orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])), torch.tensor([0.8]), 32, 32)
+    viewmats, Ks = to_opencv(
+        orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])),
+        torch.tensor([0.8]),
+        32,
+        32,
+    )
     opacities = geometry.opacities()
-    inputs = geometry.means, geometry.quats, geometry.scales(), opacities, geometry.colors(viewmats[:, 3, :3])
+    inputs = (
+        geometry.means,
+        geometry.quats,
+        geometry.scales(),
+        opacities,
+        geometry.colors(viewmats[:, 3, :3]),
+    )
     out = rasterize(*inputs, viewmats, Ks, 32, 32)
     geometry.sample_removal(pictures(out, opacities), 60)
     assert out.contribution[0, 0] > 0.1 and geometry.removal[0] > 0.01 * geometry.removal.median()
@@ -141,23 +186,45 @@ def test_the_colour_of_the_background_hides_nobody():
 
 @pytest.mark.parametrize("backend", ["auto", "torch", "reference"])
 def test_sampling_leaves_the_gradients_of_the_loss_alone(backend):
-    viewmats, Ks = to_opencv(orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])), torch.tensor([0.8]), 32, 32)
+    viewmats, Ks = to_opencv(
+        orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])),
+        torch.tensor([0.8]),
+        32,
+        32,
+    )
     left = []
     for budget in (None, 5):
         geometry = cloud(12, budget=budget, densify={"enabled": True, "absgrad": True})
         opacities = geometry.opacities()
-        inputs = geometry.means, geometry.quats, geometry.scales(), opacities, geometry.colors(viewmats[:, 3, :3])
+        inputs = (
+            geometry.means,
+            geometry.quats,
+            geometry.scales(),
+            opacities,
+            geometry.colors(viewmats[:, 3, :3]),
+        )
         out = rasterize(*inputs, viewmats, Ks, 32, 32, absgrad=True, backend=backend)
         geometry.sample_removal(pictures(out, opacities), 60)
         assert geometry.removal.any() == (budget is not None)
         (out.image**2).sum().backward()
-        left.append([out.means2d.grad, out.means2d.absgrad, *(p.grad for p in geometry.parameters() if p.numel())])
+        left.append(
+            [
+                out.means2d.grad,
+                out.means2d.absgrad,
+                *(p.grad for p in geometry.parameters() if p.numel()),
+            ]
+        )
     assert all(torch.equal(plain, sampled) for plain, sampled in zip(*left, strict=True))
 
 
-@pytest.mark.parametrize(("step", "due"), [(48, False), (51, False), (52, True), (848, True), (849, False), (852, False)])
+@pytest.mark.parametrize(
+    ("step", "due"), [(48, False), (51, False), (52, True), (848, True), (849, False), (852, False)]
+)
 def test_samples_are_taken_where_a_round_will_ask_for_them(step, due):
-    assert cloud(10, budget=5, prune={"start": 100, "stop": 900, "every": 50})._samples_removal(step) == due
+    assert (
+        cloud(10, budget=5, prune={"start": 100, "stop": 900, "every": 50})._samples_removal(step)
+        == due
+    )
 
 
 def test_a_gaussian_that_hides_its_own_colour_shows_nothing():
@@ -181,25 +248,49 @@ def test_auto_leaves_out_the_first_half_of_its_rounds():
     schedule = {"start": 100, "stop": 900, "every": 50}
     assert list(cloud(1, prune=schedule).prune_rounds) == list(range(100, 900, 50))
     auto = cloud(1, budget="auto", prune=schedule | {"quality": 0.4})
-    assert list(auto.prune_rounds) == list(range(500, 900, 50)) and auto.affordable == pytest.approx(0.05)
-    assert list(cloud(1, budget="auto", prune={"start": 1, "stop": 50, "every": 50}).prune_rounds) == []
+    assert list(auto.prune_rounds) == list(
+        range(500, 900, 50)
+    ) and auto.affordable == pytest.approx(0.05)
+    assert (
+        list(cloud(1, budget="auto", prune={"start": 1, "stop": 50, "every": 50}).prune_rounds)
+        == []
+    )
 
 
 def test_growth_stays_within_what_the_budget_leaves():
-    hot = {"enabled": True, "start": 0, "stop": 100, "every": 1, "grad_threshold": 0.0, "min_opacity": 0.0}
+    hot = {
+        "enabled": True,
+        "start": 0,
+        "stop": 100,
+        "every": 1,
+        "grad_threshold": 0.0,
+        "min_opacity": 0.0,
+    }
     geometry = cloud(100, budget=50, prune=EVERY_STEP, densify=hot)
     assert rounds(geometry, 6) == [80, 64, 51, 50, 50, 50]
 
 
 def test_a_budget_gives_room_to_grow_up_to_it():
-    hot = {"enabled": True, "start": 0, "stop": 100, "every": 1, "grad_threshold": 0.0, "min_opacity": 0.0}
+    hot = {
+        "enabled": True,
+        "start": 0,
+        "stop": 100,
+        "every": 1,
+        "grad_threshold": 0.0,
+        "min_opacity": 0.0,
+    }
     assert max(rounds(cloud(40, budget=50, prune=EVERY_STEP | {"start": 99}, densify=hot), 3)) == 50
 
 
 def test_pruning_after_densifying_keeps_track_of_rows():
     geometry = cloud(10)
     params = geometry.parameters_by_name()
-    first = densify_and_prune(params, Statistics(torch.ones(10), geometry.contribution), Rules(min_opacity=0.0), generator(0, "s"))
+    first = densify_and_prune(
+        params,
+        Statistics(torch.ones(10), geometry.contribution),
+        Rules(min_opacity=0.0),
+        generator(0, "s"),
+    )
     both = parsimony.pruned(first.values, geometry.contribution[first.parents], 7, first)
     assert len(both.parents) == len(both.fresh) == 7
     untouched = ~both.fresh
@@ -230,7 +321,12 @@ def test_auto_by_contribution_never_drops_the_top_gaussian_of_a_pixel():
 
 def test_a_weight_above_one_half_is_the_largest_of_its_pixel():
     geometry = cloud(60)
-    viewmats, Ks = to_opencv(orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])), torch.tensor([0.8]), 24, 24)
+    viewmats, Ks = to_opencv(
+        orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])),
+        torch.tensor([0.8]),
+        24,
+        24,
+    )
     inputs = geometry.means, geometry.quats, geometry.scales(), geometry.opacities()
     # a colour of its own for each Gaussian shows every weight of every pixel
     weights = rasterize(*inputs, torch.eye(60), viewmats, Ks, 24, 24, backend="torch")
@@ -249,10 +345,21 @@ def test_auto_in_the_loop_ends_where_the_quality_ends():
 
 def test_hidden_gaussians_are_as_if_they_were_not_there_and_come_back():
     geometry = cloud(50)
-    viewmats, Ks = to_opencv(orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])), torch.tensor([0.8]), 24, 24)
+    viewmats, Ks = to_opencv(
+        orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])),
+        torch.tensor([0.8]),
+        24,
+        24,
+    )
 
     def image(rows=slice(None)):
-        inputs = (geometry.means, geometry.quats, geometry.scales(), geometry.opacities(), geometry.colors(torch.zeros(1, 3)))
+        inputs = (
+            geometry.means,
+            geometry.quats,
+            geometry.scales(),
+            geometry.opacities(),
+            geometry.colors(torch.zeros(1, 3)),
+        )
         return rasterize(*(value[rows].detach() for value in inputs), viewmats, Ks, 24, 24).image
 
     kept, before = torch.arange(50) % 2 == 0, image()

@@ -17,23 +17,43 @@ def rng(seed=0):
 
 def gaussians(count=50, degree=0, seed=0):
     shapes = [(count, 3), (count, (degree + 1) ** 2, 3), (count,), (count, 3), (count, 4)]
-    return ply.GaussianArrays(*(rng(seed + i).normal(size=shape).astype(np.float32) for i, shape in enumerate(shapes)))
+    return ply.GaussianArrays(
+        *(rng(seed + i).normal(size=shape).astype(np.float32) for i, shape in enumerate(shapes))
+    )
 
 
 def cloud(count=50, normals=True):
     values = rng(9).normal(size=(count, 3)).astype(np.float32)
-    return PointCloud(points=values, colors=rng(8).random((count, 3), np.float32), normals=values if normals else None)
+    return PointCloud(
+        points=values,
+        colors=rng(8).random((count, 3), np.float32),
+        normals=values if normals else None,
+    )
 
 
 def assert_same(arrays, expected):
     for name in expected._fields:
         a, b = getattr(arrays, name), getattr(expected, name)
-        assert a is b is None or (a.dtype == np.float32 and a.shape == b.shape and a.tobytes() == b.tobytes()), name
+        assert a is b is None or (
+            a.dtype == np.float32 and a.shape == b.shape and a.tobytes() == b.tobytes()
+        ), name
 
 
-def header(encoding="ascii", count=2, properties=("float x", "float y", "float z"), before="", after=""):
+def header(
+    encoding="ascii", count=2, properties=("float x", "float y", "float z"), before="", after=""
+):
     lines = [f"property {entry}" for entry in properties]
-    return "\n".join(["ply", f"format {encoding} 1.0", *filter(None, [before]), f"element vertex {count}", *lines, after, "end_header\n"])
+    return "\n".join(
+        [
+            "ply",
+            f"format {encoding} 1.0",
+            *filter(None, [before]),
+            f"element vertex {count}",
+            *lines,
+            after,
+            "end_header\n",
+        ]
+    )
 
 
 def saved(folder, content, name="file.ply"):
@@ -62,12 +82,30 @@ class TestGaussians:
         arrays = gaussians(2, degree=1)
         ply.write_gaussians(tmp_path / "a.ply", **arrays._asdict())
         head, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
-        names = [line.split()[-1] for line in head.decode().splitlines() if line.startswith("property float ")]
+        names = [
+            line.split()[-1]
+            for line in head.decode().splitlines()
+            if line.startswith("property float ")
+        ]
         rest = [f"f_rest_{i}" for i in range(9)]
-        assert names == [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity", *ply.LOG_SCALES, *ply.QUATS]
+        assert names == [
+            *"xyz",
+            "nx",
+            "ny",
+            "nz",
+            "f_dc_0",
+            "f_dc_1",
+            "f_dc_2",
+            *rest,
+            "opacity",
+            *ply.LOG_SCALES,
+            *ply.QUATS,
+        ]
         assert head.startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n")
         row = np.array(struct.unpack(f"<{len(names)}f", data[: 4 * len(names)]), np.float32)
-        np.testing.assert_array_equal(row[names.index("f_rest_0") :][:9], arrays.sh[0, 1:].T.ravel())  # red's three, green's, blue's
+        np.testing.assert_array_equal(
+            row[names.index("f_rest_0") :][:9], arrays.sh[0, 1:].T.ravel()
+        )  # red's three, green's, blue's
         np.testing.assert_array_equal(row[-4:], arrays.quats[0])
         assert len(data) == 2 * 4 * len(names)
 
@@ -83,15 +121,23 @@ class TestGaussians:
 
     def test_shapes_that_disagree_are_refused(self, tmp_path):
         with pytest.raises((ValueError, TypeError), match="quats"):
-            ply.write_gaussians(tmp_path / "a.ply", **{**gaussians(3)._asdict(), "quats": np.zeros((4, 4))})
+            ply.write_gaussians(
+                tmp_path / "a.ply", **{**gaussians(3)._asdict(), "quats": np.zeros((4, 4))}
+            )
         assert not list(tmp_path.iterdir())
 
     @pytest.mark.parametrize("order", ["<", ">"])
     def test_any_order_of_properties_and_bytes_and_extra_ones(self, tmp_path, order):
         expected = gaussians(7, degree=1)
         names = [*ply.GAUSSIAN, *(f"f_rest_{i}" for i in range(9)), "segment"]
-        columns = dict(zip(ply.MEANS, expected.means.T, strict=True), opacity=expected.logit_opacities, segment=np.arange(7))
-        columns |= {f"f_dc_{i}": expected.sh[:, 0, i] for i in range(3)} | {f"scale_{i}": expected.log_scales[:, i] for i in range(3)}
+        columns = dict(
+            zip(ply.MEANS, expected.means.T, strict=True),
+            opacity=expected.logit_opacities,
+            segment=np.arange(7),
+        )
+        columns |= {f"f_dc_{i}": expected.sh[:, 0, i] for i in range(3)} | {
+            f"scale_{i}": expected.log_scales[:, i] for i in range(3)
+        }
         columns |= {f"rot_{i}": expected.quats[:, i] for i in range(4)}
         columns |= {f"f_rest_{i}": expected.sh[:, 1 + i % 3, i // 3] for i in range(9)}
         names = list(rng().permutation(names))
@@ -99,22 +145,40 @@ class TestGaussians:
         for name in names:
             rows[name] = columns[name]
         encoding = "binary_little_endian" if order == "<" else "binary_big_endian"
-        path = saved(tmp_path, header(encoding, 7, [f"double {name}" for name in names]).encode() + rows.tobytes())
+        path = saved(
+            tmp_path,
+            header(encoding, 7, [f"double {name}" for name in names]).encode() + rows.tobytes(),
+        )
         assert_same(ply.read_gaussians(path), expected)
         assert ply.is_gaussian_ply(path)
 
     def test_text(self, tmp_path):
         expected = gaussians(3)
-        columns = [expected.means, expected.sh[:, 0], expected.logit_opacities[:, None], expected.log_scales, expected.quats]
+        columns = [
+            expected.means,
+            expected.sh[:, 0],
+            expected.logit_opacities[:, None],
+            expected.log_scales,
+            expected.quats,
+        ]
         rows = np.concatenate(columns, axis=1)
         text = "\n".join(" ".join(repr(float(value)) for value in row) for row in rows)
-        assert_same(ply.read_gaussians(saved(tmp_path, header("ascii", 3, [f"float {n}" for n in ply.GAUSSIAN]) + text)), expected)
+        assert_same(
+            ply.read_gaussians(
+                saved(tmp_path, header("ascii", 3, [f"float {n}" for n in ply.GAUSSIAN]) + text)
+            ),
+            expected,
+        )
 
     def test_what_is_not_known_is_named(self, tmp_path, caplog):
         ply.write_gaussians(tmp_path / "a.ply", **gaussians()._asdict())
         ply.read_gaussians(tmp_path / "a.ply")
         assert not caplog.text
-        (tmp_path / "b.ply").write_bytes((tmp_path / "a.ply").read_bytes().replace(b"property float nx", b"property float filter_3D"))
+        (tmp_path / "b.ply").write_bytes(
+            (tmp_path / "a.ply")
+            .read_bytes()
+            .replace(b"property float nx", b"property float filter_3D")
+        )
         ply.read_gaussians(tmp_path / "b.ply")
         assert "b.ply: not known here, and left out: filter_3D" in caplog.text
 
@@ -126,9 +190,14 @@ class TestGaussians:
         with pytest.raises(UserError, match="lack scale_2"):
             ply.read_gaussians(saved(tmp_path, header("ascii", 0, two_dimensional)))
 
-    @pytest.mark.parametrize("rest", [["f_rest_0"], [f"f_rest_{i}" for i in range(6)], ["f_rest_0", "f_rest_1", "f_rest_3"]])
+    @pytest.mark.parametrize(
+        "rest",
+        [["f_rest_0"], [f"f_rest_{i}" for i in range(6)], ["f_rest_0", "f_rest_1", "f_rest_3"]],
+    )
     def test_impossible_harmonics_are_refused(self, tmp_path, rest):
-        path = saved(tmp_path, header("ascii", 0, [f"float {name}" for name in (*ply.GAUSSIAN, *rest)]))
+        path = saved(
+            tmp_path, header("ascii", 0, [f"float {name}" for name in (*ply.GAUSSIAN, *rest)])
+        )
         with pytest.raises(UserError, match="f_rest"):
             ply.read_gaussians(path)
 
@@ -178,38 +247,71 @@ class TestPoints:
         ],
     )
     def test_colours_of_other_programs(self, tmp_path, properties, values):
-        text = header("ascii", 1, ["float x", "float y", "float z", *properties]) + f"1 2 3 {values}\n"
+        text = (
+            header("ascii", 1, ["float x", "float y", "float z", *properties]) + f"1 2 3 {values}\n"
+        )
         read = ply.read_points(saved(tmp_path, text))
         np.testing.assert_allclose(read.colors, [[1.0, 0.0, 0.2]], atol=1e-6)
         np.testing.assert_array_equal(read.points, [[1, 2, 3]])
 
     def test_no_colours_are_grey(self, tmp_path):
-        np.testing.assert_array_equal(ply.read_points(saved(tmp_path, header() + "1 2 3\n4 5 6\n")).colors, np.full((2, 3), 0.5))
+        np.testing.assert_array_equal(
+            ply.read_points(saved(tmp_path, header() + "1 2 3\n4 5 6\n")).colors,
+            np.full((2, 3), 0.5),
+        )
 
     def test_line_ends_blank_lines_and_comments(self, tmp_path):
-        text = header().replace("ascii 1.0", "ascii 1.0\ncomment end_header is below\nobj_info x") + "1 2 3\n\n4 5 6"
+        text = (
+            header().replace("ascii 1.0", "ascii 1.0\ncomment end_header is below\nobj_info x")
+            + "1 2 3\n\n4 5 6"
+        )
         assert ply.read_points(saved(tmp_path, text.replace("\n", "\r\n"))).points.shape == (2, 3)
-        binary = header("binary_little_endian").replace("\n", "\r\n").encode() + np.arange(6, dtype="<f4").tobytes()
-        np.testing.assert_array_equal(ply.read_points(saved(tmp_path, binary)).points, [[0, 1, 2], [3, 4, 5]])
+        binary = (
+            header("binary_little_endian").replace("\n", "\r\n").encode()
+            + np.arange(6, dtype="<f4").tobytes()
+        )
+        np.testing.assert_array_equal(
+            ply.read_points(saved(tmp_path, binary)).points, [[0, 1, 2], [3, 4, 5]]
+        )
 
-    @pytest.mark.parametrize("encoding, order", [("ascii", ""), ("binary_little_endian", "<"), ("binary_big_endian", ">")])
+    @pytest.mark.parametrize(
+        "encoding, order",
+        [("ascii", ""), ("binary_little_endian", "<"), ("binary_big_endian", ">")],
+    )
     def test_elements_before_and_after_are_skipped(self, tmp_path, encoding, order):
-        before = "element face 2\nproperty list uchar int vertex_indices\nproperty float area\nelement edge 1\nproperty int a"
-        after = "element empty 1000000000000\nelement face 1\nproperty list uchar int vertex_indices"
+        before = (
+            "element face 2\nproperty list uchar int vertex_indices\nproperty float "
+            "area\nelement edge 1\nproperty int a"
+        )
+        after = (
+            "element empty 1000000000000\nelement face 1\nproperty list uchar int vertex_indices"
+        )
         head = header(encoding, 2, before=before, after=after)
         if encoding == "ascii":
             content = head + "3 0 1 2 0.5\n4 0 1 2 3 0.5\n7\n1 2 3\n4 5 6\n3 0 1 2\n"
         else:
-            faces = struct.pack(f"{order}B3if", 3, 0, 1, 2, 0.5) + struct.pack(f"{order}B4if", 4, 0, 1, 2, 3, 0.5)
-            content = head.encode() + faces + struct.pack(f"{order}i", 7) + struct.pack(f"{order}6f", 1, 2, 3, 4, 5, 6) + b"\3"
-        np.testing.assert_array_equal(ply.read_points(saved(tmp_path, content)).points, [[1, 2, 3], [4, 5, 6]])
+            faces = struct.pack(f"{order}B3if", 3, 0, 1, 2, 0.5) + struct.pack(
+                f"{order}B4if", 4, 0, 1, 2, 3, 0.5
+            )
+            content = (
+                head.encode()
+                + faces
+                + struct.pack(f"{order}i", 7)
+                + struct.pack(f"{order}6f", 1, 2, 3, 4, 5, 6)
+                + b"\3"
+            )
+        np.testing.assert_array_equal(
+            ply.read_points(saved(tmp_path, content)).points, [[1, 2, 3], [4, 5, 6]]
+        )
 
     def test_gaussians_are_read_as_their_coloured_centres(self, tmp_path):
         arrays = gaussians(30)
         ply.write_gaussians(tmp_path / "a.ply", **arrays._asdict())
         read = ply.read_points(tmp_path / "a.ply")
         np.testing.assert_array_equal(read.points, arrays.means)
-        np.testing.assert_allclose(read.colors, (0.5 + 0.28209479 * arrays.sh[:, 0]).clip(0, 1), atol=1e-6)
+        np.testing.assert_allclose(
+            read.colors, (0.5 + 0.28209479 * arrays.sh[:, 0]).clip(0, 1), atol=1e-6
+        )
 
     def test_not_finite_is_refused_or_left_to_the_caller(self, tmp_path):
         path = saved(tmp_path, header() + "1 2 3\n4 nan 6\n")
@@ -222,8 +324,14 @@ class TestDamage:
     @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
     def test_more_than_was_announced_is_said(self, tmp_path, encoding, caplog):
         data = b"1 2 3\n4 5 6\n7 8 9\n" if encoding == "ascii" else bytes(range(36))
-        assert len(ply.read_points(saved(tmp_path, header(encoding, 2).encode() + data)).points) == 2
-        assert "6 bytes follow the 2 vertices" in caplog.text if encoding == "ascii" else "12 bytes follow" in caplog.text
+        assert (
+            len(ply.read_points(saved(tmp_path, header(encoding, 2).encode() + data)).points) == 2
+        )
+        assert (
+            "6 bytes follow the 2 vertices" in caplog.text
+            if encoding == "ascii"
+            else "12 bytes follow" in caplog.text
+        )
         caplog.clear()
         ply.read_points(saved(tmp_path, header(encoding, 3).encode() + data + b"\n\n"))
         assert not [record for record in caplog.records if "follow" in record.message]
@@ -252,9 +360,19 @@ class TestDamage:
             (header("binary_middle_endian"), "binary_middle_endian"),
             (header().replace("format ascii 1.0\n", ""), "format None"),
             (header().replace("format ascii 1.0\n", "format ascii 1.0\n" * 2), "two formats"),
-            (header(count=1, before="element vertex 1\nproperty float x"), "two elements of vertices"),
-            (header(count=1, properties=["float x", "float y", "uchar z"]) + "1 2 256\n", "range of its type"),
-            (header(count=1, before="element face 1\nproperty list uchar int i") + "3 0 1\n2 1 2 3\n", "a line of 'face'"),
+            (
+                header(count=1, before="element vertex 1\nproperty float x"),
+                "two elements of vertices",
+            ),
+            (
+                header(count=1, properties=["float x", "float y", "uchar z"]) + "1 2 256\n",
+                "range of its type",
+            ),
+            (
+                header(count=1, before="element face 1\nproperty list uchar int i")
+                + "3 0 1\n2 1 2 3\n",
+                "a line of 'face'",
+            ),
             (header(count=-1), "NAME COUNT"),
             (header(count="many"), "NAME COUNT"),
             (header(count="1" * 30), "NAME COUNT"),
@@ -271,9 +389,26 @@ class TestDamage:
             (header() + "1 2 3 4\n1 2 3 4\n", "3 numbers are announced"),
             (header() + "1 2 3\n" + " " * 99, "2 vertices of 3 numbers"),
             (header("binary_little_endian") + "x" * 23, "need 24 bytes, but 23"),
-            (header("binary_little_endian", before="element face 9\nproperty list uint int i") + "\xff" * 24, "truncated or damaged"),
-            (header("binary_little_endian", before=f"element edge {10**18}\nproperty double a\nproperty double b") + "x" * 24, "truncated"),
-            (header("binary_little_endian", before="element face 99999999\nproperty list uint int i") + "\0" * 24, "truncated"),
+            (
+                header("binary_little_endian", before="element face 9\nproperty list uint int i")
+                + "\xff" * 24,
+                "truncated or damaged",
+            ),
+            (
+                header(
+                    "binary_little_endian",
+                    before=f"element edge {10**18}\nproperty double a\nproperty double b",
+                )
+                + "x" * 24,
+                "truncated",
+            ),
+            (
+                header(
+                    "binary_little_endian", before="element face 99999999\nproperty list uint int i"
+                )
+                + "\0" * 24,
+                "truncated",
+            ),
         ],
     )
     def test_each_kind_is_named(self, tmp_path, content, problem):
@@ -294,7 +429,9 @@ class TestDamage:
                 ply.read_points(name)
 
     def test_mutations_are_an_error_or_a_correct_load(self, tmp_path):
-        """Five hundred damaged files: whatever is loaded has consistent shapes, and nothing but UserError comes out."""
+        """Five hundred damaged files: whatever is loaded has consistent shapes, and nothing but
+        UserError comes out.
+        """
         ply.write_gaussians(tmp_path / "gaussians.ply", **gaussians(20, 1)._asdict())
         ply.write_points(tmp_path / "points.ply", cloud(20))
         faces = "element face 2\nproperty list uchar int vertex_indices"
@@ -311,7 +448,10 @@ class TestDamage:
                 else:
                     loaded += 1
                     assert len({len(values) for values in arrays if values is not None}) == 1
-                    assert sum(values.size for values in arrays if values is not None) <= 4 * path.stat().st_size
+                    assert (
+                        sum(values.size for values in arrays if values is not None)
+                        <= 4 * path.stat().st_size
+                    )
         assert loaded > 50  # the mutations aren't all fatal, so both outcomes were tried
 
 

@@ -28,7 +28,11 @@ def test_a_second_run_in_the_same_folder_reads_the_first_ones_points(tmp_path):
     first = cached_cloud(CountingPrior({}), "a fox", tmp_path)
     again = cached_cloud(CountingPrior({}), "a fox", tmp_path)
     assert CountingPrior.calls == 1
-    assert np.array_equal(first.points, again.points) and np.array_equal(first.colors, again.colors) and again.normals is None
+    assert (
+        np.array_equal(first.points, again.points)
+        and np.array_equal(first.colors, again.colors)
+        and again.normals is None
+    )
     assert len(read_points(tmp_path / "prior" / "points.ply").points) == 10
 
 

@@ -30,12 +30,17 @@ def assets(tmp_path_factory):
     """A folder of small sources: a body-like capsule, a coloured mesh, points and Gaussians."""
     folder = tmp_path_factory.mktemp("assets")
     body = trimesh.creation.capsule(height=1.0, radius=0.3)  # along z
-    body.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))  # now along y, as OBJ has it
+    body.apply_transform(
+        trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
+    )  # now along y, as OBJ has it
     body.export(folder / "body.obj")
     box = trimesh.creation.box(extents=[2, 1, 0.5]).subdivide().subdivide()
     box.visual.vertex_colors = (255 * (box.vertices / 2 + 0.5).clip(0, 1)).astype(np.uint8)
     box.export(folder / "box.ply")
-    ply.write_points(folder / "points.ply", PointCloud(points=rng(1).normal(size=(300, 3)), colors=rng(2).random((300, 3))))
+    ply.write_points(
+        folder / "points.ply",
+        PointCloud(points=rng(1).normal(size=(300, 3)), colors=rng(2).random((300, 3))),
+    )
     harmonics, scales, turns = (rng(i).normal(size=(200, n)) for i, n in ((3, 12), (4, 3), (5, 4)))
     ply.write_gaussians(
         folder / "gaussians.ply",
@@ -69,7 +74,9 @@ def build(name, assets, **options):
 
 
 def test_every_registered_prior_is_tested():
-    assert {p for p in PRIORS if not p.startswith(("test-", "tiny-"))} - set(OPTIONS) <= TESTED_WITH_THEIR_WEIGHTS
+    assert {p for p in PRIORS if not p.startswith(("test-", "tiny-"))} - set(
+        OPTIONS
+    ) <= TESTED_WITH_THEIR_WEIGHTS
 
 
 @pytest.mark.parametrize("name", OPTIONS)
@@ -114,7 +121,12 @@ class TestValidation:
         points = rng(0).normal(size=(200, 3))
         points[list(bad), 1] = np.nan
         faces = np.arange(198).reshape(-1, 3)
-        return PointCloud(points=points, colors=rng(1).uniform(-0.5, 1.5, (200, 3)), normals=np.ones((200, 3)) / np.sqrt(3), faces=faces)
+        return PointCloud(
+            points=points,
+            colors=rng(1).uniform(-0.5, 1.5, (200, 3)),
+            normals=np.ones((200, 3)) / np.sqrt(3),
+            faces=faces,
+        )
 
     def test_few_bad_rows_are_dropped_and_counted(self, caplog):
         cloud = self.cloud(bad=[0, 10])
@@ -130,7 +142,9 @@ class TestValidation:
 
     def test_colours_are_clipped(self):
         cloud = self.cloud()
-        np.testing.assert_array_equal(validated(cloud, "x").colors, cloud.colors.clip(0, 1).astype(np.float32))
+        np.testing.assert_array_equal(
+            validated(cloud, "x").colors, cloud.colors.clip(0, 1).astype(np.float32)
+        )
 
     def test_the_call_checks(self):
         prior = Given({})
@@ -151,7 +165,9 @@ class TestMesh:
     def test_vertices_as_the_paper(self, assets):
         cloud = build("mesh-prior", assets)("")
         mesh = trimesh.load(assets / "box.ply", process=False)
-        np.testing.assert_allclose(cloud.points, mesh.vertices, atol=1e-6)  # the box is centred, its half side is 1
+        np.testing.assert_allclose(
+            cloud.points, mesh.vertices, atol=1e-6
+        )  # the box is centred, its half side is 1
         np.testing.assert_allclose(cloud.colors, mesh.visual.vertex_colors[:, :3] / 255, atol=1e-6)
         np.testing.assert_array_equal(cloud.faces, mesh.faces)
 
@@ -163,28 +179,47 @@ class TestMesh:
         assert on_side.any(axis=1).all() and (np.abs(cloud.points) <= half + 1e-6).all()
         areas = np.array([half[1] * half[2], half[0] * half[2], half[0] * half[1]])
         expected = areas / areas.sum()
-        np.testing.assert_allclose(on_side.mean(axis=0), expected, atol=4 * np.sqrt(0.25 / 20_000))  # four standard errors
-        np.testing.assert_allclose(np.abs((cloud.normals * cloud.points).sum(1)), (on_side * half).max(1), atol=1e-5)  # outwards or inwards
-        np.testing.assert_allclose(cloud.colors, cloud.points + 0.5, atol=0.02)  # the ramp, in bytes, scaled by 2 * 0.5
+        np.testing.assert_allclose(
+            on_side.mean(axis=0), expected, atol=4 * np.sqrt(0.25 / 20_000)
+        )  # four standard errors
+        np.testing.assert_allclose(
+            np.abs((cloud.normals * cloud.points).sum(1)), (on_side * half).max(1), atol=1e-5
+        )  # outwards or inwards
+        np.testing.assert_allclose(
+            cloud.colors, cloud.points + 0.5, atol=0.02
+        )  # the ramp, in bytes, scaled by 2 * 0.5
 
     def test_faces_without_area_get_no_samples(self, tmp_path):
         vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0.5, 0, 0.2], [0, 0, 1]]
         flat = [[0, 1, 4], [0, 1, 2], [3, 1, 2]]
-        mesh = trimesh.Trimesh(vertices, flat + [[0, 0, 5]] * 30, process=False)  # an edge to (0, 0, 1) without area
+        mesh = trimesh.Trimesh(
+            vertices, flat + [[0, 0, 5]] * 30, process=False
+        )  # an edge to (0, 0, 1) without area
         mesh.export(tmp_path / "mesh.ply")
-        points = find("mesh-prior")({"path": str(tmp_path / "mesh.ply"), "num_points": 3000})("").points
+        points = find("mesh-prior")({"path": str(tmp_path / "mesh.ply"), "num_points": 3000})(
+            ""
+        ).points
         assert points[:, 2].max() < -0.5  # the edge would reach up to +0.5
 
     def test_coarse_colours_and_shape(self, assets):
         sharp = build("mesh-prior", assets, num_points=1000)("")
         smooth = build("mesh-prior", assets, num_points=1000, color_smoothing=100)("")
         np.testing.assert_array_equal(smooth.points, sharp.points)
-        nearest = np.linalg.norm(sharp.points[:, None] - sharp.points[None], axis=2).argsort(axis=1)[:, :100]
+        nearest = np.linalg.norm(sharp.points[:, None] - sharp.points[None], axis=2).argsort(
+            axis=1
+        )[:, :100]
         np.testing.assert_allclose(smooth.colors, sharp.colors[nearest].mean(axis=1), atol=1e-5)
         everything = build("mesh-prior", assets, num_points=1000, color_smoothing=10**6)("")
-        np.testing.assert_allclose(everything.colors, np.broadcast_to(sharp.colors.mean(0), (1000, 3)), atol=1e-4)
-        noise = build("mesh-prior", assets, num_points=1000, jitter=0.05, scale=2.0)("").points - 2 * sharp.points
-        assert noise.std() == pytest.approx(0.1, rel=0.05)  # 3000 draws: within four standard errors
+        np.testing.assert_allclose(
+            everything.colors, np.broadcast_to(sharp.colors.mean(0), (1000, 3)), atol=1e-4
+        )
+        noise = (
+            build("mesh-prior", assets, num_points=1000, jitter=0.05, scale=2.0)("").points
+            - 2 * sharp.points
+        )
+        assert noise.std() == pytest.approx(
+            0.1, rel=0.05
+        )  # 3000 draws: within four standard errors
 
     @pytest.mark.parametrize("color, expected", [("grey", 0.5), ([0.2, 0.4, 0.6], [0.2, 0.4, 0.6])])
     def test_fixed_colours(self, assets, color, expected):
@@ -202,7 +237,14 @@ class TestMesh:
 
     @pytest.mark.parametrize(
         "option",
-        [("color", "gray-ish"), ("color", [1, 2, 3]), ("color", [0.5]), ("num_points", -1), ("scale", 0.0), ("jitter", -0.1)],
+        [
+            ("color", "gray-ish"),
+            ("color", [1, 2, 3]),
+            ("color", [0.5]),
+            ("num_points", -1),
+            ("scale", 0.0),
+            ("jitter", -0.1),
+        ],
     )
     def test_bad_options(self, assets, option):
         with pytest.raises(UserError, match=option[0]):
@@ -213,10 +255,16 @@ class TestBody:
     def test_upright_recentred_and_really_random(self, assets):
         cloud = build("body-prior", assets, num_points=50_000)("")
         np.testing.assert_allclose(cloud.points.mean(axis=0), 0, atol=1e-6)
-        np.testing.assert_allclose(np.ptp(cloud.points, axis=0), [0.75, 0.75, 2], rtol=0.01)  # stands along z
+        np.testing.assert_allclose(
+            np.ptp(cloud.points, axis=0), [0.75, 0.75, 2], rtol=0.01
+        )  # stands along z
         assert cloud.colors.min() < 0.001 and cloud.colors.max() > 0.999
-        assert cloud.colors.std() == pytest.approx(np.sqrt(1 / 12), rel=0.01)  # the released code: 0.0003
-        assert np.abs(np.corrcoef(cloud.colors.T) - np.eye(3)).max() < 0.02  # four standard errors: coloured, not grey
+        assert cloud.colors.std() == pytest.approx(
+            np.sqrt(1 / 12), rel=0.01
+        )  # the released code: 0.0003
+        assert (
+            np.abs(np.corrcoef(cloud.colors.T) - np.eye(3)).max() < 0.02
+        )  # four standard errors: coloured, not grey
 
     def test_vertices_and_own_colours(self, assets):
         cloud = build("body-prior", assets, path="box.ply", num_points=0, color=None)("")
@@ -233,10 +281,14 @@ class TestRandom:
 
     def test_a_box(self, assets):
         points = build("random-prior", assets, num_points=20_000, shape="box", size=0.7)("").points
-        assert 0.69 < np.abs(points).max() <= 0.7 and points.std() == pytest.approx(0.7 / np.sqrt(3), rel=0.02)
+        assert 0.69 < np.abs(points).max() <= 0.7 and points.std() == pytest.approx(
+            0.7 / np.sqrt(3), rel=0.02
+        )
 
     def test_colours(self, assets):
-        assert build("random-prior", assets)("").colors.std() == pytest.approx(np.sqrt(1 / 12), rel=0.05)
+        assert build("random-prior", assets)("").colors.std() == pytest.approx(
+            np.sqrt(1 / 12), rel=0.05
+        )
         assert (build("random-prior", assets, color="grey")("").colors == 0.5).all()
 
     def test_bad_options(self, assets):
@@ -251,10 +303,16 @@ class TestGaussians:
         arrays = ply.read_gaussians(assets / "gaussians.ply")
         cloud = build("gaussians-prior", assets)("")
         np.testing.assert_array_equal(cloud.points, arrays.means)
-        np.testing.assert_allclose(cloud.colors, (0.5 + 0.28209479 * arrays.sh[:, 0]).clip(0, 1), atol=1e-6)
+        np.testing.assert_allclose(
+            cloud.colors, (0.5 + 0.28209479 * arrays.sh[:, 0]).clip(0, 1), atol=1e-6
+        )
 
     def test_all_attributes(self, assets):
-        for a, b in zip(build("gaussians-prior", assets).gaussians(""), ply.read_gaussians(assets / "gaussians.ply"), strict=True):
+        for a, b in zip(
+            build("gaussians-prior", assets).gaussians(""),
+            ply.read_gaussians(assets / "gaussians.ply"),
+            strict=True,
+        ):
             np.testing.assert_array_equal(a, b)
         with pytest.raises(UserError, match="ground"):
             build("gaussians-prior", assets, ground=True).gaussians("")
@@ -305,10 +363,14 @@ class TestPointCloud:
         elif path.suffix in (".xyz", ".txt"):
             np.savetxt(path, rows)
         else:
-            trimesh.PointCloud(self.POINTS, colors=np.insert(self.BYTES, 3, 255, axis=1).astype(np.uint8)).export(path)
+            trimesh.PointCloud(
+                self.POINTS, colors=np.insert(self.BYTES, 3, 255, axis=1).astype(np.uint8)
+            ).export(path)
         return path
 
-    @pytest.mark.parametrize("name", ["a.npz", "a.npy", "a.xyz", "a.txt", "a.csv", "a.pts", "a.ply"])
+    @pytest.mark.parametrize(
+        "name", ["a.npz", "a.npy", "a.xyz", "a.txt", "a.csv", "a.pts", "a.ply"]
+    )
     def test_formats(self, tmp_path, name):
         cloud = self.read(self.written(tmp_path, name))
         np.testing.assert_allclose(cloud.points, self.POINTS, atol=1e-6)
@@ -335,7 +397,10 @@ class TestPointCloud:
             self.read(tmp_path / "a.xyz", up="y")
 
     def test_gaussians_are_read_as_points(self, assets):
-        np.testing.assert_array_equal(self.read(assets / "gaussians.ply").points, ply.read_gaussians(assets / "gaussians.ply").means)
+        np.testing.assert_array_equal(
+            self.read(assets / "gaussians.ply").points,
+            ply.read_gaussians(assets / "gaussians.ply").means,
+        )
 
     def test_few_bad_rows_are_dropped_also_when_normalized(self, tmp_path):
         points = rng().uniform(-1, 1, (100, 3))
@@ -364,7 +429,11 @@ class TestPointCloud:
         assert problem in str(error.value)
 
     def test_bad_arrays(self, tmp_path):
-        for arrays in ({"xyz": self.POINTS}, {"points": self.POINTS[:, :2]}, {"points": self.POINTS, "colors": self.BYTES[:2]}):
+        for arrays in (
+            {"xyz": self.POINTS},
+            {"points": self.POINTS[:, :2]},
+            {"points": self.POINTS, "colors": self.BYTES[:2]},
+        ):
             np.savez(tmp_path / "a.npz", **arrays)
             with pytest.raises(UserError, match="a.npz.*(has no array|has shape)"):
                 self.read(tmp_path / "a.npz")

@@ -1,4 +1,6 @@
-"""The files of 3D models: which are needed and may be read, in folders, the hub's cache and on the hub. Shown with Shap-E's."""
+"""The files of 3D models: which are needed and may be read, in folders, the hub's cache and on the
+hub. Shown with Shap-E's.
+"""
 
 import os
 import shutil
@@ -75,7 +77,9 @@ def test_a_bin_is_read_when_allowed_and_only_then(copy, folder):
     to_bin(copy)
     with pytest.raises(UserError, match="allow_bin"):
         make(copy).preflight()
-    np.testing.assert_array_equal(make(copy, allow_bin=True)("a fox").points, make(folder)("a fox").points)
+    np.testing.assert_array_equal(
+        make(copy, allow_bin=True)("a fox").points, make(folder)("a fox").points
+    )
 
 
 def test_an_allowed_bin_cannot_run_code(copy, monkeypatch):
@@ -89,10 +93,14 @@ def test_an_allowed_bin_cannot_run_code(copy, monkeypatch):
 def test_half_precision_files_are_taken_where_there_are_no_others(copy, folder):
     from diffusers import PriorTransformer
 
-    PriorTransformer.from_pretrained(copy / "prior").half().save_pretrained(copy / "prior", variant="fp16")
+    PriorTransformer.from_pretrained(copy / "prior").half().save_pretrained(
+        copy / "prior", variant="fp16"
+    )
     (copy / "prior" / "diffusion_pytorch_model.safetensors").unlink()
     half, full = (make(where)._sample(where, "a fox", CPU, seeded()) for where in (copy, folder))
-    assert half.dtype == torch.float32 and 0 < (half - full).abs().max() < 0.05  # rounded weights, float32 arithmetic
+    assert (
+        half.dtype == torch.float32 and 0 < (half - full).abs().max() < 0.05
+    )  # rounded weights, float32 arithmetic
 
 
 def test_weights_that_are_not_in_the_file_are_no_noise(copy):
@@ -156,8 +164,13 @@ def test_what_the_hub_refuses_names_the_option(online, monkeypatch):
         raise TimeoutError("timed out")
 
     monkeypatch.setattr(huggingface_hub.HfApi, "model_info", refuse)
-    command = "hf download some/model --revision refs/pr/11 --include '\\*/\\*' --exclude 'renderer/\\*' --local-dir models/model"
-    with pytest.raises(UserError, match=f"reached .timed out.*`{command}`; then set system.geometry.prior.model"):
+    command = (
+        "hf download some/model --revision refs/pr/11 --include '\\*/\\*' --exclude "
+        "'renderer/\\*' --local-dir models/model"
+    )
+    with pytest.raises(
+        UserError, match=f"reached .timed out.*`{command}`; then set system.geometry.prior.model"
+    ):
         ShapEPrior({"model": "some/model", "revision": "refs/pr/11"}).preflight()
 
 
@@ -165,7 +178,11 @@ def test_preflight_on_the_hub_downloads_nothing(online, folder, monkeypatch):
     import huggingface_hub
 
     names = [path.relative_to(folder).as_posix() for path in folder.rglob("*")]
-    listing = type("Info", (), {"siblings": [type("File", (), {"rfilename": name, "size": 1}) for name in names]})
+    listing = type(
+        "Info",
+        (),
+        {"siblings": [type("File", (), {"rfilename": name, "size": 1}) for name in names]},
+    )
     monkeypatch.setattr(huggingface_hub.HfApi, "model_info", lambda self, *args, **kwargs: listing)
     ShapEPrior({"model": "some/model"}).preflight()
     assert not online.exists()
@@ -175,7 +192,16 @@ def test_only_needed_files_are_downloaded(online, folder, monkeypatch):
     import huggingface_hub
 
     names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
-    listing = type("Info", (), {"siblings": [type("File", (), {"rfilename": name, "size": 1}) for name in [*names, "renderer/old.bin"]]})
+    listing = type(
+        "Info",
+        (),
+        {
+            "siblings": [
+                type("File", (), {"rfilename": name, "size": 1})
+                for name in [*names, "renderer/old.bin"]
+            ]
+        },
+    )
     monkeypatch.setattr(huggingface_hub.HfApi, "model_info", lambda self, *args, **kwargs: listing)
     fetched = []
 
@@ -187,7 +213,9 @@ def test_only_needed_files_are_downloaded(online, folder, monkeypatch):
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
     assert locate(make("some/model")._source()) == folder
-    assert {"prior/diffusion_pytorch_model.safetensors", "tokenizer/tokenizer_config.json"} <= set(fetched)
+    assert {"prior/diffusion_pytorch_model.safetensors", "tokenizer/tokenizer_config.json"} <= set(
+        fetched
+    )
     assert not any(name.startswith(("renderer", "vocabulary")) for name in fetched)
 
 

@@ -1,4 +1,6 @@
-"""Point-E on tiny weights under the published names, and the Karras sampler against a case with a known answer."""
+"""Point-E on tiny weights under the published names, and the Karras sampler against a case with a
+known answer.
+"""
 
 import math
 import os
@@ -14,7 +16,12 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.priors import karras
 from threestudio_gaussiandreamer.priors.point_e import BASE, UPSAMPLER, PointEPrior, load_network
-from threestudio_gaussiandreamer.priors.point_e_model import BaseModel, PointTransformer, Upsampler, timestep_embedding
+from threestudio_gaussiandreamer.priors.point_e_model import (
+    BaseModel,
+    PointTransformer,
+    Upsampler,
+    timestep_embedding,
+)
 
 FAST = {"num_steps": 3, "num_points": 64, "num_upsampled": 96}
 
@@ -23,7 +30,11 @@ FAST = {"num_steps": 3, "num_points": 64, "num_upsampled": 96}
 def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     base, upsampler = tiny.point_e(folder / "point-e")
-    return {"checkpoint": str(base), "upsampler": str(upsampler), "clip": str(tiny.clip(folder / "clip"))}
+    return {
+        "checkpoint": str(base),
+        "upsampler": str(upsampler),
+        "clip": str(tiny.clip(folder / "clip")),
+    }
 
 
 def make(files, **options):
@@ -40,7 +51,8 @@ class TestContract(PriorContract):
         return lambda **options: make(files, **options)
 
 
-# --------------------------------------------------------------------------------------------------------- the sampler
+# --------------------------------------------------------------------------------------------------
+# the sampler
 
 MEAN, SPREAD = 0.3, 0.5
 
@@ -51,14 +63,25 @@ def gaussian_denoiser(x, sigma):
 
 
 def flow_end(noise, sigma_max):
-    """Where the noise-free sampler ends: the probability flow keeps the place within the widening normal distribution."""
+    """Where the noise-free sampler ends: the probability flow keeps the place within the widening
+    normal distribution.
+    """
     return MEAN + SPREAD / math.hypot(SPREAD, sigma_max) * (sigma_max * noise - MEAN)
 
 
 def test_sigmas_are_karras():
     sigmas = karras.karras_sigmas(64, 1e-3, 160)
-    assert len(sigmas) == 65 and sigmas[0] == pytest.approx(160) and sigmas[-2] == pytest.approx(1e-3) and sigmas[-1] == 0
-    np.testing.assert_allclose(np.diff(np.array(sigmas[:-1]) ** (1 / 7)), (1e-3 ** (1 / 7) - 160 ** (1 / 7)) / 63, rtol=1e-9)
+    assert (
+        len(sigmas) == 65
+        and sigmas[0] == pytest.approx(160)
+        and sigmas[-2] == pytest.approx(1e-3)
+        and sigmas[-1] == 0
+    )
+    np.testing.assert_allclose(
+        np.diff(np.array(sigmas[:-1]) ** (1 / 7)),
+        (1e-3 ** (1 / 7) - 160 ** (1 / 7)) / 63,
+        rtol=1e-9,
+    )
 
 
 def test_the_sampler_follows_the_flow_to_second_order():
@@ -69,22 +92,29 @@ def test_the_sampler_follows_the_flow_to_second_order():
         sample = karras.sample_heun(gaussian_denoiser, noise, sigmas, generator=seeded())
         errors.append((sample - flow_end(noise, 120)).abs().max().item())
     ratios = [coarse / fine for coarse, fine in zip(errors[:-1], errors[1:], strict=True)]
-    assert errors[-1] < 2e-3 and all(3.7 < ratio < 4.7 for ratio in ratios)  # order 2: a quarter of the error for twice the steps
+    assert errors[-1] < 2e-3 and all(
+        3.7 < ratio < 4.7 for ratio in ratios
+    )  # order 2: a quarter of the error for twice the steps
 
 
 def test_churn_keeps_the_distribution_and_needs_the_generator():
     noise = torch.randn(20_000, generator=seeded())
     sigmas = karras.karras_sigmas(64, 1e-3, 120)
     sample = karras.sample_heun(gaussian_denoiser, noise, sigmas, churn=3.0, generator=seeded(1))
-    assert sample.mean().item() == pytest.approx(MEAN, abs=0.02) and sample.std().item() == pytest.approx(
-        SPREAD, abs=0.02
-    )  # 5 sigma of 20,000
-    again, other = (karras.sample_heun(gaussian_denoiser, noise, sigmas, churn=3.0, generator=seeded(seed)) for seed in (1, 2))
+    assert sample.mean().item() == pytest.approx(
+        MEAN, abs=0.02
+    ) and sample.std().item() == pytest.approx(SPREAD, abs=0.02)  # 5 sigma of 20,000
+    again, other = (
+        karras.sample_heun(gaussian_denoiser, noise, sigmas, churn=3.0, generator=seeded(seed))
+        for seed in (1, 2)
+    )
     assert torch.equal(sample, again) and not torch.allclose(sample, other)
 
 
 def test_a_network_of_timesteps_becomes_the_denoiser_it_stands_for():
-    """A network that knows the noise of normal data: its denoiser is the exact one at the noise of each whole timestep."""
+    """A network that knows the noise of normal data: its denoiser is the exact one at the noise of
+    each whole timestep.
+    """
     alphas_cumprod = karras.cosine_alphas_cumprod()
 
     def network(z, timesteps):
@@ -95,9 +125,13 @@ def test_a_network_of_timesteps_becomes_the_denoiser_it_stands_for():
 
     denoise = karras.guided_denoiser(network, alphas_cumprod, prediction="epsilon")
     for timestep in (0, 10, 500, 900):
-        sigma = math.sqrt(1 / alphas_cumprod[timestep] - 1) * (1 + 1e-9)  # on the safe side of rounding
+        sigma = math.sqrt(1 / alphas_cumprod[timestep] - 1) * (
+            1 + 1e-9
+        )  # on the safe side of rounding
         x = torch.linspace(-0.4, 0.4, 9, dtype=torch.float64) * math.hypot(1, sigma)
-        torch.testing.assert_close(denoise(x, sigma), gaussian_denoiser(x, sigma).clamp(-1, 1), atol=1e-6, rtol=0)
+        torch.testing.assert_close(
+            denoise(x, sigma), gaussian_denoiser(x, sigma).clamp(-1, 1), atol=1e-6, rtol=0
+        )
 
 
 def test_timesteps_are_cut_and_bounded():
@@ -108,11 +142,21 @@ def test_timesteps_are_cut_and_bounded():
 
 
 def test_schedules():
-    """The ends that the formulas give; the linear one is Ho et al.'s, stretched from 1000 to 1024 timesteps."""
+    """The ends that the formulas give; the linear one is Ho et al.'s, stretched from 1000 to 1024
+    timesteps.
+    """
     cosine, linear = karras.cosine_alphas_cumprod(), karras.linear_alphas_cumprod()
-    assert len(cosine) == len(linear) == 1024 and (np.diff(cosine) < 0).all() and (np.diff(linear) < 0).all()
-    assert cosine[511] == pytest.approx(0.494, abs=0.005) and 0 < cosine[-1] < 1e-8  # cos^2 near 45 degrees, and the cap
-    assert linear[0] == pytest.approx(1 - 1e-4 * 1000 / 1024) and linear[-1] == pytest.approx(4.0e-5, rel=0.05)
+    assert (
+        len(cosine) == len(linear) == 1024
+        and (np.diff(cosine) < 0).all()
+        and (np.diff(linear) < 0).all()
+    )
+    assert (
+        cosine[511] == pytest.approx(0.494, abs=0.005) and 0 < cosine[-1] < 1e-8
+    )  # cos^2 near 45 degrees, and the cap
+    assert linear[0] == pytest.approx(1 - 1e-4 * 1000 / 1024) and linear[-1] == pytest.approx(
+        4.0e-5, rel=0.05
+    )
 
 
 def test_guidance_clamps_before_it_combines():
@@ -120,7 +164,9 @@ def test_guidance_clamps_before_it_combines():
         assert len(z) == 2 and torch.equal(z[0], z[1])
         return torch.stack([torch.full_like(z[0], 4.0), torch.full_like(z[0], -0.5)])
 
-    denoise = karras.guided_denoiser(network, np.linspace(0.99, 0.01, 20), scale=3.0, prediction="sample")
+    denoise = karras.guided_denoiser(
+        network, np.linspace(0.99, 0.01, 20), scale=3.0, prediction="sample"
+    )
     assert denoise(torch.zeros(1, 5), 1.0).unique().tolist() == [-0.5 + 3 * (1 - -0.5)]
 
 
@@ -129,35 +175,58 @@ def test_no_guidance_asks_once():
         assert len(z) == 1
         return z
 
-    karras.guided_denoiser(network, np.linspace(0.99, 0.01, 20), prediction="sample")(torch.zeros(1, 5), 1.0)
+    karras.guided_denoiser(network, np.linspace(0.99, 0.01, 20), prediction="sample")(
+        torch.zeros(1, 5), 1.0
+    )
 
 
-# -------------------------------------------------------------------------------------------------------- the networks
+# --------------------------------------------------------------------------------------------------
+# the networks
 
 
 def block_names(block):
     linear = ("attn.c_qkv", "attn.c_proj", "ln_1", "mlp.c_fc", "mlp.c_proj", "ln_2")
-    return {f"backbone.resblocks.{block}.{name}.{kind}" for name in linear for kind in ("weight", "bias")}
+    return {
+        f"backbone.resblocks.{block}.{name}.{kind}"
+        for name in linear
+        for kind in ("weight", "bias")
+    }
 
 
 def both(*names):
     return {f"{name}.{kind}" for name in names for kind in ("weight", "bias")}
 
 
-SHARED = both("time_embed.c_fc", "time_embed.c_proj", "ln_pre", "ln_post", "input_proj", "output_proj").union(*map(block_names, range(12)))
+SHARED = both(
+    "time_embed.c_fc", "time_embed.c_proj", "ln_pre", "ln_post", "input_proj", "output_proj"
+).union(*map(block_names, range(12)))
 
 
 def test_names_and_shapes_are_the_published_ones():
-    """By the configurations ``base40M-textvec`` and ``upsample`` that openai/point-e publishes beside its weights."""
+    """By the configurations ``base40M-textvec`` and ``upsample`` that openai/point-e publishes
+    beside its weights.
+    """
     with torch.device("meta"):
         base, upsampler = BaseModel().state_dict(), Upsampler().state_dict()
     assert set(base) == SHARED | both("clip_embed")
-    assert set(upsampler) == SHARED | both("cond_point_proj", "clip_embed.0", "clip_embed.1") | {"channel_scales", "channel_biases"}
-    shapes = {"input_proj.weight": (512, 6), "output_proj.weight": (12, 512), "time_embed.c_fc.weight": (2048, 512)}
-    shapes |= {"backbone.resblocks.11.attn.c_qkv.weight": (1536, 512), "backbone.resblocks.0.mlp.c_proj.weight": (512, 2048)}
+    assert set(upsampler) == SHARED | both("cond_point_proj", "clip_embed.0", "clip_embed.1") | {
+        "channel_scales",
+        "channel_biases",
+    }
+    shapes = {
+        "input_proj.weight": (512, 6),
+        "output_proj.weight": (12, 512),
+        "time_embed.c_fc.weight": (2048, 512),
+    }
+    shapes |= {
+        "backbone.resblocks.11.attn.c_qkv.weight": (1536, 512),
+        "backbone.resblocks.0.mlp.c_proj.weight": (512, 2048),
+    }
     for name, shape in shapes.items():
         assert base[name].shape == upsampler[name].shape == shape
-    assert base["clip_embed.weight"].shape == (512, 768) and upsampler["clip_embed.1.weight"].shape == (512, 1024)
+    assert base["clip_embed.weight"].shape == (512, 768) and upsampler[
+        "clip_embed.1.weight"
+    ].shape == (512, 1024)
     assert 40e6 < sum(value.numel() for value in base.values()) < 41e6  # "40M"
 
 
@@ -173,10 +242,14 @@ def test_the_transformer_is_its_formula():
     torch.manual_seed(0)
     model = PointTransformer(width=16, layers=1, heads=2).double()
     x = torch.randn(1, 5, 16, dtype=torch.float64)
-    state = {name: value.numpy() for name, value in model.backbone.resblocks[0].state_dict().items()}
+    state = {
+        name: value.numpy() for name, value in model.backbone.resblocks[0].state_dict().items()
+    }
 
     def norm(h, name):
-        return (h - h.mean(-1, keepdims=True)) / np.sqrt(h.var(-1, keepdims=True) + 1e-5) * state[f"{name}.weight"] + state[f"{name}.bias"]
+        return (h - h.mean(-1, keepdims=True)) / np.sqrt(h.var(-1, keepdims=True) + 1e-5) * state[
+            f"{name}.weight"
+        ] + state[f"{name}.bias"]
 
     def linear(h, name):
         return h @ state[f"{name}.weight"].T + state[f"{name}.bias"]
@@ -202,10 +275,14 @@ def test_points_have_no_order_and_conditions_matter():
     for model, given in ((base, condition), (upsampler, coarse)):
         output = model(points, timesteps, given)
         assert output.shape == (2, 12, 9)
-        torch.testing.assert_close(model(points[:, :, order], timesteps, given), output[:, :, order], atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(
+            model(points[:, :, order], timesteps, given), output[:, :, order], atol=1e-5, rtol=1e-5
+        )
         assert (model(points, timesteps, 0 * given) - output).abs().max() > 1e-3
         assert (model(points, timesteps + 50, given) - output).abs().max() > 1e-3
-        torch.testing.assert_close(model(points[:1], timesteps[:1], given[:1]), output[:1], atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(
+            model(points[:1], timesteps[:1], given[:1]), output[:1], atol=1e-5, rtol=1e-5
+        )
 
 
 @torch.no_grad()
@@ -223,11 +300,14 @@ def test_the_upsampler_sees_an_empty_image():
 def test_timestep_embedding():
     embedding = timestep_embedding(torch.tensor([0.0, 7.0]), 8)
     assert embedding[0].tolist() == [1, 1, 1, 1, 0, 0, 0, 0]
-    expected = [math.cos(7 * f) for f in (1, 0.1, 0.01, 0.001)] + [math.sin(7 * f) for f in (1, 0.1, 0.01, 0.001)]
+    expected = [math.cos(7 * f) for f in (1, 0.1, 0.01, 0.001)] + [
+        math.sin(7 * f) for f in (1, 0.1, 0.01, 0.001)
+    ]
     torch.testing.assert_close(embedding[1], torch.tensor(expected), atol=1e-5, rtol=0)
 
 
-# ------------------------------------------------------------------------------------------------------------ the prior
+# --------------------------------------------------------------------------------------------------
+# the prior
 
 
 def test_registered_and_valid(files):
@@ -235,7 +315,8 @@ def test_registered_and_valid(files):
     cloud = make(files)("a fox")
     assert_valid(cloud)
     assert len(cloud.points) == 64 + 96 and cloud.faces is None
-    # x0 is clamped, and guidance is 3, so coarse points lie within 1 + 2 * 2 = 5 times, further ones within the box
+    # x0 is clamped, and guidance is 3, so coarse points lie within 1 + 2 * 2 = 5 times, further
+    # ones within the box
     assert np.abs(cloud.points[64:]).max() <= 0.5 * 1.6 + 1e-5
     np.testing.assert_allclose(cloud.colors * 255, (cloud.colors * 255).round(), atol=1e-4)
 
@@ -262,10 +343,14 @@ def test_prompt_seed_and_guidance_matter(files, monkeypatch):
 
 
 def known_sample(files, monkeypatch, **options):
-    """The prior around networks that always give one point each: x, y, z and a colour, in the networks' units."""
+    """The prior around networks that always give one point each: x, y, z and a colour, in the
+    networks' units.
+    """
 
     def fixed(point):
-        return lambda self, points, timesteps, given: torch.cat([torch.tensor(point)[None, :, None].expand_as(points)] * 2, dim=1)
+        return lambda self, points, timesteps, given: torch.cat(
+            [torch.tensor(point)[None, :, None].expand_as(points)] * 2, dim=1
+        )
 
     monkeypatch.setattr(BaseModel, "forward", fixed([0.2, 0.4, 0.6, 1.0, 0.2, -1.0]))
     monkeypatch.setattr(
@@ -277,27 +362,45 @@ def known_sample(files, monkeypatch, **options):
 
 def test_units_and_axes(files, monkeypatch):
     cloud = known_sample(files, monkeypatch)
-    np.testing.assert_allclose(cloud.points, np.tile(1.6 * np.array([-0.2, 0.1, 0.3]), (64, 1)), atol=1e-5)  # (-y, x, z) of half the units
-    np.testing.assert_allclose(cloud.colors, np.tile([1.0, 153 / 255, 0.0], (64, 1)), atol=1e-6)  # 1.2 * 127.5 = 153
+    np.testing.assert_allclose(
+        cloud.points, np.tile(1.6 * np.array([-0.2, 0.1, 0.3]), (64, 1)), atol=1e-5
+    )  # (-y, x, z) of half the units
+    np.testing.assert_allclose(
+        cloud.colors, np.tile([1.0, 153 / 255, 0.0], (64, 1)), atol=1e-6
+    )  # 1.2 * 127.5 = 153
 
 
 def test_sizes_are_read_off_the_weights(tmp_path, files):
     torch.manual_seed(0)
     torch.save(BaseModel(width=128, layers=3, features=10).state_dict(), tmp_path / "other.pt")
     model = load_network(BASE, str(tmp_path / "other.pt"))
-    assert model.width == 128 and len(model.backbone.resblocks) == 3 and model.backbone.resblocks[0].attn.heads == 2
-    assert not model.training and not any(parameter.requires_grad for parameter in model.parameters())
+    assert (
+        model.width == 128
+        and len(model.backbone.resblocks) == 3
+        and model.backbone.resblocks[0].attn.heads == 2
+    )
+    assert not model.training and not any(
+        parameter.requires_grad for parameter in model.parameters()
+    )
 
 
 def test_cap3ds_wrapped_checkpoint_is_the_same_network(tmp_path, files):
-    torch.save({"model_state_dict": torch.load(files["checkpoint"]), "epoch": 3}, tmp_path / "pointE_finetuned_with_330kdata.pth")
+    torch.save(
+        {"model_state_dict": torch.load(files["checkpoint"]), "epoch": 3},
+        tmp_path / "pointE_finetuned_with_330kdata.pth",
+    )
     wrapped = make(files, checkpoint=str(tmp_path / "pointE_finetuned_with_330kdata.pth"))("a fox")
     np.testing.assert_array_equal(wrapped.points, make(files)("a fox").points)
 
 
 def test_files_of_the_old_format_are_read(tmp_path, files):
-    torch.save(torch.load(files["checkpoint"]), tmp_path / "old.pt", _use_new_zipfile_serialization=False)
-    np.testing.assert_array_equal(make(files, checkpoint=str(tmp_path / "old.pt"))("a fox").points, make(files)("a fox").points)
+    torch.save(
+        torch.load(files["checkpoint"]), tmp_path / "old.pt", _use_new_zipfile_serialization=False
+    )
+    np.testing.assert_array_equal(
+        make(files, checkpoint=str(tmp_path / "old.pt"))("a fox").points,
+        make(files)("a fox").points,
+    )
 
 
 def test_swapped_files_are_named(files):
@@ -345,7 +448,10 @@ def test_a_checkpoint_cannot_run_code(tmp_path, files, monkeypatch):
 
 
 def test_a_clip_of_another_size_is_named(tmp_path, files):
-    torch.save(BaseModel(width=64, layers=1, features=tiny.FEATURES + 8).state_dict(), tmp_path / "other.pt")
+    torch.save(
+        BaseModel(width=64, layers=1, features=tiny.FEATURES + 8).state_dict(),
+        tmp_path / "other.pt",
+    )
     with pytest.raises(UserError, match="clip: .* 24 features, .* 32: take ViT-L/14"):
         make(files, checkpoint=str(tmp_path / "other.pt"))("a fox")
 

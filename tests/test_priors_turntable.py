@@ -11,12 +11,18 @@ from threestudio_gaussiandreamer.priors.turntable import save_turntable, turntab
 
 @pytest.fixture
 def sphere():
-    """20,000 points around a far centre: red on the +x side, blue on the +y side beyond it, else green."""
+    """20,000 points around a far centre: red on the +x side, blue on the +y side beyond it, else
+    green.
+    """
     rng = np.random.default_rng(0)
     points = rng.normal(size=(20_000, 3))
     points *= 40 / np.linalg.norm(points, axis=1, keepdims=True)
     x, y, _ = points.T
-    colors = np.where((x > np.abs(y))[:, None], [1.0, 0, 0], np.where((y > np.abs(x))[:, None], [0, 0, 1.0], [0, 1.0, 0]))
+    colors = np.where(
+        (x > np.abs(y))[:, None],
+        [1.0, 0, 0],
+        np.where((y > np.abs(x))[:, None], [0, 0, 1.0], [0, 1.0, 0]),
+    )
     return PointCloud(points.astype(np.float32) + [100, -50, 7], colors.astype(np.float32))
 
 
@@ -24,12 +30,16 @@ def test_the_first_picture_is_the_front_and_it_turns_to_plus_y(sphere):
     pictures = turntable(sphere, views=4, size=64)
     assert pictures.shape == (4, 64, 64, 3) and pictures.dtype == np.uint8
     middle = pictures[:, 29:35, 29:35].mean(axis=(1, 2))
-    np.testing.assert_allclose(middle[:3], [[255, 0, 0], [0, 0, 255], [0, 255, 0]], atol=25)  # a point's alpha is at most 0.95
+    np.testing.assert_allclose(
+        middle[:3], [[255, 0, 0], [0, 0, 255], [0, 255, 0]], atol=25
+    )  # a point's alpha is at most 0.95
 
 
 def test_all_of_it_is_in_the_picture_on_white(sphere):
     pictures = turntable(sphere, views=3, size=64)
-    border = np.concatenate([pictures[:, 0], pictures[:, -1], pictures[:, :, 0], pictures[:, :, -1]], axis=1)
+    border = np.concatenate(
+        [pictures[:, 0], pictures[:, -1], pictures[:, :, 0], pictures[:, :, -1]], axis=1
+    )
     assert (border == 255).all()
     covered = (pictures < 250).any(axis=-1).mean()
     assert 0.45 < covered < 0.6  # a disc of 1 / 1.3 of the height would be 0.46; its edges are soft

@@ -6,7 +6,18 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.prompts.prompts import PlainPromptProcessor
 
-TEXTS = ["a fox", "1984", "yes", "a fox: red", "robot #1", "[a] b", "'quoted\" text", "a/../../x", "🦊 fox", " spaces "]
+TEXTS = [
+    "a fox",
+    "1984",
+    "yes",
+    "a fox: red",
+    "robot #1",
+    "[a] b",
+    "'quoted\" text",
+    "a/../../x",
+    "🦊 fox",
+    " spaces ",
+]
 TEXTS += ["x" * 4096, "two\nlines", ""]
 
 

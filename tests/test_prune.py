@@ -1,4 +1,6 @@
-"""The prune command: budgets are met on unseen views, a second run changes nothing, and mistakes cost no work."""
+"""The prune command: budgets are met on unseen views, a second run changes nothing, and mistakes
+cost no work.
+"""
 
 import json
 import math
@@ -7,8 +9,18 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.formats.gaussian_files import PRUNED, StoredCloud, in_axes, read_cloud
-from threestudio_gaussiandreamer.formats.ply import GaussianArrays, read_comments, read_gaussians, write_gaussians
+from threestudio_gaussiandreamer.formats.gaussian_files import (
+    PRUNED,
+    StoredCloud,
+    in_axes,
+    read_cloud,
+)
+from threestudio_gaussiandreamer.formats.ply import (
+    GaussianArrays,
+    read_comments,
+    read_gaussians,
+    write_gaussians,
+)
 from threestudio_gaussiandreamer.gaussians import simplify
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
 from threestudio_gaussiandreamer.gaussians.simplify import Budget, Cloud
@@ -70,13 +82,22 @@ def test_a_second_run_removes_nothing(source, tmp_path):
 
 def test_a_second_run_of_nearly_the_same_budget_has_nearly_nothing_to_spend(source, tmp_path):
     once = run(source, tmp_path / "once.ply", "--psnr", "32")["after"]["gaussians"]
-    assert run(tmp_path / "once.ply", tmp_path / "twice.ply", "--psnr", "31.999")["after"]["gaussians"] >= 0.98 * once
+    assert (
+        run(tmp_path / "once.ply", tmp_path / "twice.ply", "--psnr", "31.999")["after"]["gaussians"]
+        >= 0.98 * once
+    )
     assert read_cloud(str(tmp_path / "twice.ply")).pruned_to == 31.999
 
 
 @pytest.mark.parametrize(
     ("asked", "spent", "left"),
-    [(37.0, 40.0, 40.02), (30.0, 60.0, 30.004), (40.0, 40.0, None), (41.0, 40.0, None), (39.99999999, 40.0, None)],
+    [
+        (37.0, 40.0, 40.02),
+        (30.0, 60.0, 30.004),
+        (40.0, 40.0, None),
+        (41.0, 40.0, None),
+        (39.99999999, 40.0, None),
+    ],
 )
 def test_what_is_left_of_a_budget(asked, spent, left):
     assert prune.unspent(asked, spent) == (left and pytest.approx(left, abs=5e-3))
@@ -87,13 +108,20 @@ def test_a_count_that_changes_nothing_keeps_the_note(source, tmp_path):
     once = run(source, tmp_path / "once.ply", "--psnr", "32")["after"]["gaussians"]
     run(tmp_path / "once.ply", tmp_path / "same.ply", "--count", str(once))
     run(tmp_path / "once.ply", tmp_path / "fewer.ply", "--count", str(once - 50))
-    assert read_cloud(str(tmp_path / "same.ply")).pruned_to == 32 and read_cloud(str(tmp_path / "fewer.ply")).pruned_to is None
+    assert (
+        read_cloud(str(tmp_path / "same.ply")).pruned_to == 32
+        and read_cloud(str(tmp_path / "fewer.ply")).pruned_to is None
+    )
 
 
 def test_a_quality_that_the_format_cannot_give_is_not_said_to_be_met(source, tmp_path, caplog):
     assert run(source, tmp_path / "fine.ply", "--psnr", "30")["met"]
     report = run(source, tmp_path / "out.spz", "--psnr", "90")
-    assert not report["met"] and report["after"]["gaussians"] == 600 and "the budget isn't met" in caplog.text
+    assert (
+        not report["met"]
+        and report["after"]["gaussians"] == 600
+        and "the budget isn't met" in caplog.text
+    )
     assert 30 < read_cloud(str(tmp_path / "out.spz")).pruned_to < 80  # what the format has cost
     assert run(source, tmp_path / "out.ply", "--psnr", "120")["met"]
 
@@ -112,7 +140,10 @@ def test_what_a_format_costs_is_spent_too(tmp_path):
     for name in ("twice.spz", "count.spz"):
         found = read_cloud(str(tmp_path / name))
         turned = prune.tensors_of(StoredCloud(GaussianArrays(*in_axes(found, first.up)), first.up))
-        assert found.pruned_to < 34.9 and simplify.likeness(turned, views, pictures) > found.pruned_to - 0.5
+        assert (
+            found.pruned_to < 34.9
+            and simplify.likeness(turned, views, pictures) > found.pruned_to - 0.5
+        )
 
 
 def test_a_stricter_budget_than_what_is_spent_is_not_met(source, tmp_path, capsys):
@@ -123,19 +154,37 @@ def test_a_stricter_budget_than_what_is_spent_is_not_met(source, tmp_path, capsy
 
 
 @pytest.mark.parametrize(
-    ("here", "count", "rounds"), [(100, 100, 0), (10, 20, 0), (10000, 6400, 2), (10000, 1500, 9), (2, 1, 1), (600, 1, 24)]
+    ("here", "count", "rounds"),
+    [(100, 100, 0), (10, 20, 0), (10000, 6400, 2), (10000, 1500, 9), (2, 1, 1), (600, 1, 24)],
 )
 def test_how_many_rounds_it_takes(here, count, rounds):
     assert simplify.rounds_to(count, here) == rounds
 
 
-@pytest.mark.parametrize(("drawn", "eps2d"), [({}, 0.3), ({"eps2d": 0.05}, 0.05), ({"antialias": True}, 0.3)])
+@pytest.mark.parametrize(
+    ("drawn", "eps2d"), [({}, 0.3), ({"eps2d": 0.05}, 0.05), ({"antialias": True}, 0.3)]
+)
 def test_a_cloud_is_judged_as_the_viewer_draws_it(source, drawn, eps2d):
     for views in prune.views_of(read_cloud(str(source)), prune.PruneOptions(size=48, **drawn)):
         cloud, rgb = ball(), sh_to_colors(ball().sh, ball().means)
-        shape = cloud.means, cloud.quats, cloud.log_scales.exp(), cloud.logit_opacities.sigmoid(), rgb, views.viewmats[:1], views.Ks[:1]
-        options = {"background": views.backgrounds[:1], "near": views.near, "eps2d": eps2d, "antialias": "antialias" in drawn}
-        assert torch.equal(simplify.look(cloud, views)[0], rasterize(*shape, 48, 48, **options).image[0])
+        shape = (
+            cloud.means,
+            cloud.quats,
+            cloud.log_scales.exp(),
+            cloud.logit_opacities.sigmoid(),
+            rgb,
+            views.viewmats[:1],
+            views.Ks[:1],
+        )
+        options = {
+            "background": views.backgrounds[:1],
+            "near": views.near,
+            "eps2d": eps2d,
+            "antialias": "antialias" in drawn,
+        }
+        assert torch.equal(
+            simplify.look(cloud, views)[0], rasterize(*shape, 48, 48, **options).image[0]
+        )
 
 
 def test_the_input_is_not_overwritten(source, tmp_path, capsys):
@@ -146,9 +195,9 @@ def test_the_input_is_not_overwritten(source, tmp_path, capsys):
 
 def test_a_looser_budget_goes_on(source, tmp_path):
     run(source, tmp_path / "once.ply", "--psnr", "55")
-    assert run(tmp_path / "once.ply", tmp_path / "twice.ply", "--psnr", "40")["after"]["gaussians"] < len(
-        read_gaussians(tmp_path / "once.ply").means
-    )
+    assert run(tmp_path / "once.ply", tmp_path / "twice.ply", "--psnr", "40")["after"][
+        "gaussians"
+    ] < len(read_gaussians(tmp_path / "once.ply").means)
 
 
 def test_the_same_call_gives_the_same_bits(source, tmp_path):
@@ -162,17 +211,24 @@ def test_hidden_gaussians_go_first():
     views = simplify.views_around(cloud, 16, 48)
     kept = simplify.only(cloud, simplify.worth(cloud, views), 400)
     outside = kept.means.norm(dim=1) > 0.9
-    assert outside.double().mean() > 0.9  # two thirds of all; a few inner ones are seen through gaps
+    assert (
+        outside.double().mean() > 0.9
+    )  # two thirds of all; a few inner ones are seen through gaps
 
 
 def test_recovery_pays():
     cloud = ball()
-    probes, judges = (simplify.views_around(cloud, count, 48, turn=turn) for count, turn in ((16, 0.0), (8, 45.0)))
+    probes, judges = (
+        simplify.views_around(cloud, count, 48, turn=turn) for count, turn in ((16, 0.0), (8, 45.0))
+    )
     pictures = simplify.look(cloud, probes)
     pruned = simplify.only(cloud, simplify.worth(cloud, probes), 200)
     recovered = simplify.recover(pruned, probes, pictures, 40, 0)
     before = simplify.look(cloud, judges)
-    assert simplify.likeness(recovered, judges, before) > simplify.likeness(pruned, judges, before) + 1.0
+    assert (
+        simplify.likeness(recovered, judges, before)
+        > simplify.likeness(pruned, judges, before) + 1.0
+    )
 
 
 def test_harmonics_are_kept(tmp_path):
@@ -186,13 +242,24 @@ def test_a_checkpoint_is_read(tmp_path):
     state = {f"geometry.{name}": value for name, value in cloud._asdict().items() if name != "sh"}
     state |= {"geometry.sh0": cloud.sh, "geometry.sh_rest": torch.zeros(len(cloud.means), 0, 3)}
     torch.save({"state_dict": state, "epoch": 0, "global_step": 1}, tmp_path / "last.ckpt")
-    assert run(tmp_path / "last.ckpt", tmp_path / "out.ply", "--count", "300")["before"]["gaussians"] == 600
+    assert (
+        run(tmp_path / "last.ckpt", tmp_path / "out.ply", "--count", "300")["before"]["gaussians"]
+        == 600
+    )
 
 
 def test_gsplats_checkpoints_are_read(source, tmp_path):
     cloud = ball()
-    splats = {"means": cloud.means, "quats": cloud.quats, "scales": cloud.log_scales, "opacities": cloud.logit_opacities}
-    torch.save({"step": 7, "splats": splats | {"sh0": cloud.sh, "shN": torch.zeros(600, 0, 3)}}, tmp_path / "ckpt.pt")
+    splats = {
+        "means": cloud.means,
+        "quats": cloud.quats,
+        "scales": cloud.log_scales,
+        "opacities": cloud.logit_opacities,
+    }
+    torch.save(
+        {"step": 7, "splats": splats | {"sh0": cloud.sh, "shN": torch.zeros(600, 0, 3)}},
+        tmp_path / "ckpt.pt",
+    )
     for name, path in (("a.ply", tmp_path / "ckpt.pt"), ("b.ply", source)):
         run(path, tmp_path / name, "--count", "300", "--up", "z")
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
@@ -202,10 +269,22 @@ def test_gaussians_that_cannot_be_drawn_are_left_out(tmp_path, caplog):
     cloud = ball()
     cloud.means[3], cloud.sh[5] = float("nan"), float("inf")
     write_gaussians(tmp_path / "in.ply", **arrays_of(cloud))
-    splats = {"means": cloud.means, "quats": cloud.quats, "scales": cloud.log_scales, "opacities": cloud.logit_opacities}
-    torch.save({"splats": splats | {"sh0": cloud.sh, "shN": torch.zeros(600, 0, 3)}}, tmp_path / "in.pt")
+    splats = {
+        "means": cloud.means,
+        "quats": cloud.quats,
+        "scales": cloud.log_scales,
+        "opacities": cloud.logit_opacities,
+    }
+    torch.save(
+        {"splats": splats | {"sh0": cloud.sh, "shN": torch.zeros(600, 0, 3)}}, tmp_path / "in.pt"
+    )
     for name in ("in.ply", "in.pt"):
-        assert run(tmp_path / name, tmp_path / "out.ply", "--count", "300", "--up", "z")["before"]["gaussians"] == 598
+        assert (
+            run(tmp_path / name, tmp_path / "out.ply", "--count", "300", "--up", "z")["before"][
+                "gaussians"
+            ]
+            == 598
+        )
     assert caplog.text.count("2 of 600 Gaussians hold NaN or infinity: left out") == 2
 
 
@@ -214,13 +293,20 @@ def test_clouds_in_other_units_look_alike(unit):
     """No plane of the camera cuts a cloud in millimetres away."""
     cloud = ball()
     other = cloud._replace(means=cloud.means * unit, log_scales=cloud.log_scales + math.log(unit))
-    ours, theirs = (simplify.look(each, simplify.views_around(each, 6, 48)) for each in (cloud, other))
+    ours, theirs = (
+        simplify.look(each, simplify.views_around(each, 6, 48)) for each in (cloud, other)
+    )
     assert simplify.psnr(theirs, ours) > 60
 
 
 def test_a_cloud_that_shows_nothing_is_refused(tmp_path, capsys):
-    write_gaussians(tmp_path / "in.ply", **arrays_of(ball()._replace(logit_opacities=torch.full((600,), -20.0))))
-    assert prune.main([str(tmp_path / "in.ply"), str(tmp_path / "out.ply"), "--psnr", "40", *FAST]) == 2
+    write_gaussians(
+        tmp_path / "in.ply", **arrays_of(ball()._replace(logit_opacities=torch.full((600,), -20.0)))
+    )
+    assert (
+        prune.main([str(tmp_path / "in.ply"), str(tmp_path / "out.ply"), "--psnr", "40", *FAST])
+        == 2
+    )
     assert "none of the 600 Gaussians is to be seen" in capsys.readouterr().err
 
 
@@ -230,7 +316,9 @@ def test_ctrl_c_leaves_nothing_behind(source, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(simplify, "recover", interrupted)
     assert prune.main([str(source), str(tmp_path / "out.ply"), "--count", "300", *FAST]) == 130
-    assert "stopped" in capsys.readouterr().err and [path.name for path in tmp_path.iterdir()] == ["in.ply"]
+    assert "stopped" in capsys.readouterr().err and [path.name for path in tmp_path.iterdir()] == [
+        "in.ply"
+    ]
 
 
 def test_a_checkpoint_without_gaussians_is_refused(tmp_path, capsys):
@@ -241,9 +329,15 @@ def test_a_checkpoint_without_gaussians_is_refused(tmp_path, capsys):
 
 def test_a_compact_file_is_written_within_its_size_and_read_again(source, tmp_path):
     report = run(source, tmp_path / "out.spz", "--bytes", "7kB")
-    assert 6_600 < (tmp_path / "out.spz").stat().st_size == report["after"]["bytes"] <= 7_000 and report["after"]["gaussians"] > 300
+    assert (
+        6_600 < (tmp_path / "out.spz").stat().st_size == report["after"]["bytes"] <= 7_000
+        and report["after"]["gaussians"] > 300
+    )
     assert 900 < run(source, tmp_path / "small.spz", "--bytes", "1kB")["after"]["bytes"] <= 1_000
-    assert run(tmp_path / "out.spz", tmp_path / "again.spz", "--count", "200")["after"]["gaussians"] == 200
+    assert (
+        run(tmp_path / "out.spz", tmp_path / "again.spz", "--count", "200")["after"]["gaussians"]
+        == 200
+    )
     assert read_cloud(str(tmp_path / "again.spz")).up == "y"
 
 
@@ -264,7 +358,22 @@ def test_colours_beyond_the_compact_formats_reach_are_fitted_within_it(tmp_path)
     reports = []
     for steps in ("1", "60"):
         path = str(tmp_path / f"{steps}.spz")
-        reports.append(prune.run(prune.parse([str(tmp_path / "in.ply"), path, "--count", "600", "--size", "48", "--steps", steps])))
+        reports.append(
+            prune.run(
+                prune.parse(
+                    [
+                        str(tmp_path / "in.ply"),
+                        path,
+                        "--count",
+                        "600",
+                        "--size",
+                        "48",
+                        "--steps",
+                        steps,
+                    ]
+                )
+            )
+        )
     assert len(source.arrays.means) == reports[1]["after"]["gaussians"] == 600
     assert reports[1]["psnr_on_unseen_views"] > reports[0]["psnr_on_unseen_views"] + 1
 
@@ -272,10 +381,15 @@ def test_colours_beyond_the_compact_formats_reach_are_fitted_within_it(tmp_path)
 def test_views_turn_with_the_axes_of_the_file(tmp_path):
     source = tmp_path / "in.ply"
     write_gaussians(source, **arrays_of(ball()))
-    views = {up: prune.views_of(read_cloud(str(source), up=up), prune.PruneOptions(size=48))[0] for up in ("z", "y", "-y")}
+    views = {
+        up: prune.views_of(read_cloud(str(source), up=up), prune.PruneOptions(size=48))[0]
+        for up in ("z", "y", "-y")
+    }
     top = {"z": 2, "y": 1, "-y": 1}
     heights = {up: views[up].positions[:, top[up]] * (-1 if up == "-y" else 1) for up in views}
-    assert torch.allclose(heights["z"], heights["y"], atol=0.05) and torch.allclose(heights["y"], heights["-y"], atol=0.05)
+    assert torch.allclose(heights["z"], heights["y"], atol=0.05) and torch.allclose(
+        heights["y"], heights["-y"], atol=0.05
+    )
     assert heights["z"].max() > 1 > -1 > heights["z"].min()
 
 
@@ -329,7 +443,9 @@ def test_a_budget_is_needed_and_only_one(source, tmp_path, capsys):
 
 
 def test_any_quality_ends_the_search():
-    apart = ball(12)._replace(logit_opacities=torch.full((12,), 6.0), log_scales=torch.full((12, 3), -3.0))
+    apart = ball(12)._replace(
+        logit_opacities=torch.full((12,), 6.0), log_scales=torch.full((12, 3), -3.0)
+    )
     probes, judges = (simplify.views_around(apart, 8, 48, turn=turn) for turn in (0.0, 45.0))
     assert len(simplify.simplify(apart, probes, judges, Budget(psnr=1.0), steps=2).means) == 1
     assert len(simplify.simplify(apart, probes, judges, Budget(psnr=99.0), steps=2).means) == 12
@@ -339,15 +455,21 @@ def test_any_quality_ends_the_search():
 def test_a_recovery_makes_nothing_worse(monkeypatch, bearable):
     """It is done anew at smaller rates, and left out where none is small enough."""
     cloud, paces = ball(), []
-    probes, judges = (simplify.views_around(cloud, count, 48, turn=turn) for count, turn in ((16, 0.0), (8, 45.0)))
+    probes, judges = (
+        simplify.views_around(cloud, count, 48, turn=turn) for count, turn in ((16, 0.0), (8, 45.0))
+    )
 
     def recover(cloud, views, pictures, steps, seed, sh_reach, pace):
         paces.append(pace)
         return cloud if pace <= bearable else cloud._replace(sh=cloud.sh + 1)
 
     monkeypatch.setattr(simplify, "recover", recover)
-    monkeypatch.setattr(simplify, "merge_duplicates", lambda values, at_least: SimpleNamespace(values=values))
-    found = simplify.simplify(cloud, probes, judges, simplify.Budget(count=len(cloud.means) - 20), steps=1)
+    monkeypatch.setattr(
+        simplify, "merge_duplicates", lambda values, at_least: SimpleNamespace(values=values)
+    )
+    found = simplify.simplify(
+        cloud, probes, judges, simplify.Budget(count=len(cloud.means) - 20), steps=1
+    )
     kept = simplify.only(cloud, simplify.worth(cloud, probes), len(cloud.means) - 20)
     assert all(torch.equal(a, b) for a, b in zip(found, kept, strict=True))
     assert paces == [pace for pace in simplify.PACES if pace >= bearable]
@@ -355,14 +477,18 @@ def test_a_recovery_makes_nothing_worse(monkeypatch, bearable):
 
 def test_a_recovery_begins_near_the_pace_of_the_one_before(monkeypatch):
     cloud, paces, bearable = ball(), [], iter([1 / 16] * 5 + [1.0] * 3)
-    probes, judges = (simplify.views_around(cloud, count, 32, turn=turn) for count, turn in ((8, 0.0), (4, 45.0)))
+    probes, judges = (
+        simplify.views_around(cloud, count, 32, turn=turn) for count, turn in ((8, 0.0), (4, 45.0))
+    )
 
     def recover(cloud, views, pictures, steps, seed, sh_reach, pace):
         paces.append(pace)
         return cloud if pace <= next(bearable) else cloud._replace(sh=cloud.sh + 1)
 
     monkeypatch.setattr(simplify, "recover", recover)
-    monkeypatch.setattr(simplify, "merge_duplicates", lambda values, at_least: SimpleNamespace(values=values))
+    monkeypatch.setattr(
+        simplify, "merge_duplicates", lambda values, at_least: SimpleNamespace(values=values)
+    )
     simplify.simplify(cloud, probes, judges, simplify.Budget(count=200), steps=1)
     assert paces == [1, 1 / 4, 1 / 16, 1 / 4, 1 / 16, 1 / 4, 1, 1]
 
@@ -372,9 +498,15 @@ def test_a_round_that_failed_is_not_tried_again(monkeypatch):
     cloud, tried = ball()._replace(), []
     few = simplify.only(cloud, torch.arange(600.0), 20)
     recover = simplify.recover
-    monkeypatch.setattr(simplify, "recover", lambda cloud, *rest: tried.append(len(cloud.means)) or recover(cloud, *rest))
+    monkeypatch.setattr(
+        simplify,
+        "recover",
+        lambda cloud, *rest: tried.append(len(cloud.means)) or recover(cloud, *rest),
+    )
     probes, judges = (simplify.views_around(few, 8, 32, turn=turn) for turn in (0.0, 45.0))
-    assert len(simplify.simplify(few, probes, judges, simplify.Budget(psnr=99.0), steps=2).means) == 20
+    assert (
+        len(simplify.simplify(few, probes, judges, simplify.Budget(psnr=99.0), steps=2).means) == 20
+    )
     assert len(tried) <= 5 * len(simplify.PACES) and tried.count(19) <= len(simplify.PACES)
 
 

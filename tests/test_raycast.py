@@ -14,21 +14,33 @@ from threestudio_gaussiandreamer.meshes.raycast import MeshCaster, TargetCache, 
 
 trimesh = pytest.importorskip("trimesh")
 
-COLORS = {"+x": (1, 0, 0), "-x": (0, 1, 1), "+y": (0, 1, 0), "-y": (1, 0, 1), "+z": (0, 0, 1), "-z": (1, 1, 0)}
+COLORS = {
+    "+x": (1, 0, 0),
+    "-x": (0, 1, 1),
+    "+y": (0, 1, 0),
+    "-y": (1, 0, 1),
+    "+z": (0, 0, 1),
+    "-z": (1, 1, 0),
+}
 
 
 @pytest.fixture(params=["embree", "zbuffer"], autouse=True)
 def caster_name(request, monkeypatch):
     """Every test runs with both casters."""
     if request.param == "zbuffer":
-        monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)  # importing it is an ImportError now
+        monkeypatch.setitem(
+            sys.modules, "embreex.mesh_construction", None
+        )  # importing it is an ImportError now
     else:
         pytest.importorskip("embreex")
     return request.param
 
 
 def look(elevation, azimuth, distance):
-    angles = (torch.tensor([float(value)], dtype=torch.float64) for value in (elevation, azimuth, distance))
+    angles = (
+        torch.tensor([float(value)], dtype=torch.float64)
+        for value in (elevation, azimuth, distance)
+    )
     return cameras.orbit_c2w(*angles)[0].numpy()
 
 
@@ -37,7 +49,11 @@ def cube(size=1.0):
     source = trimesh.creation.box((size, size, size))
     sides = source.face_normals.round().astype(int)
     names = ["+-"[int(side.sum() < 0)] + "xyz"[int(np.abs(side).argmax())] for side in sides]
-    return Mesh(np.array(source.vertices), np.array(source.faces), face_colors=np.array([COLORS[name] for name in names], dtype=np.float32))
+    return Mesh(
+        np.array(source.vertices),
+        np.array(source.faces),
+        face_colors=np.array([COLORS[name] for name in names], dtype=np.float32),
+    )
 
 
 def sphere(radius=1.0, subdivisions=5):
@@ -45,11 +61,18 @@ def sphere(radius=1.0, subdivisions=5):
     return Mesh(np.array(source.vertices), np.array(source.faces))
 
 
-@pytest.mark.parametrize(("distance", "fovy", "size"), [(2.0, 70.0, (96, 96)), (3.0, 40.0, (80, 120)), (5.0, 25.0, (96, 80))])
+@pytest.mark.parametrize(
+    ("distance", "fovy", "size"),
+    [(2.0, 70.0, (96, 96)), (3.0, 40.0, (80, 120)), (5.0, 25.0, (96, 80))],
+)
 def test_the_silhouette_of_a_sphere(distance, fovy, size):
-    """Under perspective a sphere of radius r at distance d shows the angle asin(r / d): a disc of radius f tan of it."""
+    """Under perspective a sphere of radius r at distance d shows the angle asin(r / d): a disc of
+    radius f tan of it.
+    """
     height, width = size
-    image = MeshCaster(sphere(0.8)).render(look(20, 30, distance), math.radians(fovy), height, width, supersample=4)
+    image = MeshCaster(sphere(0.8)).render(
+        look(20, 30, distance), math.radians(fovy), height, width, supersample=4
+    )
     focal = height / (2 * math.tan(math.radians(fovy) / 2))
     radius = focal * math.tan(math.asin(0.8 / distance))
     # the icosphere's edges lie 5e-4 inside; 16 samples a pixel leave about 0.2 % of the area
@@ -61,7 +84,15 @@ def test_the_silhouette_of_a_sphere(distance, fovy, size):
 
 
 @pytest.mark.parametrize(
-    ("side", "elevation", "azimuth"), [("+x", 0, 0), ("+y", 0, 90), ("-x", 0, 180), ("-y", 0, -90), ("+z", 89.9, 0), ("-z", -89.9, 0)]
+    ("side", "elevation", "azimuth"),
+    [
+        ("+x", 0, 0),
+        ("+y", 0, 90),
+        ("-x", 0, 180),
+        ("-y", 0, -90),
+        ("+z", 89.9, 0),
+        ("-z", -89.9, 0),
+    ],
 )
 def test_each_side_of_a_cube_is_seen_from_its_side(side, elevation, azimuth):
     image = MeshCaster(cube()).render(look(elevation, azimuth, 3), math.radians(40), 32, 32)
@@ -71,7 +102,9 @@ def test_each_side_of_a_cube_is_seen_from_its_side(side, elevation, azimuth):
 def test_the_picture_is_not_mirrored():
     """From the front, +y is on the right and +z on top."""
     image = MeshCaster(cube()).render(look(30, 30, 3), math.radians(40), 64, 64)
-    rows, columns = np.nonzero((image[..., 1] > 0.9) & (image[..., 0] < 0.1) & (image[..., 2] < 0.1))  # green: +y
+    rows, columns = np.nonzero(
+        (image[..., 1] > 0.9) & (image[..., 0] < 0.1) & (image[..., 2] < 0.1)
+    )  # green: +y
     assert columns.mean() > 36
     rows, columns = np.nonzero((image[..., 2] > 0.9) & (image[..., 0] < 0.1))  # blue: +z
     assert rows.mean() < 24
@@ -86,15 +119,25 @@ def test_a_point_lands_where_the_intrinsics_say():
     viewmats, Ks = cameras.to_opencv(torch.tensor(c2w)[None], torch.tensor([fovy]), height, width)
     projected = Ks[0].double() @ (viewmats[0, :3, :3] @ torch.tensor(position) + viewmats[0, :3, 3])
     weights = image[..., 3] / image[..., 3].sum()
-    center = [(weights * (np.arange(width) + 0.5)).sum(), (weights * (np.arange(height) + 0.5)[:, None]).sum()]
-    np.testing.assert_allclose(center, (projected[:2] / projected[2]).numpy(), atol=0.05)  # the disc is 2 pixels wide
+    center = [
+        (weights * (np.arange(width) + 0.5)).sum(),
+        (weights * (np.arange(height) + 0.5)[:, None]).sum(),
+    ]
+    np.testing.assert_allclose(
+        center, (projected[:2] / projected[2]).numpy(), atol=0.05
+    )  # the disc is 2 pixels wide
 
 
 def test_gltf_files_show_their_front_at_azimuth_0(tmp_path):
     """glTF is y up and faces +z; its +x is the model's left, which is the world's +y."""
     source = cube()
-    corners, colors = source.vertices[source.faces].reshape(-1, 3), (source.face_colors.repeat(3, axis=0) * 255).astype(np.uint8)
-    trimesh.Trimesh(corners, np.arange(36).reshape(-1, 3), vertex_colors=colors, process=False).export(tmp_path / "cube.glb")
+    corners, colors = (
+        source.vertices[source.faces].reshape(-1, 3),
+        (source.face_colors.repeat(3, axis=0) * 255).astype(np.uint8),
+    )
+    trimesh.Trimesh(
+        corners, np.arange(36).reshape(-1, 3), vertex_colors=colors, process=False
+    ).export(tmp_path / "cube.glb")
     caster = MeshCaster(load_mesh(tmp_path / "cube.glb"))
     for elevation, azimuth, side in ((0, 0, "+z"), (0, 90, "+x"), (89.9, 0, "+y")):
         image = caster.render(look(elevation, azimuth, 4), math.radians(40), 16, 16)
@@ -147,7 +190,9 @@ def test_many_views_are_the_single_views():
 
 def orbit_tensors(*azimuths):
     azimuth = torch.tensor([float(a) for a in azimuths])
-    return cameras.orbit_c2w(torch.zeros_like(azimuth), azimuth, torch.full_like(azimuth, 3)), torch.full_like(azimuth, 0.7)
+    return cameras.orbit_c2w(
+        torch.zeros_like(azimuth), azimuth, torch.full_like(azimuth, 3)
+    ), torch.full_like(azimuth, 0.7)
 
 
 def test_the_cache_returns_the_pictures_and_casts_each_once(monkeypatch):
@@ -170,7 +215,12 @@ def test_the_cache_is_bounded_and_drops_the_oldest_use():
     kept = {np.frombuffer(key[0], dtype=np.float32).tobytes() for key in cache._pictures}
     assert len(cache) == 3
     assert kept == {orbit_tensors(a)[0][0].numpy().tobytes() for a in (20, 0, 30)}
-    assert cache(*orbit_tensors(1, 2, 3, 4, 5), 4, 4).shape == (5, 4, 4, 4)  # a batch larger than the cache
+    assert cache(*orbit_tensors(1, 2, 3, 4, 5), 4, 4).shape == (
+        5,
+        4,
+        4,
+        4,
+    )  # a batch larger than the cache
     cache(*orbit_tensors(5), 4, 4)
     cache(*orbit_tensors(5), 8, 4)
     assert len(cache) == 3
@@ -186,7 +236,11 @@ def test_a_missing_embree_is_said_once(caster_name, caplog):
     with caplog.at_level(logging.WARNING, logger=raycast.__name__):
         MeshCaster(cube())
         MeshCaster(cube())
-    lines = [record.getMessage() for record in caplog.records if "pip install embreex" in record.getMessage()]
+    lines = [
+        record.getMessage()
+        for record in caplog.records
+        if "pip install embreex" in record.getMessage()
+    ]
     assert len(lines) == (1 if caster_name == "zbuffer" else 0)
 
 

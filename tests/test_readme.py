@@ -34,7 +34,9 @@ def launches() -> list[list[str]]:
     for text in TEXTS.values():
         for block in blocks(text, "bash") + blocks(text, ""):
             for line in block.replace("\\\n", " ").splitlines():
-                command = re.search(r"(?:^|python )(?:launch\.py|gaussiandreamer) (.*--config.*)", line)
+                command = re.search(
+                    r"(?:^|python )(?:launch\.py|gaussiandreamer) (.*--config.*)", line
+                )
                 found += [shlex.split(command[1], comments=True)] if command else []
     return found
 
@@ -58,8 +60,13 @@ def test_links_lead_somewhere(name):
 
 @pytest.mark.parametrize("name", TEXTS)
 def test_files_that_are_named_exist(name):
-    """Paths in backticks that begin with one of our folders; what a run writes or a user adds isn't ours."""
-    for path in re.findall(r"`((?:configs|tests|benchmarks|docs|threestudio_gaussiandreamer|custom/threestudio)[\w./-]*)`", TEXTS[name]):
+    """Paths in backticks that begin with one of our folders; what a run writes or a user adds isn't
+    ours.
+    """
+    for path in re.findall(
+        r"`((?:configs|tests|benchmarks|docs|threestudio_gaussiandreamer|custom/threestudio)[\w./-]*)`",
+        TEXTS[name],
+    ):
         assert (ROOT / path).exists(), f"{name} names {path}"
 
 
@@ -79,21 +86,30 @@ def test_a_launch_that_is_shown_is_accepted(arguments, tmp_path, monkeypatch):
     """Configuration, options and names; what "..." stands for is the reader's."""
     args = parse_arguments([word for word in arguments if word != "..."])
     paths = [find_config(name).resolve() for name in args.config]
-    overrides = [override for override in args.overrides if "spiral-prior" not in override]  # an extension, tried below
+    overrides = [
+        override for override in args.overrides if "spiral-prior" not in override
+    ]  # an extension, tried below
     monkeypatch.chdir(tmp_path)
     check_config(load_config(*paths, cli_args=overrides))
 
 
 def python_blocks() -> list[tuple[str, str]]:
     """(file name in the first line, source) of the extensions that docs/ shows."""
-    found = [(re.match(r"# (custom/\S+\.py)\n", block), block) for text in TEXTS.values() for block in blocks(text, "python")]
+    found = [
+        (re.match(r"# (custom/\S+\.py)\n", block), block)
+        for text in TEXTS.values()
+        for block in blocks(text, "python")
+    ]
     return [(match[1], block) for match, block in found if match]
 
 
 # what the demo has to be told for each of them
 PARTS = {
     "custom/spiral.py": ["system.geometry.prior_type=spiral-prior"],
-    "custom/one_color.py": ["system.guidance_type=one-color-guidance", "system.geometry.prior.path=toy.glb"],
+    "custom/one_color.py": [
+        "system.guidance_type=one-color-guidance",
+        "system.geometry.prior.path=toy.glb",
+    ],
 }
 
 
@@ -106,5 +122,7 @@ def test_an_extension_that_is_shown_trains(name, source, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("custom").mkdir()
     Path(name).write_text(source)
-    code = experiment.main(["--config", "demo.yaml", "--train", "--gpu", "cpu", *TINY, *PARTS[name]])
+    code = experiment.main(
+        ["--config", "demo.yaml", "--train", "--gpu", "cpu", *TINY, *PARTS[name]]
+    )
     assert code == 0 and Path("outputs/demo/t/save/it2-export/gaussians.ply").is_file()

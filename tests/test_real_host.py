@@ -1,8 +1,9 @@
-"""The drop-in inside an unmodified threestudio: all stages on its own launch.py, registry, base classes, data module and savers.
+"""The drop-in inside an unmodified threestudio: all stages on its own launch.py, registry, base
+classes, data module and savers.
 
-Needs ``THREESTUDIO_SRC`` (a checkout of threestudio v0.2.3), ``HOST3_DIR`` (where the harness has put the environment that it starts in)
-and the harness itself, in ``GAUSSIANDREAMER_SHARED`` or ``../shared``; skipped without.
-"""
+Needs ``THREESTUDIO_SRC`` (a checkout of threestudio v0.2.3), ``HOST3_DIR`` (where the harness has
+put the environment that it starts in) and the harness itself, in ``GAUSSIANDREAMER_SHARED`` or
+``../shared``; skipped without."""
 
 import os
 import subprocess
@@ -43,16 +44,31 @@ def try_extension(tmp_path: Path, config: Path, *overrides: str) -> set[str]:
         **os.environ,
         "STAGES": "train test export validate resume",
         "SCRATCH": str(tmp_path / "scratch"),
-        "EXTRA_PYTHONPATH": os.pathsep.join(filter(None, [str(REPOSITORY), os.environ.get("EXTRA_PYTHONPATH")])),
+        "EXTRA_PYTHONPATH": os.pathsep.join(
+            filter(None, [str(REPOSITORY), os.environ.get("EXTRA_PYTHONPATH")])
+        ),
     }
-    command = ["bash", str(HARNESS), str(REPOSITORY / "custom" / "threestudio-gaussiandreamer"), str(config), *SMALL, *overrides]
+    command = [
+        "bash",
+        str(HARNESS),
+        str(REPOSITORY / "custom" / "threestudio-gaussiandreamer"),
+        str(config),
+        *SMALL,
+        *overrides,
+    ]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
     (run,) = (tmp_path / "scratch" / "outputs" / "demo").iterdir()
     return {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
 
 
-EXPECTED = {"ckpts/last.ckpt", "save/it3-0.png", "save/it3-test.mp4", "save/it3-export/gaussians.ply", "save/it5-test.mp4"}
+EXPECTED = {
+    "ckpts/last.ckpt",
+    "save/it3-0.png",
+    "save/it3-test.mp4",
+    "save/it3-export/gaussians.ply",
+    "save/it5-test.mp4",
+}
 
 
 def test_our_configuration_with_our_data_module(tmp_path):
@@ -61,7 +77,11 @@ def test_our_configuration_with_our_data_module(tmp_path):
 
 def test_our_configuration_with_the_data_module_and_background_of_the_host(tmp_path):
     lines = (REPOSITORY / "configs" / "demo.yaml").read_text().splitlines()
-    kept = "\n".join(line for line in lines if "train_views" not in line and not line.strip().startswith("background:"))
+    kept = "\n".join(
+        line
+        for line in lines
+        if "train_views" not in line and not line.strip().startswith("background:")
+    )
     for ours, theirs in (
         ("gaussiandreamer-datamodule", "random-camera-datamodule"),
         ("gaussiandreamer-background", "solid-color-background"),

@@ -27,7 +27,10 @@ RINGS = {  # folder, or module beside __init__ -> ring; imports point to the sam
     "launch": 4,
     "evaluation": 4,
 }
-LIBRARIES = {"core": {"imageio", "PIL"}, "meshes": {"trimesh", "embreex", "PIL", "tqdm"}}  # of ring 0, beyond MATHS_MAY_USE
+LIBRARIES = {
+    "core": {"imageio", "PIL"},
+    "meshes": {"trimesh", "embreex", "PIL", "tqdm"},
+}  # of ring 0, beyond MATHS_MAY_USE
 HEAVY = {
     "lightning",
     "pytorch_lightning",
@@ -45,11 +48,17 @@ MATHS_MAY_USE = {"torch", "numpy", "scipy", "jaxtyping"} | set(sys.stdlib_module
 
 
 def modules():
-    return [path for path in sorted(PACKAGE.rglob("*.py")) if path.name != "__init__.py" or path.parent != PACKAGE]
+    return [
+        path
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if path.name != "__init__.py" or path.parent != PACKAGE
+    ]
 
 
 def ring(top: str) -> int:
-    """0 maths, 1 host, 2 parts, 3 training, 4 programs; KeyError for a folder or module without a ring."""
+    """0 maths, 1 host, 2 parts, 3 training, 4 programs; KeyError for a folder or module without a
+    ring.
+    """
     return RINGS[top]
 
 
@@ -65,7 +74,11 @@ def imports(path: Path):
             base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
             module = ".".join(filter(None, (base, node.module)))
             # "from .. import x" names the module x, or a name of the package itself
-            names = [module] if module != NAME else [f"{base}.{alias.name}" for alias in node.names if alias.name in RINGS]
+            names = (
+                [module]
+                if module != NAME
+                else [f"{base}.{alias.name}" for alias in node.names if alias.name in RINGS]
+            )
             yield from ((name, id(node) in top_level) for name in names)
 
 
@@ -94,11 +107,20 @@ def test_the_maths_needs_torch_numpy_and_scipy_only():
 
 
 def test_only_one_file_imports_threestudio():
-    assert [str(path.relative_to(PACKAGE)) for path in modules() if any(name.split(".")[0] == "threestudio" for name, _ in imports(path))] == ["host/__init__.py"]
+    assert [
+        str(path.relative_to(PACKAGE))
+        for path in modules()
+        if any(name.split(".")[0] == "threestudio" for name, _ in imports(path))
+    ] == ["host/__init__.py"]
 
 
 def test_heavy_libraries_are_imported_where_they_are_used():
-    allowed = {"lightning", "pytorch_lightning", "omegaconf", "threestudio"}  # what the host itself is made of
+    allowed = {
+        "lightning",
+        "pytorch_lightning",
+        "omegaconf",
+        "threestudio",
+    }  # what the host itself is made of
     eager = [
         f"{path.relative_to(PACKAGE)} imports {name}"
         for path in modules()
@@ -109,6 +131,11 @@ def test_heavy_libraries_are_imported_where_they_are_used():
 
 
 def test_importing_the_package_is_cheap():
-    code = f"import sys, {NAME}; print([m for m in sys.modules if m.split('.')[0] in {sorted(HEAVY | {'torch', 'numpy'})}])"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
+    code = (
+        f"import sys, {NAME}; print([m for m in sys.modules if m.split('.')[0] in "
+        f"{sorted(HEAVY | {'torch', 'numpy'})}])"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent
+    )
     assert found.stdout.strip() == "[]"

@@ -11,14 +11,23 @@ ABAR = sds.sd_alphas_cumprod()
 
 def test_the_schedule_is_stable_diffusions():
     assert ABAR.dtype == torch.float64 and len(ABAR) == 1000
-    # Published figures of the scaled-linear schedule: sigma_0 = .029, sqrt(abar/(1-abar)) = 7.2 at t = 20 and .077 at 980.
+    # Published figures of the scaled-linear schedule: sigma_0 = .029, sqrt(abar/(1-abar)) = 7.2 at
+    # t = 20 and .077 at 980.
     assert math.isclose((1 - ABAR[0]).sqrt(), 0.0292, abs_tol=1e-4)
     ratio = (ABAR / (1 - ABAR)).sqrt()
-    assert math.isclose(ratio[20], 7.2, abs_tol=0.05) and math.isclose(ratio[980], 0.077, abs_tol=5e-4)
+    assert math.isclose(ratio[20], 7.2, abs_tol=0.05) and math.isclose(
+        ratio[980], 0.077, abs_tol=5e-4
+    )
 
 
 @pytest.mark.parametrize(
-    ("percents", "expected"), [((0.02, 0.98), (20, 980)), ((0.0, 1.0), (1, 999)), ((1.0, 1.0), (999, 999)), ((0.02, 0.55), (20, 550))]
+    ("percents", "expected"),
+    [
+        ((0.02, 0.98), (20, 980)),
+        ((0.0, 1.0), (1, 999)),
+        ((1.0, 1.0), (999, 999)),
+        ((0.02, 0.55), (20, 550)),
+    ],
 )
 def test_step_range_is_clamped_to_the_valid_timesteps(percents, expected):
     assert sds.step_range(*percents) == expected
@@ -43,7 +52,9 @@ def test_timesteps_depend_on_step_and_item_but_not_on_the_batch_size():
 
 
 def test_timesteps_stay_inside_the_table():
-    draws = torch.cat([sds.timesteps(8, 0, 10, seed=0, step=step, num_train=5) for step in range(50)])
+    draws = torch.cat(
+        [sds.timesteps(8, 0, 10, seed=0, step=step, num_train=5) for step in range(50)]
+    )
     assert draws.min() == 1 and draws.max() == 4
 
 
@@ -53,10 +64,14 @@ def test_timesteps_refuse_an_empty_range():
 
 
 def test_predict_x0_undoes_add_noise():
-    x, noise = torch.randn(2, 3, 3, 4, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    x, noise = torch.randn(
+        2, 3, 3, 4, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     abar = ABAR[torch.tensor([20, 500, 980])]
     # float64 rounding, magnified by sigma/a = 13 at t = 980
-    torch.testing.assert_close(sds.predict_x0(sds.add_noise(x, noise, abar), noise, abar), x, rtol=0, atol=1e-13)
+    torch.testing.assert_close(
+        sds.predict_x0(sds.add_noise(x, noise, abar), noise, abar), x, rtol=0, atol=1e-13
+    )
 
 
 def test_classifier_free_guidance_convention():
@@ -67,7 +82,9 @@ def test_classifier_free_guidance_convention():
     assert sds.classifier_free(cond, uncond, 101.0) == threestudio
 
 
-@pytest.mark.parametrize(("name", "expected"), [("sds", 0.75), ("uniform", 1.0), ("fantasia3d", 0.375)])
+@pytest.mark.parametrize(
+    ("name", "expected"), [("sds", 0.75), ("uniform", 1.0), ("fantasia3d", 0.375)]
+)
 def test_weights(name, expected):
     assert sds.weight(name, torch.tensor([0.25], dtype=torch.float64)).item() == expected
 

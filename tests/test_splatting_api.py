@@ -11,13 +11,24 @@ from splatting_scenes import NAMES, cameras, random_cloud, run
 
 from threestudio_gaussiandreamer import splatting
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.splatting import PRESETS, api, available_backends, rasterize, torch_backend
+from threestudio_gaussiandreamer.splatting import (
+    PRESETS,
+    api,
+    available_backends,
+    rasterize,
+    torch_backend,
+)
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 
 
 def arguments(n=6, views=2, dtype=torch.float32):
     viewmats, Ks = cameras(views, 10, 8)
-    return random_cloud(n).to(dtype)._asdict() | {"viewmats": viewmats.to(dtype), "Ks": Ks.to(dtype), "width": 10, "height": 8}
+    return random_cloud(n).to(dtype)._asdict() | {
+        "viewmats": viewmats.to(dtype),
+        "Ks": Ks.to(dtype),
+        "width": 10,
+        "height": 8,
+    }
 
 
 def call(**changes):
@@ -42,7 +53,9 @@ def test_shapes_of_what_comes_back():
 def check_shapes(values: dict, hints: dict) -> None:
     """Every tensor fits its annotation, and names such as N mean one size throughout."""
     for name, value in values.items():
-        annotation = next((a for a in typing.get_args(hints[name]) if a is not type(None)), hints[name])
+        annotation = next(
+            (a for a in typing.get_args(hints[name]) if a is not type(None)), hints[name]
+        )
         assert isinstance(value, annotation), f"{name} {tuple(value.shape)} isn't {annotation}"
 
 
@@ -117,7 +130,12 @@ def test_non_finite_error_names_attribute_count_and_place(name):
     place = str(tuple((~value.isfinite()).nonzero()[0].tolist()))
     with pytest.raises(UserError) as caught:
         call(**{"background": changes["background"], name: value}, non_finite="error")
-    assert name in str(caught.value) and " 2 " in str(caught.value) and place in str(caught.value) and "nan" in str(caught.value)
+    assert (
+        name in str(caught.value)
+        and " 2 " in str(caught.value)
+        and place in str(caught.value)
+        and "nan" in str(caught.value)
+    )
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -127,7 +145,9 @@ def test_presets_are_numbers(name):
 
 def test_presets_in_order_of_accuracy():
     truth = call(alpha_min=0.0, stop=0.0).image
-    errors = [(call(preset=name).image - truth).abs().sum() for name in ("fast", "balanced", "accurate")]
+    errors = [
+        (call(preset=name).image - truth).abs().sum() for name in ("fast", "balanced", "accurate")
+    ]
     assert errors[0] > errors[1] > errors[2]
 
 
@@ -145,7 +165,11 @@ def test_autocast_changes_nothing(backend):
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_inputs_are_widened(dtype):
-    half = {name: value.to(dtype) for name, value in arguments().items() if isinstance(value, torch.Tensor)}
+    half = {
+        name: value.to(dtype)
+        for name, value in arguments().items()
+        if isinstance(value, torch.Tensor)
+    }
     wide = {name: value.float() for name, value in half.items()}
     half["means"].requires_grad_()
     out = call(**half)
@@ -155,13 +179,20 @@ def test_half_precision_inputs_are_widened(dtype):
 
 
 def test_float64_stays_float64_and_may_have_float32_cameras():
-    values = arguments(dtype=torch.float64) | {"viewmats": arguments()["viewmats"], "backend": "auto"}
+    values = arguments(dtype=torch.float64) | {
+        "viewmats": arguments()["viewmats"],
+        "backend": "auto",
+    }
     assert call(**values).image.dtype == torch.float64
 
 
 def test_non_contiguous_inputs():
     values = arguments()
-    strided = {name: x.mT.contiguous().mT for name, x in values.items() if isinstance(x, torch.Tensor) and x.dim() > 1}
+    strided = {
+        name: x.mT.contiguous().mT
+        for name, x in values.items()
+        if isinstance(x, torch.Tensor) and x.dim() > 1
+    }
     assert torch.equal(call(**strided).image, call(**values).image)
 
 
@@ -169,7 +200,9 @@ def test_background_of_each_view_or_of_all():
     one, two = torch.tensor([0.2, 0.4, 0.6]), torch.tensor([[0.2, 0.4, 0.6], [1.0, 0.0, 0.5]])
     black, shared, each = call(), call(background=one), call(background=two)
     for out, colors in ((shared, one.expand(2, 3)), (each, two)):
-        assert torch.allclose(out.image, black.image + (1 - out.alpha) * colors[:, None, None], atol=1e-6)
+        assert torch.allclose(
+            out.image, black.image + (1 - out.alpha) * colors[:, None, None], atol=1e-6
+        )
 
 
 @pytest.mark.parametrize("only", ["colors", "opacities", "background"])
@@ -182,7 +215,9 @@ def test_means2d_reports_its_gradient_whenever_anything_is_differentiated(only, 
     out = call(**{only: value}, backend=backend, absgrad=True)
     out.image.square().sum().backward()
     assert out.means2d.grad.shape == out.means2d.absgrad.shape == (2, 6, 2)
-    assert (out.means2d.absgrad >= out.means2d.grad.abs() - 1e-7).all() and out.means2d.grad.abs().sum() > 0
+    assert (
+        out.means2d.absgrad >= out.means2d.grad.abs() - 1e-7
+    ).all() and out.means2d.grad.abs().sum() > 0
 
 
 def test_without_gradients_nothing_is_tracked():
@@ -191,7 +226,7 @@ def test_without_gradients_nothing_is_tracked():
     assert not out.image.requires_grad and not out.means2d.requires_grad
 
 
-# ---- who computes --------------------------------------------------------------------------------------------------------------
+# ---- who computes --------------------------------------------------------------------------------
 
 
 def test_available_backends_tells_why_not(monkeypatch):
@@ -225,5 +260,9 @@ def test_auto_prefers_the_native_library_and_says_once_when_it_cannot(monkeypatc
     with caplog.at_level(logging.WARNING):
         call(backend="auto"), call(backend="auto")
     assert chosen[2:] == ["torch"] * 2
-    assert [record.getMessage() for record in caplog.records if "no compiler was found" in record.getMessage()] and len(caplog.records) == 1
+    assert [
+        record.getMessage()
+        for record in caplog.records
+        if "no compiler was found" in record.getMessage()
+    ] and len(caplog.records) == 1
     api._warn_once.cache_clear()

@@ -1,4 +1,6 @@
-"""The native kernel against the float64 specification, in every build this machine can run: same pictures, same gradients, same bits."""
+"""The native kernel against the float64 specification, in every build this machine can run: same
+pictures, same gradients, same bits.
+"""
 
 import os
 import pathlib
@@ -45,31 +47,43 @@ class TestCpuKernel(KernelContract):
         return "cpu"
 
 
-# ---- the same bits -------------------------------------------------------------------------------------------------------------
+# ---- the same bits -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("views", [1, 3])
 def test_the_number_of_threads_changes_no_bit(isa, views):
-    """Also not when there are more Gaussians than one task takes, or more threads than views; twice each."""
+    """Also not when there are more Gaussians than one task takes, or more threads than views; twice
+    each.
+    """
     cloud, camera = random_cloud(9000, seed=10, size=0.03), cameras(views, 150, 90)
     background, threads, results = torch.tensor([0.2, 0.5, 0.9]), torch.get_num_threads(), []
     try:
         for count in (1, 2, 4, 1, 2, 4):
             torch.set_num_threads(count)
-            results.append(draw("cpu", cloud, camera, 150, 90, background, camera_gradient=True, absgrad=True))
+            results.append(
+                draw("cpu", cloud, camera, 150, 90, background, camera_gradient=True, absgrad=True)
+            )
     finally:
         torch.set_num_threads(threads)
     assert all(equal(results[0], other) for other in results[1:])
 
 
-# ---- as a torch function -------------------------------------------------------------------------------------------------------
+# ---- as a torch function -------------------------------------------------------------------------
 
 
 def test_backward_gives_the_memory_back(monkeypatch):
-    """What a backward pass needed goes with the saved tensors, not with the last tensor of the graph."""
+    """What a backward pass needed goes with the saved tensors, not with the last tensor of the
+    graph.
+    """
     states, as_tensor = weakref.WeakSet(), cpu._State.as_tensor
     monkeypatch.setattr(cpu._State, "as_tensor", lambda self: states.add(self) or as_tensor(self))
-    out = rasterize(*random_cloud(30).to(torch.float32).leaves(), *cameras(1, 12, 12, dtype=torch.float32), 12, 12, backend="cpu")
+    out = rasterize(
+        *random_cloud(30).to(torch.float32).leaves(),
+        *cameras(1, 12, 12, dtype=torch.float32),
+        12,
+        12,
+        backend="cpu",
+    )
     assert len(states) == 1
     out.image.sum().backward()
     assert len(states) == 0 and out.image.grad_fn is not None
@@ -81,7 +95,9 @@ def test_the_library_is_used_from_several_threads_at_once():
     alone = [draw("cpu", cloud, cameras(2, 60, 40), 60, 40) for cloud in clouds]
     with ThreadPoolExecutor(4) as pool:
         for _ in range(5):
-            together = pool.map(lambda cloud: draw("cpu", cloud, cameras(2, 60, 40), 60, 40), clouds)
+            together = pool.map(
+                lambda cloud: draw("cpu", cloud, cameras(2, 60, 40), 60, 40), clouds
+            )
             assert all(equal(a, b) for a, b in zip(alone, together, strict=True))
 
 
@@ -101,8 +117,15 @@ def run_python(text):
         torch.set_num_threads(4)
     """
     code = textwrap.dedent(scene) + textwrap.dedent(text)
-    folders = os.pathsep.join(map(str, (pathlib.Path(__file__).parents[1], pathlib.Path(__file__).parent)))
-    return subprocess.run([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": folders}, capture_output=True, text=True)
+    folders = os.pathsep.join(
+        map(str, (pathlib.Path(__file__).parents[1], pathlib.Path(__file__).parent))
+    )
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": folders},
+        capture_output=True,
+        text=True,
+    )
 
 
 def test_a_forked_process_draws_with_threads_of_its_own():
@@ -138,7 +161,9 @@ def test_denormals_of_the_process_are_not_flushed(isa):
 
 
 def test_more_memory_than_there_is_is_a_named_error():
-    """2.6e9 pairs of Gaussian and tile: more than 32 bits count, and more than any machine should try."""
+    """2.6e9 pairs of Gaussian and tile: more than 32 bits count, and more than any machine should
+    try.
+    """
     cloud, camera = (
         random_cloud(40_000).to(torch.float32)._replace(scales=torch.full((40_000, 3), 1e3)),
         cameras(1, 8192, 8192, dtype=torch.float32),
@@ -147,7 +172,7 @@ def test_more_memory_than_there_is_is_a_named_error():
         rasterize(*cloud, *camera, 8192, 8192, backend="cpu")
 
 
-# ---- the library ---------------------------------------------------------------------------------------------------------------
+# ---- the library ---------------------------------------------------------------------------------
 
 
 def test_a_build_that_does_not_exist_is_named(force):
@@ -170,9 +195,22 @@ def test_the_formulas_need_no_standard_header_and_work_on_single_floats(tmp_path
     """The CUDA kernels include the same header, compiled where no standard library is."""
     source = tmp_path / "one.cpp"
     source.write_text(
-        '#include "splat_math.h"\nfloat f(splat::Vec3<float> u, splat::Vec3<float> v) { return splat::whiten(u, v, 0.3f).a; }\n'
+        '#include "splat_math.h"\nfloat f(splat::Vec3<float> u, splat::Vec3<float> v) { return '
+        "splat::whiten(u, v, 0.3f).a; }\n"
     )
     folder = pathlib.Path(cpu.__file__).parents[1] / "shared"
     subprocess.run(
-        ["g++", "-std=c++17", "-nostdinc", "-nostdinc++", "-Wall", "-Werror", "-fsyntax-only", f"-I{folder}", "-c", str(source)], check=True
+        [
+            "g++",
+            "-std=c++17",
+            "-nostdinc",
+            "-nostdinc++",
+            "-Wall",
+            "-Werror",
+            "-fsyntax-only",
+            f"-I{folder}",
+            "-c",
+            str(source),
+        ],
+        check=True,
     )

@@ -1,7 +1,8 @@
-"""The CUDA backend without a GPU: its kernels run on the host, thread by thread, against the float64 specification.
+"""The CUDA backend without a GPU: its kernels run on the host, thread by thread, against the
+float64 specification.
 
-`cuda_shim/machine.py` stands in for the GPU and runs the text that NVRTC compiles; the Python around it is the product's, too.
-"""
+`cuda_shim/machine.py` stands in for the GPU and runs the text that NVRTC compiles; the Python
+around it is the product's, too."""
 
 import pytest
 import torch
@@ -20,9 +21,13 @@ pytestmark = pytest.mark.skipif(unavailable() is not None, reason=str(unavailabl
 
 @pytest.fixture(autouse=True)
 def machine(monkeypatch):
-    """The backend on tensors of the CPU, on a machine that tests may exchange; nothing learnt from earlier calls."""
+    """The backend on tensors of the CPU, on a machine that tests may exchange; nothing learnt from
+    earlier calls.
+    """
     machines = [HostMachine()]
-    monkeypatch.setitem(api.BACKENDS, "cuda", api.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,)))
+    monkeypatch.setitem(
+        api.BACKENDS, "cuda", api.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,))
+    )
     monkeypatch.setattr(cuda_driver, "unavailable", lambda: None)
     monkeypatch.setattr(cuda_driver, "machine", lambda device: machines[-1])
     monkeypatch.setattr(cuda, "_demands", {})
@@ -40,14 +45,16 @@ class TestCudaKernels(KernelContract):
         return "cuda"
 
 
-# ---- the same bits -------------------------------------------------------------------------------------------------------------
+# ---- the same bits -------------------------------------------------------------------------------
 
 
 def scene(machine, cloud=None, **options):
     """A picture of 3 x 2 tiles per view with everything in it, on a fresh machine."""
     machine(**options)
     cloud = random_cloud(300, seed=8, size=0.1) if cloud is None else cloud
-    return draw("cuda", cloud, cameras(3, 40, 24), 40, 24, BACKGROUND, camera_gradient=True, absgrad=True)
+    return draw(
+        "cuda", cloud, cameras(3, 40, 24), 40, 24, BACKGROUND, camera_gradient=True, absgrad=True
+    )
 
 
 def same(a, b) -> bool:
@@ -97,19 +104,25 @@ def test_the_stand_in_shows_faults(kernel):
         assert kernel == "faulty_race" and not torch.equal(out["forward"], out["backward"])
 
 
-# ---- room for the lists --------------------------------------------------------------------------------------------------------
+# ---- room for the lists --------------------------------------------------------------------------
 
 
 @pytest.fixture
 def lists(monkeypatch):
     """Those of every picture drawn."""
     drawn, draw = [], cuda._draw
-    monkeypatch.setattr(cuda, "_draw", lambda *arguments: drawn.append(draw(*arguments)) or drawn[-1])
+    monkeypatch.setattr(
+        cuda, "_draw", lambda *arguments: drawn.append(draw(*arguments)) or drawn[-1]
+    )
     return drawn
 
 
-def test_a_picture_that_needs_more_room_than_expected_is_right_to_the_bit(machine, monkeypatch, lists):
-    """Drawn without lists, differentiated with whole ones; once the number has arrived there is room."""
+def test_a_picture_that_needs_more_room_than_expected_is_right_to_the_bit(
+    machine, monkeypatch, lists
+):
+    """Drawn without lists, differentiated with whole ones; once the number has arrived there is
+    room.
+    """
     monkeypatch.setattr(cuda_memory, "STEP", 64)
     known = scene(machine)
     for demand in cuda._demands.values():
@@ -119,7 +132,9 @@ def test_a_picture_that_needs_more_room_than_expected_is_right_to_the_bit(machin
     assert same(known, scene(machine, arrived=False))
     host.arrived = True
     assert same(known, scene(machine))
-    assert [x.capacity >= 1904 for x in lists] == [True, False, False, True], "the picture has 1904 entries"
+    assert [x.capacity >= 1904 for x in lists] == [True, False, False, True], (
+        "the picture has 1904 entries"
+    )
 
 
 def test_only_the_first_picture_of_a_size_waits(machine):
@@ -153,7 +168,9 @@ def test_room_follows_what_is_needed():
 
 @pytest.mark.parametrize("most", [1500, 900])
 def test_short_memory_means_fewer_views_at_a_time(machine, monkeypatch, most):
-    """Three views need 1904 entries, each of them about 600. The same bits; the second call doesn't even try all at once."""
+    """Three views need 1904 entries, each of them about 600. The same bits; the second call doesn't
+    even try all at once.
+    """
     monkeypatch.setattr(cuda_memory, "STEP", 64)
     known, tries = scene(machine), []
     for _ in range(2):
@@ -168,22 +185,32 @@ def test_short_memory_means_fewer_views_at_a_time(machine, monkeypatch, most):
 def test_memory_that_is_short_in_the_backward_pass_only(machine, monkeypatch):
     monkeypatch.setattr(cuda_memory, "STEP", 64)
     known, host = scene(machine), machine()
-    cloud, camera = random_cloud(300, seed=8, size=0.1).to(torch.float32).leaves(), [x.float() for x in cameras(3, 40, 24)]
+    cloud, camera = (
+        random_cloud(300, seed=8, size=0.1).to(torch.float32).leaves(),
+        [x.float() for x in cameras(3, 40, 24)],
+    )
     out = rasterize(*cloud, *camera, 40, 24, background=BACKGROUND, backend="cuda")
     host.most_entries = 1500
     torch.autograd.backward([out.image, out.alpha, out.depth], cotangents(out))
     assert host.launched.count("blend_backward") > 1
-    assert all(torch.equal(leaf.grad, known.grads[name]) for name, leaf in zip(NAMES, cloud, strict=True))
+    assert all(
+        torch.equal(leaf.grad, known.grads[name]) for name, leaf in zip(NAMES, cloud, strict=True)
+    )
 
 
 def test_without_memory_for_one_view_there_is_a_picture_but_no_gradient(machine, caplog):
-    cloud, camera = random_cloud(300, seed=8, size=0.1).to(torch.float32).leaves(), cameras(1, 40, 24, dtype=torch.float32)
+    cloud, camera = (
+        random_cloud(300, seed=8, size=0.1).to(torch.float32).leaves(),
+        cameras(1, 40, 24, dtype=torch.float32),
+    )
     known = rasterize(*cloud, *camera, 40, 24, backend="cuda")
     machine(most_entries=10)
     cuda._report_short_memory.cache_clear()
     short = rasterize(*cloud, *camera, 40, 24, backend="cuda")
     assert "memory is too short" in caplog.text
-    assert torch.equal(known.image, short.image) and torch.equal(known.contribution, short.contribution)
+    assert torch.equal(known.image, short.image) and torch.equal(
+        known.contribution, short.contribution
+    )
     with pytest.raises(UserError, match=r"reach \d+ tiles .* GiB .* fewer or smaller Gaussians"):
         short.image.sum().backward()
 
@@ -202,6 +229,12 @@ def test_more_splats_than_can_be_numbered_are_refused():
 
 def test_without_gradients_nothing_is_kept(machine):
     host = machine()
-    out = rasterize(*random_cloud(30).to(torch.float32), *cameras(1, 12, 12, dtype=torch.float32), 12, 12, backend="cuda")
+    out = rasterize(
+        *random_cloud(30).to(torch.float32),
+        *cameras(1, 12, 12, dtype=torch.float32),
+        12,
+        12,
+        backend="cuda",
+    )
     assert out.image.grad_fn is None and not out.means2d.requires_grad
     assert host.launched == ["project", "count_tiles", "list_tiles", "find_tiles", "blend"]

@@ -1,4 +1,6 @@
-"""The CUDA kernels compile for every architecture without spilling, are compiled once, and are handed to the driver as it wants."""
+"""The CUDA kernels compile for every architecture without spilling, are compiled once, and are
+handed to the driver as it wants.
+"""
 
 import contextlib
 import ctypes
@@ -35,11 +37,13 @@ def cache(monkeypatch, tmp_path):
 def compiled(monkeypatch):
     """The units that are compiled from now on."""
     units, compile_unit = [], nvrtc.compile_unit
-    monkeypatch.setattr(nvrtc, "compile_unit", lambda unit, target: units.append(unit) or compile_unit(unit, target))
+    monkeypatch.setattr(
+        nvrtc, "compile_unit", lambda unit, target: units.append(unit) or compile_unit(unit, target)
+    )
     return units
 
 
-# ---- the compiler --------------------------------------------------------------------------------------------------------------
+# ---- the compiler --------------------------------------------------------------------------------
 
 
 def units():
@@ -49,9 +53,17 @@ def units():
 def properties(log: str) -> dict[str, dict[str, int]]:
     """By kernel: registers, shared bytes, spilled bytes and stack."""
     found = {}
-    for name, text in re.findall(r"Compiling entry function '(\w+)'(.*?)(?=Compiling entry function|\Z)", log, re.DOTALL):
-        number = {"registers": r"Used (\d+) registers", "shared": r"(\d+) bytes smem", "stack": r"(\d+) bytes stack"}
-        found[name] = {what: sum(map(int, re.findall(pattern, text))) for what, pattern in number.items()}
+    for name, text in re.findall(
+        r"Compiling entry function '(\w+)'(.*?)(?=Compiling entry function|\Z)", log, re.DOTALL
+    ):
+        number = {
+            "registers": r"Used (\d+) registers",
+            "shared": r"(\d+) bytes smem",
+            "stack": r"(\d+) bytes stack",
+        }
+        found[name] = {
+            what: sum(map(int, re.findall(pattern, text))) for what, pattern in number.items()
+        }
         found[name]["spilled"] = sum(map(int, re.findall(r"(\d+) bytes spill", text)))
     return found
 
@@ -67,7 +79,9 @@ def test_every_kernel_compiles_without_spills(architecture):
         for name, used in properties(log).items():
             assert cuda_driver.UNITS[name] == unit
             assert used["spilled"] == used["stack"] == 0, f"{name}: {used}"
-            assert 0 < used["registers"] * THREADS.get(unit, 128) <= REGISTERS // 3, f"{name}: {used}"
+            assert 0 < used["registers"] * THREADS.get(unit, 128) <= REGISTERS // 3, (
+                f"{name}: {used}"
+            )
             assert used["shared"] <= 48 * 1024, f"{name}: {used}"
             seen.add(name)
     assert seen == set(cuda_driver.UNITS)
@@ -76,8 +90,14 @@ def test_every_kernel_compiles_without_spills(architecture):
 @needs_nvrtc
 def test_shared_memory_is_read_four_floats_at_a_time():
     """In PTX, which is what a device newer than the compiler gets."""
-    forward, backward = (nvrtc.compile_unit(unit, "compute_80").code.decode() for unit in ("blend", "blend_backward"))
-    assert ".entry blend(" in forward and "ld.shared.f32" not in forward and forward.count("ld.shared.v4.f32") == 3
+    forward, backward = (
+        nvrtc.compile_unit(unit, "compute_80").code.decode() for unit in ("blend", "blend_backward")
+    )
+    assert (
+        ".entry blend(" in forward
+        and "ld.shared.f32" not in forward
+        and forward.count("ld.shared.v4.f32") == 3
+    )
     assert backward.count("ld.shared.v4.f32") > 20
 
 
@@ -90,7 +110,14 @@ def test_a_mistake_in_the_text_is_shown(monkeypatch):
 
 @pytest.mark.parametrize(
     "capability, target",
-    [((7, 5), "sm_75"), ((8, 6), "sm_86"), ((9, 0), "sm_90"), ((12, 1), "compute_120"), ((13, 0), "compute_120"), ((8, 7), "compute_86")],
+    [
+        ((7, 5), "sm_75"),
+        ((8, 6), "sm_86"),
+        ((9, 0), "sm_90"),
+        ((12, 1), "compute_120"),
+        ((13, 0), "compute_120"),
+        ((8, 7), "compute_86"),
+    ],
 )
 def test_devices_newer_than_the_compiler_get_the_newest_text(monkeypatch, capability, target):
     monkeypatch.setattr(nvrtc, "architectures", lambda: [52, 75, 80, 86, 90, 120])
@@ -101,7 +128,11 @@ def test_devices_newer_than_the_compiler_get_the_newest_text(monkeypatch, capabi
 def test_devices_that_are_too_old_are_named(monkeypatch, known):
     monkeypatch.setattr(nvrtc, "architectures", lambda: known)
     monkeypatch.setattr(nvrtc, "version", lambda: (13, 0))
-    with pytest.raises(UserError, match=rf"capability 7\.0;.*CUDA 13\.0, needs {max(75, known[0]) / 10} or later: use backend='torch'"):
+    with pytest.raises(
+        UserError,
+        match=rf"capability 7\.0;.*CUDA 13\.0, needs {max(75, known[0]) / 10} or later: use "
+        r"backend='torch'",
+    ):
         nvrtc.target_for((7, 0))
 
 
@@ -109,14 +140,21 @@ def test_without_a_compiler_it_says_what_to_install(monkeypatch):
     monkeypatch.setenv("GAUSSIANDREAMER_NVRTC", "/no/such/libnvrtc.so")
     nvrtc._library.cache_clear()
     try:
-        assert all(word in nvrtc.unavailable() for word in ("NVRTC", "install", "nvidia-cuda-nvrtc", "/no/such/libnvrtc.so"))
+        assert all(
+            word in nvrtc.unavailable()
+            for word in ("NVRTC", "install", "nvidia-cuda-nvrtc", "/no/such/libnvrtc.so")
+        )
     finally:
         nvrtc._library.cache_clear()
 
 
 def test_the_release_that_torch_was_built_with_is_tried_first(monkeypatch, tmp_path):
     """Both may be installed; a driver of CUDA 12 can't load what the NVRTC of CUDA 13 makes."""
-    for place in ("cu13/lib/libnvrtc.so.13", "cuda_nvrtc/lib/libnvrtc.so.12", "cuda_nvrtc/lib/libnvrtc-builtins.so.12.8"):
+    for place in (
+        "cu13/lib/libnvrtc.so.13",
+        "cuda_nvrtc/lib/libnvrtc.so.12",
+        "cuda_nvrtc/lib/libnvrtc-builtins.so.12.8",
+    ):
         (tmp_path / "nvidia" / place).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "nvidia" / place).touch()
     monkeypatch.delenv("GAUSSIANDREAMER_NVRTC", raising=False)
@@ -127,7 +165,7 @@ def test_the_release_that_torch_was_built_with_is_tried_first(monkeypatch, tmp_p
         assert ours[0].endswith(first) and len(ours) == 2
 
 
-# ---- the cache -----------------------------------------------------------------------------------------------------------------
+# ---- the cache -----------------------------------------------------------------------------------
 
 
 @needs_nvrtc
@@ -139,7 +177,9 @@ def test_what_was_compiled_once_is_read_from_the_disk(cache, compiled):
 
 
 @needs_nvrtc
-@pytest.mark.parametrize("damage", [lambda data: data[:-1], lambda data: data[:50] + b"!" + data[51:], lambda data: b""])
+@pytest.mark.parametrize(
+    "damage", [lambda data: data[:-1], lambda data: data[:50] + b"!" + data[51:], lambda data: b""]
+)
 def test_a_damaged_file_is_compiled_again(cache, compiled, damage):
     first = nvrtc.machine_code("bin", "sm_80")
     (path,) = cache.iterdir()
@@ -197,17 +237,22 @@ def test_the_cache_is_where_the_user_keeps_caches(monkeypatch):
     assert nvrtc.cache_folder().as_posix() == "/somewhere/gaussiandreamer/cubins"
 
 
-# ---- the driver ----------------------------------------------------------------------------------------------------------------
+# ---- the driver ----------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def driver(monkeypatch, cache):
-    """A driver that runs kernels on the host, and a torch that sees one GPU of compute capability 9.0."""
+    """A driver that runs kernels on the host, and a torch that sees one GPU of compute capability
+    9.0.
+    """
     if unavailable() is not None:
         pytest.skip(unavailable())
     fake = ctypes.CDLL(library()._name)
     fake.fake_stream.restype = ctypes.c_void_p
-    ctypes.c_int.in_dll(fake, "fake_loads").value, ctypes.c_int.in_dll(fake, "fake_release").value = 0, 99000
+    (
+        ctypes.c_int.in_dll(fake, "fake_loads").value,
+        ctypes.c_int.in_dll(fake, "fake_release").value,
+    ) = 0, 99000
     event = SimpleNamespace(record=lambda: None, query=lambda: True, synchronize=lambda: None)
     gpu = {
         "device": lambda index: contextlib.nullcontext(),
@@ -221,7 +266,9 @@ def driver(monkeypatch, cache):
     for name, value in gpu.items():
         monkeypatch.setattr(torch.cuda, name, value)
     empty = torch.empty
-    monkeypatch.setattr(torch, "empty", lambda *shape, pin_memory=False, **options: empty(*shape, **options))
+    monkeypatch.setattr(
+        torch, "empty", lambda *shape, pin_memory=False, **options: empty(*shape, **options)
+    )
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(cuda_driver, "LIBRARY", library()._name)
     caches = (cuda_driver._driver, cuda_driver._gpu, cuda_driver.unavailable)
@@ -234,22 +281,37 @@ def driver(monkeypatch, cache):
 
 @needs_nvrtc
 def test_a_picture_by_way_of_the_driver(driver, monkeypatch, compiled):
-    """Compiled, loaded, launched in autograd's thread too: the same bits as the torch backend's within rounding."""
-    monkeypatch.setitem(api.BACKENDS, "cuda", api.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,)))
+    """Compiled, loaded, launched in autograd's thread too: the same bits as the torch backend's
+    within rounding.
+    """
+    monkeypatch.setitem(
+        api.BACKENDS, "cuda", api.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,))
+    )
     monkeypatch.setattr(cuda, "_demands", {})
     assert available_backends()["cuda"] is None
     cloud, camera = random_cloud(60).to(torch.float32), cameras(2, 20, 20, dtype=torch.float32)
     with ThreadPoolExecutor(1) as pool:
-        pictures = [run(cloud, *camera, 20, 20, backend="cuda"), pool.submit(run, cloud, *camera, 20, 20, backend="cuda").result()]
+        pictures = [
+            run(cloud, *camera, 20, 20, backend="cuda"),
+            pool.submit(run, cloud, *camera, 20, 20, backend="cuda").result(),
+        ]
     assert equal(*pictures)
-    assert (pictures[0].out.image - run(cloud, *camera, 20, 20, backend="torch").out.image).abs().max() < 1e-6
-    assert sorted(compiled) == units() and ctypes.c_int.in_dll(driver, "fake_loads").value == len(units())
+    assert (
+        pictures[0].out.image - run(cloud, *camera, 20, 20, backend="torch").out.image
+    ).abs().max() < 1e-6
+    assert sorted(compiled) == units() and ctypes.c_int.in_dll(driver, "fake_loads").value == len(
+        units()
+    )
 
 
 @needs_nvrtc
 def test_code_that_the_driver_refuses_is_named(driver, monkeypatch):
     monkeypatch.setattr(nvrtc, "machine_code", lambda unit, target: b"nonsense")
-    with pytest.raises(UserError, match=r"loading blend.cu for sm_90 \(NVRTC of CUDA .*, driver of CUDA 99.0\): .*invalid \(200\)"):
+    with pytest.raises(
+        UserError,
+        match=r"loading blend.cu for sm_90 \(NVRTC of CUDA .*, driver of CUDA 99.0\): "
+        r".*invalid \(200\)",
+    ):
         cuda_driver.machine(torch.device("cuda")).launch("blend", (1, 1), 256)
 
 
@@ -257,7 +319,11 @@ def test_code_that_the_driver_refuses_is_named(driver, monkeypatch):
 def test_a_driver_that_is_too_old_is_named(driver, monkeypatch):
     monkeypatch.setattr(nvrtc, "version", lambda: (13, 1))
     ctypes.c_int.in_dll(driver, "fake_release").value = 12040
-    words = ("driver knows CUDA up to 12.4", "CUDA 13.1", "update the driver, or install a torch built for CUDA 12")
+    words = (
+        "driver knows CUDA up to 12.4",
+        "CUDA 13.1",
+        "update the driver, or install a torch built for CUDA 12",
+    )
     assert all(word in cuda_driver.unavailable() for word in words)
 
 

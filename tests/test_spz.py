@@ -16,8 +16,16 @@ from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
 
 def cloud(count=300, degree=0, seed=0):
     rng = np.random.default_rng(seed)
-    shapes = {"means": (3,), "sh": ((degree + 1) ** 2, 3), "logit_opacities": (), "log_scales": (3,), "quats": (4,)}
-    values = {name: rng.normal(size=(count, *shape)).astype(np.float32) for name, shape in shapes.items()}
+    shapes = {
+        "means": (3,),
+        "sh": ((degree + 1) ** 2, 3),
+        "logit_opacities": (),
+        "log_scales": (3,),
+        "quats": (4,),
+    }
+    values = {
+        name: rng.normal(size=(count, *shape)).astype(np.float32) for name, shape in shapes.items()
+    }
     values["log_scales"] -= 4
     values["sh"][:, 1:] *= 0.2
     return GaussianArrays(**values)
@@ -35,13 +43,19 @@ def stored(tmp_path, data, name="a.spz"):
     return tmp_path / name
 
 
-# Two Gaussians put together by hand from the published description, every number worked out on paper.
-HEADER = b"NGSP" + bytes([3, 0, 0, 0]) + bytes([2, 0, 0, 0]) + bytes([1, 8, 0, 0])  # version 3, two, degree 1, 8 fractional bits
-POSITIONS = bytes([0x00, 0x01, 0x00]) + bytes([0x80, 0xFF, 0xFF]) + bytes([0x01, 0x02, 0x00])  # 256, -128, 513 in 1/256
+# Two Gaussians put together by hand from the published description, every number worked out on
+# paper.
+HEADER = (
+    b"NGSP" + bytes([3, 0, 0, 0]) + bytes([2, 0, 0, 0]) + bytes([1, 8, 0, 0])
+)  # version 3, two, degree 1, 8 fractional bits
+POSITIONS = (
+    bytes([0x00, 0x01, 0x00]) + bytes([0x80, 0xFF, 0xFF]) + bytes([0x01, 0x02, 0x00])
+)  # 256, -128, 513 in 1/256
 POSITIONS += bytes(9)
 ALPHAS, COLORS = bytes([51, 204]), bytes([255, 0, 51]) + bytes([204, 102, 153])
 SCALES = bytes([96, 160, 0]) + bytes([128, 112, 255])
-# the first: w largest (3), x and z of magnitude 511/511/sqrt2 and 0, y = -256/511/sqrt2; the second: x largest (0), all others 0
+# the first: w largest (3), x and z of magnitude 511/511/sqrt2 and 0, y = -256/511/sqrt2; the
+# second: x largest (0), all others 0
 ROTATIONS = struct.pack("<II", 3 << 30 | 511 << 20 | (512 | 256) << 10, 0)
 HARMONICS = bytes([128, 136, 64]) + bytes([128] * 3) + bytes([192] * 3) + bytes([128] * 9)
 BY_HAND = HEADER + POSITIONS + ALPHAS + COLORS + SCALES + ROTATIONS + HARMONICS
@@ -51,17 +65,23 @@ def test_a_file_put_together_by_hand_is_read(tmp_path):
     read = read_spz(stored(tmp_path, gzip.compress(BY_HAND)))
     np.testing.assert_array_equal(read.means, [[1.0, -0.5, 513 / 256], [0, 0, 0]])
     np.testing.assert_allclose(1 / (1 + np.exp(-read.logit_opacities)), [0.2, 0.8], atol=1e-6)
-    np.testing.assert_allclose(read.sh[:, 0], np.array([[0.5, -0.5, -0.3], [0.3, -0.1, 0.1]]) / 0.15, atol=1e-5)
+    np.testing.assert_allclose(
+        read.sh[:, 0], np.array([[0.5, -0.5, -0.3], [0.3, -0.1, 0.1]]) / 0.15, atol=1e-5
+    )
     np.testing.assert_array_equal(read.log_scales, [[-4, 0, -10], [-2, -3, 255 / 16 - 10]])
     y = -256 / 511 / np.sqrt(2)
-    np.testing.assert_allclose(read.quats[0], [np.sqrt(1 - 0.5 - y * y), np.sqrt(0.5), y, 0], atol=1e-6)  # wxyz
+    np.testing.assert_allclose(
+        read.quats[0], [np.sqrt(1 - 0.5 - y * y), np.sqrt(0.5), y, 0], atol=1e-6
+    )  # wxyz
     np.testing.assert_allclose(read.quats[1], [0, 1, 0, 0], atol=1e-6)
     np.testing.assert_array_equal(read.sh[0, 1:], [[0, 0.0625, -0.5], [0, 0, 0], [0.5, 0.5, 0.5]])
 
 
 def test_version_2_is_read(tmp_path):
     header = BY_HAND[:4] + bytes([2]) + BY_HAND[5:16]
-    rotations = bytes([255, 128, 128]) + bytes([128, 0, 128])  # x = 1 and y = -1, as (byte / 127.5) - 1
+    rotations = bytes([255, 128, 128]) + bytes(
+        [128, 0, 128]
+    )  # x = 1 and y = -1, as (byte / 127.5) - 1
     data = header + POSITIONS + ALPHAS + COLORS + SCALES + rotations + HARMONICS
     read = read_spz(stored(tmp_path, gzip.compress(data)))
     np.testing.assert_allclose(read.quats, [[0, 1, 0, 0], [0, 0, -1, 0]], atol=0.005)
@@ -72,14 +92,24 @@ def test_what_is_written_is_laid_out_as_published():
     means = np.float32([[1.0, -0.5, 513 / 256]])
     sh = np.zeros((1, 4, 3), np.float32)
     sh[0, 0], sh[0, 1], sh[0, 3] = np.float32([0.5, -0.5, -0.3]) / 0.15, [0, 0.0625, -0.5], 0.5
-    one = GaussianArrays(means, sh, np.float32([np.log(0.25)]), np.float32([[-4, 0, -10]]), -2 * np.float32([[0.5, 0.5, -0.5, 0.5]]))
+    one = GaussianArrays(
+        means,
+        sh,
+        np.float32([np.log(0.25)]),
+        np.float32([[-4, 0, -10]]),
+        -2 * np.float32([[0.5, 0.5, -0.5, 0.5]]),
+    )
     data = gzip.decompress(spz_bytes(one))
     bits = data[13]
     assert data[:16] == b"NGSP" + bytes([3, 0, 0, 0, 1, 0, 0, 0, 1, bits, 0, 0])
-    fixed = [int.from_bytes(data[16 + 3 * axis : 19 + 3 * axis], "little", signed=True) for axis in range(3)]
+    fixed = [
+        int.from_bytes(data[16 + 3 * axis : 19 + 3 * axis], "little", signed=True)
+        for axis in range(3)
+    ]
     assert fixed == [1 << bits, -1 << bits - 1, 513 << bits - 8]
     assert data[25:26] == ALPHAS[:1] and data[26:29] == COLORS[:3] and data[29:32] == SCALES[:3]
-    # all four components are alike: x, the first, counts as the largest; 1/2 is 361.33/511 of 1/sqrt2; signs are relative to x's
+    # all four components are alike: x, the first, counts as the largest; 1/2 is 361.33/511 of
+    # 1/sqrt2; signs are relative to x's
     assert struct.unpack("<I", data[32:36])[0] == 0 << 30 | (512 | 361) << 20 | 361 << 10 | 361
     assert data[36:] == HARMONICS[:9]  # nothing of it lies between two steps of 5 bit
 
@@ -95,11 +125,19 @@ def test_what_is_read_is_close_to_what_was_written(tmp_path, degree):
     assert np.abs(read.log_scales - arrays.log_scales).max() <= 1 / 32 + 1e-5
     opacities = [torch.from_numpy(values.logit_opacities).sigmoid() for values in (read, arrays)]
     assert (opacities[0] - opacities[1]).abs().max() <= 0.5 / 255 + 1e-6
-    assert np.abs(read.sh[:, :1] - arrays.sh[:, :1].clip(-0.5 / 0.15, 0.5 / 0.15)).max() <= 0.5 / 255 / 0.15 + 1e-5
+    assert (
+        np.abs(read.sh[:, :1] - arrays.sh[:, :1].clip(-0.5 / 0.15, 0.5 / 0.15)).max()
+        <= 0.5 / 255 / 0.15 + 1e-5
+    )
     if degree:
         clipped = arrays.sh[:, 1:].clip(-1, 0.93)
-        assert np.abs(read.sh[:, 1:] - clipped).max() <= 1.01 / 16 + 0.5 / 128  # half a step of 4 bit; the last step is short
-    units = [values.quats / np.linalg.norm(values.quats, axis=1, keepdims=True) for values in (read, arrays)]
+        assert (
+            np.abs(read.sh[:, 1:] - clipped).max() <= 1.01 / 16 + 0.5 / 128
+        )  # half a step of 4 bit; the last step is short
+    units = [
+        values.quats / np.linalg.norm(values.quats, axis=1, keepdims=True)
+        for values in (read, arrays)
+    ]
     turned_by = 2 * np.arccos(np.abs((units[0] * units[1]).sum(1)).clip(0, 1))
     assert np.degrees(turned_by).max() < 0.4  # steps of 0.0014 in three components
     assert read_spz_comment(tmp_path / "a.spz") == "up: y; kept"
@@ -111,7 +149,11 @@ def test_about_seventeen_bytes_are_one_gaussian():
 
 def test_the_same_cloud_gives_the_same_bytes_in_any_order():
     arrays = cloud()
-    assert spz_bytes(arrays) == spz_bytes(arrays) == spz_bytes(GaussianArrays(*(values[::-1] for values in arrays)))
+    assert (
+        spz_bytes(arrays)
+        == spz_bytes(arrays)
+        == spz_bytes(GaussianArrays(*(values[::-1] for values in arrays)))
+    )
 
 
 def test_an_empty_cloud(tmp_path):
@@ -128,7 +170,10 @@ def test_extremes_are_stored_within_the_formats_reach(tmp_path):
     write_spz(tmp_path / "a.spz", **arrays._asdict())
     read = in_file_order(read_spz(tmp_path / "a.spz"), arrays)
     np.testing.assert_array_equal(read.log_scales[:, 0], [-10, -10, 255 / 16 - 10, 0])
-    assert np.isfinite(read.logit_opacities).all() and (np.sign(read.logit_opacities) == [1, -1, 1, -1]).all()
+    assert (
+        np.isfinite(read.logit_opacities).all()
+        and (np.sign(read.logit_opacities) == [1, -1, 1, -1]).all()
+    )
     np.testing.assert_array_equal(read.quats[0], [1, 0, 0, 0])
     assert (sh_to_colors(torch.from_numpy(read.sh), torch.ones(4, 3)) > 1.4).all()
     np.testing.assert_allclose(read.means, arrays.means, atol=0.001)
@@ -148,7 +193,9 @@ def test_what_the_format_cant_hold_is_refused(change, said):
 
 
 def with_header(version=3, count=2, degree=1, magic=b"NGSP"):
-    return gzip.compress(struct.pack("<4sIIBBBB", magic, version, count, degree, 8, 0, 0) + BY_HAND[16:])
+    return gzip.compress(
+        struct.pack("<4sIIBBBB", magic, version, count, degree, 8, 0, 0) + BY_HAND[16:]
+    )
 
 
 @pytest.mark.parametrize(
@@ -191,7 +238,9 @@ def test_random_damage_is_an_error_or_a_cloud(tmp_path):
             data[place] = rng.integers(256)
         data = data[: rng.integers(len(data))] if rng.random() < 0.3 else data
         try:
-            read = read_spz(stored(tmp_path, gzip.compress(bytes(data), 1) if inside else bytes(data)))
+            read = read_spz(
+                stored(tmp_path, gzip.compress(bytes(data), 1) if inside else bytes(data))
+            )
         except UserError:
             continue
         assert all(np.isfinite(values).all() and len(values) == len(read.means) for values in read)

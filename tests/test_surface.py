@@ -1,4 +1,6 @@
-"""The mesh of a cloud: closed, outwards, where the Gaussians are, with their colours; and as a run exports it."""
+"""The mesh of a cloud: closed, outwards, where the Gaussians are, with their colours; and as a run
+exports it.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +16,11 @@ def ball(count=4000, radius=0.5, scale=0.02, opacity=4.0, hollow=True):
     """Gaussians on, or in, a sphere, coloured by their place."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(count, 3))
-    points *= radius * (1 if hollow else rng.random((count, 1)) ** (1 / 3)) / np.linalg.norm(points, axis=1, keepdims=True)
+    points *= (
+        radius
+        * (1 if hollow else rng.random((count, 1)) ** (1 / 3))
+        / np.linalg.norm(points, axis=1, keepdims=True)
+    )
     return GaussianArrays(
         means=np.float32(points + CENTER),
         sh=np.float32((points.clip(-0.5, 0.5)) / 0.28209479)[:, None],
@@ -53,25 +59,34 @@ def test_a_solid_ball_is_one_closed_surface(resolution):
 
 @pytest.mark.parametrize(("count", "scale"), [(4000, 0.02), (16000, 0.02), (16000, 0.002)])
 def test_a_shell_lies_where_its_gaussians_are_however_many_overlap(count, scale):
-    """Of 1.2 standard deviations to each side, of the Gaussians and of a cell; unevenly spread points add a little."""
+    """Of 1.2 standard deviations to each side, of the Gaussians and of a cell; unevenly spread
+    points add a little.
+    """
     surface = gaussian_surface(ball(count, scale=scale), resolution=64)
     spread = np.hypot(scale, 1 / 64)
     away = np.abs(distances(surface) - 0.5)
     assert 0.5 * spread < np.median(away) < 1.5 * spread and away.max() < 3 * spread
-    np.testing.assert_allclose(surface.colors, (surface.vertices - CENTER + 0.5).clip(0, 1), atol=0.08)
+    np.testing.assert_allclose(
+        surface.colors, (surface.vertices - CENTER + 0.5).clip(0, 1), atol=0.08
+    )
 
 
 def test_what_is_faint_is_no_surface():
     arrays = ball()
     far = arrays._replace(means=arrays.means + 5, logit_opacities=arrays.logit_opacities - 10)
     both = GaussianArrays(*(np.concatenate(pair) for pair in zip(arrays, far, strict=True)))
-    np.testing.assert_array_equal(gaussian_surface(both, resolution=24).vertices, gaussian_surface(arrays, resolution=24).vertices)
+    np.testing.assert_array_equal(
+        gaussian_surface(both, resolution=24).vertices,
+        gaussian_surface(arrays, resolution=24).vertices,
+    )
     assert len(gaussian_surface(far).faces) == 0
 
 
 def test_size_and_place_do_not_matter():
     arrays = ball(count=500)
-    moved = arrays._replace(means=8 * arrays.means + 16, log_scales=arrays.log_scales + np.float32(np.log(8)))
+    moved = arrays._replace(
+        means=8 * arrays.means + 16, log_scales=arrays.log_scales + np.float32(np.log(8))
+    )
     first, second = gaussian_surface(arrays, resolution=24), gaussian_surface(moved, resolution=24)
     # float32 means
     np.testing.assert_allclose(8 * first.vertices + 16, second.vertices, atol=1e-3)
@@ -91,8 +106,12 @@ def test_turned_and_flat_gaussians_lie_along_their_axes():
     # as far as exp(-1/2 (r / s)^2) is a half, with s that of the disc and a cell
     reach = np.sqrt(2 * np.log(2)) * np.hypot([0.5, 0.02], 1 / 96)
     assert np.abs(vertices[:, 1]).max() == pytest.approx(reach[0], abs=0.02)
-    assert np.abs(vertices @ [np.sqrt(0.5), 0, np.sqrt(0.5)]).max() == pytest.approx(reach[0], abs=0.02)
-    assert np.abs(vertices @ [np.sqrt(0.5), 0, -np.sqrt(0.5)]).max() == pytest.approx(reach[1], abs=0.01)
+    assert np.abs(vertices @ [np.sqrt(0.5), 0, np.sqrt(0.5)]).max() == pytest.approx(
+        reach[0], abs=0.02
+    )
+    assert np.abs(vertices @ [np.sqrt(0.5), 0, -np.sqrt(0.5)]).max() == pytest.approx(
+        reach[1], abs=0.01
+    )
 
 
 def test_other_programs_read_the_file(tmp_path):

@@ -43,7 +43,9 @@ def test_what_fits(value, annotation, fits):
 
 def test_dimensions_with_the_same_name_are_the_same():
     @jaxtyped(typechecker=check)
-    def paint(means: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"], *, scale: float = 1) -> Float[Tensor, "N 3"]:
+    def paint(
+        means: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"], *, scale: float = 1
+    ) -> Float[Tensor, "N 3"]:
         return means[:-1] if scale == 2 else means
 
     assert paint(POINTS, POINTS, scale="left alone").shape == (5, 3)
@@ -76,5 +78,7 @@ try:
 except TypeError as error:
     print(type(error).__name__)
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True
+    )
     assert done.stdout == "TypeCheckError\n", done.stdout + done.stderr

@@ -14,17 +14,24 @@ PLACES = np.arange(-16, 16) + 0.5
 
 
 def look(elevation, azimuth, distance):
-    angles = (torch.tensor([float(value)], dtype=torch.float64) for value in (elevation, azimuth, distance))
+    angles = (
+        torch.tensor([float(value)], dtype=torch.float64)
+        for value in (elevation, azimuth, distance)
+    )
     return cameras.orbit_c2w(*angles)[0].numpy()
 
 
 def draw(vertices, faces, c2w=None, rows=PLACES, columns=PLACES):
     """The hits of a camera at the origin that looks along -z, unless given another."""
-    return ZBuffer(np.array(vertices, dtype=float), np.array(faces)).hits(np.eye(4) if c2w is None else c2w, FOCAL, rows, columns)
+    return ZBuffer(np.array(vertices, dtype=float), np.array(faces)).hits(
+        np.eye(4) if c2w is None else c2w, FOCAL, rows, columns
+    )
 
 
 def cast(vertices, faces, rows=PLACES, columns=PLACES):
-    """The nearest face of each sample by intersecting every ray with every triangle (Moeller and Trumbore 1997), in float64."""
+    """The nearest face of each sample by intersecting every ray with every triangle (Moeller and
+    Trumbore 1997), in float64.
+    """
     y, x = np.meshgrid(-rows / FOCAL, columns / FOCAL, indexing="ij")
     rays = np.stack([x, y, -np.ones_like(x)], axis=-1)[:, :, None]
     a, b, c = np.moveaxis(np.array(vertices, dtype=float)[np.array(faces)], 1, 0)
@@ -36,7 +43,9 @@ def cast(vertices, faces, rows=PLACES, columns=PLACES):
     t = np.einsum("fc,fc->f", c - a, q) / det
     depth = np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0), t, np.inf)
     nearest = depth.argmin(axis=-1)
-    weights = np.take_along_axis(np.stack([1 - u - v, u, v], axis=-1), nearest[..., None, None], axis=2)[:, :, 0]
+    weights = np.take_along_axis(
+        np.stack([1 - u - v, u, v], axis=-1), nearest[..., None, None], axis=2
+    )[:, :, 0]
     hit = np.isfinite(depth.min(axis=-1))
     return np.where(hit, nearest, -1), np.where(hit[..., None], weights, 0)
 
@@ -44,13 +53,17 @@ def cast(vertices, faces, rows=PLACES, columns=PLACES):
 def soup(seed, count=150):
     """Random triangles on all sides of the camera, small and large: many cross its plane."""
     rng = np.random.default_rng(seed)
-    corners = rng.normal(size=(count, 1, 3)) * 2 + rng.normal(size=(count, 3, 3)) * rng.uniform(0.1, 0.6, (count, 1, 1))
+    corners = rng.normal(size=(count, 1, 3)) * 2 + rng.normal(size=(count, 3, 3)) * rng.uniform(
+        0.1, 0.6, (count, 1, 1)
+    )
     return corners.reshape(-1, 3), np.arange(count * 3).reshape(count, 3)
 
 
 def assert_same(found, expected):
     np.testing.assert_array_equal(found[0], expected[0])
-    np.testing.assert_allclose(found[1], expected[1], atol=1e-9)  # both are float64; the triangles are a few units large
+    np.testing.assert_allclose(
+        found[1], expected[1], atol=1e-9
+    )  # both are float64; the triangles are a few units large
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -78,19 +91,29 @@ def test_a_moved_camera_sees_what_a_moved_mesh_shows():
 
 
 def test_a_floor_below_the_camera_reaches_the_horizon_in_perspective():
-    """A huge floor at height -1 under a level camera: below the horizon all samples, and the weights give the world's place back."""
+    """A huge floor at height -1 under a level camera: below the horizon all samples, and the
+    weights give the world's place back.
+    """
     vertices = np.array([[-1e3, -1, 1e3], [1e3, -1, 1e3], [0, -1, -1e6]])
     face_index, weights = draw(vertices, [[0, 1, 2]], columns=PLACES / 20)
-    np.testing.assert_array_equal(face_index, np.where(PLACES[:, None] > 0, 0, -1) * np.ones(32, int))
+    np.testing.assert_array_equal(
+        face_index, np.where(PLACES[:, None] > 0, 0, -1) * np.ones(32, int)
+    )
     places = (weights @ vertices)[16:]
     depth = FOCAL / PLACES[16:, None]
-    np.testing.assert_allclose(places[..., 2], -depth + np.zeros(32), rtol=1e-6)  # weights of 1e-9 times 1e6 units
+    np.testing.assert_allclose(
+        places[..., 2], -depth + np.zeros(32), rtol=1e-6
+    )  # weights of 1e-9 times 1e6 units
     np.testing.assert_allclose(places[..., 0], depth * PLACES / 20 / FOCAL, atol=1e-6)
 
 
 def test_what_is_nearer_than_the_near_plane_is_not_seen():
     """One corner of the triangle is before that plane; the rest of it is seen."""
-    vertices = np.array([[-1.0, -1, -1], [1, -1, -1], [0, 1, -1]]) * np.array([[0.5], [2], [2]]) * zbuffer.NEAR
+    vertices = (
+        np.array([[-1.0, -1, -1], [1, -1, -1], [0, 1, -1]])
+        * np.array([[0.5], [2], [2]])
+        * zbuffer.NEAR
+    )
     nearest, weights = cast(vertices, [[0, 1, 2]])
     seen = (nearest >= 0) & (-(weights @ vertices)[..., 2] > zbuffer.NEAR)
     assert 0 < seen.sum() < (nearest >= 0).sum()
@@ -117,7 +140,10 @@ def test_both_sides_are_seen_and_the_nearer_one_wins():
 
 def test_neighbours_leave_no_gap_on_samples_of_their_edges():
     """A fan whose edges run exactly through samples: its inside is covered wholly."""
-    ring = [[x, y, -FOCAL / 2] for x, y in ((8, 0), (8, 8), (0, 8), (-8, 8), (-8, 0), (-8, -8), (0, -8), (8, -8))]
+    ring = [
+        [x, y, -FOCAL / 2]
+        for x, y in ((8, 0), (8, 8), (0, 8), (-8, 8), (-8, 0), (-8, -8), (0, -8), (8, -8))
+    ]
     faces = [[0, 1 + i, 1 + (i + 1) % 8] for i in range(8)]
     places = np.arange(-15.5, 16, 0.5)
     face_index, weights = draw([[0, 0, -FOCAL / 2], *ring], faces, rows=places, columns=places)
@@ -136,7 +162,12 @@ def toy():
     return load_mesh("toy.glb")
 
 
-VIEWS = [(look(20, 30, 2.5), 50.0), (look(-10, 200, 1.5), 70.0), (look(60, -75, 4.0), 40.0), (look(5, 100, 0.6), 90.0)]
+VIEWS = [
+    (look(20, 30, 2.5), 50.0),
+    (look(-10, 200, 1.5), 70.0),
+    (look(60, -75, 4.0), 40.0),
+    (look(5, 100, 0.6), 90.0),
+]
 
 
 @pytest.mark.parametrize("view", range(len(VIEWS)))
@@ -158,15 +189,21 @@ def test_the_toy_has_the_faces_that_embree_finds(toy, view):
     expected, _ = raycast._embree_hits(raycast._embree_scene(toy), *camera)
     found, _ = ZBuffer(toy.vertices, toy.faces).hits(*camera)
     covered = (found >= 0) | (expected >= 0)
-    assert (found == expected)[covered].mean() > 0.995  # ties on edges, and Embree computes in float32
+    assert (found == expected)[
+        covered
+    ].mean() > 0.995  # ties on edges, and Embree computes in float32
 
 
 def test_the_weights_give_the_places_that_embree_finds():
     pytest.importorskip("embreex")
     vertices, faces = soup(1)
     camera = np.eye(4), FOCAL, PLACES, PLACES
-    expected, expected_weights = raycast._embree_hits(raycast._embree_scene(Mesh(vertices, faces)), *camera)
+    expected, expected_weights = raycast._embree_hits(
+        raycast._embree_scene(Mesh(vertices, faces)), *camera
+    )
     found, weights = draw(vertices, faces)
     same = (found == expected) & (found >= 0)
     assert same.sum() > 0.98 * (found >= 0).sum() > 200
-    np.testing.assert_allclose(weights[same], expected_weights[same], atol=1e-4)  # float32 on triangles seen nearly on edge
+    np.testing.assert_allclose(
+        weights[same], expected_weights[same], atol=1e-4
+    )  # float32 on triangles seen nearly on edge

@@ -1,8 +1,8 @@
-"""Tiny models in the files of the real ones for the 3D priors: CLIP, Shap-E, Point-E and a body in SMPL's format.
+"""Tiny models in the files of the real ones for the 3D priors: CLIP, Shap-E, Point-E and a body in
+SMPL's format.
 
-Weights are random, but for two things that make results predictable: Shap-E's renderer gives one known shape whatever the
-latents, and the body's joints and limbs are where a person's are.
-"""
+Weights are random, but for two things that make results predictable: Shap-E's renderer gives one
+known shape whatever the latents, and the body's joints and limbs are where a person's are."""
 
 import itertools
 import json
@@ -20,11 +20,14 @@ SHAPE_HALF_SIDES = np.array([0.2, 0.3, 0.5])
 """Of the octahedron that the tiny Shap-E draws, in its own space."""
 
 
-# ---------------------------------------------------------------------------------------------------------------- CLIP
+# --------------------------------------------------------------------------------------------------
+# CLIP
 
 
 def clip(folder: Path, seed: int = 0) -> Path:
-    """A whole CLIP, as ``openai/clip-vit-large-patch14`` has it: one file of weights beside the tokenizer's."""
+    """A whole CLIP, as ``openai/clip-vit-large-patch14`` has it: one file of weights beside the
+    tokenizer's.
+    """
     from transformers import CLIPConfig, CLIPModel
 
     torch.manual_seed(seed)
@@ -64,13 +67,23 @@ def _clip_text_config():
 
 def _tokenizer(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "vocab.json").write_text(json.dumps(_byte_vocabulary(), ensure_ascii=False), encoding="utf-8")
+    (folder / "vocab.json").write_text(
+        json.dumps(_byte_vocabulary(), ensure_ascii=False), encoding="utf-8"
+    )
     (folder / "merges.txt").write_text("#version: 0.2\nf o\nfo x</w>\n", encoding="utf-8")
-    special = {"bos_token": "<|startoftext|>", "eos_token": "<|endoftext|>", "unk_token": "<|endoftext|>", "pad_token": "<|endoftext|>"}
-    (folder / "tokenizer_config.json").write_text(json.dumps(special | {"model_max_length": 77, "tokenizer_class": "CLIPTokenizer"}))
+    special = {
+        "bos_token": "<|startoftext|>",
+        "eos_token": "<|endoftext|>",
+        "unk_token": "<|endoftext|>",
+        "pad_token": "<|endoftext|>",
+    }
+    (folder / "tokenizer_config.json").write_text(
+        json.dumps(special | {"model_max_length": 77, "tokenizer_class": "CLIPTokenizer"})
+    )
 
 
-# -------------------------------------------------------------------------------------------------------------- Shap-E
+# --------------------------------------------------------------------------------------------------
+# Shap-E
 
 
 def shap_e(folder: Path, seed: int = 0) -> Path:
@@ -81,7 +94,11 @@ def shap_e(folder: Path, seed: int = 0) -> Path:
     torch.manual_seed(seed)
     _tokenizer(folder / "vocabulary")
     scheduler = HeunDiscreteScheduler(
-        beta_schedule="exp", num_train_timesteps=1024, prediction_type="sample", use_karras_sigmas=True, clip_sample=True
+        beta_schedule="exp",
+        num_train_timesteps=1024,
+        prediction_type="sample",
+        use_karras_sigmas=True,
+        clip_sample=True,
     )
     ShapEPipeline(
         prior=shap_e_prior(),
@@ -116,12 +133,20 @@ def shap_e_prior(heads: int = 2, layers: int = 2):
 
 
 def _shap_e_renderer():
-    """A renderer whose signed distance is that of an octahedron: 1 - |x|/a - |y|/b - |z|/c, its |.| from pairs of SiLUs."""
+    """A renderer whose signed distance is that of an octahedron: 1 - |x|/a - |y|/b - |z|/c, its |.|
+    from pairs of SiLUs.
+    """
     from diffusers.pipelines.shap_e.renderer import ShapERenderer
 
     names, shapes = ("nerstf.mlp.0.weight", "nerstf.mlp.1.weight"), ((8, 93), (8, 8))
     renderer = ShapERenderer(
-        param_names=names, param_shapes=shapes, d_latent=8, d_hidden=8, n_output=12, n_hidden_layers=2, insert_direction_at=None
+        param_names=names,
+        param_shapes=shapes,
+        d_latent=8,
+        d_hidden=8,
+        n_output=12,
+        n_hidden_layers=2,
+        insert_direction_at=None,
     )
     steep = 200.0
     first, bias = torch.zeros(8, 93), torch.zeros(8)
@@ -130,14 +155,19 @@ def _shap_e_renderer():
             first[row, axis], bias[row] = sign * steep / half, -sign * steep * centre / half
     last = torch.zeros(12, 8)
     last[0, :6] = -1 / steep
-    last[4, 4], last[4, 5] = 1 / steep, -1 / steep  # green rises with z, from sigmoid(-1) to sigmoid(1)
+    last[4, 4], last[4, 5] = (
+        1 / steep,
+        -1 / steep,
+    )  # green rises with z, from sigmoid(-1) to sigmoid(1)
     with torch.no_grad():
         for name, weight in zip(names, (first, torch.eye(8)), strict=True):
             projection = renderer.params_proj.projections[name.replace(".", "__")]
             projection.norm.weight.zero_()  # so that the latents don't matter
             projection.norm.bias.zero_()
             projection.proj.bias.copy_(weight.flatten())
-        for layer, values in zip(renderer.mlp.mlp, (bias, torch.zeros(8), torch.zeros(12)), strict=True):
+        for layer, values in zip(
+            renderer.mlp.mlp, (bias, torch.zeros(8), torch.zeros(12)), strict=True
+        ):
             layer.bias.copy_(values)
         renderer.mlp.mlp[2].weight.copy_(last)
         renderer.mlp.mlp[2].bias[0], renderer.mlp.mlp[2].bias[3] = 1.0, 2.0
@@ -148,10 +178,11 @@ def _shap_e_renderer():
 
 
 def marching_cubes_tables() -> tuple[torch.Tensor, torch.Tensor]:
-    """Triangles (256, 5, 3) of edges and which of them count (256, 5), for each set of positive corners.
+    """Triangles (256, 5, 3) of edges and which of them count (256, 5), for each set of positive
+    corners.
 
-    Corner x + 2y + 4z; edges 0-3 along x, 4-7 along y, 8-11 along z. Loops of crossed edges are cut into fans.
-    """
+    Corner x + 2y + 4z; edges 0-3 along x, 4-7 along y, 8-11 along z. Loops of crossed edges are cut
+    into fans."""
     edges = [(c, c | 1 << axis) for axis in range(3) for c in range(8) if not c >> axis & 1]
     cases, masks = torch.zeros(256, 5, 3, dtype=torch.long), torch.zeros(256, 5, dtype=torch.bool)
     for case in range(256):
@@ -168,7 +199,9 @@ def _loops(case: int, edges: list[tuple[int, int]]) -> list[list[int]]:
         a, b = (1 << other for other in range(3) if other != axis)
         ring = [(side << axis) | corner for corner in (0, a, a | b, b)]
         crossed = [
-            edges.index(tuple(sorted((ring[i], ring[(i + 1) % 4])))) for i in range(4) if positive[ring[i]] != positive[ring[(i + 1) % 4]]
+            edges.index(tuple(sorted((ring[i], ring[(i + 1) % 4]))))
+            for i in range(4)
+            if positive[ring[i]] != positive[ring[(i + 1) % 4]]
         ]
         if len(crossed) == 4 and not positive[ring[0]]:
             crossed = crossed[1:] + crossed[:1]  # cut off the positive corners
@@ -192,7 +225,8 @@ def _fan(loop: list[int]) -> list[tuple[int, int, int]]:
     return [(loop[0], loop[i], loop[i + 1]) for i in range(1, len(loop) - 1)]
 
 
-# ------------------------------------------------------------------------------------------------------------- Point-E
+# --------------------------------------------------------------------------------------------------
+# Point-E
 
 
 def point_e(folder: Path, seed: int = 0) -> tuple[Path, Path]:
@@ -207,7 +241,8 @@ def point_e(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     return base, upsampler
 
 
-# ---------------------------------------------------------------------------------------------------------------- body
+# --------------------------------------------------------------------------------------------------
+# body
 
 PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21]
 JOINTS = np.array(  # metres, y up, looking along +z; the left side has x > 0
@@ -222,7 +257,9 @@ RING = 8
 
 
 def body_arrays(seed: int = 0) -> dict[str, np.ndarray]:
-    """A body of tubes around the bones, with the arrays of SMPL's file; two shape coefficients, height and width."""
+    """A body of tubes around the bones, with the arrays of SMPL's file; two shape coefficients,
+    height and width.
+    """
     vertices, faces, owners = [], [], []
     for joint in range(1, 24):
         tube, tube_faces = _tube(JOINTS[PARENTS[joint]], JOINTS[joint])
@@ -261,11 +298,18 @@ def _tube(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     faces = []
     for i in range(RING):
         j = (i + 1) % RING
-        faces += [(i, j, RING + i), (j, RING + j, RING + i), (2 * RING, j, i), (2 * RING + 1, RING + i, RING + j)]
+        faces += [
+            (i, j, RING + i),
+            (j, RING + j, RING + i),
+            (2 * RING, j, i),
+            (2 * RING + 1, RING + i, RING + j),
+        ]
     return np.concatenate([start + ring, end + ring, [start, end]]), np.array(faces)
 
 
 def _regressor(vertices: np.ndarray) -> np.ndarray:
     """Each joint is the mean of the vertices that are its own: centres of tubes that end in it."""
-    regressor = (np.linalg.norm(vertices[None] - JOINTS[:, None], axis=-1) < 1e-9).astype(np.float64)
+    regressor = (np.linalg.norm(vertices[None] - JOINTS[:, None], axis=-1) < 1e-9).astype(
+        np.float64
+    )
     return regressor / regressor.sum(axis=1, keepdims=True)

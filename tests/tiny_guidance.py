@@ -19,22 +19,36 @@ TIMESTEPS = torch.tensor([40, 400, 700, 950])
 
 def make_models(folder):
     """A tiny Stable Diffusion for each of ``PREDICTIONS``."""
-    return {prediction: tiny_models.stable_diffusion(folder / prediction, prediction=prediction) for prediction in PREDICTIONS}
+    return {
+        prediction: tiny_models.stable_diffusion(folder / prediction, prediction=prediction)
+        for prediction in PREDICTIONS
+    }
 
 
 def guidance(models, prediction="epsilon", **options):
-    return find("gaussiandreamer-stable-diffusion-guidance")({"pretrained_model_name_or_path": str(models[prediction]), **options})
+    return find("gaussiandreamer-stable-diffusion-guidance")(
+        {"pretrained_model_name_or_path": str(models[prediction]), **options}
+    )
 
 
 def make_prompts(models):
-    """Embeddings of one prompt, without and with Perp-Neg; they don't depend on the prediction type."""
-    options = {"pretrained_model_name_or_path": str(models["epsilon"]), "prompt": "a fox", "negative_prompt": "ugly", "use_cache": False}
+    """Embeddings of one prompt, without and with Perp-Neg; they don't depend on the prediction
+    type.
+    """
+    options = {
+        "pretrained_model_name_or_path": str(models["epsilon"]),
+        "prompt": "a fox",
+        "negative_prompt": "ugly",
+        "use_cache": False,
+    }
     processor = find("gaussiandreamer-stable-diffusion-prompt-processor")
     return {perp: processor({**options, "use_perp_neg": perp})() for perp in (False, True)}
 
 
 def renders(batch=4, size=64, seed=0):
-    return torch.rand(batch, size, size, 3, generator=torch.Generator().manual_seed(seed)).requires_grad_()
+    return torch.rand(
+        batch, size, size, 3, generator=torch.Generator().manual_seed(seed)
+    ).requires_grad_()
 
 
 def gradient(guide, prompt_utils, rgb, **options):

@@ -1,8 +1,9 @@
-"""Tiny random-weight models in the files of the real ones, made when a test asks for them: a folder each, in diffusers' format.
+"""Tiny random-weight models in the files of the real ones, made when a test asks for them: a folder
+each, in diffusers' format.
 
-Every file is laid out as on the hub (safetensors weights, tokenizer files as published, scheduler configurations of the real
-models), so what loads these is what loads the real ones. Only the sizes differ, and what they draw is noise.
-"""
+Every file is laid out as on the hub (safetensors weights, tokenizer files as published, scheduler
+configurations of the real models), so what loads these is what loads the real ones. Only the sizes
+differ, and what they draw is noise."""
 
 import json
 from io import BytesIO
@@ -12,9 +13,17 @@ from typing import Any, NamedTuple
 import torch
 
 TEXT_WIDTH = 32
-PUBLISHED_VAE_NAMES = {"to_q.": "query.", "to_k.": "key.", "to_v.": "value.", "to_out.0.": "proj_attn."}
+PUBLISHED_VAE_NAMES = {
+    "to_q.": "query.",
+    "to_k.": "key.",
+    "to_v.": "value.",
+    "to_out.0.": "proj_attn.",
+}
 """The attention's names in Stable Diffusion's VAE files, which are older than today's."""
-CORPUS = "a photo of an iron man fox corgi in the snow, side view front back overhead kicks with his left leg, ugly blurry"
+CORPUS = (
+    "a photo of an iron man fox corgi in the snow, side view front back overhead kicks "
+    "with his left leg, ugly blurry"
+)
 
 
 def nothing_cached(monkeypatch, folder: Path) -> None:
@@ -42,7 +51,12 @@ TINY = Sizes(
         "attention_head_dim": (2, 4),
         "norm_num_groups": 8,
     },
-    vae={"sample_size": 64, "block_out_channels": (8, 8, 16, 16), "layers_per_block": 1, "norm_num_groups": 4},
+    vae={
+        "sample_size": 64,
+        "block_out_channels": (8, 8, 16, 16),
+        "layers_per_block": 1,
+        "norm_num_groups": 4,
+    },
     text_width=TEXT_WIDTH,
 )
 STABLE_DIFFUSION_2_1 = Sizes(
@@ -60,21 +74,40 @@ STABLE_DIFFUSION_2_1 = Sizes(
 """The published UNet and VAE; of its text encoder, which a run frees at once, the width alone."""
 
 
-def stable_diffusion(folder: Path, *, prediction: str = "epsilon", seed: int = 0, sizes: Sizes = TINY) -> Path:
-    """Stable Diffusion 2.1, tiny: UNet on 8x8x4 latents, VAE 64x64 to 8x8; ``prediction``: epsilon, v_prediction."""
+def stable_diffusion(
+    folder: Path, *, prediction: str = "epsilon", seed: int = 0, sizes: Sizes = TINY
+) -> Path:
+    """Stable Diffusion 2.1, tiny: UNet on 8x8x4 latents, VAE 64x64 to 8x8; ``prediction``: epsilon,
+    v_prediction.
+    """
     from diffusers import AutoencoderKL, DDIMScheduler, PNDMScheduler, UNet2DConditionModel
 
     torch.manual_seed(seed)
-    unet = UNet2DConditionModel(**sizes.unet, cross_attention_dim=sizes.text_width, use_linear_projection=True)
+    unet = UNet2DConditionModel(
+        **sizes.unet, cross_attention_dim=sizes.text_width, use_linear_projection=True
+    )
     _listen_to_text(unet)
     unet.save_pretrained(folder / "unet")
-    blocks = {"down_block_types": ("DownEncoderBlock2D",) * 4, "up_block_types": ("UpDecoderBlock2D",) * 4}
+    blocks = {
+        "down_block_types": ("DownEncoderBlock2D",) * 4,
+        "up_block_types": ("UpDecoderBlock2D",) * 4,
+    }
     AutoencoderKL(**sizes.vae, **blocks, latent_channels=4).save_pretrained(folder / "vae")
     _rename(folder / "vae" / "diffusion_pytorch_model.safetensors", PUBLISHED_VAE_NAMES)
     clip_text_encoder(folder, sizes.text_width)
-    trained = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear", "steps_offset": 1, "set_alpha_to_one": False}
+    trained = {
+        "beta_start": 0.00085,
+        "beta_end": 0.012,
+        "beta_schedule": "scaled_linear",
+        "steps_offset": 1,
+        "set_alpha_to_one": False,
+    }
     # as published: 2.1-base has the first, 2.1 (768, v-prediction) the second
-    scheduler = PNDMScheduler(**trained, skip_prk_steps=True) if prediction == "epsilon" else DDIMScheduler(**trained, clip_sample=False)
+    scheduler = (
+        PNDMScheduler(**trained, skip_prk_steps=True)
+        if prediction == "epsilon"
+        else DDIMScheduler(**trained, clip_sample=False)
+    )
     scheduler.register_to_config(prediction_type=prediction)
     scheduler.save_pretrained(folder / "scheduler")
     return _index(
@@ -119,7 +152,11 @@ def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
     unet.save_pretrained(folder / "unet")
     t5_text_encoder(folder)
     DDPMScheduler(
-        beta_schedule="squaredcos_cap_v2", prediction_type="epsilon", variance_type="learned_range", thresholding=True, sample_max_value=1.5
+        beta_schedule="squaredcos_cap_v2",
+        prediction_type="epsilon",
+        variance_type="learned_range",
+        thresholding=True,
+        sample_max_value=1.5,
     ).save_pretrained(folder / "scheduler")
     return _index(
         folder,
@@ -136,14 +173,18 @@ def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
 
 
 def _listen_to_text(unet: torch.nn.Module) -> None:
-    """Enlarge what the cross-attention brings in: with PyTorch's initial weights two prompts give nearly the same picture."""
+    """Enlarge what the cross-attention brings in: with PyTorch's initial weights two prompts give
+    nearly the same picture.
+    """
     for name, weight in unet.named_parameters():
         if name.endswith(("attn2.to_v.weight", "add_v_proj.weight")):
             weight.data *= 10
 
 
 def clip_text_encoder(folder: Path, width: int = TEXT_WIDTH) -> None:
-    """``text_encoder`` and ``tokenizer`` of Stable Diffusion 2.1: CLIP, padded with "!" (which one of its two files denies)."""
+    """``text_encoder`` and ``tokenizer`` of Stable Diffusion 2.1: CLIP, padded with "!" (which one
+    of its two files denies).
+    """
     from transformers import CLIPTextConfig, CLIPTextModel
 
     vocabulary = _byte_vocabulary()
@@ -165,11 +206,21 @@ def clip_text_encoder(folder: Path, width: int = TEXT_WIDTH) -> None:
     tokenizer.mkdir(parents=True)
     _json(tokenizer / "vocab.json", vocabulary)
     (tokenizer / "merges.txt").write_text("#version: 0.2\nf o\nfo x</w>\n", encoding="utf-8")
-    special = {"bos_token": "<|startoftext|>", "eos_token": "<|endoftext|>", "unk_token": "<|endoftext|>"}
+    special = {
+        "bos_token": "<|startoftext|>",
+        "eos_token": "<|endoftext|>",
+        "unk_token": "<|endoftext|>",
+    }
     _json(tokenizer / "special_tokens_map.json", special | {"pad_token": "!"})
     _json(
         tokenizer / "tokenizer_config.json",
-        special | {"pad_token": "<|endoftext|>", "model_max_length": 77, "tokenizer_class": "CLIPTokenizer", "do_lower_case": True},
+        special
+        | {
+            "pad_token": "<|endoftext|>",
+            "model_max_length": 77,
+            "tokenizer_class": "CLIPTokenizer",
+            "do_lower_case": True,
+        },
     )
 
 
@@ -181,20 +232,31 @@ def t5_text_encoder(folder: Path) -> None:
     tokenizer.mkdir(parents=True)
     (tokenizer / "spiece.model").write_bytes(_sentencepiece())
     special = {"eos_token": "</s>", "unk_token": "<unk>", "pad_token": "<pad>"}
-    _json(tokenizer / "tokenizer_config.json", special | {"tokenizer_class": "T5Tokenizer", "model_max_length": 512, "extra_ids": 100})
+    _json(
+        tokenizer / "tokenizer_config.json",
+        special | {"tokenizer_class": "T5Tokenizer", "model_max_length": 512, "extra_ids": 100},
+    )
     sizes = {"d_model": TEXT_WIDTH, "d_kv": 8, "d_ff": 48, "num_layers": 2, "num_heads": 4}
-    config = T5Config(vocab_size=200, **sizes, feed_forward_proj="gated-gelu", tie_word_embeddings=False)
+    config = T5Config(
+        vocab_size=200, **sizes, feed_forward_proj="gated-gelu", tie_word_embeddings=False
+    )
     T5EncoderModel(config).save_pretrained(folder / "text_encoder")
 
 
 def _publish_clip(path: Path) -> None:
-    """The names of the published files: with the prefix that transformers 5 leaves out, and the positions that were once saved."""
+    """The names of the published files: with the prefix that transformers 5 leaves out, and the
+    positions that were once saved.
+    """
     from safetensors.torch import load_file, save_file
 
     tensors = load_file(path)
     prefix = "" if any(name.startswith("text_model.") for name in tensors) else "text_model."
     tensors = {prefix + name: tensor for name, tensor in tensors.items()}
-    save_file(tensors | {"text_model.embeddings.position_ids": torch.arange(77)[None]}, path, metadata={"format": "pt"})
+    save_file(
+        tensors | {"text_model.embeddings.position_ids": torch.arange(77)[None]},
+        path,
+        metadata={"format": "pt"},
+    )
 
 
 def _rename(path: Path, names: dict[str, str]) -> None:
@@ -207,11 +269,24 @@ def _rename(path: Path, names: dict[str, str]) -> None:
 
 
 def _byte_vocabulary() -> dict[str, int]:
-    """CLIP's byte-level vocabulary without most of its merges: each byte, each byte at a word's end, two merges, start and end."""
-    printable = [*range(ord("!"), ord("~") + 1), *range(ord("¡"), ord("¬") + 1), *range(ord("®"), ord("ÿ") + 1)]
+    """CLIP's byte-level vocabulary without most of its merges: each byte, each byte at a word's
+    end, two merges, start and end.
+    """
+    printable = [
+        *range(ord("!"), ord("~") + 1),
+        *range(ord("¡"), ord("¬") + 1),
+        *range(ord("®"), ord("ÿ") + 1),
+    ]
     others = [chr(256 + i) for i in range(256 - len(printable))]
     letters = [*map(chr, printable), *others]
-    tokens = [*letters, *(letter + "</w>" for letter in letters), "fo", "fox</w>", "<|startoftext|>", "<|endoftext|>"]
+    tokens = [
+        *letters,
+        *(letter + "</w>" for letter in letters),
+        "fo",
+        "fox</w>",
+        "<|startoftext|>",
+        "<|endoftext|>",
+    ]
     return {token: index for index, token in enumerate(tokens)}
 
 
@@ -234,7 +309,10 @@ def _sentencepiece() -> bytes:
 
 
 def _index(folder: Path, pipeline: str, **components) -> Path:
-    _json(folder / "model_index.json", {"_class_name": pipeline, "_diffusers_version": "0.8.0", **components})
+    _json(
+        folder / "model_index.json",
+        {"_class_name": pipeline, "_diffusers_version": "0.8.0", **components},
+    )
     return folder
 
 

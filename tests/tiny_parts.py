@@ -1,4 +1,6 @@
-"""A system of a few parameters with the whole life of a real one, for tests of the launcher; also loadable as an extension."""
+"""A system of a few parameters with the whole life of a real one, for tests of the launcher; also
+loadable as an extension.
+"""
 
 import os
 import signal
@@ -86,7 +88,8 @@ class TinyExporter(Exporter):
 class TinySystem(BaseLift3DSystem):
     @dataclass
     class Config(BaseLift3DSystem.Config):
-        # what a test wants to happen: fail in configure, on_fit_start or at a step; receive a signal at a step
+        # what a test wants to happen: fail in configure, on_fit_start or at a step; receive a
+        # signal at a step
         fail_in: str = ""
         signal_at: int = -1
         signal_name: str = "SIGINT"
@@ -119,7 +122,10 @@ class TinySystem(BaseLift3DSystem):
             os.kill(os.getpid(), getattr(signal, self.cfg.signal_name))
         self.seen.append(step)
         target = torch.randn(3, generator=generator(run_seed(), "target", step))
-        loss = self.C(self.cfg.loss.get("lambda_fit", 1.0)) * (self.geometry.means - target).square().sum()
+        loss = (
+            self.C(self.cfg.loss.get("lambda_fit", 1.0))
+            * (self.geometry.means - target).square().sum()
+        )
         optimizer = self.optimizers()
         optimizer.zero_grad()
         self.manual_backward(loss)
@@ -127,10 +133,14 @@ class TinySystem(BaseLift3DSystem):
         self.log("loss", loss.detach(), prog_bar=True)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        self.save_image_grid(f"it{self.true_global_step}-{int(batch['index'])}.png", [self._picture()])
+        self.save_image_grid(
+            f"it{self.true_global_step}-{int(batch['index'])}.png", [self._picture()]
+        )
 
     def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        self.save_image_grid(f"it{self.true_global_step}-test/{int(batch['index'])}.png", [self._picture()])
+        self.save_image_grid(
+            f"it{self.true_global_step}-test/{int(batch['index'])}.png", [self._picture()]
+        )
 
     def on_test_epoch_end(self) -> None:
         folder = f"it{self.true_global_step}-test"

@@ -1,10 +1,10 @@
 """Camera conventions, said once and converted in one place.
 
-World: right-handed, z up; azimuth 0 = +x is the front, azimuth 90 = +y. Angles of a view (elevation, azimuth) are in
-degrees, ``fovy`` is vertical and in radians. The host's cameras are OpenGL: the columns of ``c2w`` are right, up, back.
-Inside the maths cameras are OpenCV: ``viewmats`` world to camera with x right, y down, z forward; ``Ks`` in pixels, pixel
-centres at +0.5. Images are (B, H, W, C) with row 0 on top.
-"""
+World: right-handed, z up; azimuth 0 = +x is the front, azimuth 90 = +y. Angles of a view
+(elevation, azimuth) are in degrees, ``fovy`` is vertical and in radians. The host's cameras are
+OpenGL: the columns of ``c2w`` are right, up, back. Inside the maths cameras are OpenCV:
+``viewmats`` world to camera with x right, y down, z forward; ``Ks`` in pixels, pixel centres at
++0.5. Images are (B, H, W, C) with row 0 on top."""
 
 import math
 from typing import NamedTuple
@@ -35,16 +35,28 @@ class Orbit(NamedTuple):
 
 
 def orbit_positions(
-    elevation_deg: Float[Tensor, " B"], azimuth_deg: Float[Tensor, " B"], distance: Float[Tensor, " B"]
+    elevation_deg: Float[Tensor, " B"],
+    azimuth_deg: Float[Tensor, " B"],
+    distance: Float[Tensor, " B"],
 ) -> Float[Tensor, "B 3"]:
     """Points at ``distance`` from the origin, in world units."""
     elevation, azimuth = torch.deg2rad(elevation_deg), torch.deg2rad(azimuth_deg)
     horizontal = distance * torch.cos(elevation)
-    return torch.stack([horizontal * torch.cos(azimuth), horizontal * torch.sin(azimuth), distance * torch.sin(elevation)], -1)
+    return torch.stack(
+        [
+            horizontal * torch.cos(azimuth),
+            horizontal * torch.sin(azimuth),
+            distance * torch.sin(elevation),
+        ],
+        -1,
+    )
 
 
-def look_at(position: Float[Tensor, "B 3"], center: Float[Tensor, "B 3"], up: Float[Tensor, "B 3"]) -> Float[Tensor, "B 4 4"]:
-    """OpenGL ``c2w`` of cameras at ``position`` that look at ``center``; straight up or down takes +x as the picture's top.
+def look_at(
+    position: Float[Tensor, "B 3"], center: Float[Tensor, "B 3"], up: Float[Tensor, "B 3"]
+) -> Float[Tensor, "B 4 4"]:
+    """OpenGL ``c2w`` of cameras at ``position`` that look at ``center``; straight up or down takes
+    +x as the picture's top.
 
     A camera in the centre itself looks along -x, as one in front of it does.
     """
@@ -53,7 +65,9 @@ def look_at(position: Float[Tensor, "B 3"], center: Float[Tensor, "B 3"], up: Fl
     forward = F.normalize(torch.where(nowhere, _x_axis(offset).neg(), offset), dim=-1)
     right = torch.linalg.cross(forward, up)
     degenerate = right.norm(dim=-1, keepdim=True) < 1e-6
-    right = F.normalize(torch.where(degenerate, torch.linalg.cross(forward, _x_axis(up)), right), dim=-1)
+    right = F.normalize(
+        torch.where(degenerate, torch.linalg.cross(forward, _x_axis(up)), right), dim=-1
+    )
     up = torch.linalg.cross(right, forward)
     c2w = torch.eye(4, dtype=position.dtype, device=position.device).repeat(len(position), 1, 1)
     c2w[:, :3] = torch.stack([right, up, -forward, position], -1)
@@ -71,10 +85,18 @@ def orbit_c2w(
     center: Float[Tensor, "B 3"] | None = None,
     up: Float[Tensor, "B 3"] | None = None,
 ) -> Float[Tensor, "B 4 4"]:
-    """OpenGL ``c2w`` of cameras on a sphere around the origin, looking at ``center`` (default: the origin)."""
+    """OpenGL ``c2w`` of cameras on a sphere around the origin, looking at ``center`` (default: the
+    origin).
+    """
     position = orbit_positions(elevation_deg, azimuth_deg, distance)
     center = torch.zeros_like(position) if center is None else center
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=position.dtype, device=position.device).expand_as(position) if up is None else up
+    up = (
+        torch.tensor([0.0, 0.0, 1.0], dtype=position.dtype, device=position.device).expand_as(
+            position
+        )
+        if up is None
+        else up
+    )
     return look_at(position, center, up)
 
 
@@ -94,13 +116,17 @@ def intrinsics(fovy: Float[Tensor, " B"], height: int, width: int) -> Float[Tens
 def to_opencv(
     c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int
 ) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 3 3"]]:
-    """The host's OpenGL cameras as ``(viewmats, Ks)``: flip the camera's y and z axes, invert the rigid motion."""
+    """The host's OpenGL cameras as ``(viewmats, Ks)``: flip the camera's y and z axes, invert the
+    rigid motion.
+    """
     flip = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=c2w.dtype, device=c2w.device)
     return world_to_camera(c2w * flip), intrinsics(fovy, height, width)
 
 
 def world_to_camera(c2w: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 4 4"]:
-    """The inverse of rigid motions, each by its transpose: one that is no rotation spoils itself alone, and raises nothing."""
+    """The inverse of rigid motions, each by its transpose: one that is no rotation spoils itself
+    alone, and raises nothing.
+    """
     rotation = c2w[:, :3, :3].transpose(1, 2)
     inverse = torch.zeros_like(c2w)
     inverse[:, :3, :3] = rotation
@@ -110,24 +136,37 @@ def world_to_camera(c2w: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 4 4"]:
 
 
 def ray_directions(
-    c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int, normalize: bool = True
+    c2w: Float[Tensor, "B 4 4"],
+    fovy: Float[Tensor, " B"],
+    height: int,
+    width: int,
+    normalize: bool = True,
 ) -> Float[Tensor, "B H W 3"]:
-    """World directions through the pixel centres; unit length, or forward component 1 without ``normalize``."""
+    """World directions through the pixel centres; unit length, or forward component 1 without
+    ``normalize``.
+    """
     rows = torch.arange(height, dtype=c2w.dtype, device=c2w.device) + 0.5 - 0.5 * height
     columns = torch.arange(width, dtype=c2w.dtype, device=c2w.device) + 0.5 - 0.5 * width
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     focal = focal_length(fovy, height)[:, None, None]
-    directions = torch.stack([x / focal, -y / focal, torch.full_like(x, -1.0).expand(len(c2w), -1, -1)], -1)
+    directions = torch.stack(
+        [x / focal, -y / focal, torch.full_like(x, -1.0).expand(len(c2w), -1, -1)], -1
+    )
     directions = directions @ c2w[:, None, :3, :3].transpose(-1, -2)
     return F.normalize(directions, dim=-1) if normalize else directions
 
 
-def projection(fovy: Float[Tensor, " B"], aspect: float, near: float = 0.01, far: float = 100.0) -> Float[Tensor, "B 4 4"]:
+def projection(
+    fovy: Float[Tensor, " B"], aspect: float, near: float = 0.01, far: float = 100.0
+) -> Float[Tensor, "B 4 4"]:
     """threestudio's projection matrices (y negated: the top row has NDC y = -1)."""
     tan = torch.tan(0.5 * fovy)
     matrix = torch.zeros(len(fovy), 4, 4, dtype=fovy.dtype, device=fovy.device)
     matrix[:, 0, 0], matrix[:, 1, 1] = 1.0 / (tan * aspect), -1.0 / tan
-    matrix[:, 2, 2], matrix[:, 2, 3] = -(far + near) / (far - near), -2.0 * far * near / (far - near)
+    matrix[:, 2, 2], matrix[:, 2, 3] = (
+        -(far + near) / (far - near),
+        -2.0 * far * near / (far - near),
+    )
     matrix[:, 3, 2] = -1.0
     return matrix
 
@@ -141,15 +180,21 @@ class OrbitRanges(NamedTuple):
     fovy_deg: tuple[float, float] = (40.0, 70.0)
 
 
-def sample_orbit(batch: int, ranges: OrbitRanges, rng: torch.Generator, uniform_azimuth: bool = True) -> Orbit:
+def sample_orbit(
+    batch: int, ranges: OrbitRanges, rng: torch.Generator, uniform_azimuth: bool = True
+) -> Orbit:
     """Draw ``batch`` training views.
 
-    As in threestudio, with probability one half the elevations of a batch are uniform in angle, otherwise uniform on the
-    sphere (uniform in the sine); with ``uniform_azimuth`` the batch covers the whole azimuth range, one view per sector.
-    """
+    As in threestudio, with probability one half the elevations of a batch are uniform in angle,
+    otherwise uniform on the sphere (uniform in the sine); with ``uniform_azimuth`` the batch covers
+    the whole azimuth range, one view per sector."""
     by_angle, u = torch.rand(1, generator=rng) < 0.5, torch.rand(4, batch, generator=rng)
     low, high = (math.sin(math.radians(e)) for e in ranges.elevation)
-    elevation = _lerp(ranges.elevation, u[0]) if by_angle else torch.rad2deg(torch.asin((low + (high - low) * u[0]).clamp(-1.0, 1.0)))
+    elevation = (
+        _lerp(ranges.elevation, u[0])
+        if by_angle
+        else torch.rad2deg(torch.asin((low + (high - low) * u[0]).clamp(-1.0, 1.0)))
+    )
     sector = (u[1] + torch.arange(batch)) / batch if uniform_azimuth else u[1]
     fovy = torch.deg2rad(_lerp(ranges.fovy_deg, u[3]))
     return Orbit(elevation, _lerp(ranges.azimuth, sector), _lerp(ranges.distance, u[2]), fovy)
@@ -160,11 +205,15 @@ def _lerp(ends: tuple[float, float], u: Tensor) -> Tensor:
 
 
 def held_out_orbit(count: int = 24) -> Orbit:
-    """The views that a run is scored on: fixed, all around, four heights, three distances, fovy 50 degrees; in no bank."""
+    """The views that a run is scored on: fixed, all around, four heights, three distances, fovy 50
+    degrees; in no bank.
+    """
     index = torch.arange(count)
     elevation = torch.tensor([0.0, 15.0, 30.0, 45.0])[index % 4]
     distance = torch.tensor([2.0, 2.6, 3.2])[index % 3]
-    return Orbit(elevation, 360.0 * index / count, distance, torch.full((count,), math.radians(50.0)))
+    return Orbit(
+        elevation, 360.0 * index / count, distance, torch.full((count,), math.radians(50.0))
+    )
 
 
 def camera_pool(count: int, ranges: OrbitRanges, seed: int, stream: str = "camera-pool") -> Orbit:

@@ -1,4 +1,6 @@
-"""How good a result is: PSNR and SSIM against the truth, the multi-face meter, the floater meter, the share out of gamut."""
+"""How good a result is: PSNR and SSIM against the truth, the multi-face meter, the floater meter,
+the share out of gamut.
+"""
 
 import torch
 import torch.nn.functional as F
@@ -12,22 +14,29 @@ SSIM_WINDOW = 11
 
 
 def psnr(image: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
-    """-10 log10 of the mean squared error over all that is given, images in [0, 1], in dB; at most 100."""
+    """-10 log10 of the mean squared error over all that is given, images in [0, 1], in dB; at most
+    100.
+    """
     error = (image - truth).square().mean()
     return -10 * error.clamp_min(10 ** (-MAX_PSNR / 10)).log10()
 
 
-def ssim(image: Float[Tensor, "*batch H W C"], truth: Float[Tensor, "*batch H W C"]) -> Float[Tensor, "*batch"]:
+def ssim(
+    image: Float[Tensor, "*batch H W C"], truth: Float[Tensor, "*batch H W C"]
+) -> Float[Tensor, "*batch"]:
     """Structural similarity of images in [0, 1], one per image (Wang et al. 2004, eq. 13).
 
-    11 x 11 Gaussian window of sigma 1.5 around every pixel, the image reflected at its border, K1 0.01, K2 0.03, mean over
-    pixels and channels: torchmetrics' default, which a test compares.
+    11 x 11 Gaussian window of sigma 1.5 around every pixel, the image reflected at its border, K1
+    0.01, K2 0.03, mean over pixels and channels: torchmetrics' default, which a test compares.
 
     Raises:
         UserError: a side too short to be reflected.
     """
     if min(image.shape[-3:-1]) <= SSIM_WINDOW // 2:
-        raise UserError(f"SSIM needs images of at least {SSIM_WINDOW // 2 + 1} pixels a side, not {tuple(image.shape[-3:-1])}")
+        raise UserError(
+            f"SSIM needs images of at least {SSIM_WINDOW // 2 + 1} pixels a side, not "
+            f"{tuple(image.shape[-3:-1])}"
+        )
     mean_x, mean_y = _window_mean(image), _window_mean(truth)
     var_x = _window_mean(image**2) - mean_x**2
     var_y = _window_mean(truth**2) - mean_y**2
@@ -47,14 +56,19 @@ def multi_face_rate(
     threshold: float = 45.0,
     size: int = 32,
 ) -> float:
-    """The share of views whose nearest bank view is more than ``threshold`` degrees of azimuth away.
+    """The share of views whose nearest bank view is more than ``threshold`` degrees of azimuth
+    away.
 
-    Nearest by squared error at ``size`` x ``size`` pixels; renders and bank lie on the same background. Azimuths in degrees. A
-    bank from other heights and distances confuses views of like outline: best it has the views' own cameras, turned around.
-    """
-    views, bank = (_shrunk(images, size).flatten(1) for images in (renders, bank_images.to(renders)))
+    Nearest by squared error at ``size`` x ``size`` pixels; renders and bank lie on the same
+    background. Azimuths in degrees. A bank from other heights and distances confuses views of like
+    outline: best it has the views' own cameras, turned around."""
+    views, bank = (
+        _shrunk(images, size).flatten(1) for images in (renders, bank_images.to(renders))
+    )
     nearest = torch.cdist(views, bank).argmin(dim=1)
-    apart = azimuth_difference(view_azimuths, bank_azimuths.to(view_azimuths)[nearest.to(view_azimuths.device)])
+    apart = azimuth_difference(
+        view_azimuths, bank_azimuths.to(view_azimuths)[nearest.to(view_azimuths.device)]
+    )
     return (apart > threshold).double().mean().item()
 
 
@@ -63,14 +77,24 @@ def azimuth_difference(a: Float[Tensor, "*n"], b: Float[Tensor, "*n"]) -> Float[
     return ((a - b + 180) % 360 - 180).abs()
 
 
-def floater_mass(distances: Float[Tensor, " N"], opacities: Float[Tensor, " N"], *, extent: float, share: float = 0.02) -> float:
-    """The opacity-weighted share of Gaussians farther than ``share`` of ``extent`` (the box's longest side) from the surface."""
+def floater_mass(
+    distances: Float[Tensor, " N"],
+    opacities: Float[Tensor, " N"],
+    *,
+    extent: float,
+    share: float = 0.02,
+) -> float:
+    """The opacity-weighted share of Gaussians farther than ``share`` of ``extent`` (the box's
+    longest side) from the surface.
+    """
     total = opacities.sum()
     return (opacities[distances > share * extent].sum() / total).item() if total > 0 else 0.0
 
 
 def out_of_gamut(images: Float[Tensor, "*batch 3"]) -> float:
-    """The share of pixels with a colour outside of [0, 1] by more than half a grey level: what no screen shows, and guidance overdoes."""
+    """The share of pixels with a colour outside of [0, 1] by more than half a grey level: what no
+    screen shows, and guidance overdoes.
+    """
     beyond = 0.5 / 255
     return ((images < -beyond) | (images > 1 + beyond)).any(-1).double().mean().item()
 

@@ -1,4 +1,6 @@
-"""A stand-in for a GPU: runs the product's CUDA text on the host, so that the tests run kernels and glue as they are."""
+"""A stand-in for a GPU: runs the product's CUDA text on the host, so that the tests run kernels and
+glue as they are.
+"""
 
 import ctypes
 import functools
@@ -18,9 +20,12 @@ from threestudio_gaussiandreamer.splatting.cuda import nvrtc
 from threestudio_gaussiandreamer.splatting.cuda.stages import NOWHERE
 
 FOLDER = Path(__file__).parent
-# Nothing is fused but what the kernels fuse on purpose; reading four floats as one is usual in CUDA, though not in C++; jumps
-# from stack to stack are meant.
-FLAGS = "-std=c++17 -O2 -fPIC -shared -ffp-contract=off -fno-math-errno -fno-strict-aliasing -U_FORTIFY_SOURCE".split()
+# Nothing is fused but what the kernels fuse on purpose; reading four floats as one is usual in
+# CUDA, though not in C++; jumps from stack to stack are meant.
+FLAGS = (
+    "-std=c++17 -O2 -fPIC -shared -ffp-contract=off -fno-math-errno -fno-strict-aliasing "
+    "-U_FORTIFY_SOURCE"
+).split()
 WARNINGS = ["-Wall", "-Wno-unknown-pragmas"]
 
 
@@ -40,7 +45,10 @@ def library() -> ctypes.CDLL:
     folder = tempfile.TemporaryDirectory()
     includes = [f"-I{path}" for path in (FOLDER, nvrtc.KERNELS, nvrtc.SHARED)]
     target = os.path.join(folder.name, "kernels.so")
-    subprocess.run(["g++", *FLAGS, *WARNINGS, *includes, *map(str, FOLDER.glob("*.cpp")), "-o", target], check=True)
+    subprocess.run(
+        ["g++", *FLAGS, *WARNINGS, *includes, *map(str, FOLDER.glob("*.cpp")), "-o", target],
+        check=True,
+    )
     kernels = ctypes.CDLL(target)
     kernels.folder = folder
     kernels.shim_error.restype = ctypes.c_char_p
@@ -65,18 +73,27 @@ class HostMachine:
     """Like `cuda_driver.Gpu`, for tensors on the CPU.
 
     Args:
-        order: in which the threads of a block run between two barriers: "forward", "backward" or "shuffled".
+        order: in which the threads of a block run between two barriers: "forward", "backward" or
+            "shuffled".
         most_entries: more than that, in lists or in rows, are answered as if memory were short.
         arrived: whether numbers that are read later are said to be there.
     """
 
     def __init__(self, order: str = "forward", most_entries: int = NOWHERE, arrived: bool = True):
-        self.order, self.most_entries, self.arrived, self.waits = ORDERS[order], most_entries, arrived, 0
+        self.order, self.most_entries, self.arrived, self.waits = (
+            ORDERS[order],
+            most_entries,
+            arrived,
+            0,
+        )
         self.launched: list[str] = []
 
     def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments) -> None:
         self.launched.append(name)
-        if name in ("list_tiles", "blend_backward", "blend_backward_absolute") and max(map(_length, arguments)) > self.most_entries:
+        if (
+            name in ("list_tiles", "blend_backward", "blend_backward_absolute")
+            and max(map(_length, arguments)) > self.most_entries
+        ):
             raise torch.cuda.OutOfMemoryError("no memory, says the test")
         values = [ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else x for x in arguments]
         pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(x) for x in values))
@@ -89,5 +106,7 @@ class HostMachine:
 
 def _length(argument) -> int:
     """How many entries, or rows of entries, it has room for."""
-    entries = isinstance(argument, Tensor) and (argument.dim() == 1 or argument.dim() == 2 and argument.shape[1] == 12)
+    entries = isinstance(argument, Tensor) and (
+        argument.dim() == 1 or argument.dim() == 2 and argument.shape[1] == 12
+    )
     return len(argument) if entries else 0

@@ -14,13 +14,18 @@ from threestudio_gaussiandreamer.splatting import Rasterized, rasterize
 MAX = 3.4028235e38
 DENORMAL = 1e-42
 PIXELS_TIMES_GAUSSIANS = 2_000_000
-"""The most that one scene asks of the specification, which looks at every Gaussian in every pixel."""
+"""The most that one scene asks of the specification, which looks at every Gaussian in every pixel.
+"""
 ROUNDING = 2e-5
 """How far apart depths must be for float32 to tell their order, of means up to 50."""
 FLIPS = 4 / 1024
-"""How far pixels may differ: float32 rounding may put the faintest contribution (1/1024) of a few Gaussians on either side."""
+"""How far pixels may differ: float32 rounding may put the faintest contribution (1/1024) of a few
+Gaussians on either side.
+"""
 GRADIENTS = 1e-2
-"""Relative distance of gradients without the worst hundredth of the Gaussians: those at a threshold (flips of alpha_min, the cap)."""
+"""Relative distance of gradients without the worst hundredth of the Gaussians: those at a threshold
+(flips of alpha_min, the cap).
+"""
 
 SIZES = (0.0, DENORMAL, 1e-30, 1e-8, 1e-4, 0.05, 1.0, 1e2, 1e4, 1e10, 1e30, MAX)
 PLACES = (0.0, -0.0, DENORMAL, 0.01, -0.01, 0.3, 1.0, -1.0, 10.0, -1e4, 1e8, 1e20, -1e30, MAX)
@@ -28,7 +33,9 @@ LENGTHS = (0.0, DENORMAL, 1e-30, 1e-13, 1e-12, 1e-3, 1.0, 5.0, 1e10, 1e20, 1e30,
 OPACITIES = (0.0, -0.0, DENORMAL, 1 / 1024, 1 / 255, 0.5, 1 - 2**-10, 1.0, 1.5, -1.0, 100.0)
 HARMONICS = (0.0, -0.0, DENORMAL, -1.0, 1.0, 1e4, -1e10)
 DAZZLING = (1e30, -1e30, MAX, -MAX)
-"""Harmonics whose pictures float32 can hold, though not the gradients: those of a colour c grow with c times focal length / depth."""
+"""Harmonics whose pictures float32 can hold, though not the gradients: those of a colour c grow
+with c times focal length / depth.
+"""
 NOT_FINITE = (math.nan, math.inf, -math.inf)
 FOVS_DEG = (1e-3, 0.1, 1.0, 30.0, 60.0, 120.0, 179.0, 179.999)
 
@@ -53,7 +60,7 @@ class Drawn(NamedTuple):
     grads: dict[str, Tensor]
 
 
-# ---- scenes --------------------------------------------------------------------------------------------------------------------
+# ---- scenes --------------------------------------------------------------------------------------
 
 
 def hostile_scene(seed: int, most: int = 4000) -> Scene:
@@ -69,16 +76,24 @@ def hostile_scene(seed: int, most: int = 4000) -> Scene:
 
 
 def well_posed(scene: Scene) -> Scene:
-    """The part on which float32 backends must agree: finite, of moderate size and place, clear of every plane and threshold.
+    """The part on which float32 backends must agree: finite, of moderate size and place, clear of
+    every plane and threshold.
 
-    Under a field of view of less than a degree or more than 150, neither rounding nor the clamped Jacobian is moderate.
-    """
+    Under a field of view of less than a degree or more than 150, neither rounding nor the clamped
+    Jacobian is moderate."""
     cloud, near = scene.cloud, scene.options["near"]
     lengths = torch.linalg.vector_norm(cloud.quats, dim=1)
     keep = (cloud.means.abs() <= 50).all(1) & (lengths >= 1e-3) & (lengths <= 1e3)
-    keep &= ((cloud.scales >= 1e-3) & (cloud.scales <= 10)).all(1) & (cloud.opacities >= 0) & (cloud.opacities <= 1)
+    keep &= (
+        ((cloud.scales >= 1e-3) & (cloud.scales <= 10)).all(1)
+        & (cloud.opacities >= 0)
+        & (cloud.opacities <= 1)
+    )
     keep &= (cloud.colors.abs() <= 10).flatten(1).all(1)
-    depths = scene.viewmats[:, 2, :3].double() @ cloud.means.double().T + scene.viewmats[:, 2, 3:].double()
+    depths = (
+        scene.viewmats[:, 2, :3].double() @ cloud.means.double().T
+        + scene.viewmats[:, 2, 3:].double()
+    )
     keep &= ((depths - near).abs() > 0.05).all(0)
     for view in depths:
         keep[keep.nonzero()[:, 0][_of_mixed_depth(cloud.means[keep], view[keep])]] = False
@@ -88,7 +103,9 @@ def well_posed(scene: Scene) -> Scene:
 
 
 def _of_mixed_depth(means: Tensor, depths: Tensor) -> Tensor:
-    """Marks Gaussians whose order by depth is a matter of rounding; those in the very same place go by index everywhere."""
+    """Marks Gaussians whose order by depth is a matter of rounding; those in the very same place go
+    by index everywhere.
+    """
     order = depths.argsort(stable=True)
     near = depths[order].diff() < ROUNDING
     groups = torch.cat([near.new_zeros(len(order[:1]), dtype=torch.long), (~near).cumsum(0)])
@@ -105,7 +122,11 @@ def _chance(g: torch.Generator, share: float) -> bool:
 
 def _count(g: torch.Generator, most: int) -> int:
     """Few or many: uniform in the logarithm, from 0."""
-    return int(math.exp(torch.rand((), generator=g).item() * math.log(most + 1))) - 1 if _chance(g, 0.4) else most
+    return (
+        int(math.exp(torch.rand((), generator=g).item() * math.log(most + 1))) - 1
+        if _chance(g, 0.4)
+        else most
+    )
 
 
 def _size(g: torch.Generator, work: int) -> tuple[int, int]:
@@ -147,15 +168,23 @@ def _cloud(g: torch.Generator, count: int, poisoned: bool) -> Cloud:
 def _poison(g: torch.Generator, values: Tensor, hostile: tuple[float, ...], share: float) -> None:
     """Put hostile numbers into single entries, and one and the same into whole rows."""
     rows = torch.rand(len(values), generator=g) < share / 2
-    same = _picked(g, hostile, (len(values),)).reshape(-1, *[1] * (values.dim() - 1)).expand(values.shape)
+    same = (
+        _picked(g, hostile, (len(values),))
+        .reshape(-1, *[1] * (values.dim() - 1))
+        .expand(values.shape)
+    )
     values[rows] = same[rows]
     entries = torch.rand(values.shape, generator=g) < share / 4
     values[entries] = _picked(g, hostile, tuple(values.shape))[entries]
 
 
 def _cameras(g: torch.Generator, views: int, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Around the cloud; in two scenes of five odd ones: inside of it or behind, any field of view, the principal point anywhere."""
-    q = torch.nn.functional.normalize(torch.randn(views, 4, generator=g, dtype=torch.float64), dim=-1)
+    """Around the cloud; in two scenes of five odd ones: inside of it or behind, any field of view,
+    the principal point anywhere.
+    """
+    q = torch.nn.functional.normalize(
+        torch.randn(views, 4, generator=g, dtype=torch.float64), dim=-1
+    )
     w, x, y, z = q.unbind(-1)
     rotation = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -165,7 +194,9 @@ def _cameras(g: torch.Generator, views: int, width: int, height: int) -> tuple[T
     viewmats = torch.eye(4).repeat(views, 1, 1)
     viewmats[:, :3, :3] = torch.stack([torch.stack(row, -1) for row in rotation], -2).float()
     odd = torch.rand(views, generator=g) < (0.7 if _chance(g, 0.4) else 0.0)
-    viewmats[:, 2, 3] = torch.where(odd, _picked(g, (3.0, 0.5, 0.0, 100.0, -3.0), (views,)), torch.tensor(3.0))
+    viewmats[:, 2, 3] = torch.where(
+        odd, _picked(g, (3.0, 0.5, 0.0, 100.0, -3.0), (views,)), torch.tensor(3.0)
+    )
     fov = torch.where(odd, _picked(g, FOVS_DEG, (views,)), _picked(g, (40.0, 60.0), (views,)))
     focal = 0.5 * height / torch.tan(torch.deg2rad(fov) / 2)
     Ks = torch.eye(3).repeat(views, 1, 1)
@@ -176,7 +207,9 @@ def _cameras(g: torch.Generator, views: int, width: int, height: int) -> tuple[T
 
 
 def _options(g: torch.Generator, size: tuple[int, int]) -> dict[str, Any]:
-    options: dict[str, Any] = {"preset": ("fast", "balanced", "accurate")[int(torch.randint(3, (), generator=g))]}
+    options: dict[str, Any] = {
+        "preset": ("fast", "balanced", "accurate")[int(torch.randint(3, (), generator=g))]
+    }
     options |= {"antialias": _chance(g, 0.3), "absgrad": _chance(g, 0.3)}
     options |= {"near": _picked(g, (0.01, 0.01, 1e-6, 0.5), ()).item()}
     if size[0] % 2 == size[1] % 2 == 0 and _chance(g, 0.3):
@@ -184,27 +217,47 @@ def _options(g: torch.Generator, size: tuple[int, int]) -> dict[str, Any]:
     return options
 
 
-# ---- drawing and judging -------------------------------------------------------------------------------------------------------
+# ---- drawing and judging -------------------------------------------------------------------------
 
 
 def draw(scene: Scene, backend: str, dtype: torch.dtype = torch.float32) -> Drawn:
-    """Forward and backward with fixed cotangents; gradients of the harmonics pass through the colours, those of the cameras too."""
+    """Forward and backward with fixed cotangents; gradients of the harmonics pass through the
+    colours, those of the cameras too.
+    """
     leaves = scene.cloud.to(dtype).leaves()
     viewmats, background = scene.viewmats.to(dtype, copy=True).requires_grad_(), scene.background
     background = None if background is None else background.to(dtype, copy=True).requires_grad_()
-    positions = -(viewmats.detach()[:, :3, :3].transpose(1, 2) @ viewmats.detach()[:, :3, 3:])[..., 0]
-    directions = torch.nn.functional.normalize(leaves.means.detach()[None] - positions[:, None], dim=-1)
+    positions = -(viewmats.detach()[:, :3, :3].transpose(1, 2) @ viewmats.detach()[:, :3, 3:])[
+        ..., 0
+    ]
+    directions = torch.nn.functional.normalize(
+        leaves.means.detach()[None] - positions[:, None], dim=-1
+    )
     colors = sh_to_colors(leaves.colors, directions)
-    out = rasterize(*leaves[:4], colors, viewmats, scene.Ks.to(dtype), *scene.size, background=background, backend=backend, **scene.options)
+    out = rasterize(
+        *leaves[:4],
+        colors,
+        viewmats,
+        scene.Ks.to(dtype),
+        *scene.size,
+        background=background,
+        backend=backend,
+        **scene.options,
+    )
     torch.autograd.backward([out.image, out.alpha, out.depth], cotangents(out))
-    grads = dict(zip(NAMES, (leaf.grad for leaf in leaves), strict=True)) | {"viewmats": viewmats.grad, "means2d": out.means2d.grad}
+    grads = dict(zip(NAMES, (leaf.grad for leaf in leaves), strict=True)) | {
+        "viewmats": viewmats.grad,
+        "means2d": out.means2d.grad,
+    }
     return Drawn(out, grads if background is None else grads | {"background": background.grad})
 
 
 def fault(scene: Scene, drawn: Drawn) -> Optional[str]:
-    """What is wrong with a picture of any scene, in words: a value or gradient that isn't finite, or alpha outside of [0, 1].
+    """What is wrong with a picture of any scene, in words: a value or gradient that isn't finite,
+    or alpha outside of [0, 1].
 
-    Two exceptions: radii may be infinite, of a Gaussian that is larger than float32 can say; and the gradient of harmonics may be
+    Two exceptions: radii may be infinite, of a Gaussian that is larger than float32 can say; and
+        the gradient of harmonics may be
     NaN where the mean is, since no direction leads there.
     """
     for name in ("image", "alpha", "depth", "means2d", "contribution"):
@@ -224,17 +277,24 @@ def fault(scene: Scene, drawn: Drawn) -> Optional[str]:
 
 
 def disagreement(pictures: dict[str, Drawn]) -> Optional[str]:
-    """Which picture of one well-posed scene differs by more than rounding may from the last one, in words."""
+    """Which picture of one well-posed scene differs by more than rounding may from the last one, in
+    words.
+    """
     *others, (first, one) = pictures.items()
     for name, other in others:
         for part in ("image", "alpha"):
-            difference = (getattr(one.out, part).double() - getattr(other.out, part).double()).abs().max()
+            difference = (
+                (getattr(one.out, part).double() - getattr(other.out, part).double()).abs().max()
+            )
             scale = max(getattr(one.out, part).abs().max().item(), 1.0)
             if difference > FLIPS * scale:
                 return f"{part} of {first} and {name} differ by {difference:.2g}"
         for part, grad in one.grads.items():
             if (distance := _distance(other.grads[part], grad)) > GRADIENTS:
-                return f"gradients of {part} of {first} and {name} differ by {distance:.2g} of their length"
+                return (
+                    f"gradients of {part} of {first} and {name} differ by {distance:.2g} of "
+                    "their length"
+                )
     return None
 
 
@@ -244,7 +304,10 @@ def fault_of(scene: Scene, backend: str) -> Optional[str]:
 
 def disagreement_on(scene: Scene, backends: Sequence[str]) -> Optional[str]:
     """The specification is asked last, in float64."""
-    return disagreement({name: draw(scene, name) for name in backends} | {"float64": draw(scene, "reference", torch.float64)})
+    return disagreement(
+        {name: draw(scene, name) for name in backends}
+        | {"float64": draw(scene, "reference", torch.float64)}
+    )
 
 
 def _distance(a: Tensor, b: Tensor) -> float:

@@ -1,4 +1,6 @@
-"""Tries damaged files on a door, one after the other, each with a limit of time and memory, and says how each ended."""
+"""Tries damaged files on a door, one after the other, each with a limit of time and memory, and
+says how each ended.
+"""
 
 import os
 import signal
@@ -76,7 +78,11 @@ def _run(target: Target, path: Path) -> Outcome:
         return Outcome("failed", f"hang: more than {SECONDS:g} s of processor time")
     except Exception as error:
         frame = traceback.extract_tb(error.__traceback__)[-1]
-        return Outcome("failed", f"crash: {type(error).__name__}: {str(error)[:120]} ({Path(frame.filename).name}:{frame.lineno})")
+        return Outcome(
+            "failed",
+            f"crash: {type(error).__name__}: {str(error)[:120]} "
+            f"({Path(frame.filename).name}:{frame.lineno})",
+        )
 
 
 @contextmanager

@@ -1,9 +1,10 @@
-"""Damaged versions of good files, drawn from a seed: what disks, networks, other programs and enemies make of them.
+"""Damaged versions of good files, drawn from a seed: what disks, networks, other programs and
+enemies make of them.
 
-A file is taken apart where its format packs or protects what is inside (zip, gzip, the chunks of GLB), one part is damaged, and the
-file is put together again with lengths and checksums that fit, so that the damage reaches the reader behind them. Half of the
-mutants are damaged as they lie on the disk.
-"""
+A file is taken apart where its format packs or protects what is inside (zip, gzip, the chunks of
+GLB), one part is damaged, and the file is put together again with lengths and checksums that fit,
+so that the damage reaches the reader behind them. Half of the mutants are damaged as they lie on
+the disk."""
 
 import io
 import json
@@ -17,9 +18,13 @@ from typing import Any, NamedTuple, Optional
 import numpy as np
 
 NUMBERS = (
-    b"0 -0 1 -1 2 3 255 256 65535 65536 -2147483648 2147483647 4294967295 9223372036854775807 99999999999999999999 1e400 -1e400".split()
-)
-NUMBERS += b"1e38 3.5e38 1e-45 1e-400 nan inf -inf 0x10 1_000 0.1.2 1e 1,5 007 +5 --1 1000000000 1000000000000".split()
+    b"0 -0 1 -1 2 3 255 256 65535 65536 -2147483648 2147483647 4294967295 "
+    b"9223372036854775807 99999999999999999999 1e400 -1e400"
+).split()
+NUMBERS += (
+    b"1e38 3.5e38 1e-45 1e-400 nan inf -inf 0x10 1_000 0.1.2 1e 1,5 007 +5 --1 "
+    b"1000000000 1000000000000"
+).split()
 TOKENS = [
     b"",
     b"\0",
@@ -36,9 +41,58 @@ TOKENS = [
     b'"',
     b"'",
 ]
-TOKENS += [b"%s%n", b"../" * 8, b"null", b"true", b"[]", b"{}", b"[" * 50, b"(" * 50, b"#", b"${", b"???", b"-", b"=", b":", b"A" * 300]
-EXTREMES = [0, 1, 2, 3, 127, 128, 255, 256, 32767, 65535, 65536, 2**24, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1]
-FLOATS = [float("nan"), float("inf"), -float("inf"), 0.0, -0.0, 1e38, -3.4e38, 1e-45, 1e-38, 1e300, 1.0, -1.0, 255.0, 0.5]
+TOKENS += [
+    b"%s%n",
+    b"../" * 8,
+    b"null",
+    b"true",
+    b"[]",
+    b"{}",
+    b"[" * 50,
+    b"(" * 50,
+    b"#",
+    b"${",
+    b"???",
+    b"-",
+    b"=",
+    b":",
+    b"A" * 300,
+]
+EXTREMES = [
+    0,
+    1,
+    2,
+    3,
+    127,
+    128,
+    255,
+    256,
+    32767,
+    65535,
+    65536,
+    2**24,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**63 - 1,
+    2**64 - 1,
+]
+FLOATS = [
+    float("nan"),
+    float("inf"),
+    -float("inf"),
+    0.0,
+    -0.0,
+    1e38,
+    -3.4e38,
+    1e-45,
+    1e-38,
+    1e300,
+    1.0,
+    -1.0,
+    255.0,
+    0.5,
+]
 MOST_OPERATIONS = 4
 LARGEST = 1 << 16
 """Bytes of the largest mutant; blocks are repeated no further."""
@@ -50,7 +104,7 @@ def _choice(values: list, rng: np.random.Generator) -> Any:
     return values[rng.integers(len(values))]
 
 
-# ---- damage to bytes -----------------------------------------------------------------------------------------------------------
+# ---- damage to bytes -----------------------------------------------------------------------------
 
 
 def flip_bits(data: bytes, rng: np.random.Generator) -> bytes:
@@ -85,7 +139,9 @@ def overwrite_block(data: bytes, rng: np.random.Generator) -> bytes:
     """With zeros, ones, noise, or what lies elsewhere in the file."""
     start, end = _range(data, rng)
     size, source = end - start, int(rng.integers(0, len(data)))
-    fill = [bytes(size), b"\xff" * size, rng.bytes(size), data[source : source + size]][int(rng.integers(4))]
+    fill = [bytes(size), b"\xff" * size, rng.bytes(size), data[source : source + size]][
+        int(rng.integers(4))
+    ]
     return data[:start] + fill + data[end:]
 
 
@@ -93,10 +149,19 @@ def extreme_number(data: bytes, rng: np.random.Generator) -> bytes:
     """A binary integer or float of 1 to 8 bytes."""
     if rng.random() < 0.5:
         size = int(rng.choice([1, 2, 4, 8]))
-        number = (_choice(EXTREMES, rng) & (1 << 8 * size) - 1).to_bytes(size, "big" if rng.random() < 0.3 else "little")
+        number = (_choice(EXTREMES, rng) & (1 << 8 * size) - 1).to_bytes(
+            size, "big" if rng.random() < 0.3 else "little"
+        )
     else:
         value, kind = _choice(FLOATS, rng), str(rng.choice(["<f", ">f", "<d"]))
-        number = struct.pack(kind, value if "d" in kind else np.clip(value, -3.4e38, 3.4e38) if np.isfinite(value) else value)
+        number = struct.pack(
+            kind,
+            value
+            if "d" in kind
+            else np.clip(value, -3.4e38, 3.4e38)
+            if np.isfinite(value)
+            else value,
+        )
     start = int(rng.integers(0, len(data)))
     return data[:start] + number + data[start + len(number) :]
 
@@ -106,7 +171,7 @@ def insert_token(data: bytes, rng: np.random.Generator) -> bytes:
     return data[:at] + _choice(TOKENS, rng) + data[at:]
 
 
-# ---- damage to text ------------------------------------------------------------------------------------------------------------
+# ---- damage to text ------------------------------------------------------------------------------
 
 WORD = re.compile(rb"[^\s\[\]{}(),:=\"']+")
 NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
@@ -118,9 +183,13 @@ def other_number(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def other_word(data: bytes, rng: np.random.Generator) -> bytes:
-    """A word replaced by another one of the file, or by a special token: another type, another name."""
+    """A word replaced by another one of the file, or by a special token: another type, another
+    name.
+    """
     words = WORD.findall(data[:4096]) or [b"x"]
-    return _replaced(WORD, data, rng, lambda old: _choice(words if rng.random() < 0.7 else TOKENS, rng))
+    return _replaced(
+        WORD, data, rng, lambda old: _choice(words if rng.random() < 0.7 else TOKENS, rng)
+    )
 
 
 def line_operation(data: bytes, rng: np.random.Generator) -> bytes:
@@ -143,14 +212,25 @@ def _range(data: bytes, rng: np.random.Generator) -> tuple[int, int]:
     return start, min(start + int(2 ** rng.uniform(0, 10)), len(data))
 
 
-def _replaced(pattern: re.Pattern, data: bytes, rng: np.random.Generator, new: Callable[[bytes], bytes]) -> bytes:
+def _replaced(
+    pattern: re.Pattern, data: bytes, rng: np.random.Generator, new: Callable[[bytes], bytes]
+) -> bytes:
     """One match, near a random place, replaced."""
     at = int(rng.integers(0, len(data)))
     match = pattern.search(data, at) or pattern.search(data)
     return data if match is None else data[: match.start()] + new(match[0]) + data[match.end() :]
 
 
-BINARY: list[Mutator] = [flip_bits, truncate, delete_block, duplicate_block, swap_blocks, overwrite_block, extreme_number, insert_token]
+BINARY: list[Mutator] = [
+    flip_bits,
+    truncate,
+    delete_block,
+    duplicate_block,
+    swap_blocks,
+    overwrite_block,
+    extreme_number,
+    insert_token,
+]
 TEXT: list[Mutator] = [
     other_number,
     other_number,
@@ -165,14 +245,16 @@ TEXT: list[Mutator] = [
 
 
 def damaged(data: bytes, rng: np.random.Generator, mutators: list[Mutator]) -> bytes:
-    """One kind of damage, or up to four one after the other; at most ``LARGEST`` bytes more than there were."""
+    """One kind of damage, or up to four one after the other; at most ``LARGEST`` bytes more than
+    there were.
+    """
     for _ in range(1 if rng.random() < 0.5 else int(rng.integers(2, MOST_OPERATIONS + 1))):
         if data:
             data = _choice(mutators, rng)(data, rng)[: len(data) + LARGEST]
     return data
 
 
-# ---- formats that pack what they hold ------------------------------------------------------------------------------------------
+# ---- formats that pack what they hold ------------------------------------------------------------
 
 
 class Packing(NamedTuple):
@@ -211,7 +293,9 @@ def _glb(pieces: list[tuple[str, bytes]]) -> bytes:
     chunks = b""
     for name, content in pieces:
         content += (b" " if name == "JSON" else b"\0") * (-len(content) % 4)
-        chunks += struct.pack("<I4s", len(content), name.encode("latin-1").ljust(4, b"\0")) + content
+        chunks += (
+            struct.pack("<I4s", len(content), name.encode("latin-1").ljust(4, b"\0")) + content
+        )
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
@@ -249,7 +333,29 @@ def json_value(data: bytes, rng: np.random.Generator) -> bytes:
     if not places:
         return data
     holder, key = places[rng.integers(len(places))]
-    values = [None, True, -1, 0, 1, 5, 2**31, 10**12, 1e300, "x", "", [], {}, [0], [1e38] * 16, {"a": 1}, 5121, 5123, 5125, 5126, "VEC3"]
+    values = [
+        None,
+        True,
+        -1,
+        0,
+        1,
+        5,
+        2**31,
+        10**12,
+        1e300,
+        "x",
+        "",
+        [],
+        {},
+        [0],
+        [1e38] * 16,
+        {"a": 1},
+        5121,
+        5123,
+        5125,
+        5126,
+        "VEC3",
+    ]
     others = [container[name] for container, name in places]
     value = _choice(values if rng.random() < 0.6 else others, rng)
     if rng.random() < 0.1 and isinstance(holder, dict):
@@ -270,7 +376,12 @@ def _places(document: Any) -> Iterator[tuple[Any, Any]]:
             yield from _places(document[key])
 
 
-def mutant(seeds: list[bytes], rng: np.random.Generator, mutators: list[Mutator], packing: Optional[Packing]) -> bytes:
+def mutant(
+    seeds: list[bytes],
+    rng: np.random.Generator,
+    mutators: list[Mutator],
+    packing: Optional[Packing],
+) -> bytes:
     """A damaged one of ``seeds``, or a part of one in another."""
     data = _choice(seeds, rng)
     if rng.random() < 0.05:
@@ -284,6 +395,8 @@ def mutant(seeds: list[bytes], rng: np.random.Generator, mutators: list[Mutator]
         return damaged(data, rng, mutators)
     at = int(rng.integers(len(pieces)))
     name, content = pieces[at]
-    own = [*TEXT, *[json_value] * 8] if name == "JSON" else TEXT if name in packing.text else mutators
+    own = (
+        [*TEXT, *[json_value] * 8] if name == "JSON" else TEXT if name in packing.text else mutators
+    )
     pieces[at] = (name, damaged(content, rng, own))
     return packing.pack(pieces)

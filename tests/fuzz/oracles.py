@@ -1,8 +1,8 @@
-"""Second readers, slow and strict, written from the formats' descriptions alone: what a damaged file may be read as.
+"""Second readers, slow and strict, written from the formats' descriptions alone: what a damaged
+file may be read as.
 
-Each takes a file's bytes and returns what they say, or raises :class:`Illegal` where no reading is legitimate. What the product
-makes of a file must be what is said here.
-"""
+Each takes a file's bytes and returns what they say, or raises :class:`Illegal` where no reading is
+legitimate. What the product makes of a file must be what is said here."""
 
 import ast
 import hashlib
@@ -15,15 +15,33 @@ from typing import NamedTuple, Optional
 
 import numpy as np
 
-TYPES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
-TYPES |= {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
+TYPES = {
+    "char": "b",
+    "uchar": "B",
+    "short": "h",
+    "ushort": "H",
+    "int": "i",
+    "uint": "I",
+    "float": "f",
+    "double": "d",
+}
+TYPES |= {
+    "int8": "b",
+    "uint8": "B",
+    "int16": "h",
+    "uint16": "H",
+    "int32": "i",
+    "uint32": "I",
+    "float32": "f",
+    "float64": "d",
+}
 
 
 class Illegal(Exception):
     """The bytes are no file of this format."""
 
 
-# ---- PLY -----------------------------------------------------------------------------------------------------------------------
+# ---- PLY -----------------------------------------------------------------------------------------
 
 
 class PlyVertices(NamedTuple):
@@ -43,7 +61,9 @@ class _Rows:
     def __init__(self, encoding: str, body: bytes):
         self.order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[encoding]
         self.at, self.body = 0, body
-        self.lines = [line.split() for line in body.decode("latin-1").split("\n")] if not self.order else []
+        self.lines = (
+            [line.split() for line in body.decode("latin-1").split("\n")] if not self.order else []
+        )
         self.lines = [line for line in self.lines if line]
 
     def row(self, properties: list[tuple[str, str, str]]) -> list[float]:
@@ -106,9 +126,15 @@ def ply_vertices(data: bytes) -> PlyVertices:
         if name == "vertex" and vertices is None:
             if any(count_kind for _, _, count_kind in properties):
                 raise Illegal("lists in vertices are not read here")
-            columns = np.array(table, np.float64).reshape(count if properties else 0, len(properties)).T
+            columns = (
+                np.array(table, np.float64).reshape(count if properties else 0, len(properties)).T
+            )
             names = [entry[0] for entry in properties]
-            vertices = dict(zip(names, columns, strict=True)), {n: k for n, k, _ in properties}, count
+            vertices = (
+                dict(zip(names, columns, strict=True)),
+                {n: k for n, k, _ in properties},
+                count,
+            )
             if len(elements) > 1 and elements[-1][0] != "vertex":
                 return PlyVertices(*vertices, leftover=False)  # what follows isn't looked at
     if vertices is None:
@@ -136,7 +162,11 @@ def _ply_header(data: bytes) -> tuple[str, list, bytes]:
             elements[-1][2].append(_ply_property(words))
         elif words[:1] not in ([], ["comment"], ["obj_info"]):
             raise Illegal("header line")
-    if len(encodings) != 1 or encodings[0] not in ("ascii", "binary_little_endian", "binary_big_endian"):
+    if len(encodings) != 1 or encodings[0] not in (
+        "ascii",
+        "binary_little_endian",
+        "binary_big_endian",
+    ):
         raise Illegal("format")
     for _, _, properties in elements:
         if len({entry[0] for entry in properties}) < len(properties):
@@ -154,11 +184,13 @@ def _ply_property(words: list[str]) -> tuple[str, str, str]:
     raise Illegal("property")
 
 
-# ---- OBJ -----------------------------------------------------------------------------------------------------------------------
+# ---- OBJ -----------------------------------------------------------------------------------------
 
 
 def obj_triangles(data: bytes) -> np.ndarray:
-    """The corners (F, 3, 3) of an OBJ's faces, polygons cut into fans; raises where a line of v or f isn't one."""
+    """The corners (F, 3, 3) of an OBJ's faces, polygons cut into fans; raises where a line of v or
+    f isn't one.
+    """
     vertices, triangles = [], []
     for line in data.decode("utf-8", errors="replace").replace("\\\n", " ").split("\n"):
         words = line.split("#")[0].split()
@@ -168,7 +200,9 @@ def obj_triangles(data: bytes) -> np.ndarray:
             triangles += _fan([_index(word, len(vertices)) for word in words[1:]])
     if any(index >= len(vertices) for triangle in triangles for index in triangle):
         raise Illegal("a face names a vertex that isn't there")
-    return np.array(vertices, np.float64).reshape(-1, 3)[np.array(triangles, np.int64).reshape(-1, 3)]
+    return np.array(vertices, np.float64).reshape(-1, 3)[
+        np.array(triangles, np.int64).reshape(-1, 3)
+    ]
 
 
 def _coordinates(words: list[str]) -> list[float]:
@@ -191,7 +225,7 @@ def _fan(corners: list[int]) -> list[tuple[int, int, int]]:
     return [(corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1)]
 
 
-# ---- NPY, SPZ, checkpoints ---------------------------------------------------------------------------------------------------------------
+# ---- NPY, SPZ, checkpoints -----------------------------------------------------------------------
 
 
 def npy_array(data: bytes) -> np.ndarray:
@@ -201,12 +235,26 @@ def npy_array(data: bytes) -> np.ndarray:
     width = 2 if data[6] == 1 else 4
     size = int.from_bytes(data[8 : 8 + width], "little")
     try:
-        header = ast.literal_eval(data[8 + width : 8 + width + size].decode("utf-8" if data[6] == 3 else "latin-1").strip())
+        header = ast.literal_eval(
+            data[8 + width : 8 + width + size]
+            .decode("utf-8" if data[6] == 3 else "latin-1")
+            .strip()
+        )
         dtype, shape = np.dtype(header["descr"]), tuple(header["shape"])
-    except (ValueError, SyntaxError, TypeError, KeyError, UnicodeDecodeError, MemoryError, RecursionError) as error:
+    except (
+        ValueError,
+        SyntaxError,
+        TypeError,
+        KeyError,
+        UnicodeDecodeError,
+        MemoryError,
+        RecursionError,
+    ) as error:
         raise Illegal("header") from error
     body = data[8 + width + size :]
-    if dtype.hasobject or any(not isinstance(n, int) or isinstance(n, bool) or n < 0 for n in shape):
+    if dtype.hasobject or any(
+        not isinstance(n, int) or isinstance(n, bool) or n < 0 for n in shape
+    ):
         raise Illegal("type or shape")
     count = 1
     for n in shape:
@@ -229,22 +277,29 @@ def gunzipped(data: bytes) -> bytes:
 
 
 def checked_archive(data: bytes) -> None:
-    """A zip archive all of whose checksums hold: our own of the whole file where it has one, and those of its members."""
-    if data[-71:-64] == b"sha256:" and hashlib.sha256(data[:-64]).hexdigest().encode() != data[-64:]:
+    """A zip archive all of whose checksums hold: our own of the whole file where it has one, and
+    those of its members.
+    """
+    if (
+        data[-71:-64] == b"sha256:"
+        and hashlib.sha256(data[:-64]).hexdigest().encode() != data[-64:]
+    ):
         raise Illegal("checksum of the file")
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         if archive.testzip() is not None:
             raise Illegal("checksum of a member")
 
 
-# ---- GLB -----------------------------------------------------------------------------------------------------------------------
+# ---- GLB -----------------------------------------------------------------------------------------
 
 GLTF_TYPES = {5121: "u1", 5123: "u2", 5125: "u4", 5126: "f4"}
 SIMPLE = {"POSITION", "NORMAL", "TEXCOORD_0", "COLOR_0"}
 
 
 def glb_triangles(data: bytes) -> Optional[np.ndarray]:
-    """The corners (F, 3, 3) in the world of a GLB (glTF 2.0) of plain triangles; None for what is more than this reader knows."""
+    """The corners (F, 3, 3) in the world of a GLB (glTF 2.0) of plain triangles; None for what is
+    more than this reader knows.
+    """
     document, binary = _glb_chunks(data)
     try:
         scene = document["scenes"][document.get("scene", 0)]
@@ -269,7 +324,9 @@ def _placed(document: dict, binary: bytes, node: int, above: np.ndarray, depth: 
     if depth > 20 or {"rotation", "scale", "translation", "skin", "camera"} & entry.keys():
         raise KeyError("not known here")
     here = above @ np.array(entry.get("matrix", np.eye(4)), np.float64).reshape(4, 4).T
-    parts = [_placed(document, binary, child, here, depth + 1) for child in entry.get("children", [])]
+    parts = [
+        _placed(document, binary, child, here, depth + 1) for child in entry.get("children", [])
+    ]
     if "mesh" in entry:
         for primitive in document["meshes"][entry["mesh"]]["primitives"]:
             corners = _primitive(document, binary, primitive)
@@ -285,11 +342,19 @@ def _primitive(document: dict, binary: bytes, primitive: dict) -> np.ndarray:
     return positions.astype(np.float64)[indices.reshape(-1, 3)]
 
 
-def _accessor(document: dict, binary: bytes, number: int, kind: str, types: tuple[str, ...]) -> np.ndarray:
+def _accessor(
+    document: dict, binary: bytes, number: int, kind: str, types: tuple[str, ...]
+) -> np.ndarray:
     entry = document["accessors"][number]
     view = document["bufferViews"][entry["bufferView"]]
     own = GLTF_TYPES[entry["componentType"]]
-    if entry["type"] != kind or own not in types or "byteStride" in view or "sparse" in entry or view.get("buffer") != 0:
+    if (
+        entry["type"] != kind
+        or own not in types
+        or "byteStride" in view
+        or "sparse" in entry
+        or view.get("buffer") != 0
+    ):
         raise KeyError("not known here")
     width, start = 3 if kind == "VEC3" else 1, view.get("byteOffset", 0)
     part = binary[start : start + view["byteLength"]]

@@ -1,7 +1,8 @@
-"""Random lives of a cloud: optimiser steps, statistics, densification, pruning and resuming in any order, with hostile numbers.
+"""Random lives of a cloud: optimiser steps, statistics, densification, pruning and resuming in any
+order, with hostile numbers.
 
-Every Gaussian carries an id in its colour and in its rows of the optimiser, so that a row that goes astray is seen.
-"""
+Every Gaussian carries an id in its colour and in its rows of the optimiser, so that a row that goes
+astray is seen."""
 
 from typing import Any
 
@@ -31,19 +32,38 @@ class CloudLife(RuleBasedStateMachine):
     steps = 0
     """Rules that were run, in all lives."""
 
-    @initialize(count=st.integers(1, 90), floor=st.sampled_from(FLOORS), cap=st.sampled_from(CAPS), seed=SEEDS)
+    @initialize(
+        count=st.integers(1, 90),
+        floor=st.sampled_from(FLOORS),
+        cap=st.sampled_from(CAPS),
+        seed=SEEDS,
+    )
     def start(self, count: int, floor: int, cap: int, seed: int) -> None:
         self.g = torch.Generator().manual_seed(seed)
-        self.cloud = GaussianCloud({"min_gaussians": floor, "max_gaussians": cap, "densify": {"enabled": True, "start": 0, "stop": 10}})
-        shapes = {"means": (count, 3), "log_scales": (count, 3), "quats": (count, 4), "logit_opacities": (count,), "sh": (count, 1, 3)}
-        self.cloud.set_arrays(**{name: torch.randn(shape, generator=self.g) for name, shape in shapes.items()})
+        self.cloud = GaussianCloud(
+            {
+                "min_gaussians": floor,
+                "max_gaussians": cap,
+                "densify": {"enabled": True, "start": 0, "stop": 10},
+            }
+        )
+        shapes = {
+            "means": (count, 3),
+            "log_scales": (count, 3),
+            "quats": (count, 4),
+            "logit_opacities": (count,),
+            "sh": (count, 1, 3),
+        }
+        self.cloud.set_arrays(
+            **{name: torch.randn(shape, generator=self.g) for name, shape in shapes.items()}
+        )
         self.optimizer = torch.optim.Adam(self.cloud.parameter_groups(), lr=0.0)
         self.next_id, self.changes = 1, []
         self.step(seed)
         self._mark(torch.ones(count, dtype=torch.bool))
         self._record_changes()
 
-    # -- what happens --------------------------------------------------------------------------------------------------------
+    # -- what happens ------------------------------------------------------------------------------
 
     @rule(seed=SEEDS)
     def step(self, seed: int) -> None:
@@ -64,13 +84,19 @@ class CloudLife(RuleBasedStateMachine):
         CloudLife.steps += 1
         g, n = torch.Generator().manual_seed(seed), len(self.cloud)
         means2d = torch.zeros(views, n, 2, requires_grad=True)
-        means2d.grad = torch.randn(views, n, 2, generator=g) * 10.0 ** torch.randint(-8, 3, (views, n, 1), generator=g)
+        means2d.grad = torch.randn(views, n, 2, generator=g) * 10.0 ** torch.randint(
+            -8, 3, (views, n, 1), generator=g
+        )
         if bad:
-            means2d.grad[torch.rand(views, n, generator=g) < 0.2] = torch.tensor([float("nan"), float("inf")])
+            means2d.grad[torch.rand(views, n, generator=g) < 0.2] = torch.tensor(
+                [float("nan"), float("inf")]
+            )
         seen = (torch.rand(views, n, generator=g) < 0.7).float()
         contribution = torch.rand(views, n, generator=g).mul(4).round() / 4 * seen
         nothing = torch.zeros(views, 1, 1, 1)
-        self.cloud.observe(Rasterized(nothing, nothing, nothing, means2d, seen * 3, contribution), 64, 64)
+        self.cloud.observe(
+            Rasterized(nothing, nothing, nothing, means2d, seen * 3, contribution), 64, 64
+        )
 
     @rule(
         seed=SEEDS, threshold=st.sampled_from([0.0, 1e-6, 1e-3, 1e9]), split=st.sampled_from([1e-12, 0.05, 1e6]),
@@ -78,11 +104,19 @@ class CloudLife(RuleBasedStateMachine):
     )  # fmt: skip
     def densify(self, seed: int, threshold: float, split: float, faint: float, huge: float) -> None:
         self.see(seed, bad=seed % 4 == 0, views=1)
-        options = {"grad_threshold": threshold, "split_scale": split, "min_opacity": faint, "max_scale": huge, "every": 1}
+        options = {
+            "grad_threshold": threshold,
+            "split_scale": split,
+            "min_opacity": faint,
+            "max_scale": huge,
+            "every": 1,
+        }
         self._round(budget=None, densify=options)
 
     @rule(
-        budget=st.sampled_from([64, 65, 80, 400]), keep=st.floats(0.01, 0.99), score=st.sampled_from(["contribution", "opacity", "random"])
+        budget=st.sampled_from([64, 65, 80, 400]),
+        keep=st.floats(0.01, 0.99),
+        score=st.sampled_from(["contribution", "opacity", "random"]),
     )
     def prune(self, budget: int, keep: float, score: str) -> None:
         self._round(budget=budget, prune={"keep": keep, "score": score})
@@ -90,27 +124,40 @@ class CloudLife(RuleBasedStateMachine):
     @rule(keep=st.floats(0.01, 0.99), answers=st.integers(0, 255))
     def prune_as_far_as_it_holds(self, keep: float, answers: int) -> None:
         asked = iter(range(10_000))
-        self._round(budget="auto", prune={"keep": keep}, holds=lambda kept: bool(answers >> next(asked) % 8 & 1))
+        self._round(
+            budget="auto",
+            prune={"keep": keep},
+            holds=lambda kept: bool(answers >> next(asked) % 8 & 1),
+        )
 
     @rule(seed=SEEDS, budget=st.sampled_from([64, 70, "auto"]))
     def densify_and_prune(self, seed: int, budget: Any) -> None:
         self.see(seed, bad=False, views=2)
         self._round(budget=budget, densify={"grad_threshold": 0.0, "every": 1}, prune={"keep": 0.5})
 
-    @rule(name=st.sampled_from(sorted(HOSTILE)), which=st.integers(0, 10), share=st.floats(0, 1), seed=SEEDS)
+    @rule(
+        name=st.sampled_from(sorted(HOSTILE)),
+        which=st.integers(0, 10),
+        share=st.floats(0, 1),
+        seed=SEEDS,
+    )
     def poison(self, name: str, which: int, share: float, seed: int) -> None:
         """Numbers that are finite, and no more."""
         CloudLife.steps += 1
         values, g = getattr(self.cloud, name), torch.Generator().manual_seed(seed)
         with torch.no_grad():
-            values[torch.rand(values.shape, generator=g) < share] = HOSTILE[name][which % len(HOSTILE[name])]
+            values[torch.rand(values.shape, generator=g) < share] = HOSTILE[name][
+                which % len(HOSTILE[name])
+            ]
 
     @rule()
     def resume(self) -> None:
         """As from a checkpoint: another cloud, another optimiser, the same numbers."""
         CloudLife.steps += 1
         other = GaussianCloud(self.cloud.cfg)
-        other.load_state_dict({key: value.clone() for key, value in self.cloud.state_dict().items()})
+        other.load_state_dict(
+            {key: value.clone() for key, value in self.cloud.state_dict().items()}
+        )
         optimizer = torch.optim.Adam(other.parameter_groups(), lr=0.0)
         optimizer.load_state_dict(self.optimizer.state_dict())
         self.cloud, self.optimizer = other, optimizer
@@ -123,7 +170,7 @@ class CloudLife(RuleBasedStateMachine):
         require_picture(self.cloud)
         self.optimizer.zero_grad()
 
-    # -- what holds ----------------------------------------------------------------------------------------------------------
+    # -- what holds --------------------------------------------------------------------------------
 
     @invariant()
     def everything_fits(self) -> None:
@@ -131,10 +178,18 @@ class CloudLife(RuleBasedStateMachine):
         assert all(len(value) == n for value in parameters.values())
         assert all(getattr(self.cloud, name).shape == (n,) for name in STATISTICS)
         assert all(getattr(self.cloud, name).isfinite().all() for name in STATISTICS)
-        assert all(value.isfinite().all() for value in parameters.values()), "a parameter isn't finite"
+        assert all(value.isfinite().all() for value in parameters.values()), (
+            "a parameter isn't finite"
+        )
         held = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
-        mine = [value for value in parameters.values() if value.numel() or value is not self.cloud.sh_rest]
-        assert [id(value) for value in held] == [id(value) for value in mine], "the optimiser holds stale tensors"
+        mine = [
+            value
+            for value in parameters.values()
+            if value.numel() or value is not self.cloud.sh_rest
+        ]
+        assert [id(value) for value in held] == [id(value) for value in mine], (
+            "the optimiser holds stale tensors"
+        )
         assert {id(value) for value in self.optimizer.state} <= {id(value) for value in held}
 
     @invariant()
@@ -143,13 +198,24 @@ class CloudLife(RuleBasedStateMachine):
         assert len(ids.unique()) == len(ids), "two Gaussians with the same id"
         for value, state in self.optimizer.state.items():
             assert state["exp_avg"].shape == value.shape == state["exp_avg_sq"].shape
-            assert (state["exp_avg"].reshape(len(ids), -1) == ids[:, None]).all(), "a row of moments went astray"
+            assert (state["exp_avg"].reshape(len(ids), -1) == ids[:, None]).all(), (
+                "a row of moments went astray"
+            )
 
-    def _round(self, *, budget: Any, densify: dict | None = None, prune: dict | None = None, holds: Any = None) -> None:
+    def _round(
+        self,
+        *,
+        budget: Any,
+        densify: dict | None = None,
+        prune: dict | None = None,
+        holds: Any = None,
+    ) -> None:
         """One round of densification or pruning, or of both, and its bounds."""
         CloudLife.steps += 1
         cfg, before = self.cloud.cfg, len(self.cloud)
-        old = {name: value.detach().clone() for name, value in self.cloud.parameters_by_name().items()}
+        old = {
+            name: value.detach().clone() for name, value in self.cloud.parameters_by_name().items()
+        }
         cfg.budget, cfg.densify.enabled = budget, densify is not None
         for section, options in ((cfg.densify, densify), (cfg.prune, prune)):
             for key, value in (options or {}).items():
@@ -158,7 +224,9 @@ class CloudLife(RuleBasedStateMachine):
         self.changes.clear()
         self.cloud.after_step(self.optimizer, 5, holds)
         assert min(before, cfg.min_gaussians) <= len(self.cloud), "below the floor"
-        assert len(self.cloud) <= (before if densify is None else cfg.max_gaussians), "above the cap"
+        assert len(self.cloud) <= (before if densify is None else cfg.max_gaussians), (
+            "above the cap"
+        )
         for change in self.changes:
             self._check_change(change, old)
 
@@ -167,9 +235,13 @@ class CloudLife(RuleBasedStateMachine):
         stays = ~change.fresh
         assert (change.parents[stays].diff() > 0).all(), "the order changed"
         for name, value in self.cloud.parameters_by_name().items():
-            assert torch.equal(value.detach()[stays], old[name][change.parents[stays]]), f"{name} of a Gaussian that stays changed"
+            assert torch.equal(value.detach()[stays], old[name][change.parents[stays]]), (
+                f"{name} of a Gaussian that stays changed"
+            )
         for state in self.optimizer.state.values():
-            assert (state["exp_avg"][change.fresh] == 0).all() and (state["exp_avg_sq"][change.fresh] == 0).all()
+            assert (state["exp_avg"][change.fresh] == 0).all() and (
+                state["exp_avg_sq"][change.fresh] == 0
+            ).all()
         self._mark(change.fresh)
 
     def _record_changes(self) -> None:

@@ -1,8 +1,9 @@
-"""The doors through which somebody else's bytes come in: for each, good files, how to damage them, and what must hold.
+"""The doors through which somebody else's bytes come in: for each, good files, how to damage them,
+and what must hold.
 
-``exercise`` takes a damaged file through the product as far as a picture. It returns when the file was read, raises UserError when
-it was refused in one clear message, and :class:`Misread` when what was read isn't what the file says. Anything else is a crash.
-"""
+``exercise`` takes a damaged file through the product as far as a picture. It returns when the file
+was read, raises UserError when it was refused in one clear message, and :class:`Misread` when what
+was read isn't what the file says. Anything else is a crash."""
 
 import contextlib
 import io
@@ -56,7 +57,8 @@ class Target(NamedTuple):
     mutators: list[Mutator] = BINARY
     packing: Optional[Packing] = None
     traced: bool = True
-    """Whether memory is watched, which makes Python slow; of configurations the values are counted."""
+    """Whether memory is watched, which makes Python slow; of configurations the values are counted.
+    """
 
 
 def mutant(name: str, seed: int, index: int) -> bytes:
@@ -78,7 +80,7 @@ def require(holds: bool, problem: str) -> None:
         raise Misread(problem)
 
 
-# ---- pictures ------------------------------------------------------------------------------------------------------------------
+# ---- pictures ------------------------------------------------------------------------------------
 
 EYE = torch.eye(4)[None].clone()
 EYE[:, 2, 3] = 3.0
@@ -86,12 +88,35 @@ FOCAL = torch.tensor([[[12.0, 0, 6], [0, 12, 6], [0, 0, 1]]])
 
 
 def require_picture(geometry: GaussianCloud) -> None:
-    """No pixel and no gradient of a cloud is NaN; gradients may overflow where a colour is beyond any picture."""
+    """No pixel and no gradient of a cloud is NaN; gradients may overflow where a colour is beyond
+    any picture.
+    """
     colors = geometry.colors(torch.tensor([[0.0, 0, -3]]))
-    out = rasterize(geometry.means, geometry.quats, geometry.scales(), geometry.opacities(), colors, EYE, FOCAL, 12, 12)
-    require(bool(out.image.isfinite().all() and out.alpha.isfinite().all() and out.depth.isfinite().all()), "a pixel isn't finite")
+    out = rasterize(
+        geometry.means,
+        geometry.quats,
+        geometry.scales(),
+        geometry.opacities(),
+        colors,
+        EYE,
+        FOCAL,
+        12,
+        12,
+    )
+    require(
+        bool(
+            out.image.isfinite().all() and out.alpha.isfinite().all() and out.depth.isfinite().all()
+        ),
+        "a pixel isn't finite",
+    )
     out.image.clamp(-10, 10).sum().backward()
-    require(bool(torch.nan_to_num(geometry.sh0.detach()).abs().max() > 1e10 or geometry.means.grad.isfinite().all()), "gradient")
+    require(
+        bool(
+            torch.nan_to_num(geometry.sh0.detach()).abs().max() > 1e10
+            or geometry.means.grad.isfinite().all()
+        ),
+        "gradient",
+    )
 
 
 def cloud_of(arrays: ply.GaussianArrays) -> GaussianCloud:
@@ -104,17 +129,28 @@ def require_points(cloud: PointCloud) -> None:
     """What every prior promises."""
     shapes = {np.shape(cloud.points), np.shape(cloud.colors), (len(cloud.points), 3)}
     require(len(shapes) == 1 and len(cloud.points) > 0, f"shapes {shapes}")
-    require(bool(np.isfinite(cloud.points).all() and np.isfinite(cloud.colors).all()), "points or colours aren't finite")
-    require(bool((cloud.colors >= 0).all() and (cloud.colors <= 1).all()), "colours outside of [0, 1]")
+    require(
+        bool(np.isfinite(cloud.points).all() and np.isfinite(cloud.colors).all()),
+        "points or colours aren't finite",
+    )
+    require(
+        bool((cloud.colors >= 0).all() and (cloud.colors <= 1).all()), "colours outside of [0, 1]"
+    )
     if cloud.faces is not None and len(cloud.faces):
-        require(0 <= cloud.faces.min() and cloud.faces.max() < len(cloud.points), "a face names a point that isn't there")
+        require(
+            0 <= cloud.faces.min() and cloud.faces.max() < len(cloud.points),
+            "a face names a point that isn't there",
+        )
 
 
 def same(ours: np.ndarray, theirs: np.ndarray, what: str) -> None:
     """Equal to the bit as float32, NaN like NaN."""
     with np.errstate(over="ignore", invalid="ignore"):
         ours, theirs = np.asarray(ours, np.float32), np.asarray(theirs).astype(np.float32)
-    require(ours.shape == theirs.shape and np.array_equal(ours, theirs, equal_nan=True), f"{what} aren't what the file says")
+    require(
+        ours.shape == theirs.shape and np.array_equal(ours, theirs, equal_nan=True),
+        f"{what} aren't what the file says",
+    )
 
 
 def strictly(read: Callable[[bytes], Any], path: Path) -> Any:
@@ -139,7 +175,7 @@ def messages() -> Iterator[list[str]]:
         logger.removeHandler(handler)
 
 
-# ---- PLY -----------------------------------------------------------------------------------------------------------------------
+# ---- PLY -----------------------------------------------------------------------------------------
 
 
 def some_gaussians(count: int, degree: int, seed: int = 0) -> ply.GaussianArrays:
@@ -149,33 +185,74 @@ def some_gaussians(count: int, degree: int, seed: int = 0) -> ply.GaussianArrays
     return arrays._replace(log_scales=arrays.log_scales - 2)
 
 
-def ply_bytes(columns: dict[str, tuple[str, np.ndarray]], encoding: str, faces: bool = False) -> bytes:
+def ply_bytes(
+    columns: dict[str, tuple[str, np.ndarray]], encoding: str, faces: bool = False
+) -> bytes:
     """A PLY of any encoding, with an element of lists before the vertices if asked for."""
     order = ply.BYTE_ORDERS[encoding]
     count = len(next(iter(columns.values()))[1])
     lines = ["ply", f"format {encoding} 1.0", "comment made for fuzzing"]
-    lines += ["element face 2", "property list uchar int vertex_indices", "property float area"] if faces else []
-    lines += [f"element vertex {count}", *(f"property {kind} {name}" for name, (kind, _) in columns.items()), "end_header"]
-    rows = np.empty(count, [(name, (order or "<") + ply.NUMBER_TYPES[kind]) for name, (kind, _) in columns.items()])
+    lines += (
+        ["element face 2", "property list uchar int vertex_indices", "property float area"]
+        if faces
+        else []
+    )
+    lines += [
+        f"element vertex {count}",
+        *(f"property {kind} {name}" for name, (kind, _) in columns.items()),
+        "end_header",
+    ]
+    rows = np.empty(
+        count,
+        [(name, (order or "<") + ply.NUMBER_TYPES[kind]) for name, (kind, _) in columns.items()],
+    )
     for name, (_, values) in columns.items():
         rows[name] = values
     if encoding == "ascii":
         body = b"3 0 1 2 0.5\n4 0 1 2 3 0.25\n" if faces else b""
-        body += b"".join(b" ".join(b"%.9g" % value for value in row) + b"\n" for row in rows.tolist())
+        body += b"".join(
+            b" ".join(b"%.9g" % value for value in row) + b"\n" for row in rows.tolist()
+        )
     else:
         face = np.dtype([("n", "u1"), ("v", order + "i4", 3), ("area", order + "f4")])
-        body = (np.array([(3, [0, 1, 2], 0.5)] * 2, face).tobytes() if faces else b"") + rows.tobytes()
+        body = (
+            np.array([(3, [0, 1, 2], 0.5)] * 2, face).tobytes() if faces else b""
+        ) + rows.tobytes()
     return ("\n".join(lines) + "\n").encode() + body
 
 
 def gaussian_plys() -> list[bytes]:
     seeds = []
-    for encoding, degree, faces in (("ascii", 0, False), ("binary_little_endian", 1, True), ("binary_big_endian", 0, False)):
+    for encoding, degree, faces in (
+        ("ascii", 0, False),
+        ("binary_little_endian", 1, True),
+        ("binary_big_endian", 0, False),
+    ):
         arrays = some_gaussians(12, degree)
         rest = arrays.sh[:, 1:].transpose(0, 2, 1).reshape(12, -1)
-        values = [arrays.means, arrays.sh[:, 0], rest, arrays.logit_opacities[:, None], arrays.log_scales, arrays.quats]
-        names = [*ply.MEANS, *ply.SH_CONSTANT, *(f"f_rest_{i}" for i in range(rest.shape[1])), "opacity", *ply.LOG_SCALES, *ply.QUATS]
-        columns = dict(zip(names, (("float", column) for column in np.concatenate(values, axis=1).T), strict=True))
+        values = [
+            arrays.means,
+            arrays.sh[:, 0],
+            rest,
+            arrays.logit_opacities[:, None],
+            arrays.log_scales,
+            arrays.quats,
+        ]
+        names = [
+            *ply.MEANS,
+            *ply.SH_CONSTANT,
+            *(f"f_rest_{i}" for i in range(rest.shape[1])),
+            "opacity",
+            *ply.LOG_SCALES,
+            *ply.QUATS,
+        ]
+        columns = dict(
+            zip(
+                names,
+                (("float", column) for column in np.concatenate(values, axis=1).T),
+                strict=True,
+            )
+        )
         seeds.append(ply_bytes(columns, encoding, faces))
     return seeds
 
@@ -183,11 +260,21 @@ def gaussian_plys() -> list[bytes]:
 def point_plys() -> list[bytes]:
     rng = np.random.default_rng(1)
     places = {name: ("float", rng.normal(size=20)) for name in "xyz"}
-    bytes_, shorts = ({name: (kind, rng.integers(0, 255, 20)) for name in ("red", "green", "blue")} for kind in ("uchar", "ushort"))
+    bytes_, shorts = (
+        {name: (kind, rng.integers(0, 255, 20)) for name in ("red", "green", "blue")}
+        for kind in ("uchar", "ushort")
+    )
     floats = {name: ("double", rng.random(20)) for name in ("red", "green", "blue")}
     normals = {name: ("float", np.full(20, 0.577)) for name in ("nx", "ny", "nz")}
-    seeds = [ply_bytes(places | bytes_, "ascii"), ply_bytes(places | normals | bytes_, "binary_little_endian", faces=True)]
-    return [*seeds, ply_bytes(places | shorts, "binary_big_endian"), ply_bytes(places | floats, "ascii", faces=True)]
+    seeds = [
+        ply_bytes(places | bytes_, "ascii"),
+        ply_bytes(places | normals | bytes_, "binary_little_endian", faces=True),
+    ]
+    return [
+        *seeds,
+        ply_bytes(places | shorts, "binary_big_endian"),
+        ply_bytes(places | floats, "ascii", faces=True),
+    ]
 
 
 def exercise_gaussians_ply(path: Path) -> None:
@@ -196,11 +283,19 @@ def exercise_gaussians_ply(path: Path) -> None:
     truth = strictly(oracles.ply_vertices, path)
     require(not truth.leftover or bool(said), "more follows than the header announces, in silence")
     columns = truth.columns
-    rest = [columns[f"f_rest_{i}"] for i in range(sum(name.startswith("f_rest_") for name in columns))]
+    rest = [
+        columns[f"f_rest_{i}"] for i in range(sum(name.startswith("f_rest_") for name in columns))
+    ]
     sh = np.stack([columns[name] for name in ply.SH_CONSTANT], 1)[:, None]
     if rest:
-        sh = np.concatenate([sh, np.stack(rest, 1).reshape(truth.count, 3, -1).transpose(0, 2, 1)], 1)
-    for values, names in ((arrays.means, ply.MEANS), (arrays.log_scales, ply.LOG_SCALES), (arrays.quats, ply.QUATS)):
+        sh = np.concatenate(
+            [sh, np.stack(rest, 1).reshape(truth.count, 3, -1).transpose(0, 2, 1)], 1
+        )
+    for values, names in (
+        (arrays.means, ply.MEANS),
+        (arrays.log_scales, ply.LOG_SCALES),
+        (arrays.quats, ply.QUATS),
+    ):
         same(values, np.stack([columns[name] for name in names], 1), names[0])
     same(arrays.logit_opacities, columns["opacity"], "opacities")
     same(arrays.sh, sh, "harmonics")
@@ -215,25 +310,41 @@ def exercise_points_ply(path: Path) -> None:
     truth = strictly(oracles.ply_vertices, path)
     require(not truth.leftover or bool(said), "more follows than the header announces, in silence")
     same(cloud.points, np.stack([truth.columns[name] for name in "xyz"], 1), "points")
-    if truth.types.get("red") == "B" and {"green", "blue"} <= set(truth.columns) and "float_red" not in truth.columns:
+    if (
+        truth.types.get("red") == "B"
+        and {"green", "blue"} <= set(truth.columns)
+        and "float_red" not in truth.columns
+    ):
         colors = np.stack([truth.columns[name] for name in ("red", "green", "blue")], 1)
-        require(bool(np.allclose(cloud.colors, colors / 255, atol=1e-6, equal_nan=True)), "colours aren't what the file says")
+        require(
+            bool(np.allclose(cloud.colors, colors / 255, atol=1e-6, equal_nan=True)),
+            "colours aren't what the file says",
+        )
     require_points(PointCloudPrior({"path": str(path)})("a fox"))
 
 
-# ---- meshes --------------------------------------------------------------------------------------------------------------------
+# ---- meshes --------------------------------------------------------------------------------------
 
 
 def exercise_mesh(path: Path) -> None:
     """A prior from the vertices, one from the surface, and a picture by ray casting."""
     mesh = load_mesh(path)
-    require(bool(np.isfinite(mesh.vertices).all() and np.abs(mesh.vertices).max() < 1 + 1e-6), "vertices outside of the box")
-    require(mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices), "a face names a vertex that isn't there")
+    require(
+        bool(np.isfinite(mesh.vertices).all() and np.abs(mesh.vertices).max() < 1 + 1e-6),
+        "vertices outside of the box",
+    )
+    require(
+        mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices),
+        "a face names a vertex that isn't there",
+    )
     require_points(MeshPrior({"path": str(path)})("a fox"))
     require_points(MeshPrior({"path": str(path), "num_points": 50})("a fox"))
     c2w = np.array([[0.0, 0, 1, 3], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     image = MeshCaster(mesh).render(c2w, 0.8, 8, 8, supersample=1)
-    require(bool(np.isfinite(image).all() and image.min() >= 0 and image.max() < 1 + 1e-5), "a pixel isn't in [0, 1]")
+    require(
+        bool(np.isfinite(image).all() and image.min() >= 0 and image.max() < 1 + 1e-5),
+        "a pixel isn't in [0, 1]",
+    )
 
 
 def exercise_obj(path: Path) -> None:
@@ -254,36 +365,57 @@ def exercise_glb(path: Path) -> None:
 
 
 def require_same_surface(mesh: Any, corners: np.ndarray) -> None:
-    """The triangles that a file says, in the product's pose: y up and z in front become z up and x in front, the box is [-1, 1]."""
+    """The triangles that a file says, in the product's pose: y up and z in front become z up and x
+    in front, the box is [-1, 1].
+    """
     corners = corners[np.isfinite(corners).all(axis=(1, 2))]
-    require(len(corners) == len(mesh.faces), f"{len(mesh.faces)} faces, but the file says {len(corners)}")
+    require(
+        len(corners) == len(mesh.faces),
+        f"{len(mesh.faces)} faces, but the file says {len(corners)}",
+    )
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-    expected = ((corners - (low + high) / 2) / ((high - low).max() / 2))[..., [2, 0, 1]].mean(axis=1)
+    expected = ((corners - (low + high) / 2) / ((high - low).max() / 2))[..., [2, 0, 1]].mean(
+        axis=1
+    )
     ours = mesh.vertices[mesh.faces].mean(axis=1)
-    distance = [np.abs(np.sort(a @ axis) - np.sort(b @ axis)).max() for a, b in [(ours, expected)] for axis in np.eye(3)]
+    distance = [
+        np.abs(np.sort(a @ axis) - np.sort(b @ axis)).max()
+        for a, b in [(ours, expected)]
+        for axis in np.eye(3)
+    ]
     require(max(distance) < 1e-4, f"faces are up to {max(distance):.3g} from where the file says")
 
 
 def meshes(kind: str) -> list[bytes]:
-    """A box with a texture, with colours of the vertices, of the faces, and as two objects of a scene."""
+    """A box with a texture, with colours of the vertices, of the faces, and as two objects of a
+    scene.
+    """
     import trimesh
     from PIL import Image
 
     image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (4, 4, 3), dtype=np.uint8))
     textured, by_vertex, by_face = (trimesh.creation.box((1, 0.7, 0.5)) for _ in range(3))
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image) if kind == "glb" else None
-    textured.visual = trimesh.visual.TextureVisuals(uv=textured.vertices[:, :2] + 0.5, image=image, material=material)
+    material = (
+        trimesh.visual.material.PBRMaterial(baseColorTexture=image) if kind == "glb" else None
+    )
+    textured.visual = trimesh.visual.TextureVisuals(
+        uv=textured.vertices[:, :2] + 0.5, image=image, material=material
+    )
     by_vertex.visual.vertex_colors = np.random.default_rng(1).integers(0, 255, (8, 4))
     by_face.visual.face_colors = np.random.default_rng(2).integers(0, 255, (12, 4))
     moved = trimesh.transformations.translation_matrix([0, 2, 0])
     scene = trimesh.Scene([by_vertex])
     scene.add_geometry(textured, transform=moved)
-    sources = {"glb": [textured, by_vertex, scene], "obj": [textured, by_vertex], "ply": [by_vertex, by_face]}
+    sources = {
+        "glb": [textured, by_vertex, scene],
+        "obj": [textured, by_vertex],
+        "ply": [by_vertex, by_face],
+    }
     seeds = [source.export(file_type=kind) for source in sources.get(kind, [by_vertex])]
     return [seed.encode() if isinstance(seed, str) else seed for seed in seeds]
 
 
-# ---- checkpoints ---------------------------------------------------------------------------------------------------------------
+# ---- checkpoints ---------------------------------------------------------------------------------
 
 
 def checkpoints() -> list[bytes]:
@@ -307,15 +439,29 @@ def checkpoints() -> list[bytes]:
 
 
 def exercise_checkpoint(path: Path) -> None:
-    """Read, put into a cloud and drawn; nothing is read whose checksums don't hold, or that the file is too small for."""
+    """Read, put into a cloud and drawn; nothing is read whose checksums don't hold, or that the
+    file is too small for.
+    """
     checkpoint = load_checkpoint(path)
     strictly(oracles.checked_archive, path)
     tensors = list(_tensors(checkpoint))
-    stored = sum({t.untyped_storage().data_ptr(): t.untyped_storage().nbytes() for t in tensors}.values())
-    require(stored <= path.stat().st_size, f"{stored} bytes of tensors from a file of {path.stat().st_size}")
-    require(all(t.numel() * t.element_size() <= path.stat().st_size for t in tensors), "a tensor is larger than the file")
+    stored = sum(
+        {t.untyped_storage().data_ptr(): t.untyped_storage().nbytes() for t in tensors}.values()
+    )
+    require(
+        stored <= path.stat().st_size,
+        f"{stored} bytes of tensors from a file of {path.stat().st_size}",
+    )
+    require(
+        all(t.numel() * t.element_size() <= path.stat().st_size for t in tensors),
+        "a tensor is larger than the file",
+    )
     geometry = GaussianCloud({})
-    state = {key.removeprefix("geometry."): value for key, value in checkpoint["state_dict"].items() if key.startswith("geometry.")}
+    state = {
+        key.removeprefix("geometry."): value
+        for key, value in checkpoint["state_dict"].items()
+        if key.startswith("geometry.")
+    }
     with lightning_errors(str(path)):
         geometry.load_state_dict(state)
     if len(geometry):
@@ -330,12 +476,14 @@ def _tensors(value: Any) -> Iterator[torch.Tensor]:
             yield from _tensors(item)
 
 
-# ---- configurations and command lines ------------------------------------------------------------------------------------------
+# ---- configurations and command lines ------------------------------------------------------------
 
 
 def configurations() -> list[bytes]:
     """Those that say everything, or all but the prompt."""
-    sources = [(ROOT / "configs" / f"{name}.yaml").read_bytes() for name in ("demo", "gaussiandreamer")]
+    sources = [
+        (ROOT / "configs" / f"{name}.yaml").read_bytes() for name in ("demo", "gaussiandreamer")
+    ]
     return [source.replace(b"???", b'"a fox: red"') for source in sources]
 
 
@@ -358,7 +506,8 @@ COMMANDS = [
     "--config\ndemo.yaml\n--train\n--gpu\ncpu\ntrainer.max_steps=1200\nsystem.prompt_processor.prompt=a fox: red, 1984\nseed=3\ntag=t",
     "--config\ndemo.yaml\n--config\ndemo-draft.yaml\n--export\nresume=outputs/demo/x/ckpts/last.ckpt\nsystem.geometry.prior_type=random-prior\n"
     "data.elevation_range=[-10,60]\nsystem.geometry.densify={enabled: true, start: 9, stop: 99}",
-    "--config\ngaussiandreamer\n--test\n--verbose\nsystem.prompt_processor.prompt=1984\nname=a b\nuse_timestamp=false\n"
+    "--config\ngaussiandreamer\n--test\n--verbose\nsystem.prompt_processor.prompt=1984\nname=a "
+    "b\nuse_timestamp=false\n"
     "system.guidance.max_step_percent=[0,0.98,0.5,500]\n"
     "system.geometry.lr_means=1e-4\nsystem.exporter.formats=[ply,points]\ncheckpoint.save_last=true\ndata.batch_size=${seed}\nseed=2",
 ]
@@ -377,13 +526,18 @@ def exercise_command(path: Path) -> None:
         os.environ.update(environ)
     require(code in (0, 2), f"exit code {code}")
     if code == 2:
-        require(sum("error: " in line for line in err.getvalue().splitlines()) >= 1, "exit code 2 without a message")
+        require(
+            sum("error: " in line for line in err.getvalue().splitlines()) >= 1,
+            "exit code 2 without a message",
+        )
         raise UserError(err.getvalue())
 
 
 @contextlib.contextmanager
 def no_work() -> Iterator[None]:
-    """Runs end where the work would begin, and leave the process's logging and warnings as they were."""
+    """Runs end where the work would begin, and leave the process's logging and warnings as they
+    were.
+    """
     run, logger = Trial.run, logging.getLogger("threestudio_gaussiandreamer")
     handlers, propagate, level = list(logger.handlers), logger.propagate, logger.level
     Trial.run = lambda self: 0
@@ -396,7 +550,7 @@ def no_work() -> Iterator[None]:
         logger.setLevel(level)
 
 
-# ---- arrays, text, SPZ ---------------------------------------------------------------------------------------------------------
+# ---- arrays, text, SPZ ---------------------------------------------------------------------------
 
 
 def _saved(save: Callable, *arguments: Any, **named: Any) -> bytes:
@@ -410,21 +564,41 @@ ROWS = np.random.default_rng(1).random((15, 6))
 
 
 def motion_archives() -> list[bytes]:
-    named = {"motion": MOTION, "text": np.array(["a walk", "ein Sprung ü"]), "lengths": np.array([5, 3])}
-    return [_saved(np.savez, **named), _saved(np.savez_compressed, **named), _saved(np.save, MOTION)]
+    named = {
+        "motion": MOTION,
+        "text": np.array(["a walk", "ein Sprung ü"]),
+        "lengths": np.array([5, 3]),
+    }
+    return [
+        _saved(np.savez, **named),
+        _saved(np.savez_compressed, **named),
+        _saved(np.save, MOTION),
+    ]
 
 
 def exercise_motions(path: Path) -> None:
     motions = read_motions(str(path))
     samples, frames, joints, three = motions.positions.shape
     require(joints in (22, 24) and three == 3 and len(motions.lengths) == samples, "shapes")
-    require(all(np.isfinite(p[:n]).all() and 0 < n <= frames for p, n in zip(motions.positions, motions.lengths, strict=True)), "frames")
+    require(
+        all(
+            np.isfinite(p[:n]).all() and 0 < n <= frames
+            for p, n in zip(motions.positions, motions.lengths, strict=True)
+        ),
+        "frames",
+    )
     if path.read_bytes()[:6] == b"\x93NUMPY":
-        require(strictly(oracles.npy_array, path).size == motions.positions.size, "numbers are missing")
+        require(
+            strictly(oracles.npy_array, path).size == motions.positions.size, "numbers are missing"
+        )
 
 
 def point_archives() -> list[bytes]:
-    named = {"points": ROWS[:, :3], "colors": (255 * ROWS[:, 3:]).astype(np.uint8), "normals": ROWS[:, :3].astype(np.float32)}
+    named = {
+        "points": ROWS[:, :3],
+        "colors": (255 * ROWS[:, 3:]).astype(np.uint8),
+        "normals": ROWS[:, :3].astype(np.float32),
+    }
     return [_saved(np.savez, **named), _saved(np.savez_compressed, **named)]
 
 
@@ -437,19 +611,29 @@ def exercise_npy_points(path: Path) -> None:
     require_points(cloud)
     rows = strictly(oracles.npy_array, path)
     with np.errstate(over="ignore", invalid="ignore"):
-        usable = np.isfinite(rows[:, :3].astype(np.float32)).all(axis=1) if rows.dtype.kind in "fiu" else np.zeros(0)
+        usable = (
+            np.isfinite(rows[:, :3].astype(np.float32)).all(axis=1)
+            if rows.dtype.kind in "fiu"
+            else np.zeros(0)
+        )
     require(len(cloud.points) <= len(usable) <= 1.06 * len(cloud.points) + 1, "rows are missing")
 
 
 def texts() -> list[bytes]:
     points = b"\n".join(b" ".join(b"%.6f" % value for value in row[:3]) for row in ROWS)
     colored = b"\n".join(b",".join(b"%.6f" % value for value in row) for row in ROWS)
-    scan = b"15\n" + b"\n".join(b"%.4f %.4f %.4f 12 %d %d %d" % (*row[:3], *(255 * row[3:]).astype(int)) for row in ROWS)
+    scan = b"15\n" + b"\n".join(
+        b"%.4f %.4f %.4f 12 %d %d %d" % (*row[:3], *(255 * row[3:]).astype(int)) for row in ROWS
+    )
     return [points, b"x,y,z,r,g,b\n" + colored, scan]
 
 
 def spz_files() -> list[bytes]:
-    return [spz_bytes(some_gaussians(12, 0)), spz_bytes(some_gaussians(9, 1), comment="up: y"), spz_bytes(some_gaussians(3, 3))]
+    return [
+        spz_bytes(some_gaussians(12, 0)),
+        spz_bytes(some_gaussians(9, 1), comment="up: y"),
+        spz_bytes(some_gaussians(3, 3)),
+    ]
 
 
 def exercise_spz(path: Path) -> None:
@@ -472,10 +656,20 @@ TARGETS: dict[str, Target] = {
     "off": Target(".off", lambda: meshes("off"), exercise_mesh, TEXT),
     "checkpoint": Target(".ckpt", checkpoints, exercise_checkpoint, packing=mutations.ZIP),
     "configuration": Target(".yaml", configurations, exercise_configuration, TEXT, traced=False),
-    "command-line": Target(".txt", lambda: [command.encode() for command in COMMANDS], exercise_command, TEXT, traced=False),
+    "command-line": Target(
+        ".txt",
+        lambda: [command.encode() for command in COMMANDS],
+        exercise_command,
+        TEXT,
+        traced=False,
+    ),
     "motion": Target(".npz", motion_archives, exercise_motions, packing=mutations.ZIP),
     "points-npz": Target(".npz", point_archives, exercise_points, packing=mutations.ZIP),
-    "points-npy": Target(".npy", lambda: [_saved(np.save, ROWS), _saved(np.save, ROWS[:, :3].astype(np.float32))], exercise_npy_points),
+    "points-npy": Target(
+        ".npy",
+        lambda: [_saved(np.save, ROWS), _saved(np.save, ROWS[:, :3].astype(np.float32))],
+        exercise_npy_points,
+    ),
     "points-text": Target(".xyz", texts, exercise_points, TEXT),
     "spz": Target(".spz", spz_files, exercise_spz, packing=mutations.GZIP),
 }

@@ -1,4 +1,6 @@
-"""Damaged files at every door, a few of what `make fuzz` tries; and every one that was ever taken wrongly, kept in corpus/."""
+"""Damaged files at every door, a few of what `make fuzz` tries; and every one that was ever taken
+wrongly, kept in corpus/.
+"""
 
 import time
 from pathlib import Path
@@ -26,7 +28,9 @@ def test_damaged_files_are_read_rightly_or_refused(name):
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_good_files_are_read(name):
-    assert [judged(TARGETS[name], data) for data in seeds(name)] == [("read", "")] * len(seeds(name))
+    assert [judged(TARGETS[name], data) for data in seeds(name)] == [("read", "")] * len(
+        seeds(name)
+    )
 
 
 @pytest.mark.parametrize("path", CORPUS, ids=lambda path: f"{path.parent.name}-{path.stem}")
@@ -35,7 +39,7 @@ def test_what_was_taken_wrongly_once_is_refused(path):
     assert outcome.kind == "refused", outcome
 
 
-# ---- can it fail? --------------------------------------------------------------------------------------------------------------
+# ---- can it fail? --------------------------------------------------------------------------------
 
 
 def crash(path: Path) -> None:
@@ -63,7 +67,10 @@ def test_a_faulty_door_is_seen(door, monkeypatch):
     monkeypatch.setattr("judge.SECONDS", 0.2 if door is hang else 60)
     outcome = judged(Target(".bin", list, door), b"0123")
     assert outcome.kind == "failed"
-    assert outcome.detail.split(":")[0] == {crash: "crash", hang: "hang", misread: "misread", believe: "memory"}[door]
+    assert (
+        outcome.detail.split(":")[0]
+        == {crash: "crash", hang: "hang", misread: "misread", believe: "memory"}[door]
+    )
 
 
 def test_a_refusal_is_none():
@@ -76,6 +83,9 @@ def test_a_refusal_is_none():
 @pytest.mark.parametrize("mutators", [BINARY, TEXT])
 def test_mutants_are_repeatable_and_differ(mutators):
     data = [b"element vertex 12\nproperty float x\n" * 5]
-    ours, again = ([mutant(data, np.random.default_rng(i), mutators, None) for i in range(200)] for _ in range(2))
+    ours, again = (
+        [mutant(data, np.random.default_rng(i), mutators, None) for i in range(200)]
+        for _ in range(2)
+    )
     assert ours == again
     assert len(set(ours)) > 150 and data[0] not in ours[:20]

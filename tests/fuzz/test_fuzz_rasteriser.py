@@ -5,7 +5,17 @@ import functools
 import pytest
 import torch
 from backends import BACKENDS, cuda_on_the_host, each_backend
-from hostile import Drawn, Scene, disagreement, disagreement_on, draw, fault, fault_of, hostile_scene, well_posed
+from hostile import (
+    Drawn,
+    Scene,
+    disagreement,
+    disagreement_on,
+    draw,
+    fault,
+    fault_of,
+    hostile_scene,
+    well_posed,
+)
 
 SCENES, MOST = range(12), 600
 ORDINARY = 8
@@ -33,7 +43,9 @@ def test_backends_agree_on_what_is_well_posed():
     parts = {seed: well_posed(scene(seed)) for seed in SCENES}
     faults = {seed: disagreement_on(part, BACKENDS) for seed, part in parts.items()}
     assert not any(faults.values()), faults
-    assert sum(len(part.cloud.means) for part in parts.values()) > 500, "too little is well-posed to compare anything"
+    assert sum(len(part.cloud.means) for part in parts.values()) > 500, (
+        "too little is well-posed to compare anything"
+    )
 
 
 def test_scenes_hold_what_they_promise():
@@ -51,7 +63,9 @@ def test_scenes_hold_what_they_promise():
         assert any(holds(cloud) for cloud in clouds)
 
 
-@pytest.mark.parametrize("name, value", [("image", float("nan")), ("alpha", 1.5), ("depth", float("inf"))])
+@pytest.mark.parametrize(
+    "name, value", [("image", float("nan")), ("alpha", 1.5), ("depth", float("inf"))]
+)
 def test_a_wrong_picture_is_seen(name, value):
     drawn = draw(scene(ORDINARY), "torch")
     wrong = getattr(drawn.out, name).detach().clone()

@@ -29,7 +29,9 @@ def test_no_life_breaks_a_cloud():
 
 
 def test_a_split_beyond_floats_is_found(monkeypatch):
-    """As it was: a Gaussian of infinite size has its children infinitely far away, and the floor keeps them."""
+    """As it was: a Gaussian of infinite size has its children infinitely far away, and the floor
+    keeps them.
+    """
     monkeypatch.setattr(densify, "LOG_SCALE_RANGE", (-1e30, 1e30))
     with pytest.raises(AssertionError, match="isn't finite"):
         live(200, phases=[Phase.generate])
@@ -37,7 +39,9 @@ def test_a_split_beyond_floats_is_found(monkeypatch):
 
 def test_moments_that_go_astray_are_found(monkeypatch):
     def rows(value, old, change):
-        return value[change.parents.roll(1)] if getattr(value, "shape", None) == old.shape else value
+        return (
+            value[change.parents.roll(1)] if getattr(value, "shape", None) == old.shape else value
+        )
 
     monkeypatch.setattr(densify, "_rows", rows)
     with pytest.raises(AssertionError):

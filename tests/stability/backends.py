@@ -1,4 +1,6 @@
-"""Which backends draw here: those of this machine, and the CUDA kernels on a stand-in for a GPU where they can be compiled for it."""
+"""Which backends draw here: those of this machine, and the CUDA kernels on a stand-in for a GPU
+where they can be compiled for it.
+"""
 
 import pytest
 import torch
@@ -8,16 +10,22 @@ from threestudio_gaussiandreamer.splatting import api, available_backends
 from threestudio_gaussiandreamer.splatting.cuda import backend as cuda
 from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver
 
-BACKENDS = [name for name, reason in available_backends().items() if reason is None and name != "cuda"]
+BACKENDS = [
+    name for name, reason in available_backends().items() if reason is None and name != "cuda"
+]
 if unavailable() is None:
     BACKENDS.append("cuda")
 each_backend = pytest.mark.parametrize("backend", BACKENDS)
 
 
 def cuda_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lets the backend "cuda" draw tensors of the CPU, its kernels run thread by thread (test_splatting_cuda.py)."""
+    """Lets the backend "cuda" draw tensors of the CPU, its kernels run thread by thread
+    (test_splatting_cuda.py).
+    """
     machine = HostMachine()
-    monkeypatch.setitem(api.BACKENDS, "cuda", api.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,)))
+    monkeypatch.setitem(
+        api.BACKENDS, "cuda", api.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,))
+    )
     monkeypatch.setattr(cuda_driver, "unavailable", lambda: None)
     monkeypatch.setattr(cuda_driver, "machine", lambda device: machine)
     monkeypatch.setattr(cuda, "_demands", {})

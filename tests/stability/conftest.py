@@ -22,17 +22,30 @@ class Measured:
         self.properties = properties
 
     def __call__(
-        self, value: Any, unit: str = "", *, what: str = "", at_most: Optional[float] = None, at_least: Optional[float] = None
+        self,
+        value: Any,
+        unit: str = "",
+        *,
+        what: str = "",
+        at_most: Optional[float] = None,
+        at_least: Optional[float] = None,
     ) -> None:
-        """Record a number (of ``what``, in ``unit``) and assert its bound, or record a few words that were asserted before.
+        """Record a number (of ``what``, in ``unit``) and assert its bound, or record a few words
+        that were asserted before.
 
-        Of several values of the same ``what`` the report shows the worst: the smallest if it must be ``at_least``, else the largest.
-        """
+        Of several values of the same ``what`` the report shows the worst: the smallest if it must
+        be ``at_least``, else the largest."""
         worst = "min" if at_least is not None else "max"
         value = value if isinstance(value, str) else float(getattr(value, "item", lambda: value)())
-        self.properties.append(("measured", {"value": value, "unit": unit, "what": what, "worst": worst}))
-        assert at_most is None or value <= at_most, f"{what or 'measured'} {value} {unit} > {at_most}"
-        assert at_least is None or value >= at_least, f"{what or 'measured'} {value} {unit} < {at_least}"
+        self.properties.append(
+            ("measured", {"value": value, "unit": unit, "what": what, "worst": worst})
+        )
+        assert at_most is None or value <= at_most, (
+            f"{what or 'measured'} {value} {unit} > {at_most}"
+        )
+        assert at_least is None or value >= at_least, (
+            f"{what or 'measured'} {value} {unit} < {at_least}"
+        )
 
 
 @pytest.fixture(autouse=True)
@@ -48,7 +61,9 @@ def measured(request) -> Measured:
 
 @pytest.fixture
 def said() -> Iterator[list[str]]:
-    """What the package says to the user, from the beginning of the test on; also where the launcher has its own handler."""
+    """What the package says to the user, from the beginning of the test on; also where the launcher
+    has its own handler.
+    """
     messages: list[str] = []
     listener, logger = logging.Handler(), logging.getLogger("threestudio_gaussiandreamer")
     listener.emit = lambda record: messages.append(record.getMessage())
@@ -62,11 +77,12 @@ def said() -> Iterator[list[str]]:
 
 @pytest.fixture
 def fault(request):
-    """``fault(deviation, ours=..., emulation=..., at_most=...)``: ours holds the bar, and the fault in our own words breaks it.
+    """``fault(deviation, ours=..., emulation=..., at_most=...)``: ours holds the bar, and the fault
+    in our own words breaks it.
 
-    ``deviation`` is a function of an implementation; ``at_least`` instead of ``at_most`` where more is better; ``raises`` names
-    the exception of an emulation that crashes instead of giving a wrong number.
-    """
+    ``deviation`` is a function of an implementation; ``at_least`` instead of ``at_most`` where more
+    is better; ``raises`` names the exception of an emulation that crashes instead of giving a wrong
+    number."""
 
     def hold(
         deviation: Callable[[Any], float],
@@ -84,17 +100,23 @@ def fault(request):
         with pytest.raises(raises) as caught:
             emulated(deviation(emulation), unit, **bound)
         crashed = {"value": caught.type.__name__, "unit": "", "what": "", "worst": "max"}
-        request.node.user_properties.append(("emulation", emulated.properties[0][1] if emulated.properties else crashed))
+        request.node.user_properties.append(
+            ("emulation", emulated.properties[0][1] if emulated.properties else crashed)
+        )
 
     return hold
 
 
 def pytest_addoption(parser) -> None:
-    parser.addoption("--stability-report", metavar="FILE", type=Path, help="write what the rows measured as JSON")
+    parser.addoption(
+        "--stability-report", metavar="FILE", type=Path, help="write what the rows measured as JSON"
+    )
 
 
 def pytest_configure(config) -> None:
-    config.addinivalue_line("markers", "stability(group, name, bar): the row of the stability tables that a test is")
+    config.addinivalue_line(
+        "markers", "stability(group, name, bar): the row of the stability tables that a test is"
+    )
     config.stash[REPORT] = []
 
 
@@ -109,7 +131,13 @@ def _describe(item: pytest.Item, group: str, name: str, bar: Optional[str]) -> d
     reason = inspect.getdoc(item.function) or ""
     if bar and not reason:
         raise pytest.UsageError(f"{item.nodeid}: a changed bar needs a docstring that proves it")
-    return {**ROWS[group, name]._asdict(), "changed_bar": bar, "reason": reason, "file": item.path.name, "test": item.originalname}
+    return {
+        **ROWS[group, name]._asdict(),
+        "changed_bar": bar,
+        "reason": reason,
+        "file": item.path.name,
+        "test": item.originalname,
+    }
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -117,14 +145,20 @@ def pytest_runtest_makereport(item):
     report = (yield).get_result()
     properties = dict(item.user_properties)
     if report.when == "call" and "row" in properties:
-        values = {kind: [_plain(x) for key, x in item.user_properties if key == kind] for kind in ("measured", "emulation")}
+        values = {
+            kind: [_plain(x) for key, x in item.user_properties if key == kind]
+            for kind in ("measured", "emulation")
+        }
         item.config.stash[REPORT].append({**properties["row"], "outcome": report.outcome, **values})
 
 
 def _plain(entry: dict) -> dict:
     """JSON knows neither infinity nor NaN."""
     value = entry["value"]
-    return {**entry, "value": value if isinstance(value, str) or math.isfinite(value) else str(value)}
+    return {
+        **entry,
+        "value": value if isinstance(value, str) or math.isfinite(value) else str(value),
+    }
 
 
 def pytest_sessionfinish(session) -> None:

@@ -1,4 +1,5 @@
-"""Turns what the rows measured (``pytest tests/stability --stability-report FILE``) into docs/stability.md.
+"""Turns what the rows measured (``pytest tests/stability --stability-report FILE``) into
+docs/stability.md.
 
 python tests/stability/report.py FILE docs/stability.md
 """
@@ -28,12 +29,20 @@ against the same formula in float64 unless a test says otherwise.
 def main(source: str, target: str) -> None:
     results = json.loads(Path(source).read_text())
     by_row = {key: [x for x in results if (x["group"], x["name"]) == key] for key in ROWS}
-    parts = [INTRO, summary(by_row), *(section(group, by_row) for group in GROUPS), cost_of_guards()]
+    parts = [
+        INTRO,
+        summary(by_row),
+        *(section(group, by_row) for group in GROUPS),
+        cost_of_guards(),
+    ]
     Path(target).write_text("\n".join(parts))
 
 
 def summary(by_row: dict[tuple[str, str], list[dict]]) -> str:
-    held = sum(bool(tests) and all(test["outcome"] == "passed" for test in tests) for tests in by_row.values())
+    held = sum(
+        bool(tests) and all(test["outcome"] == "passed" for test in tests)
+        for tests in by_row.values()
+    )
     counts = [f"{len(by_row)} rows, {held} hold"]
     absent = [f"{group} {name}" for (group, name), tests in by_row.items() if not tests]
     if absent:
@@ -44,13 +53,33 @@ def summary(by_row: dict[tuple[str, str], list[dict]]) -> str:
 def section(group: str, by_row: dict[tuple[str, str], list[dict]]) -> str:
     rows = [row for row in ROWS.values() if row.group == group]
     faults = group == "A0"
-    heads = ["Row", "Bar", "Measured", *(["Emulated fault"] if faults else []), "Test", "What the peers do"]
+    heads = [
+        "Row",
+        "Bar",
+        "Measured",
+        *(["Emulated fault"] if faults else []),
+        "Test",
+        "What the peers do",
+    ]
     lines = [f"## {group} {GROUPS[group]}", "", table_line(heads), table_line(["---"] * len(heads))]
     for row in rows:
         tests = by_row[group, row.name]
         changed = " *(changed, see below)*" if any(test["changed_bar"] for test in tests) else ""
-        cells = [f"**{row.name}** {row.title}" if row.title else row.name, row.bar + changed, outcome(tests)]
-        lines.append(table_line([*cells, *([worst_of(tests, "emulation")] if faults else []), places(tests), row.peers]))
+        cells = [
+            f"**{row.name}** {row.title}" if row.title else row.name,
+            row.bar + changed,
+            outcome(tests),
+        ]
+        lines.append(
+            table_line(
+                [
+                    *cells,
+                    *([worst_of(tests, "emulation")] if faults else []),
+                    places(tests),
+                    row.peers,
+                ]
+            )
+        )
     return "\n".join([*lines, "", *changed_bars(rows, by_row)])
 
 
@@ -71,7 +100,9 @@ def worst_of(tests: list[dict], kind: str) -> str:
     groups: dict[tuple, list] = {}
     for entry in (entry for test in tests for entry in test[kind]):
         words = isinstance(entry["value"], str)
-        groups.setdefault((entry["what"], entry["unit"], entry["worst"], entry["value"] if words else ""), []).append(entry["value"])
+        groups.setdefault(
+            (entry["what"], entry["unit"], entry["worst"], entry["value"] if words else ""), []
+        ).append(entry["value"])
     texts = []
     for (what, unit, worst, words), values in groups.items():
         value = words or f"{min(values) if worst == 'min' else max(values):.3g}"
@@ -85,12 +116,20 @@ def places(tests: list[dict]) -> str:
 
 
 def changed_bars(rows: list[Row], by_row: dict[tuple[str, str], list[dict]]) -> list[str]:
-    """Where a bar couldn't be right: the one that a test holds instead, and the proof, its docstring."""
-    changed = {(row.name, test["test"]): test for row in rows for test in by_row[row.group, row.name] if test["changed_bar"]}
+    """Where a bar couldn't be right: the one that a test holds instead, and the proof, its
+    docstring.
+    """
+    changed = {
+        (row.name, test["test"]): test
+        for row in rows
+        for test in by_row[row.group, row.name]
+        if test["changed_bar"]
+    }
     if not changed:
         return []
     items = [
-        f"* {name} (`{test}`): **{entry['changed_bar']}**. {' '.join(entry['reason'].split())}" for (name, test), entry in changed.items()
+        f"* {name} (`{test}`): **{entry['changed_bar']}**. {' '.join(entry['reason'].split())}"
+        for (name, test), entry in changed.items()
     ]
     return ["Bars that were changed, and why:", "", *items, ""]
 
@@ -98,10 +137,22 @@ def changed_bars(rows: list[Row], by_row: dict[tuple[str, str], list[dict]]) -> 
 def cost_of_guards() -> str:
     """The figures of ``benchmarks/bench_guards.py``, which times what no test may."""
     rows = list(csv.DictReader(GUARDS.open()))
-    where = "{gaussians} Gaussians, {views} views of {size} x {size} pixels, {threads} threads".format(**rows[0])
-    lines = ["## What the guards cost", "", f"Measured by `benchmarks/bench_guards.py`: {where}. The bar is 2 %.", ""]
+    where = (
+        "{gaussians} Gaussians, {views} views of {size} x {size} pixels, {threads} threads".format(
+            **rows[0]
+        )
+    )
+    lines = [
+        "## What the guards cost",
+        "",
+        f"Measured by `benchmarks/bench_guards.py`: {where}. The bar is 2 %.",
+        "",
+    ]
     lines += [table_line(["Guard", "ms", "of ms", "%"]), table_line(["---"] * 4)]
-    figures = [(row["guard"], *(f"{float(row[key]):.3g}" for key in ("guard_ms", "whole_ms", "percent"))) for row in rows]
+    figures = [
+        (row["guard"], *(f"{float(row[key]):.3g}" for key in ("guard_ms", "whole_ms", "percent")))
+        for row in rows
+    ]
     return "\n".join([*lines, *(table_line(cells) for cells in figures), ""])
 
 

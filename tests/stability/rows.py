@@ -1,8 +1,9 @@
-"""Every way to fail that a test here provokes: its name, the bar that ours is held to, and what the peers do.
+"""Every way to fail that a test here provokes: its name, the bar that ours is held to, and what the
+peers do.
 
-Groups: A0 faults found in the peers' own code, A1 rasteriser, A2 geometry and first cloud, A3 densification, A4 score distillation,
-A5 runs. A test says which row it is with `row`; `test_all_rows.py` fails while a row has none.
-"""
+Groups: A0 faults found in the peers' own code, A1 rasteriser, A2 geometry and first cloud, A3
+densification, A4 score distillation, A5 runs. A test says which row it is with `row`;
+`test_all_rows.py` fails while a row has none."""
 
 import difflib
 from typing import NamedTuple, Optional
@@ -20,9 +21,13 @@ class Row(NamedTuple):
 
 
 def row(group: str, name: str, *, bar: Optional[str] = None) -> pytest.MarkDecorator:
-    """Marks a test as the one (or one of several) of a row; a ``bar`` of its own needs a docstring that proves it."""
+    """Marks a test as the one (or one of several) of a row; a ``bar`` of its own needs a docstring
+    that proves it.
+    """
     if (group, name) not in ROWS:
-        near = difflib.get_close_matches(name, [other for place, other in ROWS if place == group], n=3, cutoff=0.3)
+        near = difflib.get_close_matches(
+            name, [other for place, other in ROWS if place == group], n=3, cutoff=0.3
+        )
         raise KeyError(f"group {group} has no row {name!r}; near: {near}")
     return pytest.mark.stability(group, name, bar)
 
@@ -85,7 +90,12 @@ FAULTS = [
         "the count is right beyond 2^31, or a named error",
         "`rasterizer_impl.cu:280`; fvdb-core #708; graphdeco #108",
     ),
-    ("F9", "fewer than 4 points: infinite first scale", "finite scales for 1, 2 and 3 points", "simple-knn `simple_knn.cu:154,182`"),
+    (
+        "F9",
+        "fewer than 4 points: infinite first scale",
+        "finite scales for 1, 2 and 3 points",
+        "simple-knn `simple_knn.cu:154,182`",
+    ),
     (
         "F10",
         "no gradient through depth; opacity is a depth",
@@ -110,14 +120,24 @@ FAULTS = [
         "clone, split, prune of 1 Gaussian keep (M, 3)",
         "`gaussian_model.py:406`, both ports",
     ),
-    ("F14", "no grown point survives: concatenate raises", "returns the given points", "`add_points` in all ports"),
+    (
+        "F14",
+        "no grown point survives: concatenate raises",
+        "returns the given points",
+        "`add_points` in all ports",
+    ),
     (
         "F15",
         "growth depends on the unit and explodes for flat priors",
         "accepted share within 1 % from 1e-3 to 1e3; count <= cap",
         "`GaussianDreamer.py:168,180`",
     ),
-    ("F16", "growing reseeds the process", "the process's generators are untouched", "`GaussianDreamer.py:166`"),
+    (
+        "F16",
+        "growing reseeds the process",
+        "the process's generators are untouched",
+        "`GaussianDreamer.py:166`",
+    ),
     (
         "F17",
         "one field of view for both axes",
@@ -130,29 +150,54 @@ FAULTS = [
         "trajectory equal to that without densification, bit for bit",
         "both ports `training_step`; graphdeco PR #828",
     ),
-    ("F19", "a negative loss is never back-propagated", "the gradient of a negative loss arrives", "`gaussian_mvdream.py:113,156`"),
+    (
+        "F19",
+        "a negative loss is never back-propagated",
+        "the gradient of a negative loss arrives",
+        "`gaussian_mvdream.py:113,156`",
+    ),
     (
         "F20",
         "dead configuration key",
         "every learning rate in the config reaches the optimiser",
         "threestudio-gaussiandreamer `gaussian_base.py:222,541`",
     ),
-    ("F21", "cap by lottery", "what contributes least goes first, exactly to the cap", "`gaussian_base.py:871`"),
+    (
+        "F21",
+        "cap by lottery",
+        "what contributes least goes first, exactly to the cap",
+        "`gaussian_base.py:871`",
+    ),
     (
         "F22",
         "broken score becomes zero in silence",
         "bad items masked and counted; a named error after 10 steps",
         "threestudio `stable_diffusion_guidance.py:418`",
     ),
-    ("F23", "timestep 1000 of 1000; empty range", "1 <= t <= 999; a named error for min > max", "`stable_diffusion_guidance.py:403`"),
+    (
+        "F23",
+        "timestep 1000 of 1000; empty range",
+        "1 <= t <= 999; a named error for min > max",
+        "`stable_diffusion_guidance.py:403`",
+    ),
     (
         "F24",
         "guidance 100 is 101 elsewhere",
         "eps_u + s (eps_c - eps_u) exactly; s = 1 is no guidance",
         "`stable_diffusion_guidance.py:249`",
     ),
-    ("F25", "paper and released code disagree", "each preset holds its own numbers", "GaussianDreamer `arguments/__init__.py:73`"),
-    ("F26", "no near clip, unstable order", "behind the camera: no pixel; equal depths: by index", "OpenSplat `gsplat_cpu.cpp:71,153,157`"),
+    (
+        "F25",
+        "paper and released code disagree",
+        "each preset holds its own numbers",
+        "GaussianDreamer `arguments/__init__.py:73`",
+    ),
+    (
+        "F26",
+        "no near clip, unstable order",
+        "behind the camera: no pixel; equal depths: by index",
+        "OpenSplat `gsplat_cpu.cpp:71,153,157`",
+    ),
     (
         "F27",
         "one image size, crashes on a Gaussian behind the camera",
@@ -165,7 +210,8 @@ OTHERS = {
     "A1": [
         (
             "At/behind near plane; centred on the camera (z=0)",
-            "culled set = {z <= near, not finite}; all finite; culled gradients exactly 0; same bits as without",
+            "culled set = {z <= near, not finite}; all finite; culled gradients exactly 0; "
+            "same bits as without",
             "graphdeco culls z <= 0.2; gsplat z < near; OpenSplat nothing (F26)",
         ),
         (
@@ -183,7 +229,11 @@ OTHERS = {
             "float32 keeps float64's visible set",
             "graphdeco `== 0`; OpenSplat clamps 1e-6; torch-splatting `inverse()`",
         ),
-        ("Zero/denormal quaternion", "identity, gradient 0 below 1e-12; no NaN; q, -q, 5q the same picture", "gsplat: NaN (F7)"),
+        (
+            "Zero/denormal quaternion",
+            "identity, gradient 0 below 1e-12; no NaN; q, -q, 5q the same picture",
+            "gsplat: NaN (F7)",
+        ),
         (
             "Opacity -> 0 and -> 1",
             "finite; below alpha_min exactly nothing; logits loaded into [-15, 15]",
@@ -194,9 +244,21 @@ OTHERS = {
             "interior rel 1e-5; flips <= 0.1 % of pixels; jump <= alpha_min",
             "gsplat excludes a boundary band (c927d96c); graphdeco F3",
         ),
-        ("Fog: thousands of faint Gaussians on a pixel", "accurate >= 60 dB on fog(2000); bound N alpha_min", "graphdeco, gsplat: 15.2 dB"),
-        ("Early stop", "error <= 1e-4", "graphdeco `forward.cu:347`, gsplat: the crossing Gaussian is lost (F4)"),
-        ("Thousands overlapping one pixel", "gradients rel <= 1e-4", "T recovered by division; gsplat floors it at 1e-6"),
+        (
+            "Fog: thousands of faint Gaussians on a pixel",
+            "accurate >= 60 dB on fog(2000); bound N alpha_min",
+            "graphdeco, gsplat: 15.2 dB",
+        ),
+        (
+            "Early stop",
+            "error <= 1e-4",
+            "graphdeco `forward.cu:347`, gsplat: the crossing Gaussian is lost (F4)",
+        ),
+        (
+            "Thousands overlapping one pixel",
+            "gradients rel <= 1e-4",
+            "T recovered by division; gsplat floors it at 1e-6",
+        ),
         (
             "Coincident depths",
             "order (depth, index); same bits over 10 runs and 1/2/4/8 threads",
@@ -213,10 +275,26 @@ OTHERS = {
             "crop of a larger render to 1e-6; circle's axes within 0.5 px",
             "GaussianDreamer's fork: square only (F17); torch-splatting 256 only (F27)",
         ),
-        ("int32 overflow", "int64 total right; named error above a memory budget", "gsplat since ffa6d951, a5316070; fvdb-core #708 (F8)"),
-        ("autocast / fp16 / bf16 inputs", "float32, identical to the float32 call", "ports switch autocast off or call `.float()`"),
-        ("NaN/Inf inputs", "named error with count and index, or others bit-identical; cost <= 2 % of forward", "undefined (F6)"),
-        ("Gradient check", "gradcheck float64; float32 rel L2 <= 1e-4, cos >= 0.99999", "gsplat: rtol 1e-4..1.65e-2 with bands"),
+        (
+            "int32 overflow",
+            "int64 total right; named error above a memory budget",
+            "gsplat since ffa6d951, a5316070; fvdb-core #708 (F8)",
+        ),
+        (
+            "autocast / fp16 / bf16 inputs",
+            "float32, identical to the float32 call",
+            "ports switch autocast off or call `.float()`",
+        ),
+        (
+            "NaN/Inf inputs",
+            "named error with count and index, or others bit-identical; cost <= 2 % of forward",
+            "undefined (F6)",
+        ),
+        (
+            "Gradient check",
+            "gradcheck float64; float32 rel L2 <= 1e-4, cos >= 0.99999",
+            "gsplat: rtol 1e-4..1.65e-2 with bands",
+        ),
         (
             "Determinism of reductions",
             "bit-identical over 10 runs and 1/2/4/8 threads",
@@ -227,7 +305,11 @@ OTHERS = {
             "energy drift <= 5 % over 16x; >= 10 dB better than classic",
             "gsplat PR #117, #140, 421f7698",
         ),
-        ("Popping", "jump <= a1 a2 |c1 - c2|; one frame only", "StopThePop sorts per pixel, +4 % time"),
+        (
+            "Popping",
+            "jump <= a1 a2 |c1 - c2|; one frame only",
+            "StopThePop sorts per pixel, +4 % time",
+        ),
     ],
     "A2": [
         (
@@ -237,22 +319,46 @@ OTHERS = {
         ),
         ("Isolated point: huge scale", "scale <= 10 x the 99th percentile; flagged", "none"),
         ("N<4", "finite; a fraction of the bounding radius", "infinite (F9)"),
-        ("Empty mesh, zero faces, one vertex", "named error, exit code 2, nothing half-written", "crash"),
+        (
+            "Empty mesh, zero faces, one vertex",
+            "named error, exit code 2, nothing half-written",
+            "crash",
+        ),
         ("NaN/Inf vertices, NaN colours", "dropped and counted, or an error above 5 %", "silent"),
         ("No colours", "grey 0.5 and the perturbation, said in the log", "KeyError"),
-        ("Units and pose", "accepted share within 1 %; same picture within 50 dB after normalisation", "fixed 0.01 (F15)"),
-        ("Flat, needle, point bbox", "count <= cap; a flat prior grows a slab", "1 M duplicates (F15)"),
+        (
+            "Units and pose",
+            "accepted share within 1 %; same picture within 50 dB after normalisation",
+            "fixed 0.01 (F15)",
+        ),
+        (
+            "Flat, needle, point bbox",
+            "count <= cap; a flat prior grows a slab",
+            "1 M duplicates (F15)",
+        ),
         ("No grown point", "the given vertices alone", "crash (F14)"),
         (
             "Non-manifold, duplicate faces, degenerate triangles",
             "zero-area faces ignored; KS uniformity p > 0.01",
             "open3d: zero-area faces give NaN weights",
         ),
-        ("Colour perturbation", "in [0, 1]; zero-mean is an option", "ports: mean + 0.1, up to 1.2"),
+        (
+            "Colour perturbation",
+            "in [0, 1]; zero-mean is an option",
+            "ports: mean + 0.1, up to 1.2",
+        ),
     ],
     "A3": [
-        ("Explosion", "cap exact at every step; lowest contribution first", "loss scale F11; MCMC caps +5 % per 100 steps; lottery F21"),
-        ("Collapse to 0", "floor of 64 kept; warned; exit 0", "graphdeco #472, #482; RaySplatting #4; LightGaussian #27"),
+        (
+            "Explosion",
+            "cap exact at every step; lowest contribution first",
+            "loss scale F11; MCMC caps +5 % per 100 steps; lottery F21",
+        ),
+        (
+            "Collapse to 0",
+            "floor of 64 kept; warned; exit 0",
+            "graphdeco #472, #482; RaySplatting #4; LightGaussian #27",
+        ),
         ("N=1 squeeze", "shapes right for N = 1..3", "crash (F13)"),
         (
             "Optimiser state mismatch",
@@ -266,9 +372,21 @@ OTHERS = {
             "F11; pixels in one, NDC in another",
         ),
         ("Saturated 0/0", "never seen: not selected, not NaN", "`grads.isnan() = 0`"),
-        ("Opacity reset", "recovers within 0.5 dB in 200 steps, or off by default", "off in both ports; wipes the asset under SDS"),
-        ("Densify x resume", "final cloud's hash equals the uninterrupted run's", "statistics not saved (F12)"),
-        ("MCMC relocation with no live Gaussian / all-zero opacity", "handled", "gsplat's `multinomial` raises"),
+        (
+            "Opacity reset",
+            "recovers within 0.5 dB in 200 steps, or off by default",
+            "off in both ports; wipes the asset under SDS",
+        ),
+        (
+            "Densify x resume",
+            "final cloud's hash equals the uninterrupted run's",
+            "statistics not saved (F12)",
+        ),
+        (
+            "MCMC relocation with no live Gaussian / all-zero opacity",
+            "handled",
+            "gsplat's `multinomial` raises",
+        ),
     ],
     "A4": [
         (
@@ -286,9 +404,17 @@ OTHERS = {
             "none < anneal < clip in dB; share out of gamut reported",
             "NFSD; MVDream rescale; Debiasing 2303.15413",
         ),
-        ("Clip schedule", "exact values; bad lists rejected when parsed", "threestudio `C()`: divides by zero when end == start"),
+        (
+            "Clip schedule",
+            "exact values; bad lists rejected when parsed",
+            "threestudio `C()`: divides by zero when end == start",
+        ),
         ("t edges", "clamped to [1, T - 1]; named error for min > max", "F23"),
-        ("Janus", "multi-face rate: prior <= 5 %, random >= 50 %, over 5 seeds", "the paper's own ablation"),
+        (
+            "Janus",
+            "multi-face rate: prior <= 5 %, random >= 50 %, over 5 seeds",
+            "the paper's own ablation",
+        ),
         (
             "Colour drift, background shortcut",
             "alpha error mean <= 0.02; PSNR spread over 3 backgrounds <= 1 dB",
@@ -300,7 +426,11 @@ OTHERS = {
             "look-at degenerates at 90 degrees",
         ),
         ("Empty view in a batch", "the step succeeds", "TypeError in both systems"),
-        ("Resume mid-schedule", "identical continuation", "threestudio special-cases `_resumed_eval`"),
+        (
+            "Resume mid-schedule",
+            "identical continuation",
+            "threestudio special-cases `_resumed_eval`",
+        ),
         (
             "RNG",
             "stop/resume anywhere equals uninterrupted, bit for bit; validation changes nothing",
@@ -308,17 +438,41 @@ OTHERS = {
         ),
     ],
     "A5": [
-        ("Crash mid checkpoint", "always a loadable last or previous", "Lightning #688, #19970, #1150"),
-        ("Disk full, read-only", "named error, exit != 0, earlier file untouched, no temporary left", "Lightning #21800: success reported"),
-        ("Corrupted checkpoint", "checksum mismatch with path; never a partial load; fallback only with `resume=auto`", "-"),
+        (
+            "Crash mid checkpoint",
+            "always a loadable last or previous",
+            "Lightning #688, #19970, #1150",
+        ),
+        (
+            "Disk full, read-only",
+            "named error, exit != 0, earlier file untouched, no temporary left",
+            "Lightning #21800: success reported",
+        ),
+        (
+            "Corrupted checkpoint",
+            "checksum mismatch with path; never a partial load; fallback only with `resume=auto`",
+            "-",
+        ),
         (
             "Corrupted/foreign PLY",
             "clean error or correct load; no allocation beyond the file",
             "plyfile tracebacks; UnityGS #179, #159; supersplat #41; splatapult #3",
         ),
-        ("Wrong config keys", "rejected with a suggestion; every accepted key is read", "dicts are free in OmegaConf; F20"),
-        ("Prompt as path / YAML", "under the root; slug <= 64 bytes and a hash; always text", "threestudio #417"),
-        ("Ctrl-C / SIGTERM", "checkpoint written; exit 130/143; resume identical", "Lightning goes on to `test`"),
+        (
+            "Wrong config keys",
+            "rejected with a suggestion; every accepted key is read",
+            "dicts are free in OmegaConf; F20",
+        ),
+        (
+            "Prompt as path / YAML",
+            "under the root; slug <= 64 bytes and a hash; always text",
+            "threestudio #417",
+        ),
+        (
+            "Ctrl-C / SIGTERM",
+            "checkpoint written; exit 130/143; resume identical",
+            "Lightning goes on to `test`",
+        ),
         (
             "Hub offline",
             "fails < 5 s with what to place where; offline guidance needs no network",
@@ -334,5 +488,7 @@ OTHERS = {
 }
 
 ROWS = {("A0", name): Row("A0", name, *rest) for name, *rest in FAULTS} | {
-    (group, name): Row(group, name, "", *rest) for group, rows in OTHERS.items() for name, *rest in rows
+    (group, name): Row(group, name, "", *rest)
+    for group, rows in OTHERS.items()
+    for name, *rest in rows
 }

@@ -1,4 +1,6 @@
-"""Small scenes, and pictures of them by the textbook: what truths and emulated faults are written with."""
+"""Small scenes, and pictures of them by the textbook: what truths and emulated faults are written
+with.
+"""
 
 import torch
 from splatting_scenes import Cloud, Run, one_gaussian
@@ -12,42 +14,64 @@ def joined(*clouds: Cloud) -> Cloud:
 def stack(opacities: list[float], **options) -> Cloud:
     """Gaussians of these opacities with the same shape in the same place."""
     one = one_gaussian(**options)
-    return Cloud(*(x.repeat(len(opacities), *[1] * (x.dim() - 1)) for x in one))._replace(opacities=torch.tensor(opacities).double())
+    return Cloud(*(x.repeat(len(opacities), *[1] * (x.dim() - 1)) for x in one))._replace(
+        opacities=torch.tensor(opacities).double()
+    )
 
 
 def finite(result: Run) -> bool:
     """Everything but the radii, which are infinite where no threshold bounds a Gaussian."""
-    return all(x.isfinite().all() for x in (*result.out._replace(radii=result.out.alpha), *result.grads.values()))
+    return all(
+        x.isfinite().all()
+        for x in (*result.out._replace(radii=result.out.alpha), *result.grads.values())
+    )
 
 
 def pixels(width: int, height: int) -> Tensor:
     """(height, width, 2) centres."""
-    return torch.stack(torch.meshgrid(torch.arange(width) + 0.5, torch.arange(height) + 0.5, indexing="xy"), -1).double()
+    return torch.stack(
+        torch.meshgrid(torch.arange(width) + 0.5, torch.arange(height) + 0.5, indexing="xy"), -1
+    ).double()
 
 
 def clamped_slope(x: Tensor, z: Tensor, limit: float) -> Tensor:
     return torch.clamp(x / z, -limit, limit)
 
 
-def clamped_alpha(mean: Tensor, scales: Tensor, width: int, focal: float, opacity: float, slope_of=clamped_slope) -> Tensor:
-    """Alpha (width, width) of a Gaussian without rotation, by J at the clamped slope and an inverse; the camera looks along z."""
+def clamped_alpha(
+    mean: Tensor, scales: Tensor, width: int, focal: float, opacity: float, slope_of=clamped_slope
+) -> Tensor:
+    """Alpha (width, width) of a Gaussian without rotation, by J at the clamped slope and an
+    inverse; the camera looks along z.
+    """
     x, y, z = mean
     slopes = [slope_of(a, z, 1.3 * 0.5 * width / focal) for a in (x, y)]
     zero = torch.zeros_like(z)
-    J = torch.stack([torch.stack([focal / z, zero, -focal / z * slopes[0]]), torch.stack([zero, focal / z, -focal / z * slopes[1]])])
+    J = torch.stack(
+        [
+            torch.stack([focal / z, zero, -focal / z * slopes[0]]),
+            torch.stack([zero, focal / z, -focal / z * slopes[1]]),
+        ]
+    )
     covariance = J @ torch.diag(scales**2) @ J.T + 0.3 * torch.eye(2, dtype=torch.float64)
     offsets = pixels(width, width) - focal * torch.stack([x, y]) / z - 0.5 * width
     return opacity * torch.exp(-0.5 * (offsets @ covariance.inverse() * offsets).sum(-1))
 
 
-def plain_image(cloud: Cloud, width: int, height: int, focal: float, visible: Tensor, order: Tensor) -> Tensor:
-    """Isotropic Gaussians one behind the other in ``order``, (height, width, 3); nothing is checked but ``visible``."""
+def plain_image(
+    cloud: Cloud, width: int, height: int, focal: float, visible: Tensor, order: Tensor
+) -> Tensor:
+    """Isotropic Gaussians one behind the other in ``order``, (height, width, 3); nothing is checked
+    but ``visible``.
+    """
     image, T = torch.zeros(height, width, 3).double(), torch.ones(height, width).double()
     for i in order.tolist():
         if visible[i]:
             x, y, z = cloud.means[i]
             variance = (focal * cloud.scales[i, 0] / z) ** 2 + 0.3
-            offsets = pixels(width, height) - torch.stack([focal * x / z + 0.5 * width, focal * y / z + 0.5 * height])
+            offsets = pixels(width, height) - torch.stack(
+                [focal * x / z + 0.5 * width, focal * y / z + 0.5 * height]
+            )
             alpha = cloud.opacities[i] * torch.exp(-0.5 * (offsets**2).sum(-1) / variance)
             image, T = image + (T * alpha)[..., None] * cloud.colors[i], T * (1 - alpha)
     return image

@@ -1,4 +1,6 @@
-"""Runs of a few steps through the launcher, in this process: what the rows about training and files are provoked in."""
+"""Runs of a few steps through the launcher, in this process: what the rows about training and files
+are provoked in.
+"""
 
 import contextlib
 import csv
@@ -29,7 +31,9 @@ SMALL = [
 
 
 class TowardsGrey(ScoreDistillation):
-    """The shared path without a score model: the gradient is w x for latents x, which are the pixels in [-1, 1]."""
+    """The shared path without a score model: the gradient is w x for latents x, which are the
+    pixels in [-1, 1].
+    """
 
     def encode(self, rgb, **batch):
         return 2 * rgb - 1
@@ -64,7 +68,10 @@ class Ended(NamedTuple):
 
     def logged(self, name: str) -> list[float]:
         """What the run logged under a name, in order."""
-        files = sorted(self.folder.glob("csv_logs/version_*/metrics.csv"), key=lambda path: int(path.parent.name.removeprefix("version_")))
+        files = sorted(
+            self.folder.glob("csv_logs/version_*/metrics.csv"),
+            key=lambda path: int(path.parent.name.removeprefix("version_")),
+        )
         rows = [row for path in files for row in csv.DictReader(open(path))]
         return [float(row[name]) for row in rows if row.get(name)]
 
@@ -75,8 +82,21 @@ def launch(folder: Path, *overrides: str, stage: str = "--train", config: Path =
     Without the prior's turntable, a picture for people that takes longer than all the rest.
     """
     out, err = io.StringIO(), io.StringIO()
-    small = [option for option in SMALL if not (other_prior(overrides) and option.startswith("system.geometry.prior."))]
-    arguments = ["--config", str(config), stage, "--gpu", "cpu", f"exp_root_dir={folder}", *small, *overrides]
+    small = [
+        option
+        for option in SMALL
+        if not (other_prior(overrides) and option.startswith("system.geometry.prior."))
+    ]
+    arguments = [
+        "--config",
+        str(config),
+        stage,
+        "--gpu",
+        "cpu",
+        f"exp_root_dir={folder}",
+        *small,
+        *overrides,
+    ]
     with (
         mock.patch.dict(os.environ),
         mock.patch("threestudio_gaussiandreamer.priors.cache.save_turntable"),
@@ -95,11 +115,17 @@ def other_prior(overrides: Sequence[str]) -> bool:
 def training_state(checkpoint: dict[str, Any]) -> dict[str, Tensor]:
     """Everything that the next step depends on: parameters, statistics, moments, and the step."""
     moments = checkpoint["optimizer_states"][0]["state"]
-    found = {f"{i}.{name}": torch.as_tensor(value) for i, state in moments.items() for name, value in state.items()}
+    found = {
+        f"{i}.{name}": torch.as_tensor(value)
+        for i, state in moments.items()
+        for name, value in state.items()
+    }
     return {**checkpoint["state_dict"], **found, "step": torch.tensor(checkpoint["global_step"])}
 
 
 def differences(a: dict[str, Any], b: dict[str, Any]) -> int:
     """How many tensors of two checkpoints' training states aren't the same to the bit."""
     one, other = training_state(a), training_state(b)
-    return len(one.keys() ^ other.keys()) + sum(not torch.equal(one[name], other[name]) for name in one.keys() & other.keys())
+    return len(one.keys() ^ other.keys()) + sum(
+        not torch.equal(one[name], other[name]) for name in one.keys() & other.keys()
+    )

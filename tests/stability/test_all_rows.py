@@ -1,4 +1,6 @@
-"""No row is left out: every one has a test, and the table holds every row of the list that it was written from."""
+"""No row is left out: every one has a test, and the table holds every row of the list that it was
+written from.
+"""
 
 import ast
 import re
@@ -13,7 +15,12 @@ FOLDER = Path(__file__).parent
 def rows_with_a_test() -> set[tuple[str, str]]:
     """(group, name) of every ``@row(group, name)`` in this folder."""
     trees = [ast.parse(path.read_text()) for path in FOLDER.glob("test_*.py")]
-    calls = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "row"]
+    calls = [
+        node
+        for tree in trees
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "row"
+    ]
     return {tuple(ast.literal_eval(argument) for argument in call.args) for call in calls}
 
 

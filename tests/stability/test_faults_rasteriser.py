@@ -1,4 +1,6 @@
-"""A0: faults of the peers' rasterisers. Each test holds ours to the bar and shows that the fault, in our own words, breaks it."""
+"""A0: faults of the peers' rasterisers. Each test holds ours to the bar and shows that the fault,
+in our own words, breaks it.
+"""
 
 import math
 
@@ -8,7 +10,15 @@ import torch
 from backends import each_backend
 from rows import row
 from scenes import clamped_alpha, clamped_slope, joined, plain_image, stack
-from splatting_scenes import NO_CUTOFFS, Cloud, cameras, front_camera, one_gaussian, psnr, random_cloud
+from splatting_scenes import (
+    NO_CUTOFFS,
+    Cloud,
+    cameras,
+    front_camera,
+    one_gaussian,
+    psnr,
+    random_cloud,
+)
 
 from threestudio_gaussiandreamer import cameras as host_cameras
 from threestudio_gaussiandreamer.gaussians.grow import nearest_distance_scales
@@ -21,11 +31,16 @@ def single(camera):
 
 
 def central_difference(f, x: float, step: float = 1e-5) -> float:
-    return (f(torch.tensor(x + step, dtype=torch.float64)) - f(torch.tensor(x - step, dtype=torch.float64))).item() / (2 * step)
+    return (
+        f(torch.tensor(x + step, dtype=torch.float64))
+        - f(torch.tensor(x - step, dtype=torch.float64))
+    ).item() / (2 * step)
 
 
 def slope_error(f, x: float, truth) -> float:
-    """How far autograd's derivative of ``f`` at ``x`` is from the finite difference of ``truth``, relative."""
+    """How far autograd's derivative of ``f`` at ``x`` is from the finite difference of ``truth``,
+    relative.
+    """
     leaf = torch.tensor(x, dtype=torch.float64).requires_grad_()
     (slope,) = torch.autograd.grad(f(leaf), leaf)
     expected = central_difference(truth, x)
@@ -35,12 +50,21 @@ def slope_error(f, x: float, truth) -> float:
 @row("A0", "F1")
 @each_backend
 def test_f1_the_clamp_of_the_jacobian_depends_on_depth(backend, fault):
-    """Twice as far out as the image; in the emulation the clamped x is a constant: lim z, without the derivative of z."""
+    """Twice as far out as the image; in the emulation the clamped x is a constant: lim z, without
+    the derivative of z.
+    """
     width, focal, scales = 32, 20.0, torch.tensor([1.5, 0.8, 0.4]).double()
 
     def by_hand(z, slope_of=clamped_slope):
         return (
-            clamped_alpha(torch.stack([x * torch.ones_like(z), 0.1 * torch.ones_like(z), z]), scales, width, focal, 0.7, slope_of)
+            clamped_alpha(
+                torch.stack([x * torch.ones_like(z), 0.1 * torch.ones_like(z), z]),
+                scales,
+                width,
+                focal,
+                0.7,
+                slope_of,
+            )
         ).sum()
 
     def constant_x(x, z, limit):
@@ -50,11 +74,21 @@ def test_f1_the_clamp_of_the_jacobian_depends_on_depth(backend, fault):
     def ours(z):
         cloud = one_gaussian(scale=tuple(scales.tolist()), opacity=0.7)
         means = torch.stack([x * torch.ones_like(z), 0.1 * torch.ones_like(z), z])[None]
-        arguments = [a.to(torch.float32) for a in (means, *cloud[1:], *front_camera(width, width, focal))]
-        return rasterize(*arguments, width, width, backend=backend, **NO_CUTOFFS).alpha.double().sum()
+        arguments = [
+            a.to(torch.float32) for a in (means, *cloud[1:], *front_camera(width, width, focal))
+        ]
+        return (
+            rasterize(*arguments, width, width, backend=backend, **NO_CUTOFFS).alpha.double().sum()
+        )
 
     x = 3.2
-    fault(lambda f: slope_error(f, 2.0, by_hand), ours=ours, emulation=lambda z: by_hand(z, constant_x), at_most=1e-4, unit="relative")
+    fault(
+        lambda f: slope_error(f, 2.0, by_hand),
+        ours=ours,
+        emulation=lambda z: by_hand(z, constant_x),
+        at_most=1e-4,
+        unit="relative",
+    )
 
 
 @row("A0", "F2")
@@ -64,7 +98,9 @@ def test_f2_no_gaussians_show_the_background(backend, fault):
 
     def ours(cloud: Cloud) -> torch.Tensor:
         leaves = cloud.to(torch.float32).leaves()
-        image = rasterize(*leaves, *single(cameras(1, 8, 6)), 8, 6, background=background, backend=backend).image
+        image = rasterize(
+            *leaves, *single(cameras(1, 8, 6)), 8, 6, background=background, backend=backend
+        ).image
         image.sum().backward()
         assert all(leaf.grad.shape == leaf.shape for leaf in leaves)
         return image
@@ -73,19 +109,29 @@ def test_f2_no_gaussians_show_the_background(backend, fault):
         image = torch.zeros(1, 6, 8, 3)
         return image if len(cloud.means) == 0 else ours(cloud)
 
-    fault(lambda draw: (draw(random_cloud(0)) - background).abs().max(), ours=ours, emulation=black_unless_there_are_some)
+    fault(
+        lambda draw: (draw(random_cloud(0)) - background).abs().max(),
+        ours=ours,
+        emulation=black_unless_there_are_some,
+    )
 
 
 @row("A0", "F3")
 @each_backend
 def test_f3_no_gradient_flows_through_the_cap(backend, fault):
-    """Opacity 0.95 under a cap of 0.5: raising it changes nothing. The emulation caps the value and lets the gradient pass."""
+    """Opacity 0.95 under a cap of 0.5: raising it changes nothing. The emulation caps the value and
+    lets the gradient pass.
+    """
     cloud = one_gaussian(scale=5.0)
 
     def ours(opacity):
         camera = single(front_camera(2, 2, 4.0))
         arguments = [x.to(torch.float32) for x in (*cloud[:3], opacity[None], cloud.colors)]
-        return rasterize(*arguments, *camera, 2, 2, alpha_max=0.5, backend=backend).alpha.double().sum()
+        return (
+            rasterize(*arguments, *camera, 2, 2, alpha_max=0.5, backend=backend)
+            .alpha.double()
+            .sum()
+        )
 
     def through_the_cap(opacity):
         alpha = opacity * torch.ones(2, 2)
@@ -106,7 +152,9 @@ def test_f4_the_gaussian_that_crosses_the_stop_counts(backend, fault):
 
     def ours(opacities):
         cloud = stack(opacities, scale=10.0).to(torch.float32)
-        return rasterize(*cloud, *single(front_camera(1, 1, 1.0)), 1, 1, backend=backend).alpha.item()
+        return rasterize(
+            *cloud, *single(front_camera(1, 1, 1.0)), 1, 1, backend=backend
+        ).alpha.item()
 
     def stops_before(opacities):
         T = 1.0
@@ -117,16 +165,26 @@ def test_f4_the_gaussian_that_crosses_the_stop_counts(backend, fault):
         return 1 - T
 
     everything = 1 - np.prod(1 - np.array(opacities))
-    fault(lambda f: abs(f(opacities) - everything), ours=ours, emulation=stops_before, at_most=1e-4, unit="of alpha")
+    fault(
+        lambda f: abs(f(opacities) - everything),
+        ours=ours,
+        emulation=stops_before,
+        at_most=1e-4,
+        unit="of alpha",
+    )
 
 
 @row("A0", "F5")
 @each_backend
 def test_f5_the_threshold_of_alpha(backend, fault):
-    """4000 Gaussians of opacity 0.1 on a sphere, as a run starts. The emulation draws with 1/255, as everyone does."""
+    """4000 Gaussians of opacity 0.1 on a sphere, as a run starts. The emulation draws with 1/255,
+    as everyone does.
+    """
     g = torch.Generator().manual_seed(0)
     means = torch.nn.functional.normalize(torch.randn(4000, 3, generator=g), dim=1)
-    cloud = random_cloud(4000, seed=1)._replace(means=means.double(), scales=torch.full((4000, 3), 0.03).double())
+    cloud = random_cloud(4000, seed=1)._replace(
+        means=means.double(), scales=torch.full((4000, 3), 0.03).double()
+    )
     cloud = cloud._replace(opacities=torch.full((4000,), 0.1).double()).to(torch.float32)
     camera = single(cameras(1, 64, 64))
 
@@ -135,14 +193,24 @@ def test_f5_the_threshold_of_alpha(backend, fault):
             return rasterize(*cloud, *camera, 64, 64, **{"backend": backend, **options}).image
 
     truth = drawn(**NO_CUTOFFS, backend="torch")
-    fault(lambda f: psnr(f(), truth), ours=drawn, emulation=lambda: drawn(alpha_min=1 / 255), at_least=55, unit="dB")
+    fault(
+        lambda f: psnr(f(), truth),
+        ours=drawn,
+        emulation=lambda: drawn(alpha_min=1 / 255),
+        at_least=55,
+        unit="dB",
+    )
 
 
 @row("A0", "F6")
 @each_backend
-@pytest.mark.parametrize("attribute, value", [("means", math.nan), ("scales", math.inf), ("opacities", math.nan)])
+@pytest.mark.parametrize(
+    "attribute, value", [("means", math.nan), ("scales", math.inf), ("opacities", math.nan)]
+)
 def test_f6_what_is_not_finite_is_culled(backend, attribute, value, fault):
-    """The emulation culls what lies before the near plane and what has no area: both comparisons are false for NaN."""
+    """The emulation culls what lies before the near plane and what has no area: both comparisons
+    are false for NaN.
+    """
     scene = random_cloud(6, seed=2)
     scene.means[:, 2] += 3
     poisoned = Cloud(*(torch.cat([x, x[:1].clone()]) for x in scene))
@@ -157,7 +225,9 @@ def test_f6_what_is_not_finite_is_culled(backend, attribute, value, fault):
     def comparisons_that_nan_passes(cloud):
         leaves = cloud.leaves()
         z, det = leaves.means[:, 2], leaves.scales[:, 0] ** 2
-        image = plain_image(leaves, 10, 8, 8.0, ~(z <= 0.2) & ~(det == 0), z.detach().argsort(stable=True))
+        image = plain_image(
+            leaves, 10, 8, 8.0, ~(z <= 0.2) & ~(det == 0), z.detach().argsort(stable=True)
+        )
         image.square().sum().backward()
         return [image.detach(), *(leaf.grad[:6] for leaf in leaves if leaf.grad is not None)]
 
@@ -171,7 +241,9 @@ def test_f6_what_is_not_finite_is_culled(backend, attribute, value, fault):
 def test_f7_a_zero_quaternion_is_no_rotation(fault):
     def divided_by_the_norm(q):
         w, x, y, z = (q * q.square().sum(-1, keepdim=True).rsqrt()).unbind(-1)
-        diagonal = torch.stack([1 - 2 * (y * y + z * z), 1 - 2 * (x * x + z * z), 1 - 2 * (x * x + y * y)], -1)
+        diagonal = torch.stack(
+            [1 - 2 * (y * y + z * z), 1 - 2 * (x * x + z * z), 1 - 2 * (x * x + y * y)], -1
+        )
         return torch.diag_embed(diagonal)
 
     def deviation(rotation):
@@ -190,14 +262,23 @@ def test_f8_tile_intersections_are_counted_in_64_bits(fault):
     n = 524_288
 
     def ours(side):
-        bounds = tiles.Bounds(torch.empty(6, 0), torch.tensor([[0], [0], [side], [side]]).expand(4, n), torch.zeros(n).long())
+        bounds = tiles.Bounds(
+            torch.empty(6, 0),
+            torch.tensor([[0], [0], [side], [side]]).expand(4, n),
+            torch.zeros(n).long(),
+        )
         return sum((last - first) * side * side for first, last in tiles.slices(bounds))
 
     def in_32_bits(side):
         with np.errstate(over="ignore"):
             return int(np.full(n, side * side, np.int32).cumsum(dtype=np.int32)[-1])
 
-    fault(lambda count: abs(count(64) / (n * 64 * 64) - 1), ours=ours, emulation=in_32_bits, unit="relative")
+    fault(
+        lambda count: abs(count(64) / (n * 64 * 64) - 1),
+        ours=ours,
+        emulation=in_32_bits,
+        unit="relative",
+    )
 
 
 @row("A0", "F9")
@@ -216,27 +297,46 @@ def test_f9_first_scales_of_very_few_points(n, fault):
         log_scales = np.log(scales_of(points))
         return (~(np.isfinite(log_scales) & (np.abs(log_scales) < 20))).sum()
 
-    fault(deviation, ours=nearest_distance_scales, emulation=three_nearest_or_the_largest_float, unit="useless scales")
+    fault(
+        deviation,
+        ours=nearest_distance_scales,
+        emulation=three_nearest_or_the_largest_float,
+        unit="useless scales",
+    )
 
 
 @row("A0", "F10")
 @each_backend
 def test_f10_depth_has_a_gradient(backend, fault):
-    """The derivative of the rendered depth by the Gaussian's depth; in the emulation the backward ignores it."""
+    """The derivative of the rendered depth by the Gaussian's depth; in the emulation the backward
+    ignores it.
+    """
 
     def ours(z):
         means = torch.stack([torch.zeros_like(z), torch.zeros_like(z), z])[None].to(torch.float32)
         cloud = one_gaussian(scale=0.2).to(torch.float32)._replace(means=means)
-        return rasterize(*cloud, *single(front_camera(8, 8, 8.0)), 8, 8, backend=backend, **NO_CUTOFFS).depth.double().sum()
+        return (
+            rasterize(*cloud, *single(front_camera(8, 8, 8.0)), 8, 8, backend=backend, **NO_CUTOFFS)
+            .depth.double()
+            .sum()
+        )
 
     def truth(z):
         cloud = one_gaussian(scale=0.2)._replace(means=torch.stack([0 * z, 0 * z, z])[None])
-        return rasterize(*cloud, *front_camera(8, 8, 8.0), 8, 8, backend="reference", **NO_CUTOFFS).depth.sum()
+        return rasterize(
+            *cloud, *front_camera(8, 8, 8.0), 8, 8, backend="reference", **NO_CUTOFFS
+        ).depth.sum()
 
     def ignored(z):
         return truth(z).detach() + 0 * z
 
-    fault(lambda f: slope_error(f, 2.0, truth), ours=ours, emulation=ignored, at_most=1e-4, unit="relative")
+    fault(
+        lambda f: slope_error(f, 2.0, truth),
+        ours=ours,
+        emulation=ignored,
+        at_most=1e-4,
+        unit="relative",
+    )
 
 
 @row("A0", "F17")
@@ -253,26 +353,47 @@ def test_f17_a_sphere_is_round_on_a_wide_image(backend, fault):
     def deviation(intrinsics):
         Ks = intrinsics(fovy, 64, 128)
         sphere = one_gaussian(scale=0.2).to(torch.float32)
-        alpha = rasterize(*sphere, torch.eye(4)[None], Ks, 128, 64, backend=backend).alpha[0, ..., 0]
+        alpha = rasterize(*sphere, torch.eye(4)[None], Ks, 128, 64, backend=backend).alpha[
+            0, ..., 0
+        ]
         across, down = ((alpha.sum(axis) > 0).sum() for axis in (0, 1))
         return abs(across - down).item() / 2
 
-    fault(deviation, ours=host_cameras.intrinsics, emulation=one_angle_for_both, at_most=0.5, unit="px")
+    fault(
+        deviation,
+        ours=host_cameras.intrinsics,
+        emulation=one_angle_for_both,
+        at_most=0.5,
+        unit="px",
+    )
 
 
 @row("A0", "F26")
 @each_backend
 def test_f26_behind_the_camera_is_nothing_and_equal_depths_go_by_index(backend, fault):
     behind = one_gaussian((0.0, 0.0, -2.0), 0.3, 0.9)
-    red, green = (one_gaussian((0.0, 0.0, 2.0), 0.3, 0.9, color) for color in ((1.0, 0, 0), (0, 1.0, 0)))
+    red, green = (
+        one_gaussian((0.0, 0.0, 2.0), 0.3, 0.9, color) for color in ((1.0, 0, 0), (0, 1.0, 0))
+    )
 
     def ours(cloud):
-        return rasterize(*cloud.to(torch.float32), *single(front_camera(8, 8, 8.0)), 8, 8, backend=backend).image[0]
+        return rasterize(
+            *cloud.to(torch.float32), *single(front_camera(8, 8, 8.0)), 8, 8, backend=backend
+        ).image[0]
 
     def unclipped_and_unstable(cloud):
         z = cloud.means[:, 2]
-        backwards = torch.arange(len(z) - 1, -1, -1)  # a sort that keeps no order among equals may leave them so
-        return plain_image(cloud, 8, 8, 8.0, torch.ones(len(z), dtype=torch.bool), backwards[z[backwards].argsort(stable=True)])
+        backwards = torch.arange(
+            len(z) - 1, -1, -1
+        )  # a sort that keeps no order among equals may leave them so
+        return plain_image(
+            cloud,
+            8,
+            8,
+            8.0,
+            torch.ones(len(z), dtype=torch.bool),
+            backwards[z[backwards].argsort(stable=True)],
+        )
 
     def deviation(draw):
         in_front = draw(joined(red, green))[4, 4]
@@ -285,10 +406,20 @@ def test_f26_behind_the_camera_is_nothing_and_equal_depths_go_by_index(backend, 
 @each_backend
 def test_f27_any_size_and_a_gaussian_behind_the_camera(backend, fault):
     """The emulation masks the means that are behind, not the covariances, and paints 256 x 256."""
-    scene = joined(one_gaussian((0.0, 0.0, 2.0), 0.3), one_gaussian((0.0, 0.0, -2.0), 0.3), one_gaussian((0.3, 0.0, 3.0), 0.3))
+    scene = joined(
+        one_gaussian((0.0, 0.0, 2.0), 0.3),
+        one_gaussian((0.0, 0.0, -2.0), 0.3),
+        one_gaussian((0.3, 0.0, 3.0), 0.3),
+    )
 
     def ours(cloud, width, height):
-        return rasterize(*cloud.to(torch.float32), *single(front_camera(width, height, 8.0)), width, height, backend=backend).image[0]
+        return rasterize(
+            *cloud.to(torch.float32),
+            *single(front_camera(width, height, 8.0)),
+            width,
+            height,
+            backend=backend,
+        ).image[0]
 
     def half_masked(cloud, width, height):
         in_front = cloud.means[:, 2] > 0
@@ -308,10 +439,19 @@ def test_f27_the_size_that_was_asked_for(backend, fault):
 
     def ours(width, height):
         cloud = one_gaussian(scale=5.0).to(torch.float32)
-        return rasterize(*cloud, *single(front_camera(width, height, 8.0)), width, height, backend=backend).alpha[0, ..., 0]
+        return rasterize(
+            *cloud, *single(front_camera(width, height, 8.0)), width, height, backend=backend
+        ).alpha[0, ..., 0]
 
     def deviation(draw):
         sizes = [(1, 1), (40, 1), (17, 9), (31, 33)]
-        return sum(draw(*size).shape != size[::-1] or bool((draw(*size) == 0).any()) for size in sizes)
+        return sum(
+            draw(*size).shape != size[::-1] or bool((draw(*size) == 0).any()) for size in sizes
+        )
 
-    fault(deviation, ours=ours, emulation=lambda width, height: torch.ones(256, 256), unit="of 4 sizes wrong")
+    fault(
+        deviation,
+        ours=ours,
+        emulation=lambda width, height: torch.ones(256, 256),
+        unit="of 4 sizes wrong",
+    )

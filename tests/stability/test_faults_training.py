@@ -1,4 +1,6 @@
-"""A0: faults of the peers' training. Each test holds ours to the bar and shows that the fault, in our own words, breaks it."""
+"""A0: faults of the peers' training. Each test holds ours to the bar and shows that the fault, in
+our own words, breaks it.
+"""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,12 +40,14 @@ def started(**options) -> GaussianCloud:
     return geometry
 
 
-# ---- state and memory ----------------------------------------------------------------------------------------------------------
+# ---- state and memory ----------------------------------------------------------------------------
 
 
 @row("A0", "F11")
 def test_f11_the_loss_scale_does_not_choose_who_is_densified(fault):
-    """Half of the gradients lie above the threshold; mixed precision multiplies all of them by 65 536 before they are read."""
+    """Half of the gradients lie above the threshold; mixed precision multiplies all of them by 65
+    536 before they are read.
+    """
     g = torch.Generator().manual_seed(0)
     true = torch.randn(2, 1000, 2, generator=g) * torch.tensor([2e-4 / 64, 2e-4 / 64])
 
@@ -54,22 +58,35 @@ def test_f11_the_loss_scale_does_not_choose_who_is_densified(fault):
         selected = [gradients(true * scale, 128, 128, scale) > 2e-4 for scale in (1.0, 65536.0)]
         return (selected[0] != selected[1]).float().mean() * 100
 
-    fault(deviation, ours=densify.screen_gradients, emulation=as_they_come, unit="% selected differently")
+    fault(
+        deviation,
+        ours=densify.screen_gradients,
+        emulation=as_they_come,
+        unit="% selected differently",
+    )
 
 
 @row("A0", "F12")
 def test_f12_a_checkpoint_holds_the_cloud_and_its_statistics(fault):
-    """The emulation keeps the cloud in a plain object, which a module's state doesn't reach. Ours asks no prior when loading."""
+    """The emulation keeps the cloud in a plain object, which a module's state doesn't reach. Ours
+    asks no prior when loading.
+    """
 
     class PlainCloud(nn.Module):
         def __init__(self, source=None):
             super().__init__()
             names = (*PARAMETERS, *STATISTICS)
-            self.cloud = SimpleNamespace(**{name: getattr(source, name) if source else torch.zeros(0) for name in names})
+            self.cloud = SimpleNamespace(
+                **{name: getattr(source, name) if source else torch.zeros(0) for name in names}
+            )
 
         def __getattr__(self, name):
             cloud = self.__dict__.get("cloud")
-            return getattr(cloud, name) if cloud is not None and hasattr(cloud, name) else super().__getattr__(name)
+            return (
+                getattr(cloud, name)
+                if cloud is not None and hasattr(cloud, name)
+                else super().__getattr__(name)
+            )
 
     def trained():
         geometry = started()
@@ -80,10 +97,18 @@ def test_f12_a_checkpoint_holds_the_cloud_and_its_statistics(fault):
     def deviation(pair):
         saved, fresh = pair()
         fresh.load_state_dict(saved.state_dict())
-        return sum(not torch.equal(getattr(saved, name), getattr(fresh, name)) for name in (*PARAMETERS, *STATISTICS))
+        return sum(
+            not torch.equal(getattr(saved, name), getattr(fresh, name))
+            for name in (*PARAMETERS, *STATISTICS)
+        )
 
     ours = lambda: (trained(), GaussianCloud({"prior_type": "a-prior-that-does-not-exist"}))  # noqa: E731
-    fault(deviation, ours=ours, emulation=lambda: (PlainCloud(trained()), PlainCloud()), unit="tensors lost")
+    fault(
+        deviation,
+        ours=ours,
+        emulation=lambda: (PlainCloud(trained()), PlainCloud()),
+        unit="tensors lost",
+    )
 
 
 @row("A0", "F16")
@@ -96,13 +121,15 @@ def test_f16_growing_leaves_the_process_generators_alone(fault):
         np.random.seed(7)
         expected, torch_state = np.random.RandomState(7).random(), torch.get_rng_state()
         grown(ball())
-        return float(np.random.random() != expected) + float(not torch.equal(torch.get_rng_state(), torch_state))
+        return float(np.random.random() != expected) + float(
+            not torch.equal(torch.get_rng_state(), torch_state)
+        )
 
     ours = lambda cloud: grow(cloud, num_candidates=1000, generator=np.random.default_rng(0))  # noqa: E731
     fault(deviation, ours=ours, emulation=reseeding, unit="generators moved")
 
 
-# ---- growing -------------------------------------------------------------------------------------------------------------------
+# ---- growing -------------------------------------------------------------------------------------
 
 
 @row("A0", "F14")
@@ -119,7 +146,12 @@ def test_f14_no_grown_point(fault):
         kept = [c for c in candidates if np.linalg.norm(points - c, axis=1).min() < 0.01]
         return np.concatenate((points, np.array(kept)))
 
-    fault(lambda grown: float(len(grown(corners)) != 8), ours=ours, emulation=appended_to_an_empty_list, raises=ValueError)
+    fault(
+        lambda grown: float(len(grown(corners)) != 8),
+        ours=ours,
+        emulation=appended_to_an_empty_list,
+        raises=ValueError,
+    )
 
 
 @row("A0", "F15")
@@ -128,7 +160,17 @@ def test_f15_growth_does_not_depend_on_the_unit(fault):
 
     def ours(points):
         colors = np.zeros_like(points)
-        return len(grow(PointCloud(points, colors), num_candidates=20_000, radius=0.05, generator=np.random.default_rng(0)).points) - 300
+        return (
+            len(
+                grow(
+                    PointCloud(points, colors),
+                    num_candidates=20_000,
+                    radius=0.05,
+                    generator=np.random.default_rng(0),
+                ).points
+            )
+            - 300
+        )
 
     def absolute_radius(points):
         candidates = np.random.default_rng(0).uniform(points.min(0), points.max(0), (2000, 3))
@@ -144,33 +186,51 @@ def test_f15_growth_does_not_depend_on_the_unit(fault):
 @row("A0", "F15")
 @pytest.mark.parametrize("axes", [(0, 1), (2,), ()], ids=["flat", "needle", "point"])
 def test_f15_a_degenerate_prior_does_not_explode(axes, fault):
-    """Every candidate in the box of a flat cloud lies near it, so only the cap holds; the emulation has none."""
+    """Every candidate in the box of a flat cloud lies near it, so only the cap holds; the emulation
+    has none.
+    """
     points = np.zeros((300, 3), np.float32)
     points[:, axes] = ball().points[:, axes]
     options = {"enabled": True, "num_candidates": 20_000, "radius": 0.9, "max_points": 500}
 
     def ours(points):
-        return len(GaussianCloud({"grow": options}).grown(PointCloud(points, np.zeros_like(points))).points)
+        return len(
+            GaussianCloud({"grow": options}).grown(PointCloud(points, np.zeros_like(points))).points
+        )
 
     def without_a_cap(points):
         candidates = np.random.default_rng(0).uniform(points.min(0), points.max(0), (2000, 3))
         return 300 + sum(np.linalg.norm(points - c, axis=1).min() < 0.9 for c in candidates)
 
-    fault(lambda count: count(points), ours=ours, emulation=without_a_cap, at_most=800, unit="points")
+    fault(
+        lambda count: count(points), ours=ours, emulation=without_a_cap, at_most=800, unit="points"
+    )
 
 
-# ---- densifying ----------------------------------------------------------------------------------------------------------------
+# ---- densifying ----------------------------------------------------------------------------------
 
 
 def parameters(n: int) -> dict[str, torch.Tensor]:
     g = torch.Generator().manual_seed(0)
-    shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,), "sh0": (n, 1, 3), "sh_rest": (n, 0, 3)}
-    return {name: torch.randn(shape, generator=g) - 5.0 * (name == "log_scales") for name, shape in shapes.items()}
+    shapes = {
+        "means": (n, 3),
+        "log_scales": (n, 3),
+        "quats": (n, 4),
+        "logit_opacities": (n,),
+        "sh0": (n, 1, 3),
+        "sh_rest": (n, 0, 3),
+    }
+    return {
+        name: torch.randn(shape, generator=g) - 5.0 * (name == "log_scales")
+        for name, shape in shapes.items()
+    }
 
 
 @row("A0", "F13")
 def test_f13_one_gaussian_keeps_its_shape(fault):
-    """Pruning nobody. The emulation squeezes the (1, 1) mask to a single truth value, which adds a dimension to what it indexes."""
+    """Pruning nobody. The emulation squeezes the (1, 1) mask to a single truth value, which adds a
+    dimension to what it indexes.
+    """
 
     def ours(params):
         stats = Statistics(torch.zeros(1), torch.ones(1))
@@ -189,8 +249,18 @@ def test_f13_one_gaussian_keeps_its_shape(fault):
 
 @row("A0", "F18")
 def test_f18_densification_loses_no_step(fault):
-    """Selecting nobody must change nothing. In the emulation the rows are replaced between backward and step."""
-    nobody = {"enabled": True, "start": 1, "stop": 9, "every": 2, "min_opacity": 1e-9, "grad_threshold": 1e9, "max_scale": 1e9}
+    """Selecting nobody must change nothing. In the emulation the rows are replaced between backward
+    and step.
+    """
+    nobody = {
+        "enabled": True,
+        "start": 1,
+        "stop": 9,
+        "every": 2,
+        "min_opacity": 1e-9,
+        "grad_threshold": 1e9,
+        "max_scale": 1e9,
+    }
 
     def step_first(geometry, optimizer, step):
         optimizer.step()
@@ -203,7 +273,9 @@ def test_f18_densification_loses_no_step(fault):
 
     def trajectory(finish, **options):
         geometry = started(**options)
-        optimizer = torch.optim.Adam([{**group, "lr": 1e-2} for group in geometry.parameter_groups()])
+        optimizer = torch.optim.Adam(
+            [{**group, "lr": 1e-2} for group in geometry.parameter_groups()]
+        )
         for step in range(1, 7):
             sum((p**2).sum() for p in geometry.parameters()).backward()
             finish(geometry, optimizer, step)
@@ -211,7 +283,12 @@ def test_f18_densification_loses_no_step(fault):
         return geometry.means.detach()
 
     plain = trajectory(step_first)
-    fault(lambda f: (trajectory(f, densify=nobody) - plain).abs().max(), ours=step_first, emulation=densify_first, unit="moved")
+    fault(
+        lambda f: (trajectory(f, densify=nobody) - plain).abs().max(),
+        ours=step_first,
+        emulation=densify_first,
+        unit="moved",
+    )
 
 
 @row("A0", "F21")
@@ -234,7 +311,7 @@ def test_f21_the_cap_takes_what_contributes_least(fault):
     fault(deviation, ours=ours, emulation=lottery, unit="% of the contribution lost")
 
 
-# ---- losses and settings -------------------------------------------------------------------------------------------------------
+# ---- losses and settings -------------------------------------------------------------------------
 
 
 @row("A0", "F19")
@@ -245,16 +322,26 @@ def test_f19_a_negative_loss_is_back_propagated(fault):
         optimizer = torch.optim.SGD([parameter], lr=0.0)
         optimizer.zero_grad = lambda set_to_none: None
         wrapped = SimpleNamespace(
-            param_groups=optimizer.param_groups, step=lambda: None, optimizer=optimizer, zero_grad=optimizer.zero_grad
+            param_groups=optimizer.param_groups,
+            step=lambda: None,
+            optimizer=optimizer,
+            zero_grad=optimizer.zero_grad,
         )
-        nothing = SimpleNamespace(sample_removal=lambda *_: None, observe=lambda *_: None, after_step=lambda *_: None)
+        nothing = SimpleNamespace(
+            sample_removal=lambda *_: None, observe=lambda *_: None, after_step=lambda *_: None
+        )
         system = SimpleNamespace(
             optimizers=lambda: wrapped, set_learning_rates=lambda _: None, losses=lambda *_: {"x": -(parameter**2).sum()},
             manual_backward=lambda loss: loss.backward(), geometry=nothing, loss_scale=lambda: 1.0, global_step=1,
             report=lambda *_: None, tell=lambda _: None,
         )  # fmt: skip
         stepping = type(
-            "System", (), {"__call__": lambda self, batch: {"rasterized": None}, "__getattr__": lambda _, n: getattr(system, n)}
+            "System",
+            (),
+            {
+                "__call__": lambda self, batch: {"rasterized": None},
+                "__getattr__": lambda _, n: getattr(system, n),
+            },
         )
         GaussianDreamerSystem.training_step(stepping(), {"width": 1, "height": 1}, 0)
 
@@ -274,7 +361,9 @@ def test_f19_a_negative_loss_is_back_propagated(fault):
 
 @row("A0", "F20")
 def test_f20_every_learning_rate_in_the_config_reaches_the_optimiser(fault):
-    """The emulation reads ``scaling_lr`` from a config that says ``scale_lr``, and takes its default."""
+    """The emulation reads ``scaling_lr`` from a config that says ``scale_lr``, and takes its
+    default.
+    """
 
     def ours(rates):
         geometry = started(sh_degree=1, **rates)
@@ -295,23 +384,31 @@ def test_f20_every_learning_rate_in_the_config_reaches_the_optimiser(fault):
 
 @row("A0", "F25")
 def test_f25_each_preset_holds_its_own_numbers(fault):
-    """Paper: scales 1e-3, rotations 1e-2, positions 5e-5. Released code: 5e-3, 1e-3, 5e-5 times the extent 4 = 2e-4."""
+    """Paper: scales 1e-3, rotations 1e-2, positions 5e-5. Released code: 5e-3, 1e-3, 5e-5 times the
+    extent 4 = 2e-4.
+    """
     told = {"paper": (1e-3, 1e-2, 5e-5), "code": (5e-3, 1e-3, 2e-4)}
     files = {"paper": "gaussiandreamer.yaml", "code": "gaussiandreamer-official.yaml"}
 
     def rates(name):
         geometry = yaml.safe_load((CONFIGS / name).read_text())["system"]["geometry"]
-        first = geometry["lr_means"][1] if isinstance(geometry["lr_means"], list) else geometry["lr_means"]
+        first = (
+            geometry["lr_means"][1]
+            if isinstance(geometry["lr_means"], list)
+            else geometry["lr_means"]
+        )
         return geometry["lr_scales"], geometry["lr_quats"], first
 
     def deviation(files):
-        return sum(a != b for who in told for a, b in zip(rates(files[who]), told[who], strict=True))
+        return sum(
+            a != b for who in told for a, b in zip(rates(files[who]), told[who], strict=True)
+        )
 
     one_for_both = {"paper": files["code"], "code": files["code"]}
     fault(deviation, ours=files, emulation=one_for_both, unit="of 6 numbers wrong")
 
 
-# ---- score distillation --------------------------------------------------------------------------------------------------------
+# ---- score distillation --------------------------------------------------------------------------
 
 
 class Stub(TowardsGrey):
@@ -327,7 +424,9 @@ class Stub(TowardsGrey):
 
 @row("A0", "F22")
 def test_f22_a_broken_score_is_seen(fault):
-    """The first of three items is NaN in every step: how many steps of twenty go by with nothing said about it."""
+    """The first of three items is NaN in every step: how many steps of twenty go by with nothing
+    said about it.
+    """
     rgb = torch.rand(3, 4, 4, 3, generator=torch.Generator().manual_seed(0))
 
     def gradient(guidance, step):
@@ -344,7 +443,9 @@ def test_f22_a_broken_score_is_seen(fault):
         return counted > 0
 
     def nan_to_num(step):
-        torch.nan_to_num(torch.full((3, 4, 4, 3), torch.nan))  # zero from here on, and the step a success
+        torch.nan_to_num(
+            torch.full((3, 4, 4, 3), torch.nan)
+        )  # zero from here on, and the step a success
         return False
 
     def deviation(said):
@@ -369,11 +470,15 @@ def test_f23_every_timestep_has_its_entry(percents, fault):
     table = sds.sd_alphas_cumprod()
 
     def ours():
-        steps = [sds.timesteps(50, *sds.step_range(*percents), seed=0, step=step) for step in range(20)]
+        steps = [
+            sds.timesteps(50, *sds.step_range(*percents), seed=0, step=step) for step in range(20)
+        ]
         return torch.cat(steps)
 
     def inclusive():
-        return torch.randint(int(1000 * percents[0]), 1001, (200_000,), generator=torch.Generator().manual_seed(0))
+        return torch.randint(
+            int(1000 * percents[0]), 1001, (200_000,), generator=torch.Generator().manual_seed(0)
+        )
 
     def deviation(draw):
         t = draw()
@@ -392,7 +497,9 @@ def test_f23_an_empty_range_is_a_named_error(measured):
 
 @row("A0", "F24")
 def test_f24_the_guidance_scale_is_in_the_usual_convention(fault):
-    """s = 1 is no guidance, s = 100 is 100 differences from the unconditional score; the emulation starts at the conditional one."""
+    """s = 1 is no guidance, s = 100 is 100 differences from the unconditional score; the emulation
+    starts at the conditional one.
+    """
     e_c, e_u = torch.randn(2, 4, 8, 8, generator=torch.Generator().manual_seed(0))
 
     def from_the_conditional(e_c, e_u, scale):
@@ -400,6 +507,15 @@ def test_f24_the_guidance_scale_is_in_the_usual_convention(fault):
 
     def deviation(guided):
         exact = {1.0: e_c, 100.0: e_u + 100 * (e_c - e_u)}
-        return max((guided(e_c, e_u, scale) - expected).abs().max() / expected.abs().max() for scale, expected in exact.items())
+        return max(
+            (guided(e_c, e_u, scale) - expected).abs().max() / expected.abs().max()
+            for scale, expected in exact.items()
+        )
 
-    fault(deviation, ours=sds.classifier_free, emulation=from_the_conditional, at_most=1e-6, unit="relative")
+    fault(
+        deviation,
+        ours=sds.classifier_free,
+        emulation=from_the_conditional,
+        at_most=1e-6,
+        unit="relative",
+    )

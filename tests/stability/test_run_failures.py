@@ -1,4 +1,6 @@
-"""A5: what happens to runs. Kills, full disks, damaged checkpoints, wrong keys, odd prompts, signals."""
+"""A5: what happens to runs. Kills, full disks, damaged checkpoints, wrong keys, odd prompts,
+signals.
+"""
 
 import contextlib
 import ctypes
@@ -21,7 +23,12 @@ from small_runs import DEMO, Ended, differences, launch
 
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core import images as pictures
-from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, load_file, previous_of, save_file
+from threestudio_gaussiandreamer.core.checkpoint_file import (
+    load_checkpoint,
+    load_file,
+    previous_of,
+    save_file,
+)
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch.config import dump_config, load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
@@ -32,7 +39,9 @@ EVERY_STEP = ["checkpoint.every_n_train_steps=1", "trainer.max_steps=5"]
 
 
 def at_step(monkeypatch, step, act) -> None:
-    """Lets ``act(system)`` happen after that many steps, before the checkpoint of that step is written."""
+    """Lets ``act(system)`` happen after that many steps, before the checkpoint of that step is
+    written.
+    """
     training_step = GaussianDreamerSystem.training_step
 
     def wrapped(self, batch, batch_idx):
@@ -51,11 +60,15 @@ def whole(tmp_path_factory) -> Ended:
     return ended
 
 
-# ---- writing checkpoints -------------------------------------------------------------------------------------------------------
+# ---- writing checkpoints -------------------------------------------------------------------------
 
 
 def content(step: int, size: int = 20_000) -> dict:
-    return {"state_dict": {"means": torch.arange(float(size)) + step}, "epoch": 0, "global_step": step}
+    return {
+        "state_dict": {"means": torch.arange(float(size)) + step},
+        "epoch": 0,
+        "global_step": step,
+    }
 
 
 @row("A5", "Crash mid checkpoint")
@@ -80,20 +93,27 @@ def test_killed_at_random_moments_of_200_saves(tmp_path, measured):
         os.close(read_end)
         kills, told = kills + 1, struct.unpack("i", told[-4:])[0] if told else saved
         found = load_checkpoint(path)
-        assert found["state_dict"]["means"].equal(content(found["global_step"])["state_dict"]["means"])
+        assert found["state_dict"]["means"].equal(
+            content(found["global_step"])["state_dict"]["means"]
+        )
         read_end_lost += max(0, told - found["global_step"])
         if previous_of(path).exists():
             assert load_checkpoint(previous_of(path))["global_step"] <= found["global_step"]
         saved = found["global_step"]
     save_file(path, content(saved + 1))
-    assert {entry.name for entry in tmp_path.iterdir()} <= {"last.ckpt", "last-prev.ckpt"}  # what was half-written is gone
+    assert {entry.name for entry in tmp_path.iterdir()} <= {
+        "last.ckpt",
+        "last-prev.ckpt",
+    }  # what was half-written is gone
     measured(kills, "kills", what="in 200 saves or more", at_least=20)
     measured(read_end_lost, "saves", what="lost", at_most=0)
 
 
 @row("A5", "Crash mid checkpoint")
 def test_a_file_written_in_place_is_lost_by_such_kills(tmp_path, measured):
-    """The test above can fail: the same kills of a child that saves as ``torch.save(content, path)`` does leave damaged files."""
+    """The test above can fail: the same kills of a child that saves as ``torch.save(content,
+    path)`` does leave damaged files.
+    """
     path, rng, lost = tmp_path / "last.ckpt", random.Random(0), 0
     for _ in range(20):
         save_file(path, content(0))
@@ -128,16 +148,26 @@ def file_size_limit(limit: int):
 
 @contextlib.contextmanager
 def permissions_count_for_root():
-    """Root may write where permissions forbid it, by two capabilities that a thread can put down and take up again."""
+    """Root may write where permissions forbid it, by two capabilities that a thread can put down
+    and take up again.
+    """
     if os.geteuid():
         yield
         return
     libc = ctypes.CDLL(None, use_errno=True)
-    header, before, without = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)(), (ctypes.c_uint32 * 6)()
+    header, before, without = (
+        (ctypes.c_uint32 * 2)(0x20080522, 0),
+        (ctypes.c_uint32 * 6)(),
+        (ctypes.c_uint32 * 6)(),
+    )
     if libc.capget(header, before):
         pytest.skip("this system doesn't tell its capabilities")
     without[:] = before[:]
-    without[0] &= ~0b110  # DAC_OVERRIDE and DAC_READ_SEARCH are 1 and 2; the first number holds what is in effect
+    without[
+        0
+    ] &= (
+        ~0b110
+    )  # DAC_OVERRIDE and DAC_READ_SEARCH are 1 and 2; the first number holds what is in effect
     libc.capset(header, without)
     try:
         yield
@@ -146,11 +176,18 @@ def permissions_count_for_root():
 
 
 def assert_stopped_cleanly(ended: Ended, message: str) -> None:
-    """One named error; the checkpoint of step 2 is whole and the newest, and nothing temporary is left."""
+    """One named error; the checkpoint of step 2 is whole and the newest, and nothing temporary is
+    left.
+    """
     assert ended.code == 2 and "Traceback" not in ended.err, ended.err
-    assert sum(line.startswith("error: ") for line in ended.err.splitlines()) == 1 and message in ended.err, ended.err
+    assert (
+        sum(line.startswith("error: ") for line in ended.err.splitlines()) == 1
+        and message in ended.err
+    ), ended.err
     assert load_checkpoint(ended.last)["global_step"] == 2
-    assert not [path for path in ended.folder.rglob("*") if path.suffix == ".tmp" or "step=3" in path.name]
+    assert not [
+        path for path in ended.folder.rglob("*") if path.suffix == ".tmp" or "step=3" in path.name
+    ]
 
 
 @row("A5", "Disk full, read-only")
@@ -163,9 +200,13 @@ def test_a_full_disk_in_the_middle_of_a_run(tmp_path, monkeypatch, measured):
 
 
 @row("A5", "Disk full, read-only")
-@pytest.mark.parametrize("hook", ["ensure_cloud", "score", "on_test_start", "on_test_epoch_end", "export"])
+@pytest.mark.parametrize(
+    "hook", ["ensure_cloud", "score", "on_test_start", "on_test_epoch_end", "export"]
+)
 def test_a_disk_that_is_full_by_then(hook, tmp_path, monkeypatch, measured):
-    """When the prior is kept, the cloud scored, views and the video written, the cloud exported: never a success with half a file."""
+    """When the prior is kept, the cloud scored, views and the video written, the cloud exported:
+    never a success with half a file.
+    """
     original = getattr(GaussianDreamerSystem, hook)
     with contextlib.ExitStack() as full:
 
@@ -175,9 +216,17 @@ def test_a_disk_that_is_full_by_then(hook, tmp_path, monkeypatch, measured):
 
         monkeypatch.setattr(GaussianDreamerSystem, hook, wrapped)
         ended = launch(tmp_path, "trainer.max_steps=1", "data.eval_width=64", "data.eval_height=64")
-    assert ended.code == 2 and sum(line.startswith("error: ") for line in ended.err.splitlines()) == 1, ended.err
-    assert "Traceback" not in ended.err and ("cannot write" in ended.err or "could not be written" in ended.err)
-    assert not [path for path in ended.folder.rglob("*") if path.suffix == ".tmp" or path.name.startswith(".part")]
+    assert (
+        ended.code == 2 and sum(line.startswith("error: ") for line in ended.err.splitlines()) == 1
+    ), ended.err
+    assert "Traceback" not in ended.err and (
+        "cannot write" in ended.err or "could not be written" in ended.err
+    )
+    assert not [
+        path
+        for path in ended.folder.rglob("*")
+        if path.suffix == ".tmp" or path.name.startswith(".part")
+    ]
     measured("named error at every place that writes")
 
 
@@ -185,7 +234,9 @@ def test_a_disk_that_is_full_by_then(hook, tmp_path, monkeypatch, measured):
 @pytest.mark.parametrize("kind", ["mp4", "gif", "png"])
 @pytest.mark.parametrize("limit", [0, 100, 3000])
 def test_half_a_video_is_none(kind, limit, tmp_path, measured):
-    """The encoder is a process of its own, which ends in silence: an mp4 counts as written when its index is in it."""
+    """The encoder is a process of its own, which ends in silence: an mp4 counts as written when its
+    index is in it.
+    """
     noise = np.random.default_rng(0).integers(0, 255, (4, 64, 64, 3), dtype=np.uint8)
     for i, frame in enumerate(noise):
         pictures.write(tmp_path / f"{i}.png", frame)
@@ -193,7 +244,9 @@ def test_half_a_video_is_none(kind, limit, tmp_path, measured):
     path = tmp_path / f"out.{kind}"
 
     def write() -> None:
-        pictures.write(path, noise[0]) if kind == "png" else pictures.write_video(str(path), frames, fps=5)
+        pictures.write(path, noise[0]) if kind == "png" else pictures.write_video(
+            str(path), frames, fps=5
+        )
 
     with file_size_limit(limit), pytest.raises(UserError, match=f"out.{kind}"):
         write()
@@ -228,12 +281,16 @@ def test_a_read_only_output_root_is_named_before_any_work(tmp_path, measured):
     with permissions_count_for_root():
         ended = launch(tmp_path, *EVERY_STEP)
     tmp_path.chmod(0o755)
-    assert ended.code == 2 and "can't be written: Permission denied" in ended.err and "the cloud starts" not in ended.err
+    assert (
+        ended.code == 2
+        and "can't be written: Permission denied" in ended.err
+        and "the cloud starts" not in ended.err
+    )
     assert not list(tmp_path.iterdir())
     measured("named before any work")
 
 
-# ---- damaged checkpoints -------------------------------------------------------------------------------------------------------
+# ---- damaged checkpoints -------------------------------------------------------------------------
 
 
 def damaged(path: Path, how: str, rng: random.Random) -> None:
@@ -262,7 +319,9 @@ def test_no_damaged_byte_is_ever_loaded(how, times, tmp_path, measured):
 
 @pytest.fixture
 def stopped(tmp_path) -> Ended:
-    """A run of three steps whose last checkpoint, and the file that it is a copy of, are damaged; that before it is whole."""
+    """A run of three steps whose last checkpoint, and the file that it is a copy of, are damaged;
+    that before it is whole.
+    """
     ended = launch(tmp_path, "checkpoint.every_n_train_steps=1", "trainer.max_steps=3")
     assert ended.code == 0, ended.err
     for name in ("last.ckpt", "epoch=0-step=3.ckpt"):
@@ -273,7 +332,12 @@ def stopped(tmp_path) -> Ended:
 @row("A5", "Corrupted checkpoint")
 def test_a_damaged_checkpoint_that_was_asked_for_is_refused(stopped, tmp_path, measured):
     ended = launch(tmp_path, *EVERY_STEP, f"resume={stopped.last}")
-    assert ended.code == 2 and str(stopped.last) in ended.err and "checksum" in ended.err and "Traceback" not in ended.err
+    assert (
+        ended.code == 2
+        and str(stopped.last) in ended.err
+        and "checksum" in ended.err
+        and "Traceback" not in ended.err
+    )
     assert "last-prev.ckpt" in ended.err  # what could be taken instead, though only the user may
     measured("refused, its path named")
 
@@ -282,9 +346,18 @@ def test_a_damaged_checkpoint_that_was_asked_for_is_refused(stopped, tmp_path, m
 def test_resume_auto_takes_the_one_before_and_says_so(stopped, whole, tmp_path, measured):
     ended = launch(tmp_path, *EVERY_STEP, "resume=auto")
     assert ended.code == 0, ended.err
-    assert "going on from" in ended.err and "step=2.ckpt" in ended.err.split("going on from")[1] or "last-prev.ckpt" in ended.err
+    assert (
+        "going on from" in ended.err
+        and "step=2.ckpt" in ended.err.split("going on from")[1]
+        or "last-prev.ckpt" in ended.err
+    )
     assert ended.err.count("is damaged") == 2  # what was passed over is named
-    measured(differences(whole.checkpoint(), ended.checkpoint()), "tensors", what="that differ after resume=auto", at_most=0)
+    measured(
+        differences(whole.checkpoint(), ended.checkpoint()),
+        "tensors",
+        what="that differ after resume=auto",
+        at_most=0,
+    )
 
 
 @row("A5", "Corrupted checkpoint")
@@ -297,36 +370,60 @@ def test_resume_auto_without_a_checkpoint_starts_anew_and_says_so(tmp_path, meas
 HANDMADE = {
     "without loops": (lambda c: c.pop("loops"), "it has no loops"),
     "without optimizer_states": (lambda c: c.pop("optimizer_states"), "it has no optimizer_states"),
-    "0-d means": (lambda c: c["state_dict"].update({"geometry.means": torch.tensor(1.0)}), "geometry.means"),
-    "means (N, 2)": (lambda c: c["state_dict"].update({"geometry.means": torch.zeros(120, 2)}), "geometry.means"),
-    "a mean more": (lambda c: c["state_dict"].update({"geometry.means": torch.zeros(121, 3)}), "geometry.quats"),
-    "means as a list": (lambda c: c["state_dict"].update({"geometry.means": [1.0, 2.0]}), "geometry.means"),
+    "0-d means": (
+        lambda c: c["state_dict"].update({"geometry.means": torch.tensor(1.0)}),
+        "geometry.means",
+    ),
+    "means (N, 2)": (
+        lambda c: c["state_dict"].update({"geometry.means": torch.zeros(120, 2)}),
+        "geometry.means",
+    ),
+    "a mean more": (
+        lambda c: c["state_dict"].update({"geometry.means": torch.zeros(121, 3)}),
+        "geometry.quats",
+    ),
+    "means as a list": (
+        lambda c: c["state_dict"].update({"geometry.means": [1.0, 2.0]}),
+        "geometry.means",
+    ),
     "no means": (lambda c: c["state_dict"].pop("geometry.means"), "geometry.means"),
-    "moments of another size": (lambda c: c["optimizer_states"][0]["param_groups"].pop(), "another configuration"),
-    "a step that is a word": (lambda c: c.update(global_step="three"), "global_step is of type str"),
+    "moments of another size": (
+        lambda c: c["optimizer_states"][0]["param_groups"].pop(),
+        "another configuration",
+    ),
+    "a step that is a word": (
+        lambda c: c.update(global_step="three"),
+        "global_step is of type str",
+    ),
 }
 
 
 @row("A5", "Corrupted checkpoint")
 @pytest.mark.parametrize("what", HANDMADE)
 def test_a_handmade_checkpoint_that_does_not_fit_is_named(what, whole, tmp_path, measured):
-    """Whole by its checksum, but not what a run can go on from: never trained from step 0, or with half of it."""
+    """Whole by its checksum, but not what a run can go on from: never trained from step 0, or with
+    half of it.
+    """
     change, message = HANDMADE[what]
     checkpoint = whole.checkpoint()
     change(checkpoint)
     save_file(tmp_path / "made.ckpt", checkpoint)
-    ended = launch(tmp_path / "run", *EVERY_STEP, "trainer.max_steps=9", f"resume={tmp_path}/made.ckpt")
+    ended = launch(
+        tmp_path / "run", *EVERY_STEP, "trainer.max_steps=9", f"resume={tmp_path}/made.ckpt"
+    )
     assert ended.code == 2 and "Traceback" not in ended.err, ended.err
     assert "made.ckpt" in ended.err and message in ended.err, ended.err
     assert not (tmp_path / "run").exists()
     measured("named error, nothing written")
 
 
-# ---- configuration -------------------------------------------------------------------------------------------------------------
+# ---- configuration -------------------------------------------------------------------------------
 
 
 def keys_of(cfg, path=""):
-    """Every dotted key of a configuration but the names of sections' own parts, whose keys are checked with them."""
+    """Every dotted key of a configuration but the names of sections' own parts, whose keys are
+    checked with them.
+    """
     for key in cfg:
         yield f"{path}{key}"
         if hasattr(cfg._get_node(key), "keys"):
@@ -340,7 +437,9 @@ def misspelt(word: str) -> list[str]:
 
 
 def refusal(cfg, section: str, wrong: str, name: str) -> str:
-    """The message about one more key in a configuration that is fine without it; empty if it is accepted."""
+    """The message about one more key in a configuration that is fine without it; empty if it is
+    accepted.
+    """
     part = OmegaConf.select(cfg, section) if section else cfg
     try:
         if section:
@@ -356,7 +455,16 @@ def refusal(cfg, section: str, wrong: str, name: str) -> str:
     return ""
 
 
-COMPUTED = ("exp_dir", "trial_name", "trial_dir", "n_gpus", "timestamp", "resume", "description", "use_timestamp")
+COMPUTED = (
+    "exp_dir",
+    "trial_name",
+    "trial_dir",
+    "n_gpus",
+    "timestamp",
+    "resume",
+    "description",
+    "use_timestamp",
+)
 FOX = ["system.prompt_processor.prompt=a fox"]
 
 
@@ -370,11 +478,20 @@ def test_every_key_misspelt_by_one_letter_is_refused_with_the_right_one(measured
         for key in set(keys_of(cfg)) - set(COMPUTED) - tried:
             section, _, word = key.rpartition(".")
             wrongs = [wrong for wrong in misspelt(word) if len(word) > 1 and wrong != word]
-            failed += [(section, wrong) for wrong in wrongs if word not in refusal(cfg, section, wrong, name)]
+            failed += [
+                (section, wrong)
+                for wrong in wrongs
+                if word not in refusal(cfg, section, wrong, name)
+            ]
             tried.add(key)
     assert not failed, failed
     assert len(tried) > 100
-    measured(len(failed), f"of {len(tried)} keys", what="misspelt and accepted, or without the right word", at_most=0)
+    measured(
+        len(failed),
+        f"of {len(tried)} keys",
+        what="misspelt and accepted, or without the right word",
+        at_most=0,
+    )
 
 
 @row("A5", "Wrong config keys")
@@ -393,41 +510,104 @@ def test_every_option_of_every_part_misspelt_is_refused_with_the_right_one(measu
                     failed += [] if word in str(error) else [(place, wrong)]
     assert not failed, failed
     assert tried > 400
-    measured(len(failed), f"of {tried} misspelt options", what="accepted, or without the right word", at_most=0)
+    measured(
+        len(failed),
+        f"of {tried} misspelt options",
+        what="accepted, or without the right word",
+        at_most=0,
+    )
 
 
 @row("A5", "Wrong config keys")
 def test_every_accepted_key_is_read(measured):
     read, classes = test_configs.names_that_are_read(), test_configs.config_classes()
     keys = [(name, field) for name, cls in classes.items() for field in cls.__dataclass_fields__]
-    measured(sum(field not in read for _, field in keys), f"of {len(keys)} keys", what="read by nobody", at_most=0)
+    measured(
+        sum(field not in read for _, field in keys),
+        f"of {len(keys)} keys",
+        what="read by nobody",
+        at_most=0,
+    )
 
 
 @row("A5", "Wrong config keys")
 @pytest.mark.parametrize(
-    "monitor, message", [("los", "did you mean 'loss'"), ("train/loss_sdss", "train/loss_sds"), ("val/psnr", "choose")]
+    "monitor, message",
+    [("los", "did you mean 'loss'"), ("train/loss_sdss", "train/loss_sds"), ("val/psnr", "choose")],
 )
 def test_a_quantity_that_nobody_logs_is_named_before_any_work(monitor, message, tmp_path, measured):
-    ended = launch(tmp_path, "trainer.max_steps=2", f"checkpoint.monitor={monitor}", "checkpoint.save_top_k=1")
-    assert ended.code == 2 and f"unknown checkpoint.monitor {monitor!r}" in ended.err and message in ended.err, ended.err
+    ended = launch(
+        tmp_path, "trainer.max_steps=2", f"checkpoint.monitor={monitor}", "checkpoint.save_top_k=1"
+    )
+    assert (
+        ended.code == 2
+        and f"unknown checkpoint.monitor {monitor!r}" in ended.err
+        and message in ended.err
+    ), ended.err
     assert not list(tmp_path.iterdir())
-    assert launch(tmp_path, "trainer.max_steps=2", "checkpoint.monitor=loss", "checkpoint.save_top_k=1").code == 0
+    assert (
+        launch(
+            tmp_path, "trainer.max_steps=2", "checkpoint.monitor=loss", "checkpoint.save_top_k=1"
+        ).code
+        == 0
+    )
     measured("named before any work")
 
 
-# ---- prompts -------------------------------------------------------------------------------------------------------------------
+# ---- prompts -------------------------------------------------------------------------------------
 
-PROMPTS = ["a/../../x", "../../x", "/etc/passwd", "x" * 4096, "🦊" * 1000, "CON", "nul.txt", "two\nlines", "a\0b", "-x", "--help", "${x}",
-           "${oc.env:HOME}", "", " ", ".", "..", "~", "1984", "yes", "null", "it's: 3", "[a]", "{a: b}", "a fox # red", "\\", "%s", "a\tb",
-           "\u202eabc", "e\u0301", "&anchor *x", "!!python/object:os.system", "a=b", "\u2028", "٣"]  # fmt: skip
+PROMPTS = [
+    "a/../../x",
+    "../../x",
+    "/etc/passwd",
+    "x" * 4096,
+    "🦊" * 1000,
+    "CON",
+    "nul.txt",
+    "two\nlines",
+    "a\0b",
+    "-x",
+    "--help",
+    "${x}",
+    "${oc.env:HOME}",
+    "",
+    " ",
+    ".",
+    "..",
+    "~",
+    "1984",
+    "yes",
+    "null",
+    "it's: 3",
+    "[a]",
+    "{a: b}",
+    "a fox # red",
+    "\\",
+    "%s",
+    "a\tb",
+    # fmt: skip
+    "\u202eabc",
+    "e\u0301",
+    "&anchor *x",
+    "!!python/object:os.system",
+    "a=b",
+    "\u2028",
+    "٣",
+]
 
 
 @row("A5", "Prompt as path / YAML")
 @pytest.mark.parametrize(
-    "prompt, source", [*((prompt, "command line") for prompt in PROMPTS), *((prompt, "prompt file") for prompt in PROMPTS[::4])]
+    "prompt, source",
+    [
+        *((prompt, "command line") for prompt in PROMPTS),
+        *((prompt, "prompt file") for prompt in PROMPTS[::4]),
+    ],
 )
 def test_a_prompt_stays_text_and_its_folder_below_the_root(prompt, source, tmp_path, measured):
-    """What is stored is the prompt to the letter, also after parsed.yaml was read back; a folder of that name can be made."""
+    """What is stored is the prompt to the letter, also after parsed.yaml was read back; a folder of
+    that name can be made.
+    """
     if source == "prompt file":
         (tmp_path / "prompt.txt").write_bytes(prompt.encode())
         given = f"system.prompt_processor.prompt_file={tmp_path}/prompt.txt"
@@ -443,21 +623,39 @@ def test_a_prompt_stays_text_and_its_folder_below_the_root(prompt, source, tmp_p
         assert text == prompt and type(text) is str
     assert again.trial_dir == cfg.trial_dir and folder.resolve().parent == (root / "demo").resolve()
     slug, at, _ = folder.name.partition("@")
-    assert at and len(slug.encode()) <= 64 + 9  # and a hyphen and eight digits of its hash, where it isn't the prompt itself
+    assert (
+        at and len(slug.encode()) <= 64 + 9
+    )  # and a hyphen and eight digits of its hash, where it isn't the prompt itself
     measured("verbatim, below the root")
 
 
 @row("A5", "Prompt as path / YAML")
 def test_different_prompts_have_different_folders(measured):
-    """Also those that are alike in their first 64 bytes, or once the letters that file systems forbid are replaced."""
-    prompts = [*PROMPTS, "x" * 4095, "🦊" * 999, "a_.._.._x", "two_lines", "a?b", "a*b", "con", "a b", "a  b"]
-    cfgs = [load_config(DEMO, cli_args=[f"system.prompt_processor.prompt={prompt}"]) for prompt in prompts]
+    """Also those that are alike in their first 64 bytes, or once the letters that file systems
+    forbid are replaced.
+    """
+    prompts = [
+        *PROMPTS,
+        "x" * 4095,
+        "🦊" * 999,
+        "a_.._.._x",
+        "two_lines",
+        "a?b",
+        "a*b",
+        "con",
+        "a b",
+        "a  b",
+    ]
+    cfgs = [
+        load_config(DEMO, cli_args=[f"system.prompt_processor.prompt={prompt}"])
+        for prompt in prompts
+    ]
     names = {cfg.trial_name.partition("@")[0] for cfg in cfgs}
     # an empty prompt has no tag at all, only a time
     measured(len(prompts) - len(names), f"of {len(prompts)}", what="that share a folder", at_most=0)
 
 
-# ---- signals -------------------------------------------------------------------------------------------------------------------
+# ---- signals -------------------------------------------------------------------------------------
 
 
 @row("A5", "Ctrl-C / SIGTERM")
@@ -467,29 +665,54 @@ def test_a_signal_at_a_random_step(name, code, step, whole, tmp_path, monkeypatc
     with monkeypatch.context() as patch:
         at_step(patch, step, lambda _: os.kill(os.getpid(), getattr(signal, name)))
         ended = launch(tmp_path, "trainer.max_steps=5")
-    assert ended.code == code and f"stopped at step {step}; to go on: " in ended.out and f"resume={ended.last}" in ended.out, ended.err
+    assert (
+        ended.code == code
+        and f"stopped at step {step}; to go on: " in ended.out
+        and f"resume={ended.last}" in ended.out
+    ), ended.err
     assert load_checkpoint(ended.last)["global_step"] == step
     assert not list(ended.folder.glob("save/*test*"))  # Lightning would go on to the test
     finished = launch(tmp_path, *EVERY_STEP, f"resume={ended.last}")
     assert finished.code == 0, finished.err
-    measured(differences(whole.checkpoint(), finished.checkpoint()), "tensors", what="that differ after resuming", at_most=0)
+    measured(
+        differences(whole.checkpoint(), finished.checkpoint()),
+        "tensors",
+        what="that differ after resuming",
+        at_most=0,
+    )
 
 
 @row("A5", "Ctrl-C / SIGTERM")
 def test_a_signal_while_views_are_validated(whole, tmp_path, monkeypatch, measured):
     """The checkpoint of that step, once the views are done; not that of the last one saved."""
     with monkeypatch.context() as patch:
-        patch.setattr(GaussianDreamerSystem, "on_validation_epoch_end", lambda _: os.kill(os.getpid(), signal.SIGTERM))
-        ended = launch(tmp_path, "trainer.max_steps=5", "trainer.limit_val_batches=1", "trainer.val_check_interval=3")
+        patch.setattr(
+            GaussianDreamerSystem,
+            "on_validation_epoch_end",
+            lambda _: os.kill(os.getpid(), signal.SIGTERM),
+        )
+        ended = launch(
+            tmp_path,
+            "trainer.max_steps=5",
+            "trainer.limit_val_batches=1",
+            "trainer.val_check_interval=3",
+        )
     assert ended.code == 143 and "stopped at step 3; to go on: " in ended.out, ended.err
     finished = launch(tmp_path, *EVERY_STEP, f"resume={ended.last}")
     assert finished.code == 0, finished.err
-    measured(differences(whole.checkpoint(), finished.checkpoint()), "tensors", what="that differ after resuming", at_most=0)
+    measured(
+        differences(whole.checkpoint(), finished.checkpoint()),
+        "tensors",
+        what="that differ after resuming",
+        at_most=0,
+    )
 
 
 @row("A5", "Ctrl-C / SIGTERM")
 def test_a_second_signal_stops_at_once(tmp_path, monkeypatch, measured):
-    """In the middle of a step: the checkpoint of the step before is what is left, and the run can go on from it."""
+    """In the middle of a step: the checkpoint of the step before is what is left, and the run can
+    go on from it.
+    """
 
     def impatient(system):
         os.kill(os.getpid(), signal.SIGINT)
@@ -497,5 +720,12 @@ def test_a_second_signal_stops_at_once(tmp_path, monkeypatch, measured):
 
     at_step(monkeypatch, 3, impatient)
     ended = launch(tmp_path, *EVERY_STEP)
-    assert ended.code == 130 and "Traceback" not in ended.err and f"resume={ended.last}" in ended.out, ended.err
-    measured(3 - load_checkpoint(ended.last)["global_step"], "steps", what="lost to a second signal", at_most=1)
+    assert (
+        ended.code == 130 and "Traceback" not in ended.err and f"resume={ended.last}" in ended.out
+    ), ended.err
+    measured(
+        3 - load_checkpoint(ended.last)["global_step"],
+        "steps",
+        what="lost to a second signal",
+        at_most=1,
+    )

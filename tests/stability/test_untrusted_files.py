@@ -1,4 +1,6 @@
-"""A5: what comes from outside. Point clouds of others, pickles at every door, modules that fail, and no network."""
+"""A5: what comes from outside. Point clouds of others, pickles at every door, modules that fail,
+and no network.
+"""
 
 import ast
 import os
@@ -33,14 +35,28 @@ register_parts()
 PACKAGE = Path(threestudio_gaussiandreamer.__file__).parent
 
 
-# ---- PLY -----------------------------------------------------------------------------------------------------------------------
+# ---- PLY -----------------------------------------------------------------------------------------
 
-GAUSSIAN = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+GAUSSIAN = [
+    *"xyz",
+    "f_dc_0",
+    "f_dc_1",
+    "f_dc_2",
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+]
 
 
 def ply(rows: np.ndarray, names=GAUSSIAN, encoding="binary_little_endian", count=None) -> bytes:
     count = len(rows) if count is None else count
-    header = ["ply", f"format {encoding} 1.0", f"element vertex {count}", *(f"property float {name}" for name in names), "end_header\n"]
+    header = [
+        "ply",
+        f"format {encoding} 1.0",
+        f"element vertex {count}",
+        *(f"property float {name}" for name in names),
+        "end_header\n",
+    ]
     if encoding == "ascii":
         body = "".join(" ".join(map(repr, row.tolist())) + "\n" for row in rows).encode()
     else:
@@ -77,7 +93,11 @@ def test_a_ply_of_others_is_read_right(what, tmp_path, measured):
     (tmp_path / "a.ply").write_bytes(FOREIGN[what])
     arrays, expected = read_gaussians(tmp_path / "a.ply"), numbers(9)
     assert np.array_equal(read_points(tmp_path / "a.ply").points, expected[:, :3])
-    wrong = (arrays.means != expected[:, :3]).sum() + (arrays.quats != expected[:, 10:]).sum() + (arrays.sh[:, 0] != expected[:, 3:6]).sum()
+    wrong = (
+        (arrays.means != expected[:, :3]).sum()
+        + (arrays.quats != expected[:, 10:]).sum()
+        + (arrays.sh[:, 0] != expected[:, 3:6]).sum()
+    )
     measured(wrong, "numbers", what="read wrong", at_most=0)
 
 
@@ -95,14 +115,26 @@ def test_a_broken_ply_is_a_clean_error_in_little_memory(what, tmp_path, measured
 
 @row("A5", "Corrupted/foreign PLY")
 def test_500_mutants_are_read_or_refused_in_little_memory(tmp_path, measured):
-    """Bytes changed, taken out, repeated, cut off, in header and rows of each of the files above; `make fuzz` also asks what was read."""
-    path, draw, ended, peak = tmp_path / "a.ply", np.random.default_rng(0), {"read": 0, "refused": 0}, 0
+    """Bytes changed, taken out, repeated, cut off, in header and rows of each of the files above;
+    `make fuzz` also asks what was read.
+    """
+    path, draw, ended, peak = (
+        tmp_path / "a.ply",
+        np.random.default_rng(0),
+        {"read": 0, "refused": 0},
+        0,
+    )
     for i in range(500):
         data = bytearray([*FOREIGN.values()][i % len(FOREIGN)])
         for _ in range(draw.integers(1, 4)):
             # every second time in the header, which a choice among all bytes would seldom reach
             at = int(draw.integers(len(data) if i % 2 else data.find(b"end_header") % len(data)))
-            change = [bytes(draw.integers(0, 256, 1, np.uint8)), b"", bytes(data[at : at + 8]) * 2, b"9" * 12][draw.integers(4)]
+            change = [
+                bytes(draw.integers(0, 256, 1, np.uint8)),
+                b"",
+                bytes(data[at : at + 8]) * 2,
+                b"9" * 12,
+            ][draw.integers(4)]
             data[at : at + 1] = change
         path.write_bytes(data if draw.random() < 0.8 else data[: draw.integers(len(data))])
         tracemalloc.start()
@@ -126,7 +158,7 @@ def test_an_empty_cloud_is_read_as_one(tmp_path, measured):
     measured("N = 0 read")
 
 
-# ---- no network ----------------------------------------------------------------------------------------------------------------
+# ---- no network ----------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -146,9 +178,13 @@ def hang(*args, **kwargs):
 
 
 @row("A5", "Hub offline")
-@pytest.mark.parametrize("what", ["sockets blocked", "no answer to connecting", "no answer to a name", "HF_HUB_OFFLINE"])
+@pytest.mark.parametrize(
+    "what", ["sockets blocked", "no answer to connecting", "no answer to a name", "HF_HUB_OFFLINE"]
+)
 def test_a_model_that_is_not_here_is_named_within_seconds(what, empty_cache, monkeypatch, measured):
-    """The message says what to place where. A name that nobody resolves is the long one: that call knows no timeout."""
+    """The message says what to place where. A name that nobody resolves is the long one: that call
+    knows no timeout.
+    """
     if what == "HF_HUB_OFFLINE":
         monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     elif what == "no answer to a name":
@@ -162,7 +198,11 @@ def test_a_model_that_is_not_here_is_named_within_seconds(what, empty_cache, mon
         if what != "sockets blocked":
             monkeypatch.setattr(hub, "TIMEOUT", 0.5)  # what users wait is 8 times as long
     start = time.monotonic()
-    with pytest.raises(UserError, match="hf download .*--local-dir models/model`; then set .*pretrained_model_name_or_path to that folder"):
+    with pytest.raises(
+        UserError,
+        match="hf download .*--local-dir models/model`; then set "
+        ".*pretrained_model_name_or_path to that folder",
+    ):
         hub.find_model("nobody/model", ("unet", "vae"))
     seconds = time.monotonic() - start
     scale = 1.0 if what in ("sockets blocked", "HF_HUB_OFFLINE") else hub_seconds() / 0.5
@@ -172,7 +212,11 @@ def test_a_model_that_is_not_here_is_named_within_seconds(what, empty_cache, mon
 def hub_seconds() -> float:
     """The timeout as users have it, whatever a test has made of it."""
     tree = ast.parse((PACKAGE / "hub.py").read_text())
-    return next(node.value.value for node in tree.body if isinstance(node, ast.Assign) and node.targets[0].id == "TIMEOUT")
+    return next(
+        node.value.value
+        for node in tree.body
+        if isinstance(node, ast.Assign) and node.targets[0].id == "TIMEOUT"
+    )
 
 
 @row("A5", "Hub offline")
@@ -184,7 +228,7 @@ def test_the_guidance_without_weights_asks_no_network(tmp_path, monkeypatch, mea
     measured("a whole run without a socket")
 
 
-# ---- hostile files -------------------------------------------------------------------------------------------------------------
+# ---- hostile files -------------------------------------------------------------------------------
 
 
 class Bomb:
@@ -198,13 +242,24 @@ class Bomb:
 
 
 def bomb_checkpoint(path: Path, bomb: Bomb) -> Path:
-    torch.save({"state_dict": {}, "epoch": 0, "global_step": 0, "pytorch-lightning_version": "2.6.6", "hparams": bomb}, path)
+    torch.save(
+        {
+            "state_dict": {},
+            "epoch": 0,
+            "global_step": 0,
+            "pytorch-lightning_version": "2.6.6",
+            "hparams": bomb,
+        },
+        path,
+    )
     return path
 
 
 def bomb_numpy(path: Path, bomb: Bomb, **names) -> Path:
     array = np.array([bomb], object)
-    np.savez(path, **{name: array for name in names}) if path.suffix == ".npz" else np.save(path, array)
+    np.savez(path, **{name: array for name in names}) if path.suffix == ".npz" else np.save(
+        path, array
+    )
     return path
 
 
@@ -215,15 +270,28 @@ def refused(door) -> None:
 
 def tiny_text_model(folder: Path) -> Path:
     transformers = pytest.importorskip("transformers")
-    config = transformers.CLIPTextConfig(hidden_size=8, intermediate_size=8, num_hidden_layers=1, num_attention_heads=1, vocab_size=50)
+    config = transformers.CLIPTextConfig(
+        hidden_size=8,
+        intermediate_size=8,
+        num_hidden_layers=1,
+        num_attention_heads=1,
+        vocab_size=50,
+    )
     config.save_pretrained(folder / "text_encoder")
     return folder
 
 
 def open_bin(folder: Path, bomb: Bomb) -> None:
     transformers = pytest.importorskip("transformers")
-    torch.save({"text_model.embeddings.position_embedding.weight": bomb}, tiny_text_model(folder) / "text_encoder" / "pytorch_model.bin")
-    refused(lambda: model_files.load_network(transformers.CLIPTextModel, folder, "text_encoder", allow_bin=True))
+    torch.save(
+        {"text_model.embeddings.position_embedding.weight": bomb},
+        tiny_text_model(folder) / "text_encoder" / "pytorch_model.bin",
+    )
+    refused(
+        lambda: model_files.load_network(
+            transformers.CLIPTextModel, folder, "text_encoder", allow_bin=True
+        )
+    )
 
 
 def open_embedding(folder: Path, bomb: Bomb) -> None:
@@ -246,7 +314,9 @@ def launched(option: str, stage: str = "--train"):
     def door(folder: Path, bomb: Bomb) -> None:
         path = bomb_checkpoint(folder / "bomb.ckpt", bomb)
         ended = launch(folder / "out", option.format(path), "trainer.max_steps=1", stage=stage)
-        assert ended.code == 2 and "could run code" in ended.err and "Traceback" not in ended.err, ended.err
+        assert ended.code == 2 and "could run code" in ended.err and "Traceback" not in ended.err, (
+            ended.err
+        )
 
     return door
 
@@ -265,17 +335,33 @@ DOORS = {
         lambda: read_state_dict(str(bomb_checkpoint(folder / "a.pt", bomb)), "Shap-E")
     ),
     "a bare pickle as .pt": lambda folder, bomb: refused(
-        lambda: [(folder / "a.pt").write_bytes(pickle.dumps(bomb)), read_state_dict(str(folder / "a.pt"), "Shap-E")]
+        lambda: [
+            (folder / "a.pt").write_bytes(pickle.dumps(bomb)),
+            read_state_dict(str(folder / "a.pt"), "Shap-E"),
+        ]
     ),
     "pytorch_model.bin": open_bin,
-    "points .npy": lambda folder, bomb: refused(lambda: load_points(bomb_numpy(folder / "a.npy", bomb))),
-    "points .npz": lambda folder, bomb: refused(lambda: load_points(bomb_numpy(folder / "a.npz", bomb, points=1))),
-    "motion .npy": lambda folder, bomb: refused(lambda: read_motions(str(bomb_numpy(folder / "a.npy", bomb)))),
-    "motion .npz": lambda folder, bomb: refused(lambda: read_motions(str(bomb_numpy(folder / "a.npz", bomb, motion=1)))),
-    "body model .npz": lambda folder, bomb: refused(lambda: load_body_model(str(bomb_numpy(folder / "a.npz", bomb, v_template=1)))),
+    "points .npy": lambda folder, bomb: refused(
+        lambda: load_points(bomb_numpy(folder / "a.npy", bomb))
+    ),
+    "points .npz": lambda folder, bomb: refused(
+        lambda: load_points(bomb_numpy(folder / "a.npz", bomb, points=1))
+    ),
+    "motion .npy": lambda folder, bomb: refused(
+        lambda: read_motions(str(bomb_numpy(folder / "a.npy", bomb)))
+    ),
+    "motion .npz": lambda folder, bomb: refused(
+        lambda: read_motions(str(bomb_numpy(folder / "a.npz", bomb, motion=1)))
+    ),
+    "body model .npz": lambda folder, bomb: refused(
+        lambda: load_body_model(str(bomb_numpy(folder / "a.npz", bomb, v_template=1)))
+    ),
     "body model, a pickle called .npz": renamed_pickle,
     "body model .pkl": lambda folder, bomb: refused(
-        lambda: [(folder / "a.pkl").write_bytes(pickle.dumps(bomb)), load_body_model(str(folder / "a.pkl"))]
+        lambda: [
+            (folder / "a.pkl").write_bytes(pickle.dumps(bomb)),
+            load_body_model(str(folder / "a.pkl")),
+        ]
     ),
     "cached prior": open_prior_cache,
     "cached text embedding": open_embedding,
@@ -294,7 +380,11 @@ def test_nothing_that_is_opened_runs_code(door, tmp_path, measured):
     measured("nothing executed")
 
 
-SAFE = {"torch.load": ("weights_only", True), "np.load": ("allow_pickle", False), "npy.read_array": ("allow_pickle", False)}
+SAFE = {
+    "torch.load": ("weights_only", True),
+    "np.load": ("allow_pickle", False),
+    "npy.read_array": ("allow_pickle", False),
+}
 NEVER = ("pickle.load", "pickle.loads", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "torch.hub.load", "marshal.loads", "joblib.load",
          "shelve.open", "eval", "exec", "os.system", "dill.load")  # fmt: skip
 
@@ -302,17 +392,25 @@ NEVER = ("pickle.load", "pickle.loads", "yaml.load", "yaml.unsafe_load", "yaml.f
 def calls(path: Path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Call):
-            yield ast.unparse(node.func), {keyword.arg: keyword.value for keyword in node.keywords}, node.lineno
+            yield (
+                ast.unparse(node.func),
+                {keyword.arg: keyword.value for keyword in node.keywords},
+                node.lineno,
+            )
 
 
 @row("A5", "Untrusted pickle")
 def test_every_load_in_the_package_is_the_safe_one(measured):
-    """Named ``torch.load`` and ``np.load``, so that none hides behind another name; benchmarks and the launcher included."""
+    """Named ``torch.load`` and ``np.load``, so that none hides behind another name; benchmarks and
+    the launcher included.
+    """
     unsafe, found = [], 0
     root = PACKAGE.parent
     for path in [*PACKAGE.rglob("*.py"), *(root / "benchmarks").glob("*.py"), root / "launch.py"]:
         source = path.read_text()
-        assert not re.search(r"from (torch|numpy|numpy\.lib\.format) import .*(load|read_array)\b", source)
+        assert not re.search(
+            r"from (torch|numpy|numpy\.lib\.format) import .*(load|read_array)\b", source
+        )
         for name, keywords, line in calls(path):
             if name in SAFE:
                 found += 1
@@ -326,7 +424,7 @@ def test_every_load_in_the_package_is_the_safe_one(measured):
     measured(len(unsafe), f"of {found} loads", what="unsafe", at_most=0)
 
 
-# ---- modules of the user -------------------------------------------------------------------------------------------------------
+# ---- modules of the user -------------------------------------------------------------------------
 
 MODULES = {
     "ImportError": ("import nothing_of_this_name", "custom/part.py:1: ModuleNotFoundError"),
@@ -335,7 +433,8 @@ MODULES = {
     "sys.exit()": ("import sys\nsys.exit()", "custom/part.py:2: SystemExit"),
     "sys.exit(0)": ("import sys\nsys.exit(0)", "custom/part.py:2: SystemExit: 0"),
     "a name that is taken": (
-        "from threestudio_gaussiandreamer.host import register\n@register('mesh-prior')\nclass Mine: pass",
+        "from threestudio_gaussiandreamer.host import register\n@register('mesh-prior')\nclass "
+        "Mine: pass",
         "custom/part.py:2",
     ),
 }
@@ -365,9 +464,15 @@ def test_a_signal_while_a_module_is_imported_is_not_its_fault(tmp_path, monkeypa
 
 
 @row("A5", "Failed custom module")
-def test_a_part_that_calls_sys_exit_in_the_middle_of_a_run_is_named(tmp_path, monkeypatch, measured):
+def test_a_part_that_calls_sys_exit_in_the_middle_of_a_run_is_named(
+    tmp_path, monkeypatch, measured
+):
     """``sys.exit()`` means success, which a run that somebody else has ended isn't."""
     monkeypatch.setattr(GaussianDreamerSystem, "training_step", lambda *args: sys.exit())
     ended = launch(tmp_path, "trainer.max_steps=1")
-    assert ended.code == 2 and f"{Path(__file__).name}:" in ended.err and "ended the run with sys.exit(None)" in ended.err
+    assert (
+        ended.code == 2
+        and f"{Path(__file__).name}:" in ended.err
+        and "ended the run with sys.exit(None)" in ended.err
+    )
     measured("named, exit code 2")

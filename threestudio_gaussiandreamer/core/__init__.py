@@ -1,1 +1,3 @@
-"""What every ring uses: errors, random streams, files, checkpoints, schedules, images. No host, no models."""
+"""What every ring uses: errors, random streams, files, checkpoints, schedules, images. No host, no
+models.
+"""

@@ -1,8 +1,8 @@
-"""Checkpoint files: written so that a crash leaves the earlier one whole, read so that damage is noticed and no code runs.
+"""Checkpoint files: written so that a crash leaves the earlier one whole, read so that damage is
+noticed and no code runs.
 
-A file is what ``torch.save`` writes, a zip archive, with ``sha256:<hex>`` of everything before it as the archive's comment.
-Plain ``torch.load`` reads it.
-"""
+A file is what ``torch.save`` writes, a zip archive, with ``sha256:<hex>`` of everything before it
+as the archive's comment. Plain ``torch.load`` reads it."""
 
 import hashlib
 import io
@@ -31,7 +31,8 @@ _BLOCK_BYTES = 1 << 20
 
 
 def save_file(path: str | os.PathLike, content: Any) -> None:
-    """Write ``content`` to ``path``; the earlier file stays until the new one is whole, and then beside it as ``<stem>-prev``.
+    """Write ``content`` to ``path``; the earlier file stays until the new one is whole, and then
+    beside it as ``<stem>-prev``.
 
     Raises:
         UserError: the disk is full or the folder can't be written; the earlier file is untouched.
@@ -63,19 +64,28 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
         # torch's own first line advises to read it all the same
         found = re.search(r"GLOBAL (\S+)", str(error))
         what = f": {found[1]}" if found else ""
-        raise UserError(f"{path} holds Python objects that could run code when read, so it isn't read{what}") from error
-    except Exception as error:  # where a pickle is damaged, torch's reader of it raises what it likes
+        raise UserError(
+            f"{path} holds Python objects that could run code when read, so it isn't read{what}"
+        ) from error
+    except (
+        Exception
+    ) as error:  # where a pickle is damaged, torch's reader of it raises what it likes
         raise UserError(f"{path} isn't a checkpoint, or is damaged: {_reason(error)}") from error
     _require_stored(content, path)
     return content
 
 
 def _require_stored(content: Any, path: Path) -> None:
-    """Raise UserError for a tensor that repeats a few numbers to more than the file could hold: whoever copies it fills the memory."""
+    """Raise UserError for a tensor that repeats a few numbers to more than the file could hold:
+    whoever copies it fills the memory.
+    """
     size = os.path.getsize(path)
     for tensor in _tensors(content):
         if tensor.numel() * tensor.element_size() > size:
-            raise UserError(f"{path} is damaged: it announces a tensor of the shape {tuple(tensor.shape)}, which {size} bytes can't hold")
+            raise UserError(
+                f"{path} is damaged: it announces a tensor of the shape {tuple(tensor.shape)}, "
+                f"which {size} bytes can't hold"
+            )
 
 
 def _tensors(content: Any) -> Iterator[torch.Tensor]:
@@ -93,8 +103,14 @@ def previous_of(path: str | os.PathLike) -> Path:
 
 
 def newest_readable(folder: str | os.PathLike) -> Optional[tuple[Path, int]]:
-    """The whole checkpoint with most steps among a folder's, of equal ones ``last.ckpt``, and its step; says what is damaged."""
-    by_step = sorted(Path(folder).glob("*.ckpt"), key=lambda path: (_claimed_step(path), path.stem == "last"), reverse=True)
+    """The whole checkpoint with most steps among a folder's, of equal ones ``last.ckpt``, and its
+    step; says what is damaged.
+    """
+    by_step = sorted(
+        Path(folder).glob("*.ckpt"),
+        key=lambda path: (_claimed_step(path), path.stem == "last"),
+        reverse=True,
+    )
     for candidate in by_step:
         try:
             return candidate, load_checkpoint(candidate)["global_step"]
@@ -104,17 +120,25 @@ def newest_readable(folder: str | os.PathLike) -> Optional[tuple[Path, int]]:
 
 
 def _claimed_step(path: Path) -> float:
-    """The step that a checkpoint says it is from, its tensors unread and its checksum unchecked; infinity where it says none."""
+    """The step that a checkpoint says it is from, its tensors unread and its checksum unchecked;
+    infinity where it says none.
+    """
     try:
-        return int(torch.load(path, map_location="cpu", weights_only=True, mmap=True)["global_step"])
+        return int(
+            torch.load(path, map_location="cpu", weights_only=True, mmap=True)["global_step"]
+        )
     except Exception:  # whatever is wrong with it, who reads it whole will say
         return math.inf
 
 
 def load_module_weights(
-    path: str, module_name: Optional[str] = None, ignore_modules: Optional[list[str]] = None, map_location: Any = "cpu"
+    path: str,
+    module_name: Optional[str] = None,
+    ignore_modules: Optional[list[str]] = None,
+    map_location: Any = "cpu",
 ) -> tuple[dict, int, int]:
-    """Parameters of one module (its prefix removed), or of all but the ignored ones, with the epoch and step of a checkpoint.
+    """Parameters of one module (its prefix removed), or of all but the ignored ones, with the epoch
+    and step of a checkpoint.
 
     Raises:
         UserError: the file is missing, damaged or no checkpoint, or has nothing for that module.
@@ -122,11 +146,18 @@ def load_module_weights(
     checkpoint = load_checkpoint(path, map_location)
     state = checkpoint["state_dict"]
     if module_name:
-        state = {key.removeprefix(f"{module_name}."): value for key, value in state.items() if key.startswith(f"{module_name}.")}
+        state = {
+            key.removeprefix(f"{module_name}."): value
+            for key, value in state.items()
+            if key.startswith(f"{module_name}.")
+        }
     for ignored in ignore_modules or []:
         state = {key: value for key, value in state.items() if not key.startswith(f"{ignored}.")}
     if not state:
-        raise UserError(f"the checkpoint {path} has no parameters of {module_name!r}; it has {sorted(checkpoint['state_dict'])}")
+        raise UserError(
+            f"the checkpoint {path} has no parameters of {module_name!r}; it has "
+            f"{sorted(checkpoint['state_dict'])}"
+        )
     return state, checkpoint["epoch"], checkpoint["global_step"]
 
 
@@ -137,12 +168,19 @@ def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:
         UserError: as :func:`load_file`, or the file holds something else.
     """
     checkpoint = load_file(path, map_location)
-    missing = {"state_dict", "epoch", "global_step"} - set(checkpoint if isinstance(checkpoint, dict) else ())
+    missing = {"state_dict", "epoch", "global_step"} - set(
+        checkpoint if isinstance(checkpoint, dict) else ()
+    )
     if missing:
-        raise UserError(f"{path} isn't a training checkpoint: it has no {', '.join(sorted(missing))}")
+        raise UserError(
+            f"{path} isn't a training checkpoint: it has no {', '.join(sorted(missing))}"
+        )
     for key, kind in (("state_dict", Mapping), ("epoch", int), ("global_step", int)):
         if not isinstance(checkpoint[key], kind):
-            raise UserError(f"{path} isn't a training checkpoint: its {key} is of type {type(checkpoint[key]).__name__}")
+            raise UserError(
+                f"{path} isn't a training checkpoint: its {key} is of type "
+                f"{type(checkpoint[key]).__name__}"
+            )
     return checkpoint
 
 
@@ -153,7 +191,9 @@ def _prepare_folder(path: Path) -> None:
         for stale in path.parent.glob(f".{glob_escape(path.name)}.*.tmp"):
             stale.unlink(missing_ok=True)
     except OSError as error:
-        raise UserError(f"the folder of the checkpoint {path} can't be written: {error.strerror or error}") from error
+        raise UserError(
+            f"the folder of the checkpoint {path} can't be written: {error.strerror or error}"
+        ) from error
 
 
 def _with_checksum(archive: bytes) -> bytes:
@@ -174,20 +214,30 @@ def _verify(path: Path) -> None:
         file.seek(0)
         digest = _digest(file, mark_at + len(_MARK))
     if digest.hexdigest().encode() != tail[len(_MARK) :]:
-        raise UserError(f"the checkpoint {path} is damaged: its checksum doesn't match{_siblings(path)}")
+        raise UserError(
+            f"the checkpoint {path} is damaged: its checksum doesn't match{_siblings(path)}"
+        )
 
 
 def _verify_foreign(path: Path, tail: bytes) -> None:
-    """A file of plain torch: a whole archive by its end, and each record by the checksum that torch writes but doesn't read."""
+    """A file of plain torch: a whole archive by its end, and each record by the checksum that torch
+    writes but doesn't read.
+    """
     if tail[-_END_RECORD_BYTES:][:4] != _END_OF_ARCHIVE or not tail.endswith(b"\0\0"):
-        raise UserError(f"{path} isn't a checkpoint, or is cut short: it doesn't end as torch.save ends a file{_siblings(path)}")
+        raise UserError(
+            f"{path} isn't a checkpoint, or is cut short: it doesn't end as torch.save ends a "
+            f"file{_siblings(path)}"
+        )
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
     except (zipfile.BadZipFile, NotImplementedError, OSError, ValueError, RuntimeError) as error:
         raise UserError(f"the checkpoint {path} is damaged: {error}{_siblings(path)}") from error
     if damaged:
-        raise UserError(f"the checkpoint {path} is damaged: the checksum of {damaged} doesn't match{_siblings(path)}")
+        raise UserError(
+            f"the checkpoint {path} is damaged: the checksum of {damaged} doesn't "
+            f"match{_siblings(path)}"
+        )
 
 
 def _digest(file: Any, count: int) -> Any:
@@ -202,7 +252,9 @@ def _keep_previous(path: Path) -> None:
         return
     kept = previous_of(path)
     if kept.exists() and kept.samefile(path):
-        return  # a kill fell after this, the last time; renaming one name of a file to another would leave both
+        # a kill fell after this, the last time; renaming one name of a file to another would leave
+        # both
+        return
     temporary = kept.with_name(f".{kept.name}.tmp")
     temporary.unlink(missing_ok=True)
     try:
@@ -214,7 +266,11 @@ def _keep_previous(path: Path) -> None:
 
 
 def _siblings(path: Path) -> str:
-    others = sorted(str(other) for other in path.parent.glob("*.ckpt") if other != path) if path.parent.is_dir() else []
+    others = (
+        sorted(str(other) for other in path.parent.glob("*.ckpt") if other != path)
+        if path.parent.is_dir()
+        else []
+    )
     return f"; in the same folder there are {', '.join(others)}" if others else ""
 
 

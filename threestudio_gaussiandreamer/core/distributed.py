@@ -1,4 +1,5 @@
-"""Several processes that train one cloud: each renders its own views, gradients and statistics are combined.
+"""Several processes that train one cloud: each renders its own views, gradients and statistics are
+combined.
 
 Every function does nothing in a process that trains alone.
 """
@@ -34,7 +35,9 @@ def all_max(tensor: Tensor) -> Tensor:
 
 
 def average_gradients(parameters: Iterable[torch.nn.Parameter]) -> None:
-    """Make every process step with the mean gradient, so that the clouds stay equal; a missing gradient counts as zero."""
+    """Make every process step with the mean gradient, so that the clouds stay equal; a missing
+    gradient counts as zero.
+    """
     if not is_active():
         return
     for parameter in parameters:

@@ -1,4 +1,6 @@
-"""Reading and writing files so that a mistake is one clear message and a crash leaves nothing half-written."""
+"""Reading and writing files so that a mistake is one clear message and a crash leaves nothing
+half-written.
+"""
 
 import os
 import threading
@@ -12,13 +14,15 @@ from .errors import UserError
 
 
 def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] = ()) -> Path:
-    """``path`` as a :class:`Path` when a file is there; ``kind`` ("mesh", "PLY file") names it in the message.
+    """``path`` as a :class:`Path` when a file is there; ``kind`` ("mesh", "PLY file") names it in
+    the message.
 
     Args:
         bundled: bare names of files that come along, for the message only.
 
     Raises:
-        UserError: nothing, or no file, is there; the message lists the files of that folder with near names.
+        UserError: nothing, or no file, is there; the message lists the files of that folder with
+            near names.
     """
     try:
         path = Path(path).expanduser()
@@ -26,27 +30,42 @@ def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] =
             return path
         reason = "is a folder, not a file" if path.is_dir() else "does not exist"
         neighbours = near_names(path, bundled)
-    except (OSError, ValueError, RuntimeError) as error:  # a name too long, a NUL inside, a "~stranger"
+    except (
+        OSError,
+        ValueError,
+        RuntimeError,
+    ) as error:  # a name too long, a NUL inside, a "~stranger"
         raise UserError(f"{kind} {str(path)!r}: not a usable file name ({error}).") from error
     raise UserError(f"{kind} {str(path)!r} {reason}{neighbours}")
 
 
 def near_names(path: Path, bundled: Collection[str] = ()) -> str:
-    """The end of a "missing" message: the files beside ``path`` with near names or of its kind, or a bundled one that may be meant."""
+    """The end of a "missing" message: the files beside ``path`` with near names or of its kind, or
+    a bundled one that may be meant.
+    """
     folder = path.parent
-    names = sorted(entry.name for entry in folder.iterdir() if entry.is_file()) if folder.is_dir() else []
+    names = (
+        sorted(entry.name for entry in folder.iterdir() if entry.is_file())
+        if folder.is_dir()
+        else []
+    )
     near = get_close_matches(path.name, names, n=3, cutoff=0.5)
     if not near and (meant := get_close_matches(path.name, bundled, n=1, cutoff=0.5)):
         return f"; did you mean the bundled {meant[0]!r}?"
     if not folder.is_dir():
         return f": there is no folder {str(folder)!r} either."
     near = near or [name for name in names if Path(name).suffix == path.suffix][:3]
-    return f"; near names in {str(folder)!r}: {', '.join(near)}." if near else f"; no file in {str(folder)!r} has a near name."
+    return (
+        f"; near names in {str(folder)!r}: {', '.join(near)}."
+        if near
+        else f"; no file in {str(folder)!r} has a near name."
+    )
 
 
 @contextmanager
 def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[BinaryIO]:
-    """A binary file that appears under ``path`` whole, on success, or not at all; what was there stays until then.
+    """A binary file that appears under ``path`` whole, on success, or not at all; what was there
+    stays until then.
 
     The content goes to a temporary file beside it, which takes the name when it is whole.
 
@@ -68,7 +87,10 @@ def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bi
         if durable:
             _sync_folder(path.parent)
     except OSError as error:
-        raise UserError(f"cannot write {str(path)!r}: {error.strerror or error}. An earlier file of this name is untouched.") from error
+        raise UserError(
+            f"cannot write {str(path)!r}: {error.strerror or error}. An earlier file of this "
+            "name is untouched."
+        ) from error
     finally:
         temporary.unlink(missing_ok=True)
 

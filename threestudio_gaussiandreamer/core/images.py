@@ -17,8 +17,12 @@ _COLOR_MAPS = {
 }
 
 
-def rgb(image: np.ndarray, *, data_format: str = "HWC", data_range: tuple[float, float] = (0, 1)) -> np.ndarray:
-    """(H,W,C) or (C,H,W) to uint8 (H, W*ceil(C/3), 3): channels three by three side by side, missing ones black."""
+def rgb(
+    image: np.ndarray, *, data_format: str = "HWC", data_range: tuple[float, float] = (0, 1)
+) -> np.ndarray:
+    """(H,W,C) or (C,H,W) to uint8 (H, W*ceil(C/3), 3): channels three by three side by side,
+    missing ones black.
+    """
     if data_format not in ("HWC", "CHW"):
         raise ValueError(f"data_format is {data_format!r}; expected 'HWC' or 'CHW'")
     if data_format == "CHW":
@@ -29,28 +33,43 @@ def rgb(image: np.ndarray, *, data_format: str = "HWC", data_range: tuple[float,
     return np.concatenate(np.split(image, image.shape[-1] // 3, axis=-1), axis=1)
 
 
-def grayscale(image: np.ndarray, *, data_range: Optional[tuple[float, float]] = None, cmap: Optional[str] = "jet") -> np.ndarray:
+def grayscale(
+    image: np.ndarray,
+    *,
+    data_range: Optional[tuple[float, float]] = None,
+    cmap: Optional[str] = "jet",
+) -> np.ndarray:
     """(H,W) to uint8 (H,W,3); without ``data_range`` from the smallest value to the largest."""
     image = np.nan_to_num(image)
     values = _normalize(image, data_range or (image.min(), image.max()))
     if cmap is None:
         return np.repeat(_to_bytes(values)[..., None], 3, axis=-1)
     if cmap not in _COLOR_MAPS:
-        raise ValueError(f"unknown colour map {cmap!r}; expected None or one of {', '.join(_COLOR_MAPS)}")
-    knots = np.array([list(bytes.fromhex(knot)) for knot in _COLOR_MAPS[cmap].split()], dtype=np.float64)
+        raise ValueError(
+            f"unknown colour map {cmap!r}; expected None or one of {', '.join(_COLOR_MAPS)}"
+        )
+    knots = np.array(
+        [list(bytes.fromhex(knot)) for knot in _COLOR_MAPS[cmap].split()], dtype=np.float64
+    )
     positions = np.linspace(0, 1, len(knots))
-    return np.stack([np.interp(values, positions, knots[:, c]) for c in range(3)], axis=-1).round().astype(np.uint8)
+    return (
+        np.stack([np.interp(values, positions, knots[:, c]) for c in range(3)], axis=-1)
+        .round()
+        .astype(np.uint8)
+    )
 
 
 def grid(cells: list, *, align: Any = "max") -> np.ndarray:
     """A row of ``{"type", "img", "kwargs"}``, or a list of rows, as one picture.
 
-    ``align`` is the size of every cell: "max" or "min" of the cells, a number of pixels, or (height, width).
-    """
+    ``align`` is the size of every cell: "max" or "min" of the cells, a number of pixels, or
+    (height, width)."""
     if isinstance(cells[0], list):
         rows = [grid(row, align=align) for row in cells]
         width = max(row.shape[1] for row in rows)
-        return np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows], axis=0)
+        return np.concatenate(
+            [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows], axis=0
+        )
     makers = {"rgb": rgb, "grayscale": grayscale}
     images = [makers[cell["type"]](cell["img"], **cell.get("kwargs", {})) for cell in cells]
     height, width = _cell_size(images, align)
@@ -64,7 +83,13 @@ def with_texts(image: np.ndarray, texts: list) -> np.ndarray:
     canvas = Image.fromarray(image)
     draw = ImageDraw.Draw(canvas)
     for row, text in enumerate(texts):
-        draw.text((2, row * (image.shape[0] // len(texts))), str(text), fill=(0, 0, 0), stroke_width=1, stroke_fill=(255, 255, 255))
+        draw.text(
+            (2, row * (image.shape[0] // len(texts))),
+            str(text),
+            fill=(0, 0, 0),
+            stroke_width=1,
+            stroke_fill=(255, 255, 255),
+        )
     return np.asarray(canvas)
 
 
@@ -82,7 +107,8 @@ def write(path: str | os.PathLike, image: np.ndarray) -> None:
 
 
 def write_video(path: str, frames: list[Path], *, fps: int) -> None:
-    """The pictures as an mp4 (H.264) or gif; odd sizes are padded to even ones, which H.264 asks for.
+    """The pictures as an mp4 (H.264) or gif; odd sizes are padded to even ones, which H.264 asks
+    for.
 
     Raises:
         UserError: the disk is full, or there is no ffmpeg.
@@ -106,7 +132,9 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
 
 
 def _require_whole_mp4(path: Path) -> None:
-    """Raise OSError unless ffmpeg came to its end, which nobody asks it: its boxes fill the file, and the index is among them."""
+    """Raise OSError unless ffmpeg came to its end, which nobody asks it: its boxes fill the file,
+    and the index is among them.
+    """
     names, place, size = [], 0, path.stat().st_size
     with open(path, "rb") as file:
         while place + 8 <= size:

@@ -5,7 +5,9 @@ from typing import Any
 
 
 def escape(value: Any) -> Any:
-    """``value`` such that OmegaConf gives the same text back: each ``${`` of a string, also inside lists and dicts, escaped."""
+    """``value`` such that OmegaConf gives the same text back: each ``${`` of a string, also inside
+    lists and dicts, escaped.
+    """
     if isinstance(value, str):
         # backslashes mean themselves, except right before "${"
         return re.sub(r"(\\*)\$\{", lambda match: 2 * match[1] + r"\${", value)

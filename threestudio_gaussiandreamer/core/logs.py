@@ -25,5 +25,7 @@ def _log(level: int, *args: object, **kwargs: object) -> None:
 
 def get_rank() -> int:
     """The rank of this process among those that train together; 0 when it is alone."""
-    ranks = (os.environ.get(key) for key in ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK"))
+    ranks = (
+        os.environ.get(key) for key in ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
+    )
     return int(next((rank for rank in ranks if rank is not None), 0))

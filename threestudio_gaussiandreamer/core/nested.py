@@ -1,4 +1,6 @@
-"""Options in groups: a dataclass inside a part's ``Config`` keeps its defaults when a YAML gives only some of its keys."""
+"""Options in groups: a dataclass inside a part's ``Config`` keeps its defaults when a YAML gives
+only some of its keys.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -6,9 +8,11 @@ from typing import Any
 
 
 def adopt_nested(config: Any) -> None:
-    """Turn mappings given for dataclass-typed fields into those dataclasses; call it from ``__post_init__``.
+    """Turn mappings given for dataclass-typed fields into those dataclasses; call it from
+    ``__post_init__``.
 
-    The host builds ``Config(**mapping)``, which would leave a plain mapping, without the defaults of the keys that it lacks.
+    The host builds ``Config(**mapping)``, which would leave a plain mapping, without the defaults
+    of the keys that it lacks.
 
     Raises:
         TypeError: a key that the dataclass doesn't have.

@@ -1,11 +1,13 @@
-"""Values that change during training: ``C(value, epoch, global_step)`` and the check of what may be written for one.
+"""Values that change during training: ``C(value, epoch, global_step)`` and the check of what may be
+written for one.
 
-==========================================  ==================================================================
+==========================================  ========================================================
 ``5`` or ``0.5``                            constant
 ``[v0, v1, end]``                           the same as ``[0, v0, v1, end]``
 ``[s0, v0, v1, s1]``                        v0 until s0, linear to v1 at s1, then v1
-``[s0, v0, v1, s1, v2, s2, ...]``           piecewise linear through (s0, v0), (s1, v1), (s2, v2), ...
-==========================================  ==================================================================
+``[s0, v0, v1, s1, v2, s2, ...]``           piecewise linear through (s0, v0), (s1, v1), (s2, v2),
+                                            ...
+==========================================  ========================================================
 
 Integer end steps count optimiser steps, fractional ones (``10.0``) epochs.
 """
@@ -20,7 +22,9 @@ FORMS = "a number, [v0, v1, end], [s0, v0, v1, s1] or [s0, v0, v1, s1, v2, s2, .
 
 
 class Schedule(NamedTuple):
-    """Knots of a piecewise linear function; ``steps`` strictly increasing, counted in epochs or in optimiser steps."""
+    """Knots of a piecewise linear function; ``steps`` strictly increasing, counted in epochs or in
+    optimiser steps.
+    """
 
     steps: list[float]
     values: list[float]
@@ -28,7 +32,8 @@ class Schedule(NamedTuple):
 
 
 def C(value: Any, epoch: int, global_step: int, interpolation: str = "linear") -> float:
-    """The value of a schedule at this moment of training; ``interpolation`` is "linear" or "exp" (between positive values).
+    """The value of a schedule at this moment of training; ``interpolation`` is "linear" or "exp"
+    (between positive values).
 
     Raises:
         UserError: ``value`` is no schedule.
@@ -96,7 +101,11 @@ def _between(start: float, end: float, t: float, interpolation: str) -> float:
 
 def _as_list(value: Any, name: str) -> list:
     # a ListConfig is neither list nor tuple, but a sequence of plain numbers when iterated
-    if isinstance(value, (str, bytes, dict)) or not hasattr(value, "__len__") or hasattr(value, "keys"):
+    if (
+        isinstance(value, (str, bytes, dict))
+        or not hasattr(value, "__len__")
+        or hasattr(value, "keys")
+    ):
         raise UserError(f"{name} is {value!r}; expected {FORMS}")
     return list(value)
 
@@ -113,12 +122,16 @@ def _finite(value: Any, name: str) -> float:
 
 def _increasing(steps: list[float], name: str) -> list[float]:
     if any(later <= earlier for earlier, later in zip(steps, steps[1:], strict=False)):
-        raise UserError(f"{name}: its steps {steps} must increase (for a hard switch write [500, v0, v1, 501])")
+        raise UserError(
+            f"{name}: its steps {steps} must increase (for a hard switch write [500, v0, v1, 501])"
+        )
     return steps
 
 
 def _in_epochs(ends: list[float], name: str) -> bool:
     fractional = [isinstance(end, float) for end in ends]
     if any(fractional) and not all(fractional):
-        raise UserError(f"{name} mixes integer end steps (optimiser steps) and fractional ones (epochs): {ends}")
+        raise UserError(
+            f"{name} mixes integer end steps (optimiser steps) and fractional ones (epochs): {ends}"
+        )
     return all(fractional)

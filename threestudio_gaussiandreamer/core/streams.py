@@ -1,9 +1,10 @@
-"""Stateless randomness: every draw comes from a generator that is a function of (seed, stream, step, item).
+"""Stateless randomness: every draw comes from a generator that is a function of (seed, stream,
+step, item).
 
-No generator state is kept, saved or restored, so a run that is stopped anywhere and resumed draws what the run that
-never stopped drew, and drawing more in one place (say, rendering more validation views) changes nothing elsewhere.
-Draws are made on the CPU and moved, so they don't depend on the device either.
-"""
+No generator state is kept, saved or restored, so a run that is stopped anywhere and resumed draws
+what the run that never stopped drew, and drawing more in one place (say, rendering more validation
+views) changes nothing elsewhere. Draws are made on the CPU and moved, so they don't depend on the
+device either."""
 
 import hashlib
 
@@ -28,8 +29,12 @@ def numpy_generator(seed: int, stream: str, step: int = 0, item: int = 0) -> np.
     return np.random.default_rng(derive_seed(seed, stream, step, item))
 
 
-def normal_per_item(shape: tuple[int, ...], seed: int, stream: str, step: int, device: torch.device | str = "cpu") -> Tensor:
-    """Standard normal float32 of ``shape`` (B, ...); item b has its own stream, so it doesn't depend on B."""
+def normal_per_item(
+    shape: tuple[int, ...], seed: int, stream: str, step: int, device: torch.device | str = "cpu"
+) -> Tensor:
+    """Standard normal float32 of ``shape`` (B, ...); item b has its own stream, so it doesn't
+    depend on B.
+    """
     items = torch.empty(shape)
     for b, item in enumerate(items):
         item.normal_(generator=generator(seed, stream, step, b))

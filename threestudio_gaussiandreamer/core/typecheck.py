@@ -1,8 +1,9 @@
-"""``--typecheck``: every call of this package is checked against the array shapes and types in its annotations.
+"""``--typecheck``: every call of this package is checked against the array shapes and types in its
+annotations.
 
-jaxtyping's import hook wraps each function and binds the names of dimensions; what a single value must be is decided here. Only arrays
-are checked: configurations hold OmegaConf's lists and mappings where an annotation says ``list``, and numbers convert.
-"""
+jaxtyping's import hook wraps each function and binds the names of dimensions; what a single value
+must be is decided here. Only arrays are checked: configurations hold OmegaConf's lists and mappings
+where an annotation says ``list``, and numbers convert."""
 
 import functools
 import inspect
@@ -15,19 +16,25 @@ import jaxtyping
 
 
 def install() -> None:
-    """Check everything of this package that is imported from now on; for the launcher and for tests."""
+    """Check everything of this package that is imported from now on; for the launcher and for
+    tests.
+    """
     jaxtyping.install_import_hook(__package__.partition(".")[0], f"{__name__}.check")
 
 
 def check(function: Callable) -> Callable:
-    """``function``, raising TypeError when an array among its arguments or results isn't what its annotation says."""
+    """``function``, raising TypeError when an array among its arguments or results isn't what its
+    annotation says.
+    """
     signature = inspect.signature(function)
 
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
         bound = signature.bind(*args, **kwargs)
         for name, value in bound.arguments.items():
-            _require(value, signature.parameters[name].annotation, f"{function.__qualname__}: {name}")
+            _require(
+                value, signature.parameters[name].annotation, f"{function.__qualname__}: {name}"
+            )
         result = function(*args, **kwargs)
         _require(result, signature.return_annotation, f"{function.__qualname__}: result")
         return result
@@ -37,7 +44,10 @@ def check(function: Callable) -> Callable:
 
 def _require(value: Any, annotation: Any, what: str) -> None:
     if not matches(value, annotation):
-        found = f"{type(value).__name__} {getattr(value, 'dtype', '')} {tuple(getattr(value, 'shape', ()))}"
+        found = (
+            f"{type(value).__name__} {getattr(value, 'dtype', '')} "
+            f"{tuple(getattr(value, 'shape', ()))}"
+        )
         raise TypeError(f"{what} is {found}; expected {annotation}")
 
 
@@ -47,9 +57,18 @@ def matches(value: Any, annotation: Any) -> bool:
         return True
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
-        return any(matches(value, argument) if _speaks_of_arrays(argument) else _is_instance(value, argument) for argument in arguments)
+        return any(
+            matches(value, argument)
+            if _speaks_of_arrays(argument)
+            else _is_instance(value, argument)
+            for argument in arguments
+        )
     if origin is tuple and Ellipsis not in arguments:
-        return isinstance(value, tuple) and len(value) == len(arguments) and all(map(matches, value, arguments))
+        return (
+            isinstance(value, tuple)
+            and len(value) == len(arguments)
+            and all(map(matches, value, arguments))
+        )
     return isinstance(value, annotation) if inspect.isclass(annotation) else True
 
 
@@ -60,4 +79,8 @@ def _speaks_of_arrays(annotation: Any) -> bool:
 
 
 def _is_instance(value: Any, annotation: Any) -> bool:
-    return isinstance(value, typing.get_origin(annotation) or annotation) if annotation is not Any else True
+    return (
+        isinstance(value, typing.get_origin(annotation) or annotation)
+        if annotation is not Any
+        else True
+    )

@@ -1,7 +1,7 @@
 """The optimal denoiser of a known image distribution, in closed form.
 
-The data are narrow Gaussians around K known images, p(x0) = sum_k pi_k N(x_k, s^2 I). With z = a x + sigma eps,
-a = sqrt(abar), sigma = sqrt(1 - abar) and v = a^2 s^2 + sigma^2:
+The data are narrow Gaussians around K known images, p(x0) = sum_k pi_k N(x_k, s^2 I). With z = a x
++ sigma eps, a = sqrt(abar), sigma = sqrt(1 - abar) and v = a^2 s^2 + sigma^2:
 
     p_t(z)  = sum_k pi_k N(z; a x_k, v I)
     gamma_k = softmax_k(log pi_k - |z - a x_k|^2 / 2v)          responsibilities
@@ -9,10 +9,10 @@ a = sqrt(abar), sigma = sqrt(1 - abar) and v = a^2 s^2 + sigma^2:
     D       = E[x0 | z] = m + (a s^2 / v) (z - a m)             denoised
     eps_hat = (z - a D) / sigma = sigma (z - a m) / v = -sigma grad log p_t(z)
 
-The distances are differences summed in float64: expanding |z|^2 - 2 z x + |x|^2 in float32 costs about a nat at 512^2.
-The rest has the type of z. A closed form memorises: it retrieves the nearest image unless d is a few hundred
-(Scarvelis et al. 2023, "Closed-Form Diffusion Models"), so look at the perplexity of the responsibilities.
-"""
+The distances are differences summed in float64: expanding |z|^2 - 2 z x + |x|^2 in float32 costs
+about a nat at 512^2. The rest has the type of z. A closed form memorises: it retrieves the nearest
+image unless d is a few hundred (Scarvelis et al. 2023, "Closed-Form Diffusion Models"), so look at
+the perplexity of the responsibilities."""
 
 import math
 from typing import NamedTuple, Optional
@@ -42,12 +42,17 @@ class Denoised(NamedTuple):
     """exp of the responsibilities' entropy: how many images share z, in [1, K]; float64."""
 
 
-def squared_distances(z: Float[Tensor, "B d"], bank: Float[Tensor, "*batch K d"], abar: Float[Tensor, " B"]) -> Float[Tensor, "B K"]:
+def squared_distances(
+    z: Float[Tensor, "B d"], bank: Float[Tensor, "*batch K d"], abar: Float[Tensor, " B"]
+) -> Float[Tensor, "B K"]:
     """|z - sqrt(abar) x_k|^2 in float64; the bank is shared, (K, d), or per item, (B, K, d)."""
     bank = bank.expand(len(z), -1, -1)
     scaled = abar.double().sqrt().to(z.device).reshape(-1, 1, 1)
     chunk = max(1, CHUNK_ELEMENTS // max(z.numel(), 1))
-    parts = [(z.double()[:, None] - scaled * part.double()).square().sum(-1) for part in bank.split(chunk, dim=1)]
+    parts = [
+        (z.double()[:, None] - scaled * part.double()).square().sum(-1)
+        for part in bank.split(chunk, dim=1)
+    ]
     return torch.cat(parts, dim=1)
 
 
@@ -60,8 +65,8 @@ def responsibilities(
 ) -> Float[Tensor, "B K"]:
     """gamma = softmax((log pi - distances / 2v) / temperature) in float64.
 
-    ``log_prior`` needs no normalisation; -inf leaves an image out. A temperature above 1 smooths (and isn't exact any more).
-    """
+    ``log_prior`` needs no normalisation; -inf leaves an image out. A temperature above 1 smooths
+    (and isn't exact any more)."""
     logits = -distances / (2 * variance.to(distances)[:, None])
     if log_prior is not None:
         logits = logits + log_prior.to(logits)
@@ -84,18 +89,25 @@ def denoise(
         abar: per item, in (0, 1).
         bank: the images x_k, shared or per item.
         std: s, the width of each mode, >= 0.
-        distances: ``squared_distances(z, bank, abar)`` where the caller has them (two mixtures of one bank).
+        distances: ``squared_distances(z, bank, abar)`` where the caller has them (two mixtures of
+            one bank).
     """
     variance = mode_variance(abar, std)
     if distances is None:
         alone = bank.shape[-2] == 1  # then its responsibility is 1 wherever z is
-        distances = z.new_zeros((len(z), 1), dtype=torch.float64) if alone else squared_distances(z, bank, abar)
+        distances = (
+            z.new_zeros((len(z), 1), dtype=torch.float64)
+            if alone
+            else squared_distances(z, bank, abar)
+        )
     gamma = responsibilities(distances, variance, log_prior=log_prior, temperature=temperature)
     bank = bank.expand(len(z), -1, -1).to(z)
     mean = bank[:, 0] if bank.shape[1] == 1 else torch.einsum("bk,bkd->bd", gamma.to(z), bank)
     residual = z - sds.per_item(abar.double().sqrt(), z) * mean
     eps = sds.per_item((1 - abar.double()).sqrt() / variance, z) * residual
-    denoised = mean + sds.per_item(abar.double().sqrt() * std**2 / variance, z) * residual if std else mean
+    denoised = (
+        mean + sds.per_item(abar.double().sqrt() * std**2 / variance, z) * residual if std else mean
+    )
     entropy = -torch.special.xlogy(gamma, gamma).sum(1)
     return Denoised(eps, denoised, gamma, entropy.exp())
 
@@ -122,15 +134,17 @@ def mode_variance(abar: Float[Tensor, " B"], std: float) -> Float[Tensor, " B"]:
     return abar * std**2 + 1 - abar
 
 
-# The linear latent ---------------------------------------------------------------------------------------------------
+# The linear latent
+# --------------------------------------------------------------------------------------------------
 
 
 class LinearLatent(NamedTuple):
-    """Average pooling over ``factor`` x ``factor``, a colour matrix, and a scale: the pixels' stand-in for a VAE.
+    """Average pooling over ``factor`` x ``factor``, a colour matrix, and a scale: the pixels'
+    stand-in for a VAE.
 
-    ``y = scale * matrix @ pool(2 rgb - 1)``. With factor 1, no matrix and scale 1 it is the space of a pixel model.
-    The score is defined on y, so the adjoint that autograd applies is exact; nothing outside its row space is supervised.
-    """
+    ``y = scale * matrix @ pool(2 rgb - 1)``. With factor 1, no matrix and scale 1 it is the space
+    of a pixel model. The score is defined on y, so the adjoint that autograd applies is exact;
+    nothing outside its row space is supervised."""
 
     factor: int = 1
     matrix: Optional[Float[Tensor, "c 3"]] = None
@@ -147,25 +161,36 @@ class LinearLatent(NamedTuple):
         return latents if self.scale == 1 else self.scale * latents
 
     def decode(self, latents: Float[Tensor, "B c h w"]) -> Float[Tensor, "B 3 H W"]:
-        """The least-squares image in [0, 1]: pseudo-inverse of the colours, each pooled pixel repeated."""
+        """The least-squares image in [0, 1]: pseudo-inverse of the colours, each pooled pixel
+        repeated.
+        """
         inverse = None if self.matrix is None else torch.linalg.pinv(self.matrix.double())
         rgb = (_recolored(latents, inverse) / self.scale + 1) / 2
-        return rgb.clamp(0, 1).repeat_interleave(self.factor, dim=2).repeat_interleave(self.factor, dim=3)
+        return (
+            rgb.clamp(0, 1)
+            .repeat_interleave(self.factor, dim=2)
+            .repeat_interleave(self.factor, dim=3)
+        )
 
     def normalised(self, rgb: Float[Tensor, "K 3 h w"]) -> "LinearLatent":
-        """The same latent, scaled to unit variance on pooled images (as Stable Diffusion's is on photographs)."""
+        """The same latent, scaled to unit variance on pooled images (as Stable Diffusion's is on
+        photographs).
+        """
         std = self._replace(scale=1.0).encode_pooled(rgb).std()
         if not std > 0:
             raise UserError("a latent can't be normalised on images that are all of one colour")
         return self._replace(scale=1 / float(std))
 
 
-def _recolored(images: Float[Tensor, "B i h w"], matrix: Optional[Float[Tensor, "o i"]]) -> Float[Tensor, "B o h w"]:
+def _recolored(
+    images: Float[Tensor, "B i h w"], matrix: Optional[Float[Tensor, "o i"]]
+) -> Float[Tensor, "B o h w"]:
     return images if matrix is None else F.conv2d(images, matrix.to(images)[:, :, None, None])
 
 
 def color_matrix(channels: int) -> Optional[Float[Tensor, "c 3"]]:
-    """Orthonormal columns from RGB to ``channels`` >= 3: None, the identity, for 3; a tetrahedron's corners for 4; else a fixed draw.
+    """Orthonormal columns from RGB to ``channels`` >= 3: None, the identity, for 3; a tetrahedron's
+    corners for 4; else a fixed draw.
 
     For 4 the first channel is the luminance and the others are opponent colours.
     """
@@ -175,4 +200,6 @@ def color_matrix(channels: int) -> Optional[Float[Tensor, "c 3"]]:
         return None
     if channels == 4:
         return torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / 2
-    return torch.linalg.qr(torch.randn(channels, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))[0].float()
+    return torch.linalg.qr(
+        torch.randn(channels, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    )[0].float()

@@ -4,8 +4,8 @@ Notation of DDPM (Ho et al. 2020): ``abar`` is the cumulative product of 1 - bet
 
     z = sqrt(abar) x + sqrt(1 - abar) eps.
 
-``abar`` is given per item, (B,), in float64 where it comes from the table; roots are taken before rounding to z's type.
-"""
+``abar`` is given per item, (B,), in float64 where it comes from the table; roots are taken before
+rounding to z's type."""
 
 from collections.abc import Callable
 
@@ -22,17 +22,22 @@ WEIGHTS: dict[str, Callable[[Tensor], Tensor]] = {
     "uniform": torch.ones_like,
     "fantasia3d": lambda abar: abar.sqrt() * (1 - abar),
 }
-"""w(t): sigma_t^2 of DreamFusion (Poole et al. 2022), none, and a_t sigma_t^2 of Fantasia3D (Chen et al. 2023)."""
+"""w(t): sigma_t^2 of DreamFusion (Poole et al. 2022), none, and a_t sigma_t^2 of Fantasia3D (Chen
+et al. 2023).
+"""
 
 
-def sd_alphas_cumprod(num_train: int = 1000, *, beta_start: float = 0.00085, beta_end: float = 0.012) -> Float[Tensor, " T"]:
+def sd_alphas_cumprod(
+    num_train: int = 1000, *, beta_start: float = 0.00085, beta_end: float = 0.012
+) -> Float[Tensor, " T"]:
     """Stable Diffusion's "scaled linear" schedule: sqrt(beta) is linear in t. float64."""
     betas = torch.linspace(beta_start**0.5, beta_end**0.5, num_train, dtype=torch.float64) ** 2
     return torch.cumprod(1 - betas, dim=0)
 
 
 def step_range(min_percent: float, max_percent: float, num_train: int = 1000) -> tuple[int, int]:
-    """The first and last timestep of a range given in shares of ``num_train``, both clamped to [1, num_train - 1].
+    """The first and last timestep of a range given in shares of ``num_train``, both clamped to [1,
+    num_train - 1].
 
     Raises:
         UserError: a share outside [0, 1], or the minimum above the maximum.
@@ -41,15 +46,29 @@ def step_range(min_percent: float, max_percent: float, num_train: int = 1000) ->
         if not 0 <= percent <= 1:
             raise UserError(f"{name} must lie in [0, 1], not {percent}")
     if min_percent > max_percent:
-        raise UserError(f"min_step_percent {min_percent} is above max_step_percent {max_percent}: check where their schedules cross")
-    low, high = (min(max(int(num_train * percent), 1), num_train - 1) for percent in (min_percent, max_percent))
+        raise UserError(
+            f"min_step_percent {min_percent} is above max_step_percent {max_percent}: check "
+            "where their schedules cross"
+        )
+    low, high = (
+        min(max(int(num_train * percent), 1), num_train - 1)
+        for percent in (min_percent, max_percent)
+    )
     return low, high
 
 
 def timesteps(
-    batch: int, min_step: int, max_step: int, *, seed: int, step: int, num_train: int = 1000, stream: str = "timestep"
+    batch: int,
+    min_step: int,
+    max_step: int,
+    *,
+    seed: int,
+    step: int,
+    num_train: int = 1000,
+    stream: str = "timestep",
 ) -> Int[Tensor, " B"]:
-    """One timestep per item, uniform on [min_step, max_step] clamped to [1, num_train - 1]; item b doesn't depend on ``batch``.
+    """One timestep per item, uniform on [min_step, max_step] clamped to [1, num_train - 1]; item b
+    doesn't depend on ``batch``.
 
     Raises:
         UserError: ``min_step`` above ``max_step``.
@@ -57,7 +76,10 @@ def timesteps(
     if min_step > max_step:
         raise UserError(f"the smallest timestep {min_step} is above the largest {max_step}")
     low, high = (min(max(value, 1), num_train - 1) for value in (min_step, max_step))
-    draws = [torch.randint(low, high + 1, (), generator=streams.generator(seed, stream, step, item)) for item in range(batch)]
+    draws = [
+        torch.randint(low, high + 1, (), generator=streams.generator(seed, stream, step, item))
+        for item in range(batch)
+    ]
     return torch.stack(draws) if draws else torch.empty(0, dtype=torch.long)
 
 
@@ -66,17 +88,23 @@ def per_item(values: Float[Tensor, " B"], like: Tensor) -> Tensor:
     return values.to(like).reshape(-1, *[1] * (like.dim() - 1))
 
 
-def add_noise(x: Float[Tensor, "B *d"], noise: Float[Tensor, "B *d"], abar: Float[Tensor, " B"]) -> Float[Tensor, "B *d"]:
+def add_noise(
+    x: Float[Tensor, "B *d"], noise: Float[Tensor, "B *d"], abar: Float[Tensor, " B"]
+) -> Float[Tensor, "B *d"]:
     """z = sqrt(abar) x + sqrt(1 - abar) eps (DDPM eq. 4)."""
     return per_item(abar.sqrt(), x) * x + per_item((1 - abar).sqrt(), x) * noise
 
 
-def predict_x0(z: Float[Tensor, "B *d"], eps: Float[Tensor, "B *d"], abar: Float[Tensor, " B"]) -> Float[Tensor, "B *d"]:
+def predict_x0(
+    z: Float[Tensor, "B *d"], eps: Float[Tensor, "B *d"], abar: Float[Tensor, " B"]
+) -> Float[Tensor, "B *d"]:
     """The denoised x0 = (z - sqrt(1 - abar) eps) / sqrt(abar), ``add_noise`` solved for x."""
     return (z - per_item((1 - abar).sqrt(), z) * eps) / per_item(abar.sqrt(), z)
 
 
-def classifier_free(eps_cond: Float[Tensor, "B *d"], eps_uncond: Float[Tensor, "B *d"], scale: float) -> Float[Tensor, "B *d"]:
+def classifier_free(
+    eps_cond: Float[Tensor, "B *d"], eps_uncond: Float[Tensor, "B *d"], scale: float
+) -> Float[Tensor, "B *d"]:
     """eps_u + scale (eps_c - eps_u), so 1 is no guidance (Ho and Salimans 2022 with scale = 1 + w).
 
     threestudio writes eps_c + g (eps_c - eps_u): its g = 100 is scale = 101 here.
@@ -92,7 +120,9 @@ def weight(name: str, abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
 
 
 def sds_loss(x: Float[Tensor, "B *d"], grad: Float[Tensor, "B *d"]) -> Float[Tensor, ""]:
-    """0.5 sum grad^2 / B, with the gradient grad / B at x: threestudio's 0.5 sum |x - stop(x - grad)|^2 / B without its rounding."""
+    """0.5 sum grad^2 / B, with the gradient grad / B at x: threestudio's 0.5 sum |x - stop(x -
+    grad)|^2 / B without its rounding.
+    """
     return _GivenGradient.apply(x, grad.detach())
 
 
@@ -110,9 +140,14 @@ class _GivenGradient(torch.autograd.Function):
 
 
 def ddim_step(
-    z: Float[Tensor, "B *d"], eps: Float[Tensor, "B *d"], abar: Float[Tensor, " B"], abar_next: Float[Tensor, " B"]
+    z: Float[Tensor, "B *d"],
+    eps: Float[Tensor, "B *d"],
+    abar: Float[Tensor, " B"],
+    abar_next: Float[Tensor, " B"],
 ) -> Float[Tensor, "B *d"]:
-    """One deterministic DDIM step to the lower noise ``abar_next`` (Song et al. 2021 eq. 12 with eta 0)."""
+    """One deterministic DDIM step to the lower noise ``abar_next`` (Song et al. 2021 eq. 12 with
+    eta 0).
+    """
     return add_noise(predict_x0(z, eps, abar), eps, abar_next)
 
 
@@ -124,9 +159,15 @@ def ddim_sample(
     *,
     steps: int = 20,
 ) -> Float[Tensor, "B *d"]:
-    """Denoise z from each item's own timestep ``t`` to x0 in ``steps`` equal steps; ``predict(z, t)`` gives eps."""
+    """Denoise z from each item's own timestep ``t`` to x0 in ``steps`` equal steps; ``predict(z,
+    t)`` gives eps.
+    """
     for index in range(steps):
-        now, later = (torch.div(t * (steps - i), steps, rounding_mode="floor") for i in (index, index + 1))
-        abar_later = torch.where(later > 0, alphas_cumprod[later], torch.ones_like(alphas_cumprod[later]))
+        now, later = (
+            torch.div(t * (steps - i), steps, rounding_mode="floor") for i in (index, index + 1)
+        )
+        abar_later = torch.where(
+            later > 0, alphas_cumprod[later], torch.ones_like(alphas_cumprod[later])
+        )
         z = ddim_step(z, predict(z, now), alphas_cumprod[now], abar_later)
     return z

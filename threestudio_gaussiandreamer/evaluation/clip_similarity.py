@@ -1,15 +1,17 @@
 """CLIP similarity as the paper measures it: how well pictures of a result fit its prompt.
 
-``python -m threestudio_gaussiandreamer.evaluation.clip_similarity RUN_OR_PLY ... --clip FOLDER [--prompt TEXT] [--output FOLDER]``
+``python -m threestudio_gaussiandreamer.evaluation.clip_similarity RUN_OR_PLY ... --clip FOLDER
+[--prompt TEXT] [--output FOLDER]``
 
-The paper's protocol (appendix; Instant3D's): 120 views evenly around at radius 4 and elevation 15 degrees, ten of them drawn at
-random, the mean of their similarities with the text. Here for each of several seeds: a seed draws ten views of every result,
-its score is the mean over the results, and what is reported is mean and standard deviation over the seeds.
+The paper's protocol (appendix; Instant3D's): 120 views evenly around at radius 4 and elevation 15
+degrees, ten of them drawn at random, the mean of their similarities with the text. Here for each of
+several seeds: a seed draws ten views of every result, its score is the mean over the results, and
+what is reported is mean and standard deviation over the seeds.
 
-A similarity is 100 times the cosine of CLIP's features of picture and text. The paper gives no formula; its 27.23 (ViT-L/14) and
-41.88 (ViT-bigG-14) are of that size. Nor does it give the field of view, the size and the background: 70 degrees, 1024 pixels
-and the run's own (black) are the released code's. The views are 3 degrees apart from -180; none is there twice.
-"""
+A similarity is 100 times the cosine of CLIP's features of picture and text. The paper gives no
+formula; its 27.23 (ViT-L/14) and 41.88 (ViT-bigG-14) are of that size. Nor does it give the field
+of view, the size and the background: 70 degrees, 1024 pixels and the run's own (black) are the
+released code's. The views are 3 degrees apart from -180; none is there twice."""
 
 import argparse
 import json
@@ -38,7 +40,9 @@ THUMBNAIL = 160
 
 
 class Protocol(NamedTuple):
-    """Which pictures are compared; the defaults are the paper's, or the released code's where it says nothing."""
+    """Which pictures are compared; the defaults are the paper's, or the released code's where it
+    says nothing.
+    """
 
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     views: int = 120
@@ -52,11 +56,20 @@ class Protocol(NamedTuple):
     def orbit(self) -> Orbit:
         same = torch.ones(self.views)
         azimuth = -180 + 360 * torch.arange(self.views) / self.views
-        return Orbit(self.elevation_deg * same, azimuth, self.radius * same, math.radians(self.fovy_deg) * same)
+        return Orbit(
+            self.elevation_deg * same,
+            azimuth,
+            self.radius * same,
+            math.radians(self.fovy_deg) * same,
+        )
 
     def draw(self, seed: int, item: int) -> Int[np.ndarray, " drawn"]:
         """The views that ``seed`` takes of result number ``item``, in ascending order, none twice."""
-        return np.sort(numpy_generator(seed, "clip-views", item=item).choice(self.views, self.drawn, replace=False))
+        return np.sort(
+            numpy_generator(seed, "clip-views", item=item).choice(
+                self.views, self.drawn, replace=False
+            )
+        )
 
 
 class Scored(NamedTuple):
@@ -75,9 +88,12 @@ def open_clip(folder: str) -> PictureText:
     """
     if not Path(folder).expanduser().is_dir():
         raise UserError(
-            f"--clip {folder}: expected a folder, for instance after `hf download openai/clip-vit-large-patch14 --local-dir clip`"
+            f"--clip {folder}: expected a folder, for instance after `hf download "
+            "openai/clip-vit-large-patch14 --local-dir clip`"
         )
-    return PictureText(clip_source(folder, option="--clip", allow_bin=True), get_device(), allow_bin=True)
+    return PictureText(
+        clip_source(folder, option="--clip", allow_bin=True), get_device(), allow_bin=True
+    )
 
 
 def score(result: Result, prompt: str, item: int, clip: PictureText, protocol: Protocol) -> Scored:
@@ -87,22 +103,45 @@ def score(result: Result, prompt: str, item: int, clip: PictureText, protocol: P
     orbit = Orbit(*(values[needed] for values in protocol.orbit))
     similarity, thumbnails = np.full(protocol.views, np.nan), {}
     start = 0
-    for images in Pictures(read_result(result), result.background).render(orbit.c2w, orbit.fovy, protocol.size):
+    for images in Pictures(read_result(result), result.background).render(
+        orbit.c2w, orbit.fovy, protocol.size
+    ):
         rows = needed[start : start + len(images)]
         similarity[rows] = PERCENT * clip.similarities(images, prompt)
-        thumbnails.update({int(row): _thumbnail(image) for row, image in zip(rows, images, strict=True) if row in draws[0]})
+        thumbnails.update(
+            {
+                int(row): _thumbnail(image)
+                for row, image in zip(rows, images, strict=True)
+                if row in draws[0]
+            }
+        )
         start += len(images)
-    return Scored(np.array([similarity[draw].mean() for draw in draws]), [thumbnails[int(row)] for row in draws[0]])
+    return Scored(
+        np.array([similarity[draw].mean() for draw in draws]),
+        [thumbnails[int(row)] for row in draws[0]],
+    )
 
 
-def report(results: Sequence[Result], prompts: Sequence[str], scores: Sequence[Scored], clip: str, protocol: Protocol) -> dict[str, Any]:
+def report(
+    results: Sequence[Result],
+    prompts: Sequence[str],
+    scores: Sequence[Scored],
+    clip: str,
+    protocol: Protocol,
+) -> dict[str, Any]:
     """What is written as JSON."""
     seeds = np.stack([scored.per_seed for scored in scores])
     each = [
         {"result": str(result.ply), "prompt": prompt, **_mean_and_spread(scored.per_seed)}
         for result, prompt, scored in zip(results, prompts, scores, strict=True)
     ]
-    return {"clip": clip, "unit": "100 * cosine", "protocol": protocol._asdict(), **_mean_and_spread(seeds.mean(axis=0)), "results": each}
+    return {
+        "clip": clip,
+        "unit": "100 * cosine",
+        "protocol": protocol._asdict(),
+        **_mean_and_spread(seeds.mean(axis=0)),
+        "results": each,
+    }
 
 
 def _mean_and_spread(per_seed: Float[np.ndarray, " S"]) -> dict[str, Any]:
@@ -115,24 +154,38 @@ def contact_sheet(prompts: Sequence[str], scores: Sequence[Scored]) -> np.ndarra
     """A row of the first seed's views for each result, its prompt and score written over it."""
     rows = []
     for prompt, scored in zip(prompts, scores, strict=True):
-        rows.append(files_of_pictures.with_texts(np.concatenate(scored.thumbnails, axis=1), [f"{scored.per_seed.mean():.2f}  {prompt}"]))
+        rows.append(
+            files_of_pictures.with_texts(
+                np.concatenate(scored.thumbnails, axis=1),
+                [f"{scored.per_seed.mean():.2f}  {prompt}"],
+            )
+        )
     return np.concatenate(rows, axis=0)
 
 
 def _thumbnail(image: Float[np.ndarray, "H W 3"]) -> np.ndarray:
     from PIL import Image
 
-    return np.asarray(Image.fromarray((image * 255).round().astype(np.uint8)).resize((THUMBNAIL, THUMBNAIL), Image.Resampling.LANCZOS))
+    return np.asarray(
+        Image.fromarray((image * 255).round().astype(np.uint8)).resize(
+            (THUMBNAIL, THUMBNAIL), Image.Resampling.LANCZOS
+        )
+    )
 
 
-# ------------------------------------------------------------------------------------------------------- the command
+# --------------------------------------------------------------------------------------------------
+# the command
 
 
-def prompts_for(results: Sequence[Result], prompt: Optional[str], prompts_file: Optional[str]) -> list[str]:
-    """The text of each result: the given one, the file's lines in the results' order, or what its run was asked for.
+def prompts_for(
+    results: Sequence[Result], prompt: Optional[str], prompts_file: Optional[str]
+) -> list[str]:
+    """The text of each result: the given one, the file's lines in the results' order, or what its
+    run was asked for.
 
     Raises:
-        UserError: both are given, a result's text is unknown, or the file has another number of lines.
+        UserError: both are given, a result's text is unknown, or the file has another number of
+            lines.
     """
     if prompt is not None and prompts_file is not None:
         raise UserError("both --prompt and --prompts-file: give one of them")
@@ -140,44 +193,75 @@ def prompts_for(results: Sequence[Result], prompt: Optional[str], prompts_file: 
         lines = read_prompts(prompts_file)
         if len(lines) != len(results):
             raise UserError(
-                f"--prompts-file {prompts_file} has {len(lines)} prompts for {len(results)} results: one line for each is needed"
+                f"--prompts-file {prompts_file} has {len(lines)} prompts for {len(results)} "
+                "results: one line for each is needed"
             )
         return lines
     prompts = [prompt if prompt is not None else result.prompt for result in results]
     if None in prompts:
-        raise UserError(f"what was {str(results[prompts.index(None)].ply)!r} made from? Give --prompt or --prompts-file")
+        raise UserError(
+            f"what was {str(results[prompts.index(None)].ply)!r} made from? Give --prompt or "
+            "--prompts-file"
+        )
     return prompts
 
 
 def read_prompts(path: str) -> list[str]:
-    """The lines of a list of prompts, as T3Bench's ``data/prompt_single.txt``; empty ones don't count.
+    """The lines of a list of prompts, as T3Bench's ``data/prompt_single.txt``; empty ones don't
+    count.
 
     Raises:
         UserError: missing or not UTF-8.
     """
     file = existing_file(path, "list of prompts")
     try:
-        return [line.strip() for line in file.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
+        return [
+            line.strip()
+            for line in file.read_text(encoding="utf-8-sig").splitlines()
+            if line.strip()
+        ]
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"the list of prompts {path!r} can't be read as UTF-8 text: {error}") from error
+        raise UserError(
+            f"the list of prompts {path!r} can't be read as UTF-8 text: {error}"
+        ) from error
 
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     defaults = Protocol()
-    parser = argparse.ArgumentParser(prog=f"python -m {__package__}.clip_similarity", description="CLIP similarity, as in the paper.")
-    parser.add_argument("results", nargs="+", metavar="RUN_FOLDER|PLY", help="a run's folder, or a PLY of Gaussians")
+    parser = argparse.ArgumentParser(
+        prog=f"python -m {__package__}.clip_similarity",
+        description="CLIP similarity, as in the paper.",
+    )
+    parser.add_argument(
+        "results", nargs="+", metavar="RUN_FOLDER|PLY", help="a run's folder, or a PLY of Gaussians"
+    )
     parser.add_argument("--clip", help="folder of a CLIP in transformers' format")
-    parser.add_argument("--prompt", help="the text of all results; default: what each run was asked for")
+    parser.add_argument(
+        "--prompt", help="the text of all results; default: what each run was asked for"
+    )
     parser.add_argument("--prompts-file", help="one prompt for each result, a line each")
     parser.add_argument("--output", default="evaluation", help="folder for clip.json and clip.png")
     parser.add_argument("--seeds", type=int, nargs="+", default=list(defaults.seeds))
     parser.add_argument("--views", type=int, default=defaults.views, help="on the circle")
     parser.add_argument("--drawn", type=int, default=defaults.drawn, help="of them, for each seed")
     parser.add_argument("--size", type=int, default=defaults.size, help="of the pictures, pixels")
-    parser.add_argument("--fovy", type=float, default=defaults.fovy_deg, help="vertical field of view, degrees")
-    parser.add_argument("--t3bench", metavar="FOLDER", help="also write T3Bench's views of every result; see docs/models.md")
-    parser.add_argument("--t3bench-group", default="single", choices=["single", "surr", "multi"], help="the list of its prompts")
-    parser.add_argument("--t3bench-method", default="gaussiandreamer", help="its name for what made the results")
+    parser.add_argument(
+        "--fovy", type=float, default=defaults.fovy_deg, help="vertical field of view, degrees"
+    )
+    parser.add_argument(
+        "--t3bench",
+        metavar="FOLDER",
+        help="also write T3Bench's views of every result; see docs/models.md",
+    )
+    parser.add_argument(
+        "--t3bench-group",
+        default="single",
+        choices=["single", "surr", "multi"],
+        help="the list of its prompts",
+    )
+    parser.add_argument(
+        "--t3bench-method", default="gaussiandreamer", help="its name for what made the results"
+    )
     parser.add_argument("--t3bench-size", type=int, default=512, help="of its pictures, pixels")
     return parser.parse_args(argv)
 
@@ -194,7 +278,13 @@ def protocol_of(args: argparse.Namespace) -> Protocol:
         raise UserError("--size and --t3bench-size: expected a positive number of pixels")
     if not 0 < args.fovy < 180:
         raise UserError(f"--fovy {args.fovy}: expected degrees between 0 and 180")
-    return Protocol(seeds=tuple(args.seeds), views=args.views, drawn=args.drawn, fovy_deg=args.fovy, size=args.size)
+    return Protocol(
+        seeds=tuple(args.seeds),
+        views=args.views,
+        drawn=args.drawn,
+        fovy_deg=args.fovy,
+        size=args.size,
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -210,11 +300,26 @@ def run(args: argparse.Namespace) -> None:
     if args.t3bench:
         from .t3bench import write_t3bench
 
-        write_t3bench(Path(args.t3bench), results, prompts, method=args.t3bench_method, group=args.t3bench_group, size=args.t3bench_size)
+        write_t3bench(
+            Path(args.t3bench),
+            results,
+            prompts,
+            method=args.t3bench_method,
+            group=args.t3bench_group,
+            size=args.t3bench_size,
+        )
 
 
-def evaluate(results: Sequence[Result], prompts: Sequence[str], clip_folder: str, protocol: Protocol, output: Path) -> dict[str, Any]:
-    """Score all results, write ``clip.json`` and ``clip.png``, print the numbers; returns what the JSON holds."""
+def evaluate(
+    results: Sequence[Result],
+    prompts: Sequence[str],
+    clip_folder: str,
+    protocol: Protocol,
+    output: Path,
+) -> dict[str, Any]:
+    """Score all results, write ``clip.json`` and ``clip.png``, print the numbers; returns what the
+    JSON holds.
+    """
     clip, scores = open_clip(clip_folder), []
     for item, (result, prompt) in enumerate(zip(results, prompts, strict=True)):
         scores.append(score(result, prompt, item, clip, protocol))
@@ -222,11 +327,17 @@ def evaluate(results: Sequence[Result], prompts: Sequence[str], clip_folder: str
     content = report(results, prompts, scores, clip_folder, protocol)
     try:
         output.mkdir(parents=True, exist_ok=True)
-        (output / "clip.json").write_text(json.dumps(content, indent=2, ensure_ascii=False), encoding="utf-8")
+        (output / "clip.json").write_text(
+            json.dumps(content, indent=2, ensure_ascii=False), encoding="utf-8"
+        )
     except OSError as error:
         raise UserError(f"--output {output} can't be written: {error.strerror or error}") from error
     files_of_pictures.write(output / "clip.png", contact_sheet(prompts, scores))
-    spread = "" if content["std"] is None else f" +- {content['std']:.2f} over {len(protocol.seeds)} seeds"
+    spread = (
+        ""
+        if content["std"] is None
+        else f" +- {content['std']:.2f} over {len(protocol.seeds)} seeds"
+    )
     print(f"{content['mean']:6.2f}{spread}: {output / 'clip.json'}, {output / 'clip.png'}")
     return content
 

@@ -1,4 +1,6 @@
-"""Finished runs, to be judged: where a run's Gaussians and its prompt are, and pictures of them from any camera."""
+"""Finished runs, to be judged: where a run's Gaussians and its prompt are, and pictures of them
+from any camera.
+"""
 
 import math
 import re
@@ -40,11 +42,18 @@ def find_result(place: str) -> Result:
     """
     folder = Path(place).expanduser()
     if not folder.is_dir():
-        return _checked(Result(existing_file(place, "result (a run's folder or a PLY of Gaussians)"), None, BLACK))
+        return _checked(
+            Result(
+                existing_file(place, "result (a run's folder or a PLY of Gaussians)"), None, BLACK
+            )
+        )
     exported = sorted(folder.glob("save/it*-export/*.ply"), key=_step)
     gaussians = [path for path in exported if is_gaussian_ply(path)]
     if not gaussians:
-        raise UserError(f"{place!r} is no run's folder with Gaussians in save/it*-export: export it first (--export), or name a PLY file")
+        raise UserError(
+            f"{place!r} is no run's folder with Gaussians in save/it*-export: export it first "
+            "(--export), or name a PLY file"
+        )
     return Result(gaussians[-1], *_asked_for(folder / "configs" / "parsed.yaml"))
 
 
@@ -55,12 +64,17 @@ def _step(path: Path) -> tuple[int, str]:
 
 def _checked(result: Result) -> Result:
     if not is_gaussian_ply(result.ply):
-        raise UserError(f"{str(result.ply)!r} is no PLY of Gaussians: a run writes one to save/it*-export/gaussians.ply")
+        raise UserError(
+            f"{str(result.ply)!r} is no PLY of Gaussians: a run writes one to "
+            "save/it*-export/gaussians.ply"
+        )
     return result
 
 
 def _asked_for(parsed: Path) -> tuple[Optional[str], tuple[float, float, float]]:
-    """Prompt and background of the run that this configuration describes; none and black where it doesn't say."""
+    """Prompt and background of the run that this configuration describes; none and black where it
+    doesn't say.
+    """
     if not parsed.is_file():
         return None, BLACK
     system = load_config(parsed).system
@@ -70,7 +84,12 @@ def _asked_for(parsed: Path) -> tuple[Optional[str], tuple[float, float, float]]
 
 def _prompt_of(processor: Mapping[str, Any]) -> Optional[str]:
     try:
-        return spelt_out(processor.get("prompt") or "", processor.get("prompt_library", PROMPT_LIBRARY)) or None
+        return (
+            spelt_out(
+                processor.get("prompt") or "", processor.get("prompt_library", PROMPT_LIBRARY)
+            )
+            or None
+        )
     except UserError:  # its library isn't there any more: who needs the text has to give it
         return None
 
@@ -83,11 +102,15 @@ def read_result(result: Result) -> GaussianArrays:
 class Pictures:
     """Renders a cloud as validation does: our rasteriser, a flat background, no gradients."""
 
-    def __init__(self, arrays: GaussianArrays, background: tuple[float, float, float] = BLACK) -> None:
+    def __init__(
+        self, arrays: GaussianArrays, background: tuple[float, float, float] = BLACK
+    ) -> None:
         geometry = find("gaussiandreamer-cloud")({"sh_degree": math.isqrt(arrays.sh.shape[1]) - 1})
         geometry.set_arrays(**arrays._asdict())
         behind = find("gaussiandreamer-background")({"color": list(background)})
-        renderer = find("gaussiandreamer-splatting")({}, geometry=geometry, material=None, background=behind)
+        renderer = find("gaussiandreamer-splatting")(
+            {}, geometry=geometry, material=None, background=behind
+        )
         self._renderer = renderer.to(get_device()).eval()
         geometry.to(get_device())
         behind.to(get_device()).eval()
@@ -100,5 +123,7 @@ class Pictures:
             yield self._render(views, angles, size)
 
     @torch.no_grad()
-    def _render(self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], size: int) -> Float[np.ndarray, "B H W 3"]:
+    def _render(
+        self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], size: int
+    ) -> Float[np.ndarray, "B H W 3"]:
         return self._renderer(c2w, fovy, size, size)["comp_rgb"].clamp(0, 1).cpu().numpy()

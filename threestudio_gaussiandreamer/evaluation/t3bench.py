@@ -1,15 +1,19 @@
-"""Results as T3Bench's own scripts take them: a mesh, and its views as pictures, in the folders that it looks into.
+"""Results as T3Bench's own scripts take them: a mesh, and its views as pictures, in the folders
+that it looks into.
 
-Its ``run_eval_quality.py`` and ``run_caption.py`` look for a mesh of each prompt of ``data/prompt_<group>.txt`` in
-``outputs_mesh_t3/<method>_<group>/<prompt with _ for spaces>*/save/it*-export/model.obj``, have ``render/meshrender.py``
-or ``render/meshrender_cap.py`` draw it, and score the pictures ``<vertex>_<camera>.png`` and ``<vertex>.png``. The mesh written here
-is the surface of the Gaussians (``surface.py``), and that is all the published scripts need. What Gaussians show beyond their surface
-is in the pictures, rendered by our rasteriser with the same cameras: the two scripts in the folder ``render_gaussians``, put in
-the place of those in ``render``, hand them over.
+Its ``run_eval_quality.py`` and ``run_caption.py`` look for a mesh of each prompt of
+``data/prompt_<group>.txt`` in ``outputs_mesh_t3/<method>_<group>/<prompt with _ for
+spaces>*/save/it*-export/model.obj``, have ``render/meshrender.py`` or ``render/meshrender_cap.py``
+draw it, and score the pictures ``<vertex>_<camera>.png`` and ``<vertex>.png``. The mesh written
+here is the surface of the Gaussians (``surface.py``), and that is all the published scripts need.
+What Gaussians show beyond their surface is in the pictures, rendered by our rasteriser with the
+same cameras: the two scripts in the folder ``render_gaussians``, put in the place of those in
+``render``, hand them over.
 
-Quality: 162 vertices of an icosphere of radius 2.2, five fields of view each. Captions: the 12 vertices of an icosahedron at
-2.2^2, 60 degrees (its script multiplies by the radius twice). 512 pixels, black behind; the object centred on the mean of its points
-and scaled to [-1, 1]. Of a mesh that means the vertices; of Gaussians the centres of those that are at least ``MIN_OPACITY`` opaque.
+Quality: 162 vertices of an icosphere of radius 2.2, five fields of view each. Captions: the 12
+vertices of an icosahedron at 2.2^2, 60 degrees (its script multiplies by the radius twice). 512
+pixels, black behind; the object centred on the mean of its points and scaled to [-1, 1]. Of a mesh
+that means the vertices; of Gaussians the centres of those that are at least ``MIN_OPACITY`` opaque.
 """
 
 import math
@@ -53,53 +57,96 @@ if not found:
 '''
 
 
-def write_t3bench(folder: Path, results: Sequence[Result], prompts: Sequence[str], *, method: str, group: str, size: int = 512) -> None:
+def write_t3bench(
+    folder: Path,
+    results: Sequence[Result],
+    prompts: Sequence[str],
+    *,
+    method: str,
+    group: str,
+    size: int = 512,
+) -> None:
     """Write everything below ``folder``, a checkout of T3Bench; none of its own files is touched.
 
     Raises:
         UserError: a prompt can't be the name of a folder, or nothing can be written.
     """
     if bad := [prompt for prompt in prompts if "/" in prompt]:
-        raise UserError(f"T3Bench names folders after prompts, and {bad[0]!r} has a slash: leave it out, or reword it")
+        raise UserError(
+            f"T3Bench names folders after prompts, and {bad[0]!r} has a slash: leave it out, "
+            "or reword it"
+        )
     try:
         _write_stand_ins(folder / "render_gaussians", size)
         for result, prompt in zip(results, prompts, strict=True):
-            save = folder / "outputs_mesh_t3" / f"{method}_{group}" / prompt.replace(" ", "_") / "save"
+            save = (
+                folder / "outputs_mesh_t3" / f"{method}_{group}" / prompt.replace(" ", "_") / "save"
+            )
             _write_result(save, normalized(read_result(result)), size)
             print(f"T3Bench: {save}", flush=True)
     except OSError as error:
-        raise UserError(f"--t3bench {folder} can't be written: {error.strerror or error}") from error
+        raise UserError(
+            f"--t3bench {folder} can't be written: {error.strerror or error}"
+        ) from error
 
 
 def _write_stand_ins(folder: Path, size: int) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    for script, kind, names in (("meshrender.py", "quality", quality_names()), ("meshrender_cap.py", "caption", caption_names())):
-        (folder / script).write_text(STAND_IN.format(kind=kind, names=names, size=size), encoding="utf-8")
+    for script, kind, names in (
+        ("meshrender.py", "quality", quality_names()),
+        ("meshrender_cap.py", "caption", caption_names()),
+    ):
+        (folder / script).write_text(
+            STAND_IN.format(kind=kind, names=names, size=size), encoding="utf-8"
+        )
 
 
 def _write_result(save: Path, arrays: GaussianArrays, size: int) -> None:
     pictures = Pictures(arrays)
     quality = icosphere(2, RADIUS)
-    _write_views(save / "t3bench" / "quality", pictures, quality_names(), np.repeat(quality, len(QUALITY_FOVY), 0), QUALITY_FOVY, size)
-    _write_views(save / "t3bench" / "caption", pictures, caption_names(), icosphere(0, RADIUS) * RADIUS, (CAPTION_FOVY,), size)
+    _write_views(
+        save / "t3bench" / "quality",
+        pictures,
+        quality_names(),
+        np.repeat(quality, len(QUALITY_FOVY), 0),
+        QUALITY_FOVY,
+        size,
+    )
+    _write_views(
+        save / "t3bench" / "caption",
+        pictures,
+        caption_names(),
+        icosphere(0, RADIUS) * RADIUS,
+        (CAPTION_FOVY,),
+        size,
+    )
     export = save / "it0-export"
     export.mkdir(parents=True, exist_ok=True)
     write_obj(export / "model.obj", gaussian_surface(arrays))
 
 
 def _write_views(
-    folder: Path, pictures: Pictures, names: list[str], positions: Float[np.ndarray, "V 3"], fovy: Sequence[float], size: int
+    folder: Path,
+    pictures: Pictures,
+    names: list[str],
+    positions: Float[np.ndarray, "V 3"],
+    fovy: Sequence[float],
+    size: int,
 ) -> None:
     """The pictures ``names``, from ``positions`` to the origin; the fields of view take turns."""
     folder.mkdir(parents=True, exist_ok=True)
     angles, remaining = torch.tensor(fovy).repeat(len(positions) // len(fovy)), iter(names)
     for images in pictures.render(towards_origin(positions), angles, size, chunk=8):
         for image in images:
-            files_of_pictures.write(folder / next(remaining), (image * 255).round().astype(np.uint8))
+            files_of_pictures.write(
+                folder / next(remaining), (image * 255).round().astype(np.uint8)
+            )
 
 
 def quality_names() -> list[str]:
-    return [f"{vertex:03d}_{camera}.png" for vertex in range(162) for camera in range(len(QUALITY_FOVY))]
+    return [
+        f"{vertex:03d}_{camera}.png" for vertex in range(162) for camera in range(len(QUALITY_FOVY))
+    ]
 
 
 def caption_names() -> list[str]:
@@ -122,9 +169,13 @@ def towards_origin(positions: Float[np.ndarray, "V 3"]) -> Float[torch.Tensor, "
 
 
 def normalized(arrays: GaussianArrays) -> GaussianArrays:
-    """The cloud moved and scaled so that the centres of its visible Gaussians have mean 0 and lie in [-1, 1]^3."""
+    """The cloud moved and scaled so that the centres of its visible Gaussians have mean 0 and lie
+    in [-1, 1]^3.
+    """
     visible = opaque(arrays, MIN_OPACITY)
     means = arrays.means[visible] if visible.any() else arrays.means
     centre = means.mean(axis=0)
     half_side = np.abs(means - centre).max() or 1.0
-    return arrays._replace(means=(arrays.means - centre) / half_side, log_scales=arrays.log_scales - np.log(half_side))
+    return arrays._replace(
+        means=(arrays.means - centre) / half_side, log_scales=arrays.log_scales - np.log(half_side)
+    )

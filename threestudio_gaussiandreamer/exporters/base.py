@@ -1,8 +1,8 @@
 """What every exporter starts from.
 
-An exporter is one file: a subclass of the host's ``Exporter`` registered as ``<format>-exporter``, whose call returns a list
-of ``ExporterOutput(save_name, save_type, params)``; the system writes each with its ``save_<save_type>(name, **params)``.
-"""
+An exporter is one file: a subclass of the host's ``Exporter`` registered as ``<format>-exporter``,
+whose call returns a list of ``ExporterOutput(save_name, save_type, params)``; the system writes
+each with its ``save_<save_type>(name, **params)``."""
 
 import os
 from dataclasses import dataclass
@@ -13,7 +13,9 @@ from ..host import BaseGeometry, Exporter
 
 
 class FileExporter(Exporter):
-    """An exporter of one file; its options are checked before anything else, also by threestudio's own host, which doesn't."""
+    """An exporter of one file; its options are checked before anything else, also by threestudio's
+    own host, which doesn't.
+    """
 
     @dataclass
     class Config(Exporter.Config):
@@ -39,4 +41,6 @@ def require_file_name(name: str) -> None:
 
 def gaussian_arrays(geometry: BaseGeometry) -> GaussianArrays:
     """The parameters of a geometry as float32 arrays on the CPU."""
-    return GaussianArrays(*(getattr(geometry, name).detach().float().cpu().numpy() for name in GaussianArrays._fields))
+    return GaussianArrays(
+        *(getattr(geometry, name).detach().float().cpu().numpy() for name in GaussianArrays._fields)
+    )

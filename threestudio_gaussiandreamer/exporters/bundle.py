@@ -1,12 +1,13 @@
 """``gaussiandreamer-exporter``: several formats in one export.
 
-============  ==============================================================================================
+============  ======================================================================================
 option        meaning
-============  ==============================================================================================
-formats       names of registered exporters without their ``-exporter``: ``ply``, ``spz``, ``points``, ``surface``, ...
+============  ======================================================================================
+formats       names of registered exporters without their ``-exporter``: ``ply``, ``spz``,
+              ``points``, ``surface``, ...
 options       options of some of them: ``{ply: {pad_sh_degree: 3}}``
 save_video    also render the turntable
-============  ==============================================================================================
+============  ======================================================================================
 """
 
 from collections.abc import Mapping
@@ -14,7 +15,17 @@ from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional
 
 from ..core.errors import UserError, unknown
-from ..host import BaseBackground, BaseGeometry, BaseMaterial, Exporter, ExporterOutput, find, names, parse_structured, register
+from ..host import (
+    BaseBackground,
+    BaseGeometry,
+    BaseMaterial,
+    Exporter,
+    ExporterOutput,
+    find,
+    names,
+    parse_structured,
+    register,
+)
 
 SUFFIX = "-exporter"
 
@@ -31,22 +42,35 @@ class BundleExporter(Exporter):
 
         @staticmethod
         def check(cfg: "BundleExporter.Config") -> None:
-            """Raises UserError for a format that isn't registered, or options of one that isn't asked for."""
+            """Raises UserError for a format that isn't registered, or options of one that isn't
+            asked for.
+            """
             for name in cfg.formats:
                 if name not in available_formats():
                     raise unknown("export format", name, available_formats())
             for name in cfg.options:
                 if name not in cfg.formats:
-                    raise UserError(f"options.{name}: the formats are {', '.join(cfg.formats)}; options of another one have no effect")
+                    raise UserError(
+                        f"options.{name}: the formats are {', '.join(cfg.formats)}; options of "
+                        "another one have no effect"
+                    )
                 _check_options(name, cfg.options[name])
 
     cfg: Config
 
-    def configure(self, geometry: BaseGeometry, material: Optional[BaseMaterial], background: Optional[BaseBackground]) -> None:
+    def configure(
+        self,
+        geometry: BaseGeometry,
+        material: Optional[BaseMaterial],
+        background: Optional[BaseBackground],
+    ) -> None:
         super().configure(geometry, material, background)
         self.Config.check(self.cfg)  # threestudio's own host doesn't
         parts = dict(geometry=geometry, material=material, background=background)
-        self.exporters = [find(name + SUFFIX)(self.cfg.options.get(name, {}), **parts) for name in self.cfg.formats]
+        self.exporters = [
+            find(name + SUFFIX)(self.cfg.options.get(name, {}), **parts)
+            for name in self.cfg.formats
+        ]
 
     def __call__(self) -> List[ExporterOutput]:
         return [output for exporter in self.exporters for output in exporter()]

@@ -34,12 +34,18 @@ class PlyExporter(FileExporter):
             """Raises UserError for a degree that no viewer knows."""
             FileExporter.Config.check(cfg)
             if cfg.pad_sh_degree not in (None, 0, 1, 2, 3):
-                raise UserError(f"pad_sh_degree: expected null, 0, 1, 2 or 3, got {cfg.pad_sh_degree}")
+                raise UserError(
+                    f"pad_sh_degree: expected null, 0, 1, 2 or 3, got {cfg.pad_sh_degree}"
+                )
 
     cfg: Config
 
     def __call__(self) -> List[ExporterOutput]:
         arrays = gaussian_arrays(self.geometry)
         if self.cfg.pad_sh_degree is not None:
-            arrays = arrays._replace(sh=np.ascontiguousarray(padded_sh(arrays.sh, self.cfg.pad_sh_degree)))
-        return [ExporterOutput(save_name=self.cfg.save_name, save_type="ply", params=arrays._asdict())]
+            arrays = arrays._replace(
+                sh=np.ascontiguousarray(padded_sh(arrays.sh, self.cfg.pad_sh_degree))
+            )
+        return [
+            ExporterOutput(save_name=self.cfg.save_name, save_type="ply", params=arrays._asdict())
+        ]

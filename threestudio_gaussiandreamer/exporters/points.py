@@ -1,4 +1,5 @@
-"""``points-exporter``: the centres of the Gaussians as a coloured point cloud, for programs that know no Gaussians.
+"""``points-exporter``: the centres of the Gaussians as a coloured point cloud, for programs that
+know no Gaussians.
 
 ===========  ==================================================================================
 option       meaning
@@ -41,4 +42,8 @@ class PointsExporter(FileExporter):
         arrays = gaussian_arrays(self.geometry)
         keep = opaque(arrays, self.cfg.min_opacity)
         cloud = PointCloud(points=arrays.means[keep], colors=sh0_colors(arrays.sh[keep, 0]))
-        return [ExporterOutput(save_name=self.cfg.save_name, save_type="points", params={"cloud": cloud})]
+        return [
+            ExporterOutput(
+                save_name=self.cfg.save_name, save_type="points", params={"cloud": cloud}
+            )
+        ]

@@ -1,4 +1,5 @@
-"""``spz-exporter``: the Gaussians as an SPZ file, a quarter of the PLY's size, for web viewers and phones.
+"""``spz-exporter``: the Gaussians as an SPZ file, a quarter of the PLY's size, for web viewers and
+phones.
 
 ===========  ==================================================================================
 option       meaning
@@ -7,8 +8,8 @@ save_name    name of the file in the export folder
 save_video   also render the turntable
 ===========  ==================================================================================
 
-About 17 bytes a Gaussian; what its rounding costs is in docs/parsimony.md. The cloud is turned from z up to y up, SPZ's axes.
-"""
+About 17 bytes a Gaussian; what its rounding costs is in docs/parsimony.md. The cloud is turned from
+z up to y up, SPZ's axes."""
 
 from dataclasses import dataclass
 from typing import List
@@ -32,6 +33,9 @@ class SpzExporter(FileExporter):
         arrays = gaussian_arrays(self.geometry)
         keep = usable(arrays)
         if not keep.all():
-            warn(f"{(~keep).sum()} of {len(keep)} Gaussians hold NaN or infinity, which {self.cfg.save_name} can't: left out")
+            warn(
+                f"{(~keep).sum()} of {len(keep)} Gaussians hold NaN or infinity, which "
+                f"{self.cfg.save_name} can't: left out"
+            )
         params = {name: values[keep] for name, values in arrays._asdict().items()}
         return [ExporterOutput(save_name=self.cfg.save_name, save_type="spz", params=params)]

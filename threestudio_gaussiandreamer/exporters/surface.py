@@ -5,12 +5,13 @@ option       meaning
 ===========  ==================================================================================
 save_name    name of the file in the export folder; T3Bench looks for ``model.obj``
 resolution   cells along the longest side of the object
-level        share of the summed opacity's median at the centres at which the surface is; lower is thicker
+level        share of the summed opacity's median at the centres at which the surface is; lower is
+             thicker
 save_video   also render the turntable
 ===========  ==================================================================================
 
-The colours are those of the constant harmonic. A mesh loses what Gaussians show of hair, smoke and glass.
-"""
+The colours are those of the constant harmonic. A mesh loses what Gaussians show of hair, smoke and
+glass."""
 
 from dataclasses import dataclass
 from typing import List
@@ -43,7 +44,13 @@ class SurfaceExporter(FileExporter):
     cfg: Config
 
     def __call__(self) -> List[ExporterOutput]:
-        surface = gaussian_surface(gaussian_arrays(self.geometry), resolution=self.cfg.resolution, level=self.cfg.level)
+        surface = gaussian_surface(
+            gaussian_arrays(self.geometry), resolution=self.cfg.resolution, level=self.cfg.level
+        )
         if not len(surface.faces):
             warn("no Gaussian is opaque enough to be seen: the exported surface is empty")
-        return [ExporterOutput(save_name=self.cfg.save_name, save_type="surface", params={"surface": surface})]
+        return [
+            ExporterOutput(
+                save_name=self.cfg.save_name, save_type="surface", params={"surface": surface}
+            )
+        ]

@@ -1,8 +1,9 @@
-"""Clouds of Gaussians in files, PLY or SPZ by the name's ending, with the axes they are in and what was pruned from them.
+"""Clouds of Gaussians in files, PLY or SPZ by the name's ending, with the axes they are in and what
+was pruned from them.
 
-A PLY keeps the cloud's own axes and says in a comment which of them is up; SPZ demands y up, so the cloud is turned. In a file that
-doesn't say, the custom of its format holds: in an SPZ file y is up, in a PLY -y.
-"""
+A PLY keeps the cloud's own axes and says in a comment which of them is up; SPZ demands y up, so the
+cloud is turned. In a file that doesn't say, the custom of its format holds: in an SPZ file y is up,
+in a PLY -y."""
 
 import logging
 import re
@@ -17,7 +18,14 @@ from jaxtyping import Float
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file
 from ..gaussians.sh import sh_basis
-from .ply import GaussianArrays, gaussians_size, read_comments, read_gaussians, usable, write_gaussians
+from .ply import (
+    GaussianArrays,
+    gaussians_size,
+    read_comments,
+    read_gaussians,
+    usable,
+    write_gaussians,
+)
 from .spz import read_spz, read_spz_comment, spz_arrays, spz_bytes, write_spz
 
 logger = logging.getLogger(__name__)
@@ -30,7 +38,9 @@ AXES = {
     "-y": np.diag([1.0, -1.0, -1.0]),
     "z": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
 }
-"""From coordinates with this axis up to right, up, back, the axes of SPZ: ``z`` is ours (front +x), ``-y`` the custom of PLY files."""
+"""From coordinates with this axis up to right, up, back, the axes of SPZ: ``z`` is ours (front +x),
+``-y`` the custom of PLY files.
+"""
 
 
 class StoredCloud(NamedTuple):
@@ -51,7 +61,9 @@ def require_format(name: str, option: str) -> str:
     """
     suffix = Path(name).suffix.lower()
     if suffix not in CUSTOMARY_UP:
-        raise UserError(f"{option}: expected the name of a {' or '.join(CUSTOMARY_UP)} file, got {name!r}")
+        raise UserError(
+            f"{option}: expected the name of a {' or '.join(CUSTOMARY_UP)} file, got {name!r}"
+        )
     return suffix
 
 
@@ -78,13 +90,17 @@ def drawable(arrays: GaussianArrays) -> GaussianArrays:
     """The Gaussians that can be drawn; says how many can't."""
     keep = usable(arrays)
     if not keep.all():
-        logger.warning("%d of %d Gaussians hold NaN or infinity: left out", (~keep).sum(), len(keep))
+        logger.warning(
+            "%d of %d Gaussians hold NaN or infinity: left out", (~keep).sum(), len(keep)
+        )
     return GaussianArrays(*(values[keep] for values in arrays))
 
 
 def _note(notes: list[str], key: str) -> str:
     """What the last note of this kind says; empty where there is none."""
-    return next((note.removeprefix(key).strip() for note in reversed(notes) if note.startswith(key)), "")
+    return next(
+        (note.removeprefix(key).strip() for note in reversed(notes) if note.startswith(key)), ""
+    )
 
 
 def _number(text: str) -> Optional[float]:
@@ -100,7 +116,9 @@ def write_cloud(path: str, cloud: StoredCloud) -> None:
     """
     suffix = require_format(path, "OUT")
     if suffix == ".ply":
-        write_gaussians(path, **cloud.arrays._asdict(), comments=ply_notes(cloud.up, cloud.pruned_to))
+        write_gaussians(
+            path, **cloud.arrays._asdict(), comments=ply_notes(cloud.up, cloud.pruned_to)
+        )
     else:
         write_spz(path, **in_axes(cloud, "y")._asdict(), comment=spz_note(cloud.pruned_to))
 
@@ -130,7 +148,7 @@ def as_stored(cloud: StoredCloud, suffix: str) -> StoredCloud:
     return cloud._replace(arrays=in_axes(back, cloud.up))
 
 
-# ---- axes ------------------------------------------------------------------------------------------------------------------
+# ---- axes ----------------------------------------------------------------------------------------
 
 
 def in_axes(cloud: StoredCloud, up: str) -> GaussianArrays:
@@ -152,7 +170,9 @@ def turned(arrays: GaussianArrays, rotation: Float[np.ndarray, "3 3"]) -> Gaussi
     )
 
 
-def _turned_quats(quats: Float[np.ndarray, "N 4"], rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "N 4"]:
+def _turned_quats(
+    quats: Float[np.ndarray, "N 4"], rotation: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "N 4"]:
     """The product of the rotation's quaternion and these, wxyz."""
     from scipy.spatial.transform import Rotation
 
@@ -161,11 +181,18 @@ def _turned_quats(quats: Float[np.ndarray, "N 4"], rotation: Float[np.ndarray, "
     return (quats @ matrix.T).astype(np.float32)
 
 
-def _turned_sh(sh: Float[np.ndarray, "N K 3"], rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "N K 3"]:
-    """Harmonics that show towards R d what these showed towards d; each degree turns within itself, so the fit below is exact."""
+def _turned_sh(
+    sh: Float[np.ndarray, "N K 3"], rotation: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "N K 3"]:
+    """Harmonics that show towards R d what these showed towards d; each degree turns within itself,
+    so the fit below is exact.
+    """
     degree = isqrt(sh.shape[1]) - 1
     if degree == 0:
         return sh
     directions = np.random.default_rng(0).normal(size=(64, 3))
-    theirs, ours = (torch.stack(sh_basis(torch.from_numpy(d), degree), 1).numpy() for d in (directions @ rotation.T, directions))
+    theirs, ours = (
+        torch.stack(sh_basis(torch.from_numpy(d), degree), 1).numpy()
+        for d in (directions @ rotation.T, directions)
+    )
     return np.einsum("lk,nkc->nlc", np.linalg.pinv(theirs) @ ours, sh).astype(np.float32)

@@ -1,12 +1,13 @@
 """PLY files of trained Gaussians and of coloured points, written and read with numpy alone.
 
-Gaussians are written in the layout that every viewer of 3D Gaussian splatting reads (little-endian float32):
-``x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3``, where ``f_dc``/``f_rest`` are spherical harmonics
-(``f_rest`` channel by channel), ``opacity`` is a logit, ``scale`` a logarithm and ``rot`` a quaternion wxyz.
+Gaussians are written in the layout that every viewer of 3D Gaussian splatting reads (little-endian
+float32): ``x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3``, where
+``f_dc``/``f_rest`` are spherical harmonics (``f_rest`` channel by channel), ``opacity`` is a logit,
+``scale`` a logarithm and ``rot`` a quaternion wxyz.
 
-The reader takes what other programs write: text or binary of either byte order, properties in any order and of any
-number type, unknown properties and elements, no ``f_rest``. It believes no count that the file's size can't hold.
-"""
+The reader takes what other programs write: text or binary of either byte order, properties in any
+order and of any number type, unknown properties and elements, no ``f_rest``. It believes no count
+that the file's size can't hold."""
 
 import logging
 import os
@@ -83,7 +84,8 @@ class _Header(NamedTuple):
     elements: list[_Element]
 
 
-# ---------------------------------------------------------------------------------------------------------- writing
+# --------------------------------------------------------------------------------------------------
+# writing
 
 
 def write_gaussians(
@@ -101,7 +103,8 @@ def write_gaussians(
 
     Args:
         path: the file; its folder must exist.
-        means, sh, logit_opacities, log_scales, quats: as in :class:`GaussianArrays`; anything numpy takes as an array.
+        means, sh, logit_opacities, log_scales, quats: as in :class:`GaussianArrays`; anything numpy
+          takes as an array.
         pad_sh_degree: append zero harmonics up to this degree, for viewers that insist on degree 3.
         comments: ASCII lines for the header.
 
@@ -111,20 +114,35 @@ def write_gaussians(
     """
     arrays = _as_float32(GaussianArrays(means, sh, logit_opacities, log_scales, quats))
     sh = arrays.sh if pad_sh_degree is None else padded_sh(arrays.sh, pad_sh_degree)
-    rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), 3 * (sh.shape[1] - 1))  # channel by channel
-    columns = [arrays.means, np.zeros_like(arrays.means), sh[:, 0], rest, arrays.logit_opacities[:, None], arrays.log_scales, arrays.quats]
+    rest = (
+        sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), 3 * (sh.shape[1] - 1))
+    )  # channel by channel
+    columns = [
+        arrays.means,
+        np.zeros_like(arrays.means),
+        sh[:, 0],
+        rest,
+        arrays.logit_opacities[:, None],
+        arrays.log_scales,
+        arrays.quats,
+    ]
     _write(path, _gaussian_properties(sh.shape[1]), np.concatenate(columns, axis=1), comments)
 
 
 def gaussians_size(count: int, harmonics: int, comments: Sequence[str] = ()) -> int:
-    """The bytes of the file that :func:`write_gaussians` makes of ``count`` Gaussians with (degree + 1)^2 ``harmonics`` each."""
+    """The bytes of the file that :func:`write_gaussians` makes of ``count`` Gaussians with (degree
+    + 1)^2 ``harmonics`` each.
+    """
     properties = _gaussian_properties(harmonics)
     return len(_header_bytes(properties, count, comments)) + 4 * len(properties) * count
 
 
 def _gaussian_properties(harmonics: int) -> list[tuple[str, str]]:
     rest = (f"f_rest_{i}" for i in range(3 * (harmonics - 1)))
-    return [(name, "float") for name in (*MEANS, *NORMALS, *SH_CONSTANT, *rest, "opacity", *LOG_SCALES, *QUATS)]
+    return [
+        (name, "float")
+        for name in (*MEANS, *NORMALS, *SH_CONSTANT, *rest, "opacity", *LOG_SCALES, *QUATS)
+    ]
 
 
 def read_comments(path: str | os.PathLike) -> list[str]:
@@ -142,10 +160,12 @@ def padded_sh(sh: Float[np.ndarray, "N K 3"], degree: int) -> Float[np.ndarray, 
 
 
 def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
-    """Write coloured points, whole or not at all: ``x y z``, normals where known, ``red green blue`` as bytes.
+    """Write coloured points, whole or not at all: ``x y z``, normals where known, ``red green
+    blue`` as bytes.
 
-    The bytes are what every viewer understands; ``float_red float_green float_blue`` after them hold the colours
-    exactly, so that reading gives the same cloud bit for bit. Faces are not written.
+    The bytes are what every viewer understands; ``float_red float_green float_blue`` after them
+    hold the colours exactly, so that reading gives the same cloud bit for bit. Faces are not
+    written.
 
     Raises:
         ValueError: arrays whose shapes don't agree.
@@ -153,16 +173,27 @@ def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
     """
     parts = [(MEANS, "float", cloud.points), (NORMALS, "float", cloud.normals)]
     parts += [(COLORS, "uchar", _as_bytes(cloud.colors)), (EXACT_COLORS, "float", cloud.colors)]
-    parts = [(names, kind, _shaped(values, (len(cloud.points), 3), names[0])) for names, kind, values in parts if values is not None]
+    parts = [
+        (names, kind, _shaped(values, (len(cloud.points), 3), names[0]))
+        for names, kind, values in parts
+        if values is not None
+    ]
     properties = [(name, kind) for names, kind, _ in parts for name in names]
-    rows = np.empty(len(cloud.points), [(name, "<" + NUMBER_TYPES[kind]) for name, kind in properties])
+    rows = np.empty(
+        len(cloud.points), [(name, "<" + NUMBER_TYPES[kind]) for name, kind in properties]
+    )
     for names, _, values in parts:
         for name, column in zip(names, values.T, strict=True):
             rows[name] = column
     _write(path, properties, rows)
 
 
-def _write(path: str | os.PathLike, properties: list[tuple[str, str]], rows: np.ndarray, comments: Sequence[str] = ()) -> None:
+def _write(
+    path: str | os.PathLike,
+    properties: list[tuple[str, str]],
+    rows: np.ndarray,
+    comments: Sequence[str] = (),
+) -> None:
     """Header and rows; ``rows`` is a packed little-endian record array, or (N, P) float32."""
     with atomic_file(path) as file:
         file.write(_header_bytes(properties, len(rows), comments))
@@ -171,15 +202,27 @@ def _write(path: str | os.PathLike, properties: list[tuple[str, str]], rows: np.
 
 
 def _header_bytes(properties: list[tuple[str, str]], count: int, comments: Sequence[str]) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments), f"element vertex {count}"]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {comment}" for comment in comments),
+        f"element vertex {count}",
+    ]
     lines += [f"property {kind} {name}" for name, kind in properties]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
 def _as_float32(arrays: GaussianArrays) -> GaussianArrays:
-    count, harmonics = np.shape(arrays.sh)[:2] if np.ndim(arrays.sh) == 3 else (len(arrays.means), 1)
+    count, harmonics = (
+        np.shape(arrays.sh)[:2] if np.ndim(arrays.sh) == 3 else (len(arrays.means), 1)
+    )
     shapes = [(count, 3), (count, harmonics, 3), (count,), (count, 3), (count, 4)]
-    return GaussianArrays(*(_shaped(values, shape, name) for values, shape, name in zip(arrays, shapes, arrays._fields, strict=True)))
+    return GaussianArrays(
+        *(
+            _shaped(values, shape, name)
+            for values, shape, name in zip(arrays, shapes, arrays._fields, strict=True)
+        )
+    )
 
 
 def _shaped(values: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
@@ -193,7 +236,8 @@ def _as_bytes(colors: Float[np.ndarray, "P 3"]) -> np.ndarray:
     return np.rint(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-# ---------------------------------------------------------------------------------------------------------- reading
+# --------------------------------------------------------------------------------------------------
+# reading
 
 
 def read_gaussians(path: str | os.PathLike, *, allow_non_finite: bool = False) -> GaussianArrays:
@@ -204,44 +248,63 @@ def read_gaussians(path: str | os.PathLike, *, allow_non_finite: bool = False) -
         allow_non_finite: leave rows that are not :func:`usable` to the caller.
 
     Raises:
-        UserError: no such file, not a PLY, not of Gaussians, damaged, or with values that are not usable.
+        UserError: no such file, not a PLY, not of Gaussians, damaged, or with values that are not
+            usable.
     """
     table = _Table.read(path)
     if missing := [name for name in GAUSSIAN if name not in table]:
-        hint = " It holds plain points: read it as a point cloud." if not set(SH_CONSTANT) & set(table.names) else ""
+        hint = (
+            " It holds plain points: read it as a point cloud."
+            if not set(SH_CONSTANT) & set(table.names)
+            else ""
+        )
         table.fail(f"the Gaussians lack {', '.join(missing)}.{hint}")
     known = {*GAUSSIAN, *NORMALS, *COLORS}
-    if unknown := [name for name in table.names if name not in known and not name.startswith("f_rest_")]:
+    if unknown := [
+        name for name in table.names if name not in known and not name.startswith("f_rest_")
+    ]:
         more = f" and {len(unknown) - 5} more" if len(unknown) > 5 else ""
         logger.warning("%s: not known here, and left out: %s%s", path, ", ".join(unknown[:5]), more)
-    arrays = GaussianArrays(table[MEANS], _read_sh(table), table["opacity"], table[LOG_SCALES], table[QUATS])
+    arrays = GaussianArrays(
+        table[MEANS], _read_sh(table), table["opacity"], table[LOG_SCALES], table[QUATS]
+    )
     if not allow_non_finite:
         table.require_valid(usable(arrays), "values")
     return arrays
 
 
 def usable(arrays: GaussianArrays) -> Bool[np.ndarray, " N"]:
-    """Whether each Gaussian can be drawn: finite but for opacities of 0 or 1 and flat axes, whose logarithms are infinite."""
-    columns = [np.isfinite(arrays.means), np.isfinite(arrays.quats), np.isfinite(arrays.sh).all(axis=2)]
+    """Whether each Gaussian can be drawn: finite but for opacities of 0 or 1 and flat axes, whose
+    logarithms are infinite.
+    """
+    columns = [
+        np.isfinite(arrays.means),
+        np.isfinite(arrays.quats),
+        np.isfinite(arrays.sh).all(axis=2),
+    ]
     columns += [~np.isnan(arrays.logit_opacities)[:, None], arrays.log_scales < np.inf]
     return np.concatenate(columns, axis=1).all(axis=1)
 
 
 def opaque(arrays: GaussianArrays, min_opacity: float) -> Bool[np.ndarray, " N"]:
-    """Whether the opacity of each Gaussian is ``min_opacity``, in [0, 1], or more; at 0 whether it is a number."""
+    """Whether the opacity of each Gaussian is ``min_opacity``, in [0, 1], or more; at 0 whether it
+    is a number.
+    """
     with np.errstate(divide="ignore"):
         return arrays.logit_opacities >= np.log(min_opacity) - np.log1p(-min_opacity)
 
 
 def read_points(path: str | os.PathLike, *, allow_non_finite: bool = False) -> PointCloud:
-    """Read coloured points; without colours they are grey (0.5), those of Gaussians come from the constant harmonic.
+    """Read coloured points; without colours they are grey (0.5), those of Gaussians come from the
+    constant harmonic.
 
     Args:
         path: the file.
         allow_non_finite: leave rows with NaN or infinity to the caller.
 
     Raises:
-        UserError: no such file, not a PLY, without positions, damaged, or with values that are not finite.
+        UserError: no such file, not a PLY, without positions, damaged, or with values that are not
+            finite.
     """
     table = _Table.read(path)
     if missing := [name for name in MEANS if name not in table]:
@@ -261,7 +324,12 @@ def is_gaussian_ply(path: str | os.PathLike) -> bool:
             header = _read_header(file, str(path))
     except (OSError, UserError):
         return False
-    names = {entry.name for element in header.elements if element.name == "vertex" for entry in element.properties}
+    names = {
+        entry.name
+        for element in header.elements
+        if element.name == "vertex"
+        for entry in element.properties
+    }
     return names.issuperset(GAUSSIAN)
 
 
@@ -294,7 +362,9 @@ class _Table:
 
     def __getitem__(self, names: str | tuple[str, ...]) -> Float[np.ndarray, "..."]:
         """One column (N,), or several (N, C), as float32."""
-        with np.errstate(over="ignore"):  # a double too large becomes infinite, which the check of values reports
+        with np.errstate(
+            over="ignore"
+        ):  # a double too large becomes infinite, which the check of values reports
             if isinstance(names, str):
                 return self._columns[names].astype(np.float32)
             return np.stack([self._columns[name].astype(np.float32) for name in names], axis=1)
@@ -310,7 +380,10 @@ class _Table:
         """Raise unless every vertex is valid."""
         if not valid.all():
             bad = self._count - valid.sum()
-            self.fail(f"the {what} of {bad} of {self._count} vertices are NaN or infinite, first in vertex {valid.argmin()}.")
+            self.fail(
+                f"the {what} of {bad} of {self._count} vertices are NaN or infinite, first in "
+                f"vertex {valid.argmin()}."
+            )
 
 
 def _read_sh(table: _Table) -> Float[np.ndarray, "N K 3"]:
@@ -318,10 +391,16 @@ def _read_sh(table: _Table) -> Float[np.ndarray, "N K 3"]:
     count = sum(name.startswith("f_rest_") for name in table.names)
     rest_names = tuple(f"f_rest_{i}" for i in range(count))
     if any(name not in table for name in rest_names):
-        table.fail(f"{count} properties f_rest_* were expected to be numbered f_rest_0 to f_rest_{count - 1}.")
+        table.fail(
+            f"{count} properties f_rest_* were expected to be numbered f_rest_0 to "
+            f"f_rest_{count - 1}."
+        )
     harmonics = count // 3 + 1
     if count % 3 or round(harmonics**0.5) ** 2 != harmonics:
-        table.fail(f"{count} properties f_rest_* fit no degree of spherical harmonics: 0, 9, 24 or 45 were expected.")
+        table.fail(
+            f"{count} properties f_rest_* fit no degree of spherical harmonics: 0, 9, 24 or 45 "
+            "were expected."
+        )
     constant = table[SH_CONSTANT][:, None]
     if not count:
         return constant
@@ -331,7 +410,12 @@ def _read_sh(table: _Table) -> Float[np.ndarray, "N K 3"]:
 
 def _read_colors(table: _Table) -> Float[np.ndarray, "N 3"]:
     """Colours in [0, 1] from the first of the known properties."""
-    for names in (EXACT_COLORS, COLORS, ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b")):
+    for names in (
+        EXACT_COLORS,
+        COLORS,
+        ("diffuse_red", "diffuse_green", "diffuse_blue"),
+        ("r", "g", "b"),
+    ):
         if all(name in table for name in names):
             return unit_colors(table[names], table.stored_type(names[0]))
     if all(name in table for name in SH_CONSTANT):
@@ -347,7 +431,9 @@ def sh0_colors(sh0: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
     return (0.5 + np.float32(C0) * sh0).clip(0.0, 1.0)
 
 
-def unit_colors(colors: Float[np.ndarray, "N 3"], stored_type: np.dtype) -> Float[np.ndarray, "N 3"]:
+def unit_colors(
+    colors: Float[np.ndarray, "N 3"], stored_type: np.dtype
+) -> Float[np.ndarray, "N 3"]:
     """Colours stored as integers, or as floats up to 255, in [0, 1]."""
     if np.issubdtype(stored_type, np.integer):
         return colors / np.float32(np.iinfo(stored_type).max if stored_type.itemsize < 4 else 255)
@@ -401,8 +487,16 @@ def _parse_element(words: list[str], path: str) -> _Element:
 def _add_property(words: list[str], elements: list[_Element], path: str) -> None:
     is_list = words[1:2] == ["list"]
     types, name = words[2 if is_list else 1 : -1], words[-1]
-    if len(types) != (2 if is_list else 1) or any(kind not in NUMBER_TYPES for kind in types) or not elements:
-        _fail(path, f"the header line {' '.join(words)[:80]!r} is not a property of an element with a known number type.")
+    if (
+        len(types) != (2 if is_list else 1)
+        or any(kind not in NUMBER_TYPES for kind in types)
+        or not elements
+    ):
+        _fail(
+            path,
+            f"the header line {' '.join(words)[:80]!r} is not a property of an element with a "
+            "known number type.",
+        )
     codes = [NUMBER_TYPES[kind] for kind in types]
     elements[-1].properties.append(_Property(name, codes[-1], codes[0] if is_list else None))
 
@@ -415,13 +509,21 @@ def _seek_vertices(file: BinaryIO, header: _Header, path: str) -> _Element:
                 _fail(path, "a list among the properties of the vertices is not supported.")
             return element
         _skip(file, element, header.encoding, path)
-    _fail(path, f"there are no vertices: its elements are {', '.join(element.name for element in header.elements)[:200] or 'none'}.")
+    _fail(
+        path,
+        "there are no vertices: its elements are "
+        f"{', '.join(element.name for element in header.elements)[:200] or 'none'}.",
+    )
 
 
 def _skip(file: BinaryIO, element: _Element, encoding: str, path: str) -> None:
     remaining = _remaining(file)
     if element.count > remaining and element.properties:  # each row has a byte at least
-        _fail(path, f"{element.count} rows of {element.name!r} are announced, but {remaining} bytes follow: the file is truncated.")
+        _fail(
+            path,
+            f"{element.count} rows of {element.name!r} are announced, but {remaining} bytes "
+            "follow: the file is truncated.",
+        )
     if encoding == "ascii":
         _skip_lines(file, element, path)
     elif element.has_lists:
@@ -431,12 +533,18 @@ def _skip(file: BinaryIO, element: _Element, encoding: str, path: str) -> None:
 
 
 def _skip_lines(file: BinaryIO, element: _Element, path: str) -> None:
-    """Skip the lines of an element but for blank ones; their numbers must be as many as announced, or the vertices begin elsewhere."""
+    """Skip the lines of an element but for blank ones; their numbers must be as many as announced,
+    or the vertices begin elsewhere.
+    """
     count = element.count if element.properties else 0
     while count and (line := file.readline()):
         words = line.split()
         if words and not _is_row(words, element):
-            _fail(path, f"a line of {element.name!r} holds other numbers than its properties: {line[:80].decode('latin-1')!r}.")
+            _fail(
+                path,
+                f"a line of {element.name!r} holds other numbers than its properties: "
+                f"{line[:80].decode('latin-1')!r}.",
+            )
         count -= bool(words)
 
 
@@ -458,10 +566,18 @@ def _skip_lists(file: BinaryIO, element: _Element, order: str, path: str) -> Non
             if entry.count_type:
                 count_type = np.dtype(order + entry.count_type)
                 raw = file.read(count_type.itemsize)
-                length = int(np.frombuffer(raw, count_type)[0]) if len(raw) == count_type.itemsize else -1
+                length = (
+                    int(np.frombuffer(raw, count_type)[0])
+                    if len(raw) == count_type.itemsize
+                    else -1
+                )
             size = length * np.dtype(entry.type).itemsize
             if not 0 <= size <= _remaining(file):
-                _fail(path, f"a list in {element.name!r} is longer than the file: it is truncated or damaged.")
+                _fail(
+                    path,
+                    f"a list in {element.name!r} is longer than the file: it is truncated or "
+                    "damaged.",
+                )
             file.seek(size, os.SEEK_CUR)
 
 
@@ -469,7 +585,9 @@ def _remaining(file: BinaryIO) -> int:
     return os.fstat(file.fileno()).st_size - file.tell()
 
 
-def _read_rows(file: BinaryIO, vertices: _Element, encoding: str, path: str) -> dict[str, np.ndarray]:
+def _read_rows(
+    file: BinaryIO, vertices: _Element, encoding: str, path: str
+) -> dict[str, np.ndarray]:
     """The columns of the vertices."""
     if not vertices.properties:
         return {}
@@ -485,14 +603,22 @@ def _read_rows(file: BinaryIO, vertices: _Element, encoding: str, path: str) -> 
 def _read_text_rows(file: BinaryIO, vertices: _Element, path: str) -> dict[str, np.ndarray]:
     """One vertex per line; integers become floats too, so that a NaN among them is seen later."""
     width = len(vertices.properties)
-    _require_room(file, vertices, max(vertices.count * 2 * width - 1, 0), path)  # a digit and a blank per number
+    _require_room(
+        file, vertices, max(vertices.count * 2 * width - 1, 0), path
+    )  # a digit and a blank per number
     rows = _parse_text(file, vertices.count, path) if vertices.count else np.empty((0, width))
     if rows.shape != (vertices.count, width):
-        _fail(path, f"{vertices.count} vertices of {width} numbers are announced, but {rows.shape[0]} of {rows.shape[1]} are there.")
+        _fail(
+            path,
+            f"{vertices.count} vertices of {width} numbers are announced, but {rows.shape[0]} "
+            f"of {rows.shape[1]} are there.",
+        )
     for entry, values in zip(vertices.properties, rows.T, strict=True):
         limits = None if entry.type[0] == "f" else np.iinfo(entry.type)
         if limits and ((values < limits.min) | (values > limits.max)).any():
-            _fail(path, f"{entry.name} is beyond the range of its type, {limits.min} to {limits.max}.")
+            _fail(
+                path, f"{entry.name} is beyond the range of its type, {limits.min} to {limits.max}."
+            )
     return {entry.name: column for entry, column in zip(vertices.properties, rows.T, strict=True)}
 
 
@@ -500,7 +626,9 @@ def _parse_text(file: BinaryIO, count: int, path: str) -> Float[np.ndarray, "N C
     try:
         with warnings.catch_warnings():  # numpy warns of missing rows, which the caller reports
             warnings.simplefilter("ignore", UserWarning)
-            return np.loadtxt(file, np.float64, comments=None, max_rows=count, ndmin=2, encoding="latin-1")
+            return np.loadtxt(
+                file, np.float64, comments=None, max_rows=count, ndmin=2, encoding="latin-1"
+            )
     except ValueError as error:
         _fail(path, f"a vertex is not readable: {error}.")
 
@@ -508,9 +636,18 @@ def _parse_text(file: BinaryIO, count: int, path: str) -> Float[np.ndarray, "N C
 def _report_what_follows(file: BinaryIO, header: _Header, vertices: _Element, path: Path) -> None:
     """Say when there is more than the header announces, since then its count may be wrong."""
     if header.elements[-1] is vertices and (rest := _remaining(file)) and file.read(4096).strip():
-        logger.warning("PLY file %r: %d bytes follow the %d vertices that its header announces", str(path), rest, vertices.count)
+        logger.warning(
+            "PLY file %r: %d bytes follow the %d vertices that its header announces",
+            str(path),
+            rest,
+            vertices.count,
+        )
 
 
 def _require_room(file: BinaryIO, vertices: _Element, size: int, path: str) -> None:
     if size > (remaining := _remaining(file)):
-        _fail(path, f"{vertices.count} vertices need {size} bytes, but {remaining} follow the header: it is truncated or damaged.")
+        _fail(
+            path,
+            f"{vertices.count} vertices need {size} bytes, but {remaining} follow the header: "
+            "it is truncated or damaged.",
+        )

@@ -1,20 +1,24 @@
-"""SPZ, the compact file of Gaussians that web viewers read: about 17 bytes for a Gaussian of degree 0, where a PLY takes 68.
+"""SPZ, the compact file of Gaussians that web viewers read: about 17 bytes for a Gaussian of degree
+0, where a PLY takes 68.
 
-The format is Niantic's (github.com/nianticlabs/spz, MIT). Version 3 is written, 2 and 3 are read; both are gzip around a header and
-one block for each attribute. Integers are little-endian, quaternions in the order xyzw, axes right, up, back:
+The format is Niantic's (github.com/nianticlabs/spz, MIT). Version 3 is written, 2 and 3 are read;
+both are gzip around a header and one block for each attribute. Integers are little-endian,
+quaternions in the order xyzw, axes right, up, back:
 
-==========  ==========================================================================================================
-header      ``NGSP``, version u32, N u32, degree of the harmonics u8, fractional bits u8, flags u8 (1: antialiased), 0
+==========  ========================================================================================
+header      ``NGSP``, version u32, N u32, degree of the harmonics u8, fractional bits u8, flags u8
+            (1: antialiased), 0
 positions   N x 3 fixed point of 24 bit, signed
 alphas      N u8: 255 opacity
 colors      N x 3 u8: 255 (0.15 sh + 0.5)
 scales      N x 3 u8: 16 (log scale + 10), so sizes from e^-10 to e^5.9 world units
-rotations   N u32: the number of the largest component, and sign and 9 bit of each other (version 2: x y z u8)
+rotations   N u32: the number of the largest component, and sign and 9 bit of each other (version 2:
+            x y z u8)
 harmonics   N x (K - 1) x 3 u8: 128 sh + 128, of which 5 bit are used at degree 1, 4 above
-==========  ==========================================================================================================
+==========  ========================================================================================
 
-The reader believes no count that the file's size can't hold. What rounding costs: docs/parsimony.md.
-"""
+The reader believes no count that the file's size can't hold. What rounding costs:
+docs/parsimony.md."""
 
 import os
 import struct
@@ -32,7 +36,9 @@ from .ply import GaussianArrays, usable
 HEADER = struct.Struct("<4sIIBBBB")
 MAGIC, VERSION = b"NGSP", 3
 STEPS_PER_SIZE = 32
-"""Positions are kept to this part, at least, of the median Gaussian's size: where the curve of docs/parsimony.md has become flat."""
+"""Positions are kept to this part, at least, of the median Gaussian's size: where the curve of
+docs/parsimony.md has become flat.
+"""
 MOST_DEFLATE_SAVES = 1032
 """Bytes that one byte of a deflate stream stands for at most (zlib's technical notes)."""
 COLOR_SCALE = 0.15
@@ -73,23 +79,29 @@ def write_spz(path: str | os.PathLike, *, comment: str = "", **arrays: np.ndarra
 
 
 def spz_bytes(arrays: GaussianArrays, *, comment: str = "") -> bytes:
-    """Gaussians as an SPZ file of version 3, their order along a Morton curve, in which neighbours resemble each other.
+    """Gaussians as an SPZ file of version 3, their order along a Morton curve, in which neighbours
+    resemble each other.
 
     Args:
         arrays: in the axes right, up, back.
         comment: kept in the header of gzip, where no reader minds it; ASCII.
 
     Raises:
-        UserError: NaN or infinite values, positions too large for the format, or harmonics above degree 3.
+        UserError: NaN or infinite values, positions too large for the format, or harmonics above
+            degree 3.
     """
     if not usable(arrays).all():
         raise UserError("an SPZ file can't hold Gaussians with NaN or infinite values")
     if arrays.sh.shape[1] > 16:
-        raise UserError(f"an SPZ file holds harmonics up to degree 3, not {isqrt(arrays.sh.shape[1]) - 1}")
+        raise UserError(
+            f"an SPZ file holds harmonics up to degree 3, not {isqrt(arrays.sh.shape[1]) - 1}"
+        )
     order = _morton_order(arrays.means)
     arrays = GaussianArrays(*(values[order] for values in arrays))
     fractional = _fractional_bits(arrays)
-    header = HEADER.pack(MAGIC, VERSION, len(arrays.means), isqrt(arrays.sh.shape[1]) - 1, fractional, 0, 0)
+    header = HEADER.pack(
+        MAGIC, VERSION, len(arrays.means), isqrt(arrays.sh.shape[1]) - 1, fractional, 0, 0
+    )
     fixed = np.rint(arrays.means.astype(np.float64) * 2.0**fractional).astype("<i4")
     blocks = [
         fixed[..., None].view("u1")[..., :3],
@@ -99,7 +111,9 @@ def spz_bytes(arrays: GaussianArrays, *, comment: str = "") -> bytes:
         _smallest_three(arrays.quats),
         _harmonic_bytes(arrays.sh[:, 1:]),
     ]
-    return _gzip(header + b"".join(np.ascontiguousarray(block).tobytes() for block in blocks), comment)
+    return _gzip(
+        header + b"".join(np.ascontiguousarray(block).tobytes() for block in blocks), comment
+    )
 
 
 def read_spz(path: str | os.PathLike) -> GaussianArrays:
@@ -116,19 +130,28 @@ def read_spz(path: str | os.PathLike) -> GaussianArrays:
 
 
 def spz_arrays(packed: bytes, name: str = "") -> GaussianArrays:
-    """The Gaussians in the bytes of an SPZ file, which messages call by its ``name``; see :func:`read_spz`."""
+    """The Gaussians in the bytes of an SPZ file, which messages call by its ``name``; see
+    :func:`read_spz`.
+    """
     header, data = _unpacked(packed, name)
     ends = np.cumsum([size * header.count for size in header.blocks])
-    parts = [part.reshape(header.count, size) for part, size in zip(np.split(data, ends[:-1]), header.blocks, strict=True)]
+    parts = [
+        part.reshape(header.count, size)
+        for part, size in zip(np.split(data, ends[:-1]), header.blocks, strict=True)
+    ]
     positions, alphas, colors, scales, rotations, harmonics = parts
     constant = (colors / np.float32(255) - np.float32(0.5)) / np.float32(COLOR_SCALE)
-    rest = (harmonics.reshape(header.count, header.blocks[-1] // 3, 3).astype(np.float32) - 128) / 128
+    rest = (
+        harmonics.reshape(header.count, header.blocks[-1] // 3, 3).astype(np.float32) - 128
+    ) / 128
     return GaussianArrays(
         means=_positions(positions, header.fractional_bits),
         sh=np.concatenate([constant[:, None], rest], axis=1),
         logit_opacities=_logits(alphas[:, 0]),
         log_scales=scales / np.float32(16) - 10,
-        quats=_from_smallest_three(rotations) if header.version == 3 else _from_first_three(rotations),
+        quats=_from_smallest_three(rotations)
+        if header.version == 3
+        else _from_first_three(rotations),
     )
 
 
@@ -141,9 +164,15 @@ def read_spz_comment(path: str | os.PathLike) -> str:
 
 
 def _unpacked(packed: bytes, name: str) -> tuple[SpzHeader, Int[np.ndarray, " B"]]:
-    """Header and blocks; no more is unpacked than the header announces, and it may announce no more than deflate can pack."""
+    """Header and blocks; no more is unpacked than the header announces, and it may announce no more
+    than deflate can pack.
+    """
     if packed[:4] == MAGIC:
-        _fail(name, "version 4, packed with Zstandard, isn't known here: versions 2 and 3 are. Niantic's tools write version 3 too.")
+        _fail(
+            name,
+            "version 4, packed with Zstandard, isn't known here: versions 2 and 3 are. "
+            "Niantic's tools write version 3 too.",
+        )
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         header = SpzHeader._make(HEADER.unpack(stream.decompress(packed, HEADER.size)))
@@ -151,11 +180,16 @@ def _unpacked(packed: bytes, name: str) -> tuple[SpzHeader, Int[np.ndarray, " B"
         size = sum(header.blocks) * header.count
         data = stream.decompress(stream.unconsumed_tail, size) if size else b""
         while not stream.eof and stream.decompress(stream.unconsumed_tail, 1 << 16):
-            pass  # to the end, where the checksum is: extensions may follow what the header announces
+            # to the end, where the checksum is: extensions may follow what the header announces
+            pass
     except (zlib.error, struct.error) as error:
         _fail(name, f"it isn't an SPZ file, or damaged ({error}).")
     if len(data) < size or not stream.eof:
-        _fail(name, f"{header.count} Gaussians need {size} bytes, but {len(data)} are there: it is truncated or damaged.")
+        _fail(
+            name,
+            f"{header.count} Gaussians need {size} bytes, but {len(data)} are there: it is "
+            "truncated or damaged.",
+        )
     return header, np.frombuffer(data, "u1")
 
 
@@ -165,18 +199,29 @@ def _check_header(header: SpzHeader, packed_size: int, name: str) -> None:
     if header.degree > 3:
         _fail(name, f"harmonics of degree {header.degree} are announced: 0 to 3 were expected.")
     if sum(header.blocks) * header.count > MOST_DEFLATE_SAVES * packed_size:
-        _fail(name, f"{header.count} Gaussians are announced, but {packed_size} bytes can't hold them.")
+        _fail(
+            name,
+            f"{header.count} Gaussians are announced, but {packed_size} bytes can't hold them.",
+        )
 
 
 def _gzip(data: bytes, comment: str) -> bytes:
-    """The bytes as one gzip member (RFC 1952) without a time, so that equal clouds give equal files."""
+    """The bytes as one gzip member (RFC 1952) without a time, so that equal clouds give equal
+    files.
+    """
     deflate = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
     note = comment.encode("ascii") + b"\0" if comment else b""
     head = struct.pack("<4BIBB", 0x1F, 0x8B, 8, 16 if comment else 0, 0, 2, 255)
-    return head + note + deflate.compress(data) + deflate.flush() + struct.pack("<II", zlib.crc32(data), len(data) & 0xFFFFFFFF)
+    return (
+        head
+        + note
+        + deflate.compress(data)
+        + deflate.flush()
+        + struct.pack("<II", zlib.crc32(data), len(data) & 0xFFFFFFFF)
+    )
 
 
-# ---- the attributes as SPZ stores them -------------------------------------------------------------------------------------
+# ---- the attributes as SPZ stores them -----------------------------------------------------------
 
 
 def _morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
@@ -184,11 +229,16 @@ def _morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
     low, high = means.min(axis=0, initial=np.inf), means.max(axis=0, initial=-np.inf)
     cells = ((means - low) / np.maximum(high - low, 1e-12) * 1023).astype(np.int64)
     bits = cells[:, :, None] >> np.arange(10) & 1
-    return (bits << (3 * np.arange(10) + np.arange(3)[:, None])).sum(axis=(1, 2)).argsort(kind="stable")
+    return (
+        (bits << (3 * np.arange(10) + np.arange(3)[:, None]))
+        .sum(axis=(1, 2))
+        .argsort(kind="stable")
+    )
 
 
 def _fractional_bits(arrays: GaussianArrays) -> int:
-    """Bits behind the point: by the size of the Gaussians, as far as 23 bits hold the largest coordinate.
+    """Bits behind the point: by the size of the Gaussians, as far as 23 bits hold the largest
+    coordinate.
 
     Raises:
         UserError: not even whole numbers can be stored.
@@ -214,7 +264,9 @@ def _smallest_three(quats: Float[np.ndarray, "N 4"]) -> Int[np.ndarray, " N"]:
     largest = np.abs(xyzw).argmax(axis=1)
     xyzw *= np.where(xyzw[np.arange(len(xyzw)), largest] < 0, -1, 1)[:, None]
     others = xyzw[np.arange(4) != largest[:, None]].reshape(-1, 3)
-    fields = np.rint(np.abs(others) * (511 * sqrt(2))).astype(np.int64).clip(0, 511) | (others < 0) << 9
+    fields = (
+        np.rint(np.abs(others) * (511 * sqrt(2))).astype(np.int64).clip(0, 511) | (others < 0) << 9
+    )
     return (largest << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]).astype("<u4")
 
 

@@ -1,1 +1,3 @@
-"""Operations on clouds of points and Gaussians: grow, densify, rank, merge, simplify, extract a surface."""
+"""Operations on clouds of points and Gaussians: grow, densify, rank, merge, simplify, extract a
+surface.
+"""

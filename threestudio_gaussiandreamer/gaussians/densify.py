@@ -1,17 +1,19 @@
-"""Densify and prune: which Gaussians are cloned, split and dropped, as pure functions of the cloud and its statistics.
+"""Densify and prune: which Gaussians are cloned, split and dropped, as pure functions of the cloud
+and its statistics.
 
-A change of the cloud is a :class:`Change`: for every new row the old row that it comes from, and whether it is fresh.
-Applying it to the parameters, the optimiser's moments and the statistics is then one gather each, so the moments of a Gaussian
-follow it whatever happens around it.
+A change of the cloud is a :class:`Change`: for every new row the old row that it comes from, and
+whether it is fresh. Applying it to the parameters, the optimiser's moments and the statistics is
+then one gather each, so the moments of a Gaussian follow it whatever happens around it.
 
-Statistics are per view and unscaled. ``gradient`` is the norm of the loss's gradient with respect to the projected centre in
-normalised device units (half the image is 1), of the loss of one view (not divided by the batch), averaged over the views that
-saw the Gaussian: its meaning doesn't depend on resolution, batch size or a loss scale. ``contribution`` is the largest
-sigma_i T_i over the pixels of recent views (RadSplat, Niemeyer et al. 2024).
+Statistics are per view and unscaled. ``gradient`` is the norm of the loss's gradient with respect
+to the projected centre in normalised device units (half the image is 1), of the loss of one view
+(not divided by the batch), averaged over the views that saw the Gaussian: its meaning doesn't
+depend on resolution, batch size or a loss scale. ``contribution`` is the largest sigma_i T_i over
+the pixels of recent views (RadSplat, Niemeyer et al. 2024).
 
-Clone and split rules: Kerbl et al. 2023, section 5.2. There is no opacity reset (their section 5.2 sets all opacities near zero
-now and then to find floaters): score distillation doesn't rebuild what a reset erases, and pruning by what shows does its work.
-"""
+Clone and split rules: Kerbl et al. 2023, section 5.2. There is no opacity reset (their section 5.2
+sets all opacities near zero now and then to find floaters): score distillation doesn't rebuild what
+a reset erases, and pruning by what shows does its work."""
 
 import logging
 from typing import Mapping, NamedTuple
@@ -25,7 +27,9 @@ logger = logging.getLogger(__name__)
 PARAMETERS = ("means", "log_scales", "quats", "logit_opacities", "sh0", "sh_rest")
 SPLIT_SHRINK = 1.6  # the two children of a split are this much smaller
 LOG_SCALE_RANGE = (-20.0, 10.0)
-"""Where the exponential and its square are well within float32: sizes beyond are drawn, and split, as if at these bounds."""
+"""Where the exponential and its square are well within float32: sizes beyond are drawn, and split,
+as if at these bounds.
+"""
 
 
 class Change(NamedTuple):
@@ -58,23 +62,30 @@ class Statistics(NamedTuple):
     contribution: Float[Tensor, " N"]
 
 
-def screen_gradients(means2d_grad: Float[Tensor, "B N 2"], width: int, height: int, loss_scale: float = 1.0) -> Float[Tensor, "B N"]:
+def screen_gradients(
+    means2d_grad: Float[Tensor, "B N 2"], width: int, height: int, loss_scale: float = 1.0
+) -> Float[Tensor, "B N"]:
     """Per-view gradient norms in normalised device units from gradients in pixels.
 
-    ``means2d_grad`` is the gradient of a loss that is averaged over the batch and multiplied by ``loss_scale`` (that of
-    automatic mixed precision); both are undone here. Non-finite gradients count as zero.
-    """
-    half = torch.tensor([0.5 * width, 0.5 * height], dtype=means2d_grad.dtype, device=means2d_grad.device)
+    ``means2d_grad`` is the gradient of a loss that is averaged over the batch and multiplied by
+    ``loss_scale`` (that of automatic mixed precision); both are undone here. Non-finite gradients
+    count as zero."""
+    half = torch.tensor(
+        [0.5 * width, 0.5 * height], dtype=means2d_grad.dtype, device=means2d_grad.device
+    )
     norms = (means2d_grad * half).norm(dim=-1) * (len(means2d_grad) / loss_scale)
     return torch.where(norms.isfinite(), norms, torch.zeros_like(norms))
 
 
-def densify_and_prune(params: Mapping[str, Tensor], stats: Statistics, rules: Rules, rng: torch.Generator) -> Change:
-    """Clone small and split large Gaussians whose centre wants to move, drop the faint and the huge, respect cap and floor.
+def densify_and_prune(
+    params: Mapping[str, Tensor], stats: Statistics, rules: Rules, rng: torch.Generator
+) -> Change:
+    """Clone small and split large Gaussians whose centre wants to move, drop the faint and the
+    huge, respect cap and floor.
 
-    A Gaussian that no view has seen has no gradient and is never selected, whatever the threshold. Faint ones don't grow, and the
-    room that they leave under the cap is given to others in the same round.
-    """
+    A Gaussian that no view has seen has no gradient and is never selected, whatever the threshold.
+    Faint ones don't grow, and the room that they leave under the cap is given to others in the same
+    round."""
     faint = torch.sigmoid(params["logit_opacities"].detach()) < rules.min_opacity
     hot = (stats.gradient > rules.grad_threshold) & ~faint
     hot &= _affordable(hot, stats.gradient, rules.max_gaussians - int((~faint).sum()))
@@ -84,47 +95,83 @@ def densify_and_prune(params: Mapping[str, Tensor], stats: Statistics, rules: Ru
     return keep(grown, ~(faint[grown.parents] | huge), stats.contribution[grown.parents], rules)
 
 
-def _affordable(hot: Bool[Tensor, " N"], gradient: Float[Tensor, " N"], room: int) -> Bool[Tensor, " N"]:
-    """The hot rows with the largest gradients that fit into ``room`` more Gaussians (each adds exactly one)."""
+def _affordable(
+    hot: Bool[Tensor, " N"], gradient: Float[Tensor, " N"], room: int
+) -> Bool[Tensor, " N"]:
+    """The hot rows with the largest gradients that fit into ``room`` more Gaussians (each adds
+    exactly one).
+    """
     if int(hot.sum()) <= room:
         return hot
-    order = torch.argsort(torch.where(hot, gradient, torch.full_like(gradient, -1.0)), descending=True, stable=True)
+    order = torch.argsort(
+        torch.where(hot, gradient, torch.full_like(gradient, -1.0)), descending=True, stable=True
+    )
     chosen = torch.zeros_like(hot)
     chosen[order[: max(room, 0)]] = True
     return chosen
 
 
-def grow(params: Mapping[str, Tensor], *, clone: Bool[Tensor, " N"], split: Bool[Tensor, " N"], rng: torch.Generator) -> Change:
-    """Clones are added behind the originals; a split replaces its Gaussian by two smaller samples of it."""
+def grow(
+    params: Mapping[str, Tensor],
+    *,
+    clone: Bool[Tensor, " N"],
+    split: Bool[Tensor, " N"],
+    rng: torch.Generator,
+) -> Change:
+    """Clones are added behind the originals; a split replaces its Gaussian by two smaller samples
+    of it.
+    """
     rows = torch.arange(len(clone), device=clone.device)
     stay, clones, splits = rows[~split], rows[clone], rows[split]
     parents = torch.cat([stay, clones, splits, splits])
     fresh = torch.arange(len(parents), device=clone.device) >= len(stay)
     values = {name: value.detach()[parents].clone() for name, value in params.items()}
     children = slice(len(stay) + len(clones), None)
-    offsets = torch.randn(2 * len(splits), 3, generator=rng).to(clone.device) * values["log_scales"][children].clamp(*LOG_SCALE_RANGE).exp()
+    offsets = (
+        torch.randn(2 * len(splits), 3, generator=rng).to(clone.device)
+        * values["log_scales"][children].clamp(*LOG_SCALE_RANGE).exp()
+    )
     values["means"][children] += rotate(values["quats"][children], offsets)
     values["log_scales"][children] -= torch.log(torch.tensor(SPLIT_SHRINK))
     return Change(parents, fresh, values)
 
 
-def keep(change: Change, wanted: Bool[Tensor, " M"], contribution: Float[Tensor, " M"], rules: Rules) -> Change:
-    """Drop the unwanted rows; at least ``min_gaussians`` and at most ``max_gaussians`` stay, those that contribute most."""
-    # two stable sorts: every wanted row before every unwanted one, so that the floor is filled from the best unwanted rows
+def keep(
+    change: Change, wanted: Bool[Tensor, " M"], contribution: Float[Tensor, " M"], rules: Rules
+) -> Change:
+    """Drop the unwanted rows; at least ``min_gaussians`` and at most ``max_gaussians`` stay, those
+    that contribute most.
+    """
+    # two stable sorts: every wanted row before every unwanted one, so that the floor is filled from
+    # the best unwanted rows
     rank = torch.argsort(contribution, descending=True, stable=True)
     rank = rank[torch.argsort(wanted[rank].int(), descending=True, stable=True)]
     left, floor = int(wanted.sum()), min(rules.min_gaussians, len(wanted))
     if left < floor:
-        logger.warning("only %d of %d Gaussians would be left: the %d that contribute most stay (min_gaussians)", left, len(wanted), floor)
+        logger.warning(
+            "only %d of %d Gaussians would be left: the %d that contribute most stay "
+            "(min_gaussians)",
+            left,
+            len(wanted),
+            floor,
+        )
     count = min(max(left, floor), rules.max_gaussians)
     rows = rank[:count].sort().values
-    return Change(change.parents[rows], change.fresh[rows], {name: value[rows] for name, value in change.values.items()})
+    return Change(
+        change.parents[rows],
+        change.fresh[rows],
+        {name: value[rows] for name, value in change.values.items()},
+    )
 
 
 def prune_to(params: Mapping[str, Tensor], scores: Float[Tensor, " N"], count: int) -> Change:
     """Keep the ``count`` Gaussians with the highest scores, in their order."""
     rows = torch.arange(len(scores), device=scores.device)
-    everything = Change(rows, torch.zeros_like(rows, dtype=torch.bool), {name: value.detach().clone() for name, value in params.items()})
+    everything = Change(
+        rows,
+        torch.zeros_like(rows, dtype=torch.bool),
+        {name: value.detach().clone() for name, value in params.items()},
+    )
     rules = Rules(max_gaussians=count, min_gaussians=min(count, len(rows)))
     return keep(everything, torch.ones_like(everything.fresh), scores, rules)
 
@@ -137,17 +184,27 @@ def rotate(quats: Float[Tensor, "N 4"], vectors: Float[Tensor, "N 3"]) -> Float[
 
 
 def update_optimizer(
-    optimizer: torch.optim.Optimizer, old: Mapping[str, nn.Parameter], new: Mapping[str, nn.Parameter], change: Change
+    optimizer: torch.optim.Optimizer,
+    old: Mapping[str, nn.Parameter],
+    new: Mapping[str, nn.Parameter],
+    change: Change,
 ) -> None:
-    """Put the ``new`` parameters in the place of the ``old``; moments follow their Gaussian, those of fresh ones are zero."""
+    """Put the ``new`` parameters in the place of the ``old``; moments follow their Gaussian, those
+    of fresh ones are zero.
+    """
     replaced = {id(old[name]): new[name] for name in new}
     for group in optimizer.param_groups:
         group["params"] = [
-            _moved(optimizer, param, replaced[id(param)], change) if id(param) in replaced else param for param in group["params"]
+            _moved(optimizer, param, replaced[id(param)], change)
+            if id(param) in replaced
+            else param
+            for param in group["params"]
         ]
 
 
-def _moved(optimizer: torch.optim.Optimizer, old: nn.Parameter, new: nn.Parameter, change: Change) -> nn.Parameter:
+def _moved(
+    optimizer: torch.optim.Optimizer, old: nn.Parameter, new: nn.Parameter, change: Change
+) -> nn.Parameter:
     state = optimizer.state.pop(old, None)
     if state is not None:
         optimizer.state[new] = {key: _rows(value, old, change) for key, value in state.items()}

@@ -1,9 +1,10 @@
-"""Noisy point growing with colour perturbation, and the first size of each Gaussian: the paper's Algorithm 1.
+"""Noisy point growing with colour perturbation, and the first size of each Gaussian: the paper's
+Algorithm 1.
 
-Stage 1 draws points uniformly in the bounding box of the prior's points; stage 2 keeps those nearer than a radius to
-one of them and gives each the colour of that point plus noise; stage 3 takes the distance to the nearest point as the
-size of the Gaussian. Everything is in units of the cloud itself, so a prior in millimetres grows as one in metres.
-"""
+Stage 1 draws points uniformly in the bounding box of the prior's points; stage 2 keeps those nearer
+than a radius to one of them and gives each the colour of that point plus noise; stage 3 takes the
+distance to the nearest point as the size of the Gaussian. Everything is in units of the cloud
+itself, so a prior in millimetres grows as one in metres."""
 
 import logging
 from typing import Optional
@@ -19,11 +20,14 @@ logger = logging.getLogger(__name__)
 SCALE_RULES = {"nearest": 1, "rms3": 3}
 """How many neighbours each rule of the first scales averages over."""
 ISOLATED_FACTOR = 10.0
-"""A point is isolated, and its size capped, beyond this many times the 99th percentile of all distances."""
+"""A point is isolated, and its size capped, beyond this many times the 99th percentile of all
+distances.
+"""
 FLOOR_FRACTION = 1e-4
 """Points nearer than this fraction of the median distance are copies but for rounding."""
 FEW_POINTS_FRACTION = 0.1
-"""Size of each Gaussian, in units of the bounding radius, where there are fewer than four points."""
+"""Size of each Gaussian, in units of the bounding radius, where there are fewer than four points.
+"""
 
 
 def grow(
@@ -40,11 +44,13 @@ def grow(
 
     Args:
         cloud: (P, 3) points in any unit, with colours.
-        num_candidates: points drawn uniformly in the bounding box; most of them lie too far from the surface.
-        radius: a candidate is kept when it is nearer than this to a point of the cloud; in units of half the longest
-            side of the bounding box (the paper's "normalized" 0.01). Isolated points don't count for the box.
-        color_range: the noise added to the colour of the nearest point, uniform per channel; (-0.1, 0.1) has zero
-            mean, while the paper's (0, 0.2) brightens the grown points by 0.1.
+        num_candidates: points drawn uniformly in the bounding box; most of them lie too far from
+            the surface.
+        radius: a candidate is kept when it is nearer than this to a point of the cloud; in units of
+            half the longest side of the bounding box (the paper's "normalized" 0.01). Isolated
+            points don't count for the box.
+        color_range: the noise added to the colour of the nearest point, uniform per channel; (-0.1,
+            0.1) has zero mean, while the paper's (0, 0.2) brightens the grown points by 0.1.
         clamp: keep the grown colours in [0, 1]; the released code lets them reach 1.2.
         max_points: the most points that are grown.
         generator: the only source of randomness.
@@ -54,14 +60,27 @@ def grow(
     """
     _check_options(num_candidates, radius, color_range, max_points)
     points = _checked(cloud.points)
-    typical = points[~isolated(points)]  # one stray point far away would stretch the box and the radius with it
-    reach = radius * (half_longest_side(typical) or 1.0)  # a single point has no size of its own: the world's unit
+    typical = points[
+        ~isolated(points)
+    ]  # one stray point far away would stretch the box and the radius with it
+    reach = radius * (
+        half_longest_side(typical) or 1.0
+    )  # a single point has no size of its own: the world's unit
     candidates = generator.uniform(*growing_box(typical, reach), size=(num_candidates, 3))
     kept, nearest = _within_reach(points, candidates, reach)
-    logger.info("growing: %d of %d candidates lie within %.4g of %d points", len(kept), num_candidates, reach, len(points))
-    # The candidates are drawn independently, so the first ones are a uniform choice among those that lie near.
+    logger.info(
+        "growing: %d of %d candidates lie within %.4g of %d points",
+        len(kept),
+        num_candidates,
+        reach,
+        len(points),
+    )
+    # The candidates are drawn independently, so the first ones are a uniform choice among those
+    # that lie near.
     kept, nearest = kept[:max_points], nearest[:max_points]
-    colors = perturbed_colors(cloud.colors[nearest], color_range=color_range, clamp=clamp, generator=generator)
+    colors = perturbed_colors(
+        cloud.colors[nearest], color_range=color_range, clamp=clamp, generator=generator
+    )
     return _appended(cloud, candidates[kept], colors, nearest)
 
 
@@ -70,32 +89,44 @@ def half_longest_side(points: Float[np.ndarray, "P 3"]) -> float:
     return float(np.ptp(np.asarray(points, np.float64), axis=0).max()) / 2
 
 
-def growing_box(points: Float[np.ndarray, "P 3"], reach: float) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """The bounding box (low, high), each side at least ``2 * reach``: a flat cloud grows a slab, not copies of itself."""
+def growing_box(
+    points: Float[np.ndarray, "P 3"], reach: float
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """The bounding box (low, high), each side at least ``2 * reach``: a flat cloud grows a slab,
+    not copies of itself.
+    """
     low, high = points.min(axis=0), points.max(axis=0)
     padding = np.maximum(reach - (high - low) / 2, 0.0)
     return low - padding, high + padding
 
 
 def perturbed_colors(
-    colors: Float[np.ndarray, "R 3"], *, color_range: tuple[float, float], clamp: bool, generator: np.random.Generator
+    colors: Float[np.ndarray, "R 3"],
+    *,
+    color_range: tuple[float, float],
+    clamp: bool,
+    generator: np.random.Generator,
 ) -> Float[np.ndarray, "R 3"]:
     """``colors`` plus uniform noise per channel."""
     noisy = colors + generator.uniform(*color_range, size=colors.shape)
     return (noisy.clip(0.0, 1.0) if clamp else noisy).astype(np.float32)
 
 
-def nearest_distance_scales(points: Float[np.ndarray, "P 3"], rule: str = "nearest") -> Float[np.ndarray, " P"]:
-    """The first size (standard deviation) of the Gaussian at each point: the distance to its neighbours.
+def nearest_distance_scales(
+    points: Float[np.ndarray, "P 3"], rule: str = "nearest"
+) -> Float[np.ndarray, " P"]:
+    """The first size (standard deviation) of the Gaussian at each point: the distance to its
+    neighbours.
 
-    Positive and finite whatever the cloud: a point that has an exact copy gets the median (the copy's distance, zero,
-    says nothing about the surface), an isolated one at most ``ISOLATED_FACTOR`` times the 99th percentile, and fewer
-    than four distinct points a fraction of their bounding radius.
+    Positive and finite whatever the cloud: a point that has an exact copy gets the median (the
+      copy's distance, zero,
+    says nothing about the surface), an isolated one at most ``ISOLATED_FACTOR`` times the 99th
+    percentile, and fewer than four distinct points a fraction of their bounding radius.
 
     Args:
         points: (P, 3) in any unit, which is the unit of the result.
-        rule: "nearest", the distance to the nearest other point (the paper), or "rms3", the root of the mean of the
-            squared distances to the nearest three (the released code).
+        rule: "nearest", the distance to the nearest other point (the paper), or "rms3", the root of
+            the mean of the squared distances to the nearest three (the released code).
 
     Raises:
         UserError: an unknown rule, or a cloud that is empty or not finite.
@@ -112,7 +143,9 @@ def nearest_distance_scales(points: Float[np.ndarray, "P 3"], rule: str = "neare
 
 
 def isolated(points: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
-    """Marks the points whose nearest other point is beyond ``ISOLATED_FACTOR`` times the 99th percentile of such distances."""
+    """Marks the points whose nearest other point is beyond ``ISOLATED_FACTOR`` times the 99th
+    percentile of such distances.
+    """
     points = _checked(points)
     first, group, _ = distinct(points)
     if len(first) < 4:
@@ -121,44 +154,74 @@ def isolated(points: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
     return (distances > _isolation_cap(distances))[group]
 
 
-def _check_options(num_candidates: int, radius: float, color_range: tuple[float, float], max_points: Optional[int]) -> None:
+def _check_options(
+    num_candidates: int, radius: float, color_range: tuple[float, float], max_points: Optional[int]
+) -> None:
     if num_candidates < 0:
         raise UserError(f"num_candidates is {num_candidates}: give 0 (no growing) or more.")
     if not (np.isfinite(radius) and radius > 0):
-        raise UserError(f"the growing radius is {radius}: give a positive number, in units of half the longest side of the box.")
-    if len(color_range) != 2 or not (np.isfinite(color_range).all() and color_range[0] <= color_range[1]):
-        raise UserError(f"color_range is {tuple(color_range)}: give (low, high) with low <= high, as (0.0, 0.2).")
+        raise UserError(
+            f"the growing radius is {radius}: give a positive number, in units of half the "
+            "longest side of the box."
+        )
+    if len(color_range) != 2 or not (
+        np.isfinite(color_range).all() and color_range[0] <= color_range[1]
+    ):
+        raise UserError(
+            f"color_range is {tuple(color_range)}: give (low, high) with low <= high, as (0.0, "
+            "0.2)."
+        )
     if max_points is not None and max_points < 0:
-        raise UserError(f"max_points is {max_points}: give the most points to grow, 0 or more, or null for no limit.")
+        raise UserError(
+            f"max_points is {max_points}: give the most points to grow, 0 or more, or null for "
+            "no limit."
+        )
 
 
 def _checked(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
     """The points in float64, so that squares of tiny distances don't vanish."""
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-        raise UserError(f"a cloud of shape {points.shape} has no points to start from: (P, 3) with P >= 1 was expected.")
+        raise UserError(
+            f"a cloud of shape {points.shape} has no points to start from: (P, 3) with P >= 1 "
+            "was expected."
+        )
     if not np.isfinite(points).all():
-        raise UserError(f"{(~np.isfinite(points).all(axis=1)).sum()} of {len(points)} points are NaN or infinite.")
+        raise UserError(
+            f"{(~np.isfinite(points).all(axis=1)).sum()} of {len(points)} points are NaN or "
+            "infinite."
+        )
     return points
 
 
 def _within_reach(
     points: Float[np.ndarray, "P 3"], candidates: Float[np.ndarray, "Q 3"], reach: float
 ) -> tuple[Int[np.ndarray, " R"], Int[np.ndarray, " R"]]:
-    """Indices of the candidates nearer than ``reach`` to a point, and of the point nearest to each of them."""
+    """Indices of the candidates nearer than ``reach`` to a point, and of the point nearest to each
+    of them.
+    """
     from scipy.spatial import cKDTree
 
     first, _, _ = distinct(points)  # a leaf full of copies would be searched copy by copy
-    distances, nearest = cKDTree(points[first]).query(candidates, distance_upper_bound=reach, workers=-1)
+    distances, nearest = cKDTree(points[first]).query(
+        candidates, distance_upper_bound=reach, workers=-1
+    )
     kept = np.flatnonzero(distances < reach)
     return kept, first[nearest[kept]]
 
 
 def _appended(
-    cloud: PointCloud, points: Float[np.ndarray, "R 3"], colors: Float[np.ndarray, "R 3"], nearest: Int[np.ndarray, " R"]
+    cloud: PointCloud,
+    points: Float[np.ndarray, "R 3"],
+    colors: Float[np.ndarray, "R 3"],
+    nearest: Int[np.ndarray, " R"],
 ) -> PointCloud:
-    """Original points first: ``faces`` stays valid, and a grown point has the normal of its nearest one."""
-    normals = None if cloud.normals is None else np.concatenate([cloud.normals, cloud.normals[nearest]])
+    """Original points first: ``faces`` stays valid, and a grown point has the normal of its nearest
+    one.
+    """
+    normals = (
+        None if cloud.normals is None else np.concatenate([cloud.normals, cloud.normals[nearest]])
+    )
     return PointCloud(
         points=np.concatenate([cloud.points, points]).astype(np.float32),
         colors=np.concatenate([cloud.colors, colors]).astype(np.float32),
@@ -167,8 +230,12 @@ def _appended(
     )
 
 
-def distinct(points: Float[np.ndarray, "P 3"]) -> tuple[Int[np.ndarray, " D"], Int[np.ndarray, " P"], Int[np.ndarray, " D"]]:
-    """Index of the first point at each distinct place, the place of each point, and how many points are there."""
+def distinct(
+    points: Float[np.ndarray, "P 3"],
+) -> tuple[Int[np.ndarray, " D"], Int[np.ndarray, " P"], Int[np.ndarray, " D"]]:
+    """Index of the first point at each distinct place, the place of each point, and how many points
+    are there.
+    """
     order = np.lexsort(points.T)
     is_new = np.ones(len(points), bool)
     is_new[1:] = (np.diff(points[order], axis=0) != 0).any(axis=1)
@@ -177,7 +244,9 @@ def distinct(points: Float[np.ndarray, "P 3"]) -> tuple[Int[np.ndarray, " D"], I
     return order[is_new], group, np.bincount(group)
 
 
-def _neighbour_distances(points: Float[np.ndarray, "D 3"], neighbours: int) -> Float[np.ndarray, " D"]:
+def _neighbour_distances(
+    points: Float[np.ndarray, "D 3"], neighbours: int
+) -> Float[np.ndarray, " D"]:
     """Root mean square distance to the nearest ``neighbours`` other points."""
     from scipy.spatial import cKDTree
 
@@ -186,10 +255,17 @@ def _neighbour_distances(points: Float[np.ndarray, "D 3"], neighbours: int) -> F
 
 
 def _bounded(distances: Float[np.ndarray, " D"]) -> Float[np.ndarray, " D"]:
-    """Cap the distances of isolated points, and floor those of copies that differ by a rounding error."""
+    """Cap the distances of isolated points, and floor those of copies that differ by a rounding
+    error.
+    """
     cap = _isolation_cap(distances)
     if count := int((distances > cap).sum()):
-        logger.warning("%d of %d points are isolated: the first size of their Gaussians is capped at %.4g", count, len(distances), cap)
+        logger.warning(
+            "%d of %d points are isolated: the first size of their Gaussians is capped at %.4g",
+            count,
+            len(distances),
+            cap,
+        )
     return distances.clip(FLOOR_FRACTION * np.median(distances), cap)
 
 
@@ -205,5 +281,7 @@ def _as_float32(distances: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
 
 
 def _few_points_scale(points: Float[np.ndarray, "P 3"]) -> float:
-    bounding_radius = np.linalg.norm(points - (points.min(axis=0) + points.max(axis=0)) / 2, axis=1).max()
+    bounding_radius = np.linalg.norm(
+        points - (points.min(axis=0) + points.max(axis=0)) / 2, axis=1
+    ).max()
     return FEW_POINTS_FRACTION * (bounding_radius or 1.0)  # all in one place: the world's unit

@@ -1,12 +1,16 @@
-"""Duplicates become one: pairs of Gaussians that cover the same place in the same colour are replaced by one with their moments.
+"""Duplicates become one: pairs of Gaussians that cover the same place in the same colour are
+replaced by one with their moments.
 
-Pruning can't do this. Of two copies each is the front one in some view, so that both contribute, and where both stay they share the
-opacity that one could have. What a pair costs is how much the merged Gaussian is larger than its parts, in position and in colour,
-per weight (Runnalls 2007, "Kullback-Leibler approach to Gaussian mixture reduction", the bound B(i, j) over w_i + w_j), the colour as
-a dimension of its own with the standard deviation ``COLOR_TOLERANCE``:
+Pruning can't do this. Of two copies each is the front one in some view, so that both contribute,
+and where both stay they share the opacity that one could have. What a pair costs is how much the
+merged Gaussian is larger than its parts, in position and in colour, per weight (Runnalls 2007,
+"Kullback-Leibler approach to Gaussian mixture reduction", the bound B(i, j) over w_i + w_j), the
+colour as a dimension of its own with the standard deviation ``COLOR_TOLERANCE``:
 
-    cost = 1/2 (log |S| - f log |S_i| - (1 - f) log |S_j| + log(1 + f (1 - f) |c_i - c_j|^2 / tolerance^2))
-    S    = f S_i + (1 - f) S_j + f (1 - f) (m_i - m_j)(m_i - m_j)^T,   f = w_i / (w_i + w_j),   w = opacity x mean cross-section
+    cost = 1/2 (log |S| - f log |S_i| - (1 - f) log |S_j| + log(1 + f (1 - f) |c_i - c_j|^2 /
+    tolerance^2))
+    S    = f S_i + (1 - f) S_j + f (1 - f) (m_i - m_j)(m_i - m_j)^T,   f = w_i / (w_i + w_j),   w =
+         opacity x mean cross-section
 """
 
 from collections.abc import Mapping
@@ -22,7 +26,9 @@ from .densify import Change
 from .sh import C0
 
 DUPLICATE = 0.07
-"""The cost up to which two Gaussians count as one: merging all such pairs leaves clouds 50 dB alike or more, untrained ones too."""
+"""The cost up to which two Gaussians count as one: merging all such pairs leaves clouds 50 dB alike
+or more, untrained ones too.
+"""
 COLOR_TOLERANCE = 0.1
 NEIGHBOURS = 4
 LOG_THINNEST = -12.0
@@ -41,28 +47,45 @@ class _Shapes(NamedTuple):
 
 
 def merge_duplicates(params: Mapping[str, Tensor], *, at_least: int = 1) -> Change:
-    """The cloud without duplicates; merged Gaussians are fresh, and come from the first of their pair.
+    """The cloud without duplicates; merged Gaussians are fresh, and come from the first of their
+    pair.
 
     Args:
-        params: means, log_scales, quats, logit_opacities and spherical harmonics, under names with "sh".
+        params: means, log_scales, quats, logit_opacities and spherical harmonics, under names with
+            "sh".
         at_least: how many Gaussians stay, whatever duplicates there are.
     """
     rows = torch.arange(len(params["means"]), device=params["means"].device)
-    change = Change(rows, torch.zeros_like(rows, dtype=torch.bool), {name: value.detach().clone() for name, value in params.items()})
+    change = Change(
+        rows,
+        torch.zeros_like(rows, dtype=torch.bool),
+        {name: value.detach().clone() for name, value in params.items()},
+    )
     spent = torch.zeros(len(rows), dtype=torch.float64)
     while True:
-        pairs, costs = (values[: max(len(change.parents) - at_least, 0)] for values in duplicates(change.values, spent))
+        pairs, costs = (
+            values[: max(len(change.parents) - at_least, 0)]
+            for values in duplicates(change.values, spent)
+        )
         if not len(pairs):
             return change
         change, spent = _merged(change, spent, pairs, costs)
 
 
-def duplicates(params: Mapping[str, Tensor], spent: Float[Tensor, " N"]) -> tuple[Int[Tensor, "P 2"], Float[Tensor, " P"]]:
-    """Pairs of rows that count as one, the cheapest first, no row in two pairs; and their costs, with what each has ``spent`` before."""
+def duplicates(
+    params: Mapping[str, Tensor], spent: Float[Tensor, " N"]
+) -> tuple[Int[Tensor, "P 2"], Float[Tensor, " P"]]:
+    """Pairs of rows that count as one, the cheapest first, no row in two pairs; and their costs,
+    with what each has ``spent`` before.
+    """
     shapes = _shapes(params)
     pairs = _neighbours(shapes.means)
-    costs = _costs(shapes, pairs) + spent[pairs].amax(1)  # or a chain of cheap steps would lead anywhere
-    order = costs.argsort(stable=True)[: int((costs <= DUPLICATE).sum())]  # NaN, the cost of what isn't finite, comes last
+    costs = _costs(shapes, pairs) + spent[pairs].amax(
+        1
+    )  # or a chain of cheap steps would lead anywhere
+    order = costs.argsort(stable=True)[
+        : int((costs <= DUPLICATE).sum())
+    ]  # NaN, the cost of what isn't finite, comes last
     taken, chosen = set(), []
     for row, (first, second) in zip(order.tolist(), pairs[order].tolist(), strict=True):
         if first not in taken and second not in taken:
@@ -73,7 +96,8 @@ def duplicates(params: Mapping[str, Tensor], spent: Float[Tensor, " N"]) -> tupl
 
 def _shapes(params: Mapping[str, Tensor]) -> _Shapes:
     means, log_scales, quats, logits = (
-        params[name].detach().cpu().double() for name in ("means", "log_scales", "quats", "logit_opacities")
+        params[name].detach().cpu().double()
+        for name in ("means", "log_scales", "quats", "logit_opacities")
     )
     log_scales = log_scales.maximum(log_scales.amax(1, keepdim=True) + LOG_THINNEST)
     axes = quats_to_rotations(quats) * log_scales.exp()[:, None]
@@ -81,7 +105,9 @@ def _shapes(params: Mapping[str, Tensor]) -> _Shapes:
     harmonics = params["sh0"] if "sh0" in params else params["sh"]
     colors = C0 * harmonics[:, 0].detach().cpu().double()
     weights = opacities * (log_scales.sum(1) * (2 / 3)).exp()
-    return _Shapes(means, axes @ axes.transpose(1, 2), 2 * log_scales.sum(1), opacities, weights, colors)
+    return _Shapes(
+        means, axes @ axes.transpose(1, 2), 2 * log_scales.sum(1), opacities, weights, colors
+    )
 
 
 def _neighbours(means: Float[Tensor, "N 3"]) -> Int[Tensor, "P 2"]:
@@ -93,57 +119,84 @@ def _neighbours(means: Float[Tensor, "N 3"]) -> Int[Tensor, "P 2"]:
         return torch.zeros(0, 2, dtype=torch.long)
     points = means[rows].numpy()
     nearest = torch.from_numpy(cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(rows)))[1])
-    pairs = torch.stack([torch.arange(len(rows))[:, None].expand_as(nearest), nearest], -1).reshape(-1, 2)
-    # of many copies in one place all have the same few nearest, which would leave one or two pairs a round
+    pairs = torch.stack([torch.arange(len(rows))[:, None].expand_as(nearest), nearest], -1).reshape(
+        -1, 2
+    )
+    # of many copies in one place all have the same few nearest, which would leave one or two pairs
+    # a round
     order = torch.from_numpy(np.lexsort(points.T))
     pairs = torch.cat([pairs, torch.stack([order[:-1], order[1:]], 1)])
     pairs = pairs[pairs[:, 0] != pairs[:, 1]].sort(1).values.unique(dim=0)
     return rows[pairs]
 
 
-def _moments(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> tuple[Float[Tensor, " P"], Float[Tensor, "P 3"], Float[Tensor, "P 3 3"]]:
+def _moments(
+    shapes: _Shapes, pairs: Int[Tensor, "P 2"]
+) -> tuple[Float[Tensor, " P"], Float[Tensor, "P 3"], Float[Tensor, "P 3 3"]]:
     """The first's share f, mean and covariance of each pair together."""
     i, j = pairs.unbind(1)
     f = shapes.weights[i] / (shapes.weights[i] + shapes.weights[j])
     apart = shapes.means[i] - shapes.means[j]
     means = shapes.means[j] + f[:, None] * apart
-    within = f[:, None, None] * shapes.covariances[i] + (1 - f)[:, None, None] * shapes.covariances[j]
+    within = (
+        f[:, None, None] * shapes.covariances[i] + (1 - f)[:, None, None] * shapes.covariances[j]
+    )
     return f, means, within + (f * (1 - f))[:, None, None] * apart[:, :, None] * apart[:, None]
 
 
 def _costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
     i, j = pairs.unbind(1)
     f, _, covariances = _moments(shapes, pairs)
-    growth = torch.linalg.slogdet(covariances).logabsdet - f * shapes.log_determinants[i] - (1 - f) * shapes.log_determinants[j]
+    growth = (
+        torch.linalg.slogdet(covariances).logabsdet
+        - f * shapes.log_determinants[i]
+        - (1 - f) * shapes.log_determinants[j]
+    )
     apart = (shapes.colors[i] - shapes.colors[j]).square().sum(1)
     return 0.5 * (growth + torch.log1p(f * (1 - f) * apart / COLOR_TOLERANCE**2))
 
 
-def _merged(change: Change, spent: Tensor, pairs: Int[Tensor, "P 2"], costs: Float[Tensor, " P"]) -> tuple[Change, Tensor]:
+def _merged(
+    change: Change, spent: Tensor, pairs: Int[Tensor, "P 2"], costs: Float[Tensor, " P"]
+) -> tuple[Change, Tensor]:
     """The first of each pair takes the place of both."""
     values, device = change.values, change.parents.device
     for name, merged in _together(values, pairs).items():
         values[name][pairs[:, 0].to(device)] = merged.to(values[name])
     spent[pairs[:, 0]] = costs
-    fresh, stay = change.fresh.clone(), torch.ones(len(change.parents), dtype=torch.bool, device=device)
+    fresh, stay = (
+        change.fresh.clone(),
+        torch.ones(len(change.parents), dtype=torch.bool, device=device),
+    )
     fresh[pairs[:, 0].to(device)], stay[pairs[:, 1].to(device)] = True, False
-    left = Change(change.parents[stay], fresh[stay], {name: value[stay] for name, value in values.items()})
+    left = Change(
+        change.parents[stay], fresh[stay], {name: value[stay] for name, value in values.items()}
+    )
     return left, spent[stay.cpu()]
 
 
 def _together(params: Mapping[str, Tensor], pairs: Int[Tensor, "P 2"]) -> dict[str, Tensor]:
-    """One Gaussian for each pair: moments as above, the light that both stop, the mean of their harmonics."""
+    """One Gaussian for each pair: moments as above, the light that both stop, the mean of their
+    harmonics.
+    """
     from scipy.spatial.transform import Rotation
 
     shapes = _shapes(params)
     f, means, covariances = _moments(shapes, pairs)
     summed, product = shapes.opacities[pairs].sum(1), shapes.opacities[pairs].prod(1)
     opacities = summed - product
-    # one behind the other they fall off more slowly than each: their light 1 - (1 - a g)(1 - b g), integrated over the plane
-    variances, axes = torch.linalg.eigh(covariances * ((summed - 0.5 * product) / opacities)[:, None, None])
+    # one behind the other they fall off more slowly than each: their light 1 - (1 - a g)(1 - b g),
+    # integrated over the plane
+    variances, axes = torch.linalg.eigh(
+        covariances * ((summed - 0.5 * product) / opacities)[:, None, None]
+    )
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]
     x, y, z, w = torch.from_numpy(Rotation.from_matrix(axes.numpy()).as_quat()).unbind(1)
-    mixed = {"means": means, "log_scales": 0.5 * variances.log(), "quats": torch.stack([w, x, y, z], 1)}
+    mixed = {
+        "means": means,
+        "log_scales": 0.5 * variances.log(),
+        "quats": torch.stack([w, x, y, z], 1),
+    }
     mixed["logit_opacities"] = opacities.clamp(1e-6, 1 - 1e-6).logit()
     for name in params:
         if name not in mixed:

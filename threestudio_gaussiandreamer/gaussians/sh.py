@@ -1,9 +1,8 @@
 """View-dependent colour as real spherical harmonics of degree 0 to 3, evaluated outside the blend.
 
-Coefficients are in the order and with the signs that 3D Gaussian splatting files use: (l, m) = (0, 0), (1, -1), (1, 0),
-(1, 1), (2, -2), ..., with the Condon-Shortley phase, so odd m carry a minus sign. The colour of a direction is
-``max(0, 0.5 + sum_k Y_k(direction) sh_k)``.
-"""
+Coefficients are in the order and with the signs that 3D Gaussian splatting files use: (l, m) = (0,
+0), (1, -1), (1, 0), (1, 1), (2, -2), ..., with the Condon-Shortley phase, so odd m carry a minus
+sign. The colour of a direction is ``max(0, 0.5 + sum_k Y_k(direction) sh_k)``."""
 
 from math import pi, sqrt
 
@@ -28,25 +27,32 @@ def sh0_to_rgb(sh0: Float[Tensor, "*batch C"]) -> Float[Tensor, "*batch C"]:
     return 0.5 + C0 * sh0
 
 
-def sh_to_colors(sh: Float[Tensor, "N K C"], dirs: Float[Tensor, "*views N 3"]) -> Float[Tensor, "*views N C"]:
-    """Colours seen along ``dirs``, which point from the camera to the Gaussians and have any length; clamped at 0.
+def sh_to_colors(
+    sh: Float[Tensor, "N K C"], dirs: Float[Tensor, "*views N 3"]
+) -> Float[Tensor, "*views N C"]:
+    """Colours seen along ``dirs``, which point from the camera to the Gaussians and have any
+    length; clamped at 0.
 
     Raises:
         UserError: K isn't 1, 4, 9 or 16.
     """
     if sh.shape[-2] not in COEFFICIENTS:
-        raise UserError(f"sh must have the shape (N, K, C) with K = 1, 4, 9 or 16 for degree 0 to 3; got {tuple(sh.shape)}.")
+        raise UserError(
+            "sh must have the shape (N, K, C) with K = 1, 4, 9 or 16 for degree 0 to 3; got "
+            f"{tuple(sh.shape)}."
+        )
     basis = sh_basis(dirs, COEFFICIENTS.index(sh.shape[-2]))
-    # A sum of products stays in the tensors' own precision under autocast, which a matrix product would not.
+    # A sum of products stays in the tensors' own precision under autocast, which a matrix product
+    # would not.
     return (0.5 + sum(b[..., None] * sh[:, k] for k, b in enumerate(basis))).clamp_min(0)
 
 
 def sh_basis(dirs: Float[Tensor, "*batch 3"], degree: int) -> list[Float[Tensor, "*batch"]]:
-    """The (degree + 1)^2 real spherical harmonics of the normalised directions, as polynomials in x, y, z.
+    """The (degree + 1)^2 real spherical harmonics of the normalised directions, as polynomials in
+    x, y, z.
 
-    Normalisation sqrt((2l + 1) / 4 pi (l - |m|)! / (l + |m|)!), times sqrt(2) for m != 0 (Sloan 2008, Stupid Spherical
-    Harmonics Tricks, appendix A2).
-    """
+    Normalisation sqrt((2l + 1) / 4 pi (l - |m|)! / (l + |m|)!), times sqrt(2) for m != 0 (Sloan
+    2008, Stupid Spherical Harmonics Tricks, appendix A2)."""
     x, y, z = _normalize(dirs).unbind(-1)
     basis = [torch.full_like(x, C0)]
     if degree >= 1:
@@ -54,11 +60,31 @@ def sh_basis(dirs: Float[Tensor, "*batch 3"], degree: int) -> list[Float[Tensor,
         basis += [-c1 * y, c1 * z, -c1 * x]
     if degree >= 2:
         c2, c20 = sqrt(15 / (4 * pi)), sqrt(5 / (16 * pi))
-        basis += [c2 * x * y, -c2 * y * z, c20 * (3 * z * z - 1), -c2 * x * z, 0.5 * c2 * (x * x - y * y)]
+        basis += [
+            c2 * x * y,
+            -c2 * y * z,
+            c20 * (3 * z * z - 1),
+            -c2 * x * z,
+            0.5 * c2 * (x * x - y * y),
+        ]
     if degree >= 3:
-        c33, c32, c31, c30 = sqrt(35 / (32 * pi)), sqrt(105 / (4 * pi)), sqrt(21 / (32 * pi)), sqrt(7 / (16 * pi))
-        basis += [-c33 * y * (3 * x * x - y * y), c32 * x * y * z, -c31 * y * (5 * z * z - 1), c30 * z * (5 * z * z - 3)]
-        basis += [-c31 * x * (5 * z * z - 1), 0.5 * c32 * z * (x * x - y * y), -c33 * x * (x * x - 3 * y * y)]
+        c33, c32, c31, c30 = (
+            sqrt(35 / (32 * pi)),
+            sqrt(105 / (4 * pi)),
+            sqrt(21 / (32 * pi)),
+            sqrt(7 / (16 * pi)),
+        )
+        basis += [
+            -c33 * y * (3 * x * x - y * y),
+            c32 * x * y * z,
+            -c31 * y * (5 * z * z - 1),
+            c30 * z * (5 * z * z - 3),
+        ]
+        basis += [
+            -c31 * x * (5 * z * z - 1),
+            0.5 * c32 * z * (x * x - y * y),
+            -c33 * x * (x * x - 3 * y * y),
+        ]
     return basis
 
 

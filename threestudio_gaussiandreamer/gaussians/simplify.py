@@ -1,10 +1,11 @@
-"""Fewer Gaussians for the same pictures: prune by what each shows, round by round, and recover by self-distillation.
+"""Fewer Gaussians for the same pictures: prune by what each shows, round by round, and recover by
+self-distillation.
 
-What the cloud looked like before is the only truth: no diffusion model, no prompt, so nothing can drift. First duplicates become one
-(``merge.py``). Then each round keeps the best 0.8 by what they show in the probe views (the score ``removal`` of ``importance.py``),
-re-scored every round, and fits what stays to the probe views' first pictures (mean squared error, Adam). One-shot pruning of more than
-that loses to training so few from scratch; rounds don't.
-"""
+What the cloud looked like before is the only truth: no diffusion model, no prompt, so nothing can
+drift. First duplicates become one (``merge.py``). Then each round keeps the best 0.8 by what they
+show in the probe views (the score ``removal`` of ``importance.py``), re-scored every round, and
+fits what stays to the probe views' first pictures (mean squared error, Adam). One-shot pruning of
+more than that loses to training so few from scratch; rounds don't."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -28,16 +29,21 @@ KEEP = 0.8
 SMALLEST_DROP = 0.02
 """A round that can't drop this share isn't worth its recovery, and ends the search."""
 RATES = {"means": 2e-4, "quats": 4e-3, "log_scales": 1e-2, "logit_opacities": 2e-2, "sh": 5e-3}
-"""Adam's for a cloud that has just lost a fifth; that of the means in units of the cloud's radius."""
+"""Adam's for a cloud that has just lost a fifth; that of the means in units of the cloud's radius.
+"""
 PACES = (1.0, 1 / 4, 1 / 16, 1 / 64)
-"""Of these rates. What is nearly right needs small ones: Adam's steps are as long where the gradient is mostly noise."""
+"""Of these rates. What is nearly right needs small ones: Adam's steps are as long where the
+gradient is mostly noise.
+"""
 LEAST_ERROR = 10 ** (-MAX_PSNR / 10)
 """Mean squared; what is less can't be told from the rounding of float32."""
 FOVY = math.radians(50.0)
 EPS2D = 0.3
 """The screen-space dilation of viewers, square pixels."""
 NEAR = 0.01
-"""The nearest depth that is drawn, in units of the cloud's radius: clouds come in millimetres and in kilometres."""
+"""The nearest depth that is drawn, in units of the cloud's radius: clouds come in millimetres and
+in kilometres.
+"""
 
 
 class Cloud(NamedTuple):
@@ -67,7 +73,9 @@ class Views(NamedTuple):
 
 
 class Budget(NamedTuple):
-    """Where to stop: at a count, or where views that nothing is fitted to would fall below a PSNR; one of both."""
+    """Where to stop: at a count, or where views that nothing is fitted to would fall below a PSNR;
+    one of both.
+    """
 
     count: Optional[int] = None
     psnr: Optional[float] = None
@@ -82,7 +90,9 @@ class Round(NamedTuple):
 
 
 def bounds(cloud: Cloud) -> tuple[Float[Tensor, "3"], float]:
-    """Centre and radius of what is visible: of the positions' opacity-weighted median, and 99 % of the opacity."""
+    """Centre and radius of what is visible: of the positions' opacity-weighted median, and 99 % of
+    the opacity.
+    """
     weights = cloud.logit_opacities.sigmoid()
     centre = torch.stack([_quantile(axis, weights, 0.5) for axis in cloud.means.unbind(1)])
     distances = (cloud.means - centre).norm(dim=1) + cloud.log_scales.exp().amax(1)
@@ -95,12 +105,19 @@ def _quantile(values: Float[Tensor, " N"], weights: Float[Tensor, " N"], share: 
     return values[order[int(torch.searchsorted(mass, share * mass[-1]).clamp_max(len(values) - 1))]]
 
 
-def views_around(cloud: Cloud, count: int, size: int, *, turn: float = 0.0, to_z_up: Optional[Float[Tensor, "3 3"]] = None) -> Views:
-    """``count`` views on a spiral of golden angles that starts at ``turn`` degrees, near and far in turns; other turns, other views.
+def views_around(
+    cloud: Cloud,
+    count: int,
+    size: int,
+    *,
+    turn: float = 0.0,
+    to_z_up: Optional[Float[Tensor, "3 3"]] = None,
+) -> Views:
+    """``count`` views on a spiral of golden angles that starts at ``turn`` degrees, near and far in
+    turns; other turns, other views.
 
-    Each has a background of its own, so that no colour of a Gaussian can hide it, and its opacity shows.
-    ``to_z_up`` is the rotation from the cloud's axes to some with z up.
-    """
+    Each has a background of its own, so that no colour of a Gaussian can hide it, and its opacity
+    shows. ``to_z_up`` is the rotation from the cloud's axes to some with z up."""
     centre, radius = bounds(cloud)
     index = torch.arange(count)
     elevation = torch.rad2deg(torch.asin(torch.linspace(-0.5, 0.9, count)))
@@ -112,19 +129,30 @@ def views_around(cloud: Cloud, count: int, size: int, *, turn: float = 0.0, to_z
     c2w[:, :3, 3] += centre
     fovy = torch.full((count,), FOVY, device=centre.device)
     viewmats, _ = to_opencv(c2w, fovy, size, size)
-    backgrounds = torch.rand(count, 3, generator=generator(0, "backgrounds", count, round(turn))).to(centre)
-    return Views(viewmats, intrinsics(fovy, size, size), c2w[:, :3, 3], size, NEAR * radius, backgrounds)
+    backgrounds = torch.rand(
+        count, 3, generator=generator(0, "backgrounds", count, round(turn))
+    ).to(centre)
+    return Views(
+        viewmats, intrinsics(fovy, size, size), c2w[:, :3, 3], size, NEAR * radius, backgrounds
+    )
 
 
-def draw(cloud: Cloud, views: Views, rows: Tensor, opacities: Optional[Float[Tensor, " N"]] = None) -> tuple[Tensor, Tensor]:
-    """Pictures (B, size, size, 3) of some of the views, and each Gaussian's contribution to them (B, N).
+def draw(
+    cloud: Cloud, views: Views, rows: Tensor, opacities: Optional[Float[Tensor, " N"]] = None
+) -> tuple[Tensor, Tensor]:
+    """Pictures (B, size, size, 3) of some of the views, and each Gaussian's contribution to them
+    (B, N).
 
     ``opacities`` stand for the cloud's own, to be differentiated by.
     """
     opacities = cloud.logit_opacities.sigmoid() if opacities is None else opacities
     dirs = torch.nn.functional.normalize(cloud.means.detach() - views.positions[rows, None], dim=-1)
     colors = sh_to_colors(cloud.sh, dirs)
-    background = torch.full((3,), 0.5, device=cloud.means.device) if views.backgrounds is None else views.backgrounds[rows]
+    background = (
+        torch.full((3,), 0.5, device=cloud.means.device)
+        if views.backgrounds is None
+        else views.backgrounds[rows]
+    )
     out = rasterize(
         cloud.means, cloud.quats, cloud.log_scales.exp(), opacities, colors, views.viewmats[rows], views.Ks[rows],
         views.size, views.size, background=background, near=views.near, eps2d=views.eps2d, antialias=views.antialias,
@@ -140,14 +168,21 @@ def look(cloud: Cloud, views: Views) -> Float[Tensor, "V H W 3"]:
 
 @torch.enable_grad()
 def worth(cloud: Cloud, views: Views, seed: int = 0) -> Float[Tensor, " N"]:
-    """What each Gaussian shows in all views, by which they are ranked; 0 for one that isn't to be seen."""
-    opacities, rng = cloud.logit_opacities.detach().sigmoid().requires_grad_(), generator(seed, "worth")
+    """What each Gaussian shows in all views, by which they are ranked; 0 for one that isn't to be
+    seen.
+    """
+    opacities, rng = (
+        cloud.logit_opacities.detach().sigmoid().requires_grad_(),
+        generator(seed, "worth"),
+    )
     contribution, removal = torch.zeros(2, len(opacities), device=opacities.device)
     for rows in _chunks(views):
         image, contributed = draw(cloud, views, rows, opacities)
         contribution = torch.maximum(contribution, contributed.amax(0))
         removal = removal + parsimony.removal_error(image, opacities, rng)
-    return parsimony.score("removal", cloud.logit_opacities, parsimony.Seen(contribution, removal), rng)
+    return parsimony.score(
+        "removal", cloud.logit_opacities, parsimony.Seen(contribution, removal), rng
+    )
 
 
 def _chunks(views: Views) -> tuple[Tensor, ...]:
@@ -161,9 +196,13 @@ def likeness(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"]) -> 
 
 
 def assured_likeness(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"]) -> float:
-    """The PSNR that other views will have too: with two standard errors over these views added to their mean squared error."""
+    """The PSNR that other views will have too: with two standard errors over these views added to
+    their mean squared error.
+    """
     errors = (look(cloud, views) - pictures).square().mean((1, 2, 3))
-    return -10 * math.log10(max(float(errors.mean() + 2 * errors.std() / math.sqrt(len(errors))), LEAST_ERROR))
+    return -10 * math.log10(
+        max(float(errors.mean() + 2 * errors.std() / math.sqrt(len(errors))), LEAST_ERROR)
+    )
 
 
 def simplify(
@@ -183,10 +222,12 @@ def simplify(
 
     Args:
         probes: what Gaussians are scored on and fitted to.
-        judges: other views, on which a recovery and a budget of quality are measured: what is fitted to looks better than the rest.
+        judges: other views, on which a recovery and a budget of quality are measured: what is
+            fitted to looks better than the rest.
         steps: of self-distillation after each round; four views each.
         report: called after each round that was kept.
-        stored: what the file to be written makes of a cloud, which is what a budget of quality is measured on.
+        stored: what the file to be written makes of a cloud, which is what a budget of quality is
+            measured on.
         sh_reach: the largest constant harmonic, either way, that the file holds.
         rank: what each Gaussian is worth in some views, given a seed.
 
@@ -195,7 +236,10 @@ def simplify(
     """
     pictures, before, scores = look(cloud, probes), look(cloud, judges), rank(cloud, probes, seed)
     if not scores.any():
-        raise UserError(f"none of the {len(cloud.means)} Gaussians is to be seen from around: nothing says which ones to keep")
+        raise UserError(
+            f"none of the {len(cloud.means)} Gaussians is to be seen from around: nothing says "
+            "which ones to keep"
+        )
 
     fastest = 0
 
@@ -205,11 +249,14 @@ def simplify(
     def refitted(cloud: Cloud, done: int) -> tuple[Cloud, Round]:
         """Recovered at the fastest pace that makes it no worse; as it was where none does.
 
-        The judges say so: what is fitted to looks better while they may lose a dB. A round needs about the pace of the one before: the
+        The judges say so: what is fitted to looks better while they may lose a dB. A round needs
+            about the pace of the one before: the
         search begins one faster than that.
         """
         nonlocal fastest
-        found = cloud = cloud._replace(sh=torch.cat([cloud.sh[:, :1].clamp(-sh_reach, sh_reach), cloud.sh[:, 1:]], 1))
+        found = cloud = cloud._replace(
+            sh=torch.cat([cloud.sh[:, :1].clamp(-sh_reach, sh_reach), cloud.sh[:, 1:]], 1)
+        )
         reached = judged(cloud)
         for tried in range(fastest, len(PACES)):
             fastest = max(0, tried - 1)
@@ -252,7 +299,9 @@ def rounds_to(count: int, here: int) -> int:
 
 
 def _next_count(here: int, keep: float, budget: Budget) -> int:
-    """How many a round leaves; all that are ``here`` where nothing is left to do, or too little for a round."""
+    """How many a round leaves; all that are ``here`` where nothing is left to do, or too little for
+    a round.
+    """
     if budget.count is not None:
         return min(here, max(int(keep * here), budget.count))
     count = max(1, int(keep * here))
@@ -275,11 +324,16 @@ def recover(
     sh_reach: float = math.inf,
     pace: float = 1.0,
 ) -> Cloud:
-    """The cloud fitted to pictures of its former self at ``pace`` times ``RATES``, its constant harmonics within ``sh_reach``."""
+    """The cloud fitted to pictures of its former self at ``pace`` times ``RATES``, its constant
+    harmonics within ``sh_reach``.
+    """
     leaves = Cloud(*(values.detach().clone().requires_grad_() for values in cloud))
     rates = {name: pace * rate for name, rate in RATES.items()}
     rates["means"] *= bounds(cloud)[1]
-    groups = [{"params": [leaf], "lr": rates[name]} for name, leaf in zip(Cloud._fields, leaves, strict=True)]
+    groups = [
+        {"params": [leaf], "lr": rates[name]}
+        for name, leaf in zip(Cloud._fields, leaves, strict=True)
+    ]
     adam = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
     for step, rows in enumerate(_batches(len(pictures), steps, seed)):
         for group, name in zip(adam.param_groups, Cloud._fields, strict=True):
@@ -297,6 +351,11 @@ def _batches(count: int, steps: int, seed: int, size: int = 4) -> Iterator[Tenso
     order, drawn = torch.empty(0, dtype=torch.long), 0
     for _ in range(steps):
         if len(order) < size:
-            order, drawn = torch.cat([order, torch.randperm(count, generator=generator(seed, "simplify", drawn))]), drawn + 1
+            order, drawn = (
+                torch.cat(
+                    [order, torch.randperm(count, generator=generator(seed, "simplify", drawn))]
+                ),
+                drawn + 1,
+            )
         rows, order = order[:size], order[size:]
         yield rows

@@ -1,14 +1,16 @@
-"""The surface of a cloud of Gaussians as a coloured mesh, for programs and benchmarks that know no Gaussians.
+"""The surface of a cloud of Gaussians as a coloured mesh, for programs and benchmarks that know no
+Gaussians.
 
 The cloud's opacity is summed on a grid of cells of side h,
 
     d(x) = sum_i o_i exp(-1/2 (x - m_i)^T (S_i + h^2 I)^-1 (x - m_i)),
 
-where h^2 keeps Gaussians that are smaller than a cell from slipping between its corners. The surface is where d crosses a share of its
-median at the centres of the Gaussians, so that it doesn't depend on how many of them overlap. It is drawn by surface nets (Gibson 1998):
-one vertex for each cell that is crossed, at the mean of the crossings of its edges, and one quad around each edge that is crossed.
-Closed; thicker than the cloud by about sqrt(s^2 + h^2), where s is the Gaussians' size across it.
-"""
+where h^2 keeps Gaussians that are smaller than a cell from slipping between its corners. The
+surface is where d crosses a share of its median at the centres of the Gaussians, so that it doesn't
+depend on how many of them overlap. It is drawn by surface nets (Gibson 1998): one vertex for each
+cell that is crossed, at the mean of the crossings of its edges, and one quad around each edge that
+is crossed. Closed; thicker than the cloud by about sqrt(s^2 + h^2), where s is the Gaussians' size
+across it."""
 
 import os
 from collections.abc import Sequence
@@ -25,10 +27,14 @@ REACH = 3.0
 MIN_OPACITY = 0.02
 """Fainter Gaussians are haze, not surface."""
 HALF_HEIGHT = 1.25
-"""Standard deviations within which the surface of a single Gaussian is, at half of its opacity: 1.18, and a little more."""
+"""Standard deviations within which the surface of a single Gaussian is, at half of its opacity:
+1.18, and a little more.
+"""
 NODES_AT_ONCE = 4_000_000
 SMALL = 8
-"""Half a Gaussian's reach, in cells, up to which many are summed at once; larger ones are taken one by one."""
+"""Half a Gaussian's reach, in cells, up to which many are summed at once; larger ones are taken one
+by one.
+"""
 MARGIN = 3
 """Cells around the cloud, of which the outermost are empty, so that the surface closes."""
 
@@ -41,7 +47,9 @@ class Surface(NamedTuple):
     colors: Float[np.ndarray, "V 3"]
 
 
-def gaussian_surface(arrays: GaussianArrays, *, resolution: int = 128, level: float = 0.5) -> Surface:
+def gaussian_surface(
+    arrays: GaussianArrays, *, resolution: int = 128, level: float = 0.5
+) -> Surface:
     """The surface of a cloud, in its own units; empty where no Gaussian is visible.
 
     Args:
@@ -64,8 +72,11 @@ def gaussian_surface(arrays: GaussianArrays, *, resolution: int = 128, level: fl
     return Surface(corners * cell + origin, faces, _colors_at(corners, density, colored))
 
 
-def surface_nets(values: Float[np.ndarray, "X Y Z"], level: float) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    """Vertices, in units of cells, and triangles of where ``values`` crosses ``level``; outside is below it.
+def surface_nets(
+    values: Float[np.ndarray, "X Y Z"], level: float
+) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
+    """Vertices, in units of cells, and triangles of where ``values`` crosses ``level``; outside is
+    below it.
 
     The surface is open where the values at the grid's own sides are above the level.
     """
@@ -79,17 +90,28 @@ def surface_nets(values: Float[np.ndarray, "X Y Z"], level: float) -> tuple[Floa
 
 
 def write_obj(path: str | os.PathLike, surface: Surface) -> None:
-    """Write an OBJ with the colours behind the positions ("v x y z r g b"), as MeshLab, Blender and trimesh read it."""
+    """Write an OBJ with the colours behind the positions ("v x y z r g b"), as MeshLab, Blender and
+    trimesh read it.
+    """
     with atomic_file(path) as file:
-        np.savetxt(file, np.concatenate([surface.vertices, surface.colors], axis=1), fmt="v %.6g %.6g %.6g %.4f %.4f %.4f")
+        np.savetxt(
+            file,
+            np.concatenate([surface.vertices, surface.colors], axis=1),
+            fmt="v %.6g %.6g %.6g %.4f %.4f %.4f",
+        )
         np.savetxt(file, surface.faces + 1, fmt="f %d %d %d")
 
 
-# The grid -----------------------------------------------------------------------------------------------------------------------
+# The grid
+# --------------------------------------------------------------------------------------------------
 
 
 def _summed(
-    arrays: GaussianArrays, covariances: Float[np.ndarray, "N 3 3"], origin: Float[np.ndarray, "3"], cell: float, shape: tuple[int, ...]
+    arrays: GaussianArrays,
+    covariances: Float[np.ndarray, "N 3 3"],
+    origin: Float[np.ndarray, "3"],
+    cell: float,
+    shape: tuple[int, ...],
 ) -> tuple[Float[np.ndarray, "X Y Z"], Float[np.ndarray, "X Y Z 3"]]:
     """Opacity, and opacity times colour, summed at the nodes of a grid."""
     widened = covariances + cell**2 * np.eye(3)
@@ -97,9 +119,13 @@ def _summed(
         places=(arrays.means - origin) / cell,
         precisions=np.moveaxis(np.linalg.inv(widened / cell**2), 0, -1),
         opacities=1 / (1 + np.exp(-arrays.logit_opacities.astype(np.float64))),
-        weights=np.concatenate([np.ones((len(arrays.means), 1)), sh0_colors(arrays.sh[:, 0])], axis=1),
+        weights=np.concatenate(
+            [np.ones((len(arrays.means), 1)), sh0_colors(arrays.sh[:, 0])], axis=1
+        ),
     )
-    half_sides = np.ceil(REACH * np.sqrt(widened[:, range(3), range(3)].max(axis=1)) / cell).astype(int)
+    half_sides = np.ceil(REACH * np.sqrt(widened[:, range(3), range(3)].max(axis=1)) / cell).astype(
+        int
+    )
     sums = np.zeros((*shape, 4))
     for half_side in np.unique(half_sides[half_sides <= SMALL]):
         _add_many(sums, gaussians, np.flatnonzero(half_sides == half_side), int(half_side))
@@ -121,23 +147,36 @@ class _Gaussians(NamedTuple):
     """What is summed: 1, red, green, blue."""
 
 
-def _add_many(sums: Float[np.ndarray, "X Y Z 4"], gaussians: _Gaussians, rows: Int[np.ndarray, " M"], half_side: int) -> None:
+def _add_many(
+    sums: Float[np.ndarray, "X Y Z 4"],
+    gaussians: _Gaussians,
+    rows: Int[np.ndarray, " M"],
+    half_side: int,
+) -> None:
     """Add Gaussians of one size, a few million nodes at a time."""
     shape = np.array(sums.shape[:3])
-    offsets = np.stack(np.meshgrid(*[np.arange(-half_side, half_side + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    offsets = np.stack(
+        np.meshgrid(*[np.arange(-half_side, half_side + 1)] * 3, indexing="ij"), axis=-1
+    ).reshape(-1, 3)
     flat = sums.reshape(-1, 4)
     for chunk in np.array_split(rows, -(-len(rows) * len(offsets) // NODES_AT_ONCE)):
         nodes = np.round(gaussians.places[chunk]).astype(int)[:, None] + offsets
         away = np.moveaxis((nodes - gaussians.places[chunk, None]).astype(np.float32), -1, 0)
-        opacity = gaussians.opacities[chunk, None] * _falloff(away, gaussians.precisions[:, :, chunk, None])
+        opacity = gaussians.opacities[chunk, None] * _falloff(
+            away, gaussians.precisions[:, :, chunk, None]
+        )
         opacity *= ((nodes >= 0) & (nodes < shape)).all(axis=-1)
-        index = np.ravel_multi_index(tuple(np.moveaxis(nodes, -1, 0)), tuple(shape), mode="clip").ravel()
+        index = np.ravel_multi_index(
+            tuple(np.moveaxis(nodes, -1, 0)), tuple(shape), mode="clip"
+        ).ravel()
         for channel in range(4):
             added = opacity * gaussians.weights[chunk, channel, None]
             flat[:, channel] += np.bincount(index, added.ravel(), minlength=len(flat))
 
 
-def _add_one(sums: Float[np.ndarray, "X Y Z 4"], gaussians: _Gaussians, row: int, half_side: int) -> None:
+def _add_one(
+    sums: Float[np.ndarray, "X Y Z 4"], gaussians: _Gaussians, row: int, half_side: int
+) -> None:
     """Add one Gaussian, however large."""
     place, shape = gaussians.places[row], np.array(sums.shape[:3])
     first, last = (np.round(place).astype(int) + sign * half_side for sign in (-1, 1))
@@ -151,22 +190,32 @@ def _add_one(sums: Float[np.ndarray, "X Y Z 4"], gaussians: _Gaussians, row: int
 def _falloff(away: Sequence[np.ndarray], precision: Float[np.ndarray, "3 3 *k"]) -> np.ndarray:
     """exp(-1/2 d^T P d), for the three parts of d."""
     x, y, z = away
-    xx, xy, xz, yy, yz, zz = (precision[i, j].astype(np.float32) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
-    return np.exp(-0.5 * (x * (xx * x + 2 * (xy * y + xz * z)) + y * (yy * y + 2 * yz * z) + zz * z * z))
+    xx, xy, xz, yy, yz, zz = (
+        precision[i, j].astype(np.float32)
+        for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    )
+    return np.exp(
+        -0.5 * (x * (xx * x + 2 * (xy * y + xz * z)) + y * (yy * y + 2 * yz * z) + zz * z * z)
+    )
 
 
 def _covariances(arrays: GaussianArrays) -> Float[np.ndarray, "N 3 3"]:
-    w, x, y, z = (arrays.quats / np.maximum(np.linalg.norm(arrays.quats, axis=1, keepdims=True), 1e-12)).T.astype(np.float64)
+    w, x, y, z = (
+        arrays.quats / np.maximum(np.linalg.norm(arrays.quats, axis=1, keepdims=True), 1e-12)
+    ).T.astype(np.float64)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    scaled = np.moveaxis(np.array(rows), -1, 0) * np.exp(arrays.log_scales.astype(np.float64))[:, None]
+    scaled = (
+        np.moveaxis(np.array(rows), -1, 0) * np.exp(arrays.log_scales.astype(np.float64))[:, None]
+    )
     return scaled @ scaled.transpose(0, 2, 1)
 
 
-# Surface nets -------------------------------------------------------------------------------------------------------------------
+# Surface nets
+# --------------------------------------------------------------------------------------------------
 
 
 def _corner(bits: int) -> tuple[slice, ...]:
@@ -174,7 +223,9 @@ def _corner(bits: int) -> tuple[slice, ...]:
     return tuple(slice(1, None) if bits >> axis & 1 else slice(None, -1) for axis in range(3))
 
 
-def _crossings(values: Float[np.ndarray, "X Y Z"], cells: Int[np.ndarray, "V 3"], level: float) -> Float[np.ndarray, "V 3"]:
+def _crossings(
+    values: Float[np.ndarray, "X Y Z"], cells: Int[np.ndarray, "V 3"], level: float
+) -> Float[np.ndarray, "V 3"]:
     """The mean place, in its cell, of the crossings on the twelve edges of each cell."""
     place, count = np.zeros((len(cells), 3)), np.zeros(len(cells))
     at = [values[_corner(bits)][tuple(cells.T)] for bits in range(8)]
@@ -191,20 +242,28 @@ def _crossings(values: Float[np.ndarray, "X Y Z"], cells: Int[np.ndarray, "V 3"]
     return place / np.maximum(count, 1)[:, None]
 
 
-def _quads(inside: np.ndarray, number: Int[np.ndarray, "x y z"], axis: int) -> Int[np.ndarray, "Q 4"]:
-    """The four cells around each edge along ``axis`` that is crossed, counterclockwise seen from outside."""
+def _quads(
+    inside: np.ndarray, number: Int[np.ndarray, "x y z"], axis: int
+) -> Int[np.ndarray, "Q 4"]:
+    """The four cells around each edge along ``axis`` that is crossed, counterclockwise seen from
+    outside.
+    """
     u, v = (axis + 1) % 3, (axis + 2) % 3
     along = np.moveaxis(inside, (axis, u, v), (0, 1, 2))[:, 1:-1, 1:-1]
     cells = np.moveaxis(number, (axis, u, v), (0, 1, 2))
     a, b, c = np.nonzero(along[:-1] != along[1:])
-    ring = np.stack([cells[a, b, c], cells[a, b + 1, c], cells[a, b + 1, c + 1], cells[a, b, c + 1]], axis=1)
+    ring = np.stack(
+        [cells[a, b, c], cells[a, b + 1, c], cells[a, b + 1, c + 1], cells[a, b, c + 1]], axis=1
+    )
     backwards = ~along[a, b, c]  # the far end is inside, so outside lies towards -axis
     ring[backwards] = ring[backwards, ::-1]
     return ring
 
 
 def _colors_at(
-    corners: Float[np.ndarray, "V 3"], density: Float[np.ndarray, "X Y Z"], colored: Float[np.ndarray, "X Y Z 3"]
+    corners: Float[np.ndarray, "V 3"],
+    density: Float[np.ndarray, "X Y Z"],
+    colored: Float[np.ndarray, "X Y Z 3"],
 ) -> Float[np.ndarray, "V 3"]:
     """The colour at each vertex: the mean over its cell's corners, by opacity."""
     cell = tuple(np.floor(corners).astype(int).T)

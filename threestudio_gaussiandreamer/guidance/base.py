@@ -1,23 +1,30 @@
-"""Score distillation: the path that every guidance shares, from a render to the gradient of its latent.
+"""Score distillation: the path that every guidance shares, from a render to the gradient of its
+latent.
 
-    x = encode(render),  z = sqrt(abar) x + sqrt(1 - abar) eps,  grad = w(t) (eps_hat(z, t) - eps),  dloss/dx = grad / B
+    x = encode(render),  z = sqrt(abar) x + sqrt(1 - abar) eps,  grad = w(t) (eps_hat(z, t) - eps),
+                         dloss/dx = grad / B
 
-A guidance is a subclass that says how to ``encode`` and ``decode``, what to ``condition`` on, and how to ``predict`` the
-noise; it may work in half precision inside, here everything is float32. Timesteps and noise are functions of
-(seed, step, item), so a resumed run draws what the run that never stopped draws.
+A guidance is a subclass that says how to ``encode`` and ``decode``, what to ``condition`` on, and
+how to ``predict`` the noise; it may work in half precision inside, here everything is float32.
+Timesteps and noise are functions of (seed, step, item), so a resumed run draws what the run that
+never stopped draws.
 
-==================  ===================================================================================================
+==================  ================================================================================
 option              meaning
-==================  ===================================================================================================
-guidance_scale      eps = eps_u + scale (eps_c - eps_u); 1 = none. threestudio's scale is one less: its 100 is 101 here
-min_step_percent    smallest timestep as a share of all, a number or a schedule; timesteps are clamped to [1, T - 1]
+==================  ================================================================================
+guidance_scale      eps = eps_u + scale (eps_c - eps_u); 1 = none. threestudio's scale is one less:
+                    its 100 is 101 here
+min_step_percent    smallest timestep as a share of all, a number or a schedule; timesteps are
+                    clamped to [1, T - 1]
 max_step_percent    largest timestep, likewise (the paper: [500, 0.98, 0.55, 501])
-grad_clip           clamp each element of the latent's gradient to +- this; none, a number or a schedule
+grad_clip           clamp each element of the latent's gradient to +- this; none, a number or a
+                    schedule
 weighting_strategy  w(t): sds (1 - abar), uniform (1), fantasia3d (sqrt(abar) (1 - abar))
-max_bad_steps       stop after this many steps in a row in which the score of some item was NaN or infinite
+max_bad_steps       stop after this many steps in a row in which the score of some item was NaN or
+                    infinite
 max_items_eval      how many items ``guidance_eval`` shows; 0 or less = all, as in threestudio
 eval_steps          DDIM steps from the noise to ``imgs_final``
-==================  ===================================================================================================
+==================  ================================================================================
 """
 
 from abc import ABC, abstractmethod
@@ -69,7 +76,9 @@ class ScoreDistillation(BaseObject, ABC):
             if cfg.grad_clip is not None:
                 validate_schedule(cfg.grad_clip, "system.guidance.grad_clip", minimum=0)
             for step in _knots(cfg.min_step_percent, cfg.max_step_percent):
-                sds.step_range(C(cfg.min_step_percent, step, step), C(cfg.max_step_percent, step, step))
+                sds.step_range(
+                    C(cfg.min_step_percent, step, step), C(cfg.max_step_percent, step, step)
+                )
             sds.weight(cfg.weighting_strategy, torch.full((1,), 0.5))
             for name in ("max_bad_steps", "eval_steps"):
                 if cfg[name] < 1:
@@ -79,7 +88,8 @@ class ScoreDistillation(BaseObject, ABC):
     alphas_cumprod: Float[Tensor, " T"]
     """The noise schedule; a subclass sets it in ``configure``."""
 
-    # What a guidance says -------------------------------------------------------------------------------------------------
+    # What a guidance says
+    # ----------------------------------------------------------------------------------------------
 
     @abstractmethod
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B c h w"]:
@@ -91,30 +101,37 @@ class ScoreDistillation(BaseObject, ABC):
 
     @abstractmethod
     def condition(self, prompt_utils: Any, **batch: Any) -> Any:
-        """What ``predict`` needs to know of the prompt and of these views; called without gradients."""
+        """What ``predict`` needs to know of the prompt and of these views; called without
+        gradients.
+        """
 
     @abstractmethod
     def predict(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Any
     ) -> tuple[Float[Tensor, "B c h w"], Optional[Float[Tensor, "B c h w"]]]:
-        """The noise in z, conditional and unconditional (None where no guidance is asked for); called without gradients."""
+        """The noise in z, conditional and unconditional (None where no guidance is asked for);
+        called without gradients.
+        """
 
     @classmethod
     def preflight(cls, cfg: Any) -> None:
-        """Look in seconds whether a guidance of this configuration can have what it needs; called before any long work.
+        """Look in seconds whether a guidance of this configuration can have what it needs; called
+        before any long work.
 
         Raises:
             UserError: what is missing, and what to do.
         """
 
     REPORTS: tuple[str, ...] = ()
-    """The names of what :meth:`report` returns, so that ``checkpoint.monitor`` may be one of them."""
+    """The names of what :meth:`report` returns, so that ``checkpoint.monitor`` may be one of them.
+    """
 
     def report(self) -> dict[str, float]:
         """More numbers to log about the last step."""
         return {}
 
-    # The shared path ------------------------------------------------------------------------------------------------------
+    # The shared path
+    # ----------------------------------------------------------------------------------------------
 
     def configure(self) -> None:
         self.Config.check(self.cfg)
@@ -130,9 +147,14 @@ class ScoreDistillation(BaseObject, ABC):
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
         """Re-evaluate the schedules."""
         self.step = global_step
-        percents = (C(self.cfg[name], epoch, global_step) for name in ("min_step_percent", "max_step_percent"))
+        percents = (
+            C(self.cfg[name], epoch, global_step)
+            for name in ("min_step_percent", "max_step_percent")
+        )
         self.min_step, self.max_step = sds.step_range(*percents, len(self.alphas_cumprod))
-        self.grad_clip = None if self.cfg.grad_clip is None else C(self.cfg.grad_clip, epoch, global_step)
+        self.grad_clip = (
+            None if self.cfg.grad_clip is None else C(self.cfg.grad_clip, epoch, global_step)
+        )
 
     def __call__(
         self,
@@ -151,11 +173,12 @@ class ScoreDistillation(BaseObject, ABC):
             batch: the host's batch, and ``comp_rgb_bg``.
 
         Returns:
-            ``loss_sds``, ``grad_norm`` and that of each item, ``grad_norm_0`` ..., ``min_step``, ``max_step``, ``bad_items`` of this
-            step [, ``eval``] and :meth:`report`'s.
+            ``loss_sds``, ``grad_norm`` and that of each item, ``grad_norm_0`` ..., ``min_step``,
+            ``max_step``, ``bad_items`` of this step [, ``eval``] and :meth:`report`'s.
 
         Raises:
-            NonFiniteScore: some item's score wasn't finite in each of the last ``max_bad_steps`` steps.
+            NonFiniteScore: some item's score wasn't finite in each of the last ``max_bad_steps``
+                steps.
         """
         with torch.autocast(rgb.device.type, enabled=False):
             images = rgb.float().movedim(-1, 1).contiguous()
@@ -168,7 +191,12 @@ class ScoreDistillation(BaseObject, ABC):
                 self._count_bad(bad)
             loss = _masked_loss(images, latents, grad, bad)
             norms = grad.flatten(1).norm(dim=1)
-            out = {"loss_sds": loss, "grad_norm": norms.norm(), "min_step": self.min_step, "max_step": self.max_step}
+            out = {
+                "loss_sds": loss,
+                "grad_norm": norms.norm(),
+                "min_step": self.min_step,
+                "max_step": self.max_step,
+            }
             out |= {f"grad_norm_{i}": norm for i, norm in enumerate(norms)}
             out |= {"bad_items": float(bad.sum()), **self.report()}
             if guidance_eval:
@@ -178,18 +206,35 @@ class ScoreDistillation(BaseObject, ABC):
     def add_noise(self, latents: Float[Tensor, "B c h w"]) -> Noised:
         """This step's timesteps and noise on ``latents``."""
         device = latents.device
-        t = sds.timesteps(len(latents), self.min_step, self.max_step, seed=item_seed(), step=self.step, num_train=len(self.alphas_cumprod))
+        t = sds.timesteps(
+            len(latents),
+            self.min_step,
+            self.max_step,
+            seed=item_seed(),
+            step=self.step,
+            num_train=len(self.alphas_cumprod),
+        )
         abar = self.alphas_cumprod.double().cpu()[t].to(device)
-        noise = streams.normal_per_item(tuple(latents.shape), item_seed(), "noise", self.step, device)
+        noise = streams.normal_per_item(
+            tuple(latents.shape), item_seed(), "noise", self.step, device
+        )
         return Noised(t.to(device), abar, noise, sds.add_noise(latents, noise, abar))
 
-    def predict_noise(self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Any) -> Float[Tensor, "B c h w"]:
+    def predict_noise(
+        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Any
+    ) -> Float[Tensor, "B c h w"]:
         """The guided prediction, float32."""
         cond, uncond = self.predict(z, t, condition)
-        return cond.float() if uncond is None else sds.classifier_free(cond.float(), uncond.float(), self.cfg.guidance_scale)
+        return (
+            cond.float()
+            if uncond is None
+            else sds.classifier_free(cond.float(), uncond.float(), self.cfg.guidance_scale)
+        )
 
     def _gradient(self, noised: Noised, condition: Any) -> tuple[Tensor, Tensor]:
-        """w(t) (eps_hat - eps), clipped, zero for items where it isn't finite; and which those are, (B,) bool."""
+        """w(t) (eps_hat - eps), clipped, zero for items where it isn't finite; and which those are,
+        (B,) bool.
+        """
         eps = self.predict_noise(noised.z, noised.t, condition)
         weight = sds.weight(self.cfg.weighting_strategy, noised.abar)
         grad = sds.per_item(weight, eps) * (eps - noised.noise)
@@ -206,21 +251,30 @@ class ScoreDistillation(BaseObject, ABC):
             raise NonFiniteScore(
                 f"the score model returned NaN or infinity in {self.bad_steps} steps in a row"
                 f" (step {self.step}, {self.bad_items} items so far):"
-                " use full precision (half_precision_weights=false), and check the model and the prior"
+                " use full precision (half_precision_weights=false), and check the model and "
+                "the prior"
             )
         if count:
-            warn(f"step {self.step}: the score of {count} of {len(bad)} items isn't finite; they are left out")
+            warn(
+                f"step {self.step}: the score of {count} of {len(bad)} items isn't finite; "
+                "they are left out"
+            )
 
-    # Looking at what the score model sees ---------------------------------------------------------------------------------
+    # Looking at what the score model sees
+    # ---------------------------------------------------------------------------------
 
     @torch.no_grad()
     def evaluate(self, noised: Noised, prompt_utils: Any, **batch: Any) -> dict[str, Any]:
         """Pictures (B, H, W, 3) in [0, 1], as the host's ``guidance_evaluation_save`` wants them.
 
-        ``imgs_noisy`` the noisy latents; ``imgs_1step`` denoised at once with guidance; ``imgs_1orig`` denoised at once by the
-        conditional score alone; ``imgs_final`` denoised in ``eval_steps`` steps; with ``texts``, ``noise_levels`` and ``bs``.
-        """
-        count = len(noised.t) if self.cfg.max_items_eval < 1 else min(self.cfg.max_items_eval, len(noised.t))
+        ``imgs_noisy`` the noisy latents; ``imgs_1step`` denoised at once with guidance;
+        ``imgs_1orig`` denoised at once by the conditional score alone; ``imgs_final`` denoised in
+        ``eval_steps`` steps; with ``texts``, ``noise_levels`` and ``bs``."""
+        count = (
+            len(noised.t)
+            if self.cfg.max_items_eval < 1
+            else min(self.cfg.max_items_eval, len(noised.t))
+        )
         batch = _first_items(batch, len(noised.t), count)
         t, abar, _, z = (values[:count] for values in noised)
         condition = self.condition(prompt_utils, **batch)
@@ -230,23 +284,33 @@ class ScoreDistillation(BaseObject, ABC):
             "imgs_1step": sds.predict_x0(z, self.predict_noise(z, t, condition), abar),
             "imgs_1orig": sds.predict_x0(z, self.predict(z, t, condition)[0].float(), abar),
             "imgs_final": sds.ddim_sample(
-                lambda z, t: self.predict_noise(z, t, condition), z, t, alphas_cumprod, steps=self.cfg.eval_steps
+                lambda z, t: self.predict_noise(z, t, condition),
+                z,
+                t,
+                alphas_cumprod,
+                steps=self.cfg.eval_steps,
             ),
         }
         levels = (t / len(alphas_cumprod)).tolist()
-        images = {name: self.decode(value).float().movedim(1, -1) for name, value in latents.items()}
+        images = {
+            name: self.decode(value).float().movedim(1, -1) for name, value in latents.items()
+        }
         return {"bs": count, "noise_levels": levels, "texts": _captions(levels, batch), **images}
 
 
 def _bad_items(grad: Tensor) -> Tensor:
-    """(B,) bool: which items hold NaN or infinity. A sum is finite only if all its terms are, which settles the usual case."""
+    """(B,) bool: which items hold NaN or infinity. A sum is finite only if all its terms are, which
+    settles the usual case.
+    """
     if grad.sum().isfinite():
         return torch.zeros(len(grad), dtype=torch.bool, device=grad.device)
     return ~torch.isfinite(grad).flatten(1).all(dim=1)
 
 
 def _masked_loss(images: Tensor, latents: Tensor, grad: Tensor, bad: Tensor) -> Tensor:
-    """The loss without the bad items, whose ``grad`` is zero, and whose render gets a gradient of exactly zero."""
+    """The loss without the bad items, whose ``grad`` is zero, and whose render gets a gradient of
+    exactly zero.
+    """
     if bad.any() and images.requires_grad:
         # Zero times an infinite derivative of the encoder would be NaN on its way to the render.
         images.register_hook(lambda gradient: gradient.masked_fill(bad.reshape(-1, 1, 1, 1), 0.0))
@@ -255,18 +319,36 @@ def _masked_loss(images: Tensor, latents: Tensor, grad: Tensor, bad: Tensor) -> 
 
 def _first_items(batch: dict[str, Any], size: int, count: int) -> dict[str, Any]:
     """The batch of the first ``count`` of ``size`` items."""
-    return {k: v[:count] if isinstance(v, Tensor) and v.dim() and len(v) == size else v for k, v in batch.items()}
+    return {
+        k: v[:count] if isinstance(v, Tensor) and v.dim() and len(v) == size else v
+        for k, v in batch.items()
+    }
 
 
 def _captions(levels: list[float], batch: dict[str, Any]) -> list[str]:
     """threestudio's captions: noise level, elevation, azimuth and distance of each item."""
     captions = [f"n{level:.02f}" for level in levels]
-    for letter, name, digits in (("e", "elevation", 1), ("a", "azimuth", 1), ("c", "camera_distances", 2)):
+    for letter, name, digits in (
+        ("e", "elevation", 1),
+        ("a", "azimuth", 1),
+        ("c", "camera_distances", 2),
+    ):
         if name in batch:
-            captions = [f"{caption}\n{letter}{float(value):.0{digits}f}" for caption, value in zip(captions, batch[name], strict=True)]
+            captions = [
+                f"{caption}\n{letter}{float(value):.0{digits}f}"
+                for caption, value in zip(captions, batch[name], strict=True)
+            ]
     return captions
 
 
 def _knots(*schedules: Any) -> set[int]:
     """Steps among which are all those where a schedule bends (and harmlessly, its values too)."""
-    return {0, *(int(entry) for schedule in schedules if not isinstance(schedule, (int, float)) for entry in schedule)}
+    return {
+        0,
+        *(
+            int(entry)
+            for schedule in schedules
+            if not isinstance(schedule, (int, float))
+            for entry in schedule
+        ),
+    }

@@ -1,9 +1,10 @@
-"""Guidance ``gaussiandreamer-deep-floyd-guidance``: score distillation in the pixels of DeepFloyd IF's first stage, 64 x 64.
+"""Guidance ``gaussiandreamer-deep-floyd-guidance``: score distillation in the pixels of DeepFloyd
+IF's first stage, 64 x 64.
 
-Options: those of ``guidance/text_to_image.py``; ``guidance_scale`` is 20 unless given, as in threestudio; ``enable_vae_slicing`` is
-accepted, so that configurations that save memory fit any model, and there is no VAE here. The UNet also predicts the variance of its
-reverse step, which distillation doesn't need.
-"""
+Options: those of ``guidance/text_to_image.py``; ``guidance_scale`` is 20 unless given, as in
+threestudio; ``enable_vae_slicing`` is accepted, so that configurations that save memory fit any
+model, and there is no VAE here. The UNet also predicts the variance of its reverse step, which
+distillation doesn't need."""
 
 from dataclasses import dataclass
 from pathlib import Path

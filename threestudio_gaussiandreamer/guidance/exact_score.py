@@ -1,33 +1,42 @@
-"""Guidance ``exact-score-guidance``: the optimal denoiser of a mesh's pictures, in closed form; no weights, no prompt.
+"""Guidance ``exact-score-guidance``: the optimal denoiser of a mesh's pictures, in closed form; no
+weights, no prompt.
 
-It stands in for a diffusion model where the pipeline is to be measured or shown offline, and says nothing about the quality
-of a real one. The data distribution is a mixture of narrow Gaussians around ray-cast pictures of the mesh (formulas and limits:
-``exact_score.py``), composited on the render's own background.
+It stands in for a diffusion model where the pipeline is to be measured or shown offline, and says
+nothing about the quality of a real one. The data distribution is a mixture of narrow Gaussians
+around ray-cast pictures of the mesh (formulas and limits: ``exact_score.py``), composited on the
+render's own background.
 
-==================  ===================================================================================================
+==================  ================================================================================
 option              meaning
-==================  ===================================================================================================
-mesh                path of the mesh, or the bare name of a bundled one; scale, up, front: as in ``meshes.load_mesh``
-mode                ``view-exact``: the picture from this very camera (reconstruction: an upper bound, not generation);
-                    ``direction-bins``: the bank views on the camera's side (front, side, back, overhead), what
-                    view-dependent prompts can know; ``view-agnostic``: all bank views (multi-face without a prior)
-space               ``pixel``: sharp, posteriors of one picture; ``latent``: pooling and a colour matrix at unit
-                    variance on the bank, where as in a real latent several pictures compete
-image_size          height of the pictures that are compared, pixels; 0 = as rendered; the render is resized to it
-latent_size         height of the latent in pixels (image_size is a multiple); latent_channels; color_matrix: false
-                    keeps the three colours
+==================  ================================================================================
+mesh                path of the mesh, or the bare name of a bundled one; scale, up, front: as in
+                    ``meshes.load_mesh``
+mode                ``view-exact``: the picture from this very camera (reconstruction: an upper
+                    bound, not generation); ``direction-bins``: the bank views on the camera's side
+                    (front, side, back, overhead), what view-dependent prompts can know;
+                    ``view-agnostic``: all bank views (multi-face without a prior)
+space               ``pixel``: sharp, posteriors of one picture; ``latent``: pooling and a colour
+                    matrix at unit variance on the bank, where as in a real latent several pictures
+                    compete
+image_size          height of the pictures that are compared, pixels; 0 = as rendered; the render is
+                    resized to it
+latent_size         height of the latent in pixels (image_size is a multiple); latent_channels;
+                    color_matrix: false keeps the three colours
 std                 width s of each mode, in the units of the space (pixels in [-1, 1])
 temperature         of the responsibilities; 1 = exact, larger = smoother
 bank_*              number of views, their ranges (degrees, world units) and their seed
-bank_includes_view  the bank stands for all views, so the camera's own is one of them, with the weight of any other;
-                    without it the nearest view of the bank is a floor that hides what is to be measured
-supersample         rays per pixel and axis; max_cached_targets: pictures of view-exact kept in memory (4 bytes a pixel)
-guidance_scale      1 = none (the default here); otherwise the unconditional mixture is the bank, with this view in it
-==================  ===================================================================================================
+bank_includes_view  the bank stands for all views, so the camera's own is one of them, with the
+                    weight of any other; without it the nearest view of the bank is a floor that
+                    hides what is to be measured
+supersample         rays per pixel and axis; max_cached_targets: pictures of view-exact kept in
+                    memory (4 bytes a pixel)
+guidance_scale      1 = none (the default here); otherwise the unconditional mixture is the bank,
+                    with this view in it
+==================  ================================================================================
 
-A score that doesn't know the camera doesn't know its distance either: a faint start is drawn to far views before it is drawn to
-the right side. To measure the faces alone, give cameras and bank one distance and one angle of view.
-"""
+A score that doesn't know the camera doesn't know its distance either: a faint start is drawn to far
+views before it is drawn to the right side. To measure the faces alone, give cameras and bank one
+distance and one angle of view."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Optional, Tuple
@@ -67,7 +76,9 @@ class Mixture(NamedTuple):
 
     modes: Float[Tensor, "K c h w"]
     log_prior: Optional[Float[Tensor, " K"]]
-    """0 or -inf: which modes the conditional mixture has; None = all, and no unconditional one is asked for."""
+    """0 or -inf: which modes the conditional mixture has; None = all, and no unconditional one is
+    asked for.
+    """
 
 
 @register("exact-score-guidance")
@@ -113,10 +124,13 @@ class ExactScoreGuidance(ScoreDistillation):
         self._banks: dict[tuple[int, int], Bank] = {}
         self._size: Optional[tuple[int, int]] = None
         self._perplexity = 1.0
-        ranges = OrbitRanges(cfg.bank_elevation_range, (-180.0, 180.0), cfg.bank_distance_range, cfg.bank_fovy_range)
+        ranges = OrbitRanges(
+            cfg.bank_elevation_range, (-180.0, 180.0), cfg.bank_distance_range, cfg.bank_fovy_range
+        )
         self.bank_orbit = camera_pool(cfg.bank_views, ranges, cfg.bank_seed, "bank")
 
-    # The path of score distillation ---------------------------------------------------------------------------------------
+    # The path of score distillation
+    # ---------------------------------------------------------------------------------------
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B c h w"]:
         self._size = self._picture_size(*rgb.shape[-2:])
@@ -126,19 +140,33 @@ class ExactScoreGuidance(ScoreDistillation):
         return self._latent().decode(latents)
 
     def condition(
-        self, prompt_utils: Any = None, *, comp_rgb_bg: Optional[Tensor] = None, c2w: Tensor, fovy: Tensor, **batch: Any
+        self,
+        prompt_utils: Any = None,
+        *,
+        comp_rgb_bg: Optional[Tensor] = None,
+        c2w: Tensor,
+        fovy: Tensor,
+        **batch: Any,
     ) -> list[Mixture]:
         """The mixture of each item; needs ``encode`` before, which says at what size."""
         if self._size is None:
-            raise UserError("exact-score-guidance compares pictures: give it renders, not latents (rgb_as_latents)")
+            raise UserError(
+                "exact-score-guidance compares pictures: give it renders, not latents "
+                "(rgb_as_latents)"
+            )
         background = _background(comp_rgb_bg, len(c2w), c2w.device)
         own = self._own_views(c2w, fovy, background) if self._needs_own_view else [None] * len(c2w)
         members = self._members(batch, len(c2w))
         return [self._mixture(own[i], members[i], background[i]) for i in range(len(c2w))]
 
-    def predict(self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: list[Mixture]) -> tuple[Tensor, Optional[Tensor]]:
+    def predict(
+        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: list[Mixture]
+    ) -> tuple[Tensor, Optional[Tensor]]:
         abar = self.alphas_cumprod.to(t.device)[t]
-        items = [self._predict_item(z[i : i + 1].flatten(1), abar[i : i + 1], mixture) for i, mixture in enumerate(condition)]
+        items = [
+            self._predict_item(z[i : i + 1].flatten(1), abar[i : i + 1], mixture)
+            for i, mixture in enumerate(condition)
+        ]
         cond = torch.cat([item[0].eps for item in items]).view_as(z)
         self._perplexity = float(torch.cat([item[0].perplexity for item in items]).mean())
         if items[0][1] is None:
@@ -149,7 +177,9 @@ class ExactScoreGuidance(ScoreDistillation):
         """How many pictures share a noisy latent on average: 1 is retrieval of the nearest one."""
         return {"perplexity": self._perplexity}
 
-    def _predict_item(self, z: Float[Tensor, "1 d"], abar: Float[Tensor, "1"], mixture: Mixture) -> tuple:
+    def _predict_item(
+        self, z: Float[Tensor, "1 d"], abar: Float[Tensor, "1"], mixture: Mixture
+    ) -> tuple:
         modes = mixture.modes.flatten(1)
         options = {"std": self.cfg.std, "temperature": self.cfg.temperature}
         if mixture.log_prior is None:
@@ -158,22 +188,35 @@ class ExactScoreGuidance(ScoreDistillation):
         cond = denoise(z, abar, modes, log_prior=mixture.log_prior, distances=distances, **options)
         return cond, denoise(z, abar, modes, distances=distances, **options)
 
-    # Mixtures -------------------------------------------------------------------------------------------------------------
+    # Mixtures
+    # ----------------------------------------------------------------------------------------------
 
     @property
     def _needs_own_view(self) -> bool:
         return self.cfg.mode == "view-exact" or self.cfg.bank_includes_view
 
     def _mixture(
-        self, own: Optional[Float[Tensor, "1 c h w"]], members: Bool[Tensor, " K"], background: Float[Tensor, "bh bw 3"]
+        self,
+        own: Optional[Float[Tensor, "1 c h w"]],
+        members: Bool[Tensor, " K"],
+        background: Float[Tensor, "bh bw 3"],
     ) -> Mixture:
-        """The camera's own view, if any, then the bank's; conditional are the own view and the bank's ``members``."""
+        """The camera's own view, if any, then the bank's; conditional are the own view and the
+        bank's ``members``.
+        """
         own_views = [] if own is None else [own]
         if members.all() or not self.guided:
             if own is not None and not members.any():
                 return Mixture(own, None)
-            return Mixture(torch.cat([*own_views, bank_modes(_rows(self.bank(*self._size), members), background)]), None)
-        conditional = torch.cat([torch.ones(len(own_views), dtype=torch.bool), members]).to(background.device)
+            return Mixture(
+                torch.cat(
+                    [*own_views, bank_modes(_rows(self.bank(*self._size), members), background)]
+                ),
+                None,
+            )
+        conditional = torch.cat([torch.ones(len(own_views), dtype=torch.bool), members]).to(
+            background.device
+        )
         modes = torch.cat([*own_views, bank_modes(self.bank(*self._size), background)])
         return Mixture(modes, torch.where(conditional, 0.0, -torch.inf))
 
@@ -188,13 +231,19 @@ class ExactScoreGuidance(ScoreDistillation):
         # a bank that stays below 60 degrees has no overhead views
         return torch.where(members.any(dim=1, keepdim=True), members, torch.ones_like(members))
 
-    def _own_views(self, c2w: Tensor, fovy: Tensor, background: Float[Tensor, "B bh bw 3"]) -> Float[Tensor, "B 1 c h w"]:
+    def _own_views(
+        self, c2w: Tensor, fovy: Tensor, background: Float[Tensor, "B bh bw 3"]
+    ) -> Float[Tensor, "B 1 c h w"]:
         rgba = self._targets(c2w, fovy, *self._size)
         return self._latent().encode(_composite(rgba, background))[:, None]
 
     @torch.no_grad()
-    def cast_targets(self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int) -> None:
-        """Cast the pictures that training will show most of beforehand, if all can be kept: many at once take a third of the time."""
+    def cast_targets(
+        self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int
+    ) -> None:
+        """Cast the pictures that training will show most of beforehand, if all can be kept: many at
+        once take a third of the time.
+        """
         if not self._needs_own_view or len(c2w) > self.cfg.max_cached_targets:
             return
         height, width = self._picture_size(height, width)
@@ -210,7 +259,9 @@ class ExactScoreGuidance(ScoreDistillation):
 
     def _cast_bank(self, height: int, width: int) -> Bank:
         cameras = zip(self.bank_orbit.c2w.numpy(), self.bank_orbit.fovy.tolist(), strict=True)
-        images = self.caster.render_views(cameras, height, width, supersample=self.cfg.supersample, progress="bank of views")
+        images = self.caster.render_views(
+            cameras, height, width, supersample=self.cfg.supersample, progress="bank of views"
+        )
         images = torch.from_numpy(images).to(self.device)
         factor = self._factor(height, width)
         pooled = F.avg_pool2d(images.movedim(-1, 1), factor)
@@ -224,13 +275,20 @@ class ExactScoreGuidance(ScoreDistillation):
         return LinearLatent() if self.cfg.space == "pixel" else self.bank(*self._size).latent
 
     def _picture_size(self, height: int, width: int) -> tuple[int, int]:
-        """The size of the compared pictures for a render of this size: ``image_size`` high, with the render's aspect."""
+        """The size of the compared pictures for a render of this size: ``image_size`` high, with
+        the render's aspect.
+        """
         size = self.cfg.image_size
         height, width = (size, max(1, round(width * size / height))) if size else (height, width)
         needed = 12 * self.cfg.bank_views * height * width
-        if self.cfg.space == "pixel" and (self.cfg.mode != "view-exact" or self.guided) and needed > MAX_MODE_BYTES:
+        if (
+            self.cfg.space == "pixel"
+            and (self.cfg.mode != "view-exact" or self.guided)
+            and needed > MAX_MODE_BYTES
+        ):
             raise UserError(
-                f"a bank of {self.cfg.bank_views} views of {height}x{width} pixels needs {needed / 2**30:.1f} GiB for each item:"
+                f"a bank of {self.cfg.bank_views} views of {height}x{width} pixels needs "
+                f"{needed / 2**30:.1f} GiB for each item:"
                 " use system.guidance.space=latent, or a smaller system.guidance.image_size"
             )
         return height, width
@@ -241,29 +299,45 @@ class ExactScoreGuidance(ScoreDistillation):
         factor = height // self.cfg.latent_size
         if factor * self.cfg.latent_size != height or width % max(factor, 1):
             raise UserError(
-                f"pictures of {height}x{width} can't be pooled to a latent {self.cfg.latent_size} high: give a"
+                f"pictures of {height}x{width} can't be pooled to a latent "
+                f"{self.cfg.latent_size} high: give a"
                 " system.guidance.image_size that is a multiple of system.guidance.latent_size"
             )
         return factor
 
-    # What is known of the truth -------------------------------------------------------------------------------------------
+    # What is known of the truth
+    # -------------------------------------------------------------------------------------------
 
     @torch.no_grad()
     def target_rgb(
-        self, batch: dict[str, Any], comp_rgb_bg: Optional[Tensor] = None, *, size: Optional[tuple[int, int]] = None
+        self,
+        batch: dict[str, Any],
+        comp_rgb_bg: Optional[Tensor] = None,
+        *,
+        size: Optional[tuple[int, int]] = None,
     ) -> Float[Tensor, "B H W 3"]:
-        """The mesh from the batch's own cameras, on the background of the render, at (height, width) = ``size`` or the batch's."""
+        """The mesh from the batch's own cameras, on the background of the render, at (height,
+        width) = ``size`` or the batch's.
+        """
         height, width = size or (batch["height"], batch["width"])
         rgba = self._targets(batch["c2w"], batch["fovy"], height, width)
         background = _background(comp_rgb_bg, len(rgba), rgba.device)
         return _composite(rgba, background).movedim(1, -1)
 
     @torch.no_grad()
-    def bank_images(self, size: int, background: Optional[Tensor] = None) -> Float[Tensor, "K H W 3"]:
-        """The bank's pictures at ``size`` x ``size`` on one colour (3,), black by default, for the multi-face meter."""
+    def bank_images(
+        self, size: int, background: Optional[Tensor] = None
+    ) -> Float[Tensor, "K H W 3"]:
+        """The bank's pictures at ``size`` x ``size`` on one colour (3,), black by default, for the
+        multi-face meter.
+        """
         cameras = zip(self.bank_orbit.c2w.numpy(), self.bank_orbit.fovy.tolist(), strict=True)
-        rgba = torch.from_numpy(self.caster.render_views(cameras, size, size, supersample=self.cfg.supersample))
-        return over_background(rgba, torch.zeros(3) if background is None else background.detach().cpu().reshape(3))
+        rgba = torch.from_numpy(
+            self.caster.render_views(cameras, size, size, supersample=self.cfg.supersample)
+        )
+        return over_background(
+            rgba, torch.zeros(3) if background is None else background.detach().cpu().reshape(3)
+        )
 
     @property
     def bank_azimuths(self) -> Float[Tensor, " K"]:
@@ -271,8 +345,12 @@ class ExactScoreGuidance(ScoreDistillation):
         return self.bank_orbit.azimuth
 
 
-def direction_indices(elevation: Float[Tensor, " B"], azimuth: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
-    """The direction of views in degrees, by threestudio's rules for view-dependent prompts: 0 side, 1 front, 2 back, 3 overhead."""
+def direction_indices(
+    elevation: Float[Tensor, " B"], azimuth: Float[Tensor, " B"]
+) -> Int[Tensor, " B"]:
+    """The direction of views in degrees, by threestudio's rules for view-dependent prompts: 0 side,
+    1 front, 2 back, 3 overhead.
+    """
     indices = torch.zeros_like(azimuth, dtype=torch.long)
     for index, direction in enumerate(view_directions(45, 45, 60)):
         indices[direction.condition(elevation, azimuth, azimuth)] = index
@@ -283,21 +361,37 @@ def bank_modes(bank: Bank, background: Float[Tensor, "bh bw 3"]) -> Float[Tensor
     """The bank's latents on a background of one colour (1, 1, 3) or of pixels (H', W', 3)."""
     if background.shape[:2] == (1, 1):  # pooling and compositing commute
         pooled = bank.pooled.to(background.device)
-        return bank.latent.encode_pooled(pooled[:, :3] + (1 - pooled[:, 3:]) * background.reshape(3, 1, 1))
-    return torch.cat([bank.latent.encode(_composite(rgba, background[None])) for rgba in bank.rgba.split(16)])
+        return bank.latent.encode_pooled(
+            pooled[:, :3] + (1 - pooled[:, 3:]) * background.reshape(3, 1, 1)
+        )
+    return torch.cat(
+        [bank.latent.encode(_composite(rgba, background[None])) for rgba in bank.rgba.split(16)]
+    )
 
 
 def _rows(bank: Bank, members: Bool[Tensor, " K"]) -> Bank:
     members = members.to(bank.rgba.device)
-    return bank if members.all() else bank._replace(rgba=bank.rgba[members], pooled=bank.pooled[members])
+    return (
+        bank
+        if members.all()
+        else bank._replace(rgba=bank.rgba[members], pooled=bank.pooled[members])
+    )
 
 
-def _background(background: Optional[Tensor], batch: int, device: torch.device) -> Float[Tensor, "B bh bw 3"]:
+def _background(
+    background: Optional[Tensor], batch: int, device: torch.device
+) -> Float[Tensor, "B bh bw 3"]:
     """The render's background, detached; black without one."""
-    return torch.zeros(batch, 1, 1, 3, device=device) if background is None else background.detach().float().expand(batch, -1, -1, -1)
+    return (
+        torch.zeros(batch, 1, 1, 3, device=device)
+        if background is None
+        else background.detach().float().expand(batch, -1, -1, -1)
+    )
 
 
-def _composite(rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B bh bw 3"]) -> Float[Tensor, "B 3 H W"]:
+def _composite(
+    rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B bh bw 3"]
+) -> Float[Tensor, "B 3 H W"]:
     """Premultiplied pictures over the background, which is resized to them."""
     background = background.movedim(-1, 1)
     if background.shape[-2:] != (1, 1):
@@ -317,11 +411,18 @@ def _resized(images: Float[Tensor, "B c H W"], size: tuple[int, int]) -> Float[T
 
 
 def _check_choices(cfg: Any) -> None:
-    for name, choices in (("mode", MODES), ("space", SPACES), ("up", ("auto", *AXES)), ("front", AXES)):
+    for name, choices in (
+        ("mode", MODES),
+        ("space", SPACES),
+        ("up", ("auto", *AXES)),
+        ("front", AXES),
+    ):
         if cfg[name] is not None and cfg[name] not in choices:
             raise unknown(f"system.guidance.{name}", cfg[name], choices)
     if not cfg.mesh:
-        raise UserError("system.guidance.mesh: give the path of the mesh whose pictures are the truth")
+        raise UserError(
+            "system.guidance.mesh: give the path of the mesh whose pictures are the truth"
+        )
 
 
 def _check_numbers(cfg: Any) -> None:
@@ -332,7 +433,9 @@ def _check_numbers(cfg: Any) -> None:
         if cfg[name] < 0:
             raise UserError(f"system.guidance.{name}: expected 0 or more, got {cfg[name]}")
     if cfg.latent_channels < 3:
-        raise UserError(f"system.guidance.latent_channels: expected at least 3, got {cfg.latent_channels}")
+        raise UserError(
+            f"system.guidance.latent_channels: expected at least 3, got {cfg.latent_channels}"
+        )
     for name in ("temperature", "scale"):
         if not cfg[name] > 0:
             raise UserError(f"system.guidance.{name}: expected more than 0, got {cfg[name]}")
@@ -340,5 +443,6 @@ def _check_numbers(cfg: Any) -> None:
         low, high = cfg[name]
         if not low <= high or (name != "bank_elevation_range" and low <= 0):
             raise UserError(
-                f"system.guidance.{name}: expected [low, high] with low <= high, distances and angles of view above 0, got [{low}, {high}]"
+                f"system.guidance.{name}: expected [low, high] with low <= high, distances and "
+                f"angles of view above 0, got [{low}, {high}]"
             )

@@ -1,4 +1,6 @@
-"""Guidances that other packages register: called as threestudio's systems call them, whichever of its signatures they have."""
+"""Guidances that other packages register: called as threestudio's systems call them, whichever of
+its signatures they have.
+"""
 
 import inspect
 import itertools
@@ -15,11 +17,18 @@ from ..core.streams import derive_seed
 from ..host import item_seed
 
 
-def call_guidance(guidance: Any, rgb: Float[Tensor, "B H W 3"], prompt_utils: Any, batch: dict[str, Any], **options: Any) -> dict[str, Any]:
+def call_guidance(
+    guidance: Any,
+    rgb: Float[Tensor, "B H W 3"],
+    prompt_utils: Any,
+    batch: dict[str, Any],
+    **options: Any,
+) -> dict[str, Any]:
     """What ``guidance`` returns for these renders.
 
-    All get ``prompt_utils``, the whole batch and the options, or as much of them as they take: one by an image (zero123) knows no
-    prompt. threestudio passes the prompt as the second argument, which may thus have any name.
+    All get ``prompt_utils``, the whole batch and the options, or as much of them as they take: one
+    by an image (zero123) knows no prompt. threestudio passes the prompt as the second argument,
+    which may thus have any name.
 
     Raises:
         UserError: it returns no dict, or a ``loss_*`` that isn't one number.
@@ -28,7 +37,12 @@ def call_guidance(guidance: Any, rgb: Float[Tensor, "B H W 3"], prompt_utils: An
     arguments = inspect.signature(call).parameters
     given = {"prompt_utils": prompt_utils, **batch, **options}
     second = next(itertools.islice(arguments.values(), 1, None), None)
-    if second is not None and second.kind is second.POSITIONAL_OR_KEYWORD and second.default is second.empty and second.name not in given:
+    if (
+        second is not None
+        and second.kind is second.POSITIONAL_OR_KEYWORD
+        and second.default is second.empty
+        and second.name not in given
+    ):
         given[second.name] = given.pop("prompt_utils")
     if not any(argument.kind is argument.VAR_KEYWORD for argument in arguments.values()):
         given = {name: value for name, value in given.items() if name in arguments}
@@ -36,31 +50,48 @@ def call_guidance(guidance: Any, rgb: Float[Tensor, "B H W 3"], prompt_utils: An
 
 
 def _checked(out: Any, name: str, device: torch.device) -> dict[str, Any]:
-    """What a guidance returned, every ``loss_*`` in it a tensor of one number: plain numbers are what some give for a loss that is off."""
+    """What a guidance returned, every ``loss_*`` in it a tensor of one number: plain numbers are
+    what some give for a loss that is off.
+    """
     if not isinstance(out, dict):
-        raise UserError(f"{name} returned {type(out).__name__}: a guidance returns a dict with its losses as loss_*")
-    losses = {key: torch.as_tensor(value, device=device) for key, value in out.items() if key.startswith("loss_")}
+        raise UserError(
+            f"{name} returned {type(out).__name__}: a guidance returns a dict with its losses "
+            "as loss_*"
+        )
+    losses = {
+        key: torch.as_tensor(value, device=device)
+        for key, value in out.items()
+        if key.startswith("loss_")
+    }
     for key, loss in losses.items():
         if loss.numel() != 1:
-            raise UserError(f"{name} returned {key} of shape {tuple(loss.shape)}: one number was expected, as from .mean()")
+            raise UserError(
+                f"{name} returned {key} of shape {tuple(loss.shape)}: one number was expected, "
+                "as from .mean()"
+            )
     return out | {key: loss.reshape(()) for key, loss in losses.items()}
 
 
 @contextmanager
 def own_randomness(step: int) -> Iterator[None]:
-    """torch's global generators as a function of (seed, step), for guidances that draw from them; put back afterwards.
+    """torch's global generators as a function of (seed, step), for guidances that draw from them;
+    put back afterwards.
 
-    So a resumed run draws what the run that never stopped drew, and looking at pictures in between changes nothing.
-    """
+    So a resumed run draws what the run that never stopped drew, and looking at pictures in between
+    changes nothing."""
     devices = [torch.cuda.current_device()] if torch.cuda.is_available() else []
     with torch.random.fork_rng(devices):
-        # without a GPU torch.manual_seed notes a stack trace for each kind that isn't there: a millisecond each step
+        # without a GPU torch.manual_seed notes a stack trace for each kind that isn't there: a
+        # millisecond each step
         gpu = devices or torch.backends.mps.is_available()
-        (torch.manual_seed if gpu else torch.default_generator.manual_seed)(derive_seed(item_seed(), "guidance", step))
+        (torch.manual_seed if gpu else torch.default_generator.manual_seed)(
+            derive_seed(item_seed(), "guidance", step)
+        )
         yield
 
 
-# What a guidance itself learns, as VSD its LoRA ---------------------------------------------------------------------------------
+# What a guidance itself learns, as VSD its LoRA
+# ---------------------------------------------------------------------------------
 
 
 def trainable_parameters(guidance: Any) -> dict[str, nn.Parameter]:
@@ -80,7 +111,9 @@ def trainable_groups(guidance: Any, lr: float) -> list[dict[str, Any]]:
 
 
 def learnt_weights(guidance: Any) -> dict[str, Tensor]:
-    """For a checkpoint: what a guidance has learnt, without its frozen weights, which are the model's."""
+    """For a checkpoint: what a guidance has learnt, without its frozen weights, which are the
+    model's.
+    """
     return {name: parameter.detach() for name, parameter in trainable_parameters(guidance).items()}
 
 
@@ -91,9 +124,12 @@ def restore_learnt(guidance: Any, weights: dict[str, Tensor]) -> None:
         UserError: the guidance learns something else.
     """
     own = trainable_parameters(guidance)
-    if {name: parameter.shape for name, parameter in own.items()} != {name: value.shape for name, value in weights.items()}:
+    if {name: parameter.shape for name, parameter in own.items()} != {
+        name: value.shape for name, value in weights.items()
+    }:
         raise UserError(
-            f"the checkpoint's guidance had learnt {len(weights)} tensors, and {type(guidance).__name__} learns {len(own)} of its own:"
+            f"the checkpoint's guidance had learnt {len(weights)} tensors, and "
+            f"{type(guidance).__name__} learns {len(own)} of its own:"
             " resume with the configuration that the run was started with"
         )
     with torch.no_grad():

@@ -1,4 +1,6 @@
-"""Half-precision networks between float32 tensors: their type, and gradients that neither overflow nor vanish on the way back."""
+"""Half-precision networks between float32 tensors: their type, and gradients that neither overflow
+nor vanish on the way back.
+"""
 
 from collections.abc import Callable
 
@@ -8,23 +10,29 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
 PEAK = 64.0
-"""A gradient enters a half-precision network with a largest element in [PEAK, 2 PEAK): float16 goes up to 65504, and down to
-6e-8, so that it may grow a thousandfold inside and elements a hundred million times smaller still count."""
+"""A gradient enters a half-precision network with a largest element in [PEAK, 2 PEAK): float16 goes
+up to 65504, and down to 6e-8, so that it may grow a thousandfold inside and elements a hundred
+million times smaller still count.
+"""
 
 
 def weights_type(half: bool, device: torch.device) -> torch.dtype:
-    """float16 on a GPU when ``half`` is wanted; the CPU, which gains nothing from it, works in float32."""
+    """float16 on a GPU when ``half`` is wanted; the CPU, which gains nothing from it, works in
+    float32.
+    """
     return torch.float16 if half and device.type == "cuda" else torch.float32
 
 
 class GradientBorder:
     """Both sides of a half-precision network, for one forward pass and its backward pass.
 
-    ``leave`` scales each item's gradient by a power of two before it goes back through the network, ``enter`` undoes that in
-    float32 behind it. Both are the identity forwards. The loss may thus have any scale, a gradient scaler's 65536 included.
+    ``leave`` scales each item's gradient by a power of two before it goes back through the network,
+    ``enter`` undoes that in float32 behind it. Both are the identity forwards. The loss may thus
+    have any scale, a gradient scaler's 65536 included.
 
     Args:
-        on_result: told, when the gradient has come back, which items' isn't finite, (B,) bool; those are set to zero.
+        on_result: told, when the gradient has come back, which items' isn't finite, (B,) bool;
+            those are set to zero.
     """
 
     def __init__(self, on_result: Callable[[Bool[Tensor, " B"]], None]) -> None:
@@ -62,4 +70,6 @@ class _Enter(torch.autograd.Function):
         bad = ~torch.isfinite(grad).flatten(1).all(dim=1)
         ctx.border.on_result(bad)
         per_item = (-1, *[1] * (grad.dim() - 1))
-        return torch.where(bad.reshape(per_item), 0.0, grad) / ctx.border.scale.reshape(per_item), None
+        return torch.where(bad.reshape(per_item), 0.0, grad) / ctx.border.scale.reshape(
+            per_item
+        ), None

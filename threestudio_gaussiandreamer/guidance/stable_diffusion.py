@@ -1,14 +1,16 @@
-"""Guidance ``gaussiandreamer-stable-diffusion-guidance``: score distillation in the latent space of Stable Diffusion.
+"""Guidance ``gaussiandreamer-stable-diffusion-guidance``: score distillation in the latent space of
+Stable Diffusion.
 
-Takes any model in diffusers' Stable Diffusion format (1.x, 2.x; predicting noise, v or x0). Options beside those of
-``guidance/text_to_image.py``:
+Takes any model in diffusers' Stable Diffusion format (1.x, 2.x; predicting noise, v or x0). Options
+beside those of ``guidance/text_to_image.py``:
 
-===================  ==================================================================================================
+===================  ===============================================================================
 option               meaning
-===================  ==================================================================================================
-enable_vae_slicing   encode one image at a time and again in the backward pass: the memory of one image, one more encoding
+===================  ===============================================================================
+enable_vae_slicing   encode one image at a time and again in the backward pass: the memory of one
+                     image, one more encoding
 enable_vae_tiling    encode and decode in overlapping tiles: for images much larger than the model's
-===================  ==================================================================================================
+===================  ===============================================================================
 """
 
 from dataclasses import dataclass
@@ -52,11 +54,16 @@ class StableDiffusionGuidance(TextToImageDistillation):
         factor = 2 ** (len(self.vae.config.block_out_channels) - 1)
         self.image_size = self.size_of_images(factor)
         if self.image_size % factor:
-            raise UserError(f"system.guidance.image_size: expected a multiple of {factor}, got {self.image_size}")
+            raise UserError(
+                f"system.guidance.image_size: expected a multiple of {factor}, got "
+                f"{self.image_size}"
+            )
         self._bad_backwards = 0
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B 4 h w"]:
-        """A draw from the VAE's posterior, a function of (seed, step, item), at unit variance; float32."""
+        """A draw from the VAE's posterior, a function of (seed, step, item), at unit variance;
+        float32.
+        """
         images = self.resized(rgb, self.image_size) * 2 - 1
         if self.dtype == torch.float32:
             return self._encode(images)
@@ -66,7 +73,9 @@ class StableDiffusionGuidance(TextToImageDistillation):
     def _encode(self, images: Float[Tensor, "B 3 s s"]) -> Float[Tensor, "B 4 h w"]:
         images = images.to(self.dtype)
         if self.cfg.enable_vae_slicing and torch.is_grad_enabled():
-            parts = [checkpoint(self._moments, image, use_reentrant=False) for image in images.split(1)]
+            parts = [
+                checkpoint(self._moments, image, use_reentrant=False) for image in images.split(1)
+            ]
             mean, std = (torch.cat(part) for part in zip(*parts, strict=True))
         else:
             mean, std = self._moments(images)
@@ -84,14 +93,20 @@ class StableDiffusionGuidance(TextToImageDistillation):
         return (images / 2 + 0.5).clamp(0, 1)
 
     def _count_bad_backwards(self, bad: Bool[Tensor, " B"]) -> None:
-        """The encoder's gradient of some items isn't finite: they were left out; stop when that goes on."""
+        """The encoder's gradient of some items isn't finite: they were left out; stop when that
+        goes on.
+        """
         count = int(bad.sum())
         self._bad_backwards = self._bad_backwards + 1 if count else 0
         self.bad_items += count
         if self._bad_backwards >= self.cfg.max_bad_steps:
             raise NonFiniteScore(
-                f"the gradient of the VAE was NaN or infinite in {self._bad_backwards} steps in a row (step {self.step}): "
+                f"the gradient of the VAE was NaN or infinite in {self._bad_backwards} steps "
+                f"in a row (step {self.step}): "
                 "set system.guidance.half_precision_weights=false"
             )
         if count:
-            warn(f"step {self.step}: the VAE's gradient of {count} of {len(bad)} items isn't finite; they are left out")
+            warn(
+                f"step {self.step}: the VAE's gradient of {count} of {len(bad)} items isn't "
+                "finite; they are left out"
+            )

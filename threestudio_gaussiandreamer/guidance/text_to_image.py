@@ -1,22 +1,30 @@
-"""What guidances by a text-to-image diffusion model share: loading its UNet, its noise schedule, and one forward pass for all prompts.
+"""What guidances by a text-to-image diffusion model share: loading its UNet, its noise schedule,
+and one forward pass for all prompts.
 
-==================================  ===================================================================================
+==================================  ================================================================
 option                              meaning
-==================================  ===================================================================================
-pretrained_model_name_or_path       the model, the prompt processor's: a folder or a hub id; ``revision`` of a hub id
-guidance_scale, ..._step_percent,   see ``guidance/base.py``; classifier-free guidance in the usual convention, where 1 is
+==================================  ================================================================
+pretrained_model_name_or_path       the model, the prompt processor's: a folder or a hub id;
+                                    ``revision`` of a hub id
+guidance_scale, ..._step_percent,   see ``guidance/base.py``; classifier-free guidance in the usual
+                                    convention, where 1 is
 grad_clip, weighting_strategy, ...  none (threestudio's 100 is 101 here)
-recon_std_rescale                   0 to 1: bring the contrast of the guided x0 back to that of the conditional one
-                                    (Lin et al. 2023, as in MVDream), which undoes the over-exposure of large scales
+recon_std_rescale                   0 to 1: bring the contrast of the guided x0 back to that of the
+                                    conditional one (Lin et al. 2023, as in MVDream), which undoes
+                                    the over-exposure of large scales
 view_dependent_prompting            use the prompt of each view's direction
-image_size                          height and width that the model sees, pixels; none = what it was trained with
-half_precision_weights              float16 on a GPU; images, latents, gradients and splatting stay float32
+image_size                          height and width that the model sees, pixels; none = what it was
+                                    trained with
+half_precision_weights              float16 on a GPU; images, latents, gradients and splatting stay
+                                    float32
 enable_channels_last_format         lay the weights out channels last
 enable_torch_compile                compile the UNet on its first use
 enable_attention_slicing            attention in slices: less memory, slower
-enable_sequential_cpu_offload       keep the UNet's weights in the CPU's memory: least memory, much slower
-enable_memory_efficient_attention   torch's own attention is so already; accepted for threestudio's configurations
-==================================  ===================================================================================
+enable_sequential_cpu_offload       keep the UNet's weights in the CPU's memory: least memory, much
+                                    slower
+enable_memory_efficient_attention   torch's own attention is so already; accepted for threestudio's
+                                    configurations
+==================================  ================================================================
 """
 
 from dataclasses import dataclass
@@ -45,13 +53,16 @@ class Condition(NamedTuple):
     """The prompts of B views: k rows for each."""
 
     embeddings: Float[Tensor, "kB N F"]
-    """All prompts, all negative prompts, then with Perp-Neg two more for each view, view by view."""
+    """All prompts, all negative prompts, then with Perp-Neg two more for each view, view by view.
+    """
     negative_weights: Optional[Float[Tensor, "B 2"]]
     """The weights of those two, <= 0; None without Perp-Neg."""
 
 
 class TextToImageDistillation(ScoreDistillation):
-    """Score distillation from a UNet that is conditioned on text embeddings; a subclass knows its images."""
+    """Score distillation from a UNet that is conditioned on text embeddings; a subclass knows its
+    images.
+    """
 
     @dataclass
     class Config(ScoreDistillation.Config):
@@ -71,42 +82,67 @@ class TextToImageDistillation(ScoreDistillation):
         def check(cfg: Any) -> None:
             ScoreDistillation.Config.check(cfg)
             if not 0 <= cfg.recon_std_rescale <= 1:
-                raise UserError(f"system.guidance.recon_std_rescale: expected a number in [0, 1], got {cfg.recon_std_rescale}")
+                raise UserError(
+                    "system.guidance.recon_std_rescale: expected a number in [0, 1], got "
+                    f"{cfg.recon_std_rescale}"
+                )
             if cfg.image_size is not None and cfg.image_size < 1:
-                raise UserError(f"system.guidance.image_size: expected a positive number of pixels, got {cfg.image_size}")
+                raise UserError(
+                    "system.guidance.image_size: expected a positive number of pixels, got "
+                    f"{cfg.image_size}"
+                )
 
     cfg: Config
     components: ClassVar[tuple[str, ...]] = ("unet", "scheduler")
 
-    # Loading --------------------------------------------------------------------------------------------------------------
+    # Loading
+    # ----------------------------------------------------------------------------------------------
 
     @classmethod
     def preflight(cls, cfg: Any) -> None:
         cfg = parse_structured(cls.Config, cfg)
         extras.require("diffusion", "diffusers", "transformers")
-        find_model(cfg.pretrained_model_name_or_path, cls.components, revision=cfg.revision, download=False)
+        find_model(
+            cfg.pretrained_model_name_or_path, cls.components, revision=cfg.revision, download=False
+        )
 
     def configure(self) -> None:
         super().configure()
         extras.require("diffusion", "diffusers", "transformers")
         self.dtype = weights_type(self.cfg.half_precision_weights, self.device)
         folder = find_model(
-            self.cfg.pretrained_model_name_or_path, self.components, half=self.dtype == torch.float16, revision=self.cfg.revision
+            self.cfg.pretrained_model_name_or_path,
+            self.components,
+            half=self.dtype == torch.float16,
+            revision=self.cfg.revision,
         )
-        info(f"loading {self.cfg.pretrained_model_name_or_path} in {str(self.dtype).removeprefix('torch.')}")
+        info(
+            f"loading {self.cfg.pretrained_model_name_or_path} in "
+            f"{str(self.dtype).removeprefix('torch.')}"
+        )
         self.set_schedule(folder)
         self.load(folder)
 
     def set_schedule(self, folder: Path) -> None:
-        """The noise schedule that the model was trained with, in float64, and what its UNet predicts."""
+        """The noise schedule that the model was trained with, in float64, and what its UNet
+        predicts.
+        """
         from diffusers import DDPMScheduler
 
         scheduler = load_settings(DDPMScheduler, folder, "scheduler")
-        if not {"beta_schedule", "trained_betas"} & DDPMScheduler.load_config(folder, subfolder="scheduler").keys():
-            raise UserError(f"{self.cfg.pretrained_model_name_or_path} is no diffusion model of betas: its scheduler has no beta_schedule")
+        if (
+            not {"beta_schedule", "trained_betas"}
+            & DDPMScheduler.load_config(folder, subfolder="scheduler").keys()
+        ):
+            raise UserError(
+                f"{self.cfg.pretrained_model_name_or_path} is no diffusion model of betas: its "
+                "scheduler has no beta_schedule"
+            )
         self.prediction_type = scheduler.config.prediction_type
         if self.prediction_type not in PREDICTIONS:
-            raise unknown("prediction_type of the model's scheduler", self.prediction_type, PREDICTIONS)
+            raise unknown(
+                "prediction_type of the model's scheduler", self.prediction_type, PREDICTIONS
+            )
         self.alphas_cumprod = torch.cumprod(1 - scheduler.betas.double(), dim=0).clamp_min(MIN_ABAR)
         self._abar = self.alphas_cumprod.to(self.device)
         self.update_step(0, 0)
@@ -116,10 +152,14 @@ class TextToImageDistillation(ScoreDistillation):
         from diffusers import UNet2DConditionModel
 
         cfg = self.cfg
-        self.unet = self.network(UNet2DConditionModel, folder, "unet", on_device=not cfg.enable_sequential_cpu_offload)
+        self.unet = self.network(
+            UNet2DConditionModel, folder, "unet", on_device=not cfg.enable_sequential_cpu_offload
+        )
         self.text_width = self.unet.config.encoder_hid_dim or self.unet.config.cross_attention_dim
         if cfg.enable_memory_efficient_attention:
-            debug("enable_memory_efficient_attention: torch's attention is memory efficient already")
+            debug(
+                "enable_memory_efficient_attention: torch's attention is memory efficient already"
+            )
         if cfg.enable_attention_slicing:
             self.unet.set_attention_slice(1)
         if cfg.enable_sequential_cpu_offload:
@@ -128,30 +168,50 @@ class TextToImageDistillation(ScoreDistillation):
             self.unet = torch.compile(self.unet)
 
     def size_of_images(self, factor: int = 1) -> int:
-        """Height and width that the model sees, pixels: what is asked for, or what it was trained with, ``factor`` times its latents.
+        """Height and width that the model sees, pixels: what is asked for, or what it was trained
+        with, ``factor`` times its latents.
 
         Raises:
             UserError: neither is known.
         """
         trained = self.unet.config.sample_size
         if self.cfg.image_size is None and not isinstance(trained, int):
-            raise UserError(f"{self.cfg.pretrained_model_name_or_path} has sample_size {trained}: set system.guidance.image_size, pixels")
+            raise UserError(
+                f"{self.cfg.pretrained_model_name_or_path} has sample_size {trained}: set "
+                "system.guidance.image_size, pixels"
+            )
         return self.cfg.image_size or trained * factor
 
     def require_text_to_image(self, channels: int) -> None:
-        """Raise UserError unless the UNet takes a picture of so many channels and a text, and nothing else."""
+        """Raise UserError unless the UNet takes a picture of so many channels and a text, and
+        nothing else.
+        """
         config = self.unet.config
-        wanted = {"in_channels": (channels,), "class_embed_type": (None,), "addition_embed_type": (None, "text")}
-        if other := [f"{name} {config[name]}" for name, values in wanted.items() if config[name] not in values]:
+        wanted = {
+            "in_channels": (channels,),
+            "class_embed_type": (None,),
+            "addition_embed_type": (None, "text"),
+        }
+        if other := [
+            f"{name} {config[name]}"
+            for name, values in wanted.items()
+            if config[name] not in values
+        ]:
             raise UserError(
-                f"{self.cfg.pretrained_model_name_or_path} isn't text to image alone ({', '.join(other)}), as Stable Diffusion XL and"
-                " models for inpainting, depth or upscaling aren't: take Stable Diffusion 1.x or 2.x, or the first stage of DeepFloyd IF"
+                f"{self.cfg.pretrained_model_name_or_path} isn't text to image alone "
+                f"({', '.join(other)}), as Stable Diffusion XL and"
+                " models for inpainting, depth or upscaling aren't: take Stable Diffusion 1.x "
+                "or 2.x, or the first stage of DeepFloyd IF"
             )
 
-    def network(self, network_class: Any, folder: Path, component: str, *, on_device: bool = True) -> nn.Module:
+    def network(
+        self, network_class: Any, folder: Path, component: str, *, on_device: bool = True
+    ) -> nn.Module:
         """One frozen network of the model."""
         half = self.dtype == torch.float16
-        network = load_network(network_class, folder, component, half=half, torch_dtype=self.dtype).requires_grad_(False)
+        network = load_network(
+            network_class, folder, component, half=half, torch_dtype=self.dtype
+        ).requires_grad_(False)
         if self.cfg.enable_channels_last_format:
             network.to(memory_format=torch.channels_last)
         return network.to(self.device) if on_device else network
@@ -160,16 +220,29 @@ class TextToImageDistillation(ScoreDistillation):
         try:
             from accelerate import cpu_offload
         except ImportError as error:
-            raise UserError("enable_sequential_cpu_offload needs accelerate: pip install accelerate") from error
+            raise UserError(
+                "enable_sequential_cpu_offload needs accelerate: pip install accelerate"
+            ) from error
         cpu_offload(self.unet, execution_device=self.device)
 
-    # The path of score distillation ---------------------------------------------------------------------------------------
+    # The path of score distillation
+    # ---------------------------------------------------------------------------------------
 
     def condition(self, prompt_utils: Any, **batch: Any) -> Condition:
-        """The text embeddings of these views; ``prompt_utils`` is ours or threestudio's ``PromptProcessorOutput``."""
+        """The text embeddings of these views; ``prompt_utils`` is ours or threestudio's
+        ``PromptProcessorOutput``.
+        """
         if not hasattr(prompt_utils, "get_text_embeddings"):
-            raise UserError("this guidance needs text embeddings: set system.prompt_processor_type to the processor of its model")
-        views = (batch["elevation"], batch["azimuth"], batch["camera_distances"], self.cfg.view_dependent_prompting)
+            raise UserError(
+                "this guidance needs text embeddings: set system.prompt_processor_type to the "
+                "processor of its model"
+            )
+        views = (
+            batch["elevation"],
+            batch["azimuth"],
+            batch["camera_distances"],
+            self.cfg.view_dependent_prompting,
+        )
         if getattr(prompt_utils, "use_perp_neg", False):
             embeddings, weights = prompt_utils.get_text_embeddings_perp_neg(*views)
             weights = weights.to(self.device)
@@ -179,50 +252,80 @@ class TextToImageDistillation(ScoreDistillation):
             raise UserError(
                 f"the text embeddings have {embeddings.shape[-1]} channels, "
                 f"{self.cfg.pretrained_model_name_or_path} takes {self.text_width}: "
-                "give system.prompt_processor and system.guidance the same pretrained_model_name_or_path"
+                "give system.prompt_processor and system.guidance the same "
+                "pretrained_model_name_or_path"
             )
         return Condition(embeddings.to(self.device), weights)
 
-    def predict(self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition) -> tuple[Tensor, Optional[Tensor]]:
+    def predict(
+        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition
+    ) -> tuple[Tensor, Optional[Tensor]]:
         batch = len(z)
         if condition.negative_weights is None:
-            eps = self.noise(z, t, condition.embeddings if self.guided else condition.embeddings[:batch])
+            eps = self.noise(
+                z, t, condition.embeddings if self.guided else condition.embeddings[:batch]
+            )
             return eps[:batch], eps[batch:] if self.guided else None
         eps = self.noise(z, t, condition.embeddings)
         negative = eps[2 * batch :].unflatten(0, (batch, 2))
-        return perp_neg(eps[:batch], eps[batch : 2 * batch], negative, condition.negative_weights), eps[batch : 2 * batch]
+        return perp_neg(
+            eps[:batch], eps[batch : 2 * batch], negative, condition.negative_weights
+        ), eps[batch : 2 * batch]
 
-    def predict_noise(self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition) -> Float[Tensor, "B c h w"]:
+    def predict_noise(
+        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition
+    ) -> Float[Tensor, "B c h w"]:
         cond, uncond = self.predict(z, t, condition)
         if uncond is None:
             return cond
         guided = sds.classifier_free(cond, uncond, self.cfg.guidance_scale)
-        return rescaled(guided, cond, z, self._abar[t], self.cfg.recon_std_rescale) if self.cfg.recon_std_rescale else guided
+        return (
+            rescaled(guided, cond, z, self._abar[t], self.cfg.recon_std_rescale)
+            if self.cfg.recon_std_rescale
+            else guided
+        )
 
-    def noise(self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], embeddings: Float[Tensor, "kB N F"]) -> Float[Tensor, "kB c h w"]:
-        """The UNet's prediction as noise, float32, for each row of ``embeddings`` on the latent of its view, in one forward pass."""
+    def noise(
+        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], embeddings: Float[Tensor, "kB N F"]
+    ) -> Float[Tensor, "kB c h w"]:
+        """The UNet's prediction as noise, float32, for each row of ``embeddings`` on the latent of
+        its view, in one forward pass.
+        """
         rows = view_of_row(len(z), len(embeddings)).to(z.device)
         z, t = z[rows], t[rows]
-        output = self.unet(z.to(self.dtype), t, encoder_hidden_states=embeddings.to(self.dtype)).sample.float()
+        output = self.unet(
+            z.to(self.dtype), t, encoder_hidden_states=embeddings.to(self.dtype)
+        ).sample.float()
         # a model may predict the variance of the reverse step beside it
         return PREDICTIONS[self.prediction_type](output[:, : z.shape[1]], z, self._abar[t])
 
     def resized(self, images: Float[Tensor, "B 3 H W"], size: int) -> Float[Tensor, "B 3 s s"]:
-        """The images at the model's size; when shrunk more than twofold, bilinear sampling would skip pixels without antialiasing."""
+        """The images at the model's size; when shrunk more than twofold, bilinear sampling would
+        skip pixels without antialiasing.
+        """
         if images.shape[-2:] == (size, size):
             return images
         antialias = max(images.shape[-2:]) > 2 * size
-        return F.interpolate(images, (size, size), mode="bilinear", align_corners=False, antialias=antialias)
+        return F.interpolate(
+            images, (size, size), mode="bilinear", align_corners=False, antialias=antialias
+        )
 
 
-# Formulas -------------------------------------------------------------------------------------------------------------------
+# Formulas
+# --------------------------------------------------------------------------------------------------
 
 PREDICTIONS = {
     "epsilon": lambda output, z, abar: output,
-    "v_prediction": lambda output, z, abar: sds.per_item(abar.sqrt(), z) * output + sds.per_item((1 - abar).sqrt(), z) * z,
-    "sample": lambda output, z, abar: (z - sds.per_item(abar.sqrt(), z) * output) / sds.per_item((1 - abar).sqrt(), z),
+    "v_prediction": lambda output, z, abar: (
+        sds.per_item(abar.sqrt(), z) * output + sds.per_item((1 - abar).sqrt(), z) * z
+    ),
+    "sample": lambda output, z, abar: (
+        (z - sds.per_item(abar.sqrt(), z) * output) / sds.per_item((1 - abar).sqrt(), z)
+    ),
 }
-"""What the network puts out, as noise: it may predict the noise, v = sqrt(abar) eps - sqrt(1 - abar) x0 (Salimans and Ho 2022), or x0."""
+"""What the network puts out, as noise: it may predict the noise, v = sqrt(abar) eps - sqrt(1 -
+abar) x0 (Salimans and Ho 2022), or x0.
+"""
 
 
 def view_of_row(views: int, rows: int) -> Int[Tensor, " kB"]:
@@ -232,9 +335,13 @@ def view_of_row(views: int, rows: int) -> Int[Tensor, " kB"]:
 
 
 def perp_neg(
-    cond: Float[Tensor, "B c h w"], uncond: Float[Tensor, "B c h w"], negative: Float[Tensor, "B 2 c h w"], weights: Float[Tensor, "B 2"]
+    cond: Float[Tensor, "B c h w"],
+    uncond: Float[Tensor, "B c h w"],
+    negative: Float[Tensor, "B 2 c h w"],
+    weights: Float[Tensor, "B 2"],
 ) -> Float[Tensor, "B c h w"]:
-    """eps_u + d + sum_i w_i (n_i - proj_d n_i), where d = eps_c - eps_u, n_i = eps_i - eps_u (Armandpour et al. 2023, eq. 9).
+    """eps_u + d + sum_i w_i (n_i - proj_d n_i), where d = eps_c - eps_u, n_i = eps_i - eps_u
+    (Armandpour et al. 2023, eq. 9).
 
     Guided with scale s this is eps_u + s (d + ...), the paper's formula.
     """
@@ -247,9 +354,15 @@ def perp_neg(
 
 
 def rescaled(
-    guided: Float[Tensor, "B c h w"], cond: Float[Tensor, "B c h w"], z: Float[Tensor, "B c h w"], abar: Float[Tensor, " B"], share: float
+    guided: Float[Tensor, "B c h w"],
+    cond: Float[Tensor, "B c h w"],
+    z: Float[Tensor, "B c h w"],
+    abar: Float[Tensor, " B"],
+    share: float,
 ) -> Float[Tensor, "B c h w"]:
-    """The guided noise whose x0 has its standard deviation brought to that of the conditional x0, by ``share`` (0 none, 1 all)."""
+    """The guided noise whose x0 has its standard deviation brought to that of the conditional x0,
+    by ``share`` (0 none, 1 all).
+    """
     x0, reference = sds.predict_x0(z, guided, abar), sds.predict_x0(z, cond, abar)
     factor = _deviation(reference) / _deviation(x0)
     x0 = x0 * (share * factor + 1 - share)

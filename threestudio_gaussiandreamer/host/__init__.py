@@ -1,4 +1,5 @@
-"""The host of the parts: threestudio when it is importable, otherwise the built-in one. Only this file knows which.
+"""The host of the parts: threestudio when it is importable, otherwise the built-in one. Only this
+file knows which.
 
 Everything else imports these names from here; they mean the same in both hosts.
 """
@@ -13,7 +14,8 @@ from ..core.streams import derive_seed
 
 
 def _threestudio_is_importable() -> bool:
-    """Whether ``import threestudio`` works; a folder of that name on the path that is no package doesn't count.
+    """Whether ``import threestudio`` works; a folder of that name on the path that is no package
+    doesn't count.
 
     Raises:
         UserError: threestudio is there but broken: which host is meant can't be guessed.
@@ -23,9 +25,15 @@ def _threestudio_is_importable() -> bool:
     except ModuleNotFoundError as error:
         if error.name == "threestudio":
             return False
-        raise UserError(f"threestudio is on the Python path but can't be imported: {error}; mend it or take it off") from error
+        raise UserError(
+            f"threestudio is on the Python path but can't be imported: {error}; mend it or "
+            "take it off"
+        ) from error
     except Exception as error:
-        raise UserError(f"threestudio is on the Python path but can't be imported: {error!r}; mend it or take it off") from error
+        raise UserError(
+            f"threestudio is on the Python path but can't be imported: {error!r}; mend it or "
+            "take it off"
+        ) from error
     return hasattr(threestudio, "register")
 
 
@@ -66,18 +74,25 @@ if _threestudio_is_importable():
             raise unknown("part", name, names()) from None
 
     def register(name: str) -> Callable[[type], type]:
-        """A class decorator that enters the class under ``name``; entering the same class again is harmless."""
+        """A class decorator that enters the class under ``name``; entering the same class again is
+        harmless.
+        """
 
         def enter(cls: type) -> type:
             taken = threestudio.__modules__.get(name)
-            if taken is not None and (taken.__module__, taken.__qualname__) == (cls.__module__, cls.__qualname__):
+            if taken is not None and (taken.__module__, taken.__qualname__) == (
+                cls.__module__,
+                cls.__qualname__,
+            ):
                 return cls
             return threestudio.register(name)(cls)
 
         return enter
 
     def register_builtin(name: str) -> Callable[[type], type]:
-        """As :func:`register` in the built-in host; nothing here, where threestudio has its own part of that name."""
+        """As :func:`register` in the built-in host; nothing here, where threestudio has its own
+        part of that name.
+        """
         return lambda cls: cls
 
 else:
@@ -85,7 +100,14 @@ else:
 
     from ..core.logs import debug, info, warn
     from .builtin.base import BaseModule, BaseObject, Updateable, get_device, parse_structured
-    from .builtin.models import BaseBackground, BaseGeometry, BaseMaterial, Exporter, ExporterOutput, Rasterizer
+    from .builtin.models import (
+        BaseBackground,
+        BaseGeometry,
+        BaseMaterial,
+        Exporter,
+        ExporterOutput,
+        Rasterizer,
+    )
     from .builtin.registry import find, names, register
     from .builtin.system import BaseLift3DSystem, BaseSystem
 
@@ -98,7 +120,9 @@ else:
 
 
 def item_seed() -> int:
-    """The seed of what differs between processes that train one cloud together: cameras, noise, backgrounds."""
+    """The seed of what differs between processes that train one cloud together: cameras, noise,
+    backgrounds.
+    """
     return run_seed() if rank() == 0 else derive_seed(run_seed(), "rank", rank())
 
 

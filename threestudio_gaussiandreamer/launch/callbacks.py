@@ -1,4 +1,6 @@
-"""What the launcher does around training: the record of the run, the progress bar, and stopping without losing a step."""
+"""What the launcher does around training: the record of the run, the progress bar, and stopping
+without losing a step.
+"""
 
 import os
 import shutil
@@ -17,7 +19,9 @@ SOURCE_ENDINGS = (".py", ".yaml", ".h", ".cpp", ".cu")
 
 
 class Stopped(BaseException):
-    """Training was asked to stop by a signal and has written a checkpoint. Not an Exception: nobody on the way may swallow it."""
+    """Training was asked to stop by a signal and has written a checkpoint. Not an Exception: nobody
+    on the way may swallow it.
+    """
 
     def __init__(self, signum: int, step: int) -> None:
         super().__init__(f"stopped by {signal.Signals(signum).name} at step {step}")
@@ -25,7 +29,8 @@ class Stopped(BaseException):
 
 
 class RunRecord(pl.Callback):
-    """Writes ``configs/raw.yaml``, ``configs/parsed.yaml``, ``code/`` and ``cmd.txt`` when training starts.
+    """Writes ``configs/raw.yaml``, ``configs/parsed.yaml``, ``code/`` and ``cmd.txt`` when training
+    starts.
 
     Args:
         folder: the trial's folder.
@@ -63,7 +68,9 @@ class RunRecord(pl.Callback):
 
 
 def copy_sources(source: Path, destination: Path) -> None:
-    """Copy the source files below a folder, leaving out hidden folders and everything that isn't source."""
+    """Copy the source files below a folder, leaving out hidden folders and everything that isn't
+    source.
+    """
     for folder, folders, names in os.walk(source):
         folders[:] = [name for name in folders if not name.startswith((".", "__pycache__"))]
         for name in names:
@@ -74,7 +81,9 @@ def copy_sources(source: Path, destination: Path) -> None:
 
 
 class ProgressBar(pl.callbacks.TQDMProgressBar):
-    """Lightning's bar without the version number; where nobody watches, redrawn now and then instead of every step."""
+    """Lightning's bar without the version number; where nobody watches, redrawn now and then
+    instead of every step.
+    """
 
     def __init__(self) -> None:
         super().__init__(refresh_rate=1 if sys.stderr.isatty() else 100)
@@ -92,11 +101,11 @@ class ProgressBar(pl.callbacks.TQDMProgressBar):
 
 
 class GracefulStop(pl.callbacks.Checkpoint):
-    """Ctrl-C and SIGTERM during training finish the step, write ``last.ckpt`` and raise :class:`Stopped`; so does the last step.
+    """Ctrl-C and SIGTERM during training finish the step, write ``last.ckpt`` and raise
+    :class:`Stopped`; so does the last step.
 
-    A second signal stops at once. As a ``Checkpoint`` it comes after all other callbacks, exactly where ModelCheckpoint saves,
-    so its file is an ordinary one from the middle of a run.
-    """
+    A second signal stops at once. As a ``Checkpoint`` it comes after all other callbacks, exactly
+    where ModelCheckpoint saves, so its file is an ordinary one from the middle of a run."""
 
     def __init__(self, last: Path, checkpoint_io: AtomicCheckpointIO) -> None:
         self.last, self.checkpoint_io = last, checkpoint_io
@@ -106,9 +115,14 @@ class GracefulStop(pl.callbacks.Checkpoint):
     def on_train_start(self, trainer: Any, pl_module: Any) -> None:
         # only the main thread may set handlers; elsewhere signals don't arrive either
         if threading.current_thread() is threading.main_thread():
-            self._earlier = {signum: signal.signal(signum, self._ask) for signum in (signal.SIGINT, signal.SIGTERM)}
+            self._earlier = {
+                signum: signal.signal(signum, self._ask)
+                for signum in (signal.SIGINT, signal.SIGTERM)
+            }
 
-    def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_end(
+        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
         if trainer.global_step == trainer.max_steps:
             self._save(trainer)
         self._stop_if_asked(trainer)
@@ -130,7 +144,9 @@ class GracefulStop(pl.callbacks.Checkpoint):
             raise KeyboardInterrupt
         self.signum = signum
         # print() may not be entered again from a handler
-        os.write(2, b"\nstopping after this step and writing a checkpoint; once more to stop at once\n")
+        os.write(
+            2, b"\nstopping after this step and writing a checkpoint; once more to stop at once\n"
+        )
 
     def _stop_if_asked(self, trainer: Any) -> None:
         if trainer.strategy.reduce_boolean_decision(bool(self.signum), all=False):

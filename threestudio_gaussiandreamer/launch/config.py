@@ -1,9 +1,9 @@
 """The configuration of a run: YAML files, then ``key=value`` overrides, merged, resolved and typed.
 
-Sections, key names, resolvers and the output tree are threestudio's. Two things differ: loading makes no folder, and what is
-text stays text. ``system.prompt_processor.prompt=1984`` and ``prompt=${x}`` on the command line mean these very characters, and
-the folder that is named after a prompt never leaves the output root.
-"""
+Sections, key names, resolvers and the output tree are threestudio's. Two things differ: loading
+makes no folder, and what is text stays text. ``system.prompt_processor.prompt=1984`` and
+``prompt=${x}`` on the command line mean these very characters, and the folder that is named after a
+prompt never leaves the output root."""
 
 import hashlib
 import os
@@ -32,21 +32,38 @@ from ..prompts.prompts import read_prompt
 
 # keys whose value is the user's own words, never YAML
 TOP_LEVEL_TEXT = ("name", "tag", "description")
-PROMPT_TEXT = ("prompt", "negative_prompt", "prompt_front", "prompt_side", "prompt_back", "prompt_overhead")
-# a path may hold what YAML reads as a comment or a mapping; only null and interpolations are still special
+PROMPT_TEXT = (
+    "prompt",
+    "negative_prompt",
+    "prompt_front",
+    "prompt_side",
+    "prompt_back",
+    "prompt_overhead",
+)
+# a path may hold what YAML reads as a comment or a mapping; only null and interpolations are still
+# special
 PATH_ENDINGS = ("path", "mesh", "_file", "_dir", "resume", "weights")
-# stands for "${" of a text while interpolations are resolved; a character of Unicode's private use area
+# stands for "${" of a text while interpolations are resolved; a character of Unicode's private use
+# area
 PROTECTED = "$\ue000{"
 MOST_DEPTH = 32
 MOST_NODES = 10_000
 SLUG_BYTES = 64
 SLUG_CHARACTERS = "-_.,+=()'! "
-WINDOWS_DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{i}" for port in ("com", "lpt") for i in range(1, 10))}
+WINDOWS_DEVICES = {
+    "con",
+    "prn",
+    "aux",
+    "nul",
+    *(f"{port}{i}" for port in ("com", "lpt") for i in range(1, 10)),
+}
 
 
 @dataclass
 class ExperimentConfig:
-    """What a YAML file may hold at its top level; the second block is computed, and accepted from a ``parsed.yaml``."""
+    """What a YAML file may hold at its top level; the second block is computed, and accepted from a
+    ``parsed.yaml``.
+    """
 
     name: str = "default"
     description: str = ""
@@ -72,16 +89,20 @@ class ExperimentConfig:
 
 
 def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus: int = 1) -> Any:
-    """The run that these YAML files (later ones win) and ``key=value`` overrides describe; makes no folder.
+    """The run that these YAML files (later ones win) and ``key=value`` overrides describe; makes no
+    folder.
 
     Returns:
         an :class:`ExperimentConfig` as a DictConfig without interpolations.
 
     Raises:
-        UserError: a file can't be read, an override isn't ``key=value``, a top-level key is unknown, a ``???`` or an
-            interpolation is left open, a value has the wrong type.
+        UserError: a file can't be read, an override isn't ``key=value``, a top-level key is
+            unknown, a ``???`` or an interpolation is left open, a value has the wrong type.
     """
-    sources = [_with_prompt_from_file(source) for source in [*map(read_yaml, paths), parse_overrides(cli_args)]]
+    sources = [
+        _with_prompt_from_file(source)
+        for source in [*map(read_yaml, paths), parse_overrides(cli_args)]
+    ]
     merged = _merge(sources)
     merged.n_gpus = n_gpus
     _require_mandatory(merged)
@@ -92,7 +113,9 @@ def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus:
 
 
 def dump_config(path: str | os.PathLike, cfg: Any) -> None:
-    """Write a configuration so that :func:`load_config` reads the same run back; what it was resumed from is left out."""
+    """Write a configuration so that :func:`load_config` reads the same run back; what it was
+    resumed from is left out.
+    """
     plain = OmegaConf.create(OmegaConf.to_container(cfg, resolve=False))
     if "resume" in plain:
         plain.resume = None
@@ -101,10 +124,12 @@ def dump_config(path: str | os.PathLike, cfg: Any) -> None:
 
 
 def read_yaml(path: str | os.PathLike) -> DictConfig:
-    """One YAML file as a mapping; prompts that look like numbers or booleans (``prompt: 1984``) are still text.
+    """One YAML file as a mapping; prompts that look like numbers or booleans (``prompt: 1984``) are
+    still text.
 
     Raises:
-        UserError: the file is missing, isn't UTF-8, isn't YAML, or isn't a mapping; with line and column.
+        UserError: the file is missing, isn't UTF-8, isn't YAML, or isn't a mapping; with line and
+            column.
     """
     try:
         source = Path(path).read_text(encoding="utf-8-sig")
@@ -113,9 +138,13 @@ def read_yaml(path: str | os.PathLike) -> DictConfig:
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"the configuration {path} can't be read: {error}") from error
     except (yaml.YAMLError, OmegaConfBaseException) as error:
-        raise UserError(f"the configuration {path} isn't valid YAML: {_yaml_problem(error)}") from error
+        raise UserError(
+            f"the configuration {path} isn't valid YAML: {_yaml_problem(error)}"
+        ) from error
     if not isinstance(content, DictConfig):
-        raise UserError(f"the configuration {path} must hold sections and keys, such as 'name: demo'")
+        raise UserError(
+            f"the configuration {path} must hold sections and keys, such as 'name: demo'"
+        )
     _require_words(content, f"the configuration {path}")
     _restore_text(content, node)
     _map_strings(content, _protect_escaped)
@@ -123,7 +152,8 @@ def read_yaml(path: str | os.PathLike) -> DictConfig:
 
 
 def parse_overrides(arguments: Iterable[str]) -> DictConfig:
-    """``key.of.section=value`` arguments as a mapping. Values are YAML, except text and paths, which are taken as they are.
+    """``key.of.section=value`` arguments as a mapping. Values are YAML, except text and paths,
+    which are taken as they are.
 
     Raises:
         UserError: an argument that isn't ``key=value``, or whose value isn't YAML.
@@ -132,21 +162,30 @@ def parse_overrides(arguments: Iterable[str]) -> DictConfig:
     for argument in arguments:
         key, equals, value = argument.partition("=")
         if not equals or not key or not (key[0].isalpha() or key[0] == "_"):
-            raise UserError(f"{argument!r} isn't an override: expected key=value, such as trainer.max_steps=1200")
+            raise UserError(
+                f"{argument!r} isn't an override: expected key=value, such as "
+                "trainer.max_steps=1200"
+            )
         try:
             _override(overrides, key, _valid_text(key, value))
         except (yaml.YAMLError, OmegaConfBaseException) as error:
-            raise UserError(f"the value of {key} isn't valid YAML: {_yaml_problem(error)}") from error
+            raise UserError(
+                f"the value of {key} isn't valid YAML: {_yaml_problem(error)}"
+            ) from error
     _require_words(overrides, "the command line")
     return overrides
 
 
 def safe_name(text: str) -> str:
-    """``text`` as one folder name: itself if it is harmless, else a slug of at most 64 bytes and a hash of the text.
+    """``text`` as one folder name: itself if it is harmless, else a slug of at most 64 bytes and a
+    hash of the text.
 
-    Harmless means letters, digits and ``-_.,+=()'!`` or inner spaces, no leading dot or hyphen, and no device of Windows.
-    """
-    slug = "".join(c if c.isalnum() or c in SLUG_CHARACTERS else "_" for c in unicodedata.normalize("NFC", text))
+    Harmless means letters, digits and ``-_.,+=()'!`` or inner spaces, no leading dot or hyphen, and
+    no device of Windows."""
+    slug = "".join(
+        c if c.isalnum() or c in SLUG_CHARACTERS else "_"
+        for c in unicodedata.normalize("NFC", text)
+    )
     slug = slug.encode()[:SLUG_BYTES].decode(errors="ignore").lstrip("-. ").rstrip(". ")
     if slug and slug == text and slug.split(".")[0].lower() not in WINDOWS_DEVICES:
         return slug
@@ -163,14 +202,18 @@ def _override(overrides: DictConfig, key: str, value: str) -> None:
     if is_text(key):
         OmegaConf.update(overrides, key, protect(value), force_add=True)
     elif key.endswith(PATH_ENDINGS):
-        OmegaConf.update(overrides, key, None if value in ("", "null", "~") else value, force_add=True)
+        OmegaConf.update(
+            overrides, key, None if value in ("", "null", "~") else value, force_add=True
+        )
     else:
         require_modest(value, f"the value of {key}")
         overrides.merge_with_dotlist([f"{key}={value}"])
 
 
 def _valid_text(key: str, value: str) -> str:
-    """The value of a key, which is to be written into ``parsed.yaml``; Python takes other bytes than UTF-8 for lone surrogates."""
+    """The value of a key, which is to be written into ``parsed.yaml``; Python takes other bytes
+    than UTF-8 for lone surrogates.
+    """
     try:
         (key + value).encode()
     except UnicodeEncodeError as error:
@@ -181,24 +224,32 @@ def _valid_text(key: str, value: str) -> str:
 
 
 def require_modest(source: str, what: str) -> None:
-    """Raise UserError where YAML is nested so deeply, or by aliases of aliases stands for so much, that reading it ends in a crash.
+    """Raise UserError where YAML is nested so deeply, or by aliases of aliases stands for so much,
+    that reading it ends in a crash.
 
-    The parser's events come one by one, so nothing is built to find out; libyaml's own recursion would end the process.
-    """
+    The parser's events come one by one, so nothing is built to find out; libyaml's own recursion
+    would end the process."""
     for depth, values in _extent(source):
         if depth > MOST_DEPTH or values >= MOST_NODES:
-            raise UserError(f"{what} must be at most {MOST_DEPTH} levels deep and hold fewer than {MOST_NODES} values")
+            raise UserError(
+                f"{what} must be at most {MOST_DEPTH} levels deep and hold fewer than "
+                f"{MOST_NODES} values"
+            )
 
 
 def _extent(source: str) -> Iterator[tuple[int, int]]:
-    """At each event of the parser: how deep it is, also in interpolations, and for how many values the innermost section stands so far."""
+    """At each event of the parser: how deep it is, also in interpolations, and for how many values
+    the innermost section stands so far.
+    """
     sections: list[tuple[Optional[str], int]] = [(None, 0)]
     anchored: dict[Optional[str], int] = {}
     for event in yaml.parse(source, Loader=yaml.SafeLoader):
         if isinstance(event, yaml.CollectionStartEvent):
             sections.append((event.anchor, 1))
         elif isinstance(event, (yaml.CollectionEndEvent, yaml.ScalarEvent, yaml.AliasEvent)):
-            anchor, count = sections.pop() if isinstance(event, yaml.CollectionEndEvent) else (event.anchor, 1)
+            anchor, count = (
+                sections.pop() if isinstance(event, yaml.CollectionEndEvent) else (event.anchor, 1)
+            )
             if isinstance(event, yaml.AliasEvent):
                 count = anchored.get(anchor, MOST_NODES)  # of itself, which never ends
             anchored[anchor] = count
@@ -212,7 +263,10 @@ def _require_words(content: DictConfig | ListConfig, what: str) -> None:
         return
     for key in content if isinstance(content, DictConfig) else range(len(content)):
         if isinstance(content, DictConfig) and not isinstance(key, str):
-            raise UserError(f"{what} has the key {key!r}, which isn't a word: put it in quotes if it is meant so")
+            raise UserError(
+                f"{what} has the key {key!r}, which isn't a word: put it in quotes if it is "
+                "meant so"
+            )
         child = content._get_node(key)
         if isinstance(child, (DictConfig, ListConfig)):
             _require_words(child, what)
@@ -225,7 +279,9 @@ def _yaml_problem(error: Exception) -> str:
 
 
 def _restore_text(content: DictConfig, node: Any, section: str = "") -> None:
-    """Give text keys that YAML read as a number or boolean their words back; ``node`` is the file as written."""
+    """Give text keys that YAML read as a number or boolean their words back; ``node`` is the file
+    as written.
+    """
     if not isinstance(node, yaml.MappingNode):
         return
     for key_node, value_node in node.value:
@@ -234,12 +290,16 @@ def _restore_text(content: DictConfig, node: Any, section: str = "") -> None:
         key = f"{section}{key_node.value}"
         if isinstance(value_node, yaml.MappingNode):
             _restore_text(content[key_node.value], value_node, f"{key}.")
-        elif is_text(key) and isinstance(content._get_node(key_node.value)._value(), (bool, int, float)):
+        elif is_text(key) and isinstance(
+            content._get_node(key_node.value)._value(), (bool, int, float)
+        ):
             content[key_node.value] = value_node.value
 
 
 def _with_prompt_from_file(source: DictConfig) -> DictConfig:
-    """``prompt_processor.prompt_file`` replaced by a ``prompt`` that is the file's text, so that the tag can be made of it."""
+    """``prompt_processor.prompt_file`` replaced by a ``prompt`` that is the file's text, so that
+    the tag can be made of it.
+    """
     section = OmegaConf.select(source, "system.prompt_processor")
     if not isinstance(section, DictConfig) or section.get("prompt_file") is None:
         return source
@@ -260,7 +320,9 @@ def _merge(sources: list[DictConfig]) -> DictConfig:
         raise UserError(f"the configurations can't be merged: {_explain(error)}") from error
     except TypeError as error:
         clash = next(filter(None, (_clash(a, b) for a, b in combinations(sources, 2))), "a key")
-        raise UserError(f"the configurations can't be merged: {clash} is a list in one and a section in another") from error
+        raise UserError(
+            f"the configurations can't be merged: {clash} is a list in one and a section in another"
+        ) from error
     for section in ("data", "system", "trainer", "checkpoint"):
         # "trainer:" with nothing below it is null in YAML
         if section in merged and merged._get_node(section)._is_none():
@@ -269,11 +331,12 @@ def _merge(sources: list[DictConfig]) -> DictConfig:
 
 
 def _forget_replaced_parts(earlier: DictConfig, later: DictConfig, path: str = "") -> None:
-    """Where ``later`` names another part (``x_type``), drop the options of ``earlier``'s ``x`` that the new part doesn't have.
+    """Where ``later`` names another part (``x_type``), drop the options of ``earlier``'s ``x`` that
+    the new part doesn't have.
 
-    So ``system.geometry.prior_type=random-prior`` is all that it takes to try another prior; what ``later`` itself gives stays. What
-    ``later`` leaves open (``???``) has to be given anew, even if ``earlier`` has a value (OmegaConf would keep that).
-    """
+    So ``system.geometry.prior_type=random-prior`` is all that it takes to try another prior; what
+    ``later`` itself gives stays. What ``later`` leaves open (``???``) has to be given anew, even if
+    ``earlier`` has a value (OmegaConf would keep that)."""
     for key in later:
         if OmegaConf.is_missing(later, key):
             earlier._content.pop(key, None)
@@ -302,7 +365,9 @@ def _clash(a: DictConfig, b: DictConfig, section: str = "") -> Optional[str]:
     """The first key that is a list in one and a section in the other."""
     for key in a:
         one, other = a._get_node(key), b._get_node(key) if key in b else None
-        if isinstance(one, (DictConfig, ListConfig)) and isinstance(other, (DictConfig, ListConfig)):
+        if isinstance(one, (DictConfig, ListConfig)) and isinstance(
+            other, (DictConfig, ListConfig)
+        ):
             if type(one) is not type(other):
                 return f"{section}{key}"
             found = _clash(one, other, f"{section}{key}.") if isinstance(one, DictConfig) else None
@@ -315,17 +380,26 @@ def _require_mandatory(cfg: DictConfig) -> None:
     missing = sorted(_missing_keys(cfg))
     if missing:
         example = "a corgi" if is_text(missing[0]) else "..."
-        raise UserError(f"no value for {', '.join(missing)}: set it in the YAML or as {missing[0]}={example!r}")
+        raise UserError(
+            f"no value for {', '.join(missing)}: set it in the YAML or as {missing[0]}={example!r}"
+        )
 
 
 def _missing_keys(node: DictConfig, section: str = "") -> list[str]:
-    # OmegaConf.missing_keys resolves interpolations on its way, which fails when one leads to a "???"
+    # OmegaConf.missing_keys resolves interpolations on its way, which fails when one leads to a
+    # "???"
     if node._is_none() or node._is_interpolation():
         return []
     children = {f"{section}{key}": node._get_node(key) for key in node}
     missing = [key for key, child in children.items() if child._is_missing()]
-    inner = {key: child for key, child in children.items() if isinstance(child, DictConfig) and key not in missing}
-    return missing + [found for key, child in inner.items() for found in _missing_keys(child, f"{key}.")]
+    inner = {
+        key: child
+        for key, child in children.items()
+        if isinstance(child, DictConfig) and key not in missing
+    }
+    return missing + [
+        found for key, child in inner.items() for found in _missing_keys(child, f"{key}.")
+    ]
 
 
 def _resolve(cfg: DictConfig) -> None:
@@ -342,18 +416,24 @@ def _resolve(cfg: DictConfig) -> None:
 
 
 def protect(text: str) -> str:
-    """``text`` as a value that resolving leaves alone, also where another value refers to it; :func:`_unprotect` ends it.
+    """``text`` as a value that resolving leaves alone, also where another value refers to it;
+    :func:`_unprotect` ends it.
 
     Raises:
         UserError: it is ``???``, which means in every configuration that a value is missing.
     """
     if text == MISSING:
-        raise UserError(f"{MISSING!r} can't be a text: in configurations it means that a value is missing; add a word")
+        raise UserError(
+            f"{MISSING!r} can't be a text: in configurations it means that a value is missing; "
+            "add a word"
+        )
     return text.replace("${", PROTECTED)
 
 
 def _protect_escaped(text: str) -> str:
-    """A string of a YAML whose every ``${`` is escaped holds no interpolation: it is text, as in a ``parsed.yaml``."""
+    """A string of a YAML whose every ``${`` is escaped holds no interpolation: it is text, as in a
+    ``parsed.yaml``.
+    """
     if "${" not in text or re.search(r"(?<!\\)(\\\\)*\$\{", text):
         return text
     return re.sub(r"(\\+)\$\{", lambda match: "\\" * (len(match[1]) // 2) + PROTECTED, text)
@@ -382,7 +462,9 @@ def _explain(error: OmegaConfBaseException) -> str:
 
 
 def register_resolvers() -> None:
-    """The functions that a YAML may call as ``${name:...}``; those that threestudio has registered stay."""
+    """The functions that a YAML may call as ``${name:...}``; those that threestudio has registered
+    stay.
+    """
     resolvers = {
         "calc_exp_lr_decay_rate": lambda factor, n: factor ** (1.0 / n),
         "add": lambda a, b: a + b,
@@ -406,7 +488,9 @@ def register_resolvers() -> None:
 
 
 def _name_folders(cfg: Any) -> None:
-    """``exp_root_dir/name/tag@time``; a run that is resumed from its ``parsed.yaml`` keeps its time, and so its folder."""
+    """``exp_root_dir/name/tag@time``; a run that is resumed from its ``parsed.yaml`` keeps its
+    time, and so its folder.
+    """
     if not cfg.tag and not cfg.use_timestamp:
         raise UserError("a run needs a tag when use_timestamp is false: both name its folder")
     if "\0" in cfg.exp_root_dir:
@@ -414,7 +498,11 @@ def _name_folders(cfg: Any) -> None:
     tag = safe_name(cfg.tag) if cfg.tag else ""
     cfg.exp_dir = escape(os.path.join(cfg.exp_root_dir, safe_name(cfg.name)))
     if cfg.timestamp is None:
-        cfg.timestamp = _new_timestamp(os.path.join(cfg.exp_dir, tag)) if cfg.use_timestamp and cfg.n_gpus == 1 else ""
+        cfg.timestamp = (
+            _new_timestamp(os.path.join(cfg.exp_dir, tag))
+            if cfg.use_timestamp and cfg.n_gpus == 1
+            else ""
+        )
     _set_trial(cfg, tag + cfg.timestamp)
     if cfg.resume == "auto":
         _resume_newest(cfg, tag)
@@ -435,9 +523,11 @@ def _new_timestamp(prefix: str) -> str:
 
 
 def _resume_newest(cfg: Any, tag: str) -> None:
-    """``resume=auto``: go on with this run if it was started before, else with the newest of its tag, else start.
+    """``resume=auto``: go on with this run if it was started before, else with the newest of its
+    tag, else start.
 
-    In its folder it is the readable checkpoint with most steps: where the last one is damaged, the one before it.
+    In its folder it is the readable checkpoint with most steps: where the last one is damaged, the
+      one before it.
     """
     cfg.resume = None
     newest_first = sorted(Path(cfg.exp_dir).glob(f"{glob_escape(tag)}@*"), reverse=True)
@@ -450,4 +540,7 @@ def _resume_newest(cfg: Any, tag: str) -> None:
             cfg.resume = escape(str(path))
             info(f"resume=auto: going on from {path} (step {step})")
             return
-    info(f"resume=auto: no checkpoint of {os.path.join(cfg.exp_dir, tag)} to go on from; starting anew")
+    info(
+        f"resume=auto: no checkpoint of {os.path.join(cfg.exp_dir, tag)} to go on from; "
+        "starting anew"
+    )

@@ -1,9 +1,9 @@
-"""The check of a whole configuration before any work: every key at every depth, every type, every registered name.
+"""The check of a whole configuration before any work: every key at every depth, every type, every
+registered name.
 
-A section ``x`` belongs to the part that the key ``x_type`` beside it names: ``data_type`` and ``data``, ``system.geometry_type``
-and ``system.geometry``, ``system.geometry.prior_type`` and ``system.geometry.prior``. The keys of a section are the fields of its
-part's ``Config``.
-"""
+A section ``x`` belongs to the part that the key ``x_type`` beside it names: ``data_type`` and
+``data``, ``system.geometry_type`` and ``system.geometry``, ``system.geometry.prior_type`` and
+``system.geometry.prior``. The keys of a section are the fields of its part's ``Config``."""
 
 import dataclasses
 import difflib
@@ -41,11 +41,12 @@ LOGGER_KEYS = ("enable", "project", "name")
 
 
 def check_config(cfg: Any) -> None:
-    """Check what :func:`config.load_config` returned against the registered parts and Lightning's signatures.
+    """Check what :func:`config.load_config` returned against the registered parts and Lightning's
+    signatures.
 
     Raises:
-        UserError: the first mistake: an unknown key or name (with the nearest valid one), a value of the wrong type or out of
-            range; the message begins with the full dotted path.
+        UserError: the first mistake: an unknown key or name (with the nearest valid one), a value
+            of the wrong type or out of range; the message begins with the full dotted path.
     """
     if not 0 <= cfg.seed < 2**32:
         raise UserError(f"seed is {cfg.seed}; expected a whole number from 0 to 2^32 - 1")
@@ -60,7 +61,9 @@ def check_config(cfg: Any) -> None:
     _check_file_name("checkpoint.filename", cfg.checkpoint.get("filename"))
     _check_monitor(cfg)
     build("checkpoint", pl.callbacks.ModelCheckpoint, plain(cfg.checkpoint))
-    options = {key: value for key, value in plain(cfg.trainer).items() if key not in NEEDS_PROCESSES}
+    options = {
+        key: value for key, value in plain(cfg.trainer).items() if key not in NEEDS_PROCESSES
+    }
     build("trainer", pl.Trainer, {**options, "devices": 1, "logger": False})
 
 
@@ -77,7 +80,10 @@ def check_part(path: str, type_name: Any, values: Any) -> None:
         if section == key or section not in typed:
             continue
         if not typed[key] and _default(config_class, key):
-            raise UserError(f"{path}.{key} is empty: name a registered part, such as {_default(config_class, key)!r}")
+            raise UserError(
+                f"{path}.{key} is empty: name a registered part, such as "
+                f"{_default(config_class, key)!r}"
+            )
         if typed[key]:
             check_part(f"{path}.{section}", typed[key], typed[section])
 
@@ -123,21 +129,31 @@ def _typed(path: str, values: Any, config_class: type) -> DictConfig:
 
 def _mapping(path: str, values: Any) -> Any:
     if not isinstance(values, Mapping):
-        raise UserError(f"{path} is {values!r}; expected keys and values (for none, write {path.rpartition('.')[2]}: {{}})")
+        raise UserError(
+            f"{path} is {values!r}; expected keys and values (for none, write "
+            f"{path.rpartition('.')[2]}: {{}})"
+        )
     return values
 
 
 def _unknown_key(path: str, key: str, choices: Collection[str]) -> UserError:
     """As ``errors.unknown``, but near by the last name alone: whole paths are always alike."""
     near = difflib.get_close_matches(key, choices, n=3, cutoff=0.6)
-    hint = f"did you mean {' or '.join(repr(f'{path}.{name}') for name in near)}?" if near else f"choose from {', '.join(sorted(choices))}"
+    hint = (
+        f"did you mean {' or '.join(repr(f'{path}.{name}') for name in near)}?"
+        if near
+        else f"choose from {', '.join(sorted(choices))}"
+    )
     return UserError(f"unknown key '{path}.{key}': {hint}")
 
 
 def _check_loss(loss: Any, known: Any) -> None:
     for key, weight in (loss or {}).items():
         if not key.startswith("lambda_"):
-            raise UserError(f"unknown key 'system.loss.{key}': weights of losses are called lambda_<loss>, such as lambda_sds")
+            raise UserError(
+                f"unknown key 'system.loss.{key}': weights of losses are called lambda_<loss>, "
+                "such as lambda_sds"
+            )
         if known is not None:
             names = [name if name.startswith("lambda_") else f"lambda_{name}" for name in known]
             if key not in names:
@@ -161,22 +177,32 @@ def _check_arguments(section: str, values: Any, owner: type) -> None:
         if key in LAUNCHER_SETS:
             raise UserError(f"{section}.{key} is set by {LAUNCHER_SETS[key]}: remove it")
         if key not in parameters:
-            raise _unknown_key(section, key, [name for name in parameters if name not in LAUNCHER_SETS])
+            raise _unknown_key(
+                section, key, [name for name in parameters if name not in LAUNCHER_SETS]
+            )
         _check_type(f"{section}.{key}", value, parameters[key].annotation)
 
 
 def _check_type(path: str, value: Any, annotation: Any) -> None:
-    """Plain types only: what else Lightning accepts (objects, literals) it checks itself when it is built."""
+    """Plain types only: what else Lightning accepts (objects, literals) it checks itself when it is
+    built.
+    """
     accepted = _plain_types(annotation)
-    if not accepted or (isinstance(value, int) and not isinstance(value, bool) and float in accepted):
+    if not accepted or (
+        isinstance(value, int) and not isinstance(value, bool) and float in accepted
+    ):
         return
     if type(value) not in accepted:
-        names = ", ".join(sorted("null" if kind is type(None) else kind.__name__ for kind in accepted))
+        names = ", ".join(
+            sorted("null" if kind is type(None) else kind.__name__ for kind in accepted)
+        )
         raise UserError(f"{path} is {value!r} ({type(value).__name__}); expected one of: {names}")
 
 
 def _plain_types(annotation: Any) -> set[type]:
-    """The types of an annotation like ``Optional[Union[int, float]]``; empty when it holds anything but plain ones."""
+    """The types of an annotation like ``Optional[Union[int, float]]``; empty when it holds anything
+    but plain ones.
+    """
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         inner = [_plain_types(argument) for argument in typing.get_args(annotation)]
         return set().union(*inner) if all(inner) else set()
@@ -188,7 +214,10 @@ def _check_trainer_ranges(trainer: Any) -> None:
         if (trainer.get(key) if trainer.get(key) is not None else lowest) < lowest:
             raise UserError(f"trainer.{key}: expected {lowest} or more, got {trainer[key]}")
     if trainer.get("val_check_interval") in (0, 0.0):
-        raise UserError("trainer.val_check_interval: expected a number of steps above 0 (for no validation: trainer.limit_val_batches=0)")
+        raise UserError(
+            "trainer.val_check_interval: expected a number of steps above 0 (for no "
+            "validation: trainer.limit_val_batches=0)"
+        )
 
 
 def _check_file_name(path: str, name: Any) -> None:
@@ -197,10 +226,11 @@ def _check_file_name(path: str, name: Any) -> None:
 
 
 def _check_monitor(cfg: Any) -> None:
-    """Lightning misses a quantity that nobody logs only when it is to be compared, after the first validation.
+    """Lightning misses a quantity that nobody logs only when it is to be compared, after the first
+    validation.
 
-    A system that knows what it logs has a function ``logged`` from its configuration to those names.
-    """
+    A system that knows what it logs has a function ``logged`` from its configuration to those
+    names."""
     monitor, system = cfg.checkpoint.get("monitor"), find(cfg.system_type)
     logged = getattr(system, "logged", None)
     if monitor is None or logged is None:
@@ -209,7 +239,10 @@ def _check_monitor(cfg: Any) -> None:
     if names is not None and monitor not in names | {"epoch", "step"}:
         raise unknown("checkpoint.monitor", monitor, names)
     if not cfg.trainer.get("log_every_n_steps", 1):
-        raise UserError(f"checkpoint.monitor is {monitor!r}, but with trainer.log_every_n_steps=0 nothing is logged")
+        raise UserError(
+            f"checkpoint.monitor is {monitor!r}, but with trainer.log_every_n_steps=0 nothing "
+            "is logged"
+        )
 
 
 def build(section: str, owner: type, arguments: dict) -> Any:

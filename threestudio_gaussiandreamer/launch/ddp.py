@@ -1,9 +1,10 @@
-"""Lightning's strategy for several GPUs: processes that hold the same cloud and average gradients, without DDP's wrapper.
+"""Lightning's strategy for several GPUs: processes that hold the same cloud and average gradients,
+without DDP's wrapper.
 
-DistributedDataParallel binds its buckets to the parameters that it sees first; densification replaces them. The cloud is small, so
-the system averages the gradients itself (``distributed.average_gradients``), and every process densifies alike from statistics
-that are combined over all of them.
-"""
+DistributedDataParallel binds its buckets to the parameters that it sees first; densification
+replaces them. The cloud is small, so the system averages the gradients itself
+(``distributed.average_gradients``), and every process densifies alike from statistics that are
+combined over all of them."""
 
 import torch
 

@@ -1,9 +1,9 @@
 """The launcher: from a command line to a trained, tested and exported cloud.
 
-``python launch.py --config demo.yaml --train key=value ...``, or the console script ``gaussiandreamer`` with the same arguments.
-A run is a list of stages: choose the device, load the extensions, load and check the configuration, build data and system, make the
-folder, train, test. What the user can mend ends it with one message and exit code 2, before anything is written.
-"""
+``python launch.py --config demo.yaml --train key=value ...``, or the console script
+``gaussiandreamer`` with the same arguments. A run is a list of stages: choose the device, load the
+extensions, load and check the configuration, build data and system, make the folder, train, test.
+What the user can mend ends it with one message and exit code 2, before anything is written."""
 
 import argparse
 import contextlib
@@ -22,7 +22,8 @@ from ..core.errors import Terminated, UserError
 from .options import PROGRAM, announce_device, choose_gpu, find_config, parse_arguments
 
 NOISE = (
-    # Lightning's advice that doesn't apply to an endless stream of cameras made on the fly, or to a run that is resumed
+    # Lightning's advice that doesn't apply to an endless stream of cameras made on the fly, or to a
+    # run that is resumed
     ".*does not have many workers.*",
     ".*Checkpoint directory .* exists and is not empty.*",
     ".*checkpoint that ended before the epoch ended.*",
@@ -41,8 +42,8 @@ def console() -> None:
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run one command line (default: this process's); returns the exit code.
 
-    0 done; 2 something the user can mend, said in one message; 130, 141 and 143 stopped by Ctrl-C, a closed pipe and SIGTERM.
-    """
+    0 done; 2 something the user can mend, said in one message; 130, 141 and 143 stopped by Ctrl-C,
+    a closed pipe and SIGTERM."""
     spin_briefly()
     argv = list(sys.argv[1:] if argv is None else argv)
     try:
@@ -62,7 +63,9 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
         if args.verbose:
             traceback.print_exc()
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        print(f"stopped: nobody reads this run's output any more ({error.strerror})", file=sys.stderr)
+        print(
+            f"stopped: nobody reads this run's output any more ({error.strerror})", file=sys.stderr
+        )
         return 128 + signal.SIGPIPE
     except (KeyboardInterrupt, Terminated) as stop:
         print("stopped", file=sys.stderr)
@@ -70,7 +73,10 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     except SystemExit as stop:
         # nothing of ours does so, and its own code may say that all went well
         *_, place = traceback.extract_tb(stop.__traceback__)
-        print(f"error: {place.filename}:{place.lineno} ended the run with sys.exit({stop.code!r})", file=sys.stderr)
+        print(
+            f"error: {place.filename}:{place.lineno} ended the run with sys.exit({stop.code!r})",
+            file=sys.stderr,
+        )
         return 2
 
 
@@ -82,7 +88,8 @@ def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
         from ..core import typecheck
 
         typecheck.install()
-    # torch and Lightning are imported from here on, so that --help and mistakes in the arguments cost no seconds
+    # torch and Lightning are imported from here on, so that --help and mistakes in the arguments
+    # cost no seconds
     from .. import register_parts
     from .config import load_config
     from .config_check import check_config
@@ -123,11 +130,12 @@ def configure_logging(verbose: bool) -> None:
 
 
 def spin_briefly() -> None:
-    """Let idle OpenMP threads wait for about 0.1 ms before they sleep, unless the user said how; before torch is imported.
+    """Let idle OpenMP threads wait for about 0.1 ms before they sleep, unless the user said how;
+    before torch is imported.
 
-    At once asleep, they are woken for each small operation (a fifth of the demo's time); for milliseconds awake, as is their default,
-    they hold the cores that our own threads, or other programs, wait for. LLVM's and Intel's OpenMP know milliseconds only: none there.
-    """
+    At once asleep, they are woken for each small operation (a fifth of the demo's time); for
+    milliseconds awake, as is their default, they hold the cores that our own threads, or other
+    programs, wait for. LLVM's and Intel's OpenMP know milliseconds only: none there."""
     waits = {"GOMP_SPINCOUNT": "10000", "KMP_BLOCKTIME": "0"}
     if not os.environ.keys() & {"OMP_WAIT_POLICY", *waits}:
         os.environ.update(waits)
@@ -135,7 +143,9 @@ def spin_briefly() -> None:
 
 @contextlib.contextmanager
 def _signals() -> Iterator[None]:
-    """SIGTERM ends the process through ``finally`` blocks, with code 143; afterwards all handlers are what they were."""
+    """SIGTERM ends the process through ``finally`` blocks, with code 143; afterwards all handlers
+    are what they were.
+    """
 
     def end(signum: int, frame: Any) -> None:
         raise Terminated(128 + signum)

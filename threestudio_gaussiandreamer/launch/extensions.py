@@ -1,8 +1,9 @@
-"""Extensions of the user: every module in ``./custom`` is imported, so that its ``@register`` decorators run.
+"""Extensions of the user: every module in ``./custom`` is imported, so that its ``@register``
+decorators run.
 
-As in threestudio a folder with an ``__init__.py`` is loaded under its own name (hyphens are fine, relative imports work), a single
-``part.py`` as ``custom/part``; names that end in ``_disabled`` or begin with a dot are left out.
-"""
+As in threestudio a folder with an ``__init__.py`` is loaded under its own name (hyphens are fine,
+relative imports work), a single ``part.py`` as ``custom/part``; names that end in ``_disabled`` or
+begin with a dot are left out."""
 
 import importlib.util
 import sys
@@ -34,7 +35,9 @@ def _is_extension(entry: Path) -> bool:
 
 
 def _load(entry: Path) -> str:
-    name, file = (entry.name, entry / "__init__.py") if entry.is_dir() else (f"custom/{entry.stem}", entry)
+    name, file = (
+        (entry.name, entry / "__init__.py") if entry.is_dir() else (f"custom/{entry.stem}", entry)
+    )
     loaded = sys.modules.get(name)
     if loaded is not None and Path(loaded.__file__ or "").resolve() == file.resolve():
         return name
@@ -47,7 +50,9 @@ def _load(entry: Path) -> str:
         del sys.modules[name]
         if isinstance(error, Terminated):
             raise
-        raise UserError(f"the extension {entry} can't be imported: {_cause(error, entry)}") from error
+        raise UserError(
+            f"the extension {entry} can't be imported: {_cause(error, entry)}"
+        ) from error
     return name
 
 
@@ -57,5 +62,9 @@ def _cause(error: BaseException, entry: Path) -> str:
     if isinstance(error, SyntaxError) and error.lineno:
         return f"{error.filename}:{error.lineno}: {error.msg}"
     root = str(entry.resolve())
-    inside = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(root)]
+    inside = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if frame.filename.startswith(root)
+    ]
     return f"{inside[-1].filename}:{inside[-1].lineno}: {what}" if inside else what

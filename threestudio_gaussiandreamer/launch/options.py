@@ -1,4 +1,6 @@
-"""Arguments of the launcher, and what they mean before torch is imported: which GPUs, which configuration files."""
+"""Arguments of the launcher, and what they mean before torch is imported: which GPUs, which
+configuration files.
+"""
 
 import argparse
 import os
@@ -18,28 +20,66 @@ PROGRAM = {
 
 
 def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
-    """The arguments as threestudio users know them; what isn't an option is an override ``key=value``."""
+    """The arguments as threestudio users know them; what isn't an option is an override
+    ``key=value``.
+    """
     parser = argparse.ArgumentParser(
         prog=" ".join(PROGRAM),
         description="Turn a prior into a cloud of 3D Gaussians by score distillation.",
-        epilog="Everything else is an override of the configuration: trainer.max_steps=1200 'system.prompt_processor.prompt=a fox'",
+        epilog="Everything else is an override of the configuration: trainer.max_steps=1200 "
+        "'system.prompt_processor.prompt=a fox'",
         allow_abbrev=False,
     )
     parser.add_argument(
         "--config",
         action="append",
         required=True,
-        help="a YAML file, or the name of one in the current folder, in configs/ or among those that come along; "
+        help="a YAML file, or the name of one in the current folder, in configs/ or among "
+        "those that come along; "
         "given several times, later ones win",
     )
     stage = parser.add_mutually_exclusive_group(required=True)
-    stage.add_argument("--train", dest="stage", action="store_const", const="train", help="train, then render the test views")
-    stage.add_argument("--validate", dest="stage", action="store_const", const="validate", help="render the validation views")
-    stage.add_argument("--test", dest="stage", action="store_const", const="test", help="render the test views and the video")
-    stage.add_argument("--export", dest="stage", action="store_const", const="export", help="write the cloud in the exporter's formats")
-    parser.add_argument("--gpu", help="0, or 0,1, or cpu; default: GPU 0 if there is one. Ignored where CUDA_VISIBLE_DEVICES is set")
-    parser.add_argument("--verbose", action="store_true", help="more messages, and tracebacks of errors")
-    parser.add_argument("--typecheck", action="store_true", help="check shapes and types of all calls (slow; for development)")
+    stage.add_argument(
+        "--train",
+        dest="stage",
+        action="store_const",
+        const="train",
+        help="train, then render the test views",
+    )
+    stage.add_argument(
+        "--validate",
+        dest="stage",
+        action="store_const",
+        const="validate",
+        help="render the validation views",
+    )
+    stage.add_argument(
+        "--test",
+        dest="stage",
+        action="store_const",
+        const="test",
+        help="render the test views and the video",
+    )
+    stage.add_argument(
+        "--export",
+        dest="stage",
+        action="store_const",
+        const="export",
+        help="write the cloud in the exporter's formats",
+    )
+    parser.add_argument(
+        "--gpu",
+        help="0, or 0,1, or cpu; default: GPU 0 if there is one. Ignored where "
+        "CUDA_VISIBLE_DEVICES is set",
+    )
+    parser.add_argument(
+        "--verbose", action="store_true", help="more messages, and tracebacks of errors"
+    )
+    parser.add_argument(
+        "--typecheck",
+        action="store_true",
+        help="check shapes and types of all calls (slow; for development)",
+    )
     args, args.overrides = parser.parse_known_args(argv)
     for override in args.overrides:
         if override.startswith("-"):
@@ -61,11 +101,16 @@ def choose_gpu(gpu: Optional[str]) -> None:
     elif "CUDA_VISIBLE_DEVICES" not in os.environ:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpu or "0"
     elif gpu is not None:
-        print(f"CUDA_VISIBLE_DEVICES={os.environ['CUDA_VISIBLE_DEVICES']} is set: --gpu {gpu} is ignored", file=sys.stderr)
+        print(
+            f"CUDA_VISIBLE_DEVICES={os.environ['CUDA_VISIBLE_DEVICES']} is set: --gpu {gpu} is "
+            "ignored",
+            file=sys.stderr,
+        )
 
 
 def announce_device(gpu: Optional[str]) -> int:
-    """The number of GPUs that this process sees; says when it runs on the CPU without having been asked to.
+    """The number of GPUs that this process sees; says when it runs on the CPU without having been
+    asked to.
 
     Raises:
         UserError: GPUs were asked for that aren't there.
@@ -92,7 +137,8 @@ def _require_gpus(gpu: str, count: int, version: str, built_for: Optional[str]) 
 
 
 def find_config(name: str) -> Path:
-    """The YAML file that ``--config name`` means: a path, else a bare name in ``configs/`` here or among the packaged ones.
+    """The YAML file that ``--config name`` means: a path, else a bare name in ``configs/`` here or
+    among the packaged ones.
 
     Raises:
         UserError: there is none; the message names the near ones.
@@ -101,10 +147,18 @@ def find_config(name: str) -> Path:
         path = Path(name).expanduser()
         candidates = [path]
         if path.name == name:
-            candidates += [folder / file for folder in config_folders() for file in (name, f"{name}.yaml")]
+            candidates += [
+                folder / file for folder in config_folders() for file in (name, f"{name}.yaml")
+            ]
         found = next((candidate for candidate in candidates if candidate.is_file()), None)
-    except (OSError, ValueError, RuntimeError) as error:  # a name too long, a NUL inside, a "~stranger"
-        raise UserError(f"configuration {name[:200]!r}: not a usable file name ({error})") from error
+    except (
+        OSError,
+        ValueError,
+        RuntimeError,
+    ) as error:  # a name too long, a NUL inside, a "~stranger"
+        raise UserError(
+            f"configuration {name[:200]!r}: not a usable file name ({error})"
+        ) from error
     if found:
         return found
     known = sorted({file.name for folder in config_folders() for file in folder.glob("*.yaml")})
@@ -112,7 +166,9 @@ def find_config(name: str) -> Path:
 
 
 def config_folders() -> list[Path]:
-    """Where bare names are looked up: ``./configs``, the checkout's ``configs/``, the installed package's ``configs/``."""
+    """Where bare names are looked up: ``./configs``, the checkout's ``configs/``, the installed
+    package's ``configs/``.
+    """
     package = Path(__file__).resolve().parents[1]
     folders = [Path("configs"), package / "configs"]
     if (package.parent / "launch.py").is_file():

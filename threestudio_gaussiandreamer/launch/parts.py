@@ -1,4 +1,6 @@
-"""Every module that registers a part, in the order of the rings; importing this module imports them all."""
+"""Every module that registers a part, in the order of the rings; importing this module imports them
+all.
+"""
 
 from importlib import import_module
 

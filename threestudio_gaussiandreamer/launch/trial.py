@@ -1,7 +1,7 @@
 """One trial: its folder, its parts, its trainer, and the stage that was asked for.
 
-``outputs/<name>/<tag>@<time>/{ckpts, configs/{raw,parsed}.yaml, code, save, tb_logs, csv_logs, cmd.txt}``
-"""
+``outputs/<name>/<tag>@<time>/{ckpts, configs/{raw,parsed}.yaml, code, save, tb_logs, csv_logs,
+cmd.txt}``"""
 
 import argparse
 import contextlib
@@ -36,7 +36,8 @@ WRITE_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM),
     *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG),
 )
-# without the first Lightning refuses to read a checkpoint; without the others it would train on from step 0, or with a fresh optimiser
+# without the first Lightning refuses to read a checkpoint; without the others it would train on
+# from step 0, or with a fresh optimiser
 LIGHTNINGS_KEY = "pytorch-lightning_version"
 TRAINING_KEYS = (LIGHTNINGS_KEY, "loops", "optimizer_states")
 
@@ -52,8 +53,21 @@ class Trial:
         n_gpus: GPUs to use; 0 for the CPU.
     """
 
-    def __init__(self, cfg: Any, args: argparse.Namespace, config_paths: Sequence[Path], command: str, n_gpus: int) -> None:
-        self.cfg, self.args, self.config_paths, self.command, self.n_gpus = cfg, args, config_paths, command, n_gpus
+    def __init__(
+        self,
+        cfg: Any,
+        args: argparse.Namespace,
+        config_paths: Sequence[Path],
+        command: str,
+        n_gpus: int,
+    ) -> None:
+        self.cfg, self.args, self.config_paths, self.command, self.n_gpus = (
+            cfg,
+            args,
+            config_paths,
+            command,
+            n_gpus,
+        )
         self.folder = Path(cfg.trial_dir)
         self.last = self.folder / "ckpts" / "last.ckpt"
         self.made: Optional[Path] = None
@@ -64,18 +78,25 @@ class Trial:
         """Build everything, then run the stage; returns the exit code.
 
         Raises:
-            UserError: something the user can mend; a folder that was made for this run and holds no result is removed again.
+            UserError: something the user can mend; a folder that was made for this run and holds no
+                result is removed again.
         """
         try:
             self.start()
-            alone = sole_run(self.folder) if self.args.stage == "train" else contextlib.nullcontext()
+            alone = (
+                sole_run(self.folder) if self.args.stage == "train" else contextlib.nullcontext()
+            )
             with alone, lightning_errors(self.cfg.resume), write_errors(self.folder):
                 getattr(self, self.args.stage)()
             self.summarize()
         except (UserError, KeyboardInterrupt, SystemExit) as stop:
             self.discard_if_unused()
             # between training and its end, while the test views are rendered
-            if self.args.stage == "train" and not isinstance(stop, UserError) and self.last.is_file():
+            if (
+                self.args.stage == "train"
+                and not isinstance(stop, UserError)
+                and self.last.is_file()
+            ):
                 print(f"to go on: {self.resume_command()}", flush=True)
             raise
         except Stopped as stop:
@@ -90,7 +111,9 @@ class Trial:
         # one seed for all processes: what they draw differently, they draw by their rank
         pl.seed_everything(self.cfg.seed, workers=True)
         self.data = find(self.cfg.data_type)(self.cfg.data)
-        self.system = find(self.cfg.system_type)(self.cfg.system, resumed=self.cfg.resume is not None)
+        self.system = find(self.cfg.system_type)(
+            self.cfg.system, resumed=self.cfg.resume is not None
+        )
         if checkpoint is not None and self.args.stage != "train":
             self.system.set_resume_status(*checkpoint)
         self.make_folder()
@@ -98,25 +121,43 @@ class Trial:
         self.trainer = self.build_trainer()
 
     def read_resume(self) -> Optional[tuple[int, int]]:
-        """The epoch and step of the checkpoint to resume from, which is read whole here so that damage shows early."""
+        """The epoch and step of the checkpoint to resume from, which is read whole here so that
+        damage shows early.
+        """
         if self.cfg.resume is None:
             if self.args.stage != "train":
                 if "resume=auto" in self.args.overrides:
-                    raise UserError(f"resume=auto: there is no checkpoint to --{self.args.stage}; train first, or look at name and tag")
-                warn(f"no checkpoint given (resume=...): --{self.args.stage} shows what training would start from")
+                    raise UserError(
+                        f"resume=auto: there is no checkpoint to --{self.args.stage}; train "
+                        "first, or look at name and tag"
+                    )
+                warn(
+                    f"no checkpoint given (resume=...): --{self.args.stage} shows what "
+                    "training would start from"
+                )
             return None
         checkpoint = load_checkpoint(self.cfg.resume)
-        missing = [key for key in (TRAINING_KEYS if self.args.stage == "train" else (LIGHTNINGS_KEY,)) if key not in checkpoint]
+        missing = [
+            key
+            for key in (TRAINING_KEYS if self.args.stage == "train" else (LIGHTNINGS_KEY,))
+            if key not in checkpoint
+        ]
         if missing:
-            raise UserError(f"{self.cfg.resume} isn't a training checkpoint: it has no {', '.join(missing)}, which Lightning writes")
+            raise UserError(
+                f"{self.cfg.resume} isn't a training checkpoint: it has no "
+                f"{', '.join(missing)}, which Lightning writes"
+            )
         self.resumed_step = checkpoint["global_step"]
         return checkpoint["epoch"], self.resumed_step
 
-    # -- the stages ----------------------------------------------------------------------------------------------------------
+    # -- the stages --------------------------------------------------------------------------------
 
     def train(self) -> None:
         if 0 <= self.cfg.trainer.get("max_steps", -1) <= self.resumed_step:
-            info(f"the checkpoint is at step {self.resumed_step} of {self.cfg.trainer.max_steps}: nothing is left to train")
+            info(
+                f"the checkpoint is at step {self.resumed_step} of "
+                f"{self.cfg.trainer.max_steps}: nothing is left to train"
+            )
         self.trainer.fit(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
         self.trainer.test(self.system, datamodule=self.data)
 
@@ -135,11 +176,15 @@ class Trial:
         if summary and self.trainer.is_global_zero:
             print(summary, flush=True)
 
-    # -- the trainer ---------------------------------------------------------------------------------------------------------
+    # -- the trainer -------------------------------------------------------------------------------
 
     def build_trainer(self) -> Any:
         """Lightning's Trainer on the chosen device."""
-        options = {"enable_model_summary": False, "enable_progress_bar": True, **plain(self.cfg.trainer)}
+        options = {
+            "enable_model_summary": False,
+            "enable_progress_bar": True,
+            **plain(self.cfg.trainer),
+        }
         checkpoint_io = AtomicCheckpointIO()
         training = self.args.stage == "train"
         callbacks = [ProgressBar()] if options["enable_progress_bar"] else []
@@ -158,7 +203,10 @@ class Trial:
 
     def build_loggers(self) -> list:
         folder = str(self.folder)
-        loggers = [pl.loggers.TensorBoardLogger(folder, name="tb_logs"), pl.loggers.CSVLogger(folder, name="csv_logs")]
+        loggers = [
+            pl.loggers.TensorBoardLogger(folder, name="tb_logs"),
+            pl.loggers.CSVLogger(folder, name="csv_logs"),
+        ]
         return loggers + list(self.system.get_loggers())
 
     def training_callbacks(self, checkpoint_io: AtomicCheckpointIO) -> list:
@@ -171,7 +219,7 @@ class Trial:
             GracefulStop(self.last, checkpoint_io),
         ]
 
-    # -- the folder ----------------------------------------------------------------------------------------------------------
+    # -- the folder --------------------------------------------------------------------------------
 
     def make_folder(self) -> None:
         missing = [folder for folder in (self.folder, *self.folder.parents) if not folder.exists()]
@@ -207,7 +255,9 @@ def require_writable(folder: Path) -> None:
     """
     existing: Optional[Path] = None
     try:
-        existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+        existing = next(
+            parent for parent in (folder, *folder.absolute().parents) if parent.exists()
+        )
         with tempfile.TemporaryFile(dir=existing) as file:
             file.write(b"0")
     except OSError as error:
@@ -216,12 +266,15 @@ def require_writable(folder: Path) -> None:
 
 def _unwritable(folder: Path, error: Exception, where: str = "") -> UserError:
     why = getattr(error, "strerror", None) or str(error)
-    return UserError(f"the output folder {folder} can't be written: {why}{where}; choose another exp_root_dir")
+    return UserError(
+        f"the output folder {folder} can't be written: {why}{where}; choose another exp_root_dir"
+    )
 
 
 @contextlib.contextmanager
 def sole_run(folder: Path) -> Iterator[None]:
-    """Keeps other runs from training in a folder; the system lets go of it when this process ends, however it ends.
+    """Keeps other runs from training in a folder; the system lets go of it when this process ends,
+    however it ends.
 
     Raises:
         UserError: another run trains in it.
@@ -234,7 +287,9 @@ def sole_run(folder: Path) -> Iterator[None]:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         os.close(descriptor)
-        raise UserError(f"another run is training in {folder}: wait until it ends, or choose another tag") from error
+        raise UserError(
+            f"another run is training in {folder}: wait until it ends, or choose another tag"
+        ) from error
     except OSError:
         pass  # a file system without locks
     try:
@@ -248,8 +303,8 @@ def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
     """Lightning's ways of ending, translated.
 
     Raises:
-        UserError: the checkpoint's parameters or optimiser aren't those of this configuration, or the trainer's options don't
-            go together with what is to be run.
+        UserError: the checkpoint's parameters or optimiser aren't those of this configuration, or
+            the trainer's options don't go together with what is to be run.
         KeyboardInterrupt: Ctrl-C outside of training, of which Lightning makes a SystemExit(1).
     """
     try:
@@ -263,21 +318,31 @@ def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
     except (RuntimeError, ValueError, KeyError) as error:
         if isinstance(error, ValueError) and _raised_by_lightning(error):
             raise UserError(f"trainer: {str(error).strip()}") from error
-        if checkpoint is None or isinstance(error, UserError) or not (is_mismatch(error) or _raised_by_lightning(error)):
+        if (
+            checkpoint is None
+            or isinstance(error, UserError)
+            or not (is_mismatch(error) or _raised_by_lightning(error))
+        ):
             raise
-        raise UserError(f"the checkpoint {checkpoint} was made by another configuration: {str(error).strip()}") from error
+        raise UserError(
+            f"the checkpoint {checkpoint} was made by another configuration: {str(error).strip()}"
+        ) from error
 
 
 @contextlib.contextmanager
 def write_errors(folder: Path) -> Iterator[None]:
-    """What the system says while results are written below ``folder``, as a message, also where a logger's thread writes.
+    """What the system says while results are written below ``folder``, as a message, also where a
+    logger's thread writes.
 
     Raises:
         UserError: the disk is full, or something else is where a file or folder is to be made.
     """
 
     def said(error: OSError) -> str:
-        return f"cannot write {error.filename or f'the results in {folder}'}: {error.strerror}; make room, or choose another exp_root_dir"
+        return (
+            f"cannot write {error.filename or f'the results in {folder}'}: "
+            f"{error.strerror}; make room, or choose another exp_root_dir"
+        )
 
     def in_a_thread(failure: Any) -> None:
         # the logger raises it anew at its next line
@@ -307,4 +372,12 @@ def _raised_by_lightning(error: Exception) -> bool:
 def is_mismatch(error: Exception) -> bool:
     """Whether this is how torch and Lightning say that a state doesn't fit."""
     said = str(error)
-    return any(part in said for part in ("loading state_dict", "loaded state dict", "optimizer_states", "restore training state"))
+    return any(
+        part in said
+        for part in (
+            "loading state_dict",
+            "loaded state dict",
+            "optimizer_states",
+            "restore training state",
+        )
+    )

@@ -1,9 +1,9 @@
-"""Target images by ray casting a mesh: what training is scored against, made without our own splatting.
+"""Target images by ray casting a mesh: what training is scored against, made without our own
+splatting.
 
-Colours are the mesh's own, without lights, from both sides of a face. Cameras are the host's (OpenGL ``c2w``; see
-``cameras.py``): the ray through pixel (i, j) of an H x W image has the camera direction
-``((j + 0.5 - W/2)/f, -(i + 0.5 - H/2)/f, -1)`` with ``f = H / (2 tan(fovy/2))``.
-"""
+Colours are the mesh's own, without lights, from both sides of a face. Cameras are the host's
+(OpenGL ``c2w``; see ``cameras.py``): the ray through pixel (i, j) of an H x W image has the camera
+direction ``((j + 0.5 - W/2)/f, -(i + 0.5 - H/2)/f, -1)`` with ``f = H / (2 tan(fovy/2))``."""
 
 import functools
 import logging
@@ -27,7 +27,9 @@ log = logging.getLogger(__name__)
 
 
 class MeshCaster:
-    """Casts rays at one mesh; what that needs is built once, ``render`` may be called from several threads."""
+    """Casts rays at one mesh; what that needs is built once, ``render`` may be called from several
+    threads.
+    """
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
@@ -35,9 +37,15 @@ class MeshCaster:
         self._vertices = mesh.vertices.astype(np.float32)
 
     def render(
-        self, c2w: Float[np.ndarray, "4 4"], fovy: float, height: int, width: int, supersample: int = 2
+        self,
+        c2w: Float[np.ndarray, "4 4"],
+        fovy: float,
+        height: int,
+        width: int,
+        supersample: int = 2,
     ) -> Float[np.ndarray, "H W 4"]:
-        """Premultiplied colour and coverage in [0, 1], float32, each pixel the mean of a regular supersample^2 grid.
+        """Premultiplied colour and coverage in [0, 1], float32, each pixel the mean of a regular
+        supersample^2 grid.
 
         Args:
             c2w: OpenGL camera to world.
@@ -50,9 +58,16 @@ class MeshCaster:
         return image
 
     def render_views(
-        self, cameras: Iterable[tuple[np.ndarray, float]], height: int, width: int, *, supersample: int = 2, progress: str = ""
+        self,
+        cameras: Iterable[tuple[np.ndarray, float]],
+        height: int,
+        width: int,
+        *,
+        supersample: int = 2,
+        progress: str = "",
     ) -> Float[np.ndarray, "N H W 4"]:
-        """``render`` of several (c2w, fovy) on all cores (embree and numpy's gathers release the GIL).
+        """``render`` of several (c2w, fovy) on all cores (embree and numpy's gathers release the
+        GIL).
 
         ``progress`` names a progress bar, for terminals only; without it there is none.
         """
@@ -62,14 +77,29 @@ class MeshCaster:
         cameras = list(cameras)
         images = np.zeros((len(cameras), height, width, 4), dtype=np.float32)
         # bands instead of pictures, so that one picture occupies all cores too
-        bands = [fill for image, camera in zip(images, cameras, strict=True) for fill in self._bands(image, *camera, supersample)]
+        bands = [
+            fill
+            for image, camera in zip(images, cameras, strict=True)
+            for fill in self._bands(image, *camera, supersample)
+        ]
         if bands:
             with ThreadPoolExecutor(min(len(bands), os.cpu_count() or 1)) as pool:
                 drawn = pool.map(lambda fill: fill(), bands)
-                list(tqdm(drawn, progress, len(bands), unit="band", disable=None if progress else True, leave=False))
+                list(
+                    tqdm(
+                        drawn,
+                        progress,
+                        len(bands),
+                        unit="band",
+                        disable=None if progress else True,
+                        leave=False,
+                    )
+                )
         return images
 
-    def _bands(self, image: Float[np.ndarray, "H W 4"], c2w: np.ndarray, fovy: float, supersample: int) -> list[Callable[[], None]]:
+    def _bands(
+        self, image: Float[np.ndarray, "H W 4"], c2w: np.ndarray, fovy: float, supersample: int
+    ) -> list[Callable[[], None]]:
         """What has to be called to draw one picture, each a group of its rows, in any order."""
         height, width = image.shape[:2]
         c2w = np.asarray(c2w, dtype=np.float64)
@@ -79,12 +109,21 @@ class MeshCaster:
 
         def fill(start: int, end: int) -> None:
             colors = self._cast(c2w, focal, _samples(start, end, supersample) - height / 2, columns)
-            image[start:end, left:right] = colors.reshape(end - start, supersample, right - left, supersample, 4).mean(axis=(1, 3))
+            image[start:end, left:right] = colors.reshape(
+                end - start, supersample, right - left, supersample, 4
+            ).mean(axis=(1, 3))
 
-        return [functools.partial(fill, start, end) for start, end in _row_groups(top, bottom, supersample * len(columns))]
+        return [
+            functools.partial(fill, start, end)
+            for start, end in _row_groups(top, bottom, supersample * len(columns))
+        ]
 
-    def _bounds(self, c2w: np.ndarray, focal: float, height: int, width: int) -> tuple[int, int, int, int]:
-        """The pixel rectangle (top, bottom, left, right) outside which no ray can hit: the vertices' on the screen."""
+    def _bounds(
+        self, c2w: np.ndarray, focal: float, height: int, width: int
+    ) -> tuple[int, int, int, int]:
+        """The pixel rectangle (top, bottom, left, right) outside which no ray can hit: the
+        vertices' on the screen.
+        """
         x, y, z = ((self._vertices - c2w[:3, 3]) @ c2w[:3, :3]).T
         if (-z).min() < NEAR:
             return 0, height, 0, width
@@ -93,7 +132,9 @@ class MeshCaster:
         left, right = np.clip([math.floor(columns.min()), math.ceil(columns.max())], 0, width)
         return int(top), int(bottom), int(left), int(right)
 
-    def _cast(self, c2w: np.ndarray, focal: float, rows: np.ndarray, columns: np.ndarray) -> Float[np.ndarray, "H W 4"]:
+    def _cast(
+        self, c2w: np.ndarray, focal: float, rows: np.ndarray, columns: np.ndarray
+    ) -> Float[np.ndarray, "H W 4"]:
         """Colour and coverage 1 where a sample shows the mesh, zeros elsewhere."""
         face_index, barycentric = self._hits(c2w, focal, rows, columns)
         seen = face_index >= 0
@@ -106,13 +147,18 @@ class MeshCaster:
 def over_background(
     rgba: Float[np.ndarray | Tensor, "... 4"], background: Float[np.ndarray | Tensor, "... 3"]
 ) -> Float[np.ndarray | Tensor, "... 3"]:
-    """Premultiplied ``rgba`` over ``background``: C + (1 - coverage) background. Takes numpy arrays and tensors alike."""
+    """Premultiplied ``rgba`` over ``background``: C + (1 - coverage) background. Takes numpy arrays
+    and tensors alike.
+    """
     return rgba[..., :3] + (1 - rgba[..., 3:]) * background
 
 
 def _require_size(height: int, width: int, supersample: int) -> None:
     if height < 1 or width < 1 or supersample < 1:
-        raise UserError(f"a picture needs a size and supersample of at least 1, not {height}x{width} and {supersample}")
+        raise UserError(
+            f"a picture needs a size and supersample of at least 1, not {height}x{width} and "
+            f"{supersample}"
+        )
 
 
 def _samples(start: int, end: int, supersample: int) -> Float[np.ndarray, " S"]:
@@ -121,16 +167,22 @@ def _samples(start: int, end: int, supersample: int) -> Float[np.ndarray, " S"]:
 
 
 def _row_groups(top: int, bottom: int, rays_per_row: int) -> list[tuple[int, int]]:
-    """Groups of pixel rows with at most RAYS_PER_CAST rays, or one row: memory doesn't grow with size and supersample."""
+    """Groups of pixel rows with at most RAYS_PER_CAST rays, or one row: memory doesn't grow with
+    size and supersample.
+    """
     if not rays_per_row:
         return []
     size = max(1, RAYS_PER_CAST // rays_per_row)
     return [(start, min(start + size, bottom)) for start in range(top, bottom, size)]
 
 
-# Casters: functions (c2w (4, 4), focal, rows (H,), columns (W,)) -> nearest face (H, W), -1 = none, and barycentric (H, W, 3); rows and
-# columns are the places of the samples in pixels from the centre of the picture, rows downwards.
-Hits = Callable[[np.ndarray, float, np.ndarray, np.ndarray], tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]]
+# Casters: functions (c2w (4, 4), focal, rows (H,), columns (W,)) -> nearest face (H, W), -1 = none,
+# and barycentric (H, W, 3); rows and columns are the places of the samples in pixels from the
+# centre of the picture, rows downwards.
+Hits = Callable[
+    [np.ndarray, float, np.ndarray, np.ndarray],
+    tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]],
+]
 
 
 def _fastest_hits(mesh: Mesh) -> Hits:
@@ -143,7 +195,11 @@ def _fastest_hits(mesh: Mesh) -> Hits:
 
 @functools.cache
 def _report_slow_caster(reason: str) -> None:
-    log.warning("embreex is missing (%s): drawing the mesh with plain numpy, which is slower; `pip install embreex` for speed.", reason)
+    log.warning(
+        "embreex is missing (%s): drawing the mesh with plain numpy, which is slower; `pip "
+        "install embreex` for speed.",
+        reason,
+    )
 
 
 def _embree_scene(mesh: Mesh):
@@ -155,33 +211,48 @@ def _embree_scene(mesh: Mesh):
     return scene
 
 
-def _embree_hits(scene, c2w: np.ndarray, focal: float, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _embree_hits(
+    scene, c2w: np.ndarray, focal: float, rows: np.ndarray, columns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     x, y = (columns / focal)[:, None] * c2w[:3, 0], (-rows / focal)[:, None, None] * c2w[:3, 1]
     directions = (x + y - c2w[:3, 2]).astype(np.float32).reshape(-1, 3)
     origins = np.ascontiguousarray(np.broadcast_to(c2w[:3, 3].astype(np.float32), directions.shape))
     hits = scene.run(origins, directions, output=True)
     u, v = hits["u"], hits["v"]
-    barycentric = np.stack([1 - u - v, u, v], axis=1)  # embree's u and v weigh the second and the third corner
+    barycentric = np.stack(
+        [1 - u - v, u, v], axis=1
+    )  # embree's u and v weigh the second and the third corner
     shape = len(rows), len(columns)
     return hits["primID"].reshape(shape), barycentric.reshape(*shape, 3)
 
 
 class TargetCache:
-    """Pictures of a mesh from cameras seen before, as bytes; the one not asked for the longest makes room."""
+    """Pictures of a mesh from cameras seen before, as bytes; the one not asked for the longest
+    makes room.
+    """
 
     def __init__(self, caster: MeshCaster, supersample: int, capacity: int) -> None:
         self.caster, self.supersample, self.capacity = caster, supersample, capacity
         self._pictures: OrderedDict[tuple, Tensor] = OrderedDict()
 
-    def __call__(self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int) -> UInt8[Tensor, "B H W 4"]:
+    def __call__(
+        self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int
+    ) -> UInt8[Tensor, "B H W 4"]:
         """Premultiplied colour and coverage of each camera, on the cameras' device."""
         cameras = list(zip(c2w.detach().float().cpu().numpy(), fovy.detach().tolist(), strict=True))
         keys = [(matrix.tobytes(), angle, height, width) for matrix, angle in cameras]
-        missing = {key: camera for key, camera in zip(keys, cameras, strict=True) if key not in self._pictures}
-        images = self.caster.render_views(missing.values(), height, width, supersample=self.supersample)
+        missing = {
+            key: camera
+            for key, camera in zip(keys, cameras, strict=True)
+            if key not in self._pictures
+        }
+        images = self.caster.render_views(
+            missing.values(), height, width, supersample=self.supersample
+        )
         found = {key: self._pictures[key] for key in keys if key not in missing}
         found |= {
-            key: torch.from_numpy(np.round(image * 255).astype(np.uint8)).to(c2w.device) for key, image in zip(missing, images, strict=True)
+            key: torch.from_numpy(np.round(image * 255).astype(np.uint8)).to(c2w.device)
+            for key, image in zip(missing, images, strict=True)
         }
         self._remember(found)
         return torch.stack([found[key] for key in keys])

@@ -1,11 +1,13 @@
-"""A z-buffer in plain numpy: which triangle a camera sees at every sample, where there is no ray caster for it.
+"""A z-buffer in plain numpy: which triangle a camera sees at every sample, where there is no ray
+caster for it.
 
-No triangle is divided by its depth. With corners a, b, c in camera coordinates and the ray d = (x, y, -1), the three edge functions
-d . (b x c), d . (c x a), d . (a x b) all have the sign of det(a, b, c) exactly where the ray meets the triangle in front of the camera;
-in proportion they are the barycentric weights on the surface, and their sum over the determinant is 1 / depth
-(Olano and Greer 1997, "Triangle Scan Conversion using 2D Homogeneous Coordinates"). So perspective is correct, triangles through the
-plane of the camera need no clipping, and neighbours leave no gap: their common edge has the same function up to its sign.
-"""
+No triangle is divided by its depth. With corners a, b, c in camera coordinates and the ray d = (x,
+y, -1), the three edge functions d . (b x c), d . (c x a), d . (a x b) all have the sign of det(a,
+b, c) exactly where the ray meets the triangle in front of the camera; in proportion they are the
+barycentric weights on the surface, and their sum over the determinant is 1 / depth (Olano and Greer
+1997, "Triangle Scan Conversion using 2D Homogeneous Coordinates"). So perspective is correct,
+triangles through the plane of the camera need no clipping, and neighbours leave no gap: their
+common edge has the same function up to its sign."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -15,9 +17,13 @@ from jaxtyping import Float, Int
 
 NEAR = 1e-6
 PAIRS_PER_STEP = 2**17
-"""(triangle, sample) pairs that are tested at once: the arrays stay in the cache, and memory doesn't grow with the picture."""
+"""(triangle, sample) pairs that are tested at once: the arrays stay in the cache, and memory
+doesn't grow with the picture.
+"""
 SLACK = 1e-6
-"""Pixels around a triangle's box, so that its rounding never decides what the edge functions should."""
+"""Pixels around a triangle's box, so that its rounding never decides what the edge functions
+should.
+"""
 
 
 class Triangles(NamedTuple):
@@ -25,11 +31,15 @@ class Triangles(NamedTuple):
 
     face_index: Int[np.ndarray, " T"]
     edges: Float[np.ndarray, "T 3 3"]
-    """The edge function opposite each corner as a vector to multiply the ray by, >= 0 inside, world units squared."""
+    """The edge function opposite each corner as a vector to multiply the ray by, >= 0 inside, world
+    units squared.
+    """
     volume: Float[np.ndarray, " T"]
     """|det(a, b, c)|: the sum of the edge functions is volume / depth."""
     box: Int[np.ndarray, "T 4"]
-    """First and last row, first and last column of the samples around it; the last ones are exclusive."""
+    """First and last row, first and last column of the samples around it; the last ones are
+    exclusive.
+    """
 
 
 class ZBuffer:
@@ -39,14 +49,20 @@ class ZBuffer:
         self.vertices, self.faces = vertices.astype(np.float64), faces
 
     def hits(
-        self, c2w: Float[np.ndarray, "4 4"], focal: float, rows: Float[np.ndarray, " H"], columns: Float[np.ndarray, " W"]
+        self,
+        c2w: Float[np.ndarray, "4 4"],
+        focal: float,
+        rows: Float[np.ndarray, " H"],
+        columns: Float[np.ndarray, " W"],
     ) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
-        """The nearest face at each sample, -1 = none, and the weights of its three corners (0 where there is none).
+        """The nearest face at each sample, -1 = none, and the weights of its three corners (0 where
+        there is none).
 
         Args:
             c2w: OpenGL camera to world.
             focal: pixels.
-            rows, columns: ascending places of the samples in pixels from the centre of the picture, rows downwards.
+            rows, columns: ascending places of the samples in pixels from the centre of the picture,
+                rows downwards.
         """
         rays = _Rays(-rows / focal, columns / focal)
         corners = ((self.vertices - c2w[:3, 3]) @ c2w[:3, :3])[self.faces]
@@ -64,12 +80,16 @@ class _Rays(NamedTuple):
     y: Float[np.ndarray, " H"]
     x: Float[np.ndarray, " W"]
 
-    def times(self, edge: Float[np.ndarray, "P 3"], sample: Int[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
+    def times(
+        self, edge: Float[np.ndarray, "P 3"], sample: Int[np.ndarray, " P"]
+    ) -> Float[np.ndarray, " P"]:
         row, column = np.divmod(sample, len(self.x))
         return self.x[column] * edge[:, 0] + self.y[row] * edge[:, 1] - edge[:, 2]
 
 
-def _triangles(corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarray, columns: np.ndarray) -> Triangles:
+def _triangles(
+    corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarray, columns: np.ndarray
+) -> Triangles:
     """The triangles that cover a sample's place with their box and aren't seen from the edge."""
     box = _boxes(corners, focal, rows, columns)
     index = np.flatnonzero((box[:, 0] < box[:, 1]) & (box[:, 2] < box[:, 3]))
@@ -81,20 +101,35 @@ def _triangles(corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarr
     return Triangles(index[seen], edges[seen], np.abs(volume[seen]), box[index[seen]])
 
 
-def _boxes(corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarray, columns: np.ndarray) -> Int[np.ndarray, "F 4"]:
-    """The samples around each triangle: (first row, end, first column, end), empty where it is behind the camera."""
+def _boxes(
+    corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarray, columns: np.ndarray
+) -> Int[np.ndarray, "F 4"]:
+    """The samples around each triangle: (first row, end, first column, end), empty where it is
+    behind the camera.
+    """
     points = _in_front(corners)
     with np.errstate(invalid="ignore"):  # NaN is a point that isn't there
-        across, down = focal * points[..., 0] / -points[..., 2], focal * points[..., 1] / points[..., 2]
-    spans = [(rows, np.fmin.reduce(down, 1), np.fmax.reduce(down, 1)), (columns, np.fmin.reduce(across, 1), np.fmax.reduce(across, 1))]
-    ends = [(np.searchsorted(places, low - SLACK), np.searchsorted(places, high + SLACK, "right")) for places, low, high in spans]
+        across, down = (
+            focal * points[..., 0] / -points[..., 2],
+            focal * points[..., 1] / points[..., 2],
+        )
+    spans = [
+        (rows, np.fmin.reduce(down, 1), np.fmax.reduce(down, 1)),
+        (columns, np.fmin.reduce(across, 1), np.fmax.reduce(across, 1)),
+    ]
+    ends = [
+        (np.searchsorted(places, low - SLACK), np.searchsorted(places, high + SLACK, "right"))
+        for places, low, high in spans
+    ]
     box = np.stack([ends[0][0], ends[0][1], ends[1][0], ends[1][1]], axis=1)
     box[np.isnan(spans[0][1])] = 0
     return box
 
 
 def _in_front(corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "F P 3"]:
-    """The corners of what lies beyond the near plane: of those before it the NaN, and where edges cross it the crossings."""
+    """The corners of what lies beyond the near plane: of those before it the NaN, and where edges
+    cross it the crossings.
+    """
     behind = -corners[..., 2] < NEAR
     if not behind.any():
         return corners
@@ -106,8 +141,12 @@ def _in_front(corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "F P 3"]
     return np.concatenate([np.where(behind[..., None], np.nan, corners), crossings], axis=1)
 
 
-def _pairs(box: Int[np.ndarray, "T 4"], width: int) -> Iterator[tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]]:
-    """Every (triangle, sample) with the sample in the triangle's box, a limited number at a time, in the triangles' order."""
+def _pairs(
+    box: Int[np.ndarray, "T 4"], width: int
+) -> Iterator[tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]]:
+    """Every (triangle, sample) with the sample in the triangle's box, a limited number at a time,
+    in the triangles' order.
+    """
     across = box[:, 3] - box[:, 2]
     ends = np.cumsum((box[:, 1] - box[:, 0]) * across)
     starts = np.concatenate([[0], ends[:-1]])
@@ -127,7 +166,9 @@ def _draw(
     nearest: Int[np.ndarray, " S"],
     inverse_depth: Float[np.ndarray, " S"],
 ) -> None:
-    """Put those pairs into the buffers (in place) that lie inside and nearer than what is there; the first of equals stays."""
+    """Put those pairs into the buffers (in place) that lie inside and nearer than what is there;
+    the first of equals stays.
+    """
     total = 0.0
     for corner in range(3):
         value = rays.times(triangles.edges[triangle, corner], sample)

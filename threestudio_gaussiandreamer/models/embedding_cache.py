@@ -24,7 +24,8 @@ class EmbeddingCache:
 
     Args:
         folder: where the files are; made when first written to.
-        model: what the embeddings depend on beside the text, ``hub.fingerprint`` of tokenizer and text encoder.
+        model: what the embeddings depend on beside the text, ``hub.fingerprint`` of tokenizer and
+            text encoder.
     """
 
     def __init__(self, folder: str, model: str) -> None:
@@ -60,11 +61,14 @@ class EmbeddingCache:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UserError(
-                f"the folder of text embeddings {str(self.folder)!r} can't be made ({error.strerror}): "
+                f"the folder of text embeddings {str(self.folder)!r} can't be made "
+                f"({error.strerror}): "
                 "set system.prompt_processor.cache_dir to another one, or use_cache=false"
             ) from error
         with atomic_file(self.path(text)) as file:
-            file.write(save({"embedding": embedding.float().cpu().contiguous()}, metadata={"text": text}))
+            file.write(
+                save({"embedding": embedding.float().cpu().contiguous()}, metadata={"text": text})
+            )
 
     def embed(self, texts: list[str], encode: Encode) -> list[Float[Tensor, "N F"]]:
         """The embeddings of ``texts``; only those that aren't here yet are encoded, and kept."""

@@ -6,9 +6,14 @@ from ..core.errors import UserError
 
 
 def require(extra: str, *modules: str) -> None:
-    """Raise UserError, which says what to install, unless all ``modules`` of the package's ``extra`` can be imported."""
+    """Raise UserError, which says what to install, unless all ``modules`` of the package's
+    ``extra`` can be imported.
+    """
     for module in modules:
         try:
             import_module(module)
         except ImportError as error:
-            raise UserError(f"this part needs {module} ({error}): pip install 'threestudio-gaussiandreamer[{extra}]'") from error
+            raise UserError(
+                f"this part needs {module} ({error}): pip install "
+                f"'threestudio-gaussiandreamer[{extra}]'"
+            ) from error

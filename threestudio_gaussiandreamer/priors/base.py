@@ -1,16 +1,17 @@
-"""What every 3D prior is: a prompt to a checked, coloured point cloud, with an optional layer of ground below it.
+"""What every 3D prior is: a prompt to a checked, coloured point cloud, with an optional layer of
+ground below it.
 
-===============  ============================================================================================
+===============  ===================================================================================
 option           meaning (all priors have these)
-===============  ============================================================================================
+===============  ===================================================================================
 ground           add the paper's layer of randomly coloured points below the object
 ground_points    how many
 ground_size      side of the square they fill, in units of the longest side of the object's box
 ground_height    its z in world units, or ``auto``: the bottom of the object
-===============  ============================================================================================
+===============  ===================================================================================
 
-A prior is one file: a subclass of :class:`Prior` with :meth:`~Prior.generate`, registered under a name.
-"""
+A prior is one file: a subclass of :class:`Prior` with :meth:`~Prior.generate`, registered under a
+name."""
 
 import logging
 from collections.abc import Mapping
@@ -29,12 +30,16 @@ from ..meshes.load import _pose
 logger = logging.getLogger(__name__)
 
 MAX_NON_FINITE = 0.05
-"""More bad points than this fraction mean that the source is broken, not that it has a few stray rows."""
+"""More bad points than this fraction mean that the source is broken, not that it has a few stray
+rows.
+"""
 GREY = 0.5
 
 
 class Prior(BaseObject):
-    """``prior(prompt)`` gives the points that the Gaussians start from; the same prompt and seed give the same points."""
+    """``prior(prompt)`` gives the points that the Gaussians start from; the same prompt and seed
+    give the same points.
+    """
 
     @dataclass
     class Config(BaseObject.Config):
@@ -48,7 +53,10 @@ class Prior(BaseObject):
             """Raises UserError for a value out of range, before any long work."""
             require_positive(cfg, "ground_points", "ground_size")
             if cfg.ground_height != "auto" and not is_number(cfg.ground_height):
-                raise UserError(f"ground_height: expected 'auto' or a number in world units, got {cfg.ground_height!r}")
+                raise UserError(
+                    "ground_height: expected 'auto' or a number in world units, got "
+                    f"{cfg.ground_height!r}"
+                )
 
     cfg: Config
 
@@ -66,23 +74,31 @@ class Prior(BaseObject):
         """The points for ``prompt``: float32, finite, colours in [0, 1], z up, +x the front.
 
         Raises:
-            UserError: the source is missing, unreadable, empty, or more than 5 % of it is not finite.
+            UserError: the source is missing, unreadable, empty, or more than 5 % of it is not
+                finite.
         """
-        cloud = validated(self.generate(prompt, numpy_generator(run_seed(), "prior")), type(self).__name__)
+        cloud = validated(
+            self.generate(prompt, numpy_generator(run_seed(), "prior")), type(self).__name__
+        )
         if not self.cfg.ground:
             return cloud
         return with_ground(cloud, self.cfg, numpy_generator(run_seed(), "ground"))
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
-        """The object's points, which need not be checked yet; ``generator`` is the only source of randomness."""
+        """The object's points, which need not be checked yet; ``generator`` is the only source of
+        randomness.
+        """
         raise NotImplementedError(f"{type(self).__name__}.generate")
 
 
-# ------------------------------------------------------------------------------------------------- checks of options
+# -------------------------------------------------------------------------------------------------
+# checks of options
 
 
 def is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
+    return (
+        isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
+    )
 
 
 def require_positive(cfg: Any, *names: str) -> None:
@@ -106,23 +122,36 @@ def require_path(cfg: Any) -> None:
 
 
 def require_axes(cfg: Any, kind: str) -> None:
-    """Raise UserError unless the options ``up`` and ``front`` name two axes that aren't parallel, for a ``kind`` of file ("glb")."""
+    """Raise UserError unless the options ``up`` and ``front`` name two axes that aren't parallel,
+    for a ``kind`` of file ("glb").
+    """
     _pose(kind, cfg.up, cfg.front)
 
 
 def require_color(cfg: Any) -> None:
-    """Raise UserError unless the option ``color`` is null, "grey", "random" or three numbers in [0, 1]."""
+    """Raise UserError unless the option ``color`` is null, "grey", "random" or three numbers in [0,
+    1].
+    """
     color = cfg.color
     if color is None or color in ("grey", "random"):
         return
-    if isinstance(color, (str, int, float, Mapping)) or len(color) != 3 or not all(is_number(value) and 0 <= value <= 1 for value in color):
-        raise UserError(f"color: expected null, 'grey', 'random' or [red, green, blue] in [0, 1], got {color!r}")
+    if (
+        isinstance(color, (str, int, float, Mapping))
+        or len(color) != 3
+        or not all(is_number(value) and 0 <= value <= 1 for value in color)
+    ):
+        raise UserError(
+            f"color: expected null, 'grey', 'random' or [red, green, blue] in [0, 1], got {color!r}"
+        )
 
 
-# --------------------------------------------------------------------------------------------------- points and colours
+# --------------------------------------------------------------------------------------------------
+# points and colours
 
 
-def chosen_colors(color: Any, count: int, generator: np.random.Generator) -> Float[np.ndarray, "P 3"]:
+def chosen_colors(
+    color: Any, count: int, generator: np.random.Generator
+) -> Float[np.ndarray, "P 3"]:
     """``count`` colours: uniformly random in [0, 1], grey, or all the same."""
     if color == "random":
         return generator.random((count, 3), np.float32)
@@ -133,24 +162,35 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
     """``cloud`` as float32 without the rows that are not finite, its colours clipped to [0, 1].
 
     Raises:
-        UserError: no points, arrays that don't fit each other, or more than 5 % of rows that are not finite.
+        UserError: no points, arrays that don't fit each other, or more than 5 % of rows that are
+            not finite.
     """
     points, colors = (np.asarray(values, np.float32) for values in (cloud.points, cloud.colors))
     if points.ndim != 2 or points.shape[1:] != (3,) or colors.shape != points.shape:
-        raise UserError(f"{name} gave points {points.shape} and colours {colors.shape}: (P, 3) of both were expected")
+        raise UserError(
+            f"{name} gave points {points.shape} and colours {colors.shape}: (P, 3) of both "
+            "were expected"
+        )
     if not len(points):
         raise UserError(f"{name} gave no points: its source is empty")
     finite = np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1)
     if bad := int((~finite).sum()):
         report_non_finite(bad, len(points), name)
     cloud = without_rows(cloud._replace(points=points, colors=colors.clip(0.0, 1.0)), finite)
-    return cloud if cloud.normals is None else cloud._replace(normals=np.nan_to_num(np.asarray(cloud.normals, np.float32)))
+    return (
+        cloud
+        if cloud.normals is None
+        else cloud._replace(normals=np.nan_to_num(np.asarray(cloud.normals, np.float32)))
+    )
 
 
 def report_non_finite(bad: int, count: int, name: str) -> None:
     """Say that rows are dropped, or raise UserError when there are too many of them."""
     if bad > MAX_NON_FINITE * count:
-        raise UserError(f"{bad} of the {count} points of {name} are NaN or infinite (at most 5 % may be): check the source")
+        raise UserError(
+            f"{bad} of the {count} points of {name} are NaN or infinite (at most 5 % may be): "
+            "check the source"
+        )
     logger.warning("%s: dropped %d of %d points that are NaN or infinite", name, bad, count)
 
 
@@ -162,14 +202,22 @@ def without_rows(cloud: PointCloud, keep: Bool[np.ndarray, " P"]) -> PointCloud:
     if faces is not None:
         faces = (np.cumsum(keep) - 1)[faces[keep[faces].all(axis=1)]]
     normals = None if cloud.normals is None else cloud.normals[keep]
-    return PointCloud(points=cloud.points[keep], colors=cloud.colors[keep], normals=normals, faces=faces)
+    return PointCloud(
+        points=cloud.points[keep], colors=cloud.colors[keep], normals=normals, faces=faces
+    )
 
 
 def with_ground(cloud: PointCloud, cfg: Any, generator: np.random.Generator) -> PointCloud:
-    """``cloud`` followed by a horizontal square of randomly coloured points, centred below its box (paper, appendix)."""
+    """``cloud`` followed by a horizontal square of randomly coloured points, centred below its box
+    (paper, appendix).
+    """
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     side = cfg.ground_size * ((high - low).max() or 1.0)
-    points = (low + high) / 2 + generator.uniform(-0.5, 0.5, (cfg.ground_points, 3)) * [side, side, 0.0]
+    points = (low + high) / 2 + generator.uniform(-0.5, 0.5, (cfg.ground_points, 3)) * [
+        side,
+        side,
+        0.0,
+    ]
     points[:, 2] = low[2] if cfg.ground_height == "auto" else cfg.ground_height
     colors = chosen_colors("random", len(points), generator)
     upwards = np.tile(np.float32([0, 0, 1]), (len(points), 1))

@@ -1,23 +1,27 @@
-"""``body-prior``: a posed human body (SMPL-like, any triangle mesh), as the paper starts from a text-to-motion model.
+"""``body-prior``: a posed human body (SMPL-like, any triangle mesh), as the paper starts from a
+text-to-motion model.
 
-============  =================================================================================================
+============  ======================================================================================
 option        meaning
-============  =================================================================================================
-path          the posed body as a mesh file; the package brings none, since SMPL may not be passed on
-scale         half the longest side (the height, when it stands), world units; the released code's is about 1.7
-up, front     the file's axes, ``+x`` to ``-z``; ``auto`` and null: by the kind of file (see ``meshes.py``)
+============  ======================================================================================
+path          the posed body as a mesh file; the package brings none, since SMPL may not be passed
+              on
+scale         half the longest side (the height, when it stands), world units; the released code's
+              is about 1.7
+up, front     the file's axes, ``+x`` to ``-z``; ``auto`` and null: by the kind of file (see
+              ``meshes.py``)
 num_points    points uniform over the surface (the released code), or 0 for the vertices (the paper)
-color         ``random`` (the paper), ``grey``, [r, g, b] in [0, 1], or null for the mesh's own colours
+color         ``random`` (the paper), ``grey``, [r, g, b] in [0, 1], or null for the mesh's own
+              colours
 ground, ...   see ``priors/base.py``
-============  =================================================================================================
+============  ======================================================================================
 
-The points are recentred by their mean. Random colours are uniform in [0, 1]: the released code divides its random
-numbers by 255 before it takes them for spherical harmonics, so that every colour is between 0.5000 and 0.5011, a flat
-grey. ``color: grey`` gives that.
+The points are recentred by their mean. Random colours are uniform in [0, 1]: the released code
+divides its random numbers by 255 before it takes them for spherical harmonics, so that every colour
+is between 0.5000 and 0.5011, a flat grey. ``color: grey`` gives that.
 
-Limits: the prompt is not read; the pose is the file's. At ``scale`` above 1.5 the nearest cameras of the paper's range
-(1.5 to 4.0) are inside the body.
-"""
+Limits: the prompt is not read; the pose is the file's. At ``scale`` above 1.5 the nearest cameras
+of the paper's range (1.5 to 4.0) are inside the body."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +33,15 @@ from ..core.files import existing_file
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.load import load_mesh
-from .base import Prior, chosen_colors, require_axes, require_color, require_not_negative, require_path, require_positive
+from .base import (
+    Prior,
+    chosen_colors,
+    require_axes,
+    require_color,
+    require_not_negative,
+    require_path,
+    require_positive,
+)
 from .mesh import mesh_cloud
 
 
@@ -59,7 +71,9 @@ class BodyPrior(Prior):
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         cfg = self.cfg
-        mesh = load_mesh(existing_file(cfg.path, "body mesh"), scale=cfg.scale, up=cfg.up, front=cfg.front)
+        mesh = load_mesh(
+            existing_file(cfg.path, "body mesh"), scale=cfg.scale, up=cfg.up, front=cfg.front
+        )
         cloud = mesh_cloud(mesh, cfg.num_points, generator)
         if cfg.color is not None:
             cloud = cloud._replace(colors=chosen_colors(cfg.color, len(cloud.points), generator))

@@ -1,4 +1,6 @@
-"""The prior's result beside the run's other files: it is computed once, and a run that starts again in its folder reads it."""
+"""The prior's result beside the run's other files: it is computed once, and a run that starts again
+in its folder reads it.
+"""
 
 import hashlib
 import json
@@ -18,10 +20,11 @@ from .turntable import save_turntable
 
 
 def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud:
-    """``prior(prompt)``, from ``save/prior/points.npz`` when the same prior, options, prompt and seed left it there.
+    """``prior(prompt)``, from ``save/prior/points.npz`` when the same prior, options, prompt and
+    seed left it there.
 
-    ``points.ply`` and ``turntable.gif`` beside it are for people and viewers; without a ``save_dir`` nothing is cached.
-    """
+    ``points.ply`` and ``turntable.gif`` beside it are for people and viewers; without a
+    ``save_dir`` nothing is cached."""
     if save_dir is None:
         return prior(prompt)
     path, key = Path(save_dir) / "prior" / "points.npz", cache_key(prior, prompt)
@@ -32,7 +35,11 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
     cloud = prior(prompt)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path) as file:
-        np.savez_compressed(file, key=np.array(key), **{name: value for name, value in cloud._asdict().items() if value is not None})
+        np.savez_compressed(
+            file,
+            key=np.array(key),
+            **{name: value for name, value in cloud._asdict().items() if value is not None},
+        )
     write_points(path.with_suffix(".ply"), cloud)
     save_turntable(cloud, path.with_name("turntable.gif"))
     return cloud
@@ -40,13 +47,17 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
 
 def cache_key(prior: Any, prompt: str) -> str:
     """A digest of everything that the prior's result depends on."""
-    options = OmegaConf.to_container(prior.cfg) if OmegaConf.is_config(prior.cfg) else vars(prior.cfg)
+    options = (
+        OmegaConf.to_container(prior.cfg) if OmegaConf.is_config(prior.cfg) else vars(prior.cfg)
+    )
     content = [type(prior).__module__, type(prior).__qualname__, options, prompt, run_seed()]
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def read_cache(path: Path, key: str) -> Optional[PointCloud]:
-    """The cached cloud when it was made by the same prior; None when there is none, another one, or a damaged file."""
+    """The cached cloud when it was made by the same prior; None when there is none, another one, or
+    a damaged file.
+    """
     if not path.is_file():
         return None
     try:

@@ -1,18 +1,19 @@
 """``gaussians-prior``: a trained cloud of Gaussians (the PLY of any 3DGS program) as the start.
 
-============  ========================================================================================
+============  ======================================================================================
 option        meaning
-============  ========================================================================================
+============  ======================================================================================
 path          the PLY file
 min_opacity   leave out Gaussians fainter than this, in [0, 1]
 ground, ...   see ``priors/base.py``; not with all attributes
-============  ========================================================================================
+============  ======================================================================================
 
-Called as any prior it gives the centres and the colours of the constant harmonic, to be grown and sized anew; the
-geometry may instead take every attribute from :meth:`GaussiansPrior.gaussians` and go on where that training stopped.
+Called as any prior it gives the centres and the colours of the constant harmonic, to be grown and
+sized anew; the geometry may instead take every attribute from :meth:`GaussiansPrior.gaussians` and
+go on where that training stopped.
 
-Limits: the prompt is not read; positions stay as they are (world units, z up): no turning, no scaling.
-"""
+Limits: the prompt is not read; positions stay as they are (world units, z up): no turning, no
+scaling."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -41,7 +42,9 @@ class GaussiansPrior(Prior):
             Prior.Config.check(cfg)
             require_path(cfg)
             if not (is_number(cfg.min_opacity) and 0 <= cfg.min_opacity <= 1):
-                raise UserError(f"min_opacity: expected a number in [0, 1], got {cfg.min_opacity!r}")
+                raise UserError(
+                    f"min_opacity: expected a number in [0, 1], got {cfg.min_opacity!r}"
+                )
 
     cfg: Config
 
@@ -52,10 +55,14 @@ class GaussiansPrior(Prior):
         """Every attribute of the trained Gaussians, whatever the prompt.
 
         Raises:
-            UserError: missing, damaged or empty, as :meth:`__call__`; or ``ground``, which has no trained attributes.
+            UserError: missing, damaged or empty, as :meth:`__call__`; or ``ground``, which has no
+                trained attributes.
         """
         if self.cfg.ground:
-            raise UserError("ground: ground points have no trained attributes; set system.geometry.keep_attributes=false, or ground=false")
+            raise UserError(
+                "ground: ground points have no trained attributes; set "
+                "system.geometry.keep_attributes=false, or ground=false"
+            )
         return self._read()
 
     @staticmethod
@@ -71,5 +78,8 @@ class GaussiansPrior(Prior):
             report_non_finite(bad, len(keep), str(path))
         keep &= opaque(arrays, self.cfg.min_opacity)
         if not keep.any():
-            raise UserError(f"no Gaussians in {str(path)!r} with an opacity of {self.cfg.min_opacity} or more, among {len(keep)}")
+            raise UserError(
+                f"no Gaussians in {str(path)!r} with an opacity of {self.cfg.min_opacity} or "
+                f"more, among {len(keep)}"
+            )
         return GaussianArrays(*(values[keep] for values in arrays))

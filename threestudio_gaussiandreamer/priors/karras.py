@@ -1,10 +1,11 @@
-"""Sampling a diffusion model of 3D data as Point-E and Shap-E were sampled: Karras noise levels, Heun steps, guidance.
+"""Sampling a diffusion model of 3D data as Point-E and Shap-E were sampled: Karras noise levels,
+Heun steps, guidance.
 
-The networks know discrete timesteps of a "variance preserving" process, ``z_t = sqrt(abar_t) x0 + sqrt(1 - abar_t) eps``; the
-sampler works on ``x = x0 + sigma eps``, which is ``z_t / sqrt(abar_t)`` at ``sigma^2 = (1 - abar_t) / abar_t``. Written from
-Karras et al. 2022, "Elucidating the design space of diffusion-based generative models", Algorithm 2, and from reading how
-the published models are driven (openai/point-e, openai/shap-e, MIT).
-"""
+The networks know discrete timesteps of a "variance preserving" process, ``z_t = sqrt(abar_t) x0 +
+sqrt(1 - abar_t) eps``; the sampler works on ``x = x0 + sigma eps``, which is ``z_t / sqrt(abar_t)``
+at ``sigma^2 = (1 - abar_t) / abar_t``. Written from Karras et al. 2022, "Elucidating the design
+space of diffusion-based generative models", Algorithm 2, and from reading how the published models
+are driven (openai/point-e, openai/shap-e, MIT)."""
 
 import math
 from collections.abc import Callable
@@ -24,13 +25,17 @@ RHO = 7.0
 
 
 def karras_sigmas(steps: int, sigma_min: float, sigma_max: float) -> list[float]:
-    """``steps`` noise levels from ``sigma_max`` to ``sigma_min``, then 0; evenly spaced in ``sigma^(1/7)`` (eq. 5)."""
+    """``steps`` noise levels from ``sigma_max`` to ``sigma_min``, then 0; evenly spaced in
+    ``sigma^(1/7)`` (eq. 5).
+    """
     high, low = sigma_max ** (1 / RHO), sigma_min ** (1 / RHO)
     return [float((high + t * (low - high)) ** RHO) for t in np.linspace(0, 1, steps)] + [0.0]
 
 
 def cosine_alphas_cumprod(steps: int = 1024) -> Float[np.ndarray, "T"]:
-    """abar of the cosine schedule (Nichol and Dhariwal 2021, eq. 17), with every beta at most 0.999."""
+    """abar of the cosine schedule (Nichol and Dhariwal 2021, eq. 17), with every beta at most
+    0.999.
+    """
     curve = np.cos((np.arange(steps + 1) / steps + 0.008) / 1.008 * np.pi / 2) ** 2
     return np.cumprod(1 - np.minimum(1 - curve[1:] / curve[:-1], 0.999))
 
@@ -41,21 +46,31 @@ def linear_alphas_cumprod(steps: int = 1024) -> Float[np.ndarray, "T"]:
 
 
 def timestep_of(sigma: float, alphas_cumprod: Float[np.ndarray, "T"]) -> int:
-    """The timestep whose noise is nearest below ``sigma``: abar is interpolated linearly and the result cut to an integer."""
+    """The timestep whose noise is nearest below ``sigma``: abar is interpolated linearly and the
+    result cut to an integer.
+    """
     level = 1 / (sigma**2 + 1)
-    index = np.interp(-level, -alphas_cumprod, np.arange(len(alphas_cumprod)))  # interp wants rising values
+    index = np.interp(
+        -level, -alphas_cumprod, np.arange(len(alphas_cumprod))
+    )  # interp wants rising values
     return int(index)
 
 
 def guided_denoiser(
-    network: Network, alphas_cumprod: Float[np.ndarray, "T"], *, scale: float = 1.0, prediction: Literal["sample", "epsilon"] = "epsilon"
+    network: Network,
+    alphas_cumprod: Float[np.ndarray, "T"],
+    *,
+    scale: float = 1.0,
+    prediction: Literal["sample", "epsilon"] = "epsilon",
 ) -> Denoiser:
     """A denoiser from a network of discrete timesteps.
 
     Args:
-        network: with ``scale`` other than 1 it gets each item twice, first for the prompt, then for no prompt.
-        scale: 1 = no guidance; else ``x0 = x0_none + scale (x0_prompt - x0_none)``. Each estimate is clamped to [-1, 1]
-            before they are combined, and the result isn't: so the published models were sampled.
+        network: with ``scale`` other than 1 it gets each item twice, first for the prompt, then for
+            no prompt.
+        scale: 1 = no guidance; else ``x0 = x0_none + scale (x0_prompt - x0_none)``. Each estimate
+            is clamped to [-1, 1] before they are combined, and the result isn't: so the published
+            models were sampled.
         prediction: what the network gives, x0 or the noise.
     """
 
@@ -78,14 +93,21 @@ def guided_denoiser(
 
 @torch.no_grad()
 def sample_heun(
-    denoise: Denoiser, noise: Tensor, sigmas: list[float], *, churn: float = 0.0, generator: torch.Generator, progress: str = ""
+    denoise: Denoiser,
+    noise: Tensor,
+    sigmas: list[float],
+    *,
+    churn: float = 0.0,
+    generator: torch.Generator,
+    progress: str = "",
 ) -> Tensor:
     """Karras et al.'s Algorithm 2: second-order steps from pure noise to a sample.
 
     Args:
         noise: standard normal, of the sample's shape and on its device.
         sigmas: falling, ending with 0 (:func:`karras_sigmas`).
-        churn: noise added anew at each step, the paper's S_churn; 0 makes the sampler deterministic.
+        churn: noise added anew at each step, the paper's S_churn; 0 makes the sampler
+            deterministic.
         generator: a CPU generator for that noise.
         progress: names a progress bar on a terminal; without it there is none.
     """

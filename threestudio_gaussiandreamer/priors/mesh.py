@@ -1,20 +1,27 @@
-"""``mesh-prior``: any triangle mesh as the coarse shape, in place of what a text-to-3D model would give.
+"""``mesh-prior``: any triangle mesh as the coarse shape, in place of what a text-to-3D model would
+give.
 
-================  ===========================================================================================
+================  ==================================================================================
 option            meaning
-================  ===========================================================================================
-path              GLB, glTF, OBJ, PLY, STL, OFF, ... with texture, vertex colours, face colours or none (grey)
+================  ==================================================================================
+path              GLB, glTF, OBJ, PLY, STL, OFF, ... with texture, vertex colours, face colours or
+                  none (grey)
 scale             half the longest side of the result, world units
-up, front         the file's axes, ``+x`` to ``-z``; ``auto`` and null: by the kind of file (see ``meshes.py``)
-num_points        0: the mesh's vertices, as the paper takes them from Shap-E; else points uniform over the surface
-color_smoothing   average each colour over this many nearest points: the coarse colours of a text-to-3D model
-color             null: the mesh's colours; ``grey``, ``random`` or [r, g, b] in [0, 1] in their place
-jitter            standard deviation of noise on the positions, in units of ``scale``: a wrong, coarse shape
+up, front         the file's axes, ``+x`` to ``-z``; ``auto`` and null: by the kind of file (see
+                  ``meshes.py``)
+num_points        0: the mesh's vertices, as the paper takes them from Shap-E; else points uniform
+                  over the surface
+color_smoothing   average each colour over this many nearest points: the coarse colours of a
+                  text-to-3D model
+color             null: the mesh's colours; ``grey``, ``random`` or [r, g, b] in [0, 1] in their
+                  place
+jitter            standard deviation of noise on the positions, in units of ``scale``: a wrong,
+                  coarse shape
 ground, ...       see ``priors/base.py``
-================  ===========================================================================================
+================  ==================================================================================
 
-Limits: the prompt is not read. Few vertices make a sparse start: give ``num_points`` for a low-polygon mesh.
-"""
+Limits: the prompt is not read. Few vertices make a sparse start: give ``num_points`` for a
+low-polygon mesh."""
 
 import logging
 from dataclasses import dataclass
@@ -27,7 +34,15 @@ from jaxtyping import Float, Int
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.load import Mesh, load_mesh, sample_surface, surface_colors
-from .base import Prior, chosen_colors, require_axes, require_color, require_not_negative, require_path, require_positive
+from .base import (
+    Prior,
+    chosen_colors,
+    require_axes,
+    require_color,
+    require_not_negative,
+    require_path,
+    require_positive,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -71,7 +86,10 @@ class MeshPrior(Prior):
             cloud = cloud._replace(colors=chosen_colors(cfg.color, len(cloud.points), generator))
         if cfg.color_smoothing > 1:
             cloud = cloud._replace(colors=smoothed_colors(cloud, cfg.color_smoothing))
-        return cloud._replace(points=cloud.points + generator.normal(scale=cfg.jitter * cfg.scale, size=cloud.points.shape))
+        return cloud._replace(
+            points=cloud.points
+            + generator.normal(scale=cfg.jitter * cfg.scale, size=cloud.points.shape)
+        )
 
 
 def mesh_cloud(mesh: Mesh, num_points: int, generator: np.random.Generator) -> PointCloud:
@@ -84,7 +102,9 @@ def mesh_cloud(mesh: Mesh, num_points: int, generator: np.random.Generator) -> P
 
 
 def vertex_cloud(mesh: Mesh) -> PointCloud:
-    """Each vertex with its colour: where a texture has a seam or faces differ, that of one of its faces."""
+    """Each vertex with its colour: where a texture has a seam or faces differ, that of one of its
+    faces.
+    """
     corner = np.zeros(len(mesh.vertices), np.int64)
     corner[mesh.faces.ravel()] = np.arange(mesh.faces.size)  # any corner of any face at this vertex
     colors = surface_colors(mesh, corner // 3, np.eye(3)[corner % 3])
@@ -107,8 +127,12 @@ def smoothed_colors(cloud: PointCloud, neighbours: int) -> Float[np.ndarray, "P 
     neighbours = min(neighbours, len(cloud.points))
 
     def average(points: Float[np.ndarray, "Q 3"]) -> Float[np.ndarray, "Q 3"]:
-        nearest: Int[np.ndarray, "Q K"] = tree.query(points, k=range(1, neighbours + 1), workers=-1)[1]
+        nearest: Int[np.ndarray, "Q K"] = tree.query(
+            points, k=range(1, neighbours + 1), workers=-1
+        )[1]
         return cloud.colors[nearest].mean(axis=1)
 
     starts = range(0, len(cloud.points), SMOOTHING_BLOCK)
-    return np.concatenate([average(cloud.points[start : start + SMOOTHING_BLOCK]) for start in starts])
+    return np.concatenate(
+        [average(cloud.points[start : start + SMOOTHING_BLOCK]) for start in starts]
+    )

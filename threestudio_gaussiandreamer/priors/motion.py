@@ -1,31 +1,37 @@
-"""``motion-prior``: the paper's avatars. A pose from a text-to-motion model, SMPL fitted to it, points on its surface.
+"""``motion-prior``: the paper's avatars. A pose from a text-to-motion model, SMPL fitted to it,
+points on its surface.
 
-=================  =================================================================================================
+=================  =================================================================================
 option             meaning
-=================  =================================================================================================
-motion             joint positions as MDM gives them, NPZ or NPY; ``motion_files.py`` says how to make it of results.npy
+=================  =================================================================================
+motion             joint positions as MDM gives them, NPZ or NPY; ``motion_files.py`` says how to
+                   make it of results.npy
 body_model         the user's NPZ of SMPL, SMPL-H or SMPL-X (neutral); its licence is the user's
 sample             which of the file's motions; null: any
 frame              a number, from 0; or ``clip``: the frame whose body fits the text best
 num_frames         frames of each motion that ``clip`` chooses from, evenly spaced
-candidates         in place of a motion: mesh files of posed bodies, of which CLIP chooses one (the paper's appendix)
+candidates         in place of a motion: mesh files of posed bodies, of which CLIP chooses one (the
+                   paper's appendix)
 clip               any CLIP in transformers' format, a folder or an id of the hub
-clip_text          the text that pictures are compared with; null: the motion for frames, the prompt for candidates
+clip_text          the text that pictures are compared with; null: the motion for frames, the prompt
+                   for candidates
 motion_text        the motion of the prompt; null: found by the rules of ``motion_text.py``
 fit_shape          fit SMPL's shape too; else its mean shape
 max_residual_mm    the mean distance of the joints from the motion's above which a fit is an error
 face_front         turn the body to look at azimuth 0; else it looks where the motion left it
 up, front          of the candidates' files, ``+x`` to ``-z`` (see ``meshes.py``)
 scale              half the longest side, world units
-num_points         points uniform over the surface (the released code), or 0 for the vertices (the paper)
-color              ``random`` (the paper), ``grey``, [r, g, b] in [0, 1], or null for the mesh's own colours
+num_points         points uniform over the surface (the released code), or 0 for the vertices (the
+                   paper)
+color              ``random`` (the paper), ``grey``, [r, g, b] in [0, 1], or null for the mesh's own
+                   colours
 device             ``auto``: the run's GPU, or the CPU; for CLIP, the fit takes seconds on the CPU
 ground, ...        see ``priors/base.py``
-=================  =================================================================================================
+=================  =================================================================================
 
-The motion itself comes from MDM, outside this package: for "Iron man kicks with his left leg" ask it for "Someone kicks
-with the left leg". ``python -m threestudio_gaussiandreamer.priors.motion_text "<prompt>"`` prints that sentence.
-"""
+The motion itself comes from MDM, outside this package: for "Iron man kicks with his left leg" ask
+it for "Someone kicks with the left leg". ``python -m threestudio_gaussiandreamer.priors.motion_text
+"<prompt>"`` prints that sentence."""
 
 import math
 from dataclasses import dataclass, field
@@ -53,8 +59,10 @@ from .placing import chosen_device
 from .smpl_fit import BodyFit, BodyModel, fit_bodies, load_body_model, posed_vertices
 
 JOINTS = (
-    "pelvis, left hip, right hip, lower spine, left knee, right knee, middle spine, left ankle, right ankle, upper spine, left foot,"
-    " right foot, neck, left collar, right collar, head, left shoulder, right shoulder, left elbow, right elbow, left wrist, right wrist,"
+    "pelvis, left hip, right hip, lower spine, left knee, right knee, middle spine, left "
+    "ankle, right ankle, upper spine, left foot,"
+    " right foot, neck, left collar, right collar, head, left shoulder, right shoulder, left "
+    "elbow, right elbow, left wrist, right wrist,"
     " left hand, right hand"
 ).split(", ")
 LEFT, RIGHT = (1, 16), (2, 17)
@@ -106,7 +114,9 @@ class MotionPrior(Prior):
             require_positive(cfg, "num_frames", "max_residual_mm", "scale")
             require_not_negative(cfg, "num_points")
             require_color(cfg)
-            if cfg.frame != "clip" and (isinstance(cfg.frame, bool) or not isinstance(cfg.frame, int) or cfg.frame < 0):
+            if cfg.frame != "clip" and (
+                isinstance(cfg.frame, bool) or not isinstance(cfg.frame, int) or cfg.frame < 0
+            ):
                 raise UserError(f"frame: expected 'clip' or a number from 0, got {cfg.frame!r}")
 
     cfg: Config
@@ -131,10 +141,14 @@ class MotionPrior(Prior):
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         self.preflight()
-        mesh = self._chosen_candidate(prompt) if self.cfg.candidates else self._body_of_motion(prompt)
+        mesh = (
+            self._chosen_candidate(prompt) if self.cfg.candidates else self._body_of_motion(prompt)
+        )
         cloud = mesh_cloud(mesh, self.cfg.num_points, generator)
         if self.cfg.color is not None:
-            cloud = cloud._replace(colors=chosen_colors(self.cfg.color, len(cloud.points), generator))
+            cloud = cloud._replace(
+                colors=chosen_colors(self.cfg.color, len(cloud.points), generator)
+            )
         return cloud._replace(points=cloud.points - cloud.points.mean(axis=0))
 
     def _needs_clip(self) -> bool:
@@ -144,8 +158,15 @@ class MotionPrior(Prior):
         return clip_source(self.cfg.clip)
 
     def _chosen_candidate(self, prompt: str) -> Mesh:
-        meshes = [load_mesh(path, scale=self.cfg.scale, up=self.cfg.up, front=self.cfg.front) for path in self.cfg.candidates]
-        best = self._best(meshes, self.cfg.clip_text or prompt, self.cfg.candidates) if len(meshes) > 1 else 0
+        meshes = [
+            load_mesh(path, scale=self.cfg.scale, up=self.cfg.up, front=self.cfg.front)
+            for path in self.cfg.candidates
+        ]
+        best = (
+            self._best(meshes, self.cfg.clip_text or prompt, self.cfg.candidates)
+            if len(meshes) > 1
+            else 0
+        )
         info(f"body: {self.cfg.candidates[best]}")
         return meshes[best]
 
@@ -159,31 +180,53 @@ class MotionPrior(Prior):
         names = [f"motion {choice.sample}, frame {choice.frame}" for choice in choices]
         best = 0
         if len(choices) > 1:
-            best = self._best(self._fitted(model, targets, ROUGH)[1], self.cfg.clip_text or self._motion_text(prompt), names)
-        fit, meshes = self._fitted(model, targets[[best]], FINE)  # alone, so that it doesn't depend on what else was offered
+            best = self._best(
+                self._fitted(model, targets, ROUGH)[1],
+                self.cfg.clip_text or self._motion_text(prompt),
+                names,
+            )
+        fit, meshes = self._fitted(
+            model, targets[[best]], FINE
+        )  # alone, so that it doesn't depend on what else was offered
         report_residuals(fit.residuals[0], names[best], self.cfg.max_residual_mm)
         return meshes[0]
 
-    def _fitted(self, model: BodyModel, targets: Float[np.ndarray, "F K 3"], iterations: int) -> tuple[BodyFit, list[Mesh]]:
+    def _fitted(
+        self, model: BodyModel, targets: Float[np.ndarray, "F K 3"], iterations: int
+    ) -> tuple[BodyFit, list[Mesh]]:
         fit = fit_bodies(model, targets, fit_shape=self.cfg.fit_shape, iterations=iterations)
-        return fit, world_meshes(model, fit, targets, scale=self.cfg.scale, face_front=self.cfg.face_front)
+        return fit, world_meshes(
+            model, fit, targets, scale=self.cfg.scale, face_front=self.cfg.face_front
+        )
 
     def _motion_text(self, prompt: str) -> str:
         text = self.cfg.motion_text or reduced_prompt(prompt)
         if text is None:
-            warn(f"no verb of motion was found in {prompt!r}: set motion_text, for instance to 'Someone stands with open arms'")
+            warn(
+                f"no verb of motion was found in {prompt!r}: set motion_text, for instance to "
+                "'Someone stands with open arms'"
+            )
         return text or prompt
 
     def _best(self, meshes: list[Mesh], text: str, names: list[str]) -> int:
         """The index of the mesh whose pictures fit ``text`` best, by CLIP."""
         device = chosen_device(self.cfg.device, self.device)
         pictures = np.concatenate([body_pictures(mesh) for mesh in meshes])
-        scores = picture_similarities(self._clip(), pictures, text, device=device).reshape(len(meshes), -1).mean(axis=1)
-        info(f"CLIP for {text!r}: " + ", ".join(f"{name} {score:.4f}" for name, score in zip(names, scores, strict=True)))
+        scores = (
+            picture_similarities(self._clip(), pictures, text, device=device)
+            .reshape(len(meshes), -1)
+            .mean(axis=1)
+        )
+        info(
+            f"CLIP for {text!r}: "
+            + ", ".join(f"{name} {score:.4f}" for name, score in zip(names, scores, strict=True))
+        )
         return int(scores.argmax())
 
 
-def offered_frames(motions: Motions, sample: Optional[int], frame: Any, num_frames: int) -> list[Choice]:
+def offered_frames(
+    motions: Motions, sample: Optional[int], frame: Any, num_frames: int
+) -> list[Choice]:
     """The frames to choose from: the given one, or ``num_frames`` of each motion that is meant.
 
     Raises:
@@ -191,14 +234,23 @@ def offered_frames(motions: Motions, sample: Optional[int], frame: Any, num_fram
     """
     count = len(motions.lengths)
     if sample is not None and not 0 <= sample < count:
-        raise UserError(f"sample: the file has {count} motions, numbered from 0; there is no {sample}")
+        raise UserError(
+            f"sample: the file has {count} motions, numbered from 0; there is no {sample}"
+        )
     if frame != "clip":
         length = motions.lengths[sample or 0]
         if frame >= length:
-            raise UserError(f"frame: motion {sample or 0} has {length} frames, numbered from 0; there is no {frame}")
+            raise UserError(
+                f"frame: motion {sample or 0} has {length} frames, numbered from 0; there is "
+                f"no {frame}"
+            )
         return [Choice(sample or 0, frame)]
     samples = range(count) if sample is None else [sample]
-    return [Choice(s, int(f)) for s in samples for f in np.unique(np.linspace(0, motions.lengths[s] - 1, num_frames).round())]
+    return [
+        Choice(s, int(f))
+        for s in samples
+        for f in np.unique(np.linspace(0, motions.lengths[s] - 1, num_frames).round())
+    ]
 
 
 def report_residuals(residuals: Float[np.ndarray, "K"], name: str, limit: float) -> None:
@@ -207,20 +259,32 @@ def report_residuals(residuals: Float[np.ndarray, "K"], name: str, limit: float)
     found = f"{residuals.mean():.1f} mm mean, {residuals[worst]:.1f} mm at the {JOINTS[worst]}"
     if residuals.mean() > limit:
         raise UserError(
-            f"SMPL does not fit {name}: its joints are off by {found} (max_residual_mm is {limit:g}): are the positions in metres, y up and"
+            f"SMPL does not fit {name}: its joints are off by {found} (max_residual_mm is "
+            f"{limit:g}): are the positions in metres, y up and"
             " in SMPL's order? Choose another frame or raise max_residual_mm"
         )
     info(f"SMPL fitted to {name}: {found}")
 
 
-def world_meshes(model: BodyModel, fit: BodyFit, targets: Float[np.ndarray, "F K 3"], *, scale: float, face_front: bool) -> list[Mesh]:
-    """The fitted bodies with z up, centred, their longest half side ``scale``, looking along +x with ``face_front``."""
+def world_meshes(
+    model: BodyModel,
+    fit: BodyFit,
+    targets: Float[np.ndarray, "F K 3"],
+    *,
+    scale: float,
+    face_front: bool,
+) -> list[Mesh]:
+    """The fitted bodies with z up, centred, their longest half side ``scale``, looking along +x
+    with ``face_front``.
+    """
     meshes = []
     for vertices, joints in zip(posed_vertices(model, fit), targets, strict=True):
         turn = facing(joints) if face_front else np.eye(3)
         vertices = z_up(vertices) @ turn.T
         low, high = vertices.min(axis=0), vertices.max(axis=0)
-        meshes.append(Mesh(scale * (vertices - (low + high) / 2) / ((high - low).max() / 2), model.faces))
+        meshes.append(
+            Mesh(scale * (vertices - (low + high) / 2) / ((high - low).max() / 2), model.faces)
+        )
     return meshes
 
 
@@ -232,9 +296,8 @@ def z_up(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
 def facing(joints: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "3 3"]:
     """The turn about the world's z that makes a body with these joints (y up) look along +x.
 
-    It looks at right angles to the line through its hips and to that through its shoulders; one that lies with these
-    upright has no such direction and isn't turned.
-    """
+    It looks at right angles to the line through its hips and to that through its shoulders; one
+    that lies with these upright has no such direction and isn't turned."""
     joints = z_up(joints)
     across = (joints[list(RIGHT)] - joints[list(LEFT)]).sum(axis=0)
     forward = np.cross([0.0, 0.0, 1.0], across)[:2]
@@ -250,7 +313,11 @@ def body_pictures(mesh: Mesh) -> Float[np.ndarray, "V H W 3"]:
     vertices = mesh.vertices / np.abs(mesh.vertices).max()
     caster = MeshCaster(shaded(Mesh(vertices, mesh.faces)))
     azimuths = torch.tensor(VIEW_AZIMUTHS)
-    views = orbit_c2w(torch.full_like(azimuths, VIEW_ELEVATION), azimuths, torch.full_like(azimuths, VIEW_DISTANCE)).numpy()
+    views = orbit_c2w(
+        torch.full_like(azimuths, VIEW_ELEVATION),
+        azimuths,
+        torch.full_like(azimuths, VIEW_DISTANCE),
+    ).numpy()
     pictures = caster.render_views([(c2w, VIEW_FOVY) for c2w in views], PICTURE_SIZE, PICTURE_SIZE)
     return over_background(pictures, np.ones(3, np.float32))
 
@@ -268,8 +335,12 @@ def shaded(mesh: Mesh) -> Mesh:
 def _check_source(cfg: Any) -> None:
     if bool(cfg.motion) == bool(cfg.candidates):
         raise UserError(
-            "motion: set it to a file of joint positions (with body_model), or set candidates to mesh files of posed bodies, not"
+            "motion: set it to a file of joint positions (with body_model), or set candidates "
+            "to mesh files of posed bodies, not"
             f" {'both' if cfg.motion else 'neither'}"
         )
     if cfg.motion and not cfg.body_model:
-        raise UserError("body_model: set it to your NPZ of SMPL (https://smpl.is.tue.mpg.de), SMPL-H or SMPL-X; the package brings none")
+        raise UserError(
+            "body_model: set it to your NPZ of SMPL (https://smpl.is.tue.mpg.de), SMPL-H or "
+            "SMPL-X; the package brings none"
+        )

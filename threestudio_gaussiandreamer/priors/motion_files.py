@@ -1,10 +1,11 @@
-"""Reading what a text-to-motion model wrote: positions of joints, their texts and lengths, without running a pickle.
+"""Reading what a text-to-motion model wrote: positions of joints, their texts and lengths, without
+running a pickle.
 
-MDM's ``results.npy`` is a pickled dict, and a pickle runs whatever code it holds, so it is refused with the line that turns
-it into an NPZ on the user's own machine. What is read:
+MDM's ``results.npy`` is a pickled dict, and a pickle runs whatever code it holds, so it is refused
+with the line that turns it into an NPZ on the user's own machine. What is read:
 
-* NPZ with ``motion`` (S, J, 3, F), and optionally ``text`` (S,) strings and ``lengths`` (S,) frames;
-* NPY with (S, J, 3, F), or one motion as (J, 3, F) or (F, J, 3).
+* NPZ with ``motion`` (S, J, 3, F), and optionally ``text`` (S,) strings and ``lengths`` (S,)
+frames; * NPY with (S, J, 3, F), or one motion as (J, 3, F) or (F, J, 3).
 
 J is 22 (HumanML3D) or 24 joints in SMPL's order; metres, y up, as HumanML3D has them.
 """
@@ -21,7 +22,8 @@ from ..formats.array_files import PickledArray, read_arrays
 JOINT_COUNTS = (22, 24)
 CONVERT = (
     "python -c \"import numpy as np; d = np.load('results.npy', allow_pickle=True).item(); "
-    "np.savez('results.npz', motion=d['motion'], text=np.array(d['text'], str), lengths=np.array(d['lengths']))\""
+    "np.savez('results.npz', motion=d['motion'], text=np.array(d['text'], str), "
+    "lengths=np.array(d['lengths']))\""
 )
 EXPECTED = "arrays (samples, 22 or 24 joints, 3, frames) were expected"
 
@@ -40,7 +42,8 @@ def read_motions(path: str) -> Motions:
     """The motions of an NPZ or NPY file.
 
     Raises:
-        UserError: missing, pickled, of another layout, without frames, or not finite; the message says what to do.
+        UserError: missing, pickled, of another layout, without frames, or not finite; the message
+            says what to do.
     """
     file = existing_file(path, "motion file")
     try:
@@ -52,7 +55,9 @@ def read_motions(path: str) -> Motions:
     texts = None if "text" not in arrays else [str(text) for text in np.atleast_1d(arrays["text"])]
     for sample, length in zip(positions, lengths, strict=True):
         if not np.isfinite(sample[:length]).all():
-            raise UserError(f"motion file {path!r} has positions that are NaN or infinite: make it again")
+            raise UserError(
+                f"motion file {path!r} has positions that are NaN or infinite: make it again"
+            )
     return Motions(positions, texts, lengths)
 
 
@@ -68,17 +73,31 @@ def _sample_frame_joint(motion: np.ndarray, path: str) -> Float[np.ndarray, "S F
     elif len(shape) == 3 and shape[1] in JOINT_COUNTS and shape[2] == 3:
         ordered = motion[None]
     else:
-        hint = " (6 numbers for a joint are rotations: MDM's HumanML3D models give positions)" if 6 in shape else ""
+        hint = (
+            " (6 numbers for a joint are rotations: MDM's HumanML3D models give positions)"
+            if 6 in shape
+            else ""
+        )
         raise UserError(f"motion file {path!r} holds an array {shape}: {EXPECTED}{hint}")
     if not ordered.size:
         raise UserError(f"motion file {path!r} holds an array {shape}, without a frame")
     return np.ascontiguousarray(ordered, np.float64)
 
 
-def _lengths(lengths: Optional[np.ndarray], positions: Float[np.ndarray, "S F J 3"], path: str) -> list[int]:
+def _lengths(
+    lengths: Optional[np.ndarray], positions: Float[np.ndarray, "S F J 3"], path: str
+) -> list[int]:
     samples, frames = positions.shape[:2]
     if lengths is None:
         return [frames] * samples
-    if lengths.shape != (samples,) or lengths.dtype.kind not in "iu" or (lengths < 1).any() or (lengths > frames).any():
-        raise UserError(f"motion file {path!r}: lengths must be {samples} whole numbers from 1 to {frames}, got {lengths.tolist()}")
+    if (
+        lengths.shape != (samples,)
+        or lengths.dtype.kind not in "iu"
+        or (lengths < 1).any()
+        or (lengths > frames).any()
+    ):
+        raise UserError(
+            f"motion file {path!r}: lengths must be {samples} whole numbers from 1 to "
+            f"{frames}, got {lengths.tolist()}"
+        )
     return [int(length) for length in lengths]

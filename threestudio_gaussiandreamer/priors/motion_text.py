@@ -1,24 +1,35 @@
 """From a prompt to the motion in it: what a text-to-motion model is asked for.
 
-The paper keeps "only the relevant parts related to the motion" and adds a subject: "Iron man kicks with his left leg"
-becomes "Someone kicks with the left leg". Here: the first verb of motion and what follows it, up to the first comma or
-full stop, with "Someone" before it and "the" for "his", "her", "its" and "their". A small list of rules, no language model: the
-user can always give the text.
-"""
+The paper keeps "only the relevant parts related to the motion" and adds a subject: "Iron man kicks
+with his left leg" becomes "Someone kicks with the left leg". Here: the first verb of motion and
+what follows it, up to the first comma or full stop, with "Someone" before it and "the" for "his",
+"her", "its" and "their". A small list of rules, no language model: the user can always give the
+text."""
 
 import re
 from typing import Optional
 
 SUBJECT = "Someone"
 VERBS = (
-    "aim balance bend bow box brace catch cartwheel celebrate charge cheer clap climb crawl crouch curtsy dance dash dive dodge draw"
-    " drink drive duck eat embrace fall fight flex flip fly gallop gesture golf greet grab hang hit hold hop hug hurdle jab jog juggle"
-    " jump kick kneel knock land lean leap lie lift limp look lunge march meditate move nod pace paddle perform pick pirouette play point"
-    " pose practice practise pray pull punch push raise reach read recline rest ride roll row run salute shake shoot shout shrug shuffle"
-    " sing sit skate ski skip slap sleep slide sneak spin sprint squat stand stagger step stomp stop stretch stride strike stroll strum"
-    " stumble swim swing swipe talk tap throw tiptoe toss trot tumble turn twirl twist type wait walk wave wield work yawn yell"
+    "aim balance bend bow box brace catch cartwheel celebrate charge cheer clap climb crawl "
+    "crouch curtsy dance dash dive dodge draw"
+    " drink drive duck eat embrace fall fight flex flip fly gallop gesture golf greet grab "
+    "hang hit hold hop hug hurdle jab jog juggle"
+    " jump kick kneel knock land lean leap lie lift limp look lunge march meditate move nod "
+    "pace paddle perform pick pirouette play point"
+    " pose practice practise pray pull punch push raise reach read recline rest ride roll row "
+    "run salute shake shoot shout shrug shuffle"
+    " sing sit skate ski skip slap sleep slide sneak spin sprint squat stand stagger step "
+    "stomp stop stretch stride strike stroll strum"
+    " stumble swim swing swipe talk tap throw tiptoe toss trot tumble turn twirl twist type "
+    "wait walk wave wield work yawn yell"
 ).split()
-DOUBLED = set("clap dance flip hug hit hop jab jog limp nod pat row run sit skip slap spin squat step stop strum swim tap trot".split()) - {
+DOUBLED = set(
+    (
+        "clap dance flip hug hit hop jab jog limp nod pat row run sit skip slap spin squat step "
+        "stop strum swim tap trot"
+    ).split()
+) - {
     "dance",
     "limp",
     "row",
@@ -50,9 +61,9 @@ PROGRESSIVES = {progressive(verb): verb for verb in VERBS}
 def reduced_prompt(prompt: str) -> Optional[str]:
     """The motion of ``prompt`` as a sentence about someone; None when no verb of motion is found.
 
-    A verb of the kind "kicks" comes before one of the kind "kicking", which may belong to the subject ("a flying fox
-    jumps"), and both before one of the kind "kick", which may be a noun, and which becomes "kicks".
-    """
+    A verb of the kind "kicks" comes before one of the kind "kicking", which may belong to the
+    subject ("a flying fox jumps"), and both before one of the kind "kick", which may be a noun, and
+    which becomes "kicks"."""
     for forms in (FORMS, PROGRESSIVES, {verb: verb for verb in VERBS}):
         for match in re.finditer(r"[A-Za-z]+", prompt):
             if match.start() and match.group().lower() in forms:
@@ -76,4 +87,7 @@ def _sentence(verb: str, rest: str) -> str:
 if __name__ == "__main__":
     import sys
 
-    print(reduced_prompt(" ".join(sys.argv[1:])) or "no verb of motion found: write the sentence yourself")
+    print(
+        reduced_prompt(" ".join(sys.argv[1:]))
+        or "no verb of motion found: write the sentence yourself"
+    )

@@ -1,4 +1,6 @@
-"""What the priors with a network share: their axes and size in the world, their device, their randomness."""
+"""What the priors with a network share: their axes and size in the world, their device, their
+randomness.
+"""
 
 import numpy as np
 import torch
@@ -21,12 +23,18 @@ def placed(cloud: PointCloud, *, front: str, scale: float, normalize: bool) -> P
     """``cloud``, whose z is up, turned so that ``front`` is +x, and scaled.
 
     Args:
-        scale: world units for one unit of the cloud; with ``normalize`` half the longest side of the box, which is centred.
+        scale: world units for one unit of the cloud; with ``normalize`` half the longest side of
+            the box, which is centred.
     """
     axis = AXES[front]
-    points = np.asarray(cloud.points, np.float64) @ np.stack([axis, np.cross(AXES["+z"], axis), AXES["+z"]]).T
+    points = (
+        np.asarray(cloud.points, np.float64)
+        @ np.stack([axis, np.cross(AXES["+z"], axis), AXES["+z"]]).T
+    )
     if normalize:
-        points = (points - (points.min(axis=0) + points.max(axis=0)) / 2) / (half_longest_side(points) or 1.0)
+        points = (points - (points.min(axis=0) + points.max(axis=0)) / 2) / (
+            half_longest_side(points) or 1.0
+        )
     return cloud._replace(points=(scale * points).astype(np.float32))
 
 
@@ -42,7 +50,10 @@ def chosen_device(name: str, default: torch.device) -> torch.device:
         torch.empty(0, device=name)
         return torch.device(name)
     except (RuntimeError, AssertionError) as error:  # a CPU build of PyTorch asserts
-        raise UserError(f"device: {name!r} can't be used here ({str(error).splitlines()[0]}): give 'auto', 'cpu' or 'cuda'") from error
+        raise UserError(
+            f"device: {name!r} can't be used here ({str(error).splitlines()[0]}): give 'auto', "
+            "'cpu' or 'cuda'"
+        ) from error
 
 
 def torch_generator(generator: np.random.Generator) -> torch.Generator:

@@ -1,19 +1,22 @@
-"""``point-cloud-prior``: coloured points from a file, for instance a scan or what another text-to-3D model gave.
+"""``point-cloud-prior``: coloured points from a file, for instance a scan or what another
+text-to-3D model gave.
 
-============  ===============================================================================================
+============  ======================================================================================
 option        meaning
-============  ===============================================================================================
-path          PLY; NPZ with ``points`` and ``colors`` (``normals``); NPY, XYZ, TXT, PTS or CSV with columns x y z or
-              x y z r g b; or any format of trimesh, whose vertices are taken (GLB, OBJ, ...)
-normalize     centre the box and make its longest half side ``scale``; else the points stay as they are
+============  ======================================================================================
+path          PLY; NPZ with ``points`` and ``colors`` (``normals``); NPY, XYZ, TXT, PTS or CSV with
+              columns x y z or x y z r g b; or any format of trimesh, whose vertices are taken (GLB,
+              OBJ, ...)
+normalize     centre the box and make its longest half side ``scale``; else the points stay as they
+              are
 scale         half the longest side, world units, with ``normalize``
-up, front     the file's axes, ``+x`` to ``-z``; by default z is up and +x the front, but for modelling formats
-              (GLB, OBJ, ...), where y is up and +z the front
+up, front     the file's axes, ``+x`` to ``-z``; by default z is up and +x the front, but for
+              modelling formats (GLB, OBJ, ...), where y is up and +z the front
 ground, ...   see ``priors/base.py``
-============  ===============================================================================================
+============  ======================================================================================
 
-Colours are integers up to 255, or numbers up to 1; without any, the points are grey. Limits: the prompt is not read.
-"""
+Colours are integers up to 255, or numbers up to 1; without any, the points are grey. Limits: the
+prompt is not read."""
 
 import logging
 from collections.abc import Callable
@@ -66,7 +69,9 @@ class PointCloudPrior(Prior):
 
 
 def axes_kind(path: Path) -> str:
-    """The mesh format whose axes the file's are by default: those of point clouds have z up, as PLY."""
+    """The mesh format whose axes the file's are by default: those of point clouds have z up, as
+    PLY.
+    """
     return "ply" if path.suffix.lower() in READERS else path.suffix.lower().lstrip(".")
 
 
@@ -92,7 +97,9 @@ def rotated(cloud: PointCloud, rotation: Float[np.ndarray, "3 3"]) -> PointCloud
 
 
 def normalized(cloud: PointCloud, scale: float) -> PointCloud:
-    """The centre of the box in the origin, half its longest side ``scale``; rows that are not finite don't count."""
+    """The centre of the box in the origin, half its longest side ``scale``; rows that are not
+    finite don't count.
+    """
     points = np.asarray(cloud.points, np.float64)
     finite = points[np.isfinite(points).all(axis=1)]
     if not len(finite):
@@ -101,7 +108,8 @@ def normalized(cloud: PointCloud, scale: float) -> PointCloud:
     return cloud._replace(points=(points - centre) * (scale / (half_longest_side(finite) or 1.0)))
 
 
-# ------------------------------------------------------------------------------------------------------------ formats
+# --------------------------------------------------------------------------------------------------
+# formats
 
 
 def read_ply(path: Path) -> PointCloud:
@@ -109,7 +117,9 @@ def read_ply(path: Path) -> PointCloud:
 
 
 def read_npz(path: Path) -> PointCloud:
-    """Arrays ``points`` (P, 3), ``colors`` (P, 3) and ``normals`` (P, 3), of which only the first must be there."""
+    """Arrays ``points`` (P, 3), ``colors`` (P, 3) and ``normals`` (P, 3), of which only the first
+    must be there.
+    """
     arrays = read_arrays(path, "point cloud", ["points"], ["colors", "normals"])
     return _cloud(path, arrays["points"], arrays.get("colors"), arrays.get("normals"))
 
@@ -119,8 +129,12 @@ def read_npy(path: Path) -> PointCloud:
 
 
 def read_text(path: Path) -> PointCloud:
-    """Numbers separated by blanks, commas or semicolons; a first line that isn't numbers, and lines with #, are skipped."""
-    lines = path.read_text("utf-8", errors="replace").replace(",", " ").replace(";", " ").splitlines()
+    """Numbers separated by blanks, commas or semicolons; a first line that isn't numbers, and lines
+    with #, are skipped.
+    """
+    lines = (
+        path.read_text("utf-8", errors="replace").replace(",", " ").replace(";", " ").splitlines()
+    )
     if lines and not _is_row(lines[0]):
         lines = lines[1:]  # a count, or the names of the columns
     return _from_columns(path, np.loadtxt(lines, ndmin=2))
@@ -138,16 +152,27 @@ def read_with_trimesh(path: Path) -> PointCloud:
     import trimesh
 
     if path.suffix.lower().lstrip(".") not in trimesh.available_formats():
-        raise unknown("point cloud format", path.suffix, [*READERS, *("." + name for name in trimesh.available_formats())])
+        raise unknown(
+            "point cloud format",
+            path.suffix,
+            [*READERS, *("." + name for name in trimesh.available_formats())],
+        )
     try:
         parts = trimesh.load_scene(path, process=False).dump()
     except Exception as error:  # each of trimesh's readers fails in its own way
-        raise UserError(f"point cloud {str(path)!r} is not readable: {type(error).__name__}: {error}") from error
+        raise UserError(
+            f"point cloud {str(path)!r} is not readable: {type(error).__name__}: {error}"
+        ) from error
     parts = [part for part in parts if len(getattr(part, "vertices", ()))]
     if not parts:
         raise UserError(f"point cloud {str(path)!r} is empty: it has no vertices")
     clouds = [_cloud(path, part.vertices, _trimesh_colors(part)) for part in parts]
-    return PointCloud(*(np.concatenate(values) for values in zip(*((cloud.points, cloud.colors) for cloud in clouds), strict=True)))
+    return PointCloud(
+        *(
+            np.concatenate(values)
+            for values in zip(*((cloud.points, cloud.colors) for cloud in clouds), strict=True)
+        )
+    )
 
 
 def _trimesh_colors(part: Any) -> Optional[np.ndarray]:
@@ -156,26 +181,43 @@ def _trimesh_colors(part: Any) -> Optional[np.ndarray]:
     if colors is None and getattr(part, "visual", None) is not None and part.visual.defined:
         visual = part.visual.to_color() if part.visual.kind == "texture" else part.visual
         colors = visual.vertex_colors
-    return np.asarray(colors)[:, :3] if colors is not None and len(colors) == len(part.vertices) else None
+    return (
+        np.asarray(colors)[:, :3]
+        if colors is not None and len(colors) == len(part.vertices)
+        else None
+    )
 
 
 def _from_columns(path: Path, rows: np.ndarray) -> PointCloud:
     """x y z, x y z r g b, or (as PTS files have it) x y z intensity r g b."""
     if rows.ndim != 2 or rows.shape[1] not in (3, 6, 7):
-        raise UserError(f"point cloud {str(path)!r} has shape {rows.shape}: rows of x y z or x y z r g b were expected")
+        raise UserError(
+            f"point cloud {str(path)!r} has shape {rows.shape}: rows of x y z or x y z r g b "
+            "were expected"
+        )
     return _cloud(path, rows[:, :3], rows[:, -3:] if rows.shape[1] > 3 else None)
 
 
-def _cloud(path: Path, points: np.ndarray, colors: Optional[np.ndarray], normals: Optional[np.ndarray] = None) -> PointCloud:
+def _cloud(
+    path: Path,
+    points: np.ndarray,
+    colors: Optional[np.ndarray],
+    normals: Optional[np.ndarray] = None,
+) -> PointCloud:
     if colors is None:
         logger.warning("%s has no colours: grey is used", path)
         colors = np.full(np.shape(points), GREY, np.float32)
     colors = np.asarray(colors)
     for name, values in (("points", points), ("colors", colors), ("normals", normals)):
         if values is not None and np.shape(values) != (len(points), 3):
-            raise UserError(f"point cloud {str(path)!r}: {name} has shape {np.shape(values)}, ({len(points)}, 3) was expected")
+            raise UserError(
+                f"point cloud {str(path)!r}: {name} has shape {np.shape(values)}, "
+                f"({len(points)}, 3) was expected"
+            )
     return PointCloud(
-        points=np.asarray(points, np.float64),  # as the file has them: far from the origin float32 would round before they are centred
+        points=np.asarray(
+            points, np.float64
+        ),  # as the file has them: far from the origin float32 would round before they are centred
         colors=unit_colors(colors.astype(np.float32), colors.dtype),
         normals=None if normals is None else np.asarray(normals, np.float32),
     )

@@ -1,32 +1,36 @@
-"""``point-e-prior``: OpenAI's Point-E, text to 4096 coloured points; the paper's other text-to-3D model.
+"""``point-e-prior``: OpenAI's Point-E, text to 4096 coloured points; the paper's other text-to-3D
+model.
 
-==================  =================================================================================================
+==================  ================================================================================
 option              meaning
-==================  =================================================================================================
-checkpoint          ``base_40m_textvec.pt`` as OpenAI publishes it, or Cap3D's ``pointE_finetuned_with_330kdata.pth``
+==================  ================================================================================
+checkpoint          ``base_40m_textvec.pt`` as OpenAI publishes it, or Cap3D's
+                    ``pointE_finetuned_with_330kdata.pth``
 upsampler           ``upsample_40m.pt``; null: stop at the coarse points
 clip                OpenAI's CLIP ViT-L/14 in transformers' format, a folder or an id of the hub
 prompt              asked of Point-E in place of the run's prompt
-guidance_scale      of the coarse points; 1 = none, 3 in the published sampler. The upsampler isn't guided
+guidance_scale      of the coarse points; 1 = none, 3 in the published sampler. The upsampler isn't
+                    guided
 num_points          the coarse points; 1024
 num_upsampled       the further points; 3072
 num_steps           noise levels of each stage; 64
 sigma_min           the lowest noise of both stages; 1e-3
 sigma_max           the highest of the coarse points and of the further ones; 120 and 160
 churn               noise added anew at each step, likewise; 3 and 0
-scale               world units for one of Point-E's, whose points lie in [-0.5, 0.5]; with ``normalize``: half the longest side
+scale               world units for one of Point-E's, whose points lie in [-0.5, 0.5]; with
+                    ``normalize``: half the longest side
 normalize           centre the box and make its longest half side ``scale``
 front               the axis of Point-E's space that looks at azimuth 0
 device              ``auto``: the run's GPU, or the CPU, where it takes minutes
 ground, ...         see ``priors/base.py``
-==================  =================================================================================================
+==================  ================================================================================
 
-There is no diffusers pipeline and no package of Point-E: ``point_e_model.py`` has the networks, ``karras.py`` the
-sampler. The files are downloaded by the user (addresses in ``docs/models.md``) and read with ``weights_only``.
+There is no diffusers pipeline and no package of Point-E: ``point_e_model.py`` has the networks,
+``karras.py`` the sampler. The files are downloaded by the user (addresses in ``docs/models.md``)
+and read with ``weights_only``.
 
-Points and colours come as they are sampled, without faces. Axes as Shap-E's, which was trained on renders of the same
-scenes: z up, front -y, turned to +x.
-"""
+Points and colours come as they are sampled, without faces. Axes as Shap-E's, which was trained on
+renders of the same scenes: z up, front -y, turned to +x."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Optional
@@ -45,7 +49,14 @@ from ..models.clip import clip_source, load_text_encoder, load_tokenizer, text_c
 from ..models.hub import Source, locate
 from ..models.model_files import free_memory
 from .base import Prior, is_number, require_positive
-from .karras import Network, cosine_alphas_cumprod, guided_denoiser, karras_sigmas, linear_alphas_cumprod, sample_heun
+from .karras import (
+    Network,
+    cosine_alphas_cumprod,
+    guided_denoiser,
+    karras_sigmas,
+    linear_alphas_cumprod,
+    sample_heun,
+)
 from .placing import check_front, chosen_device, placed, torch_generator
 from .point_e_model import CHANNELS, HEAD_CHANNELS, BaseModel, Upsampler, sizes_of
 from .weights import load_exactly, read_state_dict
@@ -66,7 +77,9 @@ class Kind(NamedTuple):
 
 
 BASE = Kind(BaseModel, "Point-E base checkpoint", "base_40m_textvec.pt", "clip_embed.weight")
-UPSAMPLER = Kind(Upsampler, "Point-E upsampler checkpoint", "upsample_40m.pt", "clip_embed.1.weight")
+UPSAMPLER = Kind(
+    Upsampler, "Point-E upsampler checkpoint", "upsample_40m.pt", "clip_embed.1.weight"
+)
 
 
 @register("point-e-prior")
@@ -95,8 +108,19 @@ class PointEPrior(Prior):
         def check(cfg: Any) -> None:
             Prior.Config.check(cfg)
             if not cfg.checkpoint:
-                raise UserError("checkpoint: Point-E's weights are a file that you download; set checkpoint to base_40m_textvec.pt")
-            require_positive(cfg, "guidance_scale", "num_points", "num_upsampled", "num_steps", "sigma_min", "scale")
+                raise UserError(
+                    "checkpoint: Point-E's weights are a file that you download; set "
+                    "checkpoint to base_40m_textvec.pt"
+                )
+            require_positive(
+                cfg,
+                "guidance_scale",
+                "num_points",
+                "num_upsampled",
+                "num_steps",
+                "sigma_min",
+                "scale",
+            )
             _check_pair(cfg, "sigma_max", above=cfg.sigma_min)
             _check_pair(cfg, "churn", above=-1e-9)
             check_front(cfg.front)
@@ -125,8 +149,12 @@ class PointEPrior(Prior):
             points = torch.cat([points, self._further_points(points, rng)], dim=-1)
         free_memory()
         rows = points[0].T.cpu().numpy()
-        cloud = PointCloud(points=rows[:, :3], colors=rows[:, 3:].clip(0, 255).round() / np.float32(255))
-        return placed(cloud, front=self.cfg.front, scale=self.cfg.scale, normalize=self.cfg.normalize)
+        cloud = PointCloud(
+            points=rows[:, :3], colors=rows[:, 3:].clip(0, 255).round() / np.float32(255)
+        )
+        return placed(
+            cloud, front=self.cfg.front, scale=self.cfg.scale, normalize=self.cfg.normalize
+        )
 
     def _clip(self) -> Source:
         return clip_source(self.cfg.clip)
@@ -135,25 +163,41 @@ class PointEPrior(Prior):
         folder = locate(self._clip())
         return text_condition(load_tokenizer(folder), load_text_encoder(folder).to(device), prompt)
 
-    def _coarse_points(self, condition: Float[Tensor, "1 D"], rng: torch.Generator) -> Float[Tensor, "1 6 N"]:
+    def _coarse_points(
+        self, condition: Float[Tensor, "1 D"], rng: torch.Generator
+    ) -> Float[Tensor, "1 6 N"]:
         model = load_network(BASE, self.cfg.checkpoint).to(condition.device)
         require_features(model, condition, self.cfg.clip)
         scale = self.cfg.guidance_scale
-        conditions = condition if scale == 1 else torch.cat([condition, torch.zeros_like(condition)])
-        denoise = guided_denoiser(mean_of(lambda z, t: model(z, t, conditions)), cosine_alphas_cumprod(), scale=scale)
+        conditions = (
+            condition if scale == 1 else torch.cat([condition, torch.zeros_like(condition)])
+        )
+        denoise = guided_denoiser(
+            mean_of(lambda z, t: model(z, t, conditions)), cosine_alphas_cumprod(), scale=scale
+        )
         return self._sampled(denoise, self.cfg.num_points, 0, rng, condition.device)
 
-    def _further_points(self, coarse: Float[Tensor, "1 6 M"], rng: torch.Generator) -> Float[Tensor, "1 6 N"]:
+    def _further_points(
+        self, coarse: Float[Tensor, "1 6 M"], rng: torch.Generator
+    ) -> Float[Tensor, "1 6 N"]:
         model = load_network(UPSAMPLER, self.cfg.upsampler).to(coarse.device)
-        denoise = guided_denoiser(mean_of(lambda z, t: model(z, t, coarse)), linear_alphas_cumprod())
+        denoise = guided_denoiser(
+            mean_of(lambda z, t: model(z, t, coarse)), linear_alphas_cumprod()
+        )
         return self._sampled(denoise, self.cfg.num_upsampled, 1, rng, coarse.device)
 
-    def _sampled(self, denoise: Any, count: int, stage: int, rng: torch.Generator, device: torch.device) -> Float[Tensor, "1 6 N"]:
+    def _sampled(
+        self, denoise: Any, count: int, stage: int, rng: torch.Generator, device: torch.device
+    ) -> Float[Tensor, "1 6 N"]:
         """``count`` points in Point-E's units: positions, and colours up to 255."""
         noise = torch.randn(1, CHANNELS, count, generator=rng).to(device)
-        sigmas = karras_sigmas(self.cfg.num_steps, self.cfg.sigma_min, float(self.cfg.sigma_max[stage]))
+        sigmas = karras_sigmas(
+            self.cfg.num_steps, self.cfg.sigma_min, float(self.cfg.sigma_max[stage])
+        )
         name = ("Point-E", "Point-E upsampler")[stage]
-        sample = sample_heun(denoise, noise, sigmas, churn=float(self.cfg.churn[stage]), generator=rng, progress=name)
+        sample = sample_heun(
+            denoise, noise, sigmas, churn=float(self.cfg.churn[stage]), generator=rng, progress=name
+        )
         return (sample - BIASES.to(device)) / SCALES.to(device)
 
 
@@ -163,15 +207,24 @@ def mean_of(network: Network) -> Network:
 
 
 def load_network(kind: Kind, path: str) -> Any:
-    """The network of this kind with the weights of ``path``, its sizes read off them, in evaluation mode.
+    """The network of this kind with the weights of ``path``, its sizes read off them, in evaluation
+    mode.
 
     Raises:
         UserError: the file can't be read, or holds another model.
     """
     state = read_state_dict(path, kind.title)
     sizes, projection = sizes_of(state), state.get(kind.projection)
-    if projection is None or not sizes["layers"] or not sizes["width"] or sizes["width"] % HEAD_CHANNELS:
-        raise UserError(f"{kind.title} {path!r} holds another model: give {kind.file} or a finetuned one of its format")
+    if (
+        projection is None
+        or not sizes["layers"]
+        or not sizes["width"]
+        or sizes["width"] % HEAD_CHANNELS
+    ):
+        raise UserError(
+            f"{kind.title} {path!r} holds another model: give {kind.file} or a finetuned one "
+            "of its format"
+        )
     network = kind.network(**sizes, features=projection.shape[1])
     load_exactly(network, state, f"{kind.title} {path!r}")
     return network.eval().requires_grad_(False)
@@ -181,10 +234,21 @@ def require_features(model: BaseModel, condition: Float[Tensor, "1 D"], clip: st
     """Raise UserError unless CLIP's features have the size that the model was trained with."""
     expected = model.clip_embed.in_features
     if condition.shape[-1] != expected:
-        raise UserError(f"clip: {clip!r} has {condition.shape[-1]} features, but the checkpoint was trained with {expected}: take ViT-L/14")
+        raise UserError(
+            f"clip: {clip!r} has {condition.shape[-1]} features, but the checkpoint was "
+            f"trained with {expected}: take ViT-L/14"
+        )
 
 
 def _check_pair(cfg: Any, name: str, above: float) -> None:
     values = cfg[name]
-    if isinstance(values, str) or not hasattr(values, "__len__") or len(values) != 2 or not all(is_number(v) and v > above for v in values):
-        raise UserError(f"{name}: expected two numbers, of the coarse and of the further points, above {max(above, 0)}, got {values!r}")
+    if (
+        isinstance(values, str)
+        or not hasattr(values, "__len__")
+        or len(values) != 2
+        or not all(is_number(v) and v > above for v in values)
+    ):
+        raise UserError(
+            f"{name}: expected two numbers, of the coarse and of the further points, above "
+            f"{max(above, 0)}, got {values!r}"
+        )

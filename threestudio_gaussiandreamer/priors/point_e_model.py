@@ -1,9 +1,11 @@
-"""Point-E's two networks, which turn noisy points into clean ones, under the names of the published checkpoints.
+"""Point-E's two networks, which turn noisy points into clean ones, under the names of the published
+checkpoints.
 
-Written from the architecture that the checkpoints fix (Nichol et al. 2022, "Point-E"; published by OpenAI under MIT): a
-plain transformer without positions, so a set of points in any order. The base model gets two tokens more, the text's features and the
-timestep; the upsampler one for the timestep, one for each of 256 cells of an image, which text-to-3D leaves empty, and one
-for each coarse point. All sizes are read off the weights; a head has 64 channels in every published model.
+Written from the architecture that the checkpoints fix (Nichol et al. 2022, "Point-E"; published by
+OpenAI under MIT): a plain transformer without positions, so a set of points in any order. The base
+model gets two tokens more, the text's features and the timestep; the upsampler one for the
+timestep, one for each of 256 cells of an image, which text-to-3D leaves empty, and one for each
+coarse point. All sizes are read off the weights; a head has 64 channels in every published model.
 """
 
 import math
@@ -32,7 +34,9 @@ class Mlp(nn.Module):
 
 
 class Attention(nn.Module):
-    """Self-attention whose packed projection is ordered head by head: query, key and value of the first head come first."""
+    """Self-attention whose packed projection is ordered head by head: query, key and value of the
+    first head come first.
+    """
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -71,7 +75,9 @@ class Backbone(nn.Module):
 
 
 class PointTransformer(nn.Module):
-    """What both networks have: points and extra tokens through one transformer, and the points' part of the result."""
+    """What both networks have: points and extra tokens through one transformer, and the points'
+    part of the result.
+    """
 
     def __init__(self, width: int, layers: int, heads: Optional[int] = None) -> None:
         super().__init__()
@@ -86,7 +92,9 @@ class PointTransformer(nn.Module):
     def time_token(self, timesteps: Real[Tensor, " B"]) -> Float[Tensor, "B 1 W"]:
         return self.time_embed(timestep_embedding(timesteps, self.width))[:, None]
 
-    def transform(self, points: Float[Tensor, "B 6 N"], tokens: list[Tensor]) -> Float[Tensor, "B 12 N"]:
+    def transform(
+        self, points: Float[Tensor, "B 6 N"], tokens: list[Tensor]
+    ) -> Float[Tensor, "B 12 N"]:
         h = torch.cat([*tokens, self.input_proj(points.transpose(1, 2))], dim=1)
         h = self.ln_post(self.backbone(self.ln_pre(h)))
         return self.output_proj(h[:, -points.shape[-1] :]).transpose(1, 2)
@@ -95,20 +103,29 @@ class PointTransformer(nn.Module):
 class BaseModel(PointTransformer):
     """From noise to coarse points, given the text's features (``base40M-textvec``)."""
 
-    def __init__(self, width: int = 512, layers: int = 12, features: int = 768, heads: Optional[int] = None) -> None:
+    def __init__(
+        self, width: int = 512, layers: int = 12, features: int = 768, heads: Optional[int] = None
+    ) -> None:
         super().__init__(width, layers, heads)
         self.clip_embed = nn.Linear(features, width)
 
     def forward(
-        self, points: Float[Tensor, "B 6 N"], timesteps: Real[Tensor, " B"], condition: Float[Tensor, "B D"]
+        self,
+        points: Float[Tensor, "B 6 N"],
+        timesteps: Real[Tensor, " B"],
+        condition: Float[Tensor, "B D"],
     ) -> Float[Tensor, "B 12 N"]:
-        return self.transform(points, [self.clip_embed(condition)[:, None], self.time_token(timesteps)])
+        return self.transform(
+            points, [self.clip_embed(condition)[:, None], self.time_token(timesteps)]
+        )
 
 
 class Upsampler(PointTransformer):
     """From noise to further points, given the coarse ones (``upsample``)."""
 
-    def __init__(self, width: int = 512, layers: int = 12, features: int = 1024, heads: Optional[int] = None) -> None:
+    def __init__(
+        self, width: int = 512, layers: int = 12, features: int = 1024, heads: Optional[int] = None
+    ) -> None:
         super().__init__(width, layers, heads)
         self.cond_point_proj = nn.Linear(CHANNELS, width)
         self.clip_embed = nn.Sequential(nn.LayerNorm(features), nn.Linear(features, width))
@@ -116,24 +133,37 @@ class Upsampler(PointTransformer):
         self.register_buffer("channel_biases", torch.tensor([0.0] * 3 + [-1.0] * 3))
 
     def forward(
-        self, points: Float[Tensor, "B 6 N"], timesteps: Real[Tensor, " B"], coarse: Float[Tensor, "B 6 M"]
+        self,
+        points: Float[Tensor, "B 6 N"],
+        timesteps: Real[Tensor, " B"],
+        coarse: Float[Tensor, "B 6 M"],
     ) -> Float[Tensor, "B 12 N"]:
         """``coarse`` in the points' own units: positions, and colours up to 255."""
-        no_image = self.clip_embed(points.new_zeros(len(points), 1, self.clip_embed[0].normalized_shape[0]))
+        no_image = self.clip_embed(
+            points.new_zeros(len(points), 1, self.clip_embed[0].normalized_shape[0])
+        )
         scaled = coarse * self.channel_scales[:, None] + self.channel_biases[:, None]
-        tokens = [self.time_token(timesteps), no_image.expand(-1, IMAGE_CELLS, -1), self.cond_point_proj(scaled.transpose(1, 2))]
+        tokens = [
+            self.time_token(timesteps),
+            no_image.expand(-1, IMAGE_CELLS, -1),
+            self.cond_point_proj(scaled.transpose(1, 2)),
+        ]
         return self.transform(points, tokens)
 
 
 def timestep_embedding(timesteps: Real[Tensor, " B"], width: int) -> Float[Tensor, "B W"]:
     """Cosines, then sines, of frequencies that fall from 1 to 1/10000 (Vaswani et al. 2017)."""
-    frequencies = torch.exp(-math.log(10000) * torch.arange(width // 2, device=timesteps.device) / (width // 2))
+    frequencies = torch.exp(
+        -math.log(10000) * torch.arange(width // 2, device=timesteps.device) / (width // 2)
+    )
     angles = timesteps.float()[:, None] * frequencies
     return torch.cat([angles.cos(), angles.sin()], dim=-1)
 
 
 def sizes_of(state: dict[str, Tensor]) -> dict[str, int]:
-    """``width`` and ``layers`` of the model whose weights these are; zeros where they are none of Point-E's."""
+    """``width`` and ``layers`` of the model whose weights these are; zeros where they are none of
+    Point-E's.
+    """
     blocks = {name.split(".")[2] for name in state if name.startswith("backbone.resblocks.")}
     norm = state.get("ln_pre.weight")
     return {"width": 0 if norm is None else len(norm), "layers": len(blocks)}

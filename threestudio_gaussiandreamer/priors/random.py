@@ -59,10 +59,15 @@ class RandomPrior(Prior):
             require_positive(cfg, "num_points", "size")
             require_color(cfg)
             if cfg.color is None:
-                raise UserError("color: random points have no colours of their own; expected 'random', 'grey' or [red, green, blue]")
+                raise UserError(
+                    "color: random points have no colours of their own; expected 'random', "
+                    "'grey' or [red, green, blue]"
+                )
 
     cfg: Config
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         points = self.cfg.size * SHAPES[self.cfg.shape](self.cfg.num_points, generator)
-        return PointCloud(points=points, colors=chosen_colors(self.cfg.color, len(points), generator))
+        return PointCloud(
+            points=points, colors=chosen_colors(self.cfg.color, len(points), generator)
+        )

@@ -1,37 +1,44 @@
-"""``shap-e-prior``: OpenAI's Shap-E, the text-to-3D model that the paper starts from, with diffusers' networks.
+"""``shap-e-prior``: OpenAI's Shap-E, the text-to-3D model that the paper starts from, with
+diffusers' networks.
 
-===================  ================================================================================================
+===================  ===============================================================================
 option               meaning
-===================  ================================================================================================
+===================  ===============================================================================
 model                a folder in the format of diffusers' ``ShapEPipeline``, or an id of the hub
 revision             of the model on the hub
-allow_bin            where a part has no safetensors, read its ``.bin`` (with ``weights_only``: it can't run code)
-checkpoint           ``.pth`` in OpenAI's format whose weights replace the text-to-latent network's: Cap3D's finetuned
-                     ``shapE_finetuned_with_330kdata.pth``, as in the paper; null: as published
+allow_bin            where a part has no safetensors, read its ``.bin`` (with ``weights_only``: it
+                     can't run code)
+checkpoint           ``.pth`` in OpenAI's format whose weights replace the text-to-latent network's:
+                     Cap3D's finetuned ``shapE_finetuned_with_330kdata.pth``, as in the paper; null:
+                     as published
 prompt               asked of Shap-E in place of the run's prompt
 guidance_scale       1 = none; 15 in the paper's code
 num_inference_steps  noise levels; 64
 sigma_min, _max      the lowest and highest of them; 1e-3 and 160
-grid_size            the signed distance is asked for on a grid of this many points along each axis of [-1, 1]^3
+grid_size            the signed distance is asked for on a grid of this many points along each axis
+                     of [-1, 1]^3
 query_batch_size     points asked for at a time: less is less memory
-colors               ``display``: as a picture shows them; ``linear``: what the paper's code takes, which is darker
-scale                world units for one of Shap-E's; 1.6 in the paper's code. With ``normalize``: half the longest side
+colors               ``display``: as a picture shows them; ``linear``: what the paper's code takes,
+                     which is darker
+scale                world units for one of Shap-E's; 1.6 in the paper's code. With ``normalize``:
+                     half the longest side
 normalize            centre the box and make its longest half side ``scale``
 front                the axis of Shap-E's space that looks at azimuth 0
-half_precision       run the text-to-latent network in float16, on a GPU only, as the paper's code does
+half_precision       run the text-to-latent network in float16, on a GPU only, as the paper's code
+                     does
 device               ``auto``: the run's GPU, or the CPU
 ground, ...          see ``priors/base.py``
-===================  ================================================================================================
+===================  ===============================================================================
 
-The points are the vertices of the surface, with its faces. Shap-E's space has z up, and its objects look along -y, the
-convention of the Blender scenes that it was trained on: its own preview begins with a camera on that side. So the
-front becomes +x by a quarter turn, (x, y, z) -> (-y, x, z).
+The points are the vertices of the surface, with its faces. Shap-E's space has z up, and its objects
+look along -y, the convention of the Blender scenes that it was trained on: its own preview begins
+with a camera on that side. So the front becomes +x by a quarter turn, (x, y, z) -> (-y, x, z).
 
-The latents are sampled by ``karras.py`` and not by ``ShapEPipeline``: its scheduler takes the noise levels from the
-training schedule (403 to 0.108 in place of 160 to 1e-3), clamps after guidance rather than before, and the pipeline offers no
-grid size. The signed distances that the published code surrounds the grid with make its surface smaller by
-``(grid_size - 1) / (grid_size + 1)``; so does ours.
-"""
+The latents are sampled by ``karras.py`` and not by ``ShapEPipeline``: its scheduler takes the noise
+levels from the training schedule (403 to 0.108 in place of 160 to 1e-3), clamps after guidance
+rather than before, and the pipeline offers no grid size. The signed distances that the published
+code surrounds the grid with make its surface smaller by ``(grid_size - 1) / (grid_size + 1)``; so
+does ours."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -87,9 +94,19 @@ class ShapEPrior(Prior):
         @staticmethod
         def check(cfg: Any) -> None:
             Prior.Config.check(cfg)
-            require_positive(cfg, "guidance_scale", "num_inference_steps", "sigma_min", "sigma_max", "query_batch_size", "scale")
+            require_positive(
+                cfg,
+                "guidance_scale",
+                "num_inference_steps",
+                "sigma_min",
+                "sigma_max",
+                "query_batch_size",
+                "scale",
+            )
             if not cfg.sigma_min < cfg.sigma_max:
-                raise UserError(f"sigma_min: expected less than sigma_max, {cfg.sigma_max}, got {cfg.sigma_min}")
+                raise UserError(
+                    f"sigma_min: expected less than sigma_max, {cfg.sigma_max}, got {cfg.sigma_min}"
+                )
             if cfg.grid_size < 2:
                 raise UserError(f"grid_size: expected 2 or more, got {cfg.grid_size}")
             if cfg.colors not in COLORS:
@@ -115,29 +132,52 @@ class ShapEPrior(Prior):
         folder = locate(self._source())
         device = chosen_device(self.cfg.device, self.device)
         info(f"Shap-E: {self.cfg.prompt or prompt!r} on {device}")
-        latents = self._sample(folder, self.cfg.prompt or prompt, device, torch_generator(generator))
+        latents = self._sample(
+            folder, self.cfg.prompt or prompt, device, torch_generator(generator)
+        )
         cloud = self._decode(folder, latents, device)
         free_memory()
         info(f"Shap-E: a mesh of {len(cloud.points)} vertices and {len(cloud.faces)} faces")
-        return placed(cloud, front=self.cfg.front, scale=self.cfg.scale, normalize=self.cfg.normalize)
+        return placed(
+            cloud, front=self.cfg.front, scale=self.cfg.scale, normalize=self.cfg.normalize
+        )
 
     def _source(self) -> Source:
         def picks(names: Collection[str]) -> list[str]:
             return needed_files(names, COMPONENTS, allow_bin=self.cfg.allow_bin)
 
         # the folder renderer is that of another pipeline
-        return Source(self.cfg.model, picks, "system.geometry.prior.model", self.cfg.revision, "--include '*/*' --exclude 'renderer/*'")
+        return Source(
+            self.cfg.model,
+            picks,
+            "system.geometry.prior.model",
+            self.cfg.revision,
+            "--include '*/*' --exclude 'renderer/*'",
+        )
 
-    def _sample(self, folder: Path, prompt: str, device: torch.device, rng: torch.Generator) -> Float[Tensor, "1 N D"]:
-        """Latents of the shape, from text features through the text-to-latent network; both are dropped on return."""
+    def _sample(
+        self, folder: Path, prompt: str, device: torch.device, rng: torch.Generator
+    ) -> Float[Tensor, "1 N D"]:
+        """Latents of the shape, from text features through the text-to-latent network; both are
+        dropped on return.
+        """
         condition = self._condition(folder, prompt, device)
         prior = self._part(folder, "prior", device)
         if self.cfg.checkpoint:
             load_original_prior(prior, self.cfg.checkpoint)
         alphas_cumprod, prediction = read_schedule(folder)
-        noise = torch.randn(1, prior.config.num_embeddings, prior.config.embedding_dim, generator=rng).to(device)
-        network = prior_network(prior, condition, self.cfg.guidance_scale, half=self.cfg.half_precision and device.type == "cuda")
-        denoise = guided_denoiser(network, alphas_cumprod, scale=self.cfg.guidance_scale, prediction=prediction)
+        noise = torch.randn(
+            1, prior.config.num_embeddings, prior.config.embedding_dim, generator=rng
+        ).to(device)
+        network = prior_network(
+            prior,
+            condition,
+            self.cfg.guidance_scale,
+            half=self.cfg.half_precision and device.type == "cuda",
+        )
+        denoise = guided_denoiser(
+            network, alphas_cumprod, scale=self.cfg.guidance_scale, prediction=prediction
+        )
         sigmas = karras_sigmas(self.cfg.num_inference_steps, self.cfg.sigma_min, self.cfg.sigma_max)
         return sample_heun(denoise, noise, sigmas, generator=rng, progress="Shap-E")
 
@@ -145,13 +185,23 @@ class ShapEPrior(Prior):
         encoder = load_text_encoder(folder, "text_encoder", allow_bin=self.cfg.allow_bin).to(device)
         return text_condition(load_tokenizer(folder, "tokenizer"), encoder, prompt)
 
-    def _decode(self, folder: Path, latents: Float[Tensor, "1 N D"], device: torch.device) -> PointCloud:
+    def _decode(
+        self, folder: Path, latents: Float[Tensor, "1 N D"], device: torch.device
+    ) -> PointCloud:
         """The surface where the signed distance is 0, in Shap-E's own space."""
         renderer = self._part(folder, "shap_e_renderer", device)
-        return decoded(renderer, latents, grid_size=self.cfg.grid_size, query_batch_size=self.cfg.query_batch_size, colors=self.cfg.colors)
+        return decoded(
+            renderer,
+            latents,
+            grid_size=self.cfg.grid_size,
+            query_batch_size=self.cfg.query_batch_size,
+            colors=self.cfg.colors,
+        )
 
     def _part(self, folder: Path, part: str, device: torch.device) -> Any:
-        """One network, always in float32: in half precision the renderer's encoding of positions loses all detail."""
+        """One network, always in float32: in half precision the renderer's encoding of positions
+        loses all detail.
+        """
         from diffusers import PriorTransformer
         from diffusers.pipelines.shap_e.renderer import ShapERenderer
 
@@ -160,43 +210,70 @@ class ShapEPrior(Prior):
 
 
 def read_schedule(folder: Path) -> tuple[Float[np.ndarray, "T"], str]:
-    """The abar of each timestep, and what the network predicts ("sample" or "epsilon"), from the model's own scheduler."""
+    """The abar of each timestep, and what the network predicts ("sample" or "epsilon"), from the
+    model's own scheduler.
+    """
     from diffusers import HeunDiscreteScheduler
 
     scheduler = load_settings(HeunDiscreteScheduler, folder, "scheduler")
     prediction = scheduler.config.prediction_type
     if prediction not in ("sample", "epsilon"):
-        raise UserError(f"the scheduler in {str(folder)!r} has the prediction type {prediction!r}: Shap-E's is 'sample'")
+        raise UserError(
+            f"the scheduler in {str(folder)!r} has the prediction type {prediction!r}: "
+            "Shap-E's is 'sample'"
+        )
     return scheduler.alphas_cumprod.double().numpy(), prediction
 
 
-def prior_network(prior: Any, condition: Float[Tensor, "1 D"], scale: float, *, half: bool) -> Network:
-    """diffusers' network with its condition, first the prompt's and then, where there is guidance, that of no prompt."""
+def prior_network(
+    prior: Any, condition: Float[Tensor, "1 D"], scale: float, *, half: bool
+) -> Network:
+    """diffusers' network with its condition, first the prompt's and then, where there is guidance,
+    that of no prompt.
+    """
     conditions = condition if scale == 1 else torch.cat([condition, torch.zeros_like(condition)])
 
     def predict(z: Tensor, timesteps: Tensor) -> Tensor:
         with torch.autocast(z.device.type, torch.float16, enabled=half):
             output = prior(z, timesteps, conditions).predicted_image_embedding
-        return output[..., : z.shape[-1]]  # the rest is the variance, which this sampler doesn't use
+        return output[
+            ..., : z.shape[-1]
+        ]  # the rest is the variance, which this sampler doesn't use
 
     return predict
 
 
 @torch.no_grad()
-def decoded(renderer: Any, latents: Float[Tensor, "1 N D"], *, grid_size: int, query_batch_size: int, colors: str) -> PointCloud:
+def decoded(
+    renderer: Any,
+    latents: Float[Tensor, "1 N D"],
+    *,
+    grid_size: int,
+    query_batch_size: int,
+    colors: str,
+) -> PointCloud:
     """The mesh of ``latents`` by marching cubes, with the texture field's colours at its vertices.
 
     Raises:
         UserError: the latents are not finite, or the signed distance is negative everywhere.
     """
     if not torch.isfinite(latents).all():
-        raise UserError("Shap-E's latents are not finite: set half_precision: false, or check its weights")
+        raise UserError(
+            "Shap-E's latents are not finite: set half_precision: false, or check its weights"
+        )
     renderer.mesh_decoder.register_forward_hook(_refuse_empty)
     try:
-        mesh = renderer.decode_to_mesh(latents, latents.device, grid_size=grid_size, query_batch_size=query_batch_size)
+        mesh = renderer.decode_to_mesh(
+            latents, latents.device, grid_size=grid_size, query_batch_size=query_batch_size
+        )
     except torch.OutOfMemoryError as error:
-        raise UserError(f"Shap-E's grid of {grid_size}^3 does not fit the memory: set grid_size or query_batch_size lower") from error
-    linear = torch.stack([mesh.vertex_channels[name] for name in "RGB"], dim=-1).float().cpu().numpy()
+        raise UserError(
+            f"Shap-E's grid of {grid_size}^3 does not fit the memory: set grid_size or "
+            "query_batch_size lower"
+        ) from error
+    linear = (
+        torch.stack([mesh.vertex_channels[name] for name in "RGB"], dim=-1).float().cpu().numpy()
+    )
     return PointCloud(
         points=mesh.verts.float().cpu().numpy(),
         colors=linear if colors == "linear" else display_colors(linear),
@@ -205,11 +282,20 @@ def decoded(renderer: Any, latents: Float[Tensor, "1 N D"], *, grid_size: int, q
 
 
 def _refuse_empty(decoder: Any, inputs: tuple, mesh: Any) -> None:
-    """A hook behind marching cubes: what follows it in the renderer can't cope with a mesh without vertices."""
+    """A hook behind marching cubes: what follows it in the renderer can't cope with a mesh without
+    vertices.
+    """
     if not len(mesh.faces):
-        raise UserError("Shap-E found no surface for this prompt: try another seed, another prompt or a larger grid_size")
+        raise UserError(
+            "Shap-E found no surface for this prompt: try another seed, another prompt or a "
+            "larger grid_size"
+        )
 
 
 def display_colors(linear: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-    """Linear light as display values (IEC 61966-2-1): the inverse of what the decoder does to its texture field."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055).astype(np.float32)
+    """Linear light as display values (IEC 61966-2-1): the inverse of what the decoder does to its
+    texture field.
+    """
+    return np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055
+    ).astype(np.float32)

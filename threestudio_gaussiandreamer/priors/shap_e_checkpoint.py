@@ -1,9 +1,10 @@
-"""Weights of Shap-E's text-to-latent model in OpenAI's own format, as Cap3D publishes its finetuned ones, for diffusers.
+"""Weights of Shap-E's text-to-latent model in OpenAI's own format, as Cap3D publishes its finetuned
+ones, for diffusers.
 
-The file is a state dict, or a dict with one under ``model_state_dict``. Its names are those of a plain transformer inside
-a wrapper (``wrapped.``); diffusers' ``PriorTransformer`` is the same network under other names, with query, key and
-value apart. Every name must be used and every parameter filled: anything else is another model.
-"""
+The file is a state dict, or a dict with one under ``model_state_dict``. Its names are those of a
+plain transformer inside a wrapper (``wrapped.``); diffusers' ``PriorTransformer`` is the same
+network under other names, with query, key and value apart. Every name must be used and every
+parameter filled: anything else is another model."""
 
 import re
 
@@ -31,7 +32,9 @@ RENAMED = (
 """Beginnings of OpenAI's names and of diffusers'; what follows ("weight", "bias") is the same."""
 PACKED = re.compile(r"backbone\.resblocks\.(\d+)\.attn\.c_qkv\.(weight|bias)")
 UNUSED_BY_SHAP_E = ("clip_mean", "clip_std")
-"""Parameters that diffusers' class has for another model; Shap-E's checkpoint lacks them and its sampling ignores them."""
+"""Parameters that diffusers' class has for another model; Shap-E's checkpoint lacks them and its
+sampling ignores them.
+"""
 
 
 def load_original_prior(prior: nn.Module, path: str) -> None:
@@ -40,7 +43,9 @@ def load_original_prior(prior: nn.Module, path: str) -> None:
     Raises:
         UserError: the file can't be read, or its names or shapes are not those of this model.
     """
-    state = to_diffusers(read_state_dict(path, "Shap-E checkpoint"), prior.config.num_attention_heads)
+    state = to_diffusers(
+        read_state_dict(path, "Shap-E checkpoint"), prior.config.num_attention_heads
+    )
     own = prior.state_dict()
     state.update({name: own[name] for name in UNUSED_BY_SHAP_E if name in own})
     load_exactly(prior, state, f"Shap-E checkpoint {path!r}")
@@ -55,13 +60,16 @@ def to_diffusers(state: dict[str, Tensor], heads: int) -> dict[str, Tensor]:
     converted: dict[str, Tensor] = {}
     unknown = []
     for name, value in state.items():
-        parts = _converted(name.removeprefix(PREFIX), value, heads) if name.startswith(PREFIX) else {}
+        parts = (
+            _converted(name.removeprefix(PREFIX), value, heads) if name.startswith(PREFIX) else {}
+        )
         converted.update(parts)
         if not parts:
             unknown.append(name)
     if unknown:
         raise UserError(
-            f"the checkpoint has {len(unknown)} names that are none of Shap-E's text model ({named(unknown)}):"
+            f"the checkpoint has {len(unknown)} names that are none of Shap-E's text model "
+            f"({named(unknown)}):"
             f" names like {PREFIX}backbone.resblocks.0.ln_1.weight were expected"
         )
     return converted
@@ -74,7 +82,10 @@ def _converted(name: str, value: Tensor, heads: int) -> dict[str, Tensor]:
     if packed := PACKED.fullmatch(name):
         block, kind = packed.groups()
         parts = zip(("to_q", "to_k", "to_v"), unpacked(value, heads), strict=True)
-        return {f"transformer_blocks.{block}.attn1.{part}.{kind}": part_value for part, part_value in parts}
+        return {
+            f"transformer_blocks.{block}.attn1.{part}.{kind}": part_value
+            for part, part_value in parts
+        }
     for pattern, replacement in RENAMED:
         renamed, count = re.subn("^" + pattern + r"(?=(weight|bias)$)", replacement, name)
         if count:
@@ -83,8 +94,13 @@ def _converted(name: str, value: Tensor, heads: int) -> dict[str, Tensor]:
 
 
 def unpacked(value: Tensor, heads: int) -> tuple[Tensor, ...]:
-    """Query, key and value rows of a packed projection, whose rows are ordered head by head: (heads, 3, channels)."""
+    """Query, key and value rows of a packed projection, whose rows are ordered head by head:
+    (heads, 3, channels).
+    """
     if len(value) % (3 * heads):
-        raise UserError(f"the checkpoint packs query, key and value into {len(value)} rows, which are not for {heads} heads")
+        raise UserError(
+            f"the checkpoint packs query, key and value into {len(value)} rows, which are not "
+            f"for {heads} heads"
+        )
     rows = value.reshape(heads, 3, -1, *value.shape[1:])
     return tuple(torch.flatten(part, 0, 1) for part in rows.unbind(dim=1))

@@ -1,15 +1,18 @@
-"""SMPL's pose, and optionally its shape, from the positions of its joints: a small optimisation with priors.
+"""SMPL's pose, and optionally its shape, from the positions of its joints: a small optimisation
+with priors.
 
-The body model is the user's own file, an NPZ of SMPL, SMPL-H or SMPL-X: their first 22 joints are the same. The kinematics
-are smplx's. What is minimised, over the rotations of all joints (axis-angle), a translation and a few shape
-coefficients, summed over the frames, which share nothing:
+The body model is the user's own file, an NPZ of SMPL, SMPL-H or SMPL-X: their first 22 joints are
+the same. The kinematics are smplx's. What is minimised, over the rotations of all joints
+(axis-angle), a translation and a few shape coefficients, summed over the frames, which share
+nothing:
 
-    sum_j |joint_j - target_j|^2 / s^2  +  pose |theta|^2  +  shape |beta|^2  +  limits sum max(0, low - theta, theta - high)^2
+    sum_j |joint_j - target_j|^2 / s^2  +  pose |theta|^2  +  shape |beta|^2  +  limits sum max(0,
+                                        low - theta, theta - high)^2
 
-with s = 10 mm: one centimetre on one joint weighs as one radian of a rotation does at ``pose`` = 1. The limits keep knees and elbows
-from bending backwards, which positions alone would allow. The way there: first where the whole body is and looks, then
-the pose under a strong prior, then under the final one.
-"""
+with s = 10 mm: one centimetre on one joint weighs as one radian of a rotation does at ``pose`` = 1.
+The limits keep knees and elbows from bending backwards, which positions alone would allow. The way
+there: first where the whole body is and looks, then the pose under a strong prior, then under the
+final one."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -30,8 +33,10 @@ from ..models import extras
 FIELDS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 """Arrays of a body model's file that are used."""
 CONVERT = (
-    "python -c \"import pickle, numpy as np; d = pickle.load(open('SMPL_NEUTRAL.pkl', 'rb'), encoding='latin1'); "
-    "np.savez('SMPL_NEUTRAL.npz', **{k: np.array(d[k].toarray() if hasattr(d[k], 'toarray') else d[k]) for k in "
+    "python -c \"import pickle, numpy as np; d = pickle.load(open('SMPL_NEUTRAL.pkl', 'rb'), "
+    "encoding='latin1'); "
+    "np.savez('SMPL_NEUTRAL.npz', **{k: np.array(d[k].toarray() if hasattr(d[k], 'toarray') "
+    "else d[k]) for k in "
     "('v_template', 'shapedirs', 'posedirs', 'J_regressor', 'weights', 'kintree_table', 'f')})\""
 )
 BODY_JOINTS = 22
@@ -47,12 +52,15 @@ STAGES = ((1.0, 0.2), (0.02, 1.0))
 """Weight of the pose prior, and the share of the iterations, of each stage."""
 DEGREES = math.pi / 180
 LIMITS = {
-    # joint: axis: (low, high) in degrees. Knees bend about x, the elbows about y, the left one's negative side.
+    # joint: axis: (low, high) in degrees. Knees bend about x, the elbows about y, the left one's
+    # negative side.
     4: {0: (0, 150), 1: (-15, 15), 2: (-15, 15)},
     5: {0: (0, 150), 1: (-15, 15), 2: (-15, 15)},
     18: {1: (-150, 5)},
     19: {1: (-5, 150)},
-    **{joint: {0: (-60, 60), 1: (-60, 60), 2: (-60, 60)} for joint in (3, 6, 9, 12, 15)},  # spine, neck, head
+    **{
+        joint: {0: (-60, 60), 1: (-60, 60), 2: (-60, 60)} for joint in (3, 6, 9, 12, 15)
+    },  # spine, neck, head
     **{joint: {0: (-60, 60), 1: (-45, 45), 2: (-45, 45)} for joint in (7, 8)},  # ankles
 }
 
@@ -82,7 +90,8 @@ class BodyFit(NamedTuple):
 
 
 def load_body_model(path: str, *, num_shape: int = 10) -> BodyModel:
-    """Read the user's body model; only NPZ, because the PKL files of SMPL run code when they are opened.
+    """Read the user's body model; only NPZ, because the PKL files of SMPL run code when they are
+    opened.
 
     Args:
         num_shape: shape coefficients that are used.
@@ -92,7 +101,10 @@ def load_body_model(path: str, *, num_shape: int = 10) -> BodyModel:
     """
     file = existing_file(path, "body model")
     if file.suffix.lower() == ".pkl":
-        raise UserError(f"body model {path!r} is a pickle, which could run code, and isn't opened; if it is yours, convert it:\n{CONVERT}")
+        raise UserError(
+            f"body model {path!r} is a pickle, which could run code, and isn't opened; if it "
+            f"is yours, convert it:\n{CONVERT}"
+        )
     arrays = _arrays(file)
     _check_shapes(arrays, path)
     _check_values(arrays, path)
@@ -102,7 +114,9 @@ def load_body_model(path: str, *, num_shape: int = 10) -> BodyModel:
     return BodyModel(
         template=_tensor(arrays["v_template"]),
         shape_directions=_tensor(arrays["shapedirs"][:, :, :num_shape]),
-        pose_directions=_tensor(arrays["posedirs"]).reshape(vertices * 3, 9 * (joints - 1)).T.contiguous(),
+        pose_directions=_tensor(arrays["posedirs"])
+        .reshape(vertices * 3, 9 * (joints - 1))
+        .T.contiguous(),
         joint_regressor=_tensor(arrays["J_regressor"]),
         parents=parents,
         weights=_tensor(arrays["weights"]),
@@ -110,16 +124,25 @@ def load_body_model(path: str, *, num_shape: int = 10) -> BodyModel:
     )
 
 
-def fit_bodies(model: BodyModel, targets: Float[np.ndarray, "F K 3"], *, fit_shape: bool = True, iterations: int = 300) -> BodyFit:
+def fit_bodies(
+    model: BodyModel,
+    targets: Float[np.ndarray, "F K 3"],
+    *,
+    fit_shape: bool = True,
+    iterations: int = 300,
+) -> BodyFit:
     """Bodies whose joints are where ``targets`` has them.
 
     Args:
-        targets: 22 or 24 joints in SMPL's order, metres, y up; the last two of 24 are used when the model has no more.
+        targets: 22 or 24 joints in SMPL's order, metres, y up; the last two of 24 are used when the
+            model has no more.
         fit_shape: the shape coefficients too; else the model's mean shape.
         iterations: the most of the last stage.
     """
     extras.require("body", "smplx")
-    wanted = _tensor(targets)[:, : SMPL_JOINTS if len(model.parents) == SMPL_JOINTS else BODY_JOINTS]
+    wanted = _tensor(targets)[
+        :, : SMPL_JOINTS if len(model.parents) == SMPL_JOINTS else BODY_JOINTS
+    ]
     frames, joints = len(wanted), len(model.parents)
     pose = torch.zeros(frames, joints, 3, dtype=torch.float64)
     pose[:, 0], translation = _placed(model, wanted)
@@ -127,24 +150,42 @@ def fit_bodies(model: BodyModel, targets: Float[np.ndarray, "F K 3"], *, fit_sha
     moved = [pose, translation, *([shape] if fit_shape else [])]
     with _one_thread():
         for weight, share in STAGES:
-            _minimise(moved, lambda weight=weight: energy(model, pose, shape, translation, wanted, weight), int(share * iterations))
+            _minimise(
+                moved,
+                lambda weight=weight: energy(model, pose, shape, translation, wanted, weight),
+                int(share * iterations),
+            )
     found = posed_joints(model, pose, shape, translation)[:, : wanted.shape[1]]
     residuals = 1000 * (found - wanted).norm(dim=-1)
     return BodyFit(pose.detach(), shape.detach(), translation.detach(), residuals.detach().numpy())
 
 
 def energy(
-    model: BodyModel, pose: Tensor, shape: Tensor, translation: Tensor, wanted: Float[Tensor, "F K 3"], pose_weight: float
+    model: BodyModel,
+    pose: Tensor,
+    shape: Tensor,
+    translation: Tensor,
+    wanted: Float[Tensor, "F K 3"],
+    pose_weight: float,
 ) -> Tensor:
     """What is minimised, summed over the frames; see the module."""
     found = posed_joints(model, pose, shape, translation)[:, : wanted.shape[1]]
     data = ((found - wanted) / SCALE).square().sum()
-    return data + pose_weight * pose[:, 1:].square().sum() + SHAPE_WEIGHT * shape.square().sum() + LIMITS_WEIGHT * beyond_limits(pose)
+    return (
+        data
+        + pose_weight * pose[:, 1:].square().sum()
+        + SHAPE_WEIGHT * shape.square().sum()
+        + LIMITS_WEIGHT * beyond_limits(pose)
+    )
 
 
 def beyond_limits(pose: Float[Tensor, "F J 3"]) -> Tensor:
     """Squared radians by which rotations leave ``LIMITS``, summed."""
-    rows = [(joint, axis, low * DEGREES, high * DEGREES) for joint, axes in LIMITS.items() for axis, (low, high) in axes.items()]
+    rows = [
+        (joint, axis, low * DEGREES, high * DEGREES)
+        for joint, axes in LIMITS.items()
+        for axis, (low, high) in axes.items()
+    ]
     joints, axes = torch.tensor([row[:2] for row in rows]).T
     low, high = torch.tensor([row[2:] for row in rows], dtype=pose.dtype).T
     angles = pose[:, joints, axes]
@@ -152,15 +193,25 @@ def beyond_limits(pose: Float[Tensor, "F J 3"]) -> Tensor:
 
 
 def posed_joints(
-    model: BodyModel, pose: Float[Tensor, "F J 3"], shape: Float[Tensor, "F B"], translation: Float[Tensor, "F 3"]
+    model: BodyModel,
+    pose: Float[Tensor, "F J 3"],
+    shape: Float[Tensor, "F B"],
+    translation: Float[Tensor, "F 3"],
 ) -> Float[Tensor, "F J 3"]:
-    """Where the joints are; cheaper than the whole body, since vertices are needed for the shape only."""
+    """Where the joints are; cheaper than the whole body, since vertices are needed for the shape
+    only.
+    """
     from smplx.lbs import batch_rigid_transform, batch_rodrigues
 
     frames, joints = pose.shape[:2]
-    rest = model.joint_regressor @ model.template + torch.einsum("fb,jcb->fjc", shape, _joint_directions(model))
+    rest = model.joint_regressor @ model.template + torch.einsum(
+        "fb,jcb->fjc", shape, _joint_directions(model)
+    )
     rotations = batch_rodrigues(pose.reshape(-1, 3)).reshape(frames, joints, 3, 3)
-    return batch_rigid_transform(rotations, rest, model.parents, dtype=pose.dtype)[0] + translation[:, None]
+    return (
+        batch_rigid_transform(rotations, rest, model.parents, dtype=pose.dtype)[0]
+        + translation[:, None]
+    )
 
 
 @torch.no_grad()
@@ -185,13 +236,19 @@ def _joint_directions(model: BodyModel) -> Float[Tensor, "J 3 B"]:
     return torch.einsum("jv,vcb->jcb", model.joint_regressor, model.shape_directions)
 
 
-def _placed(model: BodyModel, wanted: Float[Tensor, "F K 3"]) -> tuple[Float[Tensor, "F 3"], Float[Tensor, "F 3"]]:
-    """The rotation (axis-angle) and translation that bring the resting trunk nearest to the wanted one (Kabsch 1976)."""
+def _placed(
+    model: BodyModel, wanted: Float[Tensor, "F K 3"]
+) -> tuple[Float[Tensor, "F 3"], Float[Tensor, "F 3"]]:
+    """The rotation (axis-angle) and translation that bring the resting trunk nearest to the wanted
+    one (Kabsch 1976).
+    """
     from scipy.spatial.transform import Rotation
 
     rest = (model.joint_regressor @ model.template)[list(TRUNK)]
     there = wanted[:, list(TRUNK)]
-    covariance = torch.einsum("fkc,kd->fcd", there - there.mean(1, keepdim=True), rest - rest.mean(0))
+    covariance = torch.einsum(
+        "fkc,kd->fcd", there - there.mean(1, keepdim=True), rest - rest.mean(0)
+    )
     u, _, vt = torch.linalg.svd(covariance)
     signs = torch.ones(len(wanted), 3, dtype=wanted.dtype)
     signs[:, 2] = torch.linalg.det(u @ vt).sign()
@@ -203,7 +260,9 @@ def _placed(model: BodyModel, wanted: Float[Tensor, "F K 3"]) -> tuple[Float[Ten
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """For thousands of tiny operations: on a busy machine, threads that wait for each other make them a hundred times slower."""
+    """For thousands of tiny operations: on a busy machine, threads that wait for each other make
+    them a hundred times slower.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -216,7 +275,13 @@ def _minimise(moved: list[Tensor], loss: Callable[[], Tensor], iterations: int) 
     """L-BFGS over ``moved``, in place."""
     for tensor in moved:
         tensor.requires_grad_(True)
-    optimiser = torch.optim.LBFGS(moved, max_iter=iterations, history_size=20, line_search_fn="strong_wolfe", tolerance_change=1e-5)
+    optimiser = torch.optim.LBFGS(
+        moved,
+        max_iter=iterations,
+        history_size=20,
+        line_search_fn="strong_wolfe",
+        tolerance_change=1e-5,
+    )
 
     def closure() -> Tensor:
         optimiser.zero_grad()
@@ -251,11 +316,16 @@ def _check_shapes(arrays: dict[str, np.ndarray], path: str) -> None:
     )
     if not fits or joints < BODY_JOINTS:
         shapes = ", ".join(f"{name} {arrays[name].shape}" for name in FIELDS)
-        raise UserError(f"body model {path!r} has arrays that don't fit each other or too few joints ({BODY_JOINTS} are needed): {shapes}")
+        raise UserError(
+            f"body model {path!r} has arrays that don't fit each other or too few joints "
+            f"({BODY_JOINTS} are needed): {shapes}"
+        )
 
 
 def _check_values(arrays: dict[str, np.ndarray], path: str) -> None:
-    """Raise UserError unless all are finite numbers, faces name vertices, and each joint hangs on an earlier one."""
+    """Raise UserError unless all are finite numbers, faces name vertices, and each joint hangs on
+    an earlier one.
+    """
     parents, faces = arrays["kintree_table"][0, 1:].astype(np.int64), arrays["f"].astype(np.int64)
     sound = (
         all(np.isfinite(values).all() for values in arrays.values())
@@ -263,7 +333,10 @@ def _check_values(arrays: dict[str, np.ndarray], path: str) -> None:
         and ((faces >= 0) & (faces < len(arrays["v_template"]))).all()
     )
     if not sound:
-        raise UserError(f"body model {path!r} is damaged: numbers that aren't finite, or joints or faces that don't exist; get it again")
+        raise UserError(
+            f"body model {path!r} is damaged: numbers that aren't finite, or joints or faces "
+            "that don't exist; get it again"
+        )
 
 
 def _tensor(values: np.ndarray) -> Tensor:

@@ -1,4 +1,6 @@
-"""Reading published ``.pt`` and ``.pth`` files of weights: tensors only, and every name accounted for."""
+"""Reading published ``.pt`` and ``.pth`` files of weights: tensors only, and every name accounted
+for.
+"""
 
 import pickle
 import zipfile
@@ -17,7 +19,8 @@ NAMED = 4
 
 
 def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
-    """The tensors of a checkpoint by name; it is unpickled with ``weights_only``, so that it can't run code.
+    """The tensors of a checkpoint by name; it is unpickled with ``weights_only``, so that it can't
+    run code.
 
     Args:
         kind: what the file is, for messages ("Shap-E checkpoint").
@@ -27,17 +30,27 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
     """
     file = existing_file(path, kind)
     try:  # a zip is mapped, so what isn't wanted, as an optimiser's state, is never read
-        content = torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
+        content = torch.load(
+            file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file)
+        )
     except pickle.UnpicklingError as error:
         raise UserError(
-            f"{kind} {path!r} holds more than tensors, or is no file of PyTorch, and is not unpickled, since that could run code:"
+            f"{kind} {path!r} holds more than tensors, or is no file of PyTorch, and is not "
+            "unpickled, since that could run code:"
             f" {str(error).strip().splitlines()[0][:200]}"
         ) from error
-    except Exception as error:  # where a pickle is damaged, torch's reader of it raises what it likes
-        raise UserError(f"{kind} {path!r} can't be read: {type(error).__name__}: {str(error).strip()[:200]}") from error
+    except (
+        Exception
+    ) as error:  # where a pickle is damaged, torch's reader of it raises what it likes
+        raise UserError(
+            f"{kind} {path!r} can't be read: {type(error).__name__}: {str(error).strip()[:200]}"
+        ) from error
     state = content.get(WRAPPER, content) if isinstance(content, Mapping) else {}
     if not state or not all(isinstance(value, Tensor) for value in state.values()):
-        raise UserError(f"{kind} {path!r} holds no weights by name: a state dict, or a dict with {WRAPPER!r}, was expected")
+        raise UserError(
+            f"{kind} {path!r} holds no weights by name: a state dict, or a dict with "
+            f"{WRAPPER!r}, was expected"
+        )
     return dict(state)
 
 
@@ -56,7 +69,11 @@ def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> N
     ]
     problems = [
         f"{len(names)} {word} ({named(names)})"
-        for word, names in (("missing", missing), ("unknown", unknown), ("of another shape", differing))
+        for word, names in (
+            ("missing", missing),
+            ("unknown", unknown),
+            ("of another shape", differing),
+        )
         if names
     ]
     if problems:
@@ -67,4 +84,6 @@ def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> N
 def named(names: Iterable[str]) -> str:
     """The first few of ``names``, sorted."""
     names = sorted(names)
-    return ", ".join(names[:NAMED]) + (f", and {len(names) - NAMED} more" if len(names) > NAMED else "")
+    return ", ".join(names[:NAMED]) + (
+        f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    )

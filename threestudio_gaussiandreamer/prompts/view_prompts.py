@@ -1,9 +1,10 @@
-"""Text embeddings per view: what a prompt processor with a text encoder gives to a guidance, with threestudio's interface.
+"""Text embeddings per view: what a prompt processor with a text encoder gives to a guidance, with
+threestudio's interface.
 
-A view's direction (side, front, back or overhead) picks the prompt "a fox, front view"; with Perp-Neg (Armandpour et al. 2023)
-a view between two directions gets their interpolated embedding, and the other directions as negative prompts whose weights
-decay with the angle. Angles are in degrees, azimuth 0 is the front.
-"""
+A view's direction (side, front, back or overhead) picks the prompt "a fox, front view"; with
+Perp-Neg (Armandpour et al. 2023) a view between two directions gets their interpolated embedding,
+and the other directions as negative prompts whose weights decay with the angle. Angles are in
+degrees, azimuth 0 is the front."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,11 +30,18 @@ class Direction(NamedTuple):
     """(elevation, azimuth, camera_distances), each (B,), to (B,) bool."""
 
 
-def view_directions(front_threshold: float, back_threshold: float, overhead_threshold: float, *, prefix: bool = False) -> List[Direction]:
+def view_directions(
+    front_threshold: float,
+    back_threshold: float,
+    overhead_threshold: float,
+    *,
+    prefix: bool = False,
+) -> List[Direction]:
     """threestudio's four directions in its order: side, front, back, overhead.
 
     Args:
-        front_threshold, back_threshold: half the width of the front and the back, degrees of azimuth.
+        front_threshold, back_threshold: half the width of the front and the back, degrees of
+            azimuth.
         overhead_threshold: elevation from which a view is overhead, degrees.
         prefix: "front view of a fox" instead of "a fox, front view".
     """
@@ -43,7 +51,10 @@ def view_directions(front_threshold: float, back_threshold: float, overhead_thre
         "back": lambda elevation, azimuth, distance: shifted(azimuth).abs() > 180 - back_threshold,
         "overhead": lambda elevation, azimuth, distance: elevation > overhead_threshold,
     }
-    return [Direction(name, _prompt_maker(name, prefix), str, condition) for name, condition in conditions.items()]
+    return [
+        Direction(name, _prompt_maker(name, prefix), str, condition)
+        for name, condition in conditions.items()
+    ]
 
 
 def _prompt_maker(name: str, prefix: bool) -> Callable[[str], str]:
@@ -62,8 +73,8 @@ def shifted(azimuth: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
 class PromptEmbeddings:
     """The embeddings of one prompt; the names are those of threestudio's ``PromptProcessorOutput``.
 
-    ``*_vd`` hold one row per direction; ``perp_neg_f_*`` are (a, b, c) of the weight a exp(-b r) + c.
-    """
+    ``*_vd`` hold one row per direction; ``perp_neg_f_*`` are (a, b, c) of the weight a exp(-b r) +
+    c."""
 
     text_embeddings: Float[Tensor, "1 N F"]
     uncond_text_embeddings: Float[Tensor, "1 N F"]
@@ -80,12 +91,17 @@ class PromptEmbeddings:
     prompts_vd: List[str]
 
     def direction_indices(
-        self, elevation: Float[Tensor, " B"], azimuth: Float[Tensor, " B"], camera_distances: Float[Tensor, " B"]
+        self,
+        elevation: Float[Tensor, " B"],
+        azimuth: Float[Tensor, " B"],
+        camera_distances: Float[Tensor, " B"],
     ) -> Int[Tensor, " B"]:
         """The row of ``*_vd`` of each view."""
         indices = torch.zeros_like(elevation, dtype=torch.long)
         for direction in self.directions:
-            indices[direction.condition(elevation, azimuth, camera_distances)] = self.direction2idx[direction.name]
+            indices[direction.condition(elevation, azimuth, camera_distances)] = self.direction2idx[
+                direction.name
+            ]
         return indices
 
     def get_text_embeddings(
@@ -97,10 +113,14 @@ class PromptEmbeddings:
     ) -> Float[Tensor, "2*B N F"]:
         """The prompts of all views, then their negative prompts."""
         if view_dependent_prompting:
-            rows = self.direction_indices(elevation, azimuth, camera_distances).to(self.text_embeddings_vd.device)
+            rows = self.direction_indices(elevation, azimuth, camera_distances).to(
+                self.text_embeddings_vd.device
+            )
             return torch.cat([self.text_embeddings_vd[rows], self.uncond_text_embeddings_vd[rows]])
         every = (len(elevation), -1, -1)
-        return torch.cat([self.text_embeddings.expand(every), self.uncond_text_embeddings.expand(every)])
+        return torch.cat(
+            [self.text_embeddings.expand(every), self.uncond_text_embeddings.expand(every)]
+        )
 
     def get_text_embeddings_perp_neg(
         self,
@@ -109,16 +129,21 @@ class PromptEmbeddings:
         camera_distances: Float[Tensor, " B"],
         view_dependent_prompting: bool = True,
     ) -> Tuple[Float[Tensor, "4*B N F"], Float[Tensor, "B 2"]]:
-        """The prompts of all views, their negative prompts, then two Perp-Neg rows per view; and the weights of those two, <= 0.
+        """The prompts of all views, their negative prompts, then two Perp-Neg rows per view; and
+        the weights of those two, <= 0.
 
-        The rows of one view stand together (view 0 first, view 0 second, view 1 first, ...), as threestudio has them. Its own
-        guidances evaluate them on the latents of other views when there is more than one; ours pair them by view.
+        The rows of one view stand together (view 0 first, view 0 second, view 1 first, ...), as
+        threestudio has them. Its own guidances evaluate them on the latents of other views when
+        there is more than one; ours pair them by view.
 
         Raises:
             UserError: without view-dependent prompting there are no directions to keep apart.
         """
         if not view_dependent_prompting:
-            raise UserError("use_perp_neg needs view-dependent prompts: set system.guidance.view_dependent_prompting=true")
+            raise UserError(
+                "use_perp_neg needs view-dependent prompts: set "
+                "system.guidance.view_dependent_prompting=true"
+            )
         device = self.text_embeddings_vd.device
         rows = self.direction_indices(elevation, azimuth, camera_distances).to(device)
         overhead = rows == self.direction2idx["overhead"]
@@ -128,24 +153,40 @@ class PromptEmbeddings:
         share = closeness.to(embeddings)[:, None, None]
         positive = share * embeddings[pair[:, 0]] + (1 - share) * embeddings[pair[:, 1]]
         positive = torch.where(overhead[:, None, None], embeddings[rows], positive)
-        negative = torch.where(overhead[:, None, None, None], uncond[:, None], embeddings[self._negative_rows(angle)])
+        negative = torch.where(
+            overhead[:, None, None, None], uncond[:, None], embeddings[self._negative_rows(angle)]
+        )
         weights = torch.where(overhead[:, None], 0.0, self._negative_weights(angle, closeness))
         return torch.cat([positive, uncond, negative.flatten(0, 1)]), weights.to(elevation.device)
 
-    def _interpolation(self, angle: Float[Tensor, " B"]) -> Tuple[Int[Tensor, "B 2"], Float[Tensor, " B"]]:
-        """The two directions that a view lies between, and how close it is to the first of them, in [0, 1]."""
+    def _interpolation(
+        self, angle: Float[Tensor, " B"]
+    ) -> Tuple[Int[Tensor, "B 2"], Float[Tensor, " B"]]:
+        """The two directions that a view lies between, and how close it is to the first of them, in
+        [0, 1].
+        """
         side, front, back = (self.direction2idx[name] for name in ("side", "front", "back"))
         in_front = angle < 90
-        pair = torch.where(in_front[:, None], angle.new_tensor([front, side]), angle.new_tensor([side, back])).long()
+        pair = torch.where(
+            in_front[:, None], angle.new_tensor([front, side]), angle.new_tensor([side, back])
+        ).long()
         return pair, torch.where(in_front, 1 - angle / 90, 2 - angle / 90)
 
     def _negative_rows(self, angle: Float[Tensor, " B"]) -> Int[Tensor, "B 2"]:
         side, front = self.direction2idx["side"], self.direction2idx["front"]
-        return torch.where((angle < 90)[:, None], angle.new_tensor([front, side]), angle.new_tensor([side, front])).long()
+        return torch.where(
+            (angle < 90)[:, None], angle.new_tensor([front, side]), angle.new_tensor([side, front])
+        ).long()
 
-    def _negative_weights(self, angle: Float[Tensor, " B"], closeness: Float[Tensor, " B"]) -> Float[Tensor, "B 2"]:
-        front_half = torch.stack([decay(self.perp_neg_f_fs, closeness), decay(self.perp_neg_f_sf, 1 - closeness)], dim=1)
-        back_half = torch.stack([decay(self.perp_neg_f_sb, closeness), decay(self.perp_neg_f_fsb, closeness)], dim=1)
+    def _negative_weights(
+        self, angle: Float[Tensor, " B"], closeness: Float[Tensor, " B"]
+    ) -> Float[Tensor, "B 2"]:
+        front_half = torch.stack(
+            [decay(self.perp_neg_f_fs, closeness), decay(self.perp_neg_f_sf, 1 - closeness)], dim=1
+        )
+        back_half = torch.stack(
+            [decay(self.perp_neg_f_sb, closeness), decay(self.perp_neg_f_fsb, closeness)], dim=1
+        )
         return -torch.where((angle < 90)[:, None], front_half, back_half)
 
 

@@ -89,32 +89,54 @@ def rasterize(
         opacities: in [0, 1].
         colors: any number of channels, of the Gaussians (N, C) or of each view (B, N, C).
         viewmats: world to camera, OpenCV (x right, y down, z forward).
-        Ks: intrinsics in pixels of the size below, centres at +0.5; without skew and without gradient.
+        Ks: intrinsics in pixels of the size below, centres at +0.5; without skew and without
+            gradient.
         width, height: pixels to render, before downsampling.
         background: colour behind everything, (C,) or (B, C); None is black.
         near, far: a Gaussian whose mean isn't strictly between these depths is dropped.
         eps2d: added to both variances on screen, square pixels.
-        antialias: make up for that dilation in the opacity, so that a small Gaussian keeps its energy at any distance.
+        antialias: make up for that dilation in the opacity, so that a small Gaussian keeps its
+            energy at any distance.
         preset: smallest alpha that counts: fast 1/255, balanced 1/1024, accurate 1/65536.
         alpha_min: that number itself, instead of a preset.
         alpha_max: largest alpha of one Gaussian in one pixel; no gradient above it.
         stop: a pixel is finished with the Gaussian that brings its transmittance below this.
         downsample: 2 averages 2 x 2 pixels after rendering.
         absgrad: also collect ``means2d.absgrad``, the sum over pixels of the absolute gradient.
-        backend: "cpu", "cuda", "torch", "reference", or "auto": the fastest for where the tensors are.
+        backend: "cpu", "cuda", "torch", "reference", or "auto": the fastest for where the tensors
+            are.
         non_finite: "drop" ignores Gaussians that hold NaN or infinity; "error" names them.
 
     Returns:
-        Rasterized: image, alpha, depth, means2d, radii, contribution. Always float32, or float64 for float64 Gaussians.
+        Rasterized: image, alpha, depth, means2d, radii, contribution. Always float32, or float64
+            for float64 Gaussians.
 
     Raises:
         UserError: an argument has the wrong shape, type, device or value, or the backend can't run.
 
     The image model is the one of `reference.py` and `projection.py`.
     """
-    options = RasterizeOptions(near, far, eps2d, antialias, _alpha_min(preset, alpha_min), alpha_max, stop, downsample, absgrad)
-    gaussians = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
-    cameras = {"viewmats": viewmats, "Ks": Ks} | ({} if background is None else {"background": background})
+    options = RasterizeOptions(
+        near,
+        far,
+        eps2d,
+        antialias,
+        _alpha_min(preset, alpha_min),
+        alpha_max,
+        stop,
+        downsample,
+        absgrad,
+    )
+    gaussians = {
+        "means": means,
+        "quats": quats,
+        "scales": scales,
+        "opacities": opacities,
+        "colors": colors,
+    }
+    cameras = {"viewmats": viewmats, "Ks": Ks} | (
+        {} if background is None else {"background": background}
+    )
     _check_tensors(gaussians | cameras)
     _check_shapes(gaussians | cameras)
     _check_numbers(width, height, options)
@@ -125,7 +147,15 @@ def rasterize(
         background = cameras.get("background")
         if background is not None:
             background = background.expand(len(viewmats), -1).contiguous()
-        return run(*gaussians.values(), cameras["viewmats"], cameras["Ks"].detach(), int(width), int(height), background, options)
+        return run(
+            *gaussians.values(),
+            cameras["viewmats"],
+            cameras["Ks"].detach(),
+            int(width),
+            int(height),
+            background,
+            options,
+        )
 
 
 def _alpha_min(preset: str, alpha_min: Optional[float]) -> float:
@@ -140,9 +170,14 @@ def _check_tensors(tensors: dict[str, Tensor]) -> None:
         if not isinstance(tensor, Tensor):
             raise UserError(f"{name} must be a torch.Tensor; got {type(tensor).__name__}.")
         if not tensor.is_floating_point():
-            raise UserError(f"{name} must be floating point; got {tensor.dtype}. Convert it with .float().")
+            raise UserError(
+                f"{name} must be floating point; got {tensor.dtype}. Convert it with .float()."
+            )
         if tensor.device != tensors["means"].device:
-            raise UserError(f"{name} must be on the device of means ({tensors['means'].device}); got {tensor.device}.")
+            raise UserError(
+                f"{name} must be on the device of means ({tensors['means'].device}); got "
+                f"{tensor.device}."
+            )
 
 
 def _check_shapes(tensors: dict[str, Tensor]) -> None:
@@ -182,17 +217,35 @@ def _shape(tensor: Tensor) -> str:
 def _check_numbers(width: int, height: int, options: RasterizeOptions) -> None:
     for name, size in (("width", width), ("height", height)):
         if not _is_whole(size) or not 1 <= size <= LARGEST_SIDE:
-            raise UserError(f"{name} must be a whole number of pixels, at least 1 and at most {LARGEST_SIDE}; got {size!r}.")
-        if not _is_whole(options.downsample) or options.downsample not in (1, 2) or size % options.downsample:
-            raise UserError(f"downsample must be 1 or 2 and divide the size; got downsample={options.downsample!r} with {name}={size}.")
+            raise UserError(
+                f"{name} must be a whole number of pixels, at least 1 and at most "
+                f"{LARGEST_SIDE}; got {size!r}."
+            )
+        if (
+            not _is_whole(options.downsample)
+            or options.downsample not in (1, 2)
+            or size % options.downsample
+        ):
+            raise UserError(
+                "downsample must be 1 or 2 and divide the size; got "
+                f"downsample={options.downsample!r} with {name}={size}."
+            )
     for name in ("near", "far", "eps2d", "alpha_min", "alpha_max", "stop"):
         if not isinstance(getattr(options, name), Real):
             raise UserError(f"{name} must be a number; got {getattr(options, name)!r}.")
     ranges = {
-        "near, far": (0 < options.near < options.far, "0 < near < far", (options.near, options.far)),
+        "near, far": (
+            0 < options.near < options.far,
+            "0 < near < far",
+            (options.near, options.far),
+        ),
         "eps2d": (0 <= options.eps2d < float("inf"), "a finite number >= 0", options.eps2d),
         "alpha_min": (0 <= options.alpha_min < 1, "in [0, 1)", options.alpha_min),
-        "alpha_max": (options.alpha_min < options.alpha_max <= 1, "in (alpha_min, 1]", options.alpha_max),
+        "alpha_max": (
+            options.alpha_min < options.alpha_max <= 1,
+            "in (alpha_min, 1]",
+            options.alpha_max,
+        ),
         "stop": (0 <= options.stop < 1, "in [0, 1)", options.stop),
     }
     for name, (holds, wanted, got) in ranges.items():
@@ -209,21 +262,36 @@ def _check_finite(policy: str, tensors: dict[str, Tensor]) -> None:
         raise unknown("non_finite policy", policy, ("drop", "error"))
     if policy == "error":
         for name, tensor in tensors.items():
-            if tensor.detach().sum().isfinite():  # then all of them are: one fast pass settles the usual case
+            if (
+                tensor.detach().sum().isfinite()
+            ):  # then all of them are: one fast pass settles the usual case
                 continue
             bad = (~tensor.isfinite()).nonzero()
             if len(bad):
                 first = tuple(bad[0].tolist())
-                raise UserError(f"{name} holds {len(bad)} values that aren't finite, the first at {first}: {tensor[first].item()}.")
+                raise UserError(
+                    f"{name} holds {len(bad)} values that aren't finite, the first at {first}: "
+                    f"{tensor[first].item()}."
+                )
 
 
-def _convert(gaussians: dict[str, Tensor], cameras: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Everything contiguous and float32, or float64 where all Gaussians are; only the cameras are narrowed in silence."""
+def _convert(
+    gaussians: dict[str, Tensor], cameras: dict[str, Tensor]
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Everything contiguous and float32, or float64 where all Gaussians are; only the cameras are
+    narrowed in silence.
+    """
     wide = [name for name, tensor in gaussians.items() if tensor.dtype == torch.float64]
     if wide and len(wide) < len(gaussians):
-        raise UserError(f"{', '.join(gaussians)} must all be float64 or none of them; float64 here: {', '.join(wide)}.")
+        raise UserError(
+            f"{', '.join(gaussians)} must all be float64 or none of them; float64 here: "
+            f"{', '.join(wide)}."
+        )
     dtype = torch.float64 if wide else torch.float32
-    return tuple({name: tensor.to(dtype).contiguous() for name, tensor in group.items()} for group in (gaussians, cameras))
+    return tuple(
+        {name: tensor.to(dtype).contiguous() for name, tensor in group.items()}
+        for group in (gaussians, cameras)
+    )
 
 
 def _choose(name: str, tensor: Tensor) -> Backend:
@@ -235,15 +303,27 @@ def _choose(name: str, tensor: Tensor) -> Backend:
     if name == "auto":
         _report_slow_path(usable[0], tensor)
     elif refusals[name] is not None:
-        raise UserError(f"the backend {name!r} can't run: {refusals[name]}. Use backend='auto', or one of {', '.join(usable)}.")
+        raise UserError(
+            f"the backend {name!r} can't run: {refusals[name]}. Use backend='auto', or one of "
+            f"{', '.join(usable)}."
+        )
     return BACKENDS[usable[0] if name == "auto" else name]
 
 
 def _report_slow_path(chosen: str, tensor: Tensor) -> None:
-    """Say once for each reason that the kernel made for this device isn't used though the tensors would suit it."""
+    """Say once for each reason that the kernel made for this device isn't used though the tensors
+    would suit it.
+    """
     for name, backend in BACKENDS.items():
-        if name != chosen and tensor.device.type in (backend.devices or ()) and tensor.dtype in backend.dtypes:
-            _warn_once(f"splatting in plain torch, many times slower than backend {name!r}, which can't run: {backend.refuses(tensor)}.")
+        if (
+            name != chosen
+            and tensor.device.type in (backend.devices or ())
+            and tensor.dtype in backend.dtypes
+        ):
+            _warn_once(
+                f"splatting in plain torch, many times slower than backend {name!r}, which "
+                f"can't run: {backend.refuses(tensor)}."
+            )
 
 
 @functools.cache

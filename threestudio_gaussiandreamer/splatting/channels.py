@@ -21,7 +21,10 @@ def groups(colors: Tensor, background: Tensor) -> list[tuple[Tensor, Tensor]]:
 
 def widen(x: Tensor, channels: int = CHANNELS) -> Tensor:
     """Contiguous, with zeros for the channels that are missing."""
-    x, missing = x.contiguous(), channels - x.shape[-1]  # before padding, which keeps some other layouts
+    x, missing = (
+        x.contiguous(),
+        channels - x.shape[-1],
+    )  # before padding, which keeps some other layouts
     return torch.nn.functional.pad(x, (0, missing)) if missing else x
 
 

@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass
 
-SMALLEST_ALPHA = 2.0**-100  # stands for alpha_min = 0 in kernels: below it a float32 image can't tell
+SMALLEST_ALPHA = (
+    2.0**-100
+)  # stands for alpha_min = 0 in kernels: below it a float32 image can't tell
 
 
 @dataclass(frozen=True)

@@ -16,15 +16,23 @@ class Rasterized(NamedTuple):
     image: Float[Tensor, "B H W C"]
     alpha: Float[Tensor, "B H W 1"]  # in [0, 1]
     depth: Float[Tensor, "B H W 1"]  # sum of t.z alpha_i T_i, world units, not normalised
-    means2d: Float[Tensor, "B N 2"]  # pixels before downsampling; backward fills ``.grad`` and, if asked, ``.absgrad``
-    radii: Float[Tensor, "B N"]  # pixels before downsampling, the larger half extent of alpha >= alpha_min; 0 when culled
-    contribution: Float[Tensor, "B N"]  # the largest alpha_i T_i over the pixels of the view; no gradient
+    means2d: Float[
+        Tensor, "B N 2"
+    ]  # pixels before downsampling; backward fills ``.grad`` and, if asked, ``.absgrad``
+    radii: Float[
+        Tensor, "B N"
+    ]  # pixels before downsampling, the larger half extent of alpha >= alpha_min; 0 when culled
+    contribution: Float[
+        Tensor, "B N"
+    ]  # the largest alpha_i T_i over the pixels of the view; no gradient
 
 
 def track_means2d(splats: Splats, others: tuple[Optional[Tensor], ...], absgrad: bool) -> Tensor:
     """``splats.means2d`` prepared to report its gradient whenever anything is differentiated."""
     means2d = splats.means2d
-    if torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in (*splats, *others)):
+    if torch.is_grad_enabled() and any(
+        x is not None and x.requires_grad for x in (*splats, *others)
+    ):
         means2d = means2d if means2d.requires_grad else means2d.requires_grad_()
         means2d.retain_grad()
         if absgrad:
@@ -33,9 +41,14 @@ def track_means2d(splats: Splats, others: tuple[Optional[Tensor], ...], absgrad:
 
 
 def compose(
-    sums: Float[Tensor, "B H W C+2"], splats: Splats, contribution: Tensor, background: Optional[Tensor], options: RasterizeOptions
+    sums: Float[Tensor, "B H W C+2"],
+    splats: Splats,
+    contribution: Tensor,
+    background: Optional[Tensor],
+    options: RasterizeOptions,
 ) -> Rasterized:
-    """Background behind the sums of (colour, depth, 1) weighted with ``alpha_i T_i``, then the box filter of the downsampling.
+    """Background behind the sums of (colour, depth, 1) weighted with ``alpha_i T_i``, then the box
+    filter of the downsampling.
 
     ``alpha = sum_i alpha_i T_i = 1 - T_end``, so ``image = colour + (1 - alpha) background``.
     """

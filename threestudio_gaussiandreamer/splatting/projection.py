@@ -1,9 +1,10 @@
-"""From 3-D Gaussians to splats on the screen: the first stage of the image model, in torch, for any float type.
+"""From 3-D Gaussians to splats on the screen: the first stage of the image model, in torch, for any
+float type.
 
-The formulas are EWA splatting (Zwicker et al. 2001) with the conventions of 3D Gaussian Splatting (Kerbl et al. 2023):
-a Gaussian with mean ``t`` in camera coordinates becomes a 2-D Gaussian with mean ``pinhole(t)`` and covariance
-``J W S W' J' + eps2d I``, where ``J`` is the pinhole's Jacobian at ``t``.
-"""
+The formulas are EWA splatting (Zwicker et al. 2001) with the conventions of 3D Gaussian Splatting
+(Kerbl et al. 2023): a Gaussian with mean ``t`` in camera coordinates becomes a 2-D Gaussian with
+mean ``pinhole(t)`` and covariance ``J W S W' J' + eps2d I``, where ``J`` is the pinhole's Jacobian
+at ``t``."""
 
 from typing import NamedTuple
 
@@ -21,10 +22,10 @@ ZERO = torch.zeros(())
 class Splats(NamedTuple):
     """Gaussians as the blend sees them; invisible ones hold zeros and get zero gradients.
 
-    ``conics`` are (a, k, c) of the completed square ``d' cov^-1 d = a (d.x - k d.y)^2 + c d.y^2``, that is
-    ``a = cov.yy / det``, ``k = cov.xy / cov.yy``, ``c = 1 / cov.yy``. Unlike the three entries of ``cov^-1`` it doesn't
-    cancel for a needle: its error is that of ``d.x - k d.y`` alone.
-    """
+    ``conics`` are (a, k, c) of the completed square ``d' cov^-1 d = a (d.x - k d.y)^2 + c d.y^2``,
+    that is ``a = cov.yy / det``, ``k = cov.xy / cov.yy``, ``c = 1 / cov.yy``. Unlike the three
+    entries of ``cov^-1`` it doesn't cancel for a needle: its error is that of ``d.x - k d.y``
+    alone."""
 
     means2d: Float[Tensor, "B N 2"]  # pixels, centres at +0.5
     conics: Float[Tensor, "B N 3"]
@@ -53,34 +54,48 @@ def project(
 ) -> Splats:
     """All Gaussians in all views; differentiable in means, quats, scales, opacities and viewmats.
 
-    A first pass without gradients finds what is visible. The second sees only those: whatever else there is becomes a
-    harmless Gaussian *before* the formulas, so that its NaN or overflow can't reach a gradient (0 * NaN is NaN). Colours are
-    only looked at: a Gaussian with a colour that isn't finite is invisible.
-    """
+    A first pass without gradients finds what is visible. The second sees only those: whatever else
+    there is becomes a harmless Gaussian *before* the formulas, so that its NaN or overflow can't
+    reach a gradient (0 * NaN is NaN). Colours are only looked at: a Gaussian with a colour that
+    isn't finite is invisible."""
     finite = torch.stack([_finite(x) for x in (means, quats, scales, opacities)]).all(0)
     means, quats, scales, opacities = (_keep(finite, x) for x in (means, quats, scales, opacities))
-    cameras_finite = _finite(viewmats[:, :3]) & _finite(Ks[:, [0, 1, 0, 1], [0, 1, 2, 2]])  # what is read of them
-    viewmats, Ks = _keep(cameras_finite, viewmats, torch.eye(4)), _keep(cameras_finite, Ks, torch.eye(3))
+    cameras_finite = _finite(viewmats[:, :3]) & _finite(
+        Ks[:, [0, 1, 0, 1], [0, 1, 2, 2]]
+    )  # what is read of them
+    viewmats, Ks = (
+        _keep(cameras_finite, viewmats, torch.eye(4)),
+        _keep(cameras_finite, Ks, torch.eye(3)),
+    )
 
     t, axes = _to_camera(means, quats, scales, viewmats)
     with torch.no_grad():
         candidates = _to_screen(t, axes, opacities, Ks, width, height, options)
-        visible = finite & colors.isfinite().all(-1) & cameras_finite[:, None] & _visible(*candidates, width, height, options)
+        visible = (
+            finite
+            & colors.isfinite().all(-1)
+            & cameras_finite[:, None]
+            & _visible(*candidates, width, height, options)
+        )
     t, axes = _keep(visible, t, torch.tensor([0.0, 0.0, 1.0])), _keep(visible, axes, torch.eye(3))
-    Ks = _keep(visible.any(1), Ks, torch.eye(3))  # one that shows nothing may overflow whatever it is given
+    Ks = _keep(
+        visible.any(1), Ks, torch.eye(3)
+    )  # one that shows nothing may overflow whatever it is given
     splats = _to_screen(t, axes, opacities, Ks, width, height, options)
     return Splats(*(_keep(visible, x) for x in splats), visible)
 
 
 def quats_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices of quaternions wxyz of any length; below 1e-12 the identity, with zero gradient.
+    """Rotation matrices of quaternions wxyz of any length; below 1e-12 the identity, with zero
+    gradient.
 
-    Dividing by the largest entry first keeps the squares of tiny and huge quaternions inside float32; the rotation
-    doesn't depend on that divisor, so it takes no gradient.
-    """
+    Dividing by the largest entry first keeps the squares of tiny and huge quaternions inside
+    float32; the rotation doesn't depend on that divisor, so it takes no gradient."""
     largest = quats.detach().abs().amax(-1, keepdim=True)
     usable = largest >= SMALLEST_QUATERNION
-    q = torch.where(usable, quats / torch.where(usable, largest, 1), quats.new_tensor([1.0, 0, 0, 0]))
+    q = torch.where(
+        usable, quats / torch.where(usable, largest, 1), quats.new_tensor([1.0, 0, 0, 0])
+    )
     w, x, y, z = (q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)).unbind(-1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -91,10 +106,13 @@ def quats_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batc
 
 
 def _to_camera(means, quats, scales, viewmats) -> tuple[Tensor, Tensor]:
-    """Camera coordinates ``t`` (B, N, 3) of the means, and ``axes`` (B, N, 3, 3): columns are the scaled axes in that frame."""
+    """Camera coordinates ``t`` (B, N, 3) of the means, and ``axes`` (B, N, 3, 3): columns are the
+    scaled axes in that frame.
+    """
     rotations, translations = viewmats[:, None, :3, :3], viewmats[:, None, :3, 3]
     axes = quats_to_rotations(quats) * scales[:, None, :]
-    # Written out, because the rounding of a library's matrix product may depend on the number of threads.
+    # Written out, because the rounding of a library's matrix product may depend on the number of
+    # threads.
     t = translations + sum(rotations[..., j] * means[:, j, None] for j in range(3))
     return t, sum(rotations[..., j, None] * axes[:, None, j] for j in range(3))
 
@@ -104,33 +122,45 @@ def _to_screen(t, axes, opacities, Ks, width, height, options) -> tuple[Tensor, 
     u0, u1 = _project_axes(t, axes, Ks, width, height)
     conics, variances, compensation = _invert_covariance(u0, u1, options.eps2d)
     depths = t[..., 2]
-    means2d = torch.stack([_focal(Ks, i) * (t[..., i] / depths) + _centre(Ks, i) for i in (0, 1)], -1)
+    means2d = torch.stack(
+        [_focal(Ks, i) * (t[..., i] / depths) + _centre(Ks, i) for i in (0, 1)], -1
+    )
     opacities = opacities * compensation if options.antialias else opacities.expand_as(depths)
-    return means2d, conics, opacities, depths, _extents(variances.detach(), opacities.detach(), options.alpha_min)
+    return (
+        means2d,
+        conics,
+        opacities,
+        depths,
+        _extents(variances.detach(), opacities.detach(), options.alpha_min),
+    )
 
 
 def _project_axes(t, axes, Ks, width, height) -> tuple[Tensor, Tensor]:
-    """The two rows of ``J @ axes``: d(pixel x) and d(pixel y) along each scaled axis of the Gaussian.
+    """The two rows of ``J @ axes``: d(pixel x) and d(pixel y) along each scaled axis of the
+    Gaussian.
 
-    ``J = [[fx/z, 0, -fx x/z^2], [0, fy/z, -fy y/z^2]]`` with x/z and y/z clamped to the image widened by 30 % of half the
-    field of view, outside of which the linearisation explodes. The gradient is that of the clamped formula.
-    """
+    ``J = [[fx/z, 0, -fx x/z^2], [0, fy/z, -fy y/z^2]]`` with x/z and y/z clamped to the image
+    widened by 30 % of half the field of view, outside of which the linearisation explodes. The
+    gradient is that of the clamped formula."""
     z, rows = t[..., 2], []
     for i, size in ((0, width), (1, height)):
         focal, centre = _focal(Ks, i), _centre(Ks, i)
         margin = FRUSTUM_MARGIN * 0.5 * size / focal
-        slope = torch.clamp(t[..., i] / z, -centre / focal - margin, (size - centre) / focal + margin)
+        slope = torch.clamp(
+            t[..., i] / z, -centre / focal - margin, (size - centre) / focal + margin
+        )
         rows.append((focal / z)[..., None] * (axes[..., i, :] - slope[..., None] * axes[..., 2, :]))
     return rows[0], rows[1]
 
 
 def _invert_covariance(u0, u1, eps2d) -> tuple[Tensor, Tensor, Tensor]:
-    """Conics, variances (cov.xx, cov.yy) and ``sqrt(det before / det after the dilation)`` of ``cov = U U' + eps2d I``.
+    """Conics, variances (cov.xx, cov.yy) and ``sqrt(det before / det after the dilation)`` of ``cov
+    = U U' + eps2d I``.
 
     By Lagrange's identity ``det(U U') = |u0 x u1|^2``, so with ``v = u1 / sqrt(cov.yy)``
-    ``det / cov.yy = |u0 x v|^2 + eps2d (1 + |u0|^2 / cov.yy)``: a sum of squares, which can neither cancel nor go negative,
-    and whose factors stay in float32's range where ``det`` itself overflows.
-    """
+    ``det / cov.yy = |u0 x v|^2 + eps2d (1 + |u0|^2 / cov.yy)``: a sum of squares, which can neither
+    cancel nor go negative, and whose factors stay in float32's range where ``det`` itself
+    overflows."""
     before_xx, before_yy = (u0 * u0).sum(-1), (u1 * u1).sum(-1)
     xx, xy, yy = before_xx + eps2d, (u0 * u1).sum(-1), before_yy + eps2d
     area = torch.linalg.vector_norm(torch.linalg.cross(u0, u1 / yy.sqrt()[..., None]), dim=-1)
@@ -140,7 +170,9 @@ def _invert_covariance(u0, u1, eps2d) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _compensation(area, dilation) -> Tensor:
-    """``area / sqrt(area^2 + dilation)``, in two forms whose gradients don't cancel: below and above ``area^2 = dilation``."""
+    """``area / sqrt(area^2 + dilation)``, in two forms whose gradients don't cancel: below and
+    above ``area^2 = dilation``.
+    """
     small = area * area < dilation
     ratio = area * torch.where(small, dilation, 1).rsqrt()
     inverse_square = dilation / torch.where(small, 1, area) ** 2
@@ -148,17 +180,28 @@ def _compensation(area, dilation) -> Tensor:
 
 
 def _extents(variances, opacities, alpha_min) -> Tensor:
-    """Half sizes of the box around ``opacity exp(-q/2) >= alpha_min``: ``sqrt(2 ln(opacity / alpha_min) variance)``."""
+    """Half sizes of the box around ``opacity exp(-q/2) >= alpha_min``: ``sqrt(2 ln(opacity /
+    alpha_min) variance)``.
+    """
     if alpha_min == 0:
         return torch.full_like(variances, torch.inf)
     return (2 * torch.log(opacities / alpha_min)[..., None] * variances).sqrt()
 
 
 def _visible(means2d, conics, opacities, depths, extents, width, height, options) -> Tensor:
-    """In front of the camera, representable, opaque enough for a pixel, and with a box that meets the image."""
+    """In front of the camera, representable, opaque enough for a pixel, and with a box that meets
+    the image.
+    """
     in_range = (depths > options.near) & (depths < options.far)
-    drawable = conics.isfinite().all(-1) & (conics[..., 0] > 0) & (conics[..., 2] > 0) & means2d.isfinite().all(-1)
-    on_screen = ((means2d + extents >= 0) & (means2d - extents <= means2d.new_tensor([width, height]))).all(-1)
+    drawable = (
+        conics.isfinite().all(-1)
+        & (conics[..., 0] > 0)
+        & (conics[..., 2] > 0)
+        & means2d.isfinite().all(-1)
+    )
+    on_screen = (
+        (means2d + extents >= 0) & (means2d - extents <= means2d.new_tensor([width, height]))
+    ).all(-1)
     return in_range & drawable & (opacities >= options.alpha_min) & on_screen
 
 

@@ -1,9 +1,9 @@
-"""The specification of the image model: every pixel against every visible Gaussian, differentiated by autograd.
+"""The specification of the image model: every pixel against every visible Gaussian, differentiated
+by autograd.
 
-Three stages: `project` (projection.py), `sort`, `blend`. It exists to be read and to be the truth in tests, in float32 and
-float64; there are no tiles, and memory is bounded by treating the pixels in chunks. ``alpha_min=0, alpha_max=1, stop=0``
-turn the cut-offs off.
-"""
+Three stages: `project` (projection.py), `sort`, `blend`. It exists to be read and to be the truth
+in tests, in float32 and float64; there are no tiles, and memory is bounded by treating the pixels
+in chunks. ``alpha_min=0, alpha_max=1, stop=0`` turn the cut-offs off."""
 
 from typing import NamedTuple, Optional
 
@@ -23,12 +23,26 @@ def unavailable() -> Optional[str]:
     """None: plain torch runs everywhere."""
 
 
-def rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, height, background, options: RasterizeOptions) -> Rasterized:
+def rasterize(
+    means,
+    quats,
+    scales,
+    opacities,
+    colors,
+    viewmats,
+    Ks,
+    width,
+    height,
+    background,
+    options: RasterizeOptions,
+) -> Rasterized:
     """All views; arguments as in `splatting.rasterize`, already validated."""
     splats = project(means, quats, scales, opacities, colors, viewmats, Ks, width, height, options)
     splats = splats._replace(means2d=track_means2d(splats, (colors, background), options.absgrad))
     colors = colors.expand(len(viewmats), -1, -1)
-    views = [render_view(splats, colors, view, width, height, options) for view in range(len(viewmats))]
+    views = [
+        render_view(splats, colors, view, width, height, options) for view in range(len(viewmats))
+    ]
     sums, contribution = (torch.stack(x) for x in zip(*views, strict=True))
     return compose(sums.unflatten(1, (height, width)), splats, contribution, background, options)
 
@@ -43,15 +57,22 @@ class Sorted(NamedTuple):
     features: Tensor  # (M, C + 2): colour, depth, 1
 
 
-def render_view(splats: Splats, colors: Tensor, view: int, width: int, height: int, options: RasterizeOptions) -> tuple[Tensor, Tensor]:
+def render_view(
+    splats: Splats, colors: Tensor, view: int, width: int, height: int, options: RasterizeOptions
+) -> tuple[Tensor, Tensor]:
     """The sums of `blend` (H*W, C + 2) of one view and each Gaussian's contribution (N,)."""
     front_to_back = sort(splats, colors, view)
     absgrad = splats.means2d.absgrad[view] if hasattr(splats.means2d, "absgrad") else None
     chunks = pixel_centres(width, height, splats.depths).split(_pixels_per_chunk(front_to_back))
-    blended = [_blend_in_bounded_memory(len(chunks) > 1, pixels, front_to_back, options, absgrad) for pixels in chunks]
+    blended = [
+        _blend_in_bounded_memory(len(chunks) > 1, pixels, front_to_back, options, absgrad)
+        for pixels in chunks
+    ]
     sums, largest = zip(*blended, strict=True)
     contribution = splats.depths.new_zeros(splats.depths.shape[1])
-    return torch.cat(sums), contribution.index_copy(0, front_to_back.ids, torch.stack(largest).amax(0))
+    return torch.cat(sums), contribution.index_copy(
+        0, front_to_back.ids, torch.stack(largest).amax(0)
+    )
 
 
 def sort(splats: Splats, colors: Tensor, view: int) -> Sorted:
@@ -59,16 +80,25 @@ def sort(splats: Splats, colors: Tensor, view: int) -> Sorted:
     visible = splats.visible[view].nonzero()[:, 0]
     ids = visible[splats.depths[view, visible].argsort(stable=True)]
     means2d, conics, opacities, depths = (x[view, ids] for x in splats[:4])
-    return Sorted(ids, means2d, conics, opacities, torch.cat([colors[view, ids], depths[:, None], torch.ones_like(depths)[:, None]], 1))
+    return Sorted(
+        ids,
+        means2d,
+        conics,
+        opacities,
+        torch.cat([colors[view, ids], depths[:, None], torch.ones_like(depths)[:, None]], 1),
+    )
 
 
-def blend(pixels: Tensor, splats: Sorted, options: RasterizeOptions, absgrad: Optional[Tensor]) -> tuple[Tensor, Tensor]:
-    """Front-to-back alpha compositing (Porter and Duff 1984; Kerbl et al. 2023, eq. 3) of M Gaussians at P pixels.
+def blend(
+    pixels: Tensor, splats: Sorted, options: RasterizeOptions, absgrad: Optional[Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Front-to-back alpha compositing (Porter and Duff 1984; Kerbl et al. 2023, eq. 3) of M
+    Gaussians at P pixels.
 
-    ``alpha_i = min(alpha_max, opacity_i exp(-q_i / 2))``, zero below ``alpha_min``; ``T_i = prod_{j<i} (1 - alpha_j)``; the
-    Gaussians with ``T_i >= stop`` count, so the one that brings T below ``stop`` is the last. Returns
-    ``sum_i features_i alpha_i T_i`` (P, C + 2) and ``max_pixels alpha_i T_i`` (M,).
-    """
+    ``alpha_i = min(alpha_max, opacity_i exp(-q_i / 2))``, zero below ``alpha_min``; ``T_i =
+    prod_{j<i} (1 - alpha_j)``; the Gaussians with ``T_i >= stop`` count, so the one that brings T
+    below ``stop`` is the last. Returns ``sum_i features_i alpha_i T_i`` (P, C + 2) and ``max_pixels
+    alpha_i T_i`` (M,)."""
     offsets = pixels[:, None] - splats.means2d
     if absgrad is not None and offsets.requires_grad:
         offsets.register_hook(lambda grad: _accumulate(absgrad, splats.ids, grad.abs().sum(0)))
@@ -89,7 +119,9 @@ def _accumulate(total: Tensor, ids: Tensor, values: Tensor) -> None:
 
 def pixel_centres(width: int, height: int, like: Tensor) -> Tensor:
     """(H*W, 2) x, y of the pixel centres, row by row from the top."""
-    y, x = torch.meshgrid(torch.arange(height).to(like) + 0.5, torch.arange(width).to(like) + 0.5, indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(height).to(like) + 0.5, torch.arange(width).to(like) + 0.5, indexing="ij"
+    )
     return torch.stack([x, y], -1).reshape(-1, 2)
 
 
@@ -97,9 +129,14 @@ def _blend_in_bounded_memory(bounded: bool, *arguments) -> tuple[Tensor, Tensor]
     """`blend`, repeated in backward rather than remembered when ``bounded``."""
     if not bounded:
         return blend(*arguments)
-    # Without arguments, because absgrad changes in backward, which checkpoint forbids of what it is handed.
+    # Without arguments, because absgrad changes in backward, which checkpoint forbids of what it is
+    # handed.
     return checkpoint(lambda: blend(*arguments), use_reentrant=False, preserve_rng_state=False)
 
 
 def _pixels_per_chunk(splats: Sorted) -> int:
-    return max(1, CHUNK_BYTES // (TENSORS_PER_PAIR * splats.opacities.element_size() * max(1, len(splats.ids))))
+    return max(
+        1,
+        CHUNK_BYTES
+        // (TENSORS_PER_PAIR * splats.opacities.element_size() * max(1, len(splats.ids))),
+    )

@@ -1,4 +1,5 @@
-"""Which splats may touch which tile of the screen, front to back, in bounded memory; torch on any device.
+"""Which splats may touch which tile of the screen, front to back, in bounded memory; torch on any
+device.
 
 The tiles of all views form one grid, views stacked from top to bottom, so one pass serves a batch.
 """
@@ -12,7 +13,8 @@ from torch import Tensor
 TILE = 8
 CANDIDATES_PER_SLICE = 2**22
 CANDIDATES_PER_TEST = 2**17
-# Widens the bounds of the float32 tests; the blend decides each pixel exactly, so a splat too many costs time only.
+# Widens the bounds of the float32 tests; the blend decides each pixel exactly, so a splat too many
+# costs time only.
 SLACK = 1e-3
 
 
@@ -35,13 +37,19 @@ class Grid(NamedTuple):
 class Bounds(NamedTuple):
     """S splats in their order, with what the tests need."""
 
-    shapes: Tensor  # (6, S): mean x, y in pixels of the view; conic a, k, c; the largest q at which alpha >= alpha_min
-    rectangles: Tensor  # (4, S): left, top, right, bottom in tiles of the grid, the last two exclusive
+    # (6, S): mean x, y in pixels of the view; conic a, k, c; the largest q at which alpha >=
+    # alpha_min
+    shapes: Tensor
+    rectangles: (
+        Tensor  # (4, S): left, top, right, bottom in tiles of the grid, the last two exclusive
+    )
     first_rows: Tensor  # (S,) the row of the grid where the splat's view starts
 
 
 class Lists(NamedTuple):
-    """The splats of each tile: tile i has ``splats[starts[i] : starts[i] + counts[i]]``, front to back; longest list first."""
+    """The splats of each tile: tile i has ``splats[starts[i] : starts[i] + counts[i]]``, front to
+    back; longest list first.
+    """
 
     tiles: Tensor
     starts: Tensor
@@ -54,20 +62,28 @@ def make_grid(views: int, width: int, height: int) -> Grid:
 
 
 def bound(means2d, conics, opacities, extents, views, grid: Grid, alpha_min: float) -> Bounds:
-    """Tile rectangles around alpha >= alpha_min; ``views`` (S,) says which image a splat belongs to."""
+    """Tile rectangles around alpha >= alpha_min; ``views`` (S,) says which image a splat belongs
+    to.
+    """
     limit = means2d.new_tensor([grid.columns, grid.rows])
     extents = extents * (1 + SLACK) + SLACK
     low = torch.minimum(((means2d - extents - 0.5) / TILE).floor().clamp(min=0), limit)
     high = torch.minimum(((means2d + extents - 0.5) / TILE).floor() + 1, limit).clamp(min=0)
     first_rows = views * grid.rows
     shift = torch.stack([torch.zeros_like(views), first_rows])
-    levels = 2 * torch.log(opacities / alpha_min) if alpha_min > 0 else torch.full_like(opacities, torch.inf)
+    levels = (
+        2 * torch.log(opacities / alpha_min)
+        if alpha_min > 0
+        else torch.full_like(opacities, torch.inf)
+    )
     shapes = torch.cat([means2d.t(), conics.t(), levels[None] * (1 + SLACK) + SLACK])
     return Bounds(shapes, torch.cat([low.t().long() + shift, high.t().long() + shift]), first_rows)
 
 
 def slices(bounds: Bounds) -> list[tuple[int, int]]:
-    """First and last + 1 splat of parts that are drawn one behind the other, each with a bounded number of candidates."""
+    """First and last + 1 splat of parts that are drawn one behind the other, each with a bounded
+    number of candidates.
+    """
     size = bounds.rectangles[2:] - bounds.rectangles[:2]
     part = size.clamp(min=0).prod(0).cumsum(0) // CANDIDATES_PER_SLICE
     ends = part.unique_consecutive(return_counts=True)[1].cumsum(0).tolist()
@@ -75,48 +91,60 @@ def slices(bounds: Bounds) -> list[tuple[int, int]]:
 
 
 def list_splats(bounds: Bounds, first: int, last: int, unfinished: Tensor, grid: Grid) -> Lists:
-    """Pairs of a splat ``first`` to ``last - 1`` and an unfinished tile of which it reaches a pixel centre, sorted by tile.
+    """Pairs of a splat ``first`` to ``last - 1`` and an unfinished tile of which it reaches a pixel
+    centre, sorted by tile.
 
     ``unfinished`` (tiles,) bool.
     """
     left, top, right, bottom = bounds.rectangles[:, first:last]
     width, height = (right - left).clamp(min=0), (bottom - top).clamp(min=0)
     counts = width * height
-    boxes = torch.stack([left, top, width, counts.cumsum(0) - counts, bounds.first_rows[first:last]])
+    boxes = torch.stack(
+        [left, top, width, counts.cumsum(0) - counts, bounds.first_rows[first:last]]
+    )
     splats = torch.repeat_interleave(torch.arange(last - first, device=counts.device), counts)
     shapes, parts = bounds.shapes[:, first:last], splats.split(CANDIDATES_PER_TEST)
-    pairs = [_test(shapes, boxes, part, i * CANDIDATES_PER_TEST, unfinished, grid) for i, part in enumerate(parts)]
+    pairs = [
+        _test(shapes, boxes, part, i * CANDIDATES_PER_TEST, unfinished, grid)
+        for i, part in enumerate(parts)
+    ]
     tiles, splats = (torch.cat(x) for x in zip(*pairs, strict=True))
     tiles, order = tiles.sort(stable=True)
     return _longest_first(*tiles.unique_consecutive(return_counts=True), splats[order] + first)
 
 
-def _test(shapes: Tensor, boxes: Tensor, splats: Tensor, first: int, unfinished: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
+def _test(
+    shapes: Tensor, boxes: Tensor, splats: Tensor, first: int, unfinished: Tensor, grid: Grid
+) -> tuple[Tensor, Tensor]:
     """Tiles and splats of the candidates ``first``, ``first + 1``, ... that pass the exact test."""
     left, top, width, first_candidate, first_row = boxes.index_select(1, splats)
     within = torch.arange(first, first + len(splats), device=splats.device) - first_candidate
     row = torch.div(within, width, rounding_mode="floor")
     column, row = left + within - row * width, top + row
     tiles = row * grid.columns + column
-    reached = _reaches(shapes.index_select(1, splats), column * TILE + 0.5, (row - first_row) * TILE + 0.5)
+    reached = _reaches(
+        shapes.index_select(1, splats), column * TILE + 0.5, (row - first_row) * TILE + 0.5
+    )
     kept = (reached & unfinished.index_select(0, tiles)).nonzero()[:, 0]
     return tiles[kept].int(), splats[kept].int()
 
 
 def _reaches(shapes, left, top) -> Tensor:
-    """Whether ``q = a (d.x - k d.y)^2 + c d.y^2`` gets as low as the splat's level on the box of the tile's pixel centres.
+    """Whether ``q = a (d.x - k d.y)^2 + c d.y^2`` gets as low as the splat's level on the box of
+    the tile's pixel centres.
 
-    The minimum of a convex q over a box lies, unless the centre is inside, on the box's sides nearest to the centre, where
-    the other coordinate has its closed-form optimum: ``d.x = k d.y`` for given d.y; for given d.x,
-    ``d.y = d.x a k / (a k^2 + c)``.
-    """
+    The minimum of a convex q over a box lies, unless the centre is inside, on the box's sides
+    nearest to the centre, where the other coordinate has its closed-form optimum: ``d.x = k d.y``
+    for given d.y; for given d.x, ``d.y = d.x a k / (a k^2 + c)``."""
     mean_x, mean_y, a, k, c, level = shapes
     x0, y0 = left - mean_x, top - mean_y
     x1, y1 = x0 + (TILE - 1), y0 + (TILE - 1)
     x, y = torch.clamp(torch.zeros_like(x0), x0, x1), torch.clamp(torch.zeros_like(y0), y0, y1)
     other_x = torch.clamp(k * y, x0, x1)
     other_y = torch.clamp(x * (a * k / (a * k * k + c)), y0, y1)
-    q = torch.minimum(a * (other_x - k * y) ** 2 + c * y**2, a * (x - k * other_y) ** 2 + c * other_y**2)
+    q = torch.minimum(
+        a * (other_x - k * y) ** 2 + c * y**2, a * (x - k * other_y) ** 2 + c * other_y**2
+    )
     return q <= level
 
 

@@ -1,9 +1,11 @@
-"""The image model in plain torch, exact and in bounded memory, for machines without a compiled kernel; any device.
+"""The image model in plain torch, exact and in bounded memory, for machines without a compiled
+kernel; any device.
 
-Each tile of 8 x 8 pixels has a list of splats. All tiles walk through their lists together, 64 splats per step, as blocks
-(tiles, pixels, splats) of bounded size; a tile leaves when its list ends or its pixels are finished. Backward walks the same
-way and computes the blocks again, so nothing the size of pixels x splats is ever stored. Lists are made for a slice of the
-splats at a time, front to back, so they are bounded too.
+Each tile of 8 x 8 pixels has a list of splats. All tiles walk through their lists together, 64
+splats per step, as blocks (tiles, pixels, splats) of bounded size; a tile leaves when its list ends
+or its pixels are finished. Backward walks the same way and computes the blocks again, so nothing
+the size of pixels x splats is ever stored. Lists are made for a slice of the splats at a time,
+front to back, so they are bounded too.
 
 On a CPU the result has the same bits for any number of threads, but for gradients of the cameras.
 """
@@ -35,9 +37,23 @@ def unavailable() -> Optional[str]:
     """None: plain torch runs everywhere."""
 
 
-def rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, height, background, options: RasterizeOptions) -> Rasterized:
+def rasterize(
+    means,
+    quats,
+    scales,
+    opacities,
+    colors,
+    viewmats,
+    Ks,
+    width,
+    height,
+    background,
+    options: RasterizeOptions,
+) -> Rasterized:
     """All views; arguments as in `splatting.rasterize`, already validated."""
-    splats = _project((means, quats, scales, opacities, colors), viewmats, Ks, width, height, options)
+    splats = _project(
+        (means, quats, scales, opacities, colors), viewmats, Ks, width, height, options
+    )
     splats = splats._replace(means2d=track_means2d(splats, (colors, background), options.absgrad))
     absgrad = getattr(splats.means2d, "absgrad", None)
     sums, contribution = _Blend.apply(*splats, colors, absgrad, width, height, options)
@@ -45,21 +61,28 @@ def rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, heig
 
 
 def _project(gaussians, viewmats, Ks, width, height, options) -> Splats:
-    """`project`, of many Gaussians in parts that backward computes again: autograd keeps a hundred numbers of each."""
+    """`project`, of many Gaussians in parts that backward computes again: autograd keeps a hundred
+    numbers of each.
+    """
     size = max(1, PROJECTED_AT_ONCE // len(viewmats))
     parts = list(zip(*(x.split(size, -1 if x.dim() == 1 else -2) for x in gaussians), strict=True))
     if len(parts) == 1:
         return project(*gaussians, viewmats, Ks, width, height, options)
     again = {"use_reentrant": False, "preserve_rng_state": False}
-    projected = [checkpoint(project, *part, viewmats, Ks, width, height, options, **again) for part in parts]
+    projected = [
+        checkpoint(project, *part, viewmats, Ks, width, height, options, **again) for part in parts
+    ]
     return Splats(*(torch.cat(x, 1) for x in zip(*projected, strict=True)))
 
 
 class Table(NamedTuple):
-    """The visible splats of all views, front to back, one column each; the last column is a splat that draws nothing."""
+    """The visible splats of all views, front to back, one column each; the last column is a splat
+    that draws nothing.
+    """
 
     ids: Tensor  # (S,) view * N + Gaussian
-    columns: Tensor  # (8 + C, S + 1): mean x, y, conic a, k, c, opacity, then the features: colour, depth, 1
+    # (8 + C, S + 1): mean x, y, conic a, k, c, opacity, then the features: colour, depth, 1
+    columns: Tensor
     bounds: Bounds
     slices: list[tuple[int, int]]
     lists: list[Lists]  # of the first slices, kept by the forward pass for the backward pass
@@ -68,7 +91,9 @@ class Table(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Part of a step: G tiles with K splats each; lists that end are filled up with the splat that draws nothing."""
+    """Part of a step: G tiles with K splats each; lists that end are filled up with the splat that
+    draws nothing.
+    """
 
     tiles: Tensor  # (G,)
     splats: Tensor  # (G * K,)
@@ -85,12 +110,37 @@ class _Blend(torch.autograd.Function):
     """Sums of features weighted with alpha_i T_i (B, H, W, C + 2), and contributions (B, N)."""
 
     @staticmethod
-    def forward(ctx, means2d, conics, opacities, depths, extents, visible, colors, absgrad, width, height, options):
-        table = _tabulate(means2d, conics, opacities, depths, extents, visible, colors, width, height, options)
+    def forward(
+        ctx,
+        means2d,
+        conics,
+        opacities,
+        depths,
+        extents,
+        visible,
+        colors,
+        absgrad,
+        width,
+        height,
+        options,
+    ):
+        table = _tabulate(
+            means2d, conics, opacities, depths, extents, visible, colors, width, height, options
+        )
         sums, largest = _forward(table, width, height, options)
         ctx.save_for_backward(sums)
-        ctx.table, ctx.absgrad, ctx.options, ctx.shape, ctx.colors_dim = table, absgrad, options, visible.shape, colors.dim()
-        contribution = depths.new_zeros(visible.numel()).index_copy_(0, table.ids, largest[:-1]).view(visible.shape)
+        ctx.table, ctx.absgrad, ctx.options, ctx.shape, ctx.colors_dim = (
+            table,
+            absgrad,
+            options,
+            visible.shape,
+            colors.dim(),
+        )
+        contribution = (
+            depths.new_zeros(visible.numel())
+            .index_copy_(0, table.ids, largest[:-1])
+            .view(visible.shape)
+        )
         ctx.mark_non_differentiable(contribution)
         return sums, contribution
 
@@ -98,51 +148,89 @@ class _Blend(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad, _):
         with torch.autocast(grad.device.type, enabled=False):
-            columns, absolute = _backward(ctx.table, *ctx.saved_tensors, grad, ctx.absgrad is not None, ctx.options)
+            columns, absolute = _backward(
+                ctx.table, *ctx.saved_tensors, grad, ctx.absgrad is not None, ctx.options
+            )
         if ctx.absgrad is not None:
             ctx.absgrad.view(-1, 2).index_add_(0, ctx.table.ids, absolute[:, :-1].t())
-        full = columns.new_zeros(ctx.shape.numel(), len(columns)).index_copy_(0, ctx.table.ids, columns[:, :-1].t())
+        full = columns.new_zeros(ctx.shape.numel(), len(columns)).index_copy_(
+            0, ctx.table.ids, columns[:, :-1].t()
+        )
         channels = len(columns) - SHAPE_COLUMNS - 2
         parts = full.view(*ctx.shape, len(columns)).split([2, 3, 1, channels, 1, 1], -1)
         means2d, conics, opacities, colors, depths, _ = parts
         colors = colors if ctx.colors_dim == 3 else colors.sum(0)
-        return means2d, conics, opacities[..., 0], depths[..., 0], None, None, colors, None, None, None, None
+        return (
+            means2d,
+            conics,
+            opacities[..., 0],
+            depths[..., 0],
+            None,
+            None,
+            colors,
+            None,
+            None,
+            None,
+            None,
+        )
 
 
-def _tabulate(means2d, conics, opacities, depths, extents, visible, colors, width, height, options) -> Table:
+def _tabulate(
+    means2d, conics, opacities, depths, extents, visible, colors, width, height, options
+) -> Table:
     """The visible splats of all views by depth, ties by index."""
     views, gaussians = visible.shape
     ids = visible.flatten().nonzero()[:, 0]
     ids = ids[depths.flatten()[ids].argsort(stable=True)]
-    means2d, conics, opacities, depths, extents = (x.flatten(0, 1)[ids] for x in (means2d, conics, opacities, depths, extents))
+    means2d, conics, opacities, depths, extents = (
+        x.flatten(0, 1)[ids] for x in (means2d, conics, opacities, depths, extents)
+    )
     colors = colors[ids % gaussians] if colors.dim() == 2 else colors.flatten(0, 1)[ids]
     grid = make_grid(views, width, height)
     bounds = bound(means2d, conics, opacities, extents, ids // gaussians, grid, options.alpha_min)
-    columns = torch.cat([means2d.t(), conics.t(), opacities[None], colors.t(), depths[None], torch.ones_like(depths)[None]])
+    columns = torch.cat(
+        [
+            means2d.t(),
+            conics.t(),
+            opacities[None],
+            colors.t(),
+            depths[None],
+            torch.ones_like(depths)[None],
+        ]
+    )
     columns = pad(columns, (0, 1))
-    return Table(ids, columns, bounds, slices(bounds), [], grid, bool((opacities > options.alpha_max).any()))
+    return Table(
+        ids, columns, bounds, slices(bounds), [], grid, bool((opacities > options.alpha_max).any())
+    )
 
 
-def _forward(table: Table, width: int, height: int, options: RasterizeOptions) -> tuple[Tensor, Tensor]:
+def _forward(
+    table: Table, width: int, height: int, options: RasterizeOptions
+) -> tuple[Tensor, Tensor]:
     """The sums (B, H, W, C + 2), and each splat's largest weight (S + 1,)."""
     transmittances = _start(table, width, height)
     sums = table.columns.new_zeros(table.grid.tiles, (len(table.columns) - SHAPE_COLUMNS) * PIXELS)
     largest = table.columns.new_zeros(table.columns.shape[1])
     for block in _march(table, transmittances, options):
         _, _, weights = _composite(block, transmittances, options)
-        sums.index_add_(0, block.tiles, _product(block.features, weights.transpose(1, 2)).flatten(1))
+        sums.index_add_(
+            0, block.tiles, _product(block.features, weights.transpose(1, 2)).flatten(1)
+        )
         largest.scatter_reduce_(0, block.splats, weights.amax(1).flatten(), "amax")
     return _from_tiles(sums, table.grid, width, height), largest
 
 
-def _backward(table: Table, sums: Tensor, grad: Tensor, absolute: bool, options: RasterizeOptions) -> tuple[Tensor, Tensor]:
-    """Gradients of the table's columns, and (2, S + 1) sums over pixels of the absolute gradient of the mean.
+def _backward(
+    table: Table, sums: Tensor, grad: Tensor, absolute: bool, options: RasterizeOptions
+) -> tuple[Tensor, Tensor]:
+    """Gradients of the table's columns, and (2, S + 1) sums over pixels of the absolute gradient of
+    the mean.
 
     With ``g_i = <grad, features_i>`` the loss is ``L = sum_i g_i alpha_i T_i``, hence
-    ``alpha_i dL/dalpha_i = w_i g_i - w_i / T_{i+1} sum_{j>i} w_j g_j`` with ``w_i = alpha_i T_i``. Front to back the sum is what
-    is left of L at the pixel, which starts as <grad, sums>, and T is the same running product as in forward; back to front,
-    as usual, T would have to be recovered by dividing again and again.
-    """
+    ``alpha_i dL/dalpha_i = w_i g_i - w_i / T_{i+1} sum_{j>i} w_j g_j`` with ``w_i = alpha_i T_i``.
+    Front to back the sum is what is left of L at the pixel, which starts as <grad, sums>, and T is
+    the same running product as in forward; back to front, as usual, T would have to be recovered by
+    dividing again and again."""
     height, width = grad.shape[1:3]
     transmittances = _start(table, width, height)
     cotangents = _to_tiles(grad, table.grid)
@@ -161,7 +249,9 @@ def _backward(table: Table, sums: Tensor, grad: Tensor, absolute: bool, options:
         grads = torch.cat([_splat_gradients(block, slopes), features], 1)
         columns.index_add_(1, block.splats, grads.transpose(0, 1).flatten(1))
         if absolute:
-            absolutes.index_add_(1, block.splats, _absolute_gradients(block, slopes).transpose(0, 1).flatten(1))
+            absolutes.index_add_(
+                1, block.splats, _absolute_gradients(block, slopes).transpose(0, 1).flatten(1)
+            )
     return columns, absolutes
 
 
@@ -172,22 +262,35 @@ def _start(table: Table, width: int, height: int) -> Tensor:
 
 
 def _march(table: Table, transmittances: Tensor, options: RasterizeOptions) -> Iterator[Block]:
-    """Blocks front to back; whoever takes one moves the transmittances behind it (`_composite`) before taking the next."""
+    """Blocks front to back; whoever takes one moves the transmittances behind it (`_composite`)
+    before taking the next.
+    """
     for lists in _lists(table, transmittances, options):
         active, depth = torch.arange(len(lists.tiles), device=lists.tiles.device), 0
         while len(active):
             size = ELEMENTS_PER_BLOCK // (SPLATS_PER_STEP * PIXELS)
-            for part, longest in zip(active.split(size), lists.counts[active[::size]].tolist(), strict=True):
+            for part, longest in zip(
+                active.split(size), lists.counts[active[::size]].tolist(), strict=True
+            ):
                 yield _block(table, lists, part, depth, min(longest - depth, SPLATS_PER_STEP))
             depth += SPLATS_PER_STEP
-            active = active[_unfinished(transmittances[lists.tiles[active]], options) & (lists.counts[active] > depth)]
+            active = active[
+                _unfinished(transmittances[lists.tiles[active]], options)
+                & (lists.counts[active] > depth)
+            ]
 
 
 def _lists(table: Table, transmittances: Tensor, options: RasterizeOptions) -> Iterator[Lists]:
-    """The tile lists of one slice after the other, made for the tiles that are still unfinished when its turn comes."""
+    """The tile lists of one slice after the other, made for the tiles that are still unfinished
+    when its turn comes.
+    """
     for i, (first, last) in enumerate(table.slices):
         if i == len(table.lists) < KEPT_SLICES:
-            table.lists.append(list_splats(table.bounds, first, last, _unfinished(transmittances, options), table.grid))
+            table.lists.append(
+                list_splats(
+                    table.bounds, first, last, _unfinished(transmittances, options), table.grid
+                )
+            )
         if i < len(table.lists):
             yield table.lists[i]
         elif (unfinished := _unfinished(transmittances, options)).any():
@@ -203,7 +306,9 @@ def _block(table: Table, lists: Lists, part: Tensor, depth: int, length: int) ->
     places = depth + torch.arange(length, device=part.device)
     entries = (lists.starts[part, None] + places).clamp(max=len(lists.splats) - 1)
     nothing = table.columns.shape[1] - 1
-    splats = torch.where(places < lists.counts[part, None], lists.splats[entries].long(), nothing).flatten()
+    splats = torch.where(
+        places < lists.counts[part, None], lists.splats[entries].long(), nothing
+    ).flatten()
     columns = table.columns.index_select(1, splats).view(-1, len(part), length)
     tiles = lists.tiles[part]
     middle_x, middle_y = (origin[:, None] + TILE / 2 for origin in table.grid.origins(tiles))
@@ -222,16 +327,20 @@ def _alphas(block: Block, options: RasterizeOptions) -> Tensor:
     x, y = steep * from_x, steep * block.k[:, None] * from_y
     top = block.opacity.clamp(min=FAINTEST).log()[:, None] - block.c[:, None] / 2 * from_y**2
     root = x[:, None] - y[:, :, None]
-    alphas = torch.addcmul(top[:, :, None], root, root, value=-1).exp_().clamp_(max=options.alpha_max)
+    alphas = (
+        torch.addcmul(top[:, :, None], root, root, value=-1).exp_().clamp_(max=options.alpha_max)
+    )
     return threshold_(alphas, _just_below(options.alpha_min, alphas), 0.0).flatten(1, 2)
 
 
-def _composite(block: Block, transmittances: Tensor, options: RasterizeOptions) -> tuple[Tensor, Tensor, Tensor]:
-    """Alphas, ``T_{i+1}`` and weights ``alpha_i T_i``, each (G, PIXELS, K); moves the tiles' transmittances behind the block.
+def _composite(
+    block: Block, transmittances: Tensor, options: RasterizeOptions
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Alphas, ``T_{i+1}`` and weights ``alpha_i T_i``, each (G, PIXELS, K); moves the tiles'
+    transmittances behind the block.
 
-    Weights are zero where ``T_i < stop``; the transmittance goes on as if no pixel stopped. One that is too small to divide
-    by becomes infinity: what is behind it can't be seen.
-    """
+    Weights are zero where ``T_i < stop``; the transmittance goes on as if no pixel stopped. One
+    that is too small to divide by becomes infinity: what is behind it can't be seen."""
     alphas = _alphas(block, options)
     chain = alphas.new_empty(*alphas.shape[:2], alphas.shape[2] + 1)
     chain[..., 0] = transmittances.index_select(0, block.tiles)
@@ -243,7 +352,9 @@ def _composite(block: Block, transmittances: Tensor, options: RasterizeOptions) 
 
 
 def _subtract_one_by_one(gains: Tensor, left: Tensor, tiles: Tensor) -> Tensor:
-    """What is ``left`` behind each splat, (G, PIXELS, K), when the gains are taken off front to back; updates ``left``."""
+    """What is ``left`` behind each splat, (G, PIXELS, K), when the gains are taken off front to
+    back; updates ``left``.
+    """
     rest = torch.cat([left.index_select(0, tiles)[..., None], gains.neg()], -1)
     torch.cumsum(rest, -1, out=rest)
     left.index_copy_(0, tiles, rest[..., -1])
@@ -251,10 +362,11 @@ def _subtract_one_by_one(gains: Tensor, left: Tensor, tiles: Tensor) -> Tensor:
 
 
 def _splat_gradients(block: Block, slopes: Tensor) -> Tensor:
-    """(G, 6, K): gradients of mean x, y, a, k, c, opacity from ``slopes``, the gradient of the exponent ``log(opacity) - q / 2``.
+    """(G, 6, K): gradients of mean x, y, a, k, c, opacity from ``slopes``, the gradient of the
+    exponent ``log(opacity) - q / 2``.
 
-    They are linear in the six moments of the slopes over the tile's pixels, (1, x, y, x^2, x y, y^2) from its middle.
-    """
+    They are linear in the six moments of the slopes over the tile's pixels, (1, x, y, x^2, x y,
+    y^2) from its middle."""
     s, sx, sy, sxx, sxy, syy = _product(_monomials(slopes), slopes).unbind(1)
     k, y = block.k, -block.mean_y
     t = -block.mean_x - k * y  # d.x - k d.y at the middle; elsewhere x - k y is added
@@ -265,7 +377,17 @@ def _splat_gradients(block: Block, slopes: Tensor) -> Tensor:
     slopes_dd = syy + y * (sy + sd)
     grad_x = block.a * slopes_t
     grad_y = block.c * sd - k * grad_x
-    return torch.stack([grad_x, grad_y, -slopes_tt / 2, block.a * slopes_td, -slopes_dd / 2, s / block.opacity.clamp(min=FAINTEST)], 1)
+    return torch.stack(
+        [
+            grad_x,
+            grad_y,
+            -slopes_tt / 2,
+            block.a * slopes_td,
+            -slopes_dd / 2,
+            s / block.opacity.clamp(min=FAINTEST),
+        ],
+        1,
+    )
 
 
 def _absolute_gradients(block: Block, slopes: Tensor) -> Tensor:
@@ -274,16 +396,26 @@ def _absolute_gradients(block: Block, slopes: Tensor) -> Tensor:
     slopes = slopes.view(len(slopes), TILE, TILE, -1)
     k, c = block.k[:, None, None], block.c[:, None, None]
     along_x = block.a[:, None, None] * (from_x - k * from_y)
-    return torch.stack([(slopes * along_x).abs().sum((1, 2)), (slopes * (c * from_y - k * along_x)).abs().sum((1, 2))], 1)
+    return torch.stack(
+        [
+            (slopes * along_x).abs().sum((1, 2)),
+            (slopes * (c * from_y - k * along_x)).abs().sum((1, 2)),
+        ],
+        1,
+    )
 
 
 def _product(a: Tensor, b: Tensor) -> Tensor:
-    """Matrix products of a batch. A single one is done twice: alone, threads would share it and their number would round it."""
+    """Matrix products of a batch. A single one is done twice: alone, threads would share it and
+    their number would round it.
+    """
     return a @ b if len(b) > 1 else (a @ b.repeat(2, 1, 1))[:1]
 
 
 def _offsets(means: Tensor) -> Tensor:
-    """(G, TILE, K): pixel centres of a row or column minus the means (G, K), both from the tile's middle."""
+    """(G, TILE, K): pixel centres of a row or column minus the means (G, K), both from the tile's
+    middle.
+    """
     return _centres(means)[:, None] - means[:, None]
 
 
@@ -293,12 +425,16 @@ def _centres(like: Tensor) -> Tensor:
 
 def _monomials(like: Tensor) -> Tensor:
     """(6, PIXELS): 1, x, y, x^2, x y, y^2 at the pixel centres, from the tile's middle."""
-    y, x = (axis.flatten() for axis in torch.meshgrid(_centres(like), _centres(like), indexing="ij"))
+    y, x = (
+        axis.flatten() for axis in torch.meshgrid(_centres(like), _centres(like), indexing="ij")
+    )
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
 
 
 def _just_below(bound: float, like: Tensor) -> float:
-    """The number that ``x > number`` means ``x >= bound`` in the type of ``like``: torch's fast threshold is exclusive."""
+    """The number that ``x > number`` means ``x >= bound`` in the type of ``like``: torch's fast
+    threshold is exclusive.
+    """
     bound = torch.tensor(bound, dtype=like.dtype)
     return torch.nextafter(bound, torch.tensor(-torch.inf, dtype=like.dtype)).item()
 
@@ -313,5 +449,9 @@ def _to_tiles(image: Tensor, grid: Grid) -> Tensor:
 
 def _from_tiles(tiles: Tensor, grid: Grid, width: int, height: int) -> Tensor:
     """The inverse of `_to_tiles`."""
-    tiles = tiles.view(grid.views, grid.rows, grid.columns, -1, TILE, TILE).permute(0, 1, 4, 2, 5, 3)
-    return tiles.reshape(grid.views, grid.rows * TILE, grid.columns * TILE, -1)[:, :height, :width].contiguous()
+    tiles = tiles.view(grid.views, grid.rows, grid.columns, -1, TILE, TILE).permute(
+        0, 1, 4, 2, 5, 3
+    )
+    return tiles.reshape(grid.views, grid.rows * TILE, grid.columns * TILE, -1)[
+        :, :height, :width
+    ].contiguous()

@@ -1,12 +1,13 @@
 """Background ``gaussiandreamer-background``: one colour per view, composited inside the rasteriser.
 
-======  =====================================================================================================================
+======  ============================================================================================
 option  meaning
-======  =====================================================================================================================
-mode    ``fixed``: always ``color``; ``random``: in training a random colour per view, otherwise ``color``; ``learned``
+======  ============================================================================================
+mode    ``fixed``: always ``color``; ``random``: in training a random colour per view, otherwise
+        ``color``; ``learned``
 color   RGB in [0, 1]
 lr      learning rate of the learned colour: a number or a schedule
-======  =====================================================================================================================
+======  ============================================================================================
 """
 
 from dataclasses import dataclass
@@ -36,7 +37,10 @@ class FlatBackground(BaseBackground):
             if cfg.mode not in MODES:
                 raise unknown("system.background.mode", cfg.mode, MODES)
             if not all(0.0 <= c <= 1.0 for c in cfg.color):
-                raise UserError(f"system.background.color: expected three numbers in [0, 1], got {list(cfg.color)}")
+                raise UserError(
+                    "system.background.color: expected three numbers in [0, 1], got "
+                    f"{list(cfg.color)}"
+                )
             validate_schedule(cfg.lr, "system.background.lr", minimum=0)
 
     cfg: Config
@@ -55,7 +59,11 @@ class FlatBackground(BaseBackground):
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """The optimiser's group of the learned colour; none for the other modes."""
-        return [{"params": [self.logit], "name": "background", "lr": 0.0}] if self.cfg.mode == "learned" else []
+        return (
+            [{"params": [self.logit], "name": "background", "lr": 0.0}]
+            if self.cfg.mode == "learned"
+            else []
+        )
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
         for group in optimizer.param_groups:
@@ -67,9 +75,12 @@ class FlatBackground(BaseBackground):
         if self.cfg.mode == "learned":
             return torch.sigmoid(self.logit).expand(batch_size, 3)
         if self.cfg.mode == "random" and self.training:
-            return torch.stack([torch.rand(3, generator=generator(item_seed(), "background", self.step, b)) for b in range(batch_size)]).to(
-                self.fixed
-            )
+            return torch.stack(
+                [
+                    torch.rand(3, generator=generator(item_seed(), "background", self.step, b))
+                    for b in range(batch_size)
+                ]
+            ).to(self.fixed)
         return self.fixed.expand(batch_size, 3)
 
     def forward(self, dirs: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B H W 3"]:

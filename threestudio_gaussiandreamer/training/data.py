@@ -1,23 +1,30 @@
-"""Data module ``gaussiandreamer-datamodule``: random training cameras, a ring of validation and test cameras.
+"""Data module ``gaussiandreamer-datamodule``: random training cameras, a ring of validation and
+test cameras.
 
-Same batch keys, units and config keys as threestudio's ``random-camera-datamodule`` (whose name it also answers to in the
-built-in host), with three differences. Rays aren't built unless ``rays: true``: splatting doesn't read them, and at
-4 x 1024^2 they cost half a second of CPU time per step. A batch is a function of (seed, step), so a resumed run sees the
-cameras that the run that never stopped sees. And the batch that trains step k was made for step k: no prefetched batch with
-the previous resolution, no degenerate third batch.
+Same batch keys, units and config keys as threestudio's ``random-camera-datamodule`` (whose name it
+also answers to in the built-in host), with three differences. Rays aren't built unless ``rays:
+true``: splatting doesn't read them, and at 4 x 1024^2 they cost half a second of CPU time per step.
+A batch is a function of (seed, step), so a resumed run sees the cameras that the run that never
+stopped sees. And the batch that trains step k was made for step k: no prefetched batch with the
+previous resolution, no degenerate third batch.
 
-========================  ===============================================================================================
+========================  ==========================================================================
 option                    meaning
-========================  ===============================================================================================
-height, width             pixels; a number, or a list with one entry more than ``resolution_milestones``
+========================  ==========================================================================
+height, width             pixels; a number, or a list with one entry more than
+                          ``resolution_milestones``
 batch_size                views per step; a number or such a list
-*_range                   elevation and azimuth in degrees, distance in world units, fovy in degrees (vertical)
+*_range                   elevation and azimuth in degrees, distance in world units, fovy in degrees
+                          (vertical)
 batch_uniform_azimuth     each view of a batch in its own azimuth sector
-camera_perturb            uniform shift of the camera, +- world units; center_perturb, up_perturb: normal, standard deviation
-progressive_until         widen the angles from the evaluation view to the full range over that many steps
-train_views               0: continuous cameras; n: draw from a fixed pool of n views (so that targets can be reused)
+camera_perturb            uniform shift of the camera, +- world units; center_perturb, up_perturb:
+                          normal, standard deviation
+progressive_until         widen the angles from the evaluation view to the full range over that many
+                          steps
+train_views               0: continuous cameras; n: draw from a fixed pool of n views (so that
+                          targets can be reused)
 rays                      add rays_o and rays_d (B, H, W, 3) to every batch
-========================  ===============================================================================================
+========================  ==========================================================================
 """
 
 import bisect
@@ -69,54 +76,114 @@ class CameraConfig:
     @staticmethod
     def check(cfg: Any) -> None:
         """Raises UserError when a range is empty or the lists of sizes don't fit the milestones."""
-        for name in ("elevation_range", "azimuth_range", "camera_distance_range", "fovy_range", "light_distance_range"):
+        for name in (
+            "elevation_range",
+            "azimuth_range",
+            "camera_distance_range",
+            "fovy_range",
+            "light_distance_range",
+        ):
             low, high = cfg[name]
             if not low <= high:
-                raise UserError(f"data.{name}: expected [low, high] with low <= high, got [{low}, {high}]")
+                raise UserError(
+                    f"data.{name}: expected [low, high] with low <= high, got [{low}, {high}]"
+                )
         if cfg.camera_distance_range[0] <= 0:
-            raise UserError(f"data.camera_distance_range: distances must be positive, got {list(cfg.camera_distance_range)}")
+            raise UserError(
+                "data.camera_distance_range: distances must be positive, got "
+                f"{list(cfg.camera_distance_range)}"
+            )
         if not 0 < cfg.fovy_range[0] <= cfg.fovy_range[1] < 180:
-            raise UserError(f"data.fovy_range: expected degrees between 0 and 180, got {list(cfg.fovy_range)}")
+            raise UserError(
+                f"data.fovy_range: expected degrees between 0 and 180, got {list(cfg.fovy_range)}"
+            )
         for name in ("height", "width", "batch_size"):
             values = _plain(cfg[name])
             listed = isinstance(values, list)
             if listed and len(values) not in (1, len(cfg.resolution_milestones) + 1):
-                milestones = f"{len(values) - 1} data.resolution_milestones, got {len(cfg.resolution_milestones)}"
+                milestones = (
+                    f"{len(values) - 1} data.resolution_milestones, got "
+                    f"{len(cfg.resolution_milestones)}"
+                )
                 raise UserError(f"data.{name}: {len(values)} entries need {milestones}")
-            if any(not isinstance(v, int) or isinstance(v, bool) or v < 1 for v in (values if listed else [values])):
+            if any(
+                not isinstance(v, int) or isinstance(v, bool) or v < 1
+                for v in (values if listed else [values])
+            ):
                 raise UserError(f"data.{name}: expected whole numbers >= 1, got {values}")
         _check_milestones(cfg)
-        for name in ("camera_perturb", "center_perturb", "up_perturb", "light_position_perturb", "progressive_until"):
+        for name in (
+            "camera_perturb",
+            "center_perturb",
+            "up_perturb",
+            "light_position_perturb",
+            "progressive_until",
+        ):
             if cfg[name] < 0:
                 raise UserError(f"data.{name}: expected 0 or more, got {cfg[name]}")
         if not cfg.eval_camera_distance > 0:
-            raise UserError(f"data.eval_camera_distance: expected a positive distance, got {cfg.eval_camera_distance}")
+            raise UserError(
+                "data.eval_camera_distance: expected a positive distance, got "
+                f"{cfg.eval_camera_distance}"
+            )
         if not 0 < cfg.eval_fovy_deg < 180:
-            raise UserError(f"data.eval_fovy_deg: expected degrees between 0 and 180, got {cfg.eval_fovy_deg}")
-        if not -90 <= min(cfg.elevation_range[0], cfg.eval_elevation_deg) <= max(cfg.elevation_range[1], cfg.eval_elevation_deg) <= 90:
+            raise UserError(
+                f"data.eval_fovy_deg: expected degrees between 0 and 180, got {cfg.eval_fovy_deg}"
+            )
+        if (
+            not -90
+            <= min(cfg.elevation_range[0], cfg.eval_elevation_deg)
+            <= max(cfg.elevation_range[1], cfg.eval_elevation_deg)
+            <= 90
+        ):
             elevations = [*cfg.elevation_range, cfg.eval_elevation_deg]
-            raise UserError(f"data.elevation_range, data.eval_elevation_deg: expected degrees from -90 to 90, got {elevations}")
+            raise UserError(
+                "data.elevation_range, data.eval_elevation_deg: expected degrees from -90 to "
+                f"90, got {elevations}"
+            )
         if cfg.eval_batch_size != 1:
-            raise UserError(f"data.eval_batch_size: views are evaluated one at a time, expected 1, got {cfg.eval_batch_size}")
+            raise UserError(
+                "data.eval_batch_size: views are evaluated one at a time, expected 1, got "
+                f"{cfg.eval_batch_size}"
+            )
         for name in ("eval_height", "eval_width", "n_val_views", "n_test_views"):
             if cfg[name] < 1:
                 raise UserError(f"data.{name}: expected at least 1, got {cfg[name]}")
         if cfg.train_views < 0:
-            raise UserError(f"data.train_views: expected 0 (continuous) or a number of views, got {cfg.train_views}")
+            raise UserError(
+                "data.train_views: expected 0 (continuous) or a number of views, got "
+                f"{cfg.train_views}"
+            )
 
 
 def _check_milestones(cfg: Any) -> None:
     milestones = list(cfg.resolution_milestones)
     if any(later <= earlier for earlier, later in zip([0, *milestones], milestones, strict=False)):
-        raise UserError(f"data.resolution_milestones: expected increasing steps above 0, got {milestones}")
-    if milestones and not any(isinstance(_plain(cfg[name]), list) and len(cfg[name]) > 1 for name in ("height", "width", "batch_size")):
-        raise UserError(f"data.resolution_milestones: give data.height, data.width or data.batch_size {len(milestones) + 1} entries")
+        raise UserError(
+            f"data.resolution_milestones: expected increasing steps above 0, got {milestones}"
+        )
+    if milestones and not any(
+        isinstance(_plain(cfg[name]), list) and len(cfg[name]) > 1
+        for name in ("height", "width", "batch_size")
+    ):
+        raise UserError(
+            "data.resolution_milestones: give data.height, data.width or data.batch_size "
+            f"{len(milestones) + 1} entries"
+        )
 
 
 def make_batch(
-    orbit: Orbit, c2w: Tensor, light_positions: Tensor, height: int, width: int, rays: bool = False, normalize: bool = True
+    orbit: Orbit,
+    c2w: Tensor,
+    light_positions: Tensor,
+    height: int,
+    width: int,
+    rays: bool = False,
+    normalize: bool = True,
 ) -> dict[str, Any]:
-    """The host's batch of B views: tensors in the host's conventions, ``height`` and ``width`` as plain ints."""
+    """The host's batch of B views: tensors in the host's conventions, ``height`` and ``width`` as
+    plain ints.
+    """
     proj = cameras.projection(orbit.fovy, width / height)
     batch = {
         "c2w": c2w,
@@ -142,11 +209,28 @@ class TrainCameras(IterableDataset, Updateable):
 
     def __init__(self, cfg: CameraConfig) -> None:
         self.cfg, self.start_step = cfg, 0
-        sizes = [v if isinstance(v, (list, tuple)) else [v] for v in map(_plain, (cfg.height, cfg.width, cfg.batch_size))]
+        sizes = [
+            v if isinstance(v, (list, tuple)) else [v]
+            for v in map(_plain, (cfg.height, cfg.width, cfg.batch_size))
+        ]
         stages = max(map(len, sizes))
         self.sizes = list(zip(*[v * stages if len(v) == 1 else v for v in sizes], strict=True))
-        self.ranges = OrbitRanges(*(tuple(r) for r in (cfg.elevation_range, cfg.azimuth_range, cfg.camera_distance_range, cfg.fovy_range)))
-        self.pool = cameras.camera_pool(cfg.train_views, self.ranges, run_seed()) if cfg.train_views else None
+        self.ranges = OrbitRanges(
+            *(
+                tuple(r)
+                for r in (
+                    cfg.elevation_range,
+                    cfg.azimuth_range,
+                    cfg.camera_distance_range,
+                    cfg.fovy_range,
+                )
+            )
+        )
+        self.pool = (
+            cameras.camera_pool(cfg.train_views, self.ranges, run_seed())
+            if cfg.train_views
+            else None
+        )
 
     def __iter__(self):
         step = self.start_step
@@ -155,30 +239,51 @@ class TrainCameras(IterableDataset, Updateable):
             step += 1
 
     def collate(self, step: int) -> dict[str, Any]:
-        """The batch that trains ``step``: a function of (seed, step), different in each process that trains along."""
-        height, width, batch_size = self.sizes[bisect.bisect_right(self.cfg.resolution_milestones, step)]
+        """The batch that trains ``step``: a function of (seed, step), different in each process
+        that trains along.
+        """
+        height, width, batch_size = self.sizes[
+            bisect.bisect_right(self.cfg.resolution_milestones, step)
+        ]
         rng = generator(item_seed(), "camera", step)
         orbit = (
             self._pick(batch_size, rng)
             if self.pool
-            else cameras.sample_orbit(batch_size, self._ranges(step), rng, self.cfg.batch_uniform_azimuth)
+            else cameras.sample_orbit(
+                batch_size, self._ranges(step), rng, self.cfg.batch_uniform_azimuth
+            )
         )
         c2w = self._perturbed(orbit, rng)
-        return make_batch(orbit, c2w, self._lights(c2w, rng), height, width, self.cfg.rays, self.cfg.rays_d_normalize)
+        return make_batch(
+            orbit,
+            c2w,
+            self._lights(c2w, rng),
+            height,
+            width,
+            self.cfg.rays,
+            self.cfg.rays_d_normalize,
+        )
 
     def _pick(self, batch_size: int, rng: torch.Generator) -> Orbit:
-        """``batch_size`` views of the pool, one from each azimuth sector (the pool is ordered by azimuth)."""
+        """``batch_size`` views of the pool, one from each azimuth sector (the pool is ordered by
+        azimuth).
+        """
         u = torch.rand(batch_size, generator=rng)
-        sector = (u + torch.arange(batch_size)) / batch_size if self.cfg.batch_uniform_azimuth else u
+        sector = (
+            (u + torch.arange(batch_size)) / batch_size if self.cfg.batch_uniform_azimuth else u
+        )
         index = (sector * len(self.pool.azimuth)).long().clamp_max(len(self.pool.azimuth) - 1)
         return Orbit(*(values[index] for values in self.pool))
 
     def _ranges(self, step: int) -> OrbitRanges:
-        """Elevation and azimuth grow from the evaluation view to the full range over ``progressive_until`` steps."""
+        """Elevation and azimuth grow from the evaluation view to the full range over
+        ``progressive_until`` steps.
+        """
         r = 1.0 if self.cfg.progressive_until <= 0 else min(1.0, step / self.cfg.progressive_until)
         start = self.cfg.eval_elevation_deg
         return self.ranges._replace(
-            elevation=tuple((1 - r) * start + r * e for e in self.ranges.elevation), azimuth=tuple(r * a for a in self.ranges.azimuth)
+            elevation=tuple((1 - r) * start + r * e for e in self.ranges.elevation),
+            azimuth=tuple(r * a for a in self.ranges.azimuth),
         )
 
     @property
@@ -201,7 +306,9 @@ class TrainCameras(IterableDataset, Updateable):
         """Point lights around the camera's direction, as DreamFusion draws them."""
         noise = torch.randn(len(c2w), 3, generator=rng) * self.cfg.light_position_perturb
         low, high = self.cfg.light_distance_range
-        return F.normalize(c2w[:, :3, 3] + noise, dim=-1) * (low + (high - low) * torch.rand(len(c2w), 1, generator=rng))
+        return F.normalize(c2w[:, :3, 3] + noise, dim=-1) * (
+            low + (high - low) * torch.rand(len(c2w), 1, generator=rng)
+        )
 
 
 class EvalCameras(Dataset, Updateable):
@@ -210,9 +317,18 @@ class EvalCameras(Dataset, Updateable):
     def __init__(self, cfg: CameraConfig, split: str) -> None:
         self.cfg = cfg
         count = cfg.n_val_views if split == "val" else cfg.n_test_views
-        azimuth = torch.linspace(0.0, 360.0, count + 1)[:-1] if split == "val" else torch.linspace(0.0, 360.0, count)
+        azimuth = (
+            torch.linspace(0.0, 360.0, count + 1)[:-1]
+            if split == "val"
+            else torch.linspace(0.0, 360.0, count)
+        )
         same = torch.ones(count)
-        self.orbit = Orbit(same * cfg.eval_elevation_deg, azimuth, same * cfg.eval_camera_distance, same * math.radians(cfg.eval_fovy_deg))
+        self.orbit = Orbit(
+            same * cfg.eval_elevation_deg,
+            azimuth,
+            same * cfg.eval_camera_distance,
+            same * math.radians(cfg.eval_fovy_deg),
+        )
 
     def __len__(self) -> int:
         return len(self.orbit.azimuth)
@@ -224,7 +340,15 @@ class EvalCameras(Dataset, Updateable):
         index = torch.tensor(indices)
         orbit = Orbit(*(values[index] for values in self.orbit))
         c2w, cfg = orbit.c2w, self.cfg
-        batch = make_batch(orbit, c2w, c2w[:, :3, 3].clone(), cfg.eval_height, cfg.eval_width, cfg.rays, cfg.rays_d_normalize)
+        batch = make_batch(
+            orbit,
+            c2w,
+            c2w[:, :3, 3].clone(),
+            cfg.eval_height,
+            cfg.eval_width,
+            cfg.rays,
+            cfg.rays_d_normalize,
+        )
         return {"index": index, **batch}
 
 
@@ -241,15 +365,25 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
     def setup(self, stage: str | None = None) -> None:
         if stage in (None, "fit"):
             self.train_dataset = TrainCameras(self.cfg)
-        self.val_dataset, self.test_dataset = EvalCameras(self.cfg, "val"), EvalCameras(self.cfg, "test")
+        self.val_dataset, self.test_dataset = (
+            EvalCameras(self.cfg, "val"),
+            EvalCameras(self.cfg, "test"),
+        )
 
     def train_dataloader(self) -> DataLoader:
-        # Lightning asks for the loader after it restored the loops and before it fetches the first batch
-        self.train_dataset.start_step = self.trainer.global_step if self.trainer is not None else self.train_dataset.start_step
-        return DataLoader(self.train_dataset, batch_size=None, collate_fn=self.train_dataset.collate)
+        # Lightning asks for the loader after it restored the loops and before it fetches the first
+        # batch
+        self.train_dataset.start_step = (
+            self.trainer.global_step if self.trainer is not None else self.train_dataset.start_step
+        )
+        return DataLoader(
+            self.train_dataset, batch_size=None, collate_fn=self.train_dataset.collate
+        )
 
     def pool_views(self) -> Optional[dict[str, Any]]:
-        """``c2w``, ``fovy``, ``height``, ``width``, ``batch_size`` of all views of a fixed pool; None where those change."""
+        """``c2w``, ``fovy``, ``height``, ``width``, ``batch_size`` of all views of a fixed pool;
+        None where those change.
+        """
         cameras = self.train_dataset
         if cameras.pool is None or cameras.moves or len(cameras.sizes) > 1:
             return None

@@ -1,35 +1,42 @@
 """Geometry ``gaussiandreamer-cloud``: a cloud of 3D Gaussians that starts from a 3D prior.
 
-Parameters (the names say how they are stored): ``means`` (N, 3) world units, ``log_scales`` (N, 3), ``quats`` (N, 4) wxyz,
-``logit_opacities`` (N,), ``sh0`` (N, 1, 3) and ``sh_rest`` (N, K - 1, 3) with K = (sh_degree + 1)^2. The cloud is empty until
-:meth:`initialize` runs the prior or a checkpoint is loaded; it takes its size from the checkpoint, so the prior isn't needed again.
+Parameters (the names say how they are stored): ``means`` (N, 3) world units, ``log_scales`` (N, 3),
+``quats`` (N, 4) wxyz, ``logit_opacities`` (N,), ``sh0`` (N, 1, 3) and ``sh_rest`` (N, K - 1, 3)
+with K = (sh_degree + 1)^2. The cloud is empty until :meth:`initialize` runs the prior or a
+checkpoint is loaded; it takes its size from the checkpoint, so the prior isn't needed again.
 
-==================  =========================================================================================================
+==================  ================================================================================
 option              meaning
-==================  =========================================================================================================
+==================  ================================================================================
 prior_type, prior   the registered prior and its options
-grow                Algorithm 1 of the paper: enabled, num_candidates, radius (in half box sides), color_range, clamp, max_points
-scale_rule          first standard deviation: ``nearest`` (the paper: distance to the nearest point) or ``rms3`` (the released
-                    code: root mean square distance to the three nearest)
+grow                Algorithm 1 of the paper: enabled, num_candidates, radius (in half box sides),
+                    color_range, clamp, max_points
+scale_rule          first standard deviation: ``nearest`` (the paper: distance to the nearest point)
+                    or ``rms3`` (the released code: root mean square distance to the three nearest)
 scale_factor        multiplies it
 init_opacity        opacity of every Gaussian at the start
 sh_degree           0 to 3
-lr_*                learning rate of each attribute: a number or a schedule; lr_sh_rest for the bands above degree 0
-densify             enabled, start, stop, every (steps), grad_threshold, split_scale, min_opacity, max_scale (world units);
-                    absgrad: judge by the sum of the pixels' absolute gradients, in which opposite pulls don't cancel
-                    (AbsGS, Ye et al. 2024; several times larger, so give a threshold to match)
-budget              how many Gaussians a run ends with: a number, null or none (no limit but ``max_gaussians``), or ``auto``: each round
-                    drops as many as cost no more than its share of ``prune.quality`` or, where no truth is known,
-                    ``prune.likeness``; under a budget, duplicates in the start are merged (``merging.py``)
-prune               how the budget is met (``importance.py``): start, stop, every (steps), keep (the share that a round keeps; less
-                    only where there are too few rounds for a budget that is a number), score (removal, contribution;
-                    opacity, random: to compare with), quality (dB that all rounds may lose against the truth), likeness
-                    (dB between the renders before and after a round, at least); ``auto`` leaves out the first half of the
-                    rounds: what looks superfluous early may be needed later
-max_gaussians       exact cap, reached by dropping what shows least (of untrained points: any, evenly); min_gaussians: the
-                    floor that pruning never passes
-keep_attributes     with gaussians-prior: start from all attributes of that cloud, not only from points and colours
-==================  =========================================================================================================
+lr_*                learning rate of each attribute: a number or a schedule; lr_sh_rest for the
+                    bands above degree 0
+densify             enabled, start, stop, every (steps), grad_threshold, split_scale, min_opacity,
+                    max_scale (world units); absgrad: judge by the sum of the pixels' absolute
+                    gradients, in which opposite pulls don't cancel (AbsGS, Ye et al. 2024; several
+                    times larger, so give a threshold to match)
+budget              how many Gaussians a run ends with: a number, null or none (no limit but
+                    ``max_gaussians``), or ``auto``: each round drops as many as cost no more than
+                    its share of ``prune.quality`` or, where no truth is known, ``prune.likeness``;
+                    under a budget, duplicates in the start are merged (``merging.py``)
+prune               how the budget is met (``importance.py``): start, stop, every (steps), keep (the
+                    share that a round keeps; less only where there are too few rounds for a budget
+                    that is a number), score (removal, contribution; opacity, random: to compare
+                    with), quality (dB that all rounds may lose against the truth), likeness (dB
+                    between the renders before and after a round, at least); ``auto`` leaves out the
+                    first half of the rounds: what looks superfluous early may be needed later
+max_gaussians       exact cap, reached by dropping what shows least (of untrained points: any,
+                    evenly); min_gaussians: the floor that pruning never passes
+keep_attributes     with gaussians-prior: start from all attributes of that cloud, not only from
+                    points and colours
+==================  ================================================================================
 """
 
 import contextlib
@@ -142,26 +149,53 @@ class GaussianCloud(BaseGeometry):
             if cfg.scale_rule not in SCALE_RULES:
                 raise unknown(f"{where}.scale_rule", cfg.scale_rule, SCALE_RULES)
             if not 0 < cfg.init_opacity < 1:
-                raise UserError(f"{where}.init_opacity: expected a number between 0 and 1, got {cfg.init_opacity}")
+                raise UserError(
+                    f"{where}.init_opacity: expected a number between 0 and 1, got "
+                    f"{cfg.init_opacity}"
+                )
             if cfg.sh_degree not in (0, 1, 2, 3):
                 raise UserError(f"{where}.sh_degree: expected 0, 1, 2 or 3, got {cfg.sh_degree}")
             if not 0 < cfg.min_gaussians <= cfg.max_gaussians:
-                raise UserError(f"{where}: expected 0 < min_gaussians <= max_gaussians, got {cfg.min_gaussians} and {cfg.max_gaussians}")
-            for name in ("scale_factor", "grow.radius", "densify.every", "densify.split_scale", "densify.max_scale"):
+                raise UserError(
+                    f"{where}: expected 0 < min_gaussians <= max_gaussians, got "
+                    f"{cfg.min_gaussians} and {cfg.max_gaussians}"
+                )
+            for name in (
+                "scale_factor",
+                "grow.radius",
+                "densify.every",
+                "densify.split_scale",
+                "densify.max_scale",
+            ):
                 value = _nested(cfg, name)
                 if not value > 0:
                     raise UserError(f"{where}.{name}: expected a positive number, got {value}")
-            for name in ("grow.num_candidates", "grow.max_points", "densify.start", "densify.stop", "densify.grad_threshold"):
+            for name in (
+                "grow.num_candidates",
+                "grow.max_points",
+                "densify.start",
+                "densify.stop",
+                "densify.grad_threshold",
+            ):
                 value = _nested(cfg, name)
                 if value < 0:
                     raise UserError(f"{where}.{name}: expected 0 or more, got {value}")
             _check_budget(cfg, where)
             if cfg.densify.enabled and cfg.densify.start >= cfg.densify.stop:
-                raise UserError(f"{where}.densify: expected start < stop, got {cfg.densify.start} and {cfg.densify.stop}")
+                raise UserError(
+                    f"{where}.densify: expected start < stop, got {cfg.densify.start} and "
+                    f"{cfg.densify.stop}"
+                )
             if not 0 <= cfg.densify.min_opacity < 1:
-                raise UserError(f"{where}.densify.min_opacity: expected a number from 0 to 1, got {cfg.densify.min_opacity}")
+                raise UserError(
+                    f"{where}.densify.min_opacity: expected a number from 0 to 1, got "
+                    f"{cfg.densify.min_opacity}"
+                )
             if len(cfg.grow.color_range) != 2 or cfg.grow.color_range[0] > cfg.grow.color_range[1]:
-                raise UserError(f"{where}.grow.color_range: expected [low, high], got {list(cfg.grow.color_range)}")
+                raise UserError(
+                    f"{where}.grow.color_range: expected [low, high], got "
+                    f"{list(cfg.grow.color_range)}"
+                )
             for name in LEARNING_RATES.values():
                 validate_schedule(cfg[name], f"{where}.{name}", minimum=0)
 
@@ -173,14 +207,20 @@ class GaussianCloud(BaseGeometry):
         self._warned: set[str] = set()
         self._allocate(0)
 
-    # -- size ----------------------------------------------------------------------------------------------------------------
+    # -- size --------------------------------------------------------------------------------------
 
     def __len__(self) -> int:
         return len(self.means)
 
     def _shapes(self, n: int) -> dict[str, tuple[int, ...]]:
         harmonics = {"sh0": (n, 1, 3), "sh_rest": (n, self.bands - 1, 3)}
-        return {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,), **harmonics}
+        return {
+            "means": (n, 3),
+            "log_scales": (n, 3),
+            "quats": (n, 4),
+            "logit_opacities": (n,),
+            **harmonics,
+        }
 
     def _allocate(self, n: int, device: torch.device | str = "cpu") -> None:
         for name, shape in self._shapes(n).items():
@@ -188,19 +228,27 @@ class GaussianCloud(BaseGeometry):
         for name in STATISTICS:
             self.register_buffer(name, torch.zeros(n, device=device))
 
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any) -> None:
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
         """Take the size from the checkpoint before its tensors are copied in."""
         means = state_dict.get(prefix + "means")
-        if isinstance(means, Tensor) and means.dim() and len(means) != len(self):  # otherwise torch says what is wrong with it
+        if (
+            isinstance(means, Tensor) and means.dim() and len(means) != len(self)
+        ):  # otherwise torch says what is wrong with it
             self._allocate(len(means), self.means.device)
         if prefix + "means" in state_dict:
-            state_dict.setdefault(prefix + "removal", torch.zeros(len(self)))  # older checkpoints have none
+            state_dict.setdefault(
+                prefix + "removal", torch.zeros(len(self))
+            )  # older checkpoints have none
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
-    # -- derived quantities --------------------------------------------------------------------------------------------------
+    # -- derived quantities ------------------------------------------------------------------------
 
     def scales(self) -> Float[Tensor, "N 3"]:
-        """Standard deviations along the axes, world units; clamped where exp would over- or underflow float32."""
+        """Standard deviations along the axes, world units; clamped where exp would over- or
+        underflow float32.
+        """
         return self.log_scales.clamp(*LOG_SCALE_RANGE).exp()
 
     def opacities(self) -> Float[Tensor, " N"]:
@@ -211,28 +259,37 @@ class GaussianCloud(BaseGeometry):
         """All bands of the spherical harmonics."""
         return torch.cat([self.sh0, self.sh_rest], 1)
 
-    def colors(self, camera_positions: Float[Tensor, "B 3"]) -> Float[Tensor, "N 3"] | Float[Tensor, "B N 3"]:
-        """RGB, not negative; per view when the spherical harmonics have more than the constant band."""
+    def colors(
+        self, camera_positions: Float[Tensor, "B 3"]
+    ) -> Float[Tensor, "N 3"] | Float[Tensor, "B N 3"]:
+        """RGB, not negative; per view when the spherical harmonics have more than the constant
+        band.
+        """
         if self.bands == 1:
             return sh.sh0_to_rgb(self.sh0[:, 0]).clamp_min(0.0)
-        dirs = torch.nn.functional.normalize(self.means.detach()[None] - camera_positions[:, None], dim=-1)
+        dirs = torch.nn.functional.normalize(
+            self.means.detach()[None] - camera_positions[:, None], dim=-1
+        )
         return sh.sh_to_colors(self.sh, dirs)
 
-    # -- start ---------------------------------------------------------------------------------------------------------------
+    # -- start -------------------------------------------------------------------------------------
 
     def prior(self) -> Any:
         """The prior of the configuration, which hasn't run yet."""
         return find(self.cfg.prior_type)(self.cfg.prior)
 
     def initialize(self, prompt: str, make_cloud: Any = None) -> PointCloud:
-        """Run the prior, grow and perturb its points, and start one Gaussian on each; returns the prior's points.
+        """Run the prior, grow and perturb its points, and start one Gaussian on each; returns the
+        prior's points.
 
-        ``make_cloud(prior, prompt)`` may stand in for ``prior(prompt)``, for instance to read a cached result.
-        """
+        ``make_cloud(prior, prompt)`` may stand in for ``prior(prompt)``, for instance to read a
+        cached result."""
         prior = self.prior()
         if self.cfg.keep_attributes and hasattr(prior, "gaussians"):
             arrays = prior.gaussians(prompt)
-            trained = simplify.Cloud(*(torch.as_tensor(getattr(arrays, name)) for name in simplify.Cloud._fields))
+            trained = simplify.Cloud(
+                *(torch.as_tensor(getattr(arrays, name)) for name in simplify.Cloud._fields)
+            )
             self.set_arrays(**self._capped_trained(trained)._asdict())
             cloud = prior.cloud(arrays)
         else:
@@ -243,58 +300,95 @@ class GaussianCloud(BaseGeometry):
         return cloud
 
     def merge_duplicates(self) -> None:
-        """One Gaussian in the place of those that show the same, as far as the budget asks for fewer."""
+        """One Gaussian in the place of those that show the same, as far as the budget asks for
+        fewer.
+        """
         merged = merge_duplicates(self.parameters_by_name(), at_least=self._fewest()).values
         if len(merged["means"]) < len(self):
-            logger.info("%d of %d Gaussians are duplicates of others: merged", len(self) - len(merged["means"]), len(self))
+            logger.info(
+                "%d of %d Gaussians are duplicates of others: merged",
+                len(self) - len(merged["means"]),
+                len(self),
+            )
             self.set_arrays(sh=torch.cat([merged.pop("sh0"), merged.pop("sh_rest")], 1), **merged)
 
     def grown(self, cloud: PointCloud) -> PointCloud:
         """Noisy point growing and colour perturbation (the paper's Algorithm 1), within the cap."""
         if not self.cfg.grow.enabled:
             return cloud
-        options = {k: v for k, v in dict(self.cfg.grow).items() if k not in ("enabled", "color_range")}
-        return grow(cloud, color_range=tuple(self.cfg.grow.color_range), **options, generator=numpy_generator(run_seed(), "grow"))
+        options = {
+            k: v for k, v in dict(self.cfg.grow).items() if k not in ("enabled", "color_range")
+        }
+        return grow(
+            cloud,
+            color_range=tuple(self.cfg.grow.color_range),
+            **options,
+            generator=numpy_generator(run_seed(), "grow"),
+        )
 
     def start_from(self, cloud: PointCloud) -> None:
-        """One Gaussian on each point: its colour, opacity ``init_opacity``, an isotropic scale from the nearest distances."""
+        """One Gaussian on each point: its colour, opacity ``init_opacity``, an isotropic scale from
+        the nearest distances.
+        """
         points, colors = self._capped(cloud.points, cloud.colors)
-        n, scales = len(points), nearest_distance_scales(points, self.cfg.scale_rule) * self.cfg.scale_factor
+        n, scales = (
+            len(points),
+            nearest_distance_scales(points, self.cfg.scale_rule) * self.cfg.scale_factor,
+        )
         harmonics = np.zeros((n, self.bands, 3), np.float32)
-        harmonics[:, 0] = sh.rgb_to_sh0(torch.from_numpy(np.ascontiguousarray(colors, np.float32))).numpy()
+        harmonics[:, 0] = sh.rgb_to_sh0(
+            torch.from_numpy(np.ascontiguousarray(colors, np.float32))
+        ).numpy()
         self.set_arrays(
             means=points,
             log_scales=np.repeat(np.log(scales)[:, None], 3, 1),
             quats=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-            logit_opacities=np.full(n, math.log(self.cfg.init_opacity / (1 - self.cfg.init_opacity))),
+            logit_opacities=np.full(
+                n, math.log(self.cfg.init_opacity / (1 - self.cfg.init_opacity))
+            ),
             sh=harmonics,
         )
 
     def _capped(self, points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """At most ``max_gaussians`` points, a seeded uniform choice.
 
-        None of them is trained and all are equally opaque, so none is worth more than another: a choice by contribution to first
-        renders would only prefer what lies outside, and leave holes (tests/stability measures both).
-        """
+        None of them is trained and all are equally opaque, so none is worth more than another: a
+          choice by contribution to first
+        renders would only prefer what lies outside, and leave holes (tests/stability measures
+        both)."""
         if len(points) <= self.cfg.max_gaussians:
             return points, colors
-        logger.warning("the prior and its growth give %d points; keeping %d, evenly (max_gaussians)", len(points), self.cfg.max_gaussians)
-        rows = np.sort(numpy_generator(run_seed(), "cap").choice(len(points), self.cfg.max_gaussians, replace=False))
+        logger.warning(
+            "the prior and its growth give %d points; keeping %d, evenly (max_gaussians)",
+            len(points),
+            self.cfg.max_gaussians,
+        )
+        rows = np.sort(
+            numpy_generator(run_seed(), "cap").choice(
+                len(points), self.cfg.max_gaussians, replace=False
+            )
+        )
         return points[rows], colors[rows]
 
     def _capped_trained(self, cloud: simplify.Cloud) -> simplify.Cloud:
-        """At most ``max_gaussians`` of trained Gaussians: those that show most in views from all around."""
+        """At most ``max_gaussians`` of trained Gaussians: those that show most in views from all
+        around.
+        """
         if len(cloud.means) <= self.cfg.max_gaussians:
             return cloud
         logger.warning(
-            "the prior has %d Gaussians; keeping the %d that show most (max_gaussians)", len(cloud.means), self.cfg.max_gaussians
+            "the prior has %d Gaussians; keeping the %d that show most (max_gaussians)",
+            len(cloud.means),
+            self.cfg.max_gaussians,
         )
         cloud = simplify.Cloud(*(values.to(self.means.device) for values in cloud))
         shown = simplify.worth(cloud, simplify.views_around(cloud, *CAP_VIEWS))
         return simplify.only(cloud, shown, self.cfg.max_gaussians)
 
     def set_arrays(self, *, sh: Any, **arrays: Any) -> None:
-        """Replace the cloud; spherical harmonics ``sh`` (N, K', 3) are padded with zeros or cut to ``sh_degree``."""
+        """Replace the cloud; spherical harmonics ``sh`` (N, K', 3) are padded with zeros or cut to
+        ``sh_degree``.
+        """
         device = self.means.device
         self._allocate(len(arrays["means"]), device)
         with torch.no_grad():
@@ -308,9 +402,13 @@ class GaussianCloud(BaseGeometry):
 
     @torch.no_grad()
     def warn_of_limits(self) -> None:
-        """Say once that Gaussians aren't drawn since a number of theirs isn't finite, and once that sizes are beyond their bounds."""
+        """Say once that Gaussians aren't drawn since a number of theirs isn't finite, and once that
+        sizes are beyond their bounds.
+        """
         (low, high), named = LOG_SCALE_RANGE, self.parameters_by_name().values()
-        usual = self.log_scales.clamp(low, high).equal(self.log_scales) and all(parameter.sum().isfinite() for parameter in named)
+        usual = self.log_scales.clamp(low, high).equal(self.log_scales) and all(
+            parameter.sum().isfinite() for parameter in named
+        )
         if usual:  # a sum is finite only if all its terms are
             return
         finite = torch.stack([_finite_rows(parameter) for parameter in named]).all(0)
@@ -321,17 +419,29 @@ class GaussianCloud(BaseGeometry):
         ):
             if name not in self._warned and rows.any():
                 self._warned.add(name)
-                logger.warning("%d of %d Gaussians %s; the first is number %d", rows.sum(), len(self), name, rows.nonzero()[0])
+                logger.warning(
+                    "%d of %d Gaussians %s; the first is number %d",
+                    rows.sum(),
+                    len(self),
+                    name,
+                    rows.nonzero()[0],
+                )
 
     def parameters_by_name(self) -> dict[str, nn.Parameter]:
         return {name: getattr(self, name) for name in PARAMETERS}
 
-    # -- optimisation --------------------------------------------------------------------------------------------------------
+    # -- optimisation ------------------------------------------------------------------------------
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """One optimiser group per attribute, named after it; the rates are set every step by :meth:`set_learning_rates`."""
+        """One optimiser group per attribute, named after it; the rates are set every step by
+        :meth:`set_learning_rates`.
+        """
         named = self.parameters_by_name().items()
-        return [{"params": [parameter], "name": name, "lr": 0.0} for name, parameter in named if parameter.numel() or name != "sh_rest"]
+        return [
+            {"params": [parameter], "name": name, "lr": 0.0}
+            for name, parameter in named
+            if parameter.numel() or name != "sh_rest"
+        ]
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
         for group in optimizer.param_groups:
@@ -340,45 +450,75 @@ class GaussianCloud(BaseGeometry):
 
     @property
     def wants_absgrad(self) -> bool:
-        """Whether :meth:`observe` reads absolute gradients, which the rasteriser then has to collect."""
+        """Whether :meth:`observe` reads absolute gradients, which the rasteriser then has to
+        collect.
+        """
         return self.cfg.densify.enabled and self.cfg.densify.absgrad
 
     def observe(self, out: Rasterized, width: int, height: int, loss_scale: float = 1.0) -> None:
-        """Add one step's contributions, and for densification its screen-space gradients, to the statistics."""
+        """Add one step's contributions, and for densification its screen-space gradients, to the
+        statistics.
+        """
         if out.means2d.grad is not None and self.cfg.densify.enabled:
             pixels = out.means2d.absgrad if self.wants_absgrad else out.means2d.grad
-            self.gradient_sum += all_sum(densify.screen_gradients(pixels, width, height, loss_scale).sum(0))
+            self.gradient_sum += all_sum(
+                densify.screen_gradients(pixels, width, height, loss_scale).sum(0)
+            )
             self.gradient_count += all_sum((out.radii > 0).sum(0))
         torch.maximum(self.contribution, all_max(out.contribution.amax(0)), out=self.contribution)
 
     def _samples_removal(self, step: int) -> bool:
-        """Whether a round of pruning to come asks for a sample of the removal error, after ``step`` finished steps."""
+        """Whether a round of pruning to come asks for a sample of the removal error, after ``step``
+        finished steps.
+        """
         cfg, rounds = self.cfg.prune, self.prune_rounds
-        if self.cfg.budget is None or cfg.score != "removal" or not rounds or not rounds[0] - cfg.every <= step < rounds[-1]:
+        if (
+            self.cfg.budget is None
+            or cfg.score != "removal"
+            or not rounds
+            or not rounds[0] - cfg.every <= step < rounds[-1]
+        ):
             return False
-        return len(self) > self._fewest() and step % max(1, round(cfg.every / parsimony.SAMPLES)) == 0
+        return (
+            len(self) > self._fewest() and step % max(1, round(cfg.every / parsimony.SAMPLES)) == 0
+        )
 
     def sample_removal(self, pictures: dict[str, Any], step: int) -> None:
-        """Add a sample of the removal error in these renders, before their losses, where a round of pruning will ask for it."""
+        """Add a sample of the removal error in these renders, before their losses, where a round of
+        pruning will ask for it.
+        """
         if not self._samples_removal(step):
             return
         rng = generator(run_seed(), "removal", step)
-        behind = torch.rand(len(pictures["comp_rgb"]), 1, 1, 3, generator=rng).to(pictures["comp_rgb"])
-        # before a colour of its own each view shows those too that have the colour of the run's background
-        images = pictures["comp_rgb"] + (1 - pictures["opacity"]) * (behind - pictures["comp_rgb_bg"].detach())
-        self.removal += all_sum(parsimony.removal_error(images, pictures["gaussian_opacities"], rng))
+        behind = torch.rand(len(pictures["comp_rgb"]), 1, 1, 3, generator=rng).to(
+            pictures["comp_rgb"]
+        )
+        # before a colour of its own each view shows those too that have the colour of the run's
+        # background
+        images = pictures["comp_rgb"] + (1 - pictures["opacity"]) * (
+            behind - pictures["comp_rgb_bg"].detach()
+        )
+        self.removal += all_sum(
+            parsimony.removal_error(images, pictures["gaussian_opacities"], rng)
+        )
         if self.wants_absgrad:
-            pictures["rasterized"].means2d.absgrad.zero_()  # what this backward pass has added isn't the loss's
+            pictures[
+                "rasterized"
+            ].means2d.absgrad.zero_()  # what this backward pass has added isn't the loss's
 
-    def after_step(self, optimizer: torch.optim.Optimizer, step: int, holds: Optional[Holds] = None) -> bool:
+    def after_step(
+        self, optimizer: torch.optim.Optimizer, step: int, holds: Optional[Holds] = None
+    ) -> bool:
         """Densify and prune where their schedules say so; True if the cloud was replaced.
 
-        A densification that neither makes nor drops a Gaussian only begins its statistics anew: the next pruning ranks by what it
+        A densification that neither makes nor drops a Gaussian only begins its statistics anew: the
+          next pruning ranks by what it
         would have seen without it.
 
         Args:
             step: finished optimiser steps.
-            holds: for ``budget: auto``: whether the quality holds when only the marked Gaussians are drawn.
+            holds: for ``budget: auto``: whether the quality holds when only the marked Gaussians
+                are drawn.
         """
         change = None
         if self.cfg.densify.enabled and step in rounds_of(self.cfg.densify):
@@ -394,21 +534,38 @@ class GaussianCloud(BaseGeometry):
         return change is not None
 
     def densified(self, step: int) -> Change:
-        """Clone, split and drop; under a budget the cloud doesn't grow beyond it, or beyond what it still has."""
+        """Clone, split and drop; under a budget the cloud doesn't grow beyond it, or beyond what it
+        still has.
+        """
         cfg, cap = self.cfg.densify, self.cfg.max_gaussians
         if self.cfg.budget is not None:
-            cap = min(cap, len(self) if self.cfg.budget == AUTO else max(self.cfg.budget, len(self)))
-        rules = Rules(cfg.grad_threshold, cfg.split_scale, cfg.min_opacity, cfg.max_scale, cap, self.cfg.min_gaussians)
+            cap = min(
+                cap, len(self) if self.cfg.budget == AUTO else max(self.cfg.budget, len(self))
+            )
+        rules = Rules(
+            cfg.grad_threshold,
+            cfg.split_scale,
+            cfg.min_opacity,
+            cfg.max_scale,
+            cap,
+            self.cfg.min_gaussians,
+        )
         stats = Statistics(self.gradient_sum / self.gradient_count.clamp_min(1), self.contribution)
-        return densify.densify_and_prune(self.parameters_by_name(), stats, rules, generator(run_seed(), "split", step))
+        return densify.densify_and_prune(
+            self.parameters_by_name(), stats, rules, generator(run_seed(), "split", step)
+        )
 
     def pruned(self, step: int, first: Optional[Change], holds: Optional[Holds]) -> Change:
         """One round towards the budget, after the change ``first`` if there is one."""
         cfg, values = self.cfg.prune, self.parameters_by_name() if first is None else first.values
         rows = slice(None) if first is None else first.parents
         seen = parsimony.Seen(self.contribution[rows], self.removal[rows])
-        scores = parsimony.score(cfg.score, values["logit_opacities"], seen, generator(run_seed(), "prune", step))
-        count = parsimony.next_count(len(scores), self.kept_share(len(scores), step), self._fewest())
+        scores = parsimony.score(
+            cfg.score, values["logit_opacities"], seen, generator(run_seed(), "prune", step)
+        )
+        count = parsimony.next_count(
+            len(scores), self.kept_share(len(scores), step), self._fewest()
+        )
         if self.cfg.budget == AUTO and (first is not None or holds is None):
             count = len(scores)  # what densification made has been seen in no view yet
         elif self.cfg.budget == AUTO:
@@ -423,7 +580,9 @@ class GaussianCloud(BaseGeometry):
         return rounds[len(rounds) // 2 :] if self.cfg.budget == AUTO else rounds
 
     def kept_share(self, count: int, step: int) -> float:
-        """The share of ``count`` Gaussians that the round at ``step`` keeps: ``prune.keep``, or what meets the budget with the last one."""
+        """The share of ``count`` Gaussians that the round at ``step`` keeps: ``prune.keep``, or
+        what meets the budget with the last one.
+        """
         left = sum(later >= step for later in self.prune_rounds)
         if self.cfg.budget in (None, AUTO) or not left:
             return self.cfg.prune.keep
@@ -431,7 +590,9 @@ class GaussianCloud(BaseGeometry):
 
     @property
     def affordable(self) -> float:
-        """dB that one round of ``auto`` may lose: none is sure to be won back, so all together lose ``prune.quality`` at most."""
+        """dB that one round of ``auto`` may lose: none is sure to be won back, so all together lose
+        ``prune.quality`` at most.
+        """
         return self.cfg.prune.quality / max(1, len(self.prune_rounds))
 
     def _fewest(self) -> int:
@@ -451,7 +612,9 @@ class GaussianCloud(BaseGeometry):
                 self.logit_opacities.copy_(logits)
 
     def apply_change(self, change: Change, optimizer: torch.optim.Optimizer) -> None:
-        """Replace the cloud by ``change`` and move the optimiser's rows along; the statistics start anew."""
+        """Replace the cloud by ``change`` and move the optimiser's rows along; the statistics start
+        anew.
+        """
         old = self.parameters_by_name()
         new = {name: nn.Parameter(value) for name, value in change.values.items()}
         densify.update_optimizer(optimizer, old, new, change)
@@ -462,7 +625,9 @@ class GaussianCloud(BaseGeometry):
 
 
 def _as_budget(given: Any) -> Any:
-    """What was given for a budget, with ``none`` as None and whole numbers as such, however they are written."""
+    """What was given for a budget, with ``none`` as None and whole numbers as such, however they
+    are written.
+    """
     if isinstance(given, str):
         given = given.lower()
         with contextlib.suppress(ValueError):
@@ -475,8 +640,15 @@ def _as_budget(given: Any) -> Any:
 def _check_budget(cfg: Any, where: str) -> None:
     """Raises UserError for a budget or a pruning schedule that can't be met."""
     budget, prune = cfg.budget, cfg.prune
-    if budget is not None and budget != AUTO and (isinstance(budget, bool) or not isinstance(budget, int) or budget < cfg.min_gaussians):
-        raise UserError(f"{where}.budget: expected none, auto or a number from min_gaussians ({cfg.min_gaussians}) on, got {budget!r}")
+    if (
+        budget is not None
+        and budget != AUTO
+        and (isinstance(budget, bool) or not isinstance(budget, int) or budget < cfg.min_gaussians)
+    ):
+        raise UserError(
+            f"{where}.budget: expected none, auto or a number from min_gaussians "
+            f"({cfg.min_gaussians}) on, got {budget!r}"
+        )
     if prune.score not in parsimony.SCORES:
         raise unknown(f"{where}.prune.score", prune.score, parsimony.SCORES)
     if not 0 < prune.keep < 1:
@@ -496,8 +668,12 @@ def _finite_rows(parameter: Tensor) -> Bool[Tensor, " N"]:
 
 
 def rounds_of(schedule: Any) -> range:
-    """The steps at which a schedule with ``start``, ``stop`` and ``every`` has a round: the multiples of ``every``."""
-    return range(math.ceil(schedule.start / schedule.every) * schedule.every, schedule.stop, schedule.every)
+    """The steps at which a schedule with ``start``, ``stop`` and ``every`` has a round: the
+    multiples of ``every``.
+    """
+    return range(
+        math.ceil(schedule.start / schedule.every) * schedule.every, schedule.stop, schedule.every
+    )
 
 
 def _nested(cfg: Any, dotted: str) -> Any:

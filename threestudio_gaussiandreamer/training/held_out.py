@@ -1,9 +1,10 @@
-"""Held-out scoring: the cloud against ray-cast truth on views that no bank holds, with a picture to look at.
+"""Held-out scoring: the cloud against ray-cast truth on views that no bank holds, with a picture to
+look at.
 
-The truth comes from a ray caster on the mesh, never from our splatting, and is composited on the background that the render
-has. Score: PSNR and SSIM, averaged over the views; share of views that show another side of the object (multi-face); share of
-the opacity that floats away from the surface (floater mass); share of pixels with a colour that no screen shows (out of gamut).
-"""
+The truth comes from a ray caster on the mesh, never from our splatting, and is composited on the
+background that the render has. Score: PSNR and SSIM, averaged over the views; share of views that
+show another side of the object (multi-face); share of the opacity that floats away from the surface
+(floater mass); share of pixels with a colour that no screen shows (out of gamut)."""
 
 import json
 import time
@@ -40,7 +41,9 @@ class EvaluationConfig:
             if cfg[name] < 1:
                 raise UserError(f"system.evaluation.{name}: expected at least 1, got {cfg[name]}")
         if cfg.every < 0:
-            raise UserError(f"system.evaluation.every: expected 0 (never) or a number of steps, got {cfg.every}")
+            raise UserError(
+                f"system.evaluation.every: expected 0 (never) or a number of steps, got {cfg.every}"
+            )
 
 
 def orbit_batch(orbit: Orbit, size: int) -> dict[str, Any]:
@@ -50,7 +53,9 @@ def orbit_batch(orbit: Orbit, size: int) -> dict[str, Any]:
 
 
 class HeldOut:
-    """The held-out views and their truth, cast at first use by ``caster`` (a :class:`raycast.MeshCaster`)."""
+    """The held-out views and their truth, cast at first use by ``caster`` (a
+    :class:`raycast.MeshCaster`).
+    """
 
     RING = 24  # azimuths that the multi-face meter compares with
     RING_SIZE = 32
@@ -70,7 +75,9 @@ class HeldOut:
 
     @cached_property
     def rings(self) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """For each height and distance that occurs: the views (rows), all-around azimuths, and their truth (R, h, w, 4)."""
+        """For each height and distance that occurs: the views (rows), all-around azimuths, and
+        their truth (R, h, w, 4).
+        """
         azimuth, rings = 360.0 * torch.arange(self.RING) / self.RING, []
         places = torch.stack([self.orbit.elevation, self.orbit.distance], 1)
         for place in places.unique(dim=0):
@@ -82,11 +89,15 @@ class HeldOut:
 
     def _cast(self, orbit: Orbit, size: int, supersample: int) -> Float[Tensor, "V H W 4"]:
         cameras = zip(orbit.c2w.numpy(), orbit.fovy.tolist(), strict=True)
-        return torch.from_numpy(self.caster.render_views(cameras, size, size, supersample=supersample))
+        return torch.from_numpy(
+            self.caster.render_views(cameras, size, size, supersample=supersample)
+        )
 
     @torch.no_grad()
     def render(self, renderer: Any, chunk: int = 4) -> tuple[Tensor, Tensor]:
-        """The cloud's pictures (V, H, W, 3), as they come out, and the background (V, 3) they lie on, on the CPU."""
+        """The cloud's pictures (V, H, W, 3), as they come out, and the background (V, 3) they lie
+        on, on the CPU.
+        """
         modes = [(module, module.training) for module in (renderer, renderer.background)]
         for module, _ in modes:
             module.eval()
@@ -103,28 +114,41 @@ class HeldOut:
     def truth_on(self, backgrounds: Float[Tensor, "V 3"]) -> Float[Tensor, "V H W 3"]:
         return over_background(self.truth, backgrounds[:, None, None])
 
-    def multi_face(self, images: Float[Tensor, "V H W 3"], backgrounds: Float[Tensor, "V 3"]) -> float:
-        """The share of views that look like another side of the object, more than 45 degrees of azimuth away."""
+    def multi_face(
+        self, images: Float[Tensor, "V H W 3"], backgrounds: Float[Tensor, "V 3"]
+    ) -> float:
+        """The share of views that look like another side of the object, more than 45 degrees of
+        azimuth away.
+        """
         wrong = 0.0
         for rows, azimuth, ring in self.rings:
             bank = over_background(ring, backgrounds[rows[0]])
-            wrong += multi_face_rate(images[rows], bank, self.orbit.azimuth[rows], azimuth) * len(rows)
+            wrong += multi_face_rate(images[rows], bank, self.orbit.azimuth[rows], azimuth) * len(
+                rows
+            )
         return wrong / len(images)
 
     def floaters(self, means: Float[Tensor, "N 3"], opacities: Float[Tensor, " N"]) -> float:
-        """The opacity-weighted share of Gaussians farther from the surface than 2 % of the longest side of its box."""
+        """The opacity-weighted share of Gaussians farther from the surface than 2 % of the longest
+        side of its box.
+        """
         distances = torch.from_numpy(self.surface_distance(means.double().cpu().numpy()))
-        return floater_mass(distances, opacities.double().cpu(), extent=float(np.ptp(self.caster.mesh.vertices, axis=0).max()))
+        return floater_mass(
+            distances,
+            opacities.double().cpu(),
+            extent=float(np.ptp(self.caster.mesh.vertices, axis=0).max()),
+        )
 
 
 CLOCKS = ("seconds", "cpu_seconds")
 
 
 class Measurements:
-    """What a run measured, with the training seconds that led there; kept in ``metrics.json`` and continued on resume.
+    """What a run measured, with the training seconds that led there; kept in ``metrics.json`` and
+    continued on resume.
 
-    ``cpu_seconds``, the processor time of all threads, doesn't grow when other programs hold the processor.
-    """
+    ``cpu_seconds``, the processor time of all threads, doesn't grow when other programs hold the
+    processor."""
 
     def __init__(self, held_out: HeldOut, folder: Path) -> None:
         self.held_out, self.folder = held_out, folder
@@ -155,7 +179,9 @@ class Measurements:
 
     @torch.no_grad()
     def score(self, key: str, renderer: Any, step: int) -> dict[str, Any]:
-        """Score the renderer's cloud under ``key`` ("prior", "result", or "curve", which collects); no time is counted while it runs."""
+        """Score the renderer's cloud under ``key`` ("prior", "result", or "curve", which collects);
+        no time is counted while it runs.
+        """
         with self.paused_clock():
             return self._score(key, renderer, step)
 
@@ -164,7 +190,10 @@ class Measurements:
         images = rendered.clamp(0, 1)
         truth = self.held_out.truth_on(backgrounds)
         scores = {"step": step, **self._elapsed(), "gaussians": len(renderer.geometry)}
-        scores |= {"psnr": round(float(psnr(images, truth).mean()), 3), "ssim": round(float(ssim(images, truth).mean()), 4)}
+        scores |= {
+            "psnr": round(float(psnr(images, truth).mean()), 3),
+            "ssim": round(float(ssim(images, truth).mean()), 4),
+        }
         scores["multi_face"] = round(self.held_out.multi_face(images, backgrounds), 4)
         cloud = renderer.geometry
         scores["floater_mass"] = round(self.held_out.floaters(cloud.means, cloud.opacities()), 5)
@@ -178,7 +207,9 @@ class Measurements:
         return scores
 
     def _elapsed(self) -> dict[str, float]:
-        return {name: round(float(value), 3) for name, value in zip(CLOCKS, self.seconds, strict=True)}
+        return {
+            name: round(float(value), 3) for name, value in zip(CLOCKS, self.seconds, strict=True)
+        }
 
     def write(self) -> None:
         self.values |= self._elapsed()
@@ -188,7 +219,9 @@ class Measurements:
         temporary.replace(self.path)
 
     def _save_pictures(self, key: str, renders: Tensor, truth: Tensor) -> None:
-        """Rows of six views: ``held_out/<key>.png``, ``truth.png``, and ``compare.png`` with prior, result and truth."""
+        """Rows of six views: ``held_out/<key>.png``, ``truth.png``, and ``compare.png`` with prior,
+        result and truth.
+        """
         folder = self.folder / "held_out"
         folder.mkdir(parents=True, exist_ok=True)
         rows = {key: _row(renders), "truth": _row(truth)}
@@ -206,7 +239,10 @@ class Measurements:
             if key in self.values:
                 v = self.values[key]
                 face = f"{100 * v['multi_face']:.0f} %"
-                lines.append(f"{key:<10}{v['psnr']:6.2f}   {v['ssim']:6.4f}   {face:>10}   {v['gaussians']:9d}   {v['seconds']:7.1f}")
+                lines.append(
+                    f"{key:<10}{v['psnr']:6.2f}   {v['ssim']:6.4f}   {face:>10}   "
+                    f"{v['gaussians']:9d}   {v['seconds']:7.1f}"
+                )
         return "\n".join(lines)
 
 
@@ -215,7 +251,9 @@ def _now() -> np.ndarray:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    """The mapping in a JSON file; empty when there is none, or a damaged one, whose numbers are measured anew."""
+    """The mapping in a JSON file; empty when there is none, or a damaged one, whose numbers are
+    measured anew.
+    """
     try:
         values = json.loads(path.read_text())
     except (OSError, ValueError):

@@ -1,15 +1,19 @@
-"""Renderer ``gaussiandreamer-splatting``: the host's batch in, the host's pictures out, our rasteriser between.
+"""Renderer ``gaussiandreamer-splatting``: the host's batch in, the host's pictures out, our
+rasteriser between.
 
-=============  ==============================================================================================================
+=============  =====================================================================================
 option         meaning
-=============  ==============================================================================================================
-backend        ``auto`` (by where the cloud is and what is built), ``cpu``, ``cuda``, ``torch``, ``reference``
-preset         ``fast`` | ``balanced`` | ``accurate``: the smallest alpha that is drawn, 1/255, 1/1024, 1/65536
+=============  =====================================================================================
+backend        ``auto`` (by where the cloud is and what is built), ``cpu``, ``cuda``, ``torch``,
+               ``reference``
+preset         ``fast`` | ``balanced`` | ``accurate``: the smallest alpha that is drawn, 1/255,
+               1/1024, 1/65536
 antialias      keep the energy of Gaussians smaller than a pixel
 eps2d          screen-space dilation in square pixels
-downsample     1, or 2: return the 2x2 box of the rendered size (the paper renders 1024^2 and guides at 512^2)
+downsample     1, or 2: return the 2x2 box of the rendered size (the paper renders 1024^2 and guides
+               at 512^2)
 train_normals  normals in training too; otherwise only in validation, test and export
-=============  ==============================================================================================================
+=============  =====================================================================================
 """
 
 from dataclasses import dataclass
@@ -46,13 +50,21 @@ class SplattingRenderer(Rasterizer):
                 raise unknown("system.renderer.preset", cfg.preset, PRESETS)
             _check_backend(cfg.backend)
             if cfg.downsample not in (1, 2):
-                raise UserError(f"system.renderer.downsample: expected 1 or 2, got {cfg.downsample}")
+                raise UserError(
+                    f"system.renderer.downsample: expected 1 or 2, got {cfg.downsample}"
+                )
             if not cfg.radius > 0:
-                raise UserError(f"system.renderer.radius: expected a positive number, got {cfg.radius}")
+                raise UserError(
+                    f"system.renderer.radius: expected a positive number, got {cfg.radius}"
+                )
             if cfg.eps2d < 0:
-                raise UserError(f"system.renderer.eps2d: expected 0 or more square pixels, got {cfg.eps2d}")
+                raise UserError(
+                    f"system.renderer.eps2d: expected 0 or more square pixels, got {cfg.eps2d}"
+                )
             if not 0 < cfg.near < cfg.far:
-                raise UserError(f"system.renderer: expected 0 < near < far, got near={cfg.near}, far={cfg.far}")
+                raise UserError(
+                    f"system.renderer: expected 0 < near < far, got near={cfg.near}, far={cfg.far}"
+                )
 
     cfg: Config
 
@@ -60,22 +72,32 @@ class SplattingRenderer(Rasterizer):
         super().configure(geometry, material, background)
         self.Config.check(self.cfg)
 
-    def forward(self, c2w: Tensor, fovy: Tensor, height: int, width: int, **batch: Any) -> dict[str, Any]:
-        """Render B views, in float32 whatever the trainer's precision is: half of it would move cameras by thousandths.
+    def forward(
+        self, c2w: Tensor, fovy: Tensor, height: int, width: int, **batch: Any
+    ) -> dict[str, Any]:
+        """Render B views, in float32 whatever the trainer's precision is: half of it would move
+        cameras by thousandths.
 
-        Args: ``c2w`` (B, 4, 4) OpenGL, ``fovy`` (B,) radians, ``height`` and ``width`` in pixels, before ``downsample``.
-        Returns: ``comp_rgb`` (B, H, W, 3), ``opacity`` and ``depth`` (B, H, W, 1), ``comp_normal`` (B, H, W, 3) in [0, 1],
-        ``comp_rgb_bg``, the background, (B, 1, 1, 3) or (B, H, W, 3), ``rasterized`` with what densification needs, and
-        ``gaussian_opacities`` (N,), which pruning differentiates by.
-        """
+        Args: ``c2w`` (B, 4, 4) OpenGL, ``fovy`` (B,) radians, ``height`` and ``width`` in pixels,
+            before ``downsample``.
+        Returns: ``comp_rgb`` (B, H, W, 3), ``opacity`` and ``depth`` (B, H, W, 1), ``comp_normal``
+            (B, H, W, 3) in [0, 1],
+        ``comp_rgb_bg``, the background, (B, 1, 1, 3) or (B, H, W, 3), ``rasterized`` with what
+        densification needs, and ``gaussian_opacities`` (N,), which pruning differentiates by."""
         device = self.geometry.means.device
         with torch.autocast(device.type, enabled=False):
-            return self._render(c2w.to(device, torch.float32), fovy.to(device, torch.float32), height, width, batch)
+            return self._render(
+                c2w.to(device, torch.float32), fovy.to(device, torch.float32), height, width, batch
+            )
 
-    def _render(self, c2w: Tensor, fovy: Tensor, height: int, width: int, batch: dict[str, Any]) -> dict[str, Any]:
+    def _render(
+        self, c2w: Tensor, fovy: Tensor, height: int, width: int, batch: dict[str, Any]
+    ) -> dict[str, Any]:
         cfg = self.cfg
         viewmats, Ks = cameras.to_opencv(c2w, fovy, height, width)
-        flat = self.background.color(len(c2w)) if isinstance(self.background, FlatBackground) else None
+        flat = (
+            self.background.color(len(c2w)) if isinstance(self.background, FlatBackground) else None
+        )
         opacities = self.geometry.opacities()
         out = rasterize(
             self.geometry.means,
@@ -97,15 +119,27 @@ class SplattingRenderer(Rasterizer):
             backend=cfg.backend,
             absgrad=self.training and getattr(self.geometry, "wants_absgrad", False),
         )
-        image, background = (out.image, flat[:, None, None]) if flat is not None else self._composite(out, c2w, fovy, batch)
+        image, background = (
+            (out.image, flat[:, None, None])
+            if flat is not None
+            else self._composite(out, c2w, fovy, batch)
+        )
         depth = out.depth / out.alpha.clamp_min(1e-6)
-        pictures = {"comp_rgb": image, "opacity": out.alpha, "depth": depth, "comp_rgb_bg": background, "rasterized": out}
+        pictures = {
+            "comp_rgb": image,
+            "opacity": out.alpha,
+            "depth": depth,
+            "comp_rgb_bg": background,
+            "rasterized": out,
+        }
         pictures["gaussian_opacities"] = opacities
         if cfg.train_normals or not self.training:
             pictures["comp_normal"] = normals_from_depth(depth, out.alpha, c2w, fovy)
         return pictures
 
-    def _composite(self, out: Rasterized, c2w: Tensor, fovy: Tensor, batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
+    def _composite(
+        self, out: Rasterized, c2w: Tensor, fovy: Tensor, batch: dict[str, Any]
+    ) -> tuple[Tensor, Tensor]:
         """Another extension's background, which wants a direction per pixel."""
         height, width = out.image.shape[1:3]
         rays = batch.get("rays_d")
@@ -123,19 +157,31 @@ def _check_backend(name: str) -> None:
     if name not in reasons:
         raise unknown("system.renderer.backend", name, ["auto", *reasons])
     if reasons[name] is not None:
-        raise UserError(f"system.renderer.backend={name} can't be used here: {reasons[name]} (backend=auto takes the fastest that can)")
+        raise UserError(
+            f"system.renderer.backend={name} can't be used here: {reasons[name]} (backend=auto "
+            "takes the fastest that can)"
+        )
 
 
 def normals_from_depth(
-    depth: Float[Tensor, "B H W 1"], alpha: Float[Tensor, "B H W 1"], c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"]
+    depth: Float[Tensor, "B H W 1"],
+    alpha: Float[Tensor, "B H W 1"],
+    c2w: Float[Tensor, "B 4 4"],
+    fovy: Float[Tensor, " B"],
 ) -> Float[Tensor, "B H W 3"]:
-    """World-space normals of the depth surface, mapped from [-1, 1] to [0, 1]; 0.5 where nothing is drawn.
+    """World-space normals of the depth surface, mapped from [-1, 1] to [0, 1]; 0.5 where nothing is
+    drawn.
 
-    ``depth`` is along the optical axis; the normal is the cross product of the surface's differences along rows and columns.
-    """
+    ``depth`` is along the optical axis; the normal is the cross product of the surface's
+    differences along rows and columns."""
     height, width = depth.shape[1:3]
-    points = c2w[:, None, None, :3, 3] + depth * cameras.ray_directions(c2w, fovy, height, width, normalize=False)
+    points = c2w[:, None, None, :3, 3] + depth * cameras.ray_directions(
+        c2w, fovy, height, width, normalize=False
+    )
     padded = F.pad(points.permute(0, 3, 1, 2), (1, 1, 1, 1), mode="replicate").permute(0, 2, 3, 1)
-    down, right = padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1], padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]
+    down, right = (
+        padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1],
+        padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2],
+    )
     normal = F.normalize(torch.linalg.cross(down, right), dim=-1)
     return 0.5 + 0.5 * normal * (alpha > 0.5)

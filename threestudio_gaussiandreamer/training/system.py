@@ -1,21 +1,27 @@
-"""System ``gaussiandreamer-system``: a prior becomes a cloud, score distillation improves it, the result is looked at and measured.
+"""System ``gaussiandreamer-system``: a prior becomes a cloud, score distillation improves it, the
+result is looked at and measured.
 
-The life of a run, in the host's order: ``configure_optimizers`` prepares prompt, guidance and cloud; ``training_step`` renders,
-asks the guidance for its losses, steps the optimiser, then densifies and prunes (after the step, so that no update is lost and
-a checkpoint written after it holds the cloud that the next step starts from); validation writes a grid of pictures, test a
+The life of a run, in the host's order: ``configure_optimizers`` prepares prompt, guidance and
+cloud; ``training_step`` renders, asks the guidance for its losses, steps the optimiser, then
+densifies and prunes (after the step, so that no update is lost and a checkpoint written after it
+holds the cloud that the next step starts from); validation writes a grid of pictures, test a
 turntable, and where the guidance knows the truth the cloud is scored on views that no bank holds.
 
-=============  ==============================================================================================================
+=============  =====================================================================================
 option         meaning
-=============  ==============================================================================================================
-loss.lambda_*  weight of each loss, a number or a schedule: ``sds`` and every other ``loss_*`` of the guidance;
-               ``sparsity`` mean sqrt(alpha^2 + 0.01); ``opaque`` entropy of alpha, which pushes it to 0 or 1
-optimizer      name (a torch optimiser) and args; the learning rates belong to the geometry and the background
-evaluation     views, size (pixels), supersample, every (steps; 0: only at start and end): PSNR and SSIM on held-out views
-prune          a budget that the export is made for once more: count, bytes (of the SPZ file where that is exported, else of the
-               PLY), psnr (dB to the cloud before) or within (dB lost of quality); quality, size, steps: as the prune command;
-               eps2d, antialias: the renderer's, unless given
-=============  ==============================================================================================================
+=============  =====================================================================================
+loss.lambda_*  weight of each loss, a number or a schedule: ``sds`` and every other ``loss_*`` of
+               the guidance; ``sparsity`` mean sqrt(alpha^2 + 0.01); ``opaque`` entropy of alpha,
+               which pushes it to 0 or 1
+optimizer      name (a torch optimiser) and args; the learning rates belong to the geometry and the
+               background
+evaluation     views, size (pixels), supersample, every (steps; 0: only at start and end): PSNR and
+               SSIM on held-out views
+prune          a budget that the export is made for once more: count, bytes (of the SPZ file where
+               that is exported, else of the PLY), psnr (dB to the cloud before) or within (dB lost
+               of quality); quality, size, steps: as the prune command; eps2d, antialias: the
+               renderer's, unless given
+=============  =====================================================================================
 """
 
 import contextlib
@@ -42,7 +48,13 @@ from ..gaussians.point_cloud import PointCloud
 from ..gaussians.simplify import EPS2D
 from ..gaussians.surface import Surface, write_obj
 from ..guidance.base import ScoreDistillation
-from ..guidance.foreign import call_guidance, learnt_weights, own_randomness, restore_learnt, trainable_groups
+from ..guidance.foreign import (
+    call_guidance,
+    learnt_weights,
+    own_randomness,
+    restore_learnt,
+    trainable_groups,
+)
 from ..host import BaseLift3DSystem, find, info, register, validate_schedule, warn
 from ..metrics import psnr
 from ..priors.cache import cached_cloud
@@ -51,7 +63,9 @@ from .background import FlatBackground
 from .held_out import EvaluationConfig, HeldOut, Measurements
 
 REGULARISERS = ("sparsity", "opaque")
-GUIDANCE_LR = 1e-4  # of what a guidance trains itself, such as the LoRA of variational score distillation
+GUIDANCE_LR = (
+    1e-4  # of what a guidance trains itself, such as the LoRA of variational score distillation
+)
 
 
 class Price(NamedTuple):
@@ -85,7 +99,8 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             _check_losses(cfg)
             if cfg.scheduler is not None:
                 raise UserError(
-                    "system.scheduler isn't used: learning rates are schedules themselves, for instance system.geometry.lr_means"
+                    "system.scheduler isn't used: learning rates are schedules themselves, for "
+                    "instance system.geometry.lr_means"
                 )
             for name in cfg.optimizer:
                 if name not in ("name", "args"):
@@ -96,7 +111,9 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     @staticmethod
     def logged(cfg: Any) -> Optional[set[str]]:
-        """The names that a run of this configuration logs; None where its guidance doesn't say before it runs."""
+        """The names that a run of this configuration logs; None where its guidance doesn't say
+        before it runs.
+        """
         guidance = find(cfg.guidance_type)
         if not issubclass(guidance, ScoreDistillation):
             return None
@@ -105,7 +122,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         known = {"loss", "gaussians", *(f"train/{name}" for name in guided)}
         return known | {"dB"} if hasattr(guidance, "target_rgb") else known
 
-    # -- start ---------------------------------------------------------------------------------------------------------------
+    # -- start -------------------------------------------------------------------------------------
 
     def configure(self) -> None:
         self.Config.check(self.cfg)
@@ -120,12 +137,16 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         self.prepare_guidance()
         self.ensure_cloud()
         own_background = isinstance(self.background, FlatBackground)
-        groups = self.geometry.parameter_groups() + (self.background.parameter_groups() if own_background else [])
+        groups = self.geometry.parameter_groups() + (
+            self.background.parameter_groups() if own_background else []
+        )
         groups += trainable_groups(self.guidance, GUIDANCE_LR)
         return optimizer_of(self.cfg.optimizer, groups)
 
     def preflight(self) -> None:
-        """What prior and guidance need is looked for before models are loaded: what is missing shows in seconds."""
+        """What prior and guidance need is looked for before models are loaded: what is missing
+        shows in seconds.
+        """
         prior = None if len(self.geometry) else self.geometry.prior()
         if hasattr(prior, "preflight"):
             prior.preflight()
@@ -137,7 +158,8 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         """Before the prior runs, since its weights may be missing too."""
         self.prompt_processor = find(self.cfg.prompt_processor_type)(self.cfg.prompt_processor)
         self.prompt_utils = self.prompt_processor()
-        # past nn.Module's registration: a guidance's frozen weights belong neither into the checkpoint nor among the system's modules
+        # past nn.Module's registration: a guidance's frozen weights belong neither into the
+        # checkpoint nor among the system's modules
         self.__dict__["guidance"] = find(self.cfg.guidance_type)(self.cfg.guidance)
         if self._learnt is not None:
             restore_learnt(self.guidance, self._learnt)
@@ -154,15 +176,22 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         """Run the prior, unless a checkpoint brought the cloud."""
         if len(self.geometry):
             return
-        prompt = getattr(self, "prompt_utils", None) or find(self.cfg.prompt_processor_type)(self.cfg.prompt_processor)
-        self.geometry.initialize(str(getattr(prompt, "prompt", "")), lambda prior, text: cached_cloud(prior, text, self._save_dir))
+        prompt = getattr(self, "prompt_utils", None) or find(self.cfg.prompt_processor_type)(
+            self.cfg.prompt_processor
+        )
+        self.geometry.initialize(
+            str(getattr(prompt, "prompt", "")),
+            lambda prior, text: cached_cloud(prior, text, self._save_dir),
+        )
         info(f"the cloud starts with {len(self.geometry)} Gaussians")
 
     def on_fit_start(self) -> None:
         super().on_fit_start()
         caster = getattr(self.guidance, "caster", None)
         if caster is not None and self._save_dir is not None:
-            self.measurements = Measurements(HeldOut(self.cfg.evaluation, caster), Path(self._save_dir))
+            self.measurements = Measurements(
+                HeldOut(self.cfg.evaluation, caster), Path(self._save_dir)
+            )
 
     def on_train_start(self) -> None:
         self.warn_of_a_tight_schedule()
@@ -173,8 +202,13 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         self.cast_targets()
 
     def cast_targets(self) -> None:
-        """Let a guidance that looks at a truth look at all views of a fixed pool at once, if this run will come to most of them."""
-        views, cast = getattr(self.trainer.datamodule, "pool_views", lambda: None)(), getattr(self.guidance, "cast_targets", None)
+        """Let a guidance that looks at a truth look at all views of a fixed pool at once, if this
+        run will come to most of them.
+        """
+        views, cast = (
+            getattr(self.trainer.datamodule, "pool_views", lambda: None)(),
+            getattr(self.guidance, "cast_targets", None),
+        )
         if cast is None or views is None:
             return
         drawn = (self.trainer.max_steps - self.global_step) * views["batch_size"]
@@ -184,8 +218,13 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             cast(views["c2w"].to(self.device), views["fovy"].to(self.device), *size)
 
     def warn_of_a_tight_schedule(self) -> None:
-        """Say that a budget won't be met by the rounds of pruning that this run has, or only in larger ones than they should be."""
-        geometry, end = self.geometry, self.trainer.max_steps if self.trainer.max_steps > 0 else math.inf
+        """Say that a budget won't be met by the rounds of pruning that this run has, or only in
+        larger ones than they should be.
+        """
+        geometry, end = (
+            self.geometry,
+            self.trainer.max_steps if self.trainer.max_steps > 0 else math.inf,
+        )
         budget, rounds = geometry.cfg.budget, geometry.prune_rounds
         if budget is None:
             return
@@ -194,22 +233,29 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         too_many = isinstance(budget, int) and len(geometry) > budget
         if late:
             warn(
-                f"{late} of the {len(rounds)} rounds of pruning would come after step {end}, the last:"
+                f"{late} of the {len(rounds)} rounds of pruning would come after step {end}, "
+                "the last:"
                 " give system.geometry.prune.start, stop and every to match"
             )
         elif too_many and not to_come:
             warn(
-                f"no round of pruning is to come, so that {len(geometry)} Gaussians stay, not {budget}:"
+                f"no round of pruning is to come, so that {len(geometry)} Gaussians stay, not "
+                f"{budget}:"
                 " give system.geometry.prune.start, stop and every to match"
             )
-        elif too_many and (share := geometry.kept_share(len(geometry), to_come[0])) < geometry.cfg.prune.keep - 0.005:
+        elif (
+            too_many
+            and (share := geometry.kept_share(len(geometry), to_come[0]))
+            < geometry.cfg.prune.keep - 0.005
+        ):
             warn(
-                f"{len(to_come)} rounds of pruning have to lead from {len(geometry)} Gaussians to {budget}:"
+                f"{len(to_come)} rounds of pruning have to lead from {len(geometry)} Gaussians "
+                f"to {budget}:"
                 f" each keeps {share:.2f} instead of {geometry.cfg.prune.keep:g}, which costs more;"
                 " give more rounds (system.geometry.prune.every) or start with fewer"
             )
 
-    # -- one step ------------------------------------------------------------------------------------------------------------
+    # -- one step ----------------------------------------------------------------------------------
 
     def forward(self, batch: dict[str, Any]) -> dict[str, Any]:
         return self.renderer(**batch)
@@ -222,7 +268,9 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         losses = self.losses(out, batch)
         loss = torch.stack(list(losses.values())).sum()
         self.manual_backward(loss)
-        average_gradients(parameter for group in optimizer.param_groups for parameter in group["params"])
+        average_gradients(
+            parameter for group in optimizer.param_groups for parameter in group["params"]
+        )
         loss_scale = self.loss_scale()
         self.geometry.observe(out["rasterized"], batch["width"], batch["height"], loss_scale)
         optimizer.step()
@@ -231,37 +279,64 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         optimizer.zero_grad(set_to_none=True)
         # self.optimizers() wraps the torch optimiser, whose rows have to follow the Gaussians
         prices: list[Price] = []
-        self.geometry.after_step(optimizer.optimizer, self.global_step, lambda kept: self.quality_holds(kept, batch, prices))
+        self.geometry.after_step(
+            optimizer.optimizer,
+            self.global_step,
+            lambda kept: self.quality_holds(kept, batch, prices),
+        )
         self.tell(prices)
         self.report(out, batch, losses, loss)
 
     @torch.no_grad()
-    def quality_holds(self, kept: Bool[Tensor, " N"], batch: dict[str, Any], prices: list[Price]) -> bool:
-        """Whether this batch looks nearly the same with only the ``kept`` Gaussians: for ``system.geometry.budget=auto``.
+    def quality_holds(
+        self, kept: Bool[Tensor, " N"], batch: dict[str, Any], prices: list[Price]
+    ) -> bool:
+        """Whether this batch looks nearly the same with only the ``kept`` Gaussians: for
+        ``system.geometry.budget=auto``.
 
-        Where the guidance knows the truth, the loss of dB against it is measured; elsewhere how like the renders are. What was measured
-        of those with which it holds goes to ``prices``.
-        """
+        Where the guidance knows the truth, the loss of dB against it is measured; elsewhere how
+        like the renders are. What was measured of those with which it holds goes to ``prices``."""
         all_of_them = self(batch)
         with self.geometry.only(kept):
             fewer = self(batch)["comp_rgb"]
         truth = self.truth(batch, all_of_them)
         if truth is None:
-            likeness, asked = psnr(fewer, all_of_them["comp_rgb"]).mean(), self.geometry.cfg.prune.likeness
-            margin, found = likeness - asked, {"prune/likeness": float(likeness), "prune/asked_for": asked}
+            likeness, asked = (
+                psnr(fewer, all_of_them["comp_rgb"]).mean(),
+                self.geometry.cfg.prune.likeness,
+            )
+            margin, found = (
+                likeness - asked,
+                {"prune/likeness": float(likeness), "prune/asked_for": asked},
+            )
         else:
-            loss, affordable = (psnr(all_of_them["comp_rgb"], truth) - psnr(fewer, truth)).mean(), self.geometry.affordable
-            margin, found = affordable - loss, {"prune/lost": float(loss), "prune/affordable": affordable}
-        holds = bool(all_sum(margin) >= 0)  # every process looks at other views, and all have to decide alike
+            loss, affordable = (
+                (psnr(all_of_them["comp_rgb"], truth) - psnr(fewer, truth)).mean(),
+                self.geometry.affordable,
+            )
+            margin, found = (
+                affordable - loss,
+                {"prune/lost": float(loss), "prune/affordable": affordable},
+            )
+        holds = bool(
+            all_sum(margin) >= 0
+        )  # every process looks at other views, and all have to decide alike
         prices += [Price(len(kept), int(kept.sum()), found)] if holds else []
         return holds
 
     def tell(self, prices: list[Price]) -> None:
-        """Log and print what a round of ``auto`` cost: the last of a search is the one that was made."""
+        """Log and print what a round of ``auto`` cost: the last of a search is the one that was
+        made.
+        """
         for before, after, measured in prices[-1:]:
             self.log_dict(measured)
-            told = ", ".join(f"{name.partition('/')[2]} {value:.3g}" for name, value in measured.items())
-            info(f"step {self.global_step}: {before} -> {after} Gaussians; dB on the views of this step: {told}")
+            told = ", ".join(
+                f"{name.partition('/')[2]} {value:.3g}" for name, value in measured.items()
+            )
+            info(
+                f"step {self.global_step}: {before} -> {after} Gaussians; dB on the views of "
+                f"this step: {told}"
+            )
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
         for part in (self.geometry, self.background):
@@ -269,36 +344,66 @@ class GaussianDreamerSystem(BaseLift3DSystem):
                 part.set_learning_rates(optimizer, self.true_current_epoch, self.true_global_step)
 
     def losses(self, out: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
-        """The weighted losses: every ``loss_*`` that the guidance returns, and our regularisers on the real alpha."""
+        """The weighted losses: every ``loss_*`` that the guidance returns, and our regularisers on
+        the real alpha.
+        """
         guided = self.guide(out, batch)
-        self._log_sometimes({f"train/{k}": v for k, v in guided.items() if not k.startswith("loss_") and is_one_number(v)})
+        self._log_sometimes(
+            {
+                f"train/{k}": v
+                for k, v in guided.items()
+                if not k.startswith("loss_") and is_one_number(v)
+            }
+        )
         raw = {k.removeprefix("loss_"): v for k, v in guided.items() if k.startswith("loss_")}
-        weights = {name.removeprefix("lambda_"): self.C(weight) for name, weight in self.cfg.loss.items()}
+        weights = {
+            name.removeprefix("lambda_"): self.C(weight) for name, weight in self.cfg.loss.items()
+        }
         check_weights(weights, raw)
-        raw |= {name: regulariser(name, out["opacity"]) for name in REGULARISERS if weights.get(name)}
+        raw |= {
+            name: regulariser(name, out["opacity"]) for name in REGULARISERS if weights.get(name)
+        }
         return {name: value * weights[name] for name, value in raw.items()}
 
     def guide(self, out: dict[str, Any], batch: dict[str, Any], **options: Any) -> dict[str, Any]:
-        """What the guidance makes of these renders; it gets the whole batch, and the background that they lie on."""
+        """What the guidance makes of these renders; it gets the whole batch, and the background
+        that they lie on.
+        """
         with own_randomness(self.true_global_step):
-            return call_guidance(self.guidance, out["comp_rgb"], self.prompt_utils, batch, comp_rgb_bg=out["comp_rgb_bg"], **options)
+            return call_guidance(
+                self.guidance,
+                out["comp_rgb"],
+                self.prompt_utils,
+                batch,
+                comp_rgb_bg=out["comp_rgb_bg"],
+                **options,
+            )
 
     def loss_scale(self) -> float:
-        """The factor that automatic mixed precision leaves on every gradient that isn't a parameter's."""
+        """The factor that automatic mixed precision leaves on every gradient that isn't a
+        parameter's.
+        """
         scaler = getattr(self.trainer.precision_plugin, "scaler", None)
         return 1.0 if scaler is None else float(scaler.get_scale())
 
     def count_skipped_step(self, loss_scale: float) -> None:
-        """Mixed precision halves its scale where it found infinite gradients and left the optimiser's step out."""
+        """Mixed precision halves its scale where it found infinite gradients and left the
+        optimiser's step out.
+        """
         self.skipped_steps += 1
         self.log("train/skipped_steps", float(self.skipped_steps))
         warn(
-            f"step {self.global_step}: gradients overflowed at the loss scale {loss_scale:g}, so nothing was learnt in it;"
+            f"step {self.global_step}: gradients overflowed at the loss scale {loss_scale:g}, "
+            "so nothing was learnt in it;"
             f" schedules go on ({self.skipped_steps} such steps so far)"
         )
 
-    def report(self, out: dict[str, Any], batch: dict[str, Any], losses: dict[str, Tensor], loss: Tensor) -> None:
-        """Loss, count and, where it is known, dB: to the progress bar and the loggers, every ``log_every_n_steps``."""
+    def report(
+        self, out: dict[str, Any], batch: dict[str, Any], losses: dict[str, Tensor], loss: Tensor
+    ) -> None:
+        """Loss, count and, where it is known, dB: to the progress bar and the loggers, every
+        ``log_every_n_steps``.
+        """
         if not self._log_now():
             return
         self.log_dict({f"train/loss_{name}": value.detach() for name, value in losses.items()})
@@ -309,10 +414,16 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         self.log_dict(shown, prog_bar=True)
         self.geometry.warn_of_limits()
 
-    def truth(self, batch: dict[str, Any], out: dict[str, Any]) -> Optional[Float[Tensor, "B H W 3"]]:
+    def truth(
+        self, batch: dict[str, Any], out: dict[str, Any]
+    ) -> Optional[Float[Tensor, "B H W 3"]]:
         """What these views should look like, where the guidance knows it."""
         target = getattr(self.guidance, "target_rgb", None)
-        return None if target is None else target(batch, out["comp_rgb_bg"].detach(), size=out["comp_rgb"].shape[1:3])
+        return (
+            None
+            if target is None
+            else target(batch, out["comp_rgb_bg"].detach(), size=out["comp_rgb"].shape[1:3])
+        )
 
     def _log_now(self) -> bool:
         every = self.trainer.log_every_n_steps
@@ -328,13 +439,16 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         if every and self.global_step % every == 0:
             self.score("curve")
 
-    # -- measuring -----------------------------------------------------------------------------------------------------------
+    # -- measuring ---------------------------------------------------------------------------------
 
     def score(self, key: str) -> None:
         """Score the cloud on the held-out views, where the truth is known."""
         if self.measurements:
             scores = self.measurements.score(key, self.renderer, self.global_step)
-            info(f"{key}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f} on {self.cfg.evaluation.views} held-out views")
+            info(
+                f"{key}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f} on "
+                f"{self.cfg.evaluation.views} held-out views"
+            )
 
     def on_train_end(self) -> None:
         if self.measurements:
@@ -346,21 +460,25 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         self.score("result")
 
     def summary(self) -> str:
-        """Where the pictures, the video and the clouds are, and what was measured; printed when a run has ended."""
+        """Where the pictures, the video and the clouds are, and what was measured; printed when a
+        run has ended.
+        """
         folder = Path(self._save_dir or ".")
         patterns = "held_out/compare.png", "it*-test.mp4", "it*-export/*.*", "it*-export/pruned/*.*"
         found = [path for pattern in patterns for path in sorted(folder.glob(pattern))]
         lines = [str(path) for path in found]
         return "\n".join([*lines, *(["", self.measurements.table()] if self.measurements else [])])
 
-    # -- looking -------------------------------------------------------------------------------------------------------------
+    # -- looking -----------------------------------------------------------------------------------
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         with self.measurements.paused_clock() if self.measurements else contextlib.nullcontext():
             self.show(batch)
 
     def show(self, batch: dict[str, Any]) -> None:
-        """Write a row of pictures: the render, its depth and normals, the truth where it is known, what the score model sees."""
+        """Write a row of pictures: the render, its depth and normals, the truth where it is known,
+        what the score model sees.
+        """
         out = self(batch)
         images = picture_row(out)
         truth = self.truth(batch, out) if self.guidance is not None else None
@@ -369,15 +487,25 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         if isinstance(self.guidance, ScoreDistillation):
             images += self.score_pictures(out, batch)
         self.save_image_grid(
-            f"it{self.true_global_step}-{int(batch['index'][0])}.png", images, name="validation_step", step=self.true_global_step
+            f"it{self.true_global_step}-{int(batch['index'][0])}.png",
+            images,
+            name="validation_step",
+            step=self.true_global_step,
         )
 
     def score_pictures(self, out: dict[str, Any], batch: dict[str, Any]) -> list[dict[str, Any]]:
-        """What the score model sees and makes of this render: noisy, denoised in one step, denoised in many."""
+        """What the score model sees and makes of this render: noisy, denoised in one step, denoised
+        in many.
+        """
         pictures = self.guide(out, batch, guidance_eval=True)["eval"]
         size = out["comp_rgb"].shape[1:3]
-        images = [pictures[name][:1].permute(0, 3, 1, 2) for name in ("imgs_noisy", "imgs_1step", "imgs_final")]
-        images = [F.interpolate(image, size, mode="bilinear", align_corners=False) for image in images]
+        images = [
+            pictures[name][:1].permute(0, 3, 1, 2)
+            for name in ("imgs_noisy", "imgs_1step", "imgs_final")
+        ]
+        images = [
+            F.interpolate(image, size, mode="bilinear", align_corners=False) for image in images
+        ]
         return [_rgb(image[0].permute(1, 2, 0).clamp(0, 1)) for image in images]
 
     def on_validation_epoch_end(self) -> None:
@@ -385,11 +513,21 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         name = f"it{self.true_global_step}-test/{int(batch['index'][0])}.png"
-        self.save_image_grid(name, [_rgb(self(batch)["comp_rgb"][0])], name="test_step", step=self.true_global_step)
+        self.save_image_grid(
+            name, [_rgb(self(batch)["comp_rgb"][0])], name="test_step", step=self.true_global_step
+        )
 
     def on_test_epoch_end(self) -> None:
         folder = f"it{self.true_global_step}-test"
-        self.save_img_sequence(folder, folder, r"(\d+)\.png", save_format="mp4", fps=30, name="test", step=self.true_global_step)
+        self.save_img_sequence(
+            folder,
+            folder,
+            r"(\d+)\.png",
+            save_format="mp4",
+            fps=30,
+            name="test",
+            step=self.true_global_step,
+        )
         if self.guidance is not None:
             self.export()
 
@@ -399,15 +537,21 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         self.export_pruned()
 
     def export_cloud(self, geometry: Any, folder: str, pruned_to: Optional[float] = None) -> None:
-        """Write what the exporter makes of a geometry; files of Gaussians note the dB that it has been pruned to."""
+        """Write what the exporter makes of a geometry; files of Gaussians note the dB that it has
+        been pruned to.
+        """
         parts = {"geometry": geometry, "material": self.material, "background": self.background}
         exporter = find(self.cfg.exporter_type)(self.cfg.exporter, **parts)
         for out in exporter():
             noted = {"pruned_to": pruned_to} if out.save_type in ("ply", "spz") else {}
-            getattr(self, f"save_{out.save_type}")(f"{folder}/{out.save_name}", **noted, **out.params)
+            getattr(self, f"save_{out.save_type}")(
+                f"{folder}/{out.save_name}", **noted, **out.params
+            )
 
     def export_pruned(self) -> None:
-        """The same files of the cloud pruned to ``system.prune``, in the folder ``pruned`` beside them, with prune's report."""
+        """The same files of the cloud pruned to ``system.prune``, in the folder ``pruned`` beside
+        them, with prune's report.
+        """
         options = PruneOptions(**dict(self.cfg.prune))
         if not options.asked_for:
             return
@@ -417,9 +561,13 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         if options.antialias is None:
             options.antialias = bool(getattr(drawn, "antialias", False))
         folder = f"it{self.true_global_step}-export/pruned"
-        packed = self.cfg.exporter_type == "spz-exporter" or "spz" in self.cfg.exporter.get("formats", ())
+        packed = self.cfg.exporter_type == "spz-exporter" or "spz" in self.cfg.exporter.get(
+            "formats", ()
+        )
         suffix = ".spz" if packed else ".ply"
-        done = pruned(StoredCloud(drawable(gaussian_arrays(self.geometry))), options, suffix, "system.prune.")
+        done = pruned(
+            StoredCloud(drawable(gaussian_arrays(self.geometry))), options, suffix, "system.prune."
+        )
         geometry = find(self.cfg.geometry_type)(self.cfg.geometry)
         geometry.set_arrays(**done.after.arrays._asdict())
         self.export_cloud(geometry, folder, done.after.pruned_to)
@@ -439,7 +587,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         super().on_predict_epoch_end()
         self.export_pruned()
 
-    # -- savers that the exporters name --------------------------------------------------------------------------------------
+    # -- savers that the exporters name ------------------------------------------------------------
 
     def save_ply(self, filename: str, pruned_to: Optional[float] = None, **arrays: Any) -> str:
         path = self.get_save_path(filename)
@@ -448,7 +596,11 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     def save_spz(self, filename: str, pruned_to: Optional[float] = None, **arrays: Any) -> str:
         path = self.get_save_path(filename)
-        write_spz(path, **in_axes(StoredCloud(GaussianArrays(**arrays)), "y")._asdict(), comment=spz_note(pruned_to))
+        write_spz(
+            path,
+            **in_axes(StoredCloud(GaussianArrays(**arrays)), "y")._asdict(),
+            comment=spz_note(pruned_to),
+        )
         return path
 
     def save_points(self, filename: str, cloud: PointCloud) -> str:
@@ -466,22 +618,35 @@ def optimizer_of(options: Any, groups: list[dict[str, Any]]) -> torch.optim.Opti
     """The optimiser ``{name, args}`` over parameter groups that bring their own learning rates."""
     kind = getattr(torch.optim, options.get("name", "Adam"))
     ours = {"betas": (0.9, 0.99), "eps": 1e-15}
-    accepted = {name: value for name, value in ours.items() if name in inspect.signature(kind).parameters}
+    accepted = {
+        name: value for name, value in ours.items() if name in inspect.signature(kind).parameters
+    }
     return kind(groups, lr=0.0, **accepted | dict(options.get("args", {})))
 
 
 def _check_optimizer(options: Any) -> None:
     name, arguments = options.get("name", "Adam"), options.get("args", {})
     if not isinstance(getattr(torch.optim, str(name), None), type):
-        raise unknown("system.optimizer.name", name, [n for n, v in vars(torch.optim).items() if isinstance(v, type)])
+        raise unknown(
+            "system.optimizer.name",
+            name,
+            [n for n, v in vars(torch.optim).items() if isinstance(v, type)],
+        )
     if not isinstance(arguments, Mapping):
         raise UserError(f"system.optimizer.args: expected keys and values, got {arguments!r}")
     try:
-        optimizer_of(options, [{"params": [torch.zeros(1, requires_grad=True)], "lr": 0.0} for _ in range(2)])
+        optimizer_of(
+            options, [{"params": [torch.zeros(1, requires_grad=True)], "lr": 0.0} for _ in range(2)]
+        )
     except (TypeError, ValueError, AssertionError) as error:
-        accepted = inspect.signature(getattr(torch.optim, name)).parameters.keys() - {"params", "lr"}
+        accepted = inspect.signature(getattr(torch.optim, name)).parameters.keys() - {
+            "params",
+            "lr",
+        }
         strange = [unknown("argument", key, accepted) for key in arguments if key not in accepted]
-        raise UserError(f"system.optimizer: {name} doesn't accept this: {strange[0] if strange else error}") from error
+        raise UserError(
+            f"system.optimizer: {name} doesn't accept this: {strange[0] if strange else error}"
+        ) from error
 
 
 def _check_losses(cfg: Any) -> None:
@@ -489,8 +654,13 @@ def _check_losses(cfg: Any) -> None:
     guidance = find(cfg.guidance_type)
     for name in cfg.loss:
         if not name.startswith("lambda_"):
-            raise UserError(f"unknown key 'system.loss.{name}': weights of losses are called lambda_<loss>, such as lambda_sds")
-    known = getattr(guidance, "LOSSES", ("sds",) if issubclass(guidance, ScoreDistillation) else None)
+            raise UserError(
+                f"unknown key 'system.loss.{name}': weights of losses are called "
+                "lambda_<loss>, such as lambda_sds"
+            )
+    known = getattr(
+        guidance, "LOSSES", ("sds",) if issubclass(guidance, ScoreDistillation) else None
+    )
     if known is not None:
         check_weights([name.removeprefix("lambda_") for name in cfg.loss], known)
 
@@ -501,17 +671,28 @@ def is_one_number(value: Any) -> bool:
 
 
 def check_weights(weights: Iterable[str], losses: Iterable[str]) -> None:
-    """Raise UserError unless every weight belongs to a loss or a regulariser, and every loss has its weight."""
+    """Raise UserError unless every weight belongs to a loss or a regulariser, and every loss has
+    its weight.
+    """
     for name in weights:
         if name not in losses and name not in REGULARISERS:
-            raise unknown("weight system.loss.lambda_*", f"lambda_{name}", [f"lambda_{n}" for n in (*losses, *REGULARISERS)])
+            raise unknown(
+                "weight system.loss.lambda_*",
+                f"lambda_{name}",
+                [f"lambda_{n}" for n in (*losses, *REGULARISERS)],
+            )
     for name in losses:
         if name not in weights:
-            raise UserError(f"the guidance returns loss_{name}: give its weight, for instance system.loss.lambda_{name}=1")
+            raise UserError(
+                f"the guidance returns loss_{name}: give its weight, for instance "
+                f"system.loss.lambda_{name}=1"
+            )
 
 
 def regulariser(name: str, alpha: Float[Tensor, "B H W 1"]) -> Tensor:
-    """threestudio's terms on the rendered alpha: ``sparsity`` wants little of it, ``opaque`` wants it near 0 or 1."""
+    """threestudio's terms on the rendered alpha: ``sparsity`` wants little of it, ``opaque`` wants
+    it near 0 or 1.
+    """
     if name == "sparsity":
         return (alpha**2 + 0.01).sqrt().mean()
     clamped = alpha.clamp(1e-3, 1 - 1e-3)
@@ -525,10 +706,15 @@ def picture_row(out: dict[str, Any]) -> list[dict[str, Any]]:
     depth, alpha = out["depth"][0, ..., 0], out["opacity"][0, ..., 0]
     visible = depth[alpha > 0.5]
     near, far = (float(visible.min()), float(visible.max()) + 1e-6) if len(visible) else (0.0, 1.0)
-    images.append({"type": "grayscale", "img": depth, "kwargs": {"cmap": "jet", "data_range": (near, far)}})
+    images.append(
+        {"type": "grayscale", "img": depth, "kwargs": {"cmap": "jet", "data_range": (near, far)}}
+    )
     if "comp_normal" in out:
         images.append(_rgb(out["comp_normal"][0]))
-    return [*images, {"type": "grayscale", "img": alpha, "kwargs": {"cmap": None, "data_range": (0, 1)}}]
+    return [
+        *images,
+        {"type": "grayscale", "img": alpha, "kwargs": {"cmap": None, "data_range": (0, 1)}},
+    ]
 
 
 def _rgb(image: Float[Tensor, "H W 3"]) -> dict[str, Any]:

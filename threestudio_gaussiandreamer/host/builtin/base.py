@@ -17,10 +17,12 @@ from .types import check_types
 
 
 def parse_structured(config_class: Any, values: Any = None) -> Any:
-    """The typed configuration of a part: ``config_class`` filled with ``values``, then checked by its ``check``, if any.
+    """The typed configuration of a part: ``config_class`` filled with ``values``, then checked by
+    its ``check``, if any.
 
     Raises:
-        UserError: an unknown key, a value of the wrong type or a missing one; or what ``config_class.check(cfg)`` finds.
+        UserError: an unknown key, a value of the wrong type or a missing one; or what
+            ``config_class.check(cfg)`` finds.
     """
     cfg = fill(config_class, values)
     if hasattr(config_class, "check"):
@@ -29,10 +31,12 @@ def parse_structured(config_class: Any, values: Any = None) -> Any:
 
 
 def fill(config_class: Any, values: Any = None) -> DictConfig:
-    """``config_class`` filled with ``values`` and typed. A ``${`` in a string is text: interpolations are resolved by now.
+    """``config_class`` filled with ``values`` and typed. A ``${`` in a string is text:
+    interpolations are resolved by now.
 
     Raises:
-        UserError: an unknown key, a value of the wrong type or a missing one; the message begins with the key.
+        UserError: an unknown key, a value of the wrong type or a missing one; the message begins
+            with the key.
     """
     if values is not None and not isinstance(values, Mapping):
         raise UserError(f"expected keys and values, got {values!r}")
@@ -42,7 +46,9 @@ def fill(config_class: Any, values: Any = None) -> DictConfig:
             raise unknown("key", key, known)
     try:
         check_types(config_class, values or {})
-        return OmegaConf.structured(config_class(**{key: escape(value) for key, value in (values or {}).items()}))
+        return OmegaConf.structured(
+            config_class(**{key: escape(value) for key, value in (values or {}).items()})
+        )
     except OmegaConfBaseException as error:
         raise UserError(f"{error.full_key or error.key}: {str(error).splitlines()[0]}") from error
     except TypeError as error:
@@ -57,7 +63,9 @@ def get_device() -> torch.device:
 
 
 class Updateable:
-    """Something that changes with the step: it and all its public attributes are told before and after each batch."""
+    """Something that changes with the step: it and all its public attributes are told before and
+    after each batch.
+    """
 
     def do_update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
         for part in self._updateables():
@@ -70,14 +78,20 @@ class Updateable:
         self.update_step_end(epoch, global_step)
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
-        """Called before each batch; must be idempotent, since a part can be reached by more than one way."""
+        """Called before each batch; must be idempotent, since a part can be reached by more than
+        one way.
+        """
 
     def update_step_end(self, epoch: int, global_step: int) -> None:
         """Called after each batch."""
 
     def _updateables(self) -> list["Updateable"]:
         attributes = {**vars(self), **getattr(self, "_modules", {})}
-        return [part for name, part in attributes.items() if not name.startswith("_") and isinstance(part, Updateable)]
+        return [
+            part
+            for name, part in attributes.items()
+            if not name.startswith("_") and isinstance(part, Updateable)
+        ]
 
 
 def update_if_possible(part: Any, epoch: int, global_step: int) -> None:
@@ -114,8 +128,8 @@ class BaseObject(Updateable):
 class BaseModule(nn.Module, Updateable):
     """A part with parameters: geometry, material, background, renderer.
 
-    ``weights`` is ``path:module``: the entries of a checkpoint under ``module.`` are loaded after ``configure``.
-    """
+    ``weights`` is ``path:module``: the entries of a checkpoint under ``module.`` are loaded after
+    ``configure``."""
 
     @dataclass
     class Config:
@@ -137,7 +151,10 @@ class BaseModule(nn.Module, Updateable):
     def _load_weights(self, source: str) -> None:
         path, _, module_name = source.rpartition(":")
         if not path:
-            raise UserError(f"weights: expected <checkpoint>:<module>, such as last.ckpt:geometry, got {source!r}")
+            raise UserError(
+                "weights: expected <checkpoint>:<module>, such as last.ckpt:geometry, got "
+                f"{source!r}"
+            )
         state_dict, epoch, global_step = load_module_weights(path, module_name=module_name)
         self.load_state_dict(state_dict)
         self.do_update_step(epoch, global_step, on_load_weights=True)

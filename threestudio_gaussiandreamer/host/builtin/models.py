@@ -61,7 +61,9 @@ class NoMaterial(BaseMaterial):
         @staticmethod
         def check(cfg: Any) -> None:
             if cfg.color_activation not in COLOR_ACTIVATIONS:
-                raise unknown("system.material.color_activation", cfg.color_activation, COLOR_ACTIVATIONS)
+                raise unknown(
+                    "system.material.color_activation", cfg.color_activation, COLOR_ACTIVATIONS
+                )
 
     cfg: Config
 
@@ -84,7 +86,9 @@ class BaseBackground(BaseModule):
 
 @register("solid-color-background")
 class SolidColorBackground(BaseBackground):
-    """One colour for all pixels, fixed or learned; ``random_aug`` replaces it by a random one with some probability."""
+    """One colour for all pixels, fixed or learned; ``random_aug`` replaces it by a random one with
+    some probability.
+    """
 
     @dataclass
     class Config(BaseBackground.Config):
@@ -106,7 +110,9 @@ class SolidColorBackground(BaseBackground):
     def forward(self, dirs: Tensor) -> Tensor:
         shape = (*dirs.shape[:-1], self.cfg.n_output_dims)
         if self.training and self.cfg.random_aug and torch.rand(()) < self.cfg.random_aug_prob:
-            return torch.rand(dirs.shape[0], 1, 1, self.cfg.n_output_dims, device=dirs.device).expand(shape)
+            return torch.rand(
+                dirs.shape[0], 1, 1, self.cfg.n_output_dims, device=dirs.device
+            ).expand(shape)
         return self.env_color.to(dirs).expand(shape)
 
 
@@ -119,7 +125,9 @@ class SubModules(NamedTuple):
 
 
 class Renderer(BaseModule):
-    """Cameras to pictures: ``renderer(**batch)`` gives a dict with ``comp_rgb`` (B,H,W,3), ``opacity`` (B,H,W,1), ..."""
+    """Cameras to pictures: ``renderer(**batch)`` gives a dict with ``comp_rgb`` (B,H,W,3),
+    ``opacity`` (B,H,W,1), ...
+    """
 
     @dataclass
     class Config(BaseModule.Config):
@@ -127,9 +135,13 @@ class Renderer(BaseModule):
 
     cfg: Config
 
-    def configure(self, geometry: BaseGeometry, material: BaseMaterial, background: BaseBackground) -> None:
+    def configure(
+        self, geometry: BaseGeometry, material: BaseMaterial, background: BaseBackground
+    ) -> None:
         self.sub_modules = SubModules(geometry, material, background)
-        self.register_buffer("bbox", self.cfg.radius * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+        self.register_buffer(
+            "bbox", self.cfg.radius * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+        )
 
     def forward(self, *args: Any, **kwargs: Any) -> Mapping[str, Any]:
         raise NotImplementedError(f"{type(self).__name__}.forward")
@@ -169,7 +181,9 @@ class Exporter(BaseObject):
 
     cfg: Config
 
-    def configure(self, geometry: BaseGeometry, material: BaseMaterial, background: BaseBackground) -> None:
+    def configure(
+        self, geometry: BaseGeometry, material: BaseMaterial, background: BaseBackground
+    ) -> None:
         self.sub_modules = SubModules(geometry, material, background)
 
     @property

@@ -8,7 +8,8 @@ _parts: dict[str, type] = {}
 
 
 def register(name: str) -> Callable[[type], type]:
-    """A class decorator that enters the class under ``name``; entering the same class again is harmless.
+    """A class decorator that enters the class under ``name``; entering the same class again is
+    harmless.
 
     Raises:
         UserError: another class has that name already.
@@ -17,7 +18,10 @@ def register(name: str) -> Callable[[type], type]:
     def enter(cls: type) -> type:
         taken = _parts.get(name)
         if taken is not None and _identity(taken) != _identity(cls):
-            raise UserError(f"the name {name!r} is taken by {_identity(taken)}: register {_identity(cls)} under another name")
+            raise UserError(
+                f"the name {name!r} is taken by {_identity(taken)}: register {_identity(cls)} "
+                "under another name"
+            )
         _parts[name] = cls
         return cls
 
@@ -25,7 +29,8 @@ def register(name: str) -> Callable[[type], type]:
 
 
 def find(name: str) -> type:
-    """The class registered as ``name``; ``"main:mixin1,mixin2"`` makes a class of ``main`` with the mixins before it.
+    """The class registered as ``name``; ``"main:mixin1,mixin2"`` makes a class of ``main`` with the
+    mixins before it.
 
     Raises:
         UserError: no part has that name; the message lists the near ones.

@@ -16,7 +16,9 @@ from ...core.errors import UserError
 
 
 class SaverMixin:
-    """``save_*`` methods; each takes a file name below the save folder, makes its folder, and returns the full path."""
+    """``save_*`` methods; each takes a file name below the save folder, makes its folder, and
+    returns the full path.
+    """
 
     _save_dir: Optional[str] = None
     _wandb_logger: Any = None
@@ -32,7 +34,10 @@ class SaverMixin:
     def get_save_path(self, filename: str) -> str:
         path = os.path.join(self.get_save_dir(), filename)
         if os.path.relpath(path, self.get_save_dir()).startswith(os.pardir):
-            raise UserError(f"the file name {filename!r} leads out of the folder of results {self.get_save_dir()}")
+            raise UserError(
+                f"the file name {filename!r} leads out of the folder of results "
+                f"{self.get_save_dir()}"
+            )
         os.makedirs(os.path.dirname(path), exist_ok=True)
         return path
 
@@ -55,7 +60,9 @@ class SaverMixin:
             return {key: self.convert_data(item) for key, item in data.items()}
         if data is None or isinstance(data, np.ndarray):
             return data
-        raise TypeError(f"expected an array, a tensor, or a list or dict of them, got {type(data).__name__}")
+        raise TypeError(
+            f"expected an array, a tensor, or a list or dict of them, got {type(data).__name__}"
+        )
 
     def save_rgb_image(
         self,
@@ -66,8 +73,12 @@ class SaverMixin:
         name: Optional[str] = None,
         step: Optional[int] = None,
     ) -> str:
-        """(H,W,C) or (C,H,W) values in ``data_range``; more than three channels are laid side by side, three by three."""
-        picture = pictures.rgb(self.convert_data(img), data_format=data_format, data_range=data_range)
+        """(H,W,C) or (C,H,W) values in ``data_range``; more than three channels are laid side by
+        side, three by three.
+        """
+        picture = pictures.rgb(
+            self.convert_data(img), data_format=data_format, data_range=data_range
+        )
         return self._save_picture(filename, picture, name, step)
 
     def save_grayscale_image(
@@ -79,7 +90,9 @@ class SaverMixin:
         name: Optional[str] = None,
         step: Optional[int] = None,
     ) -> str:
-        """(H,W) values; without ``data_range`` from their smallest to their largest. ``cmap``: None, "jet", "magma"."""
+        """(H,W) values; without ``data_range`` from their smallest to their largest. ``cmap``:
+        None, "jet", "magma".
+        """
         picture = pictures.grayscale(self.convert_data(img), data_range=data_range, cmap=cmap)
         return self._save_picture(filename, picture, name, step)
 
@@ -92,7 +105,9 @@ class SaverMixin:
         step: Optional[int] = None,
         texts: Optional[list] = None,
     ) -> str:
-        """A row of ``{"type": "rgb"|"grayscale", "img": ..., "kwargs": {...}}``, or a list of rows; resized to ``align``."""
+        """A row of ``{"type": "rgb"|"grayscale", "img": ..., "kwargs": {...}}``, or a list of rows;
+        resized to ``align``.
+        """
         picture = pictures.grid(self._converted(imgs), align=align)
         if texts:
             picture = pictures.with_texts(picture, texts)
@@ -112,7 +127,9 @@ class SaverMixin:
         name: Optional[str] = None,
         step: Optional[int] = None,
     ) -> str:
-        """The pictures in ``img_dir`` (below the save folder) whose name matches, by the number in the first group, as a video."""
+        """The pictures in ``img_dir`` (below the save folder) whose name matches, by the number in
+        the first group, as a video.
+        """
         if save_format not in ("mp4", "gif"):
             raise UserError(f"unknown video format {save_format!r}: expected 'mp4' or 'gif'")
         if not filename.endswith(save_format):
@@ -127,7 +144,9 @@ class SaverMixin:
         """A dict of arrays as npz, anything else as npy."""
         data = self.convert_data(data)
         extension = ".npz" if isinstance(data, dict) else ".npy"
-        path = self.get_save_path(filename if filename.endswith(extension) else filename + extension)
+        path = self.get_save_path(
+            filename if filename.endswith(extension) else filename + extension
+        )
         np.savez(path, **data) if isinstance(data, dict) else np.save(path, data)
         return path
 
@@ -136,16 +155,24 @@ class SaverMixin:
         save_checked(path, data)
         return path
 
-    def save_mesh(self, filename: str, v_pos: Any, t_pos_idx: Any, v_tex: Any = None, t_tex_idx: Any = None) -> str:
+    def save_mesh(
+        self, filename: str, v_pos: Any, t_pos_idx: Any, v_tex: Any = None, t_tex_idx: Any = None
+    ) -> str:
         """Vertices (V,3) and triangles (F,3) in the format of the file name's extension."""
         import trimesh
 
         path = self.get_save_path(filename)
-        trimesh.Trimesh(vertices=self.convert_data(v_pos), faces=self.convert_data(t_pos_idx), process=False).export(path)
+        trimesh.Trimesh(
+            vertices=self.convert_data(v_pos), faces=self.convert_data(t_pos_idx), process=False
+        ).export(path)
         return path
 
-    def save_obj(self, filename: str, mesh: Any, save_vertex_color: bool = False, **unused: Any) -> list[str]:
-        """``mesh.v_pos`` (V,3), ``mesh.t_pos_idx`` (F,3) and, if asked, ``mesh.v_rgb`` (V,3) as a Wavefront OBJ without material."""
+    def save_obj(
+        self, filename: str, mesh: Any, save_vertex_color: bool = False, **unused: Any
+    ) -> list[str]:
+        """``mesh.v_pos`` (V,3), ``mesh.t_pos_idx`` (F,3) and, if asked, ``mesh.v_rgb`` (V,3) as a
+        Wavefront OBJ without material.
+        """
         path = self.get_save_path(filename if filename.endswith(".obj") else f"{filename}.obj")
         vertices, faces = self.convert_data(mesh.v_pos), self.convert_data(mesh.t_pos_idx)
         if save_vertex_color:
@@ -170,7 +197,9 @@ class SaverMixin:
             return [self._converted(row) for row in imgs]
         return [{**cell, "img": self.convert_data(cell["img"])} for cell in imgs]
 
-    def _save_picture(self, filename: str, picture: np.ndarray, name: Optional[str], step: Optional[int]) -> str:
+    def _save_picture(
+        self, filename: str, picture: np.ndarray, name: Optional[str], step: Optional[int]
+    ) -> str:
         path = self.get_save_path(filename)
         pictures.write(path, picture)
         self._log_file("Image", path, name, step)
@@ -180,11 +209,15 @@ class SaverMixin:
         if name and self._wandb_logger:
             import wandb
 
-            self._wandb_logger.experiment.log({name: getattr(wandb, kind)(path), "trainer/global_step": step})
+            self._wandb_logger.experiment.log(
+                {name: getattr(wandb, kind)(path), "trainer/global_step": step}
+            )
 
 
 def _matching(folder: Path, matcher: re.Pattern) -> list[Path]:
-    found = [(int(match[1]), path) for path in folder.iterdir() if (match := matcher.search(path.name))]
+    found = [
+        (int(match[1]), path) for path in folder.iterdir() if (match := matcher.search(path.name))
+    ]
     if not found:
         raise FileNotFoundError(f"no picture in {folder} matches {matcher.pattern}")
     return [path for _, path in sorted(found)]
@@ -196,4 +229,6 @@ def _wandb_logger(options: Any) -> Any:
 
         return WandbLogger(project=options.get("project"), name=options.get("name"))
     except ModuleNotFoundError as error:
-        raise UserError("system.loggers.wandb.enable is true, but wandb isn't installed: pip install wandb") from error
+        raise UserError(
+            "system.loggers.wandb.enable is true, but wandb isn't installed: pip install wandb"
+        ) from error

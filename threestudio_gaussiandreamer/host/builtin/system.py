@@ -17,7 +17,8 @@ from .savers import SaverMixin
 
 
 class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
-    """Parses its configuration, calls ``configure``, tells dataset and parts the step before and after every batch.
+    """Parses its configuration, calls ``configure``, tells dataset and parts the step before and
+    after every batch.
 
     Its data loaders must have a ``dataset``.
     """
@@ -54,13 +55,17 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         """Called after ``weights`` are loaded."""
 
     def load_weights(self, weights: str, ignore_modules: Optional[List[str]] = None) -> None:
-        """Take over the parameters of a checkpoint, except those of ``ignore_modules``; names that don't exist here are skipped."""
+        """Take over the parameters of a checkpoint, except those of ``ignore_modules``; names that
+        don't exist here are skipped.
+        """
         state_dict, epoch, global_step = load_module_weights(weights, ignore_modules=ignore_modules)
         self.load_state_dict(state_dict, strict=False)
         self.do_update_step(epoch, global_step, on_load_weights=True)
 
     def set_resume_status(self, current_epoch: int, global_step: int) -> None:
-        """The epoch and step of the checkpoint that is validated, tested or exported: Lightning's own stay 0 there."""
+        """The epoch and step of the checkpoint that is validated, tested or exported: Lightning's
+        own stay 0 there.
+        """
         self._resumed_eval = current_epoch, global_step
 
     @property
@@ -81,7 +86,9 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         return C(value, self.true_current_epoch, self.true_global_step)
 
     def configure_optimizers(self) -> Any:
-        """``optimizer: {name, args, params}`` from ``torch.optim``; ``params`` names attributes, each with its own options."""
+        """``optimizer: {name, args, params}`` from ``torch.optim``; ``params`` names attributes,
+        each with its own options.
+        """
         return optimizer_from(self.cfg.optimizer, self)
 
     def training_step(self, batch: dict, batch_idx: int) -> Any:
@@ -100,12 +107,16 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         """Nothing to gather."""
 
     def preprocess_data(self, batch: dict, stage: str) -> None:
-        """Change a batch in place before it is used; ``stage`` is "train", "validation", "test" or "predict"."""
+        """Change a batch in place before it is used; ``stage`` is "train", "validation", "test" or
+        "predict".
+        """
 
     def on_train_batch_start(self, batch: dict, batch_idx: int, unused: int = 0) -> None:
         self._before_batch(batch, "train", self.trainer.train_dataloader)
 
-    def on_validation_batch_start(self, batch: dict, batch_idx: int, dataloader_idx: int = 0) -> None:
+    def on_validation_batch_start(
+        self, batch: dict, batch_idx: int, dataloader_idx: int = 0
+    ) -> None:
         self._before_batch(batch, "validation", self.trainer.val_dataloaders)
 
     def on_test_batch_start(self, batch: dict, batch_idx: int, dataloader_idx: int = 0) -> None:
@@ -117,14 +128,24 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
     def on_train_batch_end(self, outputs: Any, batch: dict, batch_idx: int) -> None:
         self._after_batch(self.trainer.train_dataloader)
 
-    def on_validation_batch_end(self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0) -> None:
-        self._after_batch(self.trainer.val_dataloaders, cleanup=self.cfg.cleanup_after_validation_step)
+    def on_validation_batch_end(
+        self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0
+    ) -> None:
+        self._after_batch(
+            self.trainer.val_dataloaders, cleanup=self.cfg.cleanup_after_validation_step
+        )
 
-    def on_test_batch_end(self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0) -> None:
+    def on_test_batch_end(
+        self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0
+    ) -> None:
         self._after_batch(self.trainer.test_dataloaders, cleanup=self.cfg.cleanup_after_test_step)
 
-    def on_predict_batch_end(self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0) -> None:
-        self._after_batch(self.trainer.predict_dataloaders, cleanup=self.cfg.cleanup_after_test_step)
+    def on_predict_batch_end(
+        self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0
+    ) -> None:
+        self._after_batch(
+            self.trainer.predict_dataloaders, cleanup=self.cfg.cleanup_after_test_step
+        )
 
     def _before_batch(self, batch: dict, stage: str, loader: Any) -> None:
         self.preprocess_data(batch, stage)
@@ -141,10 +162,11 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
 
 
 class BaseLift3DSystem(BaseSystem):
-    """Builds geometry, material, background and renderer by their names in the registry; exports through an exporter.
+    """Builds geometry, material, background and renderer by their names in the registry; exports
+    through an exporter.
 
-    Guidance and prompt processor are left to the subclass, best in ``on_fit_start``: testing and exporting need neither.
-    """
+    Guidance and prompt processor are left to the subclass, best in ``on_fit_start``: testing and
+    exporting need neither."""
 
     @dataclass
     class Config(BaseSystem.Config):
@@ -170,7 +192,10 @@ class BaseLift3DSystem(BaseSystem):
         self.material = find(self.cfg.material_type)(self.cfg.material)
         self.background = find(self.cfg.background_type)(self.cfg.background)
         self.renderer = find(self.cfg.renderer_type)(
-            self.cfg.renderer, geometry=self.geometry, material=self.material, background=self.background
+            self.cfg.renderer,
+            geometry=self.geometry,
+            material=self.material,
+            background=self.background,
         )
 
     def on_fit_start(self) -> None:
@@ -185,7 +210,10 @@ class BaseLift3DSystem(BaseSystem):
 
     def on_predict_start(self) -> None:
         self.exporter: Exporter = find(self.cfg.exporter_type)(
-            self.cfg.exporter, geometry=self.geometry, material=self.material, background=self.background
+            self.cfg.exporter,
+            geometry=self.geometry,
+            material=self.material,
+            background=self.background,
         )
 
     def predict_step(self, batch: dict, batch_idx: int) -> None:
@@ -198,7 +226,10 @@ class BaseLift3DSystem(BaseSystem):
         for output in self.exporter():
             save = getattr(self, f"save_{output.save_type}", None)
             if save is None:
-                raise UserError(f"{type(self).__name__} has no save_{output.save_type}, which {type(self.exporter).__name__} asks for")
+                raise UserError(
+                    f"{type(self).__name__} has no save_{output.save_type}, which "
+                    f"{type(self.exporter).__name__} asks for"
+                )
             save(f"it{self.true_global_step}-export/{output.save_name}", **output.params)
 
     def on_predict_end(self) -> None:
@@ -207,17 +238,24 @@ class BaseLift3DSystem(BaseSystem):
 
 
 def optimizer_from(config: Any, module: torch.nn.Module) -> torch.optim.Optimizer:
-    """``{name, args, params}``: an optimiser of ``torch.optim`` over all parameters, or over the named attributes with own options.
+    """``{name, args, params}``: an optimiser of ``torch.optim`` over all parameters, or over the
+    named attributes with own options.
 
     Raises:
         UserError: no such optimiser, or no such attribute.
     """
     optimizer_class = getattr(torch.optim, config.get("name", ""), None)
     if optimizer_class is None:
-        raise UserError(f"system.optimizer.name is {config.get('name')!r}; expected an optimiser of torch.optim, such as Adam")
+        raise UserError(
+            f"system.optimizer.name is {config.get('name')!r}; expected an optimiser of "
+            "torch.optim, such as Adam"
+        )
     params = module.parameters()
     if "params" in config:
-        params = [{"params": _parameters(module, name), "name": name, **options} for name, options in config["params"].items()]
+        params = [
+            {"params": _parameters(module, name), "name": name, **options}
+            for name, options in config["params"].items()
+        ]
     return optimizer_class(params, **config.get("args", {}))
 
 
@@ -225,6 +263,8 @@ def _parameters(module: Any, name: str) -> list[torch.nn.Parameter]:
     found = module
     for attribute in name.split("."):
         if not hasattr(found, attribute):
-            raise UserError(f"system.optimizer.params.{name}: {type(found).__name__} has no {attribute!r}")
+            raise UserError(
+                f"system.optimizer.params.{name}: {type(found).__name__} has no {attribute!r}"
+            )
         found = getattr(found, attribute)
     return list(found.parameters()) if isinstance(found, torch.nn.Module) else [found]

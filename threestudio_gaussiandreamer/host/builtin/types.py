@@ -1,4 +1,6 @@
-"""Types of options beyond what OmegaConf checks: it takes a list for a number, any length for a tuple, and NaN for a float."""
+"""Types of options beyond what OmegaConf checks: it takes a list for a number, any length for a
+tuple, and NaN for a float.
+"""
 
 import dataclasses
 import math
@@ -13,11 +15,12 @@ SCALARS = {int: "a whole number", float: "a number", bool: "true or false", str:
 
 
 def check_types(config_class: Any, values: Mapping, prefix: str = "") -> None:
-    """Compare ``values`` with the annotations of the dataclass ``config_class``; keys that it lacks aren't looked at.
+    """Compare ``values`` with the annotations of the dataclass ``config_class``; keys that it lacks
+    aren't looked at.
 
     Raises:
-        UserError: a list or section in place of a single value or the other way round, a tuple of another length, or a number
-            that isn't finite; the message begins with the key.
+        UserError: a list or section in place of a single value or the other way round, a tuple of
+            another length, or a number that isn't finite; the message begins with the key.
     """
     hints = typing.get_type_hints(config_class)
     for key, value in values.items():
@@ -52,7 +55,9 @@ def _check_scalar(path: str, value: Any, kind: type) -> None:
     """Texts that may stand for a number are OmegaConf's to convert."""
     not_bool = kind is bool and not isinstance(value, str) and value not in (0, 1)
     if _is_container(value) or value is None or not_bool:
-        raise UserError(f"{path}: expected {SCALARS[kind]}, got {'null' if value is None else repr(value)}")
+        raise UserError(
+            f"{path}: expected {SCALARS[kind]}, got {'null' if value is None else repr(value)}"
+        )
     if kind is float and not _is_finite(value):
         raise UserError(f"{path}: expected a finite number, got {value}")
 
@@ -67,7 +72,9 @@ def _check_sequence(path: str, value: Any, kind: type, items: tuple) -> None:
             raise UserError(f"{path}: expected a list of {len(items)}, got {list(value)}")
         for i, (item, annotation) in enumerate(zip(value, items, strict=True)):
             _check(f"{path}[{i}]", item, annotation)
-            if annotation in (int, float) and isinstance(item, str):  # of a tuple's items OmegaConf checks and converts none
+            if annotation in (int, float) and isinstance(
+                item, str
+            ):  # of a tuple's items OmegaConf checks and converts none
                 raise UserError(f"{path}[{i}]: expected {SCALARS[annotation]}, got {item!r}")
 
 

@@ -1,7 +1,8 @@
-"""Kernels on an NVIDIA GPU: loads what `nvrtc` compiled and launches it on torch's current stream, through the driver's C interface.
+"""Kernels on an NVIDIA GPU: loads what `nvrtc` compiled and launches it on torch's current stream,
+through the driver's C interface.
 
-ctypes is all it takes: a few functions of a library that every driver brings, so neither cuda-bindings nor a toolkit is needed.
-"""
+ctypes is all it takes: a few functions of a library that every driver brings, so neither
+cuda-bindings nor a toolkit is needed."""
 
 import ctypes
 import functools
@@ -57,12 +58,19 @@ class Gpu:
         self.functions: dict[str, ctypes.c_void_p] = {}
 
     def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Argument) -> None:
-        """Queues a kernel on torch's current stream of the device; ``arguments`` are tensors, structures and C numbers."""
+        """Queues a kernel on torch's current stream of the device; ``arguments`` are tensors,
+        structures and C numbers.
+        """
         values = [ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else x for x in arguments]
         pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(x) for x in values))
         with torch.cuda.device(self.index):
-            function, stream = self._function(name), ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
-            status = _driver().cuLaunchKernel(function, *grid, 1, threads, 1, 1, 0, stream, pointers, None)
+            function, stream = (
+                self._function(name),
+                ctypes.c_void_p(torch.cuda.current_stream().cuda_stream),
+            )
+            status = _driver().cuLaunchKernel(
+                function, *grid, 1, threads, 1, 1, 0, stream, pointers, None
+            )
         _check(status, f"launching the kernel {name}")
 
     def read_later(self, ends: Tensor) -> "Later":
@@ -70,12 +78,15 @@ class Gpu:
             return Later(ends)
 
     def _function(self, name: str) -> ctypes.c_void_p:
-        """The kernel, with the context in which it lives made current: a thread that torch hasn't used yet, such as autograd's,
-        has none."""
+        """The kernel, with the context in which it lives made current: a thread that torch hasn't
+        used yet, such as autograd's, has none.
+        """
         _check(_driver().cuCtxSetCurrent(self.context), "using the GPU")
         if name not in self.functions:
             function = ctypes.c_void_p()
-            status = _driver().cuModuleGetFunction(ctypes.byref(function), self._module(UNITS[name]), name.encode())
+            status = _driver().cuModuleGetFunction(
+                ctypes.byref(function), self._module(UNITS[name]), name.encode()
+            )
             _check(status, f"finding the kernel {name}")
             self.functions[name] = function
         return self.functions[name]
@@ -83,8 +94,13 @@ class Gpu:
     def _module(self, unit: str) -> ctypes.c_void_p:
         if unit not in self.modules:
             module = ctypes.c_void_p()
-            status = _driver().cuModuleLoadData(ctypes.byref(module), nvrtc.machine_code(unit, self.target))
-            releases = f"NVRTC of CUDA {_release(nvrtc.version())}, driver of CUDA {_release(driver_version())}"
+            status = _driver().cuModuleLoadData(
+                ctypes.byref(module), nvrtc.machine_code(unit, self.target)
+            )
+            releases = (
+                f"NVRTC of CUDA {_release(nvrtc.version())}, driver of CUDA "
+                f"{_release(driver_version())}"
+            )
             _check(status, f"loading {unit}.cu for {self.target} ({releases})")
             self.modules[unit] = module
         return self.modules[unit]
@@ -122,7 +138,9 @@ def driver_version() -> tuple[int, int]:
 
 
 def _unsuitable() -> Optional[str]:
-    """What is wrong with GPU or driver. Machine code runs on every driver of its major release or a later one."""
+    """What is wrong with GPU or driver. Machine code runs on every driver of its major release or a
+    later one.
+    """
     try:
         nvrtc.target_for(torch.cuda.get_device_capability())
         knows, compiler = driver_version(), nvrtc.version()
@@ -130,7 +148,10 @@ def _unsuitable() -> Optional[str]:
         return str(error)
     if knows[0] < compiler[0]:
         advice = f"update the driver, or install a torch built for CUDA {knows[0]}"
-        return f"the NVIDIA driver knows CUDA up to {_release(knows)}, the compiler is of CUDA {_release(compiler)}: {advice}"
+        return (
+            f"the NVIDIA driver knows CUDA up to {_release(knows)}, the compiler is of CUDA "
+            f"{_release(compiler)}: {advice}"
+        )
 
 
 def _release(version: tuple[int, int]) -> str:
@@ -142,7 +163,9 @@ def _primary_context(index: int) -> ctypes.c_void_p:
     torch.cuda.init()
     device, context = ctypes.c_int(), ctypes.c_void_p()
     _check(_driver().cuInit(0), "starting the driver")
-    _check(_driver().cuDeviceGet(ctypes.byref(device), index), "finding the GPU")  # both number what CUDA_VISIBLE_DEVICES shows
+    _check(
+        _driver().cuDeviceGet(ctypes.byref(device), index), "finding the GPU"
+    )  # both number what CUDA_VISIBLE_DEVICES shows
     _check(_driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), device), "using the GPU")
     return context
 
@@ -163,4 +186,6 @@ def _check(status: int, doing: str) -> None:
     if status:
         text = ctypes.c_char_p()
         _driver().cuGetErrorString(status, ctypes.byref(text))
-        raise UserError(f"CUDA failed at {doing}: {(text.value or b'unknown error').decode()} ({status}).")
+        raise UserError(
+            f"CUDA failed at {doing}: {(text.value or b'unknown error').decode()} ({status})."
+        )

@@ -1,4 +1,6 @@
-"""Room for the lists of the CUDA backend, whose length only the GPU knows, and what is done where memory is short."""
+"""Room for the lists of the CUDA backend, whose length only the GPU knows, and what is done where
+memory is short.
+"""
 
 import math
 import threading
@@ -14,7 +16,9 @@ HEADROOM = 1.5
 STEP = 4096  # entries; rounding up lets torch's allocator meet few sizes
 MOST = 2**31 - 1 - STEP  # entries; torch's sort and the kernels' grids count no further
 FORGET = 0.99  # how much of a demand is remembered from one call to the next
-LIST_BYTES = 4 + 4 + 4 + 8 + 20  # per entry: tile, owner, sorted tile, position, and what sorting takes
+LIST_BYTES = (
+    4 + 4 + 4 + 8 + 20
+)  # per entry: tile, owner, sorted tile, position, and what sorting takes
 ROW_BYTES = 4 * 12  # per entry: the backward pass's row of sums
 Result = TypeVar("Result")
 
@@ -31,7 +35,9 @@ def whole_steps(entries: int) -> int:
 
 
 class Demand:
-    """How many entries per Gaussian pictures of one size have needed. Numbers arrive late, and any thread may ask."""
+    """How many entries per Gaussian pictures of one size have needed. Numbers arrive late, and any
+    thread may ask.
+    """
 
     def __init__(self, views: int):
         self.views = views
@@ -41,10 +47,12 @@ class Demand:
         self.lock = threading.Lock()
 
     def room(self, totals, gaussians: int) -> int:
-        """Room for the entries of a call, of which ``totals`` (see `cuda_stages.Later`) will say how many they are.
+        """Room for the entries of a call, of which ``totals`` (see `cuda_stages.Later`) will say
+        how many they are.
 
         Raises:
-            torch.cuda.OutOfMemoryError: so much has failed before, and there are parts to try instead.
+            torch.cuda.OutOfMemoryError: so much has failed before, and there are parts to try
+            instead.
         """
         with self.lock:
             self.pending.append((totals, gaussians))
@@ -62,7 +70,9 @@ class Demand:
 
     def _learn(self, totals, gaussians: int) -> None:
         """At once when more is needed, slowly when less is."""
-        self.per_gaussian = max(FORGET * (self.per_gaussian or 0.0), sum(totals.values()) / gaussians)
+        self.per_gaussian = max(
+            FORGET * (self.per_gaussian or 0.0), sum(totals.values()) / gaussians
+        )
 
     def _room(self, gaussians: int) -> int:
         expected = math.ceil(self.per_gaussian * gaussians)
@@ -70,7 +80,8 @@ class Demand:
 
 
 def by_views(work: Callable[[int, int], Result], first: int, last: int) -> list[Result]:
-    """``work(first, last)``, or where memory is short for it, that of halves of these views, one after another.
+    """``work(first, last)``, or where memory is short for it, that of halves of these views, one
+    after another.
 
     Raises:
         torch.cuda.OutOfMemoryError: a single view doesn't fit either.
@@ -80,15 +91,22 @@ def by_views(work: Callable[[int, int], Result], first: int, last: int) -> list[
     except torch.cuda.OutOfMemoryError:
         if last - first == 1:
             raise
-    middle = (first + last) // 2  # outside of the handler: the error holds on to what the attempt had allocated
+    middle = (
+        first + last
+    ) // 2  # outside of the handler: the error holds on to what the attempt had allocated
     return by_views(work, first, middle) + by_views(work, middle, last)
 
 
 def too_large(entries: int) -> UserError:
     """What to say when one view alone doesn't fit."""
-    needed, free = entries * (LIST_BYTES + ROW_BYTES) / 2**30, torch.cuda.mem_get_info()[0] / 2**30 if torch.cuda.is_available() else 0.0
+    needed, free = (
+        entries * (LIST_BYTES + ROW_BYTES) / 2**30,
+        torch.cuda.mem_get_info()[0] / 2**30 if torch.cuda.is_available() else 0.0,
+    )
     return UserError(
-        f"one view's Gaussians reach {entries} tiles of the picture; their gradients need about {needed:.1f} GiB on the GPU, "
-        f"of which {free:.1f} GiB are free, though views are drawn one by one already: use fewer or smaller Gaussians, a smaller picture "
+        f"one view's Gaussians reach {entries} tiles of the picture; their gradients need "
+        f"about {needed:.1f} GiB on the GPU, "
+        f"of which {free:.1f} GiB are free, though views are drawn one by one already: use "
+        "fewer or smaller Gaussians, a smaller picture "
         "or preset='fast', or free memory that something else holds."
     )

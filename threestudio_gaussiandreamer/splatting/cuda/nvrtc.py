@@ -1,8 +1,9 @@
-"""CUDA text to machine code at run time: NVIDIA's run-time compiler through ctypes, and a cache on the disk of what it made.
+"""CUDA text to machine code at run time: NVIDIA's run-time compiler through ctypes, and a cache on
+the disk of what it made.
 
-Neither a compiler nor a CUDA toolkit is needed. The library libnvrtc comes with every CUDA build of torch; the variable
-GAUSSIANDREAMER_NVRTC names another one. Compiled kernels are kept in GAUSSIANDREAMER_CACHE, else in the user's cache folder, by a
-hash of everything that goes into them.
+Neither a compiler nor a CUDA toolkit is needed. The library libnvrtc comes with every CUDA build of
+torch; the variable GAUSSIANDREAMER_NVRTC names another one. Compiled kernels are kept in
+GAUSSIANDREAMER_CACHE, else in the user's cache folder, by a hash of everything that goes into them.
 """
 
 import ctypes
@@ -24,8 +25,13 @@ from ...core.files import atomic_file
 
 KERNELS = Path(__file__).parent
 SHARED = KERNELS.parent / "shared"  # the formulas: the very files that the CPU kernel includes
-OPTIONS = ("--std=c++17", "--ptxas-options=-v", "--generate-line-info")  # lines are for profilers and sanitizers
-# Blending divides by 1 - alpha and takes powers once per pair of splat and pixel; denormals can't be seen there.
+OPTIONS = (
+    "--std=c++17",
+    "--ptxas-options=-v",
+    "--generate-line-info",
+)  # lines are for profilers and sanitizers
+# Blending divides by 1 - alpha and takes powers once per pair of splat and pixel; denormals can't
+# be seen there.
 UNIT_OPTIONS = {name: ("--ftz=true", "--prec-div=false") for name in ("blend", "blend_backward")}
 OLDEST_ARCHITECTURE = 75
 DIGEST = hashlib.sha256().digest_size
@@ -64,24 +70,31 @@ def architectures() -> list[int]:
 def target_for(capability: tuple[int, int]) -> str:
     """What to compile for: "sm_90", machine code, for an architecture that the compiler knows.
 
-    For a newer one "compute_..." of the newest that it knows: that is PTX, an assembly text which the driver finishes.
+    For a newer one "compute_..." of the newest that it knows: that is PTX, an assembly text which
+    the driver finishes.
 
     Raises:
         UserError: the device is older than what the kernels, or the compiler, can do.
     """
     device, known = 10 * capability[0] + capability[1], architectures()
-    older = [architecture for architecture in known if OLDEST_ARCHITECTURE <= architecture <= device]
+    older = [
+        architecture for architecture in known if OLDEST_ARCHITECTURE <= architecture <= device
+    ]
     if not older:
         oldest = max(OLDEST_ARCHITECTURE, min(known))
         raise UserError(
-            f"this GPU has compute capability {capability[0]}.{capability[1]}; the CUDA backend, compiled by the NVRTC of CUDA "
-            f"{'.'.join(map(str, version()))}, needs {oldest // 10}.{oldest % 10} or later: use backend='torch'."
+            f"this GPU has compute capability {capability[0]}.{capability[1]}; the CUDA "
+            "backend, compiled by the NVRTC of CUDA "
+            f"{'.'.join(map(str, version()))}, needs {oldest // 10}.{oldest % 10} or later: "
+            "use backend='torch'."
         )
     return f"sm_{device}" if device in known else f"compute_{max(older)}"
 
 
 def machine_code(unit: str, target: str) -> bytes:
-    """``<unit>.cu`` compiled for a target of `target_for`, from the disk if it has been compiled before."""
+    """``<unit>.cu`` compiled for a target of `target_for`, from the disk if it has been compiled
+    before.
+    """
     name = f"{unit}-{target}-{_key(unit, target)}"
     found = _read(name)
     if found is None:
@@ -98,17 +111,32 @@ def compile_unit(unit: str, target: str) -> Compiled:
         UserError: the compiler rejects it.
     """
     nvrtc, program, texts = _library(), ctypes.c_void_p(), headers()
-    sources = (source(unit).encode(), f"{unit}.cu".encode(), len(texts), _strings(texts.values()), _strings(texts))
+    sources = (
+        source(unit).encode(),
+        f"{unit}.cu".encode(),
+        len(texts),
+        _strings(texts.values()),
+        _strings(texts),
+    )
     _check(nvrtc.nvrtcCreateProgram(ctypes.byref(program), *sources))
     try:
         options = options_of(unit, target)
         status = nvrtc.nvrtcCompileProgram(program, len(options), _strings(options))
-        messages = _bytes(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program).rstrip(b"\0").decode()
+        messages = (
+            _bytes(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program)
+            .rstrip(b"\0")
+            .decode()
+        )
         if status:
             release = ".".join(map(str, version()))
-            raise UserError(f"the NVRTC of CUDA {release} can't compile {unit}.cu for {target}: {_error(status)}\n{messages}")
+            raise UserError(
+                f"the NVRTC of CUDA {release} can't compile {unit}.cu for {target}: "
+                f"{_error(status)}\n{messages}"
+            )
         kind = "CUBIN" if target.startswith("sm_") else "PTX"
-        code = _bytes(getattr(nvrtc, f"nvrtcGet{kind}Size"), getattr(nvrtc, f"nvrtcGet{kind}"), program)
+        code = _bytes(
+            getattr(nvrtc, f"nvrtcGet{kind}Size"), getattr(nvrtc, f"nvrtcGet{kind}"), program
+        )
         return Compiled(code, messages)
     finally:
         nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
@@ -121,31 +149,45 @@ def source(unit: str) -> str:
 @functools.cache
 def headers() -> dict[str, str]:
     """Name to text of whatever a unit may include."""
-    return {path.name: path.read_text() for path in (*sorted(KERNELS.glob("*.h")), *sorted(SHARED.glob("*.h")))}
+    return {
+        path.name: path.read_text()
+        for path in (*sorted(KERNELS.glob("*.h")), *sorted(SHARED.glob("*.h")))
+    }
 
 
 def options_of(unit: str, target: str) -> tuple[str, ...]:
     return (f"--gpu-architecture={target}", *OPTIONS, *UNIT_OPTIONS.get(unit, ()))
 
 
-# ---- the cache -----------------------------------------------------------------------------------------------------------------
+# ---- the cache -----------------------------------------------------------------------------------
 
 
 def cache_folder() -> Path:
     """Where compiled kernels are kept.
 
     Raises:
-        RuntimeError: neither the variables nor the system say where the user's home is, as in some containers.
+        RuntimeError: neither the variables nor the system say where the user's home is, as in some
+            containers.
     """
     folder = os.environ.get("GAUSSIANDREAMER_CACHE")
     if folder:
         return Path(folder).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gaussiandreamer" / "cubins"
+    return (
+        Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        / "gaussiandreamer"
+        / "cubins"
+    )
 
 
 def _key(unit: str, target: str) -> str:
     """Changes with whatever changes the machine code."""
-    parts = [source(unit), *headers(), *headers().values(), *options_of(unit, target), str(version())]
+    parts = [
+        source(unit),
+        *headers(),
+        *headers().values(),
+        *options_of(unit, target),
+        str(version()),
+    ]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 
 
@@ -170,7 +212,7 @@ def _write(name: str, content: bytes) -> None:
         log.warning("compiled CUDA kernels can't be kept for the next start: %s", error)
 
 
-# ---- the library ---------------------------------------------------------------------------------------------------------------
+# ---- the library ---------------------------------------------------------------------------------
 
 
 @functools.cache
@@ -185,11 +227,16 @@ def _library() -> ctypes.CDLL:
             continue
         library.nvrtcGetErrorString.restype = ctypes.c_char_p
         return library
-    raise OSError(f"NVRTC, CUDA's run-time compiler, isn't there: install a CUDA build of torch, or nvidia-cuda-nvrtc ({failures[-1]})")
+    raise OSError(
+        "NVRTC, CUDA's run-time compiler, isn't there: install a CUDA build of torch, or "
+        f"nvidia-cuda-nvrtc ({failures[-1]})"
+    )
 
 
 def _candidates() -> list[str]:
-    """What the variable names; else what pip installed, the release that torch was built with first; else what the loader finds."""
+    """What the variable names; else what pip installed, the release that torch was built with
+    first; else what the loader finds.
+    """
     named = os.environ.get("GAUSSIANDREAMER_NVRTC")
     if named:
         return [named]
@@ -197,10 +244,18 @@ def _candidates() -> list[str]:
     pattern = "nvrtc64_*.dll" if sys.platform == "win32" else "libnvrtc*.so*"
     folders = [Path(torch.__file__).parent / "lib"]
     for root in dict.fromkeys([sysconfig.get_paths()["purelib"], *sys.path]):
-        folders += [Path(root) / "nvidia" / place for place in (f"cu{release}/lib", "cuda_nvrtc/lib", "cuda_nvrtc/bin", "cu13/lib")]
+        folders += [
+            Path(root) / "nvidia" / place
+            for place in (f"cu{release}/lib", "cuda_nvrtc/lib", "cuda_nvrtc/bin", "cu13/lib")
+        ]
     toolkit = os.environ.get("CUDA_HOME")
     folders += [Path(toolkit) / "lib64"] if toolkit else []
-    found = [path for folder in folders for path in sorted(glob.glob(str(folder / pattern))) if not re.search(r"builtins|\.alt\.", path)]
+    found = [
+        path
+        for folder in folders
+        for path in sorted(glob.glob(str(folder / pattern)))
+        if not re.search(r"builtins|\.alt\.", path)
+    ]
     return [*dict.fromkeys(found), f"libnvrtc.so.{release}", "libnvrtc.so.12", "libnvrtc.so"]
 
 

@@ -1,8 +1,8 @@
-"""The stages of the CUDA backend: which kernel of ``*.cu`` gets which tensors. Nothing here waits for the GPU.
+"""The stages of the CUDA backend: which kernel of ``*.cu`` gets which tensors. Nothing here waits
+for the GPU.
 
-project, rank (sort by depth), count tiles, list them, sort by tile, find each tile's list, blend; and their adjoints. Sorts and
-running sums are torch's. An entry is a splat in a tile.
-"""
+project, rank (sort by depth), count tiles, list them, sort by tile, find each tile's list, blend;
+and their adjoints. Sorts and running sums are torch's. An entry is a splat in a tile."""
 
 import ctypes
 import math
@@ -71,7 +71,9 @@ class Inputs(NamedTuple):
         return len(self.viewmats), len(self.means)
 
     def of_views(self, first: int, last: int) -> "Inputs":
-        per_view = {name: getattr(self, name)[first:last] for name in ("viewmats", "background", "Ks")}
+        per_view = {
+            name: getattr(self, name)[first:last] for name in ("viewmats", "background", "Ks")
+        }
         colors = self.colors[first:last] if self.colors.dim() == 3 else self.colors
         return self._replace(colors=colors, **per_view)
 
@@ -104,7 +106,9 @@ class Lists(NamedTuple):
 
 
 class Pictures(NamedTuple):
-    """In the order of ``splat::Pictures``. The last two are what a backward pass needs of each rendered pixel, or None."""
+    """In the order of ``splat::Pictures``. The last two are what a backward pass needs of each
+    rendered pixel, or None.
+    """
 
     image: Tensor  # (B, H, W, 3)
     alpha: Tensor  # (B, H, W, 1)
@@ -114,7 +118,9 @@ class Pictures(NamedTuple):
 
 
 class Upstream(NamedTuple):
-    """In the order of ``splat::Upstream``: gradients of the pictures, None for zero, and what the forward pass kept."""
+    """In the order of ``splat::Upstream``: gradients of the pictures, None for zero, and what the
+    forward pass kept.
+    """
 
     image: Optional[Tensor]
     alpha: Optional[Tensor]
@@ -139,12 +145,21 @@ class Gradients(NamedTuple):
 def project(inputs: Inputs, means2d: Tensor, frame: Frame) -> tuple[Splats, Tensor, Tensor]:
     """Stages 1 to 3; also radii (B, N) and zeros (B, N) for the contributions. Fills ``means2d``."""
     launch, shape, new = frame.machine.launch, inputs.shape, inputs.means.new_empty
-    splats, depth_keys, radii, contribution = new(*shape, SPLAT), new(shape, dtype=torch.int32), new(shape), new(shape)
+    splats, depth_keys, radii, contribution = (
+        new(*shape, SPLAT),
+        new(shape, dtype=torch.int32),
+        new(shape),
+        new(shape),
+    )
     outputs = (splats, depth_keys, means2d.detach(), radii, contribution)
-    launch("project", _per_gaussian(shape), THREADS, _scene(inputs, frame), _settings(frame), *outputs)
+    launch(
+        "project", _per_gaussian(shape), THREADS, _scene(inputs, frame), _settings(frame), *outputs
+    )
     order = depth_keys.sort(dim=1, stable=True).indices
     counts = torch.zeros_like(depth_keys)
-    launch("count_tiles", _per_gaussian(shape), THREADS, _scene(inputs, frame), splats, order, counts)
+    launch(
+        "count_tiles", _per_gaussian(shape), THREADS, _scene(inputs, frame), splats, order, counts
+    )
     ends = counts.flatten().cumsum(0, dtype=torch.int64).view(shape)
     return Splats(splats, depth_keys, order, counts, ends), radii, contribution
 
@@ -155,14 +170,26 @@ def list_entries(inputs: Inputs, splats: Splats, capacity: int, frame: Frame) ->
     Raises:
         torch.cuda.OutOfMemoryError: there is no memory for so many.
     """
-    launch, room, tiles = frame.machine.launch, ctypes.c_int64(capacity), len(splats.ends) * frame.tiles
+    launch, room, tiles = (
+        frame.machine.launch,
+        ctypes.c_int64(capacity),
+        len(splats.ends) * frame.tiles,
+    )
     tile_of = torch.full((capacity,), NOWHERE, dtype=torch.int32, device=splats.ends.device)
     owners = torch.empty_like(tile_of)
     arguments = (_scene(inputs, frame), splats.splats, *splats[2:], room, tile_of, owners)
     launch("list_tiles", _per_gaussian(inputs.shape), THREADS, *arguments)
     sorted_tiles, entries = tile_of.sort(stable=True)
     begins = splats.ends.new_empty(tiles + 1)
-    launch("find_tiles", (tiles // THREADS + 1, 1), THREADS, sorted_tiles, room, ctypes.c_int(tiles), begins)
+    launch(
+        "find_tiles",
+        (tiles // THREADS + 1, 1),
+        THREADS,
+        sorted_tiles,
+        room,
+        ctypes.c_int(tiles),
+        begins,
+    )
     return Lists(owners, entries, begins)
 
 
@@ -172,14 +199,37 @@ def no_lists(splats: Splats, frame: Frame) -> Lists:
     return Lists(empty.int(), empty, splats.ends.new_zeros(len(splats.ends) * frame.tiles + 1))
 
 
-def blend(inputs: Inputs, splats: Splats, lists: Lists, pictures: Pictures, contribution: Tensor, frame: Frame) -> None:
-    """Stage 6, with whole lists or without: the result is the same to the bit. Fills the pictures, raises the contributions."""
-    arguments = (_settings(frame), _lists(splats, lists), _Pictures(*map(_address, pictures)), contribution)
-    frame.machine.launch("blend", (frame.tiles, len(inputs.viewmats)), BLEND_THREADS, _scene(inputs, frame), *arguments)
+def blend(
+    inputs: Inputs,
+    splats: Splats,
+    lists: Lists,
+    pictures: Pictures,
+    contribution: Tensor,
+    frame: Frame,
+) -> None:
+    """Stage 6, with whole lists or without: the result is the same to the bit. Fills the pictures,
+    raises the contributions.
+    """
+    arguments = (
+        _settings(frame),
+        _lists(splats, lists),
+        _Pictures(*map(_address, pictures)),
+        contribution,
+    )
+    frame.machine.launch(
+        "blend",
+        (frame.tiles, len(inputs.viewmats)),
+        BLEND_THREADS,
+        _scene(inputs, frame),
+        *arguments,
+    )
 
 
-def blend_backward(inputs: Inputs, splats: Splats, lists: Lists, total: int, upstream: Upstream, frame: Frame) -> Tensor:
-    """The adjoints of stages 6 to 4: a row of sums for each splat (B, N, ROW); those of invisible ones aren't set.
+def blend_backward(
+    inputs: Inputs, splats: Splats, lists: Lists, total: int, upstream: Upstream, frame: Frame
+) -> Tensor:
+    """The adjoints of stages 6 to 4: a row of sums for each splat (B, N, ROW); those of invisible
+    ones aren't set.
 
     The lists must hold all of the ``total`` entries.
 
@@ -191,14 +241,30 @@ def blend_backward(inputs: Inputs, splats: Splats, lists: Lists, total: int, ups
     name = "blend_backward_absolute" if frame.options.absgrad else "blend_backward"
     arguments = (_settings(frame), _lists(splats, lists), _Upstream(*map(_address, upstream)), rows)
     launch(name, (frame.tiles, shape[0]), BLEND_THREADS, _scene(inputs, frame), *arguments)
-    launch("sum_rows", _per_gaussian((shape[0], shape[1] * WARP)), THREADS, _scene(inputs, frame), *splats[1:], rows, sums)
+    launch(
+        "sum_rows",
+        _per_gaussian((shape[0], shape[1] * WARP)),
+        THREADS,
+        _scene(inputs, frame),
+        *splats[1:],
+        rows,
+        sums,
+    )
     return sums
 
 
-def project_backward(inputs: Inputs, splats: Splats, sums: Tensor, gradients: Gradients, frame: Frame) -> None:
+def project_backward(
+    inputs: Inputs, splats: Splats, sums: Tensor, gradients: Gradients, frame: Frame
+) -> None:
     """The adjoint of stage 1, which fills ``gradients``."""
     arguments = (_settings(frame), splats.depth_keys, sums, _Gradients(*map(_address, gradients)))
-    frame.machine.launch("project_backward", _per_gaussian((1, inputs.shape[1])), THREADS, _scene(inputs, frame), *arguments)
+    frame.machine.launch(
+        "project_backward",
+        _per_gaussian((1, inputs.shape[1])),
+        THREADS,
+        _scene(inputs, frame),
+        *arguments,
+    )
 
 
 def empty_gradients(inputs: Inputs, absgrad: bool, viewmats: bool) -> Gradients:
@@ -219,21 +285,30 @@ def _per_gaussian(shape: tuple[int, int]) -> tuple[int, int]:
     return -(-shape[1] // THREADS), shape[0]
 
 
-# ---- what kernels are told: *.h ----------------------------------------------------------------------------------------
+# ---- what kernels are told: *.h ------------------------------------------------------------------
 
 
 class _Scene(ctypes.Structure):
     _fields_ = [(name, ctypes.c_void_p) for name in Inputs._fields]
-    _fields_ += [(name, ctypes.c_int) for name in ("gaussians", "views", "width", "height", "colors_per_view")]
+    _fields_ += [
+        (name, ctypes.c_int)
+        for name in ("gaussians", "views", "width", "height", "colors_per_view")
+    ]
 
 
 class _Settings(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_float) for name in ("near", "far", "eps2d", "log2_alpha_min", "alpha_max", "stop")]
+    _fields_ = [
+        (name, ctypes.c_float)
+        for name in ("near", "far", "eps2d", "log2_alpha_min", "alpha_max", "stop")
+    ]
     _fields_ += [(name, ctypes.c_int) for name in ("antialias", "downsample")]
 
 
 class _Lists(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_void_p) for name in ("splats", "order", "ends", "owners", "entries", "begins")]
+    _fields_ = [
+        (name, ctypes.c_void_p)
+        for name in ("splats", "order", "ends", "owners", "entries", "begins")
+    ]
     _fields_ += [("capacity", ctypes.c_int64)]
 
 
@@ -251,17 +326,28 @@ class _Gradients(ctypes.Structure):
 
 def _scene(inputs: Inputs, frame: Frame) -> _Scene:
     views, gaussians = inputs.shape
-    return _Scene(*map(_address, inputs), gaussians, views, frame.width, frame.height, inputs.colors.dim() == 3)
+    return _Scene(
+        *map(_address, inputs),
+        gaussians,
+        views,
+        frame.width,
+        frame.height,
+        inputs.colors.dim() == 3,
+    )
 
 
 def _settings(frame: Frame) -> _Settings:
     o = frame.options
     log2_alpha_min = math.log2(max(o.alpha_min, SMALLEST_ALPHA))
-    return _Settings(o.near, o.far, o.eps2d, log2_alpha_min, o.alpha_max, o.stop, o.antialias, o.downsample)
+    return _Settings(
+        o.near, o.far, o.eps2d, log2_alpha_min, o.alpha_max, o.stop, o.antialias, o.downsample
+    )
 
 
 def _lists(splats: Splats, lists: Lists) -> _Lists:
-    return _Lists(*map(_address, (splats.splats, splats.order, splats.ends, *lists)), lists.capacity)
+    return _Lists(
+        *map(_address, (splats.splats, splats.order, splats.ends, *lists)), lists.capacity
+    )
 
 
 def _address(tensor: Optional[Tensor]) -> Optional[int]:
