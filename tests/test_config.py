@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.checkpoint_file import save_file
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.launch.config import dump_config, load_config, safe_name
+from threestudio_gaussiandreamer.launch.config import dump_config, load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
 from threestudio_gaussiandreamer.launch.extensions import load_extensions
+from threestudio_gaussiandreamer.launch.run_folder import safe_name
 
 PROMPT = "system.prompt_processor.prompt"
 PROMPTS = [

@@ -1,0 +1,235 @@
+"""Where a configuration comes from: YAML files and ``key=value`` overrides, read as OmegaConf
+mappings before they are merged.
+
+What is text stays text: ``system.prompt_processor.prompt=1984`` and ``prompt=${x}`` on the command
+line mean these very characters."""
+
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, Optional
+
+import yaml
+from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from ..core.errors import UserError
+from ..core.interpolation import escape
+
+# keys whose value is the user's own words, never YAML
+TOP_LEVEL_TEXT = ("name", "tag", "description")
+PROMPT_TEXT = (
+    "prompt",
+    "negative_prompt",
+    "prompt_front",
+    "prompt_side",
+    "prompt_back",
+    "prompt_overhead",
+)
+# a path may hold what YAML reads as a comment or a mapping; only null and interpolations are still
+# special
+PATH_ENDINGS = ("path", "mesh", "_file", "_dir", "resume", "weights")
+# stands for "${" of a text while interpolations are resolved; a character of Unicode's private use
+# area
+PROTECTED = "$\ue000{"
+MOST_DEPTH = 32
+MOST_NODES = 10_000
+
+
+def read_yaml(path: str | os.PathLike) -> DictConfig:
+    """One YAML file as a mapping; prompts that look like numbers or booleans (``prompt: 1984``) are
+    still text.
+
+    Raises:
+        UserError: the file is missing, isn't UTF-8, isn't YAML, or isn't a mapping; with line and
+            column.
+    """
+    try:
+        source = Path(path).read_text(encoding="utf-8-sig")
+        require_modest(source, f"the configuration {path}")
+        content, node = OmegaConf.create(source), yaml.compose(source, Loader=yaml.SafeLoader)
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"the configuration {path} can't be read: {error}") from error
+    except (yaml.YAMLError, OmegaConfBaseException) as error:
+        raise UserError(
+            f"the configuration {path} isn't valid YAML: {_yaml_problem(error)}"
+        ) from error
+    if not isinstance(content, DictConfig):
+        raise UserError(
+            f"the configuration {path} must hold sections and keys, such as 'name: demo'"
+        )
+    _require_words(content, f"the configuration {path}")
+    _restore_text(content, node)
+    map_strings(content, _protect_escaped)
+    return content
+
+
+def parse_overrides(arguments: Iterable[str]) -> DictConfig:
+    """``key.of.section=value`` arguments as a mapping. Values are YAML, except text and paths,
+    which are taken as they are.
+
+    Raises:
+        UserError: an argument that isn't ``key=value``, or whose value isn't YAML.
+    """
+    overrides = OmegaConf.create({})
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if not equals or not key or not (key[0].isalpha() or key[0] == "_"):
+            raise UserError(
+                f"{argument!r} isn't an override: expected key=value, such as "
+                "trainer.max_steps=1200"
+            )
+        try:
+            _override(overrides, key, _valid_text(key, value))
+        except (yaml.YAMLError, OmegaConfBaseException) as error:
+            raise UserError(
+                f"the value of {key} isn't valid YAML: {_yaml_problem(error)}"
+            ) from error
+    _require_words(overrides, "the command line")
+    return overrides
+
+
+def is_text(key: str) -> bool:
+    """Whether the value of this dotted key is the user's own words."""
+    section, _, leaf = key.rpartition(".")
+    return key in TOP_LEVEL_TEXT or (section.endswith("prompt_processor") and leaf in PROMPT_TEXT)
+
+
+def _override(overrides: DictConfig, key: str, value: str) -> None:
+    if is_text(key):
+        OmegaConf.update(overrides, key, protect(value), force_add=True)
+    elif key.endswith(PATH_ENDINGS):
+        OmegaConf.update(
+            overrides, key, None if value in ("", "null", "~") else value, force_add=True
+        )
+    else:
+        require_modest(value, f"the value of {key}")
+        overrides.merge_with_dotlist([f"{key}={value}"])
+
+
+def _valid_text(key: str, value: str) -> str:
+    """The value of a key, which is to be written into ``parsed.yaml``; Python takes other bytes
+    than UTF-8 for lone surrogates.
+    """
+    try:
+        (key + value).encode()
+    except UnicodeEncodeError as error:
+        raise UserError(f"{key!r} or its value isn't valid UTF-8 text: {error}") from error
+    if key.count(".") >= MOST_DEPTH:
+        raise UserError(f"{key[:80]!r}... is no key: sections lie at most {MOST_DEPTH} deep")
+    return value
+
+
+def require_modest(source: str, what: str) -> None:
+    """Raise UserError where YAML is nested so deeply, or by aliases of aliases stands for so much,
+    that reading it ends in a crash.
+
+    The parser's events come one by one, so nothing is built to find out; libyaml's own recursion
+    would end the process."""
+    for depth, values in _extent(source):
+        if depth > MOST_DEPTH or values >= MOST_NODES:
+            raise UserError(
+                f"{what} must be at most {MOST_DEPTH} levels deep and hold fewer than "
+                f"{MOST_NODES} values"
+            )
+
+
+def _extent(source: str) -> Iterator[tuple[int, int]]:
+    """At each event of the parser: how deep it is, also in interpolations, and for how many values
+    the innermost section stands so far.
+    """
+    sections: list[tuple[Optional[str], int]] = [(None, 0)]
+    anchored: dict[Optional[str], int] = {}
+    for event in yaml.parse(source, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.CollectionStartEvent):
+            sections.append((event.anchor, 1))
+        elif isinstance(event, (yaml.CollectionEndEvent, yaml.ScalarEvent, yaml.AliasEvent)):
+            anchor, count = (
+                sections.pop() if isinstance(event, yaml.CollectionEndEvent) else (event.anchor, 1)
+            )
+            if isinstance(event, yaml.AliasEvent):
+                count = anchored.get(anchor, MOST_NODES)  # of itself, which never ends
+            anchored[anchor] = count
+            sections[-1] = (sections[-1][0], sections[-1][1] + count)
+        yield max(len(sections), getattr(event, "value", "").count("${")), sections[-1][1]
+
+
+def _require_words(content: DictConfig | ListConfig, what: str) -> None:
+    """Raise UserError for a key that isn't a text, such as ``on``, which is ``true`` in YAML."""
+    if content._is_none() or content._is_missing() or content._is_interpolation():
+        return
+    for key in content if isinstance(content, DictConfig) else range(len(content)):
+        if isinstance(content, DictConfig) and not isinstance(key, str):
+            raise UserError(
+                f"{what} has the key {key!r}, which isn't a word: put it in quotes if it is "
+                "meant so"
+            )
+        child = content._get_node(key)
+        if isinstance(child, (DictConfig, ListConfig)):
+            _require_words(child, what)
+
+
+def _yaml_problem(error: Exception) -> str:
+    mark = getattr(error, "problem_mark", None)
+    place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+    return place + (getattr(error, "problem", None) or str(error).splitlines()[0])
+
+
+def _restore_text(content: DictConfig, node: Any, section: str = "") -> None:
+    """Give text keys that YAML read as a number or boolean their words back; ``node`` is the file
+    as written.
+    """
+    if not isinstance(node, yaml.MappingNode):
+        return
+    for key_node, value_node in node.value:
+        if key_node.value not in content:  # an anchor's merge, or a key that isn't a word
+            continue
+        key = f"{section}{key_node.value}"
+        if isinstance(value_node, yaml.MappingNode):
+            _restore_text(content[key_node.value], value_node, f"{key}.")
+        elif is_text(key) and isinstance(
+            content._get_node(key_node.value)._value(), (bool, int, float)
+        ):
+            content[key_node.value] = value_node.value
+
+
+def protect(text: str) -> str:
+    """``text`` as a value that resolving leaves alone, also where another value refers to it;
+    :func:`unprotect` ends it.
+
+    Raises:
+        UserError: it is ``???``, which means in every configuration that a value is missing.
+    """
+    if text == MISSING:
+        raise UserError(
+            f"{MISSING!r} can't be a text: in configurations it means that a value is missing; "
+            "add a word"
+        )
+    return text.replace("${", PROTECTED)
+
+
+def _protect_escaped(text: str) -> str:
+    """A string of a YAML whose every ``${`` is escaped holds no interpolation: it is text, as in a
+    ``parsed.yaml``.
+    """
+    if "${" not in text or re.search(r"(?<!\\)(\\\\)*\$\{", text):
+        return text
+    return re.sub(r"(\\+)\$\{", lambda match: "\\" * (len(match[1]) // 2) + PROTECTED, text)
+
+
+def unprotect(text: str) -> str:
+    # after resolving, a "${" that is left is somebody's text
+    return escape(text.replace(PROTECTED, "${"))
+
+
+def map_strings(node: DictConfig | ListConfig, change: Callable[[str], str]) -> None:
+    """Replace every string below ``node`` by ``change`` of it; interpolations stay unresolved."""
+    if node._is_none() or node._is_missing() or node._is_interpolation():
+        return
+    for key in node if isinstance(node, DictConfig) else range(len(node)):
+        child = node._get_node(key)
+        if isinstance(child, (DictConfig, ListConfig)):
+            map_strings(child, change)
+        elif isinstance(child._value(), str):
+            child._set_value(change(child._value()))
