@@ -64,7 +64,7 @@ def test_training_leaves_the_tree_of_threestudio(launch):
         "configs/raw.yaml",
         "configs/parsed.yaml",
         "cmd.txt",
-        "code/threestudio_gaussiandreamer/launch/trial.py",
+        "code/threestudio_gaussiandreamer/launch/run.py",
         "csv_logs/version_0/metrics.csv",
         "save/it3-0.png",
         "save/it6-1.png",

@@ -30,7 +30,7 @@ from threestudio_gaussiandreamer.formats.spz import read_spz, spz_bytes
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.launch import config, experiment
 from threestudio_gaussiandreamer.launch.config_check import check_config
-from threestudio_gaussiandreamer.launch.trial import Trial, lightning_errors
+from threestudio_gaussiandreamer.launch.run import Run, lightning_errors
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
 from threestudio_gaussiandreamer.priors.gaussians import GaussiansPrior
@@ -538,14 +538,14 @@ def no_work() -> Iterator[None]:
     """Runs end where the work would begin, and leave the process's logging and warnings as they
     were.
     """
-    run, logger = Trial.run, logging.getLogger("threestudio_gaussiandreamer")
+    run, logger = Run.run, logging.getLogger("threestudio_gaussiandreamer")
     handlers, propagate, level = list(logger.handlers), logger.propagate, logger.level
-    Trial.run = lambda self: 0
+    Run.run = lambda self: 0
     try:
         with warnings.catch_warnings():
             yield
     finally:
-        Trial.run = run
+        Run.run = run
         logger.handlers[:], logger.propagate = handlers, propagate
         logger.setLevel(level)
 

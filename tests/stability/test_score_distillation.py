@@ -19,7 +19,7 @@ from threestudio_gaussiandreamer.cameras import Orbit
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.host import C, find, register
-from threestudio_gaussiandreamer.launch import trial
+from threestudio_gaussiandreamer.launch import run
 from threestudio_gaussiandreamer.launch.config_check import check_part
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster, over_background
@@ -110,14 +110,14 @@ def scaled_run(folder, monkeypatch, scale, *options) -> Ended:
     given the scaler.
     """
     plugin = MixedPrecision("16-mixed", "cpu", scaler=torch.amp.GradScaler("cpu", init_scale=scale))
-    build = trial.build
+    build = run.build
 
     def with_scaler(section, owner, arguments):
         arguments = {name: value for name, value in arguments.items() if name != "precision"}
         return build(section, owner, arguments | {"plugins": [*arguments["plugins"], plugin]})
 
     with monkeypatch.context() as patch:
-        patch.setattr(trial, "build", with_scaler)
+        patch.setattr(run, "build", with_scaler)
         return launch(folder, *options)
 
 

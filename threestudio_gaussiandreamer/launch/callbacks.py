@@ -33,7 +33,7 @@ class RunRecord(pl.Callback):
     starts.
 
     Args:
-        folder: the trial's folder.
+        folder: the run's folder.
         cfg: the configuration as it runs.
         config_paths: the YAML files it was made of.
         command: the command line.

@@ -102,10 +102,9 @@ def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
     cfg = load_config(*config_paths, cli_args=args.overrides, n_gpus=max(n_gpus, 1))
     check_config(cfg)
 
-    from .trial import Trial
+    from .run import Run
 
-    trial = Trial(cfg, args, config_paths, shlex.join([*PROGRAM, *argv]), n_gpus)
-    return trial.run()
+    return Run(cfg, args, config_paths, shlex.join([*PROGRAM, *argv]), n_gpus).run()
 
 
 class StderrHandler(logging.Handler):

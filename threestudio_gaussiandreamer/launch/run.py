@@ -1,4 +1,4 @@
-"""One trial: its folder, its parts, its trainer, and the stage that was asked for.
+"""One run: its folder, its parts, its trainer, and the stage that was asked for.
 
 ``outputs/<name>/<tag>@<time>/{ckpts, configs/{raw,parsed}.yaml, code, save, tb_logs, csv_logs,
 cmd.txt}``"""
@@ -42,7 +42,7 @@ LIGHTNINGS_KEY = "pytorch-lightning_version"
 TRAINING_KEYS = (LIGHTNINGS_KEY, "loops", "optimizer_states")
 
 
-class Trial:
+class Run:
     """A checked configuration and the stage to run on it.
 
     Args:
