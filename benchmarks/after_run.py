@@ -25,9 +25,9 @@ from torch import Tensor
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.gaussians import importance as parsimony
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.simplify import (
     Budget,
-    Cloud,
     Views,
     draw,
     likeness,
@@ -77,7 +77,9 @@ def measured(mesh: str, seed: int) -> list[dict[str, Any]]:
     ]
 
 
-def variants(cloud: Cloud, count: int, probes: Views, judges: Views) -> Iterator[tuple[str, Cloud]]:
+def variants(
+    cloud: Gaussians, count: int, probes: Views, judges: Views
+) -> Iterator[tuple[str, Gaussians]]:
     """The ways from a cloud to ``count`` Gaussians, and where they lead."""
     for name in parsimony.SCORES:
         yield f"one shot, by {name}", only(cloud, RANKS[name](cloud, probes, 0), count)
@@ -96,7 +98,7 @@ def variants(cloud: Cloud, count: int, probes: Views, judges: Views) -> Iterator
 
 
 @torch.no_grad()
-def contribution(cloud: Cloud, views: Views, seed: int) -> Tensor:
+def contribution(cloud: Gaussians, views: Views, seed: int) -> Tensor:
     """The largest weight in any pixel."""
     return draw(cloud, views, torch.arange(len(views.viewmats)))[1].amax(0)
 

@@ -51,8 +51,9 @@ from threestudio_gaussiandreamer.formats.gaussian_files import (
     read_cloud,
     write_cloud,
 )
-from threestudio_gaussiandreamer.formats.ply import GaussianArrays, read_gaussians
+from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.formats.spz import COLOR_SCALE
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
@@ -186,7 +187,7 @@ def rows(kind: str, count: int, mesh: str, seed: int, results: Path) -> Iterator
             }
 
 
-def written(arrays: GaussianArrays) -> Iterator[tuple[str, int, GaussianArrays]]:
+def written(arrays: Gaussians) -> Iterator[tuple[str, int, Gaussians]]:
     """The cloud as it comes back from files of each kind, with their sizes."""
     with tempfile.TemporaryDirectory() as folder:
         for name in ("a.ply", "a.spz"):
@@ -199,7 +200,7 @@ def written(arrays: GaussianArrays) -> Iterator[tuple[str, int, GaussianArrays]]
             )
 
 
-def score(mesh: str, arrays: GaussianArrays, size: int = SIZE, **drawn: Any) -> float:
+def score(mesh: str, arrays: Gaussians, size: int = SIZE, **drawn: Any) -> float:
     """PSNR on the held-out views of :mod:`evaluate`, as a run ends with it; drawn as the demo
     draws, but for ``drawn``.
     """
@@ -236,7 +237,7 @@ def steps_of(values: np.ndarray, low: float, high: float, levels: float) -> np.n
     return (low + (high - low) * np.rint(scaled * levels) / levels).astype(np.float32)
 
 
-def with_positions(arrays: GaussianArrays, bits: int) -> GaussianArrays:
+def with_positions(arrays: Gaussians, bits: int) -> Gaussians:
     low = float(arrays.means.min())
     return arrays._replace(
         means=steps_of(
@@ -245,11 +246,11 @@ def with_positions(arrays: GaussianArrays, bits: int) -> GaussianArrays:
     )
 
 
-def with_scales(arrays: GaussianArrays, bits: int) -> GaussianArrays:
+def with_scales(arrays: Gaussians, bits: int) -> Gaussians:
     return arrays._replace(log_scales=steps_of(arrays.log_scales, -10, 6, 2**bits))
 
 
-def with_rotation(arrays: GaussianArrays, bits: int) -> GaussianArrays:
+def with_rotation(arrays: Gaussians, bits: int) -> Gaussians:
     """The three smallest components, sign and magnitude; the largest follows."""
     quats = arrays.quats / np.linalg.norm(arrays.quats, axis=1, keepdims=True)
     largest = np.arange(4) == np.abs(quats).argmax(1)[:, None]
@@ -261,7 +262,7 @@ def with_rotation(arrays: GaussianArrays, bits: int) -> GaussianArrays:
     return arrays._replace(quats=np.where(largest, rest, rounded).astype(np.float32))
 
 
-def with_opacity(arrays: GaussianArrays, bits: int) -> GaussianArrays:
+def with_opacity(arrays: Gaussians, bits: int) -> Gaussians:
     levels, half_step = 2**bits - 1, 0.125 / (2**bits - 1)
     alphas = steps_of(
         1 / (1 + np.exp(-arrays.logit_opacities.astype(np.float64))), 0, 1, levels
@@ -269,12 +270,12 @@ def with_opacity(arrays: GaussianArrays, bits: int) -> GaussianArrays:
     return arrays._replace(logit_opacities=np.log(alphas / (1 - alphas)).astype(np.float32))
 
 
-def with_colour(arrays: GaussianArrays, bits: int) -> GaussianArrays:
+def with_colour(arrays: Gaussians, bits: int) -> Gaussians:
     reach = 0.5 / COLOR_SCALE
     return arrays._replace(sh=steps_of(arrays.sh, -reach, reach, 2**bits - 1))
 
 
-ROUNDED: dict[str, Callable[[GaussianArrays, int], GaussianArrays]] = {
+ROUNDED: dict[str, Callable[[Gaussians, int], Gaussians]] = {
     "opacity": with_opacity,
     "colour": with_colour,
     "scales": with_scales,

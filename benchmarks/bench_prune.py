@@ -23,8 +23,8 @@ from runs import append_rows, measured_in
 
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.formats.gaussian_files import write_cloud
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0
-from threestudio_gaussiandreamer.gaussians.simplify import Cloud
 from threestudio_gaussiandreamer.prune import command as prune
 
 COLUMNS = "scene,x,budget,gaussians,psnr,seconds,threads,load,machine,commit".split(",")
@@ -74,12 +74,12 @@ def rows(count: int, measured: set[tuple[str, ...]]) -> Iterator[dict[str, Any]]
                 }
 
 
-def torus_and_sphere(count: int) -> Cloud:
+def torus_and_sphere(count: int) -> Gaussians:
     means, quats, scales, opacities, colors = make_scene(count)
-    return Cloud(means, quats, scales.log(), opacities.logit(), rgb_to_sh0(colors[:, None]))
+    return Gaussians(means, quats, scales.log(), opacities.logit(), rgb_to_sh0(colors[:, None]))
 
 
-SCENES: dict[str, Callable[[int], Cloud]] = {
+SCENES: dict[str, Callable[[int], Gaussians]] = {
     "torus": lambda count: torus(count, 0),
     "torus and sphere": torus_and_sphere,
 }

@@ -544,7 +544,7 @@ def prune_twice(args: argparse.Namespace) -> dict[str, Any]:
 
     stored = prune.stored_cloud(torus_and_sphere(800 if args.small else 100_000))
     options = prune.PruneOptions(
-        count=len(stored.arrays.means) // 4,
+        count=len(stored.gaussians.means) // 4,
         size=48 if args.small else 256,
         steps=4 if args.small else 60,
     )
@@ -553,7 +553,7 @@ def prune_twice(args: argparse.Namespace) -> dict[str, Any]:
     views = prune.views_of(stored, options)[-1]
     same = all(
         a.tobytes() == b.tobytes()
-        for a, b in zip(first.after.arrays, second.after.arrays, strict=True)
+        for a, b in zip(first.after.gaussians, second.after.gaussians, strict=True)
     )
     return {
         "gaussians": [len(before.means), len(after.means)],

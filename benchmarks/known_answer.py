@@ -31,8 +31,9 @@ from torch import Tensor
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.cameras import held_out_orbit, to_opencv
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud, write_cloud
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0, sh_to_colors
-from threestudio_gaussiandreamer.gaussians.simplify import Cloud, Views, likeness, look
+from threestudio_gaussiandreamer.gaussians.simplify import Views, likeness, look
 from threestudio_gaussiandreamer.host import BaseObject, register
 from threestudio_gaussiandreamer.launch.experiment import main as launch
 from threestudio_gaussiandreamer.prune import command as prune
@@ -66,7 +67,7 @@ def main() -> None:
 # ---- scenes --------------------------------------------------------------------------------------
 
 
-def torus(count: int, seed: int) -> Cloud:
+def torus(count: int, seed: int) -> Gaussians:
     """Flat Gaussians of random colours on a torus, each to be seen from somewhere."""
     rng = torch.Generator().manual_seed(seed)
     u, v = 2 * math.pi * torch.rand(2, count, generator=rng)
@@ -85,7 +86,7 @@ def torus(count: int, seed: int) -> Cloud:
         1,
     )
     opacities = 0.6 + 0.35 * torch.rand(count, generator=rng)
-    return Cloud(
+    return Gaussians(
         0.7 * ring + 0.3 * normals, quats, log_scales, opacities.logit(), colored(count, rng)
     )
 
@@ -94,7 +95,7 @@ def colored(count: int, rng: torch.Generator) -> Float[Tensor, "N 1 3"]:
     return rgb_to_sh0(torch.rand(count, 1, 3, generator=rng))
 
 
-def floaters(count: int, seed: int) -> Cloud:
+def floaters(count: int, seed: int) -> Gaussians:
     """Gaussians as on the torus, anywhere in a box that no camera is in."""
     rng = torch.Generator().manual_seed(1000 + seed)
     return torus(count, seed + 1)._replace(
@@ -102,14 +103,14 @@ def floaters(count: int, seed: int) -> Cloud:
     )
 
 
-def mixed(clouds: list[Cloud], seed: int) -> Cloud:
+def mixed(clouds: list[Gaussians], seed: int) -> Gaussians:
     """All in one, in random order."""
-    together = Cloud(*(torch.cat(values) for values in zip(*clouds, strict=True)))
+    together = Gaussians(*(torch.cat(values) for values in zip(*clouds, strict=True)))
     order = torch.randperm(len(together.means), generator=torch.Generator().manual_seed(seed))
-    return Cloud(*(values[order] for values in together))
+    return together.rows(order)
 
 
-def with_copies_and_floaters(true: Cloud, seed: int) -> Cloud:
+def with_copies_and_floaters(true: Gaussians, seed: int) -> Gaussians:
     """Copies moved by about a third of the thinnest axis, and floaters as opaque as the rest."""
     rng = torch.Generator().manual_seed(seed)
     thinnest = true.log_scales.exp().amin(1, keepdim=True)
@@ -122,7 +123,7 @@ def with_copies_and_floaters(true: Cloud, seed: int) -> Cloud:
     return mixed([true, *moved, floaters(len(true.means), seed)], seed)
 
 
-def with_shares_and_faint_floaters(true: Cloud, seed: int) -> Cloud:
+def with_shares_and_faint_floaters(true: Gaussians, seed: int) -> Gaussians:
     """Three in the place of each that let through what it did, and floaters of opacity 0.01."""
     shared = 1 - (1 - true.logit_opacities.sigmoid()) ** (1 / 3)
     faint = floaters(len(true.means), seed)._replace(
@@ -179,7 +180,7 @@ class KnownCloud(BaseObject):
         }
 
 
-def found_by_auto(true: Cloud, seed: int, steps: int, folder: Path) -> tuple[int, int, float]:
+def found_by_auto(true: Gaussians, seed: int, steps: int, folder: Path) -> tuple[int, int, float]:
     """Gaussians before and after, and dB to the truth."""
     start = with_copies_and_floaters(true, seed)
     write_cloud(str(folder / "true.ply"), prune.stored_cloud(true))
@@ -221,7 +222,7 @@ def found_by_auto(true: Cloud, seed: int, steps: int, folder: Path) -> tuple[int
     return len(start.means), len(found.means), likeness(found, held_out(), look(true, held_out()))
 
 
-def found_by_prune(true: Cloud, seed: int, folder: Path) -> tuple[int, int, float]:
+def found_by_prune(true: Gaussians, seed: int, folder: Path) -> tuple[int, int, float]:
     """Gaussians before and after, and dB to what they were before."""
     start = with_shares_and_faint_floaters(true, seed)
     write_cloud(str(folder / "shared.ply"), prune.stored_cloud(start))

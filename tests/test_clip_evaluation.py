@@ -18,7 +18,8 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.evaluation import clip_similarity as module
 from threestudio_gaussiandreamer.evaluation import results, t3bench
 from threestudio_gaussiandreamer.evaluation.clip_similarity import Protocol, main
-from threestudio_gaussiandreamer.formats.ply import GaussianArrays, write_gaussians
+from threestudio_gaussiandreamer.formats.ply import write_gaussians
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.launch.experiment import main as launch
 
 register_parts()
@@ -29,7 +30,7 @@ PROMPT = "a painted toy"
 def blob(center=(0.0, 0.0, 0.0), color=(0.9, 0.1, 0.1), count=40, seed=0):
     """A few opaque Gaussians around ``center``."""
     rng = np.random.default_rng(seed)
-    return GaussianArrays(
+    return Gaussians(
         means=np.float32(np.array(center) + 0.3 * rng.normal(size=(count, 3))),
         sh=np.tile(((np.float32(color) - 0.5) / 0.28209479)[None, None], (count, 1, 1)),
         logit_opacities=np.full(count, 4.0, np.float32),

@@ -15,7 +15,8 @@ from threestudio_gaussiandreamer.formats.gaussian_files import (
     turned,
     write_cloud,
 )
-from threestudio_gaussiandreamer.formats.ply import GaussianArrays, read_comments, write_gaussians
+from threestudio_gaussiandreamer.formats.ply import read_comments, write_gaussians
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
 from threestudio_gaussiandreamer.splatting import rasterize
 
@@ -34,14 +35,12 @@ def cloud(count=60, degree=0):
         for name, shape in shapes.items()
     }
     values["log_scales"] -= 2
-    return GaussianArrays(**values)
+    return Gaussians(**values)
 
 
 def picture(arrays, rotation=AXES["y"]):
     """What a camera sees that is turned together with the cloud."""
-    means, sh, logits, log_scales, quats = (
-        torch.from_numpy(np.ascontiguousarray(values)) for values in arrays
-    )
+    means, quats, log_scales, logits, sh = arrays.tensors()
     view = torch.eye(4)
     view[:3, :3], view[2, 3] = torch.from_numpy(rotation.T).float(), 4.0
     position = torch.from_numpy(rotation).float() @ torch.tensor([0, 0, -4.0])
@@ -84,7 +83,9 @@ def test_a_ply_keeps_all_bits_and_says_what_is_up(tmp_path, up):
     write_cloud(path, stored)
     read = read_cloud(path)
     assert (read.up, read.pruned_to) == (up, 40.0)
-    assert all(a.tobytes() == b.tobytes() for a, b in zip(read.arrays, stored.arrays, strict=True))
+    assert all(
+        a.tobytes() == b.tobytes() for a, b in zip(read.gaussians, stored.gaussians, strict=True)
+    )
     assert (tmp_path / "a.ply").stat().st_size == file_size(stored, ".ply")
 
 
@@ -95,8 +96,8 @@ def test_an_spz_file_is_y_up_and_turns_back(tmp_path, up):
     read = read_cloud(path)
     assert (read.up, read.pruned_to) == ("y", 40.5)
     back = in_axes(read, up).means
-    order = [np.abs(stored.arrays.means - mean).sum(1).argmin() for mean in back]
-    np.testing.assert_allclose(back, stored.arrays.means[order], atol=0.005)
+    order = [np.abs(stored.gaussians.means - mean).sum(1).argmin() for mean in back]
+    np.testing.assert_allclose(back, stored.gaussians.means[order], atol=0.005)
     assert (tmp_path / "a.spz").stat().st_size == file_size(stored, ".spz")
 
 
@@ -115,7 +116,7 @@ def test_gaussians_that_cant_be_drawn_are_left_out(tmp_path):
     arrays = cloud()
     arrays.means[3, 0], arrays.quats[7, 1] = np.nan, np.inf
     write_cloud(str(tmp_path / "a.ply"), StoredCloud(arrays))
-    assert len(read_cloud(str(tmp_path / "a.ply")).arrays.means) == 58
+    assert len(read_cloud(str(tmp_path / "a.ply")).gaussians.means) == 58
 
 
 def test_notes_are_comments_of_the_ply(tmp_path):

@@ -13,6 +13,7 @@ from threestudio_gaussiandreamer import exporters
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.formats.spz import read_spz, write_spz
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.surface import write_obj
 from threestudio_gaussiandreamer.host import BaseGeometry, ExporterOutput, find, names
 
@@ -86,7 +87,7 @@ def test_gaussians_read_back_bit_for_bit(tmp_path, degree):
         for values in output.params.values()
     )
     read = ply.read_gaussians(write(output, tmp_path))
-    for name in ply.GaussianArrays._fields:
+    for name in Gaussians._fields:
         assert getattr(read, name).tobytes() == getattr(source, name).detach().numpy().tobytes(), (
             name
         )

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.simplify import (
     Budget,
-    Cloud,
     likeness,
     look,
     simplify,
@@ -84,7 +84,7 @@ def trained(geometry, views, pictures):
                 return bool(psnr(draw(rows).image, pictures[rows]) >= whole - geometry.affordable)
 
         geometry.after_step(adam, step, holds)
-    return Cloud(
+    return Gaussians(
         geometry.means, geometry.quats, geometry.log_scales, geometry.logit_opacities, geometry.sh
     )
 

@@ -7,8 +7,8 @@ import torch
 
 from threestudio_gaussiandreamer.gaussians import merge as merging
 from threestudio_gaussiandreamer.gaussians import simplify
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.merge import merge_duplicates
-from threestudio_gaussiandreamer.gaussians.simplify import Cloud
 
 
 def shell(count=60, seed=0):
@@ -39,8 +39,8 @@ def copies(params, times):
 
 def picture(params):
     sh = torch.cat([params["sh0"], params["sh_rest"]], 1)
-    cloud = Cloud(*(params[name] for name in Cloud._fields[:-1]), sh)
-    around = Cloud(
+    cloud = Gaussians(*(params[name] for name in Gaussians._fields[:-1]), sh)
+    around = Gaussians(
         shell()["means"],
         shell()["quats"],
         shell()["log_scales"],

@@ -8,6 +8,7 @@ import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats import ply
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians, usable
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 
 
@@ -16,8 +17,8 @@ def rng(seed=0):
 
 
 def gaussians(count=50, degree=0, seed=0):
-    shapes = [(count, 3), (count, (degree + 1) ** 2, 3), (count,), (count, 3), (count, 4)]
-    return ply.GaussianArrays(
+    shapes = [(count, 3), (count, 4), (count, 3), (count,), (count, (degree + 1) ** 2, 3)]
+    return Gaussians(
         *(rng(seed + i).normal(size=shape).astype(np.float32) for i, shape in enumerate(shapes))
     )
 
@@ -201,7 +202,7 @@ class TestGaussians:
         with pytest.raises(UserError, match="f_rest"):
             ply.read_gaussians(path)
 
-    @pytest.mark.parametrize("field", ply.GaussianArrays._fields)
+    @pytest.mark.parametrize("field", Gaussians._fields)
     def test_rows_that_are_not_numbers_are_counted(self, tmp_path, field):
         arrays = gaussians(6)
         getattr(arrays, field)[[2, 4]] = np.nan
@@ -209,7 +210,7 @@ class TestGaussians:
         with pytest.raises(UserError, match="a.ply.*2 of 6.*first in vertex 2"):
             ply.read_gaussians(tmp_path / "a.ply")
         read = ply.read_gaussians(tmp_path / "a.ply", allow_non_finite=True)
-        np.testing.assert_array_equal(ply.usable(read), [True, True, False, True, False, True])
+        np.testing.assert_array_equal(usable(read), [True, True, False, True, False, True])
 
     def test_is_gaussian_ply(self, tmp_path):
         ply.write_points(tmp_path / "points.ply", cloud())

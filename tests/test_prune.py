@@ -16,14 +16,14 @@ from threestudio_gaussiandreamer.formats.gaussian_files import (
     read_cloud,
 )
 from threestudio_gaussiandreamer.formats.ply import (
-    GaussianArrays,
     read_comments,
     read_gaussians,
     write_gaussians,
 )
 from threestudio_gaussiandreamer.gaussians import simplify
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
-from threestudio_gaussiandreamer.gaussians.simplify import Budget, Cloud
+from threestudio_gaussiandreamer.gaussians.simplify import Budget
 from threestudio_gaussiandreamer.prune import command as prune
 from threestudio_gaussiandreamer.splatting import rasterize
 
@@ -38,7 +38,7 @@ def ball(count=600, bands=1):
     sh = torch.zeros(count, bands, 3)
     sh[:, 0] = means
     quats = torch.randn(count, 4, generator=rng)
-    return Cloud(means, quats, torch.full((count, 3), -2.2), torch.full((count,), 3.0), sh)
+    return Gaussians(means, quats, torch.full((count, 3), -2.2), torch.full((count,), 3.0), sh)
 
 
 def arrays_of(cloud):
@@ -139,7 +139,7 @@ def test_what_a_format_costs_is_spent_too(tmp_path):
     pictures = simplify.look(prune.tensors_of(first), views)
     for name in ("twice.spz", "count.spz"):
         found = read_cloud(str(tmp_path / name))
-        turned = prune.tensors_of(StoredCloud(GaussianArrays(*in_axes(found, first.up)), first.up))
+        turned = prune.tensors_of(StoredCloud(in_axes(found, first.up), first.up))
         assert (
             found.pruned_to < 34.9
             and simplify.likeness(turned, views, pictures) > found.pruned_to - 0.5
@@ -345,7 +345,9 @@ def test_a_quality_holds_in_the_compact_file(source, tmp_path):
     report = run(source, tmp_path / "once.spz", "--psnr", "32")
     assert report["after"]["gaussians"] < 450 and report["psnr_on_unseen_views"] > 31.5
     run(tmp_path / "once.spz", tmp_path / "twice.spz", "--psnr", "32")
-    assert len(read_cloud(str(tmp_path / "twice.spz")).arrays.means) == report["after"]["gaussians"]
+    assert (
+        len(read_cloud(str(tmp_path / "twice.spz")).gaussians.means) == report["after"]["gaussians"]
+    )
 
 
 def test_colours_beyond_the_compact_formats_reach_are_fitted_within_it(tmp_path):
@@ -374,7 +376,7 @@ def test_colours_beyond_the_compact_formats_reach_are_fitted_within_it(tmp_path)
                 )
             )
         )
-    assert len(source.arrays.means) == reports[1]["after"]["gaussians"] == 600
+    assert len(source.gaussians.means) == reports[1]["after"]["gaussians"] == 600
     assert reports[1]["psnr_on_unseen_views"] > reports[0]["psnr_on_unseen_views"] + 1
 
 

@@ -5,7 +5,7 @@ exports it.
 import numpy as np
 import pytest
 
-from threestudio_gaussiandreamer.formats.ply import GaussianArrays
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.surface import gaussian_surface, surface_nets, write_obj
 
 trimesh = pytest.importorskip("trimesh")
@@ -21,7 +21,7 @@ def ball(count=4000, radius=0.5, scale=0.02, opacity=4.0, hollow=True):
         * (1 if hollow else rng.random((count, 1)) ** (1 / 3))
         / np.linalg.norm(points, axis=1, keepdims=True)
     )
-    return GaussianArrays(
+    return Gaussians(
         means=np.float32(points + CENTER),
         sh=np.float32((points.clip(-0.5, 0.5)) / 0.28209479)[:, None],
         logit_opacities=np.full(count, opacity, np.float32),
@@ -74,7 +74,7 @@ def test_a_shell_lies_where_its_gaussians_are_however_many_overlap(count, scale)
 def test_what_is_faint_is_no_surface():
     arrays = ball()
     far = arrays._replace(means=arrays.means + 5, logit_opacities=arrays.logit_opacities - 10)
-    both = GaussianArrays(*(np.concatenate(pair) for pair in zip(arrays, far, strict=True)))
+    both = Gaussians(*(np.concatenate(pair) for pair in zip(arrays, far, strict=True)))
     np.testing.assert_array_equal(
         gaussian_surface(both, resolution=24).vertices,
         gaussian_surface(arrays, resolution=24).vertices,
@@ -95,7 +95,7 @@ def test_size_and_place_do_not_matter():
 def test_turned_and_flat_gaussians_lie_along_their_axes():
     """One disc in the plane x = z, by a quarter turn of 45 degrees about y."""
     half = np.deg2rad(45 / 2)
-    disc = GaussianArrays(
+    disc = Gaussians(
         means=np.zeros((1, 3), np.float32),
         sh=np.zeros((1, 1, 3), np.float32),
         logit_opacities=np.float32([4.0]),

@@ -27,6 +27,7 @@ from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, sa
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.formats.spz import read_spz, spz_bytes
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians, usable
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.launch import config, experiment
 from threestudio_gaussiandreamer.launch.config_check import check_config
@@ -119,7 +120,7 @@ def require_picture(geometry: GaussianCloud) -> None:
     )
 
 
-def cloud_of(arrays: ply.GaussianArrays) -> GaussianCloud:
+def cloud_of(arrays: Gaussians) -> GaussianCloud:
     geometry = GaussianCloud({"sh_degree": min(int(arrays.sh.shape[1] ** 0.5) - 1, 3)})
     geometry.set_arrays(**arrays._asdict())
     return geometry
@@ -178,10 +179,10 @@ def messages() -> Iterator[list[str]]:
 # ---- PLY -----------------------------------------------------------------------------------------
 
 
-def some_gaussians(count: int, degree: int, seed: int = 0) -> ply.GaussianArrays:
+def some_gaussians(count: int, degree: int, seed: int = 0) -> Gaussians:
     rng = np.random.default_rng(seed)
-    shapes = [(count, 3), (count, (degree + 1) ** 2, 3), (count,), (count, 3), (count, 4)]
-    arrays = ply.GaussianArrays(*(rng.normal(size=shape).astype(np.float32) for shape in shapes))
+    shapes = [(count, 3), (count, 4), (count, 3), (count,), (count, (degree + 1) ** 2, 3)]
+    arrays = Gaussians(*(rng.normal(size=shape).astype(np.float32) for shape in shapes))
     return arrays._replace(log_scales=arrays.log_scales - 2)
 
 
@@ -641,7 +642,7 @@ def exercise_spz(path: Path) -> None:
     content = strictly(oracles.gunzipped, path)
     count = int.from_bytes(content[8:12], "little")
     require(len(arrays.means) == count, f"{len(arrays.means)} Gaussians, but the file says {count}")
-    require(bool(ply.usable(arrays).all()), "values aren't finite")
+    require(bool(usable(arrays).all()), "values aren't finite")
     if count:
         require_picture(cloud_of(arrays))
 

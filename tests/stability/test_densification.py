@@ -20,8 +20,9 @@ from threestudio_gaussiandreamer.core.streams import generator
 from threestudio_gaussiandreamer.formats.ply import write_gaussians
 from threestudio_gaussiandreamer.gaussians import densify
 from threestudio_gaussiandreamer.gaussians.densify import PARAMETERS, Rules, Statistics
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
-from threestudio_gaussiandreamer.gaussians.simplify import Cloud, look, views_around, worth
+from threestudio_gaussiandreamer.gaussians.simplify import look, views_around, worth
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
@@ -107,8 +108,8 @@ def seen_alike(geometry: GaussianCloud, gradient: torch.Tensor, contribution: to
     geometry.contribution.copy_(contribution)
 
 
-def drawn(geometry: GaussianCloud) -> Cloud:
-    return Cloud(*(getattr(geometry, name).detach() for name in Cloud._fields))
+def drawn(geometry: GaussianCloud) -> Gaussians:
+    return Gaussians.of(geometry).map(torch.Tensor.detach)
 
 
 # ---- too many ------------------------------------------------------------------------------------
@@ -169,11 +170,11 @@ def test_a_trained_cloud_that_is_too_large_keeps_what_contributes(tmp_path, meas
     )
     views = views_around(drawn(trained), 4, 64, turn=30)
 
-    def likeness(cloud: Cloud) -> float:
+    def likeness(cloud: Gaussians) -> float:
         return psnr(look(cloud, views), look(drawn(trained), views)).mean().item()
 
     lots = [torch.randperm(400, generator=generator(seed, "lottery"))[:150] for seed in range(5)]
-    luckiest = max(likeness(Cloud(*(values[rows] for values in drawn(trained)))) for rows in lots)
+    luckiest = max(likeness(drawn(trained).rows(rows)) for rows in lots)
     measured(
         likeness(drawn(geometry)) - luckiest, "dB better than the best of 5 lotteries", at_least=2.0
     )

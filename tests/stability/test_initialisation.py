@@ -15,6 +15,7 @@ from small_runs import launch
 
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.grow import (
     SCALE_RULES,
     grow,
@@ -22,7 +23,7 @@ from threestudio_gaussiandreamer.gaussians.grow import (
     nearest_distance_scales,
 )
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
-from threestudio_gaussiandreamer.gaussians.simplify import Cloud, look, views_around
+from threestudio_gaussiandreamer.gaussians.simplify import look, views_around
 from threestudio_gaussiandreamer.meshes.load import face_areas, load_mesh, sample_surface
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
@@ -53,10 +54,7 @@ def started(cloud: PointCloud, **options) -> GaussianCloud:
 
 def picture(geometry: GaussianCloud, frame: GaussianCloud | None = None) -> torch.Tensor:
     """Three views of a cloud, from where they would show ``frame``."""
-    cloud, seen = (
-        Cloud(*(getattr(g, name).detach() for name in Cloud._fields))
-        for g in (geometry, frame or geometry)
-    )
+    cloud, seen = (Gaussians.of(g).map(torch.Tensor.detach) for g in (geometry, frame or geometry))
     return look(cloud, views_around(seen, 3, 64))
 
 

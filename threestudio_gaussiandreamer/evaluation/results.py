@@ -15,7 +15,8 @@ from torch import Tensor
 
 from ..core.errors import UserError
 from ..core.files import existing_file
-from ..formats.ply import GaussianArrays, is_gaussian_ply
+from ..formats.ply import is_gaussian_ply
+from ..gaussians.gaussians import Gaussians
 from ..host import find, get_device
 from ..launch.config import load_config
 from ..prompts.prompt_processors import PROMPT_LIBRARY, spelt_out
@@ -94,7 +95,7 @@ def _prompt_of(processor: Mapping[str, Any]) -> Optional[str]:
         return None
 
 
-def read_result(result: Result) -> GaussianArrays:
+def read_result(result: Result) -> Gaussians:
     """All attributes of a result's Gaussians; rows that can't be drawn are left out."""
     return find("gaussians-prior")({"path": str(result.ply)}).gaussians("")
 
@@ -102,9 +103,7 @@ def read_result(result: Result) -> GaussianArrays:
 class Pictures:
     """Renders a cloud as validation does: our rasteriser, a flat background, no gradients."""
 
-    def __init__(
-        self, arrays: GaussianArrays, background: tuple[float, float, float] = BLACK
-    ) -> None:
+    def __init__(self, arrays: Gaussians, background: tuple[float, float, float] = BLACK) -> None:
         geometry = find("gaussiandreamer-cloud")({"sh_degree": math.isqrt(arrays.sh.shape[1]) - 1})
         geometry.set_arrays(**arrays._asdict())
         behind = find("gaussiandreamer-background")({"color": list(background)})

@@ -27,7 +27,7 @@ from jaxtyping import Float
 from ..cameras import look_at
 from ..core import images as files_of_pictures
 from ..core.errors import UserError
-from ..formats.ply import GaussianArrays, opaque
+from ..gaussians.gaussians import Gaussians, opaque
 from ..gaussians.surface import gaussian_surface, write_obj
 from .results import Pictures, Result, read_result
 
@@ -101,7 +101,7 @@ def _write_stand_ins(folder: Path, size: int) -> None:
         )
 
 
-def _write_result(save: Path, arrays: GaussianArrays, size: int) -> None:
+def _write_result(save: Path, arrays: Gaussians, size: int) -> None:
     pictures = Pictures(arrays)
     quality = icosphere(2, RADIUS)
     _write_views(
@@ -168,7 +168,7 @@ def towards_origin(positions: Float[np.ndarray, "V 3"]) -> Float[torch.Tensor, "
     return look_at(place, torch.zeros_like(place), up)
 
 
-def normalized(arrays: GaussianArrays) -> GaussianArrays:
+def normalized(arrays: Gaussians) -> Gaussians:
     """The cloud moved and scaled so that the centres of its visible Gaussians have mean 0 and lie
     in [-1, 1]^3.
     """

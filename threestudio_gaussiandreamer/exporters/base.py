@@ -8,7 +8,7 @@ import os
 from dataclasses import dataclass
 
 from ..core.errors import UserError
-from ..formats.ply import GaussianArrays
+from ..gaussians.gaussians import Gaussians
 from ..host import BaseGeometry, Exporter
 
 
@@ -39,8 +39,6 @@ def require_file_name(name: str) -> None:
         raise UserError(f"save_name: expected the name of a file, without folders, got {name!r}")
 
 
-def gaussian_arrays(geometry: BaseGeometry) -> GaussianArrays:
+def gaussian_arrays(geometry: BaseGeometry) -> Gaussians:
     """The parameters of a geometry as float32 arrays on the CPU."""
-    return GaussianArrays(
-        *(getattr(geometry, name).detach().float().cpu().numpy() for name in GaussianArrays._fields)
-    )
+    return Gaussians.of(geometry).arrays()

@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from typing import List
 
 from ..core.errors import UserError
-from ..formats.ply import opaque, sh0_colors
+from ..gaussians.gaussians import opaque
 from ..gaussians.point_cloud import PointCloud
+from ..gaussians.sh import sh0_colors
 from ..host import ExporterOutput, register
 from .base import FileExporter, gaussian_arrays
 

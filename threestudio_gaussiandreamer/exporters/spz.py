@@ -14,7 +14,7 @@ z up to y up, SPZ's axes."""
 from dataclasses import dataclass
 from typing import List
 
-from ..formats.ply import usable
+from ..gaussians.gaussians import usable
 from ..host import ExporterOutput, register, warn
 from .base import FileExporter, gaussian_arrays
 

@@ -17,15 +17,9 @@ from jaxtyping import Float
 
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file
+from ..gaussians.gaussians import Gaussians, usable
 from ..gaussians.sh import sh_basis
-from .ply import (
-    GaussianArrays,
-    gaussians_size,
-    read_comments,
-    read_gaussians,
-    usable,
-    write_gaussians,
-)
+from .ply import gaussians_size, read_comments, read_gaussians, write_gaussians
 from .spz import read_spz, read_spz_comment, spz_arrays, spz_bytes, write_spz
 
 logger = logging.getLogger(__name__)
@@ -46,7 +40,7 @@ AXES = {
 class StoredCloud(NamedTuple):
     """A cloud and what its file says about it."""
 
-    arrays: GaussianArrays
+    gaussians: Gaussians
     up: str = OUR_UP
     """The axis that is up, a key of ``AXES``."""
     pruned_to: Optional[float] = None
@@ -86,14 +80,14 @@ def read_cloud(path: str, *, up: Optional[str] = None) -> StoredCloud:
     return StoredCloud(drawable(arrays), up, _number(_note(notes, PRUNED)))
 
 
-def drawable(arrays: GaussianArrays) -> GaussianArrays:
+def drawable(arrays: Gaussians) -> Gaussians:
     """The Gaussians that can be drawn; says how many can't."""
     keep = usable(arrays)
     if not keep.all():
         logger.warning(
             "%d of %d Gaussians hold NaN or infinity: left out", (~keep).sum(), len(keep)
         )
-    return GaussianArrays(*(values[keep] for values in arrays))
+    return arrays.rows(keep)
 
 
 def _note(notes: list[str], key: str) -> str:
@@ -117,7 +111,7 @@ def write_cloud(path: str, cloud: StoredCloud) -> None:
     suffix = require_format(path, "OUT")
     if suffix == ".ply":
         write_gaussians(
-            path, **cloud.arrays._asdict(), comments=ply_notes(cloud.up, cloud.pruned_to)
+            path, **cloud.gaussians._asdict(), comments=ply_notes(cloud.up, cloud.pruned_to)
         )
     else:
         write_spz(path, **in_axes(cloud, "y")._asdict(), comment=spz_note(cloud.pruned_to))
@@ -137,7 +131,7 @@ def file_size(cloud: StoredCloud, suffix: str) -> int:
     """The bytes of the file that :func:`write_cloud` makes."""
     if suffix == ".spz":
         return len(spz_bytes(in_axes(cloud, "y"), comment=spz_note(cloud.pruned_to)))
-    return gaussians_size(*cloud.arrays.sh.shape[:2], ply_notes(cloud.up, cloud.pruned_to))
+    return gaussians_size(*cloud.gaussians.sh.shape[:2], ply_notes(cloud.up, cloud.pruned_to))
 
 
 def as_stored(cloud: StoredCloud, suffix: str) -> StoredCloud:
@@ -145,15 +139,19 @@ def as_stored(cloud: StoredCloud, suffix: str) -> StoredCloud:
     if suffix == ".ply":
         return cloud
     back = StoredCloud(spz_arrays(spz_bytes(in_axes(cloud, "y"))), "y")
-    return cloud._replace(arrays=in_axes(back, cloud.up))
+    return cloud._replace(gaussians=in_axes(back, cloud.up))
 
 
 # ---- axes ----------------------------------------------------------------------------------------
 
 
-def in_axes(cloud: StoredCloud, up: str) -> GaussianArrays:
+def in_axes(cloud: StoredCloud, up: str) -> Gaussians:
     """The same Gaussians in coordinates with another axis up."""
-    return cloud.arrays if up == cloud.up else turned(cloud.arrays, rotation_between(cloud.up, up))
+    return (
+        cloud.gaussians
+        if up == cloud.up
+        else turned(cloud.gaussians, rotation_between(cloud.up, up))
+    )
 
 
 def rotation_between(up: str, other: str) -> Float[np.ndarray, "3 3"]:
@@ -161,7 +159,7 @@ def rotation_between(up: str, other: str) -> Float[np.ndarray, "3 3"]:
     return AXES[other].T @ AXES[up]
 
 
-def turned(arrays: GaussianArrays, rotation: Float[np.ndarray, "3 3"]) -> GaussianArrays:
+def turned(arrays: Gaussians, rotation: Float[np.ndarray, "3 3"]) -> Gaussians:
     """The same cloud in other axes: ``rotation`` takes its coordinates to theirs."""
     return arrays._replace(
         means=(arrays.means @ rotation.T).astype(np.float32),

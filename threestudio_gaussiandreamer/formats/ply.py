@@ -21,7 +21,9 @@ from jaxtyping import Bool, Float
 
 from ..core.errors import UserError
 from ..core.files import atomic_file, existing_file
+from ..gaussians.gaussians import Gaussians, usable
 from ..gaussians.point_cloud import PointCloud
+from ..gaussians.sh import sh0_colors
 
 logger = logging.getLogger(__name__)
 
@@ -40,21 +42,6 @@ QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 GAUSSIAN = (*MEANS, *SH_CONSTANT, "opacity", *LOG_SCALES, *QUATS)
 COLORS = ("red", "green", "blue")
 EXACT_COLORS = ("float_red", "float_green", "float_blue")
-
-
-class GaussianArrays(NamedTuple):
-    """Every attribute of N Gaussians as they are stored, float32."""
-
-    means: np.ndarray
-    """(N, 3) world units."""
-    sh: np.ndarray
-    """(N, K, 3) spherical harmonics, K = (degree + 1)²."""
-    logit_opacities: np.ndarray
-    """(N,)"""
-    log_scales: np.ndarray
-    """(N, 3)"""
-    quats: np.ndarray
-    """(N, 4) wxyz, not normalised."""
 
 
 class _Property(NamedTuple):
@@ -103,7 +90,7 @@ def write_gaussians(
 
     Args:
         path: the file; its folder must exist.
-        means, sh, logit_opacities, log_scales, quats: as in :class:`GaussianArrays`; anything numpy
+        means, sh, logit_opacities, log_scales, quats: as in :class:`Gaussians`; anything numpy
           takes as an array.
         pad_sh_degree: append zero harmonics up to this degree, for viewers that insist on degree 3.
         comments: ASCII lines for the header.
@@ -112,7 +99,7 @@ def write_gaussians(
         ValueError: arrays whose shapes don't agree.
         UserError: the file can't be written.
     """
-    arrays = _as_float32(GaussianArrays(means, sh, logit_opacities, log_scales, quats))
+    arrays = _as_float32(Gaussians(means, quats, log_scales, logit_opacities, sh))
     sh = arrays.sh if pad_sh_degree is None else padded_sh(arrays.sh, pad_sh_degree)
     rest = (
         sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), 3 * (sh.shape[1] - 1))
@@ -212,12 +199,12 @@ def _header_bytes(properties: list[tuple[str, str]], count: int, comments: Seque
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
-def _as_float32(arrays: GaussianArrays) -> GaussianArrays:
+def _as_float32(arrays: Gaussians) -> Gaussians:
     count, harmonics = (
         np.shape(arrays.sh)[:2] if np.ndim(arrays.sh) == 3 else (len(arrays.means), 1)
     )
-    shapes = [(count, 3), (count, harmonics, 3), (count,), (count, 3), (count, 4)]
-    return GaussianArrays(
+    shapes = [(count, 3), (count, 4), (count, 3), (count,), (count, harmonics, 3)]
+    return Gaussians(
         *(
             _shaped(values, shape, name)
             for values, shape, name in zip(arrays, shapes, arrays._fields, strict=True)
@@ -240,7 +227,7 @@ def _as_bytes(colors: Float[np.ndarray, "P 3"]) -> np.ndarray:
 # reading
 
 
-def read_gaussians(path: str | os.PathLike, *, allow_non_finite: bool = False) -> GaussianArrays:
+def read_gaussians(path: str | os.PathLike, *, allow_non_finite: bool = False) -> Gaussians:
     """Read trained Gaussians, of any degree of spherical harmonics.
 
     Args:
@@ -265,33 +252,12 @@ def read_gaussians(path: str | os.PathLike, *, allow_non_finite: bool = False) -
     ]:
         more = f" and {len(unknown) - 5} more" if len(unknown) > 5 else ""
         logger.warning("%s: not known here, and left out: %s%s", path, ", ".join(unknown[:5]), more)
-    arrays = GaussianArrays(
-        table[MEANS], _read_sh(table), table["opacity"], table[LOG_SCALES], table[QUATS]
+    arrays = Gaussians(
+        table[MEANS], table[QUATS], table[LOG_SCALES], table["opacity"], _read_sh(table)
     )
     if not allow_non_finite:
         table.require_valid(usable(arrays), "values")
     return arrays
-
-
-def usable(arrays: GaussianArrays) -> Bool[np.ndarray, " N"]:
-    """Whether each Gaussian can be drawn: finite but for opacities of 0 or 1 and flat axes, whose
-    logarithms are infinite.
-    """
-    columns = [
-        np.isfinite(arrays.means),
-        np.isfinite(arrays.quats),
-        np.isfinite(arrays.sh).all(axis=2),
-    ]
-    columns += [~np.isnan(arrays.logit_opacities)[:, None], arrays.log_scales < np.inf]
-    return np.concatenate(columns, axis=1).all(axis=1)
-
-
-def opaque(arrays: GaussianArrays, min_opacity: float) -> Bool[np.ndarray, " N"]:
-    """Whether the opacity of each Gaussian is ``min_opacity``, in [0, 1], or more; at 0 whether it
-    is a number.
-    """
-    with np.errstate(divide="ignore"):
-        return arrays.logit_opacities >= np.log(min_opacity) - np.log1p(-min_opacity)
 
 
 def read_points(path: str | os.PathLike, *, allow_non_finite: bool = False) -> PointCloud:
@@ -422,13 +388,6 @@ def _read_colors(table: _Table) -> Float[np.ndarray, "N 3"]:
         return sh0_colors(table[SH_CONSTANT])
     logger.info("%s has no colours: grey is used", table.path)
     return np.full((table[MEANS].shape[0], 3), 0.5, np.float32)
-
-
-def sh0_colors(sh0: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """The colours, clipped to [0, 1], of constant spherical harmonics."""
-    from ..gaussians.sh import C0
-
-    return (0.5 + np.float32(C0) * sh0).clip(0.0, 1.0)
 
 
 def unit_colors(

@@ -31,7 +31,7 @@ from jaxtyping import Float, Int
 
 from ..core.errors import UserError
 from ..core.files import atomic_file, existing_file
-from .ply import GaussianArrays, usable
+from ..gaussians.gaussians import Gaussians, usable
 
 HEADER = struct.Struct("<4sIIBBBB")
 MAGIC, VERSION = b"NGSP", 3
@@ -73,12 +73,12 @@ def write_spz(path: str | os.PathLike, *, comment: str = "", **arrays: np.ndarra
     Raises:
         UserError: the Gaussians can't be stored, or the file can't be written.
     """
-    data = spz_bytes(GaussianArrays(**arrays), comment=comment)
+    data = spz_bytes(Gaussians(**arrays), comment=comment)
     with atomic_file(path) as file:
         file.write(data)
 
 
-def spz_bytes(arrays: GaussianArrays, *, comment: str = "") -> bytes:
+def spz_bytes(arrays: Gaussians, *, comment: str = "") -> bytes:
     """Gaussians as an SPZ file of version 3, their order along a Morton curve, in which neighbours
     resemble each other.
 
@@ -97,7 +97,7 @@ def spz_bytes(arrays: GaussianArrays, *, comment: str = "") -> bytes:
             f"an SPZ file holds harmonics up to degree 3, not {isqrt(arrays.sh.shape[1]) - 1}"
         )
     order = _morton_order(arrays.means)
-    arrays = GaussianArrays(*(values[order] for values in arrays))
+    arrays = arrays.rows(order)
     fractional = _fractional_bits(arrays)
     header = HEADER.pack(
         MAGIC, VERSION, len(arrays.means), isqrt(arrays.sh.shape[1]) - 1, fractional, 0, 0
@@ -116,7 +116,7 @@ def spz_bytes(arrays: GaussianArrays, *, comment: str = "") -> bytes:
     )
 
 
-def read_spz(path: str | os.PathLike) -> GaussianArrays:
+def read_spz(path: str | os.PathLike) -> Gaussians:
     """The Gaussians of an SPZ file of version 2 or 3, in its axes: right, up, back.
 
     Raises:
@@ -129,7 +129,7 @@ def read_spz(path: str | os.PathLike) -> GaussianArrays:
         raise UserError(f"cannot read {str(path)!r}: {error.strerror or error}.") from error
 
 
-def spz_arrays(packed: bytes, name: str = "") -> GaussianArrays:
+def spz_arrays(packed: bytes, name: str = "") -> Gaussians:
     """The Gaussians in the bytes of an SPZ file, which messages call by its ``name``; see
     :func:`read_spz`.
     """
@@ -144,7 +144,7 @@ def spz_arrays(packed: bytes, name: str = "") -> GaussianArrays:
     rest = (
         harmonics.reshape(header.count, header.blocks[-1] // 3, 3).astype(np.float32) - 128
     ) / 128
-    return GaussianArrays(
+    return Gaussians(
         means=_positions(positions, header.fractional_bits),
         sh=np.concatenate([constant[:, None], rest], axis=1),
         logit_opacities=_logits(alphas[:, 0]),
@@ -236,7 +236,7 @@ def _morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
     )
 
 
-def _fractional_bits(arrays: GaussianArrays) -> int:
+def _fractional_bits(arrays: Gaussians) -> int:
     """Bits behind the point: by the size of the Gaussians, as far as 23 bits hold the largest
     coordinate.
 

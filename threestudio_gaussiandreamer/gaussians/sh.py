@@ -6,6 +6,7 @@ sign. The colour of a direction is ``max(0, 0.5 + sum_k Y_k(direction) sh_k)``."
 
 from math import pi, sqrt
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -15,6 +16,7 @@ from ..core.errors import UserError
 C0 = sqrt(1 / (4 * pi))
 COEFFICIENTS = (1, 4, 9, 16)  # by degree
 SHORTEST_DIRECTION = 1e-12
+Colors = Float[Tensor, "*batch C"] | Float[np.ndarray, "*batch C"]
 
 
 def rgb_to_sh0(rgb: Float[Tensor, "*batch C"]) -> Float[Tensor, "*batch C"]:
@@ -22,9 +24,14 @@ def rgb_to_sh0(rgb: Float[Tensor, "*batch C"]) -> Float[Tensor, "*batch C"]:
     return (rgb - 0.5) / C0
 
 
-def sh0_to_rgb(sh0: Float[Tensor, "*batch C"]) -> Float[Tensor, "*batch C"]:
+def sh0_to_rgb(sh0: Colors) -> Colors:
     """The inverse of `rgb_to_sh0`; not clamped."""
     return 0.5 + C0 * sh0
+
+
+def sh0_colors(sh0: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    """The colours of constant harmonics, clipped to [0, 1], as arrays."""
+    return sh0_to_rgb(sh0).clip(0.0, 1.0)
 
 
 def sh_to_colors(

@@ -21,6 +21,7 @@ from ..core.streams import generator
 from ..metrics import MAX_PSNR, psnr
 from ..splatting import rasterize
 from . import importance as parsimony
+from .gaussians import Gaussians
 from .merge import merge_duplicates
 from .sh import sh_to_colors
 
@@ -44,16 +45,6 @@ NEAR = 0.01
 """The nearest depth that is drawn, in units of the cloud's radius: clouds come in millimetres and
 in kilometres.
 """
-
-
-class Cloud(NamedTuple):
-    """Gaussians as a PLY stores them, as tensors."""
-
-    means: Float[Tensor, "N 3"]
-    quats: Float[Tensor, "N 4"]
-    log_scales: Float[Tensor, "N 3"]
-    logit_opacities: Float[Tensor, " N"]
-    sh: Float[Tensor, "N K 3"]
 
 
 class Views(NamedTuple):
@@ -89,7 +80,7 @@ class Round(NamedTuple):
     """To what the judging views showed at the beginning: :func:`assured_likeness`."""
 
 
-def bounds(cloud: Cloud) -> tuple[Float[Tensor, "3"], float]:
+def bounds(cloud: Gaussians) -> tuple[Float[Tensor, "3"], float]:
     """Centre and radius of what is visible: of the positions' opacity-weighted median, and 99 % of
     the opacity.
     """
@@ -106,7 +97,7 @@ def _quantile(values: Float[Tensor, " N"], weights: Float[Tensor, " N"], share: 
 
 
 def views_around(
-    cloud: Cloud,
+    cloud: Gaussians,
     count: int,
     size: int,
     *,
@@ -138,7 +129,7 @@ def views_around(
 
 
 def draw(
-    cloud: Cloud, views: Views, rows: Tensor, opacities: Optional[Float[Tensor, " N"]] = None
+    cloud: Gaussians, views: Views, rows: Tensor, opacities: Optional[Float[Tensor, " N"]] = None
 ) -> tuple[Tensor, Tensor]:
     """Pictures (B, size, size, 3) of some of the views, and each Gaussian's contribution to them
     (B, N).
@@ -161,13 +152,13 @@ def draw(
 
 
 @torch.no_grad()
-def look(cloud: Cloud, views: Views) -> Float[Tensor, "V H W 3"]:
+def look(cloud: Gaussians, views: Views) -> Float[Tensor, "V H W 3"]:
     """All pictures."""
     return torch.cat([draw(cloud, views, rows)[0] for rows in _chunks(views)])
 
 
 @torch.enable_grad()
-def worth(cloud: Cloud, views: Views, seed: int = 0) -> Float[Tensor, " N"]:
+def worth(cloud: Gaussians, views: Views, seed: int = 0) -> Float[Tensor, " N"]:
     """What each Gaussian shows in all views, by which they are ranked; 0 for one that isn't to be
     seen.
     """
@@ -190,12 +181,12 @@ def _chunks(views: Views) -> tuple[Tensor, ...]:
     return torch.arange(len(views.viewmats)).split(4)
 
 
-def likeness(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"]) -> float:
+def likeness(cloud: Gaussians, views: Views, pictures: Float[Tensor, "V H W 3"]) -> float:
     """PSNR of a cloud's views to other pictures of them, over all pixels."""
     return float(psnr(look(cloud, views).flatten(0, 1), pictures.flatten(0, 1)))
 
 
-def assured_likeness(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 3"]) -> float:
+def assured_likeness(cloud: Gaussians, views: Views, pictures: Float[Tensor, "V H W 3"]) -> float:
     """The PSNR that other views will have too: with two standard errors over these views added to
     their mean squared error.
     """
@@ -206,7 +197,7 @@ def assured_likeness(cloud: Cloud, views: Views, pictures: Float[Tensor, "V H W 
 
 
 def simplify(
-    cloud: Cloud,
+    cloud: Gaussians,
     probes: Views,
     judges: Views,
     budget: Budget,
@@ -214,10 +205,10 @@ def simplify(
     steps: int = 60,
     seed: int = 0,
     report: Callable[[Round], None] = lambda done: None,
-    stored: Callable[[Cloud], Cloud] = lambda cloud: cloud,
+    stored: Callable[[Gaussians], Gaussians] = lambda cloud: cloud,
     sh_reach: float = math.inf,
-    rank: Callable[[Cloud, Views, int], Float[Tensor, " N"]] = worth,
-) -> Cloud:
+    rank: Callable[[Gaussians, Views, int], Float[Tensor, " N"]] = worth,
+) -> Gaussians:
     """The smallest cloud of a series of rounds that meets the budget.
 
     Args:
@@ -243,10 +234,10 @@ def simplify(
 
     fastest = 0
 
-    def judged(cloud: Cloud) -> float:
+    def judged(cloud: Gaussians) -> float:
         return assured_likeness(stored(cloud), judges, before)
 
-    def refitted(cloud: Cloud, done: int) -> tuple[Cloud, Round]:
+    def refitted(cloud: Gaussians, done: int) -> tuple[Gaussians, Round]:
         """Recovered at the fastest pace that makes it no worse; as it was where none does.
 
         The judges say so: what is fitted to looks better while they may lose a dB. A round needs
@@ -273,7 +264,7 @@ def simplify(
     if float(cloud.sh[:, 0].abs().amax()) > sh_reach:
         cloud, _ = refitted(cloud, done)
         scores = rank(cloud, probes, seed)
-    fewer = Cloud(**merge_duplicates(cloud._asdict(), at_least=budget.count or 1).values)
+    fewer = Gaussians(**merge_duplicates(cloud._asdict(), at_least=budget.count or 1).values)
     if len(fewer.means) <= (1 - SMALLEST_DROP) * len(cloud.means):
         fewer, reached = refitted(fewer, done)
         if holds(reached):
@@ -308,42 +299,42 @@ def _next_count(here: int, keep: float, budget: Budget) -> int:
     return here if count >= (1 - SMALLEST_DROP) * here else count
 
 
-def only(cloud: Cloud, scores: Float[Tensor, " N"], count: int) -> Cloud:
+def only(cloud: Gaussians, scores: Float[Tensor, " N"], count: int) -> Gaussians:
     """The ``count`` Gaussians with the highest scores, in their order."""
     rows = torch.argsort(scores, descending=True, stable=True)[:count].sort().values
-    return Cloud(*(values[rows] for values in cloud))
+    return cloud.rows(rows)
 
 
 @torch.enable_grad()
 def recover(
-    cloud: Cloud,
+    cloud: Gaussians,
     views: Views,
     pictures: Float[Tensor, "V H W 3"],
     steps: int,
     seed: int,
     sh_reach: float = math.inf,
     pace: float = 1.0,
-) -> Cloud:
+) -> Gaussians:
     """The cloud fitted to pictures of its former self at ``pace`` times ``RATES``, its constant
     harmonics within ``sh_reach``.
     """
-    leaves = Cloud(*(values.detach().clone().requires_grad_() for values in cloud))
+    leaves = cloud.map(lambda values: values.detach().clone().requires_grad_())
     rates = {name: pace * rate for name, rate in RATES.items()}
     rates["means"] *= bounds(cloud)[1]
     groups = [
         {"params": [leaf], "lr": rates[name]}
-        for name, leaf in zip(Cloud._fields, leaves, strict=True)
+        for name, leaf in zip(Gaussians._fields, leaves, strict=True)
     ]
     adam = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
     for step, rows in enumerate(_batches(len(pictures), steps, seed)):
-        for group, name in zip(adam.param_groups, Cloud._fields, strict=True):
+        for group, name in zip(adam.param_groups, Gaussians._fields, strict=True):
             group["lr"] = rates[name] * (1 - step / steps)
         image, _ = draw(leaves, views, rows)
         ((image - pictures[rows]) ** 2).mean().backward()
         adam.step()
         adam.zero_grad(set_to_none=True)
         leaves.sh.data[:, 0].clamp_(-sh_reach, sh_reach)
-    return Cloud(*(leaf.detach() for leaf in leaves))
+    return leaves.map(Tensor.detach)
 
 
 def _batches(count: int, steps: int, seed: int, size: int = 4) -> Iterator[Tensor]:

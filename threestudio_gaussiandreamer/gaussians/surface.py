@@ -20,7 +20,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.files import atomic_file
-from ..formats.ply import GaussianArrays, opaque, sh0_colors
+from .gaussians import Gaussians, opaque
+from .sh import sh0_colors
 
 REACH = 3.0
 """Standard deviations beyond which a Gaussian doesn't count: exp(-4.5) is 1 %."""
@@ -47,9 +48,7 @@ class Surface(NamedTuple):
     colors: Float[np.ndarray, "V 3"]
 
 
-def gaussian_surface(
-    arrays: GaussianArrays, *, resolution: int = 128, level: float = 0.5
-) -> Surface:
+def gaussian_surface(arrays: Gaussians, *, resolution: int = 128, level: float = 0.5) -> Surface:
     """The surface of a cloud, in its own units; empty where no Gaussian is visible.
 
     Args:
@@ -59,7 +58,7 @@ def gaussian_surface(
     visible = opaque(arrays, MIN_OPACITY)
     if not visible.any():
         return Surface(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)))
-    arrays = GaussianArrays(*(values[visible] for values in arrays))
+    arrays = arrays.rows(visible)
     covariances = _covariances(arrays)
     size = HALF_HEIGHT * np.sqrt(covariances[:, range(3), range(3)])
     low, high = (arrays.means - size).min(axis=0), (arrays.means + size).max(axis=0)
@@ -107,7 +106,7 @@ def write_obj(path: str | os.PathLike, surface: Surface) -> None:
 
 
 def _summed(
-    arrays: GaussianArrays,
+    arrays: Gaussians,
     covariances: Float[np.ndarray, "N 3 3"],
     origin: Float[np.ndarray, "3"],
     cell: float,
@@ -199,7 +198,7 @@ def _falloff(away: Sequence[np.ndarray], precision: Float[np.ndarray, "3 3 *k"])
     )
 
 
-def _covariances(arrays: GaussianArrays) -> Float[np.ndarray, "N 3 3"]:
+def _covariances(arrays: Gaussians) -> Float[np.ndarray, "N 3 3"]:
     w, x, y, z = (
         arrays.quats / np.maximum(np.linalg.norm(arrays.quats, axis=1, keepdims=True), 1e-12)
     ).T.astype(np.float64)

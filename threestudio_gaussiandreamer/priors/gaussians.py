@@ -22,8 +22,10 @@ import numpy as np
 
 from ..core.errors import UserError
 from ..core.files import existing_file
-from ..formats.ply import GaussianArrays, opaque, read_gaussians, sh0_colors, usable
+from ..formats.ply import read_gaussians
+from ..gaussians.gaussians import Gaussians, opaque, usable
 from ..gaussians.point_cloud import PointCloud
+from ..gaussians.sh import sh0_colors
 from ..host import register
 from .base import Prior, is_number, report_non_finite, require_path
 
@@ -51,7 +53,7 @@ class GaussiansPrior(Prior):
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         return self.cloud(self._read())
 
-    def gaussians(self, prompt: str) -> GaussianArrays:
+    def gaussians(self, prompt: str) -> Gaussians:
         """Every attribute of the trained Gaussians, whatever the prompt.
 
         Raises:
@@ -66,11 +68,11 @@ class GaussiansPrior(Prior):
         return self._read()
 
     @staticmethod
-    def cloud(arrays: GaussianArrays) -> PointCloud:
+    def cloud(arrays: Gaussians) -> PointCloud:
         """The coloured centres of Gaussians."""
         return PointCloud(points=arrays.means, colors=sh0_colors(arrays.sh[:, 0]))
 
-    def _read(self) -> GaussianArrays:
+    def _read(self) -> Gaussians:
         path = existing_file(self.cfg.path, "PLY file")
         arrays = read_gaussians(path, allow_non_finite=True)
         keep = usable(arrays)
@@ -82,4 +84,4 @@ class GaussiansPrior(Prior):
                 f"no Gaussians in {str(path)!r} with an opacity of {self.cfg.min_opacity} or "
                 f"more, among {len(keep)}"
             )
-        return GaussianArrays(*(values[keep] for values in arrays))
+        return arrays.rows(keep)

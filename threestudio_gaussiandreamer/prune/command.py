@@ -47,13 +47,12 @@ from ..formats.gaussian_files import (
     rotation_between,
     write_cloud,
 )
-from ..formats.ply import GaussianArrays
 from ..formats.spz import COLOR_REACH
+from ..gaussians.gaussians import Gaussians
 from ..gaussians.simplify import (
     EPS2D,
     LEAST_ERROR,
     Budget,
-    Cloud,
     Round,
     Views,
     assured_likeness,
@@ -259,15 +258,15 @@ def read(path: str, up: Optional[str] = None) -> StoredCloud:
         if checkpoint
         else read_cloud(path, up=up)
     )
-    if len(stored.arrays.means) < 2:
+    if len(stored.gaussians.means) < 2:
         raise UserError(
-            f"{path} holds {len(stored.arrays.means)} Gaussians that can be drawn: there is "
+            f"{path} holds {len(stored.gaussians.means)} Gaussians that can be drawn: there is "
             "nothing to prune"
         )
     return stored
 
 
-def from_checkpoint(file: Path) -> GaussianArrays:
+def from_checkpoint(file: Path) -> Gaussians:
     """The cloud in a training checkpoint."""
     content = load_file(file)
     for key, names in CHECKPOINTS.items():
@@ -279,7 +278,7 @@ def from_checkpoint(file: Path) -> GaussianArrays:
             harmonics = torch.cat(
                 [torch.from_numpy(values.pop(name)) for name in ("sh0", "sh_rest")], 1
             ).numpy()
-            return GaussianArrays(sh=harmonics, **values)
+            return Gaussians(sh=harmonics, **values)
     raise UserError(
         f"{file} holds no cloud of Gaussians: neither our {CHECKPOINTS['state_dict']['means']} "
         "nor gsplat's splats are there"
@@ -386,7 +385,7 @@ def pruned(stored: StoredCloud, options: PruneOptions, suffix: str, where: str) 
     Raises:
         UserError: a budget that can't be met, or values that the format can't hold.
     """
-    started, whole = time.perf_counter(), len(stored.arrays.means)
+    started, whole = time.perf_counter(), len(stored.gaussians.means)
     file_size(stored, suffix)  # says what the format can't hold before any work
     asked = budget_of(options, where, lambda size: _most_within(size, stored, suffix, where))
     after, reached = _simplified(stored, _rest_of(asked, stored), options, suffix)
@@ -394,7 +393,7 @@ def pruned(stored: StoredCloud, options: PruneOptions, suffix: str, where: str) 
         limit := size_in_bytes(options.bytes, f"{where}bytes")
     ):
         # what is left packs worse than it did among the others
-        fewer = min(int(len(after.arrays.means) * limit / size), len(after.arrays.means) - 1)
+        fewer = min(int(len(after.gaussians.means) * limit / size), len(after.gaussians.means) - 1)
         after, reached = _simplified(
             after, Budget(count=counted(fewer, f"{where}bytes, in Gaussians,")), options, suffix
         )
@@ -410,7 +409,9 @@ def pruned(stored: StoredCloud, options: PruneOptions, suffix: str, where: str) 
     if asked.psnr is not None:
         note = asked.psnr if met else spent
     else:
-        note = spent if stored.pruned_to is not None and len(after.arrays.means) == whole else None
+        note = (
+            spent if stored.pruned_to is not None and len(after.gaussians.means) == whole else None
+        )
     return Pruned(stored, after._replace(pruned_to=note), time.perf_counter() - started, met)
 
 
@@ -427,21 +428,18 @@ def _rest_of(asked: Budget, stored: StoredCloud) -> Budget:
         f"no Gaussian goes: this cloud has been pruned to {stored.pruned_to:g} dB already, as "
         "it was judged then"
     )
-    return Budget(count=len(stored.arrays.means))
+    return Budget(count=len(stored.gaussians.means))
 
 
 def _most_within(size: int, stored: StoredCloud, suffix: str, where: str) -> int:
     """How many Gaussians make a file of at most ``size`` bytes: the most whose every so manyth, as
     they are, does.
     """
-    whole = len(stored.arrays.means)
+    whole = len(stored.gaussians.means)
 
     def bytes_of(count: int) -> int:
         rows = np.arange(count) * whole // count
-        return file_size(
-            StoredCloud(GaussianArrays(*(values[rows] for values in stored.arrays)), stored.up),
-            suffix,
-        )
+        return file_size(StoredCloud(stored.gaussians.rows(rows), stored.up), suffix)
 
     if bytes_of(1) > size:
         raise UserError(
@@ -469,7 +467,7 @@ def _simplified(
             bar.set_postfix_str(f"{done.count} Gaussians, {done.psnr:.2f} dB")
             bar.update()
 
-        def written(fewer: Cloud) -> Cloud:
+        def written(fewer: Gaussians) -> Gaussians:
             return tensors_of(as_stored(stored_cloud(fewer, stored), suffix))
 
         fewer = simplify(
@@ -503,22 +501,15 @@ def views_of(stored: StoredCloud, options: PruneOptions) -> list[Views]:
     ]
 
 
-def tensors_of(stored: StoredCloud) -> Cloud:
+def tensors_of(stored: StoredCloud) -> Gaussians:
     """The cloud on the device that renders."""
-    return Cloud(
-        *(
-            torch.as_tensor(getattr(stored.arrays, name)).float().to(get_device())
-            for name in Cloud._fields
-        )
-    )
+    return stored.gaussians.tensors(get_device())
 
 
-def stored_cloud(cloud: Cloud, like: Optional[StoredCloud] = None) -> StoredCloud:
+def stored_cloud(cloud: Gaussians, like: Optional[StoredCloud] = None) -> StoredCloud:
     """A cloud to be written, with the axes of another one or our own."""
-    arrays = GaussianArrays(
-        **{name: values.detach().cpu().numpy() for name, values in cloud._asdict().items()}
-    )
-    return StoredCloud(arrays) if like is None else like._replace(arrays=arrays)
+    gaussians = cloud.arrays()
+    return StoredCloud(gaussians) if like is None else like._replace(gaussians=gaussians)
 
 
 # ---- telling -------------------------------------------------------------------------------------
@@ -565,7 +556,7 @@ def sheet(pictures: list[Tensor]) -> Any:
     return (torch.cat(rows, 0).clamp(0, 1).cpu().numpy() * 255).round().astype("uint8")
 
 
-def frame_time(cloud: Cloud, views: Views) -> float:
+def frame_time(cloud: Gaussians, views: Views) -> float:
     """Milliseconds of one view, the median."""
     times = []
     for view in range(min(5, len(views.viewmats))):

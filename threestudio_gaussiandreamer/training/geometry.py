@@ -58,6 +58,7 @@ from ..core.streams import generator, numpy_generator
 from ..gaussians import densify, sh, simplify
 from ..gaussians import importance as parsimony
 from ..gaussians.densify import LOG_SCALE_RANGE, PARAMETERS, Change, Rules, Statistics
+from ..gaussians.gaussians import Gaussians
 from ..gaussians.grow import SCALE_RULES, grow, nearest_distance_scales
 from ..gaussians.merge import merge_duplicates
 from ..gaussians.point_cloud import PointCloud
@@ -287,10 +288,7 @@ class GaussianCloud(BaseGeometry):
         prior = self.prior()
         if self.cfg.keep_attributes and hasattr(prior, "gaussians"):
             arrays = prior.gaussians(prompt)
-            trained = simplify.Cloud(
-                *(torch.as_tensor(getattr(arrays, name)) for name in simplify.Cloud._fields)
-            )
-            self.set_arrays(**self._capped_trained(trained)._asdict())
+            self.set_arrays(**self._capped_trained(arrays.tensors())._asdict())
             cloud = prior.cloud(arrays)
         else:
             cloud = make_cloud(prior, prompt) if make_cloud else prior(prompt)
@@ -370,7 +368,7 @@ class GaussianCloud(BaseGeometry):
         )
         return points[rows], colors[rows]
 
-    def _capped_trained(self, cloud: simplify.Cloud) -> simplify.Cloud:
+    def _capped_trained(self, cloud: Gaussians) -> Gaussians:
         """At most ``max_gaussians`` of trained Gaussians: those that show most in views from all
         around.
         """
@@ -381,7 +379,7 @@ class GaussianCloud(BaseGeometry):
             len(cloud.means),
             self.cfg.max_gaussians,
         )
-        cloud = simplify.Cloud(*(values.to(self.means.device) for values in cloud))
+        cloud = cloud.tensors(self.means.device)
         shown = simplify.worth(cloud, simplify.views_around(cloud, *CAP_VIEWS))
         return simplify.only(cloud, shown, self.cfg.max_gaussians)
 

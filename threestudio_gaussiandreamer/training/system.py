@@ -42,8 +42,9 @@ from ..core.errors import UserError, unknown
 from ..core.nested import adopt_nested
 from ..exporters.base import gaussian_arrays
 from ..formats.gaussian_files import OUR_UP, StoredCloud, drawable, in_axes, ply_notes, spz_note
-from ..formats.ply import GaussianArrays, write_gaussians, write_points
+from ..formats.ply import write_gaussians, write_points
 from ..formats.spz import write_spz
+from ..gaussians.gaussians import Gaussians
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.simplify import EPS2D
 from ..gaussians.surface import Surface, write_obj
@@ -569,7 +570,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             StoredCloud(drawable(gaussian_arrays(self.geometry))), options, suffix, "system.prune."
         )
         geometry = find(self.cfg.geometry_type)(self.cfg.geometry)
-        geometry.set_arrays(**done.after.arrays._asdict())
+        geometry.set_arrays(**done.after.gaussians._asdict())
         self.export_cloud(geometry, folder, done.after.pruned_to)
         write_report(self.get_save_path(f"{folder}/report"), done, suffix, options)
 
@@ -598,7 +599,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         path = self.get_save_path(filename)
         write_spz(
             path,
-            **in_axes(StoredCloud(GaussianArrays(**arrays)), "y")._asdict(),
+            **in_axes(StoredCloud(Gaussians(**arrays)), "y")._asdict(),
             comment=spz_note(pruned_to),
         )
         return path
