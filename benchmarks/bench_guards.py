@@ -21,10 +21,15 @@ from bench_splatting import make_camera, make_scene
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0
 from threestudio_gaussiandreamer.guidance.base import ScoreDistillation, _bad_items
 from threestudio_gaussiandreamer.splatting import RasterizeOptions, api, rasterize
+from threestudio_gaussiandreamer.training.finite import (
+    CHECK_EVERY,
+    optimizer_tensors,
+    require_finite,
+)
 from threestudio_gaussiandreamer.training.geometry import LOG_SCALE_RANGE, GaussianCloud
 
 RESULTS = Path(__file__).parent / "results/guards.csv"
-LOG_EVERY = 10  # steps between two looks at the cloud's limits, as in configs/demo.yaml
+LOG_EVERY = 10  # steps between two looks at the cloud's sizes, as in configs/demo.yaml
 
 
 class Pixels(ScoreDistillation):
@@ -123,8 +128,11 @@ class Bench:
         norms = self.means2d_grad[..., 0]
         torch.where(norms.isfinite(), norms, torch.zeros_like(norms))
 
-    def limits_are_looked_at(self) -> None:
-        self.geometry.warn_of_limits()
+    def sizes_are_looked_at(self) -> None:
+        self.geometry.warn_of_clamped_sizes()
+
+    def parameters_and_moments_are_finite(self) -> None:
+        require_finite(optimizer_tensors(self.optimizer), step=0)
 
 
 def milliseconds(function: Callable[[], None], seconds: float) -> float:
@@ -156,7 +164,8 @@ def main() -> None:
     step, forward = (milliseconds(f, options.seconds) for f in (bench.step, bench.forward_only))
     guards = {
         bench.arguments_are_checked: 1, bench.log_scales_are_clamped: 1, bench.bad_items_are_counted: 1,
-        bench.gradients_of_the_statistics_are_finite: 1, bench.limits_are_looked_at: LOG_EVERY,
+        bench.gradients_of_the_statistics_are_finite: 1, bench.sizes_are_looked_at: LOG_EVERY,
+        bench.parameters_and_moments_are_finite: CHECK_EVERY,
     }  # fmt: skip
     rows = [
         (f.__name__.replace("_", " "), milliseconds(f, 0.5) / every, step)

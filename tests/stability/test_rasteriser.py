@@ -29,6 +29,7 @@ from splatting_scenes import (
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import PRESETS, rasterize
+from threestudio_gaussiandreamer.training.finite import require_finite
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
@@ -232,7 +233,7 @@ def test_log_scales_are_clamped_in_the_parameterisation(measured, caplog):
         logit_opacities=torch.zeros(3),
         sh=torch.zeros(3, 1, 3),
     )
-    geometry.warn_of_limits()
+    geometry.warn_of_clamped_sizes()
     assert not caplog.records
     with torch.no_grad():
         geometry.log_scales[:2] = torch.tensor([[-1e3], [1e3]])
@@ -241,7 +242,7 @@ def test_log_scales_are_clamped_in_the_parameterisation(measured, caplog):
         high.log(), torch.tensor(10.0)
     )
     for _ in range(2):
-        geometry.warn_of_limits()
+        geometry.warn_of_clamped_sizes()
     assert len(caplog.records) == 1 and "2 of 3" in caplog.text
     measured("log scales in [-20, 10], warned once")
 
@@ -460,21 +461,14 @@ def test_a_poisoned_gaussian_changes_no_bit_of_the_others(backend, measured):
 
 
 @row("A1", "NaN/Inf inputs")
-def test_training_says_once_that_gaussians_are_dropped(measured, caplog):
-    geometry, zeros = GaussianCloud({}), torch.zeros(3, 3)
-    geometry.set_arrays(
-        means=zeros,
-        log_scales=zeros,
-        quats=torch.ones(3, 4),
-        logit_opacities=torch.zeros(3),
-        sh=torch.zeros(3, 1, 3),
-    )
+def test_training_stops_where_the_cloud_is_not_finite(measured):
+    geometry = GaussianCloud({})
+    geometry._allocate(3)
     with torch.no_grad():
         geometry.sh0[2, 0, 1] = math.nan
-    for _ in range(2):
-        geometry.warn_of_limits()
-    assert len(caplog.records) == 1 and "1 of 3" in caplog.text and "number 2" in caplog.text
-    measured("dropped ones are counted in the log")
+    with pytest.raises(UserError, match="1 of the 9 numbers of sh0"):
+        require_finite(geometry.named_parameters(), step=25)
+    measured("training stops, and names the parameter")
 
 
 @row("A1", "NaN/Inf inputs")

@@ -205,7 +205,7 @@ class GaussianCloud(BaseGeometry):
     def configure(self) -> None:
         self.Config.check(self.cfg)
         self.bands = (self.cfg.sh_degree + 1) ** 2
-        self._warned: set[str] = set()
+        self._warned = False
         self._allocate(0)
 
     # -- size --------------------------------------------------------------------------------------
@@ -399,31 +399,22 @@ class GaussianCloud(BaseGeometry):
             self.log_scales.clamp_(*LOG_SCALE_RANGE)
 
     @torch.no_grad()
-    def warn_of_limits(self) -> None:
-        """Say once that Gaussians aren't drawn since a number of theirs isn't finite, and once that
-        sizes are beyond their bounds.
-        """
-        (low, high), named = LOG_SCALE_RANGE, self.parameters_by_name().values()
-        usual = self.log_scales.clamp(low, high).equal(self.log_scales) and all(
-            parameter.sum().isfinite() for parameter in named
-        )
-        if usual:  # a sum is finite only if all its terms are
-            return
-        finite = torch.stack([_finite_rows(parameter) for parameter in named]).all(0)
+    def warn_of_clamped_sizes(self) -> None:
+        """Say once that some Gaussians are drawn at the bounds of ``LOG_SCALE_RANGE``."""
+        low, high = LOG_SCALE_RANGE
         clamped = ((self.log_scales < low) | (self.log_scales > high)).any(-1)
-        for name, rows in (
-            ("hold NaN or infinity and aren't drawn", ~finite),
-            (f"are drawn at e^{low:g} or e^{high:g}, their bounds", clamped),
-        ):
-            if name not in self._warned and rows.any():
-                self._warned.add(name)
-                logger.warning(
-                    "%d of %d Gaussians %s; the first is number %d",
-                    rows.sum(),
-                    len(self),
-                    name,
-                    rows.nonzero()[0],
-                )
+        if self._warned or not clamped.any():
+            return
+        self._warned = True
+        logger.warning(
+            "%d of %d Gaussians are drawn at e^%g or e^%g, the bounds of their sizes; the first is "
+            "number %d",
+            clamped.sum(),
+            len(self),
+            low,
+            high,
+            clamped.nonzero()[0],
+        )
 
     def parameters_by_name(self) -> dict[str, nn.Parameter]:
         return {name: getattr(self, name) for name in PARAMETERS}
@@ -656,13 +647,6 @@ def _check_budget(cfg: Any, where: str) -> None:
             raise UserError(f"{where}.prune.{name}: expected {least} or more, got {prune[name]}")
     if prune.start >= prune.stop:
         raise UserError(f"{where}.prune: expected start < stop, got {prune.start} and {prune.stop}")
-
-
-def _finite_rows(parameter: Tensor) -> Bool[Tensor, " N"]:
-    finite = parameter.isfinite()
-    while finite.dim() > 1:
-        finite = finite.all(-1)
-    return finite
 
 
 def rounds_of(schedule: Any) -> range:

@@ -61,6 +61,7 @@ from ..metrics import psnr
 from ..priors.cache import cached_cloud
 from ..prune.command import PruneOptions, pruned, write_report
 from .background import FlatBackground
+from .finite import CHECK_EVERY, optimizer_tensors, require_finite
 from .held_out import EvaluationConfig, HeldOut, Measurements
 
 REGULARISERS = ("sparsity", "opaque")
@@ -166,12 +167,20 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             restore_learnt(self.guidance, self._learnt)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.require_finite()  # before the file of an earlier, good state is replaced
         super().on_save_checkpoint(checkpoint)
         checkpoint["guidance"] = learnt_weights(self.guidance)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_load_checkpoint(checkpoint)
         self._learnt = checkpoint.get("guidance")
+
+    def require_finite(self) -> None:
+        """Check parameters and optimiser state; see :func:`.finite.require_finite`."""
+        of_optimizers = (
+            named for optimizer in self.trainer.optimizers for named in optimizer_tensors(optimizer)
+        )
+        require_finite([*self.named_parameters(), *of_optimizers], self.true_global_step)
 
     def ensure_cloud(self) -> None:
         """Run the prior, unless a checkpoint brought the cloud."""
@@ -195,6 +204,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             )
 
     def on_train_start(self) -> None:
+        self.require_finite()
         self.warn_of_a_tight_schedule()
         if self.global_step == 0:
             self.score("prior")
@@ -277,6 +287,8 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         optimizer.step()
         if self.loss_scale() < loss_scale:
             self.count_skipped_step(loss_scale)
+        if self.global_step % CHECK_EVERY == 0:
+            self.require_finite()
         optimizer.zero_grad(set_to_none=True)
         # self.optimizers() wraps the torch optimiser, whose rows have to follow the Gaussians
         prices: list[Price] = []
@@ -413,7 +425,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         if truth is not None:
             shown["dB"] = psnr(out["comp_rgb"].detach(), truth).mean()
         self.log_dict(shown, prog_bar=True)
-        self.geometry.warn_of_limits()
+        self.geometry.warn_of_clamped_sizes()
 
     def truth(
         self, batch: dict[str, Any], out: dict[str, Any]
@@ -576,12 +588,15 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     def on_validation_start(self) -> None:
         self.ensure_cloud()
+        self.require_finite()
 
     def on_test_start(self) -> None:
         self.ensure_cloud()
+        self.require_finite()
 
     def on_predict_start(self) -> None:
         self.ensure_cloud()
+        self.require_finite()
         super().on_predict_start()
 
     def on_predict_epoch_end(self) -> None:
