@@ -16,42 +16,42 @@ test: $(VENV)/ready-for-tests                ## the whole test suite, as CI runs
 
 stability: $(VENV)/ready-for-tests          ## every known way to fail, provoked and measured: docs/stability.md
 	$(ENVIRON) $(BIN)/python -m pytest tests/stability --stability-report stability.json; status=$$?; \
-	$(BIN)/python tests/stability/report.py stability.json docs/stability.md; rm -f stability.json; exit $$status
+	$(BIN)/python -m tests.stability.report stability.json docs/stability.md; rm -f stability.json; exit $$status
 
 fuzz: $(VENV)/ready-for-tests               ## damaged files at every door, hostile Gaussians, random lives of a cloud; about half an hour
-	$(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python benchmarks/fuzz.py
+	$(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.robustness.fuzz
 
 long-run: $(VENV)/ready            ## 20,000 steps with 50 random kills, against the undisturbed run; a quarter of an hour
-	$(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python benchmarks/long_run.py
+	$(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.robustness.long_run
 
 ablations: $(VENV)/ready           ## the paper's ablations as a table, measured against a known truth
-	$(ENVIRON) $(BIN)/python benchmarks/ablations.py
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.ablations
 
 bench: $(VENV)/ready-for-tests     ## the rasteriser's speed and memory, beside gsplat's torch functions
-	$(ENVIRON) $(BIN)/python benchmarks/bench_splatting.py
+	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.bench_splatting
 
 gpu-check: $(VENV)/ready-for-tests ## everything that waits for an NVIDIA GPU: correctness, speed beside gsplat, a training step
-	$(ENVIRON) $(BIN)/python benchmarks/gpu_check.py
+	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.gpu_check
 
 charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbers beside them
-	$(ENVIRON) $(BIN)/python benchmarks/chart_splatting.py --from-csv
-	$(ENVIRON) $(BIN)/python benchmarks/chart_runs.py
-	$(ENVIRON) $(BIN)/python benchmarks/attributes.py --objects
+	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting --from-csv
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.chart_runs
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.attributes --objects
 
 # the meshes to measure on: make measure-charts OBJECTS="toy.glb path/to/spot.glb path/to/duck.glb"
 OBJECTS = toy.glb
 
 measure-charts: $(VENV)/ready-for-charts     ## the numbers anew, about two hours a mesh; runs that are in the CSVs are not repeated
-	$(ENVIRON) $(BIN)/python benchmarks/chart_splatting.py
-	$(ENVIRON) $(BIN)/python benchmarks/runs.py --objects $(OBJECTS)
-	$(ENVIRON) $(BIN)/python benchmarks/chart_runs.py
-	$(ENVIRON) $(BIN)/python benchmarks/failure_table.py
-	$(ENVIRON) $(BIN)/python benchmarks/attributes.py --objects $(OBJECTS) --seeds 0 1 2 3 4
-	$(ENVIRON) $(BIN)/python benchmarks/after_run.py --objects $(OBJECTS) --seeds 0 1 2 3 4
-	$(ENVIRON) $(BIN)/python benchmarks/viewers.py --objects $(OBJECTS)
-	$(ENVIRON) $(BIN)/python benchmarks/known_answer.py
-	$(ENVIRON) $(BIN)/python benchmarks/known_answer.py --count 1000
-	$(ENVIRON) $(BIN)/python benchmarks/bench_prune.py
+	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.runs --objects $(OBJECTS)
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.chart_runs
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.failure_table
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.attributes --objects $(OBJECTS) --seeds 0 1 2 3 4
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.after_run --objects $(OBJECTS) --seeds 0 1 2 3 4
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.viewers --objects $(OBJECTS)
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.known_answer
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.known_answer --count 1000
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.bench_prune
 
 # installed once; again when what is installed changes
 PACKAGE = pyproject.toml setup.py constraints.txt $(wildcard threestudio_gaussiandreamer/splatting/cpu/*.h threestudio_gaussiandreamer/splatting/cpu/*.cpp threestudio_gaussiandreamer/splatting/shared/*.h)

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, Optional
 
 import torch
-from splatting_scenes import NAMES, Cloud, cotangents
 from torch import Tensor
 
+from tests.helpers.splatting_scenes import NAMES, Cloud, cotangents
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
 from threestudio_gaussiandreamer.splatting import Rasterized, rasterize
 

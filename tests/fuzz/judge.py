@@ -12,8 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from targets import TARGETS, Misread, Target, mutant
-
+from tests.fuzz.targets import TARGETS, Misread, Target, mutant
 from threestudio_gaussiandreamer.core.errors import UserError
 
 SECONDS = 10.0

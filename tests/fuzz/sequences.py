@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-from targets import require_picture
 from torch import Tensor
 
+from tests.fuzz.targets import require_picture
 from threestudio_gaussiandreamer.gaussians.densify import Change
 from threestudio_gaussiandreamer.splatting import Rasterized
 from threestudio_gaussiandreamer.training.geometry import STATISTICS, GaussianCloud

@@ -15,13 +15,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
-import mutations
 import numpy as np
-import oracles
 import torch
-from mutations import BINARY, TEXT, Mutator, Packing
-from oracles import Illegal
 
+from tests.fuzz import mutations, oracles
+from tests.fuzz.mutations import BINARY, TEXT, Mutator, Packing
+from tests.fuzz.oracles import Illegal
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, save_file
 from threestudio_gaussiandreamer.core.errors import UserError

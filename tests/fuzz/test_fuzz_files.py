@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from judge import judged, outcomes
-from mutations import BINARY, TEXT, mutant
-from targets import TARGETS, Misread, Target, seeds
 
+from tests.fuzz.judge import judged, outcomes
+from tests.fuzz.mutations import BINARY, TEXT, mutant
+from tests.fuzz.targets import TARGETS, Misread, Target, seeds
 from threestudio_gaussiandreamer.core.errors import UserError
 
 CORPUS = sorted(path for path in Path(__file__).with_name("corpus").rglob("*") if path.is_file())

@@ -4,8 +4,8 @@ import functools
 
 import pytest
 import torch
-from backends import BACKENDS, cuda_on_the_host, each_backend
-from hostile import (
+
+from tests.fuzz.hostile import (
     Drawn,
     Scene,
     disagreement,
@@ -16,6 +16,7 @@ from hostile import (
     hostile_scene,
     well_posed,
 )
+from tests.stability.backends import BACKENDS, cuda_on_the_host, each_backend
 
 SCENES, MOST = range(12), 600
 ORDINARY = 8

@@ -3,8 +3,8 @@
 import pytest
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis.stateful import run_state_machine_as_test
-from sequences import CloudLife
 
+from tests.fuzz.sequences import CloudLife
 from threestudio_gaussiandreamer.gaussians import densify
 
 

@@ -4,8 +4,8 @@ where they can be compiled for it.
 
 import pytest
 import torch
-from cuda_shim.machine import HostMachine, unavailable
 
+from tests.helpers.cuda_shim.machine import HostMachine, unavailable
 from threestudio_gaussiandreamer.splatting import api, available_backends
 from threestudio_gaussiandreamer.splatting.cuda import backend as cuda
 from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver

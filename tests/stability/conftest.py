@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any, Callable, Optional
 
 import pytest
-from backends import cuda_on_the_host
-from rows import ROWS
+
+from tests.stability.backends import cuda_on_the_host
+from tests.stability.rows import ROWS
 
 REPORT = pytest.StashKey[list]()
 

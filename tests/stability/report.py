@@ -1,7 +1,7 @@
 """Turns what the rows measured (``pytest tests/stability --stability-report FILE``) into
 docs/stability.md.
 
-python tests/stability/report.py FILE docs/stability.md
+python -m tests.stability.report FILE docs/stability.md
 """
 
 import csv
@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from rows import GROUPS, ROWS, Row
+from tests.stability.rows import GROUPS, ROWS, Row
 
 GUARDS = Path(__file__).parents[2] / "benchmarks/results/guards.csv"
 INTRO = """# Where methods fail, and what happens here
@@ -135,7 +135,7 @@ def changed_bars(rows: list[Row], by_row: dict[tuple[str, str], list[dict]]) -> 
 
 
 def cost_of_guards() -> str:
-    """The figures of ``benchmarks/bench_guards.py``, which times what no test may."""
+    """The figures of ``benchmarks/robustness/bench_guards.py``, which times what no test may."""
     rows = list(csv.DictReader(GUARDS.open()))
     where = (
         "{gaussians} Gaussians, {views} views of {size} x {size} pixels, {threads} threads".format(
@@ -145,7 +145,7 @@ def cost_of_guards() -> str:
     lines = [
         "## What the guards cost",
         "",
-        f"Measured by `benchmarks/bench_guards.py`: {where}. The bar is 2 %.",
+        f"Measured by `benchmarks/robustness/bench_guards.py`: {where}. The bar is 2 %.",
         "",
     ]
     lines += [table_line(["Guard", "ms", "of ms", "%"]), table_line(["---"] * 4)]

@@ -3,8 +3,9 @@ with.
 """
 
 import torch
-from splatting_scenes import Cloud, Run, one_gaussian
 from torch import Tensor
+
+from tests.helpers.splatting_scenes import Cloud, Run, one_gaussian
 
 
 def joined(*clouds: Cloud) -> Cloud:

@@ -7,7 +7,8 @@ import re
 from pathlib import Path
 
 import pytest
-from rows import FAULTS, OTHERS, ROWS
+
+from tests.stability.rows import FAULTS, OTHERS, ROWS
 
 FOLDER = Path(__file__).parent
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from rows import row
 from scipy.spatial import cKDTree
-from small_runs import DEMO, Ended, differences, launch
 
+from tests.stability.rows import row
+from tests.stability.small_runs import DEMO, Ended, differences, launch
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.cameras import orbit_c2w
 from threestudio_gaussiandreamer.core.errors import UserError

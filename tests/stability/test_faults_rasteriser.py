@@ -7,10 +7,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from backends import each_backend
-from rows import row
-from scenes import clamped_alpha, clamped_slope, joined, plain_image, stack
-from splatting_scenes import (
+
+from tests.helpers.splatting_scenes import (
     NO_CUTOFFS,
     Cloud,
     cameras,
@@ -19,7 +17,9 @@ from splatting_scenes import (
     psnr,
     random_cloud,
 )
-
+from tests.stability.backends import each_backend
+from tests.stability.rows import row
+from tests.stability.scenes import clamped_alpha, clamped_slope, joined, plain_image, stack
 from threestudio_gaussiandreamer import cameras as host_cameras
 from threestudio_gaussiandreamer.gaussians.grow import nearest_distance_scales
 from threestudio_gaussiandreamer.splatting import rasterize, tiles

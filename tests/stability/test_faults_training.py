@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from rows import row
-from small_runs import TowardsGrey
 from torch import nn
 
+from tests.stability.rows import row
+from tests.stability.small_runs import TowardsGrey
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.streams import generator
 from threestudio_gaussiandreamer.diffusion import sds

@@ -10,9 +10,9 @@ import pytest
 import scipy.spatial
 import scipy.stats
 import torch
-from rows import row
-from small_runs import launch
 
+from tests.stability.rows import row
+from tests.stability.small_runs import launch
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians

@@ -8,11 +8,9 @@ import math
 
 import pytest
 import torch
-from backends import BACKENDS, each_backend
-from rows import row
-from scenes import finite, joined, pixels, stack
-from splatting_contract import draw
-from splatting_scenes import (
+
+from tests.helpers.splatting_contract import draw
+from tests.helpers.splatting_scenes import (
     NAMES,
     NO_CUTOFFS,
     Cloud,
@@ -26,7 +24,9 @@ from splatting_scenes import (
     random_cloud,
     run,
 )
-
+from tests.stability.backends import BACKENDS, each_backend
+from tests.stability.rows import row
+from tests.stability.scenes import finite, joined, pixels, stack
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import PRESETS, rasterize
 from threestudio_gaussiandreamer.training.finite import require_finite

@@ -8,11 +8,9 @@ import math
 
 import pytest
 import torch
-from backends import BACKENDS, each_backend
-from rows import row
-from scenes import clamped_alpha, finite
-from splatting_contract import draw
-from splatting_scenes import (
+
+from tests.helpers.splatting_contract import draw
+from tests.helpers.splatting_scenes import (
     NAMES,
     NO_CUTOFFS,
     Cloud,
@@ -26,7 +24,9 @@ from splatting_scenes import (
     random_cloud,
     run,
 )
-
+from tests.stability.backends import BACKENDS, each_backend
+from tests.stability.rows import row
+from tests.stability.scenes import clamped_alpha, finite
 from threestudio_gaussiandreamer.splatting import rasterize, tiles
 
 TILTED = torch.tensor([[0.9, 0.2, 0.1, 0.4]], dtype=torch.float64)

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import test_configs
 import torch
 from omegaconf import OmegaConf, open_dict
-from rows import row
-from small_runs import DEMO, Ended, differences, launch
 
+from tests.launch import test_shipped_configs as test_configs
+from tests.stability.rows import row
+from tests.stability.small_runs import DEMO, Ended, differences, launch
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core import images as pictures
 from threestudio_gaussiandreamer.core.checkpoint_file import (

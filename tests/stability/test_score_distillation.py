@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 from lightning.pytorch.plugins import MixedPrecision
-from rows import row
-from small_runs import Ended, TowardsGrey, differences, launch
 
+from tests.stability.rows import row
+from tests.stability.small_runs import Ended, TowardsGrey, differences, launch
 from threestudio_gaussiandreamer import cameras, register_parts
 from threestudio_gaussiandreamer.cameras import Orbit
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -357,7 +357,7 @@ def test_a_prior_keeps_the_faces_apart_and_a_random_start_does_not(tmp_path, mea
 
 @row("A4", "Janus")
 def test_the_table_of_five_seeds(measured):
-    """Runs of 1200 steps at 128 pixels, by `python benchmarks/ablations.py --table faces`."""
+    """Runs of 1200 steps at 128 pixels, by `python -m benchmarks.quality.ablations --table faces`."""
     lines = [
         line
         for line in (RESULTS / "faces.csv").read_text().splitlines()

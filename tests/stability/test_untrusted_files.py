@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from rows import row
-from small_runs import launch
 
 import threestudio_gaussiandreamer
+from tests.stability.rows import row
+from tests.stability.small_runs import launch
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.ply import read_gaussians, read_points, write_gaussians

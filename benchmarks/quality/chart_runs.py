@@ -1,0 +1,294 @@
+"""Draws the run charts: docs/charts/<name>.csv, as `runs.py` measured it, becomes
+docs/charts/<name>.png.
+
+    python -m benchmarks.quality.chart_runs                # all that have been measured
+    python -m benchmarks.quality.chart_runs time count
+
+Lines are medians over the seeds, bands and bars the whole range; every panel is one object, and the
+first is the one that settings were tuned on."""
+
+import argparse
+import statistics
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+from benchmarks.quality.runs import CHARTS, SIZE, rows_of
+
+Row = dict[str, str]
+TUNED_ON = "toy"
+PAPER = "the paper's recipe"
+
+
+class Chart(NamedTuple):
+    """How a CSV is drawn."""
+
+    title: str
+    x: str
+    """The column on the horizontal axis."""
+    x_label: str
+    curves: bool
+    """Whether each run is a curve over its steps, or the one point where it ended."""
+    per_variant: str = "variant"
+    """The column that tells one line from the next."""
+    log_x: bool = True
+    marks_paper: bool = False
+    """Whether the end of the paper's recipe is drawn from the chart ``count``."""
+    size: int = SIZE
+    """Pixels of the renders each way."""
+    chosen_on: tuple[str, ...] = (TUNED_ON,)
+    """The objects that settings were chosen on."""
+    labels_x: bool = False
+    """Whether the points are labelled with the column ``x``."""
+    common: str = ""
+    """The variant that is a point of every line that has none at its place."""
+
+
+DECIBEL = "held-out PSNR, dB"
+COLOURS = [f"C{index}" for index in range(7)] + [
+    "C8",
+    "C9",
+    "navy",
+    "gold",
+    "lime",
+    "indigo",
+    "salmon",
+]
+SECONDS = "CPU seconds of training, one thread"
+RUNS = {
+    "time": Chart("What each kind of score buys per second", "cpu_seconds", SECONDS, curves=True),
+    "count": Chart(
+        "How many Gaussians a scene needs", "gaussians", "Gaussians at the end", curves=False
+    ),
+    "size": Chart(
+        "What rendering larger buys",
+        "cpu_seconds",
+        SECONDS,
+        curves=False,
+        marks_paper=True,
+        labels_x=True,
+    ),
+    "large": Chart(
+        "What rendering at 1024² and shrinking to 512² buys",
+        "cpu_seconds",
+        SECONDS,
+        curves=False,
+        size=512,
+    ),
+    "batch": Chart(
+        "Views per step, at equal seconds",
+        "cpu_seconds",
+        "CPU seconds of training, one thread",
+        True,
+        per_variant="x",
+        marks_paper=True,
+    ),
+    "iterations": Chart("What more steps buy", "x", "steps", curves=False),
+    "rates": Chart(
+        "What the learning rates buy",
+        "x",
+        "times the learning rates of demo.yaml",
+        curves=False,
+        marks_paper=True,
+        common="demo.yaml",
+    ),
+    "dilation": Chart(
+        "What a smaller screen-space dilation buys", "x", "dilation, square pixels", curves=False
+    ),
+    "quality": Chart(
+        "Draft, default and best",
+        "cpu_seconds",
+        SECONDS,
+        curves=True,
+        size=256,
+        chosen_on=(TUNED_ON, "duck"),
+    ),
+    "preset": Chart(
+        "What the rasteriser's presets buy", "cpu_seconds", SECONDS, curves=True, marks_paper=True
+    ),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "charts", nargs="*", help=f"of {', '.join(RUNS)}; default: all that have been measured"
+    )
+    for name in parser.parse_args().charts or RUNS:
+        rows = rows_of(name)
+        if rows:
+            print(draw(name, RUNS[name], rows + papers_own(RUNS[name])))
+
+
+def papers_own(chart: Chart) -> list[Row]:
+    """Where the paper's recipe ends, for charts that have no runs of it; at 1 where the axis counts
+    times something of the demo's.
+    """
+    return [row | {"x": "1"} for row in papers_ends()] if chart.marks_paper else []
+
+
+def papers_ends() -> list[Row]:
+    return [row for row in rows_of("count") if row["variant"] == PAPER and row["step"] != "0"]
+
+
+def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
+    """One figure, a panel for each object; returns the path."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    objects = objects_of(rows)
+    figure, panels = plt.subplots(
+        1, len(objects), figsize=(1.2 + 4.2 * len(objects), 4.6), sharey=True, squeeze=False
+    )
+    labels = list(dict.fromkeys(label_of(chart, row) for row in rows))
+    for panel, name_of_object in zip(panels[0], objects, strict=True):
+        draw_panel(panel, chart, labels, [row for row in rows if row["object"] == name_of_object])
+        panel.set_title(title_of(name_of_object, chart.chosen_on), fontsize=10)
+    panels[0, 0].set_ylabel(DECIBEL)
+    figure.suptitle(chart.title, x=0.01, ha="left", fontweight="bold")
+    handles, _ = panels[0, 0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="lower center", ncols=min(4, len(labels)), frameon=False, fontsize=9
+    )
+    figure.text(0.01, 0.905, caption(rows, chart.size), fontsize=8, color="0.35")
+    figure.tight_layout(rect=(0, 0.06 + 0.04 * ((len(labels) - 1) // 4), 1, 0.93))
+    path = CHARTS / f"{name}.png"
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return path
+
+
+def objects_of(rows: list[Row]) -> list[str]:
+    """Their order in charts and tables: the one that settings were chosen on is the first."""
+    return sorted({row["object"] for row in rows}, key=lambda name: (name != TUNED_ON, name))
+
+
+def title_of(name: str, chosen_on: tuple[str, ...] = (TUNED_ON,)) -> str:
+    """An object, and whether settings were chosen on it."""
+    return name if name in chosen_on else f"{name} (held back from tuning)"
+
+
+def draw_panel(panel: Any, chart: Chart, labels: list[str], rows: list[Row]) -> None:
+    """All lines of one object, in the order and the colours of their labels."""
+    from matplotlib import ticker
+
+    lines = grouped(rows, lambda row: label_of(chart, row))
+    common = lines.get(chart.common, [])
+    for index, label in enumerate(labels):
+        chosen = lines.get(label, [])
+        chosen = chosen + [row for row in common if row["x"] not in {own["x"] for own in chosen}]
+        paper = label.endswith(PAPER)
+        style = {"color": "0.15" if paper else COLOURS[index % len(COLOURS)], "label": label}
+        (draw_curve if chart.curves else draw_points)(
+            panel, chart, chosen, style, "*" if PAPER in label else "o"
+        )
+    if chart.log_x:
+        panel.set_xscale("log")
+        panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+        panel.xaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+        panel.xaxis.set_minor_formatter(ticker.NullFormatter())
+    panel.set_xlabel(chart.x_label)
+    panel.grid(alpha=0.25)
+    panel.spines[["top", "right"]].set_visible(False)
+
+
+def label_of(chart: Chart, row: Row) -> str:
+    return (
+        row["variant"]
+        if chart.per_variant == "variant" or row["variant"] == PAPER
+        else f"{row['x']} views a step"
+    )
+
+
+def draw_curve(
+    panel: Any, chart: Chart, rows: Iterable[Row], style: dict[str, Any], marker: str
+) -> None:
+    """Median over the seeds at each step, the range as a band, a marker at the end."""
+    steps = grouped(
+        (row for row in rows if float(row["cpu_seconds"]) > 0), lambda row: int(row["step"])
+    )
+    points = [(median(at, chart.x), *spread(at)) for _, at in sorted(steps.items())]
+    x, low, middle, high = zip(*points, strict=True)
+    panel.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)
+    panel.plot(x, middle, linewidth=1.6, **style)
+    panel.plot(
+        x[-1:], middle[-1:], marker, color=style["color"], markersize=10 if marker == "*" else 5
+    )
+
+
+def draw_points(
+    panel: Any, chart: Chart, rows: Iterable[Row], style: dict[str, Any], marker: str
+) -> None:
+    """One point for each place: median, and the range over the seeds as a bar."""
+    places = [ends(at) for at in grouped(rows, lambda row: float(row["x"])).values()]
+    points = sorted((median(at, chart.x), *spread(at)) for at in places)
+    x, low, middle, high = (list(column) for column in zip(*points, strict=True))
+    below = [m - b for m, b in zip(middle, low, strict=True)]
+    above = [t - m for m, t in zip(middle, high, strict=True)]
+    size = 11 if marker == "*" else 5
+    panel.errorbar(
+        x, middle, [below, above], marker=marker, markersize=size, linewidth=1.4, capsize=2, **style
+    )
+    for at in places:
+        values = [float(row[chart.x]) for row in at]
+        panel.hlines(spread(at)[1], min(values), max(values), color=style["color"], linewidth=1.4)
+        if chart.labels_x and PAPER not in at[0]["variant"]:
+            place = median(at, chart.x), spread(at)[1]
+            panel.annotate(
+                f"{at[0]['x']}²",
+                place,
+                xytext=(4, -11),
+                textcoords="offset points",
+                fontsize=8,
+                color=style["color"],
+            )
+
+
+def ends(rows: Iterable[Row]) -> list[Row]:
+    """The last row of each run."""
+    return [
+        max(run, key=lambda row: int(row["step"]))
+        for run in grouped(rows, lambda row: row["seed"]).values()
+    ]
+
+
+def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Row]]:
+    groups: dict[Any, list[Row]] = defaultdict(list)
+    for row in rows:
+        groups[key(row)].append(row)
+    return groups
+
+
+def median(rows: list[Row], column: str) -> float:
+    return statistics.median(float(row[column]) for row in rows)
+
+
+def spread(rows: list[Row]) -> tuple[float, float, float]:
+    """Least, median and greatest dB."""
+    values = [float(row["psnr"]) for row in rows]
+    return min(values), statistics.median(values), max(values)
+
+
+def caption(rows: list[Row], size: int = SIZE) -> str:
+    """What a chart was made on."""
+    counts = sorted(
+        {
+            len({row["seed"] for row in same})
+            for same in grouped(rows, lambda row: (row["variant"], row["object"])).values()
+        }
+    )
+    seeds = " to ".join(map(str, dict.fromkeys([counts[0], counts[-1]])))
+    machine, commits = (
+        ", ".join(sorted({row[column] for row in rows})) for column in ("machine", "commit")
+    )
+    spread_over = "one seed" if seeds == "1" else f"{seeds} seeds: median and range"
+    return (
+        f"exact score of a known object, configs/demo.yaml at {size}², {spread_over}; "
+        f"{machine}; commit {commits}"
+    )
+
+
+if __name__ == "__main__":
+    main()

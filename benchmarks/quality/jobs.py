@@ -1,0 +1,355 @@
+"""What is run for each chart and table: variants of configs/demo.yaml as lists of :class:`Job`;
+`runs.py` runs them.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
+
+from benchmarks.quality.ablations import (
+    CLIPPED,
+    LATENT,
+    NO_ANNEALING,
+    PAPER_RATES,
+    RANDOM_START,
+    STRONG,
+    VIEW_BLIND,
+)
+from threestudio_gaussiandreamer.gaussians.simplify import rounds_to
+from threestudio_gaussiandreamer.prune.command import PruneOptions
+
+STEPS = 1200
+SECOND_STAGE = 500
+"""The step from which the demo draws smaller timesteps."""
+COUNTS = (5000, 2500, 1500, 1000)
+STEPS_A_ROUND = PruneOptions.steps
+"""Of recovery in the prune command."""
+NO_BUDGET = {"system.geometry.budget": "null"}
+SHARP_PAPER = PAPER_RATES | NO_BUDGET | {"system.geometry.init_opacity": 0.1}
+PAPER = SHARP_PAPER | {"system.renderer.eps2d": 0.3}
+"""The recipe of the paper: its learning rates, start and screen-space dilation, and no pruning.
+Sharp: with the demo's dilation, 0.1.
+"""
+RATES = {
+    "lr_means": (2e-4, 2e-5),
+    "lr_scales": (6e-2, 1e-3),
+    "lr_quats": (6e-2, 2e-3),
+    "lr_opacities": (1e-1, 5e-3),
+    "lr_sh": (1e-1, 2e-3),
+}
+"""Learning rates of demo.yaml, at the start and the end of a run."""
+SLOWER_MEANS = {"slower means": 0.5, "means at 0.8": 0.8}
+"""The share of their rate that positions begin with: the smaller, the more Gaussians stay on the
+surface.
+"""
+BINS = VIEW_BLIND | {"system.guidance.mode": "direction-bins"}
+GREY = {"system.geometry.prior.color": "grey"}
+BALL = {
+    "system.geometry.prior_type": "random-prior",
+    "system.geometry.prior": {"num_points": 8000, "shape": "sphere", "color": "grey"},
+}
+SMALL = {"data.width": 96, "data.height": 96}
+BLURRED = {"system.guidance.latent_size": 4}
+
+
+class Job(NamedTuple):
+    """One kind of training run and its place in a chart."""
+
+    chart: str
+    variant: str
+    x: float
+    """The place on the chart's horizontal axis, where that isn't measured; else 0."""
+    options: dict[str, Any]
+    overlay: str = ""
+    """The name of a file of configs/ that is laid over demo.yaml."""
+
+
+def steps(count: int) -> dict[str, Any]:
+    """A run of ``count`` steps with its schedules in proportion."""
+    second = SECOND_STAGE * count // STEPS
+    schedule = [second, 0.98, 0.55, second + 1]
+    rounds = {
+        f"system.geometry.prune.{name}": step * count // STEPS
+        for name, step in (("start", 100), ("every", 50), ("stop", 900))
+    }
+    return (
+        rounds
+        | falling(RATES, count)
+        | {"trainer.max_steps": count, "system.guidance.max_step_percent": schedule}
+    )
+
+
+def falling(names: Iterable[str], count: int, factor: float = 1.0) -> dict[str, str]:
+    """Some of the demo's learning rates, ``factor`` times as high, for a run of ``count`` steps."""
+    return {
+        f"system.geometry.{name}": falling_rate(*(factor * rate for rate in RATES[name]), count)
+        for name in names
+    }
+
+
+def falling_rate(start: float, end: float, count: int) -> str:
+    """A learning rate that falls over ``count`` steps."""
+    return f"[0,{start:g},{end:g},{count}]"
+
+
+def scratch(count: int) -> dict[str, Any]:
+    """The start of the demo with ``count`` Gaussians: four fifths from the prior, one fifth grown."""
+    return NO_BUDGET | {
+        "system.geometry.prior.num_points": count * 4 // 5,
+        "system.geometry.grow.max_points": count // 5,
+        "system.geometry.max_gaussians": count,
+    }
+
+
+def time_jobs() -> Iterator[Job]:
+    """What each kind of score, and the prior, buys per second."""
+    yield Job("time", "view-exact, demo.yaml", 0, {})
+    yield Job("time", "view-exact, the paper's recipe", 0, PAPER)
+    yield Job("time", "direction bins", 0, BINS)
+    yield Job("time", "view-blind, prior", 0, VIEW_BLIND)
+    yield Job("time", "view-blind, random start", 0, VIEW_BLIND | RANDOM_START)
+
+
+def count_jobs() -> Iterator[Job]:
+    """What a number of Gaussians can do, by the way it was reached; all with the same steps."""
+    yield Job("count", "no pruning", 10000, NO_BUDGET)
+    yield Job("count", "the paper's recipe", 10000, PAPER)
+    yield Job("count", "the paper's recipe, dilation 0.1", 10000, SHARP_PAPER)
+    yield Job("count", "by removal error, auto", 0, {"system.geometry.budget": "auto"})
+    for count in COUNTS:
+        yield Job("count", "by removal error", count, {"system.geometry.budget": count})
+        yield Job("count", "from scratch", count, scratch(count))
+    ungrown = {"system.geometry.prior.num_points": 10000, "system.geometry.grow.enabled": "false"}
+    yield Job(
+        "count",
+        "by removal error, nothing grown",
+        COUNTS[-2],
+        ungrown | {"system.geometry.budget": COUNTS[-2]},
+    )
+    for count in COUNTS[-2:]:
+        for score in ("contribution", "opacity"):
+            yield Job(
+                "count",
+                f"by {score}",
+                count,
+                {"system.geometry.budget": count, "system.geometry.prune.score": score},
+            )
+        for name, share in SLOWER_MEANS.items():
+            start, end = RATES["lr_means"]
+            slower = {
+                "system.geometry.budget": count,
+                "system.geometry.lr_means": falling_rate(share * start, end, STEPS),
+            }
+            yield Job("count", f"by removal error, {name}", count, slower)
+        rounds = rounds_to(count, 10000)
+        pruned = NO_BUDGET | {"system.prune.count": count, "system.prune.size": 128}
+        yield Job(
+            "count",
+            "after the run, with recovery",
+            count,
+            steps(STEPS - rounds * STEPS_A_ROUND) | pruned,
+        )
+    yield Job(
+        "count",
+        "at random",
+        COUNTS[-2],
+        {"system.geometry.budget": COUNTS[-2], "system.geometry.prune.score": "random"},
+    )
+    yield Job(
+        "count",
+        "the paper's recipe, by removal error",
+        COUNTS[-2],
+        PAPER | {"system.geometry.budget": COUNTS[-2]},
+    )
+
+
+def grown_jobs() -> Iterator[Job]:
+    """Half of COUNTS[1] grown to all of it by gradients; thresholds were chosen on the toy."""
+    few = scratch(COUNTS[1] // 2) | {
+        "system.geometry.max_gaussians": 10000,
+        "system.geometry.budget": COUNTS[1],
+    }
+    rounds = {"enabled": "true", "start": 100, "stop": 800, "every": 50}
+    for absgrad, threshold, name in (
+        ("false", 3, "plain gradients"),
+        ("true", 5, "absolute gradients"),
+    ):
+        densify = rounds | {"absgrad": absgrad, "grad_threshold": threshold}
+        yield Job(
+            "grown",
+            name,
+            COUNTS[1],
+            few | {f"system.geometry.densify.{key}": value for key, value in densify.items()},
+        )
+
+
+def size_jobs() -> Iterator[Job]:
+    """Pixels rendered, and whether rendering twice as large and shrinking pays for its four times
+    as many.
+    """
+    for size in (64, 128, 256):
+        yield Job(
+            "size", "rendered and guided alike", size, {"data.width": size, "data.height": size}
+        )
+    for size in (64, 128):
+        large = {"data.width": 2 * size, "data.height": 2 * size, "system.renderer.downsample": 2}
+        yield Job("size", "rendered twice as large, shrunk", size, large)
+
+
+def large_jobs() -> Iterator[Job]:
+    """The same at 512^2 with 20,000 Gaussians; what shrinking does to the dilation, and its seconds
+    spent on steps, each alone.
+    """
+    own = {"data.width": 512, "data.height": 512, "system.evaluation.size": 512}
+    many = own | scratch(20000)
+    yield Job("large", "rendered at 512²", 0, many)
+    yield Job(
+        "large", "rendered at 512², dilation 0.025", 0, many | {"system.renderer.eps2d": 0.025}
+    )
+    yield Job("large", "rendered at 512², 2,000 steps", 0, many | steps(2000))
+    yield Job(
+        "large",
+        "rendered at 1024², shrunk",
+        0,
+        many | {"data.width": 1024, "data.height": 1024, "system.renderer.downsample": 2},
+    )
+    yield Job("large", "the paper's recipe", 0, own | PAPER)
+
+
+def batch_jobs() -> Iterator[Job]:
+    """Views per step, with as many steps as fit into the demo's seconds."""
+    for batch, count in ((1, 2200), (2, 1650), (4, STEPS), (8, 750)):
+        yield Job(
+            "batch",
+            "equal seconds",
+            batch,
+            {"data.batch_size": batch, "system.evaluation.every": count // 12} | steps(count),
+        )
+
+
+def iteration_jobs() -> Iterator[Job]:
+    """Runs of their own: a longer run is not the continuation of a shorter one."""
+    for rates, name in (({}, "demo.yaml"), (PAPER, "the paper's recipe")):
+        for count in (150, 300, 600, 1200):
+            yield Job("iterations", name, count, steps(count) | rates)
+
+
+def rate_jobs() -> Iterator[Job]:
+    """Each learning rate of the demo a third and three times as high, all of them, and all held
+    instead of falling.
+    """
+    yield Job("rates", "demo.yaml", 1, {})
+    for names in (*([name] for name in RATES), list(RATES)):
+        line = names[0].removeprefix("lr_") if len(names) == 1 else "all"
+        for factor in (0.3, 3):
+            yield Job("rates", line, factor, falling(names, STEPS, factor))
+    for factor in (0.1, 0.3, 1):
+        held = {f"system.geometry.{name}": factor * start for name, (start, _) in RATES.items()}
+        yield Job("rates", "all, held at their start", factor, held)
+    yield Job("rates", "the paper's rates", 1, PAPER_RATES)
+
+
+def preset_jobs() -> Iterator[Job]:
+    for preset in ("fast", "balanced", "accurate"):
+        yield Job("preset", preset, 0, {"system.renderer.preset": preset})
+
+
+def dilation_jobs() -> Iterator[Job]:
+    """Gaussians are widened on the screen by 0.3 square pixels nearly everywhere; a pixel's own box
+    has a twelfth.
+    """
+    for dilation in (0.03, 0.1, 0.3):
+        for antialias, name in ((False, "plain"), (True, "antialiased")):
+            yield Job(
+                "dilation",
+                name,
+                dilation,
+                {
+                    "system.renderer.eps2d": dilation,
+                    "system.renderer.antialias": str(antialias).lower(),
+                },
+            )
+        yield Job(
+            "dilation",
+            "the paper's recipe",
+            dilation,
+            SHARP_PAPER | {"system.renderer.eps2d": dilation},
+        )
+
+
+def quality_jobs() -> Iterator[Job]:
+    """The demo as it is, its quick and its good variant, at its own size."""
+    own = {"data.width": 256, "data.height": 256, "system.evaluation.size": 256}
+    for name, overlay, count in (
+        ("draft", "demo-draft", 255),
+        ("default", "", STEPS),
+        ("best", "demo-best", 3000),
+    ):
+        yield Job(
+            "quality",
+            name,
+            0,
+            own | {"trainer.max_steps": count, "system.evaluation.every": count // 20},
+            overlay,
+        )
+    beginning = {"trainer.max_steps": 160, "system.evaluation.every": 10}
+    yield Job("quality", "best, its beginning", 0, own | beginning, "demo-best")
+    yield Job(
+        "quality", "the paper's recipe", 0, own | {"system.evaluation.every": STEPS // 20} | PAPER
+    )
+
+
+def failure_jobs() -> Iterator[Job]:
+    """How the method fails, and what each remedy buys: 96^2 and 600 steps, so that 15 runs of each
+    are affordable.
+    """
+    plain_timesteps = LATENT | STRONG | NO_ANNEALING
+    variants = {
+        "multi-face: random start": VIEW_BLIND | RANDOM_START,
+        "multi-face: random start + view-dependent score": BINS | RANDOM_START,
+        "multi-face: prior": VIEW_BLIND,
+        "grey prior": VIEW_BLIND | GREY,
+        "grey prior + view-dependent score": BINS | GREY,
+        "blur: timesteps up to 0.98 throughout": VIEW_BLIND | NO_ANNEALING,
+        "blur: coarse latent": VIEW_BLIND | BLURRED,
+        "over-saturation: guidance 100": plain_timesteps,
+        "over-saturation: annealed": LATENT | STRONG,
+        "over-saturation: annealed, clipped": LATENT | STRONG | CLIPPED,
+        "over-saturation: guidance 7.5, annealed, clipped": LATENT
+        | CLIPPED
+        | {"system.guidance.guidance_scale": 8.5},
+        "wrong shape: a grey ball": BALL,
+        "right shape": {},
+    }
+    for name, options in variants.items():
+        yield Job("failures", name, 0, SMALL | steps(600) | options)
+
+
+def alike_jobs() -> Iterator[Job]:
+    """The paper's limit: an object whose front and back differ little in shape."""
+    variants = {
+        "front and back alike: grey prior": VIEW_BLIND | GREY,
+        "front and back alike: grey prior + view-dependent score": BINS | GREY,
+        "front and back alike: coloured prior": VIEW_BLIND,
+        "front and back alike: coloured prior + view-dependent score": BINS,
+    }
+    for name, options in variants.items():
+        yield Job("alike", name, 0, SMALL | steps(600) | options)
+
+
+JOBS: dict[str, Callable[[], Iterator[Job]]] = {
+    "time": time_jobs,
+    "count": count_jobs,
+    "grown": grown_jobs,
+    "size": size_jobs,
+    "large": large_jobs,
+    "batch": batch_jobs,
+    "iterations": iteration_jobs,
+    "rates": rate_jobs,
+    "preset": preset_jobs,
+    "dilation": dilation_jobs,
+    "quality": quality_jobs,
+    "failures": failure_jobs,
+    "alike": alike_jobs,
+}
+OWN_OBJECTS = {"alike": ["benchmarks/scenes/ball.ply"]}
+"""What a chart is made on, where it isn't the objects that are asked for."""

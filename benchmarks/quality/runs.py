@@ -1,0 +1,234 @@
+"""Training runs for the charts: every run that a chart needs, side by side on the CPU, into one CSV
+per chart.
+
+    python -m benchmarks.quality.runs                               # all that isn't measured yet: about two
+                                                            hours on 4 cores
+    python -m benchmarks.quality.runs --charts count --seeds 0 1 2  # one chart, fewer seeds
+    python -m benchmarks.quality.runs --list                        # what would run
+
+Each run is `launch.py` with configs/demo.yaml at 128^2 and a few options changed, on one thread,
+several side by side, and is scored on 24 held-out views that neither a bank nor a training camera
+holds, ray-cast from the mesh. Seconds are the processor's while training, targets included and
+evaluation excluded: what else the machine does counts little. Rows are appended as runs end, seeds
+in turn, and what a CSV has is not run again: stop and go on at will. Settings were tuned on the
+bundled toy alone (the draft's steps and views on the duck too); other objects are given by path and
+held back."""
+
+import argparse
+import csv
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import yaml
+from tqdm import tqdm
+
+from benchmarks.quality.jobs import JOBS, OWN_OBJECTS, STEPS, Job
+
+ROOT = Path(__file__).resolve().parents[2]
+CHARTS = ROOT / "docs/charts"
+RENDERER = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())["system"]["renderer"]
+"""How the demo draws."""
+SIZE, EVERY = 128, 100
+WITH_CURVES = ("time", "batch", "preset")
+COLUMNS = "variant,x,object,seed,step,cpu_seconds,gaussians,psnr,ssim,multi_face,floater_mass,out_of_gamut,machine,commit".split(
+    ","
+)
+
+
+def main() -> None:
+    arguments = parse_arguments()
+    measured = {
+        chart: measured_in(chart, "variant", "x", "object", "seed") for chart in arguments.charts
+    }
+    todo = [
+        (job, mesh, seed)
+        for seed in arguments.seeds
+        for chart in arguments.charts
+        for job in JOBS[chart]()
+        for mesh in OWN_OBJECTS.get(chart, arguments.objects)
+        if (job.variant, f"{job.x:g}", object_name(mesh), str(seed)) not in measured[chart]
+    ]
+    if arguments.list:
+        print(
+            "\n".join(
+                f"{job.chart}: {job.variant}, {job.x:g}, {object_name(mesh)}, seed {seed}"
+                for job, mesh, seed in todo
+            )
+        )
+        return
+    with ThreadPoolExecutor(arguments.jobs) as pool:
+        running = {
+            pool.submit(run, mesh, seed, curve(job) | job.options, job.overlay): (job, mesh, seed)
+            for job, mesh, seed in todo
+        }
+        failed = 0
+        for done in tqdm(as_completed(running), total=len(todo), unit="run", disable=None):
+            if error := done.exception():
+                failed += 1
+                tqdm.write(str(error), file=sys.stderr)
+            else:
+                append(*running[done], done.result())
+    sys.exit(f"{failed} of {len(todo)} runs failed" if failed else 0)
+
+
+def parse_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--charts", nargs="+", choices=JOBS, default=list(JOBS))
+    parser.add_argument(
+        "--objects",
+        nargs="+",
+        default=["toy.glb"],
+        help="meshes; a bare name is a bundled one (default: toy.glb)",
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(5)))
+    parser.add_argument(
+        "--jobs", type=int, default=os.cpu_count(), help="runs side by side, one thread each"
+    )
+    parser.add_argument("--list", action="store_true", help="only print what would run")
+    return parser.parse_args()
+
+
+def run(mesh: str, seed: int, options: dict[str, Any], overlay: str = "") -> dict[str, Any]:
+    """One training run in a process of its own; its metrics, at the end those of the pruned cloud
+    where ``system.prune`` asks for one.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        save = train(Path(folder), mesh, seed, options, overlay=overlay)
+        metrics = json.loads((save / "metrics.json").read_text())
+        for pruned in save.glob("it*-export/pruned/gaussians.ply"):
+            start = {
+                "system.geometry.prior_type": "gaussians-prior",
+                "system.geometry.prior": {"path": str(pruned)},
+            }
+            same = {
+                name: value
+                for name, value in options.items()
+                if not name.startswith(("system.prune.", "system.geometry."))
+            }
+            again = train(
+                Path(folder) / "again",
+                mesh,
+                seed,
+                same | start | {"system.geometry.budget": "null", "trainer.max_steps": 1},
+            )
+            scores = json.loads((again / "metrics.json").read_text())["prior"]
+            # the seconds of pruning aren't among those of training
+            metrics["result"] |= {
+                name: value
+                for name, value in scores.items()
+                if name not in ("step", "seconds", "cpu_seconds")
+            }
+        return metrics
+
+
+def train(
+    folder: Path,
+    mesh: str,
+    seed: int,
+    options: dict[str, Any],
+    *,
+    program: str = "launch.py",
+    overlay: str = "",
+) -> Path:
+    """One training run in a process of its own below ``folder``; where its results lie.
+
+    Args:
+        overlay: the name of a file of configs/ that is laid over demo.yaml.
+    """
+    common = {
+        "use_timestamp": "false", "tag": "run", "seed": seed, "data.width": SIZE, "data.height": SIZE,
+        "system.evaluation.size": SIZE, "system.guidance.mesh": mesh,
+        "system.guidance.bank_seed": seed, "data.n_test_views": 1, "data.eval_width": 64, "data.eval_height": 64,
+        "trainer.max_steps": STEPS, "trainer.val_check_interval": 100000, "trainer.enable_progress_bar": "false",
+    }  # fmt: skip
+    overrides = [
+        f"{key}={value}" for key, value in (common | options | {"exp_root_dir": folder}).items()
+    ]
+    configs = [f"--config={ROOT / 'configs' / name}.yaml" for name in ("demo", overlay) if name]
+    command = [sys.executable, str(ROOT / program), *configs, "--train", *overrides]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+    finished = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment)
+    if finished.returncode:
+        raise RuntimeError(
+            f"a run failed ({finished.returncode}): "
+            f"{' '.join(overrides)}\n{finished.stderr[-3000:]}"
+        )
+    return folder / "demo/run/save"
+
+
+def curve(job: Job) -> dict[str, Any]:
+    """How often a run is scored on its way, where its chart shows it."""
+    return {"system.evaluation.every": EVERY if job.chart in WITH_CURVES else 0}
+
+
+def object_name(mesh: str) -> str:
+    return Path(mesh).stem
+
+
+def measured_in(chart: str, *columns: str) -> set[tuple[str, ...]]:
+    """What a chart's CSV has, by these columns."""
+    return {tuple(row[column] for column in columns) for row in rows_of(chart)}
+
+
+def rows_of(chart: str) -> list[dict[str, str]]:
+    """The rows of a chart's CSV; none where it doesn't exist yet."""
+    path = CHARTS / f"{chart}.csv"
+    if not path.is_file():
+        return []
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def append(job: Job, mesh: str, seed: int, metrics: dict[str, Any]) -> None:
+    """The curve and the result of one run; a result's ``step`` is the last."""
+    start = metrics["prior"] | {"step": 0}
+    points = {
+        scores["step"]: scores for scores in (start, *metrics.get("curve", ()), metrics["result"])
+    }
+    place = {"variant": job.variant, "x": f"{job.x:g}", "object": object_name(mesh), "seed": seed}
+    append_rows(job.chart, COLUMNS, [scores | place for scores in points.values()])
+
+
+def append_rows(chart: str, columns: list[str], rows: list[dict[str, Any]]) -> None:
+    """Rows at the end of a chart's CSV, with the machine and the commit that they were measured on."""
+    path, here = CHARTS / f"{chart}.csv", {"machine": machine(), "commit": commit()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = not path.is_file()
+    with open(path, "a", newline="") as file:
+        writer = csv.DictWriter(
+            file, columns, restval="", extrasaction="ignore", lineterminator="\n"
+        )
+        if new:
+            writer.writeheader()
+        writer.writerows(row | here for row in rows)
+
+
+def machine() -> str:
+    """The processor's name, where the system tells it."""
+    try:
+        names = [
+            line.partition(":")[2].strip()
+            for line in open("/proc/cpuinfo")
+            if line.startswith("model name")
+        ]
+    except OSError:
+        names = []
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def commit() -> str:
+    answer = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT
+    )
+    return answer.stdout.strip() or "unknown"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,391 @@
+"""Fuzzing, the long version: damaged files at every door, hostile Gaussians through every backend,
+random lives of a cloud.
+
+    python -m benchmarks.robustness.fuzz                                   # `make fuzz`; about half an hour on
+                                                                one core
+    python -m benchmarks.robustness.fuzz --only glb checkpoint --inputs 500 --seed 7
+
+Every kind runs in a process of its own, with a limit of memory, which is killed when nothing comes
+from it for a minute; it goes on with the next input then. An input that failed is kept in
+``--keep`` under its target's name and number: what it is made from is (seed, number) alone. Prints
+a table and writes ``benchmarks/results/fuzz.csv``. Exit code 1 if anything failed."""
+
+import argparse
+import csv
+import json
+import os
+import resource
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ROOT = Path(__file__).resolve().parents[2]
+
+RESULTS = ROOT / "benchmarks/results/fuzz.csv"
+SILENCE = 60
+"""Seconds without a word after which a process counts as hanging; an input has 10."""
+ROOM = 3 << 30
+"""Bytes of address space that a process may add to what its libraries take."""
+STEPS_OF_A_LIFE = 25
+LIVES_AT_ONCE = 20
+
+
+class Row(NamedTuple):
+    """A line of the table."""
+
+    target: str
+    unit: str
+    inputs: int
+    failures: int
+    refused: int
+    seconds: float
+
+
+# ---- in a process of its own ---------------------------------------------------------------------
+
+Report = Iterator[tuple[int, dict[str, Any]]]
+"""Of each number that was tried what came of it, by the name of a row: counts of "inputs", and
+"failures" in words.
+"""
+
+
+def try_files(name: str, seed: int, first: int, last: int) -> Report:
+    from tests.fuzz.judge import outcomes
+
+    for index, outcome in outcomes(name, range(first, last), seed):
+        failures = [outcome.detail] if outcome.kind == "failed" else []
+        yield (
+            index,
+            {
+                "inputs": {name: 1},
+                "refused": {name: int(outcome.kind == "refused")},
+                "failures": {name: failures},
+            },
+        )
+
+
+def try_scenes(name: str, seed: int, first: int, last: int) -> Report:
+    """Each scene through every backend, and its well-posed part through all of them to be compared."""
+    import pytest
+    import torch
+
+    from tests.fuzz.hostile import disagreement_on, fault_of, hostile_scene, well_posed
+    from tests.stability.backends import BACKENDS, cuda_on_the_host
+
+    torch.set_num_threads(1)
+    if "cuda" in BACKENDS:
+        cuda_on_the_host(pytest.MonkeyPatch())
+    for index in range(first, last):
+        scene = hostile_scene(seed * 1_000_000 + index)
+        part = well_posed(scene)
+        seconds, failures = {}, {}
+        for backend in BACKENDS:
+            started = time.perf_counter()
+            failures[backend] = _faults(fault_of, scene, backend)
+            seconds[backend] = time.perf_counter() - started
+        started = time.perf_counter()
+        failures["agreement"] = _faults(disagreement_on, part, BACKENDS)
+        counts = dict.fromkeys(BACKENDS, len(scene.cloud.means)) | {
+            "agreement": len(part.cloud.means)
+        }
+        yield (
+            index,
+            {
+                "inputs": counts,
+                "failures": failures,
+                "seconds": seconds | {"agreement": time.perf_counter() - started},
+            },
+        )
+
+
+def _faults(judge: Callable[..., str | None], *arguments: Any) -> list[str]:
+    try:
+        found = judge(*arguments)
+    except Exception as error:
+        found = f"crash: {type(error).__name__}: {error}"
+    return [found] if found else []
+
+
+def try_lives(name: str, seed: int, first: int, last: int) -> Report:
+    import hypothesis
+    import torch
+    from hypothesis.stateful import run_state_machine_as_test
+
+    from tests.fuzz.sequences import CloudLife
+
+    torch.set_num_threads(1)
+    options = {
+        "deadline": None,
+        "database": None,
+        "suppress_health_check": list(hypothesis.HealthCheck),
+    }
+    for index in range(first, last, LIVES_AT_ONCE):
+        CloudLife.steps, failures = 0, []
+        settings = hypothesis.settings(
+            max_examples=LIVES_AT_ONCE, stateful_step_count=STEPS_OF_A_LIFE, **options
+        )
+        try:
+            run_state_machine_as_test(
+                hypothesis.seed(seed * 1_000_000 + index)(CloudLife), settings=settings
+            )
+        except Exception as error:
+            failures.append(f"{type(error).__name__}: {error}")
+        yield index, {"inputs": {name: CloudLife.steps}, "failures": {name: failures}}
+
+
+def work(name: str, seed: int, first: int, last: int) -> None:
+    """Try these numbers; says what came of each as a line of JSON, and nothing else."""
+    spoken = os.fdopen(os.dup(1), "w", buffering=1)
+    nothing = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 1)
+    os.dup2(nothing, 2)
+    report = kind_of(name)(name, seed, first, last)
+    print(json.dumps({"ready": True}), file=spoken)
+    libraries = (
+        int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        if Path("/proc/self/statm").exists()
+        else 0
+    )
+    if libraries:
+        resource.setrlimit(resource.RLIMIT_AS, (libraries + ROOM, resource.RLIM_INFINITY))
+    for index, counts in report:
+        print(json.dumps({"index": index, **counts}), file=spoken)
+
+
+def kind_of(name: str) -> Callable[[str, int, int, int], Report]:
+    return {"rasteriser": try_scenes, "densify and prune": try_lives}.get(name, try_files)
+
+
+# ---- watching it ---------------------------------------------------------------------------------
+
+
+class Watched:
+    """One target's processes, one after the other, and the sums of what they report."""
+
+    def __init__(self, name: str, seed: int, keep: Path) -> None:
+        self.name, self.seed, self.keep = name, seed, keep
+        self.inputs: dict[str, int] = {}
+        self.refused: dict[str, int] = {}
+        self.failures: dict[str, int] = {}
+        self.seconds: dict[str, float] = {}
+
+    def run(
+        self, count: int, enough: Callable[["Watched"], bool], tick: Callable[[int], None]
+    ) -> None:
+        """Numbers 0 to ``count``, or until there are enough; a process that ends before is followed
+        by one for the rest.
+        """
+        first, started = 0, time.perf_counter()
+        while first < count and not enough(self):
+            first = self._watch(first, count, enough, tick)
+        self.seconds.setdefault(self.name, time.perf_counter() - started)
+
+    def _watch(
+        self,
+        first: int,
+        count: int,
+        enough: Callable[["Watched"], bool],
+        tick: Callable[[int], None],
+    ) -> int:
+        """The number to go on with."""
+        command = [
+            sys.executable,
+            "-m",
+            __spec__.name,
+            "--worker",
+            self.name,
+            str(self.seed),
+            str(first),
+            str(count),
+        ]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        try:
+            while not enough(self):
+                line = (
+                    process.stdout.readline()
+                    if select.select([process.stdout], [], [], SILENCE)[0]
+                    else "hang"
+                )
+                if line in ("", "hang"):
+                    return (
+                        count
+                        if not line and process.wait() == 0
+                        else self._lost(first, line, process, tick)
+                    )
+                said = json.loads(line)
+                if "index" in said:
+                    self._add(said)
+                    tick(said["index"] + 1 - first)
+                    first = said["index"] + (
+                        LIVES_AT_ONCE if self.name == "densify and prune" else 1
+                    )
+            return count
+        finally:
+            process.kill()
+            process.wait()
+
+    def _lost(
+        self, index: int, line: str, process: subprocess.Popen, tick: Callable[[int], None]
+    ) -> int:
+        problem = (
+            f"nothing for {SILENCE} s" if line else f"the process ended with {process.returncode}"
+        )
+        self._add({"index": index, "inputs": {self.name: 1}, "failures": {self.name: [problem]}})
+        tick(1)
+        return index + 1
+
+    def _add(self, said: dict[str, Any]) -> None:
+        for kind, sums in (
+            ("inputs", self.inputs),
+            ("refused", self.refused),
+            ("seconds", self.seconds),
+        ):
+            for row, value in said.get(kind, {}).items():
+                sums[row] = sums.get(row, 0) + value
+        for row, failures in said["failures"].items():
+            self.failures[row] = self.failures.get(row, 0) + len(failures)
+            for failure in failures:
+                print(f"{row} {said['index']}: {failure}", file=sys.stderr)
+                self._keep(said["index"], failure)
+
+    def _keep(self, index: int, failure: str) -> None:
+        self.keep.mkdir(parents=True, exist_ok=True)
+        name = self.keep / f"{self.name.replace(' ', '-')}-{self.seed}-{index}"
+        name.with_suffix(".txt").write_text(failure + "\n")
+        if kind_of(self.name) is try_files:
+            from tests.fuzz.targets import TARGETS, mutant
+
+            name.with_suffix(TARGETS[self.name].suffix).write_bytes(
+                mutant(self.name, self.seed, index)
+            )
+
+    def rows(self) -> list[Row]:
+        units = {
+            "rasteriser": "Gaussians, forward and backward",
+            "densify and prune": "steps of a life",
+        }
+        named = {
+            row: f"{self.name}: {row}" if self.name == "rasteriser" else row for row in self.inputs
+        }
+        return [
+            Row(
+                named[row],
+                units.get(self.name, "damaged files"),
+                inputs,
+                self.failures.get(row, 0),
+                self.refused.get(row, 0),
+                self.seconds[row],
+            )
+            for row, inputs in self.inputs.items()
+        ]
+
+
+# ---- the table -----------------------------------------------------------------------------------
+
+
+def main() -> int:
+    options = parse()
+    from tqdm import tqdm
+
+    rows, names = [], options.only or [*file_targets(), "rasteriser", "densify and prune"]
+    for name in names:
+        watched, count = Watched(name, options.seed, Path(options.keep)), how_many(name, options)
+        with tqdm(
+            desc=name, total=None if name == "rasteriser" else count, unit="input", disable=None
+        ) as bar:
+            watched.run(count, enough_of(name, options), bar.update)
+        rows += watched.rows()
+        print("\n".join(map(line_of, watched.rows())), flush=True)
+        write(watched.rows(), options.seed)
+    return int(any(row.failures for row in rows))
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--inputs", type=int, default=2500, help="damaged files of each kind")
+    parser.add_argument(
+        "--gaussians",
+        type=int,
+        default=1_000_000,
+        help="hostile Gaussians through each backend; 'agreement' has fewer",
+    )
+    parser.add_argument(
+        "--lives",
+        type=int,
+        default=1000,
+        help=f"random lives of a cloud, each of {STEPS_OF_A_LIFE} steps at most",
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="+", help="these targets alone; the CSV's other rows stay")
+    parser.add_argument(
+        "--keep",
+        default="outputs/fuzz-failures",
+        help="folder for inputs that failed; made when there is one",
+    )
+    parser.add_argument("--worker", nargs=4, help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+def file_targets() -> list[str]:
+    from tests.fuzz.targets import TARGETS
+
+    return list(TARGETS)
+
+
+def enough_of(name: str, options: argparse.Namespace) -> Callable[[Watched], bool]:
+    """Of scenes there are enough when every backend has had its Gaussians; of the others all are
+    tried.
+    """
+
+    def enough(watched: Watched) -> bool:
+        drawn = [count for row, count in watched.inputs.items() if row != "agreement"]
+        return name == "rasteriser" and min(drawn, default=0) >= options.gaussians
+
+    return enough
+
+
+def how_many(name: str, options: argparse.Namespace) -> int:
+    return {"rasteriser": options.gaussians // 100, "densify and prune": options.lives}.get(
+        name, options.inputs
+    )
+
+
+def line_of(row: Row) -> str:
+    return (
+        f"{row.target:24} {row.inputs:>11,} {row.unit:32} {row.failures:4} failures "
+        f"{row.refused:6} refused {row.seconds:8.1f} s"
+    )
+
+
+def write(rows: list[Row], seed: int) -> None:
+    """The rows in the places of those of the same targets; the others stay."""
+    from benchmarks.splatting.bench_splatting import describe_machine
+
+    device, _, commit = describe_machine().rpartition("; commit ")
+    table: dict[str, list] = {}
+    if RESULTS.exists():
+        with RESULTS.open(newline="") as file:
+            table = {row[0]: row for row in list(csv.reader(file))[1:]}
+    table |= {
+        row.target: [*row._replace(seconds=round(row.seconds, 1)), seed, commit, device]
+        for row in rows
+    }
+    with RESULTS.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*Row._fields, "seed", "commit", "device"])
+        writer.writerows(table.values())
+
+
+if __name__ == "__main__":
+    if "--worker" in sys.argv:
+        name, seed, first, last = parse().worker
+        work(name, int(seed), int(first), int(last))
+    else:
+        sys.exit(main())

@@ -1,0 +1,412 @@
+"""Time and memory of the rasteriser on one synthetic scene: `make bench`.
+
+A torus shell with a sphere in its hole, seen once, at several sizes; forward, and forward with
+backward (gradients of all five attributes from image, depth and alpha). Every cell is a process of
+its own, so that its memory can be read; contenders take turns, so that all meet the same load.
+Prints a table and writes ``benchmarks/results/splatting.csv``.
+
+Contenders: ``cpu`` (the best build for this processor), ``cpu-v3`` and ``cpu-base`` (builds for
+older ones), ``torch``, ``gsplat`` (its plain-torch twins, see gsplat_reference.py), and
+``prototype``, the AVX-512 program that shows what a CPU can reach (where $GAUSSIANDREAMER_SHARED or
+``../shared`` has it). gsplat's twins keep every pair of Gaussian and pixel (3 GB at 100,000 and
+512^2), so that pictures larger than --gsplat-size are left to the others."""
+
+import argparse
+import csv
+import importlib.util
+import json
+import math
+import os
+import pathlib
+import platform
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from typing import Callable, NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+SHARED = pathlib.Path(os.environ.get("GAUSSIANDREAMER_SHARED", ROOT.parent / "shared"))
+PROTOTYPE = SHARED / "prototype"
+PROTOTYPE_FLAGS = "-DTS=32 -DCH=512 -DDEG=4 -DPF=48"
+CONTENDERS = ("cpu", "cpu-v3", "cpu-base", "torch", "gsplat", "prototype")
+COLUMNS = (
+    "gaussians",
+    "size",
+    "threads",
+    "contender",
+    "forward_ms",
+    "both_ms",
+    "memory_mb",
+    "load",
+)
+
+
+class Scene(NamedTuple):
+    """The arguments of `rasterize`, one view."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+
+
+def make_scene(n: int, seed: int = 0) -> Scene:
+    """85 % torus (radii 0.7 and 0.3), 15 % sphere (0.28), both 2 % thick; scales from 3-NN
+    distances with lognormal(0.35) stretch.
+    """
+    rng = np.random.default_rng(seed)
+    torus = _torus(rng, int(n * 0.85))
+    sphere = rng.standard_normal((n - len(torus), 3))
+    sphere *= (
+        0.28
+        * (1 + 0.02 * rng.standard_normal((len(sphere), 1)))
+        / np.linalg.norm(sphere, axis=1, keepdims=True)
+    )
+    points = np.concatenate([torus, sphere])[rng.permutation(n)]
+    distances, _ = cKDTree(points).query(points, k=4, workers=-1)
+    scales = np.sqrt((distances[:, 1:] ** 2).mean(1))[:, None] * np.exp(
+        0.35 * rng.standard_normal((n, 3))
+    )
+    quats = rng.standard_normal((n, 4))
+    arrays = (
+        points,
+        quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        scales,
+        0.1 + 0.8 * rng.random(n),
+        rng.random((n, 3)),
+    )
+    return Scene(*(torch.from_numpy(np.ascontiguousarray(a)).float() for a in arrays))
+
+
+def _torus(rng: np.random.Generator, n: int, large: float = 0.7, small: float = 0.3) -> np.ndarray:
+    """Uniform by area: draws are kept in proportion to their distance from the axis."""
+    kept = []
+    while sum(map(len, kept)) < n:
+        angles = rng.random((n, 2)) * 2 * math.pi
+        kept.append(
+            angles[rng.random(n) < (large + small * np.cos(angles[:, 1])) / (large + small)]
+        )
+    u, v = np.concatenate(kept)[:n].T
+    thick = small * (1 + 0.02 * rng.standard_normal(n))
+    radius = large + thick * np.cos(v)
+    return np.stack([radius * np.cos(u), radius * np.sin(u), thick * np.sin(v)], 1)
+
+
+def make_camera(
+    size: int,
+    azimuth: float = 30.0,
+    elevation: float = 35.0,
+    distance: float = 3.0,
+    fov: float = 50.0,
+) -> tuple[Tensor, Tensor]:
+    """viewmat (4, 4) and K (3, 3) of a square picture, looking at the origin; degrees."""
+    a, e = math.radians(azimuth), math.radians(elevation)
+    position = distance * np.array(
+        [math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)]
+    )
+    forward = -position / distance
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ position
+    focal = 0.5 * size / math.tan(math.radians(fov) / 2)
+    K = [[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]
+    return torch.from_numpy(viewmat).float(), torch.tensor(K)
+
+
+def make_cotangents(size: int) -> list[Tensor]:
+    """Fixed gradients of image (1, H, W, 3), depth and alpha (1, H, W, 1)."""
+    noise = torch.randn(size, size, 5, generator=torch.Generator().manual_seed(1)) / size
+    return [x.contiguous()[None] for x in noise.split([3, 1, 1], -1)]
+
+
+# ---- one cell, in its own process ----------------------------------------------------------------
+
+
+def contender(
+    name: str, size: int, preset: str, threads: int
+) -> Callable[[Scene], tuple[Tensor, ...]]:
+    """A function that draws a scene: image, depth, alpha."""
+    viewmat, K = make_camera(size)
+    if name == "prototype":
+        return _prototype(viewmat, K, size, threads)
+    if name == "gsplat":
+        from benchmarks.splatting.gsplat_reference import drawer
+
+        return drawer(viewmat, K, size)
+    if name.startswith("cpu-"):
+        os.environ["GAUSSIANDREAMER_ISA"] = name.removeprefix("cpu-")
+    from threestudio_gaussiandreamer.splatting import rasterize
+
+    def draw(scene: Scene) -> tuple[Tensor, ...]:
+        out = rasterize(
+            *scene,
+            viewmat[None],
+            K[None],
+            size,
+            size,
+            preset=preset,
+            backend=name.partition("-")[0],
+        )
+        return out.image, out.depth, out.alpha
+
+    return draw
+
+
+def _prototype(
+    viewmat: Tensor, K: Tensor, size: int, threads: int
+) -> Callable[[Scene], tuple[Tensor, ...]]:
+    sys.path.insert(0, str(PROTOTYPE))
+    from binding import Fn, Raster, build
+
+    raster = Raster(build(PROTOTYPE_FLAGS, "best"), threads)
+    camera = {"viewmat": viewmat, "K": K, "width": size, "height": size}
+    return lambda scene: tuple(x[None] for x in Fn.apply(raster, camera, *scene))
+
+
+def measure(
+    draw: Callable, leaves: Scene, cotangents: list[Tensor], seconds: float
+) -> dict[str, float]:
+    """Medians of forward and of forward with backward in milliseconds, and the peak memory above
+    inputs and libraries in MB.
+    """
+    _reset_peak()
+    before, rows, start = _memory("VmRSS"), [], time.perf_counter()
+    while len(rows) < 3 or (time.perf_counter() - start < seconds and len(rows) < 60):
+        rows.append(_step(draw, leaves, cotangents))
+    forward, both = (1e3 * statistics.median(column) for column in zip(*rows[1:], strict=True))
+    return {"forward_ms": forward, "both_ms": both, "memory_mb": _memory("VmHWM") - before}
+
+
+def _step(draw: Callable, leaves: Scene, cotangents: list[Tensor]) -> tuple[float, float]:
+    for leaf in leaves:
+        leaf.grad = None
+    start = time.perf_counter()
+    pictures = draw(leaves)
+    middle = time.perf_counter()
+    torch.autograd.backward(pictures, cotangents)
+    return middle - start, time.perf_counter() - start
+
+
+def _memory(field: str) -> float:
+    """MB from /proc/self/status; NaN where there is none."""
+    status = pathlib.Path("/proc/self/status")
+    if not status.exists():
+        return math.nan
+    return next(
+        int(line.split()[1]) / 1024
+        for line in status.read_text().splitlines()
+        if line.startswith(field)
+    )
+
+
+def _reset_peak() -> None:
+    peak = pathlib.Path("/proc/self/clear_refs")
+    if peak.exists():
+        peak.write_text("5")
+
+
+def make_leaves(gaussians: int) -> Scene:
+    return Scene(*(x.requires_grad_() for x in make_scene(gaussians)))
+
+
+def run_cell(
+    name: str, gaussians: int, size: int, threads: int, preset: str, seconds: float
+) -> None:
+    torch.set_num_threads(threads)
+    _step(
+        contender(name, 16, preset, threads), make_leaves(64), make_cotangents(16)
+    )  # loads the libraries
+    cell = measure(
+        contender(name, size, preset, threads),
+        make_leaves(gaussians),
+        make_cotangents(size),
+        seconds,
+    )
+    print(json.dumps(cell))
+
+
+# ---- the table -----------------------------------------------------------------------------------
+
+
+def run_in_process(
+    name: str, gaussians: int, size: int, threads: int, args: argparse.Namespace
+) -> dict[str, float]:
+    cell = ["--cell", name, str(gaussians), str(size), str(threads)]
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.splatting.bench_splatting",
+        *cell,
+        "--preset",
+        args.preset,
+        "--seconds",
+        str(args.seconds),
+    ]
+    done = subprocess.run(
+        command,
+        env=os.environ | {"OMP_WAIT_POLICY": "passive"},
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def run_row(gaussians: int, size: int, threads: int, args: argparse.Namespace) -> list[dict]:
+    """All contenders, in turns; of each the faster turn."""
+    names = [name for name in args.contenders if name != "gsplat" or size <= args.gsplat_size]
+    turns = [
+        {name: run_in_process(name, gaussians, size, threads, args) for name in names}
+        for _ in range(args.turns)
+    ]
+    where = {"gaussians": gaussians, "size": size, "threads": threads}
+    best = {
+        name: min((turn[name] for turn in turns), key=lambda cell: cell["both_ms"])
+        for name in names
+    }
+    return [
+        where | {"contender": name, "load": round(os.getloadavg()[0], 1)} | best[name]
+        for name in names
+    ]
+
+
+def print_row(rows: list[dict]) -> None:
+    first, fastest = rows[0], rows[0]["both_ms"]
+    print(
+        f"\n{first['gaussians']} Gaussians, {first['size']} x {first['size']}, "
+        f"{first['threads']} threads, load {first['load']}"
+    )
+    for row in rows:
+        times = f"forward {row['forward_ms']:9.2f} ms   with backward {row['both_ms']:9.2f} ms"
+        print(
+            f"  {row['contender']:10} {times}   {row['memory_mb']:7.0f} MB   "
+            f"{row['both_ms'] / fastest:8.2f} x {first['contender']}",
+            flush=True,
+        )
+
+
+def describe_machine() -> str:
+    """Processor, versions and commit, for the head of the table."""
+    info = pathlib.Path("/proc/cpuinfo")
+    names = (
+        [
+            line.split(":")[1].strip()
+            for line in info.read_text().splitlines()
+            if line.startswith("model name")
+        ]
+        if info.exists()
+        else []
+    )
+    cpu, commit = names[0] if names else platform.processor(), _commit() or "unknown"
+    return (
+        f"{cpu}, {os.cpu_count()} threads; Python {platform.python_version()}, torch "
+        f"{torch.__version__}; commit {commit}"
+    )
+
+
+def _commit() -> str:
+    """Nothing where there is no git, or this isn't a checkout."""
+    git = shutil.which("git")
+    if git is None:
+        return ""
+    return subprocess.run(
+        [git, "-C", str(ROOT), "rev-parse", "--short", "HEAD"], capture_output=True, text=True
+    ).stdout.strip()
+
+
+def available(names: list[str]) -> list[str]:
+    """Those that can run here; says why not of the others."""
+    from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
+
+    builds = cpu.usable_builds()
+    missing = {
+        name: f"no {name} build for this machine"
+        for name in names
+        if name.startswith("cpu") and name.partition("-")[2] not in ("", *builds)
+    }
+    if "prototype" in names and not ((PROTOTYPE / "proto.cpp").exists() and "v4" in builds):
+        missing["prototype"] = f"needs AVX-512 and {PROTOTYPE}"
+    if "gsplat" in names and importlib.util.find_spec("gsplat") is None:
+        missing["gsplat"] = "pip install gsplat"
+    if not builds:
+        missing["cpu"] = cpu.unavailable()
+    for name, reason in missing.items():
+        print(f"without {name}: {reason}")
+    return [name for name in names if name not in missing]
+
+
+def write_csv(rows: list[dict], machine: str) -> None:
+    path = ROOT / "benchmarks" / "results" / "splatting.csv"
+    path.parent.mkdir(exist_ok=True)
+    with path.open("w", newline="") as file:
+        file.write(f"# {machine}\n")
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(
+            {
+                key: round(value, 3) if isinstance(value, float) else value
+                for key, value in row.items()
+            }
+            for row in rows
+        )
+    print(f"\nwritten to {path.relative_to(ROOT)}")
+
+
+def parse(argv: list[str]) -> argparse.Namespace:
+    numbers, words = lambda text: [int(x) for x in text.split(",")], lambda text: text.split(",")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--gaussians", type=numbers, default=[5_000, 20_000, 100_000, 500_000])
+    parser.add_argument("--sizes", type=numbers, default=[256, 512, 1024])
+    parser.add_argument("--threads", type=numbers, default=[1, torch.get_num_threads()])
+    parser.add_argument(
+        "--contenders",
+        type=words,
+        default=list(CONTENDERS),
+        help="the first one is the unit of the ratios",
+    )
+    parser.add_argument(
+        "--preset", default="fast", help="fast is what the prototype and every peer do"
+    )
+    parser.add_argument(
+        "--gsplat-size", type=int, default=512, help="the largest picture that gsplat's twins draw"
+    )
+    parser.add_argument("--turns", type=int, default=2)
+    parser.add_argument(
+        "--seconds", type=float, default=2.0, help="per cell and turn, at least three steps"
+    )
+    parser.add_argument("--cell", nargs=4, help=argparse.SUPPRESS)
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str]) -> None:
+    args = parse(argv)
+    if args.cell:
+        name, *where = args.cell
+        return run_cell(name, *map(int, where), args.preset, args.seconds)
+    machine = describe_machine()
+    print(machine)
+    args.contenders = available(args.contenders)
+    rows = []
+    for gaussians in args.gaussians:
+        for size in args.sizes:
+            for threads in dict.fromkeys(args.threads):
+                row = run_row(gaussians, size, threads, args)
+                print_row(row)
+                rows += row
+    write_csv(rows, machine)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

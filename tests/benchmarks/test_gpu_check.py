@@ -1,0 +1,100 @@
+"""The check for machines with a GPU runs from end to end: here on the CPU, with everything tiny."""
+
+import importlib
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+ROOT = Path(__file__).parents[2]
+
+
+def check(*arguments):
+    command = [sys.executable, "-m", "benchmarks.splatting.gpu_check", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+
+
+@pytest.mark.slow
+def test_every_section_runs_and_reports(tmp_path):
+    pytest.importorskip("diffusers")
+    done = check("--device", "cpu", "--small", "--out", tmp_path / "report.json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert all(cell["gradient"] < 2e-5 for cell in report["correct"]["relative_errors"].values())
+    assert (
+        report["train"]["default"]["seconds_per_step"] > 0
+        and report["train"]["lowmem"]["seconds_per_step"] > 0
+    )
+    assert report["prune"]["gaussians"] == [800, 200] and report["prune"]["psnr"] > 20
+    assert report["compile"]["first"] > 0 and report["bench"]["fast"]["ms"] > 0
+
+
+@pytest.fixture
+def gpu_check(monkeypatch):
+    return importlib.import_module("benchmarks.splatting.gpu_check")
+
+
+@pytest.mark.slow
+def test_what_fails_is_recorded_and_the_rest_goes_on(gpu_check, monkeypatch, tmp_path):
+    monkeypatch.setattr(gpu_check, "GRADIENT_ERROR", 0.0)
+    monkeypatch.setattr(
+        gpu_check, "SECTIONS", {name: gpu_check.SECTIONS[name] for name in ("correct", "bench")}
+    )
+    status = gpu_check.main(["--device", "cpu", "--small", "--out", str(tmp_path / "report.json")])
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (
+        status == 1
+        and len(report["correct"]["failed"]) == len(report["correct"]["relative_errors"]) == 3
+    )
+    assert (
+        all("gradient by" in words for words in report["correct"]["failed"])
+        and report["bench"]["fast"]["ms"] > 0
+    )
+
+
+def test_each_section_leaves_its_numbers_whatever_the_next_one_does(
+    gpu_check, monkeypatch, tmp_path
+):
+    def crash(args):
+        raise SystemExit("as if somebody had ended the process")
+
+    monkeypatch.setattr(gpu_check, "about", lambda args: {"device": "cpu"})
+    monkeypatch.setattr(
+        gpu_check, "SECTIONS", {"compile": lambda args: {"first": 1.0}, "correct": crash}
+    )
+    with pytest.raises(SystemExit):
+        gpu_check.main(["--device", "cpu", "--out", str(tmp_path / "report.json")])
+    assert json.loads((tmp_path / "report.json").read_text())["compile"]["first"] == 1.0
+
+
+def test_a_part_that_hangs_ends_with_all_that_it_started(gpu_check):
+    """As a compiler of a compiler does, or a program under compute-sanitizer: they hold the pipes,
+    and nobody waits for them.
+    """
+    args = gpu_check.parse_arguments([])
+    started = time.monotonic()
+    with pytest.raises(RuntimeError, match=r"more than 1 s: so far"):
+        gpu_check.run(["sh", "-c", "echo so far; sleep 60 & sleep 60"], args, 1, {})
+    assert time.monotonic() - started < 30
+
+
+def test_no_part_begins_when_the_minutes_are_over(gpu_check):
+    with pytest.raises(RuntimeError, match="minutes were over"):
+        gpu_check.run(["true"], gpu_check.parse_arguments(["--minutes", "0"]), 60, {})
+
+
+def test_what_is_timed_is_drawing_alone(gpu_check, monkeypatch):
+    draw = gpu_check.drawer(gpu_check.on("cpu", gpu_check.make_scene(50)), 16, 1, "cpu")
+    monkeypatch.setattr(torch, "randn", None)
+    assert len(draw()) == 8
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_it_says_why(tmp_path):
+    done = check("--out", tmp_path / "report.json")
+    assert done.returncode == 2 and "nothing was checked" in done.stderr
+    assert "nothing was checked" in json.loads((tmp_path / "report.json").read_text())["failed"]

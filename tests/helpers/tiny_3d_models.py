@@ -1,0 +1,316 @@
+"""Tiny models in the files of the real ones for the 3D priors: CLIP, Shap-E, Point-E and a body in
+SMPL's format.
+
+Weights are random, but for two things that make results predictable: Shap-E's renderer gives one
+known shape whatever the latents, and the body's joints and limbs are where a person's are."""
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests.helpers.tiny_models import _byte_vocabulary
+
+FEATURES = 24
+"""Of the tiny CLIP."""
+IMAGE_SIZE = 32
+SHAPE_CENTRE = np.array([0.1, -0.3, 0.2])
+SHAPE_HALF_SIDES = np.array([0.2, 0.3, 0.5])
+"""Of the octahedron that the tiny Shap-E draws, in its own space."""
+
+
+# --------------------------------------------------------------------------------------------------
+# CLIP
+
+
+def clip(folder: Path, seed: int = 0) -> Path:
+    """A whole CLIP, as ``openai/clip-vit-large-patch14`` has it: one file of weights beside the
+    tokenizer's.
+    """
+    from transformers import CLIPConfig, CLIPModel
+
+    torch.manual_seed(seed)
+    config = CLIPConfig(
+        text_config=_clip_text_config().to_dict(),
+        vision_config={
+            "image_size": IMAGE_SIZE,
+            "patch_size": 8,
+            "hidden_size": 32,
+            "intermediate_size": 48,
+            "num_hidden_layers": 1,
+            "num_attention_heads": 2,
+            "projection_dim": FEATURES,
+        },
+        projection_dim=FEATURES,
+    )
+    CLIPModel(config).save_pretrained(folder)
+    _tokenizer(folder)
+    return folder
+
+
+def _clip_text_config():
+    from transformers import CLIPTextConfig
+
+    vocabulary = _byte_vocabulary()
+    return CLIPTextConfig(
+        vocab_size=len(vocabulary),
+        hidden_size=32,
+        intermediate_size=48,
+        num_hidden_layers=2,
+        num_attention_heads=2,
+        projection_dim=FEATURES,
+        bos_token_id=vocabulary["<|startoftext|>"],
+        eos_token_id=vocabulary["<|endoftext|>"],
+    )
+
+
+def _tokenizer(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "vocab.json").write_text(
+        json.dumps(_byte_vocabulary(), ensure_ascii=False), encoding="utf-8"
+    )
+    (folder / "merges.txt").write_text("#version: 0.2\nf o\nfo x</w>\n", encoding="utf-8")
+    special = {
+        "bos_token": "<|startoftext|>",
+        "eos_token": "<|endoftext|>",
+        "unk_token": "<|endoftext|>",
+        "pad_token": "<|endoftext|>",
+    }
+    (folder / "tokenizer_config.json").write_text(
+        json.dumps(special | {"model_max_length": 77, "tokenizer_class": "CLIPTokenizer"})
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Shap-E
+
+
+def shap_e(folder: Path, seed: int = 0) -> Path:
+    """What ``ShapEPipeline.save_pretrained`` writes; the scheduler has the published configuration."""
+    from diffusers import HeunDiscreteScheduler, ShapEPipeline
+    from transformers import CLIPTextModelWithProjection, CLIPTokenizer
+
+    torch.manual_seed(seed)
+    _tokenizer(folder / "vocabulary")
+    scheduler = HeunDiscreteScheduler(
+        beta_schedule="exp",
+        num_train_timesteps=1024,
+        prediction_type="sample",
+        use_karras_sigmas=True,
+        clip_sample=True,
+    )
+    ShapEPipeline(
+        prior=shap_e_prior(),
+        text_encoder=CLIPTextModelWithProjection(_clip_text_config()),
+        tokenizer=CLIPTokenizer.from_pretrained(folder / "vocabulary"),
+        scheduler=scheduler,
+        shap_e_renderer=_shap_e_renderer(),
+    ).save_pretrained(folder)
+    return folder
+
+
+def shap_e_prior(heads: int = 2, layers: int = 2):
+    """The text-to-latent network, tiny; the options are the published ones."""
+    from diffusers import PriorTransformer
+
+    return PriorTransformer(
+        num_attention_heads=heads,
+        attention_head_dim=8,
+        num_layers=layers,
+        embedding_dim=8,
+        num_embeddings=16,
+        additional_embeddings=0,
+        time_embed_act_fn="gelu",
+        norm_in_type="layer",
+        embedding_proj_norm_type=None,
+        encoder_hid_proj_type=None,
+        added_emb_type=None,
+        time_embed_dim=4 * 8 * heads,
+        embedding_proj_dim=FEATURES,
+        clip_embed_dim=16,
+    )
+
+
+def _shap_e_renderer():
+    """A renderer whose signed distance is that of an octahedron: 1 - |x|/a - |y|/b - |z|/c, its |.|
+    from pairs of SiLUs.
+    """
+    from diffusers.pipelines.shap_e.renderer import ShapERenderer
+
+    names, shapes = ("nerstf.mlp.0.weight", "nerstf.mlp.1.weight"), ((8, 93), (8, 8))
+    renderer = ShapERenderer(
+        param_names=names,
+        param_shapes=shapes,
+        d_latent=8,
+        d_hidden=8,
+        n_output=12,
+        n_hidden_layers=2,
+        insert_direction_at=None,
+    )
+    steep = 200.0
+    first, bias = torch.zeros(8, 93), torch.zeros(8)
+    for axis, (centre, half) in enumerate(zip(SHAPE_CENTRE, SHAPE_HALF_SIDES, strict=True)):
+        for row, sign in ((2 * axis, 1), (2 * axis + 1, -1)):
+            first[row, axis], bias[row] = sign * steep / half, -sign * steep * centre / half
+    last = torch.zeros(12, 8)
+    last[0, :6] = -1 / steep
+    last[4, 4], last[4, 5] = (
+        1 / steep,
+        -1 / steep,
+    )  # green rises with z, from sigmoid(-1) to sigmoid(1)
+    with torch.no_grad():
+        for name, weight in zip(names, (first, torch.eye(8)), strict=True):
+            projection = renderer.params_proj.projections[name.replace(".", "__")]
+            projection.norm.weight.zero_()  # so that the latents don't matter
+            projection.norm.bias.zero_()
+            projection.proj.bias.copy_(weight.flatten())
+        for layer, values in zip(
+            renderer.mlp.mlp, (bias, torch.zeros(8), torch.zeros(12)), strict=True
+        ):
+            layer.bias.copy_(values)
+        renderer.mlp.mlp[2].weight.copy_(last)
+        renderer.mlp.mlp[2].bias[0], renderer.mlp.mlp[2].bias[3] = 1.0, 2.0
+    cases, masks = marching_cubes_tables()
+    renderer.mesh_decoder.cases.copy_(cases)
+    renderer.mesh_decoder.masks.copy_(masks)
+    return renderer
+
+
+def marching_cubes_tables() -> tuple[torch.Tensor, torch.Tensor]:
+    """Triangles (256, 5, 3) of edges and which of them count (256, 5), for each set of positive
+    corners.
+
+    Corner x + 2y + 4z; edges 0-3 along x, 4-7 along y, 8-11 along z. Loops of crossed edges are cut
+    into fans."""
+    edges = [(c, c | 1 << axis) for axis in range(3) for c in range(8) if not c >> axis & 1]
+    cases, masks = torch.zeros(256, 5, 3, dtype=torch.long), torch.zeros(256, 5, dtype=torch.bool)
+    for case in range(256):
+        triangles = [triangle for loop in _loops(case, edges) for triangle in _fan(loop)][:5]
+        for index, triangle in enumerate(triangles):
+            cases[case, index], masks[case, index] = torch.tensor(triangle), True
+    return cases, masks
+
+
+def _loops(case: int, edges: list[tuple[int, int]]) -> list[list[int]]:
+    positive = [bool(case >> corner & 1) for corner in range(8)]
+    links: dict[int, list[int]] = {}
+    for axis, side in itertools.product(range(3), range(2)):
+        a, b = (1 << other for other in range(3) if other != axis)
+        ring = [(side << axis) | corner for corner in (0, a, a | b, b)]
+        crossed = [
+            edges.index(tuple(sorted((ring[i], ring[(i + 1) % 4]))))
+            for i in range(4)
+            if positive[ring[i]] != positive[ring[(i + 1) % 4]]
+        ]
+        if len(crossed) == 4 and not positive[ring[0]]:
+            crossed = crossed[1:] + crossed[:1]  # cut off the positive corners
+        if len(crossed) == 4:
+            crossed = [crossed[3], crossed[0], crossed[1], crossed[2]]
+        for first, second in zip(crossed[::2], crossed[1::2], strict=True):
+            links.setdefault(first, []).append(second)
+            links.setdefault(second, []).append(first)
+    loops = []
+    while links:
+        loop = [next(iter(links))]
+        while following := [edge for edge in links.get(loop[-1], []) if edge not in loop]:
+            loop.append(following[0])
+        for edge in loop:
+            links.pop(edge)
+        loops.append(loop)
+    return loops
+
+
+def _fan(loop: list[int]) -> list[tuple[int, int, int]]:
+    return [(loop[0], loop[i], loop[i + 1]) for i in range(1, len(loop) - 1)]
+
+
+# --------------------------------------------------------------------------------------------------
+# Point-E
+
+
+def point_e(folder: Path, seed: int = 0) -> tuple[Path, Path]:
+    """``base_40m_textvec.pt`` and ``upsample_40m.pt``, one block each and with random last layers."""
+    from threestudio_gaussiandreamer.priors.point_e_model import BaseModel, Upsampler
+
+    torch.manual_seed(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    base, upsampler = folder / "base_40m_textvec.pt", folder / "upsample_40m.pt"
+    torch.save(BaseModel(width=64, layers=1, features=FEATURES).state_dict(), base)
+    torch.save(Upsampler(width=64, layers=1, features=40).state_dict(), upsampler)
+    return base, upsampler
+
+
+# --------------------------------------------------------------------------------------------------
+# body
+
+PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21]
+JOINTS = np.array(  # metres, y up, looking along +z; the left side has x > 0
+    [
+        (0.00, 0.00, 0.00), (0.07, -0.09, 0.00), (-0.07, -0.09, 0.00), (0.00, 0.11, -0.02), (0.10, -0.47, 0.00), (-0.10, -0.47, 0.00),
+        (0.00, 0.25, 0.00), (0.09, -0.87, -0.04), (-0.09, -0.87, -0.04), (0.00, 0.30, 0.02), (0.11, -0.93, 0.08), (-0.11, -0.93, 0.08),
+        (0.00, 0.51, -0.02), (0.08, 0.41, -0.01), (-0.08, 0.41, -0.01), (0.00, 0.60, 0.03), (0.17, 0.45, -0.02), (-0.17, 0.45, -0.02),
+        (0.43, 0.43, -0.04), (-0.43, 0.43, -0.04), (0.68, 0.44, -0.04), (-0.68, 0.44, -0.04), (0.76, 0.43, -0.05), (-0.76, 0.43, -0.05),
+    ]
+)  # fmt: skip
+RING = 8
+
+
+def body_arrays(seed: int = 0) -> dict[str, np.ndarray]:
+    """A body of tubes around the bones, with the arrays of SMPL's file; two shape coefficients,
+    height and width.
+    """
+    vertices, faces, owners = [], [], []
+    for joint in range(1, 24):
+        tube, tube_faces = _tube(JOINTS[PARENTS[joint]], JOINTS[joint])
+        faces.append(tube_faces + sum(map(len, vertices)))
+        vertices.append(tube)
+        owners.append(np.full(len(tube), PARENTS[joint]))
+    vertices, owners = np.concatenate(vertices), np.concatenate(owners)
+    weights = np.eye(24)[owners]
+    regressor = _regressor(vertices)
+    shape = np.zeros((len(vertices), 3, 10))
+    shape[:, 1, 0], shape[:, 0, 1] = 0.05 * vertices[:, 1], 0.05 * vertices[:, 0]
+    rng = np.random.default_rng(seed)
+    return {
+        "v_template": vertices,
+        "shapedirs": shape,
+        "posedirs": rng.normal(scale=1e-4, size=(len(vertices), 3, 207)),
+        "J_regressor": regressor,
+        "weights": weights,
+        "kintree_table": np.array([[2**32 - 1, *PARENTS[1:]], range(24)], np.uint32),
+        "f": np.concatenate(faces).astype(np.uint32),
+    }
+
+
+def body_model(path: Path) -> Path:
+    np.savez(path, **body_arrays())
+    return path
+
+
+def _tube(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A closed tube of 4 cm radius: two rings, whose mean is the bone's end, and their centres."""
+    along = (end - start) / np.linalg.norm(end - start)
+    side = np.cross(along, [0.0, 0.0, 1.0] if abs(along[2]) < 0.9 else [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    angles = 2 * np.pi * np.arange(RING) / RING
+    ring = 0.04 * (np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * np.cross(along, side))
+    faces = []
+    for i in range(RING):
+        j = (i + 1) % RING
+        faces += [
+            (i, j, RING + i),
+            (j, RING + j, RING + i),
+            (2 * RING, j, i),
+            (2 * RING + 1, RING + i, RING + j),
+        ]
+    return np.concatenate([start + ring, end + ring, [start, end]]), np.array(faces)
+
+
+def _regressor(vertices: np.ndarray) -> np.ndarray:
+    """Each joint is the mean of the vertices that are its own: centres of tubes that end in it."""
+    regressor = (np.linalg.norm(vertices[None] - JOINTS[:, None], axis=-1) < 1e-9).astype(
+        np.float64
+    )
+    return regressor / regressor.sum(axis=1, keepdims=True)

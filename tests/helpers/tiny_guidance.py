@@ -1,0 +1,77 @@
+"""Stable Diffusion's guidance with tiny models, for the tests of it."""
+
+import torch
+from torch import nn
+
+from tests.helpers import tiny_models
+from threestudio_gaussiandreamer.guidance import stable_diffusion  # noqa: F401
+from threestudio_gaussiandreamer.host import find
+from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
+
+PREDICTIONS = ("epsilon", "v_prediction")
+BATCH = {
+    "elevation": torch.tensor([0.0, 10.0, 70.0, -5.0]),
+    "azimuth": torch.tensor([10.0, 60.0, 170.0, -120.0]),
+    "camera_distances": torch.tensor([2.0, 3.0, 1.5, 4.0]),
+}
+TIMESTEPS = torch.tensor([40, 400, 700, 950])
+
+
+def make_models(folder):
+    """A tiny Stable Diffusion for each of ``PREDICTIONS``."""
+    return {
+        prediction: tiny_models.stable_diffusion(folder / prediction, prediction=prediction)
+        for prediction in PREDICTIONS
+    }
+
+
+def guidance(models, prediction="epsilon", **options):
+    return find("gaussiandreamer-stable-diffusion-guidance")(
+        {"pretrained_model_name_or_path": str(models[prediction]), **options}
+    )
+
+
+def make_prompts(models):
+    """Embeddings of one prompt, without and with Perp-Neg; they don't depend on the prediction
+    type.
+    """
+    options = {
+        "pretrained_model_name_or_path": str(models["epsilon"]),
+        "prompt": "a fox",
+        "negative_prompt": "ugly",
+        "use_cache": False,
+    }
+    processor = find("gaussiandreamer-stable-diffusion-prompt-processor")
+    return {perp: processor({**options, "use_perp_neg": perp})() for perp in (False, True)}
+
+
+def renders(batch=4, size=64, seed=0):
+    return torch.rand(
+        batch, size, size, 3, generator=torch.Generator().manual_seed(seed)
+    ).requires_grad_()
+
+
+def gradient(guide, prompt_utils, rgb, **options):
+    out = guide(rgb, prompt_utils, **first(len(rgb)), **options)
+    (grad,) = torch.autograd.grad(out["loss_sds"], rgb)
+    return grad, out
+
+
+def first(count):
+    return {name: values[:count] for name, values in BATCH.items()}
+
+
+def relative(a, b):
+    return float((a.double() - b).norm() / b.norm())
+
+
+class Recorder(nn.Module):
+    """Passes calls on to a network and remembers their first arguments."""
+
+    def __init__(self, network):
+        super().__init__()
+        self.network, self.calls = network, []
+
+    def forward(self, *args, **kwargs):
+        self.calls.append((args, kwargs))
+        return self.network(*args, **kwargs)

@@ -1,0 +1,91 @@
+"""The drop-in inside an unmodified threestudio: all stages on its own launch.py, registry, base
+classes, data module and savers.
+
+Needs ``THREESTUDIO_SRC`` (a checkout of threestudio v0.2.3), ``HOST3_DIR`` (where the harness has
+put the environment that it starts in) and the harness itself, in ``GAUSSIANDREAMER_SHARED`` or
+``../shared``; skipped without."""
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+SHARED = Path(os.environ.get("GAUSSIANDREAMER_SHARED", REPOSITORY.parent / "shared"))
+HARNESS = SHARED / "real_host" / "try_extension.sh"
+HOST = Path(os.environ.get("HOST3_DIR", "no such folder"))
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not os.environ.get("THREESTUDIO_SRC"), reason="THREESTUDIO_SRC isn't set"),
+    pytest.mark.skipif(not HARNESS.is_file(), reason="the harness isn't there"),
+    pytest.mark.skipif(not (HOST / "venv").is_dir(), reason="HOST3_DIR has no environment"),
+]
+
+SMALL = [
+    f"system.guidance.mesh={SHARED / 'assets' / 'spot.glb'}",
+    "trainer.max_steps=3",
+    "data.width=32",
+    "data.height=32",
+    "data.eval_width=32",
+    "data.eval_height=32",
+    "data.n_test_views=2",
+    "system.geometry.prior.num_points=300",
+    "system.geometry.grow.max_points=100",
+    "system.evaluation.size=32",
+    "system.evaluation.views=2",
+]
+
+
+def try_extension(tmp_path: Path, config: Path, *overrides: str) -> set[str]:
+    """Run all stages; returns the files they left."""
+    environment = {
+        **os.environ,
+        "STAGES": "train test export validate resume",
+        "SCRATCH": str(tmp_path / "scratch"),
+        "EXTRA_PYTHONPATH": os.pathsep.join(
+            filter(None, [str(REPOSITORY), os.environ.get("EXTRA_PYTHONPATH")])
+        ),
+    }
+    command = [
+        "bash",
+        str(HARNESS),
+        str(REPOSITORY / "custom" / "threestudio-gaussiandreamer"),
+        str(config),
+        *SMALL,
+        *overrides,
+    ]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (run,) = (tmp_path / "scratch" / "outputs" / "demo").iterdir()
+    return {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
+
+
+EXPECTED = {
+    "ckpts/last.ckpt",
+    "save/it3-0.png",
+    "save/it3-test.mp4",
+    "save/it3-export/gaussians.ply",
+    "save/it5-test.mp4",
+}
+
+
+def test_our_configuration_with_our_data_module(tmp_path):
+    assert try_extension(tmp_path, REPOSITORY / "configs" / "demo.yaml") >= EXPECTED
+
+
+def test_our_configuration_with_the_data_module_and_background_of_the_host(tmp_path):
+    lines = (REPOSITORY / "configs" / "demo.yaml").read_text().splitlines()
+    kept = "\n".join(
+        line
+        for line in lines
+        if "train_views" not in line and not line.strip().startswith("background:")
+    )
+    for ours, theirs in (
+        ("gaussiandreamer-datamodule", "random-camera-datamodule"),
+        ("gaussiandreamer-background", "solid-color-background"),
+    ):
+        kept = kept.replace(ours, theirs)
+    (tmp_path / "host.yaml").write_text(kept)
+    assert try_extension(tmp_path, tmp_path / "host.yaml") >= EXPECTED

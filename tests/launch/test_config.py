@@ -1,0 +1,468 @@
+"""Configurations: loading, texts that stay texts, folders, and the check of every key."""
+
+import copy
+import os
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from tests.helpers import tiny_parts
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.core.checkpoint_file import save_file
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch.config import dump_config, load_config
+from threestudio_gaussiandreamer.launch.config_check import check_config
+from threestudio_gaussiandreamer.launch.extensions import load_extensions
+from threestudio_gaussiandreamer.launch.run_folder import safe_name
+
+PROMPT = "system.prompt_processor.prompt"
+PROMPTS = [
+    "a fox",
+    "1984",
+    "yes",
+    "null",
+    "~",
+    "a fox: red",
+    "robot #1",
+    "[a] b",
+    "${x}",
+    "${data.views}",
+    "\\${a} \\\\${b}\\",
+    'it\'s a "fox"',
+    "../../etc/passwd",
+    "a/b\\c",
+    "a 🦊 fox",
+    "-x --train",
+    "a = b",
+    "two\nlines",
+    "CON",
+    "x" * 4096,
+    "",
+    " spaces ",
+]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tiny.yaml").write_text(tiny_parts.CONFIG)
+    return tmp_path
+
+
+def load(*overrides: str):
+    return load_config("tiny.yaml", cli_args=overrides)
+
+
+# -- loading ---------------------------------------------------------------------------------------
+
+
+def test_sections_interpolations_and_overrides(folder):
+    cfg = load("trainer.max_steps=12", "data.views=3", "seed=7")
+    assert (
+        cfg.trainer.max_steps,
+        cfg.checkpoint.every_n_train_steps,
+        cfg.data.views,
+        cfg.seed,
+    ) == (12, 12, 3, 7)
+    assert cfg.tag == "a_red_ball" and re.fullmatch(
+        r"outputs/tiny/a_red_ball@\d{8}-\d{6}", cfg.trial_dir
+    )
+
+
+def test_loading_makes_no_folder(folder):
+    load()
+    assert os.listdir(folder) == ["tiny.yaml"]
+
+
+def test_later_files_and_the_command_line_win(folder):
+    Path("more.yaml").write_text("seed: 4\ntrainer: {max_steps: 9}\ndata: null\n")
+    cfg = load_config("tiny.yaml", "more.yaml", cli_args=["seed=5"])
+    assert (cfg.seed, cfg.trainer.max_steps, cfg.trainer.log_every_n_steps, dict(cfg.data)) == (
+        5,
+        9,
+        2,
+        {},
+    )
+
+
+@pytest.mark.parametrize(
+    ("expression", "value"),
+    [
+        ("${add:1,2}", 3),
+        ("${sub:1,2}", -1),
+        ("${mul:3,2}", 6),
+        ("${div:1,2}", 0.5),
+        ("${idiv:5,2}", 2),
+        ("${basename:a/b.yaml}", "b.yaml"),
+        ("${rmspace:'a b',_}", "a_b"),
+        ("${tuple2:3}", [3.0, 3.0]),
+        ("${gt0:1}", True),
+        ("${not:true}", False),
+        ("${cmaxgt0:[0,0.0,1.0,5]}", True),
+        ("${cmaxgt0orcmaxgt0:0,0.0}", False),
+        ("${calc_exp_lr_decay_rate:0.01,2}", 0.1),
+    ],
+)
+def test_resolvers_of_threestudio(folder, expression, value):
+    found = load(f"system.x={expression}").system.x
+    assert found == (pytest.approx(value, abs=1e-12) if isinstance(value, float) else value)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("abc", "'abc' isn't an override: expected key=value"),
+        ("=3", "isn't an override"),
+        ("~system", "isn't an override"),
+        ("data.views=[1", "the value of data.views isn't valid YAML"),
+        ("nmae=x", "unknown key 'nmae': did you mean 'name'"),
+        ("seed=x", "seed: Value 'x'"),
+        ("trainer=3", "trainer"),
+        ("data.views=${nothing}", "data.views: Interpolation key 'nothing' not found"),
+        ("data.views=${nothing:1}", "data.views: Unsupported interpolation type nothing"),
+        ("data.views=${div:1,0}", "division"),
+    ],
+)
+def test_a_bad_override_is_named(folder, override, message):
+    with pytest.raises(UserError, match=re.escape(message)):
+        load(override)
+
+
+def test_missing_values_are_all_named(folder):
+    Path("open.yaml").write_text(
+        "system: {prompt_processor: {prompt: '???'}, a: '${system.prompt_processor.prompt}'}\n"
+    )
+    Path("data.yaml").write_text("data: {views: '???'}")
+    with pytest.raises(UserError, match="no value for data.views, system.prompt_processor.prompt"):
+        load_config("open.yaml", "data.yaml")
+    assert (
+        load_config("open.yaml", "data.yaml", cli_args=["data.views=1", f"{PROMPT}=x"]).system.a
+        == "x"
+    )
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"a: " + 500 * b"[" + 500 * b"]", "at most 32 levels deep"),
+        (b"a: &a [*a]", "hold fewer than"),
+        (
+            b"".join(
+                b"a%d: &a%d [%s]\n" % (i, i, b", ".join(9 * [b"*a%d" % (i - 1) if i else b"x"]))
+                for i in range(9)
+            ),
+            "hold fewer than",
+        ),
+        (b"a: &a {b: 1}\nc: {<<: *a}\non: 3", "has the key True, which isn't a word"),
+        (b"a: [1", "isn't valid YAML: line 1, column 6: expected"),
+        (b"name: a\nname: b", "isn't valid YAML: line 2"),
+        (b"- a", "must hold sections and keys"),
+        (b"\xff\xfe", "can't be read"),
+        (b"prompt: a fox: red", "isn't valid YAML: line 1, column 14"),
+    ],
+)
+def test_a_bad_file_is_named(folder, content, message):
+    Path("bad.yaml").write_bytes(content)
+    with pytest.raises(UserError, match=f"bad.yaml.*{re.escape(message)}"):
+        load_config("bad.yaml")
+
+
+# -- texts -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("prompt", PROMPTS)
+def test_a_prompt_is_text_and_comes_back_from_the_parsed_file(folder, prompt):
+    # a second reference to the prompt must be text too
+    cfg = load(
+        f"{PROMPT}={prompt}",
+        "system.twin=${system.prompt_processor.prompt}",
+        f"description={prompt}",
+    )
+    dump_config("parsed.yaml", cfg)
+    for loaded in (cfg, load_config("parsed.yaml")):
+        assert (
+            loaded.system.prompt_processor.prompt
+            == loaded.system.twin
+            == loaded.description
+            == prompt
+        )
+        assert loaded.tag == prompt.replace(" ", "_")
+        assert loaded.trial_dir == cfg.trial_dir
+
+
+@given(st.text(st.characters(blacklist_categories=("Cs",)), max_size=20))
+@example("\0")
+def test_a_prompt_never_leaves_the_output_root(tmp_path_factory, prompt):
+    path = tmp_path_factory.getbasetemp() / "tiny.yaml"
+    path.write_text(tiny_parts.CONFIG)
+    cfg = load_config(path, cli_args=[f"{PROMPT}={prompt}", f"name={prompt}"])
+    assert cfg.system.prompt_processor.prompt == prompt
+    root, name, trial = cfg.trial_dir.split("/")
+    assert root == "outputs" and name not in ("", ".", "..") and trial.endswith(cfg.timestamp)
+    assert len(trial.encode()) <= 64 + 9 + len(cfg.timestamp) and "\0" not in cfg.trial_dir
+
+
+@pytest.mark.parametrize("text", ["a_red_ball", "v1.2-final", "Pikachu,_4k", "été"])
+def test_a_harmless_tag_names_its_folder_as_it_is(text):
+    assert safe_name(text) == text
+
+
+@pytest.mark.parametrize(
+    "text", ["a:b", "..", ".hidden", "-rf", "con", "NUL.txt", "a ", "x" * 65, "a@b", "\n"]
+)
+def test_a_harmful_tag_becomes_a_slug_with_a_hash(text):
+    assert safe_name(text) != text and re.search(r"-[0-9a-f]{8}$", safe_name(text))
+
+
+def test_different_texts_name_different_folders():
+    assert len({safe_name(text) for text in ("a/b", "a:b", "a_b", "A/b", "a\\b")}) == 5
+
+
+def test_prompts_in_a_yaml_are_text_where_yaml_reads_a_number(folder):
+    for written, meant in (
+        ("1984", "1984"),
+        ("yes", "yes"),
+        ("1e3", "1e3"),
+        ("0x10", "0x10"),
+        ("'a: b'", "a: b"),
+    ):
+        Path("more.yaml").write_text(
+            f"system:\n  prompt_processor:\n    prompt: {written}\ntag: {written}\n"
+        )
+        cfg = load_config("tiny.yaml", "more.yaml")
+        assert cfg.system.prompt_processor.prompt == cfg.tag == meant
+
+
+def test_a_prompt_from_a_file(folder):
+    Path("prompt.txt").write_text("\ufeffa fox: red\n${x}\n", encoding="utf-8")
+    cfg = load("system.prompt_processor.prompt_file=prompt.txt")
+    assert (
+        cfg.system.prompt_processor.prompt == "a fox: red\n${x}"
+        and "prompt_file" not in cfg.system.prompt_processor
+    )
+    assert cfg.trial_name.startswith("a_fox__red___x_-")
+    with pytest.raises(UserError, match="prompt file 'nothing.txt' does not exist"):
+        load("system.prompt_processor.prompt_file=nothing.txt")
+    with pytest.raises(UserError, match="both prompt and prompt_file"):
+        load("system.prompt_processor.prompt_file=prompt.txt", f"{PROMPT}=x")
+
+
+def test_paths_may_hold_what_yaml_reads_otherwise(folder):
+    cfg = load("exp_root_dir=out #1", "system.weights=a: b.ckpt", "resume=[x].ckpt")
+    assert (cfg.exp_root_dir, cfg.system.weights, cfg.resume) == ("out #1", "a: b.ckpt", "[x].ckpt")
+    assert load("resume=null").resume is None
+
+
+# -- folders ---------------------------------------------------------------------------------------
+
+
+def test_without_timestamp_the_folder_is_the_tag(folder):
+    assert load("use_timestamp=false").trial_dir == "outputs/tiny/a_red_ball"
+    with pytest.raises(UserError, match="needs a tag"):
+        load("use_timestamp=false", "tag=")
+
+
+def test_a_second_run_within_the_same_second_has_its_own_folder(folder):
+    first = load()
+    os.makedirs(first.trial_dir)
+    for _ in range(50):
+        second = load()
+        assert second.trial_dir != first.trial_dir
+
+
+def test_resume_auto_takes_the_newest_run_of_the_tag(folder):
+    assert load("resume=auto").resume is None
+    checkpoint = {"state_dict": {}, "epoch": 0, "global_step": 3}
+    for time in ("20200101-000000", "20210101-000000"):
+        save_file(f"outputs/tiny/a_red_ball@{time}/ckpts/last.ckpt", checkpoint)
+    save_file("outputs/tiny/a_red_ball_2@20220101-000000/ckpts/last.ckpt", checkpoint)
+    cfg = load("resume=auto")
+    assert (
+        cfg.trial_dir == "outputs/tiny/a_red_ball@20210101-000000"
+        and cfg.resume == cfg.trial_dir + "/ckpts/last.ckpt"
+    )
+    # a damaged last checkpoint falls back to the one before
+    save_file(cfg.resume, checkpoint)
+    Path(cfg.resume).write_bytes(b"damaged")
+    assert load("resume=auto").resume == cfg.trial_dir + "/ckpts/last-prev.ckpt"
+
+
+def test_the_parsed_file_does_not_resume_again(folder):
+    dump_config("parsed.yaml", load("resume=a.ckpt"))
+    assert load_config("parsed.yaml").resume is None
+
+
+# -- the check -------------------------------------------------------------------------------------
+
+
+def keys_of(node: dict, prefix: str = "") -> list[str]:
+    inner = [
+        key
+        for name, value in node.items()
+        if isinstance(value, dict)
+        for key in keys_of(value, f"{prefix}{name}.")
+    ]
+    return [prefix + name for name in node] + inner
+
+
+# without references, so that only the misspelling is wrong
+PLAIN = yaml.safe_load(
+    tiny_parts.CONFIG.replace("${trainer.max_steps}", "6").replace(
+        "${rmspace:${system.prompt_processor.prompt},_}", "x"
+    )
+)
+
+
+@pytest.mark.parametrize("key", keys_of(PLAIN))
+def test_every_misspelt_key_is_rejected_with_the_right_one(folder, key):
+    content = copy.deepcopy(PLAIN)
+    section, _, leaf = key.rpartition(".")
+    parent = content
+    for name in filter(None, section.split(".")):
+        parent = parent[name]
+    misspelt = leaf[:-1]
+    parent[misspelt] = parent.pop(leaf)
+    Path("misspelt.yaml").write_text(yaml.safe_dump(content))
+    wrong, right = (f"{section}.{name}" if section else name for name in (misspelt, leaf))
+    with pytest.raises(UserError, match=f"unknown key {wrong!r}.*{right!r}"):
+        check_config(load_config("misspelt.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        (
+            "system.geometry.sise=3",
+            "unknown key 'system.geometry.sise': did you mean 'system.geometry.size'?",
+        ),
+        (
+            "system.geometry.prior.cuont=3",
+            "unknown key 'system.geometry.prior.cuont': did you mean "
+            "'system.geometry.prior.count'?",
+        ),
+        ("system.geometry.size=big", "system.geometry.size: Value 'big'"),
+        (
+            "system.geometry.prior.count=0",
+            "system.geometry.prior.count: expected at least 1, got 0",
+        ),
+        (
+            "system.geometry.prior_type=tiny-piror",
+            "system.geometry.prior_type: unknown part 'tiny-piror': did you mean 'tiny-prior'",
+        ),
+        ("system.geometry_type=tiny-geomerty", "system.geometry_type: unknown part"),
+        (
+            "system_type=tiny-sistem",
+            "system_type: unknown part 'tiny-sistem': did you mean 'tiny-system'",
+        ),
+        ("data_type=", "data_type"),
+        ("data.veiws=3", "unknown key 'data.veiws'"),
+        ("system.geometry=3", "system.geometry"),
+        (
+            "system.loss.sds=1",
+            "unknown key 'system.loss.sds': weights of losses are called lambda_<loss>",
+        ),
+        ("system.loss.lambda_sparsty=1", "did you mean 'system.loss.lambda_sparsity'"),
+        ("system.loss.lambda_fit=[1,2]", "system.loss.lambda_fit has 2 elements"),
+        ("system.loggers.wadb.enable=true", "unknown key 'system.loggers.wadb'"),
+        ("system.loggers.wandb.enabled=true", "unknown key 'system.loggers.wandb.enabled'"),
+        ("trainer.max_step=3", "unknown key 'trainer.max_step': did you mean 'trainer.max_steps'"),
+        ("trainer.max_steps=many", "trainer.max_steps is 'many' (str); expected one of: int"),
+        ("trainer.max_steps=2.5", "trainer.max_steps is 2.5 (float)"),
+        ("trainer.precision=17", "trainer: Precision 17 is invalid"),
+        ("trainer.accelerator=cpu", "trainer.accelerator is set by --gpu"),
+        ("trainer.logger=false", "trainer.logger is set by the launcher"),
+        ("checkpoint.every_n_steps=3", "unknown key 'checkpoint.every_n_steps'"),
+        ("checkpoint.every_n_epochs=1", "checkpoint: Combination of parameters"),
+        ("checkpoint.dirpath=x", "checkpoint.dirpath is set by exp_root_dir"),
+    ],
+)
+def test_a_mistake_is_named_by_its_path(folder, override, message):
+    with pytest.raises(UserError, match=re.escape(message)):
+        check_config(load(override))
+
+
+def test_a_valid_configuration_passes(folder):
+    check_config(
+        load(
+            "system.loss.lambda_sparsity=[0,0.0,1.0,5]",
+            "trainer.limit_val_batches=1",
+            "trainer.max_time=00:01:00:00",
+        )
+    )
+    check_config(load_config("tiny.yaml", cli_args=["system.exporter_type=dummy-exporter"]))
+
+
+# -- extensions ------------------------------------------------------------------------------------
+
+
+def test_extensions_of_both_kinds_are_loaded_and_others_left_out(folder):
+    part = (
+        "from threestudio_gaussiandreamer.host import BaseObject, "
+        "register\n@register('{0}')\nclass Part(BaseObject): pass\n"
+    )
+    (folder / "custom" / "my-package").mkdir(parents=True)
+    (folder / "custom" / "my-package" / "__init__.py").write_text("from . import inner")
+    (folder / "custom" / "my-package" / "inner.py").write_text(part.format("package-prior"))
+    (folder / "custom" / "single_prior.py").write_text(part.format("single-prior"))
+    for name in ("old_disabled.py", ".hidden.py", "notes.txt"):
+        (folder / "custom" / name).write_text("raise RuntimeError")
+    for name in ("folder_disabled", "no_init", "__pycache__"):
+        (folder / "custom" / name).mkdir()
+    assert load_extensions() == ["my-package", "custom/single_prior"]
+    from threestudio_gaussiandreamer.host import find
+
+    assert (
+        find("package-prior").__module__ == "my-package.inner"
+        and find("single-prior").__module__ == "custom/single_prior"
+    )
+    # a second run in this process doesn't execute them again
+    assert load_extensions() == ["my-package", "custom/single_prior"] and find("single-prior")
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (
+            "import os\nimport nothing_of_this_name\n",
+            r"custom/broken.py:2: ModuleNotFoundError: No module named 'nothing_of_this_name'",
+        ),
+        ("x = 1\ny = (\n", r"custom/broken.py:2: '\(' was never closed"),
+        ("def f():\n    raise KeyError('a')\n\nf()\n", r"custom/broken.py:2: KeyError: 'a'"),
+        (
+            "from threestudio_gaussiandreamer.host import "
+            "register\n@register('solid-color-background')\nclass A: pass\n",
+            r"custom/broken.py:2: UserError: the name 'solid-color-background' is taken",
+        ),
+    ],
+)
+def test_a_broken_extension_is_an_error_with_file_line_and_cause(folder, source, message):
+    (folder / "custom").mkdir()
+    (folder / "custom" / "broken.py").write_text(source)
+    with pytest.raises(
+        UserError, match=f"the extension custom/broken.py can't be imported: .*{message}"
+    ):
+        load_extensions()
+
+
+def test_another_part_forgets_the_options_that_only_the_earlier_one_has():
+    """Trying another prior or guidance takes one override; options of the new part are kept, a
+    misspelt one is still an error.
+    """
+    register_parts()
+    demo = Path(__file__).parents[2] / "configs" / "demo.yaml"
+    cfg = load_config(
+        demo, cli_args=["system.geometry.prior_type=random-prior", "system.geometry.prior.size=0.5"]
+    )
+    assert dict(cfg.system.geometry.prior) == {"num_points": 8000, "size": 0.5}
+    check_config(cfg)
+    wrong = load_config(
+        demo, cli_args=["system.geometry.prior_type=random-prior", "system.geometry.prior.sise=0.5"]
+    )
+    with pytest.raises(UserError, match="system.geometry.prior.size"):
+        check_config(wrong)
+    same = load_config(demo, cli_args=["system.geometry.prior_type=mesh-prior"])
+    assert "path" in same.system.geometry.prior

@@ -1,0 +1,141 @@
+"""Arguments before anything heavy is imported: usage, configuration files by name, GPUs."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch import experiment
+from threestudio_gaussiandreamer.launch.options import (
+    announce_device,
+    choose_gpu,
+    find_config,
+    parse_arguments,
+)
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def test_help_imports_neither_torch_nor_lightning():
+    code = (
+        "import sys; from threestudio_gaussiandreamer.launch.experiment import main; assert "
+        "main(['--help']) == 0; "
+        "print('torch' in sys.modules, 'omegaconf' in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True
+    )
+    assert done.stdout.startswith("usage:") and done.stdout.endswith("False False\n"), done.stderr
+
+
+@pytest.mark.parametrize("said", [{}, {"OMP_WAIT_POLICY": "passive"}, {"GOMP_SPINCOUNT": "7"}])
+def test_idle_threads_wait_as_the_user_says(monkeypatch, said):
+    monkeypatch.setattr(os, "environ", dict(said))
+    experiment.spin_briefly()
+    assert os.environ == (said or {"GOMP_SPINCOUNT": "10000", "KMP_BLOCKTIME": "0"})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "required: --config"),
+        (
+            ["--config", "a.yaml"],
+            "one of the arguments --train --validate --test --export is required",
+        ),
+        (["--config", "a.yaml", "--train", "--test"], "not allowed with argument"),
+        (["--config", "a.yaml", "--train", "--tarin"], "unrecognized option --tarin"),
+        (["--config", "a.yaml", "--tra"], "is required"),
+    ],
+)
+def test_usage_mistakes_exit_with_2(arguments, message, capsys):
+    assert experiment.main(arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_several_configurations_and_overrides_in_any_place():
+    args = parse_arguments(
+        ["a=1", "--config", "a.yaml", "--config", "b.yaml", "b=2", "--export", "prompt=-x --y"]
+    )
+    assert (args.config, args.stage, args.overrides, args.gpu) == (
+        ["a.yaml", "b.yaml"],
+        "export",
+        ["a=1", "b=2", "prompt=-x --y"],
+        None,
+    )
+
+
+def test_a_configuration_is_found_by_path_or_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs" / "mine.yaml").touch()
+    (tmp_path / "other.yaml").touch()
+    assert find_config("other.yaml") == Path("other.yaml")
+    assert find_config("mine.yaml") == find_config("mine") == Path("configs/mine.yaml")
+    # from anywhere, those that come along
+    assert find_config("demo.yaml").resolve() == REPOSITORY / "configs" / "demo.yaml"
+    with pytest.raises(
+        UserError, match="unknown configuration 'mien.yaml': did you mean 'mine.yaml'"
+    ):
+        find_config("mien.yaml")
+    with pytest.raises(UserError, match="unknown configuration 'there/mine.yaml'"):
+        find_config("there/mine.yaml")
+
+
+def test_the_installed_package_brings_its_configurations(tmp_path, monkeypatch):
+    from threestudio_gaussiandreamer.launch import options as launch_options
+
+    (tmp_path / "package" / "configs").mkdir(parents=True)
+    (tmp_path / "package" / "configs" / "demo.yaml").touch()
+    monkeypatch.setattr(
+        launch_options, "__file__", str(tmp_path / "package" / "launch" / "options.py")
+    )
+    monkeypatch.chdir(tmp_path)
+    assert find_config("demo") == tmp_path / "package" / "configs" / "demo.yaml"
+
+
+@pytest.mark.parametrize(
+    ("environment", "gpu", "visible"),
+    [
+        (None, None, "0"),
+        (None, "1,2", "1,2"),
+        (None, "cpu", ""),
+        ("3", None, "3"),
+        ("3", "0", "3"),
+        ("3", "cpu", ""),
+        ("", None, ""),
+    ],
+)
+def test_what_cuda_shows(monkeypatch, environment, gpu, visible):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if environment is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", environment)
+    choose_gpu(gpu)
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == visible
+
+
+@pytest.mark.parametrize("gpu", ["", "gpu", "0,", "-1", "0 1"])
+def test_what_is_no_gpu(gpu):
+    with pytest.raises(UserError, match="expected cpu, or numbers of GPUs"):
+        choose_gpu(gpu)
+
+
+def test_gpus_that_are_not_there(monkeypatch, caplog):
+    import torch
+
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    with pytest.raises(UserError, match="--gpu 0,1: only 1 of the GPUs 0,1"):
+        announce_device("0,1")
+    assert announce_device(None) == 1
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    with pytest.raises(
+        UserError, match="--gpu 0: torch .* sees no CUDA device; run with --gpu cpu"
+    ):
+        announce_device("0")
+    assert announce_device("cpu") == announce_device(None) == 0

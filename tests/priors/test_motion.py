@@ -1,0 +1,493 @@
+"""Avatars: the motion in a prompt, files of motions and bodies, the fit of SMPL to joints, and
+CLIP's choices.
+"""
+
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from tests.helpers import tiny_3d_models as tiny
+from tests.helpers.prior_contract import PriorContract, assert_valid
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.host import find
+from threestudio_gaussiandreamer.meshes.load import Mesh
+from threestudio_gaussiandreamer.models.clip import clip_source, picture_similarities
+from threestudio_gaussiandreamer.priors import motion as module
+from threestudio_gaussiandreamer.priors import motion_files
+from threestudio_gaussiandreamer.priors.motion import (
+    MotionPrior,
+    body_pictures,
+    facing,
+    offered_frames,
+    z_up,
+)
+from threestudio_gaussiandreamer.priors.motion_files import Motions, read_motions
+from threestudio_gaussiandreamer.priors.motion_text import reduced_prompt
+from threestudio_gaussiandreamer.priors.smpl_fit import load_body_model, posed_joints
+
+FAST = {"num_points": 500}
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("bodies")
+
+
+@pytest.fixture(scope="session")
+def body_file(folder):
+    return tiny.body_model(folder / "SMPL_NEUTRAL.npz")
+
+
+@pytest.fixture(scope="session")
+def body(body_file):
+    return load_body_model(str(body_file))
+
+
+@pytest.fixture(scope="session")
+def clip(folder):
+    return str(tiny.clip(folder / "clip"))
+
+
+def joints_of(body, pose, shape=None, translation=None):
+    shape = torch.zeros(len(pose), 10, dtype=torch.float64) if shape is None else shape
+    translation = (
+        torch.zeros(len(pose), 3, dtype=torch.float64) if translation is None else translation
+    )
+    return posed_joints(body, pose, shape, translation).numpy()
+
+
+def walk(body, frames=6):
+    """A motion (F, 22, 3): standing, then raising the left knee while turning to the left."""
+    pose = torch.zeros(frames, 24, 3, dtype=torch.float64)
+    pose[:, 1, 0] = torch.linspace(0, -1.2, frames)
+    pose[:, 4, 0] = torch.linspace(0, 1.0, frames)
+    pose[:, 0, 1] = torch.linspace(0, np.pi / 2, frames)
+    return joints_of(body, pose)[:, :22]
+
+
+@pytest.fixture(scope="session")
+def motion_file(folder, body):
+    """Two motions of MDM's layout, the second shorter and backwards."""
+    forward = walk(body).transpose(1, 2, 0)
+    np.savez(
+        folder / "results.npz",
+        motion=np.stack([forward, forward[..., ::-1]]),
+        text=np.array(["Someone kicks"] * 2),
+        lengths=np.array([6, 4]),
+    )
+    return folder / "results.npz"
+
+
+@pytest.fixture
+def options(motion_file, body_file, clip):
+    return FAST | {"motion": str(motion_file), "body_model": str(body_file), "clip": clip}
+
+
+class TestContract(PriorContract):
+    @pytest.fixture
+    def make_prior(self, options):
+        return lambda **more: MotionPrior(options | {"frame": 0} | more)
+
+
+# --------------------------------------------------------------------------------------------------
+# the text
+
+
+@pytest.mark.parametrize(
+    "prompt, motion",
+    [
+        ("Iron man kicks with his left leg", "Someone kicks with the left leg"),  # the paper's
+        ("Spiderman stands with open arms", "Someone stands with open arms"),  # its figure's
+        (
+            "Stormtrooper stands with open arms, highly detailed, 4k",
+            "Someone stands with open arms",
+        ),
+        (
+            "a DSLR photo of Wonder Woman raising her right hand",
+            "Someone is raising the right hand",
+        ),
+        ("A knight is running quickly", "Someone is running quickly"),
+        ("a zombie lying on its back. Unreal engine", "Someone is lying on the back"),
+        ("The flying dutchman punches their enemy", "Someone punches the enemy"),
+        ("two soldiers march", "Someone marches"),
+        ("An astronaut DANCES", "Someone dances"),
+        ("a wizard sitting cross-legged", "Someone is sitting cross-legged"),
+        ("Spiderman", None),
+        ("kick", None),  # no subject
+        ("", None),
+    ],
+)
+def test_the_motion_of_a_prompt(prompt, motion):
+    assert reduced_prompt(prompt) == motion
+
+
+def test_the_motion_can_be_asked_for_on_the_command_line():
+    command = [
+        sys.executable,
+        "-m",
+        "threestudio_gaussiandreamer.priors.motion_text",
+        "Iron man kicks with his left leg",
+    ]
+    printed = subprocess.run(
+        command, capture_output=True, text=True, check=True, cwd=module.__file__.rsplit("/", 3)[0]
+    )
+    assert printed.stdout.strip() == "Someone kicks with the left leg"
+
+
+# --------------------------------------------------------------------------------------------------
+# files of motions
+
+
+def test_mdms_layout_is_read(motion_file, body):
+    motions = read_motions(str(motion_file))
+    assert (
+        motions.positions.shape == (2, 6, 22, 3)
+        and motions.lengths == [6, 4]
+        and motions.texts == ["Someone kicks"] * 2
+    )
+    np.testing.assert_array_equal(motions.positions[0], walk(body))
+
+
+@pytest.mark.parametrize("joints", [22, 24])
+def test_bare_arrays_are_read(tmp_path, joints):
+    frames = np.random.default_rng(0).normal(size=(5, joints, 3))
+    for array in (frames, frames.transpose(1, 2, 0), frames.transpose(1, 2, 0)[None]):
+        np.save(tmp_path / "motion.npy", array.astype(np.float32))
+        motions = read_motions(str(tmp_path / "motion.npy"))
+        np.testing.assert_allclose(motions.positions, frames[None], atol=1e-6)
+        assert motions.lengths == [5] and motions.texts is None
+
+
+class Evil:
+    def __reduce__(self):
+        return (exec, ("import os; os.environ['EVIL'] = '1'",))
+
+
+def test_a_pickle_is_refused_and_the_conversion_works(tmp_path, body, monkeypatch):
+    import os
+
+    monkeypatch.delenv("EVIL", raising=False)
+    motion = walk(body).transpose(1, 2, 0)[None]
+    results = {
+        "motion": motion,
+        "text": ["Someone kicks"],
+        "lengths": np.array([6]),
+        "num_samples": 1,
+        "num_repetitions": 1,
+    }
+    np.save(tmp_path / "results.npy", results)
+    with pytest.raises(UserError, match="pickle.*could run code") as caught:
+        read_motions(str(tmp_path / "results.npy"))
+    line = str(caught.value).splitlines()[-1]
+    assert line == motion_files.CONVERT and line.startswith('python -c "')
+    subprocess.run(
+        line.replace("python", f"'{sys.executable}'", 1), shell=True, check=True, cwd=tmp_path
+    )
+    converted = read_motions(str(tmp_path / "results.npz"))
+    np.testing.assert_array_equal(converted.positions[0], walk(body))
+    assert converted.texts == ["Someone kicks"] and converted.lengths == [6]
+    np.save(tmp_path / "evil.npy", np.array({"motion": Evil()}, dtype=object))
+    np.savez(tmp_path / "evil.npz", motion=np.array(Evil(), dtype=object))
+    for name in ("evil.npy", "evil.npz"):
+        with pytest.raises(UserError, match="pickle"):
+            read_motions(str(tmp_path / name))
+    assert "EVIL" not in os.environ
+
+
+@pytest.mark.parametrize(
+    "arrays, message",
+    [
+        ({"joints": np.zeros((1, 22, 3, 5))}, "no array 'motion', only joints"),
+        ({"motion": np.zeros((1, 25, 6, 5))}, "rotations"),
+        ({"motion": np.zeros((1, 21, 3, 5))}, r"\(1, 21, 3, 5\).*22 or 24 joints"),
+        ({"motion": np.zeros((1, 22, 3, 0))}, "without a frame"),
+        ({"motion": np.full((1, 22, 3, 5), "x")}, "not numbers"),
+        ({"motion": np.full((1, 22, 3, 5), np.nan)}, "NaN"),
+        ({"motion": np.zeros((2, 22, 3, 5)), "lengths": np.array([5])}, "lengths must be 2"),
+        ({"motion": np.zeros((1, 22, 3, 5)), "lengths": np.array([6])}, "from 1 to 5"),
+    ],
+)
+def test_other_arrays_are_refused(tmp_path, arrays, message):
+    np.savez(tmp_path / "motion.npz", **arrays)
+    with pytest.raises(UserError, match=message):
+        read_motions(str(tmp_path / "motion.npz"))
+
+
+def test_padding_may_be_anything(tmp_path):
+    motion = np.zeros((1, 22, 3, 5))
+    motion[..., 3:] = np.nan
+    np.savez(tmp_path / "motion.npz", motion=motion, lengths=np.array([3]))
+    assert read_motions(str(tmp_path / "motion.npz")).lengths == [3]
+
+
+@pytest.mark.parametrize("content", [b"", b"not an array", b"PK\x03\x04 broken"])
+def test_damaged_motion_files(tmp_path, content):
+    (tmp_path / "motion.npz").write_bytes(content)
+    with pytest.raises(UserError, match="motion file"):
+        read_motions(str(tmp_path / "motion.npz"))
+    with pytest.raises(UserError, match="near names.*motion.npz"):
+        read_motions(str(tmp_path / "motions.npz"))
+
+
+# --------------------------------------------------------------------------------------------------
+# the choice
+
+
+def test_offered_frames():
+    motions = Motions(np.zeros((2, 9, 22, 3)), None, [9, 4])
+    assert offered_frames(motions, None, "clip", 3) == [
+        (0, 0),
+        (0, 4),
+        (0, 8),
+        (1, 0),
+        (1, 2),
+        (1, 3),
+    ]
+    assert offered_frames(motions, 1, "clip", 100) == [(1, 0), (1, 1), (1, 2), (1, 3)]
+    assert offered_frames(motions, None, 7, 3) == [(0, 7)]
+    for sample, frame, message in (
+        (2, "clip", "2 motions"),
+        (1, 4, "4 frames"),
+        (-1, "clip", "no -1"),
+    ):
+        with pytest.raises(UserError, match=message):
+            offered_frames(motions, sample, frame, 3)
+
+
+def test_clip_chooses_the_frame_and_the_text_is_the_motion(options, monkeypatch):
+    """Scores by hand in place of CLIP's; the fifth of the offered bodies wins, the second frame of
+    the second motion.
+    """
+    asked = []
+
+    def scores(files, pictures, text, *, device):
+        asked.append((len(pictures), text))
+        return np.repeat([0.1, 0.2, 0.3, 0.2, 0.9, 0.1], len(module.VIEW_AZIMUTHS))
+
+    monkeypatch.setattr(module, "picture_similarities", scores)
+    chosen = MotionPrior(options | {"num_frames": 3})("Iron man kicks with his left leg")
+    same = MotionPrior(options | {"sample": 1, "frame": 2})("Iron man kicks with his left leg")
+    np.testing.assert_array_equal(chosen.points, same.points)
+    assert asked == [(6 * len(module.VIEW_AZIMUTHS), "Someone kicks with the left leg")]
+    MotionPrior(options | {"num_frames": 3, "motion_text": "Someone bows"})("Iron man")
+    MotionPrior(options | {"num_frames": 3, "motion_text": "Someone bows", "clip_text": "a bow"})(
+        "Iron man"
+    )
+    assert [text for _, text in asked[1:]] == ["Someone bows", "a bow"]
+
+
+def test_clip_itself_chooses(options, clip):
+    """The tiny CLIP's choice is arbitrary, but it is that of its own scores, and the same each
+    time.
+    """
+    prior = MotionPrior(options | {"num_frames": 3, "sample": 0})
+    cloud = prior("Iron man kicks")
+    assert_valid(cloud)
+    frames = [
+        MotionPrior(options | {"sample": 0, "frame": frame})("").points for frame in (0, 2, 5)
+    ]
+    assert sum(np.array_equal(cloud.points, points) for points in frames) == 1
+
+
+def test_similarities_are_those_of_transformers(clip):
+    from transformers import CLIPModel, CLIPTokenizer
+
+    pictures = np.random.default_rng(0).random((3, tiny.IMAGE_SIZE, tiny.IMAGE_SIZE, 3), np.float32)
+    model, tokenizer = CLIPModel.from_pretrained(clip), CLIPTokenizer.from_pretrained(clip)
+    pixels = (pictures - [0.48145466, 0.4578275, 0.40821073]) / [0.26862954, 0.26130258, 0.27577711]
+    with torch.no_grad():
+        output = model(
+            **tokenizer("a fox", return_tensors="pt"),
+            pixel_values=torch.from_numpy(pixels).float().permute(0, 3, 1, 2),
+        )
+    scores = picture_similarities(
+        clip_source(clip), pictures, "a fox", device=torch.device("cpu"), batch=2
+    )
+    np.testing.assert_allclose(
+        scores, (output.logits_per_text[0] / model.logit_scale.exp()).detach().numpy(), atol=1e-5
+    )
+
+
+def test_candidates_are_chosen_for_the_prompt(tmp_path, clip, monkeypatch):
+    for name, height in (("short", 1.0), ("tall", 3.0)):
+        trimesh.creation.box(extents=[1, 1, height]).export(tmp_path / f"{name}.ply")
+    asked = []
+    monkeypatch.setattr(
+        module,
+        "picture_similarities",
+        lambda files, pictures, text, **_: asked.append(text) or np.array([0.1] * 3 + [0.2] * 3),
+    )
+    options = FAST | {
+        "candidates": [str(tmp_path / "short.ply"), str(tmp_path / "tall.ply")],
+        "clip": clip,
+        "scale": 1.5,
+    }
+    cloud = MotionPrior(options)("Iron man kicks")
+    assert_valid(cloud)
+    assert np.ptp(cloud.points, axis=0)[2] == pytest.approx(3.0, rel=0.02) and asked == [
+        "Iron man kicks"
+    ]
+    monkeypatch.setattr(
+        module,
+        "picture_similarities",
+        lambda *_, **__: pytest.fail("one candidate needs no choice"),
+    )
+    alone = MotionPrior(options | {"candidates": options["candidates"][:1], "clip": "no/where"})(
+        "Iron man kicks"
+    )
+    assert np.ptp(alone.points, axis=0)[2] == pytest.approx(3.0, rel=0.02)
+
+
+def test_pictures_show_the_front_and_both_sides():
+    """A plate that looks along +x fills the middle picture and is narrower in the others; the
+    background is white.
+    """
+    plate = trimesh.creation.box(extents=[0.02, 1, 1])
+    front, side = (
+        body_pictures(Mesh(np.asarray(plate.vertices)[:, order], np.asarray(plate.faces)))
+        for order in ([0, 1, 2], [1, 0, 2])
+    )
+    assert front.shape == (3, 224, 224, 3) and front[:, 0, 0].min() == 1
+    covered = [(picture < 0.99).all(-1).mean() for picture in front]
+    assert covered[1] > 1.2 * covered[0] and covered[1] > 1.2 * covered[2]
+    assert (side[1] < 0.99).all(-1).mean() < 0.2 * covered[1]
+
+
+# ---------------------------------------------------------------------------------------------- the
+# body in the world
+
+
+def test_a_body_turned_anywhere_looks_along_plus_x(body):
+    pose = torch.zeros(4, 24, 3, dtype=torch.float64)
+    pose[:, 0, 1] = torch.tensor([0.0, 1.0, 2.5, -1.5])
+    for joints in joints_of(body, pose):
+        turned = z_up(joints) @ facing(joints).T
+        np.testing.assert_allclose(
+            (turned[[2, 17]] - turned[[1, 16]])[:, 0], 0, atol=1e-9
+        )  # right of left along -y
+        assert (turned[17] - turned[16])[1] < -0.3
+        assert turned[15, 2] > turned[0, 2] > turned[7, 2]  # head up
+
+
+def test_a_body_that_lies_on_its_side_is_not_turned():
+    joints = np.zeros((22, 3))
+    joints[[1, 16], 1], joints[[2, 17], 1] = 0.1, -0.1  # hips and shoulders above each other
+    np.testing.assert_array_equal(facing(joints), np.eye(3))
+
+
+def test_face_front_and_the_released_axes(options):
+    """The motion turns to its left while the knee rises; without turning back it looks along +y at
+    the end.
+    """
+    front = MotionPrior(options | {"sample": 0, "frame": 5, "num_points": 0})("")
+    free = MotionPrior(options | {"sample": 0, "frame": 5, "num_points": 0, "face_front": False})(
+        ""
+    )
+    np.testing.assert_allclose(
+        np.ptp(front.points, axis=0), np.ptp(free.points, axis=0)[[1, 0, 2]], rtol=0.02
+    )
+    assert (
+        front.points[:, 0].max() > -3 * front.points[:, 0].min()
+    )  # the raised knee is on the front's side
+    assert free.points[:, 1].max() > -3 * free.points[:, 1].min()
+    assert np.ptp(front.points, axis=0).max() == pytest.approx(
+        2.0, rel=1e-5
+    )  # half the longest side is the scale
+    np.testing.assert_allclose(front.points.mean(axis=0), 0, atol=1e-5)
+
+
+def test_points_and_colors(options):
+    cloud = MotionPrior(options | {"frame": 0, "num_points": 4000})("")
+    assert len(cloud.points) == 4000 and cloud.colors.std() == pytest.approx(
+        np.sqrt(1 / 12), rel=0.05
+    )  # uniform
+    grey = MotionPrior(options | {"frame": 0, "color": "grey"})("")
+    assert (grey.colors == 0.5).all()
+
+
+def test_residuals_are_reported_and_limited(options, caplog, tmp_path, monkeypatch):
+    said = []
+    monkeypatch.setattr(module, "info", said.append)
+    MotionPrior(options | {"frame": 3})("")
+    assert any("SMPL fitted to motion 0, frame 3:" in line and "mm mean" in line for line in said)
+    motion = 10 * np.load(options["motion"])["motion"]  # decimetres
+    np.savez(tmp_path / "results.npz", motion=motion)
+    with pytest.raises(UserError, match=r"off by \d+.* mm mean.*in metres"):
+        MotionPrior(options | {"motion": str(tmp_path / "results.npz"), "frame": 0})("")
+
+
+def test_the_clouds_of_a_frame_dont_depend_on_the_others(options, monkeypatch):
+    monkeypatch.setattr(
+        module,
+        "picture_similarities",
+        lambda files, pictures, text, **_: (np.arange(len(pictures)) < 3).astype(float),
+    )
+    alone = MotionPrior(options | {"sample": 0, "frame": 0})("a fox kicks")
+    for frames in (2, 5):
+        np.testing.assert_array_equal(
+            MotionPrior(options | {"num_frames": frames})("a fox kicks").points, alone.points
+        )
+
+
+# --------------------------------------------------------------------------------------------------
+# options and errors
+
+
+def test_registered():
+    assert find("motion-prior") is MotionPrior
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"motion": ""}, "neither"),
+        ({"candidates": ["a.obj"]}, "both"),
+        ({"body_model": ""}, "body_model.*smpl.is.tue.mpg.de"),
+        ({"frame": "best"}, "frame"),
+        ({"frame": -1}, "frame"),
+        ({"num_frames": 0}, "num_frames"),
+        ({"max_residual_mm": 0.0}, "max_residual_mm"),
+        ({"color": "pink"}, "color"),
+    ],
+)
+def test_options_out_of_range(options, change, message):
+    with pytest.raises(UserError, match=message):
+        MotionPrior(options | change)
+
+
+def test_preflight_checks_all_files(options, tmp_path, clip):
+    MotionPrior(options).preflight()
+    with pytest.raises(UserError, match="motion file"):
+        MotionPrior(options | {"motion": "nothing.npz"}).preflight()
+    with pytest.raises(UserError, match="body model"):
+        MotionPrior(options | {"body_model": "nothing.npz"}).preflight()
+    with pytest.raises(UserError, match="body mesh"):
+        MotionPrior(FAST | {"candidates": ["nothing.obj"]}).preflight()
+    spoiled = shutil.copytree(clip, tmp_path / "clip")
+    (spoiled / "model.safetensors").unlink()
+    with pytest.raises(UserError, match="safetensors, the weights, are missing"):
+        MotionPrior(options | {"clip": str(spoiled)}).preflight()
+    MotionPrior(options | {"clip": str(spoiled), "frame": 0}).preflight()  # not needed
+
+
+def test_without_smplx_the_extra_is_named(options, monkeypatch):
+    monkeypatch.setitem(sys.modules, "smplx", None)
+    with pytest.raises(UserError, match=r"pip install 'threestudio-gaussiandreamer\[body\]'"):
+        MotionPrior(options | {"frame": 0})("a fox kicks")
+
+
+def test_a_prompt_without_motion_warns_and_uses_itself(options, monkeypatch):
+    asked, warned = [], []
+    monkeypatch.setattr(module, "warn", warned.append)
+    monkeypatch.setattr(
+        module,
+        "picture_similarities",
+        lambda files, pictures, text, **_: asked.append(text) or np.zeros(len(pictures)),
+    )
+    MotionPrior(options | {"num_frames": 2})("Spiderman")
+    assert asked == ["Spiderman"] and "motion_text" in warned[0]

@@ -1,0 +1,222 @@
+"""SMPL from joints: the user's body file, and poses that are known found again."""
+
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers import tiny_3d_models as tiny
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.priors import smpl_fit
+from threestudio_gaussiandreamer.priors.smpl_fit import (
+    beyond_limits,
+    fit_bodies,
+    load_body_model,
+    posed_joints,
+    posed_vertices,
+)
+
+
+@pytest.fixture(scope="session")
+def body_file(tmp_path_factory):
+    return tiny.body_model(tmp_path_factory.mktemp("bodies") / "SMPL_NEUTRAL.npz")
+
+
+@pytest.fixture(scope="session")
+def body(body_file):
+    return load_body_model(str(body_file))
+
+
+def random_poses(count, seed=0, spread=0.25):
+    """Poses within the limits: rotations of some ``spread`` radians, and those with limits
+    somewhere between them.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    pose = spread * torch.randn(count, 24, 3, generator=rng, dtype=torch.float64)
+    for joint, axes in smpl_fit.LIMITS.items():
+        for axis, (low, high) in axes.items():
+            part = 0.15 + 0.7 * torch.rand(count, generator=rng, dtype=torch.float64)
+            pose[:, joint, axis] = (low + (high - low) * part) * smpl_fit.DEGREES
+    pose[:, 0] = torch.randn(count, 3, generator=rng, dtype=torch.float64)
+    return pose
+
+
+def joints_of(body, pose, shape=None, translation=None):
+    shape = torch.zeros(len(pose), 10, dtype=torch.float64) if shape is None else shape
+    translation = (
+        torch.zeros(len(pose), 3, dtype=torch.float64) if translation is None else translation
+    )
+    return posed_joints(body, pose, shape, translation).numpy()
+
+
+class Evil:
+    def __reduce__(self):
+        return (exec, ("import os; os.environ['EVIL'] = '1'",))
+
+
+# --------------------------------------------------------------------------------------------------
+# the body model
+
+
+def test_a_pkl_is_refused_and_the_conversion_works(tmp_path, body_file):
+    arrays = tiny.body_arrays()
+    import scipy.sparse
+
+    arrays["J_regressor"] = scipy.sparse.csc_matrix(arrays["J_regressor"])  # as SMPL's file has it
+    (tmp_path / "SMPL_NEUTRAL.pkl").write_bytes(pickle.dumps(arrays))
+    with pytest.raises(UserError, match="pickle.*could run code") as caught:
+        load_body_model(str(tmp_path / "SMPL_NEUTRAL.pkl"))
+    subprocess.run(
+        str(caught.value).splitlines()[-1].replace("python", f"'{sys.executable}'", 1),
+        shell=True,
+        check=True,
+        cwd=tmp_path,
+    )
+    converted, original = (
+        load_body_model(str(tmp_path / "SMPL_NEUTRAL.npz")),
+        load_body_model(str(body_file)),
+    )
+    for a, b in zip(converted, original, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_bodies_with_hands_are_read(tmp_path, body):
+    """SMPL-H and SMPL-X have other joints after the 22nd, and come as NPZ."""
+    arrays, more = tiny.body_arrays(), 28
+    vertices = len(arrays["v_template"])
+    arrays["posedirs"] = np.zeros((vertices, 3, 9 * 51))
+    arrays["J_regressor"] = np.concatenate(
+        [arrays["J_regressor"], np.repeat(arrays["J_regressor"][20:21], more, axis=0)]
+    )
+    arrays["weights"] = np.concatenate([arrays["weights"], np.zeros((vertices, more))], axis=1)
+    arrays["kintree_table"] = np.concatenate(
+        [arrays["kintree_table"], np.array([[20] * more, range(24, 52)], np.uint32)], axis=1
+    )
+    np.savez(tmp_path / "SMPLH_NEUTRAL.npz", **arrays)
+    model = load_body_model(str(tmp_path / "SMPLH_NEUTRAL.npz"))
+    targets = joints_of(body, random_poses(1))
+    fit = fit_bodies(model, targets)
+    assert (
+        fit.residuals.shape == (1, 22) and fit.residuals.mean() < 10
+    )  # joints 22 and 23 of SMPL are other ones here
+    assert posed_vertices(model, fit).shape == (1, vertices, 3)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda arrays: arrays.pop("posedirs"), "no array 'posedirs'"),
+        (lambda arrays: arrays.update(weights=arrays["weights"][:, :20]), "don't fit"),
+        (
+            lambda arrays: arrays.update(J_regressor=np.array(Evil(), dtype=object)),
+            "could run code",
+        ),
+        (lambda arrays: arrays["v_template"].__setitem__(0, np.nan), "damaged"),
+        (lambda arrays: arrays["kintree_table"].__setitem__((0, 5), 5), "damaged"),
+        (lambda arrays: arrays["f"].__setitem__((0, 0), 10**6), "damaged"),
+    ],
+)
+def test_other_body_files_are_refused(tmp_path, change, message):
+    arrays = tiny.body_arrays()
+    change(arrays)
+    np.savez(tmp_path / "body.npz", **arrays)
+    with pytest.raises(UserError, match=message):
+        load_body_model(str(tmp_path / "body.npz"))
+
+
+# --------------------------------------------------------------------------------------------------
+# the fit
+
+
+@pytest.mark.parametrize("joints", [22, 24])
+def test_known_poses_are_found(body, joints):
+    pose = random_poses(8)
+    shape = torch.zeros(8, 10, dtype=torch.float64)
+    shape[:, 0] = torch.linspace(-1, 1, 8)
+    translation = torch.linspace(-2, 2, 24, dtype=torch.float64).reshape(8, 3)
+    fit = fit_bodies(body, joints_of(body, pose, shape, translation)[:, :joints])
+    assert fit.residuals.shape == (8, joints)
+    assert fit.residuals.mean() < 2 and fit.residuals.max() < 8  # mm; the pose prior pulls a little
+    assert beyond_limits(fit.pose) < 1e-3  # square radians, of 8 bodies
+
+
+def test_the_surface_is_where_the_body_was(body):
+    """Not the joints alone: the bones' twist is the prior's, and for thin tubes it hardly moves the
+    surface.
+    """
+    pose = random_poses(3, seed=1, spread=0.1)
+    fit = fit_bodies(body, joints_of(body, pose))
+    zeros = torch.zeros(3, 10, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
+    truth = posed_vertices(body, smpl_fit.BodyFit(pose, *zeros, fit.residuals))
+    assert (
+        np.linalg.norm(posed_vertices(body, fit) - truth, axis=-1).mean() < 0.02
+    )  # metres; tubes are 8 cm thick
+
+
+def test_smplx_agrees_that_posed_joints_are_those_of_the_body(body):
+    from smplx.lbs import lbs
+
+    pose = random_poses(2)
+    shape = torch.full((2, 10), 0.5, dtype=torch.float64)
+    arguments = (
+        body.template,
+        body.shape_directions,
+        body.pose_directions,
+        body.joint_regressor,
+        body.parents,
+        body.weights,
+    )
+    _, joints = lbs(shape, pose.flatten(1), *arguments)
+    np.testing.assert_allclose(joints_of(body, pose, shape), joints.numpy(), atol=1e-12)
+
+
+def test_knees_bend_forwards(body):
+    """A leg that is bent the wrong way is not followed."""
+    pose = torch.zeros(2, 24, 3, dtype=torch.float64)
+    pose[0, 4, 0], pose[1, 4, 0] = 1.2, -1.2
+    fit = fit_bodies(body, joints_of(body, pose))
+    assert fit.pose[0, 4, 0] > 1.1 and fit.residuals[0].mean() < 2
+    assert fit.pose[1, 4, 0] > -0.1 and fit.residuals[1].mean() > 5
+
+
+def test_a_pose_without_evidence_is_the_resting_one(body):
+    """Wrists, head and toes have nothing after them among 22 joints."""
+    fit = fit_bodies(body, joints_of(body, random_poses(2))[:, :22])
+    for joint in (10, 11, 15, 20, 21, 22, 23):
+        assert fit.pose[:, joint].abs().max() < 1e-3
+
+
+def test_mean_shape_without_fit_shape(body):
+    shape = torch.full((1, 10), 1.0, dtype=torch.float64)
+    targets = joints_of(body, torch.zeros(1, 24, 3, dtype=torch.float64), shape)
+    without, fitted = fit_bodies(body, targets, fit_shape=False), fit_bodies(body, targets)
+    assert (without.shape == 0).all() and without.residuals.mean() > 2 * fitted.residuals.mean()
+
+
+def test_energys_gradient(body):
+    """Differences of an energy of 1e5 in steps of 1e-6 have errors of about 1e-16 * 1e5 / 1e-6 =
+    1e-5, its curvature larger ones.
+    """
+    pose, shape, translation = (
+        0.3 * torch.randn(2, *s, dtype=torch.float64) for s in ((24, 3), (10,), (3,))
+    )
+    wanted = torch.from_numpy(joints_of(body, random_poses(2)))
+    inputs = [value.requires_grad_() for value in (pose, shape, translation)]
+    assert torch.autograd.gradcheck(
+        lambda *values: smpl_fit.energy(body, *values, wanted, 0.1),
+        inputs,
+        eps=1e-6,
+        rtol=1e-4,
+        atol=0.1,
+    )
+
+
+def test_limits_in_known_cases():
+    pose = torch.zeros(1, 24, 3, dtype=torch.float64)
+    assert beyond_limits(pose) == 0
+    pose[0, 4, 0] = -0.5  # a knee the wrong way
+    pose[0, 18, 1] = -1.0  # an elbow the right way
+    assert beyond_limits(pose).item() == pytest.approx(0.25)

@@ -1,0 +1,268 @@
+"""The public function: what it accepts, what it refuses and how it says so, and who computes."""
+
+import logging
+import typing
+
+import jaxtyping
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers.splatting_scenes import NAMES, cameras, random_cloud, run
+from threestudio_gaussiandreamer import splatting
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.splatting import (
+    PRESETS,
+    api,
+    available_backends,
+    rasterize,
+    torch_backend,
+)
+from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
+
+
+def arguments(n=6, views=2, dtype=torch.float32):
+    viewmats, Ks = cameras(views, 10, 8)
+    return random_cloud(n).to(dtype)._asdict() | {
+        "viewmats": viewmats.to(dtype),
+        "Ks": Ks.to(dtype),
+        "width": 10,
+        "height": 8,
+    }
+
+
+def call(**changes):
+    options = {"backend": "torch"} | arguments() | changes
+    positional = [options.pop(name) for name in (*NAMES, "viewmats", "Ks", "width", "height")]
+    return rasterize(*positional, **options)
+
+
+def usable():
+    return [name for name, reason in available_backends().items() if reason is None]
+
+
+def test_shapes_of_what_comes_back():
+    out = call(downsample=2)
+    shapes = {name: tuple(getattr(out, name).shape) for name in out._fields}
+    images = {"image": (2, 4, 5, 3), "alpha": (2, 4, 5, 1), "depth": (2, 4, 5, 1)}
+    assert shapes == images | {"means2d": (2, 6, 2), "radii": (2, 6), "contribution": (2, 6)}
+    assert not out.radii.requires_grad and not out.contribution.requires_grad
+
+
+@jaxtyping.jaxtyped(typechecker=None)
+def check_shapes(values: dict, hints: dict) -> None:
+    """Every tensor fits its annotation, and names such as N mean one size throughout."""
+    for name, value in values.items():
+        annotation = next(
+            (a for a in typing.get_args(hints[name]) if a is not type(None)), hints[name]
+        )
+        assert isinstance(value, annotation), f"{name} {tuple(value.shape)} isn't {annotation}"
+
+
+@pytest.mark.parametrize("per_view", [False, True])
+def test_annotations_hold_for_every_backend(per_view):
+    values = arguments() | {"background": torch.zeros(2, 3) if per_view else torch.zeros(3)}
+    if per_view:
+        values["colors"] = torch.rand(2, 6, 3)
+    tensors = {name: value for name, value in values.items() if isinstance(value, torch.Tensor)}
+    for backend in usable():
+        out = call(**values, backend=backend)
+        check_shapes(tensors, typing.get_type_hints(rasterize))
+        check_shapes(out._asdict(), typing.get_type_hints(splatting.Rasterized))
+
+
+def test_a_size_may_be_numpys():
+    sizes = {name: np.int64(arguments()[name]) for name in ("width", "height")}
+    assert torch.equal(call(**sizes).image, call().image)
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"quats": torch.zeros(6, 3)}, ["quats", "(6, 4)", "(6, 3)"]),
+        ({"scales": torch.zeros(5, 3)}, ["scales", "(6, 3)", "(5, 3)"]),
+        ({"opacities": torch.zeros(6, 1)}, ["opacities", "(6,)", "(6, 1)"]),
+        ({"means": torch.zeros(6, 2)}, ["means", "(6, 3)", "(6, 2)"]),
+        ({"means": torch.zeros(())}, ["means", "(N, 3)", "single number"]),
+        ({"colors": torch.zeros(3, 6, 3)}, ["colors", "(2, 6, 3)", "(3, 6, 3)"]),
+        ({"colors": torch.zeros(6, 0)}, ["colour channel", "(6, 0)"]),
+        ({"viewmats": torch.zeros(2, 3, 4)}, ["viewmats", "(2, 4, 4)", "(2, 3, 4)"]),
+        ({"viewmats": torch.zeros(0, 4, 4), "Ks": torch.zeros(0, 3, 3)}, ["view"]),
+        ({"Ks": torch.zeros(3, 3)}, ["Ks", "(2, 3, 3)", "(3, 3)"]),
+        ({"background": torch.zeros(4)}, ["background", "(3,)", "(4,)"]),
+        ({"background": [0.0, 0, 0]}, ["background", "Tensor", "list"]),
+        ({"quats": torch.zeros(6, 4, dtype=torch.int64)}, ["quats", "floating point", "int64"]),
+        ({"scales": torch.zeros(6, 3, dtype=torch.float64)}, ["scales", "float64"]),
+        ({"quats": torch.zeros(6, 4, device="meta")}, ["quats", "device", "meta"]),
+        ({"width": 0}, ["width", "at least 1", "0"]),
+        ({"height": 8.0}, ["height", "8.0"]),
+        ({"width": True}, ["width", "True"]),
+        ({"height": 2_100_000}, ["height", "at most 1048576"]),
+        ({"width": 9, "downsample": 2}, ["downsample", "9"]),
+        ({"downsample": 3}, ["downsample", "3"]),
+        ({"downsample": 2.0}, ["downsample", "2.0"]),
+        ({"preset": "balancd"}, ["preset", "'balanced'"]),
+        ({"backend": "torhc"}, ["backend", "'torch'"]),
+        ({"non_finite": "ignore"}, ["non_finite", "drop", "error"]),
+        ({"near": 0.0}, ["near", "0 < near"]),
+        ({"near": 2.0, "far": 1.0}, ["near", "far"]),
+        ({"far": None}, ["far", "number", "None"]),
+        ({"alpha_min": "small"}, ["alpha_min", "number", "small"]),
+        ({"eps2d": -0.1}, ["eps2d", "-0.1"]),
+        ({"alpha_min": 1.5}, ["alpha_min", "1.5"]),
+        ({"alpha_max": 1e-4}, ["alpha_max", "0.0001"]),
+        ({"stop": -1.0}, ["stop", "-1.0"]),
+        ({"stop": float("nan")}, ["stop", "nan"]),
+    ],
+    ids=lambda x: "-".join(x) if isinstance(x, dict) else "",
+)
+def test_mistakes_are_named(changes, words):
+    with pytest.raises(UserError) as caught:
+        call(**changes)
+    assert all(word in str(caught.value) for word in words), caught.value
+
+
+@pytest.mark.parametrize("name", [*NAMES, "viewmats", "Ks", "background"])
+def test_non_finite_error_names_attribute_count_and_place(name):
+    changes = arguments() | {"background": torch.zeros(2, 3)}
+    value = changes[name].clone()
+    value.flatten()[3:5] = float("nan")
+    place = str(tuple((~value.isfinite()).nonzero()[0].tolist()))
+    with pytest.raises(UserError) as caught:
+        call(**{"background": changes["background"], name: value}, non_finite="error")
+    assert (
+        name in str(caught.value)
+        and " 2 " in str(caught.value)
+        and place in str(caught.value)
+        and "nan" in str(caught.value)
+    )
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_are_numbers(name):
+    assert torch.equal(call(preset=name).image, call(alpha_min=PRESETS[name]).image)
+
+
+def test_presets_in_order_of_accuracy():
+    truth = call(alpha_min=0.0, stop=0.0).image
+    errors = [
+        (call(preset=name).image - truth).abs().sum() for name in ("fast", "balanced", "accurate")
+    ]
+    assert errors[0] > errors[1] > errors[2]
+
+
+@pytest.mark.parametrize("backend", list(api.BACKENDS))
+def test_autocast_changes_nothing(backend):
+    if backend not in usable():
+        pytest.skip(available_backends()[backend])
+    plain = run(random_cloud(20).to(torch.float32), *cameras(2, 10, 8), 10, 8, backend=backend)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        cast = run(random_cloud(20).to(torch.float32), *cameras(2, 10, 8), 10, 8, backend=backend)
+    assert cast.out.image.dtype == torch.float32
+    assert all(torch.equal(a, b) for a, b in zip(plain.out, cast.out, strict=True))
+    assert all(torch.equal(grad, cast.grads[name]) for name, grad in plain.grads.items())
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_inputs_are_widened(dtype):
+    half = {
+        name: value.to(dtype)
+        for name, value in arguments().items()
+        if isinstance(value, torch.Tensor)
+    }
+    wide = {name: value.float() for name, value in half.items()}
+    half["means"].requires_grad_()
+    out = call(**half)
+    out.image.sum().backward()
+    assert out.image.dtype == torch.float32 and torch.equal(out.image, call(**wide).image)
+    assert half["means"].grad.dtype == dtype and half["means"].grad.abs().sum() > 0
+
+
+def test_float64_stays_float64_and_may_have_float32_cameras():
+    values = arguments(dtype=torch.float64) | {
+        "viewmats": arguments()["viewmats"],
+        "backend": "auto",
+    }
+    assert call(**values).image.dtype == torch.float64
+
+
+def test_non_contiguous_inputs():
+    values = arguments()
+    strided = {
+        name: x.mT.contiguous().mT
+        for name, x in values.items()
+        if isinstance(x, torch.Tensor) and x.dim() > 1
+    }
+    assert torch.equal(call(**strided).image, call(**values).image)
+
+
+def test_background_of_each_view_or_of_all():
+    one, two = torch.tensor([0.2, 0.4, 0.6]), torch.tensor([[0.2, 0.4, 0.6], [1.0, 0.0, 0.5]])
+    black, shared, each = call(), call(background=one), call(background=two)
+    for out, colors in ((shared, one.expand(2, 3)), (each, two)):
+        assert torch.allclose(
+            out.image, black.image + (1 - out.alpha) * colors[:, None, None], atol=1e-6
+        )
+
+
+@pytest.mark.parametrize("only", ["colors", "opacities", "background"])
+@pytest.mark.parametrize("backend", list(api.BACKENDS))
+def test_means2d_reports_its_gradient_whenever_anything_is_differentiated(only, backend):
+    if backend not in usable():
+        pytest.skip(available_backends()[backend])
+    changes = arguments() | {"background": torch.zeros(3)}
+    value = changes[only].clone().requires_grad_()
+    out = call(**{only: value}, backend=backend, absgrad=True)
+    out.image.square().sum().backward()
+    assert out.means2d.grad.shape == out.means2d.absgrad.shape == (2, 6, 2)
+    assert (
+        out.means2d.absgrad >= out.means2d.grad.abs() - 1e-7
+    ).all() and out.means2d.grad.abs().sum() > 0
+
+
+def test_without_gradients_nothing_is_tracked():
+    with torch.no_grad():
+        out = call(means=arguments()["means"].requires_grad_())
+    assert not out.image.requires_grad and not out.means2d.requires_grad
+
+
+# ---- who computes --------------------------------------------------------------------------------
+
+
+def test_available_backends_tells_why_not(monkeypatch):
+    assert available_backends()["torch"] is None and available_backends()["reference"] is None
+    monkeypatch.setattr(cpu, "unavailable", lambda: "no library")
+    assert available_backends()["cpu"] == "no library"
+
+
+def test_an_unavailable_backend_says_why_and_what_to_do(monkeypatch):
+    monkeypatch.setattr(cpu, "unavailable", lambda: "the library wasn't built")
+    with pytest.raises(UserError, match="(?s)'cpu'.*the library wasn't built.*torch"):
+        call(backend="cpu")
+
+
+def test_the_native_backend_takes_float32_only():
+    with pytest.raises(UserError, match="(?s)float32.*float64"):
+        call(**arguments(dtype=torch.float64), backend="cpu")
+
+
+def test_auto_prefers_the_native_library_and_says_once_when_it_cannot(monkeypatch, caplog):
+    chosen = []
+    for module, name in ((cpu, "cpu"), (torch_backend, "torch")):
+        monkeypatch.setattr(module, "rasterize", lambda *_, name=name: chosen.append(name))
+    monkeypatch.setattr(cpu, "unavailable", lambda: None)
+    call(backend="auto")
+    call(**arguments(dtype=torch.float64), backend="auto")
+    assert chosen == ["cpu", "torch"] and not caplog.records
+
+    monkeypatch.setattr(cpu, "unavailable", lambda: "no compiler was found")
+    api._warn_once.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        call(backend="auto"), call(backend="auto")
+    assert chosen[2:] == ["torch"] * 2
+    assert [
+        record.getMessage()
+        for record in caplog.records
+        if "no compiler was found" in record.getMessage()
+    ] and len(caplog.records) == 1
+    api._warn_once.cache_clear()

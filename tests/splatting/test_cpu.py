@@ -1,0 +1,213 @@
+"""The native kernel against the float64 specification, in every build this machine can run: same
+pictures, same gradients, same bits.
+"""
+
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import textwrap
+import weakref
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+from tests.helpers.splatting_contract import KernelContract, draw
+from tests.helpers.splatting_scenes import cameras, equal, random_cloud
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.splatting import rasterize
+from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
+
+pytestmark = pytest.mark.skipif(cpu.unavailable() is not None, reason=str(cpu.unavailable()))
+
+
+@pytest.fixture
+def force(monkeypatch):
+    """A function that makes one build answer."""
+
+    def force(name):
+        monkeypatch.setenv("GAUSSIANDREAMER_ISA", name)
+        cpu._library.cache_clear()
+
+    yield force
+    cpu._library.cache_clear()
+
+
+@pytest.fixture(params=cpu.usable_builds())
+def isa(request, force):
+    force(request.param)
+    return request.param
+
+
+class TestCpuKernel(KernelContract):
+    @pytest.fixture
+    def backend(self, isa):
+        return "cpu"
+
+
+# ---- the same bits -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_the_number_of_threads_changes_no_bit(isa, views):
+    """Also not when there are more Gaussians than one task takes, or more threads than views; twice
+    each.
+    """
+    cloud, camera = random_cloud(9000, seed=10, size=0.03), cameras(views, 150, 90)
+    background, threads, results = torch.tensor([0.2, 0.5, 0.9]), torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 4, 1, 2, 4):
+            torch.set_num_threads(count)
+            results.append(
+                draw("cpu", cloud, camera, 150, 90, background, camera_gradient=True, absgrad=True)
+            )
+    finally:
+        torch.set_num_threads(threads)
+    assert all(equal(results[0], other) for other in results[1:])
+
+
+# ---- as a torch function -------------------------------------------------------------------------
+
+
+def test_backward_gives_the_memory_back(monkeypatch):
+    """What a backward pass needed goes with the saved tensors, not with the last tensor of the
+    graph.
+    """
+    states, as_tensor = weakref.WeakSet(), cpu._State.as_tensor
+    monkeypatch.setattr(cpu._State, "as_tensor", lambda self: states.add(self) or as_tensor(self))
+    out = rasterize(
+        *random_cloud(30).to(torch.float32).leaves(),
+        *cameras(1, 12, 12, dtype=torch.float32),
+        12,
+        12,
+        backend="cpu",
+    )
+    assert len(states) == 1
+    out.image.sum().backward()
+    assert len(states) == 0 and out.image.grad_fn is not None
+
+
+def test_the_library_is_used_from_several_threads_at_once():
+    """Autograd and data loaders have threads of their own."""
+    clouds = [random_cloud(200, seed=n) for n in range(4)]
+    alone = [draw("cpu", cloud, cameras(2, 60, 40), 60, 40) for cloud in clouds]
+    with ThreadPoolExecutor(4) as pool:
+        for _ in range(5):
+            together = pool.map(
+                lambda cloud: draw("cpu", cloud, cameras(2, 60, 40), 60, 40), clouds
+            )
+            assert all(equal(a, b) for a, b in zip(alone, together, strict=True))
+
+
+def run_python(text):
+    """Whatever can end a process, or forbid it something, happens in another one."""
+    scene = """
+        import os, resource, signal, sys, torch
+        from tests.helpers.splatting_scenes import cameras, random_cloud
+        from threestudio_gaussiandreamer.splatting import rasterize
+
+        def draw():
+            return rasterize(*cloud, *cameras(1, 96, 96, dtype=torch.float32), 96, 96, backend="cpu").image
+
+        cloud = random_cloud(3000).to(torch.float32)
+        torch.set_num_threads(1)
+        alone = draw()
+        torch.set_num_threads(4)
+    """
+    code = textwrap.dedent(scene) + textwrap.dedent(text)
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": str(pathlib.Path(__file__).parents[2])},
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_a_forked_process_draws_with_threads_of_its_own():
+    """The parent's threads aren't in it, and what they held at that moment nobody lets go."""
+    done = run_python("""
+        for _ in range(100):
+            draw()
+            child = os.fork()
+            if child == 0:
+                signal.alarm(10)
+                os._exit(not all(torch.equal(draw(), alone) for _ in range(5)))
+            if os.waitpid(child, 0)[1]:
+                sys.exit("a child hung, or drew something else")
+    """)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_without_more_threads_those_that_there_are_do_the_work():
+    """A limit on processes or on address space, which a thread's stack takes."""
+    done = run_python("""
+        pages = int(open("/proc/self/statm").read().split()[0])
+        resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 6 * 2**20,) * 2)
+        if not torch.equal(draw(), alone):
+            sys.exit("another picture")
+    """)
+    assert done.returncode == 0, done.stderr
+
+
+def test_denormals_of_the_process_are_not_flushed(isa):
+    draw("cpu", random_cloud(100), cameras(1, 20, 20), 20, 20)
+    assert (torch.tensor(1e-40) * 1).item() > 0 and 5e-324 * 1.0 > 0
+
+
+def test_more_memory_than_there_is_is_a_named_error():
+    """2.6e9 pairs of Gaussian and tile: more than 32 bits count, and more than any machine should
+    try.
+    """
+    cloud, camera = (
+        random_cloud(40_000).to(torch.float32)._replace(scales=torch.full((40_000, 3), 1e3)),
+        cameras(1, 8192, 8192, dtype=torch.float32),
+    )
+    with pytest.raises(UserError, match="GiB"), torch.no_grad():
+        rasterize(*cloud, *camera, 8192, 8192, backend="cpu")
+
+
+# ---- the library ---------------------------------------------------------------------------------
+
+
+def test_a_build_that_does_not_exist_is_named(force):
+    force("v5")
+    with pytest.raises(UserError, match="v4"):
+        cpu._library()
+
+
+def test_without_a_library_it_says_what_to_do(monkeypatch, tmp_path):
+    monkeypatch.setattr(cpu, "FOLDER", tmp_path)
+    cpu._library.cache_clear()
+    try:
+        assert "compiler" in cpu.unavailable()
+    finally:
+        cpu._library.cache_clear()
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
+def test_the_formulas_need_no_standard_header_and_work_on_single_floats(tmp_path):
+    """The CUDA kernels include the same header, compiled where no standard library is."""
+    source = tmp_path / "one.cpp"
+    source.write_text(
+        '#include "splat_math.h"\nfloat f(splat::Vec3<float> u, splat::Vec3<float> v) { return '
+        "splat::whiten(u, v, 0.3f).a; }\n"
+    )
+    folder = pathlib.Path(cpu.__file__).parents[1] / "shared"
+    subprocess.run(
+        [
+            "g++",
+            "-std=c++17",
+            "-nostdinc",
+            "-nostdinc++",
+            "-Wall",
+            "-Werror",
+            "-fsyntax-only",
+            f"-I{folder}",
+            "-c",
+            str(source),
+        ],
+        check=True,
+    )

@@ -1,0 +1,240 @@
+"""The CUDA backend without a GPU: its kernels run on the host, thread by thread, against the
+float64 specification.
+
+`cuda_shim/machine.py` stands in for the GPU and runs the text that NVRTC compiles; the Python
+around it is the product's, too."""
+
+import pytest
+import torch
+
+from tests.helpers.cuda_shim.machine import ORDERS, HostMachine, unavailable
+from tests.helpers.splatting_contract import BACKGROUND, KernelContract, draw
+from tests.helpers.splatting_scenes import NAMES, Cloud, cameras, cotangents, equal, random_cloud
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.splatting import api, rasterize
+from threestudio_gaussiandreamer.splatting.cuda import backend as cuda
+from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver
+from threestudio_gaussiandreamer.splatting.cuda import memory as cuda_memory
+
+pytestmark = pytest.mark.skipif(unavailable() is not None, reason=str(unavailable()))
+
+
+@pytest.fixture(autouse=True)
+def machine(monkeypatch):
+    """The backend on tensors of the CPU, on a machine that tests may exchange; nothing learnt from
+    earlier calls.
+    """
+    machines = [HostMachine()]
+    monkeypatch.setitem(
+        api.BACKENDS, "cuda", api.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,))
+    )
+    monkeypatch.setattr(cuda_driver, "unavailable", lambda: None)
+    monkeypatch.setattr(cuda_driver, "machine", lambda device: machines[-1])
+    monkeypatch.setattr(cuda, "_demands", {})
+
+    def exchange(**options) -> HostMachine:
+        machines.append(HostMachine(**options))
+        return machines[-1]
+
+    return exchange
+
+
+class TestCudaKernels(KernelContract):
+    @pytest.fixture
+    def backend(self):
+        return "cuda"
+
+
+# ---- the same bits -------------------------------------------------------------------------------
+
+
+def scene(machine, cloud=None, **options):
+    """A picture of 3 x 2 tiles per view with everything in it, on a fresh machine."""
+    machine(**options)
+    cloud = random_cloud(300, seed=8, size=0.1) if cloud is None else cloud
+    return draw(
+        "cuda", cloud, cameras(3, 40, 24), 40, 24, BACKGROUND, camera_gradient=True, absgrad=True
+    )
+
+
+def same(a, b) -> bool:
+    return equal(a, b) and torch.equal(a.out.means2d.absgrad, b.out.means2d.absgrad)
+
+
+def opaque_cloud() -> Cloud:
+    """Every tile sees the first of its chunks only."""
+    cloud = random_cloud(500, seed=9, size=0.9)
+    return cloud._replace(opacities=torch.full_like(cloud.opacities, 0.99))
+
+
+CLOUDS = {"thin": None, "opaque": opaque_cloud()}
+
+
+@pytest.mark.parametrize("cloud", CLOUDS.values(), ids=CLOUDS)
+def test_the_order_of_the_threads_changes_no_bit(machine, cloud):
+    """A barrier that is missing, or a sum in the order of arrival, would show."""
+    one, *others = (scene(machine, cloud, order=order) for order in (*ORDERS, "forward"))
+    assert all(same(one, other) for other in others)
+
+
+@pytest.mark.parametrize("cloud", CLOUDS.values(), ids=CLOUDS)
+def test_nothing_is_read_before_it_is_written(machine, monkeypatch, cloud):
+    """Torch fills what it allocates with NaN, the stand-in the shared memory."""
+    plain = scene(machine, cloud)
+    monkeypatch.setattr(torch.utils.deterministic, "fill_uninitialized_memory", True)
+    torch.use_deterministic_algorithms(True)
+    try:
+        assert torch.empty(1).isnan()
+        spoilt = scene(machine, cloud)
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert same(plain, spoilt)
+    assert cloud is None or plain.out.alpha.min() > 1 - 1e-4
+
+
+@pytest.mark.parametrize("kernel", ["faulty_barrier", "faulty_race"])
+def test_the_stand_in_shows_faults(kernel):
+    out = {order: torch.zeros(64, dtype=torch.int32) for order in ORDERS}
+    try:
+        for order in ORDERS:
+            HostMachine(order).launch(kernel, (1, 1), 64, out[order])
+    except AssertionError as fault:
+        assert kernel == "faulty_barrier" and "threads that don't meet" in str(fault)
+    else:
+        assert kernel == "faulty_race" and not torch.equal(out["forward"], out["backward"])
+
+
+# ---- room for the lists --------------------------------------------------------------------------
+
+
+@pytest.fixture
+def lists(monkeypatch):
+    """Those of every picture drawn."""
+    drawn, draw = [], cuda._draw
+    monkeypatch.setattr(
+        cuda, "_draw", lambda *arguments: drawn.append(draw(*arguments)) or drawn[-1]
+    )
+    return drawn
+
+
+def test_a_picture_that_needs_more_room_than_expected_is_right_to_the_bit(
+    machine, monkeypatch, lists
+):
+    """Drawn without lists, differentiated with whole ones; once the number has arrived there is
+    room.
+    """
+    monkeypatch.setattr(cuda_memory, "STEP", 64)
+    known = scene(machine)
+    for demand in cuda._demands.values():
+        demand.per_gaussian = 0.5  # as if earlier pictures had needed less
+    short, host = scene(machine, arrived=False), cuda_driver.machine(None)
+    assert same(known, short)
+    assert same(known, scene(machine, arrived=False))
+    host.arrived = True
+    assert same(known, scene(machine))
+    assert [x.capacity >= 1904 for x in lists] == [True, False, False, True], (
+        "the picture has 1904 entries"
+    )
+
+
+def test_only_the_first_picture_of_a_size_waits(machine):
+    cloud, camera = random_cloud(50).to(torch.float32), cameras(2, 40, 24, dtype=torch.float32)
+    host = machine()
+    host.arrived = False
+    with torch.no_grad():
+        for waits in (1, 1, 1):
+            rasterize(*cloud, *camera, 40, 24, backend="cuda")
+            assert host.waits == waits
+        host.arrived = True
+        rasterize(*cloud, *camera, 40, 24, backend="cuda")
+        assert host.waits == 4, "the three numbers that have arrived are read"
+        rasterize(*cloud, *camera, 40, 25, backend="cuda")
+    assert host.waits == 5
+
+
+def test_room_follows_what_is_needed():
+    """Up at once, down slowly, and in proportion to the Gaussians."""
+    demand, host = cuda_memory.Demand(views=2), HostMachine()
+
+    def room(*totals, gaussians=1000):
+        return demand.room(host.read_later(torch.tensor(totals).cumsum(0)), gaussians)
+
+    assert 6_000_000 < room(3_000_000, 1_000_000) < 6_010_000
+    assert 3_000_000 * 0.99 < room(10, 10, gaussians=500) < 3_000_000
+    for _ in range(1000):
+        small = room(10, 10)
+    assert small <= 2 * cuda_memory.STEP
+
+
+@pytest.mark.parametrize("most", [1500, 900])
+def test_short_memory_means_fewer_views_at_a_time(machine, monkeypatch, most):
+    """Three views need 1904 entries, each of them about 600. The same bits; the second call doesn't
+    even try all at once.
+    """
+    monkeypatch.setattr(cuda_memory, "STEP", 64)
+    known, tries = scene(machine), []
+    for _ in range(2):
+        short = scene(machine, most_entries=most)
+        assert same(known, short)
+        launched = cuda_driver.machine(None).launched
+        assert 1 < launched.count("blend") <= 3 and 1 < launched.count("blend_backward_absolute")
+        tries.append(launched.count("list_tiles"))
+    assert tries[0] == tries[1] + 1
+
+
+def test_memory_that_is_short_in_the_backward_pass_only(machine, monkeypatch):
+    monkeypatch.setattr(cuda_memory, "STEP", 64)
+    known, host = scene(machine), machine()
+    cloud, camera = (
+        random_cloud(300, seed=8, size=0.1).to(torch.float32).leaves(),
+        [x.float() for x in cameras(3, 40, 24)],
+    )
+    out = rasterize(*cloud, *camera, 40, 24, background=BACKGROUND, backend="cuda")
+    host.most_entries = 1500
+    torch.autograd.backward([out.image, out.alpha, out.depth], cotangents(out))
+    assert host.launched.count("blend_backward") > 1
+    assert all(
+        torch.equal(leaf.grad, known.grads[name]) for name, leaf in zip(NAMES, cloud, strict=True)
+    )
+
+
+def test_without_memory_for_one_view_there_is_a_picture_but_no_gradient(machine, caplog):
+    cloud, camera = (
+        random_cloud(300, seed=8, size=0.1).to(torch.float32).leaves(),
+        cameras(1, 40, 24, dtype=torch.float32),
+    )
+    known = rasterize(*cloud, *camera, 40, 24, backend="cuda")
+    machine(most_entries=10)
+    cuda._report_short_memory.cache_clear()
+    short = rasterize(*cloud, *camera, 40, 24, backend="cuda")
+    assert "memory is too short" in caplog.text
+    assert torch.equal(known.image, short.image) and torch.equal(
+        known.contribution, short.contribution
+    )
+    with pytest.raises(UserError, match=r"reach \d+ tiles .* GiB .* fewer or smaller Gaussians"):
+        short.image.sum().backward()
+
+
+def test_more_entries_than_can_be_numbered_is_short_memory():
+    with pytest.raises(torch.cuda.OutOfMemoryError):
+        cuda_memory.whole_steps(2**31)
+
+
+def test_more_splats_than_can_be_numbered_are_refused():
+    with pytest.raises(UserError, match="fewer views"):
+        cuda._check_count(5000, 500_000)
+    with pytest.raises(UserError, match="fewer views"):
+        cuda._check_count(70_000, 1)
+
+
+def test_without_gradients_nothing_is_kept(machine):
+    host = machine()
+    out = rasterize(
+        *random_cloud(30).to(torch.float32),
+        *cameras(1, 12, 12, dtype=torch.float32),
+        12,
+        12,
+        backend="cuda",
+    )
+    assert out.image.grad_fn is None and not out.means2d.requires_grad
+    assert host.launched == ["project", "count_tiles", "list_tiles", "find_tiles", "blend"]

@@ -1,0 +1,348 @@
+"""The CUDA kernels compile for every architecture without spilling, are compiled once, and are
+handed to the driver as it wants.
+"""
+
+import contextlib
+import ctypes
+import logging
+import os
+import re
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from tests.helpers.cuda_shim.machine import library, unavailable
+from tests.helpers.splatting_scenes import cameras, equal, random_cloud, run
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.splatting import api, available_backends
+from threestudio_gaussiandreamer.splatting.cuda import backend as cuda
+from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver
+from threestudio_gaussiandreamer.splatting.cuda import nvrtc
+
+needs_nvrtc = pytest.mark.skipif(nvrtc.unavailable() is not None, reason=str(nvrtc.unavailable()))
+ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
+THREADS = {"blend": 256, "blend_backward": 256}  # per block; 128 in the other units
+REGISTERS = 65536  # of a multiprocessor
+
+
+@pytest.fixture
+def cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("GAUSSIANDREAMER_CACHE", str(tmp_path / "cubins"))
+    return tmp_path / "cubins"
+
+
+@pytest.fixture
+def compiled(monkeypatch):
+    """The units that are compiled from now on."""
+    units, compile_unit = [], nvrtc.compile_unit
+    monkeypatch.setattr(
+        nvrtc, "compile_unit", lambda unit, target: units.append(unit) or compile_unit(unit, target)
+    )
+    return units
+
+
+# ---- the compiler --------------------------------------------------------------------------------
+
+
+def units():
+    return sorted(path.stem for path in nvrtc.KERNELS.glob("*.cu"))
+
+
+def properties(log: str) -> dict[str, dict[str, int]]:
+    """By kernel: registers, shared bytes, spilled bytes and stack."""
+    found = {}
+    for name, text in re.findall(
+        r"Compiling entry function '(\w+)'(.*?)(?=Compiling entry function|\Z)", log, re.DOTALL
+    ):
+        number = {
+            "registers": r"Used (\d+) registers",
+            "shared": r"(\d+) bytes smem",
+            "stack": r"(\d+) bytes stack",
+        }
+        found[name] = {
+            what: sum(map(int, re.findall(pattern, text))) for what, pattern in number.items()
+        }
+        found[name]["spilled"] = sum(map(int, re.findall(r"(\d+) bytes spill", text)))
+    return found
+
+
+@needs_nvrtc
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_every_kernel_compiles_without_spills(architecture):
+    """And three blocks of each fit on a multiprocessor by their registers."""
+    seen = set()
+    for unit in units():
+        code, log = nvrtc.compile_unit(unit, f"sm_{architecture}")
+        assert code[:4] == b"\x7fELF" and "warning" not in log, log
+        for name, used in properties(log).items():
+            assert cuda_driver.UNITS[name] == unit
+            assert used["spilled"] == used["stack"] == 0, f"{name}: {used}"
+            assert 0 < used["registers"] * THREADS.get(unit, 128) <= REGISTERS // 3, (
+                f"{name}: {used}"
+            )
+            assert used["shared"] <= 48 * 1024, f"{name}: {used}"
+            seen.add(name)
+    assert seen == set(cuda_driver.UNITS)
+
+
+@needs_nvrtc
+def test_shared_memory_is_read_four_floats_at_a_time():
+    """In PTX, which is what a device newer than the compiler gets."""
+    forward, backward = (
+        nvrtc.compile_unit(unit, "compute_80").code.decode() for unit in ("blend", "blend_backward")
+    )
+    assert (
+        ".entry blend(" in forward
+        and "ld.shared.f32" not in forward
+        and forward.count("ld.shared.v4.f32") == 3
+    )
+    assert backward.count("ld.shared.v4.f32") > 20
+
+
+@needs_nvrtc
+def test_a_mistake_in_the_text_is_shown(monkeypatch):
+    monkeypatch.setattr(nvrtc, "source", lambda unit: "__global__ void f() { undeclared = 1; }")
+    with pytest.raises(UserError, match="(?s)blend.cu for sm_80.*undeclared"):
+        nvrtc.compile_unit("blend", "sm_80")
+
+
+@pytest.mark.parametrize(
+    "capability, target",
+    [
+        ((7, 5), "sm_75"),
+        ((8, 6), "sm_86"),
+        ((9, 0), "sm_90"),
+        ((12, 1), "compute_120"),
+        ((13, 0), "compute_120"),
+        ((8, 7), "compute_86"),
+    ],
+)
+def test_devices_newer_than_the_compiler_get_the_newest_text(monkeypatch, capability, target):
+    monkeypatch.setattr(nvrtc, "architectures", lambda: [52, 75, 80, 86, 90, 120])
+    assert nvrtc.target_for(capability) == target
+
+
+@pytest.mark.parametrize("known", [[52, 70, 75, 90], [75, 90], [80, 90]])
+def test_devices_that_are_too_old_are_named(monkeypatch, known):
+    monkeypatch.setattr(nvrtc, "architectures", lambda: known)
+    monkeypatch.setattr(nvrtc, "version", lambda: (13, 0))
+    with pytest.raises(
+        UserError,
+        match=rf"capability 7\.0;.*CUDA 13\.0, needs {max(75, known[0]) / 10} or later: use "
+        r"backend='torch'",
+    ):
+        nvrtc.target_for((7, 0))
+
+
+def test_without_a_compiler_it_says_what_to_install(monkeypatch):
+    monkeypatch.setenv("GAUSSIANDREAMER_NVRTC", "/no/such/libnvrtc.so")
+    nvrtc._library.cache_clear()
+    try:
+        assert all(
+            word in nvrtc.unavailable()
+            for word in ("NVRTC", "install", "nvidia-cuda-nvrtc", "/no/such/libnvrtc.so")
+        )
+    finally:
+        nvrtc._library.cache_clear()
+
+
+def test_the_release_that_torch_was_built_with_is_tried_first(monkeypatch, tmp_path):
+    """Both may be installed; a driver of CUDA 12 can't load what the NVRTC of CUDA 13 makes."""
+    for place in (
+        "cu13/lib/libnvrtc.so.13",
+        "cuda_nvrtc/lib/libnvrtc.so.12",
+        "cuda_nvrtc/lib/libnvrtc-builtins.so.12.8",
+    ):
+        (tmp_path / "nvidia" / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "nvidia" / place).touch()
+    monkeypatch.delenv("GAUSSIANDREAMER_NVRTC", raising=False)
+    monkeypatch.setattr(nvrtc.sysconfig, "get_paths", lambda: {"purelib": str(tmp_path)})
+    for release, first in (("12.8", "libnvrtc.so.12"), ("13.0", "libnvrtc.so.13")):
+        monkeypatch.setattr(torch.version, "cuda", release)
+        ours = [path for path in nvrtc._candidates() if str(tmp_path) in path]
+        assert ours[0].endswith(first) and len(ours) == 2
+
+
+# ---- the cache -----------------------------------------------------------------------------------
+
+
+@needs_nvrtc
+def test_what_was_compiled_once_is_read_from_the_disk(cache, compiled):
+    first = nvrtc.machine_code("blend", "sm_80")
+    assert nvrtc.machine_code("blend", "sm_80") == first and compiled == ["blend"]
+    assert nvrtc.machine_code("blend", "sm_90") != first and compiled == ["blend", "blend"]
+    assert len(list(cache.iterdir())) == 2
+
+
+@needs_nvrtc
+@pytest.mark.parametrize(
+    "damage", [lambda data: data[:-1], lambda data: data[:50] + b"!" + data[51:], lambda data: b""]
+)
+def test_a_damaged_file_is_compiled_again(cache, compiled, damage):
+    first = nvrtc.machine_code("bin", "sm_80")
+    (path,) = cache.iterdir()
+    path.write_bytes(damage(path.read_bytes()))
+    assert nvrtc.machine_code("bin", "sm_80") == first and compiled == ["bin", "bin"]
+    assert nvrtc.machine_code("bin", "sm_80") == first and len(compiled) == 2
+
+
+@needs_nvrtc
+def test_a_cache_that_cannot_be_written_costs_time_only(tmp_path, monkeypatch, caplog):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("GAUSSIANDREAMER_CACHE", str(tmp_path / "file" / "folder"))
+    with caplog.at_level(logging.WARNING):
+        assert nvrtc.machine_code("bin", "sm_80")[:4] == b"\x7fELF"
+    assert "can't be kept" in caplog.text and "file" in caplog.text
+
+
+@needs_nvrtc
+def test_a_user_without_a_home_compiles_at_every_start(monkeypatch, compiled, caplog):
+    """In a container whose number of a user nobody knows."""
+    for variable in ("GAUSSIANDREAMER_CACHE", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr(os, "getuid", lambda: 2**31 - 7)
+    with caplog.at_level(logging.WARNING):
+        assert nvrtc.machine_code("bin", "sm_80") == nvrtc.machine_code("bin", "sm_80")
+    assert compiled == ["bin", "bin"] and "can't be kept" in caplog.text
+
+
+@needs_nvrtc
+def test_whatever_changes_the_code_changes_its_name(monkeypatch):
+    names = {nvrtc._key("bin", "sm_80"), nvrtc._key("blend", "sm_80"), nvrtc._key("bin", "sm_86")}
+    changes = {
+        "source": lambda unit: "other",
+        "headers": lambda: {"splat_math.h": "other"},
+        "version": lambda: (99, 0),
+        "OPTIONS": ("-O0",),
+    }
+    for name, other in changes.items():
+        with monkeypatch.context() as patch:
+            patch.setattr(nvrtc, name, other)
+            names.add(nvrtc._key("bin", "sm_80"))
+    assert len(names) == 7
+
+
+@needs_nvrtc
+def test_several_threads_may_compile_at_once(cache):
+    with ThreadPoolExecutor(4) as pool:
+        assert len(set(pool.map(lambda _: nvrtc.machine_code("bin", "sm_80"), range(8)))) == 1
+    assert [path.suffix for path in cache.iterdir()] != [".tmp"] and len(list(cache.iterdir())) == 1
+
+
+def test_the_cache_is_where_the_user_keeps_caches(monkeypatch):
+    monkeypatch.delenv("GAUSSIANDREAMER_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
+    assert nvrtc.cache_folder().as_posix() == "/somewhere/gaussiandreamer/cubins"
+
+
+# ---- the driver ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def driver(monkeypatch, cache):
+    """A driver that runs kernels on the host, and a torch that sees one GPU of compute capability
+    9.0.
+    """
+    if unavailable() is not None:
+        pytest.skip(unavailable())
+    fake = ctypes.CDLL(library()._name)
+    fake.fake_stream.restype = ctypes.c_void_p
+    (
+        ctypes.c_int.in_dll(fake, "fake_loads").value,
+        ctypes.c_int.in_dll(fake, "fake_release").value,
+    ) = 0, 99000
+    event = SimpleNamespace(record=lambda: None, query=lambda: True, synchronize=lambda: None)
+    gpu = {
+        "device": lambda index: contextlib.nullcontext(),
+        "current_stream": lambda: SimpleNamespace(cuda_stream=fake.fake_stream()),
+        "current_device": lambda: 0,
+        "init": lambda: None,
+        "is_available": lambda: True,
+        "get_device_capability": lambda index=0: (9, 0),
+        "Event": lambda: event,
+    }
+    for name, value in gpu.items():
+        monkeypatch.setattr(torch.cuda, name, value)
+    empty = torch.empty
+    monkeypatch.setattr(
+        torch, "empty", lambda *shape, pin_memory=False, **options: empty(*shape, **options)
+    )
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(cuda_driver, "LIBRARY", library()._name)
+    caches = (cuda_driver._driver, cuda_driver._gpu, cuda_driver.unavailable)
+    for function in caches:
+        function.cache_clear()
+    yield fake
+    for function in caches:
+        function.cache_clear()
+
+
+@needs_nvrtc
+def test_a_picture_by_way_of_the_driver(driver, monkeypatch, compiled):
+    """Compiled, loaded, launched in autograd's thread too: the same bits as the torch backend's
+    within rounding.
+    """
+    monkeypatch.setitem(
+        api.BACKENDS, "cuda", api.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,))
+    )
+    monkeypatch.setattr(cuda, "_demands", {})
+    assert available_backends()["cuda"] is None
+    cloud, camera = random_cloud(60).to(torch.float32), cameras(2, 20, 20, dtype=torch.float32)
+    with ThreadPoolExecutor(1) as pool:
+        pictures = [
+            run(cloud, *camera, 20, 20, backend="cuda"),
+            pool.submit(run, cloud, *camera, 20, 20, backend="cuda").result(),
+        ]
+    assert equal(*pictures)
+    assert (
+        pictures[0].out.image - run(cloud, *camera, 20, 20, backend="torch").out.image
+    ).abs().max() < 1e-6
+    assert sorted(compiled) == units() and ctypes.c_int.in_dll(driver, "fake_loads").value == len(
+        units()
+    )
+
+
+@needs_nvrtc
+def test_code_that_the_driver_refuses_is_named(driver, monkeypatch):
+    monkeypatch.setattr(nvrtc, "machine_code", lambda unit, target: b"nonsense")
+    with pytest.raises(
+        UserError,
+        match=r"loading blend.cu for sm_90 \(NVRTC of CUDA .*, driver of CUDA 99.0\): "
+        r".*invalid \(200\)",
+    ):
+        cuda_driver.machine(torch.device("cuda")).launch("blend", (1, 1), 256)
+
+
+@needs_nvrtc
+def test_a_driver_that_is_too_old_is_named(driver, monkeypatch):
+    monkeypatch.setattr(nvrtc, "version", lambda: (13, 1))
+    ctypes.c_int.in_dll(driver, "fake_release").value = 12040
+    words = (
+        "driver knows CUDA up to 12.4",
+        "CUDA 13.1",
+        "update the driver, or install a torch built for CUDA 12",
+    )
+    assert all(word in cuda_driver.unavailable() for word in words)
+
+
+@needs_nvrtc
+def test_a_gpu_that_is_too_old_is_named(driver, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index=0: (6, 1))
+    assert "capability 6.1" in available_backends()["cuda"]
+
+
+@needs_nvrtc
+def test_without_a_driver_it_says_so(driver, monkeypatch):
+    monkeypatch.setattr(cuda_driver, "LIBRARY", "libcuda-that-is-not-there.so")
+    assert "libcuda-that-is-not-there.so" in cuda_driver.unavailable()
+
+
+def test_a_torch_without_cuda_says_so(monkeypatch):
+    monkeypatch.setattr(torch.version, "cuda", None)
+    cuda_driver.unavailable.cache_clear()
+    try:
+        assert "without CUDA" in available_backends()["cuda"]
+    finally:
+        cuda_driver.unavailable.cache_clear()

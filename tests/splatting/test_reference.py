@@ -1,0 +1,613 @@
+"""The specification against closed forms, hand-written numpy, finite differences, and an
+implementation that isn't ours.
+"""
+
+import math
+import sys
+import types
+
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers.splatting_scenes import (
+    NAMES,
+    NO_CUTOFFS,
+    Cloud,
+    cameras,
+    cotangents,
+    error,
+    front_camera,
+    one_gaussian,
+    psnr,
+    random_cloud,
+    run,
+)
+from threestudio_gaussiandreamer.splatting import rasterize, reference
+from threestudio_gaussiandreamer.splatting.options import RasterizeOptions
+from threestudio_gaussiandreamer.splatting.projection import project, quats_to_rotations
+
+SPECIFICATION = {"backend": "reference"}
+TRUTH = SPECIFICATION | NO_CUTOFFS
+# float64 against the same formula in another order: rounding only.
+ROUNDING = 1e-10
+
+
+def draw(cloud, camera, width, height, **options):
+    return rasterize(*cloud, *camera, width, height, **{**SPECIFICATION, **options})
+
+
+# ---- forward: closed forms -----------------------------------------------------------------------
+
+
+def test_one_gaussian_is_the_pinhole_image_of_its_ellipse():
+    """Ahead on the axis, J is diagonal: variances (f s / z)^2 + eps2d, no correlation."""
+    focal, z = 40.0, 2.0
+    cloud = one_gaussian((0.0, 0.0, z), (0.1, 0.2, 0.3), 0.6)
+    out = draw(cloud, front_camera(16, 12, focal), 16, 12, **NO_CUTOFFS)
+    y, x = np.mgrid[:12, :16] + 0.5
+    exponent = (x - 8) ** 2 / ((focal * 0.1 / z) ** 2 + 0.3) + (y - 6) ** 2 / (
+        (focal * 0.2 / z) ** 2 + 0.3
+    )
+    alpha = 0.6 * np.exp(-0.5 * exponent)
+    np.testing.assert_allclose(out.alpha[0, ..., 0], alpha, rtol=1e-12)
+    np.testing.assert_allclose(out.image[0], alpha[..., None] * [1, 0.5, 0.25], rtol=1e-12)
+    np.testing.assert_allclose(out.depth[0, ..., 0], alpha * z, rtol=1e-12)
+    assert out.contribution.item() == pytest.approx(alpha.max(), rel=1e-12)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("beyond", [0.8, 1.2])
+def test_the_jacobian_is_clamped_30_percent_beyond_the_image(side, beyond):
+    """With the principal point off centre; an axis-aligned Gaussian has variance ``(f/z)^2 (sx^2 +
+    slope^2 sz^2) + eps2d``.
+    """
+    width, focal, z, centre = 20, 10.0, 2.0, 7.0
+    limit = ((width - centre) / focal if side > 0 else centre / focal) + 0.3 * 0.5 * width / focal
+    Ks = torch.tensor([[[focal, 0, centre], [0, focal, 5.0], [0, 0, 1]]], dtype=torch.float64)
+    cloud = one_gaussian((side * beyond * limit * z, 0.0, z), (0.1, 0.2, 3.0))
+    splats = project(
+        *cloud,
+        torch.eye(4, dtype=torch.float64)[None],
+        Ks,
+        width,
+        10,
+        RasterizeOptions(**NO_CUTOFFS),
+    )
+    variance_x = (focal / z) ** 2 * (0.1**2 + (min(beyond, 1) * limit) ** 2 * 3.0**2) + 0.3
+    variance_y = (focal / z) ** 2 * 0.2**2 + 0.3
+    assert splats.conics[0, 0].tolist() == pytest.approx(
+        [1 / variance_x, 0, 1 / variance_y], rel=1e-12
+    )
+    assert splats.means2d[0, 0, 0].item() == pytest.approx(
+        centre + side * beyond * limit * focal, rel=1e-12
+    )
+
+
+def by_hand(cloud: Cloud, viewmat, K, width, height, alpha_min, alpha_max, stop, eps2d=0.3):
+    """Loops over pixels and Gaussians with textbook matrices: rotation by Rodrigues, covariance
+    inverted by numpy.
+    """
+    means, quats, scales, opacities, colors = (x.numpy() for x in cloud)
+    viewmat, K, splats = viewmat.numpy(), K.numpy(), []
+    for i in range(len(means)):
+        x, y, z = t = viewmat[:3, :3] @ means[i] + viewmat[:3, 3]
+        w, axis = quats[i, 0], quats[i, 1:]
+        angle, length = 2 * math.atan2(np.linalg.norm(axis), w), np.linalg.norm(axis)
+        k = (
+            np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+            / length
+        )
+        rotation = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * k @ k
+        sigma = (
+            viewmat[:3, :3] @ rotation @ np.diag(scales[i] ** 2) @ rotation.T @ viewmat[:3, :3].T
+        )
+        J = np.array([[K[0, 0] / z, 0, -K[0, 0] * x / z**2], [0, K[1, 1] / z, -K[1, 1] * y / z**2]])
+        splats.append((z, i, (K @ t)[:2] / z, np.linalg.inv(J @ sigma @ J.T + eps2d * np.eye(2))))
+    image = np.zeros((height, width, 5))
+    for v, u in np.ndindex(height, width):
+        T = 1.0
+        for z, i, mean, conic in sorted(splats, key=lambda s: s[:2]):
+            d = np.array([u + 0.5, v + 0.5]) - mean
+            alpha = min(alpha_max, opacities[i] * math.exp(-0.5 * d @ conic @ d))
+            if alpha < alpha_min:
+                continue
+            image[v, u] += np.array([*colors[i], z, 1.0]) * alpha * T
+            T *= 1 - alpha
+            if T < stop:
+                break
+    return image
+
+
+@pytest.mark.parametrize(
+    "cutoffs", [NO_CUTOFFS, {"alpha_min": 0.02, "alpha_max": 0.7, "stop": 0.05}]
+)
+def test_a_cloud_equals_loops_written_by_hand(cutoffs):
+    cloud, (viewmats, Ks) = random_cloud(12, seed=3, size=0.3), cameras(1, 9, 7)
+    out = draw(cloud, (viewmats, Ks), 9, 7, **cutoffs)
+    expected = by_hand(cloud, viewmats[0], Ks[0], 9, 7, **cutoffs)
+    np.testing.assert_allclose(
+        torch.cat([out.image, out.depth, out.alpha], -1)[0], expected, rtol=1e-9, atol=1e-12
+    )
+
+
+def test_the_gaussian_that_crosses_the_stop_counts_and_the_next_does_not():
+    """alphas .9, .905, .99: T = 9.5e-5 < 1e-4 only behind the third, so opacity is 1 - 9.5e-5, not
+    0.9905 (stability.md F4).
+    """
+    cloud = Cloud(*(x.repeat(4, *[1] * (x.dim() - 1)) for x in one_gaussian(scale=10.0)))
+    cloud = cloud._replace(opacities=torch.tensor([0.9, 0.905, 0.99, 0.5], dtype=torch.float64))
+    out = draw(cloud, front_camera(1, 1, 1.0), 1, 1)
+    behind = 0.1 * 0.095 * 0.01
+    assert out.alpha.item() == pytest.approx(1 - behind, abs=1e-12)
+    assert out.contribution[0, 3] == 0 and out.contribution[0, 2] > 0
+
+
+def test_equal_depths_are_ordered_by_index():
+    red, green = (
+        one_gaussian(opacity=0.8, color=(1.0, 0, 0)),
+        one_gaussian(opacity=0.8, color=(0.0, 1, 0)),
+    )
+    for first, second, channel in ((red, green, 0), (green, red, 1)):
+        cloud = Cloud(*(torch.cat(pair) for pair in zip(first, second, strict=True)))
+        image = draw(cloud, front_camera(2, 2, 10.0), 2, 2).image[0]
+        assert (image[..., channel] > image[..., 1 - channel]).all()
+
+
+def test_permuting_gaussians_of_different_depth_permutes_the_results():
+    cloud, camera = random_cloud(40, seed=5), cameras(2, 11, 8)
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
+    one, two = (
+        run(cloud, *camera, 11, 8, **SPECIFICATION),
+        run(cloud.pick(order), *camera, 11, 8, **SPECIFICATION),
+    )
+    for name in ("image", "alpha", "depth"):
+        assert error(getattr(two.out, name), getattr(one.out, name)) < ROUNDING, name
+    for name in ("means2d", "radii", "contribution"):
+        assert error(getattr(two.out, name), getattr(one.out, name)[:, order]) < ROUNDING, name
+    for name in NAMES:
+        assert error(two.grads[name], one.grads[name][order]) < ROUNDING, name
+
+
+def test_a_circle_stays_round_on_a_wide_image():
+    """stability.md F17: the same focal length in both directions whatever the aspect ratio."""
+    out = draw(one_gaussian(scale=0.2), front_camera(64, 32, 40.0), 64, 32, **NO_CUTOFFS)
+    alpha = out.alpha[0, ..., 0].numpy()
+    y, x = np.mgrid[:32, :64] + 0.5
+    spread_x, spread_y = (
+        (alpha * (axis - centre) ** 2).sum() / alpha.sum() for axis, centre in ((x, 32), (y, 16))
+    )
+    # The image crops the tails at 3.9 standard deviations vertically, which costs 0.2 %.
+    assert spread_x == pytest.approx(spread_y, rel=5e-3)
+
+
+def test_a_render_equals_the_crop_of_a_larger_one():
+    """Shifting the principal point crops; away from the Jacobian's clamp nothing else depends on
+    the size.
+    """
+    cloud, (viewmats, Ks) = random_cloud(60, seed=6, size=0.05), cameras(1, 48, 40)
+    large = draw(cloud, (viewmats, Ks), 48, 40)
+    cropped = Ks.clone()
+    cropped[0, :2, 2] -= torch.tensor([9.0, 5.0])
+    small = draw(cloud, (viewmats, cropped), 31, 33)
+    assert torch.allclose(small.image, large.image[:, 5:38, 9:40], atol=1e-12)
+
+
+def test_antialiasing_keeps_the_energy_of_a_small_gaussian():
+    """Sum of alpha times z^2 is constant for a Gaussian that only moves away; within 5 % over a
+    factor of 16 (stability.md A1).
+    """
+
+    def energies(antialias):
+        def energy(z):
+            cloud = one_gaussian((0.0, 0.0, z), 0.05)
+            return (
+                draw(
+                    cloud, front_camera(64, 64, 60.0), 64, 64, antialias=antialias, **NO_CUTOFFS
+                ).alpha.sum()
+                * z**2
+            )
+
+        return np.array([energy(z) for z in (2.0, 4.0, 8.0, 16.0, 32.0)])
+
+    drift = {flag: np.ptp(energies(flag)) / energies(flag).mean() for flag in (False, True)}
+    assert drift[True] < 0.05 and drift[False] > 1
+
+
+def test_downsampling_is_the_mean_of_boxes():
+    cloud, camera = random_cloud(50, seed=7), cameras(2, 12, 10)
+    background = torch.tensor([0.2, 0.4, 0.8], dtype=torch.float64)
+    full, half = (draw(cloud, camera, 12, 10, background=background, downsample=d) for d in (1, 2))
+    for name in ("image", "alpha", "depth"):
+        boxes = getattr(full, name).reshape(2, 5, 2, 6, 2, -1).mean((2, 4))
+        assert torch.allclose(getattr(half, name), boxes, atol=1e-14), name
+    assert torch.equal(half.means2d, full.means2d) and torch.equal(
+        half.contribution, full.contribution
+    )
+
+
+def test_radii_bound_what_is_drawn():
+    """Everything at alpha >= alpha_min lies within the radius, which is tight along one axis."""
+    out = draw(
+        one_gaussian((0.1, -0.05, 2.0), (0.3, 0.1, 0.1), 0.9),
+        front_camera(64, 64, 40.0),
+        64,
+        64,
+        alpha_min=1 / 255,
+    )
+    rows, columns = out.alpha[0, ..., 0].nonzero().T + 0.5
+    reach = max(
+        (columns - out.means2d[0, 0, 0]).abs().max(), (rows - out.means2d[0, 0, 1]).abs().max()
+    ).item()
+    assert reach <= out.radii.item() <= reach + 1
+
+
+def test_fog_needs_the_accurate_preset():
+    """2000 Gaussians of opacity 0.0038 on the same pixels: below 1/255, so `fast` shows nothing at
+    all (stability.md A1).
+    """
+    cloud = random_cloud(2000, seed=8, size=0.4)._replace(
+        opacities=torch.full((2000,), 0.0038, dtype=torch.float64)
+    )
+    truth = draw(cloud, cameras(1, 12, 12), 12, 12, **NO_CUTOFFS).image
+    images = {
+        name: draw(cloud, cameras(1, 12, 12), 12, 12, preset=name).image
+        for name in ("fast", "balanced", "accurate")
+    }
+    assert images["fast"].abs().max() == 0
+    # Measured 26 and 40 dB: four times less is missing from each splat, that is 12 dB.
+    assert psnr(images["accurate"], truth) > psnr(images["balanced"], truth) + 12 > 36
+
+
+# ---- gradients -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "n, antialias, fast", [(1, False, False), (3, True, False), (12, False, True), (30, True, True)]
+)
+def test_gradients_of_all_inputs_equal_finite_differences(n, antialias, fast):
+    """gradcheck in float64, cut-offs off: attributes, background and cameras, through image, alpha
+    and depth.
+    """
+    cloud, (viewmats, Ks) = random_cloud(n, seed=n, size=0.3), cameras(2, 5, 4)
+    background = torch.tensor(
+        [[0.1, 0.6, 0.3], [0.9, 0.2, 0.5]], dtype=torch.float64, requires_grad=True
+    )
+
+    def f(*inputs):
+        out = rasterize(
+            *inputs[:5], inputs[5], Ks, 5, 4, background=inputs[6], antialias=antialias, **TRUTH
+        )
+        return out.image, out.alpha, out.depth
+
+    inputs = (*cloud.leaves(), viewmats.requires_grad_(), background)
+    assert torch.autograd.gradcheck(f, inputs, eps=1e-6, atol=1e-7, rtol=1e-5, fast_mode=fast)
+
+
+@pytest.mark.parametrize("limits", [0.5, 0.99, 1.0, 1.29, 1.31, 5.0, 50.0])
+def test_gradients_around_the_clamp_of_the_jacobian(limits):
+    """x/z in half fields of view; beyond 1.3 the clamped Jacobian still depends on z (stability.md
+    F1).
+    """
+    focal, width, z = 10.0, 8, 1.5
+    x = limits * 0.5 * width / focal * z
+    cloud = one_gaussian((x, 0.2, z), (0.5 * x + 0.2, 0.3, 0.4), 0.8)
+    camera = front_camera(width, 6, focal)
+
+    def f(means, scales, quats):
+        out = rasterize(
+            means, quats, scales, cloud.opacities, cloud.colors, *camera, width, 6, **TRUTH
+        )
+        return out.image, out.depth
+
+    quats = torch.tensor([[0.9, 0.1, -0.3, 0.2]], dtype=torch.float64)
+    inputs = [x.clone().requires_grad_() for x in (cloud.means, cloud.scales, quats)]
+    assert torch.autograd.gradcheck(f, inputs, eps=1e-6, atol=1e-8, rtol=1e-5)
+
+
+def test_no_gradient_flows_through_the_cap():
+    """Where opacity * G exceeds alpha_max the image doesn't move, and neither may the gradient
+    (stability.md F3).
+    """
+    cloud = one_gaussian((0.03, 0.0, 2.0), 5.0, 0.95)
+    leaves = cloud.leaves()
+    out = rasterize(*leaves, *front_camera(2, 2, 4.0), 2, 2, alpha_max=0.5, **SPECIFICATION)
+    out.image.sum().backward()
+    assert torch.allclose(out.alpha, torch.full_like(out.alpha, 0.5))
+    assert leaves.means.grad.abs().max() == 0 and leaves.opacities.grad.abs().max() == 0
+    assert leaves.colors.grad.abs().min() > 0
+
+
+def test_means2d_gradient_is_per_view_and_in_pixels_before_downsampling():
+    """Shifting the principal point of a view shifts its means2d and nothing else, so the gradients
+    must add up to that slope.
+    """
+    cloud, (viewmats, Ks) = random_cloud(20, seed=9, size=0.1), cameras(2, 12, 10, distance=6.0)
+    grads = run(cloud, viewmats, Ks, 12, 10, downsample=2, **TRUTH).grads["means2d"]
+
+    def loss(Ks):
+        out = rasterize(*cloud, viewmats, Ks, 12, 10, downsample=2, **TRUTH)
+        return sum(
+            (x * g).sum()
+            for x, g in zip((out.image, out.alpha, out.depth), cotangents(out), strict=True)
+        )
+
+    for view in range(2):
+        for axis in range(2):
+            step = torch.zeros_like(Ks)
+            step[view, axis, 2] = 1e-5
+            slope = (loss(Ks + step) - loss(Ks - step)) / 2e-5
+            # Central differences of a loss of order 10 with this step are good to 1e-8.
+            assert grads[view, :, axis].sum().item() == pytest.approx(
+                slope.item(), rel=1e-5, abs=1e-7
+            )
+
+
+def test_absgrad_adds_up_absolute_values_over_pixels():
+    cloud, camera = random_cloud(6, seed=10, size=0.3), cameras(2, 4, 3)
+    leaves = cloud.leaves()
+    out = rasterize(*leaves, *camera, 4, 3, absgrad=True, **SPECIFICATION)
+    g = torch.randn(
+        out.image.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    expected = torch.zeros_like(out.means2d)
+    for pixel in np.ndindex(*out.image.shape[:3]):
+        alone = torch.zeros_like(g)
+        alone[pixel] = g[pixel]
+        fresh = rasterize(*leaves, *camera, 4, 3, **SPECIFICATION)
+        fresh.image.backward(alone)
+        expected += fresh.means2d.grad.abs()
+    out.image.backward(g)
+    assert torch.allclose(out.means2d.absgrad, expected, atol=1e-14)
+    assert (out.means2d.absgrad > out.means2d.grad.abs()).any()
+
+
+def test_chunks_of_pixels_change_nothing(monkeypatch):
+    cloud, camera = random_cloud(30, seed=11), cameras(2, 7, 6)
+    options = {"absgrad": True, "background": torch.rand(3, dtype=torch.float64)}
+    whole = run(cloud, *camera, 7, 6, camera_gradient=True, **options, **SPECIFICATION)
+    monkeypatch.setattr(reference, "CHUNK_BYTES", 40_000)
+    parts = run(cloud, *camera, 7, 6, camera_gradient=True, **options, **SPECIFICATION)
+    assert error(parts.out.image, whole.out.image) < ROUNDING
+    assert error(parts.out.means2d.absgrad, whole.out.means2d.absgrad) < ROUNDING
+    for name, grad in whole.grads.items():
+        assert error(parts.grads[name], grad) < ROUNDING, name
+
+
+# ---- what can't be drawn -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_gaussian_that_is_not_finite_is_as_if_it_weren_t_there(name, value):
+    """Pixels and gradients are the same bits as with a transparent Gaussian in its place; its own
+    are zeros, not NaN.
+    """
+    cloud, camera = random_cloud(15, seed=12), cameras(2, 8, 6)
+    transparent = Cloud(*(x.clone() for x in cloud))
+    transparent.opacities[4] = 0
+    getattr(cloud, name)[4, ...] = value
+    with_it, without = (
+        run(c, *camera, 8, 6, camera_gradient=True, **SPECIFICATION) for c in (cloud, transparent)
+    )
+    assert (
+        torch.equal(with_it.out.image, without.out.image) and (with_it.out.radii[:, 4] == 0).all()
+    )
+    for attribute, grad in with_it.grads.items():
+        assert torch.equal(grad, without.grads[attribute]), attribute
+    assert all((with_it.grads[attribute][4] == 0).all() for attribute in NAMES)
+
+
+@pytest.mark.parametrize(
+    "offset, drawn", [(-0.1, False), (-1e-7, False), (0.0, False), (1e-7, True), (0.1, True)]
+)
+def test_near_plane(offset, drawn):
+    out = run(
+        one_gaussian((0.0, 0.0, 0.5 + offset), 0.01),
+        *front_camera(8, 8, 4.0),
+        8,
+        8,
+        near=0.5,
+        **SPECIFICATION,
+    )
+    assert (out.out.radii.item() > 0) == drawn and (out.out.alpha.max() > 0) == drawn
+    assert all(g.isfinite().all() and (drawn or (g == 0).all()) for g in out.grads.values())
+
+
+@pytest.mark.parametrize(
+    "mean", [(0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (1.0, 1.0, 0.0), (0.0, 0.0, 1e38), (1e38, 0.0, 1.0)]
+)
+def test_at_or_behind_the_camera_or_absurdly_far(mean):
+    cloud = Cloud(
+        *(torch.cat(pair) for pair in zip(one_gaussian(mean), one_gaussian(), strict=True))
+    ).to(torch.float32)
+    camera = front_camera(6, 6, 5.0)
+    with_it, alone = (
+        run(cloud, *camera, 6, 6, far=1e30, **SPECIFICATION),
+        run(cloud.pick([1]), *camera, 6, 6, far=1e30, **SPECIFICATION),
+    )
+    assert torch.equal(with_it.out.image, alone.out.image) and with_it.out.radii[0, 0] == 0
+    assert all((with_it.grads[name][0] == 0).all() for name in NAMES)
+
+
+def test_a_camera_that_is_not_finite_spoils_its_own_view_only():
+    cloud, (viewmats, Ks) = random_cloud(10, seed=13), cameras(2, 6, 5)
+    background = torch.tensor([0.3, 0.5, 0.7], dtype=torch.float64)
+    broken = viewmats.clone()
+    broken[0, 1, 2] = math.nan
+    bad, good = (
+        run(cloud, broken, Ks, 6, 5, background, **SPECIFICATION),
+        run(cloud, viewmats, Ks, 6, 5, background, **SPECIFICATION),
+    )
+    assert torch.equal(bad.out.image[1], good.out.image[1])
+    assert torch.equal(bad.out.image[0], background.expand(5, 6, 3))
+    assert all(g.isfinite().all() for g in bad.grads.values())
+
+
+@pytest.mark.parametrize("backend", ["reference", "torch"])
+@pytest.mark.parametrize("place", [(0, 0), (0, 2)])
+def test_a_camera_whose_numbers_overflow_spoils_its_own_view_only(place, backend):
+    cloud, (viewmats, Ks) = (
+        random_cloud(10, seed=13).to(torch.float32),
+        cameras(2, 6, 5, dtype=torch.float32),
+    )
+    elsewhere, absurd = Ks.clone(), Ks.clone()
+    elsewhere[0, 0, 2], absurd[0][place] = 1e6, 1e30
+    good, bad = (
+        run(cloud, viewmats, K, 6, 5, antialias=True, backend=backend) for K in (elsewhere, absurd)
+    )
+    assert torch.equal(bad.out.image, good.out.image)
+    assert all(torch.equal(bad.grads[name], good.grads[name]) for name in NAMES)
+
+
+@pytest.mark.parametrize(
+    "cloud",
+    [
+        random_cloud(0),
+        random_cloud(5)._replace(means=torch.full((5, 3), 100.0, dtype=torch.float64)),
+    ],
+)
+def test_nothing_to_see_is_the_background_with_zero_gradients(cloud):
+    background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    result = run(cloud, *cameras(2, 6, 4), 6, 4, background, **SPECIFICATION)
+    assert torch.equal(result.out.image, background.expand(2, 4, 6, 3))
+    assert (result.out.alpha == 0).all() and (result.out.depth == 0).all()
+    for name, leaf in zip(NAMES, cloud, strict=True):
+        assert result.grads[name].shape == leaf.shape and (result.grads[name] == 0).all()
+    assert result.grads["means2d"].shape == (2, len(cloud.means), 2)
+
+
+@pytest.mark.parametrize(
+    "quat", [(0.0, 0, 0, 0), (1e-20, 0, 0, 1e-20), (0, 1e-38, 0, 0), (1e-42, 0, 1e-42, 0)]
+)
+def test_a_quaternion_without_length_is_no_rotation_without_gradient(quat):
+    quats = torch.tensor([quat], dtype=torch.float32, requires_grad=True)
+    rotation = quats_to_rotations(quats)
+    rotation.sum().backward()
+    assert torch.equal(rotation[0], torch.eye(3)) and torch.equal(quats.grad, torch.zeros(1, 4))
+
+
+@pytest.mark.parametrize("factor", [-1.0, 5.0, 1e20, 1e-10])
+def test_the_length_of_a_quaternion_does_not_matter(factor):
+    quats = torch.randn(20, 4, generator=torch.Generator().manual_seed(0))
+    assert torch.allclose(quats_to_rotations(quats * factor), quats_to_rotations(quats), atol=5e-7)
+
+
+def test_float32_keeps_every_needle_and_disc_that_float64_keeps():
+    """The determinant is a sum of squares, so it neither cancels nor overflows: no Gaussian is lost
+    (stability.md A1).
+    """
+    steps = torch.tensor([1e-8, 1e-4, 1e-2, 1.0, 1e2, 1e4], dtype=torch.float64)
+    scales = torch.cartesian_prod(steps, steps, steps).repeat(3, 1)
+    g = torch.Generator().manual_seed(1)
+    quats = (
+        torch.randn(3, 4, generator=g, dtype=torch.float64)
+        .float()
+        .double()
+        .repeat_interleave(len(scales) // 3, 0)
+    )
+    means = torch.tensor([0.1, -0.2, 2.0], dtype=torch.float64).expand(len(scales), 3)
+    cloud = Cloud(
+        means,
+        quats,
+        scales,
+        torch.full((len(scales),), 0.8).double(),
+        torch.ones(len(scales), 1).double(),
+    )
+    options = SPECIFICATION | {"stop": 0.0, "alpha_min": 1e-5}
+    wide, narrow = (
+        run(cloud.to(dtype), *front_camera(16, 16, 20.0), 16, 16, **options)
+        for dtype in (torch.float64, torch.float32)
+    )
+    assert torch.equal(wide.out.radii > 0, narrow.out.radii > 0) and (wide.out.radii > 0).all()
+    assert all(g.isfinite().all() for g in narrow.grads.values())
+
+
+# ---- an implementation that we did not write -----------------------------------------------------
+
+
+@pytest.fixture
+def gsplat(monkeypatch):
+    """gsplat's plain-torch twins; the two functions of nerfacc that they call, CUDA only there, in
+    plain torch here.
+    """
+    torch_impl = pytest.importorskip("gsplat.cuda._torch_impl", reason="pip install gsplat")
+
+    def render_weight_from_alpha(alphas, ray_indices, n_rays):
+        same_ray = (ray_indices[:, None] == ray_indices) & torch.ones(
+            len(alphas), len(alphas), dtype=torch.bool
+        ).tril(-1)
+        T = torch.where(same_ray, 1 - alphas, 1).prod(1)
+        return alphas * T, T
+
+    def accumulate_along_rays(weights, values, ray_indices, n_rays):
+        values = weights[:, None] if values is None else weights[:, None] * values
+        return values.new_zeros(n_rays, values.shape[1]).index_add(0, ray_indices, values)
+
+    stand_in = types.ModuleType("nerfacc")
+    stand_in.render_weight_from_alpha, stand_in.accumulate_along_rays = (
+        render_weight_from_alpha,
+        accumulate_along_rays,
+    )
+    monkeypatch.setitem(sys.modules, "nerfacc", stand_in)
+    return torch_impl
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+def test_gsplat_draws_the_same_and_has_the_same_gradients(gsplat, antialias):
+    """Its alphas: cap .999 and threshold 1/255 (our preset fast). Its stop is exclusive, ours
+    isn't, so it is off here.
+    """
+    width, height, views = 10, 8, 2
+    cloud, (viewmats, Ks) = random_cloud(25, seed=14, size=0.25), cameras(views, width, height)
+    cloud.opacities[:3] = 0.9999  # reaches the cap
+    ours = run(
+        cloud,
+        viewmats,
+        Ks,
+        width,
+        height,
+        preset="fast",
+        alpha_max=0.999,
+        stop=0.0,
+        antialias=antialias,
+        **SPECIFICATION,
+    )
+
+    leaves = cloud.leaves()
+    covariances, _ = gsplat._quat_scale_to_covar_preci(leaves.quats, leaves.scales, True, False)
+    _, means2d, depths, conics, compensation = gsplat._fully_fused_projection(
+        leaves.means, covariances, viewmats, Ks, width, height, calc_compensations=antialias
+    )
+    opacities = leaves.opacities.expand(views, -1) * (compensation if antialias else 1)
+    features = torch.cat([leaves.colors.expand(views, -1, -1), depths[..., None]], -1)
+    ids = pairs_of_gsplat(
+        means2d.detach(), conics.detach(), opacities.detach(), depths.detach(), width, height
+    )
+    image, alpha = gsplat.accumulate(means2d, conics, opacities, features, *ids, width, height)
+    assert error(ours.out.means2d, means2d) < ROUNDING
+    assert (
+        error(ours.out.image, image[..., :3]) < ROUNDING
+        and error(ours.out.depth, image[..., 3:]) < ROUNDING
+    )
+    assert error(ours.out.alpha, alpha) < ROUNDING
+    torch.autograd.backward([image[..., :3], alpha, image[..., 3:]], list(cotangents(ours.out)))
+    for name, leaf in zip(NAMES, leaves, strict=True):
+        assert error(ours.grads[name], leaf.grad) < ROUNDING, name
+
+
+def pairs_of_gsplat(means2d, conics, opacities, depths, width, height):
+    """(Gaussian, pixel, image) of every alpha >= 1/255, by image, pixel, depth: what its CUDA
+    helper would return.
+    """
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    d = torch.stack([x, y], -1).reshape(1, -1, 1, 2) - means2d[:, None]
+    a, b, c = conics[:, None].unbind(-1)
+    alphas = opacities[:, None] * torch.exp(
+        -0.5 * (a * d[..., 0] ** 2 + c * d[..., 1] ** 2) - b * d[..., 0] * d[..., 1]
+    )
+    order = depths.argsort(-1)
+    image, pixel, place = (
+        (torch.gather(alphas, 2, order[:, None].expand_as(alphas)) >= 1 / 255).nonzero().unbind(1)
+    )
+    return order[image, place], pixel, image

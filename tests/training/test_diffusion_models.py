@@ -1,0 +1,221 @@
+"""The shipped configurations, trained from the first stage to the last with tiny random models in
+the real ones' files.
+
+Nothing of the path is replaced: only the models and the sizes are smaller than what a user runs.
+"""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers import tiny_3d_models, tiny_models
+from threestudio_gaussiandreamer.formats.ply import read_gaussians
+from threestudio_gaussiandreamer.guidance.text_to_image import TextToImageDistillation
+from threestudio_gaussiandreamer.launch.experiment import main
+
+pytest.importorskip("diffusers")
+pytestmark = pytest.mark.slow
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+STEPS = 2
+SIZES = [
+    "data.width=64", "data.height=64", "data.eval_width=32", "data.eval_height=32", "data.n_val_views=1", "data.n_test_views=2",
+    "system.geometry.grow.num_candidates=20000", "system.guidance.eval_steps=2", f"trainer.max_steps={STEPS}",
+    f"trainer.val_check_interval={STEPS}", "trainer.enable_progress_bar=false", "name=run", "tag=t", "use_timestamp=false",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory):
+    """Every model that the configurations name, as options of what loads them."""
+    folder = tmp_path_factory.mktemp("models")
+    base, upsampler = tiny_3d_models.point_e(folder / "point-e")
+    clip = tiny_3d_models.clip(folder / "clip")
+    return {
+        "epsilon": {
+            "system.guidance.pretrained_model_name_or_path": tiny_models.stable_diffusion(
+                folder / "epsilon"
+            )
+        },
+        "v_prediction": {
+            "system.guidance.pretrained_model_name_or_path": tiny_models.stable_diffusion(
+                folder / "v", prediction="v_prediction"
+            )
+        },
+        "deep_floyd": {
+            "system.guidance.pretrained_model_name_or_path": tiny_models.deep_floyd(folder / "if")
+        },
+        "shap_e": prior(
+            model=tiny_3d_models.shap_e(folder / "shap-e"), num_inference_steps=2, grid_size=24
+        ),
+        "point_e": prior(
+            checkpoint=base,
+            upsampler=upsampler,
+            clip=clip,
+            num_steps=2,
+            num_points=64,
+            num_upsampled=96,
+        ),
+        "motion": prior(
+            motion=motion(folder),
+            body_model=tiny_3d_models.body_model(folder / "body.npz"),
+            clip=clip,
+        )
+        | prior(num_frames=2, num_points=400),
+        "candidates": prior(
+            candidates=f"[{bodies(folder)}]",
+            motion="''",
+            body_model="''",
+            clip=clip,
+            num_points=400,
+        ),
+    }
+
+
+def prior(**options):
+    return {f"system.geometry.prior.{name}": value for name, value in options.items()}
+
+
+def motion(folder):
+    """A motion of MDM's layout (samples, joints, 3, frames): the body raises an arm, in metres."""
+    frames = np.repeat(tiny_3d_models.JOINTS[None, :22, :, None], 4, axis=3)
+    frames[0, 20, 1] += np.linspace(0, 0.1, 4)
+    np.savez(
+        folder / "results.npz",
+        motion=frames,
+        text=np.array(["Someone waves"]),
+        lengths=np.array([4]),
+    )
+    return folder / "results.npz"
+
+
+def bodies(folder):
+    """Two mesh files of the body, one of them squeezed."""
+    import trimesh
+
+    arrays = tiny_3d_models.body_arrays()
+    for name, width in (("a.obj", 1.0), ("b.obj", 0.5)):
+        trimesh.Trimesh(
+            arrays["v_template"] * [width, 1, 1], arrays["f"].astype(np.int64), process=False
+        ).export(folder / name)
+    return ",".join(str(folder / name) for name in ("a.obj", "b.obj"))
+
+
+@pytest.fixture
+def seen(monkeypatch):
+    """(views, rows of text) of every forward pass of the UNet."""
+    calls, noise = [], TextToImageDistillation.noise
+
+    def recorded(self, z, t, embeddings):
+        calls.append((len(z), len(embeddings)))
+        return noise(self, z, t, embeddings)
+
+    monkeypatch.setattr(TextToImageDistillation, "noise", recorded)
+    return calls
+
+
+def train(configs, options, *more):
+    """The command that a user types, in the current folder; returns the folder of its results."""
+    words = [word for name in configs for word in ("--config", str(CONFIGS / name))]
+    overrides = [f"{key}={value}" for key, value in options.items()]
+    prompt = "system.prompt_processor.prompt=Iron man kicks with his left leg"
+    assert main([*words, "--train", "--gpu", "cpu", prompt, *SIZES, *overrides, *more]) == 0
+    return Path("outputs/run/t")
+
+
+def trained(folder):
+    """The result's Gaussians, and the prior's points that they started from."""
+    cloud = read_gaussians(folder / "save" / f"it{STEPS}-export" / "gaussians.ply")
+    with np.load(folder / "save" / "prior" / "points.npz") as start:
+        return cloud, start["points"]
+
+
+def assert_trained(folder, rate):
+    """All pictures, files and losses are there; every point of the prior moved, by what Adam takes
+    at this rate.
+    """
+    cloud, points = trained(folder)
+    assert all(np.isfinite(values).all() for values in cloud)
+    assert len(cloud.means) > len(points)  # Algorithm 1 added some, after the prior's own
+    moved = np.abs(cloud.means[: len(points)] - points)
+    # a step of Adam is at most lr (1 - b1) / sqrt(1 - b2) = lr for betas 0.9 and 0.99, 3.2 lr for
+    # 0.999; float32 rounds at 1e-7
+    assert 0.5 * rate < moved.max() < 3.2 * STEPS * rate + 1e-6
+    save = folder / "save"
+    for name in (f"it{STEPS}-0.png", f"it{STEPS}-test.mp4", "prior/turntable.gif"):
+        assert (save / name).is_file(), name
+    losses = [
+        float(row["train/loss_sds"])
+        for path in folder.glob("csv_logs/**/metrics.csv")
+        for row in rows(path)
+        if row["train/loss_sds"]
+    ]
+    assert len(losses) == STEPS and all(np.isfinite(losses)) and min(losses) > 0
+
+
+def rows(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+RUNS = {
+    "paper": (["gaussiandreamer.yaml"], ["shap_e", "epsilon"]),
+    "paper, v-prediction": (["gaussiandreamer.yaml"], ["shap_e", "v_prediction"]),
+    "official": (["gaussiandreamer-official.yaml"], ["shap_e", "epsilon"]),
+    "if": (["gaussiandreamer.yaml", "gaussiandreamer-if.yaml"], ["shap_e", "deep_floyd"]),
+    "pointe": (["gaussiandreamer.yaml", "gaussiandreamer-pointe.yaml"], ["point_e", "epsilon"]),
+    "avatar": (["gaussiandreamer.yaml", "gaussiandreamer-avatar.yaml"], ["motion", "epsilon"]),
+    "avatar of candidates": (
+        ["gaussiandreamer.yaml", "gaussiandreamer-avatar.yaml"],
+        ["candidates", "epsilon"],
+    ),
+    "ground": (["gaussiandreamer.yaml", "gaussiandreamer-ground.yaml"], ["shap_e", "epsilon"]),
+    "lowmem": (["gaussiandreamer.yaml", "gaussiandreamer-lowmem.yaml"], ["shap_e", "epsilon"]),
+}
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_configuration_trains(name, models, seen, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    configs, used = RUNS[name]
+    if "avatar" in name:
+        pytest.importorskip("smplx")
+    folder = train(configs, {key: value for part in used for key, value in models[part].items()})
+    # four views with and without the prompt, in one forward pass a step; what validation draws has
+    # one view
+    assert [call for call in seen if call[0] == 4] == [(4, 8)] * STEPS
+    assert_trained(folder, 2e-4 if name == "official" else 5e-5)
+    if name == "ground":
+        points = trained(folder)[1]
+        assert (points[-20000:, 2] == points[-1, 2]).all() and points[
+            :-20000, 2
+        ].min() == pytest.approx(points[-1, 2])
+
+
+def test_every_configuration_for_models_is_trained():
+    shipped = {path.name for path in CONFIGS.glob("gaussiandreamer*.yaml")}
+    assert shipped == {name for configs, _ in RUNS.values() for name in configs}
+
+
+def test_perp_neg_doubles_the_rows_and_the_run_repeats(models, seen, tmp_path, monkeypatch):
+    """Twice the same command gives the same Gaussians bit for bit, with Perp-Neg's two more rows
+    for each view.
+    """
+    options = models["shap_e"] | models["epsilon"]
+    clouds = []
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)
+        clouds.append(
+            trained(
+                train(
+                    ["gaussiandreamer.yaml"], options, "system.prompt_processor.use_perp_neg=true"
+                )
+            )[0]
+        )
+    assert [call for call in seen if call[0] == 4] == [(4, 16)] * (2 * STEPS)
+    for first, again in zip(*clouds, strict=True):
+        torch.testing.assert_close(torch.from_numpy(first), torch.from_numpy(again), rtol=0, atol=0)
