@@ -15,7 +15,7 @@ import torch
 from threestudio_gaussiandreamer import host, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host.builtin.types import check_types
-from threestudio_gaussiandreamer.launch import experiment, run
+from threestudio_gaussiandreamer.launch import experiment, folder_lock
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_part
 from threestudio_gaussiandreamer.training import held_out as evaluate
@@ -436,8 +436,9 @@ def test_a_signal_while_the_test_views_are_rendered_leaves_a_checkpoint_and_says
 
 def test_a_second_run_in_a_folder_is_refused_while_the_first_one_trains(launch):
     TRIAL.mkdir(parents=True)
-    with run.sole_run(TRIAL):
-        code, err = launch()
+    first = folder_lock.claim(TRIAL)
+    code, err = launch()
+    first.release()
     assert code == 2 and f"another run is training in {TRIAL}" in err and not list(TRIAL.iterdir())
     assert launch()[0] == 0
 

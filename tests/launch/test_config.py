@@ -260,18 +260,35 @@ def test_paths_may_hold_what_yaml_reads_otherwise(folder):
 # -- folders ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("timestamp", ["../..", "/../x", "a/b", "a\\b", r'"x\0y"'])
+def test_a_timestamp_never_leaves_the_output_root(folder, timestamp):
+    with pytest.raises(UserError, match="timestamp is .*; expected a part of a folder's name"):
+        load(f"timestamp={timestamp}")
+    with pytest.raises(UserError, match="timestamp is '..'"):
+        load("tag=", "timestamp='..'")
+
+
+def test_the_home_folder_is_expanded_once(folder, monkeypatch):
+    monkeypatch.setenv("HOME", "/home/someone")
+    cfg = load("exp_root_dir=~/runs", "use_timestamp=false")
+    assert cfg.exp_root_dir == "/home/someone/runs"
+    assert cfg.trial_dir == "/home/someone/runs/tiny/a_red_ball"
+    with pytest.raises(UserError, match="exp_root_dir is '~nobody-here/x', and there is no such"):
+        load("exp_root_dir=~nobody-here/x")
+    assert load("exp_root_dir=./~odd").exp_root_dir == "./~odd"
+
+
+def test_several_gpus_need_a_tag_which_names_their_common_folder(folder):
+    cfg = load_config("tiny.yaml", n_gpus=2)
+    assert cfg.trial_dir == "outputs/tiny/a_red_ball" and not cfg.new_folder
+    with pytest.raises(UserError, match="a run needs a tag .* with several GPUs"):
+        load_config("tiny.yaml", cli_args=["tag="], n_gpus=2)
+
+
 def test_without_timestamp_the_folder_is_the_tag(folder):
     assert load("use_timestamp=false").trial_dir == "outputs/tiny/a_red_ball"
     with pytest.raises(UserError, match="needs a tag"):
         load("use_timestamp=false", "tag=")
-
-
-def test_a_second_run_within_the_same_second_has_its_own_folder(folder):
-    first = load()
-    os.makedirs(first.trial_dir)
-    for _ in range(50):
-        second = load()
-        assert second.trial_dir != first.trial_dir
 
 
 def test_resume_auto_takes_the_newest_run_of_the_tag(folder):

@@ -2,6 +2,8 @@
 mistakes, signals, resuming.
 """
 
+import datetime
+import fcntl
 import os
 import re
 import shlex
@@ -19,8 +21,10 @@ import torch
 import threestudio_gaussiandreamer
 from tests.helpers import tiny_parts
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file, save_file
+from threestudio_gaussiandreamer.launch import run_folder
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.experiment import main
+from threestudio_gaussiandreamer.launch.folder_lock import claim
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -349,6 +353,61 @@ def test_it_runs_outside_of_the_main_thread(launch):
     thread.start()
     thread.join()
     assert codes == [0]
+
+
+# -- runs that meet --------------------------------------------------------------------------------
+
+ONE_FOLDER = ["use_timestamp=false", "tag=run"]
+
+
+def test_a_run_that_is_refused_leaves_the_folder_of_the_one_that_trains(launch, monkeypatch):
+    """The refused run made the folder and is stopped before it asks for the lock; it goes on while
+    the other one trains.
+    """
+    with monkeypatch.context() as patch:
+        flock = fcntl.flock
+        patch.setattr(
+            fcntl, "flock", lambda *lock: (os.kill(os.getpid(), signal.SIGSTOP), flock(*lock))[1]
+        )
+        refused = os.fork()
+        if refused == 0:
+            os._exit(main(["--config", "tiny.yaml", "--train", *ONE_FOLDER]))
+        assert os.WIFSTOPPED(os.waitpid(refused, os.WUNTRACED)[1])
+    ended = []
+
+    def let_it_go_on(system, batch, batch_idx):
+        if system.global_step == 1:  # when nothing is saved yet
+            os.kill(refused, signal.SIGCONT)
+            ended.append(os.waitstatus_to_exitcode(os.waitpid(refused, 0)[1]))
+        return training_step(system, batch, batch_idx)
+
+    training_step = tiny_parts.TinySystem.training_step
+    monkeypatch.setattr(tiny_parts.TinySystem, "training_step", let_it_go_on)
+    assert launch("--train", *ONE_FOLDER)[0] == 0 and ended == [2]
+    assert {"cmd.txt", "save/it3-0.png", "ckpts/last.ckpt"} <= files(Path("outputs/tiny/run"))
+
+
+def test_a_folder_in_use_is_refused_before_the_parts_are_built(launch, monkeypatch):
+    first = claim(Path("outputs/tiny/run"))
+    monkeypatch.setattr(tiny_parts.TinySystem, "configure", lambda self: 1 / 0)
+    code, _, err = launch("--train", *ONE_FOLDER)
+    first.release()
+    assert code == 2 and "another run is training in outputs/tiny/run" in err
+
+
+def test_runs_of_one_second_have_a_folder_each(launch, monkeypatch):
+    class Noon(datetime.datetime):
+        @classmethod
+        def now(cls):
+            return cls(2026, 1, 31, 12, 0, 0)
+
+    monkeypatch.setattr(run_folder, "datetime", Noon)
+    for _ in range(3):
+        assert launch("--train", "trainer.max_steps=1", "trainer.limit_val_batches=0")[0] == 0
+    folders = sorted(Path("outputs/tiny").iterdir())
+    name = "a_red_ball@20260131-120000"
+    assert [folder.name for folder in folders] == [name, f"{name}-2", f"{name}-3"]
+    assert load_config(folders[1] / "configs/parsed.yaml").trial_dir == str(folders[1])
 
 
 # -- as a command ----------------------------------------------------------------------------------

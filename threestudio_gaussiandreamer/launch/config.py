@@ -41,6 +41,7 @@ class ExperimentConfig:
     exp_dir: str = ""
     trial_name: str = ""
     trial_dir: str = ""
+    new_folder: bool = False
     n_gpus: int = 1
 
     data_type: str = ""
@@ -78,11 +79,12 @@ def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus:
 
 def dump_config(path: str | os.PathLike, cfg: Any) -> None:
     """Write a configuration so that :func:`load_config` reads the same run back; what it was
-    resumed from is left out.
+    resumed from, and that its folder was new, is left out.
     """
     plain = OmegaConf.create(OmegaConf.to_container(cfg, resolve=False))
     if "resume" in plain:
         plain.resume = None
+    plain.pop("new_folder", None)
     with atomic_file(path) as file:
         file.write(OmegaConf.to_yaml(plain).encode())
 

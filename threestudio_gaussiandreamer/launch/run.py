@@ -6,20 +6,12 @@ cmd.txt}``"""
 import argparse
 import contextlib
 import errno
-import os
 import shlex
-import shutil
-import tempfile
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Optional
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
 
 from ..core.checkpoint_file import load_checkpoint
 from ..core.errors import UserError
@@ -29,7 +21,9 @@ from .callbacks import GracefulStop, ProgressBar, RunRecord, Stopped
 from .checkpoints import AtomicCheckpointIO
 from .config_check import MisconfigurationException, build, plain
 from .ddp import ReplicatedStrategy
+from .folder_lock import RunFolder, claim, claim_new, require_writable
 from .options import PROGRAM
+from .run_folder import renumber
 
 # what ends a run that can't write its results
 WRITE_ERRORS = (
@@ -61,18 +55,20 @@ class Run:
         command: str,
         n_gpus: int,
     ) -> None:
-        self.cfg, self.args, self.config_paths, self.command, self.n_gpus = (
-            cfg,
-            args,
-            config_paths,
-            command,
-            n_gpus,
-        )
-        self.folder = Path(cfg.trial_dir)
-        self.last = self.folder / "ckpts" / "last.ckpt"
-        self.made: Optional[Path] = None
+        self.cfg, self.args, self.n_gpus = cfg, args, n_gpus
+        self.config_paths, self.command = config_paths, command
+        self.claimed = RunFolder(Path(cfg.trial_dir))
         self.resumed_step = -1
         self.trainer: Any = None
+
+    @property
+    def folder(self) -> Path:
+        return self.claimed.path
+
+    @property
+    def last(self) -> Path:
+        """The checkpoint that a stopped run goes on from."""
+        return self.folder / "ckpts" / "last.ckpt"
 
     def run(self) -> int:
         """Build everything, then run the stage; returns the exit code.
@@ -83,31 +79,28 @@ class Run:
         """
         try:
             self.start()
-            alone = (
-                sole_run(self.folder) if self.args.stage == "train" else contextlib.nullcontext()
-            )
-            with alone, lightning_errors(self.cfg.resume), write_errors(self.folder):
+            with lightning_errors(self.cfg.resume), write_errors(self.folder):
                 getattr(self, self.args.stage)()
             self.summarize()
-        except (UserError, KeyboardInterrupt, SystemExit) as stop:
-            self.discard_if_unused()
-            # between training and its end, while the test views are rendered
-            if (
-                self.args.stage == "train"
-                and not isinstance(stop, UserError)
-                and self.last.is_file()
-            ):
-                print(f"to go on: {self.resume_command()}", flush=True)
-            raise
         except Stopped as stop:
             print(f"stopped at step {stop.step}; to go on: {self.resume_command()}", flush=True)
             return 128 + stop.signum
+        except BaseException as stop:
+            self.discard_if_unused()
+            interrupted = isinstance(stop, (KeyboardInterrupt, SystemExit))
+            # between training and its end, while the test views are rendered
+            if interrupted and self.args.stage == "train" and self.last.is_file():
+                print(f"to go on: {self.resume_command()}", flush=True)
+            raise
+        finally:
+            self.claimed.release()
         return 0
 
     def start(self) -> None:
-        """Everything before the first long work: checks first, the folder last."""
+        """Everything before the first long work: checks, the folder, then the parts."""
         checkpoint = self.read_resume()
         require_writable(self.folder)
+        self.claim_folder()
         # one seed for all processes: what they draw differently, they draw by their rank
         pl.seed_everything(self.cfg.seed, workers=True)
         self.data = find(self.cfg.data_type)(self.cfg.data)
@@ -116,7 +109,6 @@ class Run:
         )
         if checkpoint is not None and self.args.stage != "train":
             self.system.set_resume_status(*checkpoint)
-        self.make_folder()
         self.system.set_save_dir(str(self.folder / "save"))
         self.trainer = self.build_trainer()
 
@@ -221,81 +213,36 @@ class Run:
 
     # -- the folder --------------------------------------------------------------------------------
 
-    def make_folder(self) -> None:
-        missing = [folder for folder in (self.folder, *self.folder.parents) if not folder.exists()]
-        self.made = missing[-1] if missing else None
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise _unwritable(self.folder, error) from error
+    def claim_folder(self) -> None:
+        """Make the folder if need be, and keep other runs from training in it.
+
+        Processes of one run share the folder of the first. What only reads a checkpoint may write
+        its pictures beside a run that trains.
+
+        Raises:
+            UserError: another run trains in it, or it can't be made.
+        """
+        evaluates_there = self.args.stage != "train" and self.folder.is_dir()
+        if get_rank() or evaluates_there:
+            return
+        if self.cfg.new_folder:
+            self.claimed, number = claim_new(self.folder)
+            if number > 1:
+                renumber(self.cfg, number)
+        else:
+            self.claimed = claim(self.folder)
 
     def discard_if_unused(self) -> None:
         """Remove the folder again if this run made it and has nothing to show for it."""
         trained = self.trainer is not None and self.trainer.global_step > max(self.resumed_step, 0)
-        if self.made is None or trained or any(self.folder.glob("save/it*")):
-            return
-        shutil.rmtree(self.folder, ignore_errors=True)
-        # parents are removed as long as they are this run's and empty
-        for parent in self.folder.parents:
-            if parent == self.made.parent or any(parent.iterdir()):
-                break
-            parent.rmdir()
+        results = [*self.folder.glob("save/it*"), *self.folder.glob("ckpts/*.ckpt")]
+        if not trained and not results:
+            self.claimed.discard()
 
     def resume_command(self) -> str:
         device = ["--gpu", self.args.gpu] if self.args.gpu else []
         parsed = str(self.folder / "configs" / "parsed.yaml")
         return shlex.join([*PROGRAM, "--config", parsed, "--train", *device, f"resume={self.last}"])
-
-
-def require_writable(folder: Path) -> None:
-    """Try to write into the nearest existing folder above.
-
-    Raises:
-        UserError: it isn't a folder, or nothing can be written there.
-    """
-    existing: Optional[Path] = None
-    try:
-        existing = next(
-            parent for parent in (folder, *folder.absolute().parents) if parent.exists()
-        )
-        with tempfile.TemporaryFile(dir=existing) as file:
-            file.write(b"0")
-    except OSError as error:
-        raise _unwritable(folder, error, f" ({existing})" if existing else "") from error
-
-
-def _unwritable(folder: Path, error: Exception, where: str = "") -> UserError:
-    why = getattr(error, "strerror", None) or str(error)
-    return UserError(
-        f"the output folder {folder} can't be written: {why}{where}; choose another exp_root_dir"
-    )
-
-
-@contextlib.contextmanager
-def sole_run(folder: Path) -> Iterator[None]:
-    """Keeps other runs from training in a folder; the system lets go of it when this process ends,
-    however it ends.
-
-    Raises:
-        UserError: another run trains in it.
-    """
-    if fcntl is None or get_rank():
-        yield
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(descriptor)
-        raise UserError(
-            f"another run is training in {folder}: wait until it ends, or choose another tag"
-        ) from error
-    except OSError:
-        pass  # a file system without locks
-    try:
-        yield
-    finally:
-        os.close(descriptor)
 
 
 @contextlib.contextmanager

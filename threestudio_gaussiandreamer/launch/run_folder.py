@@ -1,5 +1,5 @@
-"""The folder of a run: ``exp_root_dir/name/tag@time``, and the checkpoint that ``resume=auto`` goes
-on from."""
+"""The name of a run's folder: ``exp_root_dir/name/tag@time``, and the checkpoint that
+``resume=auto`` goes on from. ``folder_lock.py`` makes the folder."""
 
 import hashlib
 import os
@@ -26,24 +26,58 @@ WINDOWS_DEVICES = {
 
 
 def name_folders(cfg: Any) -> None:
-    """``exp_root_dir/name/tag@time``; a run that is resumed from its ``parsed.yaml`` keeps its
-    time, and so its folder.
+    """Fill in ``exp_dir``, ``timestamp``, ``trial_name`` and ``trial_dir``; a run that is resumed
+    from its ``parsed.yaml`` keeps its time, and so its folder.
+
+    Raises:
+        UserError: no tag and no time to name the folder after, or a part of the path that is no
+            name of a folder.
     """
-    if not cfg.tag and not cfg.use_timestamp:
-        raise UserError("a run needs a tag when use_timestamp is false: both name its folder")
-    if "\0" in cfg.exp_root_dir:
-        raise UserError(f"exp_root_dir is {cfg.exp_root_dir!r}; no folder's name has a NUL")
     tag = safe_name(cfg.tag) if cfg.tag else ""
+    cfg.exp_root_dir = escape(_home_expanded(cfg.exp_root_dir))
     cfg.exp_dir = escape(os.path.join(cfg.exp_root_dir, safe_name(cfg.name)))
-    if cfg.timestamp is None:
-        cfg.timestamp = (
-            _new_timestamp(os.path.join(cfg.exp_dir, tag))
-            if cfg.use_timestamp and cfg.n_gpus == 1
-            else ""
-        )
+    cfg.new_folder = cfg.timestamp is None and cfg.use_timestamp and cfg.n_gpus == 1
+    if cfg.new_folder:
+        cfg.timestamp = datetime.now().strftime("@%Y%m%d-%H%M%S")
+    cfg.timestamp = cfg.timestamp or ""
+    _require_folder_name(tag, cfg.timestamp)
     _set_trial(cfg, tag + cfg.timestamp)
     if cfg.resume == "auto":
         _resume_newest(cfg, tag)
+
+
+def renumber(cfg: Any, count: int) -> None:
+    """Name the folder of a new run ``<tag>@<time>-<count>``, if ``<tag>@<time>`` is taken."""
+    suffix = f"-{count}"
+    cfg.timestamp += suffix
+    _set_trial(cfg, cfg.trial_name + suffix)
+
+
+def _home_expanded(path: str) -> str:
+    """``path`` with a leading ``~`` or ``~user`` replaced by that home folder."""
+    expanded = os.path.expanduser(path)
+    if expanded.startswith("~"):
+        raise UserError(
+            f"exp_root_dir is {path!r}, and there is no such user; for a folder of this name write "
+            f"{'./' + path!r}"
+        )
+    if "\0" in expanded:
+        raise UserError(f"exp_root_dir is {path!r}; no folder's name has a NUL")
+    return expanded
+
+
+def _require_folder_name(tag: str, timestamp: str) -> None:
+    """Raise UserError unless ``tag + timestamp`` names one folder below the run's ``exp_dir``."""
+    if not tag + timestamp:
+        raise UserError(
+            "a run needs a tag when use_timestamp is false, and with several GPUs: its folder has "
+            "no time in its name then"
+        )
+    if set(timestamp) & set("/\\\0") or tag + timestamp in (os.curdir, os.pardir):
+        raise UserError(
+            f"timestamp is {timestamp!r}; expected a part of a folder's name, such as "
+            "@20260131-235959"
+        )
 
 
 def safe_name(text: str) -> str:
@@ -67,15 +101,6 @@ def _set_trial(cfg: Any, trial_name: str) -> None:
     cfg.trial_dir = escape(os.path.join(cfg.exp_dir, trial_name))
 
 
-def _new_timestamp(prefix: str) -> str:
-    timestamp = datetime.now().strftime("@%Y%m%d-%H%M%S")
-    # two runs of one prompt that start within the same second
-    count = 1
-    while os.path.exists(prefix + timestamp + (f"-{count}" if count > 1 else "")):
-        count += 1
-    return timestamp + (f"-{count}" if count > 1 else "")
-
-
 def _resume_newest(cfg: Any, tag: str) -> None:
     """``resume=auto``: go on with this run if it was started before, else with the newest of its
     tag, else start.
@@ -88,7 +113,7 @@ def _resume_newest(cfg: Any, tag: str) -> None:
     for run in [Path(cfg.trial_dir), *newest_first]:
         found = newest_readable(run / "ckpts")
         if found:
-            cfg.timestamp = run.name.removeprefix(tag)
+            cfg.timestamp, cfg.new_folder = run.name.removeprefix(tag), False
             _set_trial(cfg, run.name)
             path, step = found
             cfg.resume = escape(str(path))

@@ -1,0 +1,182 @@
+"""The folder of a run: made by one process, locked, and removed only by its maker."""
+
+import fcntl
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch import folder_lock
+from threestudio_gaussiandreamer.launch.folder_lock import (
+    FolderInUse,
+    RunFolder,
+    claim,
+    claim_new,
+    make_folder,
+    require_writable,
+)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return Path("outputs/tiny/run")
+
+
+def stop_before(monkeypatch, owner, name) -> None:
+    """Stop this process with SIGSTOP before each call of ``owner.name``."""
+    original = getattr(owner, name)
+
+    def stopping(*arguments, **named):
+        os.kill(os.getpid(), signal.SIGSTOP)
+        return original(*arguments, **named)
+
+    monkeypatch.setattr(owner, name, stopping)
+
+
+def stopped_child(work) -> int:
+    """Fork a process that does ``work`` until it stops itself; returns its id.
+
+    It exits with 0, with 3 for a folder in use, else with 1.
+    """
+    child = os.fork()
+    if child == 0:
+        try:
+            work()
+            os._exit(0)
+        except FolderInUse:
+            os._exit(3)
+        except BaseException:
+            os._exit(1)
+    assert os.WIFSTOPPED(os.waitpid(child, os.WUNTRACED)[1])
+    return child
+
+
+def go_on(child: int) -> int:
+    """Continue a stopped child until it ends; returns its exit code."""
+    os.kill(child, signal.SIGCONT)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def claim_and_discard(path: Path) -> None:
+    claim(path).discard()
+
+
+def test_who_made_the_folder_but_lost_the_lock_leaves_it_alone(folder, monkeypatch):
+    with monkeypatch.context() as patch:
+        stop_before(patch, fcntl, "flock")
+        loser = stopped_child(lambda: claim_and_discard(folder))
+    winner = claim(folder)
+    (folder / "ckpts").mkdir()
+    assert go_on(loser) == 3 and (folder / "ckpts").is_dir()
+    winner.release()
+
+
+def test_a_folder_that_is_about_to_be_removed_is_in_use(folder, monkeypatch):
+    with monkeypatch.context() as patch:
+        stop_before(patch, folder_lock.shutil, "rmtree")
+        maker = stopped_child(lambda: claim_and_discard(folder))
+    with pytest.raises(FolderInUse, match="another run is training in outputs/tiny/run"):
+        claim(folder)
+    assert go_on(maker) == 0 and not Path("outputs").exists()
+    # released and gone: the next run makes it again
+    assert claim(folder).first_made == Path("outputs")
+
+
+def test_a_lock_of_a_removed_folder_is_not_taken_for_one_of_the_new_folder(folder, monkeypatch):
+    """Between opening and locking, the folder's maker removes it and gives up the lock."""
+    first, flock = claim(folder), fcntl.flock
+
+    def remove_then_lock(*arguments):
+        if first.descriptor is not None:
+            first.discard()
+            first.release()
+        flock(*arguments)
+
+    monkeypatch.setattr(fcntl, "flock", remove_then_lock)
+    second = claim(folder)
+    assert second.first_made == Path("outputs") and folder.is_dir()
+    assert os.path.samestat(os.fstat(second.descriptor), os.stat(folder))
+
+
+def test_parents_of_another_run_stay(folder):
+    first = claim(folder)
+    other = claim(folder.with_name("other"))
+    first.discard()
+    assert os.listdir("outputs/tiny") == ["other"]
+    other.discard()
+    # its own parents were the first run's to remove
+    assert other.first_made == other.path and os.listdir("outputs/tiny") == []
+
+
+def test_without_locks_only_an_empty_folder_is_removed(folder, monkeypatch):
+    def no_locks(*arguments):
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    claim(folder).discard()
+    assert not Path("outputs").exists()
+    claimed = claim(folder)
+    (folder / "cmd.txt").touch()
+    claimed.discard()
+    assert (folder / "cmd.txt").is_file()
+
+
+def test_a_folder_that_was_there_is_never_removed(folder):
+    folder.mkdir(parents=True)
+    claim(folder).discard()
+    RunFolder(folder).discard()
+    assert folder.is_dir()
+
+
+def claim_numbered(path: Path, start, results) -> None:
+    start.wait()
+    claimed, number = claim_new(path)
+    results.put((str(claimed.path), number))
+    time.sleep(0.2)  # as a run would keep it
+
+
+def test_runs_of_one_second_get_a_folder_each(folder):
+    fork = multiprocessing.get_context("fork")
+    start, results = fork.Event(), fork.Queue()
+    runs = [fork.Process(target=claim_numbered, args=(folder, start, results)) for _ in range(6)]
+    for run in runs:
+        run.start()
+    start.set()
+    found = sorted(results.get(timeout=30) for _ in runs)
+    for run in runs:
+        run.join()
+    names = ["run", *(f"run-{number}" for number in range(2, 7))]
+    assert found == [(f"outputs/tiny/{name}", i) for i, name in enumerate(names, 1)]
+    assert sorted(os.listdir("outputs/tiny")) == names
+
+
+def test_a_deleted_working_folder_is_one_message(folder, tmp_path):
+    os.makedirs("gone")
+    os.chdir("gone")
+    os.rmdir(tmp_path / "gone")
+    with pytest.raises(UserError, match="the output folder outputs/tiny/run can't be written"):
+        make_folder(folder)
+    os.chdir(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "is_folder"),
+    [("ckpts", False), ("save", False), ("ckpts/last.ckpt", True), ("cmd.txt", True)],
+)
+def test_what_lies_in_the_way_of_a_result_is_found_before_the_work(folder, name, is_folder):
+    (folder / name).parent.mkdir(parents=True)
+    (folder / name).mkdir() if is_folder else (folder / name).touch()
+    with pytest.raises(UserError, match=f"{name} is "):
+        require_writable(folder)
+
+
+def test_paths_that_would_be_too_long_are_found_before_the_work(folder):
+    deep = Path("/".join(["d" * 200] * 19), "run")  # the folder's own path would do
+    with pytest.raises(UserError, match="too long"):
+        require_writable(folder / deep)
+    require_writable(folder)

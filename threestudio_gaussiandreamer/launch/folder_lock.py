@@ -1,0 +1,207 @@
+"""The folder of a run on disk: made by one process only, locked while it is in use, and removed
+only by the process that made it and still holds the lock."""
+
+import contextlib
+import errno
+import os
+import shutil
+import tempfile
+from itertools import count
+from pathlib import Path
+from typing import Optional
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+from ..core.errors import UserError
+
+SUBFOLDERS = ("ckpts", "configs", "code", "save", "tb_logs", "csv_logs")
+FILES = ("ckpts/last.ckpt", "configs/parsed.yaml", "cmd.txt")
+LONGEST_RESULT = 200
+"""Bytes of the longest path that a run writes below its folder, generously."""
+
+
+class RunFolder:
+    """A folder that this process has made or found.
+
+    Attributes:
+        path: the folder.
+        first_made: the topmost folder that :func:`make_folder` made on the way to it; None if the
+            folder was there before.
+        descriptor: the open, locked folder; None where it isn't locked.
+    """
+
+    def __init__(
+        self, path: Path, first_made: Optional[Path] = None, descriptor: Optional[int] = None
+    ) -> None:
+        self.path, self.first_made, self.descriptor = path, first_made, descriptor
+
+    def discard(self) -> None:
+        """Remove the folder if this process made it, and the parents that were made with it as long
+        as they are empty. Without the lock only an empty folder is removed.
+        """
+        if self.first_made is None:
+            return
+        if self.descriptor is not None:
+            shutil.rmtree(self.path, ignore_errors=True)
+        with contextlib.suppress(OSError):  # not empty: another run has put something there
+            for folder in (self.path, *self.path.parents):
+                if folder == self.first_made.parent:
+                    break
+                if folder.exists():
+                    folder.rmdir()
+
+    def release(self) -> None:
+        """Give up the lock, which the system does too when a process ends, however it ends."""
+        if self.descriptor is not None:
+            os.close(self.descriptor)
+            self.descriptor = None
+
+
+def claim_new(path: Path) -> tuple[RunFolder, int]:
+    """Make and lock the first of ``path``, ``path-2``, ``path-3``, ... that doesn't exist.
+
+    Returns:
+        the folder, and the number in its name; 1 for none.
+
+    Raises:
+        UserError: no folder can be made there.
+    """
+    for number in count(1):
+        candidate = path if number == 1 else path.with_name(f"{path.name}-{number}")
+        first_made = make_folder(candidate)
+        if first_made is not None:
+            with contextlib.suppress(FolderInUse):  # a run that was told this name was faster
+                return RunFolder(candidate, first_made, _lock(candidate)), number
+    raise AssertionError("unreachable")
+
+
+def claim(path: Path) -> RunFolder:
+    """Make ``path`` unless it is there, and lock it.
+
+    Raises:
+        UserError: another run uses it, or no folder can be made there.
+    """
+    while True:
+        first_made = make_folder(path)
+        with contextlib.suppress(FileNotFoundError):  # its maker has just removed it again
+            return RunFolder(path, first_made, _lock(path))
+
+
+def make_folder(path: Path) -> Optional[Path]:
+    """Make a folder and its missing parents; the existence of ``path`` itself is decided by the
+    system's ``mkdir``, so of several processes one makes it.
+
+    Returns:
+        the topmost folder that was missing, or None if ``path`` was there already.
+
+    Raises:
+        UserError: it can't be made.
+    """
+    try:
+        missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+        _make_parent(path)
+        path.mkdir()
+        return missing[-1] if missing else path
+    except FileExistsError as error:
+        if path.is_dir():
+            return None
+        raise unwritable(path, error) from error
+    except (OSError, ValueError) as error:
+        raise unwritable(path, error) from error
+
+
+def _make_parent(path: Path, attempts: int = 10) -> None:
+    for attempt in range(attempts):
+        try:
+            return path.parent.mkdir(parents=True, exist_ok=True)
+        except FileNotFoundError:  # another run has just removed a folder that it had made
+            if attempt == attempts - 1:
+                raise
+
+
+def require_writable(folder: Path) -> None:
+    """Check that a run could write its results into ``folder``, which may not exist yet.
+
+    Raises:
+        UserError: the nearest existing folder can't be written, a file or folder that a run writes
+            can't be replaced, or the paths would be too long.
+    """
+    existing: Optional[Path] = None
+    try:
+        existing = next(
+            parent for parent in (folder, *folder.absolute().parents) if parent.exists()
+        )
+        with tempfile.TemporaryFile(dir=existing) as file:
+            file.write(b"0")
+        _require_replaceable(folder)
+        _require_short(folder.absolute(), existing)
+    except (OSError, ValueError) as error:
+        if isinstance(error, UserError):
+            raise
+        raise unwritable(folder, error, f" ({existing})" if existing else "") from error
+
+
+def _require_replaceable(folder: Path) -> None:
+    """Raise OSError where something else is in the place of a file or folder of an earlier run."""
+    for name in SUBFOLDERS:
+        path = folder / name
+        if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        if (path.exists() or path.is_symlink()) and not path.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, f"{path} is no folder")
+    for name in FILES:
+        if (folder / name).is_dir():
+            raise IsADirectoryError(errno.EISDIR, f"{folder / name} is a folder")
+
+
+def _require_short(folder: Path, existing: Path) -> None:
+    """Raise OSError where the system takes the folder's name but not those of the files in it."""
+    longest = os.pathconf(existing, "PC_PATH_MAX") if hasattr(os, "pathconf") else 260
+    if len(os.fsencode(folder)) + LONGEST_RESULT > longest:
+        raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
+
+
+def unwritable(folder: Path, error: Exception, where: str = "") -> UserError:
+    """The error for a folder that the results can't be written to."""
+    why = getattr(error, "strerror", None) or str(error)
+    return UserError(
+        f"the output folder {folder} can't be written: {why}{where}; choose another exp_root_dir"
+    )
+
+
+class FolderInUse(UserError):
+    """Another process holds the lock."""
+
+
+def _lock(path: Path) -> Optional[int]:
+    """Lock a folder; None where the file system has no locks.
+
+    Raises:
+        FolderInUse: another process has locked it.
+        FileNotFoundError: it was removed before it was locked.
+        UserError: it can't be opened.
+    """
+    if fcntl is None:
+        return None
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except PermissionError as error:
+        raise unwritable(path, error) from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+            return descriptor
+        raise FileNotFoundError(errno.ENOENT, "replaced by another folder", str(path))
+    except (BlockingIOError, FileNotFoundError) as error:
+        os.close(descriptor)
+        if isinstance(error, FileNotFoundError):
+            raise
+        raise FolderInUse(
+            f"another run is training in {path}: wait until it ends, or choose another tag"
+        ) from error
+    except OSError:  # a file system without locks
+        os.close(descriptor)
+        return None
