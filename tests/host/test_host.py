@@ -405,6 +405,10 @@ def test_a_video_of_odd_pictures_has_even_size_and_numeric_order(saver):
     path = saver.save_img_sequence("it3-test", "it3-test", r"(\d+)\.png", fps=10)
     frames = iio.imread(path, plugin="FFMPEG")
     assert path.endswith("it3-test.mp4") and frames.shape == (3, 34, 18, 3)
+    boxes = Path(path).read_bytes()
+    assert boxes.index(b"moov") < boxes.index(b"mdat")  # a browser plays it while it loads
+    assert iio.immeta(path, plugin="FFMPEG")["codec"] == "h264"
+    assert iio.immeta(path, plugin="FFMPEG")["pix_fmt"].startswith("yuv420p")
     # H.264 rounds colours by a few levels; the order is what counts
     assert np.allclose(frames.mean((1, 2, 3)), [25.5, 51, 255], atol=6)
     assert (

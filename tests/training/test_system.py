@@ -165,6 +165,18 @@ def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, pai
     )
     rows = list(csv.DictReader(open(trial(tmp_path) / "csv_logs" / "version_0" / "metrics.csv")))
     assert {"loss", "gaussians", "dB", "train/loss_sds", "train/grad_norm"} <= set(rows[0])
+    events = tensorboard_events(trial(tmp_path))
+    logged = [(event.step, round(event.value, 3)) for event in events.Scalars("held_out/psnr")]
+    assert logged == [(0, metrics["prior"]["psnr"]), (60, metrics["result"]["psnr"])]
+    assert [event.step for event in events.Images("validation/0")] == [60]
+    assert events.Images("validation/0")[0].width > events.Images("validation/0")[0].height
+
+
+def tensorboard_events(folder):
+    """The scalars and pictures that a run has given to TensorBoard."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    return EventAccumulator(str(folder / "tb_logs" / "version_0")).Reload()
 
 
 @pytest.mark.parametrize(("steps", "times"), [(2, 0), (3, 1)])

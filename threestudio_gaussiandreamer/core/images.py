@@ -93,6 +93,13 @@ def with_texts(image: np.ndarray, texts: list) -> np.ndarray:
     return np.asarray(canvas)
 
 
+def read(path: str | os.PathLike) -> np.ndarray:
+    """Read one picture as uint8 (H,W,3)."""
+    from PIL import Image
+
+    return np.asarray(Image.open(path).convert("RGB"))
+
+
 def write(path: str | os.PathLike, image: np.ndarray) -> None:
     """One picture, uint8 or uint16, in the format of the extension.
 
@@ -106,9 +113,18 @@ def write(path: str | os.PathLike, image: np.ndarray) -> None:
         file.write(content)
 
 
+MP4_OPTIONS = {
+    "codec": "libx264",
+    "pixelformat": "yuv420p",
+    "macro_block_size": 1,
+    # the index comes first, so that a browser plays the video before all of it is loaded
+    "output_params": ["-movflags", "+faststart"],
+}
+
+
 def write_video(path: str, frames: list[Path], *, fps: int) -> None:
-    """The pictures as an mp4 (H.264) or gif; odd sizes are padded to even ones, which H.264 asks
-    for.
+    """Write the pictures as an mp4 (H.264, yuv420p, index first) or gif; odd sizes are padded to
+    even ones, which H.264 asks for.
 
     Raises:
         UserError: the disk is full, or there is no ffmpeg.
@@ -116,7 +132,7 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
     import imageio.v2 as imageio
 
     mp4, part = path.endswith(".mp4"), Path(path).with_name(f".part-{Path(path).name}")
-    options = {"fps": fps, "macro_block_size": 1} if mp4 else {"duration": 1000 / fps, "loop": 0}
+    options = {"fps": fps, **MP4_OPTIONS} if mp4 else {"duration": 1000 / fps, "loop": 0}
     try:
         with imageio.get_writer(part, mode="I", **options) as writer:
             for frame in frames:
@@ -132,9 +148,9 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
 
 
 def _require_whole_mp4(path: Path) -> None:
-    """Raise OSError unless ffmpeg came to its end, which nobody asks it: its boxes fill the file,
-    and the index is among them.
-    """
+    """Raise OSError unless the boxes fill the file and the index is among them.
+
+    imageio doesn't report when ffmpeg ends early, for instance on a full disk."""
     names, place, size = [], 0, path.stat().st_size
     with open(path, "rb") as file:
         while place + 8 <= size:

@@ -317,11 +317,8 @@ class EvalCameras(Dataset, Updateable):
     def __init__(self, cfg: CameraConfig, split: str) -> None:
         self.cfg = cfg
         count = cfg.n_val_views if split == "val" else cfg.n_test_views
-        azimuth = (
-            torch.linspace(0.0, 360.0, count + 1)[:-1]
-            if split == "val"
-            else torch.linspace(0.0, 360.0, count)
-        )
+        # 360 degrees is the first view again, which would stand still for a frame in a looped video
+        azimuth = torch.linspace(0.0, 360.0, count + 1)[:-1]
         same = torch.ones(count)
         self.orbit = Orbit(
             same * cfg.eval_elevation_deg,

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from ..cameras import Orbit, held_out_orbit
 from ..core.errors import UserError
+from ..core.images import read as read_image
 from ..meshes.load import SurfaceDistance
 from ..meshes.raycast import over_background
 from ..metrics import floater_mass, multi_face_rate, out_of_gamut, psnr, ssim
@@ -228,7 +229,7 @@ class Measurements:
         for name, row in rows.items():
             _write_png(folder / f"{name}.png", row)
         shown = [folder / f"{name}.png" for name in ("prior", "result", "truth")]
-        pictures = [_read_png(path) for path in shown if path.is_file()]
+        pictures = [read_image(path) for path in shown if path.is_file()]
         if len({picture.shape for picture in pictures}) == 1:
             _write_png(folder / "compare.png", np.concatenate(pictures, 0))
 
@@ -271,9 +272,3 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
     from PIL import Image
 
     Image.fromarray(pixels).save(path)
-
-
-def _read_png(path: Path) -> np.ndarray:
-    from PIL import Image
-
-    return np.asarray(Image.open(path).convert("RGB"))

@@ -61,6 +61,7 @@ from ..metrics import psnr
 from ..priors.cache import cached_cloud
 from ..prune.command import PruneOptions, pruned, write_report
 from .background import FlatBackground
+from .events import log_picture, log_scores
 from .finite import CHECK_EVERY, optimizer_tensors, require_finite
 from .held_out import EvaluationConfig, HeldOut, Measurements
 
@@ -458,6 +459,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         """Score the cloud on the held-out views, where the truth is known."""
         if self.measurements:
             scores = self.measurements.score(key, self.renderer, self.global_step)
+            log_scores(self.loggers, scores)
             info(
                 f"{key}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f} on "
                 f"{self.cfg.evaluation.views} held-out views"
@@ -499,12 +501,10 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             images.append(_rgb(truth[0]))
         if isinstance(self.guidance, ScoreDistillation):
             images += self.score_pictures(out, batch)
-        self.save_image_grid(
-            f"it{self.true_global_step}-{int(batch['index'][0])}.png",
-            images,
-            name="validation_step",
-            step=self.true_global_step,
-        )
+        view, step = int(batch["index"][0]), self.true_global_step
+        name = f"it{step}-{view}.png"
+        self.save_image_grid(name, images, name="validation_step", step=step)
+        log_picture(self.loggers, f"validation/{view}", self.get_save_path(name), step)
 
     def score_pictures(self, out: dict[str, Any], batch: dict[str, Any]) -> list[dict[str, Any]]:
         """What the score model sees and makes of this render: noisy, denoised in one step, denoised
