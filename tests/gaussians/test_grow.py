@@ -7,12 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as np_strategies
+from scipy.spatial import cKDTree
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.gaussians.grow import (
     grow,
     growing_box,
-    half_longest_side,
+    longest_side,
     nearest_distance_scales,
 )
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
@@ -54,7 +55,7 @@ def algorithm_1(points, colors, num_candidates, radius, generator):
 class TestGrow:
     def test_equals_the_pseudocode_of_the_paper(self):
         cloud = sphere(300)
-        unit = half_longest_side(cloud.points)
+        unit = longest_side(cloud.points)
         points, colors = algorithm_1(
             cloud.points.astype(np.float64), cloud.colors, 2000, 0.1 * unit, rng(3)
         )
@@ -69,6 +70,19 @@ class TestGrow:
         assert len(grown.points) > 350
         np.testing.assert_allclose(grown.points, points, atol=1e-7)  # one rounding to float32
         np.testing.assert_allclose(grown.colors, colors, atol=1e-7)
+
+    def test_the_papers_radius_grows_what_the_released_code_grows(self):
+        """The released code keeps candidates nearer than 0.01, in units in which the longest side
+        of Shap-E's objects is 1; half of that radius would keep a fifth as many.
+        """
+        points = (sphere(8000).points * np.float32([0.5, 0.4, 0.3])).astype(np.float64)
+        points /= np.ptp(points, axis=0).max()
+        cloud = PointCloud(points, np.full((8000, 3), 0.5, np.float32))
+        candidates = rng(3).uniform(points.min(0), points.max(0), (100_000, 3))
+        distances, _ = cKDTree(points).query(candidates)
+        grown = grow(cloud, num_candidates=100_000, radius=0.01, generator=rng(3)).points[8000:]
+        assert 4000 < len(grown) < 4700
+        np.testing.assert_array_equal(grown, candidates[distances < 0.01].astype(np.float32))
 
     def test_originals_come_first_and_untouched(self):
         cloud = sphere()._replace(faces=np.array([[0, 1, 2]]))
@@ -89,7 +103,7 @@ class TestGrow:
         )
         distances = np.linalg.norm(grown[:, None] - cloud.points[None], axis=2).min(axis=1)
         assert (
-            distances.max() < 0.05 * half_longest_side(cloud.points) + 1e-6
+            distances.max() < 0.05 * longest_side(cloud.points) + 1e-6
         )  # the point was rounded to float32
 
     @pytest.mark.parametrize("scale, shift", [(1e-3, 0.0), (1e3, 0.0), (1.0, 1e4), (1e3, -1e7)])
@@ -119,7 +133,7 @@ class TestGrow:
         grown = grow(
             cloud, num_candidates=20_000, radius=0.05, max_points=1000, generator=rng()
         ).points[500:]
-        reach = 0.05 * (half_longest_side(points) or 1.0)
+        reach = 0.05 * (longest_side(points) or 1.0)
         assert len(grown) == 1000
         assert np.abs(grown[:, flat_axes] - 0.25).max() < reach * 1.0001
         assert (

@@ -171,6 +171,7 @@ def test_the_released_codes_numbers_are_the_codes(tmp_path):
         and geometry.densify.enabled
         and geometry.densify.grad_threshold == 2e-4
     )
+    assert geometry.grow.radius == 0.01  # of the longest side, which is 1 for its objects
     steps = [
         s
         for s in range(1, 1201)

@@ -19,7 +19,7 @@ from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.grow import (
     SCALE_RULES,
     grow,
-    half_longest_side,
+    longest_side,
     nearest_distance_scales,
 )
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
@@ -379,7 +379,7 @@ def test_growing_has_no_unit(unit, shift, measured):
 def test_a_flat_prior_grows_a_slab_within_the_caps(axes, measured):
     points = np.full((500, 3), 0.25)
     points[:, axes] = rng().uniform(-1, 1, (500, len(axes)))
-    reach = 0.05 * (half_longest_side(points) or 1.0)
+    reach = 0.05 * (longest_side(points) or 1.0)
     flat = [axis for axis in range(3) if axis not in axes]
     options = {"num_candidates": 50_000, "radius": 0.05, "max_points": 2000}
     geometry = started(colored(points), grow={"enabled": True, **options})
@@ -397,7 +397,7 @@ def test_a_flat_prior_grows_a_slab_within_the_caps(axes, measured):
 @row("A2", "No grown point")
 def test_a_cube_alone(measured):
     geometry = started(
-        colored(CUBE), grow={"enabled": True, "num_candidates": 100_000, "radius": 0.005}
+        colored(CUBE), grow={"enabled": True, "num_candidates": 100_000, "radius": 0.0025}
     )
     assert torch.equal(geometry.means, torch.from_numpy(CUBE).float())
     assert torch.allclose(geometry.colors(torch.zeros(1, 3)), torch.tensor(0.5))

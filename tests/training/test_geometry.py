@@ -59,6 +59,26 @@ def test_growing_is_configured_and_seeded(sphere_points, monkeypatch):
     assert not torch.equal(first.means, started(sphere_points, grow=grow).means)
 
 
+def test_the_object_grows_first_and_the_ground_is_added_then():
+    """The ground, wider than the object, would stretch the box and the radius, and grow itself."""
+    prior = {"num_points": 400, "size": 0.7}
+    grow = {"num_candidates": 20_000, "radius": 0.04}
+    options = {"prior_type": "random-prior", "grow": grow}
+    alone, with_ground = (
+        GaussianCloud(options | {"prior": prior}),
+        GaussianCloud(
+            options | {"prior": prior | {"ground": True, "ground_points": 100, "ground_size": 3.0}}
+        ),
+    )
+    for geometry in (alone, with_ground):
+        geometry.initialize("a fox")
+    assert len(alone) > 500
+    assert torch.equal(with_ground.means[:-100], alone.means)
+    assert torch.equal(with_ground.sh0[:-100], alone.sh0)
+    bottom = alone.means[:400, 2].min()
+    assert torch.equal(with_ground.means[-100:, 2], bottom.expand(100))
+
+
 def test_some_options_of_a_group_keep_the_defaults_of_the_others():
     cfg = GaussianCloud({"densify": {"every": 50}}).cfg
     assert cfg.densify.every == 50 and cfg.densify.stop == 900 and cfg.grow.radius == 0.01

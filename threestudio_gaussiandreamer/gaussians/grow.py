@@ -40,19 +40,17 @@ def grow(
     max_points: Optional[int] = None,
     generator: np.random.Generator,
 ) -> PointCloud:
-    """``cloud`` followed by the points grown around it (Algorithm 1, stages 1 and 2).
+    """Return ``cloud`` followed by the points grown around it (Algorithm 1, stages 1 and 2).
 
     Args:
         cloud: (P, 3) points in any unit, with colours.
-        num_candidates: points drawn uniformly in the bounding box; most of them lie too far from
-            the surface.
-        radius: a candidate is kept when it is nearer than this to a point of the cloud; in units of
-            half the longest side of the bounding box (the paper's "normalized" 0.01). Isolated
-            points don't count for the box.
-        color_range: the noise added to the colour of the nearest point, uniform per channel; (-0.1,
-            0.1) has zero mean, while the paper's (0, 0.2) brightens the grown points by 0.1.
+        num_candidates: points drawn uniformly in the bounding box.
+        radius: distance below which a candidate is kept, as a share of the longest side of the
+            bounding box without isolated points (the paper's "normalized" 0.01).
+        color_range: uniform noise added to each channel of the nearest point's colour; the paper's
+            (0, 0.2) brightens the grown points by 0.1 on average.
         clamp: keep the grown colours in [0, 1]; the released code lets them reach 1.2.
-        max_points: the most points that are grown.
+        max_points: largest number of grown points.
         generator: the only source of randomness.
 
     Raises:
@@ -60,33 +58,23 @@ def grow(
     """
     _check_options(num_candidates, radius, color_range, max_points)
     points = _checked(cloud.points)
-    typical = points[
-        ~isolated(points)
-    ]  # one stray point far away would stretch the box and the radius with it
-    reach = radius * (
-        half_longest_side(typical) or 1.0
-    )  # a single point has no size of its own: the world's unit
+    # One isolated point far away would stretch the box, and the radius with it.
+    typical = points[~isolated(points)]
+    reach = radius * (longest_side(typical) or 1.0)  # a single point has no size: one world unit
     candidates = generator.uniform(*growing_box(typical, reach), size=(num_candidates, 3))
     kept, nearest = _within_reach(points, candidates, reach)
-    logger.info(
-        "growing: %d of %d candidates lie within %.4g of %d points",
-        len(kept),
-        num_candidates,
-        reach,
-        len(points),
-    )
-    # The candidates are drawn independently, so the first ones are a uniform choice among those
-    # that lie near.
+    # Candidates are independent, so the first ones are a uniform choice among those kept.
     kept, nearest = kept[:max_points], nearest[:max_points]
     colors = perturbed_colors(
         cloud.colors[nearest], color_range=color_range, clamp=clamp, generator=generator
     )
-    return _appended(cloud, candidates[kept], colors, nearest)
+    normals = None if cloud.normals is None else cloud.normals[nearest]
+    return cloud.followed_by(PointCloud(candidates[kept], colors, normals))
 
 
-def half_longest_side(points: Float[np.ndarray, "P 3"]) -> float:
-    """Half the longest side of the bounding box: the unit of the growing radius."""
-    return float(np.ptp(np.asarray(points, np.float64), axis=0).max()) / 2
+def longest_side(points: Float[np.ndarray, "P 3"]) -> float:
+    """Return the longest side of the bounding box, in the unit of the points."""
+    return float(np.ptp(np.asarray(points, np.float64), axis=0).max())
 
 
 def growing_box(
@@ -161,8 +149,8 @@ def _check_options(
         raise UserError(f"num_candidates is {num_candidates}: give 0 (no growing) or more.")
     if not (np.isfinite(radius) and radius > 0):
         raise UserError(
-            f"the growing radius is {radius}: give a positive number, in units of half the "
-            "longest side of the box."
+            f"the growing radius is {radius}: give a positive share of the longest side of the "
+            "bounding box, as 0.01."
         )
     if len(color_range) != 2 or not (
         np.isfinite(color_range).all() and color_range[0] <= color_range[1]
@@ -207,27 +195,14 @@ def _within_reach(
         candidates, distance_upper_bound=reach, workers=-1
     )
     kept = np.flatnonzero(distances < reach)
+    logger.info(
+        "growing: %d of %d candidates lie within %.4g of %d points",
+        len(kept),
+        len(candidates),
+        reach,
+        len(points),
+    )
     return kept, first[nearest[kept]]
-
-
-def _appended(
-    cloud: PointCloud,
-    points: Float[np.ndarray, "R 3"],
-    colors: Float[np.ndarray, "R 3"],
-    nearest: Int[np.ndarray, " R"],
-) -> PointCloud:
-    """Original points first: ``faces`` stays valid, and a grown point has the normal of its nearest
-    one.
-    """
-    normals = (
-        None if cloud.normals is None else np.concatenate([cloud.normals, cloud.normals[nearest]])
-    )
-    return PointCloud(
-        points=np.concatenate([cloud.points, points]).astype(np.float32),
-        colors=np.concatenate([cloud.colors, colors]).astype(np.float32),
-        normals=normals,
-        faces=cloud.faces,
-    )
 
 
 def distinct(

@@ -16,3 +16,22 @@ class PointCloud(NamedTuple):
     """(P, 3) float32 unit vectors, where known."""
     faces: Optional[np.ndarray] = None
     """(F, 3) int64 into ``points``, where the points are the vertices of a mesh."""
+
+    def followed_by(self, other: "PointCloud") -> "PointCloud":
+        """Append the points of ``other``; ``faces`` stays valid, normals need to be in both."""
+        both = self.normals is not None and other.normals is not None
+        return PointCloud(
+            points=np.concatenate([self.points, other.points]).astype(np.float32),
+            colors=np.concatenate([self.colors, other.colors]).astype(np.float32),
+            normals=np.concatenate([self.normals, other.normals]) if both else None,
+            faces=self.faces,
+        )
+
+    def split(self, count: int) -> tuple["PointCloud", "PointCloud"]:
+        """Return the first ``count`` points, with the faces, and the remaining ones."""
+        parts = (
+            [None if values is None else values[rows] for values in self[:3]]
+            for rows in (slice(count), slice(count, None))
+        )
+        first, rest = parts
+        return PointCloud(*first, faces=self.faces), PointCloud(*rest)

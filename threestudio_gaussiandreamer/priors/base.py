@@ -4,7 +4,8 @@ ground below it.
 ===============  ===================================================================================
 option           meaning (all priors have these)
 ===============  ===================================================================================
-ground           add the paper's layer of randomly coloured points below the object
+ground           add the paper's layer of randomly coloured points below the object; the object grows
+                 first (Algorithm 1), as if there were no ground
 ground_points    how many
 ground_size      side of the square they fill, in units of the longest side of the object's box
 ground_height    its z in world units, or ``auto``: the bottom of the object
@@ -82,7 +83,12 @@ class Prior(BaseObject):
         )
         if not self.cfg.ground:
             return cloud
-        return with_ground(cloud, self.cfg, numpy_generator(run_seed(), "ground"))
+        ground = ground_layer(cloud, self.cfg, numpy_generator(run_seed(), "ground"))
+        return cloud.followed_by(ground)
+
+    def ground_count(self) -> int:
+        """Return how many points at the end of the cloud are ground, which doesn't grow."""
+        return int(self.cfg.ground_points) if self.cfg.ground else 0
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         """The object's points, which need not be checked yet; ``generator`` is the only source of
@@ -207,8 +213,8 @@ def without_rows(cloud: PointCloud, keep: Bool[np.ndarray, " P"]) -> PointCloud:
     )
 
 
-def with_ground(cloud: PointCloud, cfg: Any, generator: np.random.Generator) -> PointCloud:
-    """``cloud`` followed by a horizontal square of randomly coloured points, centred below its box
+def ground_layer(cloud: PointCloud, cfg: Any, generator: np.random.Generator) -> PointCloud:
+    """Return a horizontal square of randomly coloured points, centred below the box of ``cloud``
     (paper, appendix).
     """
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
@@ -220,10 +226,4 @@ def with_ground(cloud: PointCloud, cfg: Any, generator: np.random.Generator) -> 
     ]
     points[:, 2] = low[2] if cfg.ground_height == "auto" else cfg.ground_height
     colors = chosen_colors("random", len(points), generator)
-    upwards = np.tile(np.float32([0, 0, 1]), (len(points), 1))
-    return PointCloud(
-        points=np.concatenate([cloud.points, points]).astype(np.float32),
-        colors=np.concatenate([cloud.colors, colors]),
-        normals=None if cloud.normals is None else np.concatenate([cloud.normals, upwards]),
-        faces=cloud.faces,
-    )
+    return PointCloud(points, colors, normals=np.tile(np.float32([0, 0, 1]), (len(points), 1)))

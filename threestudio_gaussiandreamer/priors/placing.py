@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from ..core.errors import UserError, unknown
-from ..gaussians.grow import half_longest_side
+from ..gaussians.grow import longest_side
 from ..gaussians.point_cloud import PointCloud
 from ..meshes.load import AXES
 
@@ -33,7 +33,7 @@ def placed(cloud: PointCloud, *, front: str, scale: float, normalize: bool) -> P
     )
     if normalize:
         points = (points - (points.min(axis=0) + points.max(axis=0)) / 2) / (
-            half_longest_side(points) or 1.0
+            longest_side(points) / 2 or 1.0
         )
     return cloud._replace(points=(scale * points).astype(np.float32))
 

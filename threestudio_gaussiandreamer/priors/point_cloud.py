@@ -31,7 +31,7 @@ from ..core.errors import UserError, unknown
 from ..core.files import existing_file
 from ..formats.array_files import read_arrays
 from ..formats.ply import read_points, unit_colors
-from ..gaussians.grow import half_longest_side
+from ..gaussians.grow import longest_side
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.load import _pose
@@ -105,7 +105,7 @@ def normalized(cloud: PointCloud, scale: float) -> PointCloud:
     if not len(finite):
         return cloud
     centre = (finite.min(axis=0) + finite.max(axis=0)) / 2
-    return cloud._replace(points=(points - centre) * (scale / (half_longest_side(finite) or 1.0)))
+    return cloud._replace(points=(points - centre) * (scale / (longest_side(finite) / 2 or 1.0)))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -9,8 +9,8 @@ checkpoint is loaded; it takes its size from the checkpoint, so the prior isn't 
 option              meaning
 ==================  ================================================================================
 prior_type, prior   the registered prior and its options
-grow                Algorithm 1 of the paper: enabled, num_candidates, radius (in half box sides),
-                    color_range, clamp, max_points
+grow                Algorithm 1 of the paper: enabled, num_candidates, radius (share of the longest
+                    side of the points' bounding box), color_range, clamp, max_points
 scale_rule          first standard deviation: ``nearest`` (the paper: distance to the nearest point)
                     or ``rms3`` (the released code: root mean square distance to the three nearest)
 scale_factor        multiplies it
@@ -292,7 +292,8 @@ class GaussianCloud(BaseGeometry):
             cloud = prior.cloud(arrays)
         else:
             cloud = make_cloud(prior, prompt) if make_cloud else prior(prompt)
-            self.start_from(self.grown(cloud))
+            ground = prior.ground_count() if hasattr(prior, "ground_count") else 0
+            self.start_from(self.grown(cloud, ground))
         if self.cfg.budget is not None:
             self.merge_duplicates()
         return cloud
@@ -310,10 +311,18 @@ class GaussianCloud(BaseGeometry):
             )
             self.set_arrays(sh=torch.cat([merged.pop("sh0"), merged.pop("sh_rest")], 1), **merged)
 
-    def grown(self, cloud: PointCloud) -> PointCloud:
-        """Noisy point growing and colour perturbation (the paper's Algorithm 1), within the cap."""
+    def grown(self, cloud: PointCloud, ground: int = 0) -> PointCloud:
+        """Grow points and perturb their colours (the paper's Algorithm 1), within the cap.
+
+        Args:
+            ground: how many points at the end of ``cloud`` are a prior's ground: they neither grow
+                nor count for the box, and stay at the end.
+        """
         if not self.cfg.grow.enabled:
             return cloud
+        if ground:
+            figure, layer = cloud.split(len(cloud.points) - ground)
+            return self.grown(figure).followed_by(layer)
         options = {
             k: v for k, v in dict(self.cfg.grow).items() if k not in ("enabled", "color_range")
         }
