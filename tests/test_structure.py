@@ -1,131 +1,94 @@
-"""Imports point inwards only, the package is cheap to import, and only one file knows the host."""
+"""Imports point inwards, the package is cheap to import, and its files and functions stay short."""
 
 import ast
+import statistics
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
-PACKAGE = Path(__file__).parent.parent / "threestudio_gaussiandreamer"
-NAME = PACKAGE.name
-RINGS = {  # folder, or module beside __init__ -> ring; imports point to the same or a lower ring
-    "core": 0,
-    "gaussians": 0,
-    "formats": 0,
-    "splatting": 0,
-    "diffusion": 0,
-    "meshes": 0,
-    "cameras": 0,
-    "metrics": 0,
-    "host": 1,
-    "models": 1,
-    "prompts": 2,
-    "priors": 2,
-    "guidance": 2,
-    "exporters": 2,
-    "training": 3,
-    "prune": 3,
-    "launch": 4,
-    "evaluation": 4,
-}
-LIBRARIES = {
+import pytest
+
+from tests.architecture import (
+    NAME,
+    PACKAGE,
+    PAGE,
+    PICTURE,
+    ROOT,
+    STEPS,
+    imports,
+    page,
+    purpose,
+    ring_of,
+    room_of,
+    sources,
+    svg,
+)
+
+RINGS = ring_of()
+MATHS_MAY_USE = {"torch", "numpy", "scipy", "jaxtyping"} | set(sys.stdlib_module_names)
+LIBRARIES = {  # of ring 0, beyond MATHS_MAY_USE
     "core": {"imageio", "PIL"},
     "meshes": {"trimesh", "embreex", "PIL", "tqdm"},
-}  # of ring 0, beyond MATHS_MAY_USE
-HEAVY = {
-    "lightning",
-    "pytorch_lightning",
-    "omegaconf",
-    "trimesh",
-    "embreex",
-    "diffusers",
-    "transformers",
-    "threestudio",
-    "imageio",
-    "PIL",
-    "smplx",
 }
-MATHS_MAY_USE = {"torch", "numpy", "scipy", "jaxtyping"} | set(sys.stdlib_module_names)
+HOST = {"lightning", "pytorch_lightning", "omegaconf", "threestudio"}
+HEAVY = HOST | {"trimesh", "embreex", "diffusers", "transformers", "imageio", "PIL", "smplx"}
+LONGEST_FUNCTION, LONGEST_FILE, LONGEST_LINE, MODULES_AT_THE_TOP = 40, 400, 100, 5
+CODE = [
+    path for top in (NAME, "tests", "benchmarks") for path in sorted((ROOT / top).rglob("*.py"))
+]
 
 
-def modules():
-    return [
-        path
-        for path in sorted(PACKAGE.rglob("*.py"))
-        if path.name != "__init__.py" or path.parent != PACKAGE
-    ]
+def named(path: Path) -> str:
+    return str(path.relative_to(ROOT))
 
 
-def ring(top: str) -> int:
-    """0 maths, 1 host, 2 parts, 3 training, 4 programs; KeyError for a folder or module without a
-    ring.
-    """
-    return RINGS[top]
+def test_every_room_has_a_ring_and_a_purpose():
+    assert {room_of(path) for path in sources()} == set(RINGS)
+    assert all(purpose(room) for room in RINGS)
 
 
-def imports(path: Path):
-    """(absolute module, at module level?) of every import statement."""
-    package = [NAME, *path.relative_to(PACKAGE).parent.parts]
-    tree = ast.parse(path.read_text())
-    top_level = {id(node) for node in tree.body}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from ((alias.name, id(node) in top_level) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
-            module = ".".join(filter(None, (base, node.module)))
-            # "from .. import x" names the module x, or a name of the package itself
-            names = (
-                [module]
-                if module != NAME
-                else [f"{base}.{alias.name}" for alias in node.names if alias.name in RINGS]
-            )
-            yield from ((name, id(node) in top_level) for name in names)
-
-
-def top(path: Path) -> str:
-    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+def test_few_modules_lie_beside_the_rooms():
+    assert len(list(PACKAGE.glob("*.py"))) <= MODULES_AT_THE_TOP
 
 
 def test_imports_point_inwards():
-    outwards = []
-    for path in modules():
-        for name, _ in imports(path):
-            if name.startswith(NAME + ".") and ring(name.split(".")[1]) > ring(top(path)):
-                outwards.append(f"{path.relative_to(PACKAGE)} imports {name}")
+    outwards = [
+        f"{named(path)} imports {name}"
+        for path in sources()
+        for name, _ in imports(path)
+        if name.startswith(NAME + ".") and RINGS[name.split(".")[1]] > RINGS[room_of(path)]
+    ]
     assert not outwards, outwards
 
 
 def test_the_maths_needs_torch_numpy_and_scipy_only():
     foreign = [
-        f"{path.relative_to(PACKAGE)} imports {name}"
-        for path in modules()
-        if ring(top(path)) == 0
+        f"{named(path)} imports {name}"
+        for path in sources()
+        if RINGS[room_of(path)] == 0
         for name, _ in imports(path)
-        if name.split(".")[0] not in MATHS_MAY_USE | LIBRARIES.get(top(path), set()) | {NAME}
+        if name.split(".")[0] not in MATHS_MAY_USE | LIBRARIES.get(room_of(path), set()) | {NAME}
     ]
     assert not foreign, foreign
 
 
 def test_only_one_file_imports_threestudio():
-    assert [
-        str(path.relative_to(PACKAGE))
-        for path in modules()
-        if any(name.split(".")[0] == "threestudio" for name, _ in imports(path))
-    ] == ["host/__init__.py"]
+    found = {
+        named(path)
+        for path in sources()
+        for name, _ in imports(path)
+        if name.split(".")[0] == "threestudio"
+    }
+    assert found == {f"{NAME}/host/__init__.py"}
 
 
 def test_heavy_libraries_are_imported_where_they_are_used():
-    allowed = {
-        "lightning",
-        "pytorch_lightning",
-        "omegaconf",
-        "threestudio",
-    }  # what the host itself is made of
     eager = [
-        f"{path.relative_to(PACKAGE)} imports {name}"
-        for path in modules()
+        f"{named(path)} imports {name}"
+        for path in sources()
         for name, top_level in imports(path)
-        if top_level and name.split(".")[0] in HEAVY - (allowed if ring(top(path)) else set())
+        if top_level and name.split(".")[0] in HEAVY - (HOST if RINGS[room_of(path)] else set())
     ]
     assert not eager, eager
 
@@ -135,7 +98,54 @@ def test_importing_the_package_is_cheap():
         f"import sys, {NAME}; print([m for m in sys.modules if m.split('.')[0] in "
         f"{sorted(HEAVY | {'torch', 'numpy'})}])"
     )
-    found = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent
-    )
+    command = [sys.executable, "-c", code]
+    found = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
     assert found.stdout.strip() == "[]"
+
+
+# ---- lengths -------------------------------------------------------------------------------------
+
+
+def functions(path: Path) -> Iterator[tuple[str, int]]:
+    """Yield name and number of lines, without docstring, of every function of a file."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            first = node.body[0]
+            docstring = first.end_lineno - first.lineno + 1 if ast.get_docstring(node) else 0
+            yield f"{named(path)}:{node.name}", node.end_lineno - node.lineno + 1 - docstring
+
+
+def test_functions_are_short():
+    lengths = dict(item for path in sources() for item in functions(path))
+    assert not {name: n for name, n in lengths.items() if n > LONGEST_FUNCTION}
+    assert statistics.median(lengths.values()) <= 10
+
+
+def test_files_are_short():
+    lengths = {named(path): len(path.read_text().splitlines()) for path in CODE}
+    assert not {name: n for name, n in lengths.items() if n > LONGEST_FILE}
+
+
+def test_lines_are_short():
+    found = [
+        f"{named(path)}:{number}"
+        for path in CODE
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        if len(line) > LONGEST_LINE
+    ]
+    assert not found, found
+
+
+# ---- the architecture page -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", STEPS, ids=lambda step: step.module)
+def test_a_station_of_the_step_exists(step):
+    tree = ast.parse((PACKAGE / step.module).read_text())
+    assert step.function in {getattr(node, "name", None) for node in ast.walk(tree)}
+
+
+def test_the_architecture_page_is_of_this_code():
+    again = "it is stale: run python -m tests.architecture"
+    assert PICTURE.read_text() == svg(), again
+    assert PAGE.read_text() == page(), again

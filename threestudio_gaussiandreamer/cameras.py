@@ -1,4 +1,4 @@
-"""Camera conventions, said once and converted in one place.
+"""Cameras: conventions and conversion.
 
 World: right-handed, z up; azimuth 0 = +x is the front, azimuth 90 = +y. Angles of a view
 (elevation, azimuth) are in degrees, ``fovy`` is vertical and in radians. The host's cameras are

@@ -1,6 +1,4 @@
-"""How good a result is: PSNR and SSIM against the truth, the multi-face meter, the floater meter,
-the share out of gamut.
-"""
+"""Metrics: PSNR, SSIM, multi-face rate, floater mass, share of colours out of gamut."""
 
 import torch
 import torch.nn.functional as F

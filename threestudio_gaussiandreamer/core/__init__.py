@@ -1,3 +1,1 @@
-"""What every ring uses: errors, random streams, files, checkpoints, schedules, images. No host, no
-models.
-"""
+"""Utilities of every ring: errors, random streams, files, checkpoints, schedules, images."""

@@ -1,1 +1,1 @@
-"""Formulas of score distillation and of the exact score."""
+"""Formulas of score distillation and exact scores."""

@@ -1,0 +1,1 @@
+"""Exporters: write the trained cloud to files."""

@@ -1,3 +1,1 @@
-"""Operations on clouds of points and Gaussians: grow, densify, rank, merge, simplify, extract a
-surface.
-"""
+"""Operations on Gaussians: grow, densify, rank, merge, prune."""

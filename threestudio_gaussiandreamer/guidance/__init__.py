@@ -1,0 +1,1 @@
+"""Guidances: score distillation from a diffusion model or an exact score."""

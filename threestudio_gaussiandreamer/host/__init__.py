@@ -1,7 +1,7 @@
-"""The host of the parts: threestudio when it is importable, otherwise the built-in one. Only this
-file knows which.
+"""The host that parts register into: threestudio when it is importable, otherwise the built-in one.
 
-Everything else imports these names from here; they mean the same in both hosts.
+Only this file knows which. Everything else imports these names from here; they mean the same in
+both hosts.
 """
 
 import os

@@ -1,0 +1,1 @@
+"""Priors: initial point clouds from meshes, files and text-to-3D models."""
