@@ -157,3 +157,19 @@ class TestBundle:
             build("gaussiandreamer-exporter", formats=["ply"], options={"points": {}})
         with pytest.raises((UserError, TypeError), match="pad"):
             build("gaussiandreamer-exporter", formats=["ply"], options={"ply": {"pad": 2}})
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"spz": {"save_name": "gaussians.ply"}}, "is the file of the format ply"),
+            ({"ply": {"save_name": "Points.PLY"}}, "is the file of the format ply"),
+            ({"ply": {"save_name": "x\0.ply"}}, "at most 255 bytes and no NUL"),
+            ({"ply": {"save_name": "ü" * 128}}, "at most 255 bytes and no NUL"),
+            ({"ply": {"save_name": "pruned"}}, "a name that a run uses itself"),
+            ({"ply": {"save_name": "a/b.ply"}}, "without folders"),
+        ],
+    )
+    def test_a_name_that_would_fail_or_overwrite_is_named_when_built(self, options, message):
+        with pytest.raises(UserError, match=f"options.{'|'.join(options)}|options.points") as info:
+            build("gaussiandreamer-exporter", formats=["ply", "spz", "points"], options=options)
+        assert message in str(info.value)

@@ -3,11 +3,11 @@ half-written.
 """
 
 import os
-import threading
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
+from threading import get_ident
 from typing import BinaryIO
 
 from .errors import UserError
@@ -76,7 +76,7 @@ def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bi
         UserError: the folder is missing or unwritable, the disk is full, ...
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name[:100]}.{os.getpid()}-{threading.get_ident()}.tmp")
+    temporary = path.with_name(f".{_shortened(path.name)}.{os.getpid()}-{get_ident()}.tmp")
     try:
         with open(temporary, "wb") as file:
             yield file
@@ -93,6 +93,11 @@ def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bi
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _shortened(name: str, size: int = 100) -> str:
+    """At most the first ``size`` bytes of a file's name, so that more can be appended to it."""
+    return name.encode(errors="surrogateescape")[:size].decode(errors="ignore")
 
 
 def _sync_folder(folder: Path) -> None:

@@ -10,7 +10,7 @@ save_video    also render the turntable
 ============  ======================================================================================
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional
 
@@ -42,8 +42,11 @@ class BundleExporter(Exporter):
 
         @staticmethod
         def check(cfg: "BundleExporter.Config") -> None:
-            """Raises UserError for a format that isn't registered, or options of one that isn't
-            asked for.
+            """Check formats and their options.
+
+            Raises:
+                UserError: a format that isn't registered, options of one that isn't asked for, or
+                    two formats that write the same file.
             """
             for name in cfg.formats:
                 if name not in available_formats():
@@ -54,7 +57,9 @@ class BundleExporter(Exporter):
                         f"options.{name}: the formats are {', '.join(cfg.formats)}; options of "
                         "another one have no effect"
                     )
-                _check_options(name, cfg.options[name])
+            _require_own_files(
+                (name, _checked(name, cfg.options.get(name, {}))) for name in cfg.formats
+            )
 
     cfg: Config
 
@@ -76,13 +81,31 @@ class BundleExporter(Exporter):
         return [output for exporter in self.exporters for output in exporter()]
 
 
-def _check_options(name: str, options: Any) -> None:
+def _checked(name: str, options: Any) -> Any:
+    """The typed options of one format."""
     if not isinstance(options, Mapping):
         raise UserError(f"options.{name}: expected keys and values, got {options!r}")
     try:
-        parse_structured(find(name + SUFFIX).Config, options)
+        return parse_structured(find(name + SUFFIX).Config, options)
     except UserError as error:
         raise UserError(f"options.{name}: {error}") from error
+
+
+def _require_own_files(formats: Iterable[tuple[str, Any]]) -> None:
+    """Raise UserError if two formats write the same file, also where the file system takes upper
+    and lower case for the same.
+    """
+    writers: dict[str, str] = {}
+    for name, cfg in formats:
+        file = getattr(cfg, "save_name", None)
+        if file is None:
+            continue
+        other = writers.setdefault(file.casefold(), name)
+        if other != name:
+            raise UserError(
+                f"options.{name}.save_name: {file!r} is the file of the format {other}; choose "
+                "another name"
+            )
 
 
 def available_formats() -> list[str]:

@@ -1,0 +1,23 @@
+"""Files that appear whole or not at all."""
+
+import pytest
+
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.files import atomic_file
+
+
+@pytest.mark.parametrize("name", ["a" * 255, "ü" * 127, "\U0001f98a" * 63], ids=["a", "ü", "fox"])
+def test_names_as_long_as_the_file_system_takes(tmp_path, name):
+    with atomic_file(tmp_path / name) as file:
+        file.write(b"1")
+    assert [entry.name for entry in tmp_path.iterdir()] == [name]
+
+
+def test_a_failure_leaves_the_earlier_file_and_nothing_else(tmp_path):
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(b"earlier")
+    with pytest.raises(UserError, match="An earlier file of this name is untouched"):
+        with atomic_file(path) as file:
+            file.write(b"half")
+            raise OSError(28, "No space left on device")
+    assert path.read_bytes() == b"earlier" and list(tmp_path.iterdir()) == [path]
