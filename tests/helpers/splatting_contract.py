@@ -108,6 +108,16 @@ class KernelContract:
     def test_options(self, backend, options):
         compare(backend, random_cloud(150, seed=1, size=0.2), cameras(2, 34, 18), 34, 18, **options)
 
+    @pytest.mark.parametrize("antialias", [False, True])
+    def test_opacity_zero_has_a_gradient_without_alpha_min(self, backend, antialias):
+        """``d alpha / d opacity`` doesn't vanish with the opacity; below zero nothing is drawn."""
+        cloud = random_cloud(40, seed=8, size=0.2)
+        cloud.opacities[::4], cloud.opacities[5] = 0, -0.1
+        options = {"alpha_min": 0, "antialias": antialias}
+        ours = compare(backend, cloud, cameras(2, 34, 18), 34, 18, **options)
+        gradients = ours.grads["opacities"]
+        assert gradients[::4].abs().min() > 1e-3 * gradients.abs().max() and gradients[5] == 0
+
     def test_a_few_thousand_gaussians(self, backend):
         """More than a chunk per tile, early stops, capped alphas; gradients of everything."""
         cloud = random_cloud(3000, seed=4, size=0.06)

@@ -91,6 +91,13 @@ def test_options(options):
     compare(random_cloud(150, seed=1, size=0.2), cameras(2, 22, 18), 22, 18, **options)
 
 
+def test_opacity_zero_has_a_gradient_without_alpha_min():
+    cloud = random_cloud(40, seed=8, size=0.2)
+    cloud.opacities[::4], cloud.opacities[5] = 0, -0.1
+    ours, _ = compare(cloud, cameras(2, 22, 18), 22, 18, alpha_min=0)
+    assert (ours.grads["opacities"][::4] != 0).all() and ours.grads["opacities"][5] == 0
+
+
 @pytest.mark.parametrize("channels", [1, 2, 5])
 @pytest.mark.parametrize("per_view", [False, True])
 def test_channels_shared_or_per_view(channels, per_view):

@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass
 
-SMALLEST_ALPHA = (
-    2.0**-100
-)  # stands for alpha_min = 0 in kernels: below it a float32 image can't tell
+NO_ALPHA_MIN = 2.0**-100
+"""What compiled kernels get for ``alpha_min = 0``: smaller alphas change no float32 image."""
 
 
 @dataclass(frozen=True)
@@ -20,3 +19,8 @@ class RasterizeOptions:
     stop: float = 1e-4
     downsample: int = 1
     absgrad: bool = False
+
+    @property
+    def kernel_alpha_min(self) -> float:
+        """Return ``alpha_min`` as compiled kernels take it: its logarithm has to be finite."""
+        return max(self.alpha_min, 2 * NO_ALPHA_MIN) if self.alpha_min > 0 else NO_ALPHA_MIN

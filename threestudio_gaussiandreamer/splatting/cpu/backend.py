@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from ...core.errors import UserError, unknown
 from .. import torch_backend
 from ..channels import CHANNELS, groups, narrow, widen
-from ..options import SMALLEST_ALPHA, RasterizeOptions
+from ..options import RasterizeOptions
 from ..output import Rasterized
 
 FOLDER = pathlib.Path(__file__).parent
@@ -254,12 +254,11 @@ def _scene(inputs: Sequence[Tensor], frame: Frame) -> _Scene:
 
 def _settings(frame: Frame) -> _Settings:
     o = frame.options
-    alpha_min = max(o.alpha_min, SMALLEST_ALPHA)
     return _Settings(
         o.near,
         o.far,
         o.eps2d,
-        alpha_min,
+        o.kernel_alpha_min,
         o.alpha_max,
         o.stop,
         o.antialias,

@@ -11,10 +11,11 @@ SPLAT_FN Vec3<Floats> load_vec3(const float* p, int count) { return load_items<3
 
 SPLAT_FN Floats load_scalars(const float* p, int count) { return load_items<1>(p, count, load<Floats>); }
 
-SPLAT_FN Gaussian<Floats> load_gaussians(const SplatScene& scene, Group group) {
+SPLAT_FN Gaussian<Floats> load_gaussians(const SplatScene& scene, const SplatSettings& settings, Group group) {
   const auto [first, count] = group;
+  const Floats opacities = load_scalars(scene.opacities + first, count);
   return {load_vec3(scene.means + 3 * first, count), load_vec3(scene.scales + 3 * first, count),
-          load_items<4>(scene.quats + 4 * first, count, load4), load_scalars(scene.opacities + first, count)};
+          load_items<4>(scene.quats + 4 * first, count, load4), drawn_opacity(opacities, std::log2(settings.alpha_min))};
 }
 
 SPLAT_FN Vec3<Floats> load_colors(const SplatScene& scene, int view, Group group) {
@@ -105,7 +106,7 @@ inline void list_lanes(View& view, Slice& slice, Group group, const Projection<F
 
 inline void project_group(const ForwardCall& call, View& view, Slice& slice, Group group) {
   const SplatSettings& settings = call.settings;
-  const Gaussian<Floats> g = load_gaussians(call.scene, group);
+  const Gaussian<Floats> g = load_gaussians(call.scene, settings, group);
   const Vec3<Floats> colors = load_colors(call.scene, view.index, group);
   const Mat3<Floats> axes = world_axes(quat_to_rotation(g.quat).matrix, g.scale);
   const Projection<Floats> p = project(view.camera, g.mean, axes, settings.eps2d);

@@ -39,8 +39,8 @@ struct Shapes {
   Mat3<Floats> axes;  // in the world
 };
 
-SPLAT_FN Shapes load_shapes(const SplatScene& scene, Group group) {
-  const Gaussian<Floats> g = load_gaussians(scene, group);
+SPLAT_FN Shapes load_shapes(const SplatScene& scene, const SplatSettings& settings, Group group) {
+  const Gaussian<Floats> g = load_gaussians(scene, settings, group);
   const Rotation<Floats> rotation = quat_to_rotation(g.quat);
   return {g, rotation, world_axes(rotation.matrix, g.scale)};
 }
@@ -98,7 +98,7 @@ SPLAT_FN bool any_lane(Ints mask) { return any_at_least(select(mask, Floats{} + 
 
 // All gradients of a group; `viewmats` holds a sum per view, or none.
 inline void project_group_backward(const BackwardCall& call, Group group, std::vector<ViewmatSums>& viewmats) {
-  const Shapes shapes = load_shapes(call.scene, group);
+  const Shapes shapes = load_shapes(call.scene, call.settings, group);
   WorldGradient<Floats> world = {};
   Ints drawn_anywhere = {};
   for (int v = 0; v < call.scene.views; v++) {

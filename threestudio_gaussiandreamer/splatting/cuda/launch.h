@@ -59,9 +59,10 @@ constexpr int ROW_QUADS = sizeof(Row) / sizeof(Quad);
 SPLAT_FN Vec3<float> load3(const float* p) { return {p[0], p[1], p[2]}; }
 SPLAT_FN void store3(float* p, const Vec3<float>& v) { p[0] = v.x, p[1] = v.y, p[2] = v.z; }
 
-SPLAT_FN Gaussian<float> load_gaussian(const Scene& scene, Index i) {
+SPLAT_FN Gaussian<float> load_gaussian(const Scene& scene, const Settings& settings, Index i) {
+  const float opacity = drawn_opacity(scene.opacities[i], settings.log2_alpha_min);
   const float* q = scene.quats + 4 * i;
-  return {load3(scene.means + 3 * i), load3(scene.scales + 3 * i), {q[0], q[1], q[2], q[3]}, scene.opacities[i]};
+  return {load3(scene.means + 3 * i), load3(scene.scales + 3 * i), {q[0], q[1], q[2], q[3]}, opacity};
 }
 
 SPLAT_FN const float* color_of(const Scene& scene, int view, Index gaussian) {

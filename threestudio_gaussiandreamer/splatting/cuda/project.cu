@@ -25,7 +25,7 @@ project(splat::Scene scene, splat::Settings settings, splat::Splat* splats, int*
   const int i = blockIdx.x * blockDim.x + threadIdx.x, view = blockIdx.y;
   if (i >= scene.gaussians) return;
   const Camera camera = make_camera(scene, view);
-  const Gaussian<float> g = load_gaussian(scene, i);
+  const Gaussian<float> g = load_gaussian(scene, settings, i);
   const Vec3<float> color = load3(color_of(scene, view, i));
   const Mat3<float> axes = world_axes(quat_to_rotation(g.quat).matrix, g.scale);
   const Projection<float> p = splat::project(camera, g.mean, axes, settings.eps2d);

@@ -90,7 +90,7 @@ project_backward(splat::Scene scene, splat::Settings settings, const int* depth_
   using namespace splat;
   const int i = blockIdx.x * THREADS + threadIdx.x;
   const bool exists = i < scene.gaussians;
-  const Gaussian<float> g = exists ? load_gaussian(scene, i) : Gaussian<float>{};
+  const Gaussian<float> g = exists ? load_gaussian(scene, settings, i) : Gaussian<float>{};
   const Rotation<float> rotation = quat_to_rotation(g.quat);
   const Mat3<float> axes = world_axes(rotation.matrix, g.scale);
   WorldGradient<float> world = {};

@@ -11,7 +11,7 @@ from typing import NamedTuple, Optional, Protocol, Union
 import torch
 from torch import Tensor
 
-from ..options import SMALLEST_ALPHA, RasterizeOptions
+from ..options import RasterizeOptions
 
 TILE, BLEND_THREADS, THREADS, WARP = 16, 256, 128, 32
 SPLAT, ROW = 16, 12  # floats
@@ -338,7 +338,7 @@ def _scene(inputs: Inputs, frame: Frame) -> _Scene:
 
 def _settings(frame: Frame) -> _Settings:
     o = frame.options
-    log2_alpha_min = math.log2(max(o.alpha_min, SMALLEST_ALPHA))
+    log2_alpha_min = math.log2(o.kernel_alpha_min)
     return _Settings(
         o.near, o.far, o.eps2d, log2_alpha_min, o.alpha_max, o.stop, o.antialias, o.downsample
     )

@@ -28,6 +28,15 @@ template <class F> struct Gaussian {
   F opacity;
 };
 
+// Where alpha_min is 0, which kernels are told as 2^-100, an opacity from 0 to 2^-64 is drawn as 2^-64: no float32 image shows
+// the difference, and 0, which has no logarithm, gets the gradient of alpha, d alpha / d opacity = exp(-|y|^2 / 2).
+constexpr float LOG2_NO_ALPHA_MIN = -100.0f, LEAST_OPACITY = 5.421010862e-20f;
+
+template <class F> SPLAT_FN F drawn_opacity(const F& opacity, float log2_alpha_min) {
+  const F zero = {}, least = zero + (log2_alpha_min <= LOG2_NO_ALPHA_MIN ? LEAST_OPACITY : 0.0f);
+  return select((opacity >= zero) & (opacity < least), least, opacity);
+}
+
 template <class F> SPLAT_FN auto all_finite(const Gaussian<F>& g, const Vec3<F>& color) {
   const Vec3<F> sum = 0.0f * g.mean + 0.0f * g.scale + 0.0f * color;
   return finite(sum.x + sum.y + sum.z + 0.0f * g.quat.w + 0.0f * g.quat.x + 0.0f * g.quat.y + 0.0f * g.quat.z +
