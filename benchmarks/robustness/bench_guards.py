@@ -21,6 +21,7 @@ from benchmarks.splatting.bench_splatting import make_camera, make_scene
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0
 from threestudio_gaussiandreamer.guidance.base import ScoreDistillation, _bad_items
 from threestudio_gaussiandreamer.splatting import RasterizeOptions, api, rasterize
+from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.finite import (
     CHECK_EVERY,
     optimizer_tensors,
@@ -88,7 +89,7 @@ class Bench:
     def step(self) -> None:
         out = self.forward()
         self.guidance(out.image)["loss_sds"].backward()
-        self.geometry.observe(out, self.size, self.size)
+        DensityControl(self.geometry).after_backward(out, self.size, self.size)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
 

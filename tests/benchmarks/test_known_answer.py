@@ -15,6 +15,7 @@ from threestudio_gaussiandreamer.gaussians.simplify import (
 )
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.splatting import rasterize
+from threestudio_gaussiandreamer.training.density import DensityControl, QualityResult
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 known_answer = pytest.importorskip(
@@ -55,6 +56,7 @@ def trained(geometry, views, pictures):
             background=views.backgrounds[rows],
         )
 
+    control = DensityControl(geometry)
     for step in range(1, STEPS + 1):
         geometry.set_learning_rates(adam, 0, step)
         rows = torch.randperm(len(pictures), generator=rng)[:4]
@@ -67,19 +69,20 @@ def trained(geometry, views, pictures):
             "comp_rgb_bg": behind,
             "gaussian_opacities": opacities,
         }
-        geometry.sample_removal(pictures_now, step - 1)
+        control.before_backward(pictures_now, step - 1)
         (0.5 * (out.image - pictures[rows]).square().sum() / 4).backward()
-        geometry.observe(out, SIZE, SIZE)
+        control.after_backward(out, SIZE, SIZE)
         adam.step()
         adam.zero_grad(set_to_none=True)
 
         @torch.no_grad()
-        def holds(kept, rows=rows):
+        def check(kept, rows=rows):
             whole = psnr(draw(rows).image, pictures[rows])
-            with geometry.only(kept):
-                return bool(psnr(draw(rows).image, pictures[rows]) >= whole - geometry.affordable)
+            with geometry.showing_only(kept):
+                loss = whole - psnr(draw(rows).image, pictures[rows])
+            return QualityResult(control.affordable_loss - loss, {})
 
-        geometry.after_step(adam, step, holds)
+        control.after_step(adam, step, check)
     return Gaussians(
         geometry.means, geometry.quats, geometry.log_scales, geometry.logit_opacities, geometry.sh
     )

@@ -14,6 +14,7 @@ from torch import Tensor
 from tests.fuzz.targets import require_picture
 from threestudio_gaussiandreamer.gaussians.densify import Change
 from threestudio_gaussiandreamer.splatting import Rasterized
+from threestudio_gaussiandreamer.training.density import DensityControl, QualityResult
 from threestudio_gaussiandreamer.training.geometry import STATISTICS, GaussianCloud
 
 HOSTILE = {
@@ -94,7 +95,7 @@ class CloudLife(RuleBasedStateMachine):
         seen = (torch.rand(views, n, generator=g) < 0.7).float()
         contribution = torch.rand(views, n, generator=g).mul(4).round() / 4 * seen
         nothing = torch.zeros(views, 1, 1, 1)
-        self.cloud.observe(
+        DensityControl(self.cloud).after_backward(
             Rasterized(nothing, nothing, nothing, means2d, seen * 3, contribution), 64, 64
         )
 
@@ -127,7 +128,9 @@ class CloudLife(RuleBasedStateMachine):
         self._round(
             budget="auto",
             prune={"keep": keep},
-            holds=lambda kept: bool(answers >> next(asked) % 8 & 1),
+            check=lambda kept: QualityResult(
+                torch.tensor((answers >> next(asked) % 8 & 1) - 0.5), {}
+            ),
         )
 
     @rule(seed=SEEDS, budget=st.sampled_from([64, 70, "auto"]))
@@ -208,7 +211,7 @@ class CloudLife(RuleBasedStateMachine):
         budget: Any,
         densify: dict | None = None,
         prune: dict | None = None,
-        holds: Any = None,
+        check: Any = None,
     ) -> None:
         """One round of densification or pruning, or of both, and its bounds."""
         CloudLife.steps += 1
@@ -222,7 +225,7 @@ class CloudLife(RuleBasedStateMachine):
                 section[key] = value
         cfg.prune.start, cfg.prune.stop, cfg.prune.every = 0, 10, 1
         self.changes.clear()
-        self.cloud.after_step(self.optimizer, 5, holds)
+        DensityControl(self.cloud).after_step(self.optimizer, 5, check)
         assert min(before, cfg.min_gaussians) <= len(self.cloud), "below the floor"
         assert len(self.cloud) <= (before if densify is None else cfg.max_gaussians), (
             "above the cap"
@@ -232,17 +235,17 @@ class CloudLife(RuleBasedStateMachine):
 
     def _check_change(self, change: Change, old: dict[str, Tensor]) -> None:
         """Who stays is unchanged and in order; who is new has no moments yet, and gets an id."""
-        stays = ~change.fresh
+        stays = ~change.is_new
         assert (change.parents[stays].diff() > 0).all(), "the order changed"
         for name, value in self.cloud.parameters_by_name().items():
             assert torch.equal(value.detach()[stays], old[name][change.parents[stays]]), (
                 f"{name} of a Gaussian that stays changed"
             )
         for state in self.optimizer.state.values():
-            assert (state["exp_avg"][change.fresh] == 0).all() and (
-                state["exp_avg_sq"][change.fresh] == 0
+            assert (state["exp_avg"][change.is_new] == 0).all() and (
+                state["exp_avg_sq"][change.is_new] == 0
             ).all()
-        self._mark(change.fresh)
+        self._mark(change.is_new)
 
     def _record_changes(self) -> None:
         apply = self.cloud.apply_change

@@ -36,7 +36,7 @@ def test_small_hot_gaussians_are_cloned_and_large_ones_split():
         params, stats, Rules(split_scale=0.04, max_scale=10, min_gaussians=1), generator(0, "s")
     )
     assert sorted(change.parents.tolist()) == [0, 0, 1, 2, 2, 3]
-    assert change.fresh.sum() == 3  # one clone, two children; the split one itself is gone
+    assert change.is_new.sum() == 3  # one clone, two children; the split one itself is gone
     children = (change.parents == 2).nonzero()[:, 0]
     expected = params["log_scales"][2] - torch.log(torch.tensor(densify.SPLIT_SHRINK))
     assert torch.allclose(change.values["log_scales"][children], expected.expand(2, 3))
@@ -111,7 +111,7 @@ def test_faint_and_huge_gaussians_go():
 def test_never_seen_gaussians_are_not_selected():
     stats = statistics(5, gradient=0.0)
     change = densify.densify_and_prune(cloud(5), stats, Rules(min_gaussians=1), generator(0, "s"))
-    assert change.parents.tolist() == [0, 1, 2, 3, 4] and not change.fresh.any()
+    assert change.parents.tolist() == [0, 1, 2, 3, 4] and not change.is_new.any()
 
 
 def test_the_threshold_means_the_same_at_any_resolution_batch_and_loss_scale():
@@ -149,7 +149,7 @@ def test_moments_follow_their_gaussian_through_random_changes(seed):
         change = densify.densify_and_prune(params, stats, rules, generator(seed, "split", round_))
         new = {name: nn.Parameter(value) for name, value in change.values.items()}
         densify.update_optimizer(optimizer, params, new, change)
-        params, ids = new, torch.where(change.fresh, torch.zeros(()), ids[change.parents])
+        params, ids = new, torch.where(change.is_new, torch.zeros(()), ids[change.parents])
         assert (
             {id(p) for group in optimizer.param_groups for p in group["params"]}
             == {id(p) for p in params.values()}

@@ -10,6 +10,7 @@ from threestudio_gaussiandreamer.core.streams import generator
 from threestudio_gaussiandreamer.gaussians import importance as parsimony
 from threestudio_gaussiandreamer.gaussians.densify import Rules, Statistics, densify_and_prune
 from threestudio_gaussiandreamer.splatting import rasterize
+from threestudio_gaussiandreamer.training.density import DensityControl, QualityResult
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 
@@ -31,13 +32,18 @@ def optimizer(geometry):
     return torch.optim.Adam(geometry.parameter_groups())
 
 
+def accepts(holds):
+    """The check of a round of ``auto`` that accepts what ``holds(kept)`` is true for."""
+    return lambda kept: QualityResult(torch.tensor(1.0 if holds(kept) else -1.0), {})
+
+
 def rounds(geometry, steps, holds=None):
     """The counts after each step of a schedule with a round at every one."""
-    adam, counts = optimizer(geometry), []
+    adam, control, counts = optimizer(geometry), DensityControl(geometry), []
     for step in range(steps):
         geometry.gradient_sum += 1.0
         geometry.gradient_count += 1
-        geometry.after_step(adam, step, holds)
+        control.after_step(adam, step, None if holds is None else accepts(holds))
         counts.append(len(geometry))
         geometry.contribution += torch.rand(len(geometry))
     return counts
@@ -87,7 +93,7 @@ def test_those_with_the_lowest_scores_go_first(sampled):
     scores = geometry.removal.sqrt() * geometry.contribution if sampled else geometry.contribution
     best = scores.topk(80).indices.sort().values
     expected = geometry.means.detach()[best]
-    geometry.after_step(optimizer(geometry), 0)
+    DensityControl(geometry).after_step(optimizer(geometry), 0)
     assert torch.equal(geometry.means, expected)
 
 
@@ -180,7 +186,7 @@ def test_the_colour_of_the_background_hides_nobody():
         geometry.colors(viewmats[:, 3, :3]),
     )
     out = rasterize(*inputs, viewmats, Ks, 32, 32)
-    geometry.sample_removal(pictures(out, opacities), 60)
+    DensityControl(geometry).before_backward(pictures(out, opacities), 60)
     assert out.contribution[0, 0] > 0.1 and geometry.removal[0] > 0.01 * geometry.removal.median()
 
 
@@ -204,7 +210,7 @@ def test_sampling_leaves_the_gradients_of_the_loss_alone(backend):
             geometry.colors(viewmats[:, 3, :3]),
         )
         out = rasterize(*inputs, viewmats, Ks, 32, 32, absgrad=True, backend=backend)
-        geometry.sample_removal(pictures(out, opacities), 60)
+        DensityControl(geometry).before_backward(pictures(out, opacities), 60)
         assert geometry.removal.any() == (budget is not None)
         (out.image**2).sum().backward()
         left.append(
@@ -222,7 +228,9 @@ def test_sampling_leaves_the_gradients_of_the_loss_alone(backend):
 )
 def test_samples_are_taken_where_a_round_will_ask_for_them(step, due):
     assert (
-        cloud(10, budget=5, prune={"start": 100, "stop": 900, "every": 50})._samples_removal(step)
+        DensityControl(
+            cloud(10, budget=5, prune={"start": 100, "stop": 900, "every": 50})
+        ).samples_removal(step)
         == due
     )
 
@@ -246,13 +254,17 @@ def test_a_gaussian_that_hides_its_own_colour_shows_nothing():
 
 def test_auto_leaves_out_the_first_half_of_its_rounds():
     schedule = {"start": 100, "stop": 900, "every": 50}
-    assert list(cloud(1, prune=schedule).prune_rounds) == list(range(100, 900, 50))
-    auto = cloud(1, budget="auto", prune=schedule | {"quality": 0.4})
+    assert list(DensityControl(cloud(1, prune=schedule)).prune_rounds) == list(range(100, 900, 50))
+    auto = DensityControl(cloud(1, budget="auto", prune=schedule | {"quality": 0.4}))
     assert list(auto.prune_rounds) == list(
         range(500, 900, 50)
-    ) and auto.affordable == pytest.approx(0.05)
+    ) and auto.affordable_loss == pytest.approx(0.05)
     assert (
-        list(cloud(1, budget="auto", prune={"start": 1, "stop": 50, "every": 50}).prune_rounds)
+        list(
+            DensityControl(
+                cloud(1, budget="auto", prune={"start": 1, "stop": 50, "every": 50})
+            ).prune_rounds
+        )
         == []
     )
 
@@ -292,10 +304,10 @@ def test_pruning_after_densifying_keeps_track_of_rows():
         generator(0, "s"),
     )
     both = parsimony.pruned(first.values, geometry.contribution[first.parents], 7, first)
-    assert len(both.parents) == len(both.fresh) == 7
-    untouched = ~both.fresh
+    assert len(both.parents) == len(both.is_new) == 7
+    untouched = ~both.is_new
     assert torch.equal(both.values["sh0"][untouched], params["sh0"][both.parents[untouched]])
-    assert (both.parents[both.fresh] < 10).all()
+    assert (both.parents[both.is_new] < 10).all()
 
 
 @pytest.mark.parametrize("needed", [1, 79, 80, 81, 90, 99, 100])
@@ -363,6 +375,6 @@ def test_hidden_gaussians_are_as_if_they_were_not_there_and_come_back():
         return rasterize(*(value[rows].detach() for value in inputs), viewmats, Ks, 24, 24).image
 
     kept, before = torch.arange(50) % 2 == 0, image()
-    with geometry.only(kept):
+    with geometry.showing_only(kept):
         assert torch.equal(image(), image(kept))
     assert torch.equal(image(), before)

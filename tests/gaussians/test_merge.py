@@ -71,7 +71,7 @@ def test_a_pair_keeps_its_peak_and_its_light():
 def test_copies_in_one_place_become_one(times):
     params = shell()
     change = merge_duplicates(copies(params, times))
-    assert len(change.parents) == 60 and change.fresh.all()
+    assert len(change.parents) == 60 and change.is_new.all()
     order = change.values["means"] @ torch.tensor([1.0, 10.0, 100.0])
     for name in ("means", "logit_opacities", "sh0", "sh_rest"):
         expected = params[name][(params["means"] @ torch.tensor([1.0, 10.0, 100.0])).argsort()]
@@ -98,7 +98,7 @@ def test_copies_a_little_apart_become_one_that_looks_like_both():
 def test_what_is_no_duplicate_stays_bit_for_bit():
     params = shell()
     change = merge_duplicates(params)
-    assert not change.fresh.any() and torch.equal(change.parents, torch.arange(60))
+    assert not change.is_new.any() and torch.equal(change.parents, torch.arange(60))
     assert all(torch.equal(change.values[name], params[name]) for name in params)
 
 
@@ -122,7 +122,7 @@ def test_a_floor_holds_and_the_cheapest_go_first():
     params["sh0"][60:90] += 0.2  # duplicates still, but dearer ones
     change = merge_duplicates(params, at_least=90)
     assert len(merge_duplicates(params, at_least=200).parents) == 120
-    assert len(change.parents) == 90 and set(change.parents[change.fresh].tolist()) == set(
+    assert len(change.parents) == 90 and set(change.parents[change.is_new].tolist()) == set(
         range(30, 60)
     )
 

@@ -27,6 +27,7 @@ from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
 from threestudio_gaussiandreamer.metrics import psnr
+from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.geometry import STATISTICS, GaussianCloud
 
 register_parts()
@@ -82,7 +83,9 @@ class Training:
         out = self.render(self.geometry, views)
         loss = ((out["comp_rgb"] - self.truth[views]) ** 2).mean()
         (loss * loss_scale).backward()
-        self.geometry.observe(out["rasterized"], self.size, self.size, loss_scale)
+        DensityControl(self.geometry).after_backward(
+            out["rasterized"], self.size, self.size, loss_scale
+        )
 
     def run(self, steps: int) -> list[int]:
         """The count after each step."""
@@ -92,7 +95,7 @@ class Training:
             self.optimizer.step()
             self.optimizer.zero_grad(set_to_none=True)
             self.step += 1
-            self.geometry.after_step(self.optimizer, self.step)
+            DensityControl(self.geometry).after_step(self.optimizer, self.step)
             counts.append(len(self.geometry))
         return counts
 
@@ -140,7 +143,7 @@ def test_above_the_cap_what_contributes_least_goes_first(cap, measured):
     training.observe(slice(None))
     best = geometry.contribution.topk(cap).indices.sort().values
     expected = geometry.means.detach()[best]
-    geometry.after_step(training.optimizer, 1)
+    DensityControl(geometry).after_step(training.optimizer, 1)
     assert torch.equal(geometry.means, expected)
     measured(abs(len(geometry) - cap), "off the cap", at_most=0)
 
@@ -405,7 +408,7 @@ def test_moments_follow_their_gaussian(seed, measured):
         ids, gradient = torch.arange(1.0, n + 1), torch.rand(n, generator=g)
         ledger.write(ids)
         seen_alike(geometry, gradient, torch.rand(n, generator=g))
-        geometry.after_step(optimizer, round_)
+        DensityControl(geometry).after_step(optimizer, round_)
         left = ledger.ids()
         assert steps == [
             optimizer.state[parameter]["step"].item() for parameter in ledger.parameters()
@@ -542,8 +545,8 @@ def judged(
 
 def selected(geometry: GaussianCloud, threshold: float) -> set[int]:
     geometry.cfg.densify.grad_threshold = threshold
-    change = geometry.densified(1)
-    return set(change.parents[change.fresh].tolist())
+    change = DensityControl(geometry).densified(1)
+    return set(change.parents[change.is_new].tolist())
 
 
 def middle(geometry: GaussianCloud) -> float:
@@ -611,7 +614,7 @@ def test_the_never_seen_are_never_selected(absgrad, measured):
     chosen = selected(geometry, 0.0)
     assert len(chosen) > 120
     training.optimizer.step()
-    geometry.after_step(training.optimizer, 1)
+    DensityControl(geometry).after_step(training.optimizer, 1)
     assert all(parameter.isfinite().all() for parameter in geometry.parameters())
     measured(len(chosen & set(range(50))), "of 50 selected", at_most=0)
 
@@ -636,7 +639,7 @@ def test_nothing_resets_the_opacities(measured, monkeypatch):
         densify, "densify_and_prune", lambda *args: rounds.append(once(*args)) or rounds[-1]
     )
     for step in range(1, 3501):
-        geometry.after_step(optimizer, step)
+        DensityControl(geometry).after_step(optimizer, step)
     assert len(rounds) == 35
     measured((geometry.logit_opacities - before).abs().max(), "moved by 35 rounds", at_most=0.0)
 

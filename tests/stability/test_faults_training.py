@@ -21,6 +21,7 @@ from threestudio_gaussiandreamer.gaussians.densify import PARAMETERS, Rules, Sta
 from threestudio_gaussiandreamer.gaussians.grow import grow
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
+from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.geometry import LEARNING_RATES, STATISTICS, GaussianCloud
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
@@ -264,11 +265,11 @@ def test_f18_densification_loses_no_step(fault):
 
     def step_first(geometry, optimizer, step):
         optimizer.step()
-        geometry.after_step(optimizer, step)
+        DensityControl(geometry).after_step(optimizer, step)
 
     def densify_first(geometry, optimizer, step):
         if geometry.cfg.densify.enabled and step % 2 == 0:
-            geometry.apply_change(geometry.densified(step), optimizer)
+            geometry.apply_change(DensityControl(geometry).densified(step), optimizer)
         optimizer.step()
 
     def trajectory(finish, **options):

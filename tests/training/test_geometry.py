@@ -14,6 +14,7 @@ from threestudio_gaussiandreamer.gaussians.grow import nearest_distance_scales
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.host import find, register
 from threestudio_gaussiandreamer.splatting import Rasterized
+from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 register_parts()
@@ -92,7 +93,7 @@ def test_the_cloud_takes_its_size_from_the_checkpoint_and_never_asks_the_prior(
     sphere_points, tmp_path
 ):
     geometry = started(sphere_points, sh_degree=2, densify={"enabled": True})
-    geometry.observe(seen(geometry), 64, 64)
+    DensityControl(geometry).after_backward(seen(geometry), 64, 64)
     torch.save(geometry.state_dict(), tmp_path / "c.pt")
     other = GaussianCloud({"sh_degree": 2, "prior_type": "no-such-prior"})
     other.load_state_dict(torch.load(tmp_path / "c.pt", weights_only=True))
@@ -166,11 +167,11 @@ def test_densification_happens_at_its_steps_only_and_the_optimiser_follows(spher
     optimizer = torch.optim.Adam(geometry.parameter_groups())
     sizes = []
     for step in range(1, 13):
-        geometry.observe(seen(geometry), 64, 64)
+        DensityControl(geometry).after_backward(seen(geometry), 64, 64)
         sum((p**2).sum() for p in geometry.parameters()).backward()
         optimizer.step()
         optimizer.zero_grad()
-        geometry.after_step(optimizer, step)
+        DensityControl(geometry).after_step(optimizer, step)
         sizes.append(len(geometry))
     assert sizes == [400] * 3 + [800] * 4 + [1600] * 5
     assert optimizer.param_groups[0]["params"][0] is geometry.means
@@ -199,7 +200,7 @@ def test_a_densification_that_selects_nobody_changes_nothing(sphere_points):
             sum((p**2).sum() for p in geometry.parameters()).backward()
             optimizer.step()
             optimizer.zero_grad()
-            geometry.after_step(optimizer, step)
+            DensityControl(geometry).after_step(optimizer, step)
     assert all(
         torch.equal(a, b) for a, b in zip(plain.parameters(), idle.parameters(), strict=True)
     )
@@ -221,7 +222,7 @@ def test_the_rasteriser_collects_absolute_gradients_where_they_decide(sphere_poi
         24,
     )
     (out["comp_rgb"] ** 2).mean().backward()
-    geometry.observe(out["rasterized"], 40, 24)
+    DensityControl(geometry).after_backward(out["rasterized"], 40, 24)
     means2d = out["rasterized"].means2d
     assert hasattr(means2d, "absgrad") == absgrad
     expected = screen_gradients(means2d.absgrad if absgrad else means2d.grad, 40, 24).sum(0)

@@ -2,7 +2,7 @@
 and its statistics.
 
 A change of the cloud is a :class:`Change`: for every new row the old row that it comes from, and
-whether it is fresh. Applying it to the parameters, the optimiser's moments and the statistics is
+whether it is is_new. Applying it to the parameters, the optimiser's moments and the statistics is
 then one gather each, so the moments of a Gaussian follow it whatever happens around it.
 
 Statistics are per view and unscaled. ``gradient`` is the norm of the loss's gradient with respect
@@ -37,7 +37,7 @@ class Change(NamedTuple):
 
     parents: Int[Tensor, " M"]
     """The old row of each new Gaussian."""
-    fresh: Bool[Tensor, " M"]
+    is_new: Bool[Tensor, " M"]
     """True where the Gaussian is new: its optimiser rows start at zero."""
     values: dict[str, Tensor]
     """The new parameters, (M, ...) each."""
@@ -87,26 +87,30 @@ def densify_and_prune(
     Faint ones don't grow, and the room that they leave under the cap is given to others in the same
     round."""
     faint = torch.sigmoid(params["logit_opacities"].detach()) < rules.min_opacity
-    hot = (stats.gradient > rules.grad_threshold) & ~faint
-    hot &= _affordable(hot, stats.gradient, rules.max_gaussians - int((~faint).sum()))
+    above_threshold = (stats.gradient > rules.grad_threshold) & ~faint
+    above_threshold &= _affordable(
+        above_threshold, stats.gradient, rules.max_gaussians - int((~faint).sum())
+    )
     large = params["log_scales"].exp().amax(-1) > rules.split_scale
-    grown = grow(params, clone=hot & ~large, split=hot & large, rng=rng)
+    grown = grow(params, clone=above_threshold & ~large, split=above_threshold & large, rng=rng)
     huge = grown.values["log_scales"].exp().amax(-1) > rules.max_scale
     return keep(grown, ~(faint[grown.parents] | huge), stats.contribution[grown.parents], rules)
 
 
 def _affordable(
-    hot: Bool[Tensor, " N"], gradient: Float[Tensor, " N"], room: int
+    above_threshold: Bool[Tensor, " N"], gradient: Float[Tensor, " N"], room: int
 ) -> Bool[Tensor, " N"]:
-    """The hot rows with the largest gradients that fit into ``room`` more Gaussians (each adds
+    """The above_threshold rows with the largest gradients that fit into ``room`` more Gaussians (each adds
     exactly one).
     """
-    if int(hot.sum()) <= room:
-        return hot
+    if int(above_threshold.sum()) <= room:
+        return above_threshold
     order = torch.argsort(
-        torch.where(hot, gradient, torch.full_like(gradient, -1.0)), descending=True, stable=True
+        torch.where(above_threshold, gradient, torch.full_like(gradient, -1.0)),
+        descending=True,
+        stable=True,
     )
-    chosen = torch.zeros_like(hot)
+    chosen = torch.zeros_like(above_threshold)
     chosen[order[: max(room, 0)]] = True
     return chosen
 
@@ -124,7 +128,7 @@ def grow(
     rows = torch.arange(len(clone), device=clone.device)
     stay, clones, splits = rows[~split], rows[clone], rows[split]
     parents = torch.cat([stay, clones, splits, splits])
-    fresh = torch.arange(len(parents), device=clone.device) >= len(stay)
+    is_new = torch.arange(len(parents), device=clone.device) >= len(stay)
     values = {name: value.detach()[parents].clone() for name, value in params.items()}
     children = slice(len(stay) + len(clones), None)
     offsets = (
@@ -133,7 +137,7 @@ def grow(
     )
     values["means"][children] += rotate(values["quats"][children], offsets)
     values["log_scales"][children] -= torch.log(torch.tensor(SPLIT_SHRINK))
-    return Change(parents, fresh, values)
+    return Change(parents, is_new, values)
 
 
 def keep(
@@ -159,7 +163,7 @@ def keep(
     rows = rank[:count].sort().values
     return Change(
         change.parents[rows],
-        change.fresh[rows],
+        change.is_new[rows],
         {name: value[rows] for name, value in change.values.items()},
     )
 
@@ -173,7 +177,7 @@ def prune_to(params: Mapping[str, Tensor], scores: Float[Tensor, " N"], count: i
         {name: value.detach().clone() for name, value in params.items()},
     )
     rules = Rules(max_gaussians=count, min_gaussians=min(count, len(rows)))
-    return keep(everything, torch.ones_like(everything.fresh), scores, rules)
+    return keep(everything, torch.ones_like(everything.is_new), scores, rules)
 
 
 def rotate(quats: Float[Tensor, "N 4"], vectors: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
@@ -190,7 +194,7 @@ def update_optimizer(
     change: Change,
 ) -> None:
     """Put the ``new`` parameters in the place of the ``old``; moments follow their Gaussian, those
-    of fresh ones are zero.
+    of is_new ones are zero.
     """
     replaced = {id(old[name]): new[name] for name in new}
     for group in optimizer.param_groups:
@@ -216,5 +220,5 @@ def _rows(value: object, old: nn.Parameter, change: Change) -> object:
     if not isinstance(value, Tensor) or value.shape != old.shape:
         return value
     rows = value[change.parents]
-    rows[change.fresh] = 0
+    rows[change.is_new] = 0
     return rows

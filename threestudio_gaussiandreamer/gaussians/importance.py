@@ -128,5 +128,5 @@ def pruned(
     return (
         change
         if first is None
-        else Change(first.parents[change.parents], first.fresh[change.parents], change.values)
+        else Change(first.parents[change.parents], first.is_new[change.parents], change.values)
     )

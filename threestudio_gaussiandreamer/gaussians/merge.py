@@ -47,7 +47,7 @@ class _Shapes(NamedTuple):
 
 
 def merge_duplicates(params: Mapping[str, Tensor], *, at_least: int = 1) -> Change:
-    """The cloud without duplicates; merged Gaussians are fresh, and come from the first of their
+    """The cloud without duplicates; merged Gaussians are new, and come from the first of their
     pair.
 
     Args:
@@ -164,13 +164,13 @@ def _merged(
     for name, merged in _together(values, pairs).items():
         values[name][pairs[:, 0].to(device)] = merged.to(values[name])
     spent[pairs[:, 0]] = costs
-    fresh, stay = (
-        change.fresh.clone(),
+    is_new, stay = (
+        change.is_new.clone(),
         torch.ones(len(change.parents), dtype=torch.bool, device=device),
     )
-    fresh[pairs[:, 0].to(device)], stay[pairs[:, 1].to(device)] = True, False
+    is_new[pairs[:, 0].to(device)], stay[pairs[:, 1].to(device)] = True, False
     left = Change(
-        change.parents[stay], fresh[stay], {name: value[stay] for name, value in values.items()}
+        change.parents[stay], is_new[stay], {name: value[stay] for name, value in values.items()}
     )
     return left, spent[stay.cpu()]
 

@@ -42,28 +42,26 @@ keep_attributes     with gaussians-prior: start from all attributes of that clou
 import contextlib
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, List, Optional
+from typing import Any, List
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from ..core.distributed import all_max, all_sum
 from ..core.errors import UserError, unknown
 from ..core.nested import adopt_nested
-from ..core.streams import generator, numpy_generator
-from ..gaussians import densify, sh, simplify
-from ..gaussians import importance as parsimony
-from ..gaussians.densify import LOG_SCALE_RANGE, PARAMETERS, Change, Rules, Statistics
+from ..core.streams import numpy_generator
+from ..gaussians import densify, importance, sh, simplify
+from ..gaussians.densify import LOG_SCALE_RANGE, PARAMETERS, Change
 from ..gaussians.gaussians import Gaussians
 from ..gaussians.grow import SCALE_RULES, grow, nearest_distance_scales
 from ..gaussians.merge import merge_duplicates
 from ..gaussians.point_cloud import PointCloud
 from ..host import BaseGeometry, C, find, register, run_seed, validate_schedule
-from ..splatting import Rasterized
+from .density import AUTO, min_count
 
 logger = logging.getLogger(__name__)
 STATISTICS = ("gradient_sum", "gradient_count", "contribution", "removal")
@@ -75,10 +73,8 @@ LEARNING_RATES = {
     "sh0": "lr_sh",
     "sh_rest": "lr_sh_rest",
 }
-AUTO = "auto"
 CAP_VIEWS = (32, 256)
 """How many views a trained cloud that is too large is judged by, and their pixels each way."""
-Holds = Callable[[Bool[Tensor, " N"]], bool]
 
 
 @dataclass
@@ -302,7 +298,7 @@ class GaussianCloud(BaseGeometry):
         """One Gaussian in the place of those that show the same, as far as the budget asks for
         fewer.
         """
-        merged = merge_duplicates(self.parameters_by_name(), at_least=self._fewest()).values
+        merged = merge_duplicates(self.parameters_by_name(), at_least=min_count(self.cfg)).values
         if len(merged["means"]) < len(self):
             logger.info(
                 "%d of %d Gaussians are duplicates of others: merged",
@@ -448,158 +444,12 @@ class GaussianCloud(BaseGeometry):
 
     @property
     def wants_absgrad(self) -> bool:
-        """Whether :meth:`observe` reads absolute gradients, which the rasteriser then has to
-        collect.
-        """
+        """Whether densification reads absolute gradients, which the rasteriser then collects."""
         return self.cfg.densify.enabled and self.cfg.densify.absgrad
 
-    def observe(self, out: Rasterized, width: int, height: int, loss_scale: float = 1.0) -> None:
-        """Add one step's contributions, and for densification its screen-space gradients, to the
-        statistics.
-        """
-        if out.means2d.grad is not None and self.cfg.densify.enabled:
-            pixels = out.means2d.absgrad if self.wants_absgrad else out.means2d.grad
-            self.gradient_sum += all_sum(
-                densify.screen_gradients(pixels, width, height, loss_scale).sum(0)
-            )
-            self.gradient_count += all_sum((out.radii > 0).sum(0))
-        torch.maximum(self.contribution, all_max(out.contribution.amax(0)), out=self.contribution)
-
-    def _samples_removal(self, step: int) -> bool:
-        """Whether a round of pruning to come asks for a sample of the removal error, after ``step``
-        finished steps.
-        """
-        cfg, rounds = self.cfg.prune, self.prune_rounds
-        if (
-            self.cfg.budget is None
-            or cfg.score != "removal"
-            or not rounds
-            or not rounds[0] - cfg.every <= step < rounds[-1]
-        ):
-            return False
-        return (
-            len(self) > self._fewest() and step % max(1, round(cfg.every / parsimony.SAMPLES)) == 0
-        )
-
-    def sample_removal(self, pictures: dict[str, Any], step: int) -> None:
-        """Add a sample of the removal error in these renders, before their losses, where a round of
-        pruning will ask for it.
-        """
-        if not self._samples_removal(step):
-            return
-        rng = generator(run_seed(), "removal", step)
-        behind = torch.rand(len(pictures["comp_rgb"]), 1, 1, 3, generator=rng).to(
-            pictures["comp_rgb"]
-        )
-        # before a colour of its own each view shows those too that have the colour of the run's
-        # background
-        images = pictures["comp_rgb"] + (1 - pictures["opacity"]) * (
-            behind - pictures["comp_rgb_bg"].detach()
-        )
-        self.removal += all_sum(
-            parsimony.removal_error(images, pictures["gaussian_opacities"], rng)
-        )
-        if self.wants_absgrad:
-            pictures[
-                "rasterized"
-            ].means2d.absgrad.zero_()  # what this backward pass has added isn't the loss's
-
-    def after_step(
-        self, optimizer: torch.optim.Optimizer, step: int, holds: Optional[Holds] = None
-    ) -> bool:
-        """Densify and prune where their schedules say so; True if the cloud was replaced.
-
-        A densification that neither makes nor drops a Gaussian only begins its statistics anew: the
-          next pruning ranks by what it
-        would have seen without it.
-
-        Args:
-            step: finished optimiser steps.
-            holds: for ``budget: auto``: whether the quality holds when only the marked Gaussians
-                are drawn.
-        """
-        change = None
-        if self.cfg.densify.enabled and step in rounds_of(self.cfg.densify):
-            change = self.densified(step)
-            if not change.fresh.any() and len(change.parents) == len(self):
-                change = None
-            self.gradient_sum.zero_()
-            self.gradient_count.zero_()
-        if self.cfg.budget is not None and step in self.prune_rounds:
-            change = self.pruned(step, change, holds)
-        if change is not None:
-            self.apply_change(change, optimizer)
-        return change is not None
-
-    def densified(self, step: int) -> Change:
-        """Clone, split and drop; under a budget the cloud doesn't grow beyond it, or beyond what it
-        still has.
-        """
-        cfg, cap = self.cfg.densify, self.cfg.max_gaussians
-        if self.cfg.budget is not None:
-            cap = min(
-                cap, len(self) if self.cfg.budget == AUTO else max(self.cfg.budget, len(self))
-            )
-        rules = Rules(
-            cfg.grad_threshold,
-            cfg.split_scale,
-            cfg.min_opacity,
-            cfg.max_scale,
-            cap,
-            self.cfg.min_gaussians,
-        )
-        stats = Statistics(self.gradient_sum / self.gradient_count.clamp_min(1), self.contribution)
-        return densify.densify_and_prune(
-            self.parameters_by_name(), stats, rules, generator(run_seed(), "split", step)
-        )
-
-    def pruned(self, step: int, first: Optional[Change], holds: Optional[Holds]) -> Change:
-        """One round towards the budget, after the change ``first`` if there is one."""
-        cfg, values = self.cfg.prune, self.parameters_by_name() if first is None else first.values
-        rows = slice(None) if first is None else first.parents
-        seen = parsimony.Seen(self.contribution[rows], self.removal[rows])
-        scores = parsimony.score(
-            cfg.score, values["logit_opacities"], seen, generator(run_seed(), "prune", step)
-        )
-        count = parsimony.next_count(
-            len(scores), self.kept_share(len(scores), step), self._fewest()
-        )
-        if self.cfg.budget == AUTO and (first is not None or holds is None):
-            count = len(scores)  # what densification made has been seen in no view yet
-        elif self.cfg.budget == AUTO:
-            tops = parsimony.top_count(seen.contribution) if cfg.score == "contribution" else 0
-            count = parsimony.smallest_count(scores, max(count, tops), holds)
-        return parsimony.pruned(values, scores, count, first)
-
-    @property
-    def prune_rounds(self) -> range:
-        """The numbers of finished steps after which a round of pruning is due."""
-        rounds = rounds_of(self.cfg.prune)
-        return rounds[len(rounds) // 2 :] if self.cfg.budget == AUTO else rounds
-
-    def kept_share(self, count: int, step: int) -> float:
-        """The share of ``count`` Gaussians that the round at ``step`` keeps: ``prune.keep``, or
-        what meets the budget with the last one.
-        """
-        left = sum(later >= step for later in self.prune_rounds)
-        if self.cfg.budget in (None, AUTO) or not left:
-            return self.cfg.prune.keep
-        return min(self.cfg.prune.keep, (self._fewest() / max(count, 1)) ** (1 / left))
-
-    @property
-    def affordable(self) -> float:
-        """dB that one round of ``auto`` may lose: none is sure to be won back, so all together lose
-        ``prune.quality`` at most.
-        """
-        return self.cfg.prune.quality / max(1, len(self.prune_rounds))
-
-    def _fewest(self) -> int:
-        """How many Gaussians pruning leaves at least."""
-        return max(self.cfg.min_gaussians, 0 if self.cfg.budget == AUTO else self.cfg.budget)
-
     @contextlib.contextmanager
-    def only(self, kept: Bool[Tensor, " N"]) -> Iterator[None]:
-        """Draws only the marked Gaussians: the others are too faint for any pixel."""
+    def showing_only(self, kept: Bool[Tensor, " N"]) -> Iterator[None]:
+        """Draw only the marked Gaussians in this context; the others get no opacity."""
         logits = self.logit_opacities.detach().clone()
         with torch.no_grad():
             self.logit_opacities[~kept] = -100.0
@@ -610,8 +460,8 @@ class GaussianCloud(BaseGeometry):
                 self.logit_opacities.copy_(logits)
 
     def apply_change(self, change: Change, optimizer: torch.optim.Optimizer) -> None:
-        """Replace the cloud by ``change`` and move the optimiser's rows along; the statistics start
-        anew.
+        """Replace the cloud by ``change``, move the optimiser's rows along and clear the
+        statistics.
         """
         old = self.parameters_by_name()
         new = {name: nn.Parameter(value) for name, value in change.values.items()}
@@ -647,8 +497,8 @@ def _check_budget(cfg: Any, where: str) -> None:
             f"{where}.budget: expected none, auto or a number from min_gaussians "
             f"({cfg.min_gaussians}) on, got {budget!r}"
         )
-    if prune.score not in parsimony.SCORES:
-        raise unknown(f"{where}.prune.score", prune.score, parsimony.SCORES)
+    if prune.score not in importance.SCORES:
+        raise unknown(f"{where}.prune.score", prune.score, importance.SCORES)
     if not 0 < prune.keep < 1:
         raise UserError(f"{where}.prune.keep: expected a share between 0 and 1, got {prune.keep}")
     for name, least in (("start", 0), ("every", 1), ("quality", 0), ("likeness", 0)):
@@ -656,15 +506,6 @@ def _check_budget(cfg: Any, where: str) -> None:
             raise UserError(f"{where}.prune.{name}: expected {least} or more, got {prune[name]}")
     if prune.start >= prune.stop:
         raise UserError(f"{where}.prune: expected start < stop, got {prune.start} and {prune.stop}")
-
-
-def rounds_of(schedule: Any) -> range:
-    """The steps at which a schedule with ``start``, ``stop`` and ``every`` has a round: the
-    multiples of ``every``.
-    """
-    return range(
-        math.ceil(schedule.start / schedule.every) * schedule.every, schedule.stop, schedule.every
-    )
 
 
 def _nested(cfg: Any, dotted: str) -> Any:

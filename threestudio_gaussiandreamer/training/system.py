@@ -26,18 +26,17 @@ prune          a budget that the export is made for once more: count, bytes (of 
 
 import contextlib
 import inspect
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Optional
+from typing import Any, Optional
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from ..core.distributed import all_sum, average_gradients
+from ..core.distributed import average_gradients
 from ..core.errors import UserError, unknown
 from ..core.nested import adopt_nested
 from ..exporters.base import gaussian_arrays
@@ -61,6 +60,7 @@ from ..metrics import psnr
 from ..priors.cache import cached_cloud
 from ..prune.command import PruneOptions, pruned, write_report
 from .background import FlatBackground
+from .density import DensityControl, DensityOutcome, RenderedQuality
 from .events import log_picture, log_scores
 from .finite import CHECK_EVERY, optimizer_tensors, require_finite
 from .held_out import EvaluationConfig, HeldOut, Measurements
@@ -69,14 +69,6 @@ REGULARISERS = ("sparsity", "opaque")
 GUIDANCE_LR = (
     1e-4  # of what a guidance trains itself, such as the LoRA of variational score distillation
 )
-
-
-class Price(NamedTuple):
-    """What a round of ``auto`` costs: Gaussians before and after, and dB by their name in the logs."""
-
-    before: int
-    after: int
-    measured: dict[str, float]
 
 
 @register("gaussiandreamer-system")
@@ -130,6 +122,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
     def configure(self) -> None:
         self.Config.check(self.cfg)
         super().configure()
+        self.density = DensityControl(self.geometry)
         self.automatic_optimization = False
         self.__dict__["guidance"] = self.measurements = None
         self.skipped_steps = 0
@@ -206,7 +199,9 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     def on_train_start(self) -> None:
         self.require_finite()
-        self.warn_of_a_tight_schedule()
+        problem = self.density.schedule_problem(self.global_step, self.trainer.max_steps)
+        if problem:
+            warn(problem)
         if self.global_step == 0:
             self.score("prior")
         if self.measurements:
@@ -229,44 +224,6 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             size = views["height"] // downsample, views["width"] // downsample
             cast(views["c2w"].to(self.device), views["fovy"].to(self.device), *size)
 
-    def warn_of_a_tight_schedule(self) -> None:
-        """Say that a budget won't be met by the rounds of pruning that this run has, or only in
-        larger ones than they should be.
-        """
-        geometry, end = (
-            self.geometry,
-            self.trainer.max_steps if self.trainer.max_steps > 0 else math.inf,
-        )
-        budget, rounds = geometry.cfg.budget, geometry.prune_rounds
-        if budget is None:
-            return
-        to_come = [step for step in rounds if self.global_step < step <= end]
-        late = sum(step > end for step in rounds)
-        too_many = isinstance(budget, int) and len(geometry) > budget
-        if late:
-            warn(
-                f"{late} of the {len(rounds)} rounds of pruning would come after step {end}, "
-                "the last:"
-                " give system.geometry.prune.start, stop and every to match"
-            )
-        elif too_many and not to_come:
-            warn(
-                f"no round of pruning is to come, so that {len(geometry)} Gaussians stay, not "
-                f"{budget}:"
-                " give system.geometry.prune.start, stop and every to match"
-            )
-        elif (
-            too_many
-            and (share := geometry.kept_share(len(geometry), to_come[0]))
-            < geometry.cfg.prune.keep - 0.005
-        ):
-            warn(
-                f"{len(to_come)} rounds of pruning have to lead from {len(geometry)} Gaussians "
-                f"to {budget}:"
-                f" each keeps {share:.2f} instead of {geometry.cfg.prune.keep:g}, which costs more;"
-                " give more rounds (system.geometry.prune.every) or start with fewer"
-            )
-
     # -- one step ----------------------------------------------------------------------------------
 
     def forward(self, batch: dict[str, Any]) -> dict[str, Any]:
@@ -276,7 +233,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         optimizer = self.optimizers()
         self.set_learning_rates(optimizer)
         out = self(batch)
-        self.geometry.sample_removal(out, self.global_step)
+        self.density.before_backward(out, self.global_step)
         losses = self.losses(out, batch)
         loss = torch.stack(list(losses.values())).sum()
         self.manual_backward(loss)
@@ -284,7 +241,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             parameter for group in optimizer.param_groups for parameter in group["params"]
         )
         loss_scale = self.loss_scale()
-        self.geometry.observe(out["rasterized"], batch["width"], batch["height"], loss_scale)
+        self.density.after_backward(out["rasterized"], batch["width"], batch["height"], loss_scale)
         optimizer.step()
         if self.loss_scale() < loss_scale:
             self.count_skipped_step(loss_scale)
@@ -292,65 +249,28 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             self.require_finite()
         optimizer.zero_grad(set_to_none=True)
         # self.optimizers() wraps the torch optimiser, whose rows have to follow the Gaussians
-        prices: list[Price] = []
-        self.geometry.after_step(
+        outcome = self.density.after_step(
             optimizer.optimizer,
             self.global_step,
-            lambda kept: self.quality_holds(kept, batch, prices),
+            RenderedQuality(
+                self.density, lambda: self(batch), lambda pictures: self.truth(batch, pictures)
+            ),
         )
-        self.tell(prices)
+        self.log_density(outcome)
         self.report(out, batch, losses, loss)
 
-    @torch.no_grad()
-    def quality_holds(
-        self, kept: Bool[Tensor, " N"], batch: dict[str, Any], prices: list[Price]
-    ) -> bool:
-        """Whether this batch looks nearly the same with only the ``kept`` Gaussians: for
-        ``system.geometry.budget=auto``.
-
-        Where the guidance knows the truth, the loss of dB against it is measured; elsewhere how
-        like the renders are. What was measured of those with which it holds goes to ``prices``."""
-        all_of_them = self(batch)
-        with self.geometry.only(kept):
-            fewer = self(batch)["comp_rgb"]
-        truth = self.truth(batch, all_of_them)
-        if truth is None:
-            likeness, asked = (
-                psnr(fewer, all_of_them["comp_rgb"]).mean(),
-                self.geometry.cfg.prune.likeness,
-            )
-            margin, found = (
-                likeness - asked,
-                {"prune/likeness": float(likeness), "prune/asked_for": asked},
-            )
-        else:
-            loss, affordable = (
-                (psnr(all_of_them["comp_rgb"], truth) - psnr(fewer, truth)).mean(),
-                self.geometry.affordable,
-            )
-            margin, found = (
-                affordable - loss,
-                {"prune/lost": float(loss), "prune/affordable": affordable},
-            )
-        holds = bool(
-            all_sum(margin) >= 0
-        )  # every process looks at other views, and all have to decide alike
-        prices += [Price(len(kept), int(kept.sum()), found)] if holds else []
-        return holds
-
-    def tell(self, prices: list[Price]) -> None:
-        """Log and print what a round of ``auto`` cost: the last of a search is the one that was
-        made.
-        """
-        for before, after, measured in prices[-1:]:
-            self.log_dict(measured)
-            told = ", ".join(
-                f"{name.partition('/')[2]} {value:.3g}" for name, value in measured.items()
-            )
-            info(
-                f"step {self.global_step}: {before} -> {after} Gaussians; dB on the views of "
-                f"this step: {told}"
-            )
+    def log_density(self, outcome: DensityOutcome) -> None:
+        """Log and print what a round of ``budget: auto`` cost."""
+        if not outcome.measured:
+            return
+        self.log_dict(outcome.measured)
+        costs = ", ".join(
+            f"{name.partition('/')[2]} {value:.3g}" for name, value in outcome.measured.items()
+        )
+        info(
+            f"step {self.global_step}: {outcome.before} -> {outcome.after} Gaussians; dB on the "
+            f"views of this step: {costs}"
+        )
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
         for part in (self.geometry, self.background):

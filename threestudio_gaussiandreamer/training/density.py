@@ -1,0 +1,340 @@
+"""Density control: clone, split and drop Gaussians while the cloud is trained.
+
+As gsplat's ``Strategy``, one object is called around every optimiser step:
+
+    control = DensityControl(cloud)
+    pictures = renderer(**batch)
+    control.before_backward(pictures, step)                    samples the removal error
+    loss.backward()
+    control.after_backward(rasterized, width, height)          adds to the statistics
+    optimizer.step()
+    outcome = control.after_step(optimizer, step + 1, check)   densifies and prunes when it is due
+
+``step`` counts finished optimiser steps. The statistics are buffers of the cloud, so that they are
+in its checkpoint. What is cloned and split: ``gaussians/densify.py``; what is dropped to meet a
+budget: ``gaussians/importance.py``; the options: ``geometry.py``.
+"""
+
+import math
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, NamedTuple, Optional
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..core.distributed import all_max, all_sum
+from ..core.streams import generator
+from ..gaussians import densify, importance
+from ..gaussians.densify import Change, Rules, Statistics
+from ..host import run_seed
+from ..metrics import psnr
+from ..splatting import Rasterized
+
+AUTO = "auto"
+
+
+class QualityResult(NamedTuple):
+    """How one batch of views looks without some of the Gaussians."""
+
+    margin: Float[Tensor, ""]
+    """dB between what is lost and what may be lost; negative where too much is."""
+    measured: dict[str, float]
+    """dB by their name in the logs."""
+
+
+QualityCheck = Callable[[Bool[Tensor, " N"]], QualityResult]
+"""Measures the quality with only the marked Gaussians."""
+
+
+class DensityOutcome(NamedTuple):
+    """What :meth:`DensityControl.after_step` did."""
+
+    before: int
+    after: int
+    """Gaussians."""
+    replaced: bool
+    """Whether the cloud has new parameters."""
+    measured: dict[str, float]
+    """dB that a round of ``budget: auto`` cost, by their name in the logs; empty for any other."""
+
+
+class DensityControl:
+    """Densification and pruning of one cloud.
+
+    Args:
+        cloud: a :class:`.geometry.GaussianCloud`, whose ``cfg`` has the options ``densify``,
+            ``prune``, ``budget``, ``min_gaussians`` and ``max_gaussians``, and whose buffers are
+            the statistics.
+    """
+
+    def __init__(self, cloud: Any) -> None:
+        self.cloud, self.cfg = cloud, cloud.cfg
+
+    # -- schedules ---------------------------------------------------------------------------------
+
+    @property
+    def prune_rounds(self) -> range:
+        """The numbers of finished steps after which a round of pruning is due."""
+        rounds = rounds_of(self.cfg.prune)
+        return rounds[len(rounds) // 2 :] if self.cfg.budget == AUTO else rounds
+
+    def kept_share(self, count: int, step: int) -> float:
+        """Return the share of ``count`` Gaussians that the round at ``step`` keeps: ``prune.keep``,
+        or less where the remaining rounds couldn't meet the budget otherwise.
+        """
+        left = sum(later >= step for later in self.prune_rounds)
+        if self.cfg.budget in (None, AUTO) or not left:
+            return self.cfg.prune.keep
+        return min(self.cfg.prune.keep, (min_count(self.cfg) / max(count, 1)) ** (1 / left))
+
+    @property
+    def affordable_loss(self) -> float:
+        """dB that one round of ``auto`` may lose: since later steps may not recover it, all rounds
+        together lose at most ``prune.quality``.
+        """
+        return self.cfg.prune.quality / max(1, len(self.prune_rounds))
+
+    def schedule_problem(self, step: int, max_steps: int) -> Optional[str]:
+        """Describe why the budget won't be met by the rounds between ``step`` and ``max_steps``
+        (-1: no end), or only in larger rounds than ``prune.keep``; None where it is met.
+        """
+        end = max_steps if max_steps > 0 else math.inf
+        budget, rounds, count = self.cfg.budget, self.prune_rounds, len(self.cloud)
+        if budget is None:
+            return None
+        late = sum(round_ > end for round_ in rounds)
+        if late:
+            return (
+                f"{late} of the {len(rounds)} rounds of pruning would come after step {end}, the "
+                "last: give system.geometry.prune.start, stop and every to match"
+            )
+        if budget == AUTO or count <= budget:
+            return None
+        return self._shortage([round_ for round_ in rounds if step < round_ <= end])
+
+    def _shortage(self, to_come: list[int]) -> Optional[str]:
+        """Describe why these rounds are too few for the budget; None where they aren't."""
+        budget, keep, count = self.cfg.budget, self.cfg.prune.keep, len(self.cloud)
+        if not to_come:
+            return (
+                f"no round of pruning is to come, so that {count} Gaussians stay, not {budget}: "
+                "give system.geometry.prune.start, stop and every to match"
+            )
+        share = self.kept_share(count, to_come[0])
+        if share >= keep - 0.005:
+            return None
+        return (
+            f"{len(to_come)} rounds of pruning have to lead from {count} Gaussians to {budget}: "
+            f"each keeps {share:.2f} instead of {keep:g}, which costs more; give more rounds "
+            "(system.geometry.prune.every) or start with fewer"
+        )
+
+    # -- statistics --------------------------------------------------------------------------------
+
+    def before_backward(self, pictures: dict[str, Any], step: int) -> None:
+        """Add a sample of the removal error in these renders to the statistics, if the next round
+        of pruning uses it; ``step`` counts the steps finished before this one.
+        """
+        if not self.samples_removal(step):
+            return
+        rng = generator(run_seed(), "removal", step)
+        image, opacity = pictures["comp_rgb"], pictures["opacity"]
+        # Composite over a random background per view, so that Gaussians of the background's colour
+        # still have a removal error.
+        random = torch.rand(len(image), 1, 1, 3, generator=rng).to(image)
+        image = image + (1 - opacity) * (random - pictures["comp_rgb_bg"].detach())
+        self.cloud.removal += all_sum(
+            importance.removal_error(image, pictures["gaussian_opacities"], rng)
+        )
+        if self.cloud.wants_absgrad:
+            # the sample's backward pass has added to it, and the statistics are of the loss
+            pictures["rasterized"].means2d.absgrad.zero_()
+
+    def samples_removal(self, step: int) -> bool:
+        """Return whether a sample of the removal error is due after ``step`` finished steps."""
+        cfg, rounds = self.cfg.prune, self.prune_rounds
+        if self.cfg.budget is None or cfg.score != "removal" or not rounds:
+            return False
+        if not rounds[0] - cfg.every <= step < rounds[-1] or len(self.cloud) <= min_count(self.cfg):
+            return False
+        return step % max(1, round(cfg.every / importance.SAMPLES)) == 0
+
+    def after_backward(
+        self, out: Rasterized, width: int, height: int, loss_scale: float = 1.0
+    ) -> None:
+        """Add one step's contributions, and for densification its screen-space gradients, to the
+        statistics.
+
+        Args:
+            out: what was rendered, with gradients at ``means2d``.
+            width, height: pixels.
+            loss_scale: the factor of automatic mixed precision on the gradients.
+        """
+        cloud = self.cloud
+        if out.means2d.grad is not None and self.cfg.densify.enabled:
+            pixels = out.means2d.absgrad if cloud.wants_absgrad else out.means2d.grad
+            cloud.gradient_sum += all_sum(
+                densify.screen_gradients(pixels, width, height, loss_scale).sum(0)
+            )
+            cloud.gradient_count += all_sum((out.radii > 0).sum(0))
+        torch.maximum(cloud.contribution, all_max(out.contribution.amax(0)), out=cloud.contribution)
+
+    # -- changes of the cloud ----------------------------------------------------------------------
+
+    def after_step(
+        self, optimizer: torch.optim.Optimizer, step: int, check: Optional[QualityCheck] = None
+    ) -> DensityOutcome:
+        """Densify and prune where the schedules say so.
+
+        Args:
+            optimizer: its parameters and state rows follow the Gaussians.
+            step: finished optimiser steps.
+            check: for ``budget: auto``; without it nothing is pruned then.
+        """
+        before, measured = len(self.cloud), {}
+        change = self._densify(step)
+        if self.cfg.budget is not None and step in self.prune_rounds:
+            change, measured = self._prune(step, change, check)
+        if change is not None:
+            self.cloud.apply_change(change, optimizer)
+        return DensityOutcome(before, len(self.cloud), change is not None, measured)
+
+    def _densify(self, step: int) -> Optional[Change]:
+        """Return the change of a due round of densification; None where nothing is cloned, split or
+        dropped.
+        """
+        if not self.cfg.densify.enabled or step not in rounds_of(self.cfg.densify):
+            return None
+        change = self.densified(step)
+        self.cloud.gradient_sum.zero_()
+        self.cloud.gradient_count.zero_()
+        return change if change.is_new.any() or len(change.parents) < len(self.cloud) else None
+
+    def densified(self, step: int) -> Change:
+        """Clone, split and drop by the statistics."""
+        cfg, cloud = self.cfg.densify, self.cloud
+        rules = Rules(
+            cfg.grad_threshold,
+            cfg.split_scale,
+            cfg.min_opacity,
+            cfg.max_scale,
+            self._cap(),
+            self.cfg.min_gaussians,
+        )
+        gradient = cloud.gradient_sum / cloud.gradient_count.clamp_min(1)
+        return densify.densify_and_prune(
+            cloud.parameters_by_name(),
+            Statistics(gradient, cloud.contribution),
+            rules,
+            generator(run_seed(), "split", step),
+        )
+
+    def _cap(self) -> int:
+        """Return how many Gaussians densification may lead to: under a budget no more than that, or
+        than there are.
+        """
+        budget, count = self.cfg.budget, len(self.cloud)
+        if budget is None:
+            return self.cfg.max_gaussians
+        return min(self.cfg.max_gaussians, count if budget == AUTO else max(budget, count))
+
+    def _prune(
+        self, step: int, first: Optional[Change], check: Optional[QualityCheck]
+    ) -> tuple[Change, dict[str, float]]:
+        """Make one round towards the budget, after the change ``first`` if there is one; returns
+        the change from the cloud as it is, and what ``auto`` measured.
+        """
+        cloud, cfg = self.cloud, self.cfg.prune
+        values = cloud.parameters_by_name() if first is None else first.values
+        rows = slice(None) if first is None else first.parents
+        seen = importance.Seen(cloud.contribution[rows], cloud.removal[rows])
+        rng = generator(run_seed(), "prune", step)
+        scores = importance.score(cfg.score, values["logit_opacities"], seen, rng)
+        share = self.kept_share(len(scores), step)
+        count, measured = importance.next_count(len(scores), share, min_count(self.cfg)), {}
+        if self.cfg.budget == AUTO and (first is not None or check is None):
+            count = len(scores)  # no view has shown what densification made
+        elif self.cfg.budget == AUTO:
+            top = importance.top_count(seen.contribution) if cfg.score == "contribution" else 0
+            count, measured = fewest_that_hold(scores, max(count, top), check)
+        return importance.pruned(values, scores, count, first), measured
+
+
+def fewest_that_hold(
+    scores: Float[Tensor, " N"], least: int, check: QualityCheck
+) -> tuple[int, dict[str, float]]:
+    """Find the fewest Gaussians, at least ``least``, with which the quality holds, and what was
+    measured with them (nothing where all stay).
+    """
+    measured: dict[int, dict[str, float]] = {}
+
+    def holds(kept: Bool[Tensor, " N"]) -> bool:
+        result = check(kept)
+        # every process renders other views, and all have to decide alike
+        if not all_sum(result.margin) >= 0:
+            return False
+        measured[int(kept.sum())] = result.measured
+        return True
+
+    count = importance.smallest_count(scores, least, holds)
+    return count, measured.get(count, {})
+
+
+class RenderedQuality:
+    """The :data:`QualityCheck` by renders of one batch of views: the loss of dB against the truth
+    where it is known, elsewhere the PSNR between the renders.
+
+    Args:
+        control: whose cloud is rendered, and whose options say what may be lost.
+        render: returns the renderer's pictures of the cloud as it is drawn now.
+        truth: returns what these pictures should show, (B, H, W, 3), or None.
+    """
+
+    def __init__(
+        self,
+        control: DensityControl,
+        render: Callable[[], dict[str, Any]],
+        truth: Callable[[dict[str, Any]], Optional[Tensor]],
+    ) -> None:
+        self.control, self.render, self._truth = control, render, truth
+
+    @cached_property
+    def whole(self) -> dict[str, Any]:
+        """The pictures with all Gaussians."""
+        return self.render()
+
+    @cached_property
+    def truth(self) -> Optional[Float[Tensor, "B H W 3"]]:
+        return self._truth(self.whole)
+
+    @torch.no_grad()
+    def __call__(self, kept: Bool[Tensor, " N"]) -> QualityResult:
+        """Render with only the ``kept`` Gaussians and compare."""
+        whole = self.whole["comp_rgb"]
+        with self.control.cloud.showing_only(kept):
+            fewer = self.render()["comp_rgb"]
+        if self.truth is None:
+            similarity, wanted = psnr(fewer, whole).mean(), self.control.cfg.prune.likeness
+            measured = {"prune/likeness": float(similarity), "prune/asked_for": wanted}
+            return QualityResult(similarity - wanted, measured)
+        loss = (psnr(whole, self.truth) - psnr(fewer, self.truth)).mean()
+        affordable = self.control.affordable_loss
+        measured = {"prune/lost": float(loss), "prune/affordable": affordable}
+        return QualityResult(affordable - loss, measured)
+
+
+def min_count(cfg: Any) -> int:
+    """Return how many Gaussians pruning leaves at least; ``cfg`` has ``min_gaussians`` and a
+    ``budget``.
+    """
+    return max(cfg.min_gaussians, 0 if cfg.budget == AUTO else cfg.budget)
+
+
+def rounds_of(schedule: Any) -> range:
+    """Return the steps at which a schedule with ``start``, ``stop`` and ``every`` has a round: the
+    multiples of ``every``.
+    """
+    first = math.ceil(schedule.start / schedule.every) * schedule.every
+    return range(first, schedule.stop, schedule.every)
