@@ -2,13 +2,16 @@
 cost no work.
 """
 
+import errno
 import json
 import math
+import os
 from types import SimpleNamespace
 
 import pytest
 import torch
 
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import (
     PRUNED,
     StoredCloud,
@@ -288,7 +291,7 @@ def test_gaussians_that_cannot_be_drawn_are_left_out(tmp_path, caplog):
     assert caplog.text.count("2 of 600 Gaussians hold NaN or infinity: left out") == 2
 
 
-@pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3])
+@pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3, 1e14])
 def test_clouds_in_other_units_look_alike(unit):
     """No plane of the camera cuts a cloud in millimetres away."""
     cloud = ball()
@@ -437,6 +440,73 @@ def test_a_folder_in_the_place_of_the_output_costs_no_work(source, tmp_path, cap
     (tmp_path / "out.ply").mkdir()
     assert prune.main([str(source), str(tmp_path / "out.ply"), "--count", "9"]) == 2
     assert "out.ply' can't be written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("ending", ["", ".json", ".png"])
+def test_a_folder_in_the_way_of_any_output_costs_no_work(
+    source, tmp_path, capsys, monkeypatch, ending
+):
+    monkeypatch.delattr(prune, "read")
+    (tmp_path / f"out.ply{ending}").mkdir()
+    assert prune.main([str(source), str(tmp_path / "out.ply"), "--count", "9"]) == 2
+    found = capsys.readouterr().err
+    assert found.startswith(f"error: OUT{ending}:") and "it is a folder" in found
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("a\0b.ply", "OUT: "),
+        ("x" * 300 + ".ply", "OUT: "),
+        ("x" * 249 + ".ply", "OUT.json: "),
+        ("none/out.ply", "OUT: there is no folder"),
+        ("in.ply/out.ply", "OUT: there is no folder"),
+    ],
+)
+def test_names_that_no_file_can_have_cost_no_work(
+    source, tmp_path, capsys, monkeypatch, name, said
+):
+    monkeypatch.delattr(prune, "read")
+    assert prune.main([str(source), f"{tmp_path}/{name}", "--count", "9"]) == 2
+    found = capsys.readouterr().err
+    assert found.startswith(f"error: {said}") and len(found) < 400 and len(found.splitlines()) == 1
+
+
+def test_the_report_replaces_a_link_and_does_not_follow_it(source, tmp_path):
+    (tmp_path / "precious").write_text("precious")
+    for ending in (".json", ".png"):
+        (tmp_path / f"out.ply{ending}").symlink_to(tmp_path / "precious")
+    run(source, tmp_path / "out.ply", "--count", "600")
+    assert (tmp_path / "precious").read_text() == "precious"
+    assert json.loads((tmp_path / "out.ply.json").read_text())["after"]["gaussians"] == 600
+
+
+def test_a_report_that_cannot_be_written_leaves_the_earlier_one(source, tmp_path, monkeypatch):
+    run(source, tmp_path / "out.ply", "--count", "600")
+    earlier = (tmp_path / "out.ply.json").read_text()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(UserError, match="No space left"):
+        prune.write_report(
+            str(tmp_path / "out.ply"),
+            prune.Pruned(*[read_cloud(str(source))] * 2, 0.0),
+            ".ply",
+            prune.PruneOptions(size=48),
+        )
+    assert (tmp_path / "out.ply.json").read_text() == earlier
+
+
+@pytest.mark.parametrize("log_scale", [40.0, 80.0, 200.0])
+def test_scales_too_large_to_render_are_named(tmp_path, capsys, log_scale):
+    cloud = ball()
+    cloud.log_scales[:] = log_scale
+    write_gaussians(tmp_path / "in.ply", **arrays_of(cloud))
+    assert prune.main([str(tmp_path / "in.ply"), str(tmp_path / "o.ply"), "--count", "9"]) == 2
+    found = capsys.readouterr().err
+    assert "the largest scale is" in found and "near" not in found
 
 
 def test_a_budget_is_needed_and_only_one(source, tmp_path, capsys):

@@ -100,6 +100,39 @@ def _shortened(name: str, size: int = 100) -> str:
     return name.encode(errors="surrogateescape")[:size].decode(errors="ignore")
 
 
+def require_writable(path: str | os.PathLike, what: str) -> None:
+    """Check that a file can be written under a name, before the work that makes its content.
+
+    Args:
+        path: the file, which need not exist; one that does will be replaced.
+        what: names it in messages.
+
+    Raises:
+        UserError: the name holds NUL or is too long, its folder is missing or can't be written, or
+            a folder has that name.
+    """
+    path = Path(path)
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"{what}: {_quoted(path)} can't be a file's name: {reason}") from error
+    if not path.parent.is_dir():
+        raise UserError(f"{what}: there is no folder {_quoted(path.parent)}")
+    if path.is_dir():
+        raise UserError(f"{what}: {_quoted(path)} can't be written: it is a folder")
+    if not os.access(path.parent, os.W_OK):
+        raise UserError(f"{what}: {_quoted(path)} can't be written: its folder is read-only")
+
+
+def _quoted(path: Path) -> str:
+    """Quote a path for a message, at most 100 characters of it."""
+    text = str(path)
+    return repr(text if len(text) <= 100 else f"{text[:80]}...")
+
+
 def _sync_folder(folder: Path) -> None:
     """Make the renaming itself durable, where the system lets a folder be opened (not on Windows)."""
     try:

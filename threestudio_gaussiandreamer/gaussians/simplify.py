@@ -43,8 +43,10 @@ EPS2D = 0.3
 """The screen-space dilation of viewers, square pixels."""
 NEAR = 0.01
 """The nearest depth that is drawn, in units of the cloud's radius: clouds come in millimetres and
-in kilometres.
+in kilometres. There is no farthest depth.
 """
+MAX_RADIUS = 1e15
+"""Of a cloud, in its units: squares of distances stay in float32's range."""
 
 
 class Views(NamedTuple):
@@ -108,8 +110,18 @@ def views_around(
     turns; other turns, other views.
 
     Each has a background of its own, so that no colour of a Gaussian can hide it, and its opacity
-    shows. ``to_z_up`` is the rotation from the cloud's axes to some with z up."""
+    shows. ``to_z_up`` is the rotation from the cloud's axes to some with z up.
+
+    Raises:
+        UserError: the cloud is too large to be rendered.
+    """
     centre, radius = bounds(cloud)
+    if not radius <= MAX_RADIUS:
+        raise UserError(
+            f"the Gaussians reach {radius:g} units from their centre, further than "
+            f"{MAX_RADIUS:g}, which float32 can't render: the largest scale is "
+            f"{float(cloud.log_scales.amax().exp()):g}; rescale them or remove the largest"
+        )
     index = torch.arange(count)
     elevation = torch.rad2deg(torch.asin(torch.linspace(-0.5, 0.9, count)))
     distance = radius / math.sin(FOVY / 2) * torch.tensor([1.0, 1.4])[index % 2]
@@ -146,7 +158,8 @@ def draw(
     )
     out = rasterize(
         cloud.means, cloud.quats, cloud.log_scales.exp(), opacities, colors, views.viewmats[rows], views.Ks[rows],
-        views.size, views.size, background=background, near=views.near, eps2d=views.eps2d, antialias=views.antialias,
+        views.size, views.size, background=background,
+        near=views.near, far=math.inf, eps2d=views.eps2d, antialias=views.antialias,
     )  # fmt: skip
     return out.image, out.contribution
 

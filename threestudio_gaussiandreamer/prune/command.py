@@ -33,7 +33,7 @@ from torch import Tensor
 
 from ..core.checkpoint_file import load_file
 from ..core.errors import UserError
-from ..core.files import existing_file
+from ..core.files import atomic_file, existing_file, require_writable
 from ..core.images import write as write_picture
 from ..formats.gaussian_files import (
     AXES,
@@ -83,6 +83,8 @@ CHECKPOINTS = {
     },
 }
 """Where the cloud is in a checkpoint of ours, and of gsplat's trainer."""
+REPORTS = (".json", ".png")
+"""What is written beside OUT: their names are OUT's and these endings."""
 BUDGETS = ("count", "bytes", "psnr", "within")
 LOSSES = (1e-3, 30.0)
 """What may be asked of ``within``, dB."""
@@ -226,11 +228,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     )
     options.check("--")
     suffix = require_format(args.output, "OUT")
-    folder = Path(args.output).parent
-    if not folder.is_dir():
-        raise UserError(f"OUT: there is no folder {str(folder)!r}")
-    if Path(args.output).is_dir() or not os.access(folder, os.W_OK):
-        raise UserError(f"OUT: {args.output!r} can't be written")
+    for ending in ("", *REPORTS):
+        require_writable(args.output + ending, f"OUT{ending}")
     if (
         Path(args.output).exists()
         and Path(args.source).exists()
@@ -533,7 +532,8 @@ def write_report(path: str, done: Pruned, suffix: str, options: PruneOptions) ->
         "met": done.met,
         "seconds": round(done.seconds, 1),
     }
-    Path(f"{path}.json").write_text(json.dumps(report | {"options": asdict(options)}, indent=2))
+    with atomic_file(f"{path}.json") as file:
+        file.write(json.dumps(report | {"options": asdict(options)}, indent=2).encode())
     write_picture(Path(f"{path}.png"), sheet([look(cloud, grey) for cloud in clouds]))
     for name, cost in zip(("before", "after"), costs, strict=True):
         print(
