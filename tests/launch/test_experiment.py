@@ -2,9 +2,11 @@
 mistakes, signals, resuming.
 """
 
+import contextlib
 import datetime
 import fcntl
 import os
+import pty
 import re
 import shlex
 import signal
@@ -21,7 +23,8 @@ import torch
 import threestudio_gaussiandreamer
 from tests.helpers import tiny_parts
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file, save_file
-from threestudio_gaussiandreamer.launch import run_folder
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch import callbacks, checkpoints, experiment, run_folder
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.experiment import main
 from threestudio_gaussiandreamer.launch.folder_lock import claim
@@ -233,7 +236,7 @@ def assert_same_training(a: Path, b: Path) -> None:
     assert all(torch.equal(state[i][key], other_state[i][key]) for i in state for key in state[i])
 
 
-@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
 @pytest.mark.parametrize("step", [0, 2, 4, 5])
 def test_stopped_and_resumed_equals_never_stopped(launch, name, code, step):
     # step 2 is followed by validation, step 5 is the last one
@@ -270,7 +273,7 @@ def test_stopped_during_validation_and_resumed_equals_never_stopped(launch, monk
 
 
 @pytest.mark.parametrize("where", ["configure", "on_fit_start"])
-@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
 def test_before_training_a_signal_ends_it_at_once(launch, monkeypatch, where, name, code):
     monkeypatch.setattr(
         tiny_parts.TinySystem, where, lambda self: os.kill(os.getpid(), getattr(signal, name))
@@ -338,6 +341,100 @@ def test_a_second_ctrl_c_stops_at_once(launch, monkeypatch):
     monkeypatch.setattr(tiny_parts.TinySystem, "training_step", endless_step)
     code, _, _ = launch("--train")
     assert code == 130 and not Path("outputs").exists()
+
+
+def test_a_second_sigterm_stops_at_once_with_its_own_code(launch, monkeypatch):
+    def endless_step(self, batch, batch_idx):
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(60)
+
+    monkeypatch.setattr(tiny_parts.TinySystem, "training_step", endless_step)
+    assert launch("--train")[0] == 143
+
+
+def test_under_nohup_a_hang_up_changes_nothing(launch):
+    earlier = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        code, _, _ = launch("--train", "system.signal_at=2", "system.signal_name=SIGHUP")
+    finally:
+        signal.signal(signal.SIGHUP, earlier)
+    assert code == 0 and load_file(trial() / "ckpts/last.ckpt")["global_step"] == 6
+
+
+def test_a_closed_terminal_leaves_a_checkpoint(launch, monkeypatch):
+    """The process loses its terminal in the middle of a step: it is sent SIGHUP, and whatever it
+    writes from then on fails.
+    """
+    child, terminal = pty.fork()
+    if child == 0:
+        sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)
+        os._exit(main(["--config", "tiny.yaml", "--train", "trainer.max_steps=100000"]))
+    os.set_blocking(terminal, False)
+    while not list(Path().glob("outputs/tiny/*/csv_logs/version_0/metrics.csv")):
+        assert os.waitpid(child, os.WNOHANG) == (0, 0)
+        with contextlib.suppress(BlockingIOError):
+            os.read(terminal, 1 << 16)
+        time.sleep(0.01)
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 129
+    assert load_file(trial() / "ckpts/last.ckpt")["global_step"] > 0
+
+
+@pytest.mark.parametrize("translated", [RecursionError, UserError, None])
+def test_a_signal_during_imports_ends_it_whatever_becomes_of_its_exception(
+    launch, monkeypatch, translated
+):
+    def importing(*arguments):
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        except BaseException as error:
+            if translated:
+                raise translated("while importing") from error
+        return 0
+
+    monkeypatch.setattr(experiment, "run", importing)
+    code, _, err = launch("--train")
+    assert code == 143 and err == "stopped\n"
+
+
+def test_a_checkpoint_is_written_about_every_minute(launch, monkeypatch):
+    """So a run that is killed between its own checkpoints loses at most that much."""
+    steps, clock = [], [0.0]
+
+    def step_of_20_seconds(system, batch, batch_idx):
+        clock[0] += 20.0
+        steps.append((trial() / "ckpts/last.ckpt").is_file() and last_step())
+        return training_step(system, batch, batch_idx)
+
+    def last_step():
+        return load_file(trial() / "ckpts/last.ckpt")["global_step"]
+
+    training_step = tiny_parts.TinySystem.training_step
+    monkeypatch.setattr(tiny_parts.TinySystem, "training_step", step_of_20_seconds)
+    monkeypatch.setattr(callbacks.time, "monotonic", lambda: clock[0])
+    assert launch("--train", "trainer.max_steps=8", "trainer.limit_val_batches=0")[0] == 0
+    assert steps == [False, False, False, 3, 3, 3, 6, 6] and last_step() == 8
+
+
+def test_checkpoints_take_a_hundredth_of_the_time_at_most(launch, monkeypatch):
+    clock, saved = [0.0], []
+
+    def slow_save(path, content):
+        clock[0] += 5.0
+        saved.append(content["global_step"])
+
+    def step_of_100_seconds(system, batch, batch_idx):
+        clock[0] += 100.0
+        return training_step(system, batch, batch_idx)
+
+    training_step = tiny_parts.TinySystem.training_step
+    monkeypatch.setattr(tiny_parts.TinySystem, "training_step", step_of_100_seconds)
+    monkeypatch.setattr(callbacks.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(checkpoints, "save_file", slow_save)
+    options = ["trainer.max_steps=12", "trainer.limit_val_batches=0", "checkpoint.save_last=false"]
+    assert launch("--train", *options)[0] == 0
+    assert [step for step in saved if step < 12] == [1, 6, 11]
 
 
 def test_the_handlers_are_put_back(launch):

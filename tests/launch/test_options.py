@@ -34,7 +34,7 @@ def test_help_imports_neither_torch_nor_lightning():
 @pytest.mark.parametrize("said", [{}, {"OMP_WAIT_POLICY": "passive"}, {"GOMP_SPINCOUNT": "7"}])
 def test_idle_threads_wait_as_the_user_says(monkeypatch, said):
     monkeypatch.setattr(os, "environ", dict(said))
-    experiment.spin_briefly()
+    experiment.limit_openmp_spin()
     assert os.environ == (said or {"GOMP_SPINCOUNT": "10000", "KMP_BLOCKTIME": "0"})
 
 

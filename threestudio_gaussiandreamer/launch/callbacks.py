@@ -2,11 +2,12 @@
 without losing a step.
 """
 
+import contextlib
 import os
 import shutil
 import signal
 import sys
-import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,18 @@ from typing import Any
 from ..host import pl
 from .checkpoints import AtomicCheckpointIO
 from .config import dump_config
+from .signals import interrupt, restore_handlers, set_handlers
 
+SECONDS_BETWEEN = 60.0
+"""Seconds of training that a crash may lose."""
+SHARE_OF_TIME = 0.01
+"""Largest share of the time that goes into checkpoints."""
 SOURCE_ENDINGS = (".py", ".yaml", ".h", ".cpp", ".cu")
 
 
 class Stopped(BaseException):
-    """Training was asked to stop by a signal and has written a checkpoint. Not an Exception: nobody
-    on the way may swallow it.
+    """Training was asked to stop by a signal and has written a checkpoint. Not an Exception, so
+    that no handler of exceptions on the way swallows it.
     """
 
     def __init__(self, signum: int, step: int) -> None:
@@ -100,32 +106,31 @@ class ProgressBar(pl.callbacks.TQDMProgressBar):
         print(file=sys.stderr)
 
 
-class GracefulStop(pl.callbacks.Checkpoint):
-    """Ctrl-C and SIGTERM during training finish the step, write ``last.ckpt`` and raise
-    :class:`Stopped`; so does the last step.
+class LastCheckpoint(pl.callbacks.Checkpoint):
+    """Writes ``last.ckpt`` at the last step, about every :data:`SECONDS_BETWEEN`, and when a signal
+    asks to stop: the step is finished, then :class:`Stopped` is raised. A second signal stops at
+    once.
 
-    A second signal stops at once. As a ``Checkpoint`` it comes after all other callbacks, exactly
-    where ModelCheckpoint saves, so its file is an ordinary one from the middle of a run."""
+    As a ``Checkpoint`` it comes after all other callbacks, exactly where ModelCheckpoint saves, so
+    its file is an ordinary one from the middle of a run."""
 
     def __init__(self, last: Path, checkpoint_io: AtomicCheckpointIO) -> None:
         self.last, self.checkpoint_io = last, checkpoint_io
         self.signum = 0
+        self._due = 0.0
         self._earlier: dict[int, Any] = {}
 
     def on_train_start(self, trainer: Any, pl_module: Any) -> None:
-        # only the main thread may set handlers; elsewhere signals don't arrive either
-        if threading.current_thread() is threading.main_thread():
-            self._earlier = {
-                signum: signal.signal(signum, self._ask)
-                for signum in (signal.SIGINT, signal.SIGTERM)
-            }
+        self._due = time.monotonic() + SECONDS_BETWEEN
+        self._earlier = set_handlers(self._ask)
 
     def on_train_batch_end(
         self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        if trainer.global_step == trainer.max_steps:
+        is_due = time.monotonic() >= self._due or trainer.global_step == trainer.max_steps
+        if _any_process(trainer, is_due or bool(self.signum)):
             self._save(trainer)
-        self._stop_if_asked(trainer)
+            self._stop_if_asked(trainer)
 
     def on_validation_end(self, trainer: Any, pl_module: Any) -> None:
         if trainer.state.fn == "fit" and not trainer.sanity_checking:
@@ -141,23 +146,35 @@ class GracefulStop(pl.callbacks.Checkpoint):
     def _ask(self, signum: int, frame: Any) -> None:
         if self.signum:
             self._restore_handlers()
-            raise KeyboardInterrupt
+            interrupt(signum)
         self.signum = signum
-        # print() may not be entered again from a handler
-        os.write(
-            2, b"\nstopping after this step and writing a checkpoint; once more to stop at once\n"
-        )
+        # print() may not be entered again from a handler; a closed terminal takes no message
+        with contextlib.suppress(OSError):
+            os.write(
+                2,
+                b"\nstopping after this step and writing a checkpoint; once more to stop at once\n",
+            )
 
     def _stop_if_asked(self, trainer: Any) -> None:
-        if trainer.strategy.reduce_boolean_decision(bool(self.signum), all=False):
+        if _any_process(trainer, bool(self.signum)):
             self._save(trainer)
             raise Stopped(self.signum or signal.SIGTERM, trainer.global_step)
 
     def _save(self, trainer: Any) -> None:
+        """Write the checkpoint, and set the time of the next one so that saving takes at most
+        :data:`SHARE_OF_TIME`.
+        """
+        started = time.monotonic()
         if self.checkpoint_io.saved_step(self.last) != trainer.global_step:
             trainer.save_checkpoint(self.last)
+        ended = time.monotonic()
+        self._due = ended + max(SECONDS_BETWEEN, (ended - started) / SHARE_OF_TIME)
 
     def _restore_handlers(self) -> None:
-        for signum, handler in self._earlier.items():
-            signal.signal(signum, handler)
+        restore_handlers(self._earlier)
         self._earlier = {}
+
+
+def _any_process(trainer: Any, decision: bool) -> bool:
+    """Whether any of the processes that train together decides so."""
+    return trainer.strategy.reduce_boolean_decision(decision, all=False)

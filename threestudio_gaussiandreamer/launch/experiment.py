@@ -6,20 +6,20 @@ extensions, load and check the configuration, build data and system, make the fo
 What the user can mend ends it with one message and exit code 2, before anything is written."""
 
 import argparse
-import contextlib
 import logging
 import os
 import shlex
 import signal
 import sys
-import threading
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
-from typing import Any, Optional
+from collections.abc import Sequence
+from typing import Optional
 
 from ..core.errors import Terminated, UserError
 from .options import PROGRAM, announce_device, choose_gpu, find_config, parse_arguments
+from .output import tolerant_output
+from .signals import raised_signals
 
 NOISE = (
     # Lightning's advice that doesn't apply to an endless stream of cameras made on the fly, or to a
@@ -42,42 +42,69 @@ def console() -> None:
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run one command line (default: this process's); returns the exit code.
 
-    0 done; 2 something the user can mend, said in one message; 130, 141 and 143 stopped by Ctrl-C,
-    a closed pipe and SIGTERM."""
-    spin_briefly()
+    0 done; 2 something the user can mend, said in one message; 129, 130, 141 and 143 stopped by
+    SIGHUP, Ctrl-C, a closed pipe and SIGTERM."""
+    limit_openmp_spin()
     argv = list(sys.argv[1:] if argv is None else argv)
     try:
         args = parse_arguments(argv)
     except SystemExit as stop:
         return int(stop.code or 0)
+    with tolerant_output():
+        try:
+            return run_until_signal(args, argv)
+        except Exception as error:
+            return exit_code(error, args.verbose)
+
+
+def run_until_signal(args: argparse.Namespace, argv: Sequence[str]) -> int:
+    """Run the stages; a signal that asks to stop decides the exit code, whatever became of the
+    exception that it raised.
+    """
+    received: Sequence[int] = ()
     try:
-        with _signals():
-            return run(args, argv)
-    except UserError as error:
-        if args.verbose:
-            traceback.print_exc()
+        with raised_signals() as received:
+            code = run(args, argv)
+            sys.stdout.flush()
+            if not received:
+                return code
+    except KeyboardInterrupt:  # of a caller's own handler too
+        received = received or [signal.SIGINT]
+    except Terminated as stop:
+        received = received or [stop.code - 128]
+    except SystemExit as stop:
+        if not received:
+            raise foreign_exit(stop) from stop
+    except Exception:
+        if not received:
+            raise
+    print("stopped", file=sys.stderr)
+    return 128 + received[0]
+
+
+def foreign_exit(stop: SystemExit) -> UserError:
+    """The error for a ``sys.exit()`` that isn't ours; its own code may say that all went well."""
+    *_, place = traceback.extract_tb(stop.__traceback__)
+    return UserError(f"{place.filename}:{place.lineno} ended the run with sys.exit({stop.code!r})")
+
+
+def exit_code(error: Exception, verbose: bool) -> int:
+    """Say what ended a run, in one message.
+
+    Raises:
+        Exception: ``error`` itself, if it is a mistake of the program.
+    """
+    if not isinstance(error, (UserError, BrokenPipeError)):
+        raise error
+    if verbose:
+        traceback.print_exc()
+    if isinstance(error, UserError):
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except BrokenPipeError as error:
-        # who read our output has gone, as `| head` does; what is still in its buffer would fail anew at the end
-        if args.verbose:
-            traceback.print_exc()
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        print(
-            f"stopped: nobody reads this run's output any more ({error.strerror})", file=sys.stderr
-        )
-        return 128 + signal.SIGPIPE
-    except (KeyboardInterrupt, Terminated) as stop:
-        print("stopped", file=sys.stderr)
-        return stop.code if isinstance(stop, Terminated) else 128 + signal.SIGINT
-    except SystemExit as stop:
-        # nothing of ours does so, and its own code may say that all went well
-        *_, place = traceback.extract_tb(stop.__traceback__)
-        print(
-            f"error: {place.filename}:{place.lineno} ended the run with sys.exit({stop.code!r})",
-            file=sys.stderr,
-        )
-        return 2
+    # the reader of the output has gone, as in `| head`; without this, flushing would fail at exit
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    print(f"stopped: nobody reads this run's output any more ({error.strerror})", file=sys.stderr)
+    return 128 + signal.SIGPIPE
 
 
 def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
@@ -108,14 +135,16 @@ def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
 
 
 class StderrHandler(logging.Handler):
-    """Messages as plain lines to what ``sys.stderr`` is at that moment."""
+    """Writes messages as plain lines to what ``sys.stderr`` is at that moment."""
 
     def emit(self, record: logging.LogRecord) -> None:
         print(self.format(record), file=sys.stderr, flush=True)
 
 
 def configure_logging(verbose: bool) -> None:
-    """Our messages to stderr as plain lines; Lightning's only from warnings up, unless ``verbose``."""
+    """Send our messages to stderr as plain lines; Lightning's only from warnings up, unless
+    ``verbose``.
+    """
     logger = logging.getLogger(__package__.partition(".")[0])
     if not logger.handlers:
         logger.addHandler(StderrHandler())
@@ -128,38 +157,16 @@ def configure_logging(verbose: bool) -> None:
             warnings.filterwarnings("ignore", message=message)
 
 
-def spin_briefly() -> None:
-    """Let idle OpenMP threads wait for about 0.1 ms before they sleep, unless the user said how;
-    before torch is imported.
+def limit_openmp_spin() -> None:
+    """Let idle OpenMP threads spin for about 0.1 ms before they sleep, unless the user has set it;
+    call it before torch is imported.
 
-    At once asleep, they are woken for each small operation (a fifth of the demo's time); for
-    milliseconds awake, as is their default, they hold the cores that our own threads, or other
-    programs, wait for. LLVM's and Intel's OpenMP know milliseconds only: none there."""
+    Threads that sleep at once are woken for each small operation (a fifth of the demo's time);
+    threads that spin for milliseconds, OpenMP's default, occupy the cores that our own threads or
+    other programs wait for. LLVM's and Intel's OpenMP count in milliseconds: 0 there."""
     waits = {"GOMP_SPINCOUNT": "10000", "KMP_BLOCKTIME": "0"}
     if not os.environ.keys() & {"OMP_WAIT_POLICY", *waits}:
         os.environ.update(waits)
-
-
-@contextlib.contextmanager
-def _signals() -> Iterator[None]:
-    """SIGTERM ends the process through ``finally`` blocks, with code 143; afterwards all handlers
-    are what they were.
-    """
-
-    def end(signum: int, frame: Any) -> None:
-        raise Terminated(128 + signum)
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    # Lightning leaves Ctrl-C ignored once it has seen one
-    earlier = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
-    signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        for signum, handler in earlier.items():
-            signal.signal(signum, handler)
 
 
 if __name__ == "__main__":

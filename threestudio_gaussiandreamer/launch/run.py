@@ -17,7 +17,7 @@ from ..core.checkpoint_file import load_checkpoint
 from ..core.errors import UserError
 from ..core.logs import get_rank
 from ..host import find, info, pl, warn
-from .callbacks import GracefulStop, ProgressBar, RunRecord, Stopped
+from .callbacks import LastCheckpoint, ProgressBar, RunRecord, Stopped
 from .checkpoints import AtomicCheckpointIO
 from .config_check import MisconfigurationException, build, plain
 from .ddp import ReplicatedStrategy
@@ -208,7 +208,7 @@ class Run:
             pl.callbacks.ModelCheckpoint(dirpath=str(self.last.parent), **checkpointing),
             pl.callbacks.LearningRateMonitor(logging_interval="step"),
             RunRecord(self.folder, self.cfg, self.config_paths, self.command),
-            GracefulStop(self.last, checkpoint_io),
+            LastCheckpoint(self.last, checkpoint_io),
         ]
 
     # -- the folder --------------------------------------------------------------------------------

@@ -1,0 +1,65 @@
+"""Standard output and error of a run: no failure to show a message ends the work."""
+
+import contextlib
+import errno
+import io
+import sys
+from collections.abc import Iterator
+from typing import Any, Optional
+
+
+class TolerantFile(io.FileIO):
+    """A file descriptor that goes on accepting text after writing has failed once: the terminal was
+    closed, or the disk of a redirected output is full.
+
+    A closed pipe still raises BrokenPipeError, since its reader wants no more.
+    """
+
+    lost = False
+
+    def write(self, data: Any) -> Optional[int]:
+        if self.lost:
+            return len(data)
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            self.lost = True
+            # after a hang-up the other stream is gone too
+            if error.errno != errno.EIO and self.fileno() == 1:
+                print(
+                    f"standard output can't be written ({error.strerror}): going on without it",
+                    file=sys.stderr,
+                )
+            return len(data)
+
+
+@contextlib.contextmanager
+def tolerant_output() -> Iterator[None]:
+    """Let ``sys.stdout`` and ``sys.stderr`` tolerate failures, and characters that their encoding
+    doesn't have, which are written as escapes.
+    """
+    earlier = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = map(_tolerant, earlier)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+        sys.stdout, sys.stderr = earlier
+
+
+def _tolerant(stream: Any) -> Any:
+    """The same stream over a :class:`TolerantFile`; one that is no open file stays as it is."""
+    raw = getattr(getattr(stream, "buffer", None), "raw", None)
+    if not isinstance(raw, io.FileIO):
+        return stream
+    stream.flush()
+    return io.TextIOWrapper(
+        io.BufferedWriter(TolerantFile(raw.fileno(), "wb", closefd=False)),
+        encoding=stream.encoding,
+        errors="backslashreplace",
+        line_buffering=stream.line_buffering,
+        write_through=stream.write_through,
+    )

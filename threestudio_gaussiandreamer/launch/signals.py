@@ -1,0 +1,66 @@
+"""Signals that stop a run: Ctrl-C, SIGTERM, and SIGHUP, which a closed terminal or a lost SSH
+connection sends."""
+
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any, NoReturn
+
+from ..core.errors import Terminated
+
+Handler = Callable[[int, Any], Any]
+
+
+def stop_signals() -> list[int]:
+    """The signals that ask a run to stop. SIGHUP is left alone where it is ignored, as under
+    ``nohup``.
+    """
+    signals = [signal.SIGINT, signal.SIGTERM]
+    hang_up = getattr(signal, "SIGHUP", None)  # not on Windows
+    if hang_up is not None and signal.getsignal(hang_up) != signal.SIG_IGN:
+        signals.append(hang_up)
+    return signals
+
+
+def set_handlers(handler: Handler) -> dict[int, Any]:
+    """Let ``handler`` answer the stop signals; returns the earlier handlers.
+
+    Outside of the main thread, where signals don't arrive, nothing is changed.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    return {signum: signal.signal(signum, handler) for signum in stop_signals()}
+
+
+def restore_handlers(handlers: dict[int, Any]) -> None:
+    """Put back what :func:`set_handlers` returned."""
+    for signum, handler in handlers.items():
+        signal.signal(signum, handler)
+
+
+def interrupt(signum: int) -> NoReturn:
+    """Raise KeyboardInterrupt for Ctrl-C and :class:`Terminated` for other signals."""
+    raise KeyboardInterrupt if signum == signal.SIGINT else Terminated(128 + signum)
+
+
+@contextlib.contextmanager
+def raised_signals() -> Iterator[list[int]]:
+    """Let stop signals raise exceptions, so that ``finally`` blocks run; afterwards all handlers
+    are what they were.
+
+    Yields:
+        the signals that have arrived: an exception raised while a module is imported may come out
+        as another one, or not at all.
+    """
+    received: list[int] = []
+
+    def stop(signum: int, frame: Any) -> None:
+        received.append(signum)
+        interrupt(signum)
+
+    earlier = set_handlers(stop)
+    try:
+        yield received
+    finally:
+        restore_handlers(earlier)
