@@ -149,7 +149,7 @@ class TestBundle:
         assert output.params["sh"].shape == (40, 9, 3) and output.save_name == "x.ply"
 
     def test_mistakes_are_named_when_built(self):
-        with pytest.raises(UserError, match="unknown export format 'pyl': did you mean 'ply'"):
+        with pytest.raises(UserError, match="unknown formats.1. 'pyl': did you mean 'ply'"):
             build("gaussiandreamer-exporter", formats=["points", "pyl"])
         with pytest.raises(UserError, match="gaussiandreamer"):
             build("gaussiandreamer-exporter", formats=["gaussiandreamer"])

@@ -174,11 +174,6 @@ class Options:
     rates: Any = 0.1
     inner: dict = field(default_factory=dict)
 
-    @staticmethod
-    def check(cfg: Any) -> None:
-        if cfg.size < 1:
-            raise UserError(f"size: expected at least 1, got {cfg.size}")
-
 
 def test_values_are_typed_and_defaults_filled():
     cfg = parse_structured(Options, {"size": "5", "rates": [1, 2, 3]})
@@ -191,7 +186,6 @@ def test_values_are_typed_and_defaults_filled():
     [
         ({"szie": 3}, "unknown key 'szie': did you mean 'size'"),
         ({"size": "big"}, "size: Value 'big'"),
-        ({"size": 0}, "size: expected at least 1"),
         ({"inner": 3}, "inner"),
         ("size", "expected keys and values"),
     ],

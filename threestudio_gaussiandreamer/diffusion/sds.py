@@ -47,7 +47,7 @@ def step_range(min_percent: float, max_percent: float, num_train: int = 1000) ->
             raise UserError(f"{name} must lie in [0, 1], not {percent}")
     if min_percent > max_percent:
         raise UserError(
-            f"min_step_percent {min_percent} is above max_step_percent {max_percent}: check "
+            f"min_step_percent: {min_percent} is above max_step_percent, {max_percent}: check "
             "where their schedules cross"
         )
     low, high = (

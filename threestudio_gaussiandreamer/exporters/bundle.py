@@ -14,7 +14,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional
 
-from ..core.errors import UserError, unknown
+from ..core.errors import UserError
+from ..core.options import check_options, each, one_of
 from ..host import (
     BaseBackground,
     BaseGeometry,
@@ -30,13 +31,22 @@ from ..host import (
 SUFFIX = "-exporter"
 
 
+def available_formats() -> list[str]:
+    """The formats that can be asked for: every registered exporter but the bundle itself."""
+    exporters = [name.removesuffix(SUFFIX) for name in names() if name.endswith(SUFFIX)]
+    return [name for name in exporters if name != "gaussiandreamer"]
+
+
 @register("gaussiandreamer-exporter")
 class BundleExporter(Exporter):
     """The files of every format, in the order of ``formats``."""
 
     @dataclass
     class Config(Exporter.Config):
-        formats: List[str] = field(default_factory=lambda: ["ply", "spz", "points"])
+        formats: List[str] = field(
+            default_factory=lambda: ["ply", "spz", "points"],
+            metadata=each(one_of(available_formats)),
+        )
         options: Dict[str, Any] = field(default_factory=dict)
         save_video: bool = True
 
@@ -45,12 +55,9 @@ class BundleExporter(Exporter):
             """Check formats and their options.
 
             Raises:
-                UserError: a format that isn't registered, options of one that isn't asked for, or
+                UserError: wrong options of a format, options of one that isn't asked for, or
                     two formats that write the same file.
             """
-            for name in cfg.formats:
-                if name not in available_formats():
-                    raise unknown("export format", name, available_formats())
             for name in cfg.options:
                 if name not in cfg.formats:
                     raise UserError(
@@ -70,7 +77,7 @@ class BundleExporter(Exporter):
         background: Optional[BaseBackground],
     ) -> None:
         super().configure(geometry, material, background)
-        self.Config.check(self.cfg)  # threestudio's own host doesn't
+        check_options(self.Config, self.cfg)
         parts = dict(geometry=geometry, material=material, background=background)
         self.exporters = [
             find(name + SUFFIX)(self.cfg.options.get(name, {}), **parts)
@@ -85,10 +92,13 @@ def _checked(name: str, options: Any) -> Any:
     """The typed options of one format."""
     if not isinstance(options, Mapping):
         raise UserError(f"options.{name}: expected keys and values, got {options!r}")
+    config_class = find(name + SUFFIX).Config
     try:
-        return parse_structured(find(name + SUFFIX).Config, options)
+        cfg = parse_structured(config_class, options)
     except UserError as error:
         raise UserError(f"options.{name}: {error}") from error
+    check_options(config_class, cfg, f"options.{name}.")
+    return cfg
 
 
 def _require_own_files(formats: Iterable[tuple[str, Any]]) -> None:
@@ -106,9 +116,3 @@ def _require_own_files(formats: Iterable[tuple[str, Any]]) -> None:
                 f"options.{name}.save_name: {file!r} is the file of the format {other}; choose "
                 "another name"
             )
-
-
-def available_formats() -> list[str]:
-    """The formats that can be asked for: every registered exporter but the bundle itself."""
-    exporters = [name.removesuffix(SUFFIX) for name in names() if name.endswith(SUFFIX)]
-    return [name for name in exporters if name != "gaussiandreamer"]

@@ -9,15 +9,15 @@ save_video      also render the turntable
 ==============  ===================================================================================
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import List, Optional
 
 import numpy as np
 
-from ..core.errors import UserError
+from ..core.options import in_range
 from ..formats.ply import padded_sh
 from ..host import ExporterOutput, register
-from .base import FileExporter, gaussian_arrays
+from .base import SAVE_NAME, FileExporter, gaussian_arrays
 
 
 @register("ply-exporter")
@@ -26,17 +26,8 @@ class PlyExporter(FileExporter):
 
     @dataclass
     class Config(FileExporter.Config):
-        save_name: str = "gaussians.ply"
-        pad_sh_degree: Optional[int] = None
-
-        @staticmethod
-        def check(cfg: "PlyExporter.Config") -> None:
-            """Raises UserError for a degree that no viewer knows."""
-            FileExporter.Config.check(cfg)
-            if cfg.pad_sh_degree not in (None, 0, 1, 2, 3):
-                raise UserError(
-                    f"pad_sh_degree: expected null, 0, 1, 2 or 3, got {cfg.pad_sh_degree}"
-                )
+        save_name: str = field(default="gaussians.ply", metadata=SAVE_NAME)
+        pad_sh_degree: Optional[int] = field(default=None, metadata=in_range(0, 3))
 
     cfg: Config
 

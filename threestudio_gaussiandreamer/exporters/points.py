@@ -10,15 +10,15 @@ save_video   also render the turntable
 ===========  ==================================================================================
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import List
 
-from ..core.errors import UserError
+from ..core.options import in_range
 from ..gaussians.gaussians import opaque
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.sh import sh0_colors
 from ..host import ExporterOutput, register
-from .base import FileExporter, gaussian_arrays
+from .base import SAVE_NAME, FileExporter, gaussian_arrays
 
 
 @register("points-exporter")
@@ -27,15 +27,8 @@ class PointsExporter(FileExporter):
 
     @dataclass
     class Config(FileExporter.Config):
-        save_name: str = "points.ply"
-        min_opacity: float = 0.0
-
-        @staticmethod
-        def check(cfg: "PointsExporter.Config") -> None:
-            """Raises UserError for a value out of range."""
-            FileExporter.Config.check(cfg)
-            if not 0 <= cfg.min_opacity <= 1:
-                raise UserError(f"min_opacity: expected a number in [0, 1], got {cfg.min_opacity}")
+        save_name: str = field(default="points.ply", metadata=SAVE_NAME)
+        min_opacity: float = field(default=0.0, metadata=in_range(0, 1))
 
     cfg: Config
 

@@ -11,12 +11,12 @@ save_video   also render the turntable
 About 17 bytes a Gaussian; what its rounding costs is in docs/parsimony.md. The cloud is turned from
 z up to y up, SPZ's axes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import List
 
 from ..gaussians.gaussians import usable
 from ..host import ExporterOutput, register, warn
-from .base import FileExporter, gaussian_arrays
+from .base import SAVE_NAME, FileExporter, gaussian_arrays
 
 
 @register("spz-exporter")
@@ -25,7 +25,7 @@ class SpzExporter(FileExporter):
 
     @dataclass
     class Config(FileExporter.Config):
-        save_name: str = "gaussians.spz"
+        save_name: str = field(default="gaussians.spz", metadata=SAVE_NAME)
 
     cfg: Config
 

@@ -13,13 +13,13 @@ save_video   also render the turntable
 The colours are those of the constant harmonic. A mesh loses what Gaussians show of hair, smoke and
 glass."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import List
 
-from ..core.errors import UserError
+from ..core.options import in_range
 from ..gaussians.surface import gaussian_surface
 from ..host import ExporterOutput, register, warn
-from .base import FileExporter, gaussian_arrays
+from .base import SAVE_NAME, FileExporter, gaussian_arrays
 
 
 @register("surface-exporter")
@@ -28,18 +28,9 @@ class SurfaceExporter(FileExporter):
 
     @dataclass
     class Config(FileExporter.Config):
-        save_name: str = "model.obj"
-        resolution: int = 128
-        level: float = 0.5
-
-        @staticmethod
-        def check(cfg: "SurfaceExporter.Config") -> None:
-            """Raises UserError for a value out of range."""
-            FileExporter.Config.check(cfg)
-            if not 8 <= cfg.resolution <= 512:
-                raise UserError(f"resolution: expected 8 to 512 cells, got {cfg.resolution}")
-            if not 0 < cfg.level <= 1:
-                raise UserError(f"level: expected a share in (0, 1], got {cfg.level}")
+        save_name: str = field(default="model.obj", metadata=SAVE_NAME)
+        resolution: int = field(default=128, metadata=in_range(8, 512, "cells"))
+        level: float = field(default=0.5, metadata=in_range(1e-6, 1))
 
     cfg: Config
 

@@ -28,7 +28,7 @@ eval_steps          DDIM steps from the noise to ``imgs_final``
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Optional
 
 import torch
@@ -37,8 +37,11 @@ from torch import Tensor
 
 from ..core import streams
 from ..core.errors import UserError
+from ..core.options import at_least, check_options, in_range, one_of, schedule
 from ..diffusion import sds
-from ..host import BaseObject, C, item_seed, validate_schedule, warn
+from ..host import BaseObject, C, item_seed, warn
+
+GUIDANCE_SCALE = in_range(-1e6, 1e6)
 
 
 class NonFiniteScore(UserError):
@@ -60,29 +63,21 @@ class ScoreDistillation(BaseObject, ABC):
 
     @dataclass
     class Config(BaseObject.Config):
-        guidance_scale: float = 100.0
-        min_step_percent: Any = 0.02
-        max_step_percent: Any = 0.98
-        grad_clip: Any = None
-        weighting_strategy: str = "sds"
-        max_bad_steps: int = 10
+        guidance_scale: float = field(default=100.0, metadata=GUIDANCE_SCALE)
+        min_step_percent: Any = field(default=0.02, metadata=schedule(min=0, max=1))
+        max_step_percent: Any = field(default=0.98, metadata=schedule(min=0, max=1))
+        grad_clip: Any = field(default=None, metadata=schedule(min=0))
+        weighting_strategy: str = field(default="sds", metadata=one_of(sds.WEIGHTS))
+        max_bad_steps: int = field(default=10, metadata=at_least(1))
         max_items_eval: int = 4
-        eval_steps: int = 20
+        eval_steps: int = field(default=20, metadata=in_range(1, 1000))
 
         @staticmethod
         def check(cfg: Any) -> None:
-            for name in ("min_step_percent", "max_step_percent"):
-                validate_schedule(cfg[name], f"system.guidance.{name}")
-            if cfg.grad_clip is not None:
-                validate_schedule(cfg.grad_clip, "system.guidance.grad_clip", minimum=0)
             for step in _knots(cfg.min_step_percent, cfg.max_step_percent):
                 sds.step_range(
                     C(cfg.min_step_percent, step, step), C(cfg.max_step_percent, step, step)
                 )
-            sds.weight(cfg.weighting_strategy, torch.full((1,), 0.5))
-            for name in ("max_bad_steps", "eval_steps"):
-                if cfg[name] < 1:
-                    raise UserError(f"system.guidance.{name}: expected at least 1, got {cfg[name]}")
 
     cfg: Config
     alphas_cumprod: Float[Tensor, " T"]
@@ -134,7 +129,7 @@ class ScoreDistillation(BaseObject, ABC):
     # ----------------------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        self.Config.check(self.cfg)
+        check_options(self.Config, self.cfg, "system.guidance.")
         self.alphas_cumprod = sds.sd_alphas_cumprod()
         self.bad_items = self.bad_steps = 0
         self.update_step(0, 0)

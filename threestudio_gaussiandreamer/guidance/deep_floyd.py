@@ -6,7 +6,7 @@ threestudio; ``enable_vae_slicing`` is accepted, so that configurations that sav
 model, and there is no VAE here. The UNet also predicts the variance of its reverse step, which
 distillation doesn't need."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..host import register, register_builtin
 from ..prompts.prompt_processors import DEEP_FLOYD
+from .base import GUIDANCE_SCALE
 from .text_to_image import TextToImageDistillation
 
 
@@ -24,7 +25,7 @@ class DeepFloydGuidance(TextToImageDistillation):
     @dataclass
     class Config(TextToImageDistillation.Config):
         pretrained_model_name_or_path: str = DEEP_FLOYD
-        guidance_scale: float = 20.0
+        guidance_scale: float = field(default=20.0, metadata=GUIDANCE_SCALE)
         enable_vae_slicing: bool = False
 
     cfg: Config

@@ -38,7 +38,7 @@ A score that doesn't know the camera doesn't know its distance either: a faint s
 views before it is drawn to the right side. To measure the faces alone, give cameras and bank one
 distance and one angle of view."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Optional, Tuple
 
 import torch
@@ -47,17 +47,21 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from ..cameras import OrbitRanges, camera_pool
-from ..core.errors import UserError, unknown
+from ..core.errors import UserError
+from ..core.memory import count_of, require_memory
+from ..core.options import at_least, in_range, interval, one_of, positive, required
 from ..diffusion.exact_score import LinearLatent, color_matrix, denoise, squared_distances
 from ..host import register
 from ..meshes.load import AXES, load_mesh
 from ..meshes.raycast import MeshCaster, TargetCache, over_background
 from ..prompts.view_prompts import view_directions
-from .base import ScoreDistillation
+from .base import GUIDANCE_SCALE, ScoreDistillation
 
 MODES = ("view-exact", "direction-bins", "view-agnostic")
 SPACES = ("pixel", "latent")
 MAX_MODE_BYTES = 2**31
+BANK_BYTES = 16
+"""Of a pixel of the bank, as it is cast."""
 PIXELS_PER_CAST = 2**20
 
 
@@ -85,33 +89,40 @@ class Mixture(NamedTuple):
 class ExactScoreGuidance(ScoreDistillation):
     @dataclass
     class Config(ScoreDistillation.Config):
-        guidance_scale: float = 1.0
-        mesh: str = ""
-        scale: float = 1.0
-        up: str = "auto"
-        front: Optional[str] = None
-        mode: str = "view-exact"
-        space: str = "pixel"
-        image_size: int = 0
-        latent_size: int = 32
-        latent_channels: int = 4
+        guidance_scale: float = field(default=1.0, metadata=GUIDANCE_SCALE)
+        mesh: str = field(default="", metadata=required("give the mesh that is the truth"))
+        scale: float = field(default=1.0, metadata=positive("world units"))
+        up: str = field(default="auto", metadata=one_of(("auto", *AXES)))
+        front: Optional[str] = field(default=None, metadata=one_of(AXES))
+        mode: str = field(default="view-exact", metadata=one_of(MODES))
+        space: str = field(default="pixel", metadata=one_of(SPACES))
+        image_size: int = field(default=0, metadata=in_range(0, 16_384, "pixels"))
+        latent_size: int = field(default=32, metadata=in_range(1, 4096, "pixels"))
+        latent_channels: int = field(default=4, metadata=in_range(3, 64))
         color_matrix: bool = True
-        std: float = 0.0
-        temperature: float = 1.0
-        bank_views: int = 200
+        std: float = field(default=0.0, metadata=at_least(0))
+        temperature: float = field(default=1.0, metadata=positive())
+        bank_views: int = field(default=200, metadata=count_of("views", 1, 4096))
         bank_includes_view: bool = True
         bank_seed: int = 0
-        bank_elevation_range: Tuple[float, float] = (-10.0, 60.0)
-        bank_distance_range: Tuple[float, float] = (1.5, 4.0)
-        bank_fovy_range: Tuple[float, float] = (40.0, 70.0)
-        supersample: int = 2
-        max_cached_targets: int = 512
+        bank_elevation_range: Tuple[float, float] = field(
+            default=(-10.0, 60.0), metadata=interval(-90, 90, "degrees")
+        )
+        bank_distance_range: Tuple[float, float] = field(
+            default=(1.5, 4.0), metadata=interval(1e-6, 1e6, "world units")
+        )
+        bank_fovy_range: Tuple[float, float] = field(
+            default=(40.0, 70.0), metadata=interval(1e-3, 179.999, "degrees")
+        )
+        supersample: int = field(default=2, metadata=in_range(1, 64, "rays a pixel each way"))
+        max_cached_targets: int = field(default=512, metadata=at_least(1))
 
         @staticmethod
         def check(cfg: Any) -> None:
             ScoreDistillation.Config.check(cfg)
-            _check_choices(cfg)
-            _check_numbers(cfg)
+            size, views = cfg.image_size, cfg.bank_views
+            what = f"{views} pictures of {size} x {size} pixels"
+            require_memory("image_size", BANK_BYTES * views * size**2, what)
 
     cfg: Config
     REPORTS = ("perplexity",)
@@ -408,41 +419,3 @@ def _resized(images: Float[Tensor, "B c H W"], size: tuple[int, int]) -> Float[T
     if height % size[0] == 0 and width % size[1] == 0:
         return F.avg_pool2d(images, (height // size[0], width // size[1]))
     return F.interpolate(images, size, mode="bilinear", align_corners=False, antialias=True)
-
-
-def _check_choices(cfg: Any) -> None:
-    for name, choices in (
-        ("mode", MODES),
-        ("space", SPACES),
-        ("up", ("auto", *AXES)),
-        ("front", AXES),
-    ):
-        if cfg[name] is not None and cfg[name] not in choices:
-            raise unknown(f"system.guidance.{name}", cfg[name], choices)
-    if not cfg.mesh:
-        raise UserError(
-            "system.guidance.mesh: give the path of the mesh whose pictures are the truth"
-        )
-
-
-def _check_numbers(cfg: Any) -> None:
-    for name in ("latent_size", "bank_views", "supersample", "max_cached_targets"):
-        if cfg[name] < 1:
-            raise UserError(f"system.guidance.{name}: expected at least 1, got {cfg[name]}")
-    for name in ("std", "image_size"):
-        if cfg[name] < 0:
-            raise UserError(f"system.guidance.{name}: expected 0 or more, got {cfg[name]}")
-    if cfg.latent_channels < 3:
-        raise UserError(
-            f"system.guidance.latent_channels: expected at least 3, got {cfg.latent_channels}"
-        )
-    for name in ("temperature", "scale"):
-        if not cfg[name] > 0:
-            raise UserError(f"system.guidance.{name}: expected more than 0, got {cfg[name]}")
-    for name in ("bank_elevation_range", "bank_distance_range", "bank_fovy_range"):
-        low, high = cfg[name]
-        if not low <= high or (name != "bank_elevation_range" and low <= 0):
-            raise UserError(
-                f"system.guidance.{name}: expected [low, high] with low <= high, distances and "
-                f"angles of view above 0, got [{low}, {high}]"
-            )

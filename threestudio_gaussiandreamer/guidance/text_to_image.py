@@ -27,7 +27,7 @@ enable_memory_efficient_attention   torch's own attention is so already; accepte
 ==================================  ================================================================
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Optional
 
@@ -37,6 +37,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ..core.errors import UserError, unknown
+from ..core.options import in_range
 from ..diffusion import sds
 from ..host import debug, info, parse_structured
 from ..models import extras
@@ -68,29 +69,15 @@ class TextToImageDistillation(ScoreDistillation):
     class Config(ScoreDistillation.Config):
         pretrained_model_name_or_path: str = ""
         revision: Optional[str] = None
-        recon_std_rescale: float = 0.0
+        recon_std_rescale: float = field(default=0.0, metadata=in_range(0, 1))
         view_dependent_prompting: bool = True
-        image_size: Optional[int] = None
+        image_size: Optional[int] = field(default=None, metadata=in_range(1, 4096, "pixels"))
         half_precision_weights: bool = True
         enable_channels_last_format: bool = False
         enable_torch_compile: bool = False
         enable_attention_slicing: bool = False
         enable_sequential_cpu_offload: bool = False
         enable_memory_efficient_attention: bool = False
-
-        @staticmethod
-        def check(cfg: Any) -> None:
-            ScoreDistillation.Config.check(cfg)
-            if not 0 <= cfg.recon_std_rescale <= 1:
-                raise UserError(
-                    "system.guidance.recon_std_rescale: expected a number in [0, 1], got "
-                    f"{cfg.recon_std_rescale}"
-                )
-            if cfg.image_size is not None and cfg.image_size < 1:
-                raise UserError(
-                    "system.guidance.image_size: expected a positive number of pixels, got "
-                    f"{cfg.image_size}"
-                )
 
     cfg: Config
     components: ClassVar[tuple[str, ...]] = ("unet", "scheduler")

@@ -17,7 +17,7 @@ from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..core.schedule import C_max
 from ..host import find, info, names
-from ..host.builtin.base import fill
+from ..host.builtin.base import parse_structured
 from ..prompts.prompts import read_prompt
 from .config_source import is_text, map_strings, parse_overrides, protect, read_yaml, unprotect
 from .run_folder import name_folders
@@ -72,7 +72,7 @@ def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus:
     merged.n_gpus = n_gpus
     _require_mandatory(merged)
     _resolve(merged)
-    cfg = fill(ExperimentConfig, merged)
+    cfg = parse_structured(ExperimentConfig, merged)
     name_folders(cfg)
     return cfg
 

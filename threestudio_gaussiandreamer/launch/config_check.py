@@ -15,10 +15,12 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError, unknown
+from ..core.options import check_options
 from ..host import find, pl, validate_schedule
-from ..host.builtin.base import fill
+from ..host.builtin.base import parse_structured
 
 MisconfigurationException = pl.utilities.exceptions.MisconfigurationException
 
@@ -112,18 +114,13 @@ def _check_keys(path: str, values: Any, config_class: type) -> None:
 
 def _typed(path: str, values: Any, config_class: type) -> DictConfig:
     try:
-        cfg = fill(config_class, values)
+        cfg = parse_structured(config_class, values)
     except UserError as error:
         raise UserError(f"{path}.{error}") from error
-    if hasattr(config_class, "check"):
-        try:
-            config_class.check(cfg)
-        except UserError as error:
-            # a part may know its path in the configuration or not; some begin with the key
-            if str(error).startswith((f"{path}.", f"{path}:")):
-                raise
-            joint = "." if str(error).partition(": ")[0] in cfg else ": "
-            raise UserError(f"{path}{joint}{error}") from error
+    try:
+        check_options(config_class, cfg, f"{path}.")
+    except OmegaConfBaseException as error:  # a default of "???"
+        raise UserError(f"{path}.{error.full_key or error.key}: no value is given") from error
     return cfg
 
 

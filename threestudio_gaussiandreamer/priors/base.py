@@ -15,14 +15,15 @@ A prior is one file: a subclass of :class:`Prior` with :meth:`~Prior.generate`, 
 name."""
 
 import logging
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from ..core.errors import UserError
+from ..core.memory import count_of
+from ..core.options import Rule, check_options, is_number, is_numbers, positive, required, satisfies
 from ..core.streams import numpy_generator
 from ..gaussians.point_cloud import PointCloud
 from ..host import BaseObject, run_seed
@@ -37,6 +38,37 @@ rows.
 GREY = 0.5
 
 
+POINT_BYTES = 128
+"""Of a point: places, colours and the parameters of its Gaussian, at least."""
+
+
+def is_color(value: Any) -> bool:
+    """Whether ``value`` is null, "grey", "random" or three numbers in [0, 1]."""
+    if value is None or value in ("grey", "random"):
+        return True
+    return is_numbers(value, 3) and all(0 <= number <= 1 for number in value)
+
+
+def points(low: int) -> Rule:
+    """Numbers of points, from ``low`` to what the memory holds."""
+    return count_of("points", low, POINT_BYTES)
+
+
+COLOR = satisfies("null, 'grey', 'random' or [red, green, blue] in [0, 1]", is_color)
+HEIGHT = satisfies(
+    "'auto' or a number in world units", lambda value: value == "auto" or is_number(value)
+)
+SCALE = positive("world units")
+PATH = required("this prior reads a file; set path to it")
+
+
+def require_axes(cfg: Any, kind: str) -> None:
+    """Raise UserError unless the options ``up`` and ``front`` name two axes that aren't parallel,
+    for a ``kind`` of file ("glb").
+    """
+    _pose(kind, cfg.up, cfg.front)
+
+
 class Prior(BaseObject):
     """``prior(prompt)`` gives the points that the Gaussians start from; the same prompt and seed
     give the same points.
@@ -45,24 +77,14 @@ class Prior(BaseObject):
     @dataclass
     class Config(BaseObject.Config):
         ground: bool = False
-        ground_points: int = 20_000
-        ground_size: float = 1.5
-        ground_height: Any = "auto"
-
-        @staticmethod
-        def check(cfg: Any) -> None:
-            """Raises UserError for a value out of range, before any long work."""
-            require_positive(cfg, "ground_points", "ground_size")
-            if cfg.ground_height != "auto" and not is_number(cfg.ground_height):
-                raise UserError(
-                    "ground_height: expected 'auto' or a number in world units, got "
-                    f"{cfg.ground_height!r}"
-                )
+        ground_points: int = field(default=20_000, metadata=points(1))
+        ground_size: float = field(default=1.5, metadata=positive())
+        ground_height: Any = field(default="auto", metadata=HEIGHT)
 
     cfg: Config
 
     def configure(self) -> None:
-        self.Config.check(self.cfg)  # threestudio's own host doesn't
+        check_options(self.Config, self.cfg)
 
     def preflight(self) -> None:
         """Look in seconds whether ``generate`` can have what it needs; called before any long work.
@@ -95,60 +117,6 @@ class Prior(BaseObject):
         randomness.
         """
         raise NotImplementedError(f"{type(self).__name__}.generate")
-
-
-# -------------------------------------------------------------------------------------------------
-# checks of options
-
-
-def is_number(value: Any) -> bool:
-    return (
-        isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
-    )
-
-
-def require_positive(cfg: Any, *names: str) -> None:
-    """Raise UserError for the first of these options that is not a finite number above 0."""
-    for name in names:
-        if not (is_number(cfg[name]) and cfg[name] > 0):
-            raise UserError(f"{name}: expected a number above 0, got {cfg[name]!r}")
-
-
-def require_not_negative(cfg: Any, *names: str) -> None:
-    """Raise UserError for the first of these options that is not a finite number of 0 or more."""
-    for name in names:
-        if not (is_number(cfg[name]) and cfg[name] >= 0):
-            raise UserError(f"{name}: expected 0 or more, got {cfg[name]!r}")
-
-
-def require_path(cfg: Any) -> None:
-    """Raise UserError when the option ``path`` is not set."""
-    if not cfg.path:
-        raise UserError("path: this prior reads a file; set path to it")
-
-
-def require_axes(cfg: Any, kind: str) -> None:
-    """Raise UserError unless the options ``up`` and ``front`` name two axes that aren't parallel,
-    for a ``kind`` of file ("glb").
-    """
-    _pose(kind, cfg.up, cfg.front)
-
-
-def require_color(cfg: Any) -> None:
-    """Raise UserError unless the option ``color`` is null, "grey", "random" or three numbers in [0,
-    1].
-    """
-    color = cfg.color
-    if color is None or color in ("grey", "random"):
-        return
-    if (
-        isinstance(color, (str, int, float, Mapping))
-        or len(color) != 3
-        or not all(is_number(value) and 0 <= value <= 1 for value in color)
-    ):
-        raise UserError(
-            f"color: expected null, 'grey', 'random' or [red, green, blue] in [0, 1], got {color!r}"
-        )
 
 
 # --------------------------------------------------------------------------------------------------

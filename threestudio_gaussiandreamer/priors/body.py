@@ -23,7 +23,7 @@ is between 0.5000 and 0.5011, a flat grey. ``color: grey`` gives that.
 Limits: the prompt is not read; the pose is the file's. At ``scale`` above 1.5 the nearest cameras
 of the paper's range (1.5 to 4.0) are inside the body."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
 
@@ -33,15 +33,7 @@ from ..core.files import existing_file
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.load import load_mesh
-from .base import (
-    Prior,
-    chosen_colors,
-    require_axes,
-    require_color,
-    require_not_negative,
-    require_path,
-    require_positive,
-)
+from .base import COLOR, PATH, SCALE, Prior, chosen_colors, points, require_axes
 from .mesh import mesh_cloud
 
 
@@ -51,21 +43,16 @@ class BodyPrior(Prior):
 
     @dataclass
     class Config(Prior.Config):
-        path: str = ""
-        scale: float = 1.0
+        path: str = field(default="", metadata=PATH)
+        scale: float = field(default=1.0, metadata=SCALE)
         up: str = "auto"
         front: Optional[str] = None
-        num_points: int = 50_000
-        color: Any = "random"
+        num_points: int = field(default=50_000, metadata=points(0))
+        color: Any = field(default="random", metadata=COLOR)
 
         @staticmethod
         def check(cfg: Any) -> None:
-            Prior.Config.check(cfg)
-            require_path(cfg)
             require_axes(cfg, Path(cfg.path).suffix.lower().lstrip("."))
-            require_positive(cfg, "scale")
-            require_not_negative(cfg, "num_points")
-            require_color(cfg)
 
     cfg: Config
 

@@ -15,19 +15,19 @@ go on where that training stopped.
 Limits: the prompt is not read; positions stay as they are (world units, z up): no turning, no
 scaling."""
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..core.errors import UserError
 from ..core.files import existing_file
+from ..core.options import in_range
 from ..formats.ply import read_gaussians
 from ..gaussians.gaussians import Gaussians, opaque, usable
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.sh import sh0_colors
 from ..host import register
-from .base import Prior, is_number, report_non_finite, require_path
+from .base import PATH, Prior, report_non_finite
 
 
 @register("gaussians-prior")
@@ -36,17 +36,8 @@ class GaussiansPrior(Prior):
 
     @dataclass
     class Config(Prior.Config):
-        path: str = ""
-        min_opacity: float = 0.0
-
-        @staticmethod
-        def check(cfg: Any) -> None:
-            Prior.Config.check(cfg)
-            require_path(cfg)
-            if not (is_number(cfg.min_opacity) and 0 <= cfg.min_opacity <= 1):
-                raise UserError(
-                    f"min_opacity: expected a number in [0, 1], got {cfg.min_opacity!r}"
-                )
+        path: str = field(default="", metadata=PATH)
+        min_opacity: float = field(default=0.0, metadata=in_range(0, 1))
 
     cfg: Config
 

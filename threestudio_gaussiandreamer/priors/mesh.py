@@ -24,30 +24,25 @@ Limits: the prompt is not read. Few vertices make a sparse start: give ``num_poi
 low-polygon mesh."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..core.options import at_least
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.load import Mesh, load_mesh, sample_surface, surface_colors
-from .base import (
-    Prior,
-    chosen_colors,
-    require_axes,
-    require_color,
-    require_not_negative,
-    require_path,
-    require_positive,
-)
+from .base import COLOR, PATH, SCALE, Prior, chosen_colors, points, require_axes
 
 logger = logging.getLogger(__name__)
 
-SMOOTHING_BLOCK = 8192
-"""Rows that are averaged at a time, so that memory doesn't grow with points times neighbours."""
+SMOOTHING_ROWS, SMOOTHING_ENTRIES = 8192, 2**22
+"""Rows that are averaged at a time, and their neighbours in all, so that memory doesn't grow with
+points times neighbours.
+"""
 
 
 @register("mesh-prior")
@@ -56,23 +51,18 @@ class MeshPrior(Prior):
 
     @dataclass
     class Config(Prior.Config):
-        path: str = ""
-        scale: float = 1.0
+        path: str = field(default="", metadata=PATH)
+        scale: float = field(default=1.0, metadata=SCALE)
         up: str = "auto"
         front: Optional[str] = None
-        num_points: int = 0
-        color_smoothing: int = 0
-        color: Any = None
-        jitter: float = 0.0
+        num_points: int = field(default=0, metadata=points(0))
+        color_smoothing: int = field(default=0, metadata=at_least(0))
+        color: Any = field(default=None, metadata=COLOR)
+        jitter: float = field(default=0.0, metadata=at_least(0))
 
         @staticmethod
         def check(cfg: Any) -> None:
-            Prior.Config.check(cfg)
-            require_path(cfg)
             require_axes(cfg, Path(cfg.path).suffix.lower().lstrip("."))
-            require_positive(cfg, "scale")
-            require_not_negative(cfg, "num_points", "color_smoothing", "jitter")
-            require_color(cfg)
 
     cfg: Config
 
@@ -132,7 +122,6 @@ def smoothed_colors(cloud: PointCloud, neighbours: int) -> Float[np.ndarray, "P 
         )[1]
         return cloud.colors[nearest].mean(axis=1)
 
-    starts = range(0, len(cloud.points), SMOOTHING_BLOCK)
-    return np.concatenate(
-        [average(cloud.points[start : start + SMOOTHING_BLOCK]) for start in starts]
-    )
+    rows = min(SMOOTHING_ROWS, max(1, SMOOTHING_ENTRIES // neighbours))
+    starts = range(0, len(cloud.points), rows)
+    return np.concatenate([average(cloud.points[start : start + rows]) for start in starts])

@@ -44,6 +44,7 @@ from jaxtyping import Float
 from ..cameras import orbit_c2w
 from ..core.errors import UserError
 from ..core.files import existing_file
+from ..core.options import at_least, in_range, is_whole, positive, satisfies
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register, warn
 from ..meshes.load import Mesh, load_mesh
@@ -51,7 +52,7 @@ from ..meshes.raycast import MeshCaster, over_background
 from ..models import extras
 from ..models.clip import clip_source, picture_similarities
 from ..models.hub import Source, locate
-from .base import Prior, chosen_colors, require_color, require_not_negative, require_positive
+from .base import COLOR, SCALE, Prior, chosen_colors, points
 from .mesh import face_normals, mesh_cloud
 from .motion_files import Motions, read_motions
 from .motion_text import reduced_prompt
@@ -75,6 +76,11 @@ ROUGH, FINE = 80, 300
 LIGHT = np.array([0.7, 0.35, 0.62])
 
 
+FRAME = satisfies(
+    "'clip' or a number from 0", lambda value: value == "clip" or is_whole(value) and value >= 0
+)
+
+
 class Choice(NamedTuple):
     """One frame of one motion."""
 
@@ -90,34 +96,26 @@ class MotionPrior(Prior):
     class Config(Prior.Config):
         motion: str = ""
         body_model: str = ""
-        sample: Optional[int] = None
-        frame: Any = "clip"
-        num_frames: int = 16
+        sample: Optional[int] = field(default=None, metadata=at_least(0))
+        frame: Any = field(default="clip", metadata=FRAME)
+        num_frames: int = field(default=16, metadata=in_range(1, 100_000))
         candidates: List[str] = field(default_factory=list)
         clip: str = "openai/clip-vit-large-patch14"
         clip_text: Optional[str] = None
         motion_text: Optional[str] = None
         fit_shape: bool = True
-        max_residual_mm: float = 50.0
+        max_residual_mm: float = field(default=50.0, metadata=positive("millimetres"))
         face_front: bool = True
         up: str = "auto"
         front: Optional[str] = None
-        scale: float = 1.0
-        num_points: int = 50_000
-        color: Any = "random"
+        scale: float = field(default=1.0, metadata=SCALE)
+        num_points: int = field(default=50_000, metadata=points(0))
+        color: Any = field(default="random", metadata=COLOR)
         device: str = "auto"
 
         @staticmethod
         def check(cfg: Any) -> None:
-            Prior.Config.check(cfg)
             _check_source(cfg)
-            require_positive(cfg, "num_frames", "max_residual_mm", "scale")
-            require_not_negative(cfg, "num_points")
-            require_color(cfg)
-            if cfg.frame != "clip" and (
-                isinstance(cfg.frame, bool) or not isinstance(cfg.frame, int) or cfg.frame < 0
-            ):
-                raise UserError(f"frame: expected 'clip' or a number from 0, got {cfg.frame!r}")
 
     cfg: Config
 

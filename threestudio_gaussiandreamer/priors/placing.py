@@ -5,7 +5,8 @@ randomness.
 import numpy as np
 import torch
 
-from ..core.errors import UserError, unknown
+from ..core.errors import UserError
+from ..core.options import one_of
 from ..gaussians.grow import longest_side
 from ..gaussians.point_cloud import PointCloud
 from ..meshes.load import AXES
@@ -13,10 +14,7 @@ from ..meshes.load import AXES
 HORIZONTAL = ("+x", "-x", "+y", "-y")
 
 
-def check_front(front: str) -> None:
-    """Raise UserError unless ``front`` is an axis of the plane."""
-    if front not in HORIZONTAL:
-        raise unknown("front axis", front, HORIZONTAL)
+FRONT = one_of(HORIZONTAL)
 
 
 def placed(cloud: PointCloud, *, front: str, scale: float, normalize: bool) -> PointCloud:

@@ -20,7 +20,7 @@ prompt is not read."""
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
 
@@ -35,7 +35,7 @@ from ..gaussians.grow import longest_side
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.load import _pose
-from .base import GREY, Prior, require_axes, require_path, require_positive
+from .base import GREY, PATH, SCALE, Prior, require_axes
 
 logger = logging.getLogger(__name__)
 
@@ -46,18 +46,15 @@ class PointCloudPrior(Prior):
 
     @dataclass
     class Config(Prior.Config):
-        path: str = ""
+        path: str = field(default="", metadata=PATH)
         normalize: bool = False
-        scale: float = 1.0
+        scale: float = field(default=1.0, metadata=SCALE)
         up: str = "auto"
         front: Optional[str] = None
 
         @staticmethod
         def check(cfg: Any) -> None:
-            Prior.Config.check(cfg)
-            require_path(cfg)
             require_axes(cfg, axes_kind(Path(cfg.path)))
-            require_positive(cfg, "scale")
 
     cfg: Config
 

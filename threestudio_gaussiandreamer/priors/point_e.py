@@ -32,7 +32,7 @@ and read with ``weights_only``.
 Points and colours come as they are sampled, without faces. Axes as Shap-E's, which was trained on
 renders of the same scenes: z up, front -y, turned to +x."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Optional
 
 import numpy as np
@@ -42,13 +42,14 @@ from torch import Tensor
 
 from ..core.errors import UserError
 from ..core.files import existing_file
+from ..core.options import in_range, is_numbers, positive, required, satisfies
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
 from ..models import extras
 from ..models.clip import clip_source, load_text_encoder, load_tokenizer, text_condition
 from ..models.hub import Source, locate
 from ..models.model_files import free_memory
-from .base import Prior, is_number, require_positive
+from .base import SCALE, Prior, points
 from .karras import (
     Network,
     cosine_alphas_cumprod,
@@ -57,7 +58,7 @@ from .karras import (
     linear_alphas_cumprod,
     sample_heun,
 )
-from .placing import check_front, chosen_device, placed, torch_generator
+from .placing import FRONT, chosen_device, placed, torch_generator
 from .point_e_model import CHANNELS, HEAD_CHANNELS, BaseModel, Upsampler, sizes_of
 from .weights import load_exactly, read_state_dict
 
@@ -82,48 +83,44 @@ UPSAMPLER = Kind(
 )
 
 
+CHECKPOINT = required(
+    "Point-E's weights are a file that you download; set checkpoint to base_40m_textvec.pt"
+)
+PAIR = satisfies(
+    "two numbers of 0 or more, of the coarse and of the further points",
+    lambda value: is_numbers(value, 2) and min(value) >= 0,
+)
+
+
 @register("point-e-prior")
 class PointEPrior(Prior):
     """The points that Point-E imagines for the prompt."""
 
     @dataclass
     class Config(Prior.Config):
-        checkpoint: str = ""
+        checkpoint: str = field(default="", metadata=CHECKPOINT)
         upsampler: Optional[str] = None
         clip: str = "openai/clip-vit-large-patch14"
         prompt: Optional[str] = None
-        guidance_scale: float = 3.0
-        num_points: int = 1024
-        num_upsampled: int = 3072
-        num_steps: int = 64
-        sigma_min: float = 1e-3
-        sigma_max: Any = (120.0, 160.0)
-        churn: Any = (3.0, 0.0)
-        scale: float = 1.6
+        guidance_scale: float = field(default=3.0, metadata=positive())
+        num_points: int = field(default=1024, metadata=points(1))
+        num_upsampled: int = field(default=3072, metadata=points(1))
+        num_steps: int = field(default=64, metadata=in_range(1, 10_000))
+        sigma_min: float = field(default=1e-3, metadata=positive())
+        sigma_max: Any = field(default=(120.0, 160.0), metadata=PAIR)
+        churn: Any = field(default=(3.0, 0.0), metadata=PAIR)
+        scale: float = field(default=1.6, metadata=SCALE)
         normalize: bool = False
-        front: str = "-y"
+        front: str = field(default="-y", metadata=FRONT)
         device: str = "auto"
 
         @staticmethod
         def check(cfg: Any) -> None:
-            Prior.Config.check(cfg)
-            if not cfg.checkpoint:
+            if not all(value > cfg.sigma_min for value in cfg.sigma_max):
                 raise UserError(
-                    "checkpoint: Point-E's weights are a file that you download; set "
-                    "checkpoint to base_40m_textvec.pt"
+                    f"sigma_max: expected two numbers above sigma_min ({cfg.sigma_min}), got "
+                    f"{list(cfg.sigma_max)}"
                 )
-            require_positive(
-                cfg,
-                "guidance_scale",
-                "num_points",
-                "num_upsampled",
-                "num_steps",
-                "sigma_min",
-                "scale",
-            )
-            _check_pair(cfg, "sigma_max", above=cfg.sigma_min)
-            _check_pair(cfg, "churn", above=-1e-9)
-            check_front(cfg.front)
 
     cfg: Config
 
@@ -237,18 +234,4 @@ def require_features(model: BaseModel, condition: Float[Tensor, "1 D"], clip: st
         raise UserError(
             f"clip: {clip!r} has {condition.shape[-1]} features, but the checkpoint was "
             f"trained with {expected}: take ViT-L/14"
-        )
-
-
-def _check_pair(cfg: Any, name: str, above: float) -> None:
-    values = cfg[name]
-    if (
-        isinstance(values, str)
-        or not hasattr(values, "__len__")
-        or len(values) != 2
-        or not all(is_number(v) and v > above for v in values)
-    ):
-        raise UserError(
-            f"{name}: expected two numbers, of the coarse and of the further points, above "
-            f"{max(above, 0)}, got {values!r}"
         )

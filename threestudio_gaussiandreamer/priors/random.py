@@ -13,16 +13,16 @@ ground, ...   see ``priors/base.py``
 Limits: the prompt is not read, and no view is told from another, so expect several faces.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from ..core.errors import UserError, unknown
+from ..core.options import one_of, satisfies
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
-from .base import Prior, chosen_colors, require_color, require_positive
+from .base import SCALE, Prior, chosen_colors, is_color, points
 
 
 def in_sphere(count: int, generator: np.random.Generator) -> Float[np.ndarray, "P 3"]:
@@ -38,6 +38,11 @@ def in_box(count: int, generator: np.random.Generator) -> Float[np.ndarray, "P 3
 
 
 SHAPES = {"sphere": in_sphere, "box": in_box}
+OWN_COLOR = satisfies(
+    "'random', 'grey' or [red, green, blue] in [0, 1], since random points have no colours of "
+    "their own",
+    lambda value: value is not None and is_color(value),
+)
 
 
 @register("random-prior")
@@ -46,23 +51,10 @@ class RandomPrior(Prior):
 
     @dataclass
     class Config(Prior.Config):
-        shape: str = "sphere"
-        num_points: int = 10_000
-        size: float = 1.0
-        color: Any = "random"
-
-        @staticmethod
-        def check(cfg: Any) -> None:
-            Prior.Config.check(cfg)
-            if cfg.shape not in SHAPES:
-                raise unknown("shape", cfg.shape, SHAPES)
-            require_positive(cfg, "num_points", "size")
-            require_color(cfg)
-            if cfg.color is None:
-                raise UserError(
-                    "color: random points have no colours of their own; expected 'random', "
-                    "'grey' or [red, green, blue]"
-                )
+        shape: str = field(default="sphere", metadata=one_of(SHAPES))
+        num_points: int = field(default=10_000, metadata=points(1))
+        size: float = field(default=1.0, metadata=SCALE)
+        color: Any = field(default="random", metadata=OWN_COLOR)
 
     cfg: Config
 

@@ -41,7 +41,7 @@ code surrounds the grid with make its surface smaller by ``(grid_size - 1) / (gr
 does ours."""
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
 
@@ -50,21 +50,25 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..core.errors import UserError, unknown
+from ..core.errors import UserError
 from ..core.files import existing_file
+from ..core.memory import count_of, require_memory
+from ..core.options import in_range, one_of, positive
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
 from ..models import extras
 from ..models.clip import load_text_encoder, load_tokenizer, text_condition
 from ..models.hub import Source, locate
 from ..models.model_files import free_memory, load_network, load_settings, needed_files
-from .base import Prior, require_positive
+from .base import SCALE, Prior
 from .karras import Network, guided_denoiser, karras_sigmas, sample_heun
-from .placing import check_front, chosen_device, placed, torch_generator
+from .placing import FRONT, chosen_device, placed, torch_generator
 from .shap_e_checkpoint import load_original_prior
 
 COMPONENTS = ("tokenizer", "text_encoder", "prior", "scheduler", "shap_e_renderer")
 COLORS = ("display", "linear")
+GRID_BYTES = 32
+"""Of a point of the grid: its place, its distance, and what marching cubes makes of it."""
 
 
 @register("shap-e-prior")
@@ -78,40 +82,27 @@ class ShapEPrior(Prior):
         allow_bin: bool = False
         checkpoint: Optional[str] = None
         prompt: Optional[str] = None
-        guidance_scale: float = 15.0
-        num_inference_steps: int = 64
-        sigma_min: float = 1e-3
-        sigma_max: float = 160.0
-        grid_size: int = 128
-        query_batch_size: int = 65536
-        colors: str = "display"
-        scale: float = 1.6
+        guidance_scale: float = field(default=15.0, metadata=positive())
+        num_inference_steps: int = field(default=64, metadata=in_range(1, 10_000))
+        sigma_min: float = field(default=1e-3, metadata=positive())
+        sigma_max: float = field(default=160.0, metadata=positive())
+        grid_size: int = field(default=128, metadata=in_range(2, 1024))
+        query_batch_size: int = field(default=65536, metadata=count_of("points", 1, 4096))
+        colors: str = field(default="display", metadata=one_of(COLORS))
+        scale: float = field(default=1.6, metadata=SCALE)
         normalize: bool = False
-        front: str = "-y"
+        front: str = field(default="-y", metadata=FRONT)
         half_precision: bool = True
         device: str = "auto"
 
         @staticmethod
         def check(cfg: Any) -> None:
-            Prior.Config.check(cfg)
-            require_positive(
-                cfg,
-                "guidance_scale",
-                "num_inference_steps",
-                "sigma_min",
-                "sigma_max",
-                "query_batch_size",
-                "scale",
-            )
             if not cfg.sigma_min < cfg.sigma_max:
                 raise UserError(
                     f"sigma_min: expected less than sigma_max, {cfg.sigma_max}, got {cfg.sigma_min}"
                 )
-            if cfg.grid_size < 2:
-                raise UserError(f"grid_size: expected 2 or more, got {cfg.grid_size}")
-            if cfg.colors not in COLORS:
-                raise unknown("colors", cfg.colors, COLORS)
-            check_front(cfg.front)
+            what = f"a grid of {cfg.grid_size} points each way"
+            require_memory("grid_size", GRID_BYTES * cfg.grid_size**3, what)
 
     cfg: Config
 

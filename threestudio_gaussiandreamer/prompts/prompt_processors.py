@@ -31,7 +31,7 @@ import multiprocessing
 from abc import abstractmethod
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, ClassVar, Optional, Tuple
@@ -42,6 +42,7 @@ from torch import Tensor
 
 from ..core.errors import UserError
 from ..core.files import existing_file
+from ..core.options import check_options, in_range
 from ..host import BaseObject, info, register, register_builtin
 from ..models import extras
 from ..models.embedding_cache import EmbeddingCache, Encode
@@ -85,9 +86,9 @@ class TextEncoderPromptProcessor(BaseObject):
         prompt_overhead: Optional[str] = None
         negative_prompt: str = NEGATIVE_PROMPT
         view_dependent_prompt_front: bool = False
-        front_threshold: float = 45.0
-        back_threshold: float = 45.0
-        overhead_threshold: float = 60.0
+        front_threshold: float = field(default=45.0, metadata=in_range(0, 180, "degrees"))
+        back_threshold: float = field(default=45.0, metadata=in_range(0, 180, "degrees"))
+        overhead_threshold: float = field(default=60.0, metadata=in_range(0, 90, "degrees"))
         use_perp_neg: bool = False
         perp_neg_f_sb: Tuple[float, float, float] = (1.0, 0.5, -0.606)
         perp_neg_f_fsb: Tuple[float, float, float] = (1.0, 0.5, 0.967)
@@ -96,19 +97,6 @@ class TextEncoderPromptProcessor(BaseObject):
         use_cache: bool = True
         cache_dir: str = ".threestudio_cache/text_embeddings"
         spawn: bool = False
-
-        @staticmethod
-        def check(cfg: Any) -> None:
-            for name, most in (
-                ("front_threshold", 180),
-                ("back_threshold", 180),
-                ("overhead_threshold", 90),
-            ):
-                if not 0 <= cfg[name] <= most:
-                    raise UserError(
-                        f"system.prompt_processor.{name}: expected degrees in [0, {most}], got "
-                        f"{cfg[name]}"
-                    )
 
     cfg: Config
     half: ClassVar[bool] = False
@@ -120,7 +108,7 @@ class TextEncoderPromptProcessor(BaseObject):
         """The embeddings of ``texts``; a function of an importable module, for ``spawn``."""
 
     def configure(self) -> None:
-        self.Config.check(self.cfg)
+        check_options(self.Config, self.cfg, "system.prompt_processor.")
         extras.require("diffusion", "diffusers", "transformers")
         self.prompt = chosen_prompt(self.cfg)
         half = self.half and self.device.type == "cuda"

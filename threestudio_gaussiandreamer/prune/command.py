@@ -23,7 +23,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
@@ -35,6 +35,7 @@ from ..core.checkpoint_file import load_file
 from ..core.errors import UserError
 from ..core.files import atomic_file, existing_file, require_writable
 from ..core.images import write as write_picture
+from ..core.options import at_least, check_options, in_range
 from ..formats.gaussian_files import (
     AXES,
     OUR_UP,
@@ -98,32 +99,22 @@ class PruneOptions:
     bytes: Any = None
     psnr: Any = None
     within: Any = None
-    quality: float = 35.0
-    size: int = 256
-    steps: int = 60
-    eps2d: Optional[float] = None
+    quality: float = field(default=35.0, metadata=in_range(-200, 200, "dB"))
+    size: int = field(default=256, metadata=in_range(16, 4096, "pixels"))
+    steps: int = field(default=60, metadata=in_range(1, 100_000))
+    eps2d: Optional[float] = field(default=None, metadata=at_least(0, "square pixels"))
     antialias: Optional[bool] = None
 
     @property
     def asked_for(self) -> bool:
         return any(getattr(self, name) is not None for name in BUDGETS)
 
-    def check(self, where: str) -> None:
-        """Raises UserError for a number that makes no sense; ``where`` is what the names of options
-        begin with.
-        """
-        given = [name for name in BUDGETS if getattr(self, name) is not None]
+    @staticmethod
+    def check(cfg: Any) -> None:
+        given = [name for name in BUDGETS if getattr(cfg, name) is not None]
         if len(given) > 1:
-            raise UserError(f"{where}{given[0]} and {where}{given[1]}: give one budget")
-        if self.size < 16 or self.steps < 1:
-            raise UserError(
-                f"{where}size and {where}steps: expected at least 16 and 1, got {self.size} "
-                f"and {self.steps}"
-            )
-        if self.eps2d is not None and not 0 <= self.eps2d < math.inf:
-            raise UserError(f"{where}eps2d: expected 0 or more square pixels, got {self.eps2d:g}")
-        number(self.quality, f"{where}quality", "dB")
-        budget_of(self, where)
+            raise UserError(f"{given[1]}: give one budget; {given[0]} is one too")
+        budget_of(cfg, "")
 
 
 class Pruned(NamedTuple):
@@ -224,9 +215,9 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
 def run(args: argparse.Namespace) -> dict[str, Any]:
     """Everything, in the order in which mistakes show; returns the report."""
     options = PruneOptions(
-        **{field.name: getattr(args, field.name) for field in fields(PruneOptions)}
+        **{option.name: getattr(args, option.name) for option in fields(PruneOptions)}
     )
-    options.check("--")
+    check_options(PruneOptions, options, "--")
     suffix = require_format(args.output, "OUT")
     for ending in ("", *REPORTS):
         require_writable(args.output + ending, f"OUT{ending}")

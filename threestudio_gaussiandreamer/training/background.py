@@ -10,16 +10,16 @@ lr      learning rate of the learned colour: a number or a schedule
 ======  ============================================================================================
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Tuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ..core.errors import UserError, unknown
+from ..core.options import check_options, each, in_range, one_of, schedule
 from ..core.streams import generator
-from ..host import BaseBackground, C, item_seed, register, validate_schedule
+from ..host import BaseBackground, C, item_seed, register
 
 MODES = ("fixed", "random", "learned")
 
@@ -28,25 +28,16 @@ MODES = ("fixed", "random", "learned")
 class FlatBackground(BaseBackground):
     @dataclass
     class Config(BaseBackground.Config):
-        mode: str = "fixed"
-        color: Tuple[float, float, float] = (0.0, 0.0, 0.0)
-        lr: Any = 1e-2
-
-        @staticmethod
-        def check(cfg: Any) -> None:
-            if cfg.mode not in MODES:
-                raise unknown("system.background.mode", cfg.mode, MODES)
-            if not all(0.0 <= c <= 1.0 for c in cfg.color):
-                raise UserError(
-                    "system.background.color: expected three numbers in [0, 1], got "
-                    f"{list(cfg.color)}"
-                )
-            validate_schedule(cfg.lr, "system.background.lr", minimum=0)
+        mode: str = field(default="fixed", metadata=one_of(MODES))
+        color: Tuple[float, float, float] = field(
+            default=(0.0, 0.0, 0.0), metadata=each(in_range(0, 1))
+        )
+        lr: Any = field(default=1e-2, metadata=schedule(min=0))
 
     cfg: Config
 
     def configure(self) -> None:
-        self.Config.check(self.cfg)
+        check_options(self.Config, self.cfg, "system.background.")
         color = torch.tensor(list(self.cfg.color), dtype=torch.float32)
         if self.cfg.mode == "learned":
             self.logit = nn.Parameter(torch.logit(color.clamp(1e-3, 1 - 1e-3)))

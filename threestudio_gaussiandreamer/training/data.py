@@ -40,136 +40,128 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset
 from .. import cameras
 from ..cameras import Orbit, OrbitRanges
 from ..core.errors import UserError
+from ..core.memory import count_of, require_memory
+from ..core.options import (
+    Rule,
+    at_least,
+    check_options,
+    in_range,
+    interval,
+    is_list,
+    is_whole,
+    satisfies,
+)
 from ..core.streams import generator
 from ..host import Updateable, item_seed, parse_structured, pl, register, register_builtin, run_seed
+
+MAX_SIDE = 16_384
+"""Pixels of a picture each way."""
+WORLD = (1e-6, 1e6)
+"""Distances of cameras and lights, world units: float32 keeps places to some digits in it."""
+FOVY = (1e-3, 179.999)
+LISTED = ("height", "width", "batch_size")
+TRAIN_BYTES, EVAL_BYTES, CAMERA_BYTES = 64, 32, 256
+"""What a pixel of a training view, a pixel of an evaluated view, and a camera take at least."""
+ELEVATIONS = interval(-90, 90, "degrees")
+AZIMUTHS = interval(-36_000, 36_000, "degrees")
+DISTANCES, LIGHT_DISTANCES = interval(*WORLD, "world units"), interval(0, WORLD[1], "world units")
+FOVYS = interval(*FOVY, "degrees")
+LENGTH = in_range(0, WORLD[1], "world units")
+
+
+ONE_VIEW = satisfies("1: views are evaluated one at a time", lambda count: count == 1)
+
+
+def whole_numbers(high: int) -> Rule:
+    """Whole numbers from 1 to ``high``, or lists of such."""
+
+    def holds(value: Any) -> bool:
+        values = value if is_list(value) else [value]
+        return len(values) > 0 and all(is_whole(v) and 1 <= v <= high for v in values)
+
+    return satisfies(f"whole numbers from 1 to {high}", holds)
+
+
+SIDE, BATCH = whole_numbers(MAX_SIDE), whole_numbers(4096)
 
 
 @dataclass
 class CameraConfig:
-    height: Any = 64
-    width: Any = 64
-    batch_size: Any = 1
+    height: Any = field(default=64, metadata=SIDE)
+    width: Any = field(default=64, metadata=SIDE)
+    batch_size: Any = field(default=1, metadata=BATCH)
     resolution_milestones: List[int] = field(default_factory=list)
-    eval_height: int = 512
-    eval_width: int = 512
-    eval_batch_size: int = 1
-    n_val_views: int = 1
-    n_test_views: int = 120
-    elevation_range: Tuple[float, float] = (-10, 60)
-    azimuth_range: Tuple[float, float] = (-180, 180)
-    camera_distance_range: Tuple[float, float] = (1.5, 4.0)
-    fovy_range: Tuple[float, float] = (40, 70)
-    camera_perturb: float = 0.0
-    center_perturb: float = 0.0
-    up_perturb: float = 0.0
-    light_position_perturb: float = 1.0
-    light_distance_range: Tuple[float, float] = (0.8, 1.5)
-    eval_elevation_deg: float = 15.0
-    eval_camera_distance: float = 4.0
-    eval_fovy_deg: float = 70.0
+    eval_height: int = field(default=512, metadata=in_range(1, MAX_SIDE, "pixels"))
+    eval_width: int = field(default=512, metadata=in_range(1, MAX_SIDE, "pixels"))
+    eval_batch_size: int = field(default=1, metadata=ONE_VIEW)
+    n_val_views: int = field(default=1, metadata=count_of("views", 1, CAMERA_BYTES))
+    n_test_views: int = field(default=120, metadata=count_of("views", 1, CAMERA_BYTES))
+    elevation_range: Tuple[float, float] = field(default=(-10, 60), metadata=ELEVATIONS)
+    azimuth_range: Tuple[float, float] = field(default=(-180, 180), metadata=AZIMUTHS)
+    camera_distance_range: Tuple[float, float] = field(default=(1.5, 4.0), metadata=DISTANCES)
+    fovy_range: Tuple[float, float] = field(default=(40, 70), metadata=FOVYS)
+    camera_perturb: float = field(default=0.0, metadata=LENGTH)
+    center_perturb: float = field(default=0.0, metadata=LENGTH)
+    up_perturb: float = field(default=0.0, metadata=LENGTH)
+    light_position_perturb: float = field(default=1.0, metadata=LENGTH)
+    light_distance_range: Tuple[float, float] = field(default=(0.8, 1.5), metadata=LIGHT_DISTANCES)
+    eval_elevation_deg: float = field(default=15.0, metadata=in_range(-90, 90, "degrees"))
+    eval_camera_distance: float = field(default=4.0, metadata=in_range(*WORLD, "world units"))
+    eval_fovy_deg: float = field(default=70.0, metadata=in_range(*FOVY, "degrees"))
     batch_uniform_azimuth: bool = True
-    progressive_until: int = 0
+    progressive_until: int = field(default=0, metadata=at_least(0, "steps"))
     rays_d_normalize: bool = True
-    train_views: int = 0
+    train_views: int = field(default=0, metadata=count_of("views", 0, CAMERA_BYTES))
     rays: bool = False
 
     @staticmethod
     def check(cfg: Any) -> None:
-        """Raises UserError when a range is empty or the lists of sizes don't fit the milestones."""
-        for name in (
-            "elevation_range",
-            "azimuth_range",
-            "camera_distance_range",
-            "fovy_range",
-            "light_distance_range",
-        ):
-            low, high = cfg[name]
-            if not low <= high:
-                raise UserError(
-                    f"data.{name}: expected [low, high] with low <= high, got [{low}, {high}]"
-                )
-        if cfg.camera_distance_range[0] <= 0:
-            raise UserError(
-                "data.camera_distance_range: distances must be positive, got "
-                f"{list(cfg.camera_distance_range)}"
-            )
-        if not 0 < cfg.fovy_range[0] <= cfg.fovy_range[1] < 180:
-            raise UserError(
-                f"data.fovy_range: expected degrees between 0 and 180, got {list(cfg.fovy_range)}"
-            )
-        for name in ("height", "width", "batch_size"):
+        """Raise UserError where the lists of sizes don't fit the milestones, or nothing could hold
+        what is asked for.
+        """
+        for name in LISTED:
             values = _plain(cfg[name])
-            listed = isinstance(values, list)
-            if listed and len(values) not in (1, len(cfg.resolution_milestones) + 1):
-                milestones = (
-                    f"{len(values) - 1} data.resolution_milestones, got "
-                    f"{len(cfg.resolution_milestones)}"
-                )
-                raise UserError(f"data.{name}: {len(values)} entries need {milestones}")
-            if any(
-                not isinstance(v, int) or isinstance(v, bool) or v < 1
-                for v in (values if listed else [values])
+            if isinstance(values, list) and len(values) not in (
+                1,
+                len(cfg.resolution_milestones) + 1,
             ):
-                raise UserError(f"data.{name}: expected whole numbers >= 1, got {values}")
+                raise UserError(
+                    f"{name}: {len(values)} entries need {len(values) - 1} "
+                    f"resolution_milestones, got {len(cfg.resolution_milestones)}"
+                )
         _check_milestones(cfg)
-        for name in (
-            "camera_perturb",
-            "center_perturb",
-            "up_perturb",
-            "light_position_perturb",
-            "progressive_until",
-        ):
-            if cfg[name] < 0:
-                raise UserError(f"data.{name}: expected 0 or more, got {cfg[name]}")
-        if not cfg.eval_camera_distance > 0:
-            raise UserError(
-                "data.eval_camera_distance: expected a positive distance, got "
-                f"{cfg.eval_camera_distance}"
-            )
-        if not 0 < cfg.eval_fovy_deg < 180:
-            raise UserError(
-                f"data.eval_fovy_deg: expected degrees between 0 and 180, got {cfg.eval_fovy_deg}"
-            )
-        if (
-            not -90
-            <= min(cfg.elevation_range[0], cfg.eval_elevation_deg)
-            <= max(cfg.elevation_range[1], cfg.eval_elevation_deg)
-            <= 90
-        ):
-            elevations = [*cfg.elevation_range, cfg.eval_elevation_deg]
-            raise UserError(
-                "data.elevation_range, data.eval_elevation_deg: expected degrees from -90 to "
-                f"90, got {elevations}"
-            )
-        if cfg.eval_batch_size != 1:
-            raise UserError(
-                "data.eval_batch_size: views are evaluated one at a time, expected 1, got "
-                f"{cfg.eval_batch_size}"
-            )
-        for name in ("eval_height", "eval_width", "n_val_views", "n_test_views"):
-            if cfg[name] < 1:
-                raise UserError(f"data.{name}: expected at least 1, got {cfg[name]}")
-        if cfg.train_views < 0:
-            raise UserError(
-                "data.train_views: expected 0 (continuous) or a number of views, got "
-                f"{cfg.train_views}"
-            )
+        _check_memory(cfg)
 
 
 def _check_milestones(cfg: Any) -> None:
     milestones = list(cfg.resolution_milestones)
     if any(later <= earlier for earlier, later in zip([0, *milestones], milestones, strict=False)):
         raise UserError(
-            f"data.resolution_milestones: expected increasing steps above 0, got {milestones}"
+            f"resolution_milestones: expected increasing steps above 0, got {milestones}"
         )
     if milestones and not any(
         isinstance(_plain(cfg[name]), list) and len(cfg[name]) > 1
         for name in ("height", "width", "batch_size")
     ):
         raise UserError(
-            "data.resolution_milestones: give data.height, data.width or data.batch_size "
-            f"{len(milestones) + 1} entries"
+            f"resolution_milestones: give height, width or batch_size {len(milestones) + 1} entries"
         )
+
+
+def _check_memory(cfg: Any) -> None:
+    """Raise UserError for pictures larger than the memory."""
+    stages = range(len(cfg.resolution_milestones) + 1)
+    for height, width, batch in zip(*(_per_stage(cfg[n], stages) for n in LISTED), strict=True):
+        what = f"{batch} views of {height} x {width} pixels"
+        require_memory("batch_size", TRAIN_BYTES * height * width * batch, what)
+    what = f"pictures of {cfg.eval_height} x {cfg.eval_width} pixels"
+    require_memory("eval_height", EVAL_BYTES * cfg.eval_height * cfg.eval_width, what)
+
+
+def _per_stage(given: Any, stages: range) -> list[int]:
+    values = _plain(given)
+    values = values if isinstance(values, list) else [values]
+    return [values[min(i, len(values) - 1)] for i in stages]
 
 
 def make_batch(
@@ -357,7 +349,7 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
     def __init__(self, cfg: Any = None) -> None:
         super().__init__()
         self.cfg = parse_structured(CameraConfig, cfg)
-        CameraConfig.check(self.cfg)
+        check_options(CameraConfig, self.cfg, "data.")
 
     def setup(self, stage: str | None = None) -> None:
         if stage in (None, "fit"):
@@ -388,10 +380,18 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         return {"c2w": cameras.pool.c2w, "fovy": cameras.pool.fovy, **sizes}
 
     def val_dataloader(self) -> DataLoader:
-        return DataLoader(self.val_dataset, batch_size=1, collate_fn=self.val_dataset.collate)
+        return DataLoader(
+            self.val_dataset,
+            batch_size=self.cfg.eval_batch_size,
+            collate_fn=self.val_dataset.collate,
+        )
 
     def test_dataloader(self) -> DataLoader:
-        return DataLoader(self.test_dataset, batch_size=1, collate_fn=self.test_dataset.collate)
+        return DataLoader(
+            self.test_dataset,
+            batch_size=self.cfg.eval_batch_size,
+            collate_fn=self.test_dataset.collate,
+        )
 
     predict_dataloader = test_dataloader
 

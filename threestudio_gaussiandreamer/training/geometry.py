@@ -51,8 +51,21 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from ..core.errors import UserError, unknown
+from ..core.errors import UserError
+from ..core.memory import count_of
 from ..core.nested import adopt_nested
+from ..core.options import (
+    at_least,
+    between,
+    check_options,
+    in_range,
+    interval,
+    is_whole,
+    one_of,
+    positive,
+    schedule,
+    shown,
+)
 from ..core.streams import numpy_generator
 from ..gaussians import densify, importance, sh, simplify
 from ..gaussians.densify import LOG_SCALE_RANGE, PARAMETERS, Change
@@ -60,7 +73,7 @@ from ..gaussians.gaussians import Gaussians
 from ..gaussians.grow import SCALE_RULES, grow, nearest_distance_scales
 from ..gaussians.merge import merge_duplicates
 from ..gaussians.point_cloud import PointCloud
-from ..host import BaseGeometry, C, find, register, run_seed, validate_schedule
+from ..host import BaseGeometry, C, find, register, run_seed
 from .density import AUTO, min_count
 
 logger = logging.getLogger(__name__)
@@ -80,35 +93,50 @@ CAP_VIEWS = (32, 256)
 @dataclass
 class GrowConfig:
     enabled: bool = True
-    num_candidates: int = 1_000_000
-    radius: float = 0.01
-    color_range: List[float] = field(default_factory=lambda: [0.0, 0.2])
+    num_candidates: int = field(default=1_000_000, metadata=count_of("candidates", 0, 48))
+    radius: float = field(default=0.01, metadata=positive())
+    color_range: List[float] = field(default_factory=lambda: [0.0, 0.2], metadata=interval())
     clamp: bool = True
-    max_points: int = 400_000
+    max_points: int = field(default=400_000, metadata=at_least(0))
 
 
 @dataclass
 class DensifyConfig:
     enabled: bool = False
-    start: int = 400
-    stop: int = 900
-    every: int = 100
-    grad_threshold: float = 2e-4
-    split_scale: float = 0.04
-    min_opacity: float = 0.05
-    max_scale: float = 0.4
+    start: int = field(default=400, metadata=at_least(0))
+    stop: int = field(default=900, metadata=at_least(0))
+    every: int = field(default=100, metadata=at_least(1))
+    grad_threshold: float = field(default=2e-4, metadata=at_least(0))
+    split_scale: float = field(default=0.04, metadata=positive())
+    min_opacity: float = field(default=0.05, metadata=in_range(0, 1 - 1e-6))
+    max_scale: float = field(default=0.4, metadata=positive("world units"))
     absgrad: bool = False
+
+    @staticmethod
+    def check(cfg: Any) -> None:
+        if cfg.enabled:
+            require_order(cfg)
 
 
 @dataclass
 class PruneConfig:
-    start: int = 100
-    stop: int = 900
-    every: int = 50
-    keep: float = 0.8
-    score: str = "removal"
-    quality: float = 0.1
-    likeness: float = 40.0
+    start: int = field(default=100, metadata=at_least(0))
+    stop: int = field(default=900, metadata=at_least(0))
+    every: int = field(default=50, metadata=at_least(1))
+    keep: float = field(default=0.8, metadata=between(0, 1))
+    score: str = field(default="removal", metadata=one_of(importance.SCORES))
+    quality: float = field(default=0.1, metadata=at_least(0, "dB"))
+    likeness: float = field(default=40.0, metadata=at_least(0, "dB"))
+
+    @staticmethod
+    def check(cfg: Any) -> None:
+        require_order(cfg)
+
+
+def require_order(cfg: Any) -> None:
+    """Raise UserError unless a schedule of rounds starts before it stops."""
+    if cfg.start >= cfg.stop:
+        raise UserError(f"stop: expected more than start ({cfg.start}), got {cfg.stop}")
 
 
 @register("gaussiandreamer-cloud")
@@ -118,22 +146,22 @@ class GaussianCloud(BaseGeometry):
         prior_type: str = "random-prior"
         prior: dict = field(default_factory=dict)
         grow: GrowConfig = field(default_factory=GrowConfig)
-        scale_rule: str = "nearest"
-        scale_factor: float = 1.0
-        init_opacity: float = 0.1
-        sh_degree: int = 0
+        scale_rule: str = field(default="nearest", metadata=one_of(SCALE_RULES))
+        scale_factor: float = field(default=1.0, metadata=positive())
+        init_opacity: float = field(default=0.1, metadata=between(0, 1))
+        sh_degree: int = field(default=0, metadata=in_range(0, 3))
         keep_attributes: bool = True
-        lr_means: Any = 5e-5
-        lr_scales: Any = 1e-3
-        lr_quats: Any = 1e-2
-        lr_opacities: Any = 1e-2
-        lr_sh: Any = 1.25e-2
-        lr_sh_rest: Any = 6.25e-4
+        lr_means: Any = field(default=5e-5, metadata=schedule(min=0))
+        lr_scales: Any = field(default=1e-3, metadata=schedule(min=0))
+        lr_quats: Any = field(default=1e-2, metadata=schedule(min=0))
+        lr_opacities: Any = field(default=1e-2, metadata=schedule(min=0))
+        lr_sh: Any = field(default=1.25e-2, metadata=schedule(min=0))
+        lr_sh_rest: Any = field(default=6.25e-4, metadata=schedule(min=0))
         densify: DensifyConfig = field(default_factory=DensifyConfig)
         budget: Any = None
         prune: PruneConfig = field(default_factory=PruneConfig)
-        max_gaussians: int = 500_000
-        min_gaussians: int = 64
+        max_gaussians: int = field(default=500_000, metadata=at_least(1))
+        min_gaussians: int = field(default=64, metadata=at_least(1))
 
         def __post_init__(self) -> None:
             adopt_nested(self)
@@ -141,65 +169,17 @@ class GaussianCloud(BaseGeometry):
 
         @staticmethod
         def check(cfg: Any) -> None:
-            """Raises UserError for a value out of range, before any long work."""
-            where = "system.geometry"
-            if cfg.scale_rule not in SCALE_RULES:
-                raise unknown(f"{where}.scale_rule", cfg.scale_rule, SCALE_RULES)
-            if not 0 < cfg.init_opacity < 1:
+            if cfg.max_gaussians < cfg.min_gaussians:
                 raise UserError(
-                    f"{where}.init_opacity: expected a number between 0 and 1, got "
-                    f"{cfg.init_opacity}"
+                    f"max_gaussians: expected min_gaussians ({cfg.min_gaussians}) or more, got "
+                    f"{cfg.max_gaussians}"
                 )
-            if cfg.sh_degree not in (0, 1, 2, 3):
-                raise UserError(f"{where}.sh_degree: expected 0, 1, 2 or 3, got {cfg.sh_degree}")
-            if not 0 < cfg.min_gaussians <= cfg.max_gaussians:
-                raise UserError(
-                    f"{where}: expected 0 < min_gaussians <= max_gaussians, got "
-                    f"{cfg.min_gaussians} and {cfg.max_gaussians}"
-                )
-            for name in (
-                "scale_factor",
-                "grow.radius",
-                "densify.every",
-                "densify.split_scale",
-                "densify.max_scale",
-            ):
-                value = _nested(cfg, name)
-                if not value > 0:
-                    raise UserError(f"{where}.{name}: expected a positive number, got {value}")
-            for name in (
-                "grow.num_candidates",
-                "grow.max_points",
-                "densify.start",
-                "densify.stop",
-                "densify.grad_threshold",
-            ):
-                value = _nested(cfg, name)
-                if value < 0:
-                    raise UserError(f"{where}.{name}: expected 0 or more, got {value}")
-            _check_budget(cfg, where)
-            if cfg.densify.enabled and cfg.densify.start >= cfg.densify.stop:
-                raise UserError(
-                    f"{where}.densify: expected start < stop, got {cfg.densify.start} and "
-                    f"{cfg.densify.stop}"
-                )
-            if not 0 <= cfg.densify.min_opacity < 1:
-                raise UserError(
-                    f"{where}.densify.min_opacity: expected a number from 0 to 1, got "
-                    f"{cfg.densify.min_opacity}"
-                )
-            if len(cfg.grow.color_range) != 2 or cfg.grow.color_range[0] > cfg.grow.color_range[1]:
-                raise UserError(
-                    f"{where}.grow.color_range: expected [low, high], got "
-                    f"{list(cfg.grow.color_range)}"
-                )
-            for name in LEARNING_RATES.values():
-                validate_schedule(cfg[name], f"{where}.{name}", minimum=0)
+            _check_budget(cfg)
 
     cfg: Config
 
     def configure(self) -> None:
-        self.Config.check(self.cfg)
+        check_options(self.Config, self.cfg, "system.geometry.")
         self.bands = (self.cfg.sh_degree + 1) ** 2
         self._warned = False
         self._allocate(0)
@@ -485,30 +465,11 @@ def _as_budget(given: Any) -> Any:
     return int(given) if isinstance(given, float) and given.is_integer() else given
 
 
-def _check_budget(cfg: Any, where: str) -> None:
-    """Raises UserError for a budget or a pruning schedule that can't be met."""
-    budget, prune = cfg.budget, cfg.prune
-    if (
-        budget is not None
-        and budget != AUTO
-        and (isinstance(budget, bool) or not isinstance(budget, int) or budget < cfg.min_gaussians)
-    ):
-        raise UserError(
-            f"{where}.budget: expected none, auto or a number from min_gaussians "
-            f"({cfg.min_gaussians}) on, got {budget!r}"
-        )
-    if prune.score not in importance.SCORES:
-        raise unknown(f"{where}.prune.score", prune.score, importance.SCORES)
-    if not 0 < prune.keep < 1:
-        raise UserError(f"{where}.prune.keep: expected a share between 0 and 1, got {prune.keep}")
-    for name, least in (("start", 0), ("every", 1), ("quality", 0), ("likeness", 0)):
-        if prune[name] < least:
-            raise UserError(f"{where}.prune.{name}: expected {least} or more, got {prune[name]}")
-    if prune.start >= prune.stop:
-        raise UserError(f"{where}.prune: expected start < stop, got {prune.start} and {prune.stop}")
-
-
-def _nested(cfg: Any, dotted: str) -> Any:
-    for key in dotted.split("."):
-        cfg = cfg[key]
-    return cfg
+def _check_budget(cfg: Any) -> None:
+    """Raise UserError for a budget that can't be met."""
+    if cfg.budget in (None, AUTO) or is_whole(cfg.budget) and cfg.budget >= cfg.min_gaussians:
+        return
+    raise UserError(
+        "budget: expected none, auto or a number from min_gaussians "
+        f"({cfg.min_gaussians}) on, got {shown(cfg.budget)}"
+    )

@@ -10,7 +10,7 @@ import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Optional
@@ -21,30 +21,30 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..cameras import Orbit, held_out_orbit
-from ..core.errors import UserError
 from ..core.images import read as read_image
+from ..core.memory import require_memory
+from ..core.options import at_least, in_range
 from ..meshes.load import SurfaceDistance
 from ..meshes.raycast import over_background
 from ..metrics import floater_mass, multi_face_rate, out_of_gamut, psnr, ssim
-from .data import make_batch
+from .data import MAX_SIDE, make_batch
+
+VIEW_BYTES = 40
+"""Of a pixel: its truth with coverage, that on the background, and the render, in float32."""
 
 
 @dataclass
 class EvaluationConfig:
-    views: int = 24
-    size: int = 256
-    supersample: int = 3
-    every: int = 0
+    views: int = field(default=24, metadata=in_range(1, 100_000))
+    size: int = field(default=256, metadata=in_range(1, MAX_SIDE, "pixels"))
+    supersample: int = field(default=3, metadata=in_range(1, 64, "rays a pixel each way"))
+    every: int = field(default=0, metadata=at_least(0, "steps; 0: never"))
 
     @staticmethod
     def check(cfg: Any) -> None:
-        for name in ("views", "size", "supersample"):
-            if cfg[name] < 1:
-                raise UserError(f"system.evaluation.{name}: expected at least 1, got {cfg[name]}")
-        if cfg.every < 0:
-            raise UserError(
-                f"system.evaluation.every: expected 0 (never) or a number of steps, got {cfg.every}"
-            )
+        pixels = cfg.views * cfg.size**2
+        what = f"{cfg.views} pictures of {cfg.size} x {cfg.size} pixels, twice"
+        require_memory("size", VIEW_BYTES * pixels, what)
 
 
 def orbit_batch(orbit: Orbit, size: int) -> dict[str, Any]:

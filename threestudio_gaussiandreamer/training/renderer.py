@@ -16,7 +16,7 @@ train_normals  normals in training too; otherwise only in validation, test and e
 =============  =====================================================================================
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -26,51 +26,54 @@ from torch import Tensor
 
 from .. import cameras
 from ..core.errors import UserError, unknown
+from ..core.options import at_least, check_options, in_range, one_of, positive, rule
 from ..host import Rasterizer, register
 from ..splatting import PRESETS, Rasterized, available_backends, rasterize
 from .background import FlatBackground
+
+
+def check_backend(option: str, name: str) -> None:
+    """Raise UserError unless the backend exists and runs here; ``auto`` always finds one.
+
+    Args:
+        option: the path of the option, for the message.
+    """
+    if name == "auto":
+        return
+    reasons = available_backends()
+    if name not in reasons:
+        raise unknown(option, name, ["auto", *reasons])
+    if reasons[name] is not None:
+        raise UserError(
+            f"{option}: {name} can't be used here: {reasons[name]} (auto takes the fastest that "
+            "can)"
+        )
 
 
 @register("gaussiandreamer-splatting")
 class SplattingRenderer(Rasterizer):
     @dataclass
     class Config(Rasterizer.Config):
-        backend: str = "auto"
-        preset: str = "balanced"
+        radius: float = field(default=1.0, metadata=positive())
+        backend: str = field(default="auto", metadata=rule(check_backend))
+        preset: str = field(default="balanced", metadata=one_of(PRESETS))
         antialias: bool = False
-        eps2d: float = 0.3
-        near: float = 0.01
-        far: float = 1e10
-        downsample: int = 1
+        eps2d: float = field(default=0.3, metadata=at_least(0, "square pixels"))
+        near: float = field(default=0.01, metadata=positive())
+        far: float = field(default=1e10, metadata=positive())
+        downsample: int = field(default=1, metadata=in_range(1, 2))
         train_normals: bool = False
 
         @staticmethod
         def check(cfg: Any) -> None:
-            if cfg.preset not in PRESETS:
-                raise unknown("system.renderer.preset", cfg.preset, PRESETS)
-            _check_backend(cfg.backend)
-            if cfg.downsample not in (1, 2):
-                raise UserError(
-                    f"system.renderer.downsample: expected 1 or 2, got {cfg.downsample}"
-                )
-            if not cfg.radius > 0:
-                raise UserError(
-                    f"system.renderer.radius: expected a positive number, got {cfg.radius}"
-                )
-            if cfg.eps2d < 0:
-                raise UserError(
-                    f"system.renderer.eps2d: expected 0 or more square pixels, got {cfg.eps2d}"
-                )
-            if not 0 < cfg.near < cfg.far:
-                raise UserError(
-                    f"system.renderer: expected 0 < near < far, got near={cfg.near}, far={cfg.far}"
-                )
+            if not cfg.near < cfg.far:
+                raise UserError(f"far: expected more than near ({cfg.near:g}), got {cfg.far:g}")
 
     cfg: Config
 
     def configure(self, geometry: Any, material: Any, background: Any) -> None:
         super().configure(geometry, material, background)
-        self.Config.check(self.cfg)
+        check_options(self.Config, self.cfg, "system.renderer.")
 
     def forward(
         self, c2w: Tensor, fovy: Tensor, height: int, width: int, **batch: Any
@@ -147,20 +150,6 @@ class SplattingRenderer(Rasterizer):
             rays = cameras.ray_directions(c2w, fovy, height, width)
         background = self.background(dirs=rays.to(out.image))
         return out.image + (1 - out.alpha) * background, background
-
-
-def _check_backend(name: str) -> None:
-    """A named backend has to exist and to run here; ``auto`` always finds one."""
-    if name == "auto":
-        return
-    reasons = available_backends()
-    if name not in reasons:
-        raise unknown("system.renderer.backend", name, ["auto", *reasons])
-    if reasons[name] is not None:
-        raise UserError(
-            f"system.renderer.backend={name} can't be used here: {reasons[name]} (backend=auto "
-            "takes the fastest that can)"
-        )
 
 
 def normals_from_depth(

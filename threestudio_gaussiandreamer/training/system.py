@@ -39,6 +39,7 @@ from torch import Tensor
 from ..core.distributed import average_gradients
 from ..core.errors import UserError, unknown
 from ..core.nested import adopt_nested
+from ..core.options import check_options
 from ..exporters.base import gaussian_arrays
 from ..formats.gaussian_files import OUR_UP, StoredCloud, drawable, in_axes, ply_notes, spz_note
 from ..formats.ply import write_gaussians, write_points
@@ -84,17 +85,15 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
         @staticmethod
         def check(cfg: Any) -> None:
-            EvaluationConfig.check(cfg.evaluation)
-            PruneOptions.check(cfg.prune, "system.prune.")
             for name in ("geometry", "renderer", "guidance", "prompt_processor"):
                 if not cfg[f"{name}_type"]:
-                    raise UserError(f"system.{name}_type is empty: name a registered part")
+                    raise UserError(f"{name}_type is empty: name a registered part")
             for name, weight in cfg.loss.items():
-                validate_schedule(weight, f"system.loss.{name}")
+                validate_schedule(weight, f"loss.{name}")
             _check_losses(cfg)
             if cfg.scheduler is not None:
                 raise UserError(
-                    "system.scheduler isn't used: learning rates are schedules themselves, for "
+                    "scheduler isn't used: learning rates are schedules themselves, for "
                     "instance system.geometry.lr_means"
                 )
             for name in cfg.optimizer:
@@ -120,7 +119,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
     # -- start -------------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        self.Config.check(self.cfg)
+        check_options(self.Config, self.cfg, "system.")
         super().configure()
         self.density = DensityControl(self.geometry)
         self.automatic_optimization = False
@@ -569,7 +568,7 @@ def _check_optimizer(options: Any) -> None:
             [n for n, v in vars(torch.optim).items() if isinstance(v, type)],
         )
     if not isinstance(arguments, Mapping):
-        raise UserError(f"system.optimizer.args: expected keys and values, got {arguments!r}")
+        raise UserError(f"optimizer.args: expected keys and values, got {arguments!r}")
     try:
         optimizer_of(
             options, [{"params": [torch.zeros(1, requires_grad=True)], "lr": 0.0} for _ in range(2)]
@@ -581,7 +580,7 @@ def _check_optimizer(options: Any) -> None:
         }
         strange = [unknown("argument", key, accepted) for key in arguments if key not in accepted]
         raise UserError(
-            f"system.optimizer: {name} doesn't accept this: {strange[0] if strange else error}"
+            f"optimizer: {name} doesn't accept this: {strange[0] if strange else error}"
         ) from error
 
 

@@ -16,23 +16,11 @@ from ...core.interpolation import escape
 from .types import check_types
 
 
-def parse_structured(config_class: Any, values: Any = None) -> Any:
-    """The typed configuration of a part: ``config_class`` filled with ``values``, then checked by
-    its ``check``, if any.
+def parse_structured(config_class: Any, values: Any = None) -> DictConfig:
+    """The typed configuration of a part: ``config_class`` filled with ``values``; ranges are
+    ``core/options.py``'s to check.
 
-    Raises:
-        UserError: an unknown key, a value of the wrong type or a missing one; or what
-            ``config_class.check(cfg)`` finds.
-    """
-    cfg = fill(config_class, values)
-    if hasattr(config_class, "check"):
-        config_class.check(cfg)
-    return cfg
-
-
-def fill(config_class: Any, values: Any = None) -> DictConfig:
-    """``config_class`` filled with ``values`` and typed. A ``${`` in a string is text:
-    interpolations are resolved by now.
+    A ``${`` in a string is text: interpolations are resolved by now.
 
     Raises:
         UserError: an unknown key, a value of the wrong type or a missing one; the message begins

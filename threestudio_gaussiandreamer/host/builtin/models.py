@@ -1,13 +1,13 @@
 """Base classes of the parts that a system is made of, and the host's own smallest ones."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Optional, Tuple
 
 import torch
 from torch import Tensor, nn
 
-from ...core.errors import unknown
+from ...core.options import check_options, one_of
 from .base import BaseModule, BaseObject
 from .registry import register
 
@@ -56,16 +56,12 @@ class NoMaterial(BaseMaterial):
     @dataclass
     class Config(BaseMaterial.Config):
         n_output_dims: int = 3
-        color_activation: str = "sigmoid"
-
-        @staticmethod
-        def check(cfg: Any) -> None:
-            if cfg.color_activation not in COLOR_ACTIVATIONS:
-                raise unknown(
-                    "system.material.color_activation", cfg.color_activation, COLOR_ACTIVATIONS
-                )
+        color_activation: str = field(default="sigmoid", metadata=one_of(COLOR_ACTIVATIONS))
 
     cfg: Config
+
+    def configure(self) -> None:
+        check_options(self.Config, self.cfg, "system.material.")
 
     def forward(self, features: Tensor, **kwargs: Any) -> Tensor:
         return COLOR_ACTIVATIONS[self.cfg.color_activation](features)

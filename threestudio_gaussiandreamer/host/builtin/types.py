@@ -3,13 +3,13 @@ tuple, and NaN for a float.
 """
 
 import dataclasses
-import math
 import types
 import typing
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ...core.errors import UserError
+from ...core.options import FLOAT32_MAX, require_representable
 
 SCALARS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
 
@@ -58,8 +58,9 @@ def _check_scalar(path: str, value: Any, kind: type) -> None:
         raise UserError(
             f"{path}: expected {SCALARS[kind]}, got {'null' if value is None else repr(value)}"
         )
-    if kind is float and not _is_finite(value):
-        raise UserError(f"{path}: expected a finite number, got {value}")
+    require_representable(path, value)
+    if kind is float and isinstance(value, str) and not _is_finite(value):
+        raise UserError(f"{path}: expected a finite number that float32 can hold, got {value}")
 
 
 def _check_sequence(path: str, value: Any, kind: type, items: tuple) -> None:
@@ -82,8 +83,8 @@ def _is_container(value: Any) -> bool:
     return isinstance(value, (Mapping, Sequence)) and not isinstance(value, (str, bytes))
 
 
-def _is_finite(value: Any) -> bool:
+def _is_finite(text: str) -> bool:
     try:
-        return math.isfinite(float(value))
-    except (TypeError, ValueError):
+        return -FLOAT32_MAX <= float(text) <= FLOAT32_MAX
+    except ValueError:
         return True  # no number at all, which OmegaConf says better

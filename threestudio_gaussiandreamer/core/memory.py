@@ -1,0 +1,69 @@
+"""The memory of this machine, and refusals of what can't fit into it, before any work."""
+
+import os
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from .errors import UserError
+from .options import Rule, is_whole, rule, shown
+
+CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+
+
+@cache
+def memory_bytes() -> int:
+    """Bytes of memory that this process can have: the largest of the machine's (or its container's)
+    and each GPU's.
+    """
+    import torch
+
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    found = [torch.cuda.get_device_properties(i).total_memory for i in range(gpus)]
+    return max([_main_memory(), *found])
+
+
+def _main_memory() -> int:
+    try:
+        pages, size = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):  # not a POSIX system
+        return 2**40
+    limit = CGROUP_LIMIT.read_text().strip() if CGROUP_LIMIT.is_file() else "max"
+    return min(pages * size, int(limit)) if limit.isdigit() else pages * size
+
+
+def require_memory(options: str, needed: float, what: str) -> None:
+    """Check that something of about ``needed`` bytes can be held at all.
+
+    Args:
+        options: the names of the options that it is from, as a message begins.
+        what: it, such as "24 pictures of 256 x 256 pixels".
+
+    Raises:
+        UserError: it is larger than the whole memory.
+    """
+    if needed > memory_bytes():
+        raise UserError(
+            f"{options}: {what} take about {size_text(needed)} of memory, and this machine has "
+            f"{size_text(memory_bytes())}; take less"
+        )
+
+
+def count_of(things: str, low: int, bytes_each: int) -> Rule:
+    """A rule for a field: whole numbers from ``low`` to as many ``things`` as the memory holds."""
+
+    def check(path: str, value: Any) -> None:
+        if not is_whole(value) or value < low:
+            raise UserError(f"{path}: expected {low} or more {things}, got {shown(value)}")
+        require_memory(path, bytes_each * value, f"{value} {things}")
+
+    return rule(check)
+
+
+def size_text(count: float) -> str:
+    """A number of bytes with its unit, such as "24 GB"."""
+    for unit in ("bytes", "kB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.4g} TB"

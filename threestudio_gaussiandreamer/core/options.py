@@ -1,0 +1,231 @@
+"""Ranges of options, declared at the fields of a part's ``Config`` and read by one walker.
+
+    scale: float = field(default=1.0, metadata=positive())
+    mode: str = field(default="fixed", metadata=one_of(MODES))
+
+:func:`check_options` looks at every field, then calls ``Config.check(cfg)`` where the class has
+one: a static method for rules across fields, which raises UserError with a message that begins with
+the option's name. The walker puts the path of the section before it. None passes where it is the
+default of a field. Every number has to be one that float32 or int64 can hold."""
+
+import dataclasses
+import string
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
+
+from .errors import UserError, unknown
+from .schedule import parse_schedule
+
+RULE = "option"
+"""The key of a field's metadata under which its rule stands."""
+FLOAT32_MAX = 3.4028234663852886e38
+FLOAT32_TINY = 1.1754943508222875e-38
+"""Smallest normal number: a positive option below it would be zero on the way."""
+NAME = string.ascii_letters + string.digits + "_"
+INT64_MAX = 2**63 - 1
+SHOWN = 80
+"""Characters of a wrong value that a message repeats."""
+
+Rule = dict[str, Callable[[str, Any], None]]
+
+
+# -- rules -----------------------------------------------------------------------------------------
+
+
+def rule(check: Callable[[str, Any], None]) -> Rule:
+    """Metadata of a field whose values ``check(path, value)`` accepts, or raises UserError."""
+    return {RULE: check}
+
+
+def satisfies(expected: str, holds: Callable[[Any], bool]) -> Rule:
+    """Values for which ``holds`` is true; a message says that ``expected`` was expected."""
+
+    def check(path: str, value: Any) -> None:
+        if not holds(value):
+            raise UserError(f"{path}: expected {expected}, got {shown(value)}")
+
+    return rule(check)
+
+
+def positive(unit: str = "") -> Rule:
+    """Numbers above 0, in float32 too."""
+    return satisfies(f"a number above 0{_of(unit)}", is_positive)
+
+
+def at_least(low: float, unit: str = "") -> Rule:
+    """Numbers of ``low`` or more."""
+    return satisfies(f"{low:g} or more{_of(unit)}", lambda v: is_number(v) and v >= low)
+
+
+def in_range(low: float, high: float, unit: str = "") -> Rule:
+    """Numbers from ``low`` to ``high``, both included."""
+    return satisfies(
+        f"a number from {low:g} to {high:g}{_of(unit)}", lambda v: is_number(v) and low <= v <= high
+    )
+
+
+def between(low: float, high: float, unit: str = "") -> Rule:
+    """Numbers between ``low`` and ``high``, both excluded."""
+    return satisfies(
+        f"a number between {low:g} and {high:g}{_of(unit)}",
+        lambda v: is_number(v) and low < v < high,
+    )
+
+
+def one_of(choices: Collection[str] | Callable[[], Collection[str]]) -> Rule:
+    """Names among ``choices``, or among what they return when called."""
+
+    def check(path: str, value: Any) -> None:
+        known = choices() if callable(choices) else choices
+        if value not in known:
+            raise unknown(path, value, known)
+
+    return rule(check)
+
+
+def schedule(min: float = -FLOAT32_MAX, max: float = FLOAT32_MAX) -> Rule:
+    """Numbers and schedules of ``core/schedule.py`` with values from ``min`` to ``max``."""
+
+    def check(path: str, value: Any) -> None:
+        values = parse_schedule(value, path).values
+        for number in values:
+            if not min <= number <= max:
+                bound = f"{min:g} or more" if number < min else f"{max:g} or less"
+                raise UserError(f"{path}: expected values of {bound}, got {number:g}")
+
+    return rule(check)
+
+
+def interval(low: float = -FLOAT32_MAX, high: float = FLOAT32_MAX, what: str = "numbers") -> Rule:
+    """Pairs [a, b] with a <= b, both from ``low`` to ``high``."""
+    bounds = [f"from {low:g}"] * (low > -FLOAT32_MAX) + [f"to {high:g}"] * (high < FLOAT32_MAX)
+    return satisfies(
+        " ".join([f"[low, high], {what}", *bounds, "with low <= high"]),
+        lambda v: is_numbers(v, 2) and low <= v[0] <= v[1] <= high,
+    )
+
+
+def each(item: Rule) -> Rule:
+    """Lists whose every item satisfies another rule."""
+
+    def check(path: str, values: Any) -> None:
+        if not is_list(values):
+            raise UserError(f"{path}: expected a list, got {shown(values)}")
+        for i, value in enumerate(values):
+            item[RULE](f"{path}[{i}]", value)
+
+    return rule(check)
+
+
+def required(purpose: str) -> Rule:
+    """Texts that aren't empty; ``purpose`` says what to give."""
+
+    def check(path: str, value: Any) -> None:
+        if not value:
+            raise UserError(f"{path}: {purpose}")
+
+    return rule(check)
+
+
+def _of(unit: str) -> str:
+    return f" ({unit})" if unit else ""
+
+
+# -- values ----------------------------------------------------------------------------------------
+
+
+def is_number(value: Any) -> bool:
+    """Whether ``value`` is a number that float32 can hold, to its precision."""
+    return (
+        isinstance(value, (int, float))
+        and not isinstance(value, bool)
+        and -FLOAT32_MAX <= value <= FLOAT32_MAX
+    )
+
+
+def is_positive(value: Any) -> bool:
+    """Whether ``value`` is a number above 0, in float32 too."""
+    return is_number(value) and value >= FLOAT32_TINY
+
+
+def is_whole(value: Any) -> bool:
+    """Whether ``value`` is an int that fits 64 bits, and no bool."""
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= INT64_MAX
+
+
+def is_list(value: Any) -> bool:
+    """Whether ``value`` is a list, tuple or OmegaConf's list."""
+    return isinstance(value, Sequence) and not isinstance(value, (str, bytes))
+
+
+def is_numbers(value: Any, count: int) -> bool:
+    """Whether ``value`` is a list of ``count`` numbers."""
+    return is_list(value) and len(value) == count and all(map(is_number, value))
+
+
+def shown(value: Any) -> str:
+    """``value`` as a message repeats it."""
+    text = (
+        _digits(value) if isinstance(value, int) else repr(list(value) if is_list(value) else value)
+    )
+    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
+
+
+def _digits(value: int) -> str:
+    """An integer as text; Python refuses to write one of more than 4300 digits."""
+    return repr(value) if value.bit_length() < 256 else f"an integer of {value.bit_length()} bits"
+
+
+def require_representable(path: str, value: Any) -> None:
+    """Check every number in a value.
+
+    Raises:
+        UserError: an int beyond 64 bits, or a float that isn't finite in float32.
+    """
+    if isinstance(value, Mapping):
+        for key in value:
+            require_representable(f"{path}.{key}", value[key])
+    elif is_list(value):
+        for i, item in enumerate(value):
+            require_representable(f"{path}[{i}]", item)
+    elif isinstance(value, int) and abs(value) > INT64_MAX:
+        raise UserError(f"{path}: expected a whole number of at most 64 bits, got {shown(value)}")
+    elif isinstance(value, float) and not is_number(value):
+        raise UserError(f"{path}: expected a finite number that float32 can hold, got {value}")
+
+
+# -- the walker ------------------------------------------------------------------------------------
+
+
+def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
+    """Check the typed options ``cfg`` against what the fields of ``config_class`` declare.
+
+    Args:
+        cfg: an instance of the dataclass, or OmegaConf's mapping of it.
+        prefix: what the names of options begin with in messages, such as "system.geometry.".
+
+    Raises:
+        UserError: the first value out of range; the message begins with its path.
+    """
+    for option in dataclasses.fields(config_class):
+        path, value = prefix + option.name, getattr(cfg, option.name)
+        if dataclasses.is_dataclass(option.type):
+            check_options(option.type, value, f"{path}.")
+            continue
+        require_representable(path, value)
+        if RULE in option.metadata and not (value is None and option.default is None):
+            option.metadata[RULE](path, value)
+    if hasattr(config_class, "check"):
+        try:
+            config_class.check(cfg)
+        except UserError as error:
+            names = {option.name for option in dataclasses.fields(config_class)}
+            raise UserError(_located(str(error), prefix, names)) from error
+
+
+def _located(message: str, prefix: str, names: Collection[str]) -> str:
+    """``message`` with the path of its option; a part of another package may give that itself."""
+    if message.startswith(prefix):
+        return message
+    begins_with_option = message[: len(message) - len(message.lstrip(NAME))] in names
+    return prefix + message if begins_with_option else f"{prefix.rstrip('.')}: {message}"
