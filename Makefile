@@ -51,10 +51,7 @@ charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbe
 # the meshes to measure on: make measure-charts OBJECTS="toy.glb path/to/spot.glb path/to/duck.glb"
 OBJECTS = toy.glb
 
-measure-docs: $(VENV)/ready-for-tests      ## the generated parts of docs/: the architecture page
-	$(BIN)/python -m tests.architecture
-
-charts: $(VENV)/ready-for-charts     ## the numbers anew, about two hours a mesh; runs that are in the CSVs are not repeated
+measure-charts: $(VENV)/ready-for-charts     ## the numbers anew, about two hours a mesh; runs that are in the CSVs are not repeated
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.runs --objects $(OBJECTS)
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.chart_runs
