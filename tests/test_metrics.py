@@ -24,6 +24,11 @@ def test_psnr_of_a_known_error():
     assert psnr(a, a) == 100
 
 
+@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan, 1e30])
+def test_psnr_of_a_picture_that_is_no_picture_is_a_number(value):
+    assert psnr(images(2, 8, 8, 3), torch.full((2, 8, 8, 3), value)) == -100
+
+
 def test_psnr_agrees_with_torchmetrics():
     reference = pytest.importorskip("torchmetrics.functional.image")
     a, b = images(2, 20, 30, 3), images(2, 20, 30, 3, seed=1)

@@ -12,11 +12,12 @@ SSIM_WINDOW = 11
 
 
 def psnr(image: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
-    """-10 log10 of the mean squared error over all that is given, images in [0, 1], in dB; at most
-    100.
+    """Compute -10 log10 of the mean squared error over all that is given, images in [0, 1], in dB.
+
+    Within 100 and -100 dB; an error that isn't finite counts as the largest.
     """
-    error = (image - truth).square().mean()
-    return -10 * error.clamp_min(10 ** (-MAX_PSNR / 10)).log10()
+    error = (image - truth).square().mean().nan_to_num(nan=torch.inf)
+    return -10 * error.clamp(10 ** (-MAX_PSNR / 10), 10 ** (MAX_PSNR / 10)).log10()
 
 
 def ssim(

@@ -1,9 +1,12 @@
 """Files that appear whole or not at all."""
 
+import json
+import math
+
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.core.files import atomic_file
+from threestudio_gaussiandreamer.core.files import atomic_file, json_text
 
 
 @pytest.mark.parametrize("name", ["a" * 255, "ü" * 127, "\U0001f98a" * 63], ids=["a", "ü", "fox"])
@@ -21,3 +24,10 @@ def test_a_failure_leaves_the_earlier_file_and_nothing_else(tmp_path):
             file.write(b"half")
             raise OSError(28, "No space left on device")
     assert path.read_bytes() == b"earlier" and list(tmp_path.iterdir()) == [path]
+
+
+def test_numbers_that_json_does_not_have_are_null():
+    content = {"psnr": -math.inf, "curve": [1.5, math.nan, (2, math.inf)], "name": "a"}
+    text = json_text(content, indent=1)
+    expected = {"psnr": None, "curve": [1.5, None, [2, None]], "name": "a"}
+    assert json.loads(text, parse_constant=pytest.fail) == expected

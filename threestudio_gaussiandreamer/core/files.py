@@ -2,13 +2,15 @@
 half-written.
 """
 
+import json
+import math
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from threading import get_ident
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from .errors import UserError
 
@@ -93,6 +95,21 @@ def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bi
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def json_text(content: Any, **options: Any) -> str:
+    """``json.dumps`` with ``null`` for numbers that JSON doesn't have: NaN and the infinities."""
+    return json.dumps(_without_infinities(content), allow_nan=False, **options)
+
+
+def _without_infinities(content: Any) -> Any:
+    if isinstance(content, float):
+        return content if math.isfinite(content) else None
+    if isinstance(content, Mapping):
+        return {key: _without_infinities(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_without_infinities(value) for value in content]
+    return content
 
 
 def _shortened(name: str, size: int = 100) -> str:

@@ -14,7 +14,6 @@ of view, the size and the background: 70 degrees, 1024 pixels and the run's own 
 released code's. The views are 3 degrees apart from -180; none is there twice."""
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Sequence
@@ -29,7 +28,7 @@ from .. import register_parts
 from ..cameras import Orbit
 from ..core import images as files_of_pictures
 from ..core.errors import UserError
-from ..core.files import existing_file
+from ..core.files import existing_file, json_text
 from ..core.streams import numpy_generator
 from ..host import get_device
 from ..models.clip import PictureText, clip_source
@@ -328,7 +327,7 @@ def evaluate(
     try:
         output.mkdir(parents=True, exist_ok=True)
         (output / "clip.json").write_text(
-            json.dumps(content, indent=2, ensure_ascii=False), encoding="utf-8"
+            json_text(content, indent=2, ensure_ascii=False), encoding="utf-8"
         )
     except OSError as error:
         raise UserError(f"--output {output} can't be written: {error.strerror or error}") from error

@@ -37,6 +37,7 @@ PACES = (1.0, 1 / 4, 1 / 16, 1 / 64)
 gradient is mostly noise.
 """
 LEAST_ERROR = 10 ** (-MAX_PSNR / 10)
+MOST_ERROR = 1 / LEAST_ERROR
 """Mean squared; what is less can't be told from the rounding of float32."""
 FOVY = math.radians(50.0)
 EPS2D = 0.3
@@ -204,6 +205,7 @@ def assured_likeness(cloud: Gaussians, views: Views, pictures: Float[Tensor, "V 
     their mean squared error.
     """
     errors = (look(cloud, views) - pictures).square().mean((1, 2, 3))
+    errors = errors.nan_to_num(nan=MOST_ERROR).clamp_max(MOST_ERROR)
     return -10 * math.log10(
         max(float(errors.mean() + 2 * errors.std() / math.sqrt(len(errors))), LEAST_ERROR)
     )

@@ -13,7 +13,6 @@ since it measures against the pruned cloud: nothing of the same budget or a stri
 
 import argparse
 import bisect
-import json
 import logging
 import math
 import os
@@ -33,7 +32,7 @@ from torch import Tensor
 
 from ..core.checkpoint_file import load_file
 from ..core.errors import UserError
-from ..core.files import atomic_file, existing_file, require_writable
+from ..core.files import atomic_file, existing_file, json_text, require_writable
 from ..core.images import write as write_picture
 from ..core.options import at_least, check_options, in_range
 from ..formats.gaussian_files import (
@@ -524,7 +523,7 @@ def write_report(path: str, done: Pruned, suffix: str, options: PruneOptions) ->
         "seconds": round(done.seconds, 1),
     }
     with atomic_file(f"{path}.json") as file:
-        file.write(json.dumps(report | {"options": asdict(options)}, indent=2).encode())
+        file.write(json_text(report | {"options": asdict(options)}, indent=2).encode())
     write_picture(Path(f"{path}.png"), sheet([look(cloud, grey) for cloud in clouds]))
     for name, cost in zip(("before", "after"), costs, strict=True):
         print(

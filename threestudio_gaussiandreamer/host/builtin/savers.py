@@ -1,6 +1,5 @@
 """Writing results into the ``save`` folder of a run, by the host's method names."""
 
-import json
 import os
 import re
 import shutil
@@ -13,6 +12,7 @@ from torch import Tensor
 from ...core import images as pictures
 from ...core.checkpoint_file import save_file as save_checked
 from ...core.errors import UserError
+from ...core.files import json_text
 
 
 class SaverMixin:
@@ -189,7 +189,7 @@ class SaverMixin:
 
     def save_json(self, filename: str, payload: Any) -> str:
         path = self.get_save_path(filename)
-        Path(path).write_text(json.dumps(payload))
+        Path(path).write_text(json_text(payload))
         return path
 
     def _converted(self, imgs: list) -> list:
