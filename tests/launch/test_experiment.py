@@ -452,6 +452,58 @@ def test_it_runs_outside_of_the_main_thread(launch):
     assert codes == [0]
 
 
+# -- files beside the run --------------------------------------------------------------------------
+
+
+def test_what_is_no_source_in_custom_is_neither_loaded_nor_copied(launch):
+    Path("custom/package").mkdir(parents=True)
+    Path("custom/part.py").write_text("LOADED = True")
+    Path("custom/package/__init__.py").write_text("from . import inner")
+    Path("custom/package/inner.py").write_text("")
+    for lock in ("custom/.#part.py", "custom/package/.#inner.py", "custom/gone.py"):
+        os.symlink("someone@somewhere.1234", lock)  # as Emacs makes while a file is edited
+    os.mkfifo("custom/pipe.py")
+    os.mkfifo("custom/package/pipe.yaml")
+    code, _, err = launch("--train", "trainer.limit_val_batches=0")
+    assert code == 0 and "custom/pipe.py is no readable file" in err
+    copied = {name for name in files(trial() / "code/custom") if not name.endswith(".pyc")}
+    assert copied == {"part.py", "package/__init__.py", "package/inner.py"}
+
+
+def test_a_source_that_can_not_be_read_is_left_out_of_the_copy_with_a_warning(
+    launch, monkeypatch, tmp_path
+):
+    def forbidden(path):
+        if path.name == "secret.py":
+            raise PermissionError(13, "Permission denied")
+        return read_bytes(path)
+
+    read_bytes = Path.read_bytes
+    (tmp_path / "source").mkdir()
+    (tmp_path / "source/secret.py").touch()
+    (tmp_path / "source/part.py").touch()
+    monkeypatch.setattr(Path, "read_bytes", forbidden)
+    callbacks.copy_sources(tmp_path / "source", tmp_path / "copy")
+    assert files(tmp_path / "copy") == {"part.py"}
+
+
+def test_a_configuration_that_vanishes_is_kept_as_it_was_read(launch, monkeypatch):
+    monkeypatch.setattr(
+        tiny_parts.TinySystem, "post_configure", lambda self: os.unlink("tiny.yaml")
+    )
+    assert launch("--train")[0] == 0
+    assert Path(trial(), "configs/raw.yaml").read_text() == tiny_parts.CONFIG
+
+
+def test_a_configuration_that_can_not_be_read_is_named(launch, monkeypatch):
+    def vanished(path):
+        raise FileNotFoundError(2, "No such file or directory", str(path))
+
+    monkeypatch.setattr(Path, "read_bytes", vanished)
+    code, _, err = launch("--train")
+    assert code == 2 and "error: the configuration tiny.yaml can't be read" in err
+
+
 # -- runs that meet --------------------------------------------------------------------------------
 
 ONE_FOLDER = ["use_timestamp=false", "tag=run"]

@@ -4,7 +4,6 @@ without losing a step.
 
 import contextlib
 import os
-import shutil
 import signal
 import sys
 import time
@@ -12,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..host import pl
+from ..host import pl, warn
 from .checkpoints import AtomicCheckpointIO
 from .config import dump_config
 from .signals import interrupt, restore_handlers, set_handlers
@@ -41,12 +40,14 @@ class RunRecord(pl.Callback):
     Args:
         folder: the run's folder.
         cfg: the configuration as it runs.
-        config_paths: the YAML files it was made of.
+        sources: the YAML files that it was made of, and their content.
         command: the command line.
     """
 
-    def __init__(self, folder: Path, cfg: Any, config_paths: Sequence[Path], command: str) -> None:
-        self.folder, self.cfg, self.config_paths, self.command = folder, cfg, config_paths, command
+    def __init__(
+        self, folder: Path, cfg: Any, sources: Sequence[tuple[Path, bytes]], command: str
+    ) -> None:
+        self.folder, self.cfg, self.sources, self.command = folder, cfg, sources, command
 
     def on_fit_start(self, trainer: Any, pl_module: Any) -> None:
         if trainer.is_global_zero:
@@ -57,16 +58,17 @@ class RunRecord(pl.Callback):
                 file.write(self.command + "\n")
 
     def save_configs(self) -> None:
+        """Write the configuration as it was given and as it runs."""
         configs = self.folder / "configs"
         configs.mkdir(parents=True, exist_ok=True)
-        for i, path in enumerate(self.config_paths):
+        for i, (path, content) in enumerate(self.sources):
             # resumed from its own parsed.yaml, the run keeps the file that it was started with
             if path.resolve().parent != configs.resolve():
-                shutil.copyfile(path, configs / (f"raw-{i}.yaml" if i else "raw.yaml"))
+                (configs / (f"raw-{i}.yaml" if i else "raw.yaml")).write_bytes(content)
         dump_config(configs / "parsed.yaml", self.cfg)
 
     def save_code(self) -> None:
-        """The sources of this package and of the extensions, as they ran."""
+        """Write the sources of this package and of the extensions, as they ran."""
         package = Path(__file__).parents[1]
         copy_sources(package, self.folder / "code" / package.name)
         if Path("custom").is_dir():
@@ -74,16 +76,23 @@ class RunRecord(pl.Callback):
 
 
 def copy_sources(source: Path, destination: Path) -> None:
-    """Copy the source files below a folder, leaving out hidden folders and everything that isn't
-    source.
+    """Copy the source files below a folder, leaving out hidden files and folders, everything that
+    isn't source, and, with a warning, what can't be read.
     """
     for folder, folders, names in os.walk(source):
         folders[:] = [name for name in folders if not name.startswith((".", "__pycache__"))]
         for name in names:
-            if name.endswith(SOURCE_ENDINGS):
-                copy = destination / Path(folder).relative_to(source) / name
-                copy.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(Path(folder, name), copy)
+            path = Path(folder, name)
+            if name.startswith(".") or not name.endswith(SOURCE_ENDINGS) or not path.is_file():
+                continue  # also an editor's lock, which links to nothing, or a FIFO
+            try:
+                content = path.read_bytes()
+            except OSError as error:
+                warn(f"{path} isn't copied to {destination}: {error.strerror}")
+                continue
+            copy = destination / path.relative_to(source)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(content)
 
 
 class ProgressBar(pl.callbacks.TQDMProgressBar):

@@ -14,6 +14,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Optional
 
 from ..core.errors import Terminated, UserError
@@ -123,6 +124,8 @@ def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
     from .extensions import load_extensions
 
     configure_logging(args.verbose)
+    # read once, since a file may be changed or removed while the parts are built
+    sources = [(path, read_source(path)) for path in config_paths]
     n_gpus = announce_device(args.gpu)
     register_parts()
     load_extensions()
@@ -131,7 +134,19 @@ def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
 
     from .run import Run
 
-    return Run(cfg, args, config_paths, shlex.join([*PROGRAM, *argv]), n_gpus).run()
+    return Run(cfg, args, sources, shlex.join([*PROGRAM, *argv]), n_gpus).run()
+
+
+def read_source(path: Path) -> bytes:
+    """The bytes of a configuration file.
+
+    Raises:
+        UserError: it can't be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise UserError(f"the configuration {path} can't be read: {error}") from error
 
 
 class StderrHandler(logging.Handler):

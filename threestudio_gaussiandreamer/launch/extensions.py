@@ -18,11 +18,15 @@ def load_extensions(folder: Path = Path("custom")) -> list[str]:
     """Import all extensions in ``folder``, by name; returns their module names.
 
     Raises:
-        UserError: one fails to import; the message names the file, the line and the cause.
+        UserError: the folder can't be read, or an extension fails to import; the message names the
+            file, the line and the cause.
     """
-    if not folder.is_dir():
-        return []
-    return [_load(entry) for entry in sorted(folder.iterdir()) if _is_extension(entry)]
+    try:
+        entries = sorted(folder.iterdir()) if folder.is_dir() else []
+        extensions = [entry for entry in entries if _is_extension(entry)]
+    except OSError as error:
+        raise UserError(f"the extensions in {folder} can't be read: {error}") from error
+    return [_load(entry) for entry in extensions]
 
 
 def _is_extension(entry: Path) -> bool:
@@ -30,6 +34,9 @@ def _is_extension(entry: Path) -> bool:
         return False
     if entry.is_dir() and not (entry / "__init__.py").is_file():
         info(f"{entry} has no __init__.py: not an extension")
+        return False
+    if entry.suffix == ".py" and not entry.is_dir() and not entry.is_file():
+        info(f"{entry} is no readable file (a FIFO, or a link to nothing): not an extension")
         return False
     return entry.is_dir() or entry.suffix == ".py"
 

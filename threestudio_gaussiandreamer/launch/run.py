@@ -42,7 +42,7 @@ class Run:
     Args:
         cfg: what ``config.load_config`` returned and ``config_check.check_config`` accepted.
         args: the parsed arguments; ``stage`` is "train", "validate", "test" or "export".
-        config_paths: the YAML files, to be kept beside the results.
+        sources: the YAML files and their content, to be kept beside the results.
         command: the command line, to be kept too.
         n_gpus: GPUs to use; 0 for the CPU.
     """
@@ -51,12 +51,12 @@ class Run:
         self,
         cfg: Any,
         args: argparse.Namespace,
-        config_paths: Sequence[Path],
+        sources: Sequence[tuple[Path, bytes]],
         command: str,
         n_gpus: int,
     ) -> None:
         self.cfg, self.args, self.n_gpus = cfg, args, n_gpus
-        self.config_paths, self.command = config_paths, command
+        self.sources, self.command = sources, command
         self.claimed = RunFolder(Path(cfg.trial_dir))
         self.resumed_step = -1
         self.trainer: Any = None
@@ -207,7 +207,7 @@ class Run:
         return [
             pl.callbacks.ModelCheckpoint(dirpath=str(self.last.parent), **checkpointing),
             pl.callbacks.LearningRateMonitor(logging_interval="step"),
-            RunRecord(self.folder, self.cfg, self.config_paths, self.command),
+            RunRecord(self.folder, self.cfg, self.sources, self.command),
             LastCheckpoint(self.last, checkpoint_io),
         ]
 
