@@ -3,16 +3,23 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN     = $(VENV)/bin
 ENVIRON = OMP_WAIT_POLICY=passive
+WORKERS ?= auto
+PYTEST  = $(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 # without the CPU kernel (no C++ compiler) plain torch draws, and the demo is smaller
 SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import available_backends as b; print("--config configs/demo-small.yaml" if b()["cpu"] else "")')
 
-.PHONY: demo test stability fuzz long-run ablations bench gpu-check charts measure-charts clean
+.PHONY: demo test test-slow test-all docs stability fuzz long-run ablations bench gpu-check charts measure-charts clean
 
 demo: $(VENV)/ready                ## train the bundled toy from a coarse prior, offline, on the CPU
 	$(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
 
-test: $(VENV)/ready-for-tests                ## the whole test suite, as CI runs it
-	$(ENVIRON) $(BIN)/python -m pytest
+test: $(VENV)/ready-for-tests      ## every test that isn't slow, one worker per core
+	$(PYTEST) -m "not slow"
+
+test-slow: $(VENV)/ready-for-tests ## kills, fuzzing, emulated kernels and runs that train: docs/testing.md
+	$(PYTEST) -m slow
+
+test-all: test test-slow           ## both, as CI runs them
 
 stability: $(VENV)/ready-for-tests          ## every known way to fail, provoked and measured: docs/stability.md
 	$(ENVIRON) $(BIN)/python -m pytest tests/stability --stability-report stability.json; status=$$?; \
@@ -32,6 +39,9 @@ bench: $(VENV)/ready-for-tests     ## the rasteriser's speed and memory, beside 
 
 gpu-check: $(VENV)/ready-for-tests ## everything that waits for an NVIDIA GPU: correctness, speed beside gsplat, a training step
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.gpu_check
+
+docs: $(VENV)/ready-for-tests      ## the generated parts of docs/: the architecture page
+	$(BIN)/python -m tests.architecture
 
 charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbers beside them
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting --from-csv
