@@ -40,8 +40,9 @@ bench: $(VENV)/ready-for-tests     ## the rasteriser's speed and memory, beside 
 gpu-check: $(VENV)/ready-for-tests ## everything that waits for an NVIDIA GPU: correctness, speed beside gsplat, a training step
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.gpu_check
 
-docs: $(VENV)/ready-for-tests      ## the generated parts of docs/: the architecture page
+docs: $(VENV)/ready-for-tests      ## the generated parts of README and docs/: architecture, measured tables
 	$(BIN)/python -m tests.architecture
+	$(BIN)/python -m benchmarks.quality.tables
 
 charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbers beside them
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting --from-csv

@@ -1,7 +1,7 @@
 """`launch.py` with one more geometry, ``round-cloud``: Gaussians with one size for all three axes,
 for `attributes.py` alone.
 
-It is no part of the package since it doesn't pay: see docs/parsimony.md.
+It is no part of the package since it doesn't pay: see docs/results.md.
 """
 
 import sys

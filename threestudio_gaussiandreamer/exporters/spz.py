@@ -8,7 +8,7 @@ save_name    name of the file in the export folder
 save_video   also render the turntable
 ===========  ==================================================================================
 
-About 17 bytes a Gaussian; what its rounding costs is in docs/parsimony.md. The cloud is turned from
+About 17 bytes a Gaussian; what its rounding costs is in docs/results.md. The cloud is turned from
 z up to y up, SPZ's axes."""
 
 from dataclasses import dataclass, field

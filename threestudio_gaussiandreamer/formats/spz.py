@@ -18,7 +18,7 @@ harmonics   N x (K - 1) x 3 u8: 128 sh + 128, of which 5 bit are used at degree 
 ==========  ========================================================================================
 
 The reader believes no count that the file's size can't hold. What rounding costs:
-docs/parsimony.md."""
+docs/results.md."""
 
 import os
 import struct
@@ -37,7 +37,7 @@ HEADER = struct.Struct("<4sIIBBBB")
 MAGIC, VERSION = b"NGSP", 3
 STEPS_PER_SIZE = 32
 """Positions are kept to this part, at least, of the median Gaussian's size: where the curve of
-docs/parsimony.md has become flat.
+docs/results.md has become flat.
 """
 MOST_DEFLATE_SAVES = 1032
 """Bytes that one byte of a deflate stream stands for at most (zlib's technical notes)."""

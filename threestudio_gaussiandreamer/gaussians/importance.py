@@ -15,7 +15,7 @@ the other knows to be useless.
 Ranked by the contribution, the top Gaussian of a pixel goes last, and under ``auto`` never
 (SafeguardGS, Lee et al. 2024): the weights of one pixel sum to at most 1, so one above 1/2 belongs
 to its top. Such a Gaussian may hold a single pixel that its neighbours would show as well; keeping
-them all costs half a dB (docs/parsimony.md), so ``removal`` doesn't."""
+them all costs half a dB (docs/results.md), so ``removal`` doesn't."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
