@@ -134,3 +134,10 @@ def test_mistakes(tmp_path):
         read_cloud(str(tmp_path / "a.ply"), up="w")
     with pytest.raises(UserError, match="a.ply"):
         read_cloud(str(tmp_path / "b.ply"))
+
+
+def test_harmonics_above_degree_3_are_refused_when_read(tmp_path):
+    path = str(tmp_path / "a.ply")
+    write_gaussians(path, **cloud(degree=4)._asdict())
+    with pytest.raises(UserError, match="harmonics of degree 4; expected 0 to 3"):
+        read_cloud(path)

@@ -88,6 +88,27 @@ def assert_refused(code: int, err: str, message: str) -> None:
             "system.material_type is empty: name a registered part, such as 'no-material'",
         ),
         ("system.guidance_type=''", "system.guidance_type is empty"),
+        # a registered part of another kind
+        (
+            "system.geometry.prior_type=ply-exporter",
+            "system.geometry.prior_type is 'ply-exporter', a part of the kind exporter; expected one of the kind prior",
+        ),
+        (
+            "system.renderer_type=no-material",
+            "a part of the kind material; expected one of the kind renderer",
+        ),
+        (
+            "system.material_type=gaussiandreamer-cloud",
+            "a part of the kind geometry; expected one of the kind material",
+        ),
+        (
+            "system.background_type=ply-exporter",
+            "a part of the kind exporter; expected one of the kind background",
+        ),
+        (
+            "data_type=mesh-prior",
+            "data_type is 'mesh-prior', a part of the kind prior; expected one of the kind data",
+        ),
         # kinds and lengths
         ("data.elevation_range=[1]", "data.elevation_range: expected a list of 2, got [1]"),
         ("data.n_test_views=[1]", "data.n_test_views: expected a whole number, got [1]"),
@@ -166,6 +187,31 @@ def assert_refused(code: int, err: str, message: str) -> None:
         ("system.optimizer.args=3", "system.optimizer.args: expected keys and values"),
         ("system.optimizer.name=Optimizer", "Optimizer doesn't accept this"),
         ("trainer.max_steps=-5", "trainer.max_steps: expected -1 or more"),
+        ("trainer.max_time=5", "trainer.max_time: expected a text such as '00:12:00:00'"),
+        ("trainer.check_val_every_n_epoch=0", "trainer.check_val_every_n_epoch: expected 1"),
+        ("trainer.precision=transformer-engine", "trainer: Requirement 'transformer_engine"),
+        ("trainer.strategy=ddp_spawn", "trainer.strategy: ddp_spawn can't start processes"),
+        ("trainer.num_nodes=2", "trainer.num_nodes: expected 1, got 2"),
+        # numbers that nothing can hold
+        ("seed=" + 400 * "9", "seed: expected a whole number of at most 64 bits"),
+        ("seed=" + 5000 * "9", "the value of seed isn't valid YAML: Exceeds the limit"),
+        ("data.width=" + 400 * "9", "data.width: expected a whole number of at most 64 bits"),
+        ("trainer.limit_val_batches=" + 400 * "9", "trainer.limit_val_batches: expected a whole"),
+        ("system.geometry.lr_means=1e39", "system.geometry.lr_means: expected a finite number"),
+        ("data.eval_camera_distance=1e30", "data.eval_camera_distance: expected a number from"),
+        ("system.guidance.guidance_scale=1e38", "system.guidance.guidance_scale: expected a"),
+        ("system.loss.lambda_sds=[0,1,1e300,9]", "system.loss.lambda_sds[2]: expected a finite"),
+        ("system.evaluation.size=100000", "system.evaluation.size: expected a number from 1 to"),
+        ("system.evaluation={size: 9999, views: 9999}", "pixels, twice take about 39.99 TB of memory"),
+        ("data.train_views=1000000000000", "data.train_views: 1000000000000 views take about"),
+        ("data.batch_size=[4096, 4096]", "data.batch_size: 2 entries need 1 resolution_milestones"),
+        ("data.eval_height=100000", "data.eval_height: expected a number from 1 to 16384"),
+        ("data={height: 9999, width: 9999, batch_size: 999}", "data.batch_size: 999 views of"),
+        ("system.geometry.prior.num_points=999999999999", "999999999999 points take about"),
+        (
+            "system.geometry.grow.num_candidates=999999999999",
+            "system.geometry.grow.num_candidates: 999999999999 candidates take about",
+        ),
         (
             "trainer.val_check_interval=0",
             "trainer.val_check_interval: expected a number of steps above 0",
@@ -376,6 +422,9 @@ def test_a_full_disk_is_named(launch, monkeypatch):
         (b"a:\n\tb: 1", "line 2, column 1"),
         (b"name: a\nname: b", "duplicate key"),
         (b"", "data_type is empty"),
+        (b"system: []", "system is a list in one and a section in another"),
+        (b"seed: " + 5000 * b"9", "isn't valid YAML: Exceeds the limit"),
+        (b"#" * (1 << 21), "the configuration bad.yaml is larger than 1 MiB"),
         (b"data: [1, 2]", "data is a list in one and a section in another"),
     ],
 )

@@ -81,7 +81,14 @@ def read_cloud(path: str, *, up: Optional[str] = None) -> StoredCloud:
 
 
 def drawable(arrays: Gaussians) -> Gaussians:
-    """The Gaussians that can be drawn; says how many can't."""
+    """The Gaussians that can be drawn; says how many can't.
+
+    Raises:
+        UserError: harmonics above degree 3, which neither the rasteriser nor SPZ has.
+    """
+    degree = isqrt(arrays.sh.shape[1]) - 1
+    if degree > 3:
+        raise UserError(f"the Gaussians have harmonics of degree {degree}; expected 0 to 3")
     keep = usable(arrays)
     if not keep.all():
         logger.warning(

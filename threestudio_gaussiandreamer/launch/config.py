@@ -93,7 +93,10 @@ def _with_prompt_from_file(source: DictConfig) -> DictConfig:
     """``prompt_processor.prompt_file`` replaced by a ``prompt`` that is the file's text, so that
     the tag can be made of it.
     """
-    section = OmegaConf.select(source, "system.prompt_processor")
+    try:
+        section = OmegaConf.select(source, "system.prompt_processor")
+    except OmegaConfBaseException:  # system is a list, or leads to another section
+        return source
     if not isinstance(section, DictConfig) or section.get("prompt_file") is None:
         return source
     if "prompt" in section:

@@ -12,15 +12,28 @@ import os
 import types
 import typing
 from collections.abc import Collection, Mapping
-from typing import Any
+from typing import Any, Optional
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError, unknown
-from ..core.options import check_options
-from ..host import find, pl, validate_schedule
+from ..core.options import check_options, require_representable
+from ..guidance.base import ScoreDistillation
+from ..host import (
+    BaseBackground,
+    BaseGeometry,
+    BaseMaterial,
+    Exporter,
+    Rasterizer,
+    find,
+    names,
+    pl,
+    validate_schedule,
+)
 from ..host.builtin.base import parse_structured
+from ..priors.base import Prior
+from ..prompts.prompt_processors import TextEncoderPromptProcessor
 
 MisconfigurationException = pl.utilities.exceptions.MisconfigurationException
 
@@ -37,8 +50,33 @@ LAUNCHER_SETS = {
 }
 # what would start or look for other processes
 NEEDS_PROCESSES = ("strategy", "num_nodes", "sync_batchnorm")
+# these start processes that don't load the custom parts, and wait for each other without end
+SPAWNING = ("ddp_spawn", "ddp_fork", "ddp_notebook")
 # what Lightning takes and fails on later
-AT_LEAST = {"log_every_n_steps": 0, "num_sanity_val_steps": -1, "max_steps": -1}
+AT_LEAST = {
+    "log_every_n_steps": 0,
+    "num_sanity_val_steps": -1,
+    "max_steps": -1,
+    "min_steps": 0,
+    "check_val_every_n_epoch": 1,
+    "accumulate_grad_batches": 1,
+}
+CLUSTER = {"MASTER_ADDR", "SLURM_NTASKS"}
+KINDS: dict[str, type] = {
+    "data": pl.LightningDataModule,
+    "system": pl.LightningModule,
+    "geometry": BaseGeometry,
+    "material": BaseMaterial,
+    "background": BaseBackground,
+    "renderer": Rasterizer,
+    "exporter": Exporter,
+    "prior": Prior,
+    "guidance": ScoreDistillation,
+    "prompt_processor": TextEncoderPromptProcessor,
+}
+"""The base class of each kind of part, by the name of its section. A part of another package may
+have another base; only one of a different kind is refused.
+"""
 LOGGER_KEYS = ("enable", "project", "name")
 
 
@@ -50,6 +88,8 @@ def check_config(cfg: Any) -> None:
         UserError: the first mistake: an unknown key or name (with the nearest valid one), a value
             of the wrong type or out of range; the message begins with the full dotted path.
     """
+    for section in cfg:
+        require_representable(section, cfg[section])
     if not 0 <= cfg.seed < 2**32:
         raise UserError(f"seed is {cfg.seed}; expected a whole number from 0 to 2^32 - 1")
     # before the parts, whose schedules may end with the trainer's steps
@@ -72,6 +112,7 @@ def check_config(cfg: Any) -> None:
 def check_part(path: str, type_name: Any, values: Any) -> None:
     """Check one section against the part ``type_name``, and the sections of parts inside it."""
     part = _find(f"{path}_type", type_name)
+    _check_kind(f"{path}_type", type_name, part)
     config_class = getattr(part, "Config", None)
     if config_class is None:
         return
@@ -101,6 +142,24 @@ def _find(path: str, type_name: Any) -> type:
         return find(type_name)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
+
+
+def _check_kind(path: str, type_name: str, part: Any) -> None:
+    """Raise UserError where a section names a part that is known to be of another kind."""
+    kind = path.rpartition(".")[2].removesuffix("_type")
+    found = _kind_of(part)
+    if kind not in KINDS or found in (None, kind):
+        return
+    choices = [name for name in names() if _kind_of(find(name)) == kind]
+    raise UserError(
+        f"{path} is {type_name!r}, a part of the kind {found}; expected one of the kind {kind}: "
+        f"choose from {', '.join(choices)}"
+    )
+
+
+def _kind_of(part: Any) -> Optional[str]:
+    kinds = (kind for kind, base in KINDS.items() if isinstance(part, type))
+    return next((kind for kind in kinds if issubclass(part, KINDS[kind])), None)
 
 
 def _check_keys(path: str, values: Any, config_class: type) -> None:
@@ -152,9 +211,9 @@ def _check_loss(loss: Any, known: Any) -> None:
                 "such as lambda_sds"
             )
         if known is not None:
-            names = [name if name.startswith("lambda_") else f"lambda_{name}" for name in known]
-            if key not in names:
-                raise _unknown_key("system.loss", key, names)
+            weights = [name if name.startswith("lambda_") else f"lambda_{name}" for name in known]
+            if key not in weights:
+                raise _unknown_key("system.loss", key, weights)
         validate_schedule(weight, f"system.loss.{key}")
 
 
@@ -190,10 +249,10 @@ def _check_type(path: str, value: Any, annotation: Any) -> None:
     ):
         return
     if type(value) not in accepted:
-        names = ", ".join(
+        known = ", ".join(
             sorted("null" if kind is type(None) else kind.__name__ for kind in accepted)
         )
-        raise UserError(f"{path} is {value!r} ({type(value).__name__}); expected one of: {names}")
+        raise UserError(f"{path} is {value!r} ({type(value).__name__}); expected one of: {known}")
 
 
 def _plain_types(annotation: Any) -> set[type]:
@@ -210,6 +269,21 @@ def _check_trainer_ranges(trainer: Any) -> None:
     for key, lowest in AT_LEAST.items():
         if (trainer.get(key) if trainer.get(key) is not None else lowest) < lowest:
             raise UserError(f"trainer.{key}: expected {lowest} or more, got {trainer[key]}")
+    if isinstance(trainer.get("max_time"), (int, float)):
+        raise UserError(
+            "trainer.max_time: expected a text such as '00:12:00:00' (days, hours, minutes, "
+            f"seconds), got {trainer.max_time}"
+        )
+    if trainer.get("strategy") in SPAWNING:
+        raise UserError(
+            f"trainer.strategy: {trainer.strategy} can't start processes of this program; give "
+            "--gpu 0,1,... alone, or ddp"
+        )
+    if trainer.get("num_nodes", 1) != 1 and not CLUSTER & os.environ.keys():
+        raise UserError(
+            f"trainer.num_nodes: expected 1, got {trainer.num_nodes}; several machines need a "
+            f"launcher that sets {' or '.join(sorted(CLUSTER))}"
+        )
     if trainer.get("val_check_interval") in (0, 0.0):
         raise UserError(
             "trainer.val_check_interval: expected a number of steps above 0 (for no "
@@ -232,9 +306,9 @@ def _check_monitor(cfg: Any) -> None:
     logged = getattr(system, "logged", None)
     if monitor is None or logged is None:
         return
-    names = logged(_typed("system", cfg.system, system.Config))
-    if names is not None and monitor not in names | {"epoch", "step"}:
-        raise unknown("checkpoint.monitor", monitor, names)
+    quantities = logged(_typed("system", cfg.system, system.Config))
+    if quantities is not None and monitor not in quantities | {"epoch", "step"}:
+        raise unknown("checkpoint.monitor", monitor, quantities)
     if not cfg.trainer.get("log_every_n_steps", 1):
         raise UserError(
             f"checkpoint.monitor is {monitor!r}, but with trainer.log_every_n_steps=0 nothing "
@@ -250,8 +324,8 @@ def build(section: str, owner: type, arguments: dict) -> Any:
     """
     try:
         return owner(**arguments)
-    except (MisconfigurationException, TypeError, ValueError) as error:
-        raise UserError(f"{section}: {error}") from error
+    except Exception as error:  # Lightning raises also OverflowError, AttributeError, ImportError
+        raise UserError(f"{section}: {str(error) or type(error).__name__}") from error
 
 
 def plain(section: Any) -> dict:

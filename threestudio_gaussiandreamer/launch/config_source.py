@@ -35,6 +35,7 @@ PATH_ENDINGS = ("path", "mesh", "_file", "_dir", "resume", "weights")
 PROTECTED = "$\ue000{"
 MOST_DEPTH = 32
 MOST_NODES = 10_000
+MOST_BYTES = 1 << 20
 
 
 def read_yaml(path: str | os.PathLike) -> DictConfig:
@@ -46,12 +47,14 @@ def read_yaml(path: str | os.PathLike) -> DictConfig:
             column.
     """
     try:
-        source = Path(path).read_text(encoding="utf-8-sig")
+        source = _read_text(Path(path))
         require_modest(source, f"the configuration {path}")
         content, node = OmegaConf.create(source), yaml.compose(source, Loader=yaml.SafeLoader)
+    except UserError:
+        raise
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"the configuration {path} can't be read: {error}") from error
-    except (yaml.YAMLError, OmegaConfBaseException) as error:
+    except (yaml.YAMLError, OmegaConfBaseException, ValueError) as error:
         raise UserError(
             f"the configuration {path} isn't valid YAML: {_yaml_problem(error)}"
         ) from error
@@ -63,6 +66,20 @@ def read_yaml(path: str | os.PathLike) -> DictConfig:
     _restore_text(content, node)
     map_strings(content, _protect_escaped)
     return content
+
+
+def _read_text(path: Path) -> str:
+    """The text of a configuration file, unless it is too large to be one.
+
+    Raises:
+        UserError: it has more than ``MOST_BYTES``.
+        OSError, UnicodeDecodeError: it can't be read.
+    """
+    with open(path, "rb") as file:
+        content = file.read(MOST_BYTES + 1)
+    if len(content) > MOST_BYTES:
+        raise UserError(f"the configuration {path} is larger than {MOST_BYTES >> 20} MiB")
+    return content.decode("utf-8-sig")
 
 
 def parse_overrides(arguments: Iterable[str]) -> DictConfig:
@@ -82,7 +99,9 @@ def parse_overrides(arguments: Iterable[str]) -> DictConfig:
             )
         try:
             _override(overrides, key, _valid_text(key, value))
-        except (yaml.YAMLError, OmegaConfBaseException) as error:
+        except UserError:
+            raise
+        except (yaml.YAMLError, OmegaConfBaseException, ValueError) as error:
             raise UserError(
                 f"the value of {key} isn't valid YAML: {_yaml_problem(error)}"
             ) from error
