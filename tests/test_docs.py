@@ -18,8 +18,9 @@ ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 TEXTS = {str(path.relative_to(ROOT)): path.read_text() for path in DOCUMENTS}
 TINY = [
-    "data.width=16", "data.height=16", "data.eval_width=16", "data.eval_height=16", "data.n_test_views=2", "data.train_views=4",
-    "system.geometry.grow.num_candidates=200", "system.evaluation.size=16", "system.evaluation.views=2", "trainer.max_steps=2",
+    "data.width=16", "data.height=16", "data.eval_width=16", "data.eval_height=16",
+    "data.n_test_views=2", "data.train_views=4", "system.geometry.grow.num_candidates=200",
+    "system.evaluation.size=16", "system.evaluation.views=2", "trainer.max_steps=2",
     "trainer.enable_progress_bar=false", "use_timestamp=false", "tag=t",
 ]  # fmt: skip
 

@@ -2,10 +2,10 @@
 minutes on a CPU.
 
     python -m benchmarks.quality.ablations                          # the paper's ablations
-    python -m benchmarks.quality.ablations --table faces            # prior against random start under a
-                                                            view-blind score, five seeds
-    python -m benchmarks.quality.ablations --table guidance         # guidance scale 100: plain, annealed,
-                                                            clipped
+    python -m benchmarks.quality.ablations --table faces            # prior against random start
+                                                            under a view-blind score, five seeds
+    python -m benchmarks.quality.ablations --table guidance         # guidance scale 100: plain,
+                                                            annealed, clipped
     python -m benchmarks.quality.ablations --mesh spot.glb --seeds 0 1 2 --size 128
 
 Each row is an ordinary run of configs/demo.yaml with a few options changed; its score is the PSNR
@@ -123,9 +123,10 @@ def run(arguments: argparse.Namespace, seed: int, options: dict[str, Any]) -> di
     """One training run in a process of its own; its metrics."""
     size, steps = arguments.size, arguments.steps
     common = {
-        "name": "run", "tag": "run", "use_timestamp": False, "seed": seed, "data.width": size, "data.height": size,
-        "system.evaluation.size": size, "data.n_test_views": 2, "data.eval_width": 64, "data.eval_height": 64,
-        "trainer.max_steps": steps, "trainer.val_check_interval": steps, "trainer.enable_progress_bar": False,
+        "name": "run", "tag": "run", "use_timestamp": False, "seed": seed, "data.width": size,
+        "data.height": size, "system.evaluation.size": size, "data.n_test_views": 2,
+        "data.eval_width": 64, "data.eval_height": 64, "trainer.max_steps": steps,
+        "trainer.val_check_interval": steps, "trainer.enable_progress_bar": False,
         "system.guidance.bank_seed": seed, "system.guidance.image_size": size,
     }  # fmt: skip
     mesh = {"system.guidance.mesh": arguments.mesh} if arguments.mesh else {}

@@ -1,8 +1,8 @@
 """After the run: what ranks best, and what rounds and recovery buy, in dB to the unpruned cloud on
 views that nothing was fitted to.
 
-    python -m benchmarks.quality.after_run                                       # the toy, one seed: three
-                                                                         minutes
+    python -m benchmarks.quality.after_run                                       # the toy, one
+                                                                         seed: three minutes
     python -m benchmarks.quality.after_run --objects toy.glb spot.glb duck.glb --seeds 0 1 2
 
 A cloud of 10,000, trained as the demo is at 128^2 on one thread (`runs.py`), goes to a count in one

@@ -1,9 +1,10 @@
 """Which attributes a scene needs: dB per byte of harmonics, anisotropy and precision, into
 docs/charts/attributes.csv and .png.
 
-    python -m benchmarks.quality.attributes                                                  # what isn't
-                                                                                     measured yet,
-                                                                                     then the chart
+    python -m benchmarks.quality.attributes                                                  # what
+                                                                                     isn't measured
+                                                                                     yet, then the
+                                                                                     chart
     python -m benchmarks.quality.attributes --objects toy.glb spot.glb duck.glb --seeds 0 1 2
 
 *trained*: clouds of other attributes, trained as the demo is at 128^2 on one thread (`runs.py`),

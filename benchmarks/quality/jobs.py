@@ -93,7 +93,9 @@ def falling_rate(start: float, end: float, count: int) -> str:
 
 
 def scratch(count: int) -> dict[str, Any]:
-    """The start of the demo with ``count`` Gaussians: four fifths from the prior, one fifth grown."""
+    """The start of the demo with ``count`` Gaussians: four fifths from the prior, one fifth
+    grown.
+    """
     return NO_BUDGET | {
         "system.geometry.prior.num_points": count * 4 // 5,
         "system.geometry.grow.max_points": count // 5,

@@ -203,9 +203,10 @@ def found_by_auto(true: Gaussians, seed: int, steps: int, folder: Path) -> tuple
     }
     (folder / "known.yaml").write_text(yaml.safe_dump(cfg))
     overrides = {
-        "exp_root_dir": folder, "use_timestamp": "false", "tag": "run", "seed": seed, "data.width": SIZE, "data.height": SIZE,
-        "data.n_test_views": 1, "data.eval_width": 64, "data.eval_height": 64, "trainer.max_steps": steps,
-        "trainer.val_check_interval": 100000, "trainer.enable_progress_bar": "false",
+        "exp_root_dir": folder, "use_timestamp": "false", "tag": "run", "seed": seed,
+        "data.width": SIZE, "data.height": SIZE, "data.n_test_views": 1, "data.eval_width": 64,
+        "data.eval_height": 64, "trainer.max_steps": steps, "trainer.val_check_interval": 100000,
+        "trainer.enable_progress_bar": "false",
     }  # fmt: skip
     if launch(
         [

@@ -1,8 +1,8 @@
 """Training runs for the charts: every run that a chart needs, side by side on the CPU, into one CSV
 per chart.
 
-    python -m benchmarks.quality.runs                               # all that isn't measured yet: about two
-                                                            hours on 4 cores
+    python -m benchmarks.quality.runs                               # all that isn't measured yet:
+                                                            about two hours on 4 cores
     python -m benchmarks.quality.runs --charts count --seeds 0 1 2  # one chart, fewer seeds
     python -m benchmarks.quality.runs --list                        # what would run
 
@@ -143,10 +143,11 @@ def train(
         overlay: the name of a file of configs/ that is laid over demo.yaml.
     """
     common = {
-        "use_timestamp": "false", "tag": "run", "seed": seed, "data.width": SIZE, "data.height": SIZE,
-        "system.evaluation.size": SIZE, "system.guidance.mesh": mesh,
-        "system.guidance.bank_seed": seed, "data.n_test_views": 1, "data.eval_width": 64, "data.eval_height": 64,
-        "trainer.max_steps": STEPS, "trainer.val_check_interval": 100000, "trainer.enable_progress_bar": "false",
+        "use_timestamp": "false", "tag": "run", "seed": seed, "data.width": SIZE,
+        "data.height": SIZE, "system.evaluation.size": SIZE, "system.guidance.mesh": mesh,
+        "system.guidance.bank_seed": seed, "data.n_test_views": 1, "data.eval_width": 64,
+        "data.eval_height": 64, "trainer.max_steps": STEPS, "trainer.val_check_interval": 100000,
+        "trainer.enable_progress_bar": "false",
     }  # fmt: skip
     overrides = [
         f"{key}={value}" for key, value in (common | options | {"exp_root_dir": folder}).items()
@@ -197,7 +198,9 @@ def append(job: Job, mesh: str, seed: int, metrics: dict[str, Any]) -> None:
 
 
 def append_rows(chart: str, columns: list[str], rows: list[dict[str, Any]]) -> None:
-    """Rows at the end of a chart's CSV, with the machine and the commit that they were measured on."""
+    """Rows at the end of a chart's CSV, with the machine and the commit that they were measured
+    on.
+    """
     path, here = CHARTS / f"{chart}.csv", {"machine": machine(), "commit": commit()}
     path.parent.mkdir(parents=True, exist_ok=True)
     new = not path.is_file()

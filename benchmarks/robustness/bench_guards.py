@@ -1,7 +1,8 @@
 """What the guards cost: each one's time next to that of the training step, and the finite check's
 next to the forward pass.
 
-    python -m benchmarks.robustness.bench_guards [--gaussians 10000 --size 256 --views 4 --threads 4]
+    python -m benchmarks.robustness.bench_guards [--gaussians 10000 --size 256 --views 4 --threads
+    4]
 
 A step is what the demo's is: four views drawn and differentiated, the shared path of score
 distillation on their pixels, Adam. Guards are timed on their own, since a difference of two steps
@@ -164,9 +165,9 @@ def main() -> None:
     bench = Bench(options.gaussians, options.size, options.views)
     step, forward = (milliseconds(f, options.seconds) for f in (bench.step, bench.forward_only))
     guards = {
-        bench.arguments_are_checked: 1, bench.log_scales_are_clamped: 1, bench.bad_items_are_counted: 1,
-        bench.gradients_of_the_statistics_are_finite: 1, bench.sizes_are_looked_at: LOG_EVERY,
-        bench.parameters_and_moments_are_finite: CHECK_EVERY,
+        bench.arguments_are_checked: 1, bench.log_scales_are_clamped: 1,
+        bench.bad_items_are_counted: 1, bench.gradients_of_the_statistics_are_finite: 1,
+        bench.sizes_are_looked_at: LOG_EVERY, bench.parameters_and_moments_are_finite: CHECK_EVERY,
     }  # fmt: skip
     rows = [
         (f.__name__.replace("_", " "), milliseconds(f, 0.5) / every, step)

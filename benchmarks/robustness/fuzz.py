@@ -1,8 +1,8 @@
 """Fuzzing, the long version: damaged files at every door, hostile Gaussians through every backend,
 random lives of a cloud.
 
-    python -m benchmarks.robustness.fuzz                                   # `make fuzz`; about half an hour on
-                                                                one core
+    python -m benchmarks.robustness.fuzz                                   # `make fuzz`; about half
+                                                                an hour on one core
     python -m benchmarks.robustness.fuzz --only glb checkpoint --inputs 500 --seed 7
 
 Every kind runs in a process of its own, with a limit of memory, which is killed when nothing comes
@@ -69,7 +69,9 @@ def try_files(name: str, seed: int, first: int, last: int) -> Report:
 
 
 def try_scenes(name: str, seed: int, first: int, last: int) -> Report:
-    """Each scene through every backend, and its well-posed part through all of them to be compared."""
+    """Each scene through every backend, and its well-posed part through all of them to be
+    compared.
+    """
     import pytest
     import torch
 

@@ -1,8 +1,8 @@
 """A long run that is killed again and again: what does it lose, and does its memory grow? One
 command, within half an hour.
 
-    python -m benchmarks.robustness.long_run                           # 20,000 steps and 50 kills: ten minutes
-                                                            or so on one core
+    python -m benchmarks.robustness.long_run                           # 20,000 steps and 50 kills:
+                                                            ten minutes or so on one core
     python -m benchmarks.robustness.long_run --steps 400 --kills 3     # in a minute
 
 The same small run (configs/demo.yaml at 24^2 with 200 Gaussians, validated and saved every few
@@ -35,12 +35,15 @@ from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, ne
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = [
-    "name=long", "tag=run", "data.width=24", "data.height=24", "data.batch_size=2", "data.train_views=16", "data.eval_width=24",
-    "data.eval_height=24", "data.n_test_views=2", "system.geometry.prior.num_points=160", "system.geometry.prior.color_smoothing=0",
-    "system.geometry.grow.num_candidates=20000", "system.geometry.grow.radius=0.05", "system.geometry.grow.max_points=40",
-    "system.geometry.budget=null", "system.guidance.eval_steps=2", "system.evaluation.views=2", "system.evaluation.size=16",
-    "system.geometry.densify.enabled=true", "system.geometry.densify.grad_threshold=2e-3", "system.geometry.max_gaussians=400",
-    "trainer.enable_progress_bar=false", "trainer.log_every_n_steps=50", "checkpoint.save_top_k=1",
+    "name=long", "tag=run", "data.width=24", "data.height=24", "data.batch_size=2",
+    "data.train_views=16", "data.eval_width=24", "data.eval_height=24", "data.n_test_views=2",
+    "system.geometry.prior.num_points=160", "system.geometry.prior.color_smoothing=0",
+    "system.geometry.grow.num_candidates=20000", "system.geometry.grow.radius=0.05",
+    "system.geometry.grow.max_points=40", "system.geometry.budget=null",
+    "system.guidance.eval_steps=2", "system.evaluation.views=2", "system.evaluation.size=16",
+    "system.geometry.densify.enabled=true", "system.geometry.densify.grad_threshold=2e-3",
+    "system.geometry.max_gaussians=400", "trainer.enable_progress_bar=false",
+    "trainer.log_every_n_steps=50", "checkpoint.save_top_k=1",
 ]  # fmt: skip
 SAMPLE_EVERY, LOOK_EVERY = 0.5, 0.02  # seconds
 PROGRESS = 0.7
@@ -79,9 +82,11 @@ class Supervisor:
         self.folder, self.steps, self.deadline = folder, steps, deadline
         middle = steps // 2
         schedule = [
-            f"trainer.max_steps={steps}", f"trainer.val_check_interval={10 * every}", f"checkpoint.every_n_train_steps={every}",
-            f"system.guidance.max_step_percent=[{middle},0.98,0.55,{middle + 1}]", f"system.geometry.densify.stop={middle}",
-            "system.geometry.densify.start=10", f"system.geometry.densify.every={2 * every}",
+            f"trainer.max_steps={steps}", f"trainer.val_check_interval={10 * every}",
+            f"checkpoint.every_n_train_steps={every}",
+            f"system.guidance.max_step_percent=[{middle},0.98,0.55,{middle + 1}]",
+            f"system.geometry.densify.stop={middle}", "system.geometry.densify.start=10",
+            f"system.geometry.densify.every={2 * every}",
         ]  # fmt: skip
         options = [f"exp_root_dir={folder}", "resume=auto", *SCENE, *schedule]
         self.command = [

@@ -1,7 +1,8 @@
 """Error against milliseconds of the rasteriser, forward and gradients: docs/charts/rasteriser.csv
 and two pictures.
 
-    python -m benchmarks.splatting.chart_splatting              # measure (some ten minutes) and draw
+    python -m benchmarks.splatting.chart_splatting              # measure (some ten minutes) and
+                                                                draw
     python -m benchmarks.splatting.chart_splatting --from-csv   # draw what was measured
 
 Truth is the specification in float64 with every cut-off off (no smallest alpha, no early stop, no

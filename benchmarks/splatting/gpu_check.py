@@ -1,9 +1,9 @@
 """Everything that waits for an NVIDIA GPU, in one command of under ten minutes: `make gpu-check`.
 
-    python -m benchmarks.splatting.gpu_check                          # exit 0: all well; 1: something failed;
-                                                            2: no GPU
-    python -m benchmarks.splatting.gpu_check --device cpu --small     # the same flow, tiny, on the CPU: does
-                                                            this script work?
+    python -m benchmarks.splatting.gpu_check                          # exit 0: all well; 1:
+                                                            something failed; 2: no GPU
+    python -m benchmarks.splatting.gpu_check --device cpu --small     # the same flow, tiny, on the
+                                                            CPU: does this script work?
 
 ========  ==========================================================================================
 section   what it does
@@ -24,8 +24,8 @@ Whatever touches the GPU runs in a process of its own, with a limit of its own a
 a kernel that hangs or ruins its context costs that part alone. What fails is recorded with the end
 of what it printed, and the others go on. The numbers go to benchmarks/results/gpu-<device>.json (or
 --out) after each section. All but `prune` and `train` needs no more than torch, NumPy, SciPy and
-jaxtyping, so on a machine without a network `python -m benchmarks.splatting.gpu_check` does where `make`
-can't install the rest."""
+jaxtyping, so on a machine without a network `python -m benchmarks.splatting.gpu_check` does where
+`make` can't install the rest."""
 
 import argparse
 import importlib.util
@@ -234,7 +234,9 @@ def about(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def describe_device(args: argparse.Namespace) -> dict[str, Any]:
-    """The GPU, the releases that have to fit one another, and why our kernels can't run, or None."""
+    """The GPU, the releases that have to fit one another, and why our kernels can't run, or
+    None.
+    """
     from threestudio_gaussiandreamer.splatting import available_backends
     from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver
     from threestudio_gaussiandreamer.splatting.cuda import nvrtc
@@ -646,8 +648,9 @@ def training_arguments(args: argparse.Namespace, folder: str) -> list[str]:
         "system.geometry.prior_type": "mesh-prior", "system.geometry.prior.path": "toy.glb",
         "system.geometry.prior.num_points": 500 if args.small else 80_000,
         "system.geometry.grow.max_points": 100 if args.small else 20_000,
-        "trainer.max_steps": steps, "trainer.val_check_interval": 100_000, "trainer.enable_progress_bar": "false",
-        "data.n_test_views": 1, "data.eval_width": 64, "data.eval_height": 64, "system.exporter.save_video": "false",
+        "trainer.max_steps": steps, "trainer.val_check_interval": 100_000,
+        "trainer.enable_progress_bar": "false", "data.n_test_views": 1, "data.eval_width": 64,
+        "data.eval_height": 64, "system.exporter.save_video": "false",
     }  # fmt: skip
     device = [] if args.device == "cuda" else ["--gpu", "cpu"]
     return [*overlays, "--train", *device, *(f"{key}={value}" for key, value in options.items())]

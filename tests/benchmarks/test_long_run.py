@@ -1,4 +1,6 @@
-"""The long run with kills, short: benchmarks/robustness/long_run.py does 20,000 steps and 50 kills."""
+"""The long run with kills, short: benchmarks/robustness/long_run.py does 20,000 steps and 50
+kills.
+"""
 
 import json
 

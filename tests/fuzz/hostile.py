@@ -1,4 +1,6 @@
-"""Hostile scenes for the rasteriser, drawn from a seed, and what every backend must hold on them."""
+"""Hostile scenes for the rasteriser, drawn from a seed, and what every backend must hold on
+them.
+"""
 
 import math
 from collections.abc import Sequence
@@ -142,7 +144,9 @@ def _picked(g: torch.Generator, values: tuple[float, ...], shape: tuple[int, ...
 
 
 def _cloud(g: torch.Generator, count: int, poisoned: bool) -> Cloud:
-    """Ordinary Gaussians with hostile rows and entries among them; some rows are copies of others."""
+    """Ordinary Gaussians with hostile rows and entries among them; some rows are copies of
+    others.
+    """
     degree = int(torch.randint(0, 4, (), generator=g))
     cloud = Cloud(
         means=0.5 * torch.randn(count, 3, generator=g),

@@ -324,7 +324,9 @@ PLY = Packing(_unply, _joined, text=("header",))
 
 
 def json_value(data: bytes, rng: np.random.Generator) -> bytes:
-    """One value of a JSON document replaced by one of another kind or size, or its key by another."""
+    """One value of a JSON document replaced by one of another kind or size, or its key by
+    another.
+    """
     try:
         document = json.loads(data)
         places = list(_places(document))

@@ -229,7 +229,9 @@ def _fan(corners: list[int]) -> list[tuple[int, int, int]]:
 
 
 def npy_array(data: bytes) -> np.ndarray:
-    """An NPY file of version 1 to 3 that holds one array of plain numbers or text and nothing else."""
+    """An NPY file of version 1 to 3 that holds one array of plain numbers or text and nothing
+    else.
+    """
     if data[:6] != b"\x93NUMPY" or data[6:7] not in (b"\1", b"\2", b"\3"):
         raise Illegal("no NPY file")
     width = 2 if data[6] == 1 else 4

@@ -100,8 +100,9 @@ class CloudLife(RuleBasedStateMachine):
         )
 
     @rule(
-        seed=SEEDS, threshold=st.sampled_from([0.0, 1e-6, 1e-3, 1e9]), split=st.sampled_from([1e-12, 0.05, 1e6]),
-        faint=st.sampled_from([0.0, 0.05, 0.999]), huge=st.sampled_from([1e-9, 0.4, 1e30]),
+        seed=SEEDS, threshold=st.sampled_from([0.0, 1e-6, 1e-3, 1e9]),
+        split=st.sampled_from([1e-12, 0.05, 1e6]), faint=st.sampled_from([0.0, 0.05, 0.999]),
+        huge=st.sampled_from([1e-9, 0.4, 1e30]),
     )  # fmt: skip
     def densify(self, seed: int, threshold: float, split: float, faint: float, huge: float) -> None:
         self.see(seed, bad=seed % 4 == 0, views=1)

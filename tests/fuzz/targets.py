@@ -426,9 +426,11 @@ def checkpoints() -> list[bytes]:
     require_picture(geometry)
     optimizer.step()
     content = {
-        "epoch": 0, "global_step": 7, "pytorch-lightning_version": "2.6.6", "callbacks": {}, "lr_schedulers": [],
+        "epoch": 0, "global_step": 7, "pytorch-lightning_version": "2.6.6", "callbacks": {},
+        "lr_schedulers": [],
         "state_dict": {f"geometry.{key}": value for key, value in geometry.state_dict().items()},
-        "optimizer_states": [optimizer.state_dict()], "loops": {"fit_loop": {"state_dict": {}, "epoch_progress": {"total": {"ready": 1}}}},
+        "optimizer_states": [optimizer.state_dict()],
+        "loops": {"fit_loop": {"state_dict": {}, "epoch_progress": {"total": {"ready": 1}}}},
     }  # fmt: skip
     plain = io.BytesIO()
     torch.save(content, plain)

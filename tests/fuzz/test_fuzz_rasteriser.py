@@ -56,9 +56,10 @@ def test_scenes_hold_what_they_promise():
     assert {1, 2, 3, 4} == {len(scene(seed).viewmats) for seed in range(60)}
     assert any(1 in scene(seed).size for seed in range(60))
     for holds in (
-        lambda c: c.means.isnan().any(), lambda c: c.scales.isinf().any(), lambda c: (c.quats == 0).all(1).any(),
-        lambda c: (c.scales == 0).any(),
-        lambda c: (c.opacities > 1).any(), lambda c: (c.opacities < 0).any(), lambda c: (c.colors.abs() > 1e29).any(),
+        lambda c: c.means.isnan().any(), lambda c: c.scales.isinf().any(),
+        lambda c: (c.quats == 0).all(1).any(), lambda c: (c.scales == 0).any(),
+        lambda c: (c.opacities > 1).any(), lambda c: (c.opacities < 0).any(),
+        lambda c: (c.colors.abs() > 1e29).any(),
         lambda c: len(c.means) and len(c.means.unique(dim=0)) < len(c.means),
     ):  # fmt: skip
         assert any(holds(cloud) for cloud in clouds)

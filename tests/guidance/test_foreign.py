@@ -111,7 +111,9 @@ class OtherNameDouble:
 
 
 class LearningDouble(nn.Module):
-    """VSD's: a module with frozen and trainable weights, a ``forward``, and a loss for the latter."""
+    """VSD's: a module with frozen and trainable weights, a ``forward``, and a loss for the
+    latter.
+    """
 
     def __init__(self):
         super().__init__()

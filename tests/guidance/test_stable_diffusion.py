@@ -60,7 +60,9 @@ def test_one_forward_pass_and_no_decoding_per_step(models, prompts):
 
 
 class HostPrompts:
-    """threestudio's own pairing of rows: a loop over the views, two negative rows after each other."""
+    """threestudio's own pairing of rows: a loop over the views, two negative rows after each
+    other.
+    """
 
     use_perp_neg = True
 

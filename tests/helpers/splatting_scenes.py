@@ -182,7 +182,9 @@ def psnr(a: Tensor, b: Tensor) -> float:
 
 
 def assert_close(ours: Run, truth: Run, tolerance: float = SINGLE, radii: bool = True) -> None:
-    """Pictures and gradients of a float32 kernel within rounding of the specification in float64."""
+    """Pictures and gradients of a float32 kernel within rounding of the specification in
+    float64.
+    """
     for name in ("image", "alpha", "depth", "means2d", "contribution"):
         picture, true = getattr(ours.out, name), getattr(truth.out, name)
         assert error(picture, true) < SINGLE or (picture - true).abs().max() < 1e-7, name

@@ -88,7 +88,9 @@ def _tokenizer(folder: Path) -> None:
 
 
 def shap_e(folder: Path, seed: int = 0) -> Path:
-    """What ``ShapEPipeline.save_pretrained`` writes; the scheduler has the published configuration."""
+    """What ``ShapEPipeline.save_pretrained`` writes; the scheduler has the published
+    configuration.
+    """
     from diffusers import HeunDiscreteScheduler, ShapEPipeline
     from transformers import CLIPTextModelWithProjection, CLIPTokenizer
 
@@ -231,7 +233,9 @@ def _fan(loop: list[int]) -> list[tuple[int, int, int]]:
 
 
 def point_e(folder: Path, seed: int = 0) -> tuple[Path, Path]:
-    """``base_40m_textvec.pt`` and ``upsample_40m.pt``, one block each and with random last layers."""
+    """``base_40m_textvec.pt`` and ``upsample_40m.pt``, one block each and with random last
+    layers.
+    """
     from threestudio_gaussiandreamer.priors.point_e_model import BaseModel, Upsampler
 
     torch.manual_seed(seed)
@@ -247,12 +251,7 @@ def point_e(folder: Path, seed: int = 0) -> tuple[Path, Path]:
 
 PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21]
 JOINTS = np.array(  # metres, y up, looking along +z; the left side has x > 0
-    [
-        (0.00, 0.00, 0.00), (0.07, -0.09, 0.00), (-0.07, -0.09, 0.00), (0.00, 0.11, -0.02), (0.10, -0.47, 0.00), (-0.10, -0.47, 0.00),
-        (0.00, 0.25, 0.00), (0.09, -0.87, -0.04), (-0.09, -0.87, -0.04), (0.00, 0.30, 0.02), (0.11, -0.93, 0.08), (-0.11, -0.93, 0.08),
-        (0.00, 0.51, -0.02), (0.08, 0.41, -0.01), (-0.08, 0.41, -0.01), (0.00, 0.60, 0.03), (0.17, 0.45, -0.02), (-0.17, 0.45, -0.02),
-        (0.43, 0.43, -0.04), (-0.43, 0.43, -0.04), (0.68, 0.44, -0.04), (-0.68, 0.44, -0.04), (0.76, 0.43, -0.05), (-0.76, 0.43, -0.05),
-    ]
+    [ (0.00, 0.00, 0.00), (0.07, -0.09, 0.00), (-0.07, -0.09, 0.00), (0.00, 0.11, -0.02), (0.10, -0.47, 0.00), (-0.10, -0.47, 0.00), (0.00, 0.25, 0.00), (0.09, -0.87, -0.04), (-0.09, -0.87, -0.04), (0.00, 0.30, 0.02), (0.11, -0.93, 0.08), (-0.11, -0.93, 0.08), (0.00, 0.51, -0.02), (0.08, 0.41, -0.01), (-0.08, 0.41, -0.01), (0.00, 0.60, 0.03), (0.17, 0.45, -0.02), (-0.17, 0.45, -0.02), (0.43, 0.43, -0.04), (-0.43, 0.43, -0.04), (0.68, 0.44, -0.04), (-0.68, 0.44, -0.04), (0.76, 0.43, -0.05), (-0.76, 0.43, -0.05), ],
 )  # fmt: skip
 RING = 8
 

@@ -24,17 +24,20 @@ from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 register_parts()
 DEMO = Path(__file__).parents[2] / "configs" / "demo.yaml"
 SMALL = [
-    "data.width=16", "data.height=16", "data.eval_width=16", "data.eval_height=16", "data.n_test_views=2", "data.train_views=4",
-    "system.geometry.prior.num_points=80", "system.geometry.prior.color_smoothing=0", "system.geometry.grow.num_candidates=200",
-    "system.evaluation.size=16", "system.evaluation.views=2", "trainer.enable_progress_bar=false", "trainer.max_steps=2",
-    "use_timestamp=false", "tag=t",
+    "data.width=16", "data.height=16", "data.eval_width=16", "data.eval_height=16",
+    "data.n_test_views=2", "data.train_views=4", "system.geometry.prior.num_points=80",
+    "system.geometry.prior.color_smoothing=0", "system.geometry.grow.num_candidates=200",
+    "system.evaluation.size=16", "system.evaluation.views=2", "trainer.enable_progress_bar=false",
+    "trainer.max_steps=2", "use_timestamp=false", "tag=t",
 ]  # fmt: skip
 TRIAL = Path("outputs/demo/t")
 
 
 @pytest.fixture
 def launch(tmp_path, monkeypatch, capsys):
-    """``launch(overrides...)`` trains a tiny demo in an empty folder; returns (exit code, stderr)."""
+    """``launch(overrides...)`` trains a tiny demo in an empty folder; returns (exit code,
+    stderr).
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
 

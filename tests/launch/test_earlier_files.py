@@ -52,5 +52,7 @@ def test_a_checkpoint_is_exported(tmp_path):
 @pytest.mark.parametrize("name", ["gaussians.ply", "gaussians.spz"])
 def test_a_cloud_is_pruned(tmp_path, name):
     out = tmp_path / "out.ply"
-    assert prune([str(EARLIER / name), str(out), "--count", "65", "--size", "32", "--steps", "2"]) == 0
+    assert (
+        prune([str(EARLIER / name), str(out), "--count", "65", "--size", "32", "--steps", "2"]) == 0
+    )
     assert b"element vertex 65\n" in out.read_bytes()

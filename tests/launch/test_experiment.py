@@ -34,7 +34,9 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def launch(tmp_path, monkeypatch, capsys):
-    """``launch("--train", overrides...)`` in an empty folder; returns (exit code, stdout, stderr)."""
+    """``launch("--train", overrides...)`` in an empty folder; returns (exit code, stdout,
+    stderr).
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(threestudio_gaussiandreamer, "register_parts", lambda: None)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")

@@ -182,7 +182,9 @@ def test_the_released_codes_numbers_are_the_codes(tmp_path):
 
 
 def config_classes():
-    """(part, Config) of everything registered by this package, with the dataclasses nested in them."""
+    """(part, Config) of everything registered by this package, with the dataclasses nested in
+    them.
+    """
     found = {}
     for name in host.names():
         part = host.find(name)

@@ -1,4 +1,6 @@
-"""What the tests of stability share: `measured` and `fault`, and the report of what they measured."""
+"""What the tests of stability share: `measured` and `fault`, and the report of what they
+measured.
+"""
 
 import inspect
 import json

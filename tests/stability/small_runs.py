@@ -22,10 +22,12 @@ from threestudio_gaussiandreamer.launch import experiment
 
 DEMO = Path(__file__).parents[2] / "configs" / "demo.yaml"
 SMALL = [
-    "data.width=24", "data.height=24", "data.eval_width=24", "data.eval_height=24", "data.n_test_views=2", "data.train_views=8",
-    "data.batch_size=2", "system.geometry.prior.num_points=120", "system.geometry.prior.color_smoothing=0",
-    "system.geometry.grow.num_candidates=2000", "system.geometry.budget=null", "system.evaluation.size=16", "system.evaluation.views=2",
-    "system.evaluation.supersample=1", "trainer.enable_progress_bar=false", "trainer.log_every_n_steps=1",
+    "data.width=24", "data.height=24", "data.eval_width=24", "data.eval_height=24",
+    "data.n_test_views=2", "data.train_views=8", "data.batch_size=2",
+    "system.geometry.prior.num_points=120", "system.geometry.prior.color_smoothing=0",
+    "system.geometry.grow.num_candidates=2000", "system.geometry.budget=null",
+    "system.evaluation.size=16", "system.evaluation.views=2", "system.evaluation.supersample=1",
+    "trainer.enable_progress_bar=false", "trainer.log_every_n_steps=1",
     "trainer.limit_val_batches=0", "use_timestamp=false", "tag=t",
 ]  # fmt: skip
 

@@ -258,7 +258,9 @@ def test_f7_a_zero_quaternion_is_no_rotation(fault):
 
 @row("A0", "F8")
 def test_f8_tile_intersections_are_counted_in_64_bits(fault):
-    """524 288 over all of 1024 x 1024 in 16-pixel tiles is 2^31; ours has smaller tiles, so more."""
+    """524 288 over all of 1024 x 1024 in 16-pixel tiles is 2^31; ours has smaller tiles, so
+    more.
+    """
     n = 524_288
 
     def ours(side):
@@ -342,7 +344,9 @@ def test_f10_depth_has_a_gradient(backend, fault):
 @row("A0", "F17")
 @each_backend
 def test_f17_a_sphere_is_round_on_a_wide_image(backend, fault):
-    """Both axes have one focal length; the emulation opens the width by the vertical field of view."""
+    """Both axes have one focal length; the emulation opens the width by the vertical field of
+    view.
+    """
     fovy = torch.tensor([math.radians(50.0)])
 
     def one_angle_for_both(fovy, height, width):

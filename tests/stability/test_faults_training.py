@@ -332,9 +332,10 @@ def test_f19_a_negative_loss_is_back_propagated(fault):
             sample_removal=lambda *_: None, observe=lambda *_: None, after_step=lambda *_: None
         )
         system = SimpleNamespace(
-            optimizers=lambda: wrapped, set_learning_rates=lambda _: None, losses=lambda *_: {"x": -(parameter**2).sum()},
-            manual_backward=lambda loss: loss.backward(), geometry=nothing, loss_scale=lambda: 1.0, global_step=1,
-            report=lambda *_: None, tell=lambda _: None,
+            optimizers=lambda: wrapped, set_learning_rates=lambda _: None,
+            losses=lambda *_: {"x": -(parameter**2).sum()},
+            manual_backward=lambda loss: loss.backward(), geometry=nothing, loss_scale=lambda: 1.0,
+            global_step=1, report=lambda *_: None, tell=lambda _: None,
         )  # fmt: skip
         stepping = type(
             "System",

@@ -185,9 +185,11 @@ def ball_mesh(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
 
 
 NOTHING = {
-    "empty.glb": "", "empty.obj": "", "empty.ply": "", "no_faces.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "one_vertex.obj": "v 1 2 3\n",
+    "empty.glb": "", "empty.obj": "", "empty.ply": "",
+    "no_faces.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "one_vertex.obj": "v 1 2 3\n",
     "one_vertex.ply": "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty " "float y\nproperty float " "z\nend_header\n1 2 3\n",
-    "one_vertex_face.obj": "v 1 2 3\nf 1 1 1\n", "no_area.off": "OFF\n3 1 0\n0 0 0\n1 0 0\n2 0 " "0\n3 0 1 2\n",
+    "one_vertex_face.obj": "v 1 2 3\nf 1 1 1\n",
+    "no_area.off": "OFF\n3 1 0\n0 0 0\n1 0 0\n2 0 " "0\n3 0 1 2\n",
 }  # fmt: skip
 
 
@@ -418,7 +420,9 @@ def uneven_square() -> tuple[np.ndarray, np.ndarray]:
 
 
 def uniformity(points: np.ndarray) -> float:
-    """The smaller p of the Kolmogorov-Smirnov tests that both coordinates are uniform on [-1, 1]."""
+    """The smaller p of the Kolmogorov-Smirnov tests that both coordinates are uniform on [-1,
+    1].
+    """
     return min(scipy.stats.kstest(axis, "uniform", (-1, 2)).pvalue for axis in points.T[:2])
 
 

@@ -145,7 +145,9 @@ def test_gradients_of_needles_and_discs(backend, antialias, measured):
 @row("A1", "Alpha cap and threshold, gradient discontinuity")
 @pytest.mark.parametrize("backend", EXACT)
 def test_interior_gradients_are_those_of_finite_differences(backend, measured):
-    """Some pixels capped, some below the threshold: a step of 1e-6 crosses neither, on either side."""
+    """Some pixels capped, some below the threshold: a step of 1e-6 crosses neither, on either
+    side.
+    """
     cloud, camera = random_cloud(12, seed=3, size=0.3), cameras(1, 12, 12)
     options = {"alpha_max": 0.6, "backend": backend}
     directions = [
@@ -409,8 +411,9 @@ def test_popping_is_one_jump_of_the_analytic_size(backend, measured):
     a1, a2 = 0.6, 0.7
     colors = torch.tensor([[1.0, 0, 0], [0, 0, 1.0]])
     flat = random_cloud(2)._replace(
-        means=torch.tensor([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]]).double(), scales=torch.full((2, 3), 0.5).double(),
-        quats=TILTED.repeat(2, 1), opacities=torch.tensor([a1, a2]).double(), colors=colors.double(),
+        means=torch.tensor([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]]).double(),
+        scales=torch.full((2, 3), 0.5).double(), quats=TILTED.repeat(2, 1),
+        opacities=torch.tensor([a1, a2]).double(), colors=colors.double(),
     )  # fmt: skip
 
     def frame(degrees: float) -> torch.Tensor:

@@ -73,7 +73,9 @@ def content(step: int, size: int = 20_000) -> dict:
 
 @row("A5", "Crash mid checkpoint")
 def test_killed_at_random_moments_of_200_saves(tmp_path, measured):
-    """After each kill the file is whole and no older than the last save that the child has told of."""
+    """After each kill the file is whole and no older than the last save that the child has told
+    of.
+    """
     path, rng = tmp_path / "last.ckpt", random.Random(0)
     save_file(path, content(0))
     saved, kills, read_end_lost = 0, 0, 0

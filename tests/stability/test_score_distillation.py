@@ -200,8 +200,8 @@ def test_the_clip_at_its_knots(measured):
 
 @row("A4", "Clip schedule")
 @pytest.mark.parametrize(
-    "knots", [[0, 1.5, 2.0, 0], [5, 1.5, 2.0, 5], [9, 1.5, 2.0, 5], [1.5, 2.0, 0], [0, 1, 2, 3, 4], [1], [], "1.5", [0, 1, math.nan, 9],
-              [0, 1, 2, 10, 3, 10], [0, 1.0, 2.0, 10, 3.0, 20.5], [0, -1.0, 2.0, 9], -1, True, {"a": 1}],
+    "knots",
+    [[0, 1.5, 2.0, 0], [5, 1.5, 2.0, 5], [9, 1.5, 2.0, 5], [1.5, 2.0, 0], [0, 1, 2, 3, 4], [1], [], "1.5", [0, 1, math.nan, 9], [0, 1, 2, 10, 3, 10], [0, 1.0, 2.0, 10, 3.0, 20.5], [0, -1.0, 2.0, 9], -1, True, {"a": 1}],
 )  # fmt: skip
 def test_a_clip_that_is_no_schedule_is_refused_when_it_is_read(knots, measured):
     with pytest.raises(UserError, match="system.guidance.grad_clip"):
@@ -311,7 +311,9 @@ def trained(folder, steps, size, *options) -> Ended:
 
 @row("A4", "Guidance 100: over-saturation")
 def test_annealing_helps_and_clipping_helps_more(tmp_path, measured):
-    """The exact score of the toy in a latent, at guidance 100 and, as what can be reached, at none."""
+    """The exact score of the toy in a latent, at guidance 100 and, as what can be reached, at
+    none.
+    """
     variants = {
         "as it is": [*STRONG, "system.guidance.max_step_percent=0.98"],
         "annealed": STRONG,
@@ -357,7 +359,9 @@ def test_a_prior_keeps_the_faces_apart_and_a_random_start_does_not(tmp_path, mea
 
 @row("A4", "Janus")
 def test_the_table_of_five_seeds(measured):
-    """Runs of 1200 steps at 128 pixels, by `python -m benchmarks.quality.ablations --table faces`."""
+    """Runs of 1200 steps at 128 pixels, by `python -m benchmarks.quality.ablations --table
+    faces`.
+    """
     lines = [
         line
         for line in (RESULTS / "faces.csv").read_text().splitlines()
@@ -653,7 +657,9 @@ def test_stopped_and_resumed_anywhere(step, random_streams, tmp_path, measured):
 def test_looking_at_more_pictures_changes_nothing(
     views, every, random_streams, tmp_path, monkeypatch, measured
 ):
-    """Neither the number of validation views nor what they draw from the process's own generators."""
+    """Neither the number of validation views nor what they draw from the process's own
+    generators.
+    """
     looked = GaussianDreamerSystem.validation_step
     seen = []
 

@@ -26,10 +26,12 @@ from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 SMALL = [
-    "data.width=24", "data.height=24", "data.eval_width=32", "data.eval_height=32", "data.n_test_views=3", "data.train_views=12",
-    "system.geometry.prior.num_points=150", "system.geometry.prior.color_smoothing=0", "system.geometry.grow.num_candidates=20000",
-    "system.geometry.grow.radius=0.05", "system.geometry.grow.max_points=50", "system.evaluation.size=24", "system.evaluation.views=6",
-    "trainer.enable_progress_bar=false", "trainer.log_every_n_steps=1", "use_timestamp=false", "tag=t",
+    "data.width=24", "data.height=24", "data.eval_width=32", "data.eval_height=32",
+    "data.n_test_views=3", "data.train_views=12", "system.geometry.prior.num_points=150",
+    "system.geometry.prior.color_smoothing=0", "system.geometry.grow.num_candidates=20000",
+    "system.geometry.grow.radius=0.05", "system.geometry.grow.max_points=50",
+    "system.evaluation.size=24", "system.evaluation.views=6", "trainer.enable_progress_bar=false",
+    "trainer.log_every_n_steps=1", "use_timestamp=false", "tag=t",
 ]  # fmt: skip
 
 

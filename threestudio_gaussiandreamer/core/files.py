@@ -151,7 +151,9 @@ def _quoted(path: Path) -> str:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the renaming itself durable, where the system lets a folder be opened (not on Windows)."""
+    """Make the renaming itself durable, where the system lets a folder be opened (not on
+    Windows).
+    """
     try:
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError:

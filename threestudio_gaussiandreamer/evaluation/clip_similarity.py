@@ -63,7 +63,9 @@ class Protocol(NamedTuple):
         )
 
     def draw(self, seed: int, item: int) -> Int[np.ndarray, " drawn"]:
-        """The views that ``seed`` takes of result number ``item``, in ascending order, none twice."""
+        """The views that ``seed`` takes of result number ``item``, in ascending order, none
+        twice.
+        """
         return np.sort(
             numpy_generator(seed, "clip-views", item=item).choice(
                 self.views, self.drawn, replace=False

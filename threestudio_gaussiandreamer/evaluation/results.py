@@ -117,7 +117,9 @@ class Pictures:
     def render(
         self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], size: int, *, chunk: int = 4
     ) -> Iterator[Float[np.ndarray, "B H W 3"]]:
-        """The views in [0, 1], ``chunk`` at a time; ``fovy`` in radians, ``size`` pixels each way."""
+        """The views in [0, 1], ``chunk`` at a time; ``fovy`` in radians, ``size`` pixels each
+        way.
+        """
         for views, angles in zip(c2w.split(chunk), fovy.split(chunk), strict=True):
             yield self._render(views, angles, size)
 

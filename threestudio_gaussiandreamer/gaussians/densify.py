@@ -100,8 +100,8 @@ def densify_and_prune(
 def _affordable(
     above_threshold: Bool[Tensor, " N"], gradient: Float[Tensor, " N"], room: int
 ) -> Bool[Tensor, " N"]:
-    """The above_threshold rows with the largest gradients that fit into ``room`` more Gaussians (each adds
-    exactly one).
+    """The above_threshold rows with the largest gradients that fit into ``room`` more Gaussians
+    (each adds exactly one).
     """
     if int(above_threshold.sum()) <= room:
         return above_threshold

@@ -96,7 +96,9 @@ def sh_basis(dirs: Float[Tensor, "*batch 3"], degree: int) -> list[Float[Tensor,
 
 
 def _normalize(dirs: Tensor) -> Tensor:
-    """Unit vectors; a direction without length becomes +z with zero gradient (0 / 0 would be NaN)."""
+    """Unit vectors; a direction without length becomes +z with zero gradient (0 / 0 would be
+    NaN).
+    """
     length = torch.linalg.vector_norm(dirs, dim=-1, keepdim=True)
     usable = length > SHORTEST_DIRECTION
     return torch.where(usable, dirs / torch.where(usable, length, 1), dirs.new_tensor([0.0, 0, 1]))

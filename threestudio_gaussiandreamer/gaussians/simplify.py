@@ -158,9 +158,9 @@ def draw(
         else views.backgrounds[rows]
     )
     out = rasterize(
-        cloud.means, cloud.quats, cloud.log_scales.exp(), opacities, colors, views.viewmats[rows], views.Ks[rows],
-        views.size, views.size, background=background,
-        near=views.near, far=math.inf, eps2d=views.eps2d, antialias=views.antialias,
+        cloud.means, cloud.quats, cloud.log_scales.exp(), opacities, colors, views.viewmats[rows],
+        views.Ks[rows], views.size, views.size, background=background, near=views.near,
+        far=math.inf, eps2d=views.eps2d, antialias=views.antialias,
     )  # fmt: skip
     return out.image, out.contribution
 

@@ -316,7 +316,9 @@ abar) x0 (Salimans and Ho 2022), or x0.
 
 
 def view_of_row(views: int, rows: int) -> Int[Tensor, " kB"]:
-    """Which view each row of a :class:`Condition` belongs to: 0..B-1, 0..B-1, then 0, 0, 1, 1, ..."""
+    """Which view each row of a :class:`Condition` belongs to: 0..B-1, 0..B-1, then 0, 0, 1, 1,
+    ...
+    """
     order = torch.arange(views)
     return torch.cat([order, order, order.repeat_interleave(2)])[:rows]
 

@@ -43,7 +43,9 @@ class Triangles(NamedTuple):
 
 
 class ZBuffer:
-    """The visible faces of one triangle mesh, from both sides; safe to call from several threads."""
+    """The visible faces of one triangle mesh, from both sides; safe to call from several
+    threads.
+    """
 
     def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
         self.vertices, self.faces = vertices.astype(np.float64), faces

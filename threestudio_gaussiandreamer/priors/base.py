@@ -4,8 +4,8 @@ ground below it.
 ===============  ===================================================================================
 option           meaning (all priors have these)
 ===============  ===================================================================================
-ground           add the paper's layer of randomly coloured points below the object; the object grows
-                 first (Algorithm 1), as if there were no ground
+ground           add the paper's layer of randomly coloured points below the object; the object
+                 grows first (Algorithm 1), as if there were no ground
 ground_points    how many
 ground_size      side of the square they fill, in units of the longest side of the object's box
 ground_height    its z in world units, or ``auto``: the bottom of the object

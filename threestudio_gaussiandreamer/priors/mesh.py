@@ -83,7 +83,9 @@ class MeshPrior(Prior):
 
 
 def mesh_cloud(mesh: Mesh, num_points: int, generator: np.random.Generator) -> PointCloud:
-    """The vertices of ``mesh`` with its faces, or ``num_points`` points uniform over its surface."""
+    """The vertices of ``mesh`` with its faces, or ``num_points`` points uniform over its
+    surface.
+    """
     if num_points == 0:
         return vertex_cloud(mesh)
     points, face_index, barycentric = sample_surface(mesh, num_points, generator)

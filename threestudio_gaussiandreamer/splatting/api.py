@@ -23,7 +23,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Backend:
-    """A module of this package with ``rasterize`` and ``unavailable``, and what tensors it takes."""
+    """A module of this package with ``rasterize`` and ``unavailable``, and what tensors it
+    takes.
+    """
 
     module: str
     devices: Optional[tuple[str, ...]] = None  # None: any

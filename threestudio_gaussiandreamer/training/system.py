@@ -585,7 +585,9 @@ def _check_optimizer(options: Any) -> None:
 
 
 def _check_losses(cfg: Any) -> None:
-    """Names of weights, where it is known before the first step which losses the guidance returns."""
+    """Names of weights, where it is known before the first step which losses the guidance
+    returns.
+    """
     guidance = find(cfg.guidance_type)
     for name in cfg.loss:
         if not name.startswith("lambda_"):

@@ -110,7 +110,9 @@ class BaseObject(Updateable):
         self.configure(*args, **kwargs)
 
     def configure(self, *args: Any, **kwargs: Any) -> None:
-        """Build the part from ``self.cfg``; gets what the constructor got after the configuration."""
+        """Build the part from ``self.cfg``; gets what the constructor got after the
+        configuration.
+        """
 
 
 class BaseModule(nn.Module, Updateable):
@@ -134,7 +136,9 @@ class BaseModule(nn.Module, Updateable):
             self._load_weights(self.cfg.weights)
 
     def configure(self, *args: Any, **kwargs: Any) -> None:
-        """Build the part from ``self.cfg``; gets what the constructor got after the configuration."""
+        """Build the part from ``self.cfg``; gets what the constructor got after the
+        configuration.
+        """
 
     def _load_weights(self, source: str) -> None:
         path, _, module_name = source.rpartition(":")

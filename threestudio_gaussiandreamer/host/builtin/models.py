@@ -51,7 +51,9 @@ COLOR_ACTIVATIONS = {"sigmoid": torch.sigmoid, "none": lambda x: x}
 
 @register("no-material")
 class NoMaterial(BaseMaterial):
-    """Passes colours through a sigmoid; without ``input_feature_dims`` there is nothing to learn."""
+    """Passes colours through a sigmoid; without ``input_feature_dims`` there is nothing to
+    learn.
+    """
 
     @dataclass
     class Config(BaseMaterial.Config):

@@ -1,4 +1,6 @@
-"""The LightningModule that holds the parts, and when it makes, updates, renders and exports them."""
+"""The LightningModule that holds the parts, and when it makes, updates, renders and exports
+them.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any, List, Optional

@@ -139,7 +139,9 @@ class _Rasterize(torch.autograd.Function):
 def _draw(
     inputs: Sequence[Tensor], means2d: Tensor, frame: Frame
 ) -> tuple[tuple[Tensor, ...], "_State"]:
-    """Image, alpha, depth, radii and contribution, and what `_draw_vjp` needs; fills ``means2d``."""
+    """Image, alpha, depth, radii and contribution, and what `_draw_vjp` needs; fills
+    ``means2d``.
+    """
     means, views, scale = inputs[0], len(means2d), frame.options.downsample
     size = (views, frame.height // scale, frame.width // scale)
     pictures = [means.new_empty(*size, channels) for channels in (CHANNELS, 1, 1)]

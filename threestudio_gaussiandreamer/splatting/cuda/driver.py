@@ -48,7 +48,9 @@ def machine(device: torch.device) -> "Gpu":
 
 
 class Gpu:
-    """One device. Its kernels are compiled, or read from the cache, when they are first launched."""
+    """One device. Its kernels are compiled, or read from the cache, when they are first
+    launched.
+    """
 
     def __init__(self, index: int):
         self.index = index

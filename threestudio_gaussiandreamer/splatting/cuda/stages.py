@@ -143,7 +143,9 @@ class Gradients(NamedTuple):
 
 
 def project(inputs: Inputs, means2d: Tensor, frame: Frame) -> tuple[Splats, Tensor, Tensor]:
-    """Stages 1 to 3; also radii (B, N) and zeros (B, N) for the contributions. Fills ``means2d``."""
+    """Stages 1 to 3; also radii (B, N) and zeros (B, N) for the contributions. Fills
+    ``means2d``.
+    """
     launch, shape, new = frame.machine.launch, inputs.shape, inputs.means.new_empty
     splats, depth_keys, radii, contribution = (
         new(*shape, SPLAT),
