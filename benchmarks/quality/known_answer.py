@@ -141,6 +141,28 @@ def held_out(size: int = SIZE) -> Views:
 # ---- finding -------------------------------------------------------------------------------------
 
 
+class CloudTruth:
+    """Pictures of a cloud of degree 0 as the truth; see ``guidance/known_truth.py``."""
+
+    mesh = None
+
+    def __init__(self, cloud: Gaussians) -> None:
+        self.cloud = cloud
+
+    def render(
+        self, batch: dict[str, Any], background: Tensor, *, size: tuple[int, int]
+    ) -> Float[Tensor, "B H W 3"]:
+        cloud, c2w = self.cloud, batch["c2w"].to(self.cloud.means)
+        viewmats, Ks = to_opencv(c2w, batch["fovy"].to(c2w), *size)
+        shape = cloud.means, cloud.quats, cloud.log_scales.exp(), cloud.logit_opacities.sigmoid()
+        colors = sh_to_colors(cloud.sh, cloud.means)  # of degree 0: any direction will do
+        out = rasterize(*shape, colors, viewmats, Ks, size[1], size[0])
+        return out.image + (1 - out.alpha) * background
+
+    def prefetch(self, *views: Any) -> None:
+        """Do nothing: rendering is fast enough."""
+
+
 @register("known-cloud-guidance")
 class KnownCloud(BaseObject):
     """Score distillation with one picture for each camera, that of a cloud, and no noise: the mean
@@ -154,23 +176,12 @@ class KnownCloud(BaseObject):
     cfg: Config
 
     def configure(self) -> None:
-        self.cloud = prune.tensors_of(read_cloud(self.cfg.path))
-
-    def target_rgb(
-        self, batch: dict[str, Any], background: Tensor, size: tuple[int, int]
-    ) -> Float[Tensor, "B H W 3"]:
-        cloud, c2w = self.cloud, batch["c2w"].to(self.cloud.means)
-        viewmats, Ks = to_opencv(c2w, batch["fovy"].to(c2w), *size)
-        shape = cloud.means, cloud.quats, cloud.log_scales.exp(), cloud.logit_opacities.sigmoid()
-        out = rasterize(
-            *shape, sh_to_colors(cloud.sh, cloud.means), viewmats, Ks, size[1], size[0]
-        )  # of degree 0: any direction will do
-        return out.image + (1 - out.alpha) * background
+        self.truth = CloudTruth(prune.tensors_of(read_cloud(self.cfg.path)))
 
     def __call__(
         self, rgb: Tensor, prompt_utils: Any, comp_rgb_bg: Tensor, **batch: Any
     ) -> dict[str, Any]:
-        difference = rgb - self.target_rgb(batch, comp_rgb_bg.detach(), rgb.shape[1:3])
+        difference = rgb - self.truth.render(batch, comp_rgb_bg.detach(), size=rgb.shape[1:3])
         loss = 0.5 * difference.square().sum() / len(rgb)
         return {
             "loss_sds": loss,

@@ -17,7 +17,7 @@ import yaml
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.formats.spz import read_spz
-from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance
+from threestudio_gaussiandreamer.guidance.known_truth import MeshTruth
 from threestudio_gaussiandreamer.host import BaseObject, register
 from threestudio_gaussiandreamer.launch.experiment import main
 from threestudio_gaussiandreamer.training import held_out as evaluate
@@ -187,8 +187,8 @@ def test_a_run_long_enough_for_its_pool_has_the_pictures_cast_at_once(
 ):
     cast = []
     monkeypatch.setattr(
-        ExactScoreGuidance,
-        "cast_targets",
+        MeshTruth,
+        "prefetch",
         lambda self, *views: cast.append((len(views[0]), *views[2:])),
     )
     options = ["data.width=48", "data.height=48", "system.renderer.downsample=2"]
@@ -308,7 +308,7 @@ def test_pruned_exports_note_what_they_have_spent(tmp_path, painted_box, capsys)
         (["system.prune.count=0"], "system.prune.count: expected a whole number from 1 on"),
         (
             ["system.prune.count=9", "system.prune.psnr=40"],
-            "system.prune.count and system.prune.psnr: give one budget",
+            "system.prune.psnr: give one budget; count is one too",
         ),
         (["system.prune.bytes=lots"], "system.prune.bytes: expected a size such as 500kB"),
     ],

@@ -121,6 +121,12 @@ class ScoreDistillation(BaseObject, ABC):
     """The names of what :meth:`report` returns, so that ``checkpoint.monitor`` may be one of them.
     """
 
+    LOSSES: tuple[str, ...] = ("sds",)
+    """The losses that a step returns, without their ``loss_``."""
+
+    KNOWS_TRUTH = False
+    """Whether its instances have a ``truth``, see :mod:`.known_truth`."""
+
     def report(self) -> dict[str, float]:
         """More numbers to log about the last step."""
         return {}

@@ -53,16 +53,16 @@ from ..core.options import at_least, in_range, interval, one_of, positive, requi
 from ..diffusion.exact_score import LinearLatent, color_matrix, denoise, squared_distances
 from ..host import register
 from ..meshes.load import AXES, load_mesh
-from ..meshes.raycast import MeshCaster, TargetCache, over_background
+from ..meshes.raycast import MeshCaster
 from ..prompts.view_prompts import view_directions
 from .base import GUIDANCE_SCALE, ScoreDistillation
+from .known_truth import MeshTruth, background_of, composite, resized
 
 MODES = ("view-exact", "direction-bins", "view-agnostic")
 SPACES = ("pixel", "latent")
 MAX_MODE_BYTES = 2**31
 BANK_BYTES = 16
 """Of a pixel of the bank, as it is cast."""
-PIXELS_PER_CAST = 2**20
 
 
 class Bank(NamedTuple):
@@ -126,12 +126,18 @@ class ExactScoreGuidance(ScoreDistillation):
 
     cfg: Config
     REPORTS = ("perplexity",)
+    KNOWS_TRUTH = True
 
     def configure(self) -> None:
         super().configure()
         cfg = self.cfg
-        self.caster = MeshCaster(load_mesh(cfg.mesh, scale=cfg.scale, up=cfg.up, front=cfg.front))
-        self._targets = TargetCache(self.caster, cfg.supersample, cfg.max_cached_targets)
+        mesh = MeshCaster(load_mesh(cfg.mesh, scale=cfg.scale, up=cfg.up, front=cfg.front))
+        self.truth = MeshTruth(
+            mesh,
+            cfg.supersample,
+            cfg.max_cached_targets,
+            self._picture_size if self._needs_own_view else None,
+        )
         self._banks: dict[tuple[int, int], Bank] = {}
         self._size: Optional[tuple[int, int]] = None
         self._perplexity = 1.0
@@ -145,7 +151,7 @@ class ExactScoreGuidance(ScoreDistillation):
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B c h w"]:
         self._size = self._picture_size(*rgb.shape[-2:])
-        return self._latent().encode(_resized(rgb, self._size))
+        return self._latent().encode(resized(rgb, self._size))
 
     def decode(self, latents: Float[Tensor, "B c h w"]) -> Float[Tensor, "B 3 H W"]:
         return self._latent().decode(latents)
@@ -165,7 +171,7 @@ class ExactScoreGuidance(ScoreDistillation):
                 "exact-score-guidance compares pictures: give it renders, not latents "
                 "(rgb_as_latents)"
             )
-        background = _background(comp_rgb_bg, len(c2w), c2w.device)
+        background = background_of(comp_rgb_bg, len(c2w), c2w.device)
         own = self._own_views(c2w, fovy, background) if self._needs_own_view else [None] * len(c2w)
         members = self._members(batch, len(c2w))
         return [self._mixture(own[i], members[i], background[i]) for i in range(len(c2w))]
@@ -245,22 +251,8 @@ class ExactScoreGuidance(ScoreDistillation):
     def _own_views(
         self, c2w: Tensor, fovy: Tensor, background: Float[Tensor, "B bh bw 3"]
     ) -> Float[Tensor, "B 1 c h w"]:
-        rgba = self._targets(c2w, fovy, *self._size)
-        return self._latent().encode(_composite(rgba, background))[:, None]
-
-    @torch.no_grad()
-    def cast_targets(
-        self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int
-    ) -> None:
-        """Cast the pictures that training will show most of beforehand, if all can be kept: many at
-        once take a third of the time.
-        """
-        if not self._needs_own_view or len(c2w) > self.cfg.max_cached_targets:
-            return
-        height, width = self._picture_size(height, width)
-        views = max(1, PIXELS_PER_CAST // (height * width))
-        for some in zip(c2w.split(views), fovy.split(views), strict=True):
-            self._targets(*some, height, width)
+        rgba = self.truth.pictures(c2w, fovy, *self._size)
+        return self._latent().encode(composite(rgba, background))[:, None]
 
     def bank(self, height: int, width: int) -> Bank:
         """The bank at a picture size; that of the last size is kept."""
@@ -270,7 +262,7 @@ class ExactScoreGuidance(ScoreDistillation):
 
     def _cast_bank(self, height: int, width: int) -> Bank:
         cameras = zip(self.bank_orbit.c2w.numpy(), self.bank_orbit.fovy.tolist(), strict=True)
-        images = self.caster.render_views(
+        images = self.truth.mesh.render_views(
             cameras, height, width, supersample=self.cfg.supersample, progress="bank of views"
         )
         images = torch.from_numpy(images).to(self.device)
@@ -316,45 +308,6 @@ class ExactScoreGuidance(ScoreDistillation):
             )
         return factor
 
-    # What is known of the truth
-    # -------------------------------------------------------------------------------------------
-
-    @torch.no_grad()
-    def target_rgb(
-        self,
-        batch: dict[str, Any],
-        comp_rgb_bg: Optional[Tensor] = None,
-        *,
-        size: Optional[tuple[int, int]] = None,
-    ) -> Float[Tensor, "B H W 3"]:
-        """The mesh from the batch's own cameras, on the background of the render, at (height,
-        width) = ``size`` or the batch's.
-        """
-        height, width = size or (batch["height"], batch["width"])
-        rgba = self._targets(batch["c2w"], batch["fovy"], height, width)
-        background = _background(comp_rgb_bg, len(rgba), rgba.device)
-        return _composite(rgba, background).movedim(1, -1)
-
-    @torch.no_grad()
-    def bank_images(
-        self, size: int, background: Optional[Tensor] = None
-    ) -> Float[Tensor, "K H W 3"]:
-        """The bank's pictures at ``size`` x ``size`` on one colour (3,), black by default, for the
-        multi-face meter.
-        """
-        cameras = zip(self.bank_orbit.c2w.numpy(), self.bank_orbit.fovy.tolist(), strict=True)
-        rgba = torch.from_numpy(
-            self.caster.render_views(cameras, size, size, supersample=self.cfg.supersample)
-        )
-        return over_background(
-            rgba, torch.zeros(3) if background is None else background.detach().cpu().reshape(3)
-        )
-
-    @property
-    def bank_azimuths(self) -> Float[Tensor, " K"]:
-        """Degrees."""
-        return self.bank_orbit.azimuth
-
 
 def direction_indices(
     elevation: Float[Tensor, " B"], azimuth: Float[Tensor, " B"]
@@ -376,7 +329,7 @@ def bank_modes(bank: Bank, background: Float[Tensor, "bh bw 3"]) -> Float[Tensor
             pooled[:, :3] + (1 - pooled[:, 3:]) * background.reshape(3, 1, 1)
         )
     return torch.cat(
-        [bank.latent.encode(_composite(rgba, background[None])) for rgba in bank.rgba.split(16)]
+        [bank.latent.encode(composite(rgba, background[None])) for rgba in bank.rgba.split(16)]
     )
 
 
@@ -387,35 +340,3 @@ def _rows(bank: Bank, members: Bool[Tensor, " K"]) -> Bank:
         if members.all()
         else bank._replace(rgba=bank.rgba[members], pooled=bank.pooled[members])
     )
-
-
-def _background(
-    background: Optional[Tensor], batch: int, device: torch.device
-) -> Float[Tensor, "B bh bw 3"]:
-    """The render's background, detached; black without one."""
-    return (
-        torch.zeros(batch, 1, 1, 3, device=device)
-        if background is None
-        else background.detach().float().expand(batch, -1, -1, -1)
-    )
-
-
-def _composite(
-    rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B bh bw 3"]
-) -> Float[Tensor, "B 3 H W"]:
-    """Premultiplied pictures over the background, which is resized to them."""
-    background = background.movedim(-1, 1)
-    if background.shape[-2:] != (1, 1):
-        background = _resized(background, tuple(rgba.shape[1:3]))
-    rgba = rgba.movedim(-1, 1).contiguous().to(background).div_(255)
-    return ((1 - rgba[:, 3:]) * background).add_(rgba[:, :3])
-
-
-def _resized(images: Float[Tensor, "B c H W"], size: tuple[int, int]) -> Float[Tensor, "B c h w"]:
-    """Images at another size: box averages for whole factors, else bilinear with antialiasing."""
-    height, width = images.shape[-2:]
-    if (height, width) == size:
-        return images
-    if height % size[0] == 0 and width % size[1] == 0:
-        return F.avg_pool2d(images, (height // size[0], width // size[1]))
-    return F.interpolate(images, size, mode="bilinear", align_corners=False, antialias=True)

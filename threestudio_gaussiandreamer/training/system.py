@@ -56,15 +56,18 @@ from ..guidance.foreign import (
     restore_learnt,
     trainable_groups,
 )
+from ..guidance.known_truth import truth_of
 from ..host import BaseLift3DSystem, find, info, register, validate_schedule, warn
 from ..metrics import psnr
 from ..priors.cache import cached_cloud
 from ..prune.command import PruneOptions, pruned, write_report
 from .background import FlatBackground
+from .data import GaussianDreamerDataModule
 from .density import DensityControl, DensityOutcome, RenderedQuality
 from .events import log_picture, log_scores
 from .finite import CHECK_EVERY, optimizer_tensors, require_finite
 from .held_out import EvaluationConfig, HeldOut, Measurements
+from .renderer import SplattingRenderer
 
 REGULARISERS = ("sparsity", "opaque")
 GUIDANCE_LR = (
@@ -114,7 +117,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         losses = [name.replace("lambda_", "loss_", 1) for name in cfg.loss]
         guided = [*losses, "grad_norm", "min_step", "max_step", "bad_items", *guidance.REPORTS]
         known = {"loss", "gaussians", *(f"train/{name}" for name in guided)}
-        return known | {"dB"} if hasattr(guidance, "target_rgb") else known
+        return known | {"dB"} if guidance.KNOWS_TRUTH else known
 
     # -- start -------------------------------------------------------------------------------------
 
@@ -123,7 +126,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         super().configure()
         self.density = DensityControl(self.geometry)
         self.automatic_optimization = False
-        self.__dict__["guidance"] = self.measurements = None
+        self.__dict__["guidance"] = self.measurements = self.prompt_utils = None
         self.skipped_steps = 0
         self._learnt: Optional[dict[str, Tensor]] = None
 
@@ -179,7 +182,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         """Run the prior, unless a checkpoint brought the cloud."""
         if len(self.geometry):
             return
-        prompt = getattr(self, "prompt_utils", None) or find(self.cfg.prompt_processor_type)(
+        prompt = self.prompt_utils or find(self.cfg.prompt_processor_type)(
             self.cfg.prompt_processor
         )
         self.geometry.initialize(
@@ -190,11 +193,10 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     def on_fit_start(self) -> None:
         super().on_fit_start()
-        caster = getattr(self.guidance, "caster", None)
-        if caster is not None and self._save_dir is not None:
-            self.measurements = Measurements(
-                HeldOut(self.cfg.evaluation, caster), Path(self._save_dir)
-            )
+        truth = truth_of(self.guidance)
+        if truth is not None and truth.mesh is not None and self._save_dir is not None:
+            held_out = HeldOut(self.cfg.evaluation, truth.mesh)
+            self.measurements = Measurements(held_out, Path(self._save_dir))
 
     def on_train_start(self) -> None:
         self.require_finite()
@@ -205,23 +207,24 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             self.score("prior")
         if self.measurements:
             self.measurements.start_clock()
-        self.cast_targets()
+        self.prefetch_truth()
 
-    def cast_targets(self) -> None:
-        """Let a guidance that looks at a truth look at all views of a fixed pool at once, if this
-        run will come to most of them.
+    def prefetch_truth(self) -> None:
+        """Render the truth from all cameras of a fixed pool at once, if this run will come to most
+        of them.
         """
-        views, cast = (
-            getattr(self.trainer.datamodule, "pool_views", lambda: None)(),
-            getattr(self.guidance, "cast_targets", None),
-        )
-        if cast is None or views is None:
+        truth, data = truth_of(self.guidance), self.trainer.datamodule
+        if truth is None or not isinstance(data, GaussianDreamerDataModule):
             return
-        drawn = (self.trainer.max_steps - self.global_step) * views["batch_size"]
-        if self.trainer.max_steps < 0 or drawn >= len(views["c2w"]):
-            downsample = getattr(self.renderer.cfg, "downsample", 1)
+        views, steps = data.pool_views(), self.trainer.max_steps
+        if views is None:
+            return
+        drawn = (steps - self.global_step) * views["batch_size"]
+        if steps < 0 or drawn >= len(views["c2w"]):
+            ours = isinstance(self.renderer, SplattingRenderer)
+            downsample = self.renderer.cfg.downsample if ours else 1
             size = views["height"] // downsample, views["width"] // downsample
-            cast(views["c2w"].to(self.device), views["fovy"].to(self.device), *size)
+            truth.prefetch(views["c2w"].to(self.device), views["fovy"].to(self.device), *size)
 
     # -- one step ----------------------------------------------------------------------------------
 
@@ -272,9 +275,9 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         )
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
-        for part in (self.geometry, self.background):
-            if hasattr(part, "set_learning_rates"):
-                part.set_learning_rates(optimizer, self.true_current_epoch, self.true_global_step)
+        own_background = isinstance(self.background, FlatBackground)
+        for part in [self.geometry, *([self.background] if own_background else [])]:
+            part.set_learning_rates(optimizer, self.true_current_epoch, self.true_global_step)
 
     def losses(self, out: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         """The weighted losses: every ``loss_*`` that the guidance returns, and our regularisers on
@@ -350,13 +353,11 @@ class GaussianDreamerSystem(BaseLift3DSystem):
     def truth(
         self, batch: dict[str, Any], out: dict[str, Any]
     ) -> Optional[Float[Tensor, "B H W 3"]]:
-        """What these views should look like, where the guidance knows it."""
-        target = getattr(self.guidance, "target_rgb", None)
-        return (
-            None
-            if target is None
-            else target(batch, out["comp_rgb_bg"].detach(), size=out["comp_rgb"].shape[1:3])
-        )
+        """Return what these views should show, where the guidance knows it."""
+        truth = truth_of(self.guidance)
+        if truth is None:
+            return None
+        return truth.render(batch, out["comp_rgb_bg"].detach(), size=out["comp_rgb"].shape[1:3])
 
     def _log_now(self) -> bool:
         every = self.trainer.log_every_n_steps
@@ -595,9 +596,7 @@ def _check_losses(cfg: Any) -> None:
                 f"unknown key 'system.loss.{name}': weights of losses are called "
                 "lambda_<loss>, such as lambda_sds"
             )
-    known = getattr(
-        guidance, "LOSSES", ("sds",) if issubclass(guidance, ScoreDistillation) else None
-    )
+    known = getattr(guidance, "LOSSES", None)  # another package's guidance may have it too
     if known is not None:
         check_weights([name.removeprefix("lambda_") for name in cfg.loss], known)
 

@@ -1,0 +1,131 @@
+"""What a guidance knows of the object that it asks for, where that is more than a prompt.
+
+A guidance with an attribute ``truth`` (a :class:`KnownTruth`) has its runs measured: dB in the
+progress bar, the truth beside validation pictures, ``budget: auto`` judged against it, and, where
+the truth is a mesh, scores on held-out views.
+"""
+
+from collections.abc import Callable
+from typing import Any, Optional, Protocol
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from ..meshes.raycast import MeshCaster, TargetCache
+
+PIXELS_PER_CAST = 2**20
+PictureSize = Callable[[int, int], tuple[int, int]]
+
+
+class KnownTruth(Protocol):
+    """Pictures of the object from any camera."""
+
+    mesh: Optional[MeshCaster]
+    """Casts the mesh from held-out cameras; None where the truth isn't a mesh."""
+
+    def render(
+        self,
+        batch: dict[str, Any],
+        background: Optional[Tensor] = None,
+        *,
+        size: Optional[tuple[int, int]] = None,
+    ) -> Float[Tensor, "B H W 3"]:
+        """Return what the views of a batch should show.
+
+        Args:
+            batch: with ``c2w``, ``fovy``, ``height`` and ``width``.
+            background: of the renders, (B, 1, 1, 3) or (B, H, W, 3); black without one.
+            size: (height, width) of the pictures; the batch's without one.
+        """
+
+    def prefetch(
+        self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int
+    ) -> None:
+        """Render these views in advance, where it saves time: training will ask for most of them at
+        this size.
+        """
+
+
+def truth_of(guidance: Any) -> Optional[KnownTruth]:
+    """Return what a guidance, maybe another package's, knows of the truth; None for most."""
+    return getattr(guidance, "truth", None)
+
+
+class MeshTruth:
+    """A :class:`KnownTruth` by ray casting, which keeps the pictures of the last cameras.
+
+    Args:
+        mesh: casts the mesh.
+        supersample: rays per pixel and axis.
+        max_cached: pictures that are kept, as bytes.
+        prefetch_size: returns the size of the picture that training needs for a render of
+            (height, width) pixels; None where it needs none.
+    """
+
+    def __init__(
+        self,
+        mesh: MeshCaster,
+        supersample: int,
+        max_cached: int,
+        prefetch_size: Optional[PictureSize] = None,
+    ) -> None:
+        self.mesh, self._prefetch_size = mesh, prefetch_size
+        self.pictures = TargetCache(mesh, supersample, max_cached)
+
+    @torch.no_grad()
+    def render(
+        self,
+        batch: dict[str, Any],
+        background: Optional[Tensor] = None,
+        *,
+        size: Optional[tuple[int, int]] = None,
+    ) -> Float[Tensor, "B H W 3"]:
+        """See :meth:`KnownTruth.render`."""
+        height, width = size or (batch["height"], batch["width"])
+        rgba = self.pictures(batch["c2w"], batch["fovy"], height, width)
+        background = background_of(background, len(rgba), rgba.device)
+        return composite(rgba, background).movedim(1, -1)
+
+    @torch.no_grad()
+    def prefetch(
+        self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int
+    ) -> None:
+        """Cast these views in large groups, which takes a third of the time, if all can be kept."""
+        if self._prefetch_size is None or len(c2w) > self.pictures.capacity:
+            return
+        height, width = self._prefetch_size(height, width)
+        views = max(1, PIXELS_PER_CAST // (height * width))
+        for group in zip(c2w.split(views), fovy.split(views), strict=True):
+            self.pictures(*group, height, width)
+
+
+def background_of(
+    background: Optional[Tensor], batch: int, device: torch.device
+) -> Float[Tensor, "B bh bw 3"]:
+    """Return the renders' background, detached; black without one."""
+    if background is None:
+        return torch.zeros(batch, 1, 1, 3, device=device)
+    return background.detach().float().expand(batch, -1, -1, -1)
+
+
+def composite(
+    rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B bh bw 3"]
+) -> Float[Tensor, "B 3 H W"]:
+    """Composite premultiplied pictures over the background, which is resized to them."""
+    background = background.movedim(-1, 1)
+    if background.shape[-2:] != (1, 1):
+        background = resized(background, tuple(rgba.shape[1:3]))
+    rgba = rgba.movedim(-1, 1).contiguous().to(background).div_(255)
+    return ((1 - rgba[:, 3:]) * background).add_(rgba[:, :3])
+
+
+def resized(images: Float[Tensor, "B c H W"], size: tuple[int, int]) -> Float[Tensor, "B c h w"]:
+    """Resize images: box averages for whole factors, else bilinear with antialiasing."""
+    height, width = images.shape[-2:]
+    if (height, width) == size:
+        return images
+    if height % size[0] == 0 and width % size[1] == 0:
+        return F.avg_pool2d(images, (height // size[0], width // size[1]))
+    return F.interpolate(images, size, mode="bilinear", align_corners=False, antialias=True)
