@@ -23,7 +23,8 @@ SCRIPT = """
 
     register_parts()
     pl.seed_everything(0)
-    overrides = [*test_system.SMALL, *test_system.DENSIFY, "exp_root_dir={folder}", "system.geometry.prior.path={mesh}"]
+    overrides = [*test_system.SMALL, *test_system.DENSIFY, "exp_root_dir={folder}"]
+    overrides += ["system.geometry.prior.path={mesh}"]
     cfg = load_config("{config}", cli_args=overrides)
     data, system = find(cfg.data_type)(cfg.data), find(cfg.system_type)(cfg.system)
     cameras = []
@@ -35,10 +36,13 @@ SCRIPT = """
         return step(batch, batch_idx)
 
     system.training_step = recorded
-    trainer = pl.Trainer(accelerator="cpu", devices=2, strategy=ReplicatedStrategy(process_group_backend="gloo"), max_steps=6, logger=False,
-                         enable_checkpointing=False, enable_progress_bar=False, limit_val_batches=0, enable_model_summary=False)
+    strategy = ReplicatedStrategy(process_group_backend="gloo")
+    options = dict(logger=False, enable_checkpointing=False, enable_progress_bar=False)
+    options |= dict(limit_val_batches=0, enable_model_summary=False)
+    trainer = pl.Trainer(accelerator="cpu", devices=2, strategy=strategy, max_steps=6, **options)
     trainer.fit(system, datamodule=data)
-    torch.save({{"cameras": torch.stack(cameras), **system.state_dict()}}, f"{folder}/rank{{trainer.global_rank}}.pt")
+    state = {{"cameras": torch.stack(cameras), **system.state_dict()}}
+    torch.save(state, f"{folder}/rank{{trainer.global_rank}}.pt")
 """
 
 

@@ -413,11 +413,8 @@ def test_t3benchs_scripts_find_their_pictures(plys, tmp_path):
         )
         == 0
     )
-    meshes = list(
-        root.glob(
-            f"outputs_mesh_t3/dreamfusion_single/{prompt.replace(' ', '_')}*/save/it*-export/model.obj"
-        )
-    )
+    runs = root / "outputs_mesh_t3/dreamfusion_single"
+    meshes = list(runs.glob(f"{prompt.replace(' ', '_')}*/save/it*-export/model.obj"))
     assert len(meshes) == 1
     mesh = trimesh.load(meshes[0])  # as T3Bench's renderer does
     assert isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) > 100

@@ -74,8 +74,27 @@ HEADER = "{'descr': '<f8', 'fortran_order': False, 'shape': (%s,)}"
 
 @pytest.mark.parametrize(
     "content",
-    [ b"", b"PK", b"hello", b"\x93NUMPY", b"\x93NUMPY\2\0\xff\xff\xff\x7f{}", b"\x93NUMPY\7\0", npy(HEADER % 3, bytes(16)), npy(HEADER % 3, bytes(32)), npy(HEADER % 10**15, bytes(16)), npy(HEADER % -1, b""), npy("{", b""), npy("[" * 500, b""), npy("{'descr': 'x', 'fortran_order': 1, " "'shape': ()}", b""), zipped(npy(HEADER % 3, bytes(32))), zipped(npy(HEADER % 3, bytes(24)), file_size=1 << 40), zipped(npy(HEADER % 3, bytes(24)), CRC=5), zipped(npy(HEADER % 3, bytes(24)), compress_type=99), zipped(npy(HEADER % 3, bytes(24)), flag_bits=1), ],
-)  # fmt: skip
+    [
+        b"",
+        b"PK",
+        b"hello",
+        b"\x93NUMPY",
+        b"\x93NUMPY\2\0\xff\xff\xff\x7f{}",
+        b"\x93NUMPY\7\0",
+        npy(HEADER % 3, bytes(16)),
+        npy(HEADER % 3, bytes(32)),
+        npy(HEADER % 10**15, bytes(16)),
+        npy(HEADER % -1, b""),
+        npy("{", b""),
+        npy("[" * 500, b""),
+        npy("{'descr': 'x', 'fortran_order': 1, 'shape': ()}", b""),
+        zipped(npy(HEADER % 3, bytes(32))),
+        zipped(npy(HEADER % 3, bytes(24)), file_size=1 << 40),
+        zipped(npy(HEADER % 3, bytes(24)), CRC=5),
+        zipped(npy(HEADER % 3, bytes(24)), compress_type=99),
+        zipped(npy(HEADER % 3, bytes(24)), flag_bits=1),
+    ],
+)
 def test_damage_is_one_message_and_no_memory(tmp_path, content):
     path = tmp_path / "x.npz"
     path.write_bytes(content)

@@ -505,8 +505,10 @@ def check_same_run(cfg: Any, path: Path) -> None:
 
 
 COMMANDS = [
-    "--config\ndemo.yaml\n--train\n--gpu\ncpu\ntrainer.max_steps=1200\nsystem.prompt_processor.prompt=a fox: red, 1984\nseed=3\ntag=t",
-    "--config\ndemo.yaml\n--config\ndemo-draft.yaml\n--export\nresume=outputs/demo/x/ckpts/last.ckpt\nsystem.geometry.prior_type=random-prior\n"
+    "--config\ndemo.yaml\n--train\n--gpu\ncpu\ntrainer.max_steps=1200\n"
+    "system.prompt_processor.prompt=a fox: red, 1984\nseed=3\ntag=t",
+    "--config\ndemo.yaml\n--config\ndemo-draft.yaml\n--export\n"
+    "resume=outputs/demo/x/ckpts/last.ckpt\nsystem.geometry.prior_type=random-prior\n"
     "data.elevation_range=[-10,60]\nsystem.geometry.densify={enabled: true, start: 9, stop: 99}",
     "--config\ngaussiandreamer\n--test\n--verbose\nsystem.prompt_processor.prompt=1984\nname=a "
     "b\nuse_timestamp=false\n"

@@ -94,7 +94,8 @@ def assert_refused(code: int, err: str, message: str) -> None:
         # a registered part of another kind
         (
             "system.geometry.prior_type=ply-exporter",
-            "system.geometry.prior_type is 'ply-exporter', a part of the kind exporter; expected one of the kind prior",
+            "system.geometry.prior_type is 'ply-exporter', a part of the kind exporter; "
+            "expected one of the kind prior",
         ),
         (
             "system.renderer_type=no-material",
@@ -205,7 +206,10 @@ def assert_refused(code: int, err: str, message: str) -> None:
         ("system.guidance.guidance_scale=1e38", "system.guidance.guidance_scale: expected a"),
         ("system.loss.lambda_sds=[0,1,1e300,9]", "system.loss.lambda_sds[2]: expected a finite"),
         ("system.evaluation.size=100000", "system.evaluation.size: expected a number from 1 to"),
-        ("system.evaluation={size: 9999, views: 9999}", "pixels, twice take about 39.99 TB of memory"),
+        (
+            "system.evaluation={size: 9999, views: 9999}",
+            "pixels, twice take about 39.99 TB of memory",
+        ),
         ("data.train_views=1000000000000", "data.train_views: 1000000000000 views take about"),
         ("data.batch_size=[4096, 4096]", "data.batch_size: 2 entries need 1 resolution_milestones"),
         ("data.eval_height=100000", "data.eval_height: expected a number from 1 to 16384"),

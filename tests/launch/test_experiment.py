@@ -628,7 +628,8 @@ class RingPrior(Prior):
 
     def generate(self, prompt, generator):
         points = generator.normal(size=(self.cfg.count, 3))
-        return PointCloud((0.5 * points).astype("float32"), generator.random((self.cfg.count, 3)).astype("float32"))
+        colors = generator.random((self.cfg.count, 3)).astype("float32")
+        return PointCloud((0.5 * points).astype("float32"), colors)
 """
 GUIDANCE_FILE = '''
 from dataclasses import dataclass
@@ -642,7 +643,8 @@ class RedGuidance(BaseObject):
 
     def __call__(self, rgb, prompt_utils, **batch):
         """Pulls every pixel towards red: the smallest guidance there is."""
-        return {"loss_sds": self.cfg.strength * (rgb - rgb.new_tensor([1.0, 0.0, 0.0])).square().mean()}
+        red = rgb.new_tensor([1.0, 0.0, 0.0])
+        return {"loss_sds": self.cfg.strength * (rgb - red).square().mean()}
 '''
 OWN_CONFIG = """
 name: own

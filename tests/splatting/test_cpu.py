@@ -109,7 +109,8 @@ def run_python(text):
         from threestudio_gaussiandreamer.splatting import rasterize
 
         def draw():
-            return rasterize(*cloud, *cameras(1, 96, 96, dtype=torch.float32), 96, 96, backend="cpu").image
+            camera = cameras(1, 96, 96, dtype=torch.float32)
+            return rasterize(*cloud, *camera, 96, 96, backend="cpu").image
 
         cloud = random_cloud(3000).to(torch.float32)
         torch.set_num_threads(1)

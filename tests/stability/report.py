@@ -17,12 +17,14 @@ INTRO = """# Where methods fail, and what happens here
 
 *Made by `make stability` from the run of `tests/stability/`; don't edit it by hand.*
 
-Every row is a way in which text-to-3D with Gaussians, or the software around it, is known to fail: faults read in the code of
-others (A0), failures reported in their issues and papers, and limits of the method itself (A1 to A5). Each has a test that
-provokes it on a CPU, offline and seeded, and holds ours to the bar in the table. The tests of A0 also run against an emulation of
-the fault, a few lines in our own words that show it, and must fail there: the column says how far off it is. Of several
-backends (the kernel, plain torch, the specification), sizes and seeds a row shows the worst. Rasterisers are judged in float32
-against the same formula in float64 unless a test says otherwise.
+Every row is a way in which text-to-3D with Gaussians, or the software around it, is known to fail:
+faults read in the code of others (A0), failures reported in their issues and papers, and limits of
+the method itself (A1 to A5). Each has a test that provokes it on a CPU, offline and seeded, and
+holds ours to the bar in the table. The tests of A0 also run against an emulation of the fault, a
+few lines in our own words that show it, and must fail there: the column says how far off it is. Of
+several backends (the kernel, plain torch, the specification), sizes and seeds a row shows the
+worst. Rasterisers are judged in float32 against the same formula in float64 unless a test says
+otherwise.
 """
 
 

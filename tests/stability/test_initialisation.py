@@ -185,12 +185,17 @@ def ball_mesh(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
 
 
 NOTHING = {
-    "empty.glb": "", "empty.obj": "", "empty.ply": "",
-    "no_faces.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "one_vertex.obj": "v 1 2 3\n",
-    "one_vertex.ply": "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty " "float y\nproperty float " "z\nend_header\n1 2 3\n",
+    "empty.glb": "",
+    "empty.obj": "",
+    "empty.ply": "",
+    "no_faces.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\n",
+    "one_vertex.obj": "v 1 2 3\n",
+    "one_vertex.ply": "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty "
+    "float y\nproperty float "
+    "z\nend_header\n1 2 3\n",
     "one_vertex_face.obj": "v 1 2 3\nf 1 1 1\n",
-    "no_area.off": "OFF\n3 1 0\n0 0 0\n1 0 0\n2 0 " "0\n3 0 1 2\n",
-}  # fmt: skip
+    "no_area.off": "OFF\n3 1 0\n0 0 0\n1 0 0\n2 0 0\n3 0 1 2\n",
+}
 
 
 @row("A2", "Empty mesh, zero faces, one vertex")

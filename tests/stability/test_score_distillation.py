@@ -201,8 +201,24 @@ def test_the_clip_at_its_knots(measured):
 @row("A4", "Clip schedule")
 @pytest.mark.parametrize(
     "knots",
-    [[0, 1.5, 2.0, 0], [5, 1.5, 2.0, 5], [9, 1.5, 2.0, 5], [1.5, 2.0, 0], [0, 1, 2, 3, 4], [1], [], "1.5", [0, 1, math.nan, 9], [0, 1, 2, 10, 3, 10], [0, 1.0, 2.0, 10, 3.0, 20.5], [0, -1.0, 2.0, 9], -1, True, {"a": 1}],
-)  # fmt: skip
+    [
+        [0, 1.5, 2.0, 0],
+        [5, 1.5, 2.0, 5],
+        [9, 1.5, 2.0, 5],
+        [1.5, 2.0, 0],
+        [0, 1, 2, 3, 4],
+        [1],
+        [],
+        "1.5",
+        [0, 1, math.nan, 9],
+        [0, 1, 2, 10, 3, 10],
+        [0, 1.0, 2.0, 10, 3.0, 20.5],
+        [0, -1.0, 2.0, 9],
+        -1,
+        True,
+        {"a": 1},
+    ],
+)
 def test_a_clip_that_is_no_schedule_is_refused_when_it_is_read(knots, measured):
     with pytest.raises(UserError, match="system.guidance.grad_clip"):
         check_part("system.guidance", "stability-spoilt-guidance", {"grad_clip": knots})
@@ -436,8 +452,13 @@ def drawn_on(cloud, orbit, background):
 
 # ---- cameras -------------------------------------------------------------------------------------
 
-EXTREME = {"above": (90.0, 0.0, 2.5, 50.0), "below": (-90.0, 45.0, 2.5, 50.0), "inside": (0.0, 0.0, 0.1, 50.0),
-           "fov 1": (0.0, 10.0, 2.5, 1.0), "fov 170": (15.0, 200.0, 2.5, 170.0)}  # fmt: skip
+EXTREME = {
+    "above": (90.0, 0.0, 2.5, 50.0),
+    "below": (-90.0, 45.0, 2.5, 50.0),
+    "inside": (0.0, 0.0, 0.1, 50.0),
+    "fov 1": (0.0, 10.0, 2.5, 1.0),
+    "fov 170": (15.0, 200.0, 2.5, 170.0),
+}
 ORDINARY = (15.0, 30.0, 2.5, 50.0)
 
 
@@ -572,8 +593,14 @@ def test_a_camera_that_looks_away(empty, tmp_path, monkeypatch, measured):
         return c2w
 
     with_cameras(monkeypatch, turned_around)
-    ended = launch(tmp_path, "trainer.max_steps=3", "system.geometry.densify.enabled=true", "system.geometry.densify.start=1",
-                   "system.geometry.densify.every=1", "system.geometry.densify.stop=9")  # fmt: skip
+    ended = launch(
+        tmp_path,
+        "trainer.max_steps=3",
+        "system.geometry.densify.enabled=true",
+        "system.geometry.densify.start=1",
+        "system.geometry.densify.every=1",
+        "system.geometry.densify.stop=9",
+    )
     assert ended.code == 0, ended.err
     assert all(value.isfinite().all() for value in ended.checkpoint()["state_dict"].values())
     measured("all steps succeed")
@@ -582,9 +609,16 @@ def test_a_camera_that_looks_away(empty, tmp_path, monkeypatch, measured):
 # ---- resuming ------------------------------------------------------------------------------------
 
 EVERY_STEP = ["checkpoint.every_n_train_steps=1", "trainer.max_steps=9"]
-EDGE = ["system.guidance.max_step_percent=[5,0.98,0.55,6]", "system.guidance.grad_clip=[5,0.5,1.0,6]", "data.height=[16,24]",
-        "data.width=[16,24]", "data.resolution_milestones=[5]", "system.geometry.lr_means=[5,1e-2,1e-3,6]", "data.progressive_until=8",
-        "system.loss.lambda_sds=[5,1.0,0.5,6]"]  # fmt: skip
+EDGE = [
+    "system.guidance.max_step_percent=[5,0.98,0.55,6]",
+    "system.guidance.grad_clip=[5,0.5,1.0,6]",
+    "data.height=[16,24]",
+    "data.width=[16,24]",
+    "data.resolution_milestones=[5]",
+    "system.geometry.lr_means=[5,1e-2,1e-3,6]",
+    "data.progressive_until=8",
+    "system.loss.lambda_sds=[5,1.0,0.5,6]",
+]
 DENSIFYING = [
     "system.geometry.densify.enabled=true",
     "system.geometry.densify.start=1",
@@ -592,7 +626,6 @@ DENSIFYING = [
     "system.geometry.densify.stop=9",
     "system.geometry.densify.grad_threshold=1e-4",
     "data.train_views=0",
-    # fmt: skip
     "data.camera_perturb=0.1",
     "data.center_perturb=0.05",
     "data.up_perturb=0.02",

@@ -152,8 +152,14 @@ def test_500_mutants_are_read_or_refused_in_little_memory(tmp_path, measured):
 
 @row("A5", "Corrupted/foreign PLY")
 def test_an_empty_cloud_is_read_as_one(tmp_path, measured):
-    write_gaussians(tmp_path / "a.ply", means=np.zeros((0, 3)), sh=np.zeros((0, 1, 3)), logit_opacities=np.zeros(0),
-                    log_scales=np.zeros((0, 3)), quats=np.zeros((0, 4)))  # fmt: skip
+    write_gaussians(
+        tmp_path / "a.ply",
+        means=np.zeros((0, 3)),
+        sh=np.zeros((0, 1, 3)),
+        logit_opacities=np.zeros(0),
+        log_scales=np.zeros((0, 3)),
+        quats=np.zeros((0, 4)),
+    )
     assert len(read_gaussians(tmp_path / "a.ply").means) == 0
     measured("N = 0 read")
 
@@ -385,8 +391,21 @@ SAFE = {
     "np.load": ("allow_pickle", False),
     "npy.read_array": ("allow_pickle", False),
 }
-NEVER = ("pickle.load", "pickle.loads", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "torch.hub.load", "marshal.loads", "joblib.load",
-         "shelve.open", "eval", "exec", "os.system", "dill.load")  # fmt: skip
+NEVER = (
+    "pickle.load",
+    "pickle.loads",
+    "yaml.load",
+    "yaml.unsafe_load",
+    "yaml.full_load",
+    "torch.hub.load",
+    "marshal.loads",
+    "joblib.load",
+    "shelve.open",
+    "eval",
+    "exec",
+    "os.system",
+    "dill.load",
+)
 
 
 def calls(path: Path):

@@ -36,7 +36,7 @@ QUALITY_FOVY = tuple(math.pi / part for part in (3.0, 4.0, 5.0, 6.0, 7.5))
 CAPTION_FOVY = math.pi / 3
 MIN_OPACITY = 0.1
 NEAR_POLE = 0.99
-STAND_IN = '''"""In place of T3Bench's script of this name: copies pictures rendered beforehand, black ones where there are none."""
+STAND_IN = '''"""Copy pictures rendered beforehand, black ones where there are none."""
 
 import argparse
 import shutil

@@ -53,7 +53,7 @@ def read_arrays(
                 return _read_archive(archive, where, required, optional)
     except UserError:
         raise
-    except Exception as error:  # of a damaged header zipfile, zlib, ast and tokenize each complain in their own way
+    except Exception as error:  # zipfile, zlib, ast and tokenize each raise errors of their own
         raise UserError(
             f"{where} can't be read: it is no NPZ or NPY file, or is damaged "
             f"({type(error).__name__}: {error})"

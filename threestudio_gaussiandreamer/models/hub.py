@@ -205,7 +205,7 @@ def _offered(source: Source) -> dict[str, int]:
                 source.name, revision=source.revision, timeout=TIMEOUT, files_metadata=True
             )
         )
-    except Exception as error:  # the library's own errors, its HTTP library's (which depends on its version), sockets
+    except Exception as error:  # of the hub's library, its HTTP library and sockets
         raise UserError(explain(source, error)) from error
     sizes = {file.rfilename: file.size or 0 for file in model.siblings or ()}
     try:

@@ -242,7 +242,7 @@ def _from_pretrained(loader: Any, folder: Path, component: str, options: dict[st
         return loader.from_pretrained(
             str(folder), subfolder=component, local_files_only=True, **options
         )
-    except Exception as error:  # the libraries raise what they like: OSError, ValueError, RuntimeError, SafetensorError, ImportError
+    except Exception as error:  # OSError, ValueError, RuntimeError, SafetensorError, ImportError
         raise UserError(
             f"{_name(loader, folder, component)} can't be loaded: {type(error).__name__}: "
             f"{str(error).strip()[:500]}. "
