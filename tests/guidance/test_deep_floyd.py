@@ -156,3 +156,13 @@ def test_the_default_is_gated_and_said_at_once(tmp_path, monkeypatch):
 @pytest.mark.skipif(NAME != "builtin", reason="inside threestudio its own part has this name")
 def test_threestudios_name_finds_ours():
     assert find("deep-floyd-guidance") is deep_floyd.DeepFloydGuidance
+
+
+def test_the_schedule_is_the_models_to_its_last_step(model):
+    """IF's cosine schedule ends at 2.4e-9, less than what stands for a signal of exactly 0."""
+    from diffusers import DDPMScheduler
+
+    expected = DDPMScheduler.from_pretrained(model, subfolder="scheduler").alphas_cumprod.double()
+    found = guidance(model).alphas_cumprod
+    assert found[-1] < 1e-8
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)

@@ -46,8 +46,10 @@ from ..models.model_files import load_network, load_settings
 from .base import ScoreDistillation
 from .half_precision import weights_type
 
-MIN_ABAR = 2.0**-24
-"""Schedules with zero terminal signal would divide by zero at their last step."""
+TERMINAL_ABAR = 2.0**-24
+"""In the place of an ``abar`` of exactly 0, the last step of a schedule with zero terminal signal:
+``predict_x0`` divides by its root.
+"""
 
 
 class Condition(NamedTuple):
@@ -130,7 +132,8 @@ class TextToImageDistillation(ScoreDistillation):
             raise unknown(
                 "prediction_type of the model's scheduler", self.prediction_type, PREDICTIONS
             )
-        self.alphas_cumprod = torch.cumprod(1 - scheduler.betas.double(), dim=0).clamp_min(MIN_ABAR)
+        abar = torch.cumprod(1 - scheduler.betas.double(), dim=0)
+        self.alphas_cumprod = torch.where(abar > 0, abar, TERMINAL_ABAR)
         self._abar = self.alphas_cumprod.to(self.device)
         self.update_step(0, 0)
 
