@@ -195,3 +195,9 @@ def test_lightnings_door(tmp_path):
     door.remove_checkpoint(path)
     door.remove_checkpoint(path)
     assert not path.exists()
+
+
+def test_a_checkpoint_in_the_home_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    save_file(tmp_path / "last.ckpt", content())
+    assert same(load_file("~/last.ckpt"), content())

@@ -276,6 +276,7 @@ def test_the_home_folder_is_expanded_once(folder, monkeypatch):
     with pytest.raises(UserError, match="exp_root_dir is '~nobody-here/x', and there is no such"):
         load("exp_root_dir=~nobody-here/x")
     assert load("exp_root_dir=./~odd").exp_root_dir == "./~odd"
+    assert load("resume=~/last.ckpt").resume == "/home/someone/last.ckpt"
 
 
 def test_several_gpus_need_a_tag_which_names_their_common_folder(folder):

@@ -24,8 +24,9 @@ import threestudio_gaussiandreamer
 from tests.helpers import tiny_parts
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file, save_file
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.launch import callbacks, checkpoints, experiment, run_folder
+from threestudio_gaussiandreamer.launch import callbacks, checkpoints, experiment, run, run_folder
 from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.ddp import ReplicatedStrategy
 from threestudio_gaussiandreamer.launch.experiment import main
 from threestudio_gaussiandreamer.launch.folder_lock import claim
 
@@ -504,6 +505,27 @@ def test_a_configuration_that_can_not_be_read_is_named(launch, monkeypatch):
     monkeypatch.setattr(Path, "read_bytes", vanished)
     code, _, err = launch("--train")
     assert code == 2 and "error: the configuration tiny.yaml can't be read" in err
+
+
+@pytest.mark.parametrize("strategy", [None, "auto", "ddp"])
+def test_several_gpus_train_replicas_of_one_cloud(launch, monkeypatch, strategy):
+    """Also where the configuration says what the default is: DDP's own wrapper would keep the
+    parameters that densification replaces.
+    """
+    built = []
+
+    class Built(Exception):
+        pass
+
+    def build(section, owner, arguments):
+        built.append(arguments)
+        raise Built
+
+    monkeypatch.setattr(run, "build", build)
+    monkeypatch.setattr(experiment, "announce_device", lambda gpu: 2)
+    with pytest.raises(Built):
+        launch("--train", *([f"trainer.strategy={strategy}"] if strategy else []))
+    assert isinstance(built[0]["strategy"], ReplicatedStrategy) and built[0]["devices"] == 2
 
 
 # -- runs that meet --------------------------------------------------------------------------------

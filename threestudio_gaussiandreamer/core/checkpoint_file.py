@@ -52,7 +52,7 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
     Raises:
         UserError: no such file, a damaged one, or one that isn't a checkpoint.
     """
-    path = Path(path)
+    path = Path(os.path.expanduser(path))
     if not path.is_file():
         if path.is_dir():
             raise UserError(f"{path} is a folder, not a checkpoint" + _siblings(path / "*"))

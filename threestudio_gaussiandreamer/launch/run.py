@@ -189,8 +189,8 @@ class Run:
             "inference_mode": False,
             "default_root_dir": str(self.folder),
         }
-        if self.n_gpus > 1:
-            options.setdefault("strategy", ReplicatedStrategy())
+        if self.n_gpus > 1 and options.get("strategy", "auto") in ("auto", "ddp"):
+            options["strategy"] = ReplicatedStrategy()
         return build("trainer", pl.Trainer, options | ours)
 
     def build_loggers(self) -> list:

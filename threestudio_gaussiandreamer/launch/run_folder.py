@@ -44,6 +44,8 @@ def name_folders(cfg: Any) -> None:
     _set_trial(cfg, tag + cfg.timestamp)
     if cfg.resume == "auto":
         _resume_newest(cfg, tag)
+    elif cfg.resume is not None:
+        cfg.resume = escape(os.path.expanduser(cfg.resume))
 
 
 def renumber(cfg: Any, count: int) -> None:
