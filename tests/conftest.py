@@ -2,11 +2,11 @@
 
 import os
 
-os.environ.setdefault(
-    "OMP_WAIT_POLICY", "passive"
-)  # before torch: spinning barriers are slow on a busy machine
+# before torch is imported: spinning barriers are slow on a busy machine
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
+import functools
 import signal
 from pathlib import Path
 
@@ -28,6 +28,17 @@ def heard_ctrl_c():
 def same_seed(monkeypatch):
     """Runs seed through the environment; a test must not inherit another one's."""
     monkeypatch.setenv("PL_GLOBAL_SEED", "0")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def small_turntables():
+    """Draw the turntables of priors in few pixels: the GIF costs as much as a short run."""
+    from threestudio_gaussiandreamer.priors import cache
+
+    small = functools.partial(cache.save_turntable, views=2, size=16)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cache, "save_turntable", small)
+        yield
 
 
 @pytest.fixture
