@@ -14,7 +14,7 @@ import torch
 
 from threestudio_gaussiandreamer import host, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.host.builtin.types import check_types
+from threestudio_gaussiandreamer.core.option_types import check_types
 from threestudio_gaussiandreamer.launch import experiment, folder_lock
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_part

@@ -17,7 +17,7 @@ from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..core.schedule import C_max
 from ..host import find, info, names
-from ..host.builtin.base import parse_structured
+from ..host.typed_config import parse_structured
 from ..prompts.prompts import read_prompt
 from .config_source import is_text, map_strings, parse_overrides, protect, read_yaml, unprotect
 from .run_folder import name_folders

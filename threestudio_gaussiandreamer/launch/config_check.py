@@ -31,7 +31,7 @@ from ..host import (
     pl,
     validate_schedule,
 )
-from ..host.builtin.base import parse_structured
+from ..host.typed_config import parse_structured
 from ..priors.base import Prior
 from ..prompts.prompt_processors import TextEncoderPromptProcessor
 

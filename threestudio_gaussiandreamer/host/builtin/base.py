@@ -1,46 +1,15 @@
 """Base classes of parts: a typed ``Config``, a device, and ``update_step`` on everything below."""
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Optional
 
 import torch
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from torch import nn
 
 from ...core.checkpoint_file import load_module_weights
-from ...core.errors import UserError, unknown
-from ...core.interpolation import escape
-from .types import check_types
-
-
-def parse_structured(config_class: Any, values: Any = None) -> DictConfig:
-    """The typed configuration of a part: ``config_class`` filled with ``values``; ranges are
-    ``core/options.py``'s to check.
-
-    A ``${`` in a string is text: interpolations are resolved by now.
-
-    Raises:
-        UserError: an unknown key, a value of the wrong type or a missing one; the message begins
-            with the key.
-    """
-    if values is not None and not isinstance(values, Mapping):
-        raise UserError(f"expected keys and values, got {values!r}")
-    known = [field.name for field in fields(config_class)]
-    for key in values or {}:
-        if key not in known:
-            raise unknown("key", key, known)
-    try:
-        check_types(config_class, values or {})
-        return OmegaConf.structured(
-            config_class(**{key: escape(value) for key, value in (values or {}).items()})
-        )
-    except OmegaConfBaseException as error:
-        raise UserError(f"{error.full_key or error.key}: {str(error).splitlines()[0]}") from error
-    except TypeError as error:
-        raise UserError(f"{config_class.__qualname__}: {error}") from error
+from ...core.errors import UserError
+from ..typed_config import parse_structured
 
 
 def get_device() -> torch.device:

@@ -8,8 +8,8 @@ import typing
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ...core.errors import UserError
-from ...core.options import FLOAT32_MAX, require_representable
+from .errors import UserError
+from .options import FLOAT32_MAX, require_representable
 
 SCALARS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
 

@@ -1,0 +1,40 @@
+"""The typed configuration of a part, as the launcher checks it in both hosts and the built-in one
+builds it."""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from ..core.errors import UserError, unknown
+from ..core.interpolation import escape
+from ..core.option_types import check_types
+
+
+def parse_structured(config_class: Any, values: Any = None) -> DictConfig:
+    """Fill the dataclass ``config_class`` with ``values`` and check their types; ranges are
+    checked by ``core/options.py``.
+
+    A ``${`` in a string is text: interpolations are resolved by now.
+
+    Raises:
+        UserError: an unknown key, a value of the wrong type or a missing one; the message begins
+            with the key.
+    """
+    if values is not None and not isinstance(values, Mapping):
+        raise UserError(f"expected keys and values, got {values!r}")
+    known = [field.name for field in fields(config_class)]
+    for key in values or {}:
+        if key not in known:
+            raise unknown("key", key, known)
+    try:
+        check_types(config_class, values or {})
+        return OmegaConf.structured(
+            config_class(**{key: escape(value) for key, value in (values or {}).items()})
+        )
+    except OmegaConfBaseException as error:
+        raise UserError(f"{error.full_key or error.key}: {str(error).splitlines()[0]}") from error
+    except TypeError as error:
+        raise UserError(f"{config_class.__qualname__}: {error}") from error
