@@ -19,9 +19,22 @@ PROGRAM = {
 }.get(Path(sys.argv[0]).name, ["python", "-m", f"{__package__}.experiment"])
 
 
+STAGES = {
+    "train": "train, then render the test views",
+    "validate": "render the validation views",
+    "test": "render the test views and the video",
+    "export": "write the cloud in the exporter's formats",
+}
+
+
 def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
-    """The arguments as threestudio users know them; what isn't an option is an override
-    ``key=value``.
+    """Parse threestudio's options; what isn't an option is an override ``key=value``.
+
+    Returns:
+        config, stage, gpu, verbose, typecheck, and overrides, a list of strings.
+
+    Raises:
+        SystemExit: ``--help``, or a mistake, which has been printed.
     """
     parser = argparse.ArgumentParser(
         prog=" ".join(PROGRAM),
@@ -30,43 +43,27 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
         "'system.prompt_processor.prompt=a fox'",
         allow_abbrev=False,
     )
+    _add_options(parser)
+    args, args.overrides = parser.parse_known_args(argv)
+    for override in args.overrides:
+        if override.startswith("-"):
+            parser.error(f"unrecognized option {override}")
+    return args
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--config",
         action="append",
         required=True,
-        help="a YAML file, or the name of one in the current folder, in configs/ or among "
-        "those that come along; "
-        "given several times, later ones win",
+        help="a YAML file, or the name of one in the current folder, in configs/ or among the "
+        "packaged ones; given several times, later ones win",
     )
-    stage = parser.add_mutually_exclusive_group(required=True)
-    stage.add_argument(
-        "--train",
-        dest="stage",
-        action="store_const",
-        const="train",
-        help="train, then render the test views",
-    )
-    stage.add_argument(
-        "--validate",
-        dest="stage",
-        action="store_const",
-        const="validate",
-        help="render the validation views",
-    )
-    stage.add_argument(
-        "--test",
-        dest="stage",
-        action="store_const",
-        const="test",
-        help="render the test views and the video",
-    )
-    stage.add_argument(
-        "--export",
-        dest="stage",
-        action="store_const",
-        const="export",
-        help="write the cloud in the exporter's formats",
-    )
+    stages = parser.add_mutually_exclusive_group(required=True)
+    for stage, text in STAGES.items():
+        stages.add_argument(
+            f"--{stage}", dest="stage", action="store_const", const=stage, help=text
+        )
     parser.add_argument(
         "--gpu",
         help="0, or 0,1, or cpu; default: GPU 0 if there is one. Ignored where "
@@ -80,15 +77,10 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
         action="store_true",
         help="check shapes and types of all calls (slow; for development)",
     )
-    args, args.overrides = parser.parse_known_args(argv)
-    for override in args.overrides:
-        if override.startswith("-"):
-            parser.error(f"unrecognized option {override}")
-    return args
 
 
 def choose_gpu(gpu: Optional[str]) -> None:
-    """Set what CUDA shows to this process, before torch looks.
+    """Set which GPUs CUDA shows to this process; call it before torch is imported.
 
     Raises:
         UserError: ``gpu`` is neither "cpu" nor a list of numbers.
@@ -109,8 +101,8 @@ def choose_gpu(gpu: Optional[str]) -> None:
 
 
 def announce_device(gpu: Optional[str]) -> int:
-    """The number of GPUs that this process sees; says when it runs on the CPU without having been
-    asked to.
+    """Count the GPUs that this process sees; say when it runs on the CPU without having been asked
+    to.
 
     Raises:
         UserError: GPUs were asked for that aren't there.
@@ -137,11 +129,11 @@ def _require_gpus(gpu: str, count: int, version: str, built_for: Optional[str]) 
 
 
 def find_config(name: str) -> Path:
-    """The YAML file that ``--config name`` means: a path, else a bare name in ``configs/`` here or
-    among the packaged ones.
+    """Find the YAML file that ``--config name`` means: a path, else a bare name in ``configs/``
+    here or among the packaged ones.
 
     Raises:
-        UserError: there is none; the message names the near ones.
+        UserError: there is none; the message lists near names.
     """
     try:
         path = Path(name).expanduser()
@@ -151,11 +143,8 @@ def find_config(name: str) -> Path:
                 folder / file for folder in config_folders() for file in (name, f"{name}.yaml")
             ]
         found = next((candidate for candidate in candidates if candidate.is_file()), None)
-    except (
-        OSError,
-        ValueError,
-        RuntimeError,
-    ) as error:  # a name too long, a NUL inside, a "~stranger"
+    except (OSError, ValueError, RuntimeError) as error:
+        # a name too long, a NUL inside, the home folder of an unknown user
         raise UserError(
             f"configuration {name[:200]!r}: not a usable file name ({error})"
         ) from error
@@ -166,8 +155,8 @@ def find_config(name: str) -> Path:
 
 
 def config_folders() -> list[Path]:
-    """Where bare names are looked up: ``./configs``, the checkout's ``configs/``, the installed
-    package's ``configs/``.
+    """List where bare names are looked up: ``./configs``, the checkout's ``configs/``, the
+    installed package's ``configs/``.
     """
     package = Path(__file__).resolve().parents[1]
     folders = [Path("configs"), package / "configs"]
