@@ -42,7 +42,7 @@ gpu-check: $(VENV)/ready-for-tests ## everything that waits for an NVIDIA GPU: c
 
 docs: $(VENV)/ready-for-tests      ## the generated parts of README and docs/: architecture, measured tables
 	$(BIN)/python -m tests.architecture
-	$(BIN)/python -m benchmarks.quality.tables
+	$(BIN)/python -m benchmarks.tables
 
 charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbers beside them
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting --from-csv
