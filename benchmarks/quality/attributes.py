@@ -54,15 +54,9 @@ from benchmarks.quality.runs import (
     train,
 )
 from threestudio_gaussiandreamer import register_parts
-from threestudio_gaussiandreamer.formats.gaussian_files import (
-    OUR_UP,
-    StoredCloud,
-    in_axes,
-    read_cloud,
-    write_cloud,
-)
-from threestudio_gaussiandreamer.formats.ply import read_gaussians
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.spz import COLOR_SCALE
+from threestudio_gaussiandreamer.gaussians.axes import WORLD_UP
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.meshes.load import load_mesh
@@ -174,7 +168,8 @@ def rows(kind: str, count: int, mesh: str, seed: int, results: Path) -> Iterator
     }
     if kind != STRETCHED or count != ROUNDED_COUNT:
         return
-    arrays = read_gaussians(next(results.glob("it*-export/gaussians.ply")))
+    exported = read_cloud(str(next(results.glob("it*-export/gaussians.ply"))))
+    arrays = exported.in_axes(WORLD_UP).gaussians
     for name, size, cloud in written(arrays):
         yield {
             "experiment": "file",
@@ -206,7 +201,7 @@ def written(arrays: Gaussians) -> Iterator[tuple[str, int, Gaussians]]:
             yield (
                 path.suffix[1:].upper(),
                 path.stat().st_size,
-                in_axes(read_cloud(str(path)), OUR_UP),
+                read_cloud(str(path)).in_axes(WORLD_UP).gaussians,
             )
 
 

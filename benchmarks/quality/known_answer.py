@@ -31,6 +31,7 @@ from benchmarks.quality.runs import ROOT, append_rows, measured_in
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.cameras import held_out_orbit, to_opencv
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud, write_cloud
+from threestudio_gaussiandreamer.gaussians.axes import WORLD_UP
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0, sh_to_colors
 from threestudio_gaussiandreamer.gaussians.simplify import Views, likeness, look
@@ -229,7 +230,7 @@ def found_by_auto(true: Gaussians, seed: int, steps: int, folder: Path) -> tuple
     ):
         raise SystemExit("the training run failed")
     found = prune.tensors_of(
-        read_cloud(str(folder / f"demo/run/save/it{steps}-export/gaussians.ply"))
+        read_cloud(str(folder / f"demo/run/save/it{steps}-export/gaussians.ply")).in_axes(WORLD_UP)
     )
     return len(start.means), len(found.means), likeness(found, held_out(), look(true, held_out()))
 

@@ -18,7 +18,8 @@ from typing import Any
 from benchmarks.quality.attributes import score
 from benchmarks.quality.runs import append_rows, measured_in, object_name, train
 from threestudio_gaussiandreamer import register_parts
-from threestudio_gaussiandreamer.formats.ply import read_gaussians
+from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
+from threestudio_gaussiandreamer.gaussians.axes import WORLD_UP
 
 DILATIONS = (0.1, 0.3)
 SIZES = (256, 512)
@@ -48,7 +49,8 @@ def rows(mesh: str, seed: int) -> Iterator[dict[str, Any]]:
     for trained in DILATIONS:
         with tempfile.TemporaryDirectory() as folder:
             save = train(Path(folder), mesh, seed, own | {"system.renderer.eps2d": trained})
-            arrays = read_gaussians(next(save.glob("it*-export/gaussians.ply")))
+            exported = read_cloud(str(next(save.glob("it*-export/gaussians.ply"))))
+            arrays = exported.in_axes(WORLD_UP).gaussians
         for size in SIZES:
             for drawn in DILATIONS:
                 found = score(mesh, arrays, size, eps2d=drawn)

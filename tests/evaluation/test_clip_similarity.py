@@ -18,7 +18,7 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.evaluation import clip_similarity as module
 from threestudio_gaussiandreamer.evaluation import results, t3bench
 from threestudio_gaussiandreamer.evaluation.clip_similarity import Protocol, main
-from threestudio_gaussiandreamer.formats.ply import write_gaussians
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.launch.experiment import main as launch
 
@@ -41,7 +41,7 @@ def blob(center=(0.0, 0.0, 0.0), color=(0.9, 0.1, 0.1), count=40, seed=0):
 
 def save(path, arrays):
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_gaussians(path, **arrays._asdict())
+    write_cloud(str(path), StoredCloud(arrays))
     return path
 
 

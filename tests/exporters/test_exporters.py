@@ -1,5 +1,5 @@
-"""Every registered exporter of ours keeps the same contract; what is written reads back bit for
-bit.
+"""Every registered exporter of ours keeps the same contract; its files read back as exported, the
+right way up.
 """
 
 import importlib
@@ -9,20 +9,25 @@ import numpy as np
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import exporters
+from threestudio_gaussiandreamer import exporters, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats import ply
-from threestudio_gaussiandreamer.formats.spz import read_spz, write_spz
+from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud, write_cloud
+from threestudio_gaussiandreamer.formats.ply import read_comments
+from threestudio_gaussiandreamer.formats.spz import read_spz
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
+from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
 from threestudio_gaussiandreamer.gaussians.surface import write_obj
 from threestudio_gaussiandreamer.host import BaseGeometry, ExporterOutput, find, names
+from threestudio_gaussiandreamer.meshes.load import load_mesh
 
+register_parts()
 for module in pkgutil.iter_modules(exporters.__path__):
     importlib.import_module(f"{exporters.__name__}.{module.name}")
 
 WRITERS = {
-    "ply": ply.write_gaussians,
-    "spz": lambda path, **arrays: write_spz(path, **arrays),
+    "ply": lambda path, stored: write_cloud(str(path), stored, ".ply"),
+    "spz": lambda path, stored: write_cloud(str(path), stored, ".spz"),
     "points": lambda path, cloud: ply.write_points(path, cloud),
     "surface": lambda path, surface: write_obj(path, surface),
 }
@@ -81,16 +86,85 @@ class TestContract:
 @pytest.mark.parametrize("degree", [0, 3])
 def test_gaussians_read_back_bit_for_bit(tmp_path, degree):
     source = geometry(degree=degree)
-    (output,) = build("ply-exporter", source)()
-    assert all(
-        isinstance(values, np.ndarray) and values.dtype == np.float32
-        for values in output.params.values()
-    )
+    (output,) = build("ply-exporter", source, up="z")()
     read = ply.read_gaussians(write(output, tmp_path))
     for name in Gaussians._fields:
         assert getattr(read, name).tobytes() == getattr(source, name).detach().numpy().tobytes(), (
             name
         )
+
+
+@pytest.mark.parametrize("name", ["ply", "spz"])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_gaussians_are_exported_in_the_axes_of_the_viewers(tmp_path, name, degree):
+    """One Gaussian high above the front: -y and -z of 3DGS' axes, +y and +z of SPZ's."""
+    source = geometry(1, degree)
+    source.means.data[:] = torch.tensor([[4.0, 1.0, 2.0]])  # front, left, up in our world
+    (output,) = build(f"{name}-exporter", source)()
+    path = write(output, tmp_path)
+    raw = ply.read_gaussians(path) if name == "ply" else read_spz(path)
+    expected = [[1, -2, -4]] if name == "ply" else [[1, 2, 4]]
+    np.testing.assert_allclose(raw.means, expected, atol=1e-3)
+    stored = read_cloud(str(path))
+    assert stored.up == ("-y" if name == "ply" else "y")
+    back, rounding = stored.in_axes("z").gaussians, 1e-5 if name == "ply" else 0.05
+    np.testing.assert_allclose(back.means, source.means.detach(), atol=1e-3)
+    view = torch.tensor([[1.0, 0.2, 0.3]])
+    colors = [sh_to_colors(torch.as_tensor(sh), view) for sh in (back.sh, source.sh.detach() * 1.0)]
+    if name == "ply":  # SPZ rounds harmonics and clips them
+        torch.testing.assert_close(*colors, atol=rounding, rtol=0)
+
+
+def test_a_ply_of_ours_that_lost_its_note_is_read_the_right_way_up(tmp_path):
+    source = geometry()
+    (output,) = build("ply-exporter", source)()
+    path = write(output, tmp_path)
+    path.write_bytes(path.read_bytes().replace(b"comment up: -y\n", b""))
+    read = read_cloud(str(path)).in_axes("z").gaussians
+    np.testing.assert_array_equal(read.means, source.means.detach().numpy())
+    prior = find("gaussians-prior")({"path": str(path)}).gaussians("")
+    np.testing.assert_array_equal(prior.means, source.means.detach().numpy())
+    points = find("point-cloud-prior")({"path": str(path)})("").points
+    np.testing.assert_array_equal(points, source.means.detach().numpy())
+
+
+def test_axes_of_the_world_can_be_asked_for(tmp_path):
+    source = geometry()
+    outputs = build(
+        "gaussiandreamer-exporter",
+        source,
+        formats=["ply", "surface", "points"],
+        options={"surface": {"up": "-y", "resolution": 16}},
+        up="z",
+    )()
+    path = write(outputs[0], tmp_path)
+    assert read_comments(path) == ["up: z"] and read_cloud(str(path)).up == "z"
+    assert ply.read_gaussians(path).means.tobytes() == source.means.detach().numpy().tobytes()
+    world, camera = (
+        build("surface-exporter", source, resolution=16, up=up)()[0].params["surface"].vertices
+        for up in ("z", "-y")
+    )
+    np.testing.assert_allclose(camera, world[:, [1, 2, 0]] * [1, -1, -1], atol=1e-6)
+    np.testing.assert_array_equal(outputs[1].params["surface"].vertices, camera)
+    for name in ("ply", "surface", "gaussiandreamer"):
+        with pytest.raises(UserError, match="unknown axis up: 'x'"):
+            build(f"{name}-exporter", up="x")
+
+
+def test_the_surface_lies_in_our_own_mesh_reader_as_the_gaussians_do(tmp_path):
+    """A tall object with a nose in front: z is its longest side, the nose points to +x."""
+    source, rng = geometry(400, 0), torch.Generator().manual_seed(1)
+    source.means.data = torch.rand(400, 3, generator=rng) * torch.tensor([0.3, 0.5, 2.0])
+    source.means.data[:60] = torch.rand(60, 3, generator=rng) * 0.2 + torch.tensor([0.3, 0.1, 0.2])
+    source.log_scales.data[:], source.logit_opacities.data[:] = -3, 4
+    (output,) = build("surface-exporter", source, resolution=48)()
+    raw = output.params["surface"].vertices
+    assert np.ptp(raw, axis=0).argmax() == 1  # y up in the file
+    mesh = load_mesh(write(output, tmp_path))
+    size = np.ptp(mesh.vertices, axis=0)
+    assert size.argmax() == 2 and size.argmin() == 0 or size[2] > 3 * size[:2].max()
+    low = mesh.vertices[mesh.vertices[:, 2] < -0.6]
+    assert low[:, 0].max() > 0.1 and low[:, 0].max() == mesh.vertices[:, 0].max()
 
 
 def test_points_read_back_bit_for_bit(tmp_path):
@@ -119,17 +193,41 @@ def test_faint_points_can_be_left_out():
 def test_harmonics_can_be_padded():
     source = geometry(degree=0)
     (output,) = build("ply-exporter", source, pad_sh_degree=3)()
-    assert output.params["sh"].shape == (40, 16, 3) and not output.params["sh"][:, 1:].any()
+    sh = output.params["stored"].gaussians.sh
+    assert sh.shape == (40, 16, 3) and not sh[:, 1:].any()
     with pytest.raises(UserError, match="pad_sh_degree"):
         build("ply-exporter", pad_sh_degree=4)
 
 
-def test_a_compact_file_leaves_out_what_it_cant_hold(tmp_path):
+def test_nothing_that_is_not_finite_is_exported_and_that_is_said_once(tmp_path, caplog):
     source = geometry(degree=1)
     with torch.no_grad():
-        source.means[3] = float("nan")
-    (output,) = build("spz-exporter", source)()
-    assert len(read_spz(write(output, tmp_path)).means) == 39
+        source.means[3], source.log_scales[5, 1] = float("nan"), float("inf")
+        source.logit_opacities[7], source.sh[9, 2, 0] = float("inf"), float("-inf")
+    options = {"surface": {"resolution": 16}}
+    formats = ["ply", "spz", "points", "surface"]
+    outputs = build("gaussiandreamer-exporter", source, formats=formats, options=options)()
+    files = [write(output, tmp_path) for output in outputs]
+    assert caplog.text.count("3 of 40 Gaussians hold NaN or infinity: left out") == 1
+    assert len([r for r in caplog.records if r.levelname == "WARNING"]) == 1
+    for gaussians in (ply.read_gaussians(files[0]), read_spz(files[1])):
+        assert len(gaussians.means) == 37
+        assert all(np.isfinite(values).all() for values in gaussians)
+    assert len(ply.read_points(files[2]).points) == 37
+    assert "nan" not in files[3].read_text() and "inf" not in files[3].read_text()
+    bad = outputs[3].params["surface"]._replace(vertices=np.full((1, 3), np.nan))
+    with pytest.raises(UserError, match="isn't written"):
+        write_obj(tmp_path / "bad.obj", bad)
+
+
+def test_one_gaussian_beyond_the_range_of_spz_aborts_no_export(tmp_path, caplog):
+    source = geometry()
+    with torch.no_grad():
+        source.means[3, 0] = 3e7
+    outputs = build("gaussiandreamer-exporter", source, formats=["spz", "ply"])()
+    spz_file, ply_file = (write(output, tmp_path) for output in outputs)
+    assert "1 of 40 Gaussians are farther away" in caplog.text
+    assert len(read_spz(spz_file).means) == len(ply.read_gaussians(ply_file).means) == 40
 
 
 class TestBundle:
@@ -146,7 +244,9 @@ class TestBundle:
             formats=["ply"],
             options={"ply": {"pad_sh_degree": 2, "save_name": "x.ply"}},
         )()
-        assert output.params["sh"].shape == (40, 9, 3) and output.save_name == "x.ply"
+        assert (
+            output.params["stored"].gaussians.sh.shape == (40, 9, 3) and output.save_name == "x.ply"
+        )
 
     def test_mistakes_are_named_when_built(self):
         with pytest.raises(UserError, match="unknown formats.1. 'pyl': did you mean 'ply'"):

@@ -6,6 +6,7 @@ import struct
 import numpy as np
 import pytest
 
+from tests.helpers.raw_ply import write_raw_gaussians
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians, usable
@@ -68,7 +69,7 @@ class TestGaussians:
     @pytest.mark.parametrize("count", [0, 1, 50])
     def test_reading_back_gives_the_same_bits(self, tmp_path, degree, count):
         expected = gaussians(count, degree)
-        ply.write_gaussians(tmp_path / "a.ply", **expected._asdict())
+        ply.write_gaussians(tmp_path / "a.ply", expected)
         assert_same(ply.read_gaussians(tmp_path / "a.ply"), expected)
 
     def test_special_floats_survive(self, tmp_path):
@@ -76,12 +77,28 @@ class TestGaussians:
         arrays.means[0] = [-0.0, 1e-45, 3.4e38]
         arrays.logit_opacities[:2] = [np.inf, -np.inf]
         arrays.log_scales[0, 2] = -np.inf
-        ply.write_gaussians(tmp_path / "a.ply", **arrays._asdict())
+        write_raw_gaussians(tmp_path / "a.ply", arrays)
         assert_same(ply.read_gaussians(tmp_path / "a.ply"), arrays)
+
+    def test_nothing_that_is_not_finite_is_written(self, tmp_path, caplog):
+        arrays = gaussians(9)
+        arrays.means[0, 1], arrays.quats[1, 0], arrays.sh[2, 0, 0] = np.nan, np.inf, -np.inf
+        arrays.logit_opacities[2:5] = [np.nan, np.inf, -np.inf]
+        arrays.log_scales[5:8, 0] = [np.inf, -np.inf, 1e30]
+        ply.write_gaussians(tmp_path / "a.ply", arrays)
+        read = ply.read_gaussians(tmp_path / "a.ply")
+        assert all(np.isfinite(values).all() for values in read) and len(read.means) == 5
+        assert np.isfinite(np.exp(read.log_scales)).all()
+        assert (np.sign(read.logit_opacities[:2]) == [1, -1]).all()
+        assert caplog.text.count("a.ply: 4 of 9 Gaussians hold NaN or infinity: left out") == 1
+        bad = cloud(3)._replace(points=np.full((3, 3), np.inf, np.float32))
+        with pytest.raises(UserError, match="b.ply' isn't written.*NaN or infinity"):
+            ply.write_points(tmp_path / "b.ply", bad)
+        assert not (tmp_path / "b.ply").exists()
 
     def test_the_layout_is_the_one_of_the_viewers(self, tmp_path):
         arrays = gaussians(2, degree=1)
-        ply.write_gaussians(tmp_path / "a.ply", **arrays._asdict())
+        ply.write_gaussians(tmp_path / "a.ply", arrays)
         head, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
         names = [
             line.split()[-1]
@@ -112,7 +129,8 @@ class TestGaussians:
 
     def test_padding_to_degree_3_is_the_248_byte_vertex(self, tmp_path):
         arrays = gaussians(5)
-        ply.write_gaussians(tmp_path / "a.ply", **arrays._asdict(), pad_sh_degree=3)
+        padded = arrays._replace(sh=ply.padded_sh(arrays.sh, 3))
+        ply.write_gaussians(tmp_path / "a.ply", padded)
         data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[1]
         assert len(data) == 5 * 248  # what Unity's importer insists on
         read = ply.read_gaussians(tmp_path / "a.ply")
@@ -122,9 +140,7 @@ class TestGaussians:
 
     def test_shapes_that_disagree_are_refused(self, tmp_path):
         with pytest.raises((ValueError, TypeError), match="quats"):
-            ply.write_gaussians(
-                tmp_path / "a.ply", **{**gaussians(3)._asdict(), "quats": np.zeros((4, 4))}
-            )
+            ply.write_gaussians(tmp_path / "a.ply", gaussians(3)._replace(quats=np.zeros((4, 4))))
         assert not list(tmp_path.iterdir())
 
     @pytest.mark.parametrize("order", ["<", ">"])
@@ -172,7 +188,7 @@ class TestGaussians:
         )
 
     def test_what_is_not_known_is_named(self, tmp_path, caplog):
-        ply.write_gaussians(tmp_path / "a.ply", **gaussians()._asdict())
+        ply.write_gaussians(tmp_path / "a.ply", gaussians())
         ply.read_gaussians(tmp_path / "a.ply")
         assert not caplog.text
         (tmp_path / "b.ply").write_bytes(
@@ -181,7 +197,7 @@ class TestGaussians:
             .replace(b"property float nx", b"property float filter_3D")
         )
         ply.read_gaussians(tmp_path / "b.ply")
-        assert "b.ply: not known here, and left out: filter_3D" in caplog.text
+        assert "b.ply: unknown properties are left out: filter_3D" in caplog.text
 
     def test_what_is_missing_is_named(self, tmp_path):
         ply.write_points(tmp_path / "points.ply", cloud())
@@ -190,6 +206,21 @@ class TestGaussians:
         two_dimensional = [f"float {name}" for name in ply.GAUSSIAN if name != "scale_2"]
         with pytest.raises(UserError, match="lack scale_2"):
             ply.read_gaussians(saved(tmp_path, header("ascii", 0, two_dimensional)))
+
+    def test_a_compressed_ply_is_called_by_its_name(self, tmp_path):
+        """PlayCanvas' layout: chunks of bounds, then four packed numbers per Gaussian."""
+        bounds = "\n".join(
+            f"property float {end}_{axis}" for end in ("min", "max") for axis in "xyz"
+        )
+        packed = [f"uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
+        head = header("binary_little_endian", 1, packed, before=f"element chunk 1\n{bounds}")
+        path = saved(tmp_path, head.encode() + bytes(6 * 4 + 4 * 4))
+        for read in (ply.read_gaussians, ply.read_points):
+            with pytest.raises(
+                UserError, match="compressed PLY.*isn't read here: convert it"
+            ) as said:
+                read(path)
+            assert "plain points" not in str(said.value)
 
     @pytest.mark.parametrize(
         "rest",
@@ -206,7 +237,7 @@ class TestGaussians:
     def test_rows_that_are_not_numbers_are_counted(self, tmp_path, field):
         arrays = gaussians(6)
         getattr(arrays, field)[[2, 4]] = np.nan
-        ply.write_gaussians(tmp_path / "a.ply", **arrays._asdict())
+        write_raw_gaussians(tmp_path / "a.ply", arrays)
         with pytest.raises(UserError, match="a.ply.*2 of 6.*first in vertex 2"):
             ply.read_gaussians(tmp_path / "a.ply")
         read = ply.read_gaussians(tmp_path / "a.ply", allow_non_finite=True)
@@ -214,7 +245,7 @@ class TestGaussians:
 
     def test_is_gaussian_ply(self, tmp_path):
         ply.write_points(tmp_path / "points.ply", cloud())
-        ply.write_gaussians(tmp_path / "gaussians.ply", **gaussians()._asdict())
+        ply.write_gaussians(tmp_path / "gaussians.ply", gaussians())
         assert ply.is_gaussian_ply(tmp_path / "gaussians.ply")
         others = [tmp_path / "points.ply", tmp_path / "none.ply", tmp_path, saved(tmp_path, "x")]
         assert not any(ply.is_gaussian_ply(path) for path in others)
@@ -307,7 +338,7 @@ class TestPoints:
 
     def test_gaussians_are_read_as_their_coloured_centres(self, tmp_path):
         arrays = gaussians(30)
-        ply.write_gaussians(tmp_path / "a.ply", **arrays._asdict())
+        ply.write_gaussians(tmp_path / "a.ply", arrays)
         read = ply.read_points(tmp_path / "a.ply")
         np.testing.assert_array_equal(read.points, arrays.means)
         np.testing.assert_allclose(
@@ -433,7 +464,7 @@ class TestDamage:
         """Five hundred damaged files: whatever is loaded has consistent shapes, and nothing but
         UserError comes out.
         """
-        ply.write_gaussians(tmp_path / "gaussians.ply", **gaussians(20, 1)._asdict())
+        ply.write_gaussians(tmp_path / "gaussians.ply", gaussians(20, 1))
         ply.write_points(tmp_path / "points.ply", cloud(20))
         faces = "element face 2\nproperty list uchar int vertex_indices"
         saved(tmp_path, header(before=faces) + "3 0 1 2\n3 0 1 2\n1 2 3\n4 5 6\n", "text.ply")

@@ -9,7 +9,15 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.formats.spz import read_spz, read_spz_comment, spz_bytes, write_spz
+from threestudio_gaussiandreamer.formats.spz import (
+    DECODED_BYTES,
+    DECODED_BYTES_PER_HARMONIC,
+    read_spz,
+    read_spz_comment,
+    spz_arrays,
+    spz_bytes,
+    write_spz,
+)
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
 
@@ -117,7 +125,7 @@ def test_what_is_written_is_laid_out_as_published():
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_what_is_read_is_close_to_what_was_written(tmp_path, degree):
     arrays = cloud(degree=degree)
-    write_spz(tmp_path / "a.spz", comment="up: y; kept", **arrays._asdict())
+    write_spz(tmp_path / "a.spz", arrays, comment="up: y; kept")
     read = read_spz(tmp_path / "a.spz")
     arrays = in_file_order(arrays, read)
     size = np.exp(np.median(arrays.log_scales.mean(1)))
@@ -153,7 +161,7 @@ def test_the_same_cloud_gives_the_same_bytes_in_any_order():
 
 
 def test_an_empty_cloud(tmp_path):
-    write_spz(tmp_path / "a.spz", **cloud(0)._asdict())
+    write_spz(tmp_path / "a.spz", cloud(0))
     assert read_spz(tmp_path / "a.spz").sh.shape == (0, 1, 3)
 
 
@@ -163,7 +171,7 @@ def test_extremes_are_stored_within_the_formats_reach(tmp_path):
     arrays.logit_opacities[:] = [np.inf, -np.inf, 50, -50]
     arrays.quats[0], arrays.sh[:] = 0, 100
     arrays.means[:] = np.arange(12).reshape(4, 3) * 1000.0
-    write_spz(tmp_path / "a.spz", **arrays._asdict())
+    write_spz(tmp_path / "a.spz", arrays)
     read = in_file_order(read_spz(tmp_path / "a.spz"), arrays)
     np.testing.assert_array_equal(read.log_scales[:, 0], [-10, -10, 255 / 16 - 10, 0])
     assert (
@@ -175,11 +183,49 @@ def test_extremes_are_stored_within_the_formats_reach(tmp_path):
     np.testing.assert_allclose(read.means, arrays.means, atol=0.001)
 
 
+def test_opacities_stay_below_the_byte_whose_logit_is_infinite():
+    """Niantic's reader takes the logit of the byte over 255."""
+    arrays = cloud(4)._replace(logit_opacities=np.float32([87, 9, 5.5, -20]))
+    alphas = gzip.decompress(spz_bytes(arrays))[16 + 4 * 9 :][:4]
+    assert sorted(alphas) == [0, 254, 254, 254]
+
+
+def test_one_gaussian_beyond_the_range_is_clipped_and_the_rest_keeps_its_precision(
+    tmp_path, caplog
+):
+    arrays, size = cloud(300), float(np.exp(-4))
+    arrays.means[7], arrays.means[9, 1], arrays.log_scales[11, 0] = 1e7, -3e38, 9
+    write_spz(tmp_path / "a.spz", arrays)
+    assert caplog.text.count("a.spz: 3 of 300 Gaussians are farther away or larger") == 1
+    read = read_spz(tmp_path / "a.spz")
+    assert len(read.means) == 300 and all(np.isfinite(values).all() for values in read)
+    near = np.delete(arrays.means, [7, 9], axis=0)
+    nearest = np.abs(near[:, None] - read.means[None]).max(axis=2).min(axis=1)
+    assert nearest.max() <= size / 2
+    caplog.clear()
+    write_spz(tmp_path / "b.spz", cloud(300))
+    assert not caplog.text
+
+
+def test_a_cloud_that_is_far_away_as_a_whole_is_not_clipped(tmp_path, caplog):
+    arrays = cloud(50)._replace(means=cloud(50).means + np.float32(1e6))
+    write_spz(tmp_path / "a.spz", arrays._replace(log_scales=arrays.log_scales - 20))
+    read = read_spz(tmp_path / "a.spz")
+    assert not caplog.text and np.abs(read.means.mean(axis=0) - 1e6).max() < 1
+
+
+def test_what_is_not_finite_is_left_out_of_the_file(tmp_path, caplog):
+    arrays = cloud(20)
+    arrays.means[3], arrays.sh[5] = np.nan, np.inf
+    write_spz(tmp_path / "a.spz", arrays)
+    assert len(read_spz(tmp_path / "a.spz").means) == 18
+    assert caplog.text.count("a.spz: 2 of 20 Gaussians hold NaN or infinity: left out") == 1
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         ({"means": np.float32([[np.nan, 0, 0]])}, "NaN or infinite"),
-        ({"means": np.float32([[1e7, 0, 0]])}, "positions as large as 1e"),
         ({"sh": np.zeros((1, 25, 3), np.float32)}, "up to degree 3, not 4"),
     ],
 )
@@ -222,6 +268,32 @@ def test_a_file_that_unpacks_to_far_more_than_it_announces_costs_no_memory(tmp_p
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 10 * path.stat().st_size  # 900 kB packed
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_a_small_file_of_many_gaussians_is_refused_before_they_are_unpacked(tmp_path, degree):
+    """Deflate packs up to 1032 bytes into one: 50 kB would take 0.5 GB."""
+    count = 2_000_000 // (1 + degree)
+    size = 20 + 3 * ((degree + 1) ** 2 - 1)
+    head = struct.pack("<4sIIBBBB", b"NGSP", 3, count, degree, 8, 0, 0)
+    path = stored(tmp_path, gzip.compress(head + bytes(count * size), 9))
+    tracemalloc.start()
+    with pytest.raises(UserError, match=f"{count} Gaussians would take .* of memory"):
+        read_spz(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10 * path.stat().st_size
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_the_memory_that_is_budgeted_is_what_reading_takes(degree):
+    packed = spz_bytes(cloud(20_000, degree))
+    tracemalloc.start()
+    spz_arrays(packed)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    announced = 20_000 * (DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * (degree + 1) ** 2)
+    assert 0.7 * announced < peak < 1.05 * announced
 
 
 def test_random_damage_is_an_error_or_a_cloud(tmp_path):

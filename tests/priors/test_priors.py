@@ -10,9 +10,11 @@ import pytest
 import trimesh
 
 from tests.helpers.prior_contract import PriorContract, assert_valid
+from tests.helpers.raw_ply import write_raw_gaussians
 from threestudio_gaussiandreamer import priors
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats import ply
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.host import find, names
 from threestudio_gaussiandreamer.priors.base import Prior, validated
@@ -42,14 +44,14 @@ def assets(tmp_path_factory):
         PointCloud(points=rng(1).normal(size=(300, 3)), colors=rng(2).random((300, 3))),
     )
     harmonics, scales, turns = (rng(i).normal(size=(200, n)) for i, n in ((3, 12), (4, 3), (5, 4)))
-    ply.write_gaussians(
-        folder / "gaussians.ply",
+    gaussians = Gaussians(
         means=rng(6).normal(size=(200, 3)),
-        sh=harmonics.reshape(200, 4, 3),
-        logit_opacities=np.linspace(-5, 5, 200),
-        log_scales=scales,
         quats=turns,
+        log_scales=scales,
+        logit_opacities=np.linspace(-5, 5, 200),
+        sh=harmonics.reshape(200, 4, 3),
     )
+    ply.write_gaussians(folder / "gaussians.ply", gaussians, ["up: z"])
     return folder
 
 
@@ -327,12 +329,12 @@ class TestGaussians:
     def test_few_bad_rows_are_dropped(self, assets, tmp_path, caplog):
         arrays = ply.read_gaussians(assets / "gaussians.ply")
         arrays.log_scales[3] = np.nan
-        ply.write_gaussians(tmp_path / "a.ply", **arrays._asdict())
+        write_raw_gaussians(tmp_path / "a.ply", arrays)
         with caplog.at_level(logging.WARNING):
             assert len(find("gaussians-prior")({"path": str(tmp_path / "a.ply")})("").points) == 199
         assert "dropped 1 of 200" in caplog.text
         arrays.quats[:20] = np.inf
-        ply.write_gaussians(tmp_path / "a.ply", **arrays._asdict())
+        write_raw_gaussians(tmp_path / "a.ply", arrays)
         with pytest.raises(UserError, match="20 of the 200"):
             find("gaussians-prior")({"path": str(tmp_path / "a.ply")})("")
 

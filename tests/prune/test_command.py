@@ -8,21 +8,19 @@ import math
 import os
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
+from tests.helpers.raw_ply import write_raw_gaussians
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import (
     PRUNED,
     StoredCloud,
-    in_axes,
     read_cloud,
+    write_cloud,
 )
-from threestudio_gaussiandreamer.formats.ply import (
-    read_comments,
-    read_gaussians,
-    write_gaussians,
-)
+from threestudio_gaussiandreamer.formats.ply import read_comments, read_gaussians, write_gaussians
 from threestudio_gaussiandreamer.gaussians import simplify
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
@@ -44,14 +42,10 @@ def ball(count=600, bands=1):
     return Gaussians(means, quats, torch.full((count, 3), -2.2), torch.full((count,), 3.0), sh)
 
 
-def arrays_of(cloud):
-    return {name: values.numpy() for name, values in cloud._asdict().items()}
-
-
 @pytest.fixture
 def source(tmp_path):
     path = tmp_path / "in.ply"
-    write_gaussians(path, **arrays_of(ball()))
+    write_gaussians(path, ball().arrays())
     return path
 
 
@@ -133,7 +127,7 @@ def test_what_a_format_costs_is_spent_too(tmp_path):
     """Also where the budget has been spent already, and where a count drops nothing."""
     bright = ball()
     bright.sh[:] *= 6
-    write_gaussians(tmp_path / "in.ply", **arrays_of(bright))
+    write_gaussians(tmp_path / "in.ply", bright.arrays())
     assert run(tmp_path / "in.ply", tmp_path / "once.ply", "--psnr", "35")["met"]
     assert not run(tmp_path / "once.ply", tmp_path / "twice.spz", "--psnr", "35")["met"]
     run(tmp_path / "once.ply", tmp_path / "count.spz", "--count", "600")
@@ -142,7 +136,7 @@ def test_what_a_format_costs_is_spent_too(tmp_path):
     pictures = simplify.look(prune.tensors_of(first), views)
     for name in ("twice.spz", "count.spz"):
         found = read_cloud(str(tmp_path / name))
-        turned = prune.tensors_of(StoredCloud(in_axes(found, first.up), first.up))
+        turned = prune.tensors_of(found.in_axes(first.up))
         assert (
             found.pruned_to < 34.9
             and simplify.likeness(turned, views, pictures) > found.pruned_to - 0.5
@@ -235,7 +229,7 @@ def test_recovery_pays():
 
 
 def test_harmonics_are_kept(tmp_path):
-    write_gaussians(tmp_path / "in.ply", **arrays_of(ball(bands=4)))
+    write_gaussians(tmp_path / "in.ply", ball(bands=4).arrays())
     run(tmp_path / "in.ply", tmp_path / "out.ply", "--count", "400")
     assert read_gaussians(tmp_path / "out.ply").sh.shape == (400, 4, 3)
 
@@ -263,15 +257,42 @@ def test_gsplats_checkpoints_are_read(source, tmp_path):
         {"step": 7, "splats": splats | {"sh0": cloud.sh, "shN": torch.zeros(600, 0, 3)}},
         tmp_path / "ckpt.pt",
     )
-    for name, path in (("a.ply", tmp_path / "ckpt.pt"), ("b.ply", source)):
-        run(path, tmp_path / name, "--count", "300", "--up", "z")
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    write_cloud(str(tmp_path / "in.ply"), StoredCloud(cloud.arrays()).in_axes("-y"))
+    for name in ("ckpt.pt", "in.ply"):
+        run(tmp_path / name, tmp_path / f"{name}.ply", "--count", "300")
+    from_checkpoint, from_ply = (tmp_path / f"{name}.ply" for name in ("ckpt.pt", "in.ply"))
+    assert from_checkpoint.read_bytes() == from_ply.read_bytes()
+    assert read_cloud(str(from_ply)).up == "-y"
+
+
+@pytest.mark.parametrize(("stated", "written"), [("z", "z"), ("-y", "-y"), (None, "-y")])
+def test_pruning_a_ply_does_not_rotate_it(tmp_path, stated, written):
+    notes = [f"up: {stated}"] if stated else []
+    write_gaussians(tmp_path / "in.ply", ball().arrays(), notes)
+    run(tmp_path / "in.ply", tmp_path / "out.ply", "--count", "600")
+    read = read_cloud(str(tmp_path / "out.ply"))
+    np.testing.assert_array_equal(read.gaussians.means, ball().means)
+    assert read.up == written
+
+
+def test_a_ply_from_an_spz_has_the_axes_of_the_viewers(source, tmp_path):
+    run(source, tmp_path / "a.spz", "--count", "600")
+    run(tmp_path / "a.spz", tmp_path / "b.ply", "--count", "600")
+    assert read_cloud(str(tmp_path / "b.ply")).up == "-y"
+
+
+@pytest.mark.parametrize("output", ["out.spz", "out.ply"])
+def test_harmonics_that_cannot_be_drawn_are_one_message(tmp_path, capsys, output):
+    write_gaussians(tmp_path / "in.ply", ball(bands=25).arrays())
+    arguments = [str(tmp_path / "in.ply"), str(tmp_path / output), "--count", "300", *FAST]
+    assert prune.main(arguments) == 2
+    assert "in.ply has spherical harmonics of degree 4: up to 3" in capsys.readouterr().err
 
 
 def test_gaussians_that_cannot_be_drawn_are_left_out(tmp_path, caplog):
     cloud = ball()
     cloud.means[3], cloud.sh[5] = float("nan"), float("inf")
-    write_gaussians(tmp_path / "in.ply", **arrays_of(cloud))
+    write_raw_gaussians(tmp_path / "in.ply", cloud.arrays())
     splats = {
         "means": cloud.means,
         "quats": cloud.quats,
@@ -304,7 +325,7 @@ def test_clouds_in_other_units_look_alike(unit):
 
 def test_a_cloud_that_shows_nothing_is_refused(tmp_path, capsys):
     write_gaussians(
-        tmp_path / "in.ply", **arrays_of(ball()._replace(logit_opacities=torch.full((600,), -20.0)))
+        tmp_path / "in.ply", ball()._replace(logit_opacities=torch.full((600,), -20.0)).arrays()
     )
     assert (
         prune.main([str(tmp_path / "in.ply"), str(tmp_path / "out.ply"), "--psnr", "40", *FAST])
@@ -357,7 +378,7 @@ def test_colours_beyond_the_compact_formats_reach_are_fitted_within_it(tmp_path)
     cloud = ball()
     cloud.sh[::7] *= 12  # thin ones, which others hide in part
     cloud.logit_opacities[::7] = -1
-    write_gaussians(tmp_path / "in.ply", **arrays_of(cloud))
+    write_gaussians(tmp_path / "in.ply", cloud.arrays())
     assert float(cloud.sh.abs().max()) > 2 * prune.COLOR_REACH
     source = read_cloud(str(tmp_path / "in.ply"))
     reports = []
@@ -385,7 +406,7 @@ def test_colours_beyond_the_compact_formats_reach_are_fitted_within_it(tmp_path)
 
 def test_views_turn_with_the_axes_of_the_file(tmp_path):
     source = tmp_path / "in.ply"
-    write_gaussians(source, **arrays_of(ball()))
+    write_gaussians(source, ball().arrays())
     views = {
         up: prune.views_of(read_cloud(str(source), up=up), prune.PruneOptions(size=48))[0]
         for up in ("z", "y", "-y")

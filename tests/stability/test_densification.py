@@ -17,7 +17,7 @@ from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.cameras import orbit_c2w
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.streams import generator
-from threestudio_gaussiandreamer.formats.ply import write_gaussians
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
 from threestudio_gaussiandreamer.gaussians import densify
 from threestudio_gaussiandreamer.gaussians.densify import PARAMETERS, Rules, Statistics
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
@@ -158,8 +158,7 @@ def test_a_trained_cloud_that_is_too_large_keeps_what_contributes(tmp_path, meas
     trained.logit_opacities.data = (
         torch.randn(400, generator=generator(0, "o")) * 2 + torch.arange(400) % 2 * 2
     )
-    arrays = {name: value.numpy() for name, value in drawn(trained)._asdict().items()}
-    write_gaussians(tmp_path / "a.ply", **arrays)
+    write_cloud(str(tmp_path / "a.ply"), StoredCloud(drawn(trained).arrays()))
     geometry = GaussianCloud(
         {
             "prior_type": "gaussians-prior",

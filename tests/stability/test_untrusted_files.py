@@ -22,6 +22,7 @@ from tests.stability.small_runs import launch
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.ply import read_gaussians, read_points, write_gaussians
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.models import hub, model_files
 from threestudio_gaussiandreamer.models.embedding_cache import EmbeddingCache
 from threestudio_gaussiandreamer.priors.cache import read_cache
@@ -152,14 +153,8 @@ def test_500_mutants_are_read_or_refused_in_little_memory(tmp_path, measured):
 
 @row("A5", "Corrupted/foreign PLY")
 def test_an_empty_cloud_is_read_as_one(tmp_path, measured):
-    write_gaussians(
-        tmp_path / "a.ply",
-        means=np.zeros((0, 3)),
-        sh=np.zeros((0, 1, 3)),
-        logit_opacities=np.zeros(0),
-        log_scales=np.zeros((0, 3)),
-        quats=np.zeros((0, 4)),
-    )
+    shapes = (0, 3), (0, 4), (0, 3), (0,), (0, 1, 3)
+    write_gaussians(tmp_path / "a.ply", Gaussians(*map(np.zeros, shapes)))
     assert len(read_gaussians(tmp_path / "a.ply").means) == 0
     measured("N = 0 read")
 

@@ -7,9 +7,10 @@ import torch
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.cameras import orbit_c2w
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.formats.ply import write_gaussians
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
 from threestudio_gaussiandreamer.gaussians import sh
 from threestudio_gaussiandreamer.gaussians.densify import screen_gradients
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.grow import nearest_distance_scales
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.host import find, register
@@ -233,12 +234,7 @@ def test_a_trained_cloud_above_the_cap_keeps_what_contributes(sphere_points, tmp
     """All attributes of the best are kept bit for bit; every fourth is faint and goes."""
     trained = started(sphere_points, init_opacity=0.9)
     trained.logit_opacities.data[::4] = -5.0
-    names = ("means", "log_scales", "quats", "logit_opacities")
-    write_gaussians(
-        tmp_path / "a.ply",
-        **{name: getattr(trained, name).detach().numpy() for name in names},
-        sh=trained.sh.detach().numpy(),
-    )
+    write_cloud(str(tmp_path / "a.ply"), StoredCloud(Gaussians.of(trained).arrays()))
     geometry = GaussianCloud(
         {
             "prior_type": "gaussians-prior",
@@ -250,7 +246,7 @@ def test_a_trained_cloud_above_the_cap_keeps_what_contributes(sphere_points, tmp
     bright = torch.arange(400) % 4 != 0
     assert all(
         torch.equal(getattr(geometry, name), getattr(trained, name)[bright])
-        for name in (*names, "sh0")
+        for name in ("means", "log_scales", "quats", "logit_opacities", "sh0")
     )
 
 

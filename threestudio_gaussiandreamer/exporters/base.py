@@ -1,4 +1,4 @@
-"""What every exporter starts from.
+"""What all exporters share.
 
 An exporter is one file: a subclass of the host's ``Exporter`` registered as ``<format>-exporter``,
 whose call returns a list of ``ExporterOutput(save_name, save_type, params)``; the system writes
@@ -6,10 +6,12 @@ each with its ``save_<save_type>(name, **params)``."""
 
 import os
 from dataclasses import dataclass, field
+from typing import Optional
 
 from ..core.errors import UserError
-from ..core.options import check_options, rule
-from ..gaussians.gaussians import Gaussians
+from ..core.options import check_options, one_of, rule
+from ..gaussians.axes import AXES
+from ..gaussians.gaussians import Gaussians, finite
 from ..host import BaseGeometry, Exporter
 
 NAME_BYTES = 255
@@ -37,6 +39,8 @@ def require_file_name(option: str, name: str) -> None:
 
 
 SAVE_NAME = rule(require_file_name)
+UP = one_of(AXES)
+"""The axis of a file that is up."""
 
 
 class FileExporter(Exporter):
@@ -47,12 +51,20 @@ class FileExporter(Exporter):
         save_name: str = field(default="", metadata=SAVE_NAME)
 
     cfg: Config
+    shared: Optional[Gaussians] = None
+    """The Gaussians that a bundle has read for all its formats."""
 
     def configure(self, geometry: BaseGeometry, *args: object, **kwargs: object) -> None:
         check_options(self.Config, self.cfg)
         super().configure(geometry, *args, **kwargs)
 
+    def gaussians(self) -> Gaussians:
+        """Return what is to be exported, in the world's axes; every value is finite."""
+        return read_gaussians(self.geometry) if self.shared is None else self.shared
 
-def gaussian_arrays(geometry: BaseGeometry) -> Gaussians:
-    """The parameters of a geometry as float32 arrays on the CPU."""
-    return Gaussians.of(geometry).arrays()
+
+def read_gaussians(geometry: BaseGeometry) -> Gaussians:
+    """Read the Gaussians of a geometry as finite float32 arrays; those that can't be drawn are left
+    out, with a warning.
+    """
+    return finite(Gaussians.of(geometry).arrays(), "export")

@@ -6,6 +6,8 @@ option        meaning
 formats       names of registered exporters without their ``-exporter``: ``ply``, ``spz``,
               ``points``, ``surface``, ...
 options       options of some of them: ``{ply: {pad_sh_degree: 3}}``
+up            the axis that is up in all formats that leave a choice (``ply``, ``surface``): ``z``
+              for this package's world; by default what the viewers of each format expect
 save_video    also render the turntable
 ============  ======================================================================================
 """
@@ -27,6 +29,7 @@ from ..host import (
     parse_structured,
     register,
 )
+from .base import UP, FileExporter, read_gaussians
 
 SUFFIX = "-exporter"
 
@@ -48,6 +51,7 @@ class BundleExporter(Exporter):
             metadata=each(one_of(available_formats)),
         )
         options: Dict[str, Any] = field(default_factory=dict)
+        up: Optional[str] = field(default=None, metadata=UP)
         save_video: bool = True
 
         @staticmethod
@@ -65,7 +69,7 @@ class BundleExporter(Exporter):
                         "another one have no effect"
                     )
             _require_own_files(
-                (name, _checked(name, cfg.options.get(name, {}))) for name in cfg.formats
+                (name, _checked(name, options_of(name, cfg))) for name in cfg.formats
             )
 
     cfg: Config
@@ -80,12 +84,23 @@ class BundleExporter(Exporter):
         check_options(self.Config, self.cfg)
         parts = dict(geometry=geometry, material=material, background=background)
         self.exporters = [
-            find(name + SUFFIX)(self.cfg.options.get(name, {}), **parts)
-            for name in self.cfg.formats
+            find(name + SUFFIX)(options_of(name, self.cfg), **parts) for name in self.cfg.formats
         ]
 
     def __call__(self) -> List[ExporterOutput]:
+        ours = [exporter for exporter in self.exporters if isinstance(exporter, FileExporter)]
+        shared = read_gaussians(self.geometry) if ours else None
+        for exporter in ours:
+            exporter.shared = shared
         return [output for exporter in self.exporters for output in exporter()]
+
+
+def options_of(name: str, cfg: Any) -> Any:
+    """Return the options of one format, with the bundle's ``up`` where it has such an option."""
+    options, known = cfg.options.get(name, {}), find(name + SUFFIX).Config.__dataclass_fields__
+    if cfg.up is None or "up" not in known or not isinstance(options, Mapping):
+        return options
+    return {"up": cfg.up, **options}
 
 
 def _checked(name: str, options: Any) -> Any:

@@ -8,7 +8,8 @@ save_name    name of the file in the export folder
 min_opacity  leave out Gaussians fainter than this; 0 keeps all, in their order
 save_video   also render the turntable
 ===========  ==================================================================================
-"""
+
+The points are in the world's axes, z up, as programs for point clouds expect."""
 
 from dataclasses import dataclass, field
 from typing import List
@@ -18,7 +19,7 @@ from ..gaussians.gaussians import opaque
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.sh import sh0_colors
 from ..host import ExporterOutput, register
-from .base import SAVE_NAME, FileExporter, gaussian_arrays
+from .base import SAVE_NAME, FileExporter
 
 
 @register("points-exporter")
@@ -33,9 +34,9 @@ class PointsExporter(FileExporter):
     cfg: Config
 
     def __call__(self) -> List[ExporterOutput]:
-        arrays = gaussian_arrays(self.geometry)
-        keep = opaque(arrays, self.cfg.min_opacity)
-        cloud = PointCloud(points=arrays.means[keep], colors=sh0_colors(arrays.sh[keep, 0]))
+        gaussians = self.gaussians()
+        gaussians = gaussians.rows(opaque(gaussians, self.cfg.min_opacity))
+        cloud = PointCloud(points=gaussians.means, colors=sh0_colors(gaussians.sh[:, 0]))
         return [
             ExporterOutput(
                 save_name=self.cfg.save_name, save_type="points", params={"cloud": cloud}

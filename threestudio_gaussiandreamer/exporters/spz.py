@@ -8,20 +8,20 @@ save_name    name of the file in the export folder
 save_video   also render the turntable
 ===========  ==================================================================================
 
-About 17 bytes a Gaussian; what its rounding costs is in docs/results.md. The cloud is turned from
-z up to y up, SPZ's axes."""
+About 17 bytes a Gaussian; what its rounding costs is in docs/results.md. The file is y up,
+as SPZ demands."""
 
 from dataclasses import dataclass, field
 from typing import List
 
-from ..gaussians.gaussians import usable
-from ..host import ExporterOutput, register, warn
-from .base import SAVE_NAME, FileExporter, gaussian_arrays
+from ..formats.gaussian_files import StoredCloud
+from ..host import ExporterOutput, register
+from .base import SAVE_NAME, FileExporter
 
 
 @register("spz-exporter")
 class SpzExporter(FileExporter):
-    """One file of save_type "spz"; its params are the arrays of the Gaussians, z up."""
+    """One file of save_type "spz"; its params are ``{"stored": StoredCloud}``."""
 
     @dataclass
     class Config(FileExporter.Config):
@@ -30,12 +30,5 @@ class SpzExporter(FileExporter):
     cfg: Config
 
     def __call__(self) -> List[ExporterOutput]:
-        arrays = gaussian_arrays(self.geometry)
-        keep = usable(arrays)
-        if not keep.all():
-            warn(
-                f"{(~keep).sum()} of {len(keep)} Gaussians hold NaN or infinity, which "
-                f"{self.cfg.save_name} can't: left out"
-            )
-        params = {name: values[keep] for name, values in arrays._asdict().items()}
+        params = {"stored": StoredCloud(self.gaussians())}
         return [ExporterOutput(save_name=self.cfg.save_name, save_type="spz", params=params)]

@@ -9,7 +9,8 @@ quaternions in the order xyzw, axes right, up, back:
 header      ``NGSP``, version u32, N u32, degree of the harmonics u8, fractional bits u8, flags u8
             (1: antialiased), 0
 positions   N x 3 fixed point of 24 bit, signed
-alphas      N u8: 255 opacity
+alphas      N u8: 255 opacity, written up to 254: Niantic's reader takes the logit of the byte over
+            255, which is infinite at 255
 colors      N x 3 u8: 255 (0.15 sh + 0.5)
 scales      N x 3 u8: 16 (log scale + 10), so sizes from e^-10 to e^5.9 world units
 rotations   N u32: the number of the largest component, and sign and 9 bit of each other (version 2:
@@ -17,35 +18,49 @@ rotations   N u32: the number of the largest component, and sign and 9 bit of ea
 harmonics   N x (K - 1) x 3 u8: 128 sh + 128, of which 5 bit are used at degree 1, 4 above
 ==========  ========================================================================================
 
-The reader believes no count that the file's size can't hold. What rounding costs:
-docs/results.md."""
+What the header announces is checked against the file's size before it is unpacked. What rounding
+costs: docs/results.md."""
 
+import logging
 import os
 import struct
 import zlib
-from math import ceil, isqrt, log, log2, sqrt
+from math import ceil, log, log2, sqrt
 from typing import NamedTuple, NoReturn
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..core.errors import UserError
+from ..core.file_memory import require_file_memory
 from ..core.files import atomic_file, existing_file
-from ..gaussians.gaussians import Gaussians, usable
+from ..gaussians.gaussians import Gaussians, finite, usable
 
+logger = logging.getLogger(__name__)
 HEADER = struct.Struct("<4sIIBBBB")
 MAGIC, VERSION = b"NGSP", 3
+SPZ_UP = "y"
 STEPS_PER_SIZE = 32
-"""Positions are kept to this part, at least, of the median Gaussian's size: where the curve of
+"""Positions are kept to this part of the median Gaussian's size: where the curve of
 docs/results.md has become flat.
+"""
+MIN_STEPS_PER_SIZE = 2
+INLIERS, OUTLIER = 0.99, 256
+"""Where the farthest positions would leave the median Gaussian fewer than ``MIN_STEPS_PER_SIZE``
+steps, those are clipped that are ``OUTLIER`` times farther than a share ``INLIERS`` of all.
 """
 MOST_DEFLATE_SAVES = 1032
 """Bytes that one byte of a deflate stream stands for at most (zlib's technical notes)."""
+MAX_OPACITY_BYTE = 254
 COLOR_SCALE = 0.15
+MAX_FIXED = 2**23 - 1
 COLOR_REACH = 0.5 / COLOR_SCALE
 """The largest constant harmonic that is stored, either way: colours from -0.44 to 1.44."""
+MIN_LOG_SCALE, MAX_LOG_SCALE = -10.0, 255 / 16 - 10
 SH_BITS = (5, 4, 4)
 """By degree from 1 on."""
+DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 180, 9
+"""Memory that reading takes per Gaussian, and per harmonic of it, measured with some room."""
 OPACITY_MARGIN = 1 / 2040
 """Opacities are read no closer to 0 and 1, an eighth of a step, where the logit is infinite."""
 
@@ -67,57 +82,68 @@ class SpzHeader(NamedTuple):
         return [9, 1, 3, 3, 4 if self.version == 3 else 3, 3 * ((self.degree + 1) ** 2 - 1)]
 
 
-def write_spz(path: str | os.PathLike, *, comment: str = "", **arrays: np.ndarray) -> None:
-    """Write :func:`spz_bytes`, whole or not at all.
+def write_spz(path: str | os.PathLike, gaussians: Gaussians, *, comment: str = "") -> None:
+    """Write :func:`spz_bytes`, whole or not at all; what the format can't hold is left out or
+    clipped, with a warning.
 
     Raises:
-        UserError: the Gaussians can't be stored, or the file can't be written.
+        UserError: harmonics above degree 3, or the file can't be written.
     """
-    data = spz_bytes(Gaussians(**arrays), comment=comment)
+    gaussians = finite(gaussians, str(path))
+    data = spz_bytes(gaussians, comment=comment)
+    if clipped := int(out_of_range(gaussians).sum()):
+        logger.warning(
+            "%s: %d of %d Gaussians are farther away or larger than SPZ can hold: clipped to its "
+            "range",
+            path,
+            clipped,
+            len(gaussians.means),
+        )
     with atomic_file(path) as file:
         file.write(data)
 
 
-def spz_bytes(arrays: Gaussians, *, comment: str = "") -> bytes:
-    """Gaussians as an SPZ file of version 3, their order along a Morton curve, in which neighbours
-    resemble each other.
+def spz_bytes(gaussians: Gaussians, *, comment: str = "") -> bytes:
+    """Encode Gaussians as an SPZ file of version 3, in the order of a Morton curve, along which
+    neighbours resemble each other. Positions and scales beyond the format's range are clipped.
 
     Args:
-        arrays: in the axes right, up, back.
-        comment: kept in the header of gzip, where no reader minds it; ASCII.
+        gaussians: in the axes right, up, back.
+        comment: kept in the header of gzip, which readers ignore; ASCII.
 
     Raises:
-        UserError: NaN or infinite values, positions too large for the format, or harmonics above
-            degree 3.
+        UserError: NaN or infinite values, or harmonics above degree 3.
     """
-    if not usable(arrays).all():
+    if not usable(gaussians).all():
         raise UserError("an SPZ file can't hold Gaussians with NaN or infinite values")
-    if arrays.sh.shape[1] > 16:
-        raise UserError(
-            f"an SPZ file holds harmonics up to degree 3, not {isqrt(arrays.sh.shape[1]) - 1}"
-        )
-    order = _morton_order(arrays.means)
-    arrays = arrays.rows(order)
-    fractional = _fractional_bits(arrays)
-    header = HEADER.pack(
-        MAGIC, VERSION, len(arrays.means), isqrt(arrays.sh.shape[1]) - 1, fractional, 0, 0
-    )
-    fixed = np.rint(arrays.means.astype(np.float64) * 2.0**fractional).astype("<i4")
+    if gaussians.sh_degree > 3:
+        raise UserError(f"an SPZ file holds harmonics up to degree 3, not {gaussians.sh_degree}")
+    gaussians = gaussians.rows(_morton_order(gaussians.means))
+    fractional = _fractional_bits(gaussians)
+    count = len(gaussians.means)
+    header = HEADER.pack(MAGIC, VERSION, count, gaussians.sh_degree, fractional, 0, 0)
     blocks = [
-        fixed[..., None].view("u1")[..., :3],
-        _to_byte(255 * _opacities(arrays.logit_opacities)),
-        _to_byte(255 * (COLOR_SCALE * arrays.sh[:, 0] + 0.5)),
-        _to_byte(16 * (arrays.log_scales + 10)),
-        _smallest_three(arrays.quats),
-        _harmonic_bytes(arrays.sh[:, 1:]),
+        _fixed_point(gaussians.means, fractional),
+        _to_byte(255 * _opacities(gaussians.logit_opacities)).clip(max=MAX_OPACITY_BYTE),
+        _to_byte(255 * (COLOR_SCALE * gaussians.sh[:, 0] + 0.5)),
+        _to_byte(16 * (gaussians.log_scales - MIN_LOG_SCALE)),
+        _smallest_three(gaussians.quats),
+        _harmonic_bytes(gaussians.sh[:, 1:]),
     ]
     return _gzip(
         header + b"".join(np.ascontiguousarray(block).tobytes() for block in blocks), comment
     )
 
 
+def out_of_range(gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
+    """Tell which Gaussians have a position or a scale that is clipped."""
+    reach = MAX_FIXED * 2.0 ** -_fractional_bits(gaussians)
+    far = (np.abs(gaussians.means) > reach).any(axis=1)
+    return far | (gaussians.log_scales > MAX_LOG_SCALE + 1 / 32).any(axis=1)
+
+
 def read_spz(path: str | os.PathLike) -> Gaussians:
-    """The Gaussians of an SPZ file of version 2 or 3, in its axes: right, up, back.
+    """Read the Gaussians of an SPZ file of version 2 or 3, in its axes: right, up, back.
 
     Raises:
         UserError: no such file, not an SPZ file of these versions, or damaged.
@@ -130,9 +156,7 @@ def read_spz(path: str | os.PathLike) -> Gaussians:
 
 
 def spz_arrays(packed: bytes, name: str = "") -> Gaussians:
-    """The Gaussians in the bytes of an SPZ file, which messages call by its ``name``; see
-    :func:`read_spz`.
-    """
+    """Decode the bytes of an SPZ file, called ``name`` in messages; see :func:`read_spz`."""
     header, data = _unpacked(packed, name)
     ends = np.cumsum([size * header.count for size in header.blocks])
     parts = [
@@ -140,23 +164,18 @@ def spz_arrays(packed: bytes, name: str = "") -> Gaussians:
         for part, size in zip(np.split(data, ends[:-1]), header.blocks, strict=True)
     ]
     positions, alphas, colors, scales, rotations, harmonics = parts
-    constant = (colors / np.float32(255) - np.float32(0.5)) / np.float32(COLOR_SCALE)
-    rest = (
-        harmonics.reshape(header.count, header.blocks[-1] // 3, 3).astype(np.float32) - 128
-    ) / 128
+    read_quats = _from_smallest_three if header.version == 3 else _from_first_three
     return Gaussians(
         means=_positions(positions, header.fractional_bits),
-        sh=np.concatenate([constant[:, None], rest], axis=1),
+        quats=read_quats(rotations),
+        log_scales=scales / np.float32(16) + np.float32(MIN_LOG_SCALE),
         logit_opacities=_logits(alphas[:, 0]),
-        log_scales=scales / np.float32(16) - 10,
-        quats=_from_smallest_three(rotations)
-        if header.version == 3
-        else _from_first_three(rotations),
+        sh=_harmonics(colors, harmonics),
     )
 
 
 def read_spz_comment(path: str | os.PathLike) -> str:
-    """The comment that :func:`spz_bytes` kept; empty where there is none."""
+    """Read the comment that :func:`spz_bytes` keeps; empty where there is none."""
     with open(path, "rb") as file:
         head = file.read(4096)
     has_comment_alone = head[:2] == b"\x1f\x8b" and head[3:4] == b"\x10"
@@ -164,9 +183,7 @@ def read_spz_comment(path: str | os.PathLike) -> str:
 
 
 def _unpacked(packed: bytes, name: str) -> tuple[SpzHeader, Int[np.ndarray, " B"]]:
-    """Header and blocks; no more is unpacked than the header announces, and it may announce no more
-    than deflate can pack.
-    """
+    """Unpack header and blocks, no more than the header announces."""
     if packed[:4] == MAGIC:
         _fail(
             name,
@@ -203,10 +220,13 @@ def _check_header(header: SpzHeader, packed_size: int, name: str) -> None:
             name,
             f"{header.count} Gaussians are announced, but {packed_size} bytes can't hold them.",
         )
+    each = DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * (header.degree + 1) ** 2
+    what = f"{header.count} Gaussians"
+    require_file_memory(each * header.count, packed_size, f"SPZ file {name!r}", what)
 
 
 def _gzip(data: bytes, comment: str) -> bytes:
-    """The bytes as one gzip member (RFC 1952) without a time, so that equal clouds give equal
+    """Compress to one gzip member (RFC 1952) without a time, so that equal clouds give equal
     files.
     """
     deflate = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
@@ -225,7 +245,8 @@ def _gzip(data: bytes, comment: str) -> bytes:
 
 
 def _morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
-    """Rows in the order of the interleaved bits of their positions, 10 bits an axis."""
+    """Return rows in the order of the interleaved bits of their positions, 10 bits an axis."""
+    means = means.astype(np.float64)
     low, high = means.min(axis=0, initial=np.inf), means.max(axis=0, initial=-np.inf)
     cells = ((means - low) / np.maximum(high - low, 1e-12) * 1023).astype(np.int64)
     bits = cells[:, :, None] >> np.arange(10) & 1
@@ -236,21 +257,31 @@ def _morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
     )
 
 
-def _fractional_bits(arrays: Gaussians) -> int:
-    """Bits behind the point: by the size of the Gaussians, as far as 23 bits hold the largest
-    coordinate.
-
-    Raises:
-        UserError: not even whole numbers can be stored.
+def _fractional_bits(gaussians: Gaussians) -> int:
+    """Choose the bits behind the point: by the Gaussians' size, fewer where positions are so large
+    that they need more bits before it.
     """
-    if not len(arrays.means):
+    if not len(gaussians.means):
         return 0
-    reach = max(float(np.abs(arrays.means).max()), 2.0**-40)
-    room = 23 - ceil(log2(reach * (1 + 1e-6)))
-    if room < 0:
-        raise UserError(f"an SPZ file can't hold positions as large as {reach:g}: 8388607 at most")
-    log_size = float(np.median(arrays.log_scales.clip(-50, 50).mean(axis=1)))
-    return min(room, max(0, ceil(log2(STEPS_PER_SIZE) - log_size / log(2))), 30)
+    distances = np.abs(gaussians.means).max(axis=1)
+    inliers = float(np.quantile(distances, INLIERS, method="lower"))
+    log2_size = float(np.median(gaussians.log_scales.clip(-50, 50).mean(axis=1))) / log(2)
+    fewest, wanted = (ceil(log2(n) - log2_size) for n in (MIN_STEPS_PER_SIZE, STEPS_PER_SIZE))
+    room = _room(float(distances.max()))
+    if room < fewest:
+        room = max(room, _room(OUTLIER * inliers))
+    return max(0, min(room, wanted, 30))
+
+
+def _room(reach: float) -> int:
+    """Return how many of 23 bits are left behind the point for coordinates up to ``reach``."""
+    return 23 - ceil(log2(max(reach, 2.0**-40) * (1 + 1e-6)))
+
+
+def _fixed_point(means: Float[np.ndarray, "N 3"], fractional_bits: int) -> Int[np.ndarray, "N 9"]:
+    fixed = np.rint(means.astype(np.float64) * 2.0**fractional_bits)
+    low_bytes = fixed.clip(-MAX_FIXED, MAX_FIXED).astype("<i4")[..., None].view("u1")[..., :3]
+    return low_bytes.reshape(-1, 9)
 
 
 def _positions(block: Int[np.ndarray, "N 9"], fractional_bits: int) -> Float[np.ndarray, "N 3"]:
@@ -287,15 +318,27 @@ def _from_first_three(block: Int[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4"]
     return np.concatenate([w, xyz], axis=1).astype(np.float32)
 
 
+def _harmonics(
+    colors: Int[np.ndarray, "N 3"], rest: Int[np.ndarray, "N R"]
+) -> Float[np.ndarray, "N K 3"]:
+    """Decode the constant harmonic and the others, in place, since this is most of the memory."""
+    sh = np.empty((len(colors), 1 + rest.shape[1] // 3, 3), np.float32)
+    sh[:, 0] = (colors / np.float32(255) - np.float32(0.5)) / np.float32(COLOR_SCALE)
+    sh[:, 1:] = rest.reshape(len(rest), -1, 3) if rest.size else 0
+    sh[:, 1:] -= 128
+    sh[:, 1:] /= 128
+    return sh
+
+
 def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Int[np.ndarray, "N K 3"]:
-    """128 is zero; only multiples of the step of its degree are used, which pack better."""
+    """Encode with zero at 128, in multiples of the step of each degree, which pack better."""
     degrees = np.sqrt(np.arange(1, rest.shape[1] + 1)).astype(int) - 1
     steps = 2 ** (8 - np.array(SH_BITS))[degrees][:, None]
     return _to_byte(np.floor((np.rint(128 * rest) + 128 + steps // 2) / steps) * steps)
 
 
 def _unit(quats: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
-    """Quaternions of length 1 in float64; one without length turns nothing."""
+    """Normalise in float64; a zero quaternion becomes the identity."""
     quats = np.array(quats, np.float64)
     lengths = np.linalg.norm(quats, axis=1, keepdims=True)
     return np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1), [1.0, 0, 0, 0])

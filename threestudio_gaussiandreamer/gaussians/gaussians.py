@@ -1,6 +1,7 @@
 """The type that holds N Gaussians, as NumPy arrays or as tensors, in the encoding of files and
 optimisers: logarithms of the scales, logits of the opacities, spherical harmonics for colours."""
 
+import logging
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,7 +10,12 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+logger = logging.getLogger(__name__)
 Array = np.ndarray | Tensor
+MAX_LOG = 87.0
+"""Logits and logarithms of scales are stored within this: exp(-87) is about the smallest normal
+float32, and the sigmoid of +-87 is 1 and 0.
+"""
 
 
 class Gaussians(NamedTuple):
@@ -64,6 +70,27 @@ def usable(gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
         gaussians.log_scales < np.inf,
     ]
     return np.concatenate(columns, axis=1).all(axis=1)
+
+
+def drawable(gaussians: Gaussians, name: str) -> Gaussians:
+    """Leave out the Gaussians that can't be drawn, with a warning; ``name`` says where they are."""
+    keep = usable(gaussians)
+    if keep.all():
+        return gaussians
+    bad = len(keep) - int(keep.sum())
+    logger.warning("%s: %d of %d Gaussians hold NaN or infinity: left out", name, bad, len(keep))
+    return gaussians.rows(keep)
+
+
+def finite(gaussians: Gaussians, name: str) -> Gaussians:
+    """Return Gaussians of which every value is finite: those that can't be drawn are left out, and
+    logits and logarithms stay finite, those of scales also when a reader takes the exponential.
+    """
+    gaussians = drawable(gaussians, name)
+    return gaussians._replace(
+        logit_opacities=gaussians.logit_opacities.clip(-MAX_LOG, MAX_LOG),
+        log_scales=gaussians.log_scales.clip(-MAX_LOG, MAX_LOG),
+    )
 
 
 def opaque(gaussians: Gaussians, min_opacity: float) -> Bool[np.ndarray, " N"]:

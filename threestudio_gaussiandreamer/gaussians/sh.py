@@ -15,6 +15,7 @@ from ..core.errors import UserError
 
 C0 = sqrt(1 / (4 * pi))
 COEFFICIENTS = (1, 4, 9, 16)  # by degree
+MAX_DEGREE = len(COEFFICIENTS) - 1
 SHORTEST_DIRECTION = 1e-12
 Colors = Float[Tensor, "*batch C"] | Float[np.ndarray, "*batch C"]
 

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..core.errors import UserError
 from ..core.files import atomic_file
 from .gaussians import Gaussians, opaque
 from .sh import sh0_colors
@@ -46,6 +47,10 @@ class Surface(NamedTuple):
     vertices: Float[np.ndarray, "V 3"]
     faces: Int[np.ndarray, "F 3"]
     colors: Float[np.ndarray, "V 3"]
+
+    def rotated(self, rotation: Float[np.ndarray, "3 3"]) -> "Surface":
+        """Rotate about the origin."""
+        return self._replace(vertices=self.vertices @ rotation.T)
 
 
 def gaussian_surface(arrays: Gaussians, *, resolution: int = 128, level: float = 0.5) -> Surface:
@@ -91,7 +96,12 @@ def surface_nets(
 def write_obj(path: str | os.PathLike, surface: Surface) -> None:
     """Write an OBJ with the colours behind the positions ("v x y z r g b"), as MeshLab, Blender and
     trimesh read it.
+
+    Raises:
+        UserError: vertices or colours that aren't finite, or the file can't be written.
     """
+    if not (np.isfinite(surface.vertices).all() and np.isfinite(surface.colors).all()):
+        raise UserError(f"{str(path)!r} isn't written: some of its vertices hold NaN or infinity")
     with atomic_file(path) as file:
         np.savetxt(
             file,

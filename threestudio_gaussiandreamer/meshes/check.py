@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..core.errors import UserError
-from ..formats.ply import _Table
+from ..formats.ply_table import PlyTable
 
 NUMBER = rb"[-+]?(?:\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?|nan|inf)"
 CORNER = rb"-?[1-9]\d*(?:/(?:-?[1-9]\d*)?){0,2}"
@@ -26,7 +26,7 @@ def check_mesh_file(path: Path) -> None:
         UserError: the file is damaged, or uses what trimesh reads wrongly.
     """
     if path.suffix.lower() == ".ply":
-        _Table.read(path)
+        PlyTable.read(path)
     check = {".glb": _check_glb, ".gltf": _check_gltf, ".obj": _check_obj}.get(path.suffix.lower())
     if check is not None:
         try:

@@ -1,19 +1,21 @@
-"""``gaussians-prior``: a trained cloud of Gaussians (the PLY of any 3DGS program) as the start.
+"""``gaussians-prior``: trained Gaussians (the PLY of any 3DGS program, or an SPZ) as the start.
 
 ============  ======================================================================================
 option        meaning
 ============  ======================================================================================
-path          the PLY file
+path          the PLY or SPZ file
+up            the file's axis that is up: ``z``, ``y``, ``-y``, or ``auto``: what the file says, else
+              -y for a PLY, as other programs write it; SPZ is always y up
 min_opacity   leave out Gaussians fainter than this, in [0, 1]
 ground, ...   see ``priors/base.py``; not with all attributes
 ============  ======================================================================================
 
-Called as any prior it gives the centres and the colours of the constant harmonic, to be grown and
-sized anew; the geometry may instead take every attribute from :meth:`GaussiansPrior.gaussians` and
-go on where that training stopped.
+Called as any prior it gives the centres and the colours of the constant harmonic, from which points
+are grown; the geometry may instead take every attribute from :meth:`GaussiansPrior.gaussians` and
+continue that training.
 
-Limits: the prompt is not read; positions stay as they are (world units, z up): no turning, no
-scaling."""
+Limits: the prompt is not read; the Gaussians are rotated to the world's axes, but not moved or
+scaled."""
 
 from dataclasses import dataclass, field
 
@@ -21,11 +23,12 @@ import numpy as np
 
 from ..core.errors import UserError
 from ..core.files import existing_file
-from ..core.options import in_range
-from ..formats.ply import read_gaussians
+from ..core.options import in_range, one_of
+from ..formats.gaussian_files import read_stored
+from ..gaussians.axes import AXES, WORLD_UP
 from ..gaussians.gaussians import Gaussians, opaque, usable
 from ..gaussians.point_cloud import PointCloud
-from ..gaussians.sh import sh0_colors
+from ..gaussians.sh import COEFFICIENTS, sh0_colors
 from ..host import register
 from .base import PATH, Prior, report_non_finite
 
@@ -37,6 +40,7 @@ class GaussiansPrior(Prior):
     @dataclass
     class Config(Prior.Config):
         path: str = field(default="", metadata=PATH)
+        up: str = field(default="auto", metadata=one_of(("auto", *AXES)))
         min_opacity: float = field(default=0.0, metadata=in_range(0, 1))
 
     cfg: Config
@@ -64,8 +68,11 @@ class GaussiansPrior(Prior):
         return PointCloud(points=arrays.means, colors=sh0_colors(arrays.sh[:, 0]))
 
     def _read(self) -> Gaussians:
-        path = existing_file(self.cfg.path, "PLY file")
-        arrays = read_gaussians(path, allow_non_finite=True)
+        path = existing_file(self.cfg.path, "file of Gaussians")
+        stored = read_stored(path, up=None if self.cfg.up == "auto" else self.cfg.up)
+        harmonics = stored.gaussians.sh[:, : COEFFICIENTS[-1]]  # more can't be drawn
+        stored = stored._replace(gaussians=stored.gaussians._replace(sh=harmonics))
+        arrays = stored.in_axes(WORLD_UP).gaussians
         keep = usable(arrays)
         if bad := int((~keep).sum()):
             report_non_finite(bad, len(keep), str(path))

@@ -11,7 +11,8 @@ normalize     centre the box and make its longest half side ``scale``; else the 
               are
 scale         half the longest side, world units, with ``normalize``
 up, front     the file's axes, ``+x`` to ``-z``; by default z is up and +x the front, but for
-              modelling formats (GLB, OBJ, ...), where y is up and +z the front
+              modelling formats (GLB, OBJ, ...), where y is up and +z the front, and for a PLY of
+              Gaussians, whose header says so, or -y is up and -z the front
 ground, ...   see ``priors/base.py``
 ============  ======================================================================================
 
@@ -30,7 +31,9 @@ from jaxtyping import Float
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file
 from ..formats.array_files import read_arrays
-from ..formats.ply import read_points, unit_colors
+from ..formats.gaussian_files import ply_up
+from ..formats.ply import is_gaussian_ply, read_points, unit_colors
+from ..gaussians.axes import FRONTS
 from ..gaussians.grow import longest_side
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
@@ -61,8 +64,17 @@ class PointCloudPrior(Prior):
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         path = existing_file(self.cfg.path, "point cloud")
         cloud = load_points(path)
-        cloud = rotated(cloud, _pose(axes_kind(path), self.cfg.up, self.cfg.front))
+        cloud = rotated(cloud, to_world(path, self.cfg.up, self.cfg.front))
         return normalized(cloud, self.cfg.scale) if self.cfg.normalize else cloud
+
+
+def to_world(path: Path, up: str, front: Optional[str]) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation of the file's axes to the world's."""
+    if up == "auto" and is_gaussian_ply(path):
+        named = ply_up(path)
+        front = front or FRONTS[named]
+        up = named if named.startswith("-") else f"+{named}"
+    return _pose(axes_kind(path), up, front)
 
 
 def axes_kind(path: Path) -> str:

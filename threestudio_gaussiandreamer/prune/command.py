@@ -2,7 +2,8 @@
 --psnr 40``.
 
 IN is a PLY or SPZ file of Gaussians, ours or any other tool's, or a checkpoint, ours or gsplat's;
-OUT a PLY or SPZ file. Beside OUT are written OUT.json, the report, and OUT.png, before (top) and
+OUT a PLY or SPZ file. From PLY to PLY the axes stay as they are; otherwise a PLY is written -y up,
+as viewers expect it. Beside OUT are written OUT.json, the report, and OUT.png, before (top) and
 after. The method: ``simplify.py``. Three sets of views, none in another: what Gaussians are scored
 on and fitted to, what decides whether a budget of quality is met (two standard errors on the safe
 side), and what the report says. Both of the latter look at what OUT gives back, rounding included.
@@ -36,19 +37,17 @@ from ..core.files import atomic_file, existing_file, json_text, require_writable
 from ..core.images import write as write_picture
 from ..core.options import at_least, check_options, in_range
 from ..formats.gaussian_files import (
-    AXES,
-    OUR_UP,
     StoredCloud,
     as_stored,
-    drawable,
     file_size,
     read_cloud,
     require_format,
-    rotation_between,
     write_cloud,
 )
 from ..formats.spz import COLOR_REACH
-from ..gaussians.gaussians import Gaussians
+from ..gaussians.axes import AXES, VIEWER_UP, WORLD_UP, rotation_between
+from ..gaussians.gaussians import Gaussians, drawable
+from ..gaussians.sh import MAX_DEGREE
 from ..gaussians.simplify import (
     EPS2D,
     LEAST_ERROR,
@@ -226,7 +225,10 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         and os.path.samefile(args.source, args.output)
     ):
         raise UserError("OUT is IN: give it another name, so that the unpruned cloud is kept")
-    done = pruned(read(args.source, args.up), options, suffix, "--")
+    stored = read(args.source, args.up)
+    if suffix == ".ply" and Path(args.source).suffix.lower() != ".ply":
+        stored = stored.in_axes(VIEWER_UP)  # from a PLY, the axes stay as they are
+    done = pruned(stored, options, suffix, "--")
     write_cloud(args.output, done.after)
     return write_report(args.output, done, suffix, options)
 
@@ -238,15 +240,20 @@ def read(path: str, up: Optional[str] = None) -> StoredCloud:
     """The cloud in a file or checkpoint.
 
     Raises:
-        UserError: there is no file, it holds no Gaussians, or fewer than two.
+        UserError: there is no file, it holds no Gaussians, fewer than two, or harmonics that can't
+            be drawn.
     """
     file = existing_file(path, "file of Gaussians or checkpoint")
     checkpoint = file.suffix in (".ckpt", ".pt", ".pth")
     stored = (
-        StoredCloud(drawable(from_checkpoint(file)), up or OUR_UP)
+        StoredCloud(drawable(from_checkpoint(file), path), up or WORLD_UP)
         if checkpoint
         else read_cloud(path, up=up)
     )
+    if (degree := stored.gaussians.sh_degree) > MAX_DEGREE:
+        raise UserError(
+            f"{path} has spherical harmonics of degree {degree}: up to {MAX_DEGREE} can be drawn"
+        )
     if len(stored.gaussians.means) < 2:
         raise UserError(
             f"{path} holds {len(stored.gaussians.means)} Gaussians that can be drawn: there is "

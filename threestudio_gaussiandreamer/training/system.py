@@ -40,11 +40,9 @@ from ..core.distributed import average_gradients
 from ..core.errors import UserError, unknown
 from ..core.nested import adopt_nested
 from ..core.options import check_options
-from ..exporters.base import gaussian_arrays
-from ..formats.gaussian_files import OUR_UP, StoredCloud, drawable, in_axes, ply_notes, spz_note
-from ..formats.ply import write_gaussians, write_points
-from ..formats.spz import write_spz
-from ..gaussians.gaussians import Gaussians
+from ..exporters.base import read_gaussians
+from ..formats.gaussian_files import StoredCloud, write_cloud
+from ..formats.ply import write_points
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.simplify import EPS2D
 from ..gaussians.surface import Surface, write_obj
@@ -498,9 +496,8 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             "formats", ()
         )
         suffix = ".spz" if packed else ".ply"
-        done = pruned(
-            StoredCloud(drawable(gaussian_arrays(self.geometry))), options, suffix, "system.prune."
-        )
+        stored = StoredCloud(read_gaussians(self.geometry))
+        done = pruned(stored, options, suffix, "system.prune.")
         geometry = find(self.cfg.geometry_type)(self.cfg.geometry)
         geometry.set_arrays(**done.after.gaussians._asdict())
         self.export_cloud(geometry, folder, done.after.pruned_to)
@@ -525,18 +522,18 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     # -- savers that the exporters name ------------------------------------------------------------
 
-    def save_ply(self, filename: str, pruned_to: Optional[float] = None, **arrays: Any) -> str:
+    def save_ply(
+        self, filename: str, stored: StoredCloud, pruned_to: Optional[float] = None
+    ) -> str:
         path = self.get_save_path(filename)
-        write_gaussians(path, **{"comments": ply_notes(OUR_UP, pruned_to)} | arrays)
+        write_cloud(path, stored._replace(pruned_to=pruned_to), ".ply")
         return path
 
-    def save_spz(self, filename: str, pruned_to: Optional[float] = None, **arrays: Any) -> str:
+    def save_spz(
+        self, filename: str, stored: StoredCloud, pruned_to: Optional[float] = None
+    ) -> str:
         path = self.get_save_path(filename)
-        write_spz(
-            path,
-            **in_axes(StoredCloud(Gaussians(**arrays)), "y")._asdict(),
-            comment=spz_note(pruned_to),
-        )
+        write_cloud(path, stored._replace(pruned_to=pruned_to), ".spz")
         return path
 
     def save_points(self, filename: str, cloud: PointCloud) -> str:

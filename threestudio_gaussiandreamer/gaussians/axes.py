@@ -1,0 +1,91 @@
+"""Coordinate axes of Gaussians, named by the axis that points up, and rotations between them.
+
+=======  =====  =======  ==========================================================================
+up       right  front    used by
+=======  =====  =======  ==========================================================================
+``z``    +y     +x       this package's world
+``y``    +x     +z       SPZ, glTF, OBJ
+``-y``   +x     -z       PLY files of 3D Gaussian splatting and their viewers: the axes of a camera
+                         (x right, y down, z forward) that looks at the front
+=======  =====  =======  ==========================================================================
+
+"Right" is the right-hand side of a viewer who looks at the front."""
+
+from functools import cache
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from ..core.errors import UserError
+from .gaussians import Gaussians
+from .sh import MAX_DEGREE, sh_basis
+
+WORLD_UP = "z"
+VIEWER_UP = "-y"
+AXES = {
+    "y": np.eye(3),
+    "-y": np.diag([1.0, -1.0, -1.0]),
+    "z": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+}
+"""By the axis that is up: the rotation to the axes right, up, front."""
+FRONTS = {"y": "+z", "-y": "-z", "z": "+x"}
+
+
+def rotation_between(up: str, other: str) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation of coordinates with the axis ``up`` up to those with ``other`` up."""
+    return AXES[other].T @ AXES[up]
+
+
+def rotate(gaussians: Gaussians, rotation: Float[np.ndarray, "3 3"]) -> Gaussians:
+    """Rotate Gaussians (arrays) about the origin: positions, quaternions and harmonics.
+
+    Raises:
+        UserError: spherical harmonics above degree 3.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):  # of rows that can't be drawn
+        return gaussians._replace(
+            means=(gaussians.means @ rotation.T).astype(np.float32),
+            quats=_rotate_quats(gaussians.quats, rotation),
+            sh=_rotate_sh(gaussians.sh, rotation),
+        )
+
+
+def _rotate_quats(
+    quats: Float[np.ndarray, "N 4"], rotation: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "N 4"]:
+    """Multiply quaternions (wxyz) from the left by that of the rotation."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return (quats @ product.T).astype(np.float32)
+
+
+def _rotate_sh(
+    sh: Float[np.ndarray, "N K 3"], rotation: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "N K 3"]:
+    """Return harmonics that have in direction R d the values that these have in direction d."""
+    degree = round(sh.shape[1] ** 0.5) - 1
+    if degree == 0:
+        return sh
+    if degree > MAX_DEGREE:
+        raise UserError(
+            f"spherical harmonics of degree {degree} can't be converted to other axes: degree "
+            f"{MAX_DEGREE} is the highest"
+        )
+    matrix = _sh_rotation(tuple(map(tuple, rotation.tolist())), degree)
+    return np.einsum("lk,nkc->nlc", matrix, sh).astype(np.float32)
+
+
+@cache
+def _sh_rotation(rotation: tuple[tuple[float, ...], ...], degree: int) -> Float[np.ndarray, "K K"]:
+    """Fit the matrix of coefficients at random directions; exact, since the harmonics of each
+    degree rotate among themselves.
+    """
+    directions = np.random.default_rng(0).normal(size=(64, 3))
+    rotated, original = (
+        torch.stack(sh_basis(torch.from_numpy(dirs), degree), 1).numpy()
+        for dirs in (directions @ np.array(rotation).T, directions)
+    )
+    return np.linalg.pinv(rotated) @ original
