@@ -524,7 +524,7 @@ def test_a_report_that_cannot_be_written_leaves_the_earlier_one(source, tmp_path
 def test_scales_too_large_to_render_are_named(tmp_path, capsys, log_scale):
     cloud = ball()
     cloud.log_scales[:] = log_scale
-    write_gaussians(tmp_path / "in.ply", **arrays_of(cloud))
+    write_raw_gaussians(tmp_path / "in.ply", cloud.arrays())
     assert prune.main([str(tmp_path / "in.ply"), str(tmp_path / "o.ply"), "--count", "9"]) == 2
     found = capsys.readouterr().err
     assert "the largest scale is" in found and "near" not in found
