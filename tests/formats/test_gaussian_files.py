@@ -95,6 +95,6 @@ def test_mistakes(tmp_path):
 
 def test_harmonics_above_degree_3_are_refused_when_read(tmp_path):
     path = str(tmp_path / "a.ply")
-    write_gaussians(path, **cloud(degree=4)._asdict())
+    write_raw_gaussians(path, cloud(degree=4))
     with pytest.raises(UserError, match="harmonics of degree 4; expected 0 to 3"):
         read_cloud(path)

@@ -10,6 +10,9 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from ..core.errors import UserError
+from .sh import MAX_DEGREE
+
 logger = logging.getLogger(__name__)
 Array = np.ndarray | Tensor
 MAX_LOG = 87.0
@@ -73,7 +76,16 @@ def usable(gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
 
 
 def drawable(gaussians: Gaussians, name: str) -> Gaussians:
-    """Leave out the Gaussians that can't be drawn, with a warning; ``name`` says where they are."""
+    """Leave out the Gaussians that can't be drawn, with a warning; ``name`` says where they are.
+
+    Raises:
+        UserError: harmonics above degree 3, which neither the rasteriser nor SPZ has.
+    """
+    if gaussians.sh_degree > MAX_DEGREE:
+        raise UserError(
+            f"{name}: the Gaussians have harmonics of degree {gaussians.sh_degree}; expected 0 to "
+            f"{MAX_DEGREE}"
+        )
     keep = usable(gaussians)
     if keep.all():
         return gaussians

@@ -47,7 +47,6 @@ from ..formats.gaussian_files import (
 from ..formats.spz import COLOR_REACH
 from ..gaussians.axes import AXES, VIEWER_UP, WORLD_UP, rotation_between
 from ..gaussians.gaussians import Gaussians, drawable
-from ..gaussians.sh import MAX_DEGREE
 from ..gaussians.simplify import (
     EPS2D,
     LEAST_ERROR,
@@ -250,10 +249,6 @@ def read(path: str, up: Optional[str] = None) -> StoredCloud:
         if checkpoint
         else read_cloud(path, up=up)
     )
-    if (degree := stored.gaussians.sh_degree) > MAX_DEGREE:
-        raise UserError(
-            f"{path} has spherical harmonics of degree {degree}: up to {MAX_DEGREE} can be drawn"
-        )
     if len(stored.gaussians.means) < 2:
         raise UserError(
             f"{path} holds {len(stored.gaussians.means)} Gaussians that can be drawn: there is "
