@@ -4,8 +4,8 @@
 option        meaning
 ============  ======================================================================================
 path          the PLY or SPZ file
-up            the file's axis that is up: ``z``, ``y``, ``-y``, or ``auto``: what the file says, else
-              -y for a PLY, as other programs write it; SPZ is always y up
+up            the file's axis that is up: ``z``, ``y``, ``-y``, or ``auto``: what the file says,
+              else -y for a PLY, as other programs write it; SPZ is always y up
 min_opacity   leave out Gaussians fainter than this, in [0, 1]
 ground, ...   see ``priors/base.py``; not with all attributes
 ============  ======================================================================================
