@@ -143,7 +143,7 @@ class Supervisor:
         chosen = re.search(r"resume=auto: going on from (.*) \(step (\d+)\)", self.said())
         if chosen:
             return int(chosen[2])
-        return 0 if "starting anew" in self.said() else before
+        return 0 if "starting from the prior" in self.said() else before
 
     def newest_step(self) -> int:
         return self.newest()[1]

@@ -538,4 +538,4 @@ def test_a_closed_pipe_is_no_traceback(monkeypatch, capsys):
     )
     monkeypatch.setattr(os, "dup2", lambda _, to: closed.append(to))
     assert experiment.main(["--config", str(DEMO), "--train"]) == 128 + signal.SIGPIPE
-    assert closed == [1] and "nobody reads this run's output any more" in capsys.readouterr().err
+    assert closed == [1] and "the reader of the output has closed it" in capsys.readouterr().err

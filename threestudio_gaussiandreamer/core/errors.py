@@ -15,9 +15,7 @@ class UserError(ValueError):
 
 
 class Terminated(SystemExit):
-    """A signal asked the process to end: unlike a ``sys.exit()`` of somebody's module this is no
-    mistake of theirs.
-    """
+    """A signal asked the process to end; a ``sys.exit()`` in an extension is a mistake instead."""
 
 
 def unknown(kind: str, name: str, choices: Iterable[str]) -> UserError:

@@ -16,11 +16,11 @@ from .errors import UserError
 
 
 def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] = ()) -> Path:
-    """``path`` as a :class:`Path` when a file is there; ``kind`` ("mesh", "PLY file") names it in
-    the message.
+    """Return ``path`` as a :class:`Path` if a file is there; ``kind`` ("mesh", "PLY file") names it
+    in the message.
 
     Args:
-        bundled: bare names of files that come along, for the message only.
+        bundled: bare names of packaged files, for the message only.
 
     Raises:
         UserError: nothing, or no file, is there; the message lists the files of that folder with
@@ -32,18 +32,15 @@ def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] =
             return path
         reason = "is a folder, not a file" if path.is_dir() else "does not exist"
         neighbours = near_names(path, bundled)
-    except (
-        OSError,
-        ValueError,
-        RuntimeError,
-    ) as error:  # a name too long, a NUL inside, a "~stranger"
+    except (OSError, ValueError, RuntimeError) as error:
+        # a name too long, a NUL inside, the home folder of an unknown user
         raise UserError(f"{kind} {str(path)!r}: not a usable file name ({error}).") from error
     raise UserError(f"{kind} {str(path)!r} {reason}{neighbours}")
 
 
 def near_names(path: Path, bundled: Collection[str] = ()) -> str:
-    """The end of a "missing" message: the files beside ``path`` with near names or of its kind, or
-    a bundled one that may be meant.
+    """Write the end of a "missing" message: the files beside ``path`` with near names or of its
+    kind, or a bundled one that may be meant.
     """
     folder = path.parent
     names = (
@@ -66,8 +63,8 @@ def near_names(path: Path, bundled: Collection[str] = ()) -> str:
 
 @contextmanager
 def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[BinaryIO]:
-    """A binary file that appears under ``path`` whole, on success, or not at all; what was there
-    stays until then.
+    """Open a binary file that appears under ``path`` whole, on success, or not at all; what was
+    there stays until then.
 
     The content goes to a temporary file beside it, which takes the name when it is whole.
 
@@ -98,7 +95,7 @@ def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bi
 
 
 def json_text(content: Any, **options: Any) -> str:
-    """``json.dumps`` with ``null`` for numbers that JSON doesn't have: NaN and the infinities."""
+    """Encode as JSON, with ``null`` for numbers that JSON doesn't have: NaN and the infinities."""
     return json.dumps(_without_infinities(content), allow_nan=False, **options)
 
 
@@ -113,7 +110,7 @@ def _without_infinities(content: Any) -> Any:
 
 
 def _shortened(name: str, size: int = 100) -> str:
-    """At most the first ``size`` bytes of a file's name, so that more can be appended to it."""
+    """Cut a file's name to at most ``size`` bytes, so that more can be appended to it."""
     return name.encode(errors="surrogateescape")[:size].decode(errors="ignore")
 
 

@@ -14,8 +14,8 @@ from ..core.streams import derive_seed
 
 
 def _threestudio_is_importable() -> bool:
-    """Whether ``import threestudio`` works; a folder of that name on the path that is no package
-    doesn't count.
+    """Tell whether ``import threestudio`` works; a folder of that name on the path that is no
+    package doesn't count.
 
     Raises:
         UserError: threestudio is there but broken: which host is meant can't be guessed.
@@ -54,16 +54,16 @@ if _threestudio_is_importable():
     NAME = "threestudio"
 
     def run_seed() -> int:
-        """The seed of this run, the same in every process of it; 0 without one."""
+        """Return the seed of this run, the same in every process of it; 0 without one."""
         # threestudio gives each process the seed of the run plus its rank
         return int(os.environ.get("PL_GLOBAL_SEED", get_rank())) - get_rank()
 
     def names() -> list[str]:
-        """All registered names, sorted."""
+        """Return all registered names, sorted."""
         return sorted(threestudio.__modules__)
 
     def find(name: str) -> type:
-        """The class registered as ``name``.
+        """Return the class registered as ``name``.
 
         Raises:
             UserError: no part has that name; the message lists the near ones.
@@ -74,8 +74,8 @@ if _threestudio_is_importable():
             raise unknown("part", name, names()) from None
 
     def register(name: str) -> Callable[[type], type]:
-        """A class decorator that enters the class under ``name``; entering the same class again is
-        harmless.
+        """Return a class decorator that enters the class under ``name``; entering the same class
+        twice is harmless.
         """
 
         def enter(cls: type) -> type:
@@ -90,8 +90,8 @@ if _threestudio_is_importable():
         return enter
 
     def register_builtin(name: str) -> Callable[[type], type]:
-        """As :func:`register` in the built-in host; nothing here, where threestudio has its own
-        part of that name.
+        """Return :func:`register`'s decorator in the built-in host, and one without effect here,
+        where threestudio has its own part of that name.
         """
         return lambda cls: cls
 
@@ -115,13 +115,13 @@ else:
     register_builtin = register
 
     def run_seed() -> int:
-        """The seed of this run, the same in every process of it; 0 without one."""
+        """Return the seed of this run, the same in every process of it; 0 without one."""
         return int(os.environ.get("PL_GLOBAL_SEED", 0))
 
 
 def item_seed() -> int:
-    """The seed of what differs between processes that train one cloud together: cameras, noise,
-    backgrounds.
+    """Return the seed of what differs between processes that train one cloud together: cameras,
+    noise, backgrounds.
     """
     return run_seed() if rank() == 0 else derive_seed(run_seed(), "rank", rank())
 

@@ -96,8 +96,8 @@ def copy_sources(source: Path, destination: Path) -> None:
 
 
 class ProgressBar(pl.callbacks.TQDMProgressBar):
-    """Lightning's bar without the version number; where nobody watches, redrawn now and then
-    instead of every step.
+    """Lightning's bar without the version number; redrawn every 100 steps where the output is no
+    terminal.
     """
 
     def __init__(self) -> None:
@@ -185,5 +185,5 @@ class LastCheckpoint(pl.callbacks.Checkpoint):
 
 
 def _any_process(trainer: Any, decision: bool) -> bool:
-    """Whether any of the processes that train together decides so."""
+    """Tell whether any of the processes that train together decides so."""
     return trainer.strategy.reduce_boolean_decision(decision, all=False)

@@ -21,8 +21,8 @@ class AtomicCheckpointIO(pl.plugins.CheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike, storage_options: Any = None
     ) -> None:
-        """Raises UserError when the disk is full or the folder can't be written; the earlier file
-        is untouched then.
+        """Save a checkpoint; raises UserError, with the earlier file untouched, when the disk is
+        full or the folder can't be written.
         """
         save_file(path, checkpoint)
         self.saved_steps[os.path.abspath(path)] = checkpoint.get("global_step", -1)
@@ -30,8 +30,8 @@ class AtomicCheckpointIO(pl.plugins.CheckpointIO):
     def load_checkpoint(
         self, path: str | os.PathLike, map_location: Any = None, weights_only: Any = True
     ) -> dict[str, Any]:
-        """Raises UserError when the file is missing, damaged or foreign. ``weights_only`` is always
-        true, whatever is asked.
+        """Load a checkpoint; raises UserError when the file is missing, damaged or foreign.
+        ``weights_only`` is always true, whatever is asked.
         """
         return load_file(path, "cpu" if map_location is None else map_location)
 
@@ -39,5 +39,5 @@ class AtomicCheckpointIO(pl.plugins.CheckpointIO):
         Path(path).unlink(missing_ok=True)
 
     def saved_step(self, path: str | os.PathLike) -> int:
-        """The step of the checkpoint that this process last wrote to ``path``; -1 for none."""
+        """Return the step that this process last wrote to ``path``; -1 for none."""
         return self.saved_steps.get(os.path.abspath(path), -1)

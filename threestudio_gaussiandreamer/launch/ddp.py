@@ -18,4 +18,4 @@ class ReplicatedStrategy(pl.strategies.DDPStrategy):
         return model
 
     def configure_ddp(self) -> None:
-        """Nothing to wrap, no hooks to register."""
+        """Do nothing: no module is wrapped, and no hooks are registered."""

@@ -36,7 +36,7 @@ NOISE = (
 
 
 def console() -> None:
-    """Entry point of the console script ``gaussiandreamer``."""
+    """Run the console script ``gaussiandreamer``."""
     sys.exit(main())
 
 
@@ -84,7 +84,7 @@ def run_until_signal(args: argparse.Namespace, argv: Sequence[str]) -> int:
 
 
 def foreign_exit(stop: SystemExit) -> UserError:
-    """The error for a ``sys.exit()`` that isn't ours; its own code may say that all went well."""
+    """Make the error for a ``sys.exit()`` that isn't ours, whose code may be that of success."""
     *_, place = traceback.extract_tb(stop.__traceback__)
     return UserError(f"{place.filename}:{place.lineno} ended the run with sys.exit({stop.code!r})")
 
@@ -104,12 +104,12 @@ def exit_code(error: Exception, verbose: bool) -> int:
         return 2
     # the reader of the output has gone, as in `| head`; without this, flushing would fail at exit
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    print(f"stopped: nobody reads this run's output any more ({error.strerror})", file=sys.stderr)
+    print(f"stopped: the reader of the output has closed it ({error.strerror})", file=sys.stderr)
     return 128 + signal.SIGPIPE
 
 
 def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
-    """The stages of one run; see the module's docstring. Returns the exit code."""
+    """Run the stages of the module's docstring; returns the exit code."""
     config_paths = [find_config(name) for name in args.config]
     choose_gpu(args.gpu)
     if args.typecheck:
@@ -138,7 +138,7 @@ def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
 
 
 def read_source(path: Path) -> bytes:
-    """The bytes of a configuration file.
+    """Read the bytes of a configuration file.
 
     Raises:
         UserError: it can't be read.

@@ -64,7 +64,7 @@ def _load(entry: Path) -> str:
 
 
 def _cause(error: BaseException, entry: Path) -> str:
-    """``file:line: what``, the line being the innermost one inside the extension."""
+    """Say ``file:line: what``, where the line is the innermost one inside the extension."""
     what = f"{type(error).__name__}: {error}"
     if isinstance(error, SyntaxError) and error.lineno:
         return f"{error.filename}:{error.lineno}: {error.msg}"

@@ -165,7 +165,7 @@ def _require_short(folder: Path, existing: Path) -> None:
 
 
 def unwritable(folder: Path, error: Exception, where: str = "") -> UserError:
-    """The error for a folder that the results can't be written to."""
+    """Make the error for a folder that the results can't be written to."""
     why = getattr(error, "strerror", None) or str(error)
     return UserError(
         f"the output folder {folder} can't be written: {why}{where}; choose another exp_root_dir"

@@ -51,7 +51,7 @@ def tolerant_output() -> Iterator[None]:
 
 
 def _tolerant(stream: Any) -> Any:
-    """The same stream over a :class:`TolerantFile`; one that is no open file stays as it is."""
+    """Open a stream's file as a :class:`TolerantFile`; a stream of another kind is returned."""
     raw = getattr(getattr(stream, "buffer", None), "raw", None)
     if not isinstance(raw, io.FileIO):
         return stream

@@ -97,7 +97,7 @@ class Run:
         return 0
 
     def start(self) -> None:
-        """Everything before the first long work: checks, the folder, then the parts."""
+        """Do everything before the first long work: checks, the folder, then the parts."""
         checkpoint = self.read_resume()
         require_writable(self.folder)
         self.claim_folder()
@@ -113,8 +113,8 @@ class Run:
         self.trainer = self.build_trainer()
 
     def read_resume(self) -> Optional[tuple[int, int]]:
-        """The epoch and step of the checkpoint to resume from, which is read whole here so that
-        damage shows early.
+        """Return the epoch and step of the checkpoint to resume from, which is read whole here so
+        that damage shows early.
         """
         if self.cfg.resume is None:
             if self.args.stage != "train":
@@ -163,7 +163,7 @@ class Run:
         self.trainer.predict(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
 
     def summarize(self) -> None:
-        """What the system has to say about where its results are."""
+        """Print what the system says about where its results are."""
         summary = self.system.summary() if hasattr(self.system, "summary") else None
         if summary and self.trainer.is_global_zero:
             print(summary, flush=True)
@@ -171,7 +171,7 @@ class Run:
     # -- the trainer -------------------------------------------------------------------------------
 
     def build_trainer(self) -> Any:
-        """Lightning's Trainer on the chosen device."""
+        """Build Lightning's Trainer on the chosen device."""
         options = {
             "enable_model_summary": False,
             "enable_progress_bar": True,
@@ -247,7 +247,7 @@ class Run:
 
 @contextlib.contextmanager
 def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
-    """Lightning's ways of ending, translated.
+    """Translate Lightning's ways of ending.
 
     Raises:
         UserError: the checkpoint's parameters or optimiser aren't those of this configuration, or
@@ -278,8 +278,8 @@ def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def write_errors(folder: Path) -> Iterator[None]:
-    """What the system says while results are written below ``folder``, as a message, also where a
-    logger's thread writes.
+    """Turn the system's errors while results are written below ``folder`` into one message, also
+    those of a logger's thread.
 
     Raises:
         UserError: the disk is full, or something else is where a file or folder is to be made.
@@ -292,7 +292,7 @@ def write_errors(folder: Path) -> Iterator[None]:
         )
 
     def in_a_thread(failure: Any) -> None:
-        # the logger raises it anew at its next line
+        # the logger raises it again at its next line
         warn(said(failure.exc_value)) if _is_write_error(failure.exc_value) else earlier(failure)
 
     earlier, threading.excepthook = threading.excepthook, in_a_thread
@@ -311,13 +311,13 @@ def _is_write_error(error: Optional[BaseException]) -> bool:
 
 
 def _raised_by_lightning(error: Exception) -> bool:
-    """Whether Lightning itself refused, as against something that it called."""
+    """Tell whether Lightning itself raised an error, rather than something that it called."""
     *_, (frame, _) = traceback.walk_tb(error.__traceback__)
     return frame.f_globals.get("__name__", "").startswith(pl.__name__)
 
 
 def is_mismatch(error: Exception) -> bool:
-    """Whether this is how torch and Lightning say that a state doesn't fit."""
+    """Tell whether this is how torch and Lightning say that a state doesn't fit."""
     said = str(error)
     return any(
         part in said

@@ -56,7 +56,7 @@ def renumber(cfg: Any, count: int) -> None:
 
 
 def _home_expanded(path: str) -> str:
-    """``path`` with a leading ``~`` or ``~user`` replaced by that home folder."""
+    """Replace a leading ``~`` or ``~user`` by that home folder."""
     expanded = os.path.expanduser(path)
     if expanded.startswith("~"):
         raise UserError(
@@ -83,8 +83,8 @@ def _require_folder_name(tag: str, timestamp: str) -> None:
 
 
 def safe_name(text: str) -> str:
-    """``text`` as one folder name: itself if it is harmless, else a slug of at most 64 bytes and a
-    hash of the text.
+    """Turn ``text`` into one folder name: itself if it is harmless, else a slug of at most 64 bytes
+    and a hash of the text.
 
     Harmless means letters, digits and ``-_.,+=()'!`` or inner spaces, no leading dot or hyphen, and
     no device of Windows."""
@@ -104,8 +104,8 @@ def _set_trial(cfg: Any, trial_name: str) -> None:
 
 
 def _resume_newest(cfg: Any, tag: str) -> None:
-    """``resume=auto``: go on with this run if it was started before, else with the newest of its
-    tag, else start.
+    """Resolve ``resume=auto``: go on with this run if it was started before, else with the newest
+    of its tag, else start.
 
     In its folder it is the readable checkpoint with most steps: where the last one is damaged, the
       one before it.
@@ -123,5 +123,5 @@ def _resume_newest(cfg: Any, tag: str) -> None:
             return
     info(
         f"resume=auto: no checkpoint of {os.path.join(cfg.exp_dir, tag)} to go on from; "
-        "starting anew"
+        "starting from the prior"
     )

@@ -13,7 +13,7 @@ Handler = Callable[[int, Any], Any]
 
 
 def stop_signals() -> list[int]:
-    """The signals that ask a run to stop. SIGHUP is left alone where it is ignored, as under
+    """List the signals that ask a run to stop. SIGHUP is left out where it is ignored, as under
     ``nohup``.
     """
     signals = [signal.SIGINT, signal.SIGTERM]

@@ -65,7 +65,7 @@ def find_model(
     revision: Optional[str] = None,
     download: bool = True,
 ) -> Optional[Path]:
-    """:func:`locate` for a model in diffusers' format that has all of ``components``.
+    """Locate a model in diffusers' format that has all of ``components``; see :func:`locate`.
 
     Args:
         half: prefer half-precision files where there are both.
@@ -85,8 +85,8 @@ def find_model(
 
 
 def locate(source: Source, *, download: bool = True) -> Optional[Path]:
-    """The folder that holds the needed files of a model; without ``download`` None when they are on
-    the hub.
+    """Return the folder that holds the needed files of a model; without ``download`` None when they
+    are on the hub.
 
     Raises:
         UserError: no such model, files are missing, gated, offline, ...; says what to do.
@@ -108,7 +108,7 @@ def locate(source: Source, *, download: bool = True) -> Optional[Path]:
 
 
 def is_hub_id(name: str) -> bool:
-    """Whether ``name`` reads like "owner/model"."""
+    """Tell whether ``name`` reads like "owner/model"."""
     return (
         re.fullmatch(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", name) is not None
         and ".." not in name
@@ -136,7 +136,7 @@ def _checked(folder: Path, source: Source) -> Path:
 
 
 def _is_complete(folder: Path, source: Source) -> bool:
-    """Whether the cache has all; what is missing may be fetched, so here it is no error."""
+    """Tell whether the cache has all files; missing ones may be fetched, so here it is no error."""
     try:
         source.picks(files_below(folder))
     except UserError:
@@ -167,8 +167,8 @@ def _near_folders(folder: Path) -> str:
 
 
 def cached_snapshot(source: Source) -> Optional[Path]:
-    """The folder of the hub's cache that holds a model's newest downloaded version, complete or
-    not; asks no network.
+    """Return the folder of the hub's cache that holds a model's newest downloaded version, complete
+    or not; asks no network.
     """
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HFValidationError
@@ -190,7 +190,7 @@ def cached_snapshot(source: Source) -> Optional[Path]:
 
 
 def _offered(source: Source) -> dict[str, int]:
-    """The needed files of a model on the hub, and their bytes."""
+    """Ask the hub for the needed files of a model, and their bytes."""
     from huggingface_hub import HfApi
 
     if offline():
@@ -215,8 +215,8 @@ def _offered(source: Source) -> dict[str, int]:
 
 
 def _in_time(ask: Callable[[], Any]) -> Any:
-    """``ask()``, left behind in its thread after ``TIMEOUT``: looking up an address knows no
-    timeout and may take a minute.
+    """Call ``ask()``, and leave it behind in its thread after ``TIMEOUT``: looking up an address
+    knows no timeout and may take a minute.
 
     Raises:
         TimeoutError: there is no answer yet.
@@ -258,7 +258,7 @@ def _endpoint() -> Optional[str]:
 
 
 def offline() -> bool:
-    """Whether the environment forbids asking the hub."""
+    """Tell whether the environment forbids asking the hub."""
     from huggingface_hub import constants
 
     return constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").upper() in (
@@ -270,7 +270,7 @@ def offline() -> bool:
 
 
 def explain(source: Source, error: Exception) -> str:
-    """What went wrong at the hub, and what to do about it."""
+    """Say what went wrong at the hub, and what to do about it."""
     from huggingface_hub import errors
 
     if isinstance(error, errors.GatedRepoError):

@@ -13,14 +13,14 @@ from ..typed_config import parse_structured
 
 
 def get_device() -> torch.device:
-    """Where parts are built: this process's GPU, or the CPU when none is visible."""
+    """Return where parts are built: this process's GPU, or the CPU when none is visible."""
     if not torch.cuda.is_available():
         return torch.device("cpu")
     return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
 
 
 class Updateable:
-    """Something that changes with the step: it and all its public attributes are told before and
+    """Something that changes with the step: it and all its public attributes are updated before and
     after each batch.
     """
 
@@ -35,12 +35,12 @@ class Updateable:
         self.update_step_end(epoch, global_step)
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
-        """Called before each batch; must be idempotent, since a part can be reached by more than
-        one way.
+        """Prepare for the next batch; must be idempotent, since a part may be an attribute of
+        several others.
         """
 
     def update_step_end(self, epoch: int, global_step: int) -> None:
-        """Called after each batch."""
+        """Do what is due after a batch."""
 
     def _updateables(self) -> list["Updateable"]:
         attributes = {**vars(self), **getattr(self, "_modules", {})}
@@ -52,13 +52,13 @@ class Updateable:
 
 
 def update_if_possible(part: Any, epoch: int, global_step: int) -> None:
-    """``part.do_update_step`` when it has one."""
+    """Call ``part.do_update_step`` if it has one."""
     if isinstance(part, Updateable):
         part.do_update_step(epoch, global_step)
 
 
 def update_end_if_possible(part: Any, epoch: int, global_step: int) -> None:
-    """``part.do_update_step_end`` when it has one."""
+    """Call ``part.do_update_step_end`` if it has one."""
     if isinstance(part, Updateable):
         part.do_update_step_end(epoch, global_step)
 

@@ -23,7 +23,7 @@ class BaseGeometry(BaseModule):
 
     @staticmethod
     def create_from(other: "BaseGeometry", cfg: Any = None, **kwargs: Any) -> "BaseGeometry":
-        """A geometry made from another one; those that can't be raise a TypeError."""
+        """Make a geometry from another one; raises TypeError if that isn't possible."""
         raise TypeError(f"a {type(other).__name__} can't be converted to this geometry")
 
     def export(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
@@ -70,7 +70,7 @@ class NoMaterial(BaseMaterial):
 
 
 class BaseBackground(BaseModule):
-    """Colour behind the Gaussians: ray directions (B,H,W,3) to colours (B,H,W,C) in [0,1]."""
+    """Colour of the background: ray directions (B,H,W,3) to colours (B,H,W,C) in [0,1]."""
 
     @dataclass
     class Config(BaseModule.Config):

@@ -8,8 +8,8 @@ _parts: dict[str, type] = {}
 
 
 def register(name: str) -> Callable[[type], type]:
-    """A class decorator that enters the class under ``name``; entering the same class again is
-    harmless.
+    """Return a class decorator that enters the class under ``name``; entering the same class twice
+    is harmless.
 
     Raises:
         UserError: another class has that name already.
@@ -29,8 +29,8 @@ def register(name: str) -> Callable[[type], type]:
 
 
 def find(name: str) -> type:
-    """The class registered as ``name``; ``"main:mixin1,mixin2"`` makes a class of ``main`` with the
-    mixins before it.
+    """Return the class registered as ``name``; ``"main:mixin1,mixin2"`` makes a class of ``main``
+    with the mixins before it.
 
     Raises:
         UserError: no part has that name; the message lists the near ones.
@@ -43,7 +43,7 @@ def find(name: str) -> type:
 
 
 def names() -> list[str]:
-    """All registered names, sorted."""
+    """Return all registered names, sorted."""
     return sorted(_parts)
 
 

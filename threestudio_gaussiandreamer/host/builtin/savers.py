@@ -51,7 +51,7 @@ class SaverMixin:
         return [self._wandb_logger] if self._wandb_logger else []
 
     def convert_data(self, data: Any) -> Any:
-        """Tensors to numpy arrays, also inside lists and dicts."""
+        """Convert tensors to numpy arrays, also inside lists and dicts."""
         if isinstance(data, Tensor):
             return data.detach().cpu().numpy()
         if isinstance(data, list):
@@ -73,8 +73,8 @@ class SaverMixin:
         name: Optional[str] = None,
         step: Optional[int] = None,
     ) -> str:
-        """(H,W,C) or (C,H,W) values in ``data_range``; more than three channels are laid side by
-        side, three by three.
+        """Save (H,W,C) or (C,H,W) values in ``data_range``; more than three channels are laid side
+        by side, three by three.
         """
         picture = pictures.rgb(
             self.convert_data(img), data_format=data_format, data_range=data_range
@@ -90,7 +90,7 @@ class SaverMixin:
         name: Optional[str] = None,
         step: Optional[int] = None,
     ) -> str:
-        """(H,W) values; without ``data_range`` from their smallest to their largest. ``cmap``:
+        """Save (H,W) values; without ``data_range`` from their smallest to their largest. ``cmap``:
         None, "jet", "magma".
         """
         picture = pictures.grayscale(self.convert_data(img), data_range=data_range, cmap=cmap)
@@ -105,8 +105,8 @@ class SaverMixin:
         step: Optional[int] = None,
         texts: Optional[list] = None,
     ) -> str:
-        """A row of ``{"type": "rgb"|"grayscale", "img": ..., "kwargs": {...}}``, or a list of rows;
-        resized to ``align``.
+        """Save a row of ``{"type": "rgb"|"grayscale", "img": ..., "kwargs": {...}}``, or a list of
+        rows; resized to ``align``.
         """
         picture = pictures.grid(self._converted(imgs), align=align)
         if texts:
@@ -114,7 +114,7 @@ class SaverMixin:
         return self._save_picture(filename, picture, name, step)
 
     def save_image(self, filename: str, img: Any) -> str:
-        """An 8 bit or 16 bit picture as it is: (H,W), (H,W,3) or (H,W,4)."""
+        """Save an 8 bit or 16 bit picture as it is: (H,W), (H,W,3) or (H,W,4)."""
         return self._save_picture(filename, self.convert_data(img), None, None)
 
     def save_img_sequence(
@@ -127,8 +127,8 @@ class SaverMixin:
         name: Optional[str] = None,
         step: Optional[int] = None,
     ) -> str:
-        """The pictures in ``img_dir`` (below the save folder) whose name matches, by the number in
-        the first group, as a video.
+        """Save the pictures in ``img_dir`` (below the save folder) whose name matches as a video,
+        in the order of the number in the first group.
         """
         if save_format not in ("mp4", "gif"):
             raise UserError(f"unknown video format {save_format!r}: expected 'mp4' or 'gif'")
@@ -141,7 +141,7 @@ class SaverMixin:
         return path
 
     def save_data(self, filename: str, data: Any) -> str:
-        """A dict of arrays as npz, anything else as npy."""
+        """Save a dict of arrays as npz, anything else as npy."""
         data = self.convert_data(data)
         extension = ".npz" if isinstance(data, dict) else ".npy"
         path = self.get_save_path(
@@ -158,7 +158,7 @@ class SaverMixin:
     def save_mesh(
         self, filename: str, v_pos: Any, t_pos_idx: Any, v_tex: Any = None, t_tex_idx: Any = None
     ) -> str:
-        """Vertices (V,3) and triangles (F,3) in the format of the file name's extension."""
+        """Save vertices (V,3) and triangles (F,3) in the format of the file name's extension."""
         import trimesh
 
         path = self.get_save_path(filename)
@@ -170,8 +170,8 @@ class SaverMixin:
     def save_obj(
         self, filename: str, mesh: Any, save_vertex_color: bool = False, **unused: Any
     ) -> list[str]:
-        """``mesh.v_pos`` (V,3), ``mesh.t_pos_idx`` (F,3) and, if asked, ``mesh.v_rgb`` (V,3) as a
-        Wavefront OBJ without material.
+        """Save ``mesh.v_pos`` (V,3), ``mesh.t_pos_idx`` (F,3) and, if asked, ``mesh.v_rgb`` (V,3)
+        as a Wavefront OBJ without material.
         """
         path = self.get_save_path(filename if filename.endswith(".obj") else f"{filename}.obj")
         vertices, faces = self.convert_data(mesh.v_pos), self.convert_data(mesh.t_pos_idx)

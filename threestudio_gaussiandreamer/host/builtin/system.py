@@ -19,8 +19,8 @@ from .savers import SaverMixin
 
 
 class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
-    """Parses its configuration, calls ``configure``, tells dataset and parts the step before and
-    after every batch.
+    """Parses its configuration, calls ``configure``, and updates dataset and parts before and after
+    every batch.
 
     Its data loaders must have a ``dataset``.
     """
@@ -54,19 +54,19 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         """Build the parts."""
 
     def post_configure(self) -> None:
-        """Called after ``weights`` are loaded."""
+        """Do what is due after ``weights`` are loaded."""
 
     def load_weights(self, weights: str, ignore_modules: Optional[List[str]] = None) -> None:
-        """Take over the parameters of a checkpoint, except those of ``ignore_modules``; names that
-        don't exist here are skipped.
+        """Load the parameters of a checkpoint, except those of ``ignore_modules``; names that don't
+        exist here are skipped.
         """
         state_dict, epoch, global_step = load_module_weights(weights, ignore_modules=ignore_modules)
         self.load_state_dict(state_dict, strict=False)
         self.do_update_step(epoch, global_step, on_load_weights=True)
 
     def set_resume_status(self, current_epoch: int, global_step: int) -> None:
-        """The epoch and step of the checkpoint that is validated, tested or exported: Lightning's
-        own stay 0 there.
+        """Set the epoch and step of the checkpoint that is validated, tested or exported:
+        Lightning's own stay 0 there.
         """
         self._resumed_eval = current_epoch, global_step
 
@@ -84,12 +84,12 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         return self._resumed_eval[1] if self._resumed_eval else self.global_step
 
     def C(self, value: Any) -> float:
-        """The value of a schedule now."""
+        """Return the value of a schedule now."""
         return C(value, self.true_current_epoch, self.true_global_step)
 
     def configure_optimizers(self) -> Any:
-        """``optimizer: {name, args, params}`` from ``torch.optim``; ``params`` names attributes,
-        each with its own options.
+        """Build ``optimizer: {name, args, params}`` from ``torch.optim``; ``params`` names
+        attributes, each with its own options.
         """
         return optimizer_from(self.cfg.optimizer, self)
 
@@ -106,7 +106,7 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         raise NotImplementedError(f"{type(self).__name__}.predict_step")
 
     def on_validation_epoch_end(self) -> None:
-        """Nothing to gather."""
+        """Do nothing: there are no results to gather."""
 
     def preprocess_data(self, batch: dict, stage: str) -> None:
         """Change a batch in place before it is used; ``stage`` is "train", "validation", "test" or
@@ -240,8 +240,8 @@ class BaseLift3DSystem(BaseSystem):
 
 
 def optimizer_from(config: Any, module: torch.nn.Module) -> torch.optim.Optimizer:
-    """``{name, args, params}``: an optimiser of ``torch.optim`` over all parameters, or over the
-    named attributes with own options.
+    """Build the optimiser ``{name, args, params}`` of ``torch.optim`` over all parameters, or over
+    the named attributes with their own options.
 
     Raises:
         UserError: no such optimiser, or no such attribute.
