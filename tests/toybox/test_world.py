@@ -1,0 +1,239 @@
+"""The toybox's objects, prompts, pictures and tokenizer, as functions of (seed, index)."""
+
+import numpy as np
+import pytest
+import torch
+
+from threestudio_gaussiandreamer.meshes.load import AXES
+from threestudio_gaussiandreamer.prompts.view_prompts import view_directions
+from threestudio_gaussiandreamer.toybox import views, words, world
+from threestudio_gaussiandreamer.toybox.kinds import ACCESSORIES, KINDS, ORIENTED
+from threestudio_gaussiandreamer.toybox.tokenizer import LENGTH, write_tokenizer
+
+MANY = 400
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    return [world.draw_attributes(0, index) for index in range(MANY)]
+
+
+def mesh_of(attributes, seed=0):
+    return world.object_mesh(attributes, np.random.default_rng(seed))
+
+
+def test_the_world_is_as_large_as_it_should_be(drawn):
+    assert len(KINDS) >= 16 and len(ORIENTED) >= 8
+    assert len(world.COLORS) == 12 and len(world.PATTERNS) == 5
+    assert {a.kind for a in drawn} == set(KINDS) == set(words.NOUNS) == set(words.PARTS)
+    assert {a.pattern for a in drawn} == set(world.PATTERNS)
+    assert {a.accessory for a in drawn} == {None, *ACCESSORIES}
+    assert any(a.part for a in drawn)
+
+
+def test_an_object_is_a_function_of_seed_and_index(drawn):
+    assert drawn[7] == world.draw_attributes(0, 7)
+    assert [world.draw_attributes(1, index) for index in range(20)] != drawn[:20]
+
+
+def test_colors_of_one_object_differ(drawn):
+    for a in drawn:
+        named = [c for c in (a.color, a.second, a.part, a.accessory_color) if c]
+        assert len(set(named)) == len(named)
+        assert (a.second is None) == (a.pattern == "plain")
+
+
+def test_withheld_combinations_are_many_and_never_drawn(drawn):
+    combinations = world.withheld_combinations()
+    assert len(combinations) >= 100 and len(set(combinations)) == len(combinations)
+    assert not any(world.withheld(a) for a in drawn)
+    assert all(world.withheld(world.draw_attributes(0, i, held_out=True)) for i in range(20))
+    # every kind, colour and pattern is learnt from other objects
+    assert not any(world.withheld(world.Attributes(k, c)) for k in KINDS for c in world.COLORS)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_has_a_mesh_inside_the_sphere(kind):
+    for accessory in (None, *ACCESSORIES):
+        color = "red" if accessory else None
+        mesh = mesh_of(world.Attributes(kind, "blue", "dotted", "white", None, accessory, color))
+        distance = np.linalg.norm(mesh.vertices, axis=1)
+        assert distance.max() == pytest.approx(world.RADIUS)
+        assert np.isfinite(mesh.uv).all() and (0 <= mesh.uv).all() and (mesh.uv <= 1).all()
+        assert ((0.69 < mesh.vertex_colors) & (mesh.vertex_colors <= 1)).all()
+
+
+@pytest.mark.parametrize("kind", ["fox", "house", "robot"])
+def test_an_accessory_shows_in_its_color(kind):
+    for name in ACCESSORIES:
+        attributes = world.Attributes(kind, "blue", accessory=name, accessory_color="lime")
+        share = share_of(attributes, "lime")
+        assert share > 0.01, name
+        assert share_of(attributes._replace(accessory=None, accessory_color=None), "lime") == 0
+
+
+@pytest.mark.parametrize("pattern", world.PATTERNS[1:])
+def test_a_pattern_shows_both_colors(pattern):
+    attributes = world.Attributes("mug", "blue", pattern, "yellow")
+    for color in ("blue", "yellow"):
+        assert share_of(attributes, color) > 0.1
+
+
+def test_two_tone_has_the_second_color_above():
+    points = points_of(world.Attributes("penguin", "blue", "two-tone", "yellow"))
+    heights = {
+        name: points[hue_matches(points[:, 3:], name), 2].mean() for name in ("blue", "yellow")
+    }
+    assert heights["yellow"] > heights["blue"] + 0.2
+
+
+def test_the_front_is_plus_x():
+    points = points_of(world.Attributes("duck", "blue"))
+    beak = points[hue_matches(points[:, 3:], "orange")]
+    top = beak[beak[:, 2] > 0]  # without the feet
+    assert (top[:, :3] @ AXES["+x"]).min() > 0.1
+
+
+def points_of(attributes):
+    rng = np.random.default_rng(0)
+    return views.surface_points(world.object_mesh(attributes, rng), rng).astype(np.float32)
+
+
+def hue_matches(colors, name):
+    """Rows whose direction of colour is that of a named colour, whatever the light."""
+    unit = colors / np.linalg.norm(colors, axis=1, keepdims=True).clip(1e-6)
+    wanted = np.array(world.COLORS[name])
+    return unit @ (wanted / np.linalg.norm(wanted)) > 0.995
+
+
+def share_of(attributes, color):
+    """Of the points on its surface."""
+    return hue_matches(points_of(attributes)[:, 3:], color).mean()
+
+
+# Prompts ------------------------------------------------------------------------------------
+
+
+def test_prompts_name_what_there_is(drawn):
+    rng = np.random.default_rng(0)
+    for a in drawn:
+        text = words.describe(a, rng)
+        assert any(noun in text for noun in words.NOUNS[a.kind])
+        for color in (a.color, a.second, a.part, a.accessory_color):
+            assert color is None or any(
+                word in text for word in (color, *words.COLOR_WORDS.get(color, ()))
+            )
+        if a.accessory:
+            assert any(word in text for word in words.ACCESSORY_WORDS[a.accessory])
+        assert " a o" not in f" {text}" and " a e" not in f" {text}"
+
+
+def test_one_prompt_in_ten_is_empty_and_most_name_the_direction(drawn):
+    rng = np.random.default_rng(0)
+    texts = [words.prompt_of(a, 10, 5 * i, rng) for i, a in enumerate(drawn) for _ in range(5)]
+    assert np.mean([text == "" for text in texts]) == pytest.approx(0.1, abs=0.02)
+    assert np.mean(["view" in text for text in texts]) == pytest.approx(0.7, abs=0.04)
+
+
+@pytest.mark.parametrize("elevation", [-10.0, 30.0, 59.9, 60.1, 80.0])
+def test_directions_are_those_of_the_prompt_processors(elevation):
+    directions = view_directions(45.0, 45.0, 60.0)
+    for azimuth in np.arange(-180.0, 180.0, 7.5):
+        angles = (torch.tensor([elevation]), torch.tensor([azimuth]), torch.ones(1))
+        expected = [d for d in directions if bool(d.condition(*angles))][-1]
+        assert words.direction(elevation, azimuth) == expected.name
+        assert expected.prompt("a fox") == f"a fox, {expected.name} view"
+
+
+# Tokenizer ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tokenizer(tmp_path_factory):
+    from transformers import CLIPTokenizer
+
+    folder = tmp_path_factory.mktemp("tokenizer")
+    write_tokenizer(folder, words.vocabulary())
+    return CLIPTokenizer.from_pretrained(str(folder))
+
+
+def test_every_word_is_one_token(tokenizer, drawn):
+    for word in words.vocabulary():
+        assert len(tokenizer(word).input_ids) == 3, word
+    rng = np.random.default_rng(0)
+    texts = [words.prompt_of(a, 10, 90, rng) for a in drawn]
+    assert max(len(tokenizer(text).input_ids) for text in texts) <= LENGTH
+
+
+@pytest.mark.parametrize("text", ["", "a wombat", "Ein Fuchs, über 火 🦊", "x" * 4096, "\x00\t\n"])
+def test_any_text_can_be_tokenized(tokenizer, text):
+    ids = tokenizer(text, padding="max_length", truncation=True, max_length=LENGTH).input_ids
+    assert len(ids) == LENGTH and max(ids) < len(tokenizer)
+    assert ids[0] == len(tokenizer) - 2 and len(tokenizer) - 1 in ids
+
+
+# Pictures -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory):
+    return views.Shards(tmp_path_factory.mktemp("shards"), 0, objects=6, views=4)
+
+
+def test_a_shard_is_a_function_of_seed_and_index(shards):
+    shard, again = shards.get(0), shards.make(0)
+    for first, second in zip(shard, again, strict=True):
+        assert np.array_equal(first, second)
+    assert not np.array_equal(shard.rgba, shards.make(1).rgba)
+    assert [path.name for path in shards.folder.iterdir()] == ["train-0-6x4-00000.npz"]
+
+
+def test_a_shard_has_labels_of_its_objects(shards):
+    shard = shards.get(0)
+    for row in range(24):
+        attributes = views.attributes_of(shard.labels[row])
+        assert attributes == world.draw_attributes(0, row // 4)
+        assert np.array_equal(shard.labels[row], views.label_row(attributes, shard.azimuth[row]))
+
+
+def test_quadrants_are_centred_on_front_left_back_and_right():
+    attributes = world.Attributes("fox", "red")
+    names = views.LABELS["quadrant"]
+    for azimuth, name in ((0, "front"), (44, "front"), (46, "left"), (180, "back"), (-90, "right")):
+        assert names[views.label_row(attributes, azimuth)[-1]] == name
+
+
+def test_objects_fill_the_picture_and_are_not_cut(shards):
+    alpha = shards.get(0).rgba[..., 3]
+    for picture in alpha:
+        assert not picture[[0, -1]].any() and not picture[:, [0, -1]].any()
+    extents = [max(np.ptp(np.nonzero(picture)[axis]) for axis in (0, 1)) for picture in alpha]
+    assert np.median(extents) > 0.6 * views.SIZE
+
+
+def test_the_size_in_the_picture_varies_by_at_most_fifteen_percent():
+    near, far = views.DISTANCE
+    assert far / near <= 1.15
+
+
+def test_backgrounds_are_fixed_but_for_the_asked_share(shards):
+    rgba = shards.get(0).rgba
+    fixed = views.with_backgrounds(rgba, np.random.default_rng(0), random_share=0)
+    assert torch.equal(fixed[:, :, 0, 0], torch.tensor(views.BACKGROUND).expand(24, 3))
+    random = views.with_backgrounds(rgba, np.random.default_rng(0), random_share=1)
+    assert (random[:, :, 0, 0] - fixed[:, :, 0, 0]).abs().amax(dim=1).min() > 0
+    inside = rgba[0, :, :, 3] == 255
+    colors = rgba[0, :, :, :3][inside] / np.float32(255)
+    assert np.allclose(random[0].movedim(0, -1).numpy()[inside], colors, atol=1e-6)
+
+
+def test_batches_resume_anywhere(shards):
+    whole = views.row_batches(shards, 0, "x", 5, 2, 0)
+    first = [next(whole) for _ in range(9)]
+    later = views.row_batches(shards, 0, "x", 5, 2, 6)
+    for index, rows in first[6:]:
+        again_index, again_rows = next(later)
+        assert index == again_index and np.array_equal(rows, again_rows)
+    # 24 pictures are four batches of 5: the same shard, no picture twice
+    assert [index for index, _ in first] == [0] * 4 + [1] * 4 + [0]
+    assert len(set(np.concatenate([rows for _, rows in first[:4]]))) == 20

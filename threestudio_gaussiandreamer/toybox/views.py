@@ -1,0 +1,236 @@
+"""Pictures of the toybox's objects, in shards that are functions of (seed, shard) and kept on the
+disk.
+
+A shard holds some objects, several views of each as premultiplied RGBA bytes, and points on each
+surface. The background is chosen when a shard is used, so that one set of pictures serves models
+that want different ones.
+"""
+
+import math
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+
+from ..cameras import Orbit, orbit_c2w
+from ..core.files import atomic_file
+from ..core.streams import numpy_generator
+from ..meshes.load import Mesh, sample_surface, surface_colors
+from ..meshes.raycast import MeshCaster
+from .kinds import ACCESSORIES, KINDS
+from .world import COLORS, PATTERNS, Attributes, draw_attributes, object_mesh
+
+SIZE = 128
+"""Height and width of the pictures, pixels."""
+FOVY_DEG = 45.0
+DISTANCE = (2.1, 2.4)
+"""Nearest and farthest camera: the size in the picture varies by 14 %, and the whole sphere around
+an object is seen.
+"""
+ELEVATION, OVERHEAD_ELEVATION, OVERHEAD_SHARE = (-10.0, 60.0), (60.0, 80.0), 0.06
+"""Degrees; the paper's range, and a few views from above, so that "overhead view" has a meaning."""
+BACKGROUND = (0.5, 0.5, 0.5)
+"""Behind nearly all pictures; no object has this colour."""
+OBJECTS, VIEWS, POINTS = 256, 4, 1024
+"""Of one shard: objects, views of each, and points on each surface."""
+HELD_OUT_OBJECTS = 64
+"""Withheld from training; what a training is measured on."""
+
+LABELS: dict[str, tuple[str, ...]] = {
+    "kind": tuple(KINDS),
+    "color": tuple(COLORS),
+    "pattern": PATTERNS,
+    "second": (*COLORS, "none"),
+    "part": (*COLORS, "none"),
+    "accessory": (*ACCESSORIES, "none"),
+    "accessory_color": (*COLORS, "none"),
+    "quadrant": ("front", "left", "back", "right"),
+}
+"""What there is to recognise in a picture, and the classes of each."""
+
+
+class Shard(NamedTuple):
+    """N = objects x views pictures; the views of an object stand together."""
+
+    rgba: UInt8[np.ndarray, "N 128 128 4"]
+    """Premultiplied colour and coverage."""
+    labels: Int[np.ndarray, "N L"]
+    """Classes in the order of LABELS."""
+    elevation: Float[np.ndarray, " N"]
+    azimuth: Float[np.ndarray, " N"]
+    """Degrees."""
+    points: Float[np.ndarray, "O P 6"]
+    """Positions in the world and colours in [0, 1] of places uniform over each object's surface;
+    float16.
+    """
+
+
+class Shards:
+    """The shards of one seed, made when first asked for.
+
+    Args:
+        folder: where they are kept, 70 MB each.
+        held_out: of objects withheld from training.
+        objects, views: of one shard.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        seed: int,
+        *,
+        held_out: bool = False,
+        objects: int = OBJECTS,
+        views: int = VIEWS,
+    ) -> None:
+        self.folder, self.seed, self.held_out = Path(folder), seed, held_out
+        self.objects, self.views = objects, views
+        self.get = lru_cache(maxsize=2)(self._get)
+
+    def path(self, index: int) -> Path:
+        """Return the file of shard ``index``."""
+        sort = "held-out" if self.held_out else "train"
+        return self.folder / f"{sort}-{self.seed}-{self.objects}x{self.views}-{index:05d}.npz"
+
+    def _get(self, index: int) -> Shard:
+        path = self.path(index)
+        if not path.exists():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            shard = self.make(index)
+            with atomic_file(path, durable=False) as file:
+                np.savez(file, **shard._asdict())
+        with np.load(path) as file:
+            return Shard(**{name: file[name] for name in Shard._fields})
+
+    def make(self, index: int) -> Shard:
+        """Render shard ``index``."""
+        rows = [self._object(index * self.objects + i) for i in range(self.objects)]
+        names = ("rgba", "labels", "elevation", "azimuth", "points")
+        columns = dict(zip(names, zip(*rows, strict=True), strict=True))
+        points = np.stack(columns.pop("points"))
+        return Shard(
+            points=points, **{name: np.concatenate(values) for name, values in columns.items()}
+        )
+
+    def _object(self, index: int) -> tuple:
+        attributes = draw_attributes(self.seed, index, held_out=self.held_out)
+        rng = numpy_generator(self.seed, "toybox-object", int(self.held_out), index)
+        mesh = object_mesh(attributes, rng)
+        orbit = draw_orbit(self.views, rng)
+        images = render(mesh, orbit)
+        labels = np.stack([label_row(attributes, float(a)) for a in orbit.azimuth])
+        rgba = (images * 255).round().astype(np.uint8)
+        return (
+            rgba,
+            labels,
+            orbit.elevation.numpy(),
+            orbit.azimuth.numpy(),
+            surface_points(mesh, rng),
+        )
+
+
+def held_out_shard(folder: Path, seed: int) -> Shard:
+    """Return the pictures of the withheld objects that a training is measured on."""
+    return Shards(folder, seed, held_out=True, objects=HELD_OUT_OBJECTS).get(0)
+
+
+def draw_orbit(count: int, rng: np.random.Generator) -> Orbit:
+    """Draw ``count`` views, one in each sector of the azimuth, the first sector anywhere."""
+    azimuth = (
+        rng.uniform(0, 360) + 360 / count * (np.arange(count) + rng.uniform(0, 1, count))
+    ) % 360 - 180
+    overhead = rng.uniform(size=count) < OVERHEAD_SHARE
+    elevation = np.where(
+        overhead, rng.uniform(*OVERHEAD_ELEVATION, count), rng.uniform(*ELEVATION, count)
+    )
+    fovy = np.full(count, math.radians(FOVY_DEG))
+    values = (elevation, azimuth, rng.uniform(*DISTANCE, count), fovy)
+    return Orbit(*(torch.from_numpy(np.float32(value)) for value in values))
+
+
+def render(mesh: Mesh, orbit: Orbit, size: int = SIZE) -> Float[np.ndarray, "N s s 4"]:
+    """Render premultiplied RGBA of the mesh from these cameras, in [0, 1]."""
+    cameras = zip(orbit_c2w(*orbit[:3]).numpy(), orbit.fovy.tolist(), strict=True)
+    caster = MeshCaster(mesh)
+    return np.stack([caster.render(c2w, fovy, size, size) for c2w, fovy in cameras])
+
+
+def surface_points(mesh: Mesh, rng: np.random.Generator) -> Float[np.ndarray, "P 6"]:
+    """Sample POINTS places on the surface with their colours, float16."""
+    places, faces, barycentric = sample_surface(mesh, POINTS, rng)
+    return np.concatenate([places, surface_colors(mesh, faces, barycentric)], axis=1).astype(
+        np.float16
+    )
+
+
+def label_row(attributes: Attributes, azimuth: float) -> Int[np.ndarray, " L"]:
+    """Return the classes of an object seen from an azimuth in degrees, in the order of LABELS."""
+    quadrant = LABELS["quadrant"][int(((azimuth + 45) % 360) // 90)]
+    values = {name: value or "none" for name, value in attributes._asdict().items()} | {
+        "quadrant": quadrant
+    }
+    return np.array([classes.index(values[name]) for name, classes in LABELS.items()])
+
+
+def attributes_of(row: Int[np.ndarray, " L"]) -> Attributes:
+    """Invert :func:`label_row`."""
+    values = {name: classes[int(i)] for (name, classes), i in zip(LABELS.items(), row, strict=True)}
+    return Attributes(
+        **{name: None if values[name] == "none" else values[name] for name in Attributes._fields}
+    )
+
+
+def with_backgrounds(
+    rgba: UInt8[np.ndarray, "N H W 4"], rng: np.random.Generator, *, random_share: float
+) -> Float[torch.Tensor, "N 3 H W"]:
+    """Composite the pictures over BACKGROUND, or a share of them over random backgrounds.
+
+    Args:
+        random_share: of pictures over a random plain colour or a gradient of two.
+
+    Returns:
+        Pictures in [0, 1], float32.
+    """
+    count, height = rgba.shape[:2]
+    top, bottom = (rng.uniform(0, 1, (count, 1, 1, 3)) for _ in range(2))
+    bottom = np.where(rng.uniform(size=(count, 1, 1, 1)) < 0.5, top, bottom)
+    ramp = np.linspace(0, 1, height)[None, :, None, None]
+    fixed = rng.uniform(size=(count, 1, 1, 1)) >= random_share
+    background = np.where(fixed, np.array(BACKGROUND), top + (bottom - top) * ramp).astype(
+        np.float32
+    )
+    images = rgba.astype(np.float32) / 255
+    images = images[..., :3] + (1 - images[..., 3:]) * background
+    return torch.from_numpy(images).movedim(-1, 1).contiguous()
+
+
+def row_batches(
+    shards: Shards,
+    seed: int,
+    stream: str,
+    batch: int,
+    pool: int,
+    step: int,
+    *,
+    per_object: bool = False,
+) -> Iterator[tuple[int, Int[np.ndarray, " B"]]]:
+    """Yield (shard, rows) of each batch from ``step`` on, a function of (seed, stream, step).
+
+    Each pass over a shard is a permutation of its rows; the rest that fills no batch is left out.
+
+    Args:
+        pool: number of shards that are visited in turn.
+        per_object: rows are objects instead of pictures.
+    """
+    rows = shards.objects * (1 if per_object else shards.views)
+    batch = min(batch, rows)
+    per_shard = rows // batch
+    while True:
+        visit, place = divmod(step, per_shard)
+        order = numpy_generator(seed, stream, visit).permutation(rows)
+        yield visit % pool, order[place * batch : (place + 1) * batch]
+        step += 1

@@ -1,0 +1,181 @@
+"""Prompts of the toybox's objects: synonyms, templates, and the directions as our prompt processors
+write them.
+"""
+
+import re
+from collections.abc import Iterator
+
+import numpy as np
+
+from .world import COLORS, Attributes
+
+NOUNS: dict[str, tuple[str, ...]] = {
+    "fox": ("fox", "vixen"),
+    "rabbit": ("rabbit", "bunny", "hare"),
+    "bear": ("bear", "teddy bear", "teddy"),
+    "duck": ("duck", "duckling"),
+    "elephant": ("elephant",),
+    "penguin": ("penguin",),
+    "turtle": ("turtle", "tortoise"),
+    "car": ("car", "automobile"),
+    "truck": ("truck", "lorry"),
+    "boat": ("boat", "sailing boat", "ship"),
+    "plane": ("plane", "airplane", "aeroplane"),
+    "house": ("house", "cottage", "hut"),
+    "mug": ("mug", "cup"),
+    "chair": ("chair", "seat"),
+    "mushroom": ("mushroom", "toadstool"),
+    "robot": ("robot", "android"),
+}
+COLOR_WORDS: dict[str, tuple[str, ...]] = {
+    "red": ("red", "scarlet", "crimson"),
+    "lime": ("lime", "light green"),
+    "green": ("green", "dark green"),
+    "teal": ("teal", "turquoise", "cyan"),
+    "blue": ("blue", "navy"),
+    "purple": ("purple", "violet"),
+    "pink": ("pink", "rose"),
+    "yellow": ("yellow", "golden"),
+}
+"""Other words for colours; the rest have only their own."""
+PARTS: dict[str, str] = {
+    "fox": "ears and tail",
+    "rabbit": "ears",
+    "bear": "belly",
+    "duck": "wings",
+    "elephant": "ears",
+    "penguin": "belly",
+    "turtle": "legs",
+    "car": "roof",
+    "truck": "trailer",
+    "boat": "sail",
+    "plane": "wings",
+    "house": "roof",
+    "mug": "handle",
+    "chair": "cushion",
+    "mushroom": "stem",
+    "robot": "head",
+}
+"""What the role "part" of each kind is called."""
+PLURALS = ("ears", "wings", "legs")
+ACCESSORY_WORDS: dict[str, tuple[str, ...]] = {
+    "hat": ("hat", "cap"),
+    "scarf": ("scarf", "ribbon"),
+    "flag": ("flag", "banner"),
+    "balloon": ("balloon",),
+}
+OPENINGS = (
+    "a {}",
+    "a {}",
+    "a {}",
+    "a toy {}",
+    "a small {}",
+    "a photo of a {}",
+    "a 3d model of a {}",
+    "{}",
+)
+"""Around the object; "a {}" is drawn most often."""
+DIRECTIONS = ("side", "front", "back", "overhead")
+FRONT_HALF = BACK_HALF = 45.0
+OVERHEAD = 60.0
+"""Degrees, the prompt processors' thresholds."""
+EMPTY_SHARE, PLAIN_SHARE, PREFIX_SHARE = 0.1, 0.2, 0.04
+"""Shares of prompts that are empty, that name no direction, and that name it in front ("side view
+of ...").
+"""
+
+
+def direction(elevation: float, azimuth: float) -> str:
+    """Return the direction of a view in degrees, with the prompt processors' thresholds."""
+    angle = abs((azimuth + 180) % 360 - 180)
+    if elevation > OVERHEAD:
+        return "overhead"
+    return "front" if angle < FRONT_HALF else "back" if angle > 180 - BACK_HALF else "side"
+
+
+def describe(attributes: Attributes, rng: np.random.Generator) -> str:
+    """Write a prompt for the object, without a direction."""
+    noun = _pick(NOUNS[attributes.kind], rng)
+    color = _color(attributes.color, rng)
+    text = _pick(OPENINGS, rng).format(_patterned(attributes, noun, color, rng))
+    if attributes.part:
+        name = PARTS[attributes.kind]
+        article = "" if name.startswith(PLURALS) else "a "
+        text = f"{text}{_joint(text)}{article}{_color(attributes.part, rng)} {name}"
+    if attributes.accessory:
+        name = _pick(ACCESSORY_WORDS[attributes.accessory], rng)
+        verb = "wearing" if name in ("hat", "cap", "scarf") and rng.random() < 0.25 else "with"
+        joint = " and" if " with " in text and verb == "with" else f" {verb}"
+        text = f"{text}{joint} a {_color(attributes.accessory_color, rng)} {name}"
+    return re.sub(r"\ba (?=[aeio])", "an ", text)
+
+
+def prompt_of(
+    attributes: Attributes, elevation: float, azimuth: float, rng: np.random.Generator
+) -> str:
+    """Write a training prompt of one view.
+
+    It is empty, names no direction, or names it as the prompt processors write it.
+    """
+    share = rng.random()
+    if share < EMPTY_SHARE:
+        return ""
+    text, view = describe(attributes, rng), direction(elevation, azimuth)
+    if share < EMPTY_SHARE + PLAIN_SHARE:
+        return text
+    if share < EMPTY_SHARE + PLAIN_SHARE + PREFIX_SHARE:
+        return f"{'backside' if view == 'back' else view} view of {text}"
+    return f"{text}, {view} view"
+
+
+def vocabulary() -> list[str]:
+    """Return all words that prompts consist of, sorted."""
+    return sorted(set(re.findall(r"[a-z]+|\d|,", " ".join(_phrases()))))
+
+
+def _phrases() -> Iterator[str]:
+    yield from COLORS
+    yield from (
+        word
+        for words in (*NOUNS.values(), *COLOR_WORDS.values(), *ACCESSORY_WORDS.values())
+        for word in words
+    )
+    yield from (*PARTS.values(), *OPENINGS, *DIRECTIONS, "backside view of , an with and wearing")
+    yield "striped stripes dotted dots spots polka spotted checkered checks"
+    yield "two tone half below above bottom top"
+
+
+def _patterned(attributes: Attributes, noun: str, color: str, rng: np.random.Generator) -> str:
+    if attributes.pattern == "plain":
+        return f"{color} {noun}"
+    second = _color(attributes.second, rng)
+    return _pick(PATTERN_PHRASES[attributes.pattern], rng).format(c=color, s=second, n=noun)
+
+
+PATTERN_PHRASES: dict[str, tuple[str, ...]] = {
+    "striped": ("{c} {n} with {s} stripes", "{c} and {s} striped {n}", "striped {c} and {s} {n}"),
+    "dotted": (
+        "{c} {n} with {s} dots",
+        "{c} {n} with {s} spots",
+        "{c} {n} with {s} polka dots",
+        "{c} {n} dotted with {s}",
+    ),
+    "checkered": (
+        "{c} and {s} checkered {n}",
+        "{c} {n} with {s} checks",
+        "checkered {c} and {s} {n}",
+    ),
+    "two-tone": ("two tone {n}, {c} below and {s} above", "{n} with {c} bottom and {s} top"),
+}
+
+
+def _joint(text: str) -> str:
+    return " and " if " with " in text else " with "
+
+
+def _color(color: str, rng: np.random.Generator) -> str:
+    return _pick(COLOR_WORDS.get(color, (color,)), rng) if rng.random() < 0.4 else color
+
+
+def _pick(choices: tuple[str, ...], rng: np.random.Generator) -> str:
+    return choices[int(rng.integers(len(choices)))]

@@ -1,0 +1,229 @@
+"""The toybox's objects as functions of (seed, index): what an object is (:class:`Attributes`), and
+its mesh.
+
+An object has a kind, a colour, a pattern in a second colour, and at most one extra: a part in a
+colour of its own, or an accessory. Meshes lie in the world's pose (z up, front +x), centred, inside
+a sphere of radius :data:`RADIUS`. Light is baked into the vertex colours, since the ray caster
+draws a mesh's own colours: the same from every view, so that Gaussians without view-dependent
+colour can show it.
+
+Some combinations of attributes are withheld from all training (:func:`withheld`), to measure
+generalisation on.
+"""
+
+import hashlib
+from typing import NamedTuple, Optional
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.streams import numpy_generator
+from ..meshes.load import Mesh
+from .kinds import ACCESSORIES, KINDS, Model, Proportions, accessory
+from .shapes import Shape, joined
+
+RADIUS = 0.8
+"""Of the sphere around every object, world units: half the longest side that Point-E's scale of 1.6
+gives.
+"""
+COLORS: dict[str, tuple[float, float, float]] = {
+    "red": (0.86, 0.11, 0.12),
+    "orange": (0.97, 0.52, 0.08),
+    "yellow": (0.98, 0.86, 0.14),
+    "lime": (0.60, 0.88, 0.18),
+    "green": (0.10, 0.52, 0.17),
+    "teal": (0.10, 0.72, 0.70),
+    "blue": (0.13, 0.29, 0.85),
+    "purple": (0.50, 0.17, 0.72),
+    "pink": (0.98, 0.55, 0.74),
+    "brown": (0.44, 0.25, 0.11),
+    "black": (0.08, 0.08, 0.09),
+    "white": (0.97, 0.97, 0.96),
+}
+DETAILS: dict[str, tuple[float, float, float]] = {
+    "dark": (0.14, 0.14, 0.16),
+    "pale": (0.93, 0.92, 0.88),
+    "warm": (0.93, 0.47, 0.16),
+    "glass": (0.63, 0.82, 0.94),
+}
+"""Colours of details that no prompt names."""
+PATTERNS = ("plain", "striped", "dotted", "checkered", "two-tone")
+PART_SHADE = 0.82
+"""A part without a colour of its own is the body's, darker."""
+LIGHT = np.array([0.25, -0.35, 0.9]) / np.linalg.norm([0.25, -0.35, 0.9])
+AMBIENT = 0.70
+CELL = 16
+"""Texels of a pattern's period."""
+PERIODS = 8
+"""Periods of the pattern in the texture; more on a surface repeat the last one's colour."""
+WITHHELD_SHARE = 0.04
+
+
+class Attributes(NamedTuple):
+    """What a prompt can say of an object."""
+
+    kind: str
+    color: str
+    pattern: str = "plain"
+    second: Optional[str] = None
+    """The pattern's colour; None when plain."""
+    part: Optional[str] = None
+    """The colour of the kind's part (a roof, a handle, ...); None = the body's."""
+    accessory: Optional[str] = None
+    accessory_color: Optional[str] = None
+
+
+def draw_attributes(seed: int, index: int, *, held_out: bool = False) -> Attributes:
+    """Draw the attributes of object ``index``, either withheld from training or not."""
+    for attempt in range(10_000):
+        attributes = _draw(numpy_generator(seed, "toybox-attributes", attempt, index))
+        if withheld(attributes) == held_out:
+            return attributes
+    raise AssertionError("one in 25 combinations is withheld")
+
+
+def _draw(rng: np.random.Generator) -> Attributes:
+    colors = [list(COLORS)[i] for i in rng.permutation(len(COLORS))]
+    pattern = "plain" if rng.random() < 0.4 else str(rng.choice(PATTERNS[1:]))
+    extra = str(rng.choice(["none", "part", "accessory"], p=[0.35, 0.25, 0.4]))
+    return Attributes(
+        kind=str(rng.choice(list(KINDS))),
+        color=colors[0],
+        pattern=pattern,
+        second=colors[1] if pattern != "plain" else None,
+        part=colors[2] if extra == "part" else None,
+        accessory=str(rng.choice(list(ACCESSORIES))) if extra == "accessory" else None,
+        accessory_color=colors[2] if extra == "accessory" else None,
+    )
+
+
+def withheld(attributes: Attributes) -> bool:
+    """Tell whether no training sees this combination of kind, colour, pattern and extra.
+
+    All second colours of a combination are withheld together. Plain objects without any extra are
+    never withheld: the words are learnt from them.
+    """
+    extra = attributes.accessory or ("part" if attributes.part else "none")
+    if attributes.pattern == "plain" and extra == "none":
+        return False
+    name = f"{attributes.kind}/{attributes.color}/{attributes.pattern}/{extra}"
+    digest = hashlib.blake2b(name.encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "little") < WITHHELD_SHARE * 2**64
+
+
+def withheld_combinations() -> list[str]:
+    """List all withheld combinations as "kind/colour/pattern/extra", sorted."""
+    extras = [
+        {},
+        {"part": "red"},
+        *({"accessory": name, "accessory_color": "red"} for name in ACCESSORIES),
+    ]
+    found = []
+    for kind in KINDS:
+        for color in COLORS:
+            for pattern in PATTERNS:
+                for extra in extras:
+                    if withheld(Attributes(kind, color, pattern, **extra)):
+                        name = extra.get("accessory") or next(iter(extra), "none")
+                        found.append(f"{kind}/{color}/{pattern}/{name}")
+    return sorted(found)
+
+
+def object_mesh(attributes: Attributes, rng: np.random.Generator) -> Mesh:
+    """Make an object's mesh with random proportions, a texture and baked light."""
+    proportions = Proportions(rng)
+    model = KINDS[attributes.kind](proportions)
+    shapes = list(model.shapes)
+    if attributes.accessory:
+        shapes += accessory(attributes.accessory, model.anchors, proportions)
+    shape, roles = joined(shapes)
+    vertices = _centred(shape.vertices)
+    return Mesh(
+        vertices=vertices,
+        faces=shape.faces,
+        uv=_texture_coordinates(attributes.pattern, shape, roles, _body_heights(model, shape), rng),
+        texture=texture(attributes),
+        vertex_colors=np.repeat(_light(shape.normals)[:, None], 3, axis=1).astype(np.float32),
+    )
+
+
+def _centred(vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
+    """Move the box's centre to the origin and scale the farthest vertex to RADIUS."""
+    vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    return vertices * (RADIUS / np.linalg.norm(vertices, axis=1).max())
+
+
+def _light(normals: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, " V"]:
+    """Return half-Lambert light from above, never below AMBIENT."""
+    return AMBIENT + (1 - AMBIENT) * (0.5 + 0.5 * normals @ LIGHT)
+
+
+def _body_heights(model: Model, shape: Shape) -> tuple[float, float]:
+    body = np.concatenate([s.vertices[:, 2] for s in model.shapes if s.role == "body"])
+    return float(body.min()), float(body.max())
+
+
+# Texture: the pattern's PERIODS^2 periods, and to the right of them one column of cells, a plain c
+
+PLAIN_ROLES = ("part", "accessory", *DETAILS)
+SIZE = CELL * PERIODS
+
+
+def texture(attributes: Attributes) -> Float[np.ndarray, "H W 3"]:
+    """Draw the object's colours: float32 (128, 144, 3), row 0 on top."""
+    first = np.float32(COLORS[attributes.color])
+    second = np.float32(COLORS[attributes.second]) if attributes.second else first
+    mask = _pattern_mask(attributes.pattern)
+    pattern = np.where(mask[..., None], second, first)
+    part = np.float32(COLORS[attributes.part]) if attributes.part else first * PART_SHADE
+    extra = np.float32(COLORS[attributes.accessory_color]) if attributes.accessory_color else part
+    plain = np.stack([part, extra, *(np.float32(DETAILS[name]) for name in DETAILS)])
+    column = np.zeros((SIZE, CELL, 3), np.float32)
+    column[: CELL * len(plain)] = np.repeat(plain, CELL, axis=0)[:, None]
+    return np.concatenate([pattern, column], axis=1)
+
+
+def _pattern_mask(pattern: str) -> np.ndarray:
+    """Mark where the second colour is, (128, 128) bool; row 0 on top."""
+    y, x = (np.indices((CELL, CELL)) + 0.5) / CELL
+    cells = {
+        "plain": np.zeros((CELL, CELL), bool),
+        "striped": y < 0.5,
+        "dotted": (x - 0.5) ** 2 + (y - 0.5) ** 2 < 0.33**2,
+        "checkered": (x < 0.5) ^ (y < 0.5),
+    }
+    if pattern == "two-tone":  # v runs over the body's height, so the upper half is on top
+        return np.broadcast_to((np.arange(SIZE) < SIZE // 2)[:, None], (SIZE, SIZE))
+    return np.tile(cells[pattern], (PERIODS, PERIODS))
+
+
+def _texture_coordinates(
+    pattern: str,
+    shape: Shape,
+    roles: list[str],
+    heights: tuple[float, float],
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "V 2"]:
+    """Return uv of each vertex: the body's in the pattern, others in their colour's cell."""
+    period = {"striped": 0.3, "dotted": 0.29, "checkered": 0.42}.get(pattern, 1.0) * rng.uniform(
+        0.85, 1.15
+    )
+    height = (shape.vertices[:, 2] - heights[0]) / max(heights[1] - heights[0], 1e-6)
+    along = {"two-tone": height * PERIODS, "striped": (shape.vertices[:, 2] - heights[0]) / period}
+    v = along.get(pattern, shape.uv[:, 1] / period)
+    u = shape.uv[:, 0] / period
+    body = np.stack([_inside(u), _inside(v)], 1) * [SIZE / (SIZE + CELL), 1.0]
+    roles = np.array(roles)
+    for row, role in enumerate(PLAIN_ROLES):
+        body[roles == role] = [(SIZE + CELL / 2) / (SIZE + CELL), 1 - (row + 0.5) * CELL / SIZE]
+    return body
+
+
+def _inside(periods: Float[np.ndarray, " V"]) -> Float[np.ndarray, " V"]:
+    """Convert numbers of periods to shares of the texture, half a texel from its borders.
+
+    Negative ones are moved up by whole periods.
+    """
+    periods = periods - min(0.0, np.floor(periods.min()))
+    margin = 0.5 / SIZE
+    return (periods / PERIODS).clip(margin, 1 - margin)
