@@ -1,0 +1,32 @@
+"""What the tests of the toybox share: a small world, and a folder with trained stages."""
+
+import pytest
+
+from tests.toybox.helpers import training
+from threestudio_gaussiandreamer.toybox import loop, models, views
+
+
+@pytest.fixture(scope="package", autouse=True)
+def small_world():
+    """Make pictures few and networks small, so that a step takes milliseconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(models, "UNET_CHANNELS", (16, 32))
+        patch.setattr(models, "VAE_CHANNELS", (8, 8, 8, 8))
+        patch.setattr(models, "TEXT_LAYERS", 1)
+        patch.setattr(models, "VISION_LAYERS", 1)
+        patch.setattr(models, "POINTS_LAYERS", 1)
+        patch.setattr(models.Judge, "CHANNELS", (8, 8, 8, 8))
+        patch.setattr(views, "POINTS", 300)
+        patch.setattr(views, "HELD_OUT_OBJECTS", 4)
+        patch.setattr(loop, "LOG_EVERY", 1)
+        patch.setattr(loop, "WARMUP", 1)
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A training folder in which CLIP and the autoencoder are trained for two steps."""
+    folder = tmp_path_factory.mktemp("toybox")
+    for name in ("clip", "autoencoder"):
+        training(folder, name).run(8)
+    return folder

@@ -1,0 +1,153 @@
+"""The toybox's models in the published formats: the package's own parts load them as any model."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from tests.toybox.helpers import options, training
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.guidance import stable_diffusion  # noqa: F401
+from threestudio_gaussiandreamer.host import find
+from threestudio_gaussiandreamer.models.clip import PictureText, clip_source
+from threestudio_gaussiandreamer.priors.point_e import PointEPrior
+from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
+from threestudio_gaussiandreamer.toybox import models, warm_start
+from threestudio_gaussiandreamer.toybox.export import main
+from threestudio_gaussiandreamer.toybox.loop import averaged_weights
+from threestudio_gaussiandreamer.toybox.train import STAGES
+
+PROMPT = "a red fox with a green scarf"
+HALF = {"rtol": 2e-3, "atol": 2e-3}
+"""Float16 keeps eleven bits."""
+
+
+@pytest.fixture(scope="module")
+def trained(folder):
+    """A folder in which every stage is trained for a step."""
+    for name in ("unet", "points", "judge"):
+        training(folder, name).run(4)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def exported(trained, tmp_path_factory):
+    target = tmp_path_factory.mktemp("models")
+    assert main([str(trained), str(target)]) == 0
+    return target
+
+
+@pytest.fixture(scope="module")
+def unet_stage(trained):
+    stage = STAGES["unet"](options(trained))
+    stage.model.load_state_dict(averaged_weights(trained, "unet"))
+    return stage
+
+
+@pytest.fixture
+def prompts(exported):
+    processor = find("gaussiandreamer-stable-diffusion-prompt-processor")
+    model = str(exported / "stable-diffusion")
+    cfg = {"pretrained_model_name_or_path": model, "prompt": PROMPT, "negative_prompt": ""}
+    return processor({**cfg, "use_cache": False})()
+
+
+@pytest.fixture
+def guidance(exported):
+    model = str(exported / "stable-diffusion")
+    guide = find("gaussiandreamer-stable-diffusion-guidance")
+    return guide({"pretrained_model_name_or_path": model, "guidance_scale": 7.5})
+
+
+def test_the_prompt_processor_gives_the_tokens_of_the_training(prompts, unet_stage):
+    texts = [PROMPT, "", f"{PROMPT}, side view", f"{PROMPT}, overhead view"]
+    expected = unet_stage.tokens(texts)
+    found = [prompts.text_embeddings, prompts.uncond_text_embeddings]
+    found += [prompts.text_embeddings_vd[:1], prompts.text_embeddings_vd[3:]]
+    assert torch.allclose(torch.cat(found), expected, **HALF)
+
+
+def test_the_guidance_sees_what_the_training_saw(guidance, prompts, unet_stage):
+    assert guidance.prediction_type == "v_prediction"
+    assert guidance.image_size == 128
+    assert torch.allclose(guidance.alphas_cumprod, unet_stage.alphas_cumprod)
+    z = torch.randn(2, 4, 16, 16, generator=torch.Generator().manual_seed(0))
+    t = torch.tensor([50, 900])
+    tokens = unet_stage.tokens([PROMPT] * 2)
+    v = unet_stage.model(z, t, encoder_hidden_states=tokens).sample
+    abar = unet_stage.alphas_cumprod[t].float().reshape(-1, 1, 1, 1)
+    expected = abar.sqrt() * v + (1 - abar).sqrt() * z
+    assert torch.allclose(guidance.noise(z, t, tokens), expected, **HALF)
+
+
+def test_latents_of_the_guidance_have_the_training_scale(guidance, unet_stage):
+    images = torch.rand(2, 3, 128, 128, generator=torch.Generator().manual_seed(0))
+    mean = guidance.vae.encode(images * 2 - 1).latent_dist.mean * guidance.vae.config.scaling_factor
+    expected = unet_stage.vae.encode(images * 2 - 1).latent_dist.mean * unet_stage.scale
+    assert torch.allclose(mean, expected, **HALF)
+
+
+def test_the_guidance_gives_a_gradient(guidance, prompts):
+    rgb = torch.rand(2, 128, 128, 3, requires_grad=True)
+    angles = torch.tensor([10.0, 100.0])
+    views = {"elevation": angles, "azimuth": angles, "camera_distances": angles}
+    guidance(rgb, prompts, **views)["loss_sds"].backward()
+    assert rgb.grad.isfinite().all() and rgb.grad.abs().sum() > 0
+
+
+def test_clip_compares_pictures_with_texts(exported):
+    clip = PictureText(clip_source(str(exported / "clip")), torch.device("cpu"))
+    pictures = np.random.default_rng(0).random((3, 100, 100, 3), np.float32)
+    assert (np.abs(clip.similarities(pictures, PROMPT)) <= 1).all()
+
+
+def test_the_point_e_prior_loads_the_points_model(exported, trained):
+    files = {"checkpoint": str(exported / "points.pt"), "clip": str(exported / "clip")}
+    prior = PointEPrior({**files, "upsampler": None, "num_steps": 3, "num_points": 50})
+    prior.preflight()
+    cloud = prior(PROMPT)
+    assert cloud.points.shape == (50, 3) and np.isfinite(cloud.points).all()
+    stage = STAGES["points"](options(trained))
+    assert torch.allclose(
+        prior._condition(PROMPT, torch.device("cpu")), stage.condition([PROMPT]), **HALF
+    )
+
+
+def test_the_record_says_what_was_seen(exported):
+    record = json.loads((exported / "training.json").read_text())
+    assert set(record) == set(STAGES)
+    assert record["clip"]["images"] == 8 and record["unet"]["steps"] == 1
+
+
+def test_a_training_continues_from_the_weights(exported, trained, tmp_path):
+    there = options(tmp_path)
+    tokenizer_before = (trained / "tokenizer" / "vocab.json").read_bytes()
+    warm_start.start_from(exported, there, STAGES)
+    assert (tmp_path / "tokenizer" / "vocab.json").read_bytes() == tokenizer_before
+    for name in STAGES:
+        expected, found = averaged_weights(trained, name), averaged_weights(tmp_path, name)
+        for key, value in expected.items():
+            if "heads" not in key or name == "judge":
+                assert torch.allclose(found[key], value, **HALF), key
+        run = training(tmp_path, name)
+        before = run.progress.images
+        assert before == training(trained, name).progress.images
+        run.run(before + 4)
+
+
+def test_weights_of_another_size_are_refused(exported, tmp_path, monkeypatch):
+    monkeypatch.setattr(models, "VISION_LAYERS", 2)
+    monkeypatch.setattr(models, "FEATURES", 64)
+    with pytest.raises(UserError, match="'clip'.*of another model"):
+        warm_start.start_from(exported, options(tmp_path), STAGES)
+
+
+def test_no_weights_are_said(tmp_path):
+    with pytest.raises(UserError, match="training.json"):
+        warm_start.start_from(tmp_path, options(tmp_path), STAGES)
+
+
+def test_an_untrained_folder_is_said(tmp_path, capsys):
+    assert main([str(tmp_path / "nothing"), str(tmp_path / "models")]) == 2
+    assert "train the stage 'clip' first" in capsys.readouterr().err

@@ -1,0 +1,199 @@
+"""Every stage of the toybox's training: it learns, resumes exactly, and says what is wrong."""
+
+import signal
+
+import numpy as np
+import pytest
+import torch
+
+from tests.toybox.helpers import copied, options, training
+from threestudio_gaussiandreamer.core.checkpoint_file import load_file
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.toybox import loop, points_stage, unet_stage
+from threestudio_gaussiandreamer.toybox.clip_stage import IGNORED, LABELS, text_labels
+from threestudio_gaussiandreamer.toybox.train import STAGES, main
+
+
+def weights(run: loop.Training) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in run.ema.state_dict().items()}
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_resuming_gives_what_an_uninterrupted_training_gives(folder, name, tmp_path):
+    whole, parts = copied(folder, tmp_path / "whole"), copied(folder, tmp_path / "parts")
+    uninterrupted = training(whole, name)
+    uninterrupted.run(uninterrupted.progress.images + 8)
+    for _ in range(2):
+        run = training(parts, name)
+        run.run(run.progress.images + 4)
+    assert run.progress.images == uninterrupted.progress.images
+    for key, value in weights(uninterrupted).items():
+        assert torch.equal(value, weights(run)[key]), key
+    losses = [[row["loss"] for row in r.progress.history] for r in (uninterrupted, run)]
+    assert losses[0] == losses[1]
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_a_stage_learns_one_batch(folder, name, tmp_path):
+    run = training(copied(folder, tmp_path / "run"), name)
+    batch = next(run.stage.batches(0))
+    losses = []
+    for _ in range(12):
+        run.progress.step = 1  # the same noise each time
+        losses.append(float(run.train_step(batch)["loss"]))
+    assert losses[-1] < 0.97 * losses[0]
+
+
+@pytest.mark.parametrize("name", ["autoencoder", "unet", "points"])
+def test_a_sheet_is_drawn(folder, name, monkeypatch):
+    monkeypatch.setattr(unet_stage, "SAMPLE_STEPS", 2)
+    monkeypatch.setattr(points_stage, "SAMPLE_STEPS", 2)
+    stage = STAGES[name](options(folder))
+    picture = stage.sheet(stage.model.eval())
+    assert picture.dtype == np.uint8 and picture.shape[2] == 3 and picture.std() > 0
+
+
+@pytest.mark.parametrize("name", ["clip", "judge", "autoencoder"])
+def test_a_stage_is_measured_on_withheld_objects(folder, name):
+    stage = STAGES[name](options(folder))
+    numbers = stage.evaluate(stage.model.eval())
+    assert numbers and all(np.isfinite(value) for value in numbers.values())
+
+
+def test_sigterm_saves_and_stops(folder, tmp_path):
+    run = training(copied(folder, tmp_path / "run"), "judge")
+    step = run.train_step
+
+    def interrupted(batch):
+        signal.raise_signal(signal.SIGTERM)
+        return step(batch)
+
+    run.train_step = interrupted
+    run.run(1000)
+    assert run.progress.images == 4
+    assert load_file(run.path)["images"] == 4
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_a_full_disk_is_said_and_leaves_the_earlier_checkpoint(folder, tmp_path, monkeypatch):
+    run = training(copied(folder, tmp_path / "run"), "judge")
+    run.run(4)
+    before = run.path.read_bytes()
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", full)
+    with pytest.raises(UserError, match="No space left"):
+        run.run(8)
+    assert run.path.read_bytes() == before
+
+
+def test_a_damaged_checkpoint_is_refused(folder, tmp_path):
+    run = training(copied(folder, tmp_path / "run"), "judge")
+    run.run(4)
+    content = bytearray(run.path.read_bytes())
+    content[len(content) // 2] ^= 255
+    run.path.write_bytes(content)
+    with pytest.raises(UserError, match="judge.pt"):
+        training(tmp_path / "run", "judge")
+
+
+def test_stages_that_need_others_name_them(tmp_path):
+    with pytest.raises(UserError, match="train the stage 'clip' first"):
+        training(tmp_path, "unet")
+
+
+def test_a_unet_of_another_text_encoder_is_refused(folder, tmp_path):
+    place = copied(folder, tmp_path / "run")
+    training(place, "unet").run(4)
+    (place / "clip.pt").unlink()
+    other = training(place, "clip", seed=1)
+    other.train_step(next(other.stage.batches(0)))
+    other.save()
+    with pytest.raises(UserError, match="trained with another clip"):
+        training(place, "unet")
+
+
+def test_curves_are_written(folder):
+    rows = (folder / "clip.csv").read_text().splitlines()
+    assert rows[0].startswith("images,seconds,loss") and len(rows) == 3
+    assert (folder / "clip.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--stages", "unett"], "did you mean 'unet'"),
+        (["--images", "0"], "--images 0: expected at least 1"),
+        (["--pool", "-3"], "--pool -3: expected at least 1"),
+        (["--device", "cuda"], "sees no GPU"),
+    ],
+)
+def test_bad_options_are_one_message(tmp_path, capsys, arguments, message):
+    if "cuda" in arguments and torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    assert main([str(tmp_path), *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+# Formulas -----------------------------------------------------------------------------------
+
+
+def test_the_ema_starts_short():
+    average = [torch.zeros(1)]
+    loop._average(average, [torch.ones(1)], torch.tensor(1))
+    assert average[0] == pytest.approx(1 - 2 / 11)
+    average = [torch.zeros(1)]
+    loop._average(average, [torch.ones(1)], torch.tensor(10**6))
+    assert average[0] == pytest.approx(1 - loop.EMA_DECAY)
+
+
+def test_min_snr_weight_of_v():
+    abar = torch.tensor([0.5, 0.99], dtype=torch.float64)
+    assert torch.allclose(unet_stage.min_snr_weight(abar), torch.tensor([0.5, 0.05]).double())
+
+
+def test_latents_are_scaled_to_unit_variance():
+    generator = torch.Generator().manual_seed(0)
+    mean = 3 * torch.randn(50, 4, 16, 16, generator=generator)
+    moments = torch.stack([mean, torch.full_like(mean, 4.0)])
+    assert unet_stage.latent_scale(moments) == pytest.approx(1 / 5, rel=0.01)
+
+
+def test_points_go_to_point_es_units_and_back():
+    points = torch.rand(1, 10, 6) * 1.6 - 0.8
+    units = points_stage.network_units(points)
+    assert torch.allclose(points_stage.world_units(units[0]), points[0], atol=1e-5)
+    front = torch.tensor([[[0.8, 0, 0, 1.0, 0, 0]]])
+    expected = torch.tensor([0, -1.0, 0, 1, -1, -1])  # Point-E's front is -y
+    assert torch.allclose(points_stage.network_units(front)[0, :, 0], expected, atol=1e-6)
+
+
+def test_what_a_prompt_cannot_say_is_no_label(folder):
+    batch = next(STAGES["clip"](options(folder)).batches(0))
+    labels = text_labels(batch._replace(has_text=torch.ones(4, dtype=torch.bool)))
+    quadrant = list(LABELS).index("quadrant")
+    for row in range(4):
+        side = int(batch.labels[row, quadrant]) % 2 == 1
+        ignored = side or not batch.has_view[row]
+        assert (int(labels[row, quadrant]) == IGNORED) == ignored
+
+
+@pytest.mark.parametrize(
+    ("name", "user", "prefix", "free"),
+    [
+        ("clip", "points", "clip.text_model.", "clip.vision_model."),
+        ("autoencoder", "unet", "encoder.", "decoder."),
+    ],
+)
+def test_what_others_are_trained_on_no_longer_changes(folder, tmp_path, name, user, prefix, free):
+    place = copied(folder, tmp_path / "run")
+    training(place, user).run(4)
+    before = loop.averaged_weights(place, name)
+    run = training(place, name)
+    run.run(run.progress.images + 8)
+    after = loop.averaged_weights(place, name)
+    assert all(torch.equal(before[key], after[key]) for key in before if key.startswith(prefix))
+    assert any(not torch.equal(before[key], after[key]) for key in before if key.startswith(free))
+    training(place, user)  # which would be refused if its text encoder or its latents had changed

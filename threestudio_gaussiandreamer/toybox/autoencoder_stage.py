@@ -1,0 +1,165 @@
+"""Training the autoencoder on clean pictures and on renders of rough Gaussians.
+
+Score distillation encodes renders of half-transparent Gaussians in its first iterations, and needs
+useful gradients there.
+"""
+
+import functools
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+
+from ..cameras import Orbit, to_opencv
+from ..core.streams import generator, numpy_generator
+from ..splatting import rasterize
+from . import models
+from .loop import Stage, checkpoint_path
+from .sheet import contact_sheet
+from .views import (
+    DISTANCE,
+    FOVY_DEG,
+    SIZE,
+    Shard,
+    Shards,
+    held_out_shard,
+    row_batches,
+    with_backgrounds,
+)
+
+RANDOM_BACKGROUNDS = 0.15
+SPLAT_SHARE = 0.2
+"""Of the pictures, renders of rough Gaussians."""
+FULL_EVERY = 4
+"""Every fourth step trains on pictures of the full size, a quarter as many; the others on pictures
+of half the size. Crops would be as cheap, but group normalisation computes other statistics on
+them, and colours were learnt much more slowly.
+"""
+KL_WEIGHT = 2e-4
+EDGE_WEIGHT, SQUARE_WEIGHT = 1.0, 2.0
+
+
+class AutoencoderStage(Stage):
+    """Minimise errors of pixels and of their differences, and a small KL divergence."""
+
+    name = "autoencoder"
+    batch_size = 8
+    learning_rate = 4e-4
+    images = 200_000
+
+    def build(self) -> nn.Module:
+        self.shards = Shards(
+            self.options.shards_folder(), self.options.seed, objects=self.options.shard_objects
+        )
+        return models.autoencoder()
+
+    def frozen(self) -> tuple[str, ...]:
+        """Freeze the encoder once the U-Net is trained on its latents; the decoder may improve."""
+        trained = checkpoint_path(self.options.folder, "unet").exists()
+        return ("encoder.", "quant_conv.") if trained else ()
+
+    def batches(self, step: int) -> Iterator[Float[Tensor, "B 3 s s"]]:
+        seed = self.options.seed
+        order = row_batches(self.shards, seed, "autoencoder", self.batch, self.options.pool, step)
+        for number, (index, rows) in enumerate(order, step):
+            rng = numpy_generator(seed, "autoencoder-batch", number)
+            full = number % FULL_EVERY == FULL_EVERY - 1
+            rows = rows[: max(1, len(rows) // 4)] if full else rows
+            images = self._images(self.shards.get(index), rows, rng)
+            yield (images if full else F.avg_pool2d(images, 2)).to(self.device)
+
+    def _images(
+        self, shard: Shard, rows: np.ndarray, rng: np.random.Generator
+    ) -> Float[Tensor, "B 3 s s"]:
+        rgba = shard.rgba[rows]
+        for place in np.flatnonzero(rng.uniform(size=len(rows)) < SPLAT_SHARE):
+            rgba[place] = rough_render(shard, int(rows[place]), rng)
+        return with_backgrounds(rgba, rng, random_share=RANDOM_BACKGROUNDS)
+
+    def loss(self, model: nn.Module, batch: Tensor, step: int) -> tuple[Tensor, dict[str, Tensor]]:
+        images = batch * 2 - 1
+        posterior = model.encode(images).latent_dist
+        noise = torch.randn(
+            posterior.mean.shape, generator=generator(self.options.seed, "autoencoder-noise", step)
+        )
+        decoded = model.decode(posterior.mean + posterior.std * noise.to(self.device)).sample
+        error = decoded - images
+        pixels, edges = error.abs().mean(), edge_error(decoded, images)
+        kl = posterior.kl().mean() / posterior.mean[0].numel()
+        metrics = {"l1": pixels, "edges": edges, "kl": kl}
+        loss = pixels + SQUARE_WEIGHT * error.square().mean() + EDGE_WEIGHT * edges
+        return loss + KL_WEIGHT * kl, metrics
+
+    @functools.cached_property
+    def held_out(self) -> Tensor:
+        """Return pictures of withheld objects, and the first eight also as rough Gaussians."""
+        shard = held_out_shard(self.options.shards_folder(), self.options.seed)
+        rng = numpy_generator(self.options.seed, "autoencoder-held-out")
+        rgba = np.concatenate(
+            [shard.rgba[:64], np.stack([rough_render(shard, row, rng) for row in range(8)])]
+        )
+        return with_backgrounds(rgba, rng, random_share=0).to(self.device)
+
+    def evaluate(self, model: nn.Module) -> dict[str, float]:
+        errors = [
+            (reconstructed(model, part) - part).square().mean() for part in self.held_out.split(8)
+        ]
+        return {"psnr": float(-10 * torch.stack(errors).mean().log10())}
+
+    def sheet(self, model: nn.Module) -> np.ndarray:
+        shown = torch.cat([self.held_out[:60:6], self.held_out[-4:]])
+        return contact_sheet(torch.cat([shown, reconstructed(model, shown)]), columns=len(shown))
+
+
+def reconstructed(model: nn.Module, images: Float[Tensor, "B 3 s s"]) -> Float[Tensor, "B 3 s s"]:
+    """Encode and decode pictures in [0, 1], using the posterior's mean."""
+    return (model.decode(model.encode(images * 2 - 1).latent_dist.mean).sample / 2 + 0.5).clamp(
+        0, 1
+    )
+
+
+def edge_error(decoded: Float[Tensor, "B 3 s s"], images: Float[Tensor, "B 3 s s"]) -> Tensor:
+    """Return the mean absolute error of differences between neighbouring pixels."""
+    error = decoded - images
+    return error.diff(dim=-1).abs().mean() + error.diff(dim=-2).abs().mean()
+
+
+def rough_render(shard: Shard, row: int, rng: np.random.Generator) -> UInt8[np.ndarray, "s s 4"]:
+    """Render the object of picture ``row`` as a few hundred half-transparent Gaussians.
+
+    Returns:
+        Premultiplied RGBA bytes.
+    """
+    views = len(shard.rgba) // len(shard.points)
+    gaussians = rough_gaussians(shard.points[row // views].astype(np.float32), rng)
+    angles = (shard.elevation[row], shard.azimuth[row], np.mean(DISTANCE), math.radians(FOVY_DEG))
+    orbit = Orbit(*(torch.tensor([float(value)]) for value in angles))
+    viewmats, Ks = to_opencv(orbit.c2w, orbit.fovy, SIZE, SIZE)
+    drawn = rasterize(*gaussians, viewmats, Ks, SIZE, SIZE, preset="fast")
+    rgba = torch.cat([drawn.image[0], drawn.alpha[0].reshape(SIZE, SIZE, 1)], dim=-1)
+    return (rgba.clamp(0, 1) * 255).round().byte().numpy()
+
+
+def rough_gaussians(points: Float[np.ndarray, "P 6"], rng: np.random.Generator) -> list[Tensor]:
+    """Make Gaussians of a random number, size, opacity and error of place and colour.
+
+    Args:
+        points: places on a surface and their colours.
+
+    Returns:
+        Means, quaternions, scales, opacities and colours, as ``rasterize`` takes them.
+    """
+    points = points[: int(rng.integers(200, 1000))]
+    count = len(points)
+    grey = rng.uniform(0, 1)
+    colors = grey * 0.5 + (1 - grey) * points[:, 3:]
+    colors = (colors + rng.normal(0, 0.1 * rng.uniform(), (count, 3))).clip(0, 1)
+    means = points[:, :3] + rng.normal(0, rng.uniform(0, 0.08), (count, 3))
+    scales = rng.uniform(0.01, 0.06) * rng.uniform(0.6, 1.6, (count, 3))
+    opacities = rng.uniform(0.1, 0.9) * rng.uniform(0.6, 1, count)
+    values = (means, rng.normal(size=(count, 4)), scales, opacities, colors)
+    return [torch.from_numpy(np.float32(value)) for value in values]

@@ -1,0 +1,166 @@
+"""Write the toybox's averaged weights in the published formats, in float16.
+
+``python -m threestudio_gaussiandreamer.toybox.export TRAINING_FOLDER MODELS_FOLDER``
+
+====================  ==========================================================================
+stable-diffusion/     diffusers' pipeline: tokenizer, text_encoder, vae, unet, scheduler
+clip/                 transformers' CLIPModel and tokenizer: both towers
+points.pt             Point-E's base checkpoint
+judge.safetensors     the judge, which has no published format
+training.json         what each network has seen: images, hours, numbers on withheld objects
+====================  ==========================================================================
+"""
+
+import argparse
+import json
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Optional
+
+import torch
+from torch import Tensor
+
+from ..core.checkpoint_file import load_file
+from ..core.errors import UserError
+from ..core.files import atomic_file
+from . import models
+from .loop import averaged_weights, checkpoint_path
+from .text_batches import open_tokenizer
+from .unet_stage import LATENT_SCALE, frozen_autoencoder, frozen_clip
+
+STAGES = ("clip", "autoencoder", "unet", "points", "judge")
+
+
+def export(training: Path, target: Path) -> dict[str, Any]:
+    """Write the models of a training that has all of clip, autoencoder and unet.
+
+    Networks that it hasn't are left out; what there is of ``target`` is replaced.
+
+    Returns:
+        What ``training.json`` says.
+
+    Raises:
+        UserError: a stage isn't trained yet, or the disk is full.
+    """
+    tokenizer = open_tokenizer(training)
+    clip = frozen_clip(training, len(tokenizer))
+    write_clip(target / "clip", clip, training / "tokenizer")
+    write_stable_diffusion(target / "stable-diffusion", training, clip)
+    if checkpoint_path(training, "points").exists():
+        write_points(target / "points.pt", averaged_weights(training, "points"))
+    if checkpoint_path(training, "judge").exists():
+        write_judge(target / "judge.safetensors", averaged_weights(training, "judge"))
+    record = training_record(training)
+    with atomic_file(target / "training.json") as file:
+        file.write(json.dumps(record, indent=2).encode())
+    return record
+
+
+def write_clip(folder: Path, clip: Any, tokenizer: Path) -> None:
+    """Write a whole CLIP with its tokenizer."""
+    _save(clip, folder)
+    shutil.copytree(tokenizer, folder, dirs_exist_ok=True)
+
+
+def write_stable_diffusion(folder: Path, training: Path, clip: Any) -> None:
+    """Write a Stable Diffusion pipeline's folder."""
+    from transformers import CLIPTextModel
+
+    text_encoder = CLIPTextModel(clip.config.text_config)
+    text_encoder.load_state_dict(_for(text_encoder, clip.text_model.state_dict()))
+    vae, unet = frozen_autoencoder(training), models.unet()
+    content = load_file(checkpoint_path(training, "unet"))
+    unet.load_state_dict(averaged_weights(training, "unet"))
+    vae.register_to_config(scaling_factor=content["constants"][LATENT_SCALE])
+    for name, network in (("text_encoder", text_encoder), ("vae", vae), ("unet", unet)):
+        _save(network, folder / name)
+    shutil.copytree(training / "tokenizer", folder / "tokenizer", dirs_exist_ok=True)
+    models.scheduler().save_pretrained(folder / "scheduler")
+    with atomic_file(folder / "model_index.json", durable=False) as file:
+        file.write(json.dumps(MODEL_INDEX, indent=2).encode())
+
+
+MODEL_INDEX = {
+    "_class_name": "StableDiffusionPipeline",
+    "feature_extractor": [None, None],
+    "safety_checker": [None, None],
+    "requires_safety_checker": False,
+    "scheduler": ["diffusers", "DDPMScheduler"],
+    "text_encoder": ["transformers", "CLIPTextModel"],
+    "tokenizer": ["transformers", "CLIPTokenizer"],
+    "unet": ["diffusers", "UNet2DConditionModel"],
+    "vae": ["diffusers", "AutoencoderKL"],
+}
+
+
+def write_points(path: Path, weights: dict[str, Tensor]) -> None:
+    """Write Point-E's base checkpoint: a pickle of tensors alone, as the published file is."""
+    with atomic_file(path) as file:
+        torch.save({name: value.half() for name, value in weights.items()}, file)
+
+
+def write_judge(path: Path, weights: dict[str, Tensor]) -> None:
+    """Write the judge's weights."""
+    from safetensors.torch import save
+
+    with atomic_file(path) as file:
+        file.write(save({name: value.half().contiguous() for name, value in weights.items()}))
+
+
+def training_record(training: Path) -> dict[str, Any]:
+    """Return what each network of a training has seen, and its last losses."""
+    record = {}
+    for name in STAGES:
+        if checkpoint_path(training, name).exists():
+            content = load_file(checkpoint_path(training, name))
+            record[name] = {
+                "images": content["images"],
+                "steps": content["step"],
+                "hours": round(content["seconds"] / 3600, 3),
+                "last": content["history"][-1] if content["history"] else {},
+                "withheld": content["measured"],
+            }
+    return record
+
+
+def _save(network: Any, folder: Path) -> None:
+    try:
+        network.half().save_pretrained(str(folder), safe_serialization=True)
+    except OSError as error:
+        raise UserError(f"cannot write {str(folder)!r}: {error.strerror or error}") from error
+    finally:
+        network.float()
+
+
+def _for(network: Any, weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Rename weights of a text tower for a model with or without its prefix."""
+    prefix = "text_model."
+    prefixed = any(name.startswith(prefix) for name in network.state_dict())
+    return {(prefix if prefixed else "") + name: value for name, value in weights.items()}
+
+
+def main(argv: Optional[Sequence[str]] = None) -> int:
+    """Run one command line; returns the exit code: 0 done, 2 something the user can mend."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m {__package__}.export", description="Write the toybox's models."
+    )
+    parser.add_argument("training", type=Path, help="folder of toybox.train")
+    parser.add_argument("target", type=Path, help="folder for the models")
+    try:
+        args = parser.parse_args(argv)
+        args.target.mkdir(parents=True, exist_ok=True)
+        record = export(args.training, args.target)
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    size = sum(path.stat().st_size for path in args.target.rglob("*") if path.is_file())
+    print(f"{args.target}: {', '.join(record)}, {size / 1e6:.1f} MB")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,87 @@
+"""Training the judge, on a data stream and a seed of its own."""
+
+import functools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from ..core.streams import numpy_generator
+from .clip_stage import accuracies, classified
+from .loop import Stage
+from .models import Judge
+from .text_batches import label_tensor
+from .views import Shards, held_out_shard, row_batches, with_backgrounds
+
+SEED_OFFSET = 1000
+"""Added to the seed, so that no picture of the teacher's is among the judge's."""
+
+
+class JudgeBatch(NamedTuple):
+    images: Float[Tensor, "B 3 s s"]
+    labels: Int[Tensor, "B L"]
+
+
+class JudgeStage(Stage):
+    """Minimise the cross entropy of every attribute on clean, blurred and noisy pictures."""
+
+    name = "judge"
+    batch_size = 64
+    learning_rate = 1e-3
+    images = 400_000
+
+    def build(self) -> nn.Module:
+        self.seed = self.options.seed + SEED_OFFSET
+        self.shards = Shards(
+            self.options.shards_folder(), self.seed, objects=self.options.shard_objects
+        )
+        return Judge()
+
+    def batches(self, step: int) -> Iterator[JudgeBatch]:
+        order = row_batches(self.shards, self.seed, "judge", self.batch, self.options.pool, step)
+        for number, (index, rows) in enumerate(order, step):
+            yield self._batch(index, rows, numpy_generator(self.seed, "judge-batch", number))
+
+    def _batch(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> JudgeBatch:
+        shard = self.shards.get(index)
+        images = with_backgrounds(shard.rgba[rows], rng, random_share=0.5)
+        return JudgeBatch(
+            degraded(images, rng).to(self.device), label_tensor(shard, rows).to(self.device)
+        )
+
+    def loss(
+        self, model: nn.Module, batch: JudgeBatch, step: int
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        loss, right = classified(model(batch.images), batch.labels)
+        return loss, {"right": right}
+
+    @functools.cached_property
+    def held_out(self) -> JudgeBatch:
+        """Return withheld objects, which no training saw."""
+        shard = held_out_shard(self.options.shards_folder(), self.seed)
+        images = with_backgrounds(
+            shard.rgba, numpy_generator(self.seed, "judge-held-out"), random_share=0
+        )
+        return JudgeBatch(images.to(self.device), torch.from_numpy(shard.labels).to(self.device))
+
+    def evaluate(self, model: nn.Module) -> dict[str, float]:
+        return accuracies(model(self.held_out.images), self.held_out.labels)
+
+
+def degraded(
+    images: Float[Tensor, "B 3 s s"], rng: np.random.Generator
+) -> Float[Tensor, "B 3 s s"]:
+    """Blur a third of the batch by shrinking and enlarging it, and add noise to another third."""
+    third = len(images) // 3
+    size = images.shape[-1]
+    small = F.interpolate(
+        images[:third], (int(rng.integers(size // 2, size)),) * 2, mode="bilinear", antialias=True
+    )
+    blurred = F.interpolate(small, (size, size), mode="bilinear") if third else images[:0]
+    noise = rng.normal(0, rng.uniform(0, 0.06), images[third : 2 * third].shape).astype(np.float32)
+    noisy = (images[third : 2 * third] + torch.from_numpy(noise)).clamp(0, 1)
+    return torch.cat([blurred, noisy, images[2 * third :]])

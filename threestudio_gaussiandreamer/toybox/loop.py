@@ -1,0 +1,359 @@
+"""The training loop of all of the toybox's networks.
+
+It can be killed at any time and resumed, averages the weights, and writes curves and sample sheets.
+
+Everything that a step draws is a function of (seed, stage, step), so a resumed training is the one
+that was never stopped.
+"""
+
+import logging
+import signal
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Optional
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
+
+from ..core.checkpoint_file import load_file, save_file
+from ..core.errors import UserError
+from ..core.files import atomic_file
+from ..core.images import write as write_picture
+
+EMA_DECAY = 0.999
+WARMUP, DECAY_START = 200, 10_000
+"""Steps over which the learning rate rises, and after which it falls as their inverse root."""
+CLIP_GRADIENT = 1.0
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Options:
+    """The options of a training."""
+
+    folder: Path
+    """Shards, checkpoints, curves and sheets."""
+    seed: int = 0
+    device: str = "cpu"
+    pool: int = 40
+    """Shards that a stage goes round in."""
+    shard_objects: int = 256
+    precision: str = "float32"
+    """Or "bfloat16": autocast, for GPUs."""
+    save_seconds: float = 300.0
+    sheet_seconds: float = 1200.0
+    batch: Optional[int] = None
+    """In place of each stage's own."""
+
+    def shards_folder(self) -> Path:
+        return self.folder / "shards"
+
+
+class Stage(ABC):
+    """One network and how it is trained; ``model`` is what is optimised and averaged."""
+
+    name: ClassVar[str]
+    batch_size: ClassVar[int]
+    learning_rate: ClassVar[float]
+    images: ClassVar[int]
+    """How many a full training sees."""
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+        self.device = torch.device(options.device)
+        self.batch = options.batch or self.batch_size
+        self.constants: dict[str, float] = {}
+        """Numbers that the trained network only fits with; kept in the checkpoint."""
+        self.model = self.build().to(self.device)
+
+    @abstractmethod
+    def build(self) -> nn.Module:
+        """Make a new network with random weights, and load what its training depends on."""
+
+    @abstractmethod
+    def batches(self, step: int) -> Iterator[Any]:
+        """Yield the batches from ``step`` on."""
+
+    @abstractmethod
+    def loss(self, model: nn.Module, batch: Any, step: int) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss of one batch, and numbers to log beside it."""
+
+    def frozen(self) -> tuple[str, ...]:
+        """Return prefixes of the parameters that no longer change, since others depend on them."""
+        return ()
+
+    def evaluate(self, model: nn.Module) -> dict[str, float]:
+        """Measure the model on objects that are withheld from training."""
+        return {}
+
+    def sheet(self, model: nn.Module) -> Optional[np.ndarray]:
+        """Draw what the model does, uint8 (H, W, 3), where that can be shown."""
+        return None
+
+    def depends(self) -> dict[str, str]:
+        """Return fingerprints of the frozen networks that this one is trained with."""
+        return {}
+
+
+@dataclass
+class Progress:
+    """What is saved beside the weights."""
+
+    step: int = 0
+    images: int = 0
+    seconds: float = 0.0
+    history: list[dict[str, float]] = field(default_factory=list)
+    """Means over LOG_EVERY steps."""
+
+
+LOG_EVERY = 50
+
+
+class Training:
+    """Trains one stage up to a number of images."""
+
+    def __init__(self, stage: Stage) -> None:
+        torch.manual_seed(stage.options.seed)
+        self.stage = stage
+        self.model = stage.model
+        self.ema = AveragedModel(self.model, multi_avg_fn=_average, use_buffers=False)
+        self.optimizer = torch.optim.AdamW(
+            self.model.parameters(), lr=stage.learning_rate, betas=(0.9, 0.99), weight_decay=0.01
+        )
+        self.progress = Progress()
+        self.measured: dict[str, float] = {}
+        self._stop = False
+        if self.path.exists():
+            self._resume()
+        self._freeze()
+
+    @property
+    def path(self) -> Path:
+        return checkpoint_path(self.stage.options.folder, self.stage.name)
+
+    def run(self, images: Optional[int] = None) -> Progress:
+        """Train until ``images`` were seen; SIGTERM and SIGINT save and stop."""
+        target = images or self.stage.images
+        earlier = {
+            number: signal.signal(number, self._on_signal)
+            for number in (signal.SIGTERM, signal.SIGINT)
+        }
+        try:
+            self._loop(target)
+        finally:
+            for number, handler in earlier.items():
+                signal.signal(number, handler)
+        return self.progress
+
+    def _loop(self, target: int) -> None:
+        progress, sums = self.progress, _Sums()
+        saved = shown = started = time.monotonic()
+        for batch in self.stage.batches(progress.step):
+            if progress.images >= target or self._stop:
+                break
+            metrics = self.train_step(batch)
+            now = time.monotonic()
+            progress.seconds += now - started
+            started = now
+            if sums.add(metrics) == LOG_EVERY:
+                self._log(sums.mean(), target)
+            if now - shown > self.stage.options.sheet_seconds:
+                shown = now
+                self._show()
+            if now - saved > self.stage.options.save_seconds:
+                saved = now
+                self.save()
+        self._show()
+        self.save()
+
+    def train_step(self, batch: Any) -> dict[str, Tensor]:
+        """Make one step of the optimiser and of the average."""
+        progress, device = self.progress, self.stage.device.type
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.stage.learning_rate * rate_factor(progress.step)
+        mixed = self.stage.options.precision == "bfloat16"
+        with torch.autocast(device, dtype=torch.bfloat16, enabled=mixed):
+            loss, metrics = self.stage.loss(self.model, batch, progress.step)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), CLIP_GRADIENT)
+        self.optimizer.step()
+        self.ema.update_parameters(self.model)
+        progress.step += 1
+        progress.images += self.stage.batch
+        return {"loss": loss.detach(), "grad_norm": norm, **metrics}
+
+    def save(self) -> None:
+        """Write the checkpoint and the curves.
+
+        Raises:
+            UserError: the disk is full or the folder can't be written; the earlier file stays.
+        """
+        content = {
+            "model": self.model.state_dict(),
+            "ema": self.ema.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "depends": self.stage.depends(),
+            "constants": self.stage.constants,
+            "measured": self.measured,
+            **vars(self.progress),
+        }
+        save_file(self.path, content)
+        write_curves(self.path.with_suffix(".csv"), self.progress.history)
+
+    def _resume(self) -> None:
+        content = load_file(self.path)
+        if content["depends"] != self.stage.depends():
+            changed = [
+                name
+                for name, digest in self.stage.depends().items()
+                if content["depends"].get(name) != digest
+            ]
+            raise UserError(
+                f"{self.path} was trained with another {' and '.join(changed)}:"
+                " put that checkpoint back, or delete this one"
+            )
+        self.model.load_state_dict(content["model"])
+        self.ema.load_state_dict(content["ema"])
+        self.optimizer.load_state_dict(content["optimizer"])
+        self.progress = Progress(**{name: content[name] for name in vars(Progress())})
+        self.stage.constants.update(content["constants"])
+        self.measured = content["measured"]
+        log.info("%s: resumed after %d images", self.stage.name, self.progress.images)
+
+    @torch.no_grad()
+    def _freeze(self) -> None:
+        """Set the frozen parameters to their averages, which is what others were trained with."""
+        prefixes = self.stage.frozen()
+        averages = dict(self.ema.module.named_parameters())
+        for name, parameter in self.model.named_parameters():
+            if name.startswith(prefixes):
+                parameter.copy_(averages[name])
+                parameter.requires_grad_(False)
+
+    def _log(self, means: dict[str, float], target: int) -> None:
+        progress = self.progress
+        progress.history.append(
+            {"images": progress.images, "seconds": round(progress.seconds, 1), **means}
+        )
+        numbers = "  ".join(f"{name} {value:.4g}" for name, value in means.items())
+        rate = progress.images / max(progress.seconds, 1e-9)
+        print(f"{self.stage.name}  {progress.images}/{target}  {rate:.1f}/s  {numbers}", flush=True)
+
+    @torch.no_grad()
+    def _show(self) -> None:
+        """Evaluate the averaged model on withheld objects and write its sheet."""
+        model = self.ema.module.eval()
+        self.measured = self.stage.evaluate(model)
+        if self.measured:
+            text = "  ".join(f"{name} {value:.4g}" for name, value in self.measured.items())
+            print(
+                f"{self.stage.name}  {self.progress.images}  withheld objects: {text}", flush=True
+            )
+        image = self.stage.sheet(model)
+        if image is not None:
+            folder = self.stage.options.folder / "sheets"
+            folder.mkdir(parents=True, exist_ok=True)
+            write_picture(folder / f"{self.stage.name}-{self.progress.images:08d}.png", image)
+
+    def _on_signal(self, number: int, frame: Any) -> None:
+        self._stop = True
+
+
+class _Sums:
+    """Sums of metrics since the last log."""
+
+    def __init__(self) -> None:
+        self.count, self.values = 0, {}
+
+    def add(self, metrics: dict[str, Tensor]) -> int:
+        self.count += 1
+        for name, value in metrics.items():
+            self.values[name] = self.values.get(name, 0) + value.detach()
+        return self.count
+
+    def mean(self) -> dict[str, float]:
+        """Return the means since the last call."""
+        means = {name: float(value) / self.count for name, value in self.values.items()}
+        self.count, self.values = 0, {}
+        return means
+
+
+def _average(averages: list[Tensor], current: list[Tensor], count: Any) -> None:
+    """Update an EMA whose decay is min(EMA_DECAY, (1 + n) / (10 + n)) after n steps."""
+    decay = min(EMA_DECAY, (1 + float(count)) / (10 + float(count)))
+    torch._foreach_lerp_(averages, current, 1 - decay)
+
+
+def rate_factor(step: int) -> float:
+    """Return a step's learning rate as a share of the stage's.
+
+    It rises linearly, is constant, and then falls as the inverse root of the steps.
+    """
+    return min(1.0, (step + 1) / WARMUP) * min(1.0, (DECAY_START / (step + 1)) ** 0.5)
+
+
+def checkpoint_path(folder: Path, name: str) -> Path:
+    """Return the path of a stage's checkpoint."""
+    return Path(folder) / f"{name}.pt"
+
+
+def averaged_weights(folder: Path, name: str) -> dict[str, Tensor]:
+    """Read the averaged weights of a stage's checkpoint.
+
+    Raises:
+        UserError: the stage isn't trained yet, or its file is damaged.
+    """
+    path = checkpoint_path(folder, name)
+    if not path.exists():
+        raise UserError(f"{path} is missing: train the stage {name!r} first")
+    ema = load_file(path)["ema"]
+    return {
+        key.removeprefix("module."): value
+        for key, value in ema.items()
+        if key.startswith("module.")
+    }
+
+
+def write_curves(path: Path, history: list[dict[str, float]]) -> None:
+    """Write the history as CSV, and as a chart beside it."""
+    if not history:
+        return
+    columns = list(history[-1])
+    lines = [
+        ",".join(columns),
+        *(",".join(str(row.get(name, "")) for name in columns) for row in history),
+    ]
+    with atomic_file(path, durable=False) as file:
+        file.write(("\n".join(lines) + "\n").encode())
+    write_picture(
+        path.with_suffix(".png"), curve(np.array([[row["images"], row["loss"]] for row in history]))
+    )
+
+
+def curve(points: np.ndarray, size: tuple[int, int] = (640, 320)) -> np.ndarray:
+    """Draw (images, loss) with a logarithmic loss axis, uint8 (H, W, 3)."""
+    from PIL import Image, ImageDraw
+
+    chart = Image.new("RGB", size, "white")
+    draw = ImageDraw.Draw(chart)
+    x, y = points[:, 0], np.log(np.maximum(points[:, 1], 1e-12))
+    left, top, right, bottom = 60, 10, size[0] - 10, size[1] - 25
+    place = np.stack(
+        [
+            left + (right - left) * x / max(x.max(), 1),
+            bottom - (bottom - top) * (y - y.min()) / max(np.ptp(y), 1e-9),
+        ],
+        1,
+    )
+    draw.rectangle((left, top, right, bottom), outline="grey")
+    draw.line([tuple(row) for row in place.tolist()], fill="blue")
+    draw.text((4, top), f"{np.exp(y.max()):.3g}", fill="black")
+    draw.text((4, bottom - 10), f"{np.exp(y.min()):.3g}", fill="black")
+    draw.text((right - 140, bottom + 8), f"{int(x.max())} images", fill="black")
+    return np.asarray(chart)

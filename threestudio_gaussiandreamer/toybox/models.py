@@ -1,0 +1,193 @@
+"""Sizes and construction of the toybox's networks; all but the judge have published formats."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ..priors.point_e_model import BaseModel
+from .tokenizer import LENGTH
+from .views import LABELS, SIZE
+
+TEXT_WIDTH, TEXT_LAYERS, HEADS = 128, 2, 4
+VISION_WIDTH, VISION_LAYERS, PATCH = 128, 4, 16
+FEATURES = 128
+"""Of CLIP's common space, and so of the points model's condition."""
+VAE_CHANNELS = (16, 32, 64, 80)
+UNET_CHANNELS = (96, 160)
+"""At 16^2 and 8^2."""
+LATENT_CHANNELS = 4
+POINTS_WIDTH, POINTS_LAYERS = 128, 5
+SCHEDULE = {
+    "num_train_timesteps": 1000,
+    "beta_start": 0.00085,
+    "beta_end": 0.012,
+    "beta_schedule": "scaled_linear",
+}
+"""Stable Diffusion's."""
+
+
+def clip_model(vocabulary_size: int) -> Any:
+    """Make a transformers CLIPModel; the tokenizer's last two tokens are start and end."""
+    from transformers import CLIPConfig, CLIPModel
+
+    start, end = vocabulary_size - 2, vocabulary_size - 1
+    text = dict(
+        vocab_size=vocabulary_size,
+        hidden_size=TEXT_WIDTH,
+        intermediate_size=4 * TEXT_WIDTH,
+        num_hidden_layers=TEXT_LAYERS,
+        num_attention_heads=HEADS,
+        max_position_embeddings=LENGTH,
+        hidden_act="gelu",
+        projection_dim=FEATURES,
+        bos_token_id=start,
+        eos_token_id=end,
+        pad_token_id=end,
+    )
+    vision = dict(
+        hidden_size=VISION_WIDTH,
+        intermediate_size=4 * VISION_WIDTH,
+        num_hidden_layers=VISION_LAYERS,
+        num_attention_heads=HEADS,
+        image_size=SIZE,
+        patch_size=PATCH,
+        hidden_act="gelu",
+        projection_dim=FEATURES,
+    )
+    return CLIPModel(CLIPConfig(text_config=text, vision_config=vision, projection_dim=FEATURES))
+
+
+def autoencoder() -> Any:
+    """Make a diffusers AutoencoderKL that shrinks 8 times."""
+    from diffusers import AutoencoderKL
+
+    levels = len(VAE_CHANNELS)
+    network = AutoencoderKL(
+        down_block_types=("DownEncoderBlock2D",) * levels,
+        up_block_types=("UpDecoderBlock2D",) * levels,
+        block_out_channels=VAE_CHANNELS,
+        layers_per_block=1,
+        latent_channels=LATENT_CHANNELS,
+        norm_num_groups=2,
+        sample_size=SIZE,
+        mid_block_add_attention=False,
+    )
+    start_as_identity(network)
+    _start_with_little_noise(network)
+    return network
+
+
+def unet() -> Any:
+    """Make a diffusers UNet2DConditionModel of 16^2 latents with cross attention at 8^2."""
+    from diffusers import UNet2DConditionModel
+
+    network = UNet2DConditionModel(
+        sample_size=SIZE // 8,
+        in_channels=LATENT_CHANNELS,
+        out_channels=LATENT_CHANNELS,
+        down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"),
+        up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"),
+        mid_block_type=None,
+        block_out_channels=UNET_CHANNELS,
+        layers_per_block=1,
+        cross_attention_dim=TEXT_WIDTH,
+        attention_head_dim=HEADS,
+        norm_num_groups=16,
+    )
+    start_as_identity(network)
+    nn.init.zeros_(network.conv_out.weight)
+    return network
+
+
+@torch.no_grad()
+def _start_with_little_noise(network: Any) -> None:
+    """Initialise the posterior's deviation to exp(-3): at 1 it would drown the first colours."""
+    for convolution in (network.quant_conv, network.post_quant_conv):
+        nn.init.dirac_(convolution.weight)
+        nn.init.zeros_(convolution.bias)
+    network.quant_conv.weight[LATENT_CHANNELS:] *= 0.1
+    network.quant_conv.bias[LATENT_CHANNELS:] = -6.0
+
+
+@torch.no_grad()
+def start_as_identity(network: nn.Module) -> None:
+    """Initialise every block of a diffusers network to pass its input on unchanged.
+
+    Residual branches start at zero and resampling convolutions as plain averages, so that colours
+    reach the other end from the first step on: training needs far fewer steps.
+    """
+    for name, module in network.named_modules():
+        if name.endswith(("conv2", "to_out.0", "ff.net.2", "proj_out")):
+            nn.init.zeros_(module.weight)
+            nn.init.zeros_(module.bias)
+        elif name.endswith(("downsamplers.0.conv", "upsamplers.0.conv", "conv_shortcut")):
+            _start_as_average(module, places=2 if "downsamplers" in name else 1)
+
+
+def _start_as_average(convolution: nn.Conv2d, places: int) -> None:
+    """Average ``places``^2 inputs per channel; missing channels keep small random weights."""
+    convolution.weight.mul_(0.1)
+    nn.init.zeros_(convolution.bias)
+    start = 0 if convolution.stride == (2, 2) else convolution.kernel_size[0] // 2
+    rows = slice(start, start + places)
+    for channel in range(min(convolution.weight.shape[:2])):
+        convolution.weight[channel, channel, rows, rows] += 1 / places**2
+
+
+def scheduler() -> Any:
+    """Make Stable Diffusion's noise schedule, for a network that predicts v."""
+    from diffusers import DDPMScheduler
+
+    return DDPMScheduler(**SCHEDULE, prediction_type="v_prediction", clip_sample=False)
+
+
+def points_model() -> BaseModel:
+    """Make a small one of Point-E's base models."""
+    return BaseModel(width=POINTS_WIDTH, layers=POINTS_LAYERS, features=FEATURES)
+
+
+class AttributeHeads(nn.Module):
+    """One linear classifier for each of LABELS."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.heads = nn.ModuleDict(
+            {name: nn.Linear(width, len(classes)) for name, classes in LABELS.items()}
+        )
+
+    def forward(self, features: Float[Tensor, "B W"]) -> dict[str, Tensor]:
+        return {name: head(features) for name, head in self.heads.items()}
+
+
+class Judge(nn.Module):
+    """A convolutional classifier of pictures in [0, 1], (B, 3, 128, 128), into LABELS.
+
+    It shares neither architecture nor data nor seed with the models that it judges.
+    """
+
+    CHANNELS = (24, 48, 96, 128)
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers, previous = [], 3
+        for channels in self.CHANNELS:
+            layers += [
+                nn.Conv2d(previous, channels, 4, stride=2, padding=1),
+                nn.GroupNorm(8, channels),
+                nn.SiLU(),
+            ]
+            layers += [
+                nn.Conv2d(channels, channels, 3, padding=1, groups=8),
+                nn.GroupNorm(8, channels),
+                nn.SiLU(),
+            ]
+            previous = channels
+        self.body = nn.Sequential(*layers)
+        self.mix = nn.Sequential(nn.Linear(2 * previous, 256), nn.SiLU())
+        self.heads = AttributeHeads(256)
+
+    def forward(self, images: Float[Tensor, "B 3 s s"]) -> dict[str, Tensor]:
+        x = self.body(images * 2 - 1).flatten(2)
+        return self.heads(self.mix(torch.cat([x.mean(-1), x.amax(-1)], dim=1)))

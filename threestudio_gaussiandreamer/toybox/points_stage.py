@@ -1,0 +1,160 @@
+"""Training the text-to-points model in Point-E's format, on CLIP's text features."""
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ..cameras import Orbit, to_opencv
+from ..core.streams import generator, numpy_generator
+from ..diffusion import sds
+from ..priors.karras import cosine_alphas_cumprod, guided_denoiser, karras_sigmas, sample_heun
+from ..priors.point_e import BIASES, SCALES, mean_of
+from ..splatting import rasterize
+from . import models
+from .loop import Stage
+from .sheet import contact_sheet
+from .text_batches import object_prompts, open_tokenizer, token_ids
+from .unet_stage import digest, frozen_clip
+from .views import BACKGROUND, FOVY_DEG, VIEWS, Shards, held_out_shard, row_batches
+from .world import RADIUS
+
+POINTS = 256
+"""Of one training sample; a set transformer takes any number later."""
+EMPTY_SHARE = 0.1
+SAMPLES, SAMPLE_POINTS, SAMPLE_STEPS, SAMPLE_GUIDANCE = 16, 512, 24, 3.0
+
+
+class PointsBatch(NamedTuple):
+    points: Float[Tensor, "B 6 N"]
+    """In the network's units, about [-1, 1]."""
+    condition: Float[Tensor, "B D"]
+
+
+class PointsStage(Stage):
+    """Minimise Point-E's own loss: the squared error of the noise, with the cosine schedule."""
+
+    name = "points"
+    batch_size = 32
+    learning_rate = 8e-4
+    images = 400_000
+
+    def build(self) -> nn.Module:
+        self.tokenizer = open_tokenizer(self.options.folder)
+        self.clip = frozen_clip(self.options.folder, len(self.tokenizer)).to(self.device)
+        objects = self.options.shard_objects
+        self.shards = Shards(self.options.shards_folder(), self.options.seed, objects=objects)
+        self.alphas_cumprod = torch.from_numpy(cosine_alphas_cumprod())
+        return models.points_model()
+
+    def depends(self) -> dict[str, str]:
+        return {"clip": digest(self.clip.text_model)}
+
+    def batches(self, step: int) -> Iterator[PointsBatch]:
+        seed = self.options.seed
+        order = row_batches(
+            self.shards, seed, "points", self.batch, self.options.pool, step, per_object=True
+        )
+        for number, (index, rows) in enumerate(order, step):
+            rng, shard = numpy_generator(seed, "points-batch", number), self.shards.get(index)
+            texts = object_prompts(shard.labels[rows * self.shards.views], rng)
+            condition = self.condition(texts)
+            condition[
+                torch.from_numpy(rng.uniform(size=len(rows)) < EMPTY_SHARE).to(self.device)
+            ] = 0
+            chosen = rng.permuted(
+                np.tile(np.arange(shard.points.shape[1]), (len(rows), 1)), axis=1
+            )[:, :POINTS]
+            points = np.take_along_axis(shard.points[rows], chosen[..., None], axis=1)
+            yield PointsBatch(
+                network_units(torch.from_numpy(points).float()).to(self.device), condition
+            )
+
+    def loss(
+        self, model: nn.Module, batch: PointsBatch, step: int
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        rng, x = generator(self.options.seed, "points-noise", step), batch.points
+        places = (torch.randperm(len(x), generator=rng) + torch.rand(len(x), generator=rng)) / len(
+            x
+        )
+        t = (places * len(self.alphas_cumprod)).long().clamp(max=len(self.alphas_cumprod) - 1)
+        noise = torch.randn(x.shape, generator=rng).to(self.device)
+        z = sds.add_noise(x, noise, self.alphas_cumprod[t].to(self.device))
+        predicted = mean_of(lambda z, t: model(z, t, batch.condition))(z, t.to(self.device)).float()
+        errors = (predicted - noise).square()
+        return errors.mean(), {
+            "mse_points": errors[:, :3].mean(),
+            "mse_colors": errors[:, 3:].mean(),
+        }
+
+    @torch.no_grad()
+    def condition(self, texts: list[str]) -> Float[Tensor, "B D"]:
+        """Return CLIP's text features with unit variance, as the Point-E prior gives them."""
+        output = self.clip.text_model(
+            token_ids(self.tokenizer, texts).to(self.device)
+        ).pooler_output
+        features = self.clip.text_projection(output).float()
+        return features / features.norm(dim=-1, keepdim=True) * features.shape[-1] ** 0.5
+
+    @torch.no_grad()
+    def sheet(self, model: nn.Module) -> np.ndarray:
+        shard = held_out_shard(self.options.shards_folder(), self.options.seed)
+        texts = object_prompts(
+            shard.labels[::VIEWS][:SAMPLES], numpy_generator(self.options.seed, "points-sheet")
+        )
+        condition = self.condition(texts)
+        conditions = torch.cat([condition, torch.zeros_like(condition)])
+        network = mean_of(lambda z, t: model(z, t, conditions))
+        denoise = guided_denoiser(network, cosine_alphas_cumprod(), scale=SAMPLE_GUIDANCE)
+        rng = generator(self.options.seed, "points-sheet")
+        noise = torch.randn(len(texts), 6, SAMPLE_POINTS, generator=rng).to(self.device)
+        sigmas = karras_sigmas(SAMPLE_STEPS, 1e-3, 120.0)
+        sample = sample_heun(denoise, noise, sigmas, churn=3.0, generator=rng).cpu()
+        return contact_sheet(torch.stack([drawn(points) for points in sample]), texts, columns=8)
+
+
+def network_units(points: Float[Tensor, "B N 6"]) -> Float[Tensor, "B 6 N"]:
+    """Convert points of the world to the units of Point-E's networks.
+
+    Their front is -y and their unit is 2 RADIUS; then follow the published scales and biases.
+    """
+    x, y, z = (points[..., i] / (2 * RADIUS) for i in range(3))
+    turned = torch.stack([y, -x, z, *(255 * points[..., i] for i in (3, 4, 5))], dim=1)
+    return turned * SCALES + BIASES
+
+
+def world_units(sample: Float[Tensor, "6 N"]) -> Float[Tensor, "N 6"]:
+    """Invert :func:`network_units` for one sample."""
+    x, y, z, *colors = (sample - BIASES[:, 0][:, None]) / SCALES[:, 0][:, None]
+    return torch.stack(
+        [-y * 2 * RADIUS, x * 2 * RADIUS, z * 2 * RADIUS, *(color / 255 for color in colors)], dim=1
+    )
+
+
+def drawn(sample: Float[Tensor, "6 N"], size: int = 128) -> Float[Tensor, "3 s s"]:
+    """Draw a sample's points as small Gaussians, seen from the front and the left."""
+    points = world_units(sample)
+    angles = (15.0, 40.0, 2.25, math.radians(FOVY_DEG))
+    orbit = Orbit(*(torch.tensor([float(value)]) for value in angles))
+    viewmats, Ks = to_opencv(orbit.c2w, orbit.fovy, size, size)
+    count = len(points)
+    quats, scales = torch.tensor([1.0, 0, 0, 0]).repeat(count, 1), torch.full((count, 3), 0.02)
+    colors = points[:, 3:].clamp(0, 1).contiguous()
+    background = torch.tensor(BACKGROUND)
+    image = rasterize(
+        points[:, :3].contiguous(),
+        quats,
+        scales,
+        torch.full((count,), 0.9),
+        colors,
+        viewmats,
+        Ks,
+        size,
+        size,
+        background=background,
+    ).image[0]
+    return image.movedim(-1, 0)

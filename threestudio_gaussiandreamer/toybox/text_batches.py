@@ -1,0 +1,63 @@
+"""Prompts of pictures as token ids, the same for every stage that reads text."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from . import words
+from .tokenizer import LENGTH, write_tokenizer
+from .views import Shard, attributes_of
+
+
+def open_tokenizer(folder: Path) -> Any:
+    """Load the training's tokenizer, which is written on first use."""
+    from transformers import CLIPTokenizer
+
+    place = Path(folder) / "tokenizer"
+    if not (place / "tokenizer_config.json").exists():
+        write_tokenizer(place, words.vocabulary())
+    return CLIPTokenizer.from_pretrained(str(place))
+
+
+def token_ids(tokenizer: Any, texts: Sequence[str]) -> Int[Tensor, "B 32"]:
+    """Return padded token ids, as Stable Diffusion's prompt processors make them."""
+    options = {
+        "padding": "max_length",
+        "max_length": LENGTH,
+        "truncation": True,
+        "return_tensors": "pt",
+    }
+    return tokenizer(list(texts), **options).input_ids
+
+
+def training_prompts(shard: Shard, rows: np.ndarray, rng: np.random.Generator) -> list[str]:
+    """Write a prompt for each picture: see :func:`words.prompt_of`."""
+    views = zip(shard.labels[rows], shard.elevation[rows], shard.azimuth[rows], strict=True)
+    return [
+        words.prompt_of(attributes_of(row), elevation, azimuth, rng)
+        for row, elevation, azimuth in views
+    ]
+
+
+def object_prompts(labels: np.ndarray, rng: np.random.Generator) -> list[str]:
+    """Write a prompt without a direction for each row of labels."""
+    return [words.describe(attributes_of(row), rng) for row in labels]
+
+
+def view_prompts(shard: Shard, rows: np.ndarray, rng: np.random.Generator) -> list[str]:
+    """Write a prompt with its direction for each picture, as the prompt processors write it."""
+    texts = object_prompts(shard.labels[rows], rng)
+    angles = zip(shard.elevation[rows], shard.azimuth[rows], strict=True)
+    return [
+        f"{text}, {words.direction(*view)} view" for text, view in zip(texts, angles, strict=True)
+    ]
+
+
+def label_tensor(shard: Shard, rows: np.ndarray) -> Int[Tensor, "B L"]:
+    """Return the classes of the pictures."""
+    return torch.from_numpy(shard.labels[rows])

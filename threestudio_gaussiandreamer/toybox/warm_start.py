@@ -1,0 +1,96 @@
+"""Continue a training from published weights: the inverse of ``export.py``."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..core.errors import UserError
+from ..core.files import existing_file
+from .loop import Options, Progress, Stage, Training, checkpoint_path
+from .unet_stage import LATENT_SCALE
+
+
+def start_from(weights: Path, options: Options, stages: dict[str, type[Stage]]) -> None:
+    """Write a checkpoint for every stage of ``weights`` that the training folder has none of.
+
+    Optimisers start anew; CLIP's attribute classifiers, which aren't published, start at random.
+
+    Args:
+        weights: a folder that ``toybox.export`` wrote.
+        stages: all stages by name, in the order in which they depend on each other.
+
+    Raises:
+        UserError: a file is missing or holds another model.
+    """
+    path = existing_file(weights / "training.json", "record of the toybox's weights")
+    record = json.loads(path.read_text(encoding="utf-8"))
+    if not (options.folder / "tokenizer").exists():
+        shutil.copytree(weights / "stable-diffusion" / "tokenizer", options.folder / "tokenizer")
+    for name, stage in stages.items():
+        if name in record and not checkpoint_path(options.folder, name).exists():
+            training = Training(stage(options))
+            _load(training.model, READERS[name](weights), weights, name)
+            training.ema.module.load_state_dict(training.model.state_dict())
+            training.ema.n_averaged.fill_(record[name]["steps"])
+            if name == "unet":
+                training.stage.constants[LATENT_SCALE] = _latent_scale(weights)
+            seen = record[name]
+            training.progress = Progress(seen["steps"], seen["images"], 3600 * seen["hours"])
+            training.save()
+
+
+def _load(model: nn.Module, state: dict[str, Tensor], weights: Path, name: str) -> None:
+    known = model.state_dict()
+    differing = [
+        key for key, value in state.items() if key not in known or known[key].shape != value.shape
+    ]
+    if differing or (name != "clip" and state.keys() != known.keys()):
+        raise UserError(
+            f"the weights of {name!r} in {str(weights)!r} are of another model"
+            f" ({', '.join(differing[:3]) or 'some are missing'}): take those of this version"
+        )
+    model.load_state_dict(state, strict=False)
+
+
+def _read_diffusers(name: str) -> Any:
+    return lambda weights: _read(
+        weights / "stable-diffusion" / name / "diffusion_pytorch_model.safetensors"
+    )
+
+
+def _read_clip(weights: Path) -> dict[str, Tensor]:
+    from transformers import CLIPModel
+
+    return {
+        f"clip.{key}": value
+        for key, value in CLIPModel.from_pretrained(weights / "clip").float().state_dict().items()
+    }
+
+
+def _read_points(weights: Path) -> dict[str, Tensor]:
+    path = existing_file(weights / "points.pt", "weights of the points model")
+    return {key: value.float() for key, value in torch.load(path, weights_only=True).items()}
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    from safetensors.torch import load_file
+
+    return {key: value.float() for key, value in load_file(existing_file(path, "weights")).items()}
+
+
+READERS = {
+    "clip": _read_clip,
+    "autoencoder": _read_diffusers("vae"),
+    "unet": _read_diffusers("unet"),
+    "points": _read_points,
+    "judge": lambda weights: _read(weights / "judge.safetensors"),
+}
+
+
+def _latent_scale(weights: Path) -> float:
+    config = existing_file(weights / "stable-diffusion" / "vae" / "config.json", "configuration")
+    return float(json.loads(config.read_text(encoding="utf-8"))["scaling_factor"])
