@@ -13,7 +13,8 @@ import pytest
 
 from tests.helpers import tiny_models
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.models import extras, hub, model_files
+from threestudio_gaussiandreamer.models import hub, model_files
+from threestudio_gaussiandreamer.models.extras import require_extra
 
 huggingface_hub = pytest.importorskip("huggingface_hub")
 pytest.importorskip("diffusers")
@@ -322,9 +323,9 @@ def test_a_full_disk_is_named():
 
 
 def test_without_the_libraries_the_extra_is_named(monkeypatch):
-    extras.require("diffusion", "json")
+    require_extra("diffusion", "json")
     monkeypatch.setitem(sys.modules, "diffusers", None)
     with pytest.raises(
         UserError, match=r"needs diffusers .*pip install 'threestudio-gaussiandreamer\[diffusion\]'"
     ):
-        extras.require("diffusion", "json", "diffusers")
+        require_extra("diffusion", "json", "diffusers")

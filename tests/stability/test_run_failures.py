@@ -365,7 +365,8 @@ def test_resume_auto_takes_the_one_before_and_says_so(stopped, whole, tmp_path, 
 @row("A5", "Corrupted checkpoint")
 def test_resume_auto_without_a_checkpoint_starts_anew_and_says_so(tmp_path, measured):
     ended = launch(tmp_path, "trainer.max_steps=1", "resume=auto")
-    assert ended.code == 0 and "no checkpoint of" in ended.err and "starting from the prior" in ended.err
+    assert ended.code == 0
+    assert "no checkpoint of" in ended.err and "starting from the prior" in ended.err
     measured("says what it chose")
 
 

@@ -40,7 +40,7 @@ from ..core.errors import UserError, unknown
 from ..core.options import in_range
 from ..diffusion import sds
 from ..host import debug, info, parse_structured
-from ..models import extras
+from ..models.extras import require_extra
 from ..models.hub import find_model
 from ..models.model_files import load_network, load_settings
 from .base import ScoreDistillation
@@ -90,14 +90,14 @@ class TextToImageDistillation(ScoreDistillation):
     @classmethod
     def preflight(cls, cfg: Any) -> None:
         cfg = parse_structured(cls.Config, cfg)
-        extras.require("diffusion", "diffusers", "transformers")
+        require_extra("diffusion", "diffusers", "transformers")
         find_model(
             cfg.pretrained_model_name_or_path, cls.components, revision=cfg.revision, download=False
         )
 
     def configure(self) -> None:
         super().configure()
-        extras.require("diffusion", "diffusers", "transformers")
+        require_extra("diffusion", "diffusers", "transformers")
         self.dtype = weights_type(self.cfg.half_precision_weights, self.device)
         folder = find_model(
             self.cfg.pretrained_model_name_or_path,

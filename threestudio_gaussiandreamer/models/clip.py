@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from . import extras
+from .extras import require_extra
 from .hub import Source, locate
 from .model_files import (
     component_files,
@@ -82,7 +82,7 @@ class PictureText:
     def __init__(
         self, source: Source, device: torch.device, *, allow_bin: Optional[bool] = None
     ) -> None:
-        extras.require("diffusion", "transformers")
+        require_extra("diffusion", "transformers")
         from transformers import CLIPModel
 
         folder = locate(source)

@@ -5,7 +5,7 @@ from importlib import import_module
 from ..core.errors import UserError
 
 
-def require(extra: str, *modules: str) -> None:
+def require_extra(extra: str, *modules: str) -> None:
     """Raise UserError, which says what to install, unless all ``modules`` of the package's
     ``extra`` can be imported.
     """

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Optional
 
 from ..core.errors import UserError
 from ..host import info
-from . import extras
+from .extras import require_extra
 from .model_files import files_below, needed_files
 
 TIMEOUT = 4.0
@@ -99,7 +99,7 @@ def locate(source: Source, *, download: bool = True) -> Optional[Path]:
             f"{source}: there is no such folder{_near_folders(folder)}, and a hub id reads "
             "owner/model."
         )
-    extras.require("diffusion", "huggingface_hub")
+    require_extra("diffusion", "huggingface_hub")
     cached = cached_snapshot(source)
     if cached is not None and _is_complete(cached, source):
         return cached

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..host import get_device, warn
-from . import extras
+from .extras import require_extra
 from .model_files import free_memory, load_network, load_settings
 
 LENGTH = 77
@@ -51,7 +51,7 @@ def encode_t5(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
     In half precision on a GPU, where nothing else is loaded yet: IF's encoder then takes about 11
       GB, in float32 19 GB.
     """
-    extras.require(
+    require_extra(
         "diffusion", "sentencepiece", "google.protobuf"
     )  # without them transformers takes the tokenizer for another kind
     from transformers import T5EncoderModel

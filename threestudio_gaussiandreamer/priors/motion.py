@@ -49,8 +49,8 @@ from ..gaussians.point_cloud import PointCloud
 from ..host import info, register, warn
 from ..meshes.load import Mesh, load_mesh
 from ..meshes.raycast import MeshCaster, over_background
-from ..models import extras
 from ..models.clip import clip_source, picture_similarities
+from ..models.extras import require_extra
 from ..models.hub import Source, locate
 from .base import COLOR, SCALE, Prior, chosen_colors, points
 from .mesh import face_normals, mesh_cloud
@@ -131,9 +131,9 @@ class MotionPrior(Prior):
         else:
             read_motions(self.cfg.motion)
             load_body_model(self.cfg.body_model)
-            extras.require("body", "smplx")
+            require_extra("body", "smplx")
         if self._needs_clip():
-            extras.require("diffusion", "transformers")
+            require_extra("diffusion", "transformers")
             chosen_device(self.cfg.device, self.device)
             locate(self._clip(), download=False)
 

@@ -45,8 +45,8 @@ from ..core.files import existing_file
 from ..core.options import in_range, is_numbers, positive, required, satisfies
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
-from ..models import extras
 from ..models.clip import clip_source, load_text_encoder, load_tokenizer, text_condition
+from ..models.extras import require_extra
 from ..models.hub import Source, locate
 from ..models.model_files import free_memory
 from .base import SCALE, Prior, points
@@ -133,7 +133,7 @@ class PointEPrior(Prior):
         existing_file(self.cfg.checkpoint, BASE.title)
         if self.cfg.upsampler:
             existing_file(self.cfg.upsampler, UPSAMPLER.title)
-        extras.require("diffusion", "transformers")
+        require_extra("diffusion", "transformers")
         chosen_device(self.cfg.device, self.device)
         locate(self._clip(), download=False)
 

@@ -56,8 +56,8 @@ from ..core.memory import count_of, require_memory
 from ..core.options import in_range, one_of, positive
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
-from ..models import extras
 from ..models.clip import load_text_encoder, load_tokenizer, text_condition
+from ..models.extras import require_extra
 from ..models.hub import Source, locate
 from ..models.model_files import free_memory, load_network, load_settings, needed_files
 from .base import SCALE, Prior
@@ -112,7 +112,7 @@ class ShapEPrior(Prior):
         Raises:
             UserError: what is missing, and what to do.
         """
-        extras.require("diffusion", "diffusers", "transformers")
+        require_extra("diffusion", "diffusers", "transformers")
         chosen_device(self.cfg.device, self.device)
         locate(self._source(), download=False)
         if self.cfg.checkpoint:

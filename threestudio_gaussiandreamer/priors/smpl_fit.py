@@ -28,7 +28,7 @@ from torch import Tensor
 from ..core.errors import UserError
 from ..core.files import existing_file
 from ..formats.array_files import read_arrays
-from ..models import extras
+from ..models.extras import require_extra
 
 FIELDS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 """Arrays of a body model's file that are used."""
@@ -139,7 +139,7 @@ def fit_bodies(
         fit_shape: the shape coefficients too; else the model's mean shape.
         iterations: the most of the last stage.
     """
-    extras.require("body", "smplx")
+    require_extra("body", "smplx")
     wanted = _tensor(targets)[
         :, : SMPL_JOINTS if len(model.parents) == SMPL_JOINTS else BODY_JOINTS
     ]

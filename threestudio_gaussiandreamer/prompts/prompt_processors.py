@@ -44,8 +44,8 @@ from ..core.errors import UserError
 from ..core.files import existing_file
 from ..core.options import check_options, in_range
 from ..host import BaseObject, info, register, register_builtin
-from ..models import extras
 from ..models.embedding_cache import EmbeddingCache, Encode
+from ..models.extras import require_extra
 from ..models.hub import find_model
 from ..models.model_files import fingerprint
 from ..models.text_encoders import encode_clip, encode_t5
@@ -109,7 +109,7 @@ class TextEncoderPromptProcessor(BaseObject):
 
     def configure(self) -> None:
         check_options(self.Config, self.cfg, "system.prompt_processor.")
-        extras.require("diffusion", "diffusers", "transformers")
+        require_extra("diffusion", "diffusers", "transformers")
         self.prompt = chosen_prompt(self.cfg)
         half = self.half and self.device.type == "cuda"
         folder = find_model(
