@@ -23,6 +23,7 @@ from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
 from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.geometry import LEARNING_RATES, STATISTICS, GaussianCloud
+from threestudio_gaussiandreamer.training.initialization import grow_points
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -196,7 +197,9 @@ def test_f15_a_degenerate_prior_does_not_explode(axes, fault):
 
     def ours(points):
         return len(
-            GaussianCloud({"grow": options}).grown(PointCloud(points, np.zeros_like(points))).points
+            grow_points(
+                PointCloud(points, np.zeros_like(points)), GaussianCloud({"grow": options}).cfg.grow
+            ).points
         )
 
     def without_a_cap(points):

@@ -27,6 +27,7 @@ from threestudio_gaussiandreamer.gaussians.simplify import look, views_around
 from threestudio_gaussiandreamer.meshes.load import face_areas, load_mesh, sample_surface
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
+from threestudio_gaussiandreamer.training.initialization import grow_points
 
 register_parts()
 CUBE = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
@@ -48,7 +49,7 @@ def colored(points: np.ndarray, color: float = 0.5) -> PointCloud:
 
 def started(cloud: PointCloud, **options) -> GaussianCloud:
     geometry = GaussianCloud({"grow": {"enabled": False}, **options})
-    geometry.start_from(geometry.grown(cloud))
+    geometry.start_from(grow_points(cloud, geometry.cfg.grow))
     return geometry
 
 
@@ -467,7 +468,9 @@ def test_noise_stays_in_its_range_and_colours_in_theirs(color_range, mean, measu
     }
 
     def grown(color: float, **more) -> np.ndarray:
-        return GaussianCloud({"grow": options | more}).grown(colored(sphere(), color)).colors[1000:]
+        return grow_points(
+            colored(sphere(), color), GaussianCloud({"grow": options | more}).cfg.grow
+        ).colors[1000:]
 
     noise = grown(0.5) - 0.5
     counts, expected = np.histogram(noise, 10, color_range)[0], noise.size / 10

@@ -17,6 +17,7 @@ from threestudio_gaussiandreamer.host import find, register
 from threestudio_gaussiandreamer.splatting import Rasterized
 from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
+from threestudio_gaussiandreamer.training.initialization import grow_points
 
 register_parts()
 NO_GROWTH = {"enabled": False}
@@ -24,7 +25,7 @@ NO_GROWTH = {"enabled": False}
 
 def started(cloud, **cfg):
     geometry = GaussianCloud({"grow": NO_GROWTH, **cfg})
-    geometry.start_from(geometry.grown(cloud))
+    geometry.start_from(grow_points(cloud, geometry.cfg.grow))
     return geometry
 
 

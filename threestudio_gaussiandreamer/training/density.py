@@ -12,7 +12,7 @@ As gsplat's ``Strategy``, one object is called around every optimiser step:
 
 ``step`` counts finished optimiser steps. The statistics are buffers of the cloud, so that they are
 in its checkpoint. What is cloned and split: ``gaussians/densify.py``; what is dropped to meet a
-budget: ``gaussians/importance.py``; the options: ``geometry.py``.
+budget: ``gaussians/importance.py``; the options: ``density_options.py``.
 """
 
 import math
@@ -31,8 +31,7 @@ from ..gaussians.densify import Change, Rules, Statistics
 from ..host import run_seed
 from ..metrics import psnr
 from ..splatting import Rasterized
-
-AUTO = "auto"
+from .density_options import AUTO, min_count, rounds_of
 
 
 class QualityResult(NamedTuple):
@@ -323,18 +322,3 @@ class RenderedQuality:
         affordable = self.control.affordable_loss
         measured = {"prune/lost": float(loss), "prune/affordable": affordable}
         return QualityResult(affordable - loss, measured)
-
-
-def min_count(cfg: Any) -> int:
-    """Return how many Gaussians pruning leaves at least; ``cfg`` has ``min_gaussians`` and a
-    ``budget``.
-    """
-    return max(cfg.min_gaussians, 0 if cfg.budget == AUTO else cfg.budget)
-
-
-def rounds_of(schedule: Any) -> range:
-    """Return the steps at which a schedule with ``start``, ``stop`` and ``every`` has a round: the
-    multiples of ``every``.
-    """
-    first = math.ceil(schedule.start / schedule.every) * schedule.every
-    return range(first, schedule.stop, schedule.every)

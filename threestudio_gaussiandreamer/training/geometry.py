@@ -41,40 +41,33 @@ keep_attributes     with gaussians-prior: start from all attributes of that clou
 
 import contextlib
 import logging
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, List
+from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ..core.errors import UserError
-from ..core.memory import count_of
 from ..core.nested import adopt_nested
 from ..core.options import (
     at_least,
     between,
     check_options,
     in_range,
-    interval,
-    is_whole,
     one_of,
     positive,
     schedule,
-    shown,
 )
-from ..core.streams import numpy_generator
-from ..gaussians import densify, importance, sh, simplify
+from ..gaussians import densify, sh
 from ..gaussians.densify import LOG_SCALE_RANGE, PARAMETERS, Change
-from ..gaussians.gaussians import Gaussians
-from ..gaussians.grow import SCALE_RULES, grow, nearest_distance_scales
+from ..gaussians.grow import SCALE_RULES
 from ..gaussians.merge import merge_duplicates
 from ..gaussians.point_cloud import PointCloud
-from ..host import BaseGeometry, C, find, register, run_seed
-from .density import AUTO, min_count
+from ..host import BaseGeometry, C, find, register
+from .density_options import DensifyConfig, PruneConfig, as_budget, check_budget, min_count
+from .initialization import GrowConfig, gaussians_on_points, grow_points, most_visible
 
 logger = logging.getLogger(__name__)
 STATISTICS = ("gradient_sum", "gradient_count", "contribution", "removal")
@@ -86,57 +79,6 @@ LEARNING_RATES = {
     "sh0": "lr_sh",
     "sh_rest": "lr_sh_rest",
 }
-CAP_VIEWS = (32, 256)
-"""How many views a trained cloud that is too large is judged by, and their pixels each way."""
-
-
-@dataclass
-class GrowConfig:
-    enabled: bool = True
-    num_candidates: int = field(default=1_000_000, metadata=count_of("candidates", 0, 48))
-    radius: float = field(default=0.01, metadata=positive())
-    color_range: List[float] = field(default_factory=lambda: [0.0, 0.2], metadata=interval())
-    clamp: bool = True
-    max_points: int = field(default=400_000, metadata=at_least(0))
-
-
-@dataclass
-class DensifyConfig:
-    enabled: bool = False
-    start: int = field(default=400, metadata=at_least(0))
-    stop: int = field(default=900, metadata=at_least(0))
-    every: int = field(default=100, metadata=at_least(1))
-    grad_threshold: float = field(default=2e-4, metadata=at_least(0))
-    split_scale: float = field(default=0.04, metadata=positive())
-    min_opacity: float = field(default=0.05, metadata=in_range(0, 1 - 1e-6))
-    max_scale: float = field(default=0.4, metadata=positive("world units"))
-    absgrad: bool = False
-
-    @staticmethod
-    def check(cfg: Any) -> None:
-        if cfg.enabled:
-            require_order(cfg)
-
-
-@dataclass
-class PruneConfig:
-    start: int = field(default=100, metadata=at_least(0))
-    stop: int = field(default=900, metadata=at_least(0))
-    every: int = field(default=50, metadata=at_least(1))
-    keep: float = field(default=0.8, metadata=between(0, 1))
-    score: str = field(default="removal", metadata=one_of(importance.SCORES))
-    quality: float = field(default=0.1, metadata=at_least(0, "dB"))
-    likeness: float = field(default=40.0, metadata=at_least(0, "dB"))
-
-    @staticmethod
-    def check(cfg: Any) -> None:
-        require_order(cfg)
-
-
-def require_order(cfg: Any) -> None:
-    """Raise UserError unless a schedule of rounds starts before it stops."""
-    if cfg.start >= cfg.stop:
-        raise UserError(f"stop: expected more than start ({cfg.start}), got {cfg.stop}")
 
 
 @register("gaussiandreamer-cloud")
@@ -165,7 +107,7 @@ class GaussianCloud(BaseGeometry):
 
         def __post_init__(self) -> None:
             adopt_nested(self)
-            self.budget = _as_budget(self.budget)
+            self.budget = as_budget(self.budget)
 
         @staticmethod
         def check(cfg: Any) -> None:
@@ -174,7 +116,7 @@ class GaussianCloud(BaseGeometry):
                     f"max_gaussians: expected min_gaussians ({cfg.min_gaussians}) or more, got "
                     f"{cfg.max_gaussians}"
                 )
-            _check_budget(cfg)
+            check_budget(cfg)
 
     cfg: Config
 
@@ -264,12 +206,13 @@ class GaussianCloud(BaseGeometry):
         prior = self.prior()
         if self.cfg.keep_attributes and hasattr(prior, "gaussians"):
             arrays = prior.gaussians(prompt)
-            self.set_arrays(**self._capped_trained(arrays.tensors())._asdict())
+            trained = most_visible(arrays.tensors(), self.cfg.max_gaussians, self.means.device)
+            self.set_arrays(**trained._asdict())
             cloud = prior.cloud(arrays)
         else:
             cloud = make_cloud(prior, prompt) if make_cloud else prior(prompt)
             ground = prior.ground_count() if hasattr(prior, "ground_count") else 0
-            self.start_from(self.grown(cloud, ground))
+            self.start_from(grow_points(cloud, self.cfg.grow, ground))
         if self.cfg.budget is not None:
             self.merge_duplicates()
         return cloud
@@ -287,86 +230,9 @@ class GaussianCloud(BaseGeometry):
             )
             self.set_arrays(sh=torch.cat([merged.pop("sh0"), merged.pop("sh_rest")], 1), **merged)
 
-    def grown(self, cloud: PointCloud, ground: int = 0) -> PointCloud:
-        """Grow points and perturb their colours (the paper's Algorithm 1), within the cap.
-
-        Args:
-            ground: how many points at the end of ``cloud`` are a prior's ground: they neither grow
-                nor count for the box, and stay at the end.
-        """
-        if not self.cfg.grow.enabled:
-            return cloud
-        if ground:
-            figure, layer = cloud.split(len(cloud.points) - ground)
-            return self.grown(figure).followed_by(layer)
-        options = {
-            k: v for k, v in dict(self.cfg.grow).items() if k not in ("enabled", "color_range")
-        }
-        return grow(
-            cloud,
-            color_range=tuple(self.cfg.grow.color_range),
-            **options,
-            generator=numpy_generator(run_seed(), "grow"),
-        )
-
     def start_from(self, cloud: PointCloud) -> None:
-        """One Gaussian on each point: its colour, opacity ``init_opacity``, an isotropic scale from
-        the nearest distances.
-        """
-        points, colors = self._capped(cloud.points, cloud.colors)
-        n, scales = (
-            len(points),
-            nearest_distance_scales(points, self.cfg.scale_rule) * self.cfg.scale_factor,
-        )
-        harmonics = np.zeros((n, self.bands, 3), np.float32)
-        harmonics[:, 0] = sh.rgb_to_sh0(
-            torch.from_numpy(np.ascontiguousarray(colors, np.float32))
-        ).numpy()
-        self.set_arrays(
-            means=points,
-            log_scales=np.repeat(np.log(scales)[:, None], 3, 1),
-            quats=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-            logit_opacities=np.full(
-                n, math.log(self.cfg.init_opacity / (1 - self.cfg.init_opacity))
-            ),
-            sh=harmonics,
-        )
-
-    def _capped(self, points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """At most ``max_gaussians`` points, a seeded uniform choice.
-
-        None of them is trained and all are equally opaque, so none is worth more than another: a
-          choice by contribution to first
-        renders would only prefer what lies outside, and leave holes (tests/stability measures
-        both)."""
-        if len(points) <= self.cfg.max_gaussians:
-            return points, colors
-        logger.warning(
-            "the prior and its growth give %d points; keeping %d, evenly (max_gaussians)",
-            len(points),
-            self.cfg.max_gaussians,
-        )
-        rows = np.sort(
-            numpy_generator(run_seed(), "cap").choice(
-                len(points), self.cfg.max_gaussians, replace=False
-            )
-        )
-        return points[rows], colors[rows]
-
-    def _capped_trained(self, cloud: Gaussians) -> Gaussians:
-        """At most ``max_gaussians`` of trained Gaussians: those that show most in views from all
-        around.
-        """
-        if len(cloud.means) <= self.cfg.max_gaussians:
-            return cloud
-        logger.warning(
-            "the prior has %d Gaussians; keeping the %d that show most (max_gaussians)",
-            len(cloud.means),
-            self.cfg.max_gaussians,
-        )
-        cloud = cloud.tensors(self.means.device)
-        shown = simplify.worth(cloud, simplify.views_around(cloud, *CAP_VIEWS))
-        return simplify.only(cloud, shown, self.cfg.max_gaussians)
+        """Start with one Gaussian on each point, see :func:`.initialization.gaussians_on_points`."""
+        self.set_arrays(**gaussians_on_points(cloud, self.cfg)._asdict())
 
     def set_arrays(self, *, sh: Any, **arrays: Any) -> None:
         """Replace the cloud; spherical harmonics ``sh`` (N, K', 3) are padded with zeros or cut to
@@ -450,26 +316,3 @@ class GaussianCloud(BaseGeometry):
             setattr(self, name, parameter)
         for name in STATISTICS:
             self.register_buffer(name, torch.zeros(len(change.parents), device=self.means.device))
-
-
-def _as_budget(given: Any) -> Any:
-    """What was given for a budget, with ``none`` as None and whole numbers as such, however they
-    are written.
-    """
-    if isinstance(given, str):
-        given = given.lower()
-        with contextlib.suppress(ValueError):
-            given = float(given)  # 5e3 is text to PyYAML
-    if given == "none":
-        return None
-    return int(given) if isinstance(given, float) and given.is_integer() else given
-
-
-def _check_budget(cfg: Any) -> None:
-    """Raise UserError for a budget that can't be met."""
-    if cfg.budget in (None, AUTO) or is_whole(cfg.budget) and cfg.budget >= cfg.min_gaussians:
-        return
-    raise UserError(
-        "budget: expected none, auto or a number from min_gaussians "
-        f"({cfg.min_gaussians}) on, got {shown(cfg.budget)}"
-    )

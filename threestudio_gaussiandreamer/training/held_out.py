@@ -28,7 +28,8 @@ from ..core.options import at_least, in_range
 from ..meshes.load import SurfaceDistance
 from ..meshes.raycast import over_background
 from ..metrics import floater_mass, multi_face_rate, out_of_gamut, psnr, ssim
-from .data import MAX_SIDE, make_batch
+from .camera_options import MAX_SIDE
+from .data import make_batch
 
 VIEW_BYTES = 40
 """Of a pixel: its truth with coverage, that on the background, and the render, in float32."""

@@ -25,19 +25,16 @@ prune          a budget that the export is made for once more: count, bytes (of 
 """
 
 import contextlib
-import inspect
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 from ..core.distributed import average_gradients
-from ..core.errors import UserError, unknown
+from ..core.errors import UserError
 from ..core.nested import adopt_nested
 from ..core.options import check_options
 from ..exporters.base import read_gaussians
@@ -65,12 +62,13 @@ from .density import DensityControl, DensityOutcome, RenderedQuality
 from .events import log_picture, log_scores
 from .finite import CHECK_EVERY, optimizer_tensors, require_finite
 from .held_out import EvaluationConfig, HeldOut, Measurements
+from .losses import check_losses, loggable, weighted_losses
+from .optimizer import check_optimizer, make_optimizer
+from .pictures import render_panels, rgb_panel, score_panels
 from .renderer import SplattingRenderer
 
-REGULARISERS = ("sparsity", "opaque")
-GUIDANCE_LR = (
-    1e-4  # of what a guidance trains itself, such as the LoRA of variational score distillation
-)
+GUIDANCE_LR = 1e-4
+"""Of what a guidance trains itself, such as the LoRA of variational score distillation."""
 
 
 @register("gaussiandreamer-system")
@@ -91,16 +89,13 @@ class GaussianDreamerSystem(BaseLift3DSystem):
                     raise UserError(f"{name}_type is empty: name a registered part")
             for name, weight in cfg.loss.items():
                 validate_schedule(weight, f"loss.{name}")
-            _check_losses(cfg)
+            check_losses(find(cfg.guidance_type), cfg.loss)
             if cfg.scheduler is not None:
                 raise UserError(
                     "scheduler isn't used: learning rates are schedules themselves, for "
                     "instance system.geometry.lr_means"
                 )
-            for name in cfg.optimizer:
-                if name not in ("name", "args"):
-                    raise unknown("key system.optimizer.", name, ("name", "args"))
-            _check_optimizer(cfg.optimizer)
+            check_optimizer(cfg.optimizer)
 
     cfg: Config
 
@@ -137,7 +132,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             self.background.parameter_groups() if own_background else []
         )
         groups += trainable_groups(self.guidance, GUIDANCE_LR)
-        return optimizer_of(self.cfg.optimizer, groups)
+        return make_optimizer(self.cfg.optimizer, groups)
 
     def preflight(self) -> None:
         """What prior and guidance need is looked for before models are loaded: what is missing
@@ -282,22 +277,13 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         the real alpha.
         """
         guided = self.guide(out, batch)
-        self._log_sometimes(
-            {
-                f"train/{k}": v
-                for k, v in guided.items()
-                if not k.startswith("loss_") and is_one_number(v)
-            }
-        )
-        raw = {k.removeprefix("loss_"): v for k, v in guided.items() if k.startswith("loss_")}
+        if self._log_now():
+            numbers = loggable(guided).items()
+            self.log_dict({f"train/{name}": float(value) for name, value in numbers})
         weights = {
             name.removeprefix("lambda_"): self.C(weight) for name, weight in self.cfg.loss.items()
         }
-        check_weights(weights, raw)
-        raw |= {
-            name: regulariser(name, out["opacity"]) for name in REGULARISERS if weights.get(name)
-        }
-        return {name: value * weights[name] for name, value in raw.items()}
+        return weighted_losses(guided, out["opacity"], weights)
 
     def guide(self, out: dict[str, Any], batch: dict[str, Any], **options: Any) -> dict[str, Any]:
         """What the guidance makes of these renders; it gets the whole batch, and the background
@@ -361,10 +347,6 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         every = self.trainer.log_every_n_steps
         return bool(every) and self.global_step % every == 0
 
-    def _log_sometimes(self, values: dict[str, Any]) -> None:
-        if self._log_now():
-            self.log_dict({name: float(value) for name, value in values.items()})
-
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_end(outputs, batch, batch_idx)
         every = self.cfg.evaluation.every
@@ -413,31 +395,18 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         what the score model sees.
         """
         out = self(batch)
-        images = picture_row(out)
+        images = render_panels(out)
         truth = self.truth(batch, out) if self.guidance is not None else None
         if truth is not None:
-            images.append(_rgb(truth[0]))
+            images.append(rgb_panel(truth[0]))
         if isinstance(self.guidance, ScoreDistillation):
-            images += self.score_pictures(out, batch)
+            images += score_panels(
+                self.guide(out, batch, guidance_eval=True)["eval"], out["comp_rgb"].shape[1:3]
+            )
         view, step = int(batch["index"][0]), self.true_global_step
         name = f"it{step}-{view}.png"
         self.save_image_grid(name, images, name="validation_step", step=step)
         log_picture(self.loggers, f"validation/{view}", self.get_save_path(name), step)
-
-    def score_pictures(self, out: dict[str, Any], batch: dict[str, Any]) -> list[dict[str, Any]]:
-        """What the score model sees and makes of this render: noisy, denoised in one step, denoised
-        in many.
-        """
-        pictures = self.guide(out, batch, guidance_eval=True)["eval"]
-        size = out["comp_rgb"].shape[1:3]
-        images = [
-            pictures[name][:1].permute(0, 3, 1, 2)
-            for name in ("imgs_noisy", "imgs_1step", "imgs_final")
-        ]
-        images = [
-            F.interpolate(image, size, mode="bilinear", align_corners=False) for image in images
-        ]
-        return [_rgb(image[0].permute(1, 2, 0).clamp(0, 1)) for image in images]
 
     def on_validation_epoch_end(self) -> None:
         pass
@@ -445,7 +414,10 @@ class GaussianDreamerSystem(BaseLift3DSystem):
     def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         name = f"it{self.true_global_step}-test/{int(batch['index'][0])}.png"
         self.save_image_grid(
-            name, [_rgb(self(batch)["comp_rgb"][0])], name="test_step", step=self.true_global_step
+            name,
+            [rgb_panel(self(batch)["comp_rgb"][0])],
+            name="test_step",
+            step=self.true_global_step,
         )
 
     def on_test_epoch_end(self) -> None:
@@ -545,110 +517,3 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         path = self.get_save_path(filename)
         write_obj(path, surface)
         return path
-
-
-def optimizer_of(options: Any, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
-    """The optimiser ``{name, args}`` over parameter groups that bring their own learning rates."""
-    kind = getattr(torch.optim, options.get("name", "Adam"))
-    ours = {"betas": (0.9, 0.99), "eps": 1e-15}
-    accepted = {
-        name: value for name, value in ours.items() if name in inspect.signature(kind).parameters
-    }
-    return kind(groups, lr=0.0, **accepted | dict(options.get("args", {})))
-
-
-def _check_optimizer(options: Any) -> None:
-    name, arguments = options.get("name", "Adam"), options.get("args", {})
-    if not isinstance(getattr(torch.optim, str(name), None), type):
-        raise unknown(
-            "system.optimizer.name",
-            name,
-            [n for n, v in vars(torch.optim).items() if isinstance(v, type)],
-        )
-    if not isinstance(arguments, Mapping):
-        raise UserError(f"optimizer.args: expected keys and values, got {arguments!r}")
-    try:
-        optimizer_of(
-            options, [{"params": [torch.zeros(1, requires_grad=True)], "lr": 0.0} for _ in range(2)]
-        )
-    except (TypeError, ValueError, AssertionError) as error:
-        accepted = inspect.signature(getattr(torch.optim, name)).parameters.keys() - {
-            "params",
-            "lr",
-        }
-        strange = [unknown("argument", key, accepted) for key in arguments if key not in accepted]
-        raise UserError(
-            f"optimizer: {name} doesn't accept this: {strange[0] if strange else error}"
-        ) from error
-
-
-def _check_losses(cfg: Any) -> None:
-    """Names of weights, where it is known before the first step which losses the guidance
-    returns.
-    """
-    guidance = find(cfg.guidance_type)
-    for name in cfg.loss:
-        if not name.startswith("lambda_"):
-            raise UserError(
-                f"unknown key 'system.loss.{name}': weights of losses are called "
-                "lambda_<loss>, such as lambda_sds"
-            )
-    known = getattr(guidance, "LOSSES", None)  # another package's guidance may have it too
-    if known is not None:
-        check_weights([name.removeprefix("lambda_") for name in cfg.loss], known)
-
-
-def is_one_number(value: Any) -> bool:
-    """What can be logged; guidances also return pictures, latents and the timestep of each view."""
-    return isinstance(value, (int, float)) or isinstance(value, Tensor) and value.numel() == 1
-
-
-def check_weights(weights: Iterable[str], losses: Iterable[str]) -> None:
-    """Raise UserError unless every weight belongs to a loss or a regulariser, and every loss has
-    its weight.
-    """
-    for name in weights:
-        if name not in losses and name not in REGULARISERS:
-            raise unknown(
-                "weight system.loss.lambda_*",
-                f"lambda_{name}",
-                [f"lambda_{n}" for n in (*losses, *REGULARISERS)],
-            )
-    for name in losses:
-        if name not in weights:
-            raise UserError(
-                f"the guidance returns loss_{name}: give its weight, for instance "
-                f"system.loss.lambda_{name}=1"
-            )
-
-
-def regulariser(name: str, alpha: Float[Tensor, "B H W 1"]) -> Tensor:
-    """threestudio's terms on the rendered alpha: ``sparsity`` wants little of it, ``opaque`` wants
-    it near 0 or 1.
-    """
-    if name == "sparsity":
-        return (alpha**2 + 0.01).sqrt().mean()
-    clamped = alpha.clamp(1e-3, 1 - 1e-3)
-    # written out, since torch forbids its function under mixed precision
-    return -(clamped * clamped.log() + (1 - clamped) * (1 - clamped).log()).mean()
-
-
-def picture_row(out: dict[str, Any]) -> list[dict[str, Any]]:
-    """Colour, depth, normals and alpha of the first view, as the host's image grid wants them."""
-    images = [_rgb(out["comp_rgb"][0])]
-    depth, alpha = out["depth"][0, ..., 0], out["opacity"][0, ..., 0]
-    visible = depth[alpha > 0.5]
-    near, far = (float(visible.min()), float(visible.max()) + 1e-6) if len(visible) else (0.0, 1.0)
-    images.append(
-        {"type": "grayscale", "img": depth, "kwargs": {"cmap": "jet", "data_range": (near, far)}}
-    )
-    if "comp_normal" in out:
-        images.append(_rgb(out["comp_normal"][0]))
-    return [
-        *images,
-        {"type": "grayscale", "img": alpha, "kwargs": {"cmap": None, "data_range": (0, 1)}},
-    ]
-
-
-def _rgb(image: Float[Tensor, "H W 3"]) -> dict[str, Any]:
-    return {"type": "rgb", "img": image, "kwargs": {"data_format": "HWC"}}

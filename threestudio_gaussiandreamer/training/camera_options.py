@@ -1,0 +1,120 @@
+"""The options of the data module; ``data.py`` describes them."""
+
+from dataclasses import dataclass, field
+from typing import Any, List, Tuple
+
+from ..core.errors import UserError
+from ..core.memory import count_of, require_memory
+from ..core.options import Rule, at_least, in_range, interval, is_list, is_whole, satisfies
+
+MAX_SIDE = 16_384
+"""Pixels of a picture each way."""
+WORLD = (1e-6, 1e6)
+"""Distances of cameras and lights, world units: float32 keeps places to some digits in it."""
+FOVY = (1e-3, 179.999)
+LISTED = ("height", "width", "batch_size")
+TRAIN_BYTES, EVAL_BYTES, CAMERA_BYTES = 64, 32, 256
+"""What a pixel of a training view, a pixel of an evaluated view, and a camera take at least."""
+ELEVATIONS = interval(-90, 90, "degrees")
+AZIMUTHS = interval(-36_000, 36_000, "degrees")
+DISTANCES, LIGHT_DISTANCES = interval(*WORLD, "world units"), interval(0, WORLD[1], "world units")
+FOVYS = interval(*FOVY, "degrees")
+LENGTH = in_range(0, WORLD[1], "world units")
+ONE_VIEW = satisfies("1: views are evaluated one at a time", lambda count: count == 1)
+
+
+def whole_numbers(high: int) -> Rule:
+    """Whole numbers from 1 to ``high``, or lists of such."""
+
+    def holds(value: Any) -> bool:
+        values = value if is_list(value) else [value]
+        return len(values) > 0 and all(is_whole(v) and 1 <= v <= high for v in values)
+
+    return satisfies(f"whole numbers from 1 to {high}", holds)
+
+
+SIDE, BATCH = whole_numbers(MAX_SIDE), whole_numbers(4096)
+
+
+@dataclass
+class CameraConfig:
+    height: Any = field(default=64, metadata=SIDE)
+    width: Any = field(default=64, metadata=SIDE)
+    batch_size: Any = field(default=1, metadata=BATCH)
+    resolution_milestones: List[int] = field(default_factory=list)
+    eval_height: int = field(default=512, metadata=in_range(1, MAX_SIDE, "pixels"))
+    eval_width: int = field(default=512, metadata=in_range(1, MAX_SIDE, "pixels"))
+    eval_batch_size: int = field(default=1, metadata=ONE_VIEW)
+    n_val_views: int = field(default=1, metadata=count_of("views", 1, CAMERA_BYTES))
+    n_test_views: int = field(default=120, metadata=count_of("views", 1, CAMERA_BYTES))
+    elevation_range: Tuple[float, float] = field(default=(-10, 60), metadata=ELEVATIONS)
+    azimuth_range: Tuple[float, float] = field(default=(-180, 180), metadata=AZIMUTHS)
+    camera_distance_range: Tuple[float, float] = field(default=(1.5, 4.0), metadata=DISTANCES)
+    fovy_range: Tuple[float, float] = field(default=(40, 70), metadata=FOVYS)
+    camera_perturb: float = field(default=0.0, metadata=LENGTH)
+    center_perturb: float = field(default=0.0, metadata=LENGTH)
+    up_perturb: float = field(default=0.0, metadata=LENGTH)
+    light_position_perturb: float = field(default=1.0, metadata=LENGTH)
+    light_distance_range: Tuple[float, float] = field(default=(0.8, 1.5), metadata=LIGHT_DISTANCES)
+    eval_elevation_deg: float = field(default=15.0, metadata=in_range(-90, 90, "degrees"))
+    eval_camera_distance: float = field(default=4.0, metadata=in_range(*WORLD, "world units"))
+    eval_fovy_deg: float = field(default=70.0, metadata=in_range(*FOVY, "degrees"))
+    batch_uniform_azimuth: bool = True
+    progressive_until: int = field(default=0, metadata=at_least(0, "steps"))
+    rays_d_normalize: bool = True
+    train_views: int = field(default=0, metadata=count_of("views", 0, CAMERA_BYTES))
+    rays: bool = False
+
+    @staticmethod
+    def check(cfg: Any) -> None:
+        """Raise UserError where the lists of sizes don't fit the milestones, or nothing could hold
+        what is asked for.
+        """
+        for name in LISTED:
+            values = plain(cfg[name])
+            if isinstance(values, list) and len(values) not in (
+                1,
+                len(cfg.resolution_milestones) + 1,
+            ):
+                raise UserError(
+                    f"{name}: {len(values)} entries need {len(values) - 1} "
+                    f"resolution_milestones, got {len(cfg.resolution_milestones)}"
+                )
+        _check_milestones(cfg)
+        _check_memory(cfg)
+
+
+def _check_milestones(cfg: Any) -> None:
+    milestones = list(cfg.resolution_milestones)
+    if any(later <= earlier for earlier, later in zip([0, *milestones], milestones, strict=False)):
+        raise UserError(
+            f"resolution_milestones: expected increasing steps above 0, got {milestones}"
+        )
+    if milestones and not any(
+        isinstance(plain(cfg[name]), list) and len(cfg[name]) > 1
+        for name in ("height", "width", "batch_size")
+    ):
+        raise UserError(
+            f"resolution_milestones: give height, width or batch_size {len(milestones) + 1} entries"
+        )
+
+
+def _check_memory(cfg: Any) -> None:
+    """Raise UserError for pictures larger than the memory."""
+    stages = range(len(cfg.resolution_milestones) + 1)
+    for height, width, batch in zip(*(_per_stage(cfg[n], stages) for n in LISTED), strict=True):
+        what = f"{batch} views of {height} x {width} pixels"
+        require_memory("batch_size", TRAIN_BYTES * height * width * batch, what)
+    what = f"pictures of {cfg.eval_height} x {cfg.eval_width} pixels"
+    require_memory("eval_height", EVAL_BYTES * cfg.eval_height * cfg.eval_width, what)
+
+
+def _per_stage(given: Any, stages: range) -> list[int]:
+    values = plain(given)
+    values = values if isinstance(values, list) else [values]
+    return [values[min(i, len(values) - 1)] for i in stages]
+
+
+def plain(value: Any) -> Any:
+    """Convert an OmegaConf list to a list; return anything else as it is."""
+    return value if isinstance(value, (int, float, str)) or value is None else list(value)

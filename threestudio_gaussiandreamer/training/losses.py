@@ -1,0 +1,81 @@
+"""The weighted losses of a step: those that the guidance returns, and regularisers of the rendered
+alpha; ``system.loss.lambda_<name>`` is the weight of each, a number or a schedule.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from ..core.errors import UserError, unknown
+
+REGULARISERS = ("sparsity", "opaque")
+
+
+def weighted_losses(
+    guided: Mapping[str, Any], alpha: Float[Tensor, "B H W 1"], weights: Mapping[str, float]
+) -> dict[str, Tensor]:
+    """Multiply the ``loss_*`` of a guidance, and the regularisers with a weight, by their weights.
+
+    Raises:
+        UserError: a weight without a loss, or a loss without a weight.
+    """
+    raw = {k.removeprefix("loss_"): v for k, v in guided.items() if k.startswith("loss_")}
+    check_weights(weights, raw)
+    raw |= {name: regulariser(name, alpha) for name in REGULARISERS if weights.get(name)}
+    return {name: value * weights[name] for name, value in raw.items()}
+
+
+def loggable(guided: Mapping[str, Any]) -> dict[str, Any]:
+    """Select what is one number and no loss; guidances also return pictures and latents."""
+    return {k: v for k, v in guided.items() if not k.startswith("loss_") and _is_one_number(v)}
+
+
+def _is_one_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) or isinstance(value, Tensor) and value.numel() == 1
+
+
+def check_losses(guidance: type, options: Iterable[str]) -> None:
+    """Check the keys of ``system.loss``, where the class of the guidance says which losses it
+    returns.
+
+    Raises:
+        UserError: a key that isn't ``lambda_*``, or see :func:`check_weights`.
+    """
+    for name in options:
+        if not name.startswith("lambda_"):
+            raise UserError(
+                f"unknown key 'system.loss.{name}': weights of losses are called "
+                "lambda_<loss>, such as lambda_sds"
+            )
+    known = getattr(guidance, "LOSSES", None)  # another package's guidance may have it too
+    if known is not None:
+        check_weights([name.removeprefix("lambda_") for name in options], known)
+
+
+def check_weights(weights: Iterable[str], losses: Iterable[str]) -> None:
+    """Raise UserError unless every weight belongs to a loss or a regulariser, and every loss has
+    its weight.
+    """
+    for name in weights:
+        if name not in losses and name not in REGULARISERS:
+            known = [f"lambda_{n}" for n in (*losses, *REGULARISERS)]
+            raise unknown("weight system.loss.lambda_*", f"lambda_{name}", known)
+    for name in losses:
+        if name not in weights:
+            raise UserError(
+                f"the guidance returns loss_{name}: give its weight, for instance "
+                f"system.loss.lambda_{name}=1"
+            )
+
+
+def regulariser(name: str, alpha: Float[Tensor, "B H W 1"]) -> Float[Tensor, ""]:
+    """Compute threestudio's term on the rendered alpha: ``sparsity`` is mean sqrt(alpha^2 + 0.01),
+    ``opaque`` the entropy, which is least at 0 and 1.
+    """
+    if name == "sparsity":
+        return (alpha**2 + 0.01).sqrt().mean()
+    clamped = alpha.clamp(1e-3, 1 - 1e-3)
+    # torch forbids its binary_cross_entropy under mixed precision
+    return -(clamped * clamped.log() + (1 - clamped) * (1 - clamped).log()).mean()

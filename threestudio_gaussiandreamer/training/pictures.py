@@ -1,0 +1,43 @@
+"""Rows of pictures for validation, as the host's ``save_image_grid`` takes them."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+Panel = dict[str, Any]
+SCORE_PICTURES = ("imgs_noisy", "imgs_1step", "imgs_final")
+
+
+def render_panels(out: Mapping[str, Any]) -> list[Panel]:
+    """Arrange colour, depth, normals and alpha of the first view of a render."""
+    depth, alpha = out["depth"][0, ..., 0], out["opacity"][0, ..., 0]
+    visible = depth[alpha > 0.5]
+    near, far = (float(visible.min()), float(visible.max()) + 1e-6) if len(visible) else (0.0, 1.0)
+    panels = [rgb_panel(out["comp_rgb"][0]), _grey_panel(depth, (near, far), "jet")]
+    if "comp_normal" in out:
+        panels.append(rgb_panel(out["comp_normal"][0]))
+    return [*panels, _grey_panel(alpha, (0, 1), None)]
+
+
+def score_panels(evaluated: Mapping[str, Any], size: tuple[int, int]) -> list[Panel]:
+    """Arrange what the score model makes of the first view, resized to (height, width): noisy,
+    denoised in one step, denoised in many.
+    """
+    images = [evaluated[name][:1].movedim(-1, 1) for name in SCORE_PICTURES]
+    images = [F.interpolate(x, size, mode="bilinear", align_corners=False) for x in images]
+    return [rgb_panel(image[0].movedim(0, -1).clamp(0, 1)) for image in images]
+
+
+def rgb_panel(image: Float[Tensor, "H W 3"]) -> Panel:
+    return {"type": "rgb", "img": image, "kwargs": {"data_format": "HWC"}}
+
+
+def _grey_panel(image: Float[Tensor, "H W"], data_range: Any, cmap: Any) -> Panel:
+    return {
+        "type": "grayscale",
+        "img": image,
+        "kwargs": {"cmap": cmap, "data_range": data_range},
+    }
