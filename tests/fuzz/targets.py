@@ -24,7 +24,7 @@ from tests.fuzz.oracles import Illegal
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, save_file
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.formats import ply
+from threestudio_gaussiandreamer.formats import ply, ply_table
 from threestudio_gaussiandreamer.formats.spz import read_spz, spz_bytes
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians, usable
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
@@ -189,7 +189,7 @@ def ply_bytes(
     columns: dict[str, tuple[str, np.ndarray]], encoding: str, faces: bool = False
 ) -> bytes:
     """A PLY of any encoding, with an element of lists before the vertices if asked for."""
-    order = ply.BYTE_ORDERS[encoding]
+    order = ply_table.BYTE_ORDERS[encoding]
     count = len(next(iter(columns.values()))[1])
     lines = ["ply", f"format {encoding} 1.0", "comment made for fuzzing"]
     lines += (
@@ -204,7 +204,7 @@ def ply_bytes(
     ]
     rows = np.empty(
         count,
-        [(name, (order or "<") + ply.NUMBER_TYPES[kind]) for name, (kind, _) in columns.items()],
+        [(name, (order or "<") + ply_table.NUMBER_TYPES[kind]) for name, (kind, _) in columns.items()],
     )
     for name, (_, values) in columns.items():
         rows[name] = values

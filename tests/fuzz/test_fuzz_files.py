@@ -64,7 +64,7 @@ def believe(path: Path) -> None:
 
 @pytest.mark.parametrize("door", [crash, hang, misread, believe])
 def test_a_faulty_door_is_seen(door, monkeypatch):
-    monkeypatch.setattr("judge.SECONDS", 0.2 if door is hang else 60)
+    monkeypatch.setattr("tests.fuzz.judge.SECONDS", 0.2 if door is hang else 60)
     outcome = judged(Target(".bin", list, door), b"0123")
     assert outcome.kind == "failed"
     assert (
