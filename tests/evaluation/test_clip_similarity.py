@@ -278,6 +278,7 @@ def test_one_line_of_the_list_for_each_result(plys, tmp_path):
         module.prompts_for(found[:1], None, str(file))
 
 
+@pytest.mark.slow
 def test_it_is_a_command(plys, tmp_path):
     command = [
         sys.executable,

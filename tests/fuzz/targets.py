@@ -204,7 +204,10 @@ def ply_bytes(
     ]
     rows = np.empty(
         count,
-        [(name, (order or "<") + ply_table.NUMBER_TYPES[kind]) for name, (kind, _) in columns.items()],
+        [
+            (name, (order or "<") + ply_table.NUMBER_TYPES[kind])
+            for name, (kind, _) in columns.items()
+        ],
     )
     for name, (_, values) in columns.items():
         rows[name] = values

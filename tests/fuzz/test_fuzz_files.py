@@ -13,6 +13,8 @@ from tests.fuzz.mutations import BINARY, TEXT, mutant
 from tests.fuzz.targets import TARGETS, Misread, Target, seeds
 from threestudio_gaussiandreamer.core.errors import UserError
 
+pytestmark = pytest.mark.slow
+
 CORPUS = sorted(path for path in Path(__file__).with_name("corpus").rglob("*") if path.is_file())
 INPUTS = {"configuration": 25, "command-line": 15, "checkpoint": 30}
 """How many damaged files of a kind; of others 70."""

@@ -18,6 +18,8 @@ from tests.fuzz.hostile import (
 )
 from tests.stability.backends import BACKENDS, cuda_on_the_host, each_backend
 
+pytestmark = pytest.mark.slow
+
 SCENES, MOST = range(12), 600
 ORDINARY = 8
 """A seed whose scene is mostly well-posed."""

@@ -7,6 +7,8 @@ from hypothesis.stateful import run_state_machine_as_test
 from tests.fuzz.sequences import CloudLife
 from threestudio_gaussiandreamer.gaussians import densify
 
+pytestmark = pytest.mark.slow
+
 
 def live(lives: int, **options) -> None:
     health = list(HealthCheck)

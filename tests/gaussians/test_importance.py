@@ -141,6 +141,7 @@ def drawn(geometry, opacities, preset="accurate"):
     ).image
 
 
+@pytest.mark.slow
 def test_the_removal_error_is_that_of_leaving_each_gaussian_out():
     geometry = cloud(12)
     opacities = geometry.opacities().detach().double().requires_grad_()

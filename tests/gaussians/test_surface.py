@@ -48,6 +48,7 @@ def test_surface_nets_of_a_sphere():
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 0.7, atol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("resolution", [32, 64])
 def test_a_solid_ball_is_one_closed_surface(resolution):
     surface = gaussian_surface(ball(count=8000, scale=0.04, hollow=False), resolution=resolution)

@@ -358,6 +358,7 @@ def assert_resumes(path, folder, *options):
 PARTS = ("state_dict", "guidance", "optimizer_states")
 
 
+@pytest.mark.slow
 def test_a_guidance_that_learns_resumes_as_if_it_had_never_stopped(tmp_path):
     system = {
         "guidance_type": "test-learning-guidance",
@@ -375,6 +376,7 @@ def test_a_guidance_that_learns_resumes_as_if_it_had_never_stopped(tmp_path):
     assert not [name for name in found if "frozen" in name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
 def test_a_diffusion_model_resumes_as_if_it_had_never_stopped(tmp_path, monkeypatch, prediction):
     """The random draws of its guidance (timesteps, noise, the VAE's) belong to the step, and
@@ -412,6 +414,7 @@ def test_a_loss_without_a_weight_is_an_error(tmp_path, capsys):
     assert "system.loss.lambda_recon" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction", "deep-floyd"])
 def test_a_run_with_a_tiny_real_model(tmp_path, monkeypatch, kind):
     """Prompt, text encoder, VAE, UNet, SDS, test and export, through the configuration that a user

@@ -444,6 +444,7 @@ def test_a_configuration_that_is_none_is_refused(launch, content, message):
 # -- prompts ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "prompt", ["1984", "a fox: red", "${x}", "../../x", "-x", "🦊" * 1000, "two\nlines", " "]
 )

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 
 from threestudio_gaussiandreamer.formats.ply import read_points
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
@@ -36,6 +37,7 @@ def test_a_second_run_in_the_same_folder_reads_the_first_ones_points(tmp_path):
     assert len(read_points(tmp_path / "prior" / "points.ply").points) == 10
 
 
+@pytest.mark.slow
 def test_another_prompt_option_or_seed_runs_the_prior_again(tmp_path, monkeypatch):
     CountingPrior.calls = 0
     cached_cloud(CountingPrior({}), "a fox", tmp_path)
@@ -46,6 +48,7 @@ def test_another_prompt_option_or_seed_runs_the_prior_again(tmp_path, monkeypatc
     assert CountingPrior.calls == 4
 
 
+@pytest.mark.slow
 def test_a_damaged_cache_is_ignored_and_no_folder_means_no_cache(tmp_path):
     CountingPrior.calls = 0
     cached_cloud(CountingPrior({}), "a fox", tmp_path)

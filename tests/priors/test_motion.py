@@ -259,6 +259,7 @@ def test_offered_frames():
             offered_frames(motions, sample, frame, 3)
 
 
+@pytest.mark.slow
 def test_clip_chooses_the_frame_and_the_text_is_the_motion(options, monkeypatch):
     """Scores by hand in place of CLIP's; the fifth of the offered bodies wins, the second frame of
     the second motion.
@@ -281,6 +282,7 @@ def test_clip_chooses_the_frame_and_the_text_is_the_motion(options, monkeypatch)
     assert [text for _, text in asked[1:]] == ["Someone bows", "a bow"]
 
 
+@pytest.mark.slow
 def test_clip_itself_chooses(options, clip):
     """The tiny CLIP's choice is arbitrary, but it is that of its own scores, and the same each
     time.

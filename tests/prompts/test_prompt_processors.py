@@ -150,6 +150,7 @@ def test_too_little_memory_on_the_gpu_means_the_cpu(monkeypatch, caplog):
     assert "runs on the CPU" in caplog.text
 
 
+@pytest.mark.slow
 def test_spawn_gives_the_same(models):
     here, there = (
         processor(models, use_cache=False)(),

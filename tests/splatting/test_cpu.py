@@ -126,6 +126,7 @@ def run_python(text):
     )
 
 
+@pytest.mark.slow
 def test_a_forked_process_draws_with_threads_of_its_own():
     """The parent's threads aren't in it, and what they held at that moment nobody lets go."""
     done = run_python("""

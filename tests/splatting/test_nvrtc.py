@@ -68,6 +68,7 @@ def properties(log: str) -> dict[str, dict[str, int]]:
     return found
 
 
+@pytest.mark.slow
 @needs_nvrtc
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_every_kernel_compiles_without_spills(architecture):

@@ -499,6 +499,7 @@ def cloud_hash(run: Ended) -> str:
     ).hexdigest()
 
 
+@pytest.mark.slow
 @row("A3", "Densify x resume")
 @pytest.mark.parametrize("k", [29, 30, 31, 35, 90])
 def test_resumed_anywhere_the_cloud_is_the_same(k, whole, tmp_path, measured):

@@ -113,6 +113,7 @@ def needles(antialias: bool):
     return found
 
 
+@pytest.mark.slow
 @row(
     "A1",
     "Needle, disc, scale 1e-8..1e4",

@@ -71,6 +71,7 @@ def content(step: int, size: int = 20_000) -> dict:
     }
 
 
+@pytest.mark.slow
 @row("A5", "Crash mid checkpoint")
 def test_killed_at_random_moments_of_200_saves(tmp_path, measured):
     """After each kill the file is whole and no older than the last save that the child has told
@@ -471,6 +472,7 @@ COMPUTED = (
 FOX = ["system.prompt_processor.prompt=a fox"]
 
 
+@pytest.mark.slow
 @row("A5", "Wrong config keys")
 def test_every_key_misspelt_by_one_letter_is_refused_with_the_right_one(measured):
     """Every key that the shipped files use, at every depth: the right word is in the message."""

@@ -325,6 +325,7 @@ def trained(folder, steps, size, *options) -> Ended:
     return ended
 
 
+@pytest.mark.slow
 @row("A4", "Guidance 100: over-saturation")
 def test_annealing_helps_and_clipping_helps_more(tmp_path, measured):
     """The exact score of the toy in a latent, at guidance 100 and, as what can be reached, at
@@ -358,6 +359,7 @@ def test_annealing_helps_and_clipping_helps_more(tmp_path, measured):
     )
 
 
+@pytest.mark.slow
 @row("A4", "Janus")
 def test_a_prior_keeps_the_faces_apart_and_a_random_start_does_not(tmp_path, measured):
     """A score that knows no view, short runs; the meter is the package's own and in every run's
@@ -399,6 +401,7 @@ def test_the_table_of_five_seeds(measured):
     )
 
 
+@pytest.mark.slow
 @row("A4", "Colour drift, background shortcut")
 def test_the_cloud_is_the_same_thing_on_any_background(tmp_path, measured):
     """What differs between backgrounds is the alpha error alone, mostly at the outline: with the

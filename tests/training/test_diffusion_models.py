@@ -179,6 +179,7 @@ RUNS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
 def test_a_configuration_trains(name, models, seen, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -202,6 +203,7 @@ def test_every_configuration_for_models_is_trained():
     assert shipped == {name for configs, _ in RUNS.values() for name in configs}
 
 
+@pytest.mark.slow
 def test_perp_neg_doubles_the_rows_and_the_run_repeats(models, seen, tmp_path, monkeypatch):
     """Twice the same command gives the same Gaussians bit for bit, with Perp-Neg's two more rows
     for each view.

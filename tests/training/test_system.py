@@ -264,6 +264,7 @@ def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted
     )
 
 
+@pytest.mark.slow
 def test_a_budget_without_a_round_to_come_says_so(tmp_path, painted_box, capsys):
     """Also of a run that goes on where its rounds are over."""
     steps = ["trainer.max_steps=7", "trainer.val_check_interval=7"]
@@ -394,6 +395,7 @@ def test_a_budget_that_needs_larger_rounds_is_met_and_says_so(tmp_path, painted_
     assert len(cloud_of(trial(tmp_path) / "ckpts" / "last.ckpt")["geometry.means"]) == 70
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "stop"), [(DENSIFY, 3), (DENSIFY, 4), (DENSIFY, 5), (PRUNE, 2), (PRUNE, 4)]
 )
@@ -534,6 +536,7 @@ def test_a_run_that_turns_non_finite_stops_and_saves_nothing_of_it(
     assert not [*tmp_path.rglob("*.ckpt"), *tmp_path.rglob("it*")]
 
 
+@pytest.mark.slow
 def test_a_non_finite_state_never_replaces_a_good_checkpoint(tmp_path, painted_box, monkeypatch):
     """The checkpoint of the step before stays; resumed from it, the run ends as it should."""
     step = GaussianDreamerSystem.training_step
