@@ -1,0 +1,32 @@
+"""Runs of the tiny system, in this process."""
+
+import pytest
+
+import threestudio_gaussiandreamer
+from tests.helpers import tiny_parts
+from tests.helpers.tiny_runs import only_run
+from threestudio_gaussiandreamer.launch.experiment import main
+
+
+@pytest.fixture
+def launch(tmp_path, monkeypatch, capsys):
+    """``launch("--train", overrides...)`` in an empty folder; returns (exit code, stdout,
+    stderr).
+    """
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(threestudio_gaussiandreamer, "register_parts", lambda: None)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    (tmp_path / "tiny.yaml").write_text(tiny_parts.CONFIG)
+
+    def run(*arguments: str, config: str = "tiny.yaml") -> tuple[int, str, str]:
+        code = main(["--config", config, *arguments])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture
+def trained(launch):
+    assert launch("--train")[0] == 0
+    return only_run()

@@ -1,0 +1,144 @@
+"""What a run keeps beside its results, and runs that meet in one folder."""
+
+import datetime
+import fcntl
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests.helpers import tiny_parts
+from tests.helpers.tiny_runs import files, only_run
+from threestudio_gaussiandreamer.launch import callbacks, experiment, run, run_folder
+from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.ddp import ReplicatedStrategy
+from threestudio_gaussiandreamer.launch.experiment import main
+from threestudio_gaussiandreamer.launch.folder_lock import claim
+
+# -- files beside the run --------------------------------------------------------------------------
+
+
+def test_what_is_no_source_in_custom_is_neither_loaded_nor_copied(launch):
+    Path("custom/package").mkdir(parents=True)
+    Path("custom/part.py").write_text("LOADED = True")
+    Path("custom/package/__init__.py").write_text("from . import inner")
+    Path("custom/package/inner.py").write_text("")
+    for lock in ("custom/.#part.py", "custom/package/.#inner.py", "custom/gone.py"):
+        os.symlink("someone@somewhere.1234", lock)  # as Emacs makes while a file is edited
+    os.mkfifo("custom/pipe.py")
+    os.mkfifo("custom/package/pipe.yaml")
+    code, _, err = launch("--train", "trainer.limit_val_batches=0")
+    assert code == 0 and "custom/pipe.py is no readable file" in err
+    copied = {name for name in files(only_run() / "code/custom") if not name.endswith(".pyc")}
+    assert copied == {"part.py", "package/__init__.py", "package/inner.py"}
+
+
+def test_a_source_that_can_not_be_read_is_left_out_of_the_copy_with_a_warning(
+    launch, monkeypatch, tmp_path
+):
+    def forbidden(path):
+        if path.name == "secret.py":
+            raise PermissionError(13, "Permission denied")
+        return read_bytes(path)
+
+    read_bytes = Path.read_bytes
+    (tmp_path / "source").mkdir()
+    (tmp_path / "source/secret.py").touch()
+    (tmp_path / "source/part.py").touch()
+    monkeypatch.setattr(Path, "read_bytes", forbidden)
+    callbacks.copy_sources(tmp_path / "source", tmp_path / "copy")
+    assert files(tmp_path / "copy") == {"part.py"}
+
+
+def test_a_configuration_that_vanishes_is_kept_as_it_was_read(launch, monkeypatch):
+    monkeypatch.setattr(
+        tiny_parts.TinySystem, "post_configure", lambda self: os.unlink("tiny.yaml")
+    )
+    assert launch("--train")[0] == 0
+    assert Path(only_run(), "configs/raw.yaml").read_text() == tiny_parts.CONFIG
+
+
+def test_a_configuration_that_can_not_be_read_is_named(launch, monkeypatch):
+    def vanished(path):
+        raise FileNotFoundError(2, "No such file or directory", str(path))
+
+    monkeypatch.setattr(Path, "read_bytes", vanished)
+    code, _, err = launch("--train")
+    assert code == 2 and "error: the configuration tiny.yaml can't be read" in err
+
+
+@pytest.mark.parametrize("strategy", [None, "auto", "ddp"])
+def test_several_gpus_train_replicas_of_one_cloud(launch, monkeypatch, strategy):
+    """Also where the configuration says what the default is: DDP's own wrapper would keep the
+    parameters that densification replaces.
+    """
+    built = []
+
+    class Built(Exception):
+        pass
+
+    def build(section, owner, arguments):
+        built.append(arguments)
+        raise Built
+
+    monkeypatch.setattr(run, "build", build)
+    monkeypatch.setattr(experiment, "announce_device", lambda gpu: 2)
+    with pytest.raises(Built):
+        launch("--train", *([f"trainer.strategy={strategy}"] if strategy else []))
+    assert isinstance(built[0]["strategy"], ReplicatedStrategy) and built[0]["devices"] == 2
+
+
+# -- runs that meet --------------------------------------------------------------------------------
+
+ONE_FOLDER = ["use_timestamp=false", "tag=run"]
+
+
+def test_a_run_that_is_refused_leaves_the_folder_of_the_one_that_trains(launch, monkeypatch):
+    """The refused run made the folder and is stopped before it asks for the lock; it goes on while
+    the other one trains.
+    """
+    with monkeypatch.context() as patch:
+        flock = fcntl.flock
+        patch.setattr(
+            fcntl, "flock", lambda *lock: (os.kill(os.getpid(), signal.SIGSTOP), flock(*lock))[1]
+        )
+        refused = os.fork()
+        if refused == 0:
+            os._exit(main(["--config", "tiny.yaml", "--train", *ONE_FOLDER]))
+        assert os.WIFSTOPPED(os.waitpid(refused, os.WUNTRACED)[1])
+    ended = []
+
+    def let_it_go_on(system, batch, batch_idx):
+        if system.global_step == 1:  # when nothing is saved yet
+            os.kill(refused, signal.SIGCONT)
+            ended.append(os.waitstatus_to_exitcode(os.waitpid(refused, 0)[1]))
+        return training_step(system, batch, batch_idx)
+
+    training_step = tiny_parts.TinySystem.training_step
+    monkeypatch.setattr(tiny_parts.TinySystem, "training_step", let_it_go_on)
+    assert launch("--train", *ONE_FOLDER)[0] == 0 and ended == [2]
+    assert {"cmd.txt", "save/it3-0.png", "ckpts/last.ckpt"} <= files(Path("outputs/tiny/run"))
+
+
+def test_a_folder_in_use_is_refused_before_the_parts_are_built(launch, monkeypatch):
+    first = claim(Path("outputs/tiny/run"))
+    monkeypatch.setattr(tiny_parts.TinySystem, "configure", lambda self: 1 / 0)
+    code, _, err = launch("--train", *ONE_FOLDER)
+    first.release()
+    assert code == 2 and "another run is training in outputs/tiny/run" in err
+
+
+def test_runs_of_one_second_have_a_folder_each(launch, monkeypatch):
+    class Noon(datetime.datetime):
+        @classmethod
+        def now(cls):
+            return cls(2026, 1, 31, 12, 0, 0)
+
+    monkeypatch.setattr(run_folder, "datetime", Noon)
+    for _ in range(3):
+        assert launch("--train", "trainer.max_steps=1", "trainer.limit_val_batches=0")[0] == 0
+    folders = sorted(Path("outputs/tiny").iterdir())
+    name = "a_red_ball@20260131-120000"
+    assert [folder.name for folder in folders] == [name, f"{name}-2", f"{name}-3"]
+    assert load_config(folders[1] / "configs/parsed.yaml").trial_dir == str(folders[1])

@@ -1,0 +1,238 @@
+"""Stopping by signals, checkpoints, and going on."""
+
+import contextlib
+import os
+import pty
+import re
+import shlex
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.helpers import tiny_parts
+from tests.helpers.tiny_runs import assert_same_training, files, only_run
+from threestudio_gaussiandreamer.core.checkpoint_file import load_file
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch import callbacks, checkpoints, experiment
+from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.experiment import main
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+@pytest.mark.parametrize("step", [0, 2, 4, 5])
+def test_stopped_and_resumed_equals_never_stopped(launch, name, code, step):
+    # step 2 is followed by validation, step 5 is the last one
+    assert launch("--train", "name=whole")[0] == 0
+    stopped, out, err = launch("--train", f"system.signal_at={step}", f"system.signal_name={name}")
+    assert stopped == code and "stopping after this step" in err or stopped == code
+    assert f"stopped at step {step + 1}" in out and "it6-test" not in str(files(only_run()))
+    assert load_file(only_run() / "ckpts/last.ckpt")["global_step"] == step + 1
+
+    command = shlex.split(re.search("to go on: (.*)", out)[1])
+    options = command[command.index("--config") :]
+    assert options[1] == f"{only_run()}/configs/parsed.yaml"
+    assert main([*options, "system.signal_at=-1"]) == 0
+    (whole,) = Path("outputs/whole").glob("*/ckpts/last.ckpt")
+    assert_same_training(only_run() / "ckpts/last.ckpt", whole)
+    assert "save/it6-test.mp4" in files(only_run())
+
+
+def test_stopped_during_validation_and_resumed_equals_never_stopped(launch, monkeypatch):
+    assert launch("--train", "name=whole")[0] == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            tiny_parts.TinySystem,
+            "validation_step",
+            lambda self, batch, batch_idx: os.kill(os.getpid(), signal.SIGTERM),
+        )
+        # the second view brings the second signal, which would end it at once
+        code, out, _ = launch("--train", "data.views=1")
+    assert code == 143 and "stopped at step 3" in out
+    parsed = f"{only_run()}/configs/parsed.yaml"
+    assert launch("--train", f"resume={only_run()}/ckpts/last.ckpt", config=parsed)[0] == 0
+    (whole,) = Path("outputs/whole").glob("*/ckpts/last.ckpt")
+    assert_same_training(only_run() / "ckpts/last.ckpt", whole)
+
+
+@pytest.mark.parametrize("where", ["configure", "on_fit_start"])
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+def test_before_training_a_signal_ends_it_at_once(launch, monkeypatch, where, name, code):
+    monkeypatch.setattr(
+        tiny_parts.TinySystem, where, lambda self: os.kill(os.getpid(), getattr(signal, name))
+    )
+    assert launch("--train")[0] == code and os.listdir() == ["tiny.yaml"]
+
+
+def test_a_resumed_run_keeps_its_first_configuration_and_adds_its_command(launch, trained):
+    code, _, _ = launch(
+        "--train",
+        f"resume={trained}/ckpts/last.ckpt",
+        "trainer.max_steps=8",
+        config=f"{trained}/configs/parsed.yaml",
+    )
+    assert code == 0 and only_run() == trained
+    assert (trained / "configs/raw.yaml").read_text() == tiny_parts.CONFIG
+    assert load_config(trained / "configs/parsed.yaml").trainer.max_steps == 8
+    assert len((trained / "cmd.txt").read_text().splitlines()) == 2
+    # every_n_train_steps is still 6 there, but the last step is always kept
+    assert load_file(trained / "ckpts/last.ckpt")["global_step"] == 8 and not list(
+        trained.glob("ckpts/last-v*")
+    )
+
+
+def test_resume_auto_goes_on_where_the_last_run_stopped(launch):
+    assert launch("--train", "resume=auto", "system.signal_at=2")[0] == 130
+    code, _, _ = launch("--train", "resume=auto")
+    assert code == 0 and load_file(only_run() / "ckpts/last.ckpt")["global_step"] == 6
+
+
+def test_a_full_disk_is_named_and_the_earlier_checkpoint_stays(launch, monkeypatch):
+    original = os.fsync
+
+    def fsync(descriptor):
+        if "step=4" in os.readlink(f"/proc/self/fd/{descriptor}"):
+            raise OSError(28, "No space left on device")
+        original(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    code, _, err = launch("--train", "checkpoint.every_n_train_steps=2")
+    assert code == 2 and "No space left on device" in err and "Traceback" not in err
+    assert load_file(only_run() / "ckpts/last.ckpt")["global_step"] == 2 and not list(
+        only_run().glob("ckpts/.*")
+    )
+
+
+def test_ctrl_c_during_the_test_ends_with_130(launch, monkeypatch):
+    monkeypatch.setattr(
+        tiny_parts.TinySystem,
+        "test_step",
+        lambda self, batch, batch_idx: os.kill(os.getpid(), signal.SIGINT),
+    )
+    code, _, err = launch("--train")
+    assert code == 130 and "Traceback" not in err
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert load_file(only_run() / "ckpts/last.ckpt")["global_step"] == 6
+
+
+def test_a_second_ctrl_c_stops_at_once(launch, monkeypatch):
+    def endless_step(self, batch, batch_idx):
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(60)
+
+    monkeypatch.setattr(tiny_parts.TinySystem, "training_step", endless_step)
+    code, _, _ = launch("--train")
+    assert code == 130 and not Path("outputs").exists()
+
+
+def test_a_second_sigterm_stops_at_once_with_its_own_code(launch, monkeypatch):
+    def endless_step(self, batch, batch_idx):
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(60)
+
+    monkeypatch.setattr(tiny_parts.TinySystem, "training_step", endless_step)
+    assert launch("--train")[0] == 143
+
+
+def test_under_nohup_a_hang_up_changes_nothing(launch):
+    earlier = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        code, _, _ = launch("--train", "system.signal_at=2", "system.signal_name=SIGHUP")
+    finally:
+        signal.signal(signal.SIGHUP, earlier)
+    assert code == 0 and load_file(only_run() / "ckpts/last.ckpt")["global_step"] == 6
+
+
+def test_a_closed_terminal_leaves_a_checkpoint(launch, monkeypatch):
+    """The process loses its terminal in the middle of a step: it is sent SIGHUP, and whatever it
+    writes from then on fails.
+    """
+    child, terminal = pty.fork()
+    if child == 0:
+        sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)
+        os._exit(main(["--config", "tiny.yaml", "--train", "trainer.max_steps=100000"]))
+    os.set_blocking(terminal, False)
+    while not list(Path().glob("outputs/tiny/*/csv_logs/version_0/metrics.csv")):
+        assert os.waitpid(child, os.WNOHANG) == (0, 0)
+        with contextlib.suppress(BlockingIOError):
+            os.read(terminal, 1 << 16)
+        time.sleep(0.01)
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 129
+    assert load_file(only_run() / "ckpts/last.ckpt")["global_step"] > 0
+
+
+@pytest.mark.parametrize("translated", [RecursionError, UserError, None])
+def test_a_signal_during_imports_ends_it_whatever_becomes_of_its_exception(
+    launch, monkeypatch, translated
+):
+    def importing(*arguments):
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        except BaseException as error:
+            if translated:
+                raise translated("while importing") from error
+        return 0
+
+    monkeypatch.setattr(experiment, "run", importing)
+    code, _, err = launch("--train")
+    assert code == 143 and err == "stopped\n"
+
+
+def test_a_checkpoint_is_written_about_every_minute(launch, monkeypatch):
+    """So a run that is killed between its own checkpoints loses at most that much."""
+    steps, clock = [], [0.0]
+
+    def step_of_20_seconds(system, batch, batch_idx):
+        clock[0] += 20.0
+        steps.append((only_run() / "ckpts/last.ckpt").is_file() and last_step())
+        return training_step(system, batch, batch_idx)
+
+    def last_step():
+        return load_file(only_run() / "ckpts/last.ckpt")["global_step"]
+
+    training_step = tiny_parts.TinySystem.training_step
+    monkeypatch.setattr(tiny_parts.TinySystem, "training_step", step_of_20_seconds)
+    monkeypatch.setattr(callbacks.time, "monotonic", lambda: clock[0])
+    assert launch("--train", "trainer.max_steps=8", "trainer.limit_val_batches=0")[0] == 0
+    assert steps == [False, False, False, 3, 3, 3, 6, 6] and last_step() == 8
+
+
+def test_checkpoints_take_a_hundredth_of_the_time_at_most(launch, monkeypatch):
+    clock, saved = [0.0], []
+
+    def slow_save(path, content):
+        clock[0] += 5.0
+        saved.append(content["global_step"])
+
+    def step_of_100_seconds(system, batch, batch_idx):
+        clock[0] += 100.0
+        return training_step(system, batch, batch_idx)
+
+    training_step = tiny_parts.TinySystem.training_step
+    monkeypatch.setattr(tiny_parts.TinySystem, "training_step", step_of_100_seconds)
+    monkeypatch.setattr(callbacks.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(checkpoints, "save_file", slow_save)
+    options = ["trainer.max_steps=12", "trainer.limit_val_batches=0", "checkpoint.save_last=false"]
+    assert launch("--train", *options)[0] == 0
+    assert [step for step in saved if step < 12] == [1, 6, 11]
+
+
+def test_the_handlers_are_put_back(launch):
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    assert launch("--train")[0] == 0
+    assert launch("--train", "system.signal_at=1")[0] == 130
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_it_runs_outside_of_the_main_thread(launch):
+    codes = []
+    thread = threading.Thread(target=lambda: codes.append(launch("--train")[0]))
+    thread.start()
+    thread.join()
+    assert codes == [0]
