@@ -1,6 +1,7 @@
 """Random lives of a cloud, a few of what `make fuzz` tries."""
 
 import pytest
+import torch
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis.stateful import run_state_machine_as_test
 
@@ -31,12 +32,15 @@ def test_no_life_breaks_a_cloud():
 
 
 def test_a_split_beyond_floats_is_found(monkeypatch):
-    """As it was: a Gaussian of infinite size has its children infinitely far away, and the floor
-    keeps them.
-    """
+    """Without the limit of densify, a Gaussian of infinite size has children at infinity."""
     monkeypatch.setattr(densify, "LOG_SCALE_RANGE", (-1e30, 1e30))
+    life = CloudLife()
+    life.start(count=20, floor=1, cap=500, seed=0)
+    with torch.no_grad():
+        life.cloud.log_scales.fill_(300.0)
     with pytest.raises(AssertionError, match="isn't finite"):
-        live(200, phases=[Phase.generate])
+        life.densify(seed=1, threshold=0.0, split=0.05, faint=0.0, huge=1e30)
+        life.everything_fits()
 
 
 def test_moments_that_go_astray_are_found(monkeypatch):
