@@ -664,7 +664,7 @@ def test_different_prompts_have_different_folders(measured):
 
 
 @row("A5", "Ctrl-C / SIGTERM")
-@pytest.mark.parametrize("name, code", [("SIGINT", 130), ("SIGTERM", 143)])
+@pytest.mark.parametrize("name, code", [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
 @pytest.mark.parametrize("step", random.Random(5).sample(range(1, 5), 2))
 def test_a_signal_at_a_random_step(name, code, step, whole, tmp_path, monkeypatch, measured):
     with monkeypatch.context() as patch:

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..cameras import Orbit, held_out_orbit
-from ..core.files import json_text
+from ..core.files import atomic_file, json_text
 from ..core.images import read as read_image
 from ..core.memory import require_memory
 from ..core.options import at_least, in_range
@@ -217,9 +217,8 @@ class Measurements:
     def write(self) -> None:
         self.values |= self._elapsed()
         self.folder.mkdir(parents=True, exist_ok=True)
-        temporary = self.path.with_suffix(".tmp")
-        temporary.write_text(json_text(self.values, indent=2))
-        temporary.replace(self.path)
+        with atomic_file(self.path) as file:
+            file.write(json_text(self.values, indent=2).encode())
 
     def _save_pictures(self, key: str, renders: Tensor, truth: Tensor) -> None:
         """Rows of six views: ``held_out/<key>.png``, ``truth.png``, and ``compare.png`` with prior,
