@@ -33,24 +33,23 @@ from benchmarks.quality.runs import (
 )
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
-from threestudio_gaussiandreamer.gaussians import importance as parsimony
+from threestudio_gaussiandreamer.gaussians import importance
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
+from threestudio_gaussiandreamer.gaussians.recover import Recovery, recover
 from threestudio_gaussiandreamer.gaussians.simplify import (
     Budget,
-    Views,
-    draw,
-    likeness,
-    look,
-    only,
-    recover,
+    keep_best,
     rounds_to,
     simplify,
-    worth,
+    view_importance,
 )
-from threestudio_gaussiandreamer.prune import command as prune
+from threestudio_gaussiandreamer.gaussians.views import Views, draw, psnr_to_original, render_all
+from threestudio_gaussiandreamer.host import get_device
+from threestudio_gaussiandreamer.prune import PruneOptions
+from threestudio_gaussiandreamer.prune.pipeline import views_of
 
 COUNTS = (2500, 1500)
-DRAWN = prune.PruneOptions(size=SIZE, eps2d=RENDERER["eps2d"])
+DRAWN = PruneOptions(size=SIZE, eps2d=RENDERER["eps2d"])
 """As the cloud was in training."""
 COLUMNS = "variant,x,object,seed,psnr,machine,commit".split(",")
 
@@ -75,33 +74,47 @@ def measured(mesh: str, seed: int) -> list[dict[str, Any]]:
         stored = read_cloud(
             str(train(Path(folder), mesh, seed, NO_BUDGET) / f"it{STEPS}-export/gaussians.ply")
         )
-    cloud = prune.tensors_of(stored)
-    probes, judges, tests = prune.views_of(stored, DRAWN)
-    pictures = look(cloud, tests)
+    cloud = stored.gaussians.tensors(get_device())
+    train_views, val_views, tests = views_of(stored, DRAWN)
+    pictures = render_all(cloud, tests)
     place = {"object": object_name(mesh), "seed": seed}
     return [
-        place | {"variant": variant, "x": count, "psnr": round(likeness(fewer, tests, pictures), 3)}
+        place
+        | {
+            "variant": variant,
+            "x": count,
+            "psnr": round(psnr_to_original(fewer, tests, pictures), 3),
+        }
         for count in COUNTS
-        for variant, fewer in variants(cloud, count, probes, judges)
+        for variant, fewer in variants(cloud, count, train_views, val_views)
     ]
 
 
 def variants(
-    cloud: Gaussians, count: int, probes: Views, judges: Views
+    cloud: Gaussians, count: int, train_views: Views, val_views: Views
 ) -> Iterator[tuple[str, Gaussians]]:
     """The ways from a cloud to ``count`` Gaussians, and where they lead."""
-    for name in parsimony.SCORES:
-        yield f"one shot, by {name}", only(cloud, RANKS[name](cloud, probes, 0), count)
+    for name in importance.SCORES:
+        yield f"one shot, by {name}", keep_best(cloud, RANKS[name](cloud, train_views, 0), count)
     steps = STEPS_A_ROUND * rounds_to(count, len(cloud.means))
     yield (
         "one shot, by removal, recovered",
-        recover(only(cloud, worth(cloud, probes), count), probes, look(cloud, probes), steps, 0),
+        recover(
+            keep_best(cloud, view_importance(cloud, train_views), count),
+            train_views,
+            render_all(cloud, train_views),
+            steps,
+            0,
+        ),
     )
-    for name in parsimony.SCORES:
+    for name in importance.SCORES:
         yield (
             f"in rounds, by {name}",
             simplify(
-                cloud, probes, judges, Budget(count=count), steps=STEPS_A_ROUND, rank=RANKS[name]
+                cloud,
+                Budget(count=count),
+                Recovery(cloud, train_views, val_views, steps=STEPS_A_ROUND),
+                rank=RANKS[name],
             ),
         )
 
@@ -113,7 +126,7 @@ def contribution(cloud: Gaussians, views: Views, seed: int) -> Tensor:
 
 
 RANKS = {
-    "removal": worth,
+    "removal": view_importance,
     "contribution": contribution,
     "opacity": lambda cloud, views, seed: cloud.logit_opacities.detach(),
     "random": lambda cloud, views, seed: torch.rand(

@@ -22,7 +22,7 @@ from benchmarks.quality.known_answer import torus
 from benchmarks.quality.runs import append_rows, measured_in
 from benchmarks.splatting.bench_splatting import make_scene
 from threestudio_gaussiandreamer import register_parts
-from threestudio_gaussiandreamer.formats.gaussian_files import write_cloud
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0
 from threestudio_gaussiandreamer.prune import command as prune
@@ -52,7 +52,7 @@ def rows(count: int, measured: set[tuple[str, ...]]) -> Iterator[dict[str, Any]]
     with tempfile.TemporaryDirectory() as folder:
         for scene, make in SCENES.items():
             source = Path(folder) / "source.ply"
-            write_cloud(str(source), prune.stored_cloud(make(count)))
+            write_cloud(str(source), StoredCloud(make(count).arrays()))
             for budget in (["--count", str(count // 4)], ["--psnr", "40"]):
                 if (scene, str(count), " ".join(budget)) in measured:
                     continue

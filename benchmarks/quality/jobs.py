@@ -15,7 +15,7 @@ from benchmarks.quality.ablations import (
     VIEW_BLIND,
 )
 from threestudio_gaussiandreamer.gaussians.simplify import rounds_to
-from threestudio_gaussiandreamer.prune.command import PruneOptions
+from threestudio_gaussiandreamer.prune import PruneOptions
 
 STEPS = 1200
 SECOND_STAGE = 500

@@ -30,12 +30,12 @@ from benchmarks.quality.jobs import RATES
 from benchmarks.quality.runs import ROOT, append_rows, measured_in
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.cameras import held_out_orbit, to_opencv
-from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud, write_cloud
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from threestudio_gaussiandreamer.gaussians.axes import WORLD_UP
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0, sh_to_colors
-from threestudio_gaussiandreamer.gaussians.simplify import Views, likeness, look
-from threestudio_gaussiandreamer.host import BaseObject, register
+from threestudio_gaussiandreamer.gaussians.views import Views, psnr_to_original, render_all
+from threestudio_gaussiandreamer.host import BaseObject, get_device, register
 from threestudio_gaussiandreamer.launch.experiment import main as launch
 from threestudio_gaussiandreamer.prune import command as prune
 from threestudio_gaussiandreamer.splatting import rasterize
@@ -177,7 +177,7 @@ class KnownCloud(BaseObject):
     cfg: Config
 
     def configure(self) -> None:
-        self.truth = CloudTruth(prune.tensors_of(read_cloud(self.cfg.path)))
+        self.truth = CloudTruth(read_cloud(self.cfg.path).gaussians.tensors(get_device()))
 
     def __call__(
         self, rgb: Tensor, prompt_utils: Any, comp_rgb_bg: Tensor, **batch: Any
@@ -195,8 +195,8 @@ class KnownCloud(BaseObject):
 def found_by_auto(true: Gaussians, seed: int, steps: int, folder: Path) -> tuple[int, int, float]:
     """Gaussians before and after, and dB to the truth."""
     start = with_copies_and_floaters(true, seed)
-    write_cloud(str(folder / "true.ply"), prune.stored_cloud(true))
-    write_cloud(str(folder / "start.ply"), prune.stored_cloud(start))
+    write_cloud(str(folder / "true.ply"), StoredCloud(true.arrays()))
+    write_cloud(str(folder / "start.ply"), StoredCloud(start.arrays()))
     cfg = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())
     cfg["system"] |= {
         "guidance_type": "known-cloud-guidance",
@@ -229,16 +229,19 @@ def found_by_auto(true: Gaussians, seed: int, steps: int, folder: Path) -> tuple
         ]
     ):
         raise SystemExit("the training run failed")
-    found = prune.tensors_of(
-        read_cloud(str(folder / f"demo/run/save/it{steps}-export/gaussians.ply")).in_axes(WORLD_UP)
+    exported = read_cloud(str(folder / f"demo/run/save/it{steps}-export/gaussians.ply"))
+    found = exported.in_axes(WORLD_UP).gaussians.tensors(get_device())
+    return (
+        len(start.means),
+        len(found.means),
+        psnr_to_original(found, held_out(), render_all(true, held_out())),
     )
-    return len(start.means), len(found.means), likeness(found, held_out(), look(true, held_out()))
 
 
 def found_by_prune(true: Gaussians, seed: int, folder: Path) -> tuple[int, int, float]:
     """Gaussians before and after, and dB to what they were before."""
     start = with_shares_and_faint_floaters(true, seed)
-    write_cloud(str(folder / "shared.ply"), prune.stored_cloud(start))
+    write_cloud(str(folder / "shared.ply"), StoredCloud(start.arrays()))
     report = prune.run(
         prune.parse(
             [

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer.gaussians import merge as merging
-from threestudio_gaussiandreamer.gaussians import simplify
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.merge import merge_duplicates
+from threestudio_gaussiandreamer.gaussians.views import render_all, views_around
+from threestudio_gaussiandreamer.metrics import psnr
 
 
 def shell(count=60, seed=0):
@@ -47,7 +48,7 @@ def picture(params):
         shell()["logit_opacities"],
         shell()["sh0"],
     )
-    return simplify.look(cloud, simplify.views_around(around, 6, 48))
+    return render_all(cloud, views_around(around, 6, 48))
 
 
 def test_a_pair_keeps_its_peak_and_its_light():
@@ -80,7 +81,7 @@ def test_copies_in_one_place_become_one(times):
         )  # float32 logits
     growth = (change.values["log_scales"] - params["log_scales"][change.parents % 60]).mean(1)
     assert (growth > 0).all() and (growth < 0.4).all()  # together they fall off more slowly
-    assert simplify.psnr(picture(change.values), picture(copies(params, times))) > 40
+    assert psnr(picture(change.values), picture(copies(params, times))) > 40
 
 
 def test_copies_a_little_apart_become_one_that_looks_like_both():
@@ -91,7 +92,7 @@ def test_copies_a_little_apart_become_one_that_looks_like_both():
     change = merge_duplicates(both)
     assert len(change.parents) == 60
     assert (
-        simplify.psnr(picture(change.values), picture(both)) > 28
+        psnr(picture(change.values), picture(both)) > 28
     )  # where neighbours overlap, another one is in front
 
 

@@ -22,7 +22,8 @@ from threestudio_gaussiandreamer.gaussians import densify
 from threestudio_gaussiandreamer.gaussians.densify import PARAMETERS, Rules, Statistics
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
-from threestudio_gaussiandreamer.gaussians.simplify import look, views_around, worth
+from threestudio_gaussiandreamer.gaussians.simplify import view_importance
+from threestudio_gaussiandreamer.gaussians.views import render_all, views_around
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
@@ -172,13 +173,15 @@ def test_a_trained_cloud_that_is_too_large_keeps_what_contributes(tmp_path, meas
     )
     views = views_around(drawn(trained), 4, 64, turn=30)
 
-    def likeness(cloud: Gaussians) -> float:
-        return psnr(look(cloud, views), look(drawn(trained), views)).mean().item()
+    def psnr_to_trained(cloud: Gaussians) -> float:
+        return psnr(render_all(cloud, views), render_all(drawn(trained), views)).mean().item()
 
     lots = [torch.randperm(400, generator=generator(seed, "lottery"))[:150] for seed in range(5)]
-    luckiest = max(likeness(drawn(trained).rows(rows)) for rows in lots)
+    luckiest = max(psnr_to_trained(drawn(trained).rows(rows)) for rows in lots)
     measured(
-        likeness(drawn(geometry)) - luckiest, "dB better than the best of 5 lotteries", at_least=2.0
+        psnr_to_trained(drawn(geometry)) - luckiest,
+        "dB better than the best of 5 lotteries",
+        at_least=2.0,
     )
 
 
@@ -201,7 +204,7 @@ def test_a_first_cloud_that_is_too_large_is_thinned_evenly(measured, said):
         "give 10000 points; keeping 2500" in message for message in said
     )
     ranked = GaussianCloud(prior)
-    rows = worth(drawn(whole), views_around(drawn(whole), 8, 128)).topk(2500).indices
+    rows = view_importance(drawn(whole), views_around(drawn(whole), 8, 128)).topk(2500).indices
     ranked.start_from(
         PointCloud(
             whole.means.detach()[rows].numpy(),
@@ -209,7 +212,7 @@ def test_a_first_cloud_that_is_too_large_is_thinned_evenly(measured, said):
         )
     )
     views = views_around(drawn(whole), 4, 96, turn=30)
-    pictures = [look(drawn(geometry), views) for geometry in (whole, capped, ranked)]
+    pictures = [render_all(drawn(geometry), views) for geometry in (whole, capped, ranked)]
     holes = [
         cKDTree(geometry.means.detach()).query(whole.means.detach())[0].max()
         for geometry in (capped, ranked)

@@ -23,7 +23,7 @@ from threestudio_gaussiandreamer.gaussians.grow import (
     nearest_distance_scales,
 )
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
-from threestudio_gaussiandreamer.gaussians.simplify import look, views_around
+from threestudio_gaussiandreamer.gaussians.views import render_all, views_around
 from threestudio_gaussiandreamer.meshes.load import face_areas, load_mesh, sample_surface
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
@@ -56,7 +56,7 @@ def started(cloud: PointCloud, **options) -> GaussianCloud:
 def picture(geometry: GaussianCloud, frame: GaussianCloud | None = None) -> torch.Tensor:
     """Three views of a cloud, from where they would show ``frame``."""
     cloud, seen = (Gaussians.of(g).map(torch.Tensor.detach) for g in (geometry, frame or geometry))
-    return look(cloud, views_around(seen, 3, 64))
+    return render_all(cloud, views_around(seen, 3, 64))
 
 
 # ---- distances -----------------------------------------------------------------------------------

@@ -1,5 +1,11 @@
-"""Prune a finished cloud to a budget: ``python -m threestudio_gaussiandreamer.prune IN OUT``."""
+"""Prune a finished cloud to a budget: ``python -m threestudio_gaussiandreamer.prune IN OUT``.
 
-from .command import PruneOptions, main, pruned, write_report
+``options.py`` says what may be asked for, ``pipeline.py`` reads and prunes, ``report.py`` measures
+and writes the report, ``command.py`` is the command line."""
 
-__all__ = ["PruneOptions", "main", "pruned", "write_report"]
+from .command import main
+from .options import PruneOptions
+from .pipeline import prune_to_budget
+from .report import write_report
+
+__all__ = ["PruneOptions", "main", "prune_to_budget", "write_report"]

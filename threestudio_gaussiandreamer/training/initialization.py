@@ -13,10 +13,12 @@ import torch
 from ..core.memory import count_of
 from ..core.options import at_least, interval, positive
 from ..core.streams import numpy_generator
-from ..gaussians import sh, simplify
+from ..gaussians import sh
 from ..gaussians.gaussians import Gaussians
 from ..gaussians.grow import grow, nearest_distance_scales
 from ..gaussians.point_cloud import PointCloud
+from ..gaussians.simplify import keep_best, view_importance
+from ..gaussians.views import views_around
 from ..host import run_seed
 
 logger = logging.getLogger(__name__)
@@ -103,5 +105,5 @@ def most_visible(cloud: Gaussians, max_gaussians: int, device: torch.device) -> 
         max_gaussians,
     )
     cloud = cloud.tensors(device)
-    shown = simplify.worth(cloud, simplify.views_around(cloud, *CAP_VIEWS))
-    return simplify.only(cloud, shown, max_gaussians)
+    importance = view_importance(cloud, views_around(cloud, *CAP_VIEWS))
+    return keep_best(cloud, importance, max_gaussians)

@@ -41,8 +41,8 @@ from ..exporters.base import read_gaussians
 from ..formats.gaussian_files import StoredCloud, write_cloud
 from ..formats.ply import write_points
 from ..gaussians.point_cloud import PointCloud
-from ..gaussians.simplify import EPS2D
 from ..gaussians.surface import Surface, write_obj
+from ..gaussians.views import EPS2D
 from ..guidance.base import ScoreDistillation
 from ..guidance.foreign import (
     call_guidance,
@@ -55,7 +55,7 @@ from ..guidance.known_truth import truth_of
 from ..host import BaseLift3DSystem, find, info, register, validate_schedule, warn
 from ..metrics import psnr
 from ..priors.cache import cached_cloud
-from ..prune.command import PruneOptions, pruned, write_report
+from ..prune import PruneOptions, prune_to_budget, write_report
 from .background import FlatBackground
 from .data import GaussianDreamerDataModule
 from .density import DensityControl, DensityOutcome, RenderedQuality
@@ -469,11 +469,11 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         )
         suffix = ".spz" if packed else ".ply"
         stored = StoredCloud(read_gaussians(self.geometry))
-        done = pruned(stored, options, suffix, "system.prune.")
+        result = prune_to_budget(stored, options, suffix, "system.prune.")
         geometry = find(self.cfg.geometry_type)(self.cfg.geometry)
-        geometry.set_arrays(**done.after.gaussians._asdict())
-        self.export_cloud(geometry, folder, done.after.pruned_to)
-        write_report(self.get_save_path(f"{folder}/report"), done, suffix, options)
+        geometry.set_arrays(**result.after.gaussians._asdict())
+        self.export_cloud(geometry, folder, result.after.pruned_to)
+        write_report(self.get_save_path(f"{folder}/report"), result, suffix, options)
 
     def on_validation_start(self) -> None:
         self.ensure_cloud()

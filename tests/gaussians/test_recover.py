@@ -1,0 +1,71 @@
+"""Recovery makes Gaussians better, and never worse."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from tests.helpers.pruning import ball
+from threestudio_gaussiandreamer.gaussians import recover, simplify
+from threestudio_gaussiandreamer.gaussians.recover import LR_SCALES, Recovery
+from threestudio_gaussiandreamer.gaussians.simplify import Budget, keep_best, view_importance
+from threestudio_gaussiandreamer.gaussians.views import psnr_to_original, render_all, views_around
+
+
+def views(cloud, train, val, size=48):
+    """Training and validation views."""
+    sets = ((train, 0.0), (val, 45.0))
+    return [views_around(cloud, count, size, turn=turn) for count, turn in sets]
+
+
+def keep_duplicates(monkeypatch):
+    monkeypatch.setattr(
+        simplify, "merge_duplicates", lambda values, at_least: SimpleNamespace(values=values)
+    )
+
+
+def test_recovery_pays():
+    cloud = ball()
+    train_views, val_views = views(cloud, 16, 8)
+    images = render_all(cloud, train_views)
+    pruned = keep_best(cloud, view_importance(cloud, train_views), 200)
+    recovered = recover.recover(pruned, train_views, images, 40, 0)
+    before = render_all(cloud, val_views)
+    assert (
+        psnr_to_original(recovered, val_views, before)
+        > psnr_to_original(pruned, val_views, before) + 1.0
+    )
+
+
+@pytest.mark.parametrize("bearable", [1.0, 1 / 16, 0.0])
+def test_a_recovery_makes_nothing_worse(monkeypatch, bearable):
+    """It is repeated with smaller rates, and left out where none is small enough."""
+    cloud, scales = ball(), []
+    train_views, val_views = views(cloud, 16, 8)
+
+    def recover_with(cloud, views, images, steps, seed, sh_reach, lr_scale):
+        scales.append(lr_scale)
+        return cloud if lr_scale <= bearable else cloud._replace(sh=cloud.sh + 1)
+
+    monkeypatch.setattr(recover, "recover", recover_with)
+    keep_duplicates(monkeypatch)
+    count = len(cloud.means) - 20
+    recovery = Recovery(cloud, train_views, val_views, steps=1)
+    found = simplify.simplify(cloud, Budget(count=count), recovery)
+    kept = keep_best(cloud, view_importance(cloud, train_views), count)
+    assert all(torch.equal(a, b) for a, b in zip(found, kept, strict=True))
+    assert scales == [scale for scale in LR_SCALES if scale >= bearable]
+
+
+def test_a_recovery_begins_near_the_rates_of_the_one_before(monkeypatch):
+    cloud, scales, bearable = ball(), [], iter([1 / 16] * 5 + [1.0] * 3)
+    train_views, val_views = views(cloud, 8, 4, size=32)
+
+    def recover_with(cloud, views, images, steps, seed, sh_reach, lr_scale):
+        scales.append(lr_scale)
+        return cloud if lr_scale <= next(bearable) else cloud._replace(sh=cloud.sh + 1)
+
+    monkeypatch.setattr(recover, "recover", recover_with)
+    keep_duplicates(monkeypatch)
+    simplify.simplify(cloud, Budget(count=200), Recovery(cloud, train_views, val_views, steps=1))
+    assert scales == [1, 1 / 4, 1 / 16, 1 / 4, 1 / 16, 1 / 4, 1, 1]

@@ -1,0 +1,71 @@
+"""What is hidden goes first, and the search for the smallest cloud ends."""
+
+import pytest
+import torch
+
+from tests.helpers.pruning import ball
+from threestudio_gaussiandreamer.gaussians import recover
+from threestudio_gaussiandreamer.gaussians.recover import LR_SCALES, Recovery
+from threestudio_gaussiandreamer.gaussians.simplify import (
+    Budget,
+    keep_best,
+    rounds_to,
+    simplify,
+    view_importance,
+)
+from threestudio_gaussiandreamer.gaussians.views import views_around
+
+
+@pytest.mark.parametrize(
+    ("here", "count", "rounds"),
+    [(100, 100, 0), (10, 20, 0), (10000, 6400, 2), (10000, 1500, 9), (2, 1, 1), (600, 1, 24)],
+)
+def test_how_many_rounds_it_takes(here, count, rounds):
+    assert rounds_to(count, here) == rounds
+
+
+def test_hidden_gaussians_go_first():
+    cloud = ball()
+    views = views_around(cloud, 16, 48)
+    kept = keep_best(cloud, view_importance(cloud, views), 400)
+    outside = kept.means.norm(dim=1) > 0.9
+    assert (
+        outside.double().mean() > 0.9
+    )  # two thirds of all; a few inner ones are seen through gaps
+
+
+def recovery(cloud, size):
+    """Two steps, fitted to eight views and judged on eight others."""
+    views = (views_around(cloud, 8, size, turn=turn) for turn in (0.0, 45.0))
+    return Recovery(cloud, *views, steps=2)
+
+
+def test_any_quality_ends_the_search():
+    apart = ball(12)._replace(
+        logit_opacities=torch.full((12,), 6.0), log_scales=torch.full((12, 3), -3.0)
+    )
+    for psnr, count in ((1.0, 1), (99.0, 12)):
+        assert len(simplify(apart, Budget(psnr=psnr), recovery(apart, 48)).means) == count
+
+
+def test_a_round_that_failed_is_not_tried_again(monkeypatch):
+    """Below a hundred Gaussians a round of one can't become smaller."""
+    few, tried = keep_best(ball(), torch.arange(600.0), 20), []
+    original = recover.recover
+
+    def counted(cloud, *rest):
+        tried.append(len(cloud.means))
+        return original(cloud, *rest)
+
+    monkeypatch.setattr(recover, "recover", counted)
+    assert len(simplify(few, Budget(psnr=99.0), recovery(few, 32)).means) == 20
+    assert len(tried) <= 5 * len(LR_SCALES) and tried.count(19) <= len(LR_SCALES)
+
+
+def test_grey_gaussians_are_not_lost_before_grey():
+    cloud = ball()
+    cloud.sh[::2] = 0.0
+    kept = keep_best(cloud, view_importance(cloud, views_around(cloud, 16, 48)), 300)
+    outside = kept.means.norm(dim=1) > 0.9
+    grey = (kept.sh == 0).all(-1)[:, 0] & outside
+    assert 0.3 < grey.double().sum() / outside.double().sum() < 0.7

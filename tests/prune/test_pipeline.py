@@ -1,0 +1,218 @@
+"""Files and checkpoints of Gaussians are read and pruned as their formats store them."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers.pruning import FAST, ball, run
+from tests.helpers.raw_ply import write_raw_gaussians
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
+from threestudio_gaussiandreamer.formats.ply import read_gaussians, write_gaussians
+from threestudio_gaussiandreamer.formats.spz import COLOR_REACH
+from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
+from threestudio_gaussiandreamer.gaussians.views import psnr_to_original, render_all
+from threestudio_gaussiandreamer.host import get_device
+from threestudio_gaussiandreamer.prune import PruneOptions, command
+from threestudio_gaussiandreamer.prune.pipeline import views_of
+from threestudio_gaussiandreamer.splatting import rasterize
+
+
+def test_what_a_format_costs_is_spent_too(tmp_path):
+    """Also where the budget has been spent already, and where a count drops nothing."""
+    bright = ball()
+    bright.sh[:] *= 6
+    write_gaussians(tmp_path / "in.ply", bright.arrays())
+    assert run(tmp_path / "in.ply", tmp_path / "once.ply", "--psnr", "35")["met"]
+    assert not run(tmp_path / "once.ply", tmp_path / "twice.spz", "--psnr", "35")["met"]
+    run(tmp_path / "once.ply", tmp_path / "count.spz", "--count", "600")
+    first = read_cloud(str(tmp_path / "in.ply"))
+    views = views_of(first, PruneOptions(size=48))[-1]
+    pictures = render_all(first.gaussians.tensors(get_device()), views)
+    for name in ("twice.spz", "count.spz"):
+        found = read_cloud(str(tmp_path / name))
+        turned = found.in_axes(first.up).gaussians.tensors(get_device())
+        assert (
+            found.pruned_to < 34.9
+            and psnr_to_original(turned, views, pictures) > found.pruned_to - 0.5
+        )
+
+
+@pytest.mark.parametrize(
+    ("drawn", "eps2d"), [({}, 0.3), ({"eps2d": 0.05}, 0.05), ({"antialias": True}, 0.3)]
+)
+def test_a_cloud_is_judged_as_the_viewer_draws_it(source, drawn, eps2d):
+    for views in views_of(read_cloud(str(source)), PruneOptions(size=48, **drawn)):
+        cloud, rgb = ball(), sh_to_colors(ball().sh, ball().means)
+        shape = (
+            cloud.means,
+            cloud.quats,
+            cloud.log_scales.exp(),
+            cloud.logit_opacities.sigmoid(),
+            rgb,
+            views.viewmats[:1],
+            views.Ks[:1],
+        )
+        options = {
+            "background": views.backgrounds[:1],
+            "near": views.near,
+            "eps2d": eps2d,
+            "antialias": "antialias" in drawn,
+        }
+        assert torch.equal(
+            render_all(cloud, views)[0], rasterize(*shape, 48, 48, **options).image[0]
+        )
+
+
+def test_harmonics_are_kept(tmp_path):
+    write_gaussians(tmp_path / "in.ply", ball(bands=4).arrays())
+    run(tmp_path / "in.ply", tmp_path / "out.ply", "--count", "400")
+    assert read_gaussians(tmp_path / "out.ply").sh.shape == (400, 4, 3)
+
+
+def test_a_checkpoint_is_read(tmp_path):
+    cloud = ball()
+    state = {f"geometry.{name}": value for name, value in cloud._asdict().items() if name != "sh"}
+    state |= {"geometry.sh0": cloud.sh, "geometry.sh_rest": torch.zeros(len(cloud.means), 0, 3)}
+    torch.save({"state_dict": state, "epoch": 0, "global_step": 1}, tmp_path / "last.ckpt")
+    assert (
+        run(tmp_path / "last.ckpt", tmp_path / "out.ply", "--count", "300")["before"]["gaussians"]
+        == 600
+    )
+
+
+def test_gsplats_checkpoints_are_read(source, tmp_path):
+    cloud = ball()
+    splats = {
+        "means": cloud.means,
+        "quats": cloud.quats,
+        "scales": cloud.log_scales,
+        "opacities": cloud.logit_opacities,
+    }
+    torch.save(
+        {"step": 7, "splats": splats | {"sh0": cloud.sh, "shN": torch.zeros(600, 0, 3)}},
+        tmp_path / "ckpt.pt",
+    )
+    write_cloud(str(tmp_path / "in.ply"), StoredCloud(cloud.arrays()).in_axes("-y"))
+    for name in ("ckpt.pt", "in.ply"):
+        run(tmp_path / name, tmp_path / f"{name}.ply", "--count", "300")
+    from_checkpoint, from_ply = (tmp_path / f"{name}.ply" for name in ("ckpt.pt", "in.ply"))
+    assert from_checkpoint.read_bytes() == from_ply.read_bytes()
+    assert read_cloud(str(from_ply)).up == "-y"
+
+
+@pytest.mark.parametrize(("stated", "written"), [("z", "z"), ("-y", "-y"), (None, "-y")])
+def test_pruning_a_ply_does_not_rotate_it(tmp_path, stated, written):
+    notes = [f"up: {stated}"] if stated else []
+    write_gaussians(tmp_path / "in.ply", ball().arrays(), notes)
+    run(tmp_path / "in.ply", tmp_path / "out.ply", "--count", "600")
+    read = read_cloud(str(tmp_path / "out.ply"))
+    np.testing.assert_array_equal(read.gaussians.means, ball().means)
+    assert read.up == written
+
+
+def test_a_ply_from_an_spz_has_the_axes_of_the_viewers(source, tmp_path):
+    run(source, tmp_path / "a.spz", "--count", "600")
+    run(tmp_path / "a.spz", tmp_path / "b.ply", "--count", "600")
+    assert read_cloud(str(tmp_path / "b.ply")).up == "-y"
+
+
+@pytest.mark.parametrize("output", ["out.spz", "out.ply"])
+def test_harmonics_that_cannot_be_drawn_are_one_message(tmp_path, capsys, output):
+    write_raw_gaussians(tmp_path / "in.ply", ball(bands=25).arrays())
+    arguments = [str(tmp_path / "in.ply"), str(tmp_path / output), "--count", "300", *FAST]
+    assert command.main(arguments) == 2
+    assert (
+        "in.ply: the Gaussians have harmonics of degree 4; expected 0 to 3"
+        in capsys.readouterr().err
+    )
+
+
+def test_gaussians_that_cannot_be_drawn_are_left_out(tmp_path, caplog):
+    cloud = ball()
+    cloud.means[3], cloud.sh[5] = float("nan"), float("inf")
+    write_raw_gaussians(tmp_path / "in.ply", cloud.arrays())
+    splats = {
+        "means": cloud.means,
+        "quats": cloud.quats,
+        "scales": cloud.log_scales,
+        "opacities": cloud.logit_opacities,
+    }
+    torch.save(
+        {"splats": splats | {"sh0": cloud.sh, "shN": torch.zeros(600, 0, 3)}}, tmp_path / "in.pt"
+    )
+    for name in ("in.ply", "in.pt"):
+        assert (
+            run(tmp_path / name, tmp_path / "out.ply", "--count", "300", "--up", "z")["before"][
+                "gaussians"
+            ]
+            == 598
+        )
+    assert caplog.text.count("2 of 600 Gaussians hold NaN or infinity: left out") == 2
+
+
+def test_a_compact_file_is_written_within_its_size_and_read_again(source, tmp_path):
+    report = run(source, tmp_path / "out.spz", "--bytes", "7kB")
+    assert (
+        6_600 < (tmp_path / "out.spz").stat().st_size == report["after"]["bytes"] <= 7_000
+        and report["after"]["gaussians"] > 300
+    )
+    assert 900 < run(source, tmp_path / "small.spz", "--bytes", "1kB")["after"]["bytes"] <= 1_000
+    assert (
+        run(tmp_path / "out.spz", tmp_path / "again.spz", "--count", "200")["after"]["gaussians"]
+        == 200
+    )
+    assert read_cloud(str(tmp_path / "again.spz")).up == "y"
+
+
+def test_a_quality_holds_in_the_compact_file(source, tmp_path):
+    report = run(source, tmp_path / "once.spz", "--psnr", "32")
+    assert report["after"]["gaussians"] < 450 and report["psnr_on_unseen_views"] > 31.5
+    run(tmp_path / "once.spz", tmp_path / "twice.spz", "--psnr", "32")
+    assert (
+        len(read_cloud(str(tmp_path / "twice.spz")).gaussians.means) == report["after"]["gaussians"]
+    )
+
+
+def test_colours_beyond_the_compact_formats_reach_are_fitted_within_it(tmp_path):
+    cloud = ball()
+    cloud.sh[::7] *= 12  # thin ones, which others hide in part
+    cloud.logit_opacities[::7] = -1
+    write_gaussians(tmp_path / "in.ply", cloud.arrays())
+    assert float(cloud.sh.abs().max()) > 2 * COLOR_REACH
+    source = read_cloud(str(tmp_path / "in.ply"))
+    reports = []
+    for steps in ("1", "60"):
+        path = str(tmp_path / f"{steps}.spz")
+        reports.append(
+            command.run(
+                command.parse(
+                    [
+                        str(tmp_path / "in.ply"),
+                        path,
+                        "--count",
+                        "600",
+                        "--size",
+                        "48",
+                        "--steps",
+                        steps,
+                    ]
+                )
+            )
+        )
+    assert len(source.gaussians.means) == reports[1]["after"]["gaussians"] == 600
+    assert reports[1]["psnr_on_unseen_views"] > reports[0]["psnr_on_unseen_views"] + 1
+
+
+def test_views_turn_with_the_axes_of_the_file(tmp_path):
+    source = tmp_path / "in.ply"
+    write_gaussians(source, ball().arrays())
+    views = {
+        up: views_of(read_cloud(str(source), up=up), PruneOptions(size=48))[0]
+        for up in ("z", "y", "-y")
+    }
+    top = {"z": 2, "y": 1, "-y": 1}
+    heights = {up: views[up].positions[:, top[up]] * (-1 if up == "-y" else 1) for up in views}
+    assert torch.allclose(heights["z"], heights["y"], atol=0.05) and torch.allclose(
+        heights["y"], heights["-y"], atol=0.05
+    )
+    assert heights["z"].max() > 1 > -1 > heights["z"].min()

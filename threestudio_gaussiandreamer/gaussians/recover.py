@@ -1,0 +1,158 @@
+"""Recovery: fit Gaussians that have just lost some to the images that they showed before.
+
+The loss is the mean squared error to these images, the optimiser Adam. There is no diffusion model
+and no prompt, so recovery can't drift away from what was there."""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..core.streams import generator
+from .gaussians import Gaussians
+from .views import Views, bounds, draw, psnr_lower_bound, render_all
+
+LEARNING_RATES = {
+    "means": 2e-4,
+    "quats": 4e-3,
+    "log_scales": 1e-2,
+    "logit_opacities": 2e-2,
+    "sh": 5e-3,
+}
+"""Adam's for Gaussians that have just lost a fifth of their number; that of the means in units of
+the cloud's radius.
+"""
+LR_SCALES = (1.0, 1 / 4, 1 / 16, 1 / 64)
+"""Learning-rate multipliers, tried from largest to smallest: near the optimum Adam's steps are as
+long as far from it, and mostly noise.
+"""
+VIEWS_PER_STEP = 4
+
+
+class Round(NamedTuple):
+    """Gaussians after a round of pruning and recovery."""
+
+    cloud: Gaussians
+    psnr: float
+    """:func:`psnr_lower_bound` of the validation views to what they showed before any round, dB."""
+
+    @property
+    def count(self) -> int:
+        return len(self.cloud.means)
+
+
+class Recovery:
+    """Recovers Gaussians after each round of pruning, and never makes them worse.
+
+    Args:
+        original: the Gaussians before the first round, whose images are the targets.
+        train_views: the views that are fitted.
+        val_views: other views, on which a recovery is accepted or rejected: the fitted ones improve
+            even where the others lose a dB.
+        steps: of Adam per recovery.
+        seed: of the order of the views.
+        as_stored: what the file to be written makes of the Gaussians; quality is measured after it.
+        sh_reach: largest absolute value of the constant harmonic that the file holds.
+    """
+
+    def __init__(
+        self,
+        original: Gaussians,
+        train_views: Views,
+        val_views: Views,
+        *,
+        steps: int = 60,
+        seed: int = 0,
+        as_stored: Callable[[Gaussians], Gaussians] = lambda cloud: cloud,
+        sh_reach: float = math.inf,
+    ) -> None:
+        self.train_views, self.val_views = train_views, val_views
+        self.train_images = render_all(original, train_views)
+        self.val_images = render_all(original, val_views)
+        self.steps, self.seed = steps, seed
+        self.as_stored, self.sh_reach = as_stored, sh_reach
+        self.first_scale = 0  # index into LR_SCALES
+
+    def __call__(self, cloud: Gaussians, round_number: int) -> Round:
+        """Recover with the largest learning rates that don't lower the validation PSNR.
+
+        The Gaussians are returned unchanged where all of them do. A round needs about the rates of
+        the round before, so the search begins one step above those."""
+        cloud = best = clamp_constant_sh(cloud, self.sh_reach)
+        reached = self.quality(cloud)
+        for tried in range(self.first_scale, len(LR_SCALES)):
+            self.first_scale = max(0, tried - 1)
+            recovered = recover(
+                cloud,
+                self.train_views,
+                self.train_images,
+                self.steps,
+                self.seed + round_number,
+                self.sh_reach,
+                LR_SCALES[tried],
+            )
+            if (now := self.quality(recovered)) >= reached:
+                best, reached = recovered, now
+                break
+        return Round(best, reached)
+
+    def quality(self, cloud: Gaussians) -> float:
+        """Return a lower bound of the PSNR to the original, after what a file makes of it, dB."""
+        return psnr_lower_bound(self.as_stored(cloud), self.val_views, self.val_images)
+
+
+def clamp_constant_sh(cloud: Gaussians, limit: float) -> Gaussians:
+    """Clamp the constant harmonics to [-limit, limit]."""
+    return cloud._replace(sh=torch.cat([cloud.sh[:, :1].clamp(-limit, limit), cloud.sh[:, 1:]], 1))
+
+
+@torch.enable_grad()
+def recover(
+    cloud: Gaussians,
+    views: Views,
+    images: Float[Tensor, "V H W 3"],
+    steps: int,
+    seed: int,
+    sh_reach: float = math.inf,
+    lr_scale: float = 1.0,
+) -> Gaussians:
+    """Fit Gaussians to images; return new ones.
+
+    Args:
+        views: of the images.
+        steps: of Adam, each on four views; the rates fall linearly to zero.
+        seed: of the order of the views.
+        sh_reach: largest absolute value of the constant harmonics.
+        lr_scale: multiplies ``LEARNING_RATES``.
+    """
+    leaves = cloud.map(lambda values: values.detach().clone().requires_grad_())
+    rates = {name: lr_scale * rate for name, rate in LEARNING_RATES.items()}
+    rates["means"] *= bounds(cloud)[1]
+    groups = [
+        {"params": [leaf], "lr": rates[name]}
+        for name, leaf in zip(Gaussians._fields, leaves, strict=True)
+    ]
+    adam = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
+    for step, rows in enumerate(_batches(len(images), steps, seed)):
+        for group, name in zip(adam.param_groups, Gaussians._fields, strict=True):
+            group["lr"] = rates[name] * (1 - step / steps)
+        image, _ = draw(leaves, views, rows)
+        ((image - images[rows]) ** 2).mean().backward()
+        adam.step()
+        adam.zero_grad(set_to_none=True)
+        leaves.sh.data[:, 0].clamp_(-sh_reach, sh_reach)
+    return leaves.map(Tensor.detach)
+
+
+def _batches(count: int, steps: int, seed: int, size: int = VIEWS_PER_STEP) -> Iterator[Tensor]:
+    """Yield the rows of the views of each step: every view once before any comes twice."""
+    order, epoch = torch.empty(0, dtype=torch.long), 0
+    for _ in range(steps):
+        if len(order) < size:
+            shuffled = torch.randperm(count, generator=generator(seed, "simplify", epoch))
+            order, epoch = torch.cat([order, shuffled]), epoch + 1
+        rows, order = order[:size], order[size:]
+        yield rows

@@ -1,0 +1,180 @@
+"""Fixed views around Gaussians: where they are, what they show, and how far two sets of Gaussians
+are apart in them.
+
+Recovery, pruning and the choice of initial points compare Gaussians with their former selves in
+such views, not with training images."""
+
+import math
+from typing import NamedTuple, Optional
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..cameras import Orbit, intrinsics, to_opencv
+from ..core.errors import UserError
+from ..core.streams import generator
+from ..metrics import MAX_PSNR, psnr
+from ..splatting import rasterize
+from .gaussians import Gaussians
+from .sh import sh_to_colors
+
+LEAST_ERROR, MOST_ERROR = 10 ** (-MAX_PSNR / 10), 10 ** (MAX_PSNR / 10)
+"""Range of mean squared errors: what is less can't be told from the rounding of float32."""
+FOVY = math.radians(50.0)
+EPS2D = 0.3
+"""The screen-space dilation of viewers, square pixels."""
+NEAR = 0.01
+"""The nearest depth that is drawn, in units of the cloud's radius: clouds come in millimetres and
+in kilometres. There is no farthest depth.
+"""
+MAX_RADIUS = 1e15
+"""Of a cloud, in its units: squares of distances stay in float32's range."""
+VIEWS_PER_CALL = 4
+
+
+class Views(NamedTuple):
+    """V square views from all around, and how they are rendered."""
+
+    viewmats: Float[Tensor, "V 4 4"]
+    Ks: Float[Tensor, "V 3 3"]
+    positions: Float[Tensor, "V 3"]
+    size: int
+    """Pixels each way."""
+    near: float = NEAR
+    """The nearest depth that is drawn."""
+    backgrounds: Optional[Float[Tensor, "V 3"]] = None
+    """The background of each view; None is grey."""
+    eps2d: float = EPS2D
+    """Screen-space dilation, square pixels."""
+    antialias: bool = False
+
+
+def bounds(cloud: Gaussians) -> tuple[Float[Tensor, "3"], float]:
+    """Return the centre and the radius of what is visible.
+
+    The centre is the opacity-weighted median of the positions; a ball of that radius around it
+    holds 99 % of the opacity, counting each Gaussian at its centre plus one standard deviation.
+    """
+    weights = cloud.logit_opacities.sigmoid()
+    centre = torch.stack([_quantile(axis, weights, 0.5) for axis in cloud.means.unbind(1)])
+    distances = (cloud.means - centre).norm(dim=1) + cloud.log_scales.exp().amax(1)
+    return centre, float(_quantile(distances, weights, 0.99).clamp_min(1e-12))
+
+
+def _quantile(values: Float[Tensor, " N"], weights: Float[Tensor, " N"], share: float) -> Tensor:
+    order = values.argsort()
+    mass = weights[order].cumsum(0)
+    return values[order[int(torch.searchsorted(mass, share * mass[-1]).clamp_max(len(values) - 1))]]
+
+
+def views_around(
+    cloud: Gaussians,
+    count: int,
+    size: int,
+    *,
+    turn: float = 0.0,
+    to_z_up: Optional[Float[Tensor, "3 3"]] = None,
+) -> Views:
+    """Place views around Gaussians on a golden-angle spiral, alternately near and far.
+
+    Each view has its own random background, so that Gaussians of the background's colour still
+    have a removal error and opacities are observed.
+
+    Args:
+        cloud: the Gaussians to look at.
+        count: how many views.
+        size: of their images, pixels each way.
+        turn: azimuth of the first view, degrees; other turns give other views.
+        to_z_up: the rotation from the cloud's axes to axes with z up.
+
+    Raises:
+        UserError: the Gaussians reach too far to be rendered.
+    """
+    centre, radius = bounds(cloud)
+    _require_renderable(cloud, radius)
+    c2w = _spiral(count, radius, turn).to(centre)
+    if to_z_up is not None:
+        c2w[:, :3] = to_z_up.T.to(c2w) @ c2w[:, :3]
+    c2w[:, :3, 3] += centre
+    fovy = torch.full((count,), FOVY, device=centre.device)
+    viewmats, _ = to_opencv(c2w, fovy, size, size)
+    rng = generator(0, "backgrounds", count, round(turn))
+    backgrounds = torch.rand(count, 3, generator=rng).to(centre)
+    Ks = intrinsics(fovy, size, size)
+    return Views(viewmats, Ks, c2w[:, :3, 3], size, NEAR * radius, backgrounds)
+
+
+def _require_renderable(cloud: Gaussians, radius: float) -> None:
+    if not radius <= MAX_RADIUS:
+        raise UserError(
+            f"the Gaussians reach {radius:g} units from their centre, further than "
+            f"{MAX_RADIUS:g}, which float32 can't render: the largest scale is "
+            f"{float(cloud.log_scales.amax().exp()):g}; rescale them or remove the largest"
+        )
+
+
+def _spiral(count: int, radius: float, turn: float) -> Float[Tensor, "V 3 4"]:
+    """Return camera-to-world matrices of views that show a ball around the origin."""
+    index = torch.arange(count)
+    elevation = torch.rad2deg(torch.asin(torch.linspace(-0.5, 0.9, count)))
+    distance = radius / math.sin(FOVY / 2) * torch.tensor([1.0, 1.4])[index % 2]
+    azimuth = (turn + index * 137.50776) % 360.0
+    return Orbit(elevation, azimuth, distance, torch.full((count,), FOVY)).c2w
+
+
+def draw(
+    cloud: Gaussians, views: Views, rows: Tensor, opacities: Optional[Float[Tensor, " N"]] = None
+) -> tuple[Float[Tensor, "B size size 3"], Float[Tensor, "B N"]]:
+    """Render some of the views; return images and each Gaussian's contribution to them.
+
+    Args:
+        rows: (B,) which of the views.
+        opacities: used instead of the cloud's own, to be differentiated by.
+    """
+    opacities = cloud.logit_opacities.sigmoid() if opacities is None else opacities
+    dirs = torch.nn.functional.normalize(cloud.means.detach() - views.positions[rows, None], dim=-1)
+    grey = torch.full((3,), 0.5, device=cloud.means.device)
+    out = rasterize(
+        cloud.means,
+        cloud.quats,
+        cloud.log_scales.exp(),
+        opacities,
+        sh_to_colors(cloud.sh, dirs),
+        views.viewmats[rows],
+        views.Ks[rows],
+        views.size,
+        views.size,
+        background=grey if views.backgrounds is None else views.backgrounds[rows],
+        near=views.near,
+        far=math.inf,
+        eps2d=views.eps2d,
+        antialias=views.antialias,
+    )
+    return out.image, out.contribution
+
+
+@torch.no_grad()
+def render_all(cloud: Gaussians, views: Views) -> Float[Tensor, "V H W 3"]:
+    """Render the images of all views."""
+    return torch.cat([draw(cloud, views, rows)[0] for rows in row_batches(views)])
+
+
+def row_batches(views: Views) -> tuple[Tensor, ...]:
+    """Split the rows of the views into those that are rendered together."""
+    return torch.arange(len(views.viewmats)).split(VIEWS_PER_CALL)
+
+
+def psnr_to_original(cloud: Gaussians, views: Views, images: Float[Tensor, "V H W 3"]) -> float:
+    """Return the PSNR of a cloud's views to given images of them, over all pixels, dB."""
+    return float(psnr(render_all(cloud, views).flatten(0, 1), images.flatten(0, 1)))
+
+
+def psnr_lower_bound(cloud: Gaussians, views: Views, images: Float[Tensor, "V H W 3"]) -> float:
+    """Return a PSNR that views other than these reach too, dB.
+
+    Two standard errors over the views are added to their mean squared error."""
+    errors = (render_all(cloud, views) - images).square().mean((1, 2, 3))
+    errors = errors.nan_to_num(nan=MOST_ERROR).clamp_max(MOST_ERROR)
+    upper = float(errors.mean() + 2 * errors.std() / math.sqrt(len(errors)))
+    return -10 * math.log10(max(upper, LEAST_ERROR))

@@ -1,0 +1,262 @@
+"""Read a cloud of Gaussians and prune it to a budget.
+
+Three sets of views have none in common: Gaussians are ranked in and fitted to the training views;
+the validation views decide whether a budget of quality is met, with two standard errors to spare;
+the report measures on the test views. The latter two see what a file of the asked format stores,
+rounding included. All views are from around and outside: right for an object, not for a room."""
+
+import bisect
+import logging
+import math
+import time
+from pathlib import Path
+from typing import NamedTuple, Optional
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..core.checkpoint_file import load_file
+from ..core.errors import UserError
+from ..core.files import existing_file
+from ..formats.gaussian_files import StoredCloud, as_stored, file_size, read_cloud
+from ..formats.spz import COLOR_REACH
+from ..gaussians.axes import WORLD_UP, rotation_between
+from ..gaussians.gaussians import Gaussians, drawable
+from ..gaussians.recover import Recovery, Round
+from ..gaussians.simplify import Budget, rounds_to, simplify
+from ..gaussians.views import (
+    EPS2D,
+    LEAST_ERROR,
+    Views,
+    views_around,
+)
+from ..host import get_device
+from .options import (
+    PruneOptions,
+    budget_of,
+    combined_psnr,
+    error_of,
+    parse_bytes,
+    parse_count,
+    remaining_psnr_budget,
+)
+
+logger = logging.getLogger(__name__)
+TRAIN_VIEWS, VAL_VIEWS, TEST_VIEWS = 64, 32, 48
+TURNS = (0.0, 45.0, 60.0)
+"""Azimuth of the first view of each set, degrees."""
+CHECKPOINTS = {
+    "state_dict": {
+        name: f"geometry.{name}"
+        for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "sh_rest")
+    },
+    "splats": {
+        "means": "means",
+        "quats": "quats",
+        "log_scales": "scales",
+        "logit_opacities": "opacities",
+        "sh0": "sh0",
+        "sh_rest": "shN",
+    },
+}
+"""Where the Gaussians are in a checkpoint of ours, and of gsplat's trainer."""
+
+
+class PruneResult(NamedTuple):
+    """A cloud before and after pruning."""
+
+    before: StoredCloud
+    after: StoredCloud
+    seconds: float
+    met: bool = True
+    """Whether the budget is met."""
+
+
+# ---- reading -------------------------------------------------------------------------------------
+
+
+def read(path: str, up: Optional[str] = None) -> StoredCloud:
+    """Read the Gaussians in a file or a checkpoint; ``up`` overrides the axis that a file states.
+
+    Raises:
+        UserError: there is no file, it holds fewer than two Gaussians, or harmonics that can't be
+            drawn.
+    """
+    file = existing_file(path, "file of Gaussians or checkpoint")
+    if file.suffix in (".ckpt", ".pt", ".pth"):
+        stored = StoredCloud(drawable(from_checkpoint(file), path), up or WORLD_UP)
+    else:
+        stored = read_cloud(path, up=up)
+    if len(stored.gaussians.means) < 2:
+        raise UserError(
+            f"{path} holds {len(stored.gaussians.means)} Gaussians that can be drawn: there is "
+            "nothing to prune"
+        )
+    return stored
+
+
+def from_checkpoint(file: Path) -> Gaussians:
+    """Read the Gaussians in a training checkpoint.
+
+    Raises:
+        UserError: there are none.
+    """
+    content = load_file(file)
+    for key, names in CHECKPOINTS.items():
+        state = content.get(key, {}) if isinstance(content, dict) else {}
+        if all(isinstance(state.get(stored), Tensor) for stored in names.values()):
+            values = {name: state[stored].detach().float() for name, stored in names.items()}
+            harmonics = torch.cat([values.pop("sh0"), values.pop("sh_rest")], 1)
+            return Gaussians(sh=harmonics, **values).arrays()
+    raise UserError(
+        f"{file} holds no cloud of Gaussians: neither our {CHECKPOINTS['state_dict']['means']} "
+        "nor gsplat's splats are there"
+    )
+
+
+# ---- pruning -------------------------------------------------------------------------------------
+
+
+def prune_to_budget(
+    stored: StoredCloud, options: PruneOptions, suffix: str, where: str
+) -> PruneResult:
+    """Prune a cloud to its budget as a file of the format ``suffix``.
+
+    The PSNR already lost is stored in the file, so pruning again counts from the original.
+
+    Raises:
+        UserError: a budget that can't be met, or values that the format can't hold.
+    """
+    started = time.perf_counter()
+    file_size(stored, suffix)  # fails for what the format can't hold, before any work
+    asked = budget_of(options, where, lambda size: _count_within(size, stored, suffix, where))
+    after, reached = _simplify(stored, _remaining_budget(asked, stored), options, suffix)
+    if options.bytes is not None:
+        limit = parse_bytes(options.bytes, f"{where}bytes")
+        after, reached = _shrink(after, reached, limit, options, suffix, where)
+    spent = reached if stored.pruned_to is None else combined_psnr(stored.pruned_to, reached)
+    met = asked.psnr is None or error_of(spent) <= error_of(asked.psnr) + 2 * LEAST_ERROR
+    if not met:
+        logger.warning(
+            "the budget isn't met: as a %s file no cloud of these Gaussians is more than %.2f "
+            "dB like the first",
+            suffix,
+            spent,
+        )
+    after = after._replace(pruned_to=_note(stored, after, asked, spent, met))
+    return PruneResult(stored, after, time.perf_counter() - started, met)
+
+
+def _note(
+    stored: StoredCloud, after: StoredCloud, asked: Budget, spent: float, met: bool
+) -> Optional[float]:
+    """Return the PSNR to the original that the file states; None where it isn't known to last, as
+    after pruning to a count.
+    """
+    if asked.psnr is not None:
+        return asked.psnr if met else spent
+    unchanged = len(after.gaussians.means) == len(stored.gaussians.means)
+    return spent if stored.pruned_to is not None and unchanged else None
+
+
+def _remaining_budget(asked: Budget, stored: StoredCloud) -> Budget:
+    """Return what earlier pruning has left of a budget of quality: maybe nothing, so that all
+    Gaussians stay.
+    """
+    if asked.psnr is None or stored.pruned_to is None:
+        return asked
+    left = remaining_psnr_budget(asked.psnr, stored.pruned_to)
+    if left is not None:
+        return Budget(psnr=left)
+    print(
+        f"no Gaussian goes: this cloud has been pruned to {stored.pruned_to:g} dB already, as "
+        "it was judged then"
+    )
+    return Budget(count=len(stored.gaussians.means))
+
+
+def _count_within(size: int, stored: StoredCloud, suffix: str, where: str) -> int:
+    """Return the largest count whose evenly strided subset encodes to at most ``size`` bytes.
+
+    Raises:
+        UserError: not even one Gaussian does.
+    """
+    whole = len(stored.gaussians.means)
+
+    def bytes_of(count: int) -> int:
+        rows = np.arange(count) * whole // count
+        return file_size(StoredCloud(stored.gaussians.rows(rows), stored.up), suffix)
+
+    if bytes_of(1) > size:
+        raise UserError(
+            f"{where}bytes: {size} are too few for one Gaussian, which takes {bytes_of(1)} as "
+            f"a {suffix} file"
+        )
+    return bisect.bisect_left(range(1, whole + 1), True, key=lambda count: bytes_of(count) > size)
+
+
+def _shrink(
+    after: StoredCloud,
+    reached: float,
+    limit: int,
+    options: PruneOptions,
+    suffix: str,
+    where: str,
+) -> tuple[StoredCloud, float]:
+    """Prune on until the file has at most ``limit`` bytes: what is left compresses worse than the
+    subset that the count was estimated from.
+    """
+    while (size := file_size(after, suffix)) > limit:
+        count = len(after.gaussians.means)
+        fewer = min(int(count * limit / size), count - 1)
+        budget = Budget(count=parse_count(fewer, f"{where}bytes, in Gaussians,"))
+        after, reached = _simplify(after, budget, options, suffix)
+    return after, reached
+
+
+def _simplify(
+    stored: StoredCloud, budget: Budget, options: PruneOptions, suffix: str
+) -> tuple[StoredCloud, float]:
+    """Prune within a budget; return the cloud, and a lower bound of the PSNR of its file to the
+    given one, dB.
+    """
+    from tqdm import tqdm
+
+    cloud = stored.gaussians.tensors(get_device())
+    train_views, val_views, _ = views_of(stored, options)
+
+    def after_file(fewer: Gaussians) -> Gaussians:
+        file = as_stored(stored._replace(gaussians=fewer.arrays()), suffix)
+        return file.gaussians.tensors(get_device())
+
+    recovery = Recovery(
+        cloud,
+        train_views,
+        val_views,
+        steps=options.steps,
+        as_stored=after_file,
+        sh_reach=COLOR_REACH if suffix == ".spz" else math.inf,
+    )
+    rounds = None if budget.count is None else rounds_to(budget.count, len(cloud.means))
+    with tqdm(desc="pruning", unit="round", total=rounds, disable=None) as bar:
+
+        def report(done: Round) -> None:
+            bar.set_postfix_str(f"{done.count} Gaussians, {done.psnr:.2f} dB")
+            bar.update()
+
+        fewer = simplify(cloud, budget, recovery, report=report)
+    return stored._replace(gaussians=fewer.arrays()), recovery.quality(fewer)
+
+
+def views_of(stored: StoredCloud, options: PruneOptions) -> list[Views]:
+    """Return training, validation and test views, rendered as the options say that viewers do."""
+    cloud = stored.gaussians.tensors(get_device())
+    to_z_up = torch.from_numpy(rotation_between(stored.up, "z"))
+    eps2d = EPS2D if options.eps2d is None else options.eps2d
+    return [
+        views_around(cloud, count, options.size, turn=turn, to_z_up=to_z_up)._replace(
+            eps2d=eps2d, antialias=bool(options.antialias)
+        )
+        for count, turn in zip((TRAIN_VIEWS, VAL_VIEWS, TEST_VIEWS), TURNS, strict=True)
+    ]
