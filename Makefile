@@ -8,7 +8,7 @@ PYTEST  = $(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --d
 # without the CPU kernel (no C++ compiler) plain torch draws, and the demo is smaller
 SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import available_backends as b; print("--config configs/demo-small.yaml" if b()["cpu"] else "")')
 
-.PHONY: demo test test-slow test-all docs stability fuzz long-run ablations bench gpu-check train-toybox charts measure-charts clean
+.PHONY: demo test test-slow test-all docs stability fuzz long-run ablations bench gpu-check train-toybox toybox-sheet charts measure-charts clean
 
 demo: $(VENV)/ready                ## train the bundled toy from a coarse prior, offline, on the CPU
 	$(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
@@ -47,6 +47,9 @@ docs: $(VENV)/ready-for-tests      ## the generated parts of README and docs/: a
 TOYBOX = .toybox
 train-toybox: $(VENV)/ready-for-models       ## small models of generated objects, from nothing; hours on a CPU, continues after a stop
 	$(ENVIRON) $(BIN)/python -m threestudio_gaussiandreamer.toybox.train $(TOYBOX)
+
+toybox-sheet: $(VENV)/ready-for-models       ## docs/images/toybox-world.png: 100 objects of the toybox
+	$(BIN)/python -m threestudio_gaussiandreamer.toybox.world_sheet docs/images/toybox-world.png
 
 charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbers beside them
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting --from-csv

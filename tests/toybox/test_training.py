@@ -9,9 +9,9 @@ import torch
 from tests.toybox.helpers import copied, options, training
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.toybox import loop, points_stage, unet_stage
+from threestudio_gaussiandreamer.toybox import loop, points_stage, unet_stage, views
 from threestudio_gaussiandreamer.toybox.clip_stage import IGNORED, LABELS, text_labels
-from threestudio_gaussiandreamer.toybox.train import STAGES, main
+from threestudio_gaussiandreamer.toybox.train import STAGES, main, render_shards
 
 
 def weights(run: loop.Training) -> dict[str, torch.Tensor]:
@@ -135,6 +135,16 @@ def test_bad_options_are_one_message(tmp_path, capsys, arguments, message):
         pytest.skip("there is a GPU")
     assert main([str(tmp_path), *arguments]) == 2
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow  # starts processes
+def test_workers_render_the_shards_that_a_training_makes_by_itself(tmp_path):
+    there = loop.Options(folder=tmp_path, pool=2, shard_objects=1)
+    render_shards(there, [0, 1000], workers=1)
+    names = sorted(path.name for path in there.shards_folder().iterdir())
+    assert names == [f"train-{seed}-1x4-0000{i}.npz" for seed in (0, 1000) for i in (0, 1)]
+    shards = views.Shards(there.shards_folder(), 0, objects=1)
+    assert np.array_equal(shards.get(1).rgba, shards.make(1).rgba)
 
 
 # Formulas -----------------------------------------------------------------------------------

@@ -3,12 +3,15 @@
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from threestudio_gaussiandreamer.meshes.load import AXES
 from threestudio_gaussiandreamer.prompts.view_prompts import view_directions
 from threestudio_gaussiandreamer.toybox import views, words, world
 from threestudio_gaussiandreamer.toybox.kinds import ACCESSORIES, KINDS, ORIENTED
+from threestudio_gaussiandreamer.toybox.sheet import TEXT_HEIGHT
 from threestudio_gaussiandreamer.toybox.tokenizer import LENGTH, write_tokenizer
+from threestudio_gaussiandreamer.toybox.world_sheet import main
 
 MANY = 400
 
@@ -188,6 +191,20 @@ def test_a_shard_is_a_function_of_seed_and_index(shards):
     assert [path.name for path in shards.folder.iterdir()] == ["train-0-6x4-00000.npz"]
 
 
+def test_a_truncated_shard_is_rendered_again(shards):
+    expected = shards.get(0)
+    content = shards.path(0).read_bytes()
+    shards.path(0).write_bytes(content[: len(content) // 2])
+    again = views.Shards(shards.folder, 0, objects=6, views=4).get(0)
+    assert np.array_equal(expected.rgba, again.rgba)
+
+
+def test_a_shard_can_be_read_without_its_pictures(shards):
+    light, whole = shards.get_light(0), shards.get(0)
+    assert light.rgba.size == 0
+    assert all(np.array_equal(a, b) for a, b in zip(light[1:], whole[1:], strict=True))
+
+
 def test_a_shard_has_labels_of_its_objects(shards):
     shard = shards.get(0)
     for row in range(24):
@@ -237,3 +254,16 @@ def test_batches_resume_anywhere(shards):
     # 24 pictures are four batches of 5: the same shard, no picture twice
     assert [index for index, _ in first] == [0] * 4 + [1] * 4 + [0]
     assert len(set(np.concatenate([rows for _, rows in first[:4]]))) == 20
+
+
+# The sheet ----------------------------------------------------------------------------------
+
+
+def test_the_sheet_shows_every_object_with_its_prompt(tmp_path):
+    assert main([str(tmp_path / "world.png"), "--count", "12"]) == 0
+    sheet = np.asarray(Image.open(tmp_path / "world.png"))
+    cell = views.SIZE + TEXT_HEIGHT
+    assert sheet.shape == (2 * cell, 10 * views.SIZE, 3)
+    texts = sheet[views.SIZE : cell, : 10 * views.SIZE]
+    assert all((part < 128).any() for part in np.split(texts, 10, axis=1))
+    assert (sheet[cell:, 2 * views.SIZE :] == 255).all()

@@ -60,7 +60,7 @@ class PointsStage(Stage):
             self.shards, seed, "points", self.batch, self.options.pool, step, per_object=True
         )
         for number, (index, rows) in enumerate(order, step):
-            rng, shard = numpy_generator(seed, "points-batch", number), self.shards.get(index)
+            rng, shard = numpy_generator(seed, "points-batch", number), self.shards.get_light(index)
             texts = object_prompts(shard.labels[rows * self.shards.views], rng)
             condition = self.condition(texts)
             condition[

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-TEXT_HEIGHT, LINE = 36, 11
+TEXT_HEIGHT, LINE = 47, 11
 """Pixels below each picture, and from line to line."""
 
 

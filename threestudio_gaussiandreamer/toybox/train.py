@@ -91,22 +91,15 @@ def options_of(args: argparse.Namespace) -> Options:
 
 def render_shards(options: Options, seeds: Sequence[int], workers: int) -> None:
     """Render all missing shards of these seeds in ``workers`` processes."""
-    pools = [Shards(options.shards_folder(), seed, objects=options.shard_objects) for seed in seeds]
-    missing = [
-        (shards, index)
-        for shards in pools
-        for index in range(options.pool)
-        if not shards.path(index).exists()
-    ]
+    jobs = [(options, seed, index) for seed in seeds for index in range(options.pool)]
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for count, _ in enumerate(
-            pool.map(_render, *zip(*missing, strict=True)) if missing else (), 1
-        ):
-            print(f"rendered {count}/{len(missing)} shards", flush=True)
+        for count, _ in enumerate(pool.map(_render, jobs), 1):
+            print(f"rendered {count}/{len(jobs)} shards", flush=True)
 
 
-def _render(shards: Shards, index: int) -> None:
-    shards.get(index)
+def _render(job: tuple[Options, int, int]) -> None:
+    options, seed, index = job
+    Shards(options.shards_folder(), seed, objects=options.shard_objects).ensure(index)
 
 
 def train(options: Options, stages: Sequence[str], images: Optional[int] = None) -> None:

@@ -69,7 +69,7 @@ class UNetStage(Stage):
         order = row_batches(self.shards, seed, "unet", self.batch, self.options.pool, step)
         for number, (index, rows) in enumerate(order, step):
             rng = numpy_generator(seed, "unet-batch", number)
-            texts = training_prompts(self.shards.get(index), rows, rng)
+            texts = training_prompts(self.shards.get_light(index), rows, rng)
             mean, std = self.latents(index)[:, torch.from_numpy(rows)].float()
             noise = torch.randn(mean.shape, generator=generator(seed, "unet-posterior", number))
             yield UNetBatch(((mean + std * noise) * self.scale).to(self.device), self.tokens(texts))

@@ -7,6 +7,7 @@ that want different ones.
 """
 
 import math
+import zipfile
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -37,6 +38,8 @@ BACKGROUND = (0.5, 0.5, 0.5)
 """Behind nearly all pictures; no object has this colour."""
 OBJECTS, VIEWS, POINTS = 256, 4, 1024
 """Of one shard: objects, views of each, and points on each surface."""
+LIGHT_SHARDS = 64
+"""Kept in memory without their pictures, 3 MB each."""
 HELD_OUT_OBJECTS = 64
 """Withheld from training; what a training is measured on."""
 
@@ -90,21 +93,34 @@ class Shards:
         self.folder, self.seed, self.held_out = Path(folder), seed, held_out
         self.objects, self.views = objects, views
         self.get = lru_cache(maxsize=2)(self._get)
+        self.get_light = lru_cache(maxsize=LIGHT_SHARDS)(self._get_light)
 
     def path(self, index: int) -> Path:
         """Return the file of shard ``index``."""
         sort = "held-out" if self.held_out else "train"
         return self.folder / f"{sort}-{self.seed}-{self.objects}x{self.views}-{index:05d}.npz"
 
-    def _get(self, index: int) -> Shard:
+    def ensure(self, index: int) -> None:
+        """Render shard ``index`` into its file unless a whole one is there."""
         path = self.path(index)
-        if not path.exists():
-            self.folder.mkdir(parents=True, exist_ok=True)
-            shard = self.make(index)
-            with atomic_file(path, durable=False) as file:
-                np.savez(file, **shard._asdict())
-        with np.load(path) as file:
+        if _is_whole(path):
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        shard = self.make(index)
+        with atomic_file(path, durable=False) as file:
+            np.savez(file, **shard._asdict())
+
+    def _get(self, index: int) -> Shard:
+        self.ensure(index)
+        with np.load(self.path(index)) as file:
             return Shard(**{name: file[name] for name in Shard._fields})
+
+    def _get_light(self, index: int) -> Shard:
+        """Read everything but the pictures, which are nearly all of a shard."""
+        self.ensure(index)
+        with np.load(self.path(index)) as file:
+            values = {name: file[name] for name in Shard._fields if name != "rgba"}
+        return Shard(rgba=np.zeros((0, SIZE, SIZE, 4), np.uint8), **values)
 
     def make(self, index: int) -> Shard:
         """Render shard ``index``."""
@@ -131,6 +147,11 @@ class Shards:
             orbit.azimuth.numpy(),
             surface_points(mesh, rng),
         )
+
+
+def _is_whole(path: Path) -> bool:
+    """Tell whether a file is a zip archive with its end, which a truncated one lacks."""
+    return path.is_file() and zipfile.is_zipfile(path)
 
 
 def held_out_shard(folder: Path, seed: int) -> Shard:
