@@ -94,6 +94,16 @@ def test_rgb_round_trip_and_constant_color():
     assert sh.C0 == pytest.approx(0.28209479177387814, rel=1e-15)
 
 
+def test_bounded_colors_pass_gradients_that_lead_into_the_range():
+    colors = torch.tensor([-0.5, 0.0, 0.5, 1.0, 2.2]).repeat(2).requires_grad_()
+    bounded = sh.bounded_colors(colors)
+    assert bounded.tolist() == [0, 0, 0.5, 1, 1] * 2
+    # descent decreases the first five colours and increases the others
+    bounded.backward(torch.tensor([0.3] * 5 + [-0.3] * 5))
+    expected = torch.tensor([0, 0, 0.3, 0.3, 0.3, -0.3, -0.3, -0.3, 0, 0])
+    assert torch.equal(colors.grad, expected)
+
+
 def test_a_direction_without_length_is_harmless():
     dirs = torch.zeros(2, 3, requires_grad=True)
     colors = sh.sh_to_colors(torch.ones(2, 16, 3), dirs)

@@ -136,7 +136,39 @@ def test_colours_see_the_direction_from_the_camera(sphere_points):
     geometry.sh_rest.data.normal_()
     camera = torch.tensor([[0.0, 0.0, 5.0]])
     dirs = torch.nn.functional.normalize(geometry.means - camera, dim=-1)
-    assert torch.allclose(geometry.colors(camera)[0], sh.sh_to_colors(geometry.sh, dirs), atol=1e-6)
+    seen = sh.sh_to_colors(geometry.sh, dirs)
+    assert seen.max() > 1.5
+    assert torch.allclose(geometry.colors(camera)[0], seen.clamp_max(1), atol=1e-6)
+    geometry.cfg.bound_colors = False
+    assert torch.allclose(geometry.colors(camera)[0], seen, atol=1e-6)
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_a_step_leaves_the_stored_colours_in_the_range_that_viewers_show(sphere_points, degree):
+    geometry = started(sphere_points, sh_degree=degree)
+    colors = torch.tensor([-0.7, 0.25, 2.2])
+    geometry.sh0.data[:] = sh.rgb_to_sh0(colors)
+    geometry.sh_rest.data.fill_(3.0)
+    geometry.clamp_colors()
+    stored = sh.sh0_to_rgb(geometry.sh[:, 0])
+    assert torch.allclose(stored, colors.clamp(0, 1).expand_as(stored), atol=1e-6)
+    assert (geometry.sh_rest == 3.0).all()
+    geometry.cfg.bound_colors = False
+    geometry.sh0.data[:] = sh.rgb_to_sh0(colors)
+    geometry.clamp_colors()
+    assert torch.allclose(sh.sh0_to_rgb(geometry.sh0[:, 0]), colors.expand_as(stored), atol=1e-6)
+
+
+def test_a_colour_beyond_a_bound_comes_back(sphere_points):
+    """A stored cloud may have such colours; clamp's own gradient would leave them there."""
+    geometry = started(sphere_points, bound_colors=True)
+    geometry.sh0.data[:] = sh.rgb_to_sh0(torch.tensor([-0.7, 0.5, 2.2]))
+    optimizer = torch.optim.SGD([geometry.sh0], lr=100.0)
+    (geometry.colors(torch.zeros(1, 3)) - 0.5).square().mean().backward()
+    optimizer.step()
+    after = sh.sh0_to_rgb(geometry.sh0[:, 0])
+    assert (after[:, 0] > -0.7).all() and (after[:, 2] < 2.2).all()
+    assert torch.allclose(after[:, 1], torch.tensor(0.5), atol=1e-6)
 
 
 def test_learning_rates_follow_their_schedules(sphere_points):

@@ -17,6 +17,7 @@ import yaml
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.formats.spz import read_spz
+from threestudio_gaussiandreamer.gaussians.sh import sh0_to_rgb
 from threestudio_gaussiandreamer.guidance.known_truth import MeshTruth
 from threestudio_gaussiandreamer.host import BaseObject, register
 from threestudio_gaussiandreamer.launch.experiment import main
@@ -158,6 +159,11 @@ def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, pai
         metrics["result"]["psnr"] > metrics["prior"]["psnr"] + 1.5
     )  # 60 steps at 24 pixels give about 4 dB
     assert metrics["result"]["step"] == 60 and metrics["result"]["gaussians"] == 200
+    (exported,) = (trial(tmp_path) / "save").glob("it60-export/gaussians.ply")
+    colors = sh0_to_rgb(read_gaussians(exported).sh[:, 0])
+    assert (
+        colors.min() > -1e-6 and colors.max() < 1 + 1e-6 and metrics["result"]["out_of_gamut"] == 0
+    )
     printed = capsys.readouterr().out
     assert (
         "compare.png" in printed

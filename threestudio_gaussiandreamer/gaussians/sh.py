@@ -5,6 +5,7 @@ Coefficients are in the order and with the signs that 3D Gaussian splatting file
 sign. The colour of a direction is ``max(0, 0.5 + sum_k Y_k(direction) sh_k)``."""
 
 from math import pi, sqrt
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,12 +39,21 @@ def sh0_colors(sh0: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
 def sh_to_colors(
     sh: Float[Tensor, "N K C"], dirs: Float[Tensor, "*views N 3"]
 ) -> Float[Tensor, "*views N C"]:
-    """Colours seen along ``dirs``, which point from the camera to the Gaussians and have any
-    length; clamped at 0.
+    """Compute the colours seen along ``dirs``, clamped at 0.
+
+    Args:
+        dirs: from the camera to the Gaussians, of any length.
 
     Raises:
         UserError: K isn't 1, 4, 9 or 16.
     """
+    return sh_to_unclamped_colors(sh, dirs).clamp_min(0)
+
+
+def sh_to_unclamped_colors(
+    sh: Float[Tensor, "N K C"], dirs: Float[Tensor, "*views N 3"]
+) -> Float[Tensor, "*views N C"]:
+    """Compute what :func:`sh_to_colors` clamps; arguments and errors are the same."""
     if sh.shape[-2] not in COEFFICIENTS:
         raise UserError(
             "sh must have the shape (N, K, C) with K = 1, 4, 9 or 16 for degree 0 to 3; got "
@@ -52,7 +62,31 @@ def sh_to_colors(
     basis = sh_basis(dirs, COEFFICIENTS.index(sh.shape[-2]))
     # A sum of products stays in the tensors' own precision under autocast, which a matrix product
     # would not.
-    return (0.5 + sum(b[..., None] * sh[:, k] for k, b in enumerate(basis))).clamp_min(0)
+    return 0.5 + sum(b[..., None] * sh[:, k] for k, b in enumerate(basis))
+
+
+class _Bounded(torch.autograd.Function):
+    """Clamp to [0, 1], with the gradient that leads back from beyond a bound."""
+
+    @staticmethod
+    def forward(ctx: Any, colors: Tensor) -> Tensor:
+        ctx.save_for_backward(colors)
+        return colors.clamp(0, 1)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (colors,) = ctx.saved_tensors
+        leaves = (colors >= 1) & (gradient < 0) | (colors <= 0) & (gradient > 0)
+        return gradient.masked_fill(leaves, 0)
+
+
+def bounded_colors(colors: Float[Tensor, "*batch C"]) -> Float[Tensor, "*batch C"]:
+    """Clamp colours to [0, 1], the range that viewers show.
+
+    At a bound and beyond it, a gradient is passed on if its descent leads into the range, and is 0
+    if it leads out of it: clamp's own is always 0 beyond a bound, where a colour would stay.
+    """
+    return _Bounded.apply(colors)
 
 
 def sh_basis(dirs: Float[Tensor, "*batch 3"], degree: int) -> list[Float[Tensor, "*batch"]]:

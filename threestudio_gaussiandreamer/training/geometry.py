@@ -16,6 +16,8 @@ scale_rule          first standard deviation: ``nearest`` (the paper: distance t
 scale_factor        multiplies it
 init_opacity        opacity of every Gaussian at the start
 sh_degree           0 to 3
+bound_colors        keep colours in [0, 1], which is all that viewers show: the constant band is
+                    clamped after each step, and the colour that a view sees as it is drawn
 lr_*                learning rate of each attribute: a number or a schedule; lr_sh_rest for the
                     bands above degree 0
 densify             enabled, start, stop, every (steps), grad_threshold, split_scale, min_opacity,
@@ -92,6 +94,7 @@ class GaussianCloud(BaseGeometry):
         scale_factor: float = field(default=1.0, metadata=positive())
         init_opacity: float = field(default=0.1, metadata=between(0, 1))
         sh_degree: int = field(default=0, metadata=in_range(0, 3))
+        bound_colors: bool = True
         keep_attributes: bool = True
         lr_means: Any = field(default=5e-5, metadata=schedule(min=0))
         lr_scales: Any = field(default=1e-3, metadata=schedule(min=0))
@@ -181,15 +184,27 @@ class GaussianCloud(BaseGeometry):
     def colors(
         self, camera_positions: Float[Tensor, "B 3"]
     ) -> Float[Tensor, "N 3"] | Float[Tensor, "B N 3"]:
-        """RGB, not negative; per view when the spherical harmonics have more than the constant
-        band.
+        """Compute RGB in [0, 1], or just not negative without ``bound_colors``; per view when the
+        spherical harmonics have more than the constant band.
         """
         if self.bands == 1:
-            return sh.sh0_to_rgb(self.sh0[:, 0]).clamp_min(0.0)
-        dirs = torch.nn.functional.normalize(
-            self.means.detach()[None] - camera_positions[:, None], dim=-1
-        )
-        return sh.sh_to_colors(self.sh, dirs)
+            colors = sh.sh0_to_rgb(self.sh0[:, 0])
+        else:
+            dirs = torch.nn.functional.normalize(
+                self.means.detach()[None] - camera_positions[:, None], dim=-1
+            )
+            colors = sh.sh_to_unclamped_colors(self.sh, dirs)
+        return sh.bounded_colors(colors) if self.cfg.bound_colors else colors.clamp_min(0.0)
+
+    @torch.no_grad()
+    def clamp_colors(self) -> None:
+        """Clamp the constant band to colours in [0, 1], unless ``bound_colors`` is off.
+
+        Called after each step of the optimiser, so that what is stored and exported is in the
+        range too. The bands above it add to this colour by direction and aren't changed.
+        """
+        if self.cfg.bound_colors:
+            self.sh0.clamp_(*(sh.rgb_to_sh0(bound) for bound in (0.0, 1.0)))
 
     # -- start -------------------------------------------------------------------------------------
 

@@ -238,6 +238,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         loss_scale = self.loss_scale()
         self.density.after_backward(out["rasterized"], batch["width"], batch["height"], loss_scale)
         optimizer.step()
+        self.geometry.clamp_colors()
         if self.loss_scale() < loss_scale:
             self.count_skipped_step(loss_scale)
         if self.global_step % CHECK_EVERY == 0:
