@@ -4,6 +4,10 @@ import os
 import pickle
 import random
 import resource
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -201,3 +205,61 @@ def test_a_checkpoint_in_the_home_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     save_file(tmp_path / "last.ckpt", content())
     assert same(load_file("~/last.ckpt"), content())
+
+
+# -- memory ----------------------------------------------------------------------------------------
+
+
+def repacked(path: Path, change: Callable[[str, bytes], bytes], compression: int) -> None:
+    """Rewrite the records of an archive with checksums that fit."""
+    with zipfile.ZipFile(path) as archive:
+        records = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, content in records.items():
+            archive.writestr(name, change(name, content))
+
+
+def refused(path: Path, message: str, most_bytes: int = 8 << 20) -> None:
+    """The file is refused, and little is allocated for it."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(UserError, match=message):
+            load_file(path)
+        assert tracemalloc.get_traced_memory()[1] < most_bytes
+    finally:
+        tracemalloc.stop()
+
+
+def test_compressed_records_are_refused_before_they_are_unpacked(tmp_path):
+    path = tmp_path / "a.ckpt"
+    torch.save({"x": torch.zeros(1 << 24)}, path)
+    repacked(path, lambda name, content: content, zipfile.ZIP_DEFLATED)
+    assert os.path.getsize(path) < 100_000
+    refused(path, "its records are compressed")
+
+
+@pytest.mark.parametrize(
+    "call", [b"cbuiltins\nbytearray\n", b"ctorch\nFloatTensor\n", b"ctorch\nTensor\n"]
+)
+def test_a_call_that_allocates_is_refused(tmp_path, call):
+    path = tmp_path / "a.ckpt"
+    torch.save({"x": torch.zeros(3)}, path)
+    pickled = b"\x80\x02" + call + b"J\x00\x00\x00\x7f\x85R."
+    repacked(
+        path, lambda name, old: pickled if name.endswith("data.pkl") else old, zipfile.ZIP_STORED
+    )
+    refused(path, "which no checkpoint needs")
+
+
+def test_many_tensors_that_share_a_storage_are_refused(tmp_path):
+    base = torch.zeros(1000)
+    torch.save({str(i): base[:] for i in range(200)}, tmp_path / "a.ckpt")
+    refused(tmp_path / "a.ckpt", "bytes can't hold")
+
+
+def test_containers_that_repeat_themselves_are_walked_once(tmp_path):
+    nested: list = [1]
+    for _ in range(60):
+        nested = [nested, nested]
+    torch.save(content() | {"x": nested}, tmp_path / "a.ckpt")
+    assert load_checkpoint(tmp_path / "a.ckpt")["global_step"] == 7

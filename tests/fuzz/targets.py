@@ -503,7 +503,8 @@ def check_same_run(cfg: Any, path: Path) -> None:
     config.dump_config(parsed, cfg)
     again = config.load_config(parsed)
     ours, theirs = (config.OmegaConf.to_container(c, resolve=False) for c in (cfg, again))
-    ours["resume"] = theirs["resume"] = None
+    for key in ("resume", "new_folder"):  # of this run alone
+        ours[key] = theirs[key] = None
     require(repr(ours) == repr(theirs), "parsed.yaml isn't the same run")
 
 

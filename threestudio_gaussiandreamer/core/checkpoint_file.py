@@ -19,15 +19,21 @@ from typing import Any, Optional
 
 import torch
 
+from .archive import require_plain_archive
 from .errors import UserError
 from .files import atomic_file
 from .logs import warn
+from .options import is_whole, shown
 
 _MARK = b"sha256:"
 _COMMENT_BYTES = len(_MARK) + 64
 _END_OF_ARCHIVE = b"PK\x05\x06"
 _END_RECORD_BYTES = 22
 _BLOCK_BYTES = 1 << 20
+MAX_COUNT = 10**12
+"""Steps of a training run; more are a damaged number."""
+SHARING = 2
+"""How many times a file's size its tensors may be together, where some share their numbers."""
 
 
 def save_file(path: str | os.PathLike, content: Any) -> None:
@@ -58,6 +64,7 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
             raise UserError(f"{path} is a folder, not a checkpoint" + _siblings(path / "*"))
         raise UserError(f"there is no checkpoint {path}" + _siblings(path))
     _verify(path)
+    require_plain_archive(path)
     try:
         content = torch.load(path, map_location=map_location, weights_only=True)
     except pickle.UnpicklingError as error:
@@ -76,12 +83,13 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
 
 
 def _require_stored(content: Any, path: Path) -> None:
-    """Raise UserError for a tensor that repeats a few numbers to more than the file could hold:
-    whoever copies it fills the memory.
+    """Raise UserError for tensors that repeat a few numbers to more than the file could hold:
+    whoever copies them fills the memory.
     """
-    size = os.path.getsize(path)
+    size, total = os.path.getsize(path), 0
     for tensor in _tensors(content):
-        if tensor.numel() * tensor.element_size() > size:
+        total += tensor.numel() * tensor.element_size()
+        if total > SHARING * size:
             raise UserError(
                 f"{path} is damaged: it announces a tensor of the shape {tuple(tensor.shape)}, "
                 f"which {size} bytes can't hold"
@@ -89,11 +97,17 @@ def _require_stored(content: Any, path: Path) -> None:
 
 
 def _tensors(content: Any) -> Iterator[torch.Tensor]:
-    if isinstance(content, torch.Tensor):
-        yield content
-    elif isinstance(content, (Mapping, list, tuple, set)):
-        for item in content.values() if isinstance(content, Mapping) else content:
-            yield from _tensors(item)
+    """Every tensor below ``content``, once; containers may hold themselves."""
+    pending, seen = [content], set()
+    while pending:
+        item = pending.pop()
+        if id(item) in seen:
+            continue
+        seen.add(id(item))
+        if isinstance(item, torch.Tensor):
+            yield item
+        elif isinstance(item, (Mapping, list, tuple, set)):
+            pending.extend(item.values() if isinstance(item, Mapping) else item)
 
 
 def previous_of(path: str | os.PathLike) -> Path:
@@ -124,6 +138,7 @@ def _claimed_step(path: Path) -> float:
     infinity where it says none.
     """
     try:
+        require_plain_archive(path)
         return int(
             torch.load(path, map_location="cpu", weights_only=True, mmap=True)["global_step"]
         )
@@ -181,7 +196,23 @@ def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:
                 f"{path} isn't a training checkpoint: its {key} is of type "
                 f"{type(checkpoint[key]).__name__}"
             )
+    for key in ("epoch", "global_step"):
+        if not is_count(checkpoint[key]):
+            raise UserError(
+                f"{path} isn't a training checkpoint: its {key} is {shown(checkpoint[key])}"
+            )
+    for name, value in checkpoint["state_dict"].items():
+        if not (isinstance(name, str) and isinstance(value, torch.Tensor)):
+            raise UserError(
+                f"{path} isn't a training checkpoint: {shown(name)} in its state_dict is of type "
+                f"{type(value).__name__}"
+            )
     return checkpoint
+
+
+def is_count(value: Any) -> bool:
+    """Whether ``value`` can count steps or epochs."""
+    return is_whole(value) and 0 <= value <= MAX_COUNT
 
 
 def _prepare_folder(path: Path) -> None:

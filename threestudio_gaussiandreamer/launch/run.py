@@ -24,6 +24,7 @@ from .ddp import ReplicatedStrategy
 from .folder_lock import RunFolder, claim, claim_new, require_writable
 from .options import PROGRAM
 from .run_folder import renumber
+from .training_state import check_training_state
 
 # what ends a run that can't write its results
 WRITE_ERRORS = (
@@ -139,8 +140,22 @@ class Run:
                 f"{self.cfg.resume} isn't a training checkpoint: it has no "
                 f"{', '.join(missing)}, which Lightning writes"
             )
+        self.check_content(checkpoint)
         self.resumed_step = checkpoint["global_step"]
         return checkpoint["epoch"], self.resumed_step
+
+    def check_content(self, checkpoint: dict[str, Any]) -> None:
+        """Check what the system and Lightning are going to restore.
+
+        Raises:
+            UserError: content that no run writes, such as a cloud without Gaussians.
+        """
+        check_checkpoint = getattr(find(self.cfg.system_type), "check_checkpoint", None)
+        if check_checkpoint is not None:
+            check_checkpoint(checkpoint, self.cfg.resume)
+        if self.args.stage == "train":
+            optimizer = self.cfg.system.get("optimizer") or {}
+            check_training_state(checkpoint, optimizer, self.cfg.resume)
 
     # -- the stages --------------------------------------------------------------------------------
 

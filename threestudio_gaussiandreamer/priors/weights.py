@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 import torch
 from torch import Tensor, nn
 
+from ..core.archive import require_plain_archive
 from ..core.errors import UserError
 from ..core.files import existing_file
 
@@ -29,6 +30,8 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
         UserError: the file is missing, unreadable, refused, or holds no tensors by name.
     """
     file = existing_file(path, kind)
+    if zipfile.is_zipfile(file):
+        require_plain_archive(file)
     try:  # a zip is mapped, so what isn't wanted, as an optimiser's state, is never read
         content = torch.load(
             file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file)

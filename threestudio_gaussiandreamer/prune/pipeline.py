@@ -9,6 +9,7 @@ import bisect
 import logging
 import math
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple, Optional
 
@@ -25,6 +26,7 @@ from ..gaussians.axes import WORLD_UP, rotation_between
 from ..gaussians.gaussians import Gaussians, drawable
 from ..gaussians.recover import Recovery, Round
 from ..gaussians.simplify import Budget, rounds_to, simplify
+from ..gaussians.stored_state import require_cloud
 from ..gaussians.views import (
     EPS2D,
     LEAST_ERROR,
@@ -104,8 +106,10 @@ def from_checkpoint(file: Path) -> Gaussians:
     """
     content = load_file(file)
     for key, names in CHECKPOINTS.items():
-        state = content.get(key, {}) if isinstance(content, dict) else {}
+        state = content.get(key) if isinstance(content, dict) else None
+        state = state if isinstance(state, Mapping) else {}
         if all(isinstance(state.get(stored), Tensor) for stored in names.values()):
+            require_cloud(state, names, str(file), allow_non_finite=True)
             values = {name: state[stored].detach().float() for name, stored in names.items()}
             harmonics = torch.cat([values.pop("sh0"), values.pop("sh_rest")], 1)
             return Gaussians(sh=harmonics, **values).arrays()

@@ -67,6 +67,7 @@ from ..gaussians.densify import LOG_SCALE_RANGE, PARAMETERS, Change
 from ..gaussians.grow import SCALE_RULES
 from ..gaussians.merge import merge_duplicates
 from ..gaussians.point_cloud import PointCloud
+from ..gaussians.stored_state import SHAPES, require_cloud
 from ..host import BaseGeometry, C, find, register
 from .density_options import DensifyConfig, PruneConfig, as_budget, check_budget, min_count
 from .initialization import GrowConfig, gaussians_on_points, grow_points, most_visible
@@ -160,6 +161,8 @@ class GaussianCloud(BaseGeometry):
         ):  # otherwise torch says what is wrong with it
             self._allocate(len(means), self.means.device)
         if prefix + "means" in state_dict:
+            if len(self):
+                require_cloud(state_dict, {name: prefix + name for name in SHAPES}, "the state")
             state_dict.setdefault(
                 prefix + "removal", torch.zeros(len(self))
             )  # older checkpoints have none

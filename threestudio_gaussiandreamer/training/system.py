@@ -25,6 +25,7 @@ prune          a budget that the export is made for once more: count, bytes (of 
 """
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
@@ -41,6 +42,7 @@ from ..exporters.base import read_gaussians
 from ..formats.gaussian_files import StoredCloud, write_cloud
 from ..formats.ply import write_points
 from ..gaussians.point_cloud import PointCloud
+from ..gaussians.stored_state import SHAPES, require_cloud
 from ..gaussians.surface import Surface, write_obj
 from ..gaussians.views import EPS2D
 from ..guidance.base import ScoreDistillation
@@ -111,6 +113,25 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         guided = [*losses, "grad_norm", "min_step", "max_step", "bad_items", *guidance.REPORTS]
         known = {"loss", "gaussians", *(f"train/{name}" for name in guided)}
         return known | {"dB"} if guidance.KNOWS_TRUTH else known
+
+    @staticmethod
+    def check_checkpoint(checkpoint: dict[str, Any], what: str) -> None:
+        """Check a cloud before anything is built for it; called by the launcher.
+
+        Args:
+            what: the file, for messages.
+
+        Raises:
+            UserError: no Gaussians, or what can't be one.
+        """
+        if "geometry.means" in checkpoint["state_dict"]:
+            names = {name: f"geometry.{name}" for name in SHAPES}
+            require_cloud(checkpoint["state_dict"], names, what)
+        learnt = checkpoint.get("guidance") or {}
+        if not isinstance(learnt, Mapping) or not all(
+            isinstance(value, Tensor) for value in learnt.values()
+        ):
+            raise UserError(f"{what}: its guidance isn't a mapping of tensors")
 
     # -- start -------------------------------------------------------------------------------------
 

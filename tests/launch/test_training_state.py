@@ -1,0 +1,111 @@
+"""Checkpoints with a valid checksum and impossible content: one message before any work."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from tests.helpers.checkpoints import CALLBACK, whole_checkpoint
+from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, save_file
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch.training_state import check_training_state
+from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
+
+
+def read(path: Any, content: dict) -> dict:
+    """Write, read and check, as a run does that is resumed."""
+    save_file(path, content)
+    checkpoint = load_checkpoint(path)
+    GaussianDreamerSystem.check_checkpoint(checkpoint, str(path))
+    check_training_state(checkpoint, {"name": "Adam"}, str(path))
+    return checkpoint
+
+
+def at(*keys: Any, value: Any) -> Callable[[dict], None]:
+    """Replace what lies under these keys; call ``value`` with it where that is a function."""
+
+    def change(content: dict) -> None:
+        *path, last = keys
+        for key in path:
+            content = content[key]
+        content[last] = value(content[last]) if callable(value) else value
+
+    return change
+
+
+def without(*keys: Any) -> Callable[[dict], None]:
+    def change(content: dict) -> None:
+        *path, last = keys
+        for key in path:
+            content = content[key]
+        del content[last]
+
+    return change
+
+
+def empty_cloud(content: dict) -> None:
+    state = content["state_dict"]
+    state |= {key: value[:0] for key, value in state.items() if key.startswith("geometry.")}
+
+
+MEANS, ADAM = ("state_dict", "geometry.means"), ("optimizer_states", 0)
+FIT = ("loops", "fit_loop")
+NAN = lambda tensor: tensor * math.nan  # noqa: E731
+IMPOSSIBLE = [
+    (empty_cloud, "holds no Gaussian"),
+    (at(*MEANS, value=NAN), "geometry.means holds 30 numbers that are NaN"),
+    (at(*MEANS, value=torch.Tensor.long), "is of the type torch.int64"),
+    (at(*MEANS, value=[1.0]), "in its state_dict is of type list"),
+    (at("state_dict", "geometry.quats", value=lambda t: t[:4]), "has the shape .4, 4.; expected"),
+    (at("state_dict", 3, value=torch.zeros(1)), "3 in its state_dict is of type Tensor"),
+    (at("guidance", value=[1]), "its guidance isn't a mapping of tensors"),
+    (at("global_step", value=-1), "its global_step is -1"),
+    (at("global_step", value=10**20), "its global_step is 1000"),
+    (at("global_step", value=10**400), "its global_step is an integer of 1329 bits"),
+    (at("global_step", value=True), "its global_step is True"),
+    (at("global_step", value=7), "loops are at step 3, its global_step is 7"),
+    (at("epoch", value=-1), "its epoch is -1"),
+    (at("epoch", value="0"), "its epoch is of type str"),
+    (at("loops", value={}), "its loops have no fit_loop"),
+    (at("loops", value=[1]), "its loops have no fit_loop"),
+    (at(*FIT, value={}), "its fit_loop has no epoch_loop.automatic"),
+    (
+        at(*FIT, "epoch_loop.manual_optimization.optim_step_progress", value={}),
+        "isn't one of Lightning's: KeyError",
+    ),
+    (without(*FIT, "epoch_progress"), "its fit_loop has no epoch_progress"),
+    (at(*FIT, "epoch_progress", "total", "ready", value=-1), "total.ready is -1; expected a"),
+    (at(*FIT, "epoch_progress", "total", value="x"), "total is 'x'; expected a count"),
+    (at("optimizer_states", value=[]), "hold no optimiser"),
+    (at("optimizer_states", value=[None]), "has no state and param_groups"),
+    (at(*ADAM, "state", value={}), "has no moments"),
+    (at(*ADAM, "state", value=3), "isn't a mapping of mappings"),
+    (at(*ADAM, "param_groups", value=[3]), "isn't a list of groups"),
+    (at(*ADAM, "param_groups", value=[]), "Adam can't go on"),
+    (at(*ADAM, "param_groups", 0, "lr", value=math.nan), "lr of the group means is nan"),
+    (at(*ADAM, "param_groups", 0, "betas", value="x"), "Adam can't go on"),
+    (at(*ADAM, "state", 0, "exp_avg", value=lambda t: t[:3]), "has the shape .3, 3.; expected"),
+    (at(*ADAM, "state", 0, "exp_avg_sq", value=NAN), "means.exp_avg_sq holds NaN"),
+    (without(*ADAM, "state", 0, "step"), "Adam can't go on from its optimizer_states: KeyError"),
+    (at("pytorch-lightning_version", value=3), "pytorch-lightning_version is of type int"),
+    (at("pytorch-lightning_version", value="x"), "is 'x'; expected 2.0 or later"),
+    (at("callbacks", value=[]), "its callbacks is of type list"),
+    (at("callbacks", CALLBACK, value=[]), "is of type list"),
+    (at("callbacks", CALLBACK, "best_k_models", value=3), "its best_k_models is of type int"),
+    (at("lr_schedulers", value=3), "its lr_schedulers is of type int"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), IMPOSSIBLE, ids=[m for _, m in IMPOSSIBLE])
+def test_impossible_content_is_refused_in_one_message(tmp_path, change, message):
+    content = whole_checkpoint()
+    change(content)
+    with pytest.raises(UserError, match=message):
+        read(tmp_path / "a.ckpt", content)
+
+
+def test_a_whole_checkpoint_is_accepted(tmp_path):
+    assert read(tmp_path / "a.ckpt", whole_checkpoint())["global_step"] == 3
+    read(tmp_path / "b.ckpt", whole_checkpoint(steps=0))
