@@ -262,7 +262,7 @@ def _fractional_bits(gaussians: Gaussians) -> int:
     that they need more bits before it.
     """
     if not len(gaussians.means):
-        return 0
+        return 1  # some readers refuse 0
     distances = np.abs(gaussians.means).max(axis=1)
     inliers = float(np.quantile(distances, INLIERS, method="lower"))
     log2_size = float(np.median(gaussians.log_scales.clip(-50, 50).mean(axis=1))) / log(2)
@@ -270,7 +270,7 @@ def _fractional_bits(gaussians: Gaussians) -> int:
     room = _room(float(distances.max()))
     if room < fewest:
         room = max(room, _room(OUTLIER * inliers))
-    return max(0, min(room, wanted, 30))
+    return max(0, min(room, max(1, wanted), 30))
 
 
 def _room(reach: float) -> int:
