@@ -103,3 +103,17 @@ def test_damage_is_one_message_and_no_memory(tmp_path, content):
         read_arrays(path, "file", ["a"])
     assert tracemalloc.get_traced_memory()[1] < 4 << 20
     tracemalloc.stop()
+
+
+def test_a_small_archive_of_large_arrays_is_refused_before_they_are_unpacked(tmp_path):
+    """Each array alone would be within the budget, all together aren't."""
+    arrays = {name: np.zeros(1_200_000, np.uint8) for name in "abc"}
+    np.savez_compressed(tmp_path / "x.npz", **arrays)
+    assert read_arrays(tmp_path / "x.npz", "file", ["a"])["a"].shape == (1_200_000,)
+    tracemalloc.start()
+    with pytest.raises(
+        UserError, match="file .*x.npz': the arrays a, b, c would take .* of memory"
+    ):
+        read_arrays(tmp_path / "x.npz", "file", ["a"], ["b", "c"])
+    assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    tracemalloc.stop()

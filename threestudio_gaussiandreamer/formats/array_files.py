@@ -1,24 +1,27 @@
-"""NumPy's files, NPY and NPZ, from strangers: no pickles, no size that the file can't hold, and one
+"""Read NPY and NPZ files, which may come from anywhere: no pickles, a memory budget, and one
 message whatever is wrong.
 
-``numpy.load`` believes the header: it allocates what that announces, ignores what is left over, and
-where the header is damaged whatever parses it raises what it likes."""
+``numpy.load`` trusts the header: it allocates what that announces, ignores what is left over, and
+raises errors of many kinds where the file is damaged."""
 
 import math
 import os
 import zipfile
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 import numpy as np
 from numpy.lib import format as npy
 
 from ..core.errors import UserError
+from ..core.file_memory import require_file_memory
 
 MOST_DEFLATE_SAVES = 1032
 """Bytes that one byte of a deflate stream stands for at most (zlib's technical notes)."""
 PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+CONVERTED_BYTES = 16
+"""Memory that is counted per number for what callers make of it: two copies in float64."""
 
 
 class PickledArray(UserError):
@@ -28,17 +31,18 @@ class PickledArray(UserError):
 def read_arrays(
     path: str | os.PathLike, kind: str, required: Sequence[str], optional: Collection[str] = ()
 ) -> dict[str, np.ndarray]:
-    """The arrays of these names in an NPZ; the one array of an NPY counts as the first that is
+    """Read the arrays of these names from an NPZ; the one array of an NPY is the first that is
     required.
 
     Args:
         kind: what the file is, for messages ("motion file").
-        optional: names that may be missing; others that the file holds are not looked at.
+        optional: names that may be missing; other arrays of the file are not read.
 
     Raises:
         PickledArray: one of them holds Python objects; it is not unpickled, since that could run
             code.
-        UserError: not such a file, damaged, or without a required array.
+        UserError: not such a file, damaged, without a required array, or one that announces more
+            than the memory budget of its size.
     """
     path, where = Path(path), f"{kind} {str(path)!r}"
     try:
@@ -69,27 +73,40 @@ def _read_archive(
             f"{where} has no array {', '.join(map(repr, missing))}, only "
             f"{', '.join(members) or 'none'}"
         )
-    return {
-        name: _read_member(archive, members[name], where)
-        for name in (*required, *optional)
-        if name in members
-    }
+    wanted = {name: members[name] for name in (*required, *optional) if name in members}
+    _require_memory(archive, wanted, where)
+    return {name: _read_member(archive, info, where) for name, info in wanted.items()}
+
+
+def _require_memory(
+    archive: zipfile.ZipFile, wanted: dict[str, zipfile.ZipInfo], where: str
+) -> None:
+    """Check what all headers together announce, before any array is unpacked."""
+    needed = 0
+    for info in wanted.values():
+        with _open_member(archive, info, where) as file:
+            shape, dtype = _read_header(file, info.file_size)
+        needed += math.prod(shape) * (dtype.itemsize + CONVERTED_BYTES)
+    file_size = os.fstat(archive.fp.fileno()).st_size
+    require_file_memory(needed, file_size, where, f"the arrays {', '.join(wanted)}")
+
+
+def _open_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str) -> IO[bytes]:
+    too_large = info.file_size > MOST_DEFLATE_SAVES * info.compress_size
+    if info.compress_type not in PACKINGS or too_large:
+        raise UserError(f"{where} is damaged: {info.filename!r} can't be unpacked")
+    return archive.open(info)
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str) -> np.ndarray:
-    if (
-        info.compress_type not in PACKINGS
-        or info.file_size > MOST_DEFLATE_SAVES * info.compress_size
-    ):
-        raise UserError(f"{where} is damaged: {info.filename!r} can't be unpacked")
-    with archive.open(info) as file:
+    with _open_member(archive, info, where) as file:
         array = _read_array(file, info.file_size, where)
-        file.read()  # reaching the end makes zipfile look at the checksum
+        file.read()  # at the end, zipfile compares the checksum
     return array
 
 
-def _read_array(file: BinaryIO, size: int, where: str) -> np.ndarray:
-    """The array in a stream of ``size`` bytes, which it has to fill exactly."""
+def _read_array(file: IO[bytes], size: int, where: str) -> np.ndarray:
+    """Read the array in a stream of ``size`` bytes, which it has to fill exactly."""
     shape, dtype = _read_header(file, size)
     if dtype.hasobject:
         raise PickledArray(
@@ -104,14 +121,13 @@ def _read_array(file: BinaryIO, size: int, where: str) -> np.ndarray:
     return npy.read_array(file, allow_pickle=False)
 
 
-def _read_header(file: BinaryIO, size: int) -> tuple[tuple[int, ...], np.dtype]:
+def _read_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype]:
     version = npy.read_magic(file)
     length_bytes = 2 if version == (1, 0) else 4
     if int.from_bytes(file.read(length_bytes), "little") > size:
         raise ValueError("the header is longer than the file")
     file.seek(-length_bytes, os.SEEK_CUR)
-    # version 3 differs from 2 only in that names of fields may be Unicode, which plain arrays have
-    # none of
+    # version 3 differs from 2 only in that names of fields may be Unicode: plain arrays have none
     read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
     shape, _, dtype = read(file)
     return shape, dtype
