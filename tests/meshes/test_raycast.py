@@ -9,7 +9,8 @@ import torch
 from threestudio_gaussiandreamer import cameras
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.meshes import raycast
-from threestudio_gaussiandreamer.meshes.load import Mesh, load_mesh
+from threestudio_gaussiandreamer.meshes.load import load_mesh
+from threestudio_gaussiandreamer.meshes.mesh import Mesh
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster, TargetCache, over_background
 
 trimesh = pytest.importorskip("trimesh")

@@ -6,7 +6,8 @@ import torch
 
 from threestudio_gaussiandreamer import cameras
 from threestudio_gaussiandreamer.meshes import raycast, zbuffer
-from threestudio_gaussiandreamer.meshes.load import Mesh, load_mesh
+from threestudio_gaussiandreamer.meshes.load import load_mesh
+from threestudio_gaussiandreamer.meshes.mesh import Mesh
 from threestudio_gaussiandreamer.meshes.zbuffer import ZBuffer
 
 FOCAL = 20.0

@@ -15,7 +15,7 @@ from tests.helpers import tiny_3d_models as tiny
 from tests.helpers.prior_contract import PriorContract, assert_valid
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
-from threestudio_gaussiandreamer.meshes.load import Mesh
+from threestudio_gaussiandreamer.meshes.mesh import Mesh
 from threestudio_gaussiandreamer.models.clip import clip_source, picture_similarities
 from threestudio_gaussiandreamer.priors import motion as module
 from threestudio_gaussiandreamer.priors import motion_files

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from ..core.errors import UserError
-from .load import Mesh, surface_colors
+from .mesh import Mesh, surface_colors
 from .zbuffer import NEAR, ZBuffer
 
 RAYS_PER_CAST = 2**15

@@ -43,9 +43,7 @@ class Triangles(NamedTuple):
 
 
 class ZBuffer:
-    """The visible faces of one triangle mesh, from both sides; safe to call from several
-    threads.
-    """
+    """The visible faces of one triangle mesh, from both sides; for several threads."""
 
     def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
         self.vertices, self.faces = vertices.astype(np.float64), faces

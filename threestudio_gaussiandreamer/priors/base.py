@@ -27,7 +27,7 @@ from ..core.options import Rule, check_options, is_number, is_numbers, positive,
 from ..core.streams import numpy_generator
 from ..gaussians.point_cloud import PointCloud
 from ..host import BaseObject, run_seed
-from ..meshes.load import _pose
+from ..meshes.load import pose_rotation
 
 logger = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ def require_axes(cfg: Any, kind: str) -> None:
     """Raise UserError unless the options ``up`` and ``front`` name two axes that aren't parallel,
     for a ``kind`` of file ("glb").
     """
-    _pose(kind, cfg.up, cfg.front)
+    pose_rotation(kind, cfg.up, cfg.front)
 
 
 class Prior(BaseObject):

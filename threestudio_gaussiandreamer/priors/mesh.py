@@ -34,7 +34,8 @@ from jaxtyping import Float, Int
 from ..core.options import at_least
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
-from ..meshes.load import Mesh, load_mesh, sample_surface, surface_colors
+from ..meshes.load import load_mesh
+from ..meshes.mesh import Mesh, sample_surface, surface_colors, vertex_surface_colors
 from .base import COLOR, PATH, SCALE, Prior, chosen_colors, points, require_axes
 
 logger = logging.getLogger(__name__)
@@ -83,9 +84,7 @@ class MeshPrior(Prior):
 
 
 def mesh_cloud(mesh: Mesh, num_points: int, generator: np.random.Generator) -> PointCloud:
-    """The vertices of ``mesh`` with its faces, or ``num_points`` points uniform over its
-    surface.
-    """
+    """Return the vertices of ``mesh`` with its faces, or ``num_points`` points on its surface."""
     if num_points == 0:
         return vertex_cloud(mesh)
     points, face_index, barycentric = sample_surface(mesh, num_points, generator)
@@ -94,13 +93,8 @@ def mesh_cloud(mesh: Mesh, num_points: int, generator: np.random.Generator) -> P
 
 
 def vertex_cloud(mesh: Mesh) -> PointCloud:
-    """Each vertex with its colour: where a texture has a seam or faces differ, that of one of its
-    faces.
-    """
-    corner = np.zeros(len(mesh.vertices), np.int64)
-    corner[mesh.faces.ravel()] = np.arange(mesh.faces.size)  # any corner of any face at this vertex
-    colors = surface_colors(mesh, corner // 3, np.eye(3)[corner % 3])
-    return PointCloud(points=mesh.vertices, colors=colors, faces=mesh.faces)
+    """Return the vertices of ``mesh`` with their colours and faces."""
+    return PointCloud(points=mesh.vertices, colors=vertex_surface_colors(mesh), faces=mesh.faces)
 
 
 def face_normals(mesh: Mesh) -> Float[np.ndarray, "F 3"]:

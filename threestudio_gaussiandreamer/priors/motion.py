@@ -47,7 +47,8 @@ from ..core.files import existing_file
 from ..core.options import at_least, in_range, is_whole, positive, satisfies
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register, warn
-from ..meshes.load import Mesh, load_mesh
+from ..meshes.load import load_mesh
+from ..meshes.mesh import Mesh
 from ..meshes.raycast import MeshCaster, over_background
 from ..models.clip import clip_source, picture_similarities
 from ..models.extras import require_extra

@@ -37,7 +37,8 @@ from ..gaussians.axes import FRONTS
 from ..gaussians.grow import longest_side
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
-from ..meshes.load import _pose
+from ..meshes.load import mesh_formats, pose_rotation, read_parts
+from ..meshes.mesh import vertex_surface_colors
 from .base import GREY, PATH, SCALE, Prior, require_axes
 
 logger = logging.getLogger(__name__)
@@ -74,7 +75,7 @@ def to_world(path: Path, up: str, front: Optional[str]) -> Float[np.ndarray, "3 
         named = ply_up(path)
         front = front or FRONTS[named]
         up = named if named.startswith("-") else f"+{named}"
-    return _pose(axes_kind(path), up, front)
+    return pose_rotation(axes_kind(path), up, front)
 
 
 def axes_kind(path: Path) -> str:
@@ -91,7 +92,7 @@ def load_points(path: Path) -> PointCloud:
         UserError: an unknown extension, an unreadable file, or one without points.
     """
     try:
-        return READERS.get(path.suffix.lower(), read_with_trimesh)(path)
+        return READERS.get(path.suffix.lower(), read_mesh_points)(path)
     except UserError:
         raise
     except (OSError, ValueError, KeyError, MemoryError) as error:
@@ -156,45 +157,17 @@ def _is_row(line: str) -> bool:
         return False
 
 
-def read_with_trimesh(path: Path) -> PointCloud:
-    """The vertices of whatever trimesh reads, with the scene's placing applied."""
-    import trimesh
-
-    if path.suffix.lower().lstrip(".") not in trimesh.available_formats():
-        raise unknown(
-            "point cloud format",
-            path.suffix,
-            [*READERS, *("." + name for name in trimesh.available_formats())],
-        )
-    try:
-        parts = trimesh.load_scene(path, process=False).dump()
-    except Exception as error:  # each of trimesh's readers fails in its own way
-        raise UserError(
-            f"point cloud {str(path)!r} is not readable: {type(error).__name__}: {error}"
-        ) from error
-    parts = [part for part in parts if len(getattr(part, "vertices", ()))]
+def read_mesh_points(path: Path) -> PointCloud:
+    """Return the vertices of a mesh file, and its points, where its scene places them."""
+    extension, known = path.suffix.lower().lstrip("."), mesh_formats()
+    if extension not in known:
+        raise unknown("point cloud format", path.suffix, [*READERS, *("." + e for e in known)])
+    parts = [part for part in read_parts(path) if len(part.vertices)]
     if not parts:
         raise UserError(f"point cloud {str(path)!r} is empty: it has no vertices")
-    clouds = [_cloud(path, part.vertices, _trimesh_colors(part)) for part in parts]
-    return PointCloud(
-        *(
-            np.concatenate(values)
-            for values in zip(*((cloud.points, cloud.colors) for cloud in clouds), strict=True)
-        )
-    )
-
-
-def _trimesh_colors(part: Any) -> Optional[np.ndarray]:
-    """Colours of the vertices of a trimesh geometry; a texture is looked up at each vertex."""
-    colors = getattr(part, "colors", None)
-    if colors is None and getattr(part, "visual", None) is not None and part.visual.defined:
-        visual = part.visual.to_color() if part.visual.kind == "texture" else part.visual
-        colors = visual.vertex_colors
-    return (
-        np.asarray(colors)[:, :3]
-        if colors is not None and len(colors) == len(part.vertices)
-        else None
-    )
+    colored = any(part.has_colors for part in parts)
+    colors = np.concatenate([vertex_surface_colors(part) for part in parts]) if colored else None
+    return _cloud(path, np.concatenate([part.vertices for part in parts]), colors)
 
 
 def _from_columns(path: Path, rows: np.ndarray) -> PointCloud:

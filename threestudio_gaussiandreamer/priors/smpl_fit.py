@@ -303,9 +303,7 @@ def _arrays(file: Path) -> dict[str, np.ndarray]:
 
 
 def _check_shapes(arrays: dict[str, np.ndarray], path: str) -> None:
-    """Raise UserError unless the arrays are those of one body with at least SMPL's 22 body
-    joints.
-    """
+    """Raise UserError unless the arrays are those of a body with SMPL's 22 joints or more."""
     vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
     fits = (
         arrays["v_template"].shape == (vertices, 3)

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int, UInt8
 from ..cameras import Orbit, orbit_c2w
 from ..core.files import atomic_file
 from ..core.streams import numpy_generator
-from ..meshes.load import Mesh, sample_surface, surface_colors
+from ..meshes.mesh import Mesh, sample_surface, surface_colors
 from ..meshes.raycast import MeshCaster
 from .kinds import ACCESSORIES, KINDS
 from .world import COLORS, PATTERNS, Attributes, draw_attributes, object_mesh

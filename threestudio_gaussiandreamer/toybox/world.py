@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.streams import numpy_generator
-from ..meshes.load import Mesh
+from ..meshes.mesh import Mesh
 from .kinds import ACCESSORIES, KINDS, Model, Proportions, accessory
 from .shapes import Shape, joined
 

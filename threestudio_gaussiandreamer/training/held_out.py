@@ -25,7 +25,7 @@ from ..core.files import atomic_file, json_text
 from ..core.images import read as read_image
 from ..core.memory import require_memory
 from ..core.options import at_least, in_range
-from ..meshes.load import SurfaceDistance
+from ..meshes.mesh import SurfaceDistance
 from ..meshes.raycast import over_background
 from ..metrics import floater_mass, multi_face_rate, out_of_gamut, psnr, ssim
 from .camera_options import MAX_SIDE

@@ -1,0 +1,461 @@
+"""glTF files made by hand, one feature each: positions and colours are what the standard says."""
+
+import base64
+import json
+import os
+import threading
+import tracemalloc
+import zlib
+
+import numpy as np
+import pytest
+
+from tests.helpers.gltf_builder import QUAD, QUAD_UV, Gltf, png, textured_quad
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.meshes import budget
+from threestudio_gaussiandreamer.meshes.gltf import read_gltf
+from threestudio_gaussiandreamer.meshes.load import load_mesh
+from threestudio_gaussiandreamer.meshes.mesh import surface_colors
+from threestudio_gaussiandreamer.priors.point_cloud import PointCloudPrior
+
+RED, GREEN, BLUE, WHITE = np.uint8([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]])
+FOUR = np.array([[RED, GREEN], [BLUE, WHITE]])
+"""Red green / blue white, row 0 on top."""
+NEAREST = {"magFilter": 9728}
+HALF = 0.5
+
+
+@pytest.fixture
+def saved(tmp_path):
+    def save(made, name="a.glb"):
+        path = tmp_path / name
+        path.write_bytes(made.glb())
+        return path
+
+    return save
+
+
+def color_at(path, x, y):
+    """The colour at a place of the one part of a file, seen along -z in the file's axes."""
+    (part,) = read_gltf(path)
+    for face, corners in enumerate(part.vertices[part.faces][:, :, :2]):
+        weights = np.linalg.solve(np.vstack([corners.T, np.ones(3)]), [x, y, 1])
+        if weights.min() > -1e-9:
+            return surface_colors(part, np.array([face]), weights[None])[0]
+
+
+def test_a_picture_is_upright(saved):
+    path = saved(textured_quad(FOUR, sampler=NEAREST))
+    for place, color in (((0.2, 0.8), RED), ((0.8, 0.8), GREEN), ((0.2, 0.2), BLUE)):
+        np.testing.assert_allclose(color_at(path, *place), color / 255)
+
+
+@pytest.mark.parametrize("kind", ["u1", "u2"])
+def test_normalised_integers_are_fractions(kind, saved):
+    most = np.iinfo(kind).max
+    made = textured_quad(FOUR, sampler=NEAREST)
+    uv = made.accessor((QUAD_UV * most).astype(kind), stride=4, normalized=True)
+    colors = made.accessor(np.full((4, 4), most // 3, kind), normalized=True)
+    made.document["meshes"][0]["primitives"][0]["attributes"] |= {
+        "TEXCOORD_0": uv,
+        "COLOR_0": colors,
+    }
+    expected = np.array([1, 0, 0]) * (most // 3) / most
+    np.testing.assert_allclose(color_at(saved(made), 0.2, 0.8), expected, atol=1e-6)
+
+
+def test_quantised_positions_are_read(saved):
+    """KHR_mesh_quantization: normalised signed integers, strided to four bytes."""
+    made = Gltf(extensionsRequired=["KHR_mesh_quantization"])
+    positions = made.accessor(np.int8([[-128, -127, 0], [127, 0, 64]] * 2), 4, normalized=True)
+    made.primitive({"POSITION": positions}, indices=made.accessor(np.uint8([0, 1, 2])))
+    (part,) = read_gltf(saved(made))
+    np.testing.assert_allclose(part.vertices[:2], [[-1, -1, 0], [1, 0, 64 / 127]], atol=1e-7)
+
+
+@pytest.mark.parametrize("by_extension", [False, True])
+def test_the_second_set_of_coordinates_is_taken(by_extension, saved):
+    info = {"texCoord": 1}
+    if by_extension:  # it overrides that of the texture info
+        info = {"texCoord": 0, "extensions": {"KHR_texture_transform": {"texCoord": 1}}}
+    elsewhere = np.full((4, 2), 0.9, np.float32)
+    attributes = {"TEXCOORD_0": elsewhere, "TEXCOORD_1": QUAD_UV}
+    path = saved(textured_quad(FOUR, sampler=NEAREST, info=info, attributes=attributes))
+    np.testing.assert_allclose(color_at(path, 0.2, 0.8), RED / 255)
+
+
+@pytest.mark.parametrize(
+    "transform, uv",
+    [
+        ({"offset": [0.5, 0.0]}, [0.6, 0.2]),
+        ({"scale": [0.5, 2.0]}, [0.05, 0.4]),
+        ({"rotation": np.pi / 2}, [0.2, -0.1]),
+        ({"rotation": np.pi / 6, "scale": [2, 3], "offset": [0.1, 0.2]}, None),
+    ],
+)
+def test_texture_transforms(transform, uv, saved):
+    """Scale, then rotate, then move; rotations are counter-clockwise as the picture is seen, where
+    v grows downwards (what three.js and Blender show).
+    """
+    corner = np.float32([0.1, 0.2])
+    if uv is None:
+        c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
+        uv = [c * 0.2 + s * 0.6 + 0.1, -s * 0.2 + c * 0.6 + 0.2]
+    info = {"extensions": {"KHR_texture_transform": transform}}
+    (part,) = read_gltf(saved(textured_quad(FOUR, uv=np.tile(corner, (4, 1)), info=info)))
+    np.testing.assert_allclose(part.uv[0], [uv[0], 1 - uv[1]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "code, u, expected",
+    [
+        (10497, 1.25, RED),  # repeat: 0.25
+        (10497, -0.25, GREEN),
+        (33648, 1.25, GREEN),  # mirrored: 0.75
+        (33648, -0.25, RED),
+        (33648, 2.25, RED),
+        (33071, 1.25, GREEN),  # clamped: the edge
+        (33071, -3.0, RED),
+    ],
+)
+def test_samplers_wrap_as_they_say(code, u, expected, saved):
+    uv = np.tile(np.float32([u, 0.25]), (4, 1))
+    sampler = {"wrapS": code, "wrapT": 33071} | NEAREST
+    path = saved(textured_quad(FOUR, uv=uv, sampler=sampler))
+    np.testing.assert_allclose(color_at(path, 0.5, 0.5), expected / 255)
+
+
+def test_a_clamped_edge_isn_t_blended_with_the_other_one(saved):
+    uv = np.tile(np.float32([0.0, 0.25]), (4, 1))
+    clamped, mirrored, repeated = (
+        color_at(
+            saved(textured_quad(FOUR, uv=uv, sampler={"wrapS": code, "wrapT": 33071})), 0.5, 0.5
+        )
+        for code in (33071, 33648, 10497)
+    )
+    np.testing.assert_allclose(clamped, RED / 255)
+    np.testing.assert_allclose(mirrored, RED / 255)
+    np.testing.assert_allclose(repeated, [0.5, 0.5, 0])
+
+
+def test_wrapping_survives_a_merge_and_a_picture_is_kept_once(tmp_path):
+    """Two quads with one picture and other samplers, in the merged mesh that training sees."""
+    uv = np.tile(np.float32([1.25, 0.25]), (4, 1))
+    made = textured_quad(FOUR, uv=uv, sampler={"wrapS": 33071} | NEAREST)
+    made.add("samplers", wrapS=33648, wrapT=33071, magFilter=9728)
+    other = made.add("textures", source=0, sampler=1)
+    primitive = dict(made.document["meshes"][0]["primitives"][0])
+    primitive["material"] = made.material(other)
+    made.document["meshes"][0]["primitives"].append(primitive)
+    made.add("nodes", mesh=0, translation=[0, 0, 2])
+    made.document["scenes"][0]["nodes"] = [0, 1]
+    (tmp_path / "a.glb").write_bytes(made.glb())
+    mesh = load_mesh(tmp_path / "a.glb")
+    assert mesh.texture.size == 4 * 3 and len(mesh.tiles) == 2 and len(mesh.faces) == 8
+    centers = surface_colors(mesh, np.arange(8), np.full((8, 3), 1 / 3))
+    np.testing.assert_allclose(centers, np.array([GREEN, GREEN] * 4) / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize("with_base", [False, True])
+def test_sparse_accessors(with_base, saved):
+    made = Gltf()
+    base = np.arange(12).reshape(4, 3) if with_base else None
+    positions = made.sparse(4, [1, 3], [[5, 6, 7], [8, 9, 10]], base)
+    made.primitive({"POSITION": positions}, indices=made.accessor(np.uint8([0, 1, 3])))
+    expected = np.zeros((4, 3)) if base is None else base.copy()
+    expected[[1, 3]] = [[5, 6, 7], [8, 9, 10]]
+    np.testing.assert_array_equal(read_gltf(saved(made))[0].vertices, expected)
+
+
+@pytest.mark.parametrize("where", ["mesh", "node", "both"])
+def test_default_weights_of_morph_targets(where, saved):
+    """Those of the node come before those of the mesh."""
+    made = Gltf()
+    up, right = np.float32([[0, 0, 1]] * 4), made.sparse(4, [2], [[4, 0, 0]])
+    targets = [{"POSITION": made.accessor(up)}, {"POSITION": right}]
+    made.primitive({"POSITION": QUAD}, indices=made.accessor(np.uint8([0, 1, 2])), targets=targets)
+    if where != "node":
+        made.document["meshes"][0]["weights"] = [0.5, 0.25] if where == "mesh" else [9, 9]
+    if where != "mesh":
+        made.document["nodes"][0]["weights"] = [0.5, 0.25]
+    expected = QUAD + [0, 0, 0.5]
+    expected[2, 0] += 1
+    np.testing.assert_allclose(read_gltf(saved(made))[0].vertices, expected)
+
+
+@pytest.mark.parametrize("indexed", [False, True])
+@pytest.mark.parametrize(
+    "mode, faces",
+    [(5, [[0, 1, 2], [1, 3, 2], [2, 3, 4]]), (6, [[1, 2, 0], [2, 3, 0], [3, 4, 0]])],
+    ids=["strip", "fan"],
+)
+def test_strips_and_fans(mode, faces, indexed, saved):
+    """All triangles of a strip are the same way round."""
+    made = Gltf()
+    order = np.array([4, 2, 0, 1, 3]) if indexed else np.arange(5)
+    indices = {"indices": made.accessor(order.astype("u4"))} if indexed else {}
+    made.primitive(
+        {"POSITION": np.float32(np.random.default_rng(0).random((5, 3)))}, mode=mode, **indices
+    )
+    np.testing.assert_array_equal(read_gltf(saved(made))[0].faces, order[np.array(faces)])
+
+
+def test_16_bit_pictures(saved):
+    grey = np.uint16([[0x4040, 0xFFFF], [0, 0x8080]])
+    (part,) = read_gltf(saved(textured_quad(grey)))
+    np.testing.assert_array_equal(part.texture[..., 0], [[0x40, 0xFF], [0, 0x80]])
+
+
+def test_a_factor_tints_the_texture(saved):
+    path = saved(textured_quad(FOUR, sampler=NEAREST, factor=[0.2158605, 1, 1, 1]))
+    np.testing.assert_allclose(color_at(path, 0.2, 0.8), [128 / 255, 0, 0], atol=2e-3)  # sRGB
+
+
+def test_nodes_are_placed_by_all_their_parents(saved):
+    made = textured_quad(FOUR)
+    turn = [0, 0, np.sqrt(0.5), np.sqrt(0.5)]  # +x becomes +y
+    made.document["nodes"] = [
+        {"children": [1], "translation": [0, 0, 5]},
+        {"mesh": 0, "rotation": turn, "scale": [2, 3, 4], "translation": [1, 0, 0]},
+    ]
+    (part,) = read_gltf(saved(made))
+    np.testing.assert_allclose(part.vertices[2], [1 - 3, 2, 5], atol=1e-12)
+
+
+def test_a_mirrored_node_turns_its_faces_round(saved):
+    made = textured_quad(FOUR)
+    made.document["nodes"][0]["scale"] = [-1, 1, 1]
+    (part,) = read_gltf(saved(made))
+    a, b, c = part.vertices[part.faces[0]]
+    assert np.cross(b - a, c - a)[2] > 0
+
+
+def test_a_skin_has_the_pose_of_its_joints(saved):
+    """Half of the vertices follow a joint that was moved since the mesh was bound to it."""
+    made = Gltf(
+        nodes=[{"mesh": 0, "skin": 0, "translation": [9, 9, 9]}, {}, {"translation": [3, 0, 0]}]
+    )
+    made.document["scenes"][0]["nodes"] = [0, 1, 2]
+    bind = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
+    bind[1, 3, 0] = -1.0  # column-major: it was bound one unit along x
+    made.add("skins", joints=[1, 2], inverseBindMatrices=made.accessor(bind.reshape(2, 16)))
+    joints, weights = np.zeros((4, 4), np.uint8), np.zeros((4, 4), np.float32)
+    joints[2:, 0], weights[:, 0] = 1, 1
+    attributes = {"POSITION": QUAD, "JOINTS_0": joints, "WEIGHTS_0": weights}
+    made.primitive(attributes, indices=made.accessor(np.uint8([0, 1, 2])))
+    expected = QUAD + np.array([[0, 0, 0], [0, 0, 0], [2, 0, 0], [2, 0, 0]])
+    np.testing.assert_allclose(read_gltf(saved(made))[0].vertices, expected)
+
+
+def test_points_are_for_point_clouds(saved):
+    made = Gltf()
+    colors = made.accessor(np.uint8([[255, 0, 0, 255]] * 4), normalized=True)
+    made.primitive({"POSITION": QUAD, "COLOR_0": colors}, mode=0)
+    path = saved(made)
+    cloud = PointCloudPrior({"path": str(path), "up": "+z", "front": "+x"})("a fox")
+    np.testing.assert_array_equal(cloud.points, QUAD)
+    np.testing.assert_array_equal(cloud.colors, [[1, 0, 0]] * 4)
+    with pytest.raises(UserError, match="no faces"):
+        load_mesh(path)
+
+
+def test_a_point_cloud_of_a_mesh_has_its_texture_s_colours(saved):
+    """Coordinates outside of [0, 1] repeat, as they do for a mesh prior."""
+    uv = np.float32([[1.25, 0.25], [-0.25, 0.25], [3.25, 1.75], [0.75, -0.25]])
+    path = saved(textured_quad(FOUR, uv=uv, sampler=NEAREST))
+    cloud = PointCloudPrior({"path": str(path)})("a fox")
+    np.testing.assert_array_equal(cloud.colors, np.array([RED, GREEN, BLUE, WHITE]) / 255)
+
+
+# ---- files beside --------------------------------------------------------------------------------
+
+
+def gltf_beside(tmp_path, uri="picture%20one.png"):
+    """A .gltf with its buffer as data and its picture in a file."""
+    made = textured_quad(FOUR, sampler=NEAREST)
+    made.glb()
+    data = base64.b64encode(made.binary).decode()
+    made.document["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{data}"
+    made.document["images"] = [{"uri": uri}]
+    (tmp_path / "a.gltf").write_text(json.dumps(made.document))
+    return tmp_path / "a.gltf"
+
+
+def test_pictures_and_buffers_are_found(tmp_path):
+    (tmp_path / "picture one.png").write_bytes(png(FOUR))
+    np.testing.assert_allclose(color_at(gltf_beside(tmp_path), 0.2, 0.8), RED / 255)
+
+
+def test_a_missing_texture_is_named_and_leaves_grey(tmp_path, caplog):
+    path = gltf_beside(tmp_path)
+    np.testing.assert_allclose(color_at(path, 0.2, 0.8), HALF)
+    assert "names the file 'picture one.png', which does not exist" in caplog.text
+    np.testing.assert_allclose(PointCloudPrior({"path": str(path)})("a fox").colors, HALF)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="FIFOs are of Unix")
+@pytest.mark.parametrize("kind", ["texture", "buffer", "mtl", "texture of an OBJ"])
+def test_a_fifo_beside_a_mesh_is_refused(kind, tmp_path):
+    """Opened plainly it would wait for a writer for ever."""
+    os.mkfifo(tmp_path / "fifo.png")
+    path = gltf_beside(tmp_path, "fifo.png")
+    if kind == "buffer":
+        document = json.loads(path.read_text())
+        document["buffers"][0]["uri"] = "fifo.png"
+        path.write_text(json.dumps(document))
+    if "mtl" in kind or "OBJ" in kind:
+        path = tmp_path / "a.obj"
+        path.write_text(f"mtllib {'fifo.png' if kind == 'mtl' else 'a.mtl'}\n" + TRIANGLE)
+        (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd fifo.png\n")
+    caught = []
+    thread = threading.Thread(target=lambda: caught.append(error_of(path)), daemon=True)
+    thread.start()
+    thread.join(20)
+    assert caught and "not a regular file" in caught[0]
+
+
+def error_of(path):
+    try:
+        load_mesh(path)
+    except UserError as error:
+        return str(error)
+
+
+# ---- OBJ -----------------------------------------------------------------------------------------
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+
+
+@pytest.mark.parametrize("head", ["", "mtllib missing.mtl\n"])
+def test_an_obj_with_coordinates_and_no_material_is_grey(head, tmp_path):
+    (tmp_path / "a.obj").write_text(head + TRIANGLE)
+    mesh = load_mesh(tmp_path / "a.obj")
+    assert not mesh.has_colors
+    np.testing.assert_array_equal(surface_colors(mesh, np.array([0]), np.full((1, 3), 1 / 3)), HALF)
+    cloud = PointCloudPrior({"path": str(tmp_path / "a.obj")})("a fox")
+    np.testing.assert_array_equal(cloud.colors, HALF)
+
+
+@pytest.mark.parametrize("picture, expected", [(None, [1, 0.5, 0]), (np.uint16([[0x8080]]), 0.5)])
+def test_an_obj_s_material(picture, expected, tmp_path, caplog):
+    """A missing picture leaves the material's colour; one of 16 bits isn't clipped to white."""
+    kd = "Kd 1 0.5 0\n" if picture is None else ""
+    (tmp_path / "a.mtl").write_text(f"newmtl m\n{kd}map_Kd p.png\n")
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + TRIANGLE)
+    if picture is not None:
+        (tmp_path / "p.png").write_bytes(png(picture))
+    mesh = load_mesh(tmp_path / "a.obj")
+    color = surface_colors(mesh, np.array([0]), np.full((1, 3), 1 / 3))[0]
+    np.testing.assert_allclose(color, np.broadcast_to(expected, 3), atol=2e-3)
+    assert ("p.png" in caplog.text) == (picture is None)
+
+
+# ---- what isn't read -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "ACME_magic", "KHR_texture_basisu"],
+)
+def test_extensions_that_are_required_and_not_read_are_named(name, saved):
+    with pytest.raises(UserError, match=f"requires the glTF extension '{name}'"):
+        read_gltf(saved(textured_quad(FOUR, extensionsRequired=[name])))
+
+
+def test_extensions_that_change_no_colour_are_no_hindrance(saved):
+    names = ["KHR_materials_unlit", "KHR_texture_transform", "KHR_materials_clearcoat"]
+    assert read_gltf(saved(textured_quad(FOUR, extensionsRequired=names)))
+
+
+def changed(made, path, value):
+    """The document with one value replaced."""
+    *way, last = path
+    entry = made.document
+    for key in way:
+        entry = entry[key]
+    entry[last] = value
+    return made
+
+
+@pytest.mark.parametrize(
+    "path, value, message",
+    [
+        (("asset",), {"version": "1.0"}, "glTF of version 1.0"),
+        (("nodes", 0, "extensions"), {"EXT_mesh_gpu_instancing": {}}, "EXT_mesh_gpu_instancing"),
+        (("nodes", 0, "children"), [0], "node 0 has two parents"),
+        (("nodes", 0, "rotation"), [1, 2], "rotation of a node should be 4 numbers"),
+        (("nodes", 0, "mesh"), 7, "names number 7 of 1 meshes"),
+        (("nodes", 0, "mesh"), -1, "names number -1 of 1 meshes"),
+        (("meshes", 0, "primitives", 0, "mode"), 9, "mode 9 is unknown"),
+        (("meshes", 0, "primitives", 0, "indices"), 1, "SCALAR was expected"),
+        (("accessors", 1, "count"), 10**6, "buffer view"),
+        (("accessors", 1, "count"), 3, "names vertex 3 of 3|rows for"),
+        (("accessors", 1, "componentType"), 1, "component type 1"),
+        (
+            ("accessors", 1),
+            {"count": 4, "type": "VEC3", "componentType": 5126},
+            "aren't in the file",
+        ),
+        (("bufferViews", 0, "byteLength"), 10**12, "ends after its buffer"),
+        (("samplers", 0, "wrapS"), 5, "wraps by"),
+        (("textures", 0), {"extensions": {"KHR_texture_basisu": {}}}, "KHR_texture_basisu"),
+        (("images", 0), {"uri": "https://example.org/a.png"}, "only files beside the mesh"),
+        (("images", 0, "bufferView"), 1, "texture 0 can't be read"),
+        (("scenes",), 5, "isn't that of a glTF file"),
+    ],
+)
+def test_damage_is_one_message(path, value, message, saved):
+    with pytest.raises(UserError, match=message):
+        read_gltf(saved(changed(textured_quad(FOUR, sampler=NEAREST), path, value)))
+
+
+# ---- memory --------------------------------------------------------------------------------------
+
+
+def refused(made, saved):
+    """The message of a refusal, and the most that Python allocated before it."""
+    path = saved(made)
+    tracemalloc.start()
+    try:
+        with pytest.raises(UserError) as caught:
+            load_mesh(path)
+        return str(caught.value), tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_textures_count_together(saved, monkeypatch):
+    """Two pictures of half a megabyte in a file of few bytes: one fits, two don't."""
+    monkeypatch.setattr(budget, "FIXED_BYTES", 700_000)
+    monkeypatch.setattr(budget, "BYTES_PER_BYTE", 0)
+    flat = np.zeros((256, 256, 3), np.uint8)
+    made = textured_quad(flat)
+    assert load_mesh(saved(made)).texture.shape == (256, 256, 3)
+    made.document["meshes"][0]["primitives"].append(
+        made.document["meshes"][0]["primitives"][0]
+        | {"material": made.material(made.texture(flat))}
+    )
+    message, taken = refused(made, saved)
+    assert "the texture 1 of 256 x 256 texels is too large" in message and taken < 1 << 20
+
+
+def test_instances_count(saved, monkeypatch):
+    """2,000 nodes that show one mesh are refused before they are made; the texture is kept once."""
+    monkeypatch.setattr(budget, "FIXED_BYTES", 1 << 20)
+    monkeypatch.setattr(budget, "BYTES_PER_BYTE", 0)
+    made = textured_quad(np.zeros((64, 64, 3), np.uint8))
+    made.document["nodes"] = [{"mesh": 0, "translation": [i, 0, 0]} for i in range(500)]
+    made.document["scenes"][0]["nodes"] = list(range(500))
+    assert load_mesh(saved(made)).texture.size == 64 * 64 * 3
+    made.document["nodes"] *= 4
+    made.document["scenes"][0]["nodes"] = list(range(2000))
+    assert "too large" in refused(made, saved)[0]
+
+
+def test_a_large_header_is_refused_before_anything_is_allocated(saved):
+    """A PNG of 12,000 x 12,000 pixels whose header alone is right."""
+    data = bytearray(png(FOUR))
+    data[16:24] = (12000).to_bytes(4, "big") * 2
+    data[29:33] = zlib.crc32(bytes(data[12:29])).to_bytes(4, "big")
+    message, taken = refused(textured_quad(bytes(data)), saved)
+    assert "12000 x 12000 texels is too large" in message and taken < 4 << 20

@@ -1,0 +1,27 @@
+"""Colours of files as float32 display values in [0, 1]."""
+
+import logging
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from .mesh import GREY
+
+log = logging.getLogger(__name__)
+
+
+def unit_rgb(colors: Shaped[np.ndarray, "N C"]) -> Float[np.ndarray, "N 3"]:
+    """Return integer or float colours as RGB in [0, 1]; one that isn't finite becomes grey."""
+    colors = np.asarray(colors)[:, :3]
+    if colors.dtype.kind in "ui":
+        return colors.astype(np.float32) / np.iinfo(colors.dtype).max
+    if not (finite := np.isfinite(colors).all(axis=1)).all():
+        log.warning("%d colours of the mesh aren't finite: they become grey", (~finite).sum())
+    return np.where(finite[:, None], colors, GREY).clip(0, 1).astype(np.float32)
+
+
+def linear_to_srgb(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Apply the curve of IEC 61966-2-1; glTF's factors are linear, its textures are not."""
+    return np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - 0.055
+    ).astype(np.float32)

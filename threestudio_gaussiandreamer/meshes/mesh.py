@@ -1,0 +1,210 @@
+"""The type of a triangle mesh, the colour at places on its surface, and points on it."""
+
+from typing import NamedTuple, Optional
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from ..gaussians.grow import distinct
+
+GREY = 0.5
+REPEAT, MIRROR, CLAMP = range(3)
+
+
+class Tile(NamedTuple):
+    """A texture inside ``Mesh.texture``, and how it is looked up."""
+
+    start: int
+    """Index of its first texel in the texture's flattened rows."""
+    width: int
+    height: int
+    wrap_u: int = REPEAT
+    wrap_v: int = REPEAT
+    nearest: bool = False
+    """The colour of the texel itself; else bilinear between texel centres."""
+
+
+class Mesh(NamedTuple):
+    """A triangle mesh and what colours it; see :func:`surface_colors` for how they combine."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    """float64, world units."""
+    faces: Int[np.ndarray, "F 3"]
+    uv: Optional[Float[np.ndarray, "V 2"]] = None
+    """v grows upwards in the texture; outside [0, 1] the tile's wrapping says what is shown."""
+    texture: Optional[UInt8[np.ndarray, "H W 3"] | Float[np.ndarray, "H W 3"]] = None
+    """Bytes, or floats in [0, 1]; row 0 on top; with ``tiles`` the texels of several textures, one
+    after the other.
+    """
+    vertex_colors: Optional[Float[np.ndarray, "V 3"]] = None
+    face_colors: Optional[Float[np.ndarray, "F 3"]] = None
+    tiles: tuple[Tile, ...] = ()
+    """The textures; empty: ``texture`` is one, which repeats."""
+    tile_index: Optional[Int[np.ndarray, " F"]] = None
+    """The tile of each face, -1 = not textured; None = the first one for all faces."""
+
+    @property
+    def has_colors(self) -> bool:
+        """Whether the file said anything about colour."""
+        return any(
+            colors is not None for colors in (self.texture, self.vertex_colors, self.face_colors)
+        )
+
+
+# Colours
+# --------------------------------------------------------------------------------------------------
+
+
+def surface_colors(
+    mesh: Mesh, face_index: Int[np.ndarray, " M"], barycentric: Float[np.ndarray, "M 3"]
+) -> Float[np.ndarray, "M 3"]:
+    """Return the colour at M places on the surface, float32 in [0, 1].
+
+    Args:
+        face_index: rows of ``mesh.faces``.
+        barycentric: weights of the face's three corners, each row sums to 1.
+    """
+    weights = barycentric.astype(np.float32)
+    if mesh.texture is None:
+        return _flat_colors(mesh, face_index, weights)
+    colors = _texture_colors(mesh, face_index, weights)
+    if mesh.vertex_colors is not None:
+        colors *= _flat_colors(mesh, face_index, weights)
+    return colors
+
+
+def vertex_surface_colors(mesh: Mesh) -> Float[np.ndarray, "V 3"]:
+    """Return the colour at each vertex: where a texture has a seam or faces differ, that of one of
+    its faces.
+    """
+    if not len(mesh.faces):
+        return _vertex_colors(mesh)
+    corner = np.zeros(len(mesh.vertices), np.int64)
+    corner[mesh.faces.ravel()] = np.arange(mesh.faces.size)  # any corner of any face at this vertex
+    return surface_colors(mesh, corner // 3, np.eye(3)[corner % 3])
+
+
+def _vertex_colors(mesh: Mesh) -> np.ndarray:
+    if mesh.vertex_colors is not None:
+        return mesh.vertex_colors
+    return np.full(mesh.vertices.shape, GREY, np.float32)
+
+
+def _flat_colors(mesh: Mesh, face_index: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return vertex colours interpolated, else face colours, else grey."""
+    if mesh.vertex_colors is not None:
+        return np.einsum("mk,mkc->mc", weights, mesh.vertex_colors[mesh.faces[face_index]])
+    if mesh.face_colors is not None:
+        return mesh.face_colors[face_index]
+    return np.full((len(face_index), 3), GREY, dtype=np.float32)
+
+
+def _texture_colors(mesh: Mesh, face_index: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the colour of each face's tile; 1 where a face has no texture."""
+    uv = np.einsum("mk,mkc->mc", weights, mesh.uv[mesh.faces[face_index]])
+    texels = mesh.texture.reshape(-1, 3)
+    if mesh.tile_index is None:
+        height, width = mesh.texture.shape[:2]
+        return _looked_up(texels, uv, mesh.tiles[0] if mesh.tiles else Tile(0, width, height))
+    colors = np.ones((len(uv), 3), dtype=np.float32)
+    tiles = mesh.tile_index[face_index]
+    for number in np.unique(tiles[tiles >= 0]):
+        rows = tiles == number
+        colors[rows] = _looked_up(texels, uv[rows], mesh.tiles[number])
+    return colors
+
+
+def _looked_up(texels: np.ndarray, uv: np.ndarray, tile: Tile) -> np.ndarray:
+    """Return the colours of ``tile`` at uv (M, 2), v upwards."""
+    u, v = _wrapped(uv[:, 0], tile.wrap_u), _wrapped(1 - uv[:, 1], tile.wrap_v)
+    x, y = u * tile.width - 0.5, v * tile.height - 0.5
+    if tile.nearest:
+        x, y = np.floor(x + 0.5), np.floor(y + 0.5)
+    x0, y0 = np.floor(x), np.floor(y)
+    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
+    columns = [_neighbour(x0, i, tile.width, tile.wrap_u) for i in (0, 1)]
+    rows = [tile.start + _neighbour(y0, i, tile.height, tile.wrap_v) * tile.width for i in (0, 1)]
+    upper, lower = (
+        (1 - fx) * _texel(texels, row + columns[0]) + fx * _texel(texels, row + columns[1])
+        for row in rows
+    )
+    return (1 - fy) * upper + fy * lower
+
+
+def _texel(texels: np.ndarray, index: np.ndarray) -> Float[np.ndarray, "M 3"]:
+    values = texels[index].astype(np.float32)
+    return values / 255 if texels.dtype == np.uint8 else values
+
+
+def _wrapped(coordinate: np.ndarray, wrap: int) -> np.ndarray:
+    """Return the coordinate inside [0, 1] that shows the same texel."""
+    if wrap == CLAMP:
+        return coordinate.clip(0, 1)
+    if wrap == MIRROR:
+        return 1 - np.abs(np.mod(coordinate, 2) - 1)
+    return np.mod(coordinate, 1)
+
+
+def _neighbour(first: np.ndarray, offset: int, size: int, wrap: int) -> np.ndarray:
+    """Return the column or row ``offset`` after ``first``, which is in [-1, size - 1].
+
+    Beyond an edge lies the other edge where the texture repeats, else the edge itself.
+    """
+    index = first.astype(np.int64) + offset
+    return index % size if wrap == REPEAT else index.clip(0, size - 1)
+
+
+# Surface
+# --------------------------------------------------------------------------------------------------
+
+
+def sample_surface(
+    mesh: Mesh, count: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Draw ``count`` places uniformly over the surface: points (count, 3), face_index (count,) and
+    barycentric (count, 3).
+
+    Faces without area get none, and where faces repeat each other only the first does: their
+    surface is there once.
+    """
+    areas = face_areas(mesh) * ~repeated_faces(mesh)
+    face_index = generator.choice(len(areas), size=count, p=areas / areas.sum())
+    # Osada et al. 2002, "Shape Distributions", eq. 1: uniform in a triangle.
+    root, along = np.sqrt(generator.random(count)), generator.random(count)
+    barycentric = np.stack([1 - root, root * (1 - along), root * along], axis=1)
+    points = np.einsum("mk,mkc->mc", barycentric, mesh.vertices[mesh.faces[face_index]])
+    return points, face_index, barycentric
+
+
+class SurfaceDistance:
+    """Distances from a surface, by the nearest of ``samples`` points on it.
+
+    Too large by about the spacing of the samples, sqrt(area / samples): some 0.5 % of the box.
+    """
+
+    def __init__(self, mesh: Mesh, *, samples: int = 200_000) -> None:
+        from scipy.spatial import cKDTree
+
+        self._tree = cKDTree(sample_surface(mesh, samples, np.random.default_rng(0))[0])
+
+    def __call__(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
+        """Return the distance of each point, world units."""
+        return self._tree.query(points)[0]
+
+
+def face_areas(mesh: Mesh) -> Float[np.ndarray, " F"]:
+    """Return the area of each face, world units squared."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def repeated_faces(mesh: Mesh) -> Bool[np.ndarray, " F"]:
+    """Mark each face with the corners of an earlier one, whichever way round and even if the
+    vertices are other copies.
+    """
+    _, place, _ = distinct(mesh.vertices)
+    corners = np.sort(place[mesh.faces], axis=1)
+    order = np.lexsort(corners.T)
+    repeated = np.zeros(len(corners), bool)
+    repeated[order[1:]] = (np.diff(corners[order], axis=0) == 0).all(axis=1)
+    return repeated

@@ -1,0 +1,48 @@
+"""Files that a mesh names beside itself: buffers of glTF, materials of OBJ, textures of both."""
+
+import logging
+import os
+import stat
+from pathlib import Path
+from typing import Optional
+
+from .budget import Budget, fail
+
+log = logging.getLogger(__name__)
+
+
+class SideFiles:
+    """Reads files whose names are relative to the mesh file."""
+
+    def __init__(self, path: Path, budget: Budget) -> None:
+        self.path, self.budget = path, budget
+
+    def read(self, name: str) -> Optional[bytes]:
+        """Return the content of the file ``name``; log a warning and return None if there is none.
+
+        The name may have the separators of Windows; a file of its last part beside the mesh is
+        taken where its folder is missing.
+
+        Raises:
+            UserError: not a regular file (a FIFO would block), or unreadable.
+        """
+        relative = name.strip().replace("\\", "/").lstrip("/")
+        for candidate in (relative, relative.rpartition("/")[2]):
+            try:
+                return self._content(self.path.parent / candidate)
+            except (FileNotFoundError, NotADirectoryError):
+                continue
+            except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+                fail(self.path, f"the file {name[:200]!r} that it names isn't readable: {error}")
+        log.warning("%s names the file %r, which does not exist", self.path, name[:200])
+        return None
+
+    def _content(self, path: Path) -> bytes:
+        # without O_NONBLOCK, opening a FIFO waits for somebody to write to it
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+        with open(descriptor, "rb") as file:
+            status = os.fstat(descriptor)
+            if not stat.S_ISREG(status.st_mode):
+                raise OSError(f"{str(path)!r} is not a regular file")
+            self.budget.add_file(status.st_size)
+            return file.read()

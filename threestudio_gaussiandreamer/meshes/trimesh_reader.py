@@ -1,0 +1,196 @@
+"""Parts of mesh files in the formats that trimesh reads: OBJ, PLY, STL, OFF, ..."""
+
+import io
+import logging
+from pathlib import Path
+from typing import Any, Optional
+
+import numpy as np
+
+from ..core.errors import UserError
+from .budget import Budget, fail
+from .check import check_mesh_file
+from .colors import linear_to_srgb, unit_rgb
+from .gltf import LARGEST_UV
+from .mesh import GREY, Mesh
+from .side_files import SideFiles
+from .textures import decode_image
+
+MAX_NON_FINITE = 0.05
+UNSET_COLOR = (102, 102, 102)
+"""What trimesh writes where a material names no colour; it would only darken the texture."""
+
+log = logging.getLogger(__name__)
+
+
+def read_with_trimesh(path: Path) -> list[Mesh]:
+    """Read the parts of a file where its scene places them; parts of points have no faces.
+
+    Raises:
+        UserError: damaged, too large for its budget, or it names what is no regular file.
+    """
+    try:
+        check_mesh_file(path)
+        return [_require_fitting(part, path) for part in _parts(path, Budget(path))]
+    except UserError:
+        raise
+    except Exception as error:  # each of trimesh's readers fails in its own way
+        fail(path, f"{type(error).__name__}: {error}")
+
+
+def _parts(path: Path, budget: Budget) -> list[Mesh]:
+    import trimesh
+
+    files = _Resolver(path, budget)
+    scene = trimesh.load_scene(
+        io.BytesIO(path.read_bytes()),
+        file_type=path.suffix.lower().lstrip("."),
+        resolver=files,
+        process=False,
+    )
+    if files.refused:
+        raise files.refused
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        world, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        if len(getattr(geometry, "vertices", ())):
+            part = _colored(_surface(geometry, path, budget), geometry, files)
+            parts.append(part._replace(vertices=_placed(part.vertices, world)))
+    return parts
+
+
+class _Resolver:
+    """Gives trimesh the files that a mesh names.
+
+    trimesh swallows what is raised here, so the first refusal is kept.
+    """
+
+    def __init__(self, path: Path, budget: Budget) -> None:
+        self.budget, self.file_name = budget, path.name
+        self.refused: Optional[UserError] = None
+        self._files = SideFiles(path, budget)
+        self._pictures: dict[int, tuple[Any, np.ndarray]] = {}
+
+    def get(self, name: str) -> bytes:
+        try:
+            content = self._files.read(name)
+        except UserError as error:
+            self.refused = self.refused or error
+            raise
+        if content is None:
+            raise FileNotFoundError(name)
+        return content
+
+    __getitem__ = get
+
+    def picture(self, image: Any) -> np.ndarray:
+        """Return the picture of an image that trimesh has opened, decoded once."""
+        if id(image) not in self._pictures:  # the image is kept, so that its id stays its own
+            name = str(image.info.get("file_path", ""))[:80]
+            self._pictures[id(image)] = image, decode_image(image, repr(name), self.budget)
+        return self._pictures[id(image)][1]
+
+
+def _placed(vertices: np.ndarray, world: np.ndarray) -> np.ndarray:
+    if np.array_equal(world, np.eye(4)):
+        return vertices
+    return vertices @ world[:3, :3].T + world[:3, 3]
+
+
+def _surface(geometry: Any, path: Path, budget: Budget) -> Mesh:
+    """Return vertices and faces of a geometry of trimesh."""
+    vertices = np.array(geometry.vertices, dtype=np.float64)
+    faces = np.asarray(getattr(geometry, "faces", np.zeros((0, 3))), dtype=np.int64)
+    budget.spend_geometry(len(vertices), len(faces))
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.shape[1:] != (3,):
+        fail(
+            path,
+            f"it is damaged: vertices {vertices.shape} and faces {faces.shape} aren't of three "
+            "numbers",
+        )
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+        fail(path, f"it is damaged: a face names vertex {faces.max()} of {len(vertices)}")
+    return Mesh(vertices=vertices, faces=faces)
+
+
+def _colored(part: Mesh, geometry: Any, files: _Resolver) -> Mesh:
+    """Return the part with its colours, of whichever kind."""
+    visual = geometry.visual
+    if not len(part.faces):
+        colors = getattr(geometry, "colors", None)
+        usual = colors is not None and len(colors) == len(part.vertices)
+        return part._replace(vertex_colors=unit_rgb(colors)) if usual else part
+    if visual.kind == "texture":
+        return _with_material(part, visual, files)
+    if visual.kind == "vertex":
+        return part._replace(vertex_colors=_vertex_colors(geometry, files.budget.path))
+    if visual.kind == "face":
+        return part._replace(face_colors=unit_rgb(visual.face_colors))
+    return part
+
+
+def _vertex_colors(geometry: Any, path: Path) -> np.ndarray:
+    """Return the vertices' colours, grey where a PLY's own aren't finite: trimesh makes those black
+    without a word.
+    """
+    colors = unit_rgb(geometry.visual.vertex_colors)
+    stored = geometry.metadata.get("_ply_raw", {}).get("vertex", {"properties": ()})
+    names = [name for name in ("red", "green", "blue") if name in stored["properties"]]
+    finite = np.all(
+        [np.isfinite(stored["data"][name]).reshape(-1) for name in names], axis=0
+    ) | np.zeros(len(colors), bool)
+    if (bad := int((~finite).sum())) > MAX_NON_FINITE * len(finite):
+        raise UserError(
+            f"{bad} of {len(finite)} colours of {str(path)!r} aren't finite (at most 5 % may "
+            "be): export the mesh again"
+        )
+    if bad:
+        log.warning(
+            "%d of %d colours of %s aren't finite: they become grey", bad, len(finite), path
+        )
+    return np.where(finite[:, None], colors, np.float32(GREY))
+
+
+def _with_material(part: Mesh, visual: Any, files: _Resolver) -> Mesh:
+    """Return the part with its texture tinted by the material's colour, else with that colour."""
+    texture, tint = _texture(visual.material, files), _tint(visual.material)
+    if tint is not None:
+        part = part._replace(vertex_colors=np.broadcast_to(tint, part.vertices.shape))
+    if texture is None or visual.uv is None:
+        return part
+    uv = np.nan_to_num(np.asarray(visual.uv, dtype=np.float32)[:, :2])
+    return part._replace(uv=uv.clip(-LARGEST_UV, LARGEST_UV), texture=texture)
+
+
+def _texture(material: Any, files: _Resolver) -> Optional[np.ndarray]:
+    """Return the picture of a material's colours; None where it has none.
+
+    Where an OBJ has coordinates without a material, trimesh makes up a grey image, which has no
+    file format.
+    """
+    image = getattr(material, "image", getattr(material, "baseColorTexture", None))
+    return None if getattr(image, "format", None) is None else files.picture(image)
+
+
+def _tint(material: Any) -> Optional[np.ndarray]:
+    """Return the material's colour (3,) in [0, 1] as a display value; None where it has none."""
+    linear = hasattr(material, "baseColorFactor")
+    tint = getattr(material, "baseColorFactor" if linear else "diffuse", None)
+    if tint is None or tuple(np.asarray(tint)[:3]) == UNSET_COLOR:
+        return None
+    tint = unit_rgb(np.asarray(tint)[None])[0]
+    return linear_to_srgb(tint) if linear else tint
+
+
+def _require_fitting(part: Mesh, path: Path) -> Mesh:
+    """Return the part itself if what colours it has a row for each vertex or face."""
+    count = {
+        "uv": (len(part.vertices), 2),
+        "vertex_colors": (len(part.vertices), 3),
+        "face_colors": (len(part.faces), 3),
+    }
+    for name, shape in count.items():
+        if (values := getattr(part, name)) is not None and values.shape != shape:
+            fail(path, f"it is damaged: its {name} are {values.shape}, {shape} was expected")
+    return part
