@@ -259,6 +259,13 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         sizes = dict(zip(("height", "width", "batch_size"), cameras.sizes[0], strict=True))
         return {"c2w": cameras.pool.c2w, "fovy": cameras.pool.fovy, **sizes}
 
+    def views_to_prefetch(self, steps: float) -> Optional[dict[str, Any]]:
+        """Return :meth:`pool_views` if ``steps`` more steps will draw about as many views."""
+        views = self.pool_views()
+        if views is None or steps * views["batch_size"] < len(views["c2w"]):
+            return None
+        return views
+
     def val_dataloader(self) -> DataLoader:
         return DataLoader(
             self.val_dataset,

@@ -58,6 +58,13 @@ class DensityOutcome(NamedTuple):
     measured: dict[str, float]
     """dB that a round of ``budget: auto`` cost, by their name in the logs; empty for any other."""
 
+    def __str__(self) -> str:
+        costs = (f"{name.partition('/')[2]} {dB:.3g}" for name, dB in self.measured.items())
+        return (
+            f"{self.before} -> {self.after} Gaussians; dB on the views of this step: "
+            f"{', '.join(costs)}"
+        )
+
 
 class DensityControl:
     """Densification and pruning of one cloud.

@@ -249,7 +249,7 @@ class GaussianCloud(BaseGeometry):
             self.set_arrays(sh=torch.cat([merged.pop("sh0"), merged.pop("sh_rest")], 1), **merged)
 
     def start_from(self, cloud: PointCloud) -> None:
-        """Start with one Gaussian on each point, see :func:`.initialization.gaussians_on_points`."""
+        """Start with one Gaussian on each point, see ``gaussians_on_points``."""
         self.set_arrays(**gaussians_on_points(cloud, self.cfg)._asdict())
 
     def set_arrays(self, *, sh: Any, **arrays: Any) -> None:

@@ -3,12 +3,13 @@ alpha; ``system.loss.lambda_<name>`` is the weight of each, a number or a schedu
 """
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Optional
 
 from jaxtyping import Float
 from torch import Tensor
 
 from ..core.errors import UserError, unknown
+from ..guidance.base import ScoreDistillation
 
 REGULARISERS = ("sparsity", "opaque")
 
@@ -34,6 +35,18 @@ def loggable(guided: Mapping[str, Any]) -> dict[str, Any]:
 
 def _is_one_number(value: Any) -> bool:
     return isinstance(value, (int, float)) or isinstance(value, Tensor) and value.numel() == 1
+
+
+def logged_names(guidance: type, options: Iterable[str]) -> Optional[set[str]]:
+    """Name what a run logs with the weights ``options``; None for a class of guidance that doesn't
+    say what it returns.
+    """
+    if not issubclass(guidance, ScoreDistillation):
+        return None
+    losses = [name.replace("lambda_", "loss_", 1) for name in options]
+    guided = [*losses, "grad_norm", "min_step", "max_step", "bad_items", *guidance.REPORTS]
+    known = {"loss", "gaussians", *(f"train/{name}" for name in guided)}
+    return known | {"dB"} if guidance.KNOWS_TRUTH else known
 
 
 def check_losses(guidance: type, options: Iterable[str]) -> None:

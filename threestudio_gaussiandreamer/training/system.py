@@ -31,20 +31,13 @@ from pathlib import Path
 from typing import Any, Optional
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from ..core.distributed import average_gradients
 from ..core.errors import UserError
 from ..core.nested import adopt_nested
 from ..core.options import check_options
-from ..exporters.base import read_gaussians
-from ..formats.gaussian_files import StoredCloud, write_cloud
-from ..formats.ply import write_points
-from ..gaussians.point_cloud import PointCloud
 from ..gaussians.stored_state import SHAPES, require_cloud
-from ..gaussians.surface import Surface, write_obj
-from ..gaussians.views import EPS2D
 from ..guidance.base import ScoreDistillation
 from ..guidance.foreign import (
     call_guidance,
@@ -57,24 +50,25 @@ from ..guidance.known_truth import truth_of
 from ..host import BaseLift3DSystem, find, info, register, validate_schedule, warn
 from ..metrics import psnr
 from ..priors.cache import cached_cloud
-from ..prune import PruneOptions, prune_to_budget, write_report
+from ..prune import PruneOptions
 from .background import FlatBackground
-from .data import GaussianDreamerDataModule
-from .density import DensityControl, DensityOutcome, RenderedQuality
+from .density import DensityControl, RenderedQuality
 from .events import log_picture, log_scores
+from .export import GaussianSavers, export, export_pruned, exported_files
 from .finite import CHECK_EVERY, optimizer_tensors, require_finite
 from .held_out import EvaluationConfig, HeldOut, Measurements
-from .losses import check_losses, loggable, weighted_losses
+from .loss_scale import LossScale
+from .losses import check_losses, loggable, logged_names, weighted_losses
 from .optimizer import check_optimizer, make_optimizer
 from .pictures import render_panels, rgb_panel, score_panels
-from .renderer import SplattingRenderer
+from .truth import prefetch_truth, true_views
 
 GUIDANCE_LR = 1e-4
 """Of what a guidance trains itself, such as the LoRA of variational score distillation."""
 
 
 @register("gaussiandreamer-system")
-class GaussianDreamerSystem(BaseLift3DSystem):
+class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     @dataclass
     class Config(BaseLift3DSystem.Config):
         exporter_type: str = "gaussiandreamer-exporter"
@@ -103,16 +97,10 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     @staticmethod
     def logged(cfg: Any) -> Optional[set[str]]:
-        """The names that a run of this configuration logs; None where its guidance doesn't say
-        before it runs.
+        """Name what a run of this configuration logs, for ``checkpoint.monitor``; None where its
+        guidance doesn't say before it runs.
         """
-        guidance = find(cfg.guidance_type)
-        if not issubclass(guidance, ScoreDistillation):
-            return None
-        losses = [name.replace("lambda_", "loss_", 1) for name in cfg.loss]
-        guided = [*losses, "grad_norm", "min_step", "max_step", "bad_items", *guidance.REPORTS]
-        known = {"loss", "gaussians", *(f"train/{name}" for name in guided)}
-        return known | {"dB"} if guidance.KNOWS_TRUTH else known
+        return logged_names(find(cfg.guidance_type), cfg.loss)
 
     @staticmethod
     def check_checkpoint(checkpoint: dict[str, Any], what: str) -> None:
@@ -141,7 +129,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         self.density = DensityControl(self.geometry)
         self.automatic_optimization = False
         self.__dict__["guidance"] = self.measurements = self.prompt_utils = None
-        self.skipped_steps = 0
+        self.loss_scale = LossScale()
         self._learnt: Optional[dict[str, Tensor]] = None
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -156,9 +144,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         return make_optimizer(self.cfg.optimizer, groups)
 
     def preflight(self) -> None:
-        """What prior and guidance need is looked for before models are loaded: what is missing
-        shows in seconds.
-        """
+        """Check that prior and guidance can have what they need, before models are loaded."""
         prior = None if len(self.geometry) else self.geometry.prior()
         if hasattr(prior, "preflight"):
             prior.preflight()
@@ -167,11 +153,12 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             guidance.preflight(self.cfg.guidance)
 
     def prepare_guidance(self) -> None:
-        """Before the prior runs, since its weights may be missing too."""
+        """Build prompt processor and guidance; before the prior runs, since weights may be missing
+        here too.
+        """
         self.prompt_processor = find(self.cfg.prompt_processor_type)(self.cfg.prompt_processor)
         self.prompt_utils = self.prompt_processor()
-        # past nn.Module's registration: a guidance's frozen weights belong neither into the
-        # checkpoint nor among the system's modules
+        # not registered as a submodule, so that its frozen weights stay out of the checkpoint
         self.__dict__["guidance"] = find(self.cfg.guidance_type)(self.cfg.guidance)
         if self._learnt is not None:
             restore_learnt(self.guidance, self._learnt)
@@ -221,24 +208,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             self.score("prior")
         if self.measurements:
             self.measurements.start_clock()
-        self.prefetch_truth()
-
-    def prefetch_truth(self) -> None:
-        """Render the truth from all cameras of a fixed pool at once, if this run will come to most
-        of them.
-        """
-        truth, data = truth_of(self.guidance), self.trainer.datamodule
-        if truth is None or not isinstance(data, GaussianDreamerDataModule):
-            return
-        views, steps = data.pool_views(), self.trainer.max_steps
-        if views is None:
-            return
-        drawn = (steps - self.global_step) * views["batch_size"]
-        if steps < 0 or drawn >= len(views["c2w"]):
-            ours = isinstance(self.renderer, SplattingRenderer)
-            downsample = self.renderer.cfg.downsample if ours else 1
-            size = views["height"] // downsample, views["width"] // downsample
-            truth.prefetch(views["c2w"].to(self.device), views["fovy"].to(self.device), *size)
+        prefetch_truth(self)
 
     # -- one step ----------------------------------------------------------------------------------
 
@@ -256,38 +226,28 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         average_gradients(
             parameter for group in optimizer.param_groups for parameter in group["params"]
         )
-        loss_scale = self.loss_scale()
+        loss_scale = self.loss_scale.value(self.trainer)
         self.density.after_backward(out["rasterized"], batch["width"], batch["height"], loss_scale)
         optimizer.step()
         self.geometry.clamp_colors()
-        if self.loss_scale() < loss_scale:
-            self.count_skipped_step(loss_scale)
+        if self.loss_scale.has_skipped(self.trainer, loss_scale):
+            self.log("train/skipped_steps", float(self.loss_scale.skipped_steps))
         if self.global_step % CHECK_EVERY == 0:
             self.require_finite()
         optimizer.zero_grad(set_to_none=True)
-        # self.optimizers() wraps the torch optimiser, whose rows have to follow the Gaussians
-        outcome = self.density.after_step(
-            optimizer.optimizer,
-            self.global_step,
-            RenderedQuality(
-                self.density, lambda: self(batch), lambda pictures: self.truth(batch, pictures)
-            ),
-        )
-        self.log_density(outcome)
+        self.control_density(optimizer, batch)
         self.report(out, batch, losses, loss)
 
-    def log_density(self, outcome: DensityOutcome) -> None:
-        """Log and print what a round of ``budget: auto`` cost."""
-        if not outcome.measured:
-            return
-        self.log_dict(outcome.measured)
-        costs = ", ".join(
-            f"{name.partition('/')[2]} {value:.3g}" for name, value in outcome.measured.items()
+    def control_density(self, optimizer: torch.optim.Optimizer, batch: dict[str, Any]) -> None:
+        """Densify and prune where it is due; log what a round of ``budget: auto`` cost."""
+        check = RenderedQuality(
+            self.density, lambda: self(batch), lambda out: true_views(self.guidance, batch, out)
         )
-        info(
-            f"step {self.global_step}: {outcome.before} -> {outcome.after} Gaussians; dB on the "
-            f"views of this step: {costs}"
-        )
+        # self.optimizers() wraps the torch optimiser, whose rows have to follow the Gaussians
+        outcome = self.density.after_step(optimizer.optimizer, self.global_step, check)
+        if outcome.measured:
+            self.log_dict(outcome.measured)
+            info(f"step {self.global_step}: {outcome}")
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
         own_background = isinstance(self.background, FlatBackground)
@@ -295,9 +255,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             part.set_learning_rates(optimizer, self.true_current_epoch, self.true_global_step)
 
     def losses(self, out: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
-        """The weighted losses: every ``loss_*`` that the guidance returns, and our regularisers on
-        the real alpha.
-        """
+        """Weigh every ``loss_*`` that the guidance returns, and the regularisers of alpha."""
         guided = self.guide(out, batch)
         if self._log_now():
             numbers = loggable(guided).items()
@@ -308,9 +266,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         return weighted_losses(guided, out["opacity"], weights)
 
     def guide(self, out: dict[str, Any], batch: dict[str, Any], **options: Any) -> dict[str, Any]:
-        """What the guidance makes of these renders; it gets the whole batch, and the background
-        that they lie on.
-        """
+        """Call the guidance with these renders, the whole batch and the renders' background."""
         with own_randomness(self.true_global_step):
             return call_guidance(
                 self.guidance,
@@ -321,49 +277,21 @@ class GaussianDreamerSystem(BaseLift3DSystem):
                 **options,
             )
 
-    def loss_scale(self) -> float:
-        """The factor that automatic mixed precision leaves on every gradient that isn't a
-        parameter's.
-        """
-        scaler = getattr(self.trainer.precision_plugin, "scaler", None)
-        return 1.0 if scaler is None else float(scaler.get_scale())
-
-    def count_skipped_step(self, loss_scale: float) -> None:
-        """Mixed precision halves its scale where it found infinite gradients and left the
-        optimiser's step out.
-        """
-        self.skipped_steps += 1
-        self.log("train/skipped_steps", float(self.skipped_steps))
-        warn(
-            f"step {self.global_step}: gradients overflowed at the loss scale {loss_scale:g}, "
-            "so nothing was learnt in it;"
-            f" schedules go on ({self.skipped_steps} such steps so far)"
-        )
-
     def report(
         self, out: dict[str, Any], batch: dict[str, Any], losses: dict[str, Tensor], loss: Tensor
     ) -> None:
-        """Loss, count and, where it is known, dB: to the progress bar and the loggers, every
+        """Log loss, number of Gaussians and, where the truth is known, dB, every
         ``log_every_n_steps``.
         """
         if not self._log_now():
             return
         self.log_dict({f"train/loss_{name}": value.detach() for name, value in losses.items()})
         shown = {"loss": loss.detach(), "gaussians": float(len(self.geometry))}
-        truth = self.truth(batch, out)
+        truth = true_views(self.guidance, batch, out)
         if truth is not None:
             shown["dB"] = psnr(out["comp_rgb"].detach(), truth).mean()
         self.log_dict(shown, prog_bar=True)
         self.geometry.warn_of_clamped_sizes()
-
-    def truth(
-        self, batch: dict[str, Any], out: dict[str, Any]
-    ) -> Optional[Float[Tensor, "B H W 3"]]:
-        """Return what these views should show, where the guidance knows it."""
-        truth = truth_of(self.guidance)
-        if truth is None:
-            return None
-        return truth.render(batch, out["comp_rgb_bg"].detach(), size=out["comp_rgb"].shape[1:3])
 
     def _log_now(self) -> bool:
         every = self.trainer.log_every_n_steps
@@ -397,13 +325,8 @@ class GaussianDreamerSystem(BaseLift3DSystem):
         self.score("result")
 
     def summary(self) -> str:
-        """Where the pictures, the video and the clouds are, and what was measured; printed when a
-        run has ended.
-        """
-        folder = Path(self._save_dir or ".")
-        patterns = "held_out/compare.png", "it*-test.mp4", "it*-export/*.*", "it*-export/pruned/*.*"
-        found = [path for pattern in patterns for path in sorted(folder.glob(pattern))]
-        lines = [str(path) for path in found]
+        """List the results and what was measured; printed when a run has ended."""
+        lines = exported_files(Path(self._save_dir or "."))
         return "\n".join([*lines, *(["", self.measurements.table()] if self.measurements else [])])
 
     # -- looking -----------------------------------------------------------------------------------
@@ -413,12 +336,12 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             self.show(batch)
 
     def show(self, batch: dict[str, Any]) -> None:
-        """Write a row of pictures: the render, its depth and normals, the truth where it is known,
-        what the score model sees.
+        """Save a row of pictures: the render, its depth and normals, the truth where it is known,
+        and what the score model sees.
         """
         out = self(batch)
         images = render_panels(out)
-        truth = self.truth(batch, out) if self.guidance is not None else None
+        truth = true_views(self.guidance, batch, out)
         if truth is not None:
             images.append(rgb_panel(truth[0]))
         if isinstance(self.guidance, ScoreDistillation):
@@ -454,48 +377,7 @@ class GaussianDreamerSystem(BaseLift3DSystem):
             step=self.true_global_step,
         )
         if self.guidance is not None:
-            self.export()
-
-    def export(self) -> None:
-        """Write what the exporter makes, as ``--export`` does; a training run ends with it."""
-        self.export_cloud(self.geometry, f"it{self.true_global_step}-export")
-        self.export_pruned()
-
-    def export_cloud(self, geometry: Any, folder: str, pruned_to: Optional[float] = None) -> None:
-        """Write what the exporter makes of a geometry; files of Gaussians note the dB that it has
-        been pruned to.
-        """
-        parts = {"geometry": geometry, "material": self.material, "background": self.background}
-        exporter = find(self.cfg.exporter_type)(self.cfg.exporter, **parts)
-        for out in exporter():
-            noted = {"pruned_to": pruned_to} if out.save_type in ("ply", "spz") else {}
-            getattr(self, f"save_{out.save_type}")(
-                f"{folder}/{out.save_name}", **noted, **out.params
-            )
-
-    def export_pruned(self) -> None:
-        """The same files of the cloud pruned to ``system.prune``, in the folder ``pruned`` beside
-        them, with prune's report.
-        """
-        options = PruneOptions(**dict(self.cfg.prune))
-        if not options.asked_for:
-            return
-        drawn = self.renderer.cfg  # that of another extension has no such options
-        if options.eps2d is None:  # which counts pixels before they are shrunk
-            options.eps2d = getattr(drawn, "eps2d", EPS2D) / getattr(drawn, "downsample", 1) ** 2
-        if options.antialias is None:
-            options.antialias = bool(getattr(drawn, "antialias", False))
-        folder = f"it{self.true_global_step}-export/pruned"
-        packed = self.cfg.exporter_type == "spz-exporter" or "spz" in self.cfg.exporter.get(
-            "formats", ()
-        )
-        suffix = ".spz" if packed else ".ply"
-        stored = StoredCloud(read_gaussians(self.geometry))
-        result = prune_to_budget(stored, options, suffix, "system.prune.")
-        geometry = find(self.cfg.geometry_type)(self.cfg.geometry)
-        geometry.set_arrays(**result.after.gaussians._asdict())
-        self.export_cloud(geometry, folder, result.after.pruned_to)
-        write_report(self.get_save_path(f"{folder}/report"), result, suffix, options)
+            export(self)
 
     def on_validation_start(self) -> None:
         self.ensure_cloud()
@@ -512,30 +394,4 @@ class GaussianDreamerSystem(BaseLift3DSystem):
 
     def on_predict_epoch_end(self) -> None:
         super().on_predict_epoch_end()
-        self.export_pruned()
-
-    # -- savers that the exporters name ------------------------------------------------------------
-
-    def save_ply(
-        self, filename: str, stored: StoredCloud, pruned_to: Optional[float] = None
-    ) -> str:
-        path = self.get_save_path(filename)
-        write_cloud(path, stored._replace(pruned_to=pruned_to), ".ply")
-        return path
-
-    def save_spz(
-        self, filename: str, stored: StoredCloud, pruned_to: Optional[float] = None
-    ) -> str:
-        path = self.get_save_path(filename)
-        write_cloud(path, stored._replace(pruned_to=pruned_to), ".spz")
-        return path
-
-    def save_points(self, filename: str, cloud: PointCloud) -> str:
-        path = self.get_save_path(filename)
-        write_points(path, cloud)
-        return path
-
-    def save_surface(self, filename: str, surface: Surface) -> str:
-        path = self.get_save_path(filename)
-        write_obj(path, surface)
-        return path
+        export_pruned(self)

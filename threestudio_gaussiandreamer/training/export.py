@@ -1,0 +1,117 @@
+"""Exports of a run: the files of ``exporter_type`` of the cloud as it is, and of the cloud pruned
+to ``system.prune``.
+"""
+
+from pathlib import Path
+from typing import Any, Optional
+
+from ..exporters.base import read_gaussians
+from ..formats.gaussian_files import StoredCloud, write_cloud
+from ..formats.ply import write_points
+from ..gaussians.point_cloud import PointCloud
+from ..gaussians.surface import Surface, write_obj
+from ..gaussians.views import EPS2D
+from ..host import find
+from ..prune import PruneOptions, prune_to_budget, write_report
+from .renderer import SplattingRenderer
+
+SUMMARY = ("held_out/compare.png", "it*-test.mp4", "it*-export/*.*", "it*-export/pruned/*.*")
+"""Files below the folder of results that the last message of a run names."""
+
+
+class GaussianSavers:
+    """The ``save_<save_type>`` that our exporters name, for a system of the host; each writes
+    below the system's folder and returns the path.
+    """
+
+    def save_ply(
+        self, filename: str, stored: StoredCloud, pruned_to: Optional[float] = None
+    ) -> str:
+        path = self.get_save_path(filename)
+        write_cloud(path, stored._replace(pruned_to=pruned_to), ".ply")
+        return path
+
+    def save_spz(
+        self, filename: str, stored: StoredCloud, pruned_to: Optional[float] = None
+    ) -> str:
+        path = self.get_save_path(filename)
+        write_cloud(path, stored._replace(pruned_to=pruned_to), ".spz")
+        return path
+
+    def save_points(self, filename: str, cloud: PointCloud) -> str:
+        path = self.get_save_path(filename)
+        write_points(path, cloud)
+        return path
+
+    def save_surface(self, filename: str, surface: Surface) -> str:
+        path = self.get_save_path(filename)
+        write_obj(path, surface)
+        return path
+
+
+def export(system: Any) -> None:
+    """Write what ``--export`` writes but for the video; a training run ends with it."""
+    export_cloud(system, system.geometry, export_folder(system))
+    export_pruned(system)
+
+
+def export_folder(system: Any) -> str:
+    """Name the folder of this step's exports, below the folder of results."""
+    return f"it{system.true_global_step}-export"
+
+
+def export_cloud(
+    system: Any, geometry: Any, folder: str, pruned_to: Optional[float] = None
+) -> None:
+    """Write what the exporter of ``system`` makes of a geometry.
+
+    Args:
+        folder: below the system's folder of results.
+        pruned_to: PSNR in dB, noted in files of Gaussians.
+    """
+    parts = {"geometry": geometry, "material": system.material, "background": system.background}
+    exporter = find(system.cfg.exporter_type)(system.cfg.exporter, **parts)
+    for out in exporter():
+        noted = {"pruned_to": pruned_to} if out.save_type in ("ply", "spz") else {}
+        save = getattr(system, f"save_{out.save_type}")
+        save(f"{folder}/{out.save_name}", **noted, **out.params)
+
+
+def export_pruned(system: Any) -> None:
+    """Write the same files of the cloud pruned to ``system.prune``, if it is given, into the
+    folder ``pruned`` beside them, with the prune command's report.
+    """
+    options = prune_options(system)
+    if not options.asked_for:
+        return
+    folder, suffix = f"{export_folder(system)}/pruned", _suffix(system.cfg)
+    result = prune_to_budget(
+        StoredCloud(read_gaussians(system.geometry)), options, suffix, "system.prune."
+    )
+    geometry = find(system.cfg.geometry_type)(system.cfg.geometry)
+    geometry.set_arrays(**result.after.gaussians._asdict())
+    export_cloud(system, geometry, folder, result.after.pruned_to)
+    write_report(system.get_save_path(f"{folder}/report"), result, suffix, options)
+
+
+def prune_options(system: Any) -> PruneOptions:
+    """Return ``system.prune``, with the dilation and antialiasing of our renderer unless given."""
+    options, renderer = PruneOptions(**dict(system.cfg.prune)), system.renderer
+    ours = renderer.cfg if isinstance(renderer, SplattingRenderer) else None
+    if options.eps2d is None:
+        # in square pixels of what is exported, which downsampling has made smaller
+        options.eps2d = ours.eps2d / ours.downsample**2 if ours else EPS2D
+    if options.antialias is None:
+        options.antialias = bool(ours and ours.antialias)
+    return options
+
+
+def _suffix(cfg: Any) -> str:
+    """Return the format that a budget in bytes holds for: SPZ where it is exported."""
+    spz = cfg.exporter_type == "spz-exporter" or "spz" in cfg.exporter.get("formats", ())
+    return ".spz" if spz else ".ply"
+
+
+def exported_files(folder: Path) -> list[str]:
+    """List the results below ``folder`` that a user wants to open."""
+    return [str(path) for pattern in SUMMARY for path in sorted(folder.glob(pattern))]
