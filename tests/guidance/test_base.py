@@ -16,8 +16,6 @@ from tests.helpers.tiny_guidance import (
     Recorder,
     gradient,
     guidance,
-    make_models,
-    make_prompts,
     relative,
     renders,
 )
@@ -27,16 +25,6 @@ from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
 from threestudio_gaussiandreamer.guidance.half_precision import GradientBorder, weights_type
 
 pytest.importorskip("diffusers")
-
-
-@pytest.fixture(scope="module")
-def models(tmp_path_factory):
-    return make_models(tmp_path_factory.mktemp("models"))
-
-
-@pytest.fixture(scope="module")
-def prompts(models):
-    return make_prompts(models)
 
 
 # Against float64 by hand

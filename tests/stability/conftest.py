@@ -14,6 +14,8 @@ import pytest
 
 from tests.stability.backends import cuda_on_the_host
 from tests.stability.rows import ROWS
+from tests.stability.run_failures_cases import EVERY_STEP
+from tests.stability.small_runs import Ended, launch
 
 REPORT = pytest.StashKey[list]()
 
@@ -168,3 +170,11 @@ def pytest_sessionfinish(session) -> None:
     path = session.config.getoption("--stability-report", default=None)
     if path:
         path.write_text(json.dumps(session.config.stash[REPORT], indent=1) + "\n")
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory) -> Ended:
+    """A run that nothing happens to."""
+    ended = launch(tmp_path_factory.mktemp("whole"), *EVERY_STEP)
+    assert ended.code == 0, ended.err
+    return ended

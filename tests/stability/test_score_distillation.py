@@ -2,10 +2,8 @@
 schedules, cameras, resuming.
 """
 
-import csv
 import math
 import random
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,23 +12,15 @@ from lightning.pytorch.plugins import MixedPrecision
 
 from tests.stability.rows import row
 from tests.stability.small_runs import Ended, TowardsGrey, differences, launch
-from threestudio_gaussiandreamer import cameras, register_parts
-from threestudio_gaussiandreamer.cameras import Orbit
+from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion import sds
-from threestudio_gaussiandreamer.host import C, find, register
+from threestudio_gaussiandreamer.host import C, register
 from threestudio_gaussiandreamer.launch import run
 from threestudio_gaussiandreamer.launch.config_check import check_part
-from threestudio_gaussiandreamer.meshes.load import load_mesh
-from threestudio_gaussiandreamer.meshes.raycast import MeshCaster, over_background
-from threestudio_gaussiandreamer.metrics import psnr
-from threestudio_gaussiandreamer.splatting import rasterize
-from threestudio_gaussiandreamer.training.data import TrainCameras, make_batch
-from threestudio_gaussiandreamer.training.held_out import EvaluationConfig, HeldOut
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 register_parts()
-RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 
 
 # ---- scores that aren't finite -------------------------------------------------------------------
@@ -267,351 +257,11 @@ def test_the_gradient_at_the_first_and_last_timestep_is_finite(name, measured):
     )
 
 
-# ---- what guidance does to colours and faces -----------------------------------------------------
-
-# configs/demo.yaml's rates rise and fall over the whole run; a short one gets them in proportion
-RATES = {
-    "means": (4e-4, 2e-5),
-    "scales": (6e-2, 1e-3),
-    "quats": (6e-2, 2e-3),
-    "opacities": (1e-1, 5e-3),
-    "sh": (1e-1, 2e-3),
-}
-POINTS = ["system.geometry.prior.num_points=1500"]
-LATENT = [
-    "system.guidance.space=latent",
-    "system.guidance.latent_size=16",
-    "system.guidance.bank_views=100",
-]
-STRONG = [*LATENT, "system.guidance.guidance_scale=101.0"]
-BLIND = [
-    *LATENT,
-    "system.guidance.mode=view-agnostic",
-    "data.camera_distance_range=[2.5,2.5]",
-    "data.fovy_range=[50,50]",
-    # fmt: skip
-    "system.guidance.bank_distance_range=[2.5,2.5]",
-    "system.guidance.bank_fovy_range=[50,50]",
-]
-RANDOM_START = [
-    *POINTS,
-    "system.geometry.prior_type=random-prior",
-    "system.geometry.prior.shape=sphere",
-]
-
-
-def trained(folder, steps, size, *options) -> Ended:
-    """A run that is long enough to show where it goes: ``size`` pixels, timesteps up to 0.55 after
-    five twelfths of it.
-    """
-    middle = steps * 5 // 12
-    rates = [
-        f"system.geometry.lr_{name}=[0,{start},{end},{steps}]"
-        for name, (start, end) in RATES.items()
-    ]
-    sizes = [f"data.{side}={size}" for side in ("width", "height")] + [
-        "data.train_views=40",
-        f"trainer.max_steps={steps}",
-    ]
-    measured = [
-        "system.evaluation.size=48",
-        "system.evaluation.views=8",
-        "system.evaluation.supersample=2",
-        "trainer.log_every_n_steps=50",
-    ]
-    annealed = f"system.guidance.max_step_percent=[{middle},0.98,0.55,{middle + 1}]"
-    ended = launch(folder, *rates, *sizes, *measured, annealed, *options)
-    assert ended.code == 0, ended.err
-    return ended
-
-
-@pytest.mark.slow
-@row("A4", "Guidance 100: over-saturation")
-def test_annealing_helps_and_clipping_helps_more(tmp_path, measured):
-    """The exact score of the toy in a latent, at guidance 100 and, as what can be reached, at
-    none.
-    """
-    variants = {
-        "as it is": [*STRONG, "system.guidance.max_step_percent=0.98"],
-        "annealed": STRONG,
-        "annealed and clipped": [*STRONG, "system.guidance.grad_clip=[0,1.5,2.0,150]"],
-        "no guidance": LATENT,
-    }
-    results = {}
-    for name, options in variants.items():
-        options = ["data.batch_size=4", *POINTS, *options]
-        results[name] = trained(tmp_path / name.replace(" ", "-"), 150, 48, *options).metrics()[
-            "result"
-        ]
-        measured(
-            results[name]["psnr"],
-            "dB",
-            what=f"guidance 100 {name}" if name != "no guidance" else name,
-        )
-        measured(100 * results[name]["out_of_gamut"], "%", what=f"out of gamut {name}")
-    dB = [result["psnr"] for result in results.values()]
-    # 15.1, 16.6, 19.1 and 23.1 dB here
-    assert dB[0] + 0.5 < dB[1] and dB[1] + 1 < dB[2] and dB[2] + 1 < dB[3], dB
-    assert (
-        results["as it is"]["out_of_gamut"]
-        > results["annealed and clipped"]["out_of_gamut"]
-        > results["no guidance"]["out_of_gamut"]
-    )
-
-
-@pytest.mark.slow
-@row("A4", "Janus")
-def test_a_prior_keeps_the_faces_apart_and_a_random_start_does_not(tmp_path, measured):
-    """A score that knows no view, short runs; the meter is the package's own and in every run's
-    metrics.json.
-    """
-    starts = {"prior": POINTS, "random": RANDOM_START}
-    rates = {
-        name: 100
-        * trained(tmp_path / name, 100, 48, *BLIND, *start).metrics()["result"]["multi_face"]
-        for name, start in starts.items()
-    }
-    measured(rates["prior"], "% multi-face", what="prior", at_most=5)
-    measured(rates["random"], "% multi-face", what="random start", at_least=50)
-
-
-@row("A4", "Janus")
-def test_the_table_of_five_seeds(measured):
-    """Runs of 1200 steps at 128 pixels, by `python -m benchmarks.quality.ablations --table
-    faces`.
-    """
-    lines = [
-        line
-        for line in (RESULTS / "faces.csv").read_text().splitlines()
-        if not line.startswith("#")
-    ]
-    rows = {row["variant"]: row for row in csv.DictReader(lines)}
-    assert all(int(row["seeds"]) >= 5 for row in rows.values())
-    measured(
-        100 * float(rows["prior"]["multi_face"]),
-        "% multi-face",
-        what="prior, five seeds of 1200 steps",
-        at_most=5,
-    )
-    measured(
-        100 * float(rows["random start"]["multi_face"]),
-        "% multi-face",
-        what="random start, five seeds of 1200 steps",
-        at_least=50,
-    )
-
-
-@pytest.mark.slow
-@row("A4", "Colour drift, background shortcut")
-def test_the_cloud_is_the_same_thing_on_any_background(tmp_path, measured):
-    """What differs between backgrounds is the alpha error alone, mostly at the outline: with the
-    customary dilation of 0.3 square pixels instead of the demo's 0.1 the spread is 1.1 dB, and 2 to
-    3 dB where a run is trained on black alone, as the paper's code is.
-    """
-    ended = trained(
-        tmp_path, 300, 96, "system.geometry.prior.num_points=3000", "data.train_views=60"
-    )
-    state = ended.checkpoint()["state_dict"]
-    cloud = find("gaussiandreamer-cloud")({})
-    cloud.load_state_dict(
-        {
-            name.removeprefix("geometry."): value
-            for name, value in state.items()
-            if name.startswith("geometry.")
-        }
-    )
-    held_out = HeldOut(EvaluationConfig(views=8, size=96), MeshCaster(load_mesh("toy.glb")))
-    backgrounds = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "magenta": (1.0, 0.0, 1.0)}
-    images = {
-        name: drawn_on(cloud, held_out.orbit, torch.tensor(color))
-        for name, color in backgrounds.items()
-    }
-    alpha = 1 - (images["white"] - images["black"]).mean(-1)
-    measured((alpha - held_out.truth[..., 3]).abs().mean(), what="alpha error", at_most=0.02)
-    truths = {
-        name: over_background(held_out.truth, torch.tensor(color))
-        for name, color in backgrounds.items()
-    }
-    scores = [float(psnr(images[name].clamp(0, 1), truths[name])) for name in backgrounds]
-    assert min(scores) > 25
-    measured(max(scores) - min(scores), "dB", what="spread over three backgrounds", at_most=1.0)
-
-
-@torch.no_grad()
-def drawn_on(cloud, orbit, background):
-    c2w = orbit.c2w
-    viewmats, Ks = cameras.to_opencv(c2w, orbit.fovy, 96, 96)
-    gaussians = (
-        cloud.means,
-        cloud.quats,
-        cloud.scales(),
-        cloud.opacities(),
-        cloud.colors(c2w[:, :3, 3]),
-    )
-    return rasterize(
-        *gaussians, viewmats, Ks, 96, 96, background=background, eps2d=0.1
-    ).image  # as demo.yaml draws
-
-
-# ---- cameras -------------------------------------------------------------------------------------
-
-EXTREME = {
-    "above": (90.0, 0.0, 2.5, 50.0),
-    "below": (-90.0, 45.0, 2.5, 50.0),
-    "inside": (0.0, 0.0, 0.1, 50.0),
-    "fov 1": (0.0, 10.0, 2.5, 1.0),
-    "fov 170": (15.0, 200.0, 2.5, 170.0),
-}
-ORDINARY = (15.0, 30.0, 2.5, 50.0)
-
-
-def orbit(*views) -> Orbit:
-    elevation, azimuth, distance, fovy = torch.tensor(views).T
-    return Orbit(elevation, azimuth, distance, torch.deg2rad(fovy))
-
-
-def ball_cloud():
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(300, 3))
-    points *= 0.7 / np.linalg.norm(points, axis=1, keepdims=True)
-    cloud = find("gaussiandreamer-cloud")({"grow": {"enabled": False}})
-    cloud.start_from(
-        type(
-            "Points",
-            (),
-            {"points": points.astype(np.float32), "colors": rng.random((300, 3), np.float32)},
-        )
-    )
-    return cloud
-
-
-def pictures_and_gradients(cloud, c2w, fovy):
-    """The ordinary, first view's picture, and the cloud's gradients, of a loss on all views."""
-    viewmats, Ks = cameras.to_opencv(c2w, fovy, 48, 48)
-    cloud.zero_grad()
-    colors = cloud.colors(c2w[:, :3, 3])
-    gaussians = cloud.means, cloud.quats, cloud.scales(), cloud.opacities(), colors
-    image = rasterize(*gaussians, viewmats, Ks, 48, 48, background=torch.ones(3)).image
-    image.square().sum().backward()
-    assert image.isfinite().all()
-    return image[0].detach(), {
-        name: parameter.grad
-        for name, parameter in cloud.parameters_by_name().items()
-        if parameter.numel()
-    }
-
-
-@row("A4", "Extreme cameras in a batch")
-@pytest.mark.parametrize("name", EXTREME)
-def test_an_extreme_camera_leaves_the_others_pictures_alone(name, measured):
-    cloud, (view, odd) = ball_cloud(), (orbit(ORDINARY), orbit(ORDINARY, EXTREME[name]))
-    alone, _ = pictures_and_gradients(cloud, view.c2w, view.fovy)
-    beside, gradients = pictures_and_gradients(cloud, odd.c2w, odd.fovy)
-    assert all(grad.isfinite().all() for grad in gradients.values())
-    measured((alone != beside).sum(), "numbers", what="changed in the other view", at_most=0)
-
-
-@row("A4", "Extreme cameras in a batch")
-@pytest.mark.parametrize("what", ["NaN", "infinite", "zero", "in the centre it looks at"])
-def test_a_degenerate_camera_affects_only_its_own_item(what, measured):
-    """Beyond the row: a camera that is none. Neither its picture nor its gradient is anything but
-    the background's.
-    """
-    cloud, view = ball_cloud(), orbit(ORDINARY)
-    alone, expected = pictures_and_gradients(cloud, view.c2w, view.fovy)
-    at_center = cameras.look_at(
-        torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]])
-    )
-    bad = {
-        "NaN": torch.full((1, 4, 4), math.nan),
-        "infinite": torch.full((1, 4, 4), math.inf),
-        "zero": torch.zeros(1, 4, 4),
-    }
-    c2w = torch.cat([view.c2w, bad.get(what, at_center)])
-    beside, gradients = pictures_and_gradients(cloud, c2w, view.fovy.repeat(2))
-    batch = make_batch(
-        orbit(ORDINARY, ORDINARY), c2w, c2w[:, :3, 3], 48, 48
-    )  # the inverse of one camera spoils no other
-    assert batch["mvp_mtx"][0].equal(
-        make_batch(view, view.c2w, view.c2w[:, :3, 3], 48, 48)["mvp_mtx"][0]
-    )
-    assert torch.linalg.det(at_center[0]).sub(1).abs() < 1e-6
-    changed = (alone != beside).sum()
-    if what in bad:
-        changed += sum((gradients[name] != expected[name]).sum() for name in gradients)
-    measured(changed, "numbers", what="changed by a degenerate one", at_most=0)
-
-
-def with_cameras(monkeypatch, change) -> None:
-    """Lets ``change(step, batch)`` return other cameras for each training batch, an :class:`Orbit`
-    or c2w matrices.
-    """
-    collate = TrainCameras.collate
-
-    def changed(self, step):
-        batch = collate(self, step)
-        odd = change(step, batch)
-        view = (
-            odd
-            if isinstance(odd, Orbit)
-            else Orbit(*(batch[n] for n in ("elevation", "azimuth", "camera_distances", "fovy")))
-        )
-        c2w = odd.c2w if isinstance(odd, Orbit) else odd
-        return make_batch(view, c2w, batch["light_positions"], batch["height"], batch["width"])
-
-    monkeypatch.setattr(TrainCameras, "collate", changed)
-
-
-@row("A4", "Extreme cameras in a batch")
-def test_training_with_extreme_cameras_logs_each_items_gradient(tmp_path, monkeypatch, measured):
-    """The whole step, ray-cast truth included, in one batch of an ordinary camera and all the
-    extreme ones.
-    """
-    views = [ORDINARY, *EXTREME.values()]
-    options = ["trainer.max_steps=3", f"data.batch_size={len(views)}"]
-    ordinary = []
-    for name, batch in (("ordinary", [ORDINARY] * len(views)), ("extreme", views)):
-        with monkeypatch.context() as patch:
-            with_cameras(patch, lambda step, _, batch=batch: orbit(*batch))
-            ended = launch(tmp_path / name, *options)
-        assert ended.code == 0, ended.err
-        ordinary.append(ended.logged("train/grad_norm_0")[0])
-    assert all(value.isfinite().all() for value in ended.checkpoint()["state_dict"].values())
-    norms = [ended.logged(f"train/grad_norm_{i}") for i in range(len(views))]
-    assert all(len(norm) == 3 and np.isfinite(norm).all() for norm in norms)
-    measured(
-        abs(ordinary[0] - ordinary[1]),
-        what="change of the ordinary item's gradient norm",
-        at_most=0,
-    )
-
-
-@row("A4", "Empty view in a batch")
-@pytest.mark.parametrize("empty", [(1,), (0, 1)], ids=["one", "all"])
-def test_a_camera_that_looks_away(empty, tmp_path, monkeypatch, measured):
-    def turned_around(step, batch):
-        c2w = batch["c2w"].clone()
-        c2w[list(empty), :3, 0] *= -1
-        c2w[list(empty), :3, 2] *= -1
-        return c2w
-
-    with_cameras(monkeypatch, turned_around)
-    ended = launch(
-        tmp_path,
-        "trainer.max_steps=3",
-        "system.geometry.densify.enabled=true",
-        "system.geometry.densify.start=1",
-        "system.geometry.densify.every=1",
-        "system.geometry.densify.stop=9",
-    )
-    assert ended.code == 0, ended.err
-    assert all(value.isfinite().all() for value in ended.checkpoint()["state_dict"].values())
-    measured("all steps succeed")
-
-
 # ---- resuming ------------------------------------------------------------------------------------
 
 EVERY_STEP = ["checkpoint.every_n_train_steps=1", "trainer.max_steps=9"]
+
+
 EDGE = [
     "system.guidance.max_step_percent=[5,0.98,0.55,6]",
     "system.guidance.grad_clip=[5,0.5,1.0,6]",
@@ -622,6 +272,8 @@ EDGE = [
     "data.progressive_until=8",
     "system.loss.lambda_sds=[5,1.0,0.5,6]",
 ]
+
+
 DENSIFYING = [
     "system.geometry.densify.enabled=true",
     "system.geometry.densify.start=1",

@@ -1,0 +1,209 @@
+"""The path of score distillation that every guidance shares."""
+
+import math
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from tests.guidance.exact_score_cases import step, uniform
+from threestudio_gaussiandreamer.core import streams
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.diffusion import sds
+from threestudio_gaussiandreamer.guidance.base import NonFiniteScore, ScoreDistillation
+
+pytest.importorskip("embreex")
+
+
+# The shared path
+
+
+class Stub(ScoreDistillation):
+    """Predicts the noise plus the latent (so that the gradient is w x), or what ``spoil`` makes of
+    it.
+    """
+
+    spoil = staticmethod(lambda eps, step: eps)
+    unconditional = None
+
+    def encode(self, rgb, **batch):
+        self.latents = 2 * rgb - 1
+        return self.latents
+
+    def decode(self, latents):
+        return (latents + 1) / 2
+
+    def condition(self, prompt_utils, **batch):
+        return batch.get("azimuth")
+
+    def predict(self, z, t, condition):
+        noise = streams.normal_per_item(tuple(z.shape), 0, "noise", self.step)
+        abar = self.alphas_cumprod[t]
+        x = sds.predict_x0(z, noise, abar)
+        return self.spoil(
+            noise + x, self.step
+        ), None if self.unconditional is None else noise + self.unconditional * x
+
+
+def test_the_gradient_is_w_times_the_residual_over_the_batch():
+    guidance, rgb = Stub({"guidance_scale": 1.0}), uniform(4, 6, 5, 3)
+    out, grad = step(guidance, rgb)
+    t = sds.timesteps(4, 20, 980, seed=0, step=0)
+    weight = (1 - guidance.alphas_cumprod[t]).float().reshape(4, 1, 1, 1)
+    # predict_x0 in float32 loses sigma/a = 13 times the rounding of z at t = 980
+    torch.testing.assert_close(grad, 2 * weight * (2 * rgb - 1) / 4, rtol=0, atol=1e-5)
+    assert (out["min_step"], out["max_step"], out["bad_items"]) == (20, 980, 0)
+    torch.testing.assert_close(out["grad_norm"], (weight * (2 * rgb - 1)).norm(), rtol=1e-4, atol=0)
+
+
+def test_guidance_scale_extrapolates_in_the_usual_convention():
+    guidance, rgb = Stub({"guidance_scale": 5.0}), uniform(2, 4, 4, 3)
+    guidance.unconditional = 0.5
+    plain = Stub({"guidance_scale": 1.0})
+    # 0.5 + 5 (1 - 0.5) = 3 times the conditional residual
+    torch.testing.assert_close(step(guidance, rgb)[1], 3 * step(plain, rgb)[1], rtol=0, atol=3e-5)
+
+
+def test_draws_are_a_function_of_step_and_item(monkeypatch):
+    rgb = uniform(4, 4, 4, 3)
+    guidance = Stub({})
+    guidance.update_step(0, 7)
+    first, again = guidance.add_noise(rgb.movedim(-1, 1)), guidance.add_noise(rgb.movedim(-1, 1))
+    assert torch.equal(first.z, again.z)
+    assert torch.equal(guidance.add_noise(rgb[:2].movedim(-1, 1)).z, first.z[:2])
+    guidance.update_step(0, 8)
+    other = guidance.add_noise(rgb.movedim(-1, 1))
+    assert not torch.equal(other.t, first.t) and not torch.equal(other.noise, first.noise)
+    monkeypatch.setenv("PL_GLOBAL_SEED", "5")
+    assert not torch.equal(guidance.add_noise(rgb.movedim(-1, 1)).noise, other.noise)
+
+
+def test_schedules_are_evaluated_at_every_step():
+    cfg = OmegaConf.create(
+        {"max_step_percent": [500, 0.98, 0.55, 501], "grad_clip": [0, 1.5, 2.0, 1000]}
+    )
+    guidance = Stub(cfg)
+    seen = {}
+    for at in (0, 500, 501, 1000, 2000):
+        guidance.update_step(0, at)
+        seen[at] = (guidance.min_step, guidance.max_step, guidance.grad_clip)
+    assert seen == {
+        0: (20, 980, 1.5),
+        500: (20, 980, 1.75),
+        501: (20, 550, 1.7505),
+        1000: (20, 550, 2.0),
+        2000: (20, 550, 2.0),
+    }
+
+
+def test_clipping_is_elementwise_on_the_latents_gradient():
+    rgb = uniform(2, 4, 4, 3)
+    _, free = step(Stub({}), rgb)
+    _, clipped = step(Stub({"grad_clip": 0.05}), rgb)
+    limit = 0.05 * 2 / 2  # dlatent/drgb = 2, batch of 2
+    torch.testing.assert_close(clipped, free.clamp(-limit, limit), rtol=0, atol=1e-6)
+    assert (free.abs() > limit).any()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_bad_items_are_masked_and_the_others_keep_their_gradient_bit_for_bit(value, caplog):
+    rgb = uniform(4, 4, 4, 3)
+    guidance = Stub({"grad_clip": 10.0})
+    _, expected = step(guidance, rgb)
+
+    def spoil(eps, step):
+        eps = eps.clone()
+        eps[1, 0, 2, 3] = value
+        return eps
+
+    guidance.spoil = spoil
+    out, grad = step(guidance, rgb)
+    assert out["bad_items"] == 1 and guidance.bad_items == 1
+    assert torch.equal(grad[[0, 2, 3]], expected[[0, 2, 3]])
+    assert (
+        (grad[1] == 0).all()
+        and torch.isfinite(out["loss_sds"])
+        and torch.isfinite(out["grad_norm"])
+    )
+
+
+def test_an_encoder_that_overflows_spoils_only_its_item():
+    class Overflowing(Stub):
+        def encode(self, rgb, **batch):
+            scale = torch.tensor([1.0, math.inf, 1.0]).reshape(3, 1, 1, 1)
+            return super().encode(rgb) * scale
+
+    rgb = uniform(3, 4, 4, 3)
+    _, expected = step(Stub({}), rgb)
+    out, grad = step(Overflowing({}), rgb)
+    assert out["bad_items"] == 1 and (grad[1] == 0).all()
+    assert torch.equal(grad[[0, 2]], expected[[0, 2]])
+
+
+def test_ten_bad_steps_in_a_row_end_the_run_with_a_named_error():
+    guidance, rgb = Stub({}), uniform(2, 4, 4, 3)
+
+    def spoil(eps, step):
+        return eps * math.nan if step != 5 else eps
+
+    guidance.spoil = spoil
+    for at in range(15):  # five bad, one good, nine bad
+        guidance.update_step(0, at)
+        step(guidance, rgb)
+    guidance.update_step(0, 15)
+    with pytest.raises(NonFiniteScore, match="10 steps in a row"):
+        step(guidance, rgb)
+    assert guidance.bad_items == 30
+
+
+def test_autocast_changes_nothing():
+    rgb = uniform(2, 4, 4, 3)
+    _, expected = step(Stub({}), rgb)
+    with torch.autocast("cpu", torch.bfloat16):
+        _, grad = step(Stub({}), rgb)
+    assert grad.dtype == torch.float32 and torch.equal(grad, expected)
+
+
+def test_latents_can_be_given_directly():
+    guidance, latents = Stub({}), uniform(2, 4, 4, 3)
+    rgb = latents.clone().requires_grad_()
+    guidance(rgb, None, rgb_as_latents=True)["loss_sds"].backward()
+    t = sds.timesteps(2, 20, 980, seed=0, step=0)
+    weight = (1 - guidance.alphas_cumprod[t]).float().reshape(2, 1, 1, 1)
+    torch.testing.assert_close(rgb.grad, weight * latents / 2, rtol=0, atol=1e-5)
+
+
+def test_evaluation_has_what_the_hosts_saver_reads():
+    guidance = Stub({"max_items_eval": 2, "eval_steps": 3})
+    batch = {
+        "elevation": torch.zeros(3),
+        "azimuth": torch.tensor([0.0, 90, 180]),
+        "camera_distances": torch.full((3,), 2.5),
+    }
+    out = guidance(uniform(3, 8, 6, 3), None, guidance_eval=True, **batch)["eval"]
+    for name in ("imgs_noisy", "imgs_1step", "imgs_1orig", "imgs_final"):
+        assert out[name].shape == (2, 8, 6, 3)
+    assert out["bs"] == 2 and len(out["noise_levels"]) == 2
+    assert [text.split("\n")[1:] for text in out["texts"]] == [
+        ["e0.0", "a0.0", "c2.50"],
+        ["e0.0", "a90.0", "c2.50"],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("cfg", "message"),
+    [
+        ({"min_step_percent": 0.6, "max_step_percent": 0.5}, "above max_step_percent"),
+        (
+            {"min_step_percent": 0.6, "max_step_percent": [500, 0.98, 0.55, 501]},
+            "above max_step_percent",
+        ),
+        ({"max_step_percent": 1.5}, "max_step_percent: expected values of 1 or less"),
+        ({"grad_clip": [0, 1, 2, 3, 4]}, "system.guidance.grad_clip"),
+        ({"weighting_strategy": "sdss"}, "did you mean 'sds'"),
+        ({"max_bad_steps": 0}, "max_bad_steps"),
+    ],
+)
+def test_bad_options_are_named_at_once(cfg, message):
+    with pytest.raises(UserError, match=message):
+        Stub(cfg)

@@ -1,0 +1,5 @@
+"""What the tests of rasteriser share."""
+
+import torch
+
+BACKGROUND = torch.tensor([0.2, 0.5, 0.9])

@@ -1,0 +1,157 @@
+"""What the densification threshold means, and what happens to opacities."""
+
+import math
+
+import pytest
+import torch
+
+from tests.stability.densification_cases import EVERY_STEP, NO_LIMITS, Training, started
+from tests.stability.rows import row
+from tests.stability.small_runs import DEMO
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.gaussians import densify
+from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.config_check import check_config
+from threestudio_gaussiandreamer.training.density import DensityControl
+from threestudio_gaussiandreamer.training.geometry import GaussianCloud
+
+register_parts()
+
+
+# ---- what the threshold means --------------------------------------------------------------------
+
+
+def judged(
+    size: int = 128,
+    batch: int = 4,
+    loss_scale: float = 1.0,
+    autocast: bool = False,
+    absgrad: bool = False,
+) -> GaussianCloud:
+    """The first cloud after the four views were seen, ``batch`` at a time."""
+    geometry = started(densify=EVERY_STEP | NO_LIMITS | {"absgrad": absgrad})
+    training = Training(geometry, size)
+    with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        for first in range(0, 4, batch):
+            training.observe(slice(first, first + batch), loss_scale)
+    return geometry
+
+
+def selected(geometry: GaussianCloud, threshold: float) -> set[int]:
+    geometry.cfg.densify.grad_threshold = threshold
+    change = DensityControl(geometry).densified(1)
+    return set(change.parents[change.is_new].tolist())
+
+
+def middle(geometry: GaussianCloud) -> float:
+    return (geometry.gradient_sum / geometry.gradient_count.clamp_min(1)).median().item()
+
+
+each_gradient = pytest.mark.parametrize("absgrad", [False, True], ids=["gradient", "absgrad"])
+
+
+@row("A3", "Threshold's meaning")
+@each_gradient
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"loss_scale": 65536.0},
+        {"loss_scale": 65536.0, "autocast": True},
+        {"batch": 1},
+        {"batch": 2},
+    ],
+    ids=str,
+)
+def test_neither_precision_nor_batch_chooses(other, absgrad, measured):
+    """Half of the Gaussians lie above the threshold. The loss is the mean over the batch, as a
+    guidance's is.
+    """
+    usual = judged(absgrad=absgrad)
+    threshold = middle(usual)
+    expected, found = (
+        selected(usual, threshold),
+        selected(judged(**other, absgrad=absgrad), threshold),
+    )
+    assert 80 < len(expected) < 120
+    measured(len(expected ^ found), "selected differently, of 200", at_most=0)
+
+
+@row("A3", "Threshold's meaning")
+@each_gradient
+@pytest.mark.parametrize("size", [128, 256])
+def test_resolution_hardly_chooses(size, absgrad, measured):
+    """Twice the resolution of a loss that doesn't depend on it; what changes is what the pixels'
+    dilation of 0.3 covers.
+    """
+    usual, finer = judged(size, absgrad=absgrad), judged(2 * size, absgrad=absgrad)
+    threshold = middle(usual)
+    first, second, in_pixels = (
+        selected(usual, threshold),
+        selected(finer, threshold),
+        selected(finer, 2 * threshold),
+    )
+    measured(len(first & second) / len(first | second) * 100, "% overlap", at_least=90.0)
+    assert len(first & in_pixels) < 0.9 * len(
+        first | in_pixels
+    )  # a pixel is half as large there: the test can fail
+
+
+@row("A3", "Saturated 0/0")
+@each_gradient
+def test_the_never_seen_are_never_selected(absgrad, measured):
+    """Fifty Gaussians out of every view, and a threshold that all others reach."""
+    geometry = started(densify=EVERY_STEP | NO_LIMITS | {"absgrad": absgrad, "grad_threshold": 0.0})
+    geometry.means.data[:50] = torch.tensor([0.0, 0.0, 1e4])
+    training = Training(geometry)
+    training.observe(slice(None))
+    assert (geometry.gradient_count[:50] == 0).all() and geometry.gradient_sum.isfinite().all()
+    chosen = selected(geometry, 0.0)
+    assert len(chosen) > 120
+    training.optimizer.step()
+    DensityControl(geometry).after_step(training.optimizer, 1)
+    assert all(parameter.isfinite().all() for parameter in geometry.parameters())
+    measured(len(chosen & set(range(50))), "of 50 selected", at_most=0)
+
+
+# ---- opacity reset -------------------------------------------------------------------------------
+
+
+@row("A3", "Opacity reset")
+def test_nothing_resets_the_opacities(measured, monkeypatch):
+    """There is no such option, and 35 rounds (a reset comes every 3000 steps elsewhere) leave the
+    opacities as they are.
+    """
+    with pytest.raises(UserError, match="opacity_reset"):
+        check_config(load_config(DEMO, cli_args=["system.geometry.densify.opacity_reset=3000"]))
+    geometry = started(densify=EVERY_STEP | NO_LIMITS | {"every": 100, "grad_threshold": 1e9})
+    before, optimizer = (
+        geometry.logit_opacities.detach().clone(),
+        torch.optim.Adam(geometry.parameter_groups()),
+    )
+    rounds, once = [], densify.densify_and_prune
+    monkeypatch.setattr(
+        densify, "densify_and_prune", lambda *args: rounds.append(once(*args)) or rounds[-1]
+    )
+    for step in range(1, 3501):
+        DensityControl(geometry).after_step(optimizer, step)
+    assert len(rounds) == 35
+    measured((geometry.logit_opacities - before).abs().max(), "moved by 35 rounds", at_most=0.0)
+
+
+@row("A3", "Opacity reset")
+def test_a_reset_by_hand_is_recovered_from(measured):
+    """To 0.01, after 100 steps; with an absolute error, which score distillation doesn't give: it
+    pulls at what is still visible.
+    """
+    training = Training(started())
+    training.optimizer.param_groups[3]["lr"] = 0.1
+    training.run(100)
+    before = training.quality()
+    training.geometry.logit_opacities.data.fill_(math.log(0.01 / 0.99))
+    after = training.quality()
+    training.run(200)
+    assert after < before - 5
+    measured(
+        training.quality() - before, "dB over what was there, 200 steps after it", at_least=-0.5
+    )

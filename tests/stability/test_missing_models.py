@@ -1,0 +1,86 @@
+"""Models that can't be had are named within seconds."""
+
+import ast
+import socket
+import time
+
+import pytest
+
+from tests.stability.rows import row
+from tests.stability.small_runs import launch
+from tests.stability.untrusted_files_cases import PACKAGE
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.models import hub
+
+register_parts()
+
+
+# ---- no network ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def empty_cache(monkeypatch, tmp_path):
+    constants = pytest.importorskip("huggingface_hub").constants
+    monkeypatch.setenv("HF_HUB_OFFLINE", "0")
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+
+
+def refuse(*args, **kwargs):
+    raise OSError(101, "Network is unreachable")
+
+
+def hang(*args, **kwargs):
+    time.sleep(30)
+
+
+@row("A5", "Hub offline")
+@pytest.mark.parametrize(
+    "what", ["sockets blocked", "no answer to connecting", "no answer to a name", "HF_HUB_OFFLINE"]
+)
+def test_a_model_that_is_not_here_is_named_within_seconds(what, empty_cache, monkeypatch, measured):
+    """The message says what to place where. A name that nobody resolves is the long one: that call
+    knows no timeout.
+    """
+    if what == "HF_HUB_OFFLINE":
+        monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    elif what == "no answer to a name":
+        monkeypatch.setattr(socket, "getaddrinfo", hang)
+    elif what == "no answer to connecting":
+        silent = socket.create_server(("127.0.0.1", 0))
+        monkeypatch.setenv("HF_ENDPOINT", f"http://127.0.0.1:{silent.getsockname()[1]}")
+    monkeypatch.setattr(socket.socket, "connect", refuse) if what == "sockets blocked" else None
+    if what != "HF_HUB_OFFLINE":
+        assert hub.TIMEOUT <= 4.5
+        if what != "sockets blocked":
+            monkeypatch.setattr(hub, "TIMEOUT", 0.5)  # what users wait is 8 times as long
+    start = time.monotonic()
+    with pytest.raises(
+        UserError,
+        match="hf download .*--local-dir models/model`; then set "
+        ".*pretrained_model_name_or_path to that folder",
+    ):
+        hub.find_model("nobody/model", ("unet", "vae"))
+    seconds = time.monotonic() - start
+    scale = 1.0 if what in ("sockets blocked", "HF_HUB_OFFLINE") else hub_seconds() / 0.5
+    measured(seconds * scale, "s", what="until the message", at_most=5.0)
+
+
+def hub_seconds() -> float:
+    """The timeout as users have it, whatever a test has made of it."""
+    tree = ast.parse((PACKAGE / "models/hub.py").read_text())
+    return next(
+        node.value.value
+        for node in tree.body
+        if isinstance(node, ast.Assign) and node.targets[0].id == "TIMEOUT"
+    )
+
+
+@row("A5", "Hub offline")
+def test_the_guidance_without_weights_asks_no_network(tmp_path, monkeypatch, measured):
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    monkeypatch.setattr(socket, "getaddrinfo", refuse)
+    ended = launch(tmp_path, "trainer.max_steps=2")
+    assert ended.code == 0, ended.err
+    measured("a whole run without a socket")
