@@ -1,7 +1,7 @@
 """Faults known from other implementations: losses, settings and score distillation."""
 
 from pathlib import Path
-from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -27,32 +27,14 @@ def test_f19_a_negative_loss_is_back_propagated(fault):
     """A whole training step of the system on a loss of -p^2, with everything around it stubbed."""
 
     def ours(parameter):
-        optimizer = torch.optim.SGD([parameter], lr=0.0)
-        optimizer.zero_grad = lambda set_to_none: None
-        wrapped = SimpleNamespace(
-            param_groups=optimizer.param_groups,
-            step=lambda: None,
-            optimizer=optimizer,
-            zero_grad=optimizer.zero_grad,
-        )
-        nothing = SimpleNamespace(
-            sample_removal=lambda *_: None, observe=lambda *_: None, after_step=lambda *_: None
-        )
-        system = SimpleNamespace(
-            optimizers=lambda: wrapped, set_learning_rates=lambda _: None,
-            losses=lambda *_: {"x": -(parameter**2).sum()},
-            manual_backward=lambda loss: loss.backward(), geometry=nothing, loss_scale=lambda: 1.0,
-            global_step=1, report=lambda *_: None, tell=lambda _: None,
-        )  # fmt: skip
-        stepping = type(
-            "System",
-            (),
-            {
-                "__call__": lambda self, batch: {"rasterized": None},
-                "__getattr__": lambda _, n: getattr(system, n),
-            },
-        )
-        GaussianDreamerSystem.training_step(stepping(), {"width": 1, "height": 1}, 0)
+        kept = MagicMock(param_groups=[{"params": [parameter]}])  # its zero_grad clears nothing
+        system = MagicMock(global_step=1, return_value={"rasterized": None})
+        system.optimizers.return_value = kept
+        system.losses.return_value = {"x": -(parameter**2).sum()}
+        system.manual_backward.side_effect = lambda loss: loss.backward()
+        system.loss_scale.value.return_value = 1.0
+        system.loss_scale.has_skipped.return_value = False
+        GaussianDreamerSystem.training_step(system, {"width": 1, "height": 1}, 0)
 
     def if_positive(parameter):
         loss = -(parameter**2).sum()

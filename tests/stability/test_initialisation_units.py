@@ -25,7 +25,8 @@ from threestudio_gaussiandreamer.gaussians.grow import (
     grow,
     longest_side,
 )
-from threestudio_gaussiandreamer.meshes.load import face_areas, load_mesh, sample_surface
+from threestudio_gaussiandreamer.meshes.load import load_mesh
+from threestudio_gaussiandreamer.meshes.mesh import face_areas, sample_surface
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 from threestudio_gaussiandreamer.training.initialization import grow_points
