@@ -52,7 +52,7 @@ def test_split_samples_follow_the_gaussian():
         for name, value in cloud(1).items()
     }
     params["log_scales"].data[:] = torch.log(torch.tensor([0.5, 0.1, 0.02]))
-    change = densify.grow(
+    change = densify.clone_and_split(
         params,
         clone=torch.zeros(n, dtype=torch.bool),
         split=torch.ones(n, dtype=torch.bool),

@@ -22,7 +22,7 @@ from tests.helpers.tiny_guidance import (
 from threestudio_gaussiandreamer.core import streams
 from threestudio_gaussiandreamer.guidance import text_to_image
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
-from threestudio_gaussiandreamer.guidance.half_precision import GradientBorder, weights_type
+from threestudio_gaussiandreamer.guidance.half_precision import PerItemLossScale, weights_type
 
 pytest.importorskip("diffusers")
 
@@ -287,14 +287,14 @@ def test_the_scale_of_the_loss_does_not_matter_in_half_precision(models, prompts
     assert (plain != 0).float().mean() > 0.99
 
 
-def test_the_border_scales_each_item_and_undoes_it():
+def test_the_loss_scale_of_each_item_is_undone():
     x = torch.randn(3, 5, generator=torch.Generator().manual_seed(0)).requires_grad_()
     seen, results = [], []
-    border = GradientBorder(results.append)
-    inner = border.enter(x) * 1.0
+    loss_scale = PerItemLossScale(results.append)
+    inner = loss_scale.enter(x) * 1.0
     inner.register_hook(seen.append)
     weights = torch.tensor([[1e-12], [0.0], [3e12]])
-    (border.leave(inner) * weights).sum().backward()
+    (loss_scale.leave(inner) * weights).sum().backward()
     torch.testing.assert_close(x.grad, weights.expand(3, 5), rtol=0, atol=0)
     peaks = seen[0].abs().amax(1)
     assert (peaks[[0, 2]] >= 64).all() and (peaks[[0, 2]] < 128).all() and peaks[1] == 0

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from tests.helpers import tiny_3d_models, tiny_models
-from threestudio_gaussiandreamer.formats.ply import read_gaussians
+from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.guidance.text_to_image import TextToImageDistillation
 from threestudio_gaussiandreamer.launch.experiment import main
 
@@ -130,7 +130,8 @@ def train(configs, options, *more):
 
 def trained(folder):
     """The result's Gaussians, and the prior's points that they started from."""
-    cloud = read_gaussians(folder / "save" / f"it{STEPS}-export" / "gaussians.ply")
+    file = folder / "save" / f"it{STEPS}-export" / "gaussians.ply"
+    cloud = read_cloud(str(file)).in_axes("z").gaussians
     with np.load(folder / "save" / "prior" / "points.npz") as start:
         return cloud, start["points"]
 

@@ -45,7 +45,9 @@ class Denoised(NamedTuple):
 def squared_distances(
     z: Float[Tensor, "B d"], bank: Float[Tensor, "*batch K d"], abar: Float[Tensor, " B"]
 ) -> Float[Tensor, "B K"]:
-    """|z - sqrt(abar) x_k|^2 in float64; the bank is shared, (K, d), or per item, (B, K, d)."""
+    """Compute |z - sqrt(abar) x_k|^2 in float64; the bank is shared, (K, d), or per item, (B, K,
+    d).
+    """
     bank = bank.expand(len(z), -1, -1)
     scaled = abar.double().sqrt().to(z.device).reshape(-1, 1, 1)
     chunk = max(1, CHUNK_ELEMENTS // max(z.numel(), 1))
@@ -63,7 +65,7 @@ def responsibilities(
     log_prior: Optional[Float[Tensor, "*prior K"]] = None,
     temperature: float = 1.0,
 ) -> Float[Tensor, "B K"]:
-    """gamma = softmax((log pi - distances / 2v) / temperature) in float64.
+    """Compute gamma = softmax((log pi - distances / 2v) / temperature) in float64.
 
     ``log_prior`` needs no normalisation; -inf leaves an image out. A temperature above 1 smooths
     (and isn't exact any more)."""
@@ -83,7 +85,7 @@ def denoise(
     temperature: float = 1.0,
     distances: Optional[Float[Tensor, "B K"]] = None,
 ) -> Denoised:
-    """The exact score at z.
+    """Compute the exact score at z.
 
     Args:
         abar: per item, in (0, 1).
@@ -120,7 +122,7 @@ def log_density(
     std: float = 0.0,
     log_prior: Optional[Float[Tensor, "*prior K"]] = None,
 ) -> Float[Tensor, " B"]:
-    """log p_t(z), float64, with the ``log_prior`` normalised (uniform without one)."""
+    """Compute log p_t(z), float64, with the ``log_prior`` normalised (uniform without one)."""
     variance = mode_variance(abar, std).to(z.device)
     distances = squared_distances(z, bank, abar)
     log_prior = torch.zeros_like(distances[:1]) if log_prior is None else log_prior
@@ -129,7 +131,7 @@ def log_density(
 
 
 def mode_variance(abar: Float[Tensor, " B"], std: float) -> Float[Tensor, " B"]:
-    """v = abar s^2 + 1 - abar: the variance of each noised mode, float64."""
+    """Compute v = abar s^2 + 1 - abar, the variance of each noised mode, float64."""
     abar = abar.double()
     return abar * std**2 + 1 - abar
 
@@ -152,17 +154,17 @@ class LinearLatent(NamedTuple):
     scale: float = 1.0
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B c h w"]:
-        """Latents of images in [0, 1]; H and W are multiples of ``factor``."""
+        """Encode images in [0, 1]; H and W are multiples of ``factor``."""
         return self.encode_pooled(F.avg_pool2d(rgb, self.factor) if self.factor > 1 else rgb)
 
     def encode_pooled(self, rgb: Float[Tensor, "B 3 h w"]) -> Float[Tensor, "B c h w"]:
-        """Latents of images that are pooled already."""
+        """Encode images that are pooled already."""
         latents = _recolored(2 * rgb - 1, self.matrix)
         return latents if self.scale == 1 else self.scale * latents
 
     def decode(self, latents: Float[Tensor, "B c h w"]) -> Float[Tensor, "B 3 H W"]:
-        """The least-squares image in [0, 1]: pseudo-inverse of the colours, each pooled pixel
-        repeated.
+        """Compute the least-squares image in [0, 1]: pseudo-inverse of the colours, each pooled
+        pixel repeated.
         """
         inverse = None if self.matrix is None else torch.linalg.pinv(self.matrix.double())
         rgb = (_recolored(latents, inverse) / self.scale + 1) / 2
@@ -173,7 +175,7 @@ class LinearLatent(NamedTuple):
         )
 
     def normalised(self, rgb: Float[Tensor, "K 3 h w"]) -> "LinearLatent":
-        """The same latent, scaled to unit variance on pooled images (as Stable Diffusion's is on
+        """Scale the latent to unit variance on pooled images (as Stable Diffusion's is on
         photographs).
         """
         std = self._replace(scale=1.0).encode_pooled(rgb).std()
@@ -189,8 +191,8 @@ def _recolored(
 
 
 def color_matrix(channels: int) -> Optional[Float[Tensor, "c 3"]]:
-    """Orthonormal columns from RGB to ``channels`` >= 3: None, the identity, for 3; a tetrahedron's
-    corners for 4; else a fixed draw.
+    """Return orthonormal columns from RGB to ``channels`` >= 3: None, the identity, for 3; a
+    tetrahedron's corners for 4; else a fixed draw.
 
     For 4 the first channel is the luminance and the others are opponent colours.
     """

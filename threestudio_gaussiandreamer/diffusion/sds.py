@@ -30,14 +30,16 @@ et al. 2023).
 def sd_alphas_cumprod(
     num_train: int = 1000, *, beta_start: float = 0.00085, beta_end: float = 0.012
 ) -> Float[Tensor, " T"]:
-    """Stable Diffusion's "scaled linear" schedule: sqrt(beta) is linear in t. float64."""
+    """Compute Stable Diffusion's "scaled linear" schedule, in which sqrt(beta) is linear in t.
+    float64.
+    """
     betas = torch.linspace(beta_start**0.5, beta_end**0.5, num_train, dtype=torch.float64) ** 2
     return torch.cumprod(1 - betas, dim=0)
 
 
 def step_range(min_percent: float, max_percent: float, num_train: int = 1000) -> tuple[int, int]:
-    """The first and last timestep of a range given in shares of ``num_train``, both clamped to [1,
-    num_train - 1].
+    """Convert a range given in shares of ``num_train`` to its first and last timestep, both clamped
+    to [1, num_train - 1].
 
     Raises:
         UserError: a share outside [0, 1], or the minimum above the maximum.
@@ -67,8 +69,8 @@ def timesteps(
     num_train: int = 1000,
     stream: str = "timestep",
 ) -> Int[Tensor, " B"]:
-    """One timestep per item, uniform on [min_step, max_step] clamped to [1, num_train - 1]; item b
-    doesn't depend on ``batch``.
+    """Draw one timestep per item, uniform on [min_step, max_step] clamped to [1, num_train - 1];
+    item b doesn't depend on ``batch``.
 
     Raises:
         UserError: ``min_step`` above ``max_step``.
@@ -84,28 +86,31 @@ def timesteps(
 
 
 def per_item(values: Float[Tensor, " B"], like: Tensor) -> Tensor:
-    """(B,) as (B, 1, ..., 1) in the type and on the device of ``like``."""
+    """Reshape (B,) to (B, 1, ..., 1) in the type and on the device of ``like``."""
     return values.to(like).reshape(-1, *[1] * (like.dim() - 1))
 
 
 def add_noise(
     x: Float[Tensor, "B *d"], noise: Float[Tensor, "B *d"], abar: Float[Tensor, " B"]
 ) -> Float[Tensor, "B *d"]:
-    """z = sqrt(abar) x + sqrt(1 - abar) eps (DDPM eq. 4)."""
+    """Compute z = sqrt(abar) x + sqrt(1 - abar) eps (DDPM eq. 4)."""
     return per_item(abar.sqrt(), x) * x + per_item((1 - abar).sqrt(), x) * noise
 
 
 def predict_x0(
     z: Float[Tensor, "B *d"], eps: Float[Tensor, "B *d"], abar: Float[Tensor, " B"]
 ) -> Float[Tensor, "B *d"]:
-    """The denoised x0 = (z - sqrt(1 - abar) eps) / sqrt(abar), ``add_noise`` solved for x."""
+    """Compute the denoised x0 = (z - sqrt(1 - abar) eps) / sqrt(abar), the inverse of
+    ``add_noise``.
+    """
     return (z - per_item((1 - abar).sqrt(), z) * eps) / per_item(abar.sqrt(), z)
 
 
 def classifier_free(
     eps_cond: Float[Tensor, "B *d"], eps_uncond: Float[Tensor, "B *d"], scale: float
 ) -> Float[Tensor, "B *d"]:
-    """eps_u + scale (eps_c - eps_u), so 1 is no guidance (Ho and Salimans 2022 with scale = 1 + w).
+    """Compute eps_u + scale (eps_c - eps_u), so 1 is no guidance (Ho and Salimans 2022 with scale =
+    1 + w).
 
     threestudio writes eps_c + g (eps_c - eps_u): its g = 100 is scale = 101 here.
     """
@@ -113,15 +118,15 @@ def classifier_free(
 
 
 def weight(name: str, abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
-    """The weight w(t) of the named strategy: "sds", "uniform" or "fantasia3d"."""
+    """Compute the weight w(t) of the named strategy: "sds", "uniform" or "fantasia3d"."""
     if name not in WEIGHTS:
         raise unknown("weighting_strategy", name, WEIGHTS)
     return WEIGHTS[name](abar)
 
 
 def sds_loss(x: Float[Tensor, "B *d"], grad: Float[Tensor, "B *d"]) -> Float[Tensor, ""]:
-    """0.5 sum grad^2 / B, with the gradient grad / B at x: threestudio's 0.5 sum |x - stop(x -
-    grad)|^2 / B without its rounding.
+    """Compute 0.5 sum grad^2 / B, with the gradient grad / B at x: threestudio's 0.5 sum |x -
+    stop(x - grad)|^2 / B without its rounding.
     """
     return _GivenGradient.apply(x, grad.detach())
 
@@ -145,8 +150,8 @@ def ddim_step(
     abar: Float[Tensor, " B"],
     abar_next: Float[Tensor, " B"],
 ) -> Float[Tensor, "B *d"]:
-    """One deterministic DDIM step to the lower noise ``abar_next`` (Song et al. 2021 eq. 12 with
-    eta 0).
+    """Take one deterministic DDIM step to the lower noise ``abar_next`` (Song et al. 2021 eq. 12
+    with eta 0).
     """
     return add_noise(predict_x0(z, eps, abar), eps, abar_next)
 

@@ -1,9 +1,9 @@
 """Densify and prune: which Gaussians are cloned, split and dropped, as pure functions of the cloud
 and its statistics.
 
-A change of the cloud is a :class:`Change`: for every new row the old row that it comes from, and
-whether it is is_new. Applying it to the parameters, the optimiser's moments and the statistics is
-then one gather each, so the moments of a Gaussian follow it whatever happens around it.
+A change of the cloud is a :class:`Change`: for every row the old row that it comes from, and
+whether the Gaussian is new. Applying it to the parameters, the optimiser's moments and the
+statistics is then one gather each, so the moments of a Gaussian follow it.
 
 Statistics are per view and unscaled. ``gradient`` is the norm of the loss's gradient with respect
 to the projected centre in normalised device units (half the image is 1), of the loss of one view
@@ -11,9 +11,9 @@ to the projected centre in normalised device units (half the image is 1), of the
 depend on resolution, batch size or a loss scale. ``contribution`` is the largest sigma_i T_i over
 the pixels of recent views (RadSplat, Niemeyer et al. 2024).
 
-Clone and split rules: Kerbl et al. 2023, section 5.2. There is no opacity reset (their section 5.2
-sets all opacities near zero now and then to find floaters): score distillation doesn't rebuild what
-a reset erases, and pruning by what shows does its work."""
+Clone and split rules: Kerbl et al. 2023, section 5.2. Their opacity reset, which sets all opacities
+near zero now and then to find floaters, isn't there: score distillation doesn't rebuild what a
+reset erases, and pruning by contribution finds floaters too."""
 
 import logging
 from typing import Mapping, NamedTuple
@@ -65,7 +65,7 @@ class Statistics(NamedTuple):
 def screen_gradients(
     means2d_grad: Float[Tensor, "B N 2"], width: int, height: int, loss_scale: float = 1.0
 ) -> Float[Tensor, "B N"]:
-    """Per-view gradient norms in normalised device units from gradients in pixels.
+    """Compute per-view gradient norms in normalised device units from gradients in pixels.
 
     ``means2d_grad`` is the gradient of a loss that is averaged over the batch and multiplied by
     ``loss_scale`` (that of automatic mixed precision); both are undone here. Non-finite gradients
@@ -80,28 +80,30 @@ def screen_gradients(
 def densify_and_prune(
     params: Mapping[str, Tensor], stats: Statistics, rules: Rules, rng: torch.Generator
 ) -> Change:
-    """Clone small and split large Gaussians whose centre wants to move, drop the faint and the
-    huge, respect cap and floor.
+    """Clone small and split large Gaussians with a large gradient at their centre, drop faint and
+    huge ones, and respect cap and floor.
 
-    A Gaussian that no view has seen has no gradient and is never selected, whatever the threshold.
-    Faint ones don't grow, and the room that they leave under the cap is given to others in the same
-    round."""
+    A Gaussian that no view has seen has no gradient and is never selected. Faint ones are neither
+    cloned nor split, and the room that they leave under the cap goes to others in the same round.
+    """
     faint = torch.sigmoid(params["logit_opacities"].detach()) < rules.min_opacity
     above_threshold = (stats.gradient > rules.grad_threshold) & ~faint
     above_threshold &= _affordable(
         above_threshold, stats.gradient, rules.max_gaussians - int((~faint).sum())
     )
     large = params["log_scales"].exp().amax(-1) > rules.split_scale
-    grown = grow(params, clone=above_threshold & ~large, split=above_threshold & large, rng=rng)
-    huge = grown.values["log_scales"].exp().amax(-1) > rules.max_scale
-    return keep(grown, ~(faint[grown.parents] | huge), stats.contribution[grown.parents], rules)
+    selected = {"clone": above_threshold & ~large, "split": above_threshold & large}
+    change = clone_and_split(params, **selected, rng=rng)
+    huge = change.values["log_scales"].exp().amax(-1) > rules.max_scale
+    rows = change.parents
+    return keep(change, ~(faint[rows] | huge), stats.contribution[rows], rules)
 
 
 def _affordable(
     above_threshold: Bool[Tensor, " N"], gradient: Float[Tensor, " N"], room: int
 ) -> Bool[Tensor, " N"]:
-    """The above_threshold rows with the largest gradients that fit into ``room`` more Gaussians
-    (each adds exactly one).
+    """Choose the rows above the threshold with the largest gradients that fit into ``room`` more
+    Gaussians (each adds exactly one).
     """
     if int(above_threshold.sum()) <= room:
         return above_threshold
@@ -115,16 +117,14 @@ def _affordable(
     return chosen
 
 
-def grow(
+def clone_and_split(
     params: Mapping[str, Tensor],
     *,
     clone: Bool[Tensor, " N"],
     split: Bool[Tensor, " N"],
     rng: torch.Generator,
 ) -> Change:
-    """Clones are added behind the originals; a split replaces its Gaussian by two smaller samples
-    of it.
-    """
+    """Append the clones, and replace each split Gaussian by two smaller samples of it."""
     rows = torch.arange(len(clone), device=clone.device)
     stay, clones, splits = rows[~split], rows[clone], rows[split]
     parents = torch.cat([stay, clones, splits, splits])
@@ -194,7 +194,7 @@ def update_optimizer(
     change: Change,
 ) -> None:
     """Put the ``new`` parameters in the place of the ``old``; moments follow their Gaussian, those
-    of is_new ones are zero.
+    of new ones are zero.
     """
     replaced = {id(old[name]): new[name] for name in new}
     for group in optimizer.param_groups:
@@ -216,7 +216,7 @@ def _moved(
 
 
 def _rows(value: object, old: nn.Parameter, change: Change) -> object:
-    """The rows of a per-Gaussian state tensor; anything else (Adam's step) stays."""
+    """Gather the rows of a per-Gaussian state tensor; anything else (Adam's step) stays."""
     if not isinstance(value, Tensor) or value.shape != old.shape:
         return value
     rows = value[change.parents]

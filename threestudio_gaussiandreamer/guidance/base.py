@@ -88,29 +88,27 @@ class ScoreDistillation(BaseObject, ABC):
 
     @abstractmethod
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B c h w"]:
-        """The latents of images in [0, 1], differentiably."""
+        """Encode images in [0, 1], differentiably."""
 
     @abstractmethod
     def decode(self, latents: Float[Tensor, "B c h w"]) -> Float[Tensor, "B 3 H W"]:
-        """The images in [0, 1] of latents, for looking at."""
+        """Decode latents to images in [0, 1], for display."""
 
     @abstractmethod
     def condition(self, prompt_utils: Any, **batch: Any) -> Any:
-        """What ``predict`` needs to know of the prompt and of these views; called without
-        gradients.
-        """
+        """Return what ``predict`` needs of prompt and views; called without gradients."""
 
     @abstractmethod
     def predict(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Any
     ) -> tuple[Float[Tensor, "B c h w"], Optional[Float[Tensor, "B c h w"]]]:
-        """The noise in z, conditional and unconditional (None where no guidance is asked for);
-        called without gradients.
+        """Predict the noise in z, conditional and unconditional (None where no guidance is asked
+        for); called without gradients.
         """
 
     @classmethod
     def preflight(cls, cfg: Any) -> None:
-        """Look in seconds whether a guidance of this configuration can have what it needs; called
+        """Check in seconds whether a guidance of this configuration can have what it needs; called
         before any long work.
 
         Raises:
@@ -128,7 +126,7 @@ class ScoreDistillation(BaseObject, ABC):
     """Whether its instances have a ``truth``, see :mod:`.known_truth`."""
 
     def report(self) -> dict[str, float]:
-        """More numbers to log about the last step."""
+        """Return more numbers to log about the last step."""
         return {}
 
     # The shared path
@@ -146,7 +144,7 @@ class ScoreDistillation(BaseObject, ABC):
         return self.cfg.guidance_scale != 1
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
-        """Re-evaluate the schedules."""
+        """Evaluate the schedules at this step."""
         self.step = global_step
         percents = (
             C(self.cfg[name], epoch, global_step)
@@ -166,7 +164,7 @@ class ScoreDistillation(BaseObject, ABC):
         guidance_eval: bool = False,
         **batch: Any,
     ) -> dict[str, Any]:
-        """The loss whose gradient is the score distillation gradient, and what to log.
+        """Return the loss whose gradient is the score distillation gradient, and what to log.
 
         Args:
             rgb: renders in [0, 1]; or latents, with ``rgb_as_latents``.
@@ -205,7 +203,7 @@ class ScoreDistillation(BaseObject, ABC):
         return out
 
     def add_noise(self, latents: Float[Tensor, "B c h w"]) -> Noised:
-        """This step's timesteps and noise on ``latents``."""
+        """Draw this step's timesteps and noise, and add the noise to ``latents``."""
         device = latents.device
         t = sds.timesteps(
             len(latents),
@@ -224,7 +222,7 @@ class ScoreDistillation(BaseObject, ABC):
     def predict_noise(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Any
     ) -> Float[Tensor, "B c h w"]:
-        """The guided prediction, float32."""
+        """Predict the noise with guidance, float32."""
         cond, uncond = self.predict(z, t, condition)
         return (
             cond.float()
@@ -233,8 +231,8 @@ class ScoreDistillation(BaseObject, ABC):
         )
 
     def _gradient(self, noised: Noised, condition: Any) -> tuple[Tensor, Tensor]:
-        """w(t) (eps_hat - eps), clipped, zero for items where it isn't finite; and which those are,
-        (B,) bool.
+        """Compute w(t) (eps_hat - eps), clipped, zero for items where it isn't finite; and which
+        those are, (B,) bool.
         """
         eps = self.predict_noise(noised.z, noised.t, condition)
         weight = sds.weight(self.cfg.weighting_strategy, noised.abar)
@@ -266,7 +264,8 @@ class ScoreDistillation(BaseObject, ABC):
 
     @torch.no_grad()
     def evaluate(self, noised: Noised, prompt_utils: Any, **batch: Any) -> dict[str, Any]:
-        """Pictures (B, H, W, 3) in [0, 1], as the host's ``guidance_evaluation_save`` wants them.
+        """Render pictures (B, H, W, 3) in [0, 1], as the host's ``guidance_evaluation_save`` takes
+        them.
 
         ``imgs_noisy`` the noisy latents; ``imgs_1step`` denoised at once with guidance;
         ``imgs_1orig`` denoised at once by the conditional score alone; ``imgs_final`` denoised in
@@ -300,8 +299,8 @@ class ScoreDistillation(BaseObject, ABC):
 
 
 def _bad_items(grad: Tensor) -> Tensor:
-    """(B,) bool: which items hold NaN or infinity. A sum is finite only if all its terms are, which
-    settles the usual case.
+    """Return which items hold NaN or infinity, (B,) bool. A sum is finite only if all its terms
+    are, which settles the usual case.
     """
     if grad.sum().isfinite():
         return torch.zeros(len(grad), dtype=torch.bool, device=grad.device)
@@ -309,8 +308,8 @@ def _bad_items(grad: Tensor) -> Tensor:
 
 
 def _masked_loss(images: Tensor, latents: Tensor, grad: Tensor, bad: Tensor) -> Tensor:
-    """The loss without the bad items, whose ``grad`` is zero, and whose render gets a gradient of
-    exactly zero.
+    """Compute the loss without the bad items, whose ``grad`` is zero, and whose render gets a
+    gradient of exactly zero.
     """
     if bad.any() and images.requires_grad:
         # Zero times an infinite derivative of the encoder would be NaN on its way to the render.
@@ -319,7 +318,7 @@ def _masked_loss(images: Tensor, latents: Tensor, grad: Tensor, bad: Tensor) -> 
 
 
 def _first_items(batch: dict[str, Any], size: int, count: int) -> dict[str, Any]:
-    """The batch of the first ``count`` of ``size`` items."""
+    """Return the batch of the first ``count`` of ``size`` items."""
     return {
         k: v[:count] if isinstance(v, Tensor) and v.dim() and len(v) == size else v
         for k, v in batch.items()
@@ -327,7 +326,7 @@ def _first_items(batch: dict[str, Any], size: int, count: int) -> dict[str, Any]
 
 
 def _captions(levels: list[float], batch: dict[str, Any]) -> list[str]:
-    """threestudio's captions: noise level, elevation, azimuth and distance of each item."""
+    """Write threestudio's captions: noise level, elevation, azimuth and distance of each item."""
     captions = [f"n{level:.02f}" for level in levels]
     for letter, name, digits in (
         ("e", "elevation", 1),
@@ -343,7 +342,9 @@ def _captions(levels: list[float], batch: dict[str, Any]) -> list[str]:
 
 
 def _knots(*schedules: Any) -> set[int]:
-    """Steps among which are all those where a schedule bends (and harmlessly, its values too)."""
+    """Return a set of steps that has all those at which a schedule bends (and, which is harmless,
+    its values too).
+    """
     return {
         0,
         *(

@@ -36,7 +36,7 @@ class DeepFloydGuidance(TextToImageDistillation):
         self.image_size = self.size_of_images()
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B 3 s s"]:
-        """The pixels themselves, in [-1, 1]."""
+        """Return the pixels themselves, in [-1, 1]."""
         return self.resized(rgb, self.image_size) * 2 - 1
 
     def decode(self, latents: Float[Tensor, "B 3 s s"]) -> Float[Tensor, "B 3 s s"]:

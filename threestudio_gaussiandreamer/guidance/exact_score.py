@@ -165,7 +165,7 @@ class ExactScoreGuidance(ScoreDistillation):
         fovy: Tensor,
         **batch: Any,
     ) -> list[Mixture]:
-        """The mixture of each item; needs ``encode`` before, which says at what size."""
+        """Return the mixture of each item; needs ``encode`` before, which sets the size."""
         if self._size is None:
             raise UserError(
                 "exact-score-guidance compares pictures: give it renders, not latents "
@@ -191,7 +191,9 @@ class ExactScoreGuidance(ScoreDistillation):
         return cond, torch.cat([item[1].eps for item in items]).view_as(z)
 
     def report(self) -> dict[str, float]:
-        """How many pictures share a noisy latent on average: 1 is retrieval of the nearest one."""
+        """Return how many pictures share a noisy latent on average: 1 is retrieval of the nearest
+        one.
+        """
         return {"perplexity": self._perplexity}
 
     def _predict_item(
@@ -218,7 +220,7 @@ class ExactScoreGuidance(ScoreDistillation):
         members: Bool[Tensor, " K"],
         background: Float[Tensor, "bh bw 3"],
     ) -> Mixture:
-        """The camera's own view, if any, then the bank's; conditional are the own view and the
+        """Join the camera's own view, if any, and the bank's; conditional are the own view and the
         bank's ``members``.
         """
         own_views = [] if own is None else [own]
@@ -238,7 +240,7 @@ class ExactScoreGuidance(ScoreDistillation):
         return Mixture(modes, torch.where(conditional, 0.0, -torch.inf))
 
     def _members(self, batch: dict[str, Any], count: int) -> Bool[Tensor, "B K"]:
-        """Which views of the bank the conditional mixture of each item has."""
+        """Return which views of the bank the conditional mixture of each item has."""
         if self.cfg.mode == "view-exact":
             return torch.zeros(count, self.cfg.bank_views, dtype=torch.bool)
         if self.cfg.mode == "view-agnostic":
@@ -255,7 +257,7 @@ class ExactScoreGuidance(ScoreDistillation):
         return self._latent().encode(composite(rgba, background))[:, None]
 
     def bank(self, height: int, width: int) -> Bank:
-        """The bank at a picture size; that of the last size is kept."""
+        """Return the bank at a picture size; that of the last size is kept."""
         if (height, width) not in self._banks:
             self._banks = {(height, width): self._cast_bank(height, width)}
         return self._banks[height, width]
@@ -278,8 +280,8 @@ class ExactScoreGuidance(ScoreDistillation):
         return LinearLatent() if self.cfg.space == "pixel" else self.bank(*self._size).latent
 
     def _picture_size(self, height: int, width: int) -> tuple[int, int]:
-        """The size of the compared pictures for a render of this size: ``image_size`` high, with
-        the render's aspect.
+        """Return the size of the compared pictures for a render of this size: ``image_size`` high,
+        with the render's aspect.
         """
         size = self.cfg.image_size
         height, width = (size, max(1, round(width * size / height))) if size else (height, width)
@@ -312,8 +314,8 @@ class ExactScoreGuidance(ScoreDistillation):
 def direction_indices(
     elevation: Float[Tensor, " B"], azimuth: Float[Tensor, " B"]
 ) -> Int[Tensor, " B"]:
-    """The direction of views in degrees, by threestudio's rules for view-dependent prompts: 0 side,
-    1 front, 2 back, 3 overhead.
+    """Classify views in degrees by threestudio's rules for view-dependent prompts: 0 side, 1 front,
+    2 back, 3 overhead.
     """
     indices = torch.zeros_like(azimuth, dtype=torch.long)
     for index, direction in enumerate(view_directions(45, 45, 60)):
@@ -322,7 +324,7 @@ def direction_indices(
 
 
 def bank_modes(bank: Bank, background: Float[Tensor, "bh bw 3"]) -> Float[Tensor, "K c h w"]:
-    """The bank's latents on a background of one colour (1, 1, 3) or of pixels (H', W', 3)."""
+    """Encode the bank on a background of one colour (1, 1, 3) or of pixels (H', W', 3)."""
     if background.shape[:2] == (1, 1):  # pooling and compositing commute
         pooled = bank.pooled.to(background.device)
         return bank.latent.encode_pooled(

@@ -24,7 +24,7 @@ def call_guidance(
     batch: dict[str, Any],
     **options: Any,
 ) -> dict[str, Any]:
-    """What ``guidance`` returns for these renders.
+    """Call ``guidance`` with these renders.
 
     All get ``prompt_utils``, the whole batch and the options, or as much of them as they take: one
     by an image (zero123) knows no prompt. threestudio passes the prompt as the second argument,
@@ -50,8 +50,8 @@ def call_guidance(
 
 
 def _checked(out: Any, name: str, device: torch.device) -> dict[str, Any]:
-    """What a guidance returned, every ``loss_*`` in it a tensor of one number: plain numbers are
-    what some give for a loss that is off.
+    """Check what a guidance returned and make every ``loss_*`` a tensor of one number: some return
+    plain numbers for a loss that is off.
     """
     if not isinstance(out, dict):
         raise UserError(
@@ -74,8 +74,8 @@ def _checked(out: Any, name: str, device: torch.device) -> dict[str, Any]:
 
 @contextmanager
 def own_randomness(step: int) -> Iterator[None]:
-    """torch's global generators as a function of (seed, step), for guidances that draw from them;
-    put back afterwards.
+    """Seed torch's global generators with (seed, step), for guidances that draw from them; their
+    state is restored afterwards.
 
     So a resumed run draws what the run that never stopped drew, and looking at pictures in between
     changes nothing."""
@@ -95,13 +95,13 @@ def own_randomness(step: int) -> Iterator[None]:
 
 
 def trainable_parameters(guidance: Any) -> dict[str, nn.Parameter]:
-    """The parameters that a guidance trains, by name; none for most."""
+    """Return the parameters that a guidance trains, by name; none for most."""
     named = guidance.named_parameters() if isinstance(guidance, nn.Module) else ()
     return {name: parameter for name, parameter in named if parameter.requires_grad}
 
 
 def trainable_groups(guidance: Any, lr: float) -> list[dict[str, Any]]:
-    """The optimiser's group of what a guidance learns; none for most.
+    """Return the optimiser's group of what a guidance learns; none for most.
 
     Args:
         lr: its learning rate.
@@ -111,9 +111,7 @@ def trainable_groups(guidance: Any, lr: float) -> list[dict[str, Any]]:
 
 
 def learnt_weights(guidance: Any) -> dict[str, Tensor]:
-    """For a checkpoint: what a guidance has learnt, without its frozen weights, which are the
-    model's.
-    """
+    """Return what a guidance has learnt, for a checkpoint; its frozen weights are the model's."""
     return {name: parameter.detach() for name, parameter in trainable_parameters(guidance).items()}
 
 

@@ -17,14 +17,14 @@ million times smaller still count.
 
 
 def weights_type(half: bool, device: torch.device) -> torch.dtype:
-    """float16 on a GPU when ``half`` is wanted; the CPU, which gains nothing from it, works in
-    float32.
+    """Return float16 on a GPU when ``half`` is asked for, else float32: the CPU gains nothing from
+    half precision.
     """
     return torch.float16 if half and device.type == "cuda" else torch.float32
 
 
-class GradientBorder:
-    """Both sides of a half-precision network, for one forward pass and its backward pass.
+class PerItemLossScale:
+    """Loss scale of each item inside a half-precision network, for one forward and backward pass.
 
     ``leave`` scales each item's gradient by a power of two before it goes back through the network,
     ``enter`` undoes that in float32 behind it. Both are the identity forwards. The loss may thus
@@ -48,28 +48,28 @@ class GradientBorder:
 
 class _Leave(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: FunctionCtx, y: Tensor, border: GradientBorder) -> Tensor:
-        ctx.border = border
+    def forward(ctx: FunctionCtx, y: Tensor, loss_scale: PerItemLossScale) -> Tensor:
+        ctx.loss_scale = loss_scale
         return y.view_as(y)
 
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None]:
         peak = grad.abs().amax(dim=tuple(range(1, grad.dim())), keepdim=True)
-        ctx.border.scale = torch.where(peak > 0, PEAK / torch.exp2(peak.log2().floor()), 1.0)
-        return grad * ctx.border.scale, None
+        ctx.loss_scale.scale = torch.where(peak > 0, PEAK / torch.exp2(peak.log2().floor()), 1.0)
+        return grad * ctx.loss_scale.scale, None
 
 
 class _Enter(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: FunctionCtx, x: Tensor, border: GradientBorder) -> Tensor:
-        ctx.border = border
+    def forward(ctx: FunctionCtx, x: Tensor, loss_scale: PerItemLossScale) -> Tensor:
+        ctx.loss_scale = loss_scale
         return x.view_as(x)
 
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None]:
         bad = ~torch.isfinite(grad).flatten(1).all(dim=1)
-        ctx.border.on_result(bad)
+        ctx.loss_scale.on_result(bad)
         per_item = (-1, *[1] * (grad.dim() - 1))
-        return torch.where(bad.reshape(per_item), 0.0, grad) / ctx.border.scale.reshape(
+        return torch.where(bad.reshape(per_item), 0.0, grad) / ctx.loss_scale.scale.reshape(
             per_item
         ), None

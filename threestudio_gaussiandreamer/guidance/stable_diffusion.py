@@ -27,7 +27,7 @@ from ..core.streams import normal_per_item
 from ..host import item_seed, register, register_builtin, warn
 from ..prompts.prompt_processors import STABLE_DIFFUSION
 from .base import NonFiniteScore
-from .half_precision import GradientBorder
+from .half_precision import PerItemLossScale
 from .text_to_image import TextToImageDistillation
 
 
@@ -67,8 +67,8 @@ class StableDiffusionGuidance(TextToImageDistillation):
         images = self.resized(rgb, self.image_size) * 2 - 1
         if self.dtype == torch.float32:
             return self._encode(images)
-        border = GradientBorder(self._count_bad_backwards)
-        return border.leave(self._encode(border.enter(images)))
+        loss_scale = PerItemLossScale(self._count_bad_backwards)
+        return loss_scale.leave(self._encode(loss_scale.enter(images)))
 
     def _encode(self, images: Float[Tensor, "B 3 s s"]) -> Float[Tensor, "B 4 h w"]:
         images = images.to(self.dtype)
@@ -93,8 +93,8 @@ class StableDiffusionGuidance(TextToImageDistillation):
         return (images / 2 + 0.5).clamp(0, 1)
 
     def _count_bad_backwards(self, bad: Bool[Tensor, " B"]) -> None:
-        """The encoder's gradient of some items isn't finite: they were left out; stop when that
-        goes on.
+        """Count backward passes in which the encoder's gradient of some items wasn't finite, so
+        that they were left out; stop when that goes on.
         """
         count = int(bad.sum())
         self._bad_backwards = self._bad_backwards + 1 if count else 0

@@ -197,7 +197,7 @@ class TextToImageDistillation(ScoreDistillation):
     def network(
         self, network_class: Any, folder: Path, component: str, *, on_device: bool = True
     ) -> nn.Module:
-        """One frozen network of the model."""
+        """Load one frozen network of the model."""
         half = self.dtype == torch.float16
         network = load_network(
             network_class, folder, component, half=half, torch_dtype=self.dtype
@@ -278,7 +278,7 @@ class TextToImageDistillation(ScoreDistillation):
     def noise(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], embeddings: Float[Tensor, "kB N F"]
     ) -> Float[Tensor, "kB c h w"]:
-        """The UNet's prediction as noise, float32, for each row of ``embeddings`` on the latent of
+        """Predict the noise with the UNet, float32, for each row of ``embeddings`` on the latent of
         its view, in one forward pass.
         """
         rows = view_of_row(len(z), len(embeddings)).to(z.device)
@@ -290,8 +290,8 @@ class TextToImageDistillation(ScoreDistillation):
         return PREDICTIONS[self.prediction_type](output[:, : z.shape[1]], z, self._abar[t])
 
     def resized(self, images: Float[Tensor, "B 3 H W"], size: int) -> Float[Tensor, "B 3 s s"]:
-        """The images at the model's size; when shrunk more than twofold, bilinear sampling would
-        skip pixels without antialiasing.
+        """Resize images to the model's size; with antialiasing when shrunk more than twofold, since
+        bilinear sampling skips pixels.
         """
         if images.shape[-2:] == (size, size):
             return images
@@ -319,8 +319,8 @@ abar) x0 (Salimans and Ho 2022), or x0.
 
 
 def view_of_row(views: int, rows: int) -> Int[Tensor, " kB"]:
-    """Which view each row of a :class:`Condition` belongs to: 0..B-1, 0..B-1, then 0, 0, 1, 1,
-    ...
+    """Return which view each row of a :class:`Condition` belongs to: 0..B-1, 0..B-1, then 0, 0, 1,
+    1, ...
     """
     order = torch.arange(views)
     return torch.cat([order, order, order.repeat_interleave(2)])[:rows]
@@ -332,8 +332,8 @@ def perp_neg(
     negative: Float[Tensor, "B 2 c h w"],
     weights: Float[Tensor, "B 2"],
 ) -> Float[Tensor, "B c h w"]:
-    """eps_u + d + sum_i w_i (n_i - proj_d n_i), where d = eps_c - eps_u, n_i = eps_i - eps_u
-    (Armandpour et al. 2023, eq. 9).
+    """Compute eps_u + d + sum_i w_i (n_i - proj_d n_i), where d = eps_c - eps_u, n_i = eps_i -
+    eps_u (Armandpour et al. 2023, eq. 9).
 
     Guided with scale s this is eps_u + s (d + ...), the paper's formula.
     """
@@ -352,8 +352,8 @@ def rescaled(
     abar: Float[Tensor, " B"],
     share: float,
 ) -> Float[Tensor, "B c h w"]:
-    """The guided noise whose x0 has its standard deviation brought to that of the conditional x0,
-    by ``share`` (0 none, 1 all).
+    """Rescale the guided noise so that its x0 has the standard deviation of the conditional x0, by
+    ``share`` (0 none, 1 all).
     """
     x0, reference = sds.predict_x0(z, guided, abar), sds.predict_x0(z, cond, abar)
     factor = _deviation(reference) / _deviation(x0)

@@ -116,19 +116,19 @@ def sample_heun(
     gamma = min(churn / (len(sigmas) - 1), math.sqrt(2) - 1)
     x = noise * sigmas[0]
     steps = list(zip(sigmas[:-1], sigmas[1:], strict=True))
-    for sigma, following in tqdm(steps, progress, disable=None if progress else True, leave=False):
-        raised = sigma * (1 + gamma)
+    for sigma, sigma_next in tqdm(steps, progress, disable=None if progress else True, leave=False):
+        sigma_hat = sigma * (1 + gamma)
         if gamma > 0:
             fresh = torch.randn(x.shape, generator=generator).to(x)
-            x = x + fresh * math.sqrt(raised**2 - sigma**2)
-        x = _heun_step(denoise, x, raised, following)
+            x = x + fresh * math.sqrt(sigma_hat**2 - sigma**2)
+        x = _heun_step(denoise, x, sigma_hat, sigma_next)
     return x
 
 
-def _heun_step(denoise: Denoiser, x: Tensor, sigma: float, following: float) -> Tensor:
+def _heun_step(denoise: Denoiser, x: Tensor, sigma: float, sigma_next: float) -> Tensor:
     slope = (x - denoise(x, sigma)) / sigma
-    euler = x + (following - sigma) * slope
-    if following == 0:
+    euler = x + (sigma_next - sigma) * slope
+    if sigma_next == 0:
         return euler
-    slope_there = (euler - denoise(euler, following)) / following
-    return x + (following - sigma) * (slope + slope_there) / 2
+    slope_there = (euler - denoise(euler, sigma_next)) / sigma_next
+    return x + (sigma_next - sigma) * (slope + slope_there) / 2

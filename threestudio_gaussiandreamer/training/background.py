@@ -49,7 +49,7 @@ class FlatBackground(BaseBackground):
         self.step = global_step
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """The optimiser's group of the learned colour; none for the other modes."""
+        """Return the optimiser's group of the learned colour; none for the other modes."""
         return (
             [{"params": [self.logit], "name": "background", "lr": 0.0}]
             if self.cfg.mode == "learned"
@@ -62,7 +62,7 @@ class FlatBackground(BaseBackground):
                 group["lr"] = C(self.cfg.lr, epoch, step)
 
     def color(self, batch_size: int) -> Float[Tensor, "B 3"]:
-        """One colour per view, in [0, 1]; random ones are a function of (seed, step, view)."""
+        """Return a colour per view, in [0, 1]; random ones are a function of (seed, step, view)."""
         if self.cfg.mode == "learned":
             return torch.sigmoid(self.logit).expand(batch_size, 3)
         if self.cfg.mode == "random" and self.training:

@@ -24,7 +24,7 @@ ONE_VIEW = satisfies("1: views are evaluated one at a time", lambda count: count
 
 
 def whole_numbers(high: int) -> Rule:
-    """Whole numbers from 1 to ``high``, or lists of such."""
+    """Return the rule for whole numbers from 1 to ``high``, or lists of such."""
 
     def holds(value: Any) -> bool:
         values = value if is_list(value) else [value]

@@ -53,8 +53,8 @@ def make_batch(
     rays: bool = False,
     normalize: bool = True,
 ) -> dict[str, Any]:
-    """The host's batch of B views: tensors in the host's conventions, ``height`` and ``width`` as
-    plain ints.
+    """Make the host's batch of B views: tensors in the host's conventions, ``height`` and ``width``
+    as plain ints.
     """
     proj = cameras.projection(orbit.fovy, width / height)
     batch = {
@@ -137,8 +137,8 @@ class TrainCameras(IterableDataset, Updateable):
         )
 
     def _pick(self, batch_size: int, rng: torch.Generator) -> Orbit:
-        """``batch_size`` views of the pool, one from each azimuth sector (the pool is ordered by
-        azimuth).
+        """Draw ``batch_size`` views of the pool, one from each azimuth sector (the pool is ordered
+        by azimuth).
         """
         u = torch.rand(batch_size, generator=rng)
         sector = (
@@ -148,7 +148,7 @@ class TrainCameras(IterableDataset, Updateable):
         return Orbit(*(values[index] for values in self.pool))
 
     def _ranges(self, step: int) -> OrbitRanges:
-        """Elevation and azimuth grow from the evaluation view to the full range over
+        """Widen elevation and azimuth from the evaluation view to the full range over
         ``progressive_until`` steps.
         """
         r = 1.0 if self.cfg.progressive_until <= 0 else min(1.0, step / self.cfg.progressive_until)
@@ -175,7 +175,7 @@ class TrainCameras(IterableDataset, Updateable):
         return cameras.look_at(position, center, up)
 
     def _lights(self, c2w: Tensor, rng: torch.Generator) -> Tensor:
-        """Point lights around the camera's direction, as DreamFusion draws them."""
+        """Draw point lights around the camera's direction, as DreamFusion does."""
         noise = torch.randn(len(c2w), 3, generator=rng) * self.cfg.light_position_perturb
         low, high = self.cfg.light_distance_range
         return F.normalize(c2w[:, :3, 3] + noise, dim=-1) * (
@@ -250,8 +250,8 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         )
 
     def pool_views(self) -> Optional[dict[str, Any]]:
-        """``c2w``, ``fovy``, ``height``, ``width``, ``batch_size`` of all views of a fixed pool;
-        None where those change.
+        """Return ``c2w``, ``fovy``, ``height``, ``width``, ``batch_size`` of all views of a fixed
+        pool; None where those change.
         """
         cameras = self.train_dataset
         if cameras.pool is None or cameras.moves or len(cameras.sizes) > 1:

@@ -171,7 +171,7 @@ class GaussianCloud(BaseGeometry):
     # -- derived quantities ------------------------------------------------------------------------
 
     def scales(self) -> Float[Tensor, "N 3"]:
-        """Standard deviations along the axes, world units; clamped where exp would over- or
+        """Compute standard deviations along the axes, world units; clamped where exp would over- or
         underflow float32.
         """
         return self.log_scales.clamp(*LOG_SCALE_RANGE).exp()
@@ -212,7 +212,7 @@ class GaussianCloud(BaseGeometry):
     # -- start -------------------------------------------------------------------------------------
 
     def prior(self) -> Any:
-        """The prior of the configuration, which hasn't run yet."""
+        """Build the prior of the configuration, without running it."""
         return find(self.cfg.prior_type)(self.cfg.prior)
 
     def initialize(self, prompt: str, make_cloud: Any = None) -> PointCloud:
@@ -236,9 +236,7 @@ class GaussianCloud(BaseGeometry):
         return cloud
 
     def merge_duplicates(self) -> None:
-        """One Gaussian in the place of those that show the same, as far as the budget asks for
-        fewer.
-        """
+        """Replace Gaussians that show the same by one, as far as the budget asks for fewer."""
         merged = merge_duplicates(self.parameters_by_name(), at_least=min_count(self.cfg)).values
         if len(merged["means"]) < len(self):
             logger.info(
@@ -291,7 +289,7 @@ class GaussianCloud(BaseGeometry):
     # -- optimisation ------------------------------------------------------------------------------
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """One optimiser group per attribute, named after it; the rates are set every step by
+        """Return one optimiser group per attribute, named after it; the rates are set every step by
         :meth:`set_learning_rates`.
         """
         named = self.parameters_by_name().items()

@@ -50,7 +50,7 @@ class EvaluationConfig:
 
 
 def orbit_batch(orbit: Orbit, size: int) -> dict[str, Any]:
-    """The host's batch of the views of ``orbit``, square pictures of ``size`` pixels."""
+    """Make the host's batch of the views of ``orbit``, square pictures of ``size`` pixels."""
     c2w = orbit.c2w
     return make_batch(orbit, c2w, c2w[:, :3, 3].clone(), size, size)
 
@@ -98,8 +98,8 @@ class HeldOut:
 
     @torch.no_grad()
     def render(self, renderer: Any, chunk: int = 4) -> tuple[Tensor, Tensor]:
-        """The cloud's pictures (V, H, W, 3), as they come out, and the background (V, 3) they lie
-        on, on the CPU.
+        """Render the cloud's pictures (V, H, W, 3), not clamped, and return the background (V, 3)
+        of each too, on the CPU.
         """
         modes = [(module, module.training) for module in (renderer, renderer.background)]
         for module, _ in modes:
@@ -120,8 +120,8 @@ class HeldOut:
     def multi_face(
         self, images: Float[Tensor, "V H W 3"], backgrounds: Float[Tensor, "V 3"]
     ) -> float:
-        """The share of views that look like another side of the object, more than 45 degrees of
-        azimuth away.
+        """Compute the share of views that look like another side of the object, more than 45
+        degrees of azimuth away.
         """
         wrong = 0.0
         for rows, azimuth, ring in self.rings:
@@ -132,8 +132,8 @@ class HeldOut:
         return wrong / len(images)
 
     def floaters(self, means: Float[Tensor, "N 3"], opacities: Float[Tensor, " N"]) -> float:
-        """The opacity-weighted share of Gaussians farther from the surface than 2 % of the longest
-        side of its box.
+        """Compute the opacity-weighted share of Gaussians farther from the surface than 2 % of the
+        longest side of its box.
         """
         distances = torch.from_numpy(self.surface_distance(means.double().cpu().numpy()))
         return floater_mass(
@@ -171,7 +171,7 @@ class Measurements:
 
     @contextmanager
     def paused_clock(self) -> Iterator[None]:
-        """No time is counted in here: looking isn't training."""
+        """Count no time in this context: rendering pictures isn't training."""
         running = self._started is not None
         self.stop_clock()
         try:
@@ -221,8 +221,8 @@ class Measurements:
             file.write(json_text(self.values, indent=2).encode())
 
     def _save_pictures(self, key: str, renders: Tensor, truth: Tensor) -> None:
-        """Rows of six views: ``held_out/<key>.png``, ``truth.png``, and ``compare.png`` with prior,
-        result and truth.
+        """Save rows of six views: ``held_out/<key>.png``, ``truth.png``, and ``compare.png`` with
+        prior, result and truth.
         """
         folder = self.folder / "held_out"
         folder.mkdir(parents=True, exist_ok=True)
@@ -235,7 +235,7 @@ class Measurements:
             _write_png(folder / "compare.png", np.concatenate(pictures, 0))
 
     def table(self) -> str:
-        """Prior against result: dB, SSIM, Gaussians, seconds."""
+        """Tabulate prior and result: dB, SSIM, Gaussians, seconds."""
         lines = ["              dB     SSIM   multi-face   Gaussians   seconds"]
         for key in ("prior", "result"):
             if key in self.values:
@@ -253,9 +253,7 @@ def _now() -> np.ndarray:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    """The mapping in a JSON file; empty when there is none, or a damaged one, whose numbers are
-    measured anew.
-    """
+    """Read the mapping in a JSON file; empty when there is none, or a damaged one."""
     try:
         values = json.loads(path.read_text())
     except (OSError, ValueError):
@@ -264,7 +262,7 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _row(images: Float[Tensor, "V H W 3"], count: int = 6) -> np.ndarray:
-    """``count`` views spread around the object, side by side, as bytes."""
+    """Join ``count`` views spread around the object side by side, as bytes."""
     chosen = images[:: max(1, len(images) // count)][:count]
     return (torch.cat(list(chosen), 1).clamp(0, 1) * 255).round().byte().numpy()
 

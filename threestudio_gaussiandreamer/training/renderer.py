@@ -143,7 +143,7 @@ class SplattingRenderer(Rasterizer):
     def _composite(
         self, out: Rasterized, c2w: Tensor, fovy: Tensor, batch: dict[str, Any]
     ) -> tuple[Tensor, Tensor]:
-        """Another extension's background, which wants a direction per pixel."""
+        """Composite over another extension's background, which takes a direction per pixel."""
         height, width = out.image.shape[1:3]
         rays = batch.get("rays_d")
         if rays is None or rays.shape[1:3] != (height, width):
@@ -158,8 +158,8 @@ def normals_from_depth(
     c2w: Float[Tensor, "B 4 4"],
     fovy: Float[Tensor, " B"],
 ) -> Float[Tensor, "B H W 3"]:
-    """World-space normals of the depth surface, mapped from [-1, 1] to [0, 1]; 0.5 where nothing is
-    drawn.
+    """Compute world-space normals of the depth surface, mapped from [-1, 1] to [0, 1]; 0.5 where
+    nothing is drawn.
 
     ``depth`` is along the optical axis; the normal is the cross product of the surface's
     differences along rows and columns."""
