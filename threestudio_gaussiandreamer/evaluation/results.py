@@ -19,7 +19,7 @@ from ..formats.ply import is_gaussian_ply
 from ..gaussians.gaussians import Gaussians
 from ..host import find, get_device
 from ..launch.config import load_config
-from ..prompts.prompt_processors import PROMPT_LIBRARY, spelt_out
+from ..prompts.prompt_processors import PROMPT_LIBRARY, resolve_prompt
 
 BLACK = (0.0, 0.0, 0.0)
 
@@ -86,7 +86,7 @@ def _asked_for(parsed: Path) -> tuple[Optional[str], tuple[float, float, float]]
 def _prompt_of(processor: Mapping[str, Any]) -> Optional[str]:
     try:
         return (
-            spelt_out(
+            resolve_prompt(
                 processor.get("prompt") or "", processor.get("prompt_library", PROMPT_LIBRARY)
             )
             or None

@@ -203,18 +203,18 @@ def chosen_prompt(cfg: Any) -> str:
         raise UserError(
             'no prompt: give one, for instance system.prompt_processor.prompt="a corgi"'
         )
-    return spelt_out(prompt, cfg.prompt_library)
+    return resolve_prompt(prompt, cfg.prompt_library)
 
 
-def spelt_out(prompt: str, library: str) -> str:
-    """``prompt``, or the text of the library that ``lib:...`` stands for; raises as
+def resolve_prompt(prompt: str, library: str) -> str:
+    """Return ``prompt``, or the text of the library that ``lib:...`` stands for; raises as
     :func:`from_library`.
     """
     return from_library(prompt[4:], library) if prompt.startswith("lib:") else prompt
 
 
 def from_library(words: str, path: str) -> str:
-    """The only text of a prompt library that contains all of ``words``, which are joined by
+    """Find the only text of a prompt library that contains all of ``words``, which are joined by
     underscores.
 
     Raises:

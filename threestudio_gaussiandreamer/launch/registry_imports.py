@@ -1,6 +1,4 @@
-"""Every module that registers a part, in the order of the rings; importing this module imports them
-all.
-"""
+"""Imports of every module that registers a part, in the order of the rings."""
 
 from importlib import import_module
 
