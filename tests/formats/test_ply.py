@@ -2,6 +2,7 @@
 
 import os
 import struct
+import time
 
 import numpy as np
 import pytest
@@ -353,6 +354,25 @@ class TestPoints:
 
 
 class TestDamage:
+    @pytest.mark.parametrize(
+        ("kind", "length"),
+        [("char", struct.pack("<b", -1)), ("float", struct.pack("<f", float("nan")))]
+        + [("double", struct.pack("<d", float("inf"))), ("uint", struct.pack("<I", 2**32 - 1))],
+    )
+    def test_lengths_of_lists_that_are_none(self, tmp_path, kind, length):
+        before = f"element face 1\nproperty list {kind} int vertex_indices"
+        head = header("binary_little_endian", 2, before=before)
+        with pytest.raises(UserError, match="a list in 'face' is longer than the file"):
+            ply.read_points(saved(tmp_path, head.encode() + length + bytes(40)))
+
+    def test_many_lists_before_the_vertices_are_skipped_fast(self, tmp_path):
+        before = "element face 1000000\nproperty list uchar int vertex_indices"
+        head = header("binary_little_endian", 2, before=before)
+        path = saved(tmp_path, head.encode() + bytes(1_000_000) + bytes(range(24)))
+        started = time.process_time()
+        assert len(ply.read_points(path).points) == 2
+        assert time.process_time() - started < 1.5
+
     @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
     def test_more_than_was_announced_is_said(self, tmp_path, encoding, caplog):
         data = b"1 2 3\n4 5 6\n7 8 9\n" if encoding == "ascii" else bytes(range(36))

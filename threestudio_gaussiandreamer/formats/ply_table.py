@@ -6,6 +6,7 @@ size accounts for, whatever count the header states."""
 
 import logging
 import os
+import struct
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -286,25 +287,39 @@ def _is_row(words: list[bytes], element: Element) -> bool:
 
 def _skip_lists(file: BinaryIO, element: Element, order: str, path: str) -> None:
     """Skip binary rows with lists, each of which states its length."""
+    start, data = file.tell(), file.read()
+    try:
+        size = _size_of_lists(data, element, order)
+    except (struct.error, ValueError, OverflowError):  # NaN and infinity have no int
+        size = len(data) + 1
+    if size > len(data):
+        _fail(
+            path,
+            f"a list in {element.name!r} is longer than the file: it is truncated or damaged.",
+        )
+    file.seek(start + size)
+
+
+def _size_of_lists(data: bytes, element: Element, order: str) -> int:
+    """Return how many bytes the rows of an element take.
+
+    Raises:
+        struct.error, ValueError, OverflowError: a length outside of the data, or not a length.
+    """
+    kinds = [(entry.count_type, np.dtype(entry.type).itemsize) for entry in element.properties]
+    readers = [
+        (kind and struct.Struct((order or "=") + np.dtype(kind).char), size) for kind, size in kinds
+    ]
+    at = 0
     for _ in range(element.count):
-        for entry in element.properties:
-            length = 1
-            if entry.count_type:
-                count_type = np.dtype(order + entry.count_type)
-                raw = file.read(count_type.itemsize)
-                length = (
-                    int(np.frombuffer(raw, count_type)[0])
-                    if len(raw) == count_type.itemsize
-                    else -1
-                )
-            size = length * np.dtype(entry.type).itemsize
-            if not 0 <= size <= _remaining(file):
-                _fail(
-                    path,
-                    f"a list in {element.name!r} is longer than the file: it is truncated or "
-                    "damaged.",
-                )
-            file.seek(size, os.SEEK_CUR)
+        for length, size in readers:
+            if length:
+                size *= int(length.unpack_from(data, at)[0])
+                if size < 0:
+                    raise ValueError("a negative length")
+                at += length.size
+            at += size
+    return at
 
 
 def _remaining(file: BinaryIO) -> int:
