@@ -7,11 +7,18 @@ import struct
 import numpy as np
 from PIL import Image
 
+from threestudio_gaussiandreamer.meshes.gltf import read_gltf
+from threestudio_gaussiandreamer.meshes.mesh import surface_colors
+
 CODES = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
 KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 QUAD = np.float32([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 QUAD_UV = np.float32([[0, 1], [1, 1], [1, 0], [0, 0]])
 """glTF's v grows downwards: the quad shows the picture upright to who looks along -z."""
+RED, GREEN, BLUE, WHITE = np.uint8([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]])
+FOUR = np.array([[RED, GREEN], [BLUE, WHITE]])
+"""Red green / blue white, row 0 on top."""
+NEAREST = {"magFilter": 9728}
 
 
 class Gltf:
@@ -117,3 +124,12 @@ def textured_quad(
     indices = made.accessor(np.uint16([0, 1, 2, 0, 2, 3]))
     made.primitive(attributes, indices=indices, material=made.material(texture, factor, info))
     return made
+
+
+def color_at(path, x, y):
+    """The colour at a place of the one part of a file, seen along -z in the file's axes."""
+    (part,) = read_gltf(path)
+    for face, corners in enumerate(part.vertices[part.faces][:, :, :2]):
+        weights = np.linalg.solve(np.vstack([corners.T, np.ones(3)]), [x, y, 1])
+        if weights.min() > -1e-9:
+            return surface_colors(part, np.array([face]), weights[None])[0]

@@ -1,47 +1,26 @@
 """glTF files made by hand, one feature each: positions and colours are what the standard says."""
 
-import base64
-import json
-import os
-import threading
-import tracemalloc
-import zlib
-
 import numpy as np
 import pytest
 
-from tests.helpers.gltf_builder import QUAD, QUAD_UV, Gltf, png, textured_quad
+from tests.helpers.gltf_builder import (
+    BLUE,
+    FOUR,
+    GREEN,
+    NEAREST,
+    QUAD,
+    QUAD_UV,
+    RED,
+    WHITE,
+    Gltf,
+    color_at,
+    textured_quad,
+)
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.meshes import budget
 from threestudio_gaussiandreamer.meshes.gltf import read_gltf
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.mesh import surface_colors
 from threestudio_gaussiandreamer.priors.point_cloud import PointCloudPrior
-
-RED, GREEN, BLUE, WHITE = np.uint8([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]])
-FOUR = np.array([[RED, GREEN], [BLUE, WHITE]])
-"""Red green / blue white, row 0 on top."""
-NEAREST = {"magFilter": 9728}
-HALF = 0.5
-
-
-@pytest.fixture
-def saved(tmp_path):
-    def save(made, name="a.glb"):
-        path = tmp_path / name
-        path.write_bytes(made.glb())
-        return path
-
-    return save
-
-
-def color_at(path, x, y):
-    """The colour at a place of the one part of a file, seen along -z in the file's axes."""
-    (part,) = read_gltf(path)
-    for face, corners in enumerate(part.vertices[part.faces][:, :, :2]):
-        weights = np.linalg.solve(np.vstack([corners.T, np.ones(3)]), [x, y, 1])
-        if weights.min() > -1e-9:
-            return surface_colors(part, np.array([face]), weights[None])[0]
 
 
 def test_a_picture_is_upright(saved):
@@ -267,89 +246,6 @@ def test_a_point_cloud_of_a_mesh_has_its_texture_s_colours(saved):
     np.testing.assert_array_equal(cloud.colors, np.array([RED, GREEN, BLUE, WHITE]) / 255)
 
 
-# ---- files beside --------------------------------------------------------------------------------
-
-
-def gltf_beside(tmp_path, uri="picture%20one.png"):
-    """A .gltf with its buffer as data and its picture in a file."""
-    made = textured_quad(FOUR, sampler=NEAREST)
-    made.glb()
-    data = base64.b64encode(made.binary).decode()
-    made.document["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{data}"
-    made.document["images"] = [{"uri": uri}]
-    (tmp_path / "a.gltf").write_text(json.dumps(made.document))
-    return tmp_path / "a.gltf"
-
-
-def test_pictures_and_buffers_are_found(tmp_path):
-    (tmp_path / "picture one.png").write_bytes(png(FOUR))
-    np.testing.assert_allclose(color_at(gltf_beside(tmp_path), 0.2, 0.8), RED / 255)
-
-
-def test_a_missing_texture_is_named_and_leaves_grey(tmp_path, caplog):
-    path = gltf_beside(tmp_path)
-    np.testing.assert_allclose(color_at(path, 0.2, 0.8), HALF)
-    assert "names the file 'picture one.png', which does not exist" in caplog.text
-    np.testing.assert_allclose(PointCloudPrior({"path": str(path)})("a fox").colors, HALF)
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="FIFOs are of Unix")
-@pytest.mark.parametrize("kind", ["texture", "buffer", "mtl", "texture of an OBJ"])
-def test_a_fifo_beside_a_mesh_is_refused(kind, tmp_path):
-    """Opened plainly it would wait for a writer for ever."""
-    os.mkfifo(tmp_path / "fifo.png")
-    path = gltf_beside(tmp_path, "fifo.png")
-    if kind == "buffer":
-        document = json.loads(path.read_text())
-        document["buffers"][0]["uri"] = "fifo.png"
-        path.write_text(json.dumps(document))
-    if "mtl" in kind or "OBJ" in kind:
-        path = tmp_path / "a.obj"
-        path.write_text(f"mtllib {'fifo.png' if kind == 'mtl' else 'a.mtl'}\n" + TRIANGLE)
-        (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd fifo.png\n")
-    caught = []
-    thread = threading.Thread(target=lambda: caught.append(error_of(path)), daemon=True)
-    thread.start()
-    thread.join(20)
-    assert caught and "not a regular file" in caught[0]
-
-
-def error_of(path):
-    try:
-        load_mesh(path)
-    except UserError as error:
-        return str(error)
-
-
-# ---- OBJ -----------------------------------------------------------------------------------------
-
-TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
-
-
-@pytest.mark.parametrize("head", ["", "mtllib missing.mtl\n"])
-def test_an_obj_with_coordinates_and_no_material_is_grey(head, tmp_path):
-    (tmp_path / "a.obj").write_text(head + TRIANGLE)
-    mesh = load_mesh(tmp_path / "a.obj")
-    assert not mesh.has_colors
-    np.testing.assert_array_equal(surface_colors(mesh, np.array([0]), np.full((1, 3), 1 / 3)), HALF)
-    cloud = PointCloudPrior({"path": str(tmp_path / "a.obj")})("a fox")
-    np.testing.assert_array_equal(cloud.colors, HALF)
-
-
-@pytest.mark.parametrize("picture, expected", [(None, [1, 0.5, 0]), (np.uint16([[0x8080]]), 0.5)])
-def test_an_obj_s_material(picture, expected, tmp_path, caplog):
-    """A missing picture leaves the material's colour; one of 16 bits isn't clipped to white."""
-    kd = "Kd 1 0.5 0\n" if picture is None else ""
-    (tmp_path / "a.mtl").write_text(f"newmtl m\n{kd}map_Kd p.png\n")
-    (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + TRIANGLE)
-    if picture is not None:
-        (tmp_path / "p.png").write_bytes(png(picture))
-    mesh = load_mesh(tmp_path / "a.obj")
-    color = surface_colors(mesh, np.array([0]), np.full((1, 3), 1 / 3))[0]
-    np.testing.assert_allclose(color, np.broadcast_to(expected, 3), atol=2e-3)
-    assert ("p.png" in caplog.text) == (picture is None)
-
-
 # ---- what isn't read -----------------------------------------------------------------------------
 
 
@@ -407,55 +303,3 @@ def changed(made, path, value):
 def test_damage_is_one_message(path, value, message, saved):
     with pytest.raises(UserError, match=message):
         read_gltf(saved(changed(textured_quad(FOUR, sampler=NEAREST), path, value)))
-
-
-# ---- memory --------------------------------------------------------------------------------------
-
-
-def refused(made, saved):
-    """The message of a refusal, and the most that Python allocated before it."""
-    path = saved(made)
-    tracemalloc.start()
-    try:
-        with pytest.raises(UserError) as caught:
-            load_mesh(path)
-        return str(caught.value), tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-
-
-def test_textures_count_together(saved, monkeypatch):
-    """Two pictures of half a megabyte in a file of few bytes: one fits, two don't."""
-    monkeypatch.setattr(budget, "FIXED_BYTES", 700_000)
-    monkeypatch.setattr(budget, "BYTES_PER_BYTE", 0)
-    flat = np.zeros((256, 256, 3), np.uint8)
-    made = textured_quad(flat)
-    assert load_mesh(saved(made)).texture.shape == (256, 256, 3)
-    made.document["meshes"][0]["primitives"].append(
-        made.document["meshes"][0]["primitives"][0]
-        | {"material": made.material(made.texture(flat))}
-    )
-    message, taken = refused(made, saved)
-    assert "the texture 1 of 256 x 256 texels is too large" in message and taken < 1 << 20
-
-
-def test_instances_count(saved, monkeypatch):
-    """2,000 nodes that show one mesh are refused before they are made; the texture is kept once."""
-    monkeypatch.setattr(budget, "FIXED_BYTES", 1 << 20)
-    monkeypatch.setattr(budget, "BYTES_PER_BYTE", 0)
-    made = textured_quad(np.zeros((64, 64, 3), np.uint8))
-    made.document["nodes"] = [{"mesh": 0, "translation": [i, 0, 0]} for i in range(500)]
-    made.document["scenes"][0]["nodes"] = list(range(500))
-    assert load_mesh(saved(made)).texture.size == 64 * 64 * 3
-    made.document["nodes"] *= 4
-    made.document["scenes"][0]["nodes"] = list(range(2000))
-    assert "too large" in refused(made, saved)[0]
-
-
-def test_a_large_header_is_refused_before_anything_is_allocated(saved):
-    """A PNG of 12,000 x 12,000 pixels whose header alone is right."""
-    data = bytearray(png(FOUR))
-    data[16:24] = (12000).to_bytes(4, "big") * 2
-    data[29:33] = zlib.crc32(bytes(data[12:29])).to_bytes(4, "big")
-    message, taken = refused(textured_quad(bytes(data)), saved)
-    assert "12000 x 12000 texels is too large" in message and taken < 4 << 20

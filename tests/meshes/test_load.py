@@ -1,4 +1,5 @@
 import logging
+import time
 
 import numpy as np
 import pytest
@@ -6,9 +7,6 @@ import pytest
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.meshes.load import find_mesh, load_mesh
 from threestudio_gaussiandreamer.meshes.mesh import (
-    Mesh,
-    SurfaceDistance,
-    face_areas,
     sample_surface,
     surface_colors,
 )
@@ -184,23 +182,6 @@ def test_the_textures_first_row_is_at_v_1(tmp_path):
     )
 
 
-def test_texels_are_bilinear_and_repeat():
-    """Values at texel centres are the texels', halfway between two their mean; outside [0, 1] the
-    texture repeats.
-    """
-    texture = np.array(IMAGE, dtype=np.uint8)
-    places = np.array([[0.25, 0.75], [0.5, 0.75], [0.75, 0.25], [1.25, -0.25], [0.0, 0.75]])
-    expected = [[1, 0, 0], [0.5, 0.5, 0], [1, 1, 1], [1, 0, 0], [0.5, 0.5, 0]]
-    for place, color in zip(places, expected, strict=True):
-        mesh = Mesh(
-            np.zeros((3, 3)),
-            np.array([[0, 1, 2]]),
-            uv=np.repeat(place[None], 3, axis=0).astype(np.float32),
-            texture=texture,
-        )
-        np.testing.assert_allclose(center_color(mesh), color, atol=1e-6)
-
-
 def test_a_texture_is_tinted_by_its_material(tmp_path):
     quad = textured_quad(np.full((2, 2, 3), 255))
     quad.visual.material.baseColorFactor = [255, 0, 255, 255]
@@ -244,33 +225,6 @@ def test_a_scene_of_textures_and_colours_keeps_them_apart(tmp_path):
     np.testing.assert_allclose(stripes, [[0, 0, 1], [0, 1, 0], [0, 0, 1], [0, 0, 1]], atol=1e-5)
     np.testing.assert_allclose(center_color(mesh, order[-13]), [1, 1, 0], atol=1e-6)
     np.testing.assert_allclose(center_color(mesh, order[-1]), 0.5, atol=1e-6)
-
-
-# Sampling
-
-
-def test_samples_are_uniform_over_the_area_and_ignore_empty_faces():
-    from scipy import stats
-
-    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 3, 0]], float)
-    mesh = Mesh(vertices, np.array([[0, 1, 2], [1, 1, 2], [1, 3, 2]]))
-    points, faces, weights = sample_surface(mesh, 20000, np.random.default_rng(0))
-    areas = face_areas(mesh)
-    np.testing.assert_allclose(areas, [0.5, 0, 1.5], atol=1e-12)
-    assert not (faces == 1).any()
-    assert stats.binomtest(int((faces == 0).sum()), 20000, 0.25).pvalue > 0.01
-    first = points[faces == 0]
-    assert (
-        stats.kstest(1 - (1 - first[:, 0]) ** 2, "uniform").pvalue > 0.01
-    )  # the marginal of a uniform right triangle
-    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-12)
-
-
-def test_surface_distances_of_a_sphere(tmp_path):
-    mesh = load_mesh(saved(trimesh.creation.icosphere(4), tmp_path / "a.ply"))
-    points = np.array([[1.5, 0, 0], [0, 0, 0], [0, 1.0, 0]])
-    # spacing of 2e5 samples on a sphere is 0.008; the icosphere's faces lie up to 0.002 inside
-    np.testing.assert_allclose(SurfaceDistance(mesh)(points), [0.5, 1.0, 0.0], atol=0.012)
 
 
 # Bad input
@@ -351,6 +305,29 @@ def test_what_cannot_be_used_is_named(tmp_path, name, content, message):
         (tmp_path / name).write_bytes(content)
     with pytest.raises(UserError, match=message):
         load_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"v 0 0 %b" % (b"1" * 64_000 + b"x"),
+        b"v 0 0 1.%b" % (b"1" * 64_000 + b"x"),
+        b"v 0 0 1e%b" % (b"1" * 64_000 + b"x"),
+        b"v" + b" 1" * 32_000 + b" x",
+        b"v 0 0" + b" " * 64_000 + b"x",
+        b"f" + b" 1/1/1" * 16_000 + b" x",
+        b"f" + b" " * 64_000 + b"x",
+        b"f 1 2 " + b"3" * 64_000 + b"x",
+    ],
+    ids=lambda line: line[:8].decode(),
+)
+def test_a_long_line_takes_linear_time(tmp_path, line):
+    """64 kB; where a number may be split in two ways, 16 kB took 25 s."""
+    (tmp_path / "a.obj").write_bytes(b"v 0 0 0\n" + line + b"\n")
+    started = time.process_time()
+    with pytest.raises(UserError, match="line 2 is no vertex or face"):
+        load_mesh(tmp_path / "a.obj")
+    assert time.process_time() - started < 2  # a quadratic search takes minutes
 
 
 @pytest.mark.parametrize(

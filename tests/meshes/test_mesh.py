@@ -1,0 +1,60 @@
+"""Colours at places on a mesh, and points on its surface."""
+
+import numpy as np
+import pytest
+
+from threestudio_gaussiandreamer.meshes.load import load_mesh
+from threestudio_gaussiandreamer.meshes.mesh import (
+    Mesh,
+    SurfaceDistance,
+    face_areas,
+    sample_surface,
+    surface_colors,
+)
+
+trimesh = pytest.importorskip("trimesh")
+IMAGE = [[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]]  # red green / blue white
+
+
+def test_texels_are_bilinear_and_repeat():
+    """Values at texel centres are the texels', halfway between two their mean; outside [0, 1] the
+    texture repeats.
+    """
+    texture = np.array(IMAGE, dtype=np.uint8)
+    places = np.array([[0.25, 0.75], [0.5, 0.75], [0.75, 0.25], [1.25, -0.25], [0.0, 0.75]])
+    expected = [[1, 0, 0], [0.5, 0.5, 0], [1, 1, 1], [1, 0, 0], [0.5, 0.5, 0]]
+    for place, color in zip(places, expected, strict=True):
+        mesh = Mesh(
+            np.zeros((3, 3)),
+            np.array([[0, 1, 2]]),
+            uv=np.repeat(place[None], 3, axis=0).astype(np.float32),
+            texture=texture,
+        )
+        np.testing.assert_allclose(
+            surface_colors(mesh, np.array([0]), np.full((1, 3), 1 / 3))[0], color, atol=1e-6
+        )
+
+
+def test_samples_are_uniform_over_the_area_and_ignore_empty_faces():
+    from scipy import stats
+
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 3, 0]], float)
+    mesh = Mesh(vertices, np.array([[0, 1, 2], [1, 1, 2], [1, 3, 2]]))
+    points, faces, weights = sample_surface(mesh, 20000, np.random.default_rng(0))
+    areas = face_areas(mesh)
+    np.testing.assert_allclose(areas, [0.5, 0, 1.5], atol=1e-12)
+    assert not (faces == 1).any()
+    assert stats.binomtest(int((faces == 0).sum()), 20000, 0.25).pvalue > 0.01
+    first = points[faces == 0]
+    assert (
+        stats.kstest(1 - (1 - first[:, 0]) ** 2, "uniform").pvalue > 0.01
+    )  # the marginal of a uniform right triangle
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-12)
+
+
+def test_surface_distances_of_a_sphere(tmp_path):
+    trimesh.creation.icosphere(4).export(tmp_path / "a.ply")
+    mesh = load_mesh(tmp_path / "a.ply")
+    points = np.array([[1.5, 0, 0], [0, 0, 0], [0, 1.0, 0]])
+    # spacing of 2e5 samples on a sphere is 0.008; the icosphere's faces lie up to 0.002 inside
+    np.testing.assert_allclose(SurfaceDistance(mesh)(points), [0.5, 1.0, 0.0], atol=0.012)

@@ -1,0 +1,97 @@
+"""Files that a mesh names beside itself, and the materials of OBJ files."""
+
+import base64
+import json
+import os
+import threading
+
+import numpy as np
+import pytest
+
+from tests.helpers.gltf_builder import FOUR, NEAREST, RED, color_at, png, textured_quad
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.meshes.load import load_mesh
+from threestudio_gaussiandreamer.meshes.mesh import surface_colors
+from threestudio_gaussiandreamer.priors.point_cloud import PointCloudPrior
+
+HALF = 0.5
+
+
+def gltf_beside(tmp_path, uri="picture%20one.png"):
+    """A .gltf with its buffer as data and its picture in a file."""
+    made = textured_quad(FOUR, sampler=NEAREST)
+    made.glb()
+    data = base64.b64encode(made.binary).decode()
+    made.document["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{data}"
+    made.document["images"] = [{"uri": uri}]
+    (tmp_path / "a.gltf").write_text(json.dumps(made.document))
+    return tmp_path / "a.gltf"
+
+
+def test_pictures_and_buffers_are_found(tmp_path):
+    (tmp_path / "picture one.png").write_bytes(png(FOUR))
+    np.testing.assert_allclose(color_at(gltf_beside(tmp_path), 0.2, 0.8), RED / 255)
+
+
+def test_a_missing_texture_is_named_and_leaves_grey(tmp_path, caplog):
+    path = gltf_beside(tmp_path)
+    np.testing.assert_allclose(color_at(path, 0.2, 0.8), HALF)
+    assert "names the file 'picture one.png', which does not exist" in caplog.text
+    np.testing.assert_allclose(PointCloudPrior({"path": str(path)})("a fox").colors, HALF)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="FIFOs are of Unix")
+@pytest.mark.parametrize("kind", ["texture", "buffer", "mtl", "texture of an OBJ"])
+def test_a_fifo_beside_a_mesh_is_refused(kind, tmp_path):
+    """Opened plainly it would wait for a writer for ever."""
+    os.mkfifo(tmp_path / "fifo.png")
+    path = gltf_beside(tmp_path, "fifo.png")
+    if kind == "buffer":
+        document = json.loads(path.read_text())
+        document["buffers"][0]["uri"] = "fifo.png"
+        path.write_text(json.dumps(document))
+    if "mtl" in kind or "OBJ" in kind:
+        path = tmp_path / "a.obj"
+        path.write_text(f"mtllib {'fifo.png' if kind == 'mtl' else 'a.mtl'}\n" + TRIANGLE)
+        (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd fifo.png\n")
+    caught = []
+    thread = threading.Thread(target=lambda: caught.append(error_of(path)), daemon=True)
+    thread.start()
+    thread.join(20)
+    assert caught and "not a regular file" in caught[0]
+
+
+def error_of(path):
+    try:
+        load_mesh(path)
+    except UserError as error:
+        return str(error)
+
+
+# ---- OBJ -----------------------------------------------------------------------------------------
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+
+
+@pytest.mark.parametrize("head", ["", "mtllib missing.mtl\n"])
+def test_an_obj_with_coordinates_and_no_material_is_grey(head, tmp_path):
+    (tmp_path / "a.obj").write_text(head + TRIANGLE)
+    mesh = load_mesh(tmp_path / "a.obj")
+    assert not mesh.has_colors
+    np.testing.assert_array_equal(surface_colors(mesh, np.array([0]), np.full((1, 3), 1 / 3)), HALF)
+    cloud = PointCloudPrior({"path": str(tmp_path / "a.obj")})("a fox")
+    np.testing.assert_array_equal(cloud.colors, HALF)
+
+
+@pytest.mark.parametrize("picture, expected", [(None, [1, 0.5, 0]), (np.uint16([[0x8080]]), 0.5)])
+def test_an_obj_s_material(picture, expected, tmp_path, caplog):
+    """A missing picture leaves the material's colour; one of 16 bits isn't clipped to white."""
+    kd = "Kd 1 0.5 0\n" if picture is None else ""
+    (tmp_path / "a.mtl").write_text(f"newmtl m\n{kd}map_Kd p.png\n")
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + TRIANGLE)
+    if picture is not None:
+        (tmp_path / "p.png").write_bytes(png(picture))
+    mesh = load_mesh(tmp_path / "a.obj")
+    color = surface_colors(mesh, np.array([0]), np.full((1, 3), 1 / 3))[0]
+    np.testing.assert_allclose(color, np.broadcast_to(expected, 3), atol=2e-3)
+    assert ("p.png" in caplog.text) == (picture is None)
