@@ -9,8 +9,9 @@ def escape(value: Any) -> Any:
     lists and dicts, escaped.
     """
     if isinstance(value, str):
-        # backslashes mean themselves, except right before "${"
-        return re.sub(r"(\\*)\$\{", lambda match: 2 * match[1] + r"\${", value)
+        # Backslashes mean themselves, except right before "${"; the look behind lets a row of them
+        # be tried from its start only, which takes linear time.
+        return re.sub(r"(?<!\\)(\\*)\$\{", lambda match: 2 * match[1] + r"\${", value)
     if isinstance(value, dict):
         return {key: escape(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

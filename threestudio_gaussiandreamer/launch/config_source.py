@@ -234,7 +234,7 @@ def _protect_escaped(text: str) -> str:
     """
     if "${" not in text or re.search(r"(?<!\\)(\\\\)*\$\{", text):
         return text
-    return re.sub(r"(\\+)\$\{", lambda match: "\\" * (len(match[1]) // 2) + PROTECTED, text)
+    return re.sub(r"(?<!\\)(\\+)\$\{", lambda match: "\\" * (len(match[1]) // 2) + PROTECTED, text)
 
 
 def unprotect(text: str) -> str:

@@ -1,0 +1,23 @@
+"""Text that OmegaConf must give back as it is."""
+
+import time
+
+import pytest
+from omegaconf import OmegaConf
+
+from threestudio_gaussiandreamer.core.interpolation import escape
+from threestudio_gaussiandreamer.launch.config_source import _protect_escaped
+
+
+@pytest.mark.parametrize("text", ["${a}", "\\${a}", "x\\\\${", "\\\\", "${${", "a\\b ${c} \\\\${d"])
+def test_escaped_text_comes_back(text):
+    assert OmegaConf.create({"text": escape(text)}).text == text
+
+
+def test_a_row_of_backslashes_takes_linear_time():
+    """100 kB from a file; where each backslash is tried as the first of its row, a minute."""
+    text = "\\" * 100_000
+    started = time.process_time()
+    assert escape(text) == text
+    assert _protect_escaped(text + " \\${a}").startswith(text)
+    assert time.process_time() - started < 1
