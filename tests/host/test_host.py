@@ -1,35 +1,20 @@
-"""The built-in host: registry, schedules, typed configurations, updates, savers, and the choice of
-the host.
-"""
+"""The built-in host: registry, updates, parts and system; and the choice of the host."""
 
-import json
-import math
 import sys
-from dataclasses import dataclass, field
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import imageio.v3 as iio
-import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from threestudio_gaussiandreamer import host
-from threestudio_gaussiandreamer.core import images as pictures
 from threestudio_gaussiandreamer.core.checkpoint_file import save_file
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.core.interpolation import escape
-from threestudio_gaussiandreamer.core.schedule import C, C_max, validate_schedule
 from threestudio_gaussiandreamer.host.builtin import registry
 from threestudio_gaussiandreamer.host.builtin.base import (
     BaseModule,
     BaseObject,
     Updateable,
-    parse_structured,
 )
 from threestudio_gaussiandreamer.host.builtin.models import (
     BaseGeometry,
@@ -37,7 +22,6 @@ from threestudio_gaussiandreamer.host.builtin.models import (
     Renderer,
     SolidColorBackground,
 )
-from threestudio_gaussiandreamer.host.builtin.savers import SaverMixin
 from threestudio_gaussiandreamer.host.builtin.system import (
     BaseLift3DSystem,
     BaseSystem,
@@ -86,125 +70,6 @@ def test_mixins_come_before_the_main_class(own_registry):
     own_registry.register("mixin")(mixin)
     assert own_registry.find("main:mixin").kind == "mixin"
     assert issubclass(own_registry.find("main:mixin"), main)
-
-
-# -- schedules -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("value", "step", "expected"),
-    [
-        (0.5, 7, 0.5),
-        (3, 7, 3),
-        ([1.0, 3.0, 10], 0, 1.0),
-        ([1.0, 3.0, 10], 5, 2.0),
-        ([1.0, 3.0, 10], 99, 3.0),
-        ((4, 1.0, 3.0, 8), 4, 1.0),
-        ((4, 1.0, 3.0, 8), 6, 2.0),
-        # the paper's switch of the largest timestep
-        ([500, 0.98, 0.55, 501], 500, 0.98),
-        ([500, 0.98, 0.55, 501], 501, 0.55),
-        # the released code's clipping: three knots at 0, 1000, 2000
-        ([0, 1.5, 2.0, 1000, 3.0, 2000], 500, 1.75),
-        ([0, 1.5, 2.0, 1000, 3.0, 2000], 1500, 2.5),
-        ([0, 1.5, 2.0, 1000, 3.0, 2000], 5000, 3.0),
-        (OmegaConf.create([1.0, 3.0, 10]), 5, 2.0),
-    ],
-)
-def test_schedule_by_step(value, step, expected):
-    assert C(value, epoch=0, global_step=step) == pytest.approx(expected, abs=1e-12)
-
-
-def test_a_fractional_end_counts_epochs():
-    assert C([0, 0.0, 1.0, 10.0], epoch=5, global_step=9999) == 0.5
-    assert C([0, 0.0, 1.0, 10], epoch=5, global_step=2) == 0.2
-
-
-def test_exponential_interpolation_is_the_geometric_mean_half_way():
-    assert C([0, 1.0, 100.0, 10], 0, 5, interpolation="exp") == pytest.approx(10.0)
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        "0.5",
-        None,
-        True,
-        [],
-        [1.0],
-        [1.0, 2.0],
-        [0, 1.0, 2.0, 10, 3.0],
-        [0, 1.0, 2.0, 10, 3.0, 20, 4.0],
-        [5, 1.0, 2.0, 5],
-        [0, 1.0, 2.0, 20, 3.0, 10],
-        [1.0, 2.0, 0],
-        [0, "a", 2.0, 10],
-        [0, True, 2.0, 10],
-        [0, math.nan, 2.0, 10],
-        math.inf,
-        {"a": 1},
-        [0, 1.0, 2.0, 10, 3.0, 20.0],
-    ],
-)
-def test_anything_else_is_no_schedule(value):
-    with pytest.raises(UserError, match="grad_clip"):
-        validate_schedule(value, "grad_clip")
-    with pytest.raises(UserError):
-        C(value, 0, 0)
-
-
-@given(st.lists(st.floats(-10, 10), min_size=3, max_size=6), st.integers(-5, 80))
-def test_a_piecewise_schedule_is_numpys_interpolation(values, step):
-    steps = [10 * i for i in range(len(values))]
-    knots = [steps[0], values[0]] + [
-        x for pair in zip(values[1:], steps[1:], strict=True) for x in pair
-    ]
-    # exact up to the rounding of one multiplication
-    assert C(knots, 0, step) == pytest.approx(np.interp(step, steps, values), abs=1e-12)
-    assert C_max(knots) == max(values)
-
-
-# -- configurations --------------------------------------------------------------------------------
-
-
-@dataclass
-class Options:
-    size: int = 3
-    text: str = ""
-    rates: Any = 0.1
-    inner: dict = field(default_factory=dict)
-
-
-def test_values_are_typed_and_defaults_filled():
-    cfg = parse_structured(Options, {"size": "5", "rates": [1, 2, 3]})
-    assert cfg.size == 5 and list(cfg.rates) == [1, 2, 3] and cfg.text == ""
-    assert parse_structured(Options).size == 3
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"szie": 3}, "unknown key 'szie': did you mean 'size'"),
-        ({"size": "big"}, "size: Value 'big'"),
-        ({"inner": 3}, "inner"),
-        ("size", "expected keys and values"),
-    ],
-)
-def test_a_mistake_in_a_configuration_is_named(values, message):
-    with pytest.raises(UserError, match=message):
-        parse_structured(Options, values)
-
-
-@given(st.text(alphabet="ab\\${} :#[]", max_size=12))
-def test_strings_are_text_whatever_they_look_like(text):
-    assert OmegaConf.create({"x": escape(text)}).x == text
-    cfg = parse_structured(Options, {"text": text, "inner": {"prompt": text}})
-    assert cfg.text == text and cfg.inner.prompt == text
-    # a part hands a section of its own configuration on
-    assert (
-        parse_structured(Options, {"text": cfg.inner.prompt, "inner": cfg.inner}).inner.prompt
-        == text
-    )
 
 
 # -- parts -----------------------------------------------------------------------------------------
@@ -335,115 +200,6 @@ def test_optimizer_groups_are_named_attributes_with_their_own_options():
         optimizer_from(OmegaConf.create({"name": "Adam", "params": {"geometry.maens": {}}}), module)
     with pytest.raises(UserError, match="system.optimizer.name is 'Adma'"):
         optimizer_from(OmegaConf.create({"name": "Adma"}), module)
-
-
-# -- savers ----------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def saver(tmp_path):
-    saver = SaverMixin()
-    saver.set_save_dir(str(tmp_path / "save"))
-    return saver
-
-
-def test_saving_without_a_folder_is_our_own_mistake():
-    with pytest.raises(ValueError, match="set_save_dir"):
-        SaverMixin().get_save_path("a.png")
-
-
-def test_colours_come_back_from_the_file(saver):
-    image = torch.tensor([[[1.0, 0.0, 0.0], [0.0, 0.5, 2.0]]])
-    path = saver.save_rgb_image("it3-0.png", image)
-    assert iio.imread(path).tolist() == [[[255, 0, 0], [0, 128, 255]]]
-    assert path.endswith("save/it3-0.png")
-    path = saver.save_rgb_image("deep/er/chw.png", image.permute(2, 0, 1), data_format="CHW")
-    assert iio.imread(path).tolist() == [[[255, 0, 0], [0, 128, 255]]]
-
-
-def test_more_channels_are_laid_side_by_side():
-    four = pictures.rgb(np.ones((2, 3, 4)))
-    assert four.shape == (2, 6, 3)
-    assert four[0, 2].tolist() == [255, 255, 255] and four[0, 5].tolist() == [255, 0, 0]
-
-
-def test_grayscale_is_stretched_or_kept_and_a_constant_is_black():
-    values = np.array([[1.0, 3.0]])
-    assert pictures.grayscale(values, cmap=None)[..., 0].tolist() == [[0, 255]]
-    assert pictures.grayscale(values, data_range=(0, 4), cmap=None)[..., 0].tolist() == [[64, 191]]
-    assert pictures.grayscale(np.full((1, 2), 7.0), cmap=None).max() == 0
-    assert pictures.grayscale(np.array([[np.nan, 1.0]]), cmap=None)[..., 0].tolist() == [[0, 255]]
-    assert pictures.grayscale(values, cmap="jet")[0].tolist() == [[0, 0, 128], [128, 0, 0]]
-
-
-def test_a_grid_has_cells_of_one_size_and_rows(saver):
-    small = {"type": "rgb", "img": torch.ones(2, 2, 3), "kwargs": {"data_format": "HWC"}}
-    large = {
-        "type": "grayscale",
-        "img": torch.eye(4),
-        "kwargs": {"cmap": None, "data_range": (0, 1)},
-    }
-    assert iio.imread(saver.save_image_grid("row.png", [small, large])).shape == (4, 8, 3)
-    assert iio.imread(saver.save_image_grid("min.png", [small, large], align="min")).shape == (
-        2,
-        4,
-        3,
-    )
-    rows = saver.save_image_grid("rows.png", [[small, large], [large]], align=6, texts=["a", "b"])
-    assert iio.imread(rows).shape == (12, 12, 3)
-
-
-def test_a_video_of_odd_pictures_has_even_size_and_numeric_order(saver):
-    for i in (10, 2, 1):
-        saver.save_rgb_image(f"it3-test/{i}.png", np.full((33, 17, 3), i / 10))
-    path = saver.save_img_sequence("it3-test", "it3-test", r"(\d+)\.png", fps=10)
-    frames = iio.imread(path, plugin="FFMPEG")
-    assert path.endswith("it3-test.mp4") and frames.shape == (3, 34, 18, 3)
-    boxes = Path(path).read_bytes()
-    assert boxes.index(b"moov") < boxes.index(b"mdat")  # a browser plays it while it loads
-    assert iio.immeta(path, plugin="FFMPEG")["codec"] == "h264"
-    assert iio.immeta(path, plugin="FFMPEG")["pix_fmt"].startswith("yuv420p")
-    # H.264 rounds colours by a few levels; the order is what counts
-    assert np.allclose(frames.mean((1, 2, 3)), [25.5, 51, 255], atol=6)
-    assert (
-        iio.imread(
-            saver.save_img_sequence("turn", "it3-test", r"(\d+)\.png", save_format="gif")
-        ).shape[0]
-        == 3
-    )
-
-
-def test_a_video_of_nothing_and_an_unknown_format_are_errors(saver):
-    Path(saver.get_save_path("empty/x.txt")).touch()
-    with pytest.raises(FileNotFoundError):
-        saver.save_img_sequence("a", "empty", r"(\d+)\.png")
-    with pytest.raises(UserError, match="unknown video format 'avi'"):
-        saver.save_img_sequence("a", "empty", r"(\d+)\.png", save_format="avi")
-
-
-def test_data_json_files_and_meshes_come_back(saver, tmp_path):
-    assert np.load(saver.save_data("a", {"x": torch.arange(3)}))["x"].tolist() == [0, 1, 2]
-    assert np.load(saver.save_data("b.npy", np.ones(2))).tolist() == [1, 1]
-    assert json.loads(Path(saver.save_json("c.json", {"psnr": 30.5})).read_text()) == {"psnr": 30.5}
-    assert (
-        torch.load(saver.save_state_dict("d.ckpt", {"x": torch.ones(1)}), weights_only=True)["x"]
-        == 1
-    )
-    (tmp_path / "source.bin").write_bytes(b"abc")
-    assert Path(saver.save_file("copy.bin", tmp_path / "source.bin")).read_bytes() == b"abc"
-    mesh = SimpleNamespace(
-        v_pos=torch.eye(3), t_pos_idx=torch.tensor([[0, 1, 2]]), v_rgb=torch.ones(3, 3)
-    )
-    lines = Path(saver.save_obj("m", mesh, save_vertex_color=True)[0]).read_text().splitlines()
-    assert lines[0] == "v 1 0 0 1 1 1" and lines[-1] == "f 1 2 3"
-    assert (
-        Path(saver.save_mesh("m.ply", torch.eye(3), torch.tensor([[0, 1, 2]]))).stat().st_size > 0
-    )
-
-
-def test_only_arrays_can_be_converted(saver):
-    with pytest.raises(TypeError, match="got str"):
-        saver.convert_data({"a": ["text"]})
 
 
 # -- which host ------------------------------------------------------------------------------------

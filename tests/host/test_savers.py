@@ -1,0 +1,120 @@
+"""The built-in host's savers: pictures, videos, arrays and meshes that can be read again."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+from threestudio_gaussiandreamer.core import images as pictures
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.host.builtin.savers import SaverMixin
+
+
+@pytest.fixture
+def saver(tmp_path):
+    saver = SaverMixin()
+    saver.set_save_dir(str(tmp_path / "save"))
+    return saver
+
+
+def test_saving_without_a_folder_is_our_own_mistake():
+    with pytest.raises(ValueError, match="set_save_dir"):
+        SaverMixin().get_save_path("a.png")
+
+
+def test_colours_come_back_from_the_file(saver):
+    image = torch.tensor([[[1.0, 0.0, 0.0], [0.0, 0.5, 2.0]]])
+    path = saver.save_rgb_image("it3-0.png", image)
+    assert iio.imread(path).tolist() == [[[255, 0, 0], [0, 128, 255]]]
+    assert path.endswith("save/it3-0.png")
+    path = saver.save_rgb_image("deep/er/chw.png", image.permute(2, 0, 1), data_format="CHW")
+    assert iio.imread(path).tolist() == [[[255, 0, 0], [0, 128, 255]]]
+
+
+def test_more_channels_are_laid_side_by_side():
+    four = pictures.rgb(np.ones((2, 3, 4)))
+    assert four.shape == (2, 6, 3)
+    assert four[0, 2].tolist() == [255, 255, 255] and four[0, 5].tolist() == [255, 0, 0]
+
+
+def test_grayscale_is_stretched_or_kept_and_a_constant_is_black():
+    values = np.array([[1.0, 3.0]])
+    assert pictures.grayscale(values, cmap=None)[..., 0].tolist() == [[0, 255]]
+    assert pictures.grayscale(values, data_range=(0, 4), cmap=None)[..., 0].tolist() == [[64, 191]]
+    assert pictures.grayscale(np.full((1, 2), 7.0), cmap=None).max() == 0
+    assert pictures.grayscale(np.array([[np.nan, 1.0]]), cmap=None)[..., 0].tolist() == [[0, 255]]
+    assert pictures.grayscale(values, cmap="jet")[0].tolist() == [[0, 0, 128], [128, 0, 0]]
+
+
+def test_a_grid_has_cells_of_one_size_and_rows(saver):
+    small = {"type": "rgb", "img": torch.ones(2, 2, 3), "kwargs": {"data_format": "HWC"}}
+    large = {
+        "type": "grayscale",
+        "img": torch.eye(4),
+        "kwargs": {"cmap": None, "data_range": (0, 1)},
+    }
+    assert iio.imread(saver.save_image_grid("row.png", [small, large])).shape == (4, 8, 3)
+    assert iio.imread(saver.save_image_grid("min.png", [small, large], align="min")).shape == (
+        2,
+        4,
+        3,
+    )
+    rows = saver.save_image_grid("rows.png", [[small, large], [large]], align=6, texts=["a", "b"])
+    assert iio.imread(rows).shape == (12, 12, 3)
+
+
+def test_a_video_of_odd_pictures_has_even_size_and_numeric_order(saver):
+    for i in (10, 2, 1):
+        saver.save_rgb_image(f"it3-test/{i}.png", np.full((33, 17, 3), i / 10))
+    path = saver.save_img_sequence("it3-test", "it3-test", r"(\d+)\.png", fps=10)
+    frames = iio.imread(path, plugin="FFMPEG")
+    assert path.endswith("it3-test.mp4") and frames.shape == (3, 34, 18, 3)
+    boxes = Path(path).read_bytes()
+    assert boxes.index(b"moov") < boxes.index(b"mdat")  # a browser plays it while it loads
+    assert iio.immeta(path, plugin="FFMPEG")["codec"] == "h264"
+    assert iio.immeta(path, plugin="FFMPEG")["pix_fmt"].startswith("yuv420p")
+    # H.264 rounds colours by a few levels; the order is what counts
+    assert np.allclose(frames.mean((1, 2, 3)), [25.5, 51, 255], atol=6)
+    assert (
+        iio.imread(
+            saver.save_img_sequence("turn", "it3-test", r"(\d+)\.png", save_format="gif")
+        ).shape[0]
+        == 3
+    )
+
+
+def test_a_video_of_nothing_and_an_unknown_format_are_errors(saver):
+    Path(saver.get_save_path("empty/x.txt")).touch()
+    with pytest.raises(FileNotFoundError):
+        saver.save_img_sequence("a", "empty", r"(\d+)\.png")
+    with pytest.raises(UserError, match="unknown video format 'avi'"):
+        saver.save_img_sequence("a", "empty", r"(\d+)\.png", save_format="avi")
+
+
+def test_data_json_files_and_meshes_come_back(saver, tmp_path):
+    assert np.load(saver.save_data("a", {"x": torch.arange(3)}))["x"].tolist() == [0, 1, 2]
+    assert np.load(saver.save_data("b.npy", np.ones(2))).tolist() == [1, 1]
+    assert json.loads(Path(saver.save_json("c.json", {"psnr": 30.5})).read_text()) == {"psnr": 30.5}
+    assert (
+        torch.load(saver.save_state_dict("d.ckpt", {"x": torch.ones(1)}), weights_only=True)["x"]
+        == 1
+    )
+    (tmp_path / "source.bin").write_bytes(b"abc")
+    assert Path(saver.save_file("copy.bin", tmp_path / "source.bin")).read_bytes() == b"abc"
+    mesh = SimpleNamespace(
+        v_pos=torch.eye(3), t_pos_idx=torch.tensor([[0, 1, 2]]), v_rgb=torch.ones(3, 3)
+    )
+    lines = Path(saver.save_obj("m", mesh, save_vertex_color=True)[0]).read_text().splitlines()
+    assert lines[0] == "v 1 0 0 1 1 1" and lines[-1] == "f 1 2 3"
+    assert (
+        Path(saver.save_mesh("m.ply", torch.eye(3), torch.tensor([[0, 1, 2]]))).stat().st_size > 0
+    )
+
+
+def test_only_arrays_can_be_converted(saver):
+    with pytest.raises(TypeError, match="got str"):
+        saver.convert_data({"a": ["text"]})
