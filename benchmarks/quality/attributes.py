@@ -29,6 +29,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.quality.chart_runs import (
@@ -206,10 +208,23 @@ def written(arrays: Gaussians) -> Iterator[tuple[str, int, Gaussians]]:
 
 
 def score(mesh: str, arrays: Gaussians, size: int = SIZE, **drawn: Any) -> float:
-    """PSNR on the held-out views of :mod:`evaluate`, as a run ends with it; drawn as the demo
-    draws, but for ``drawn``.
+    """Compute the PSNR on the held-out views, as a run ends with it; drawn as the demo draws, but
+    for ``drawn``.
     """
-    geometry = find("gaussiandreamer-cloud")({})
+    images, truth = held_out_pictures(mesh, arrays, size, **drawn)
+    return round(float(psnr(images, truth)), 4)
+
+
+def held_out_pictures(
+    mesh: str, arrays: Gaussians, size: int, *, bound_colors: bool = True, **drawn: Any
+) -> tuple[Float[Tensor, "V H W 3"], Float[Tensor, "V H W 3"]]:
+    """Draw the held-out views of a cloud, in [0, 1], and cast their truth, both on white.
+
+    Args:
+        bound_colors: clamp the colour of each Gaussian to [0, 1], as viewers do.
+        drawn: options of the renderer that differ from the demo's.
+    """
+    geometry = find("gaussiandreamer-cloud")({"bound_colors": bound_colors})
     geometry.set_arrays(**arrays._asdict())
     background = find("gaussiandreamer-background")({"color": [1.0, 1.0, 1.0]})
     renderer = find("gaussiandreamer-splatting")(
@@ -217,7 +232,7 @@ def score(mesh: str, arrays: Gaussians, size: int = SIZE, **drawn: Any) -> float
     )
     held_out = held_out_views(mesh, size)
     images, backgrounds = held_out.render(renderer)
-    return round(float(psnr(images.clamp(0, 1), held_out.truth_on(backgrounds))), 4)
+    return images.clamp(0, 1), held_out.truth_on(backgrounds)
 
 
 @cache
