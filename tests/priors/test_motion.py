@@ -13,12 +13,12 @@ import trimesh
 
 from tests.helpers import tiny_3d_models as tiny
 from tests.helpers.prior_contract import PriorContract, assert_valid
+from tests.priors.motion_cases import joints_of
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.meshes.mesh import Mesh
 from threestudio_gaussiandreamer.models.clip import clip_source, picture_similarities
 from threestudio_gaussiandreamer.priors import motion as module
-from threestudio_gaussiandreamer.priors import motion_files
 from threestudio_gaussiandreamer.priors.motion import (
     MotionPrior,
     body_pictures,
@@ -26,61 +26,15 @@ from threestudio_gaussiandreamer.priors.motion import (
     offered_frames,
     z_up,
 )
-from threestudio_gaussiandreamer.priors.motion_files import Motions, read_motions
+from threestudio_gaussiandreamer.priors.motion_files import Motions
 from threestudio_gaussiandreamer.priors.motion_text import reduced_prompt
-from threestudio_gaussiandreamer.priors.smpl_fit import load_body_model, posed_joints
 
 FAST = {"num_points": 500}
 
 
 @pytest.fixture(scope="session")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("bodies")
-
-
-@pytest.fixture(scope="session")
-def body_file(folder):
-    return tiny.body_model(folder / "SMPL_NEUTRAL.npz")
-
-
-@pytest.fixture(scope="session")
-def body(body_file):
-    return load_body_model(str(body_file))
-
-
-@pytest.fixture(scope="session")
-def clip(folder):
-    return str(tiny.clip(folder / "clip"))
-
-
-def joints_of(body, pose, shape=None, translation=None):
-    shape = torch.zeros(len(pose), 10, dtype=torch.float64) if shape is None else shape
-    translation = (
-        torch.zeros(len(pose), 3, dtype=torch.float64) if translation is None else translation
-    )
-    return posed_joints(body, pose, shape, translation).numpy()
-
-
-def walk(body, frames=6):
-    """A motion (F, 22, 3): standing, then raising the left knee while turning to the left."""
-    pose = torch.zeros(frames, 24, 3, dtype=torch.float64)
-    pose[:, 1, 0] = torch.linspace(0, -1.2, frames)
-    pose[:, 4, 0] = torch.linspace(0, 1.0, frames)
-    pose[:, 0, 1] = torch.linspace(0, np.pi / 2, frames)
-    return joints_of(body, pose)[:, :22]
-
-
-@pytest.fixture(scope="session")
-def motion_file(folder, body):
-    """Two motions of MDM's layout, the second shorter and backwards."""
-    forward = walk(body).transpose(1, 2, 0)
-    np.savez(
-        folder / "results.npz",
-        motion=np.stack([forward, forward[..., ::-1]]),
-        text=np.array(["Someone kicks"] * 2),
-        lengths=np.array([6, 4]),
-    )
-    return folder / "results.npz"
+def clip(bodies):
+    return str(tiny.clip(bodies / "clip"))
 
 
 @pytest.fixture
@@ -137,101 +91,6 @@ def test_the_motion_can_be_asked_for_on_the_command_line():
         command, capture_output=True, text=True, check=True, cwd=module.__file__.rsplit("/", 3)[0]
     )
     assert printed.stdout.strip() == "Someone kicks with the left leg"
-
-
-# --------------------------------------------------------------------------------------------------
-# files of motions
-
-
-def test_mdms_layout_is_read(motion_file, body):
-    motions = read_motions(str(motion_file))
-    assert (
-        motions.positions.shape == (2, 6, 22, 3)
-        and motions.lengths == [6, 4]
-        and motions.texts == ["Someone kicks"] * 2
-    )
-    np.testing.assert_array_equal(motions.positions[0], walk(body))
-
-
-@pytest.mark.parametrize("joints", [22, 24])
-def test_bare_arrays_are_read(tmp_path, joints):
-    frames = np.random.default_rng(0).normal(size=(5, joints, 3))
-    for array in (frames, frames.transpose(1, 2, 0), frames.transpose(1, 2, 0)[None]):
-        np.save(tmp_path / "motion.npy", array.astype(np.float32))
-        motions = read_motions(str(tmp_path / "motion.npy"))
-        np.testing.assert_allclose(motions.positions, frames[None], atol=1e-6)
-        assert motions.lengths == [5] and motions.texts is None
-
-
-class Evil:
-    def __reduce__(self):
-        return (exec, ("import os; os.environ['EVIL'] = '1'",))
-
-
-def test_a_pickle_is_refused_and_the_conversion_works(tmp_path, body, monkeypatch):
-    import os
-
-    monkeypatch.delenv("EVIL", raising=False)
-    motion = walk(body).transpose(1, 2, 0)[None]
-    results = {
-        "motion": motion,
-        "text": ["Someone kicks"],
-        "lengths": np.array([6]),
-        "num_samples": 1,
-        "num_repetitions": 1,
-    }
-    np.save(tmp_path / "results.npy", results)
-    with pytest.raises(UserError, match="pickle.*could run code") as caught:
-        read_motions(str(tmp_path / "results.npy"))
-    line = str(caught.value).splitlines()[-1]
-    assert line == motion_files.CONVERT and line.startswith('python -c "')
-    subprocess.run(
-        line.replace("python", f"'{sys.executable}'", 1), shell=True, check=True, cwd=tmp_path
-    )
-    converted = read_motions(str(tmp_path / "results.npz"))
-    np.testing.assert_array_equal(converted.positions[0], walk(body))
-    assert converted.texts == ["Someone kicks"] and converted.lengths == [6]
-    np.save(tmp_path / "evil.npy", np.array({"motion": Evil()}, dtype=object))
-    np.savez(tmp_path / "evil.npz", motion=np.array(Evil(), dtype=object))
-    for name in ("evil.npy", "evil.npz"):
-        with pytest.raises(UserError, match="pickle"):
-            read_motions(str(tmp_path / name))
-    assert "EVIL" not in os.environ
-
-
-@pytest.mark.parametrize(
-    "arrays, message",
-    [
-        ({"joints": np.zeros((1, 22, 3, 5))}, "no array 'motion', only joints"),
-        ({"motion": np.zeros((1, 25, 6, 5))}, "rotations"),
-        ({"motion": np.zeros((1, 21, 3, 5))}, r"\(1, 21, 3, 5\).*22 or 24 joints"),
-        ({"motion": np.zeros((1, 22, 3, 0))}, "without a frame"),
-        ({"motion": np.full((1, 22, 3, 5), "x")}, "not numbers"),
-        ({"motion": np.full((1, 22, 3, 5), np.nan)}, "NaN"),
-        ({"motion": np.zeros((2, 22, 3, 5)), "lengths": np.array([5])}, "lengths must be 2"),
-        ({"motion": np.zeros((1, 22, 3, 5)), "lengths": np.array([6])}, "from 1 to 5"),
-    ],
-)
-def test_other_arrays_are_refused(tmp_path, arrays, message):
-    np.savez(tmp_path / "motion.npz", **arrays)
-    with pytest.raises(UserError, match=message):
-        read_motions(str(tmp_path / "motion.npz"))
-
-
-def test_padding_may_be_anything(tmp_path):
-    motion = np.zeros((1, 22, 3, 5))
-    motion[..., 3:] = np.nan
-    np.savez(tmp_path / "motion.npz", motion=motion, lengths=np.array([3]))
-    assert read_motions(str(tmp_path / "motion.npz")).lengths == [3]
-
-
-@pytest.mark.parametrize("content", [b"", b"not an array", b"PK\x03\x04 broken"])
-def test_damaged_motion_files(tmp_path, content):
-    (tmp_path / "motion.npz").write_bytes(content)
-    with pytest.raises(UserError, match="motion file"):
-        read_motions(str(tmp_path / "motion.npz"))
-    with pytest.raises(UserError, match="near names.*motion.npz"):
-        read_motions(str(tmp_path / "motions.npz"))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -10,32 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from tests.helpers import tiny_3d_models as tiny
+from tests.priors.shap_e_cases import CPU, FAST, make, seeded
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.models.hub import locate
 from threestudio_gaussiandreamer.priors.shap_e import ShapEPrior
-
-FAST = {"num_inference_steps": 2, "grid_size": 24}
-CPU = torch.device("cpu")
-
-
-@pytest.fixture(scope="session")
-def folder(tmp_path_factory):
-    return tiny.shap_e(tmp_path_factory.mktemp("models") / "shap-e")
-
-
-@pytest.fixture
-def copy(folder, tmp_path):
-    """A copy whose files a test may spoil."""
-    return shutil.copytree(folder, tmp_path / "copy")
-
-
-def make(folder, **options):
-    return ShapEPrior(FAST | {"model": str(folder)} | options)
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 class Evil:

@@ -1,0 +1,142 @@
+"""Sampling along Karras' schedules, with and without guidance."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from threestudio_gaussiandreamer.priors import karras
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+# --------------------------------------------------------------------------------------------------
+# the sampler
+
+MEAN, SPREAD = 0.3, 0.5
+
+
+def gaussian_denoiser(x, sigma):
+    """E[x0 | x0 + sigma eps] of data that are normal with this mean and spread."""
+    return MEAN + SPREAD**2 / (SPREAD**2 + sigma**2) * (x - MEAN)
+
+
+def flow_end(noise, sigma_max):
+    """Where the noise-free sampler ends: the probability flow keeps the place within the widening
+    normal distribution.
+    """
+    return MEAN + SPREAD / math.hypot(SPREAD, sigma_max) * (sigma_max * noise - MEAN)
+
+
+def test_sigmas_are_karras():
+    sigmas = karras.karras_sigmas(64, 1e-3, 160)
+    assert (
+        len(sigmas) == 65
+        and sigmas[0] == pytest.approx(160)
+        and sigmas[-2] == pytest.approx(1e-3)
+        and sigmas[-1] == 0
+    )
+    np.testing.assert_allclose(
+        np.diff(np.array(sigmas[:-1]) ** (1 / 7)),
+        (1e-3 ** (1 / 7) - 160 ** (1 / 7)) / 63,
+        rtol=1e-9,
+    )
+
+
+def test_the_sampler_follows_the_flow_to_second_order():
+    noise = torch.randn(200, generator=seeded(), dtype=torch.float64)
+    errors = []
+    for steps in (16, 32, 64, 128):
+        sigmas = karras.karras_sigmas(steps, 1e-3, 120)
+        sample = karras.sample_heun(gaussian_denoiser, noise, sigmas, generator=seeded())
+        errors.append((sample - flow_end(noise, 120)).abs().max().item())
+    ratios = [coarse / fine for coarse, fine in zip(errors[:-1], errors[1:], strict=True)]
+    assert errors[-1] < 2e-3 and all(
+        3.7 < ratio < 4.7 for ratio in ratios
+    )  # order 2: a quarter of the error for twice the steps
+
+
+def test_churn_keeps_the_distribution_and_needs_the_generator():
+    noise = torch.randn(20_000, generator=seeded())
+    sigmas = karras.karras_sigmas(64, 1e-3, 120)
+    sample = karras.sample_heun(gaussian_denoiser, noise, sigmas, churn=3.0, generator=seeded(1))
+    assert sample.mean().item() == pytest.approx(
+        MEAN, abs=0.02
+    ) and sample.std().item() == pytest.approx(SPREAD, abs=0.02)  # 5 sigma of 20,000
+    again, other = (
+        karras.sample_heun(gaussian_denoiser, noise, sigmas, churn=3.0, generator=seeded(seed))
+        for seed in (1, 2)
+    )
+    assert torch.equal(sample, again) and not torch.allclose(sample, other)
+
+
+def test_a_network_of_timesteps_becomes_the_denoiser_it_stands_for():
+    """A network that knows the noise of normal data: its denoiser is the exact one at the noise of
+    each whole timestep.
+    """
+    alphas_cumprod = karras.cosine_alphas_cumprod()
+
+    def network(z, timesteps):
+        level = float(alphas_cumprod[timesteps[0]])
+        sigma = math.sqrt((1 - level) / level)
+        x = z * math.sqrt(sigma**2 + 1)
+        return (x - gaussian_denoiser(x, sigma)) / sigma
+
+    denoise = karras.guided_denoiser(network, alphas_cumprod, prediction="epsilon")
+    for timestep in (0, 10, 500, 900):
+        sigma = math.sqrt(1 / alphas_cumprod[timestep] - 1) * (
+            1 + 1e-9
+        )  # on the safe side of rounding
+        x = torch.linspace(-0.4, 0.4, 9, dtype=torch.float64) * math.hypot(1, sigma)
+        torch.testing.assert_close(
+            denoise(x, sigma), gaussian_denoiser(x, sigma).clamp(-1, 1), atol=1e-6, rtol=0
+        )
+
+
+def test_timesteps_are_cut_and_bounded():
+    levels = karras.linear_alphas_cumprod()
+    between = 0.3 * levels[100] + 0.7 * levels[101]
+    assert karras.timestep_of(math.sqrt(1 / between - 1), levels) == 100
+    assert karras.timestep_of(1e-6, levels) == 0 and karras.timestep_of(1e6, levels) == 1023
+
+
+def test_schedules():
+    """The ends that the formulas give; the linear one is Ho et al.'s, stretched from 1000 to 1024
+    timesteps.
+    """
+    cosine, linear = karras.cosine_alphas_cumprod(), karras.linear_alphas_cumprod()
+    assert (
+        len(cosine) == len(linear) == 1024
+        and (np.diff(cosine) < 0).all()
+        and (np.diff(linear) < 0).all()
+    )
+    assert (
+        cosine[511] == pytest.approx(0.494, abs=0.005) and 0 < cosine[-1] < 1e-8
+    )  # cos^2 near 45 degrees, and the cap
+    assert linear[0] == pytest.approx(1 - 1e-4 * 1000 / 1024) and linear[-1] == pytest.approx(
+        4.0e-5, rel=0.05
+    )
+
+
+def test_guidance_clamps_before_it_combines():
+    def network(z, timesteps):
+        assert len(z) == 2 and torch.equal(z[0], z[1])
+        return torch.stack([torch.full_like(z[0], 4.0), torch.full_like(z[0], -0.5)])
+
+    denoise = karras.guided_denoiser(
+        network, np.linspace(0.99, 0.01, 20), scale=3.0, prediction="sample"
+    )
+    assert denoise(torch.zeros(1, 5), 1.0).unique().tolist() == [-0.5 + 3 * (1 - -0.5)]
+
+
+def test_no_guidance_asks_once():
+    def network(z, timesteps):
+        assert len(z) == 1
+        return z
+
+    karras.guided_denoiser(network, np.linspace(0.99, 0.01, 20), prediction="sample")(
+        torch.zeros(1, 5), 1.0
+    )

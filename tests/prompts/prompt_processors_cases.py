@@ -1,0 +1,13 @@
+"""What the tests of prompt processors share."""
+
+from threestudio_gaussiandreamer.host import find
+
+
+def processor(models, kind="stable-diffusion", **options):
+    options = {
+        "prompt": "a fox",
+        "negative_prompt": "ugly",
+        "pretrained_model_name_or_path": str(models[kind]),
+        **options,
+    }
+    return find(f"gaussiandreamer-{kind}-prompt-processor")(options)

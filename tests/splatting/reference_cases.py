@@ -1,0 +1,7 @@
+"""What the tests of reference share."""
+
+SPECIFICATION = {"backend": "reference"}
+
+
+# float64 against the same formula in another order: rounding only.
+ROUNDING = 1e-10
