@@ -20,11 +20,20 @@ def test_characters_that_the_terminal_does_not_have_are_written_as_escapes(tmp_p
     assert (tmp_path / "out.txt").read_text() == "ein Fuchs, gr\\xfcn\n"
 
 
-def test_a_full_device_is_said_once_on_the_other_stream(capfd, monkeypatch):
+def buffered(descriptor):
+    return open(descriptor, "w", closefd=False)
+
+
+def unbuffered(descriptor):
+    return io.TextIOWrapper(io.FileIO(descriptor, "w", closefd=False), write_through=True)
+
+
+@pytest.mark.parametrize("opened", [buffered, unbuffered])
+def test_a_full_device_is_said_once_on_the_other_stream(capfd, monkeypatch, opened):
     descriptor = os.dup(1)
     full = os.open("/dev/full", os.O_WRONLY)
     os.dup2(full, 1)
-    monkeypatch.setattr(sys, "stdout", open(1, "w", closefd=False))
+    monkeypatch.setattr(sys, "stdout", opened(1))
     try:
         with tolerant_output():
             for _ in range(3):

@@ -52,12 +52,14 @@ def tolerant_output() -> Iterator[None]:
 
 def _tolerant(stream: Any) -> Any:
     """Open a stream's file as a :class:`TolerantFile`; a stream of another kind is returned."""
-    raw = getattr(getattr(stream, "buffer", None), "raw", None)
-    if not isinstance(raw, io.FileIO):
+    buffer = getattr(stream, "buffer", None)
+    is_unbuffered = isinstance(buffer, io.FileIO)  # python -u, or PYTHONUNBUFFERED
+    if not isinstance(buffer if is_unbuffered else getattr(buffer, "raw", None), io.FileIO):
         return stream
     stream.flush()
+    file = TolerantFile(buffer.fileno(), "wb", closefd=False)
     return io.TextIOWrapper(
-        io.BufferedWriter(TolerantFile(raw.fileno(), "wb", closefd=False)),
+        file if is_unbuffered else io.BufferedWriter(file),
         encoding=stream.encoding,
         errors="backslashreplace",
         line_buffering=stream.line_buffering,
