@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Optional
 import numpy as np
 import torch
 
-from tests.fuzz import mutations, oracles
+from tests.fuzz import checkpoint_content, config_values, mutations, oracles
 from tests.fuzz.mutations import BINARY, TEXT, Mutator, Packing
 from tests.fuzz.oracles import Illegal
 from threestudio_gaussiandreamer import register_parts
@@ -664,6 +664,19 @@ TARGETS: dict[str, Target] = {
     "off": Target(".off", lambda: meshes("off"), exercise_mesh, TEXT),
     "checkpoint": Target(".ckpt", checkpoints, exercise_checkpoint, packing=mutations.ZIP),
     "configuration": Target(".yaml", configurations, exercise_configuration, TEXT, traced=False),
+    "config-values": Target(
+        ".txt",
+        config_values.seeds,
+        config_values.exercise,
+        [config_values.hostile_option],
+        traced=False,
+    ),
+    "checkpoint-content": Target(
+        ".ckpt",
+        checkpoint_content.seeds,
+        lambda path: checkpoint_content.exercise(path, require_picture),
+        [checkpoint_content.other_content],
+    ),
     "command-line": Target(
         ".txt",
         lambda: [command.encode() for command in COMMANDS],

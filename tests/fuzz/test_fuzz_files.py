@@ -16,7 +16,13 @@ from threestudio_gaussiandreamer.core.errors import UserError
 pytestmark = pytest.mark.slow
 
 CORPUS = sorted(path for path in Path(__file__).with_name("corpus").rglob("*") if path.is_file())
-INPUTS = {"configuration": 25, "command-line": 15, "checkpoint": 30}
+INPUTS = {
+    "configuration": 25,
+    "config-values": 60,
+    "checkpoint-content": 60,
+    "command-line": 15,
+    "checkpoint": 30,
+}
 """How many damaged files of a kind; of others 70."""
 
 
