@@ -89,6 +89,34 @@ def test_a_full_disk_is_said_and_leaves_the_earlier_checkpoint(folder, tmp_path,
     assert run.path.read_bytes() == before
 
 
+@pytest.mark.parametrize("name", STAGES)
+def test_random_weights_are_a_function_of_the_seed(folder, name):
+    found = []
+    for seed in (0, 0, 1):
+        torch.seed()  # whatever the process drew before
+        stage = STAGES[name](options(folder, seed=seed))
+        found.append(torch.cat([value.flatten() for value in stage.model.parameters()]))
+    assert torch.equal(found[0], found[1])
+    assert not torch.equal(found[0], found[2])
+
+
+def test_a_gradient_that_is_not_finite_stops_before_it_is_saved(folder, tmp_path):
+    run = training(copied(folder, tmp_path / "run"), "judge")
+    run.run(4)
+    before = run.path.read_bytes()
+    loss = run.stage.loss
+
+    def broken(model, batch, step):
+        value, metrics = loss(model, batch, step)
+        return value * float("nan"), metrics
+
+    run.stage.loss = broken
+    with pytest.raises(UserError, match="gradient of step 1 isn't finite"):
+        run.run(8)
+    assert run.path.read_bytes() == before
+    assert all(value.isfinite().all() for value in run.model.parameters())
+
+
 def test_a_damaged_checkpoint_is_refused(folder, tmp_path):
     run = training(copied(folder, tmp_path / "run"), "judge")
     run.run(4)

@@ -69,6 +69,7 @@ class Stage(ABC):
         self.batch = options.batch or self.batch_size
         self.constants: dict[str, float] = {}
         """Numbers that the trained network only fits with; kept in the checkpoint."""
+        torch.manual_seed(options.seed)
         self.model = self.build().to(self.device)
 
     @abstractmethod
@@ -118,7 +119,6 @@ class Training:
     """Trains one stage up to a number of images."""
 
     def __init__(self, stage: Stage) -> None:
-        torch.manual_seed(stage.options.seed)
         self.stage = stage
         self.model = stage.model
         self.ema = AveragedModel(self.model, multi_avg_fn=_average, use_buffers=False)
@@ -172,7 +172,11 @@ class Training:
         self.save()
 
     def train_step(self, batch: Any) -> dict[str, Tensor]:
-        """Make one step of the optimiser and of the average."""
+        """Make one step of the optimiser and of the average.
+
+        Raises:
+            UserError: the gradient isn't finite; nothing is changed then.
+        """
         progress, device = self.progress, self.stage.device.type
         for group in self.optimizer.param_groups:
             group["lr"] = self.stage.learning_rate * rate_factor(progress.step)
@@ -182,6 +186,11 @@ class Training:
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), CLIP_GRADIENT)
+        if not norm.isfinite():
+            raise UserError(
+                f"{self.stage.name}: the gradient of step {progress.step} isn't finite, so training"
+                f" stops; {self.path} is as it was last saved"
+            )
         self.optimizer.step()
         self.ema.update_parameters(self.model)
         progress.step += 1
