@@ -6,7 +6,7 @@ from tests.toybox.helpers import training
 from threestudio_gaussiandreamer.toybox import loop, models, views
 
 
-@pytest.fixture(scope="package", autouse=True)
+@pytest.fixture(scope="module")
 def small_world():
     """Make pictures few and networks small, so that a step takes milliseconds."""
     with pytest.MonkeyPatch.context() as patch:
@@ -24,7 +24,7 @@ def small_world():
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(tmp_path_factory, small_world):
     """A training folder in which CLIP and the autoencoder are trained for two steps."""
     folder = tmp_path_factory.mktemp("toybox")
     for name in ("clip", "autoencoder"):

@@ -22,6 +22,8 @@ PROMPT = "a red fox with a green scarf"
 HALF = {"rtol": 2e-3, "atol": 2e-3}
 """Float16 keeps eleven bits."""
 
+pytestmark = pytest.mark.usefixtures("small_world")
+
 
 @pytest.fixture(scope="module")
 def trained(folder):

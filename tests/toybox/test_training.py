@@ -13,6 +13,8 @@ from threestudio_gaussiandreamer.toybox import loop, points_stage, unet_stage, v
 from threestudio_gaussiandreamer.toybox.clip_stage import IGNORED, LABELS, text_labels
 from threestudio_gaussiandreamer.toybox.train import STAGES, main, render_shards
 
+pytestmark = pytest.mark.usefixtures("small_world")
+
 
 def weights(run: loop.Training) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in run.ema.state_dict().items()}

@@ -97,7 +97,7 @@ def unet() -> Any:
         norm_num_groups=16,
     )
     start_as_identity(network)
-    nn.init.zeros_(network.conv_out.weight)
+    _start_at_zero(network.conv_out)
     return network
 
 
@@ -119,11 +119,15 @@ def start_as_identity(network: nn.Module) -> None:
     reach the other end from the first step on: training needs far fewer steps.
     """
     for name, module in network.named_modules():
-        if name.endswith(("conv2", "to_out.0", "ff.net.2", "proj_out")):
-            nn.init.zeros_(module.weight)
-            nn.init.zeros_(module.bias)
+        if name.endswith(("conv2", "proj_out")):
+            _start_at_zero(module)
         elif name.endswith(("downsamplers.0.conv", "upsamplers.0.conv", "conv_shortcut")):
             _start_as_average(module, places=2 if "downsamplers" in name else 1)
+
+
+def _start_at_zero(layer: Any) -> None:
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
 
 
 def _start_as_average(convolution: nn.Conv2d, places: int) -> None:
