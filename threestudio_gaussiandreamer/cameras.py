@@ -7,7 +7,7 @@ OpenGL: the columns of ``c2w`` are right, up, back. Inside the maths cameras are
 +0.5. Images are (B, H, W, C) with row 0 on top."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -32,6 +32,10 @@ class Orbit(NamedTuple):
     @property
     def c2w(self) -> Float[Tensor, "B 4 4"]:
         return orbit_c2w(self.elevation, self.azimuth, self.distance)
+
+    def rows(self, index: Any) -> "Orbit":
+        """Select cameras by whatever indexes a field."""
+        return Orbit(*(values[index] for values in self))
 
 
 def orbit_positions(

@@ -13,11 +13,11 @@ from threestudio_gaussiandreamer import exporters, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud, write_cloud
+from threestudio_gaussiandreamer.formats.obj import write_obj
 from threestudio_gaussiandreamer.formats.ply import read_comments
 from threestudio_gaussiandreamer.formats.spz import read_spz
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
-from threestudio_gaussiandreamer.gaussians.surface import write_obj
 from threestudio_gaussiandreamer.host import BaseGeometry, ExporterOutput, find, names
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.helpers.raw_ply import write_raw_gaussians
+from tests.helpers.ply_files import write_raw_gaussians
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import (
     PRUNED,

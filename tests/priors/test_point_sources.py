@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from tests.helpers.raw_ply import write_raw_gaussians
+from tests.helpers.ply_files import write_raw_gaussians
 from tests.priors.priors_cases import build, rng
 from threestudio_gaussiandreamer import priors
 from threestudio_gaussiandreamer.core.errors import UserError

@@ -101,7 +101,7 @@ def score(result: Result, prompt: str, item: int, clip: PictureText, protocol: P
     """The similarities of the views that the seeds draw, each of which is rendered once."""
     draws = [protocol.draw(seed, item) for seed in protocol.seeds]
     needed = np.unique(np.concatenate(draws))
-    orbit = Orbit(*(values[needed] for values in protocol.orbit))
+    orbit = protocol.orbit.rows(needed)
     similarity, thumbnails = np.full(protocol.views, np.nan), {}
     start = 0
     for images in Pictures(read_result(result), result.background).render(

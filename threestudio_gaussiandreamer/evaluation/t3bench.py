@@ -27,8 +27,9 @@ from jaxtyping import Float
 from ..cameras import look_at
 from ..core import images as files_of_pictures
 from ..core.errors import UserError
+from ..formats.obj import write_obj
 from ..gaussians.gaussians import Gaussians, opaque
-from ..gaussians.surface import gaussian_surface, write_obj
+from ..gaussians.surface import gaussian_surface
 from .results import Pictures, Result, read_result
 
 RADIUS = 2.2

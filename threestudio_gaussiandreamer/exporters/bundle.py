@@ -35,7 +35,7 @@ SUFFIX = "-exporter"
 
 
 def available_formats() -> list[str]:
-    """The formats that can be asked for: every registered exporter but the bundle itself."""
+    """Return the formats: every registered exporter but the bundle itself."""
     exporters = [name.removesuffix(SUFFIX) for name in names() if name.endswith(SUFFIX)]
     return [name for name in exporters if name != "gaussiandreamer"]
 
@@ -104,7 +104,7 @@ def options_of(name: str, cfg: Any) -> Any:
 
 
 def _checked(name: str, options: Any) -> Any:
-    """The typed options of one format."""
+    """Parse and check the options of one format."""
     if not isinstance(options, Mapping):
         raise UserError(f"options.{name}: expected keys and values, got {options!r}")
     config_class = find(name + SUFFIX).Config

@@ -78,7 +78,7 @@ class SpzHeader(NamedTuple):
 
     @property
     def blocks(self) -> list[int]:
-        """Bytes per Gaussian: positions, alphas, colours, scales, rotations, harmonics."""
+        """Return bytes per Gaussian: positions, alphas, colours, scales, rotations, harmonics."""
         return [9, 1, 3, 3, 4 if self.version == 3 else 3, 3 * ((self.degree + 1) ** 2 - 1)]
 
 

@@ -22,17 +22,17 @@ Colors = Float[Tensor, "*batch C"] | Float[np.ndarray, "*batch C"]
 
 
 def rgb_to_sh0(rgb: Float[Tensor, "*batch C"]) -> Float[Tensor, "*batch C"]:
-    """The coefficients of degree 0 that show these colours, [0, 1], from everywhere."""
+    """Return the coefficients of degree 0 for colours in [0, 1]."""
     return (rgb - 0.5) / C0
 
 
 def sh0_to_rgb(sh0: Colors) -> Colors:
-    """The inverse of `rgb_to_sh0`; not clamped."""
+    """Invert :func:`rgb_to_sh0`; not clamped."""
     return 0.5 + C0 * sh0
 
 
 def sh0_colors(sh0: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """The colours of constant harmonics, clipped to [0, 1], as arrays."""
+    """Return the colours of coefficients of degree 0, clipped to [0, 1]."""
     return sh0_to_rgb(sh0).clip(0.0, 1.0)
 
 
@@ -90,8 +90,8 @@ def bounded_colors(colors: Float[Tensor, "*batch C"]) -> Float[Tensor, "*batch C
 
 
 def sh_basis(dirs: Float[Tensor, "*batch 3"], degree: int) -> list[Float[Tensor, "*batch"]]:
-    """The (degree + 1)^2 real spherical harmonics of the normalised directions, as polynomials in
-    x, y, z.
+    """Evaluate the (degree + 1)^2 real spherical harmonics at the normalised directions, as
+    polynomials in x, y, z.
 
     Normalisation sqrt((2l + 1) / 4 pi (l - |m|)! / (l + |m|)!), times sqrt(2) for m != 0 (Sloan
     2008, Stupid Spherical Harmonics Tricks, appendix A2)."""
@@ -131,9 +131,7 @@ def sh_basis(dirs: Float[Tensor, "*batch 3"], degree: int) -> list[Float[Tensor,
 
 
 def _normalize(dirs: Tensor) -> Tensor:
-    """Unit vectors; a direction without length becomes +z with zero gradient (0 / 0 would be
-    NaN).
-    """
+    """Scale to length 1; a zero vector becomes +z with zero gradient, since 0 / 0 is NaN."""
     length = torch.linalg.vector_norm(dirs, dim=-1, keepdim=True)
     usable = length > SHORTEST_DIRECTION
     return torch.where(usable, dirs / torch.where(usable, length, 1), dirs.new_tensor([0.0, 0, 1]))

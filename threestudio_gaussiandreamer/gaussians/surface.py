@@ -1,41 +1,37 @@
-"""The surface of a cloud of Gaussians as a coloured mesh, for programs and benchmarks that know no
-Gaussians.
+"""Extract the surface of Gaussians as a mesh with coloured vertices.
 
-The cloud's opacity is summed on a grid of cells of side h,
+The opacity is summed on a grid of cells of side h,
 
     d(x) = sum_i o_i exp(-1/2 (x - m_i)^T (S_i + h^2 I)^-1 (x - m_i)),
 
-where h^2 keeps Gaussians that are smaller than a cell from slipping between its corners. The
-surface is where d crosses a share of its median at the centres of the Gaussians, so that it doesn't
-depend on how many of them overlap. It is drawn by surface nets (Gibson 1998): one vertex for each
-cell that is crossed, at the mean of the crossings of its edges, and one quad around each edge that
-is crossed. Closed; thicker than the cloud by about sqrt(s^2 + h^2), where s is the Gaussians' size
-across it."""
+where h^2 widens Gaussians smaller than a cell, so that its corners sample them. The surface is the
+level set of d at a share of its median over the centres of the Gaussians, so that it doesn't depend
+on how many of them overlap. Surface nets (Gibson 1998) give one vertex for each cell that is
+crossed, at the mean of the crossings of its edges, and one quad around each edge that is crossed.
+The mesh is closed, and thicker than the object by about sqrt(s^2 + h^2), where s is the Gaussians'
+standard deviation across it."""
 
-import os
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.errors import UserError
-from ..core.files import atomic_file
 from .gaussians import Gaussians, opaque
 from .sh import sh0_colors
 
 REACH = 3.0
 """Standard deviations beyond which a Gaussian doesn't count: exp(-4.5) is 1 %."""
 MIN_OPACITY = 0.02
-"""Fainter Gaussians are haze, not surface."""
+"""Fainter Gaussians are left out."""
 HALF_HEIGHT = 1.25
-"""Standard deviations within which the surface of a single Gaussian is, at half of its opacity:
-1.18, and a little more.
+"""Standard deviations within which the surface of a single Gaussian lies: half of its opacity is at
+1.18.
 """
 NODES_AT_ONCE = 4_000_000
 SMALL = 8
-"""Half a Gaussian's reach, in cells, up to which many are summed at once; larger ones are taken one
-by one.
+"""Reach of a Gaussian, in cells, up to which many are added at once; larger ones are added one by
+one.
 """
 MARGIN = 3
 """Cells around the cloud, of which the outermost are empty, so that the surface closes."""
@@ -53,25 +49,25 @@ class Surface(NamedTuple):
         return self._replace(vertices=self.vertices @ rotation.T)
 
 
-def gaussian_surface(arrays: Gaussians, *, resolution: int = 128, level: float = 0.5) -> Surface:
-    """The surface of a cloud, in its own units; empty where no Gaussian is visible.
+def gaussian_surface(gaussians: Gaussians, *, resolution: int = 128, level: float = 0.5) -> Surface:
+    """Extract the surface, in the Gaussians' units; empty where no Gaussian is visible.
 
     Args:
-        resolution: cells along the longest side of the cloud's box.
+        resolution: cells along the longest side of the Gaussians' box.
         level: share of the summed opacity's median at the centres, in (0, 1]; lower is thicker.
     """
-    visible = opaque(arrays, MIN_OPACITY)
+    visible = opaque(gaussians, MIN_OPACITY)
     if not visible.any():
         return Surface(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)))
-    arrays = arrays.rows(visible)
-    covariances = _covariances(arrays)
+    gaussians = gaussians.rows(visible)
+    covariances = _covariances(gaussians)
     size = HALF_HEIGHT * np.sqrt(covariances[:, range(3), range(3)])
-    low, high = (arrays.means - size).min(axis=0), (arrays.means + size).max(axis=0)
+    low, high = (gaussians.means - size).min(axis=0), (gaussians.means + size).max(axis=0)
     cell = max(float((high - low).max()) / resolution, 1e-6)
     origin = low - MARGIN * cell
     shape = tuple(int(n) for n in np.ceil((high - low) / cell) + 2 * MARGIN + 1)
-    density, colored = _summed(arrays, covariances, origin, cell, shape)
-    centers = np.round((arrays.means - origin) / cell).astype(int)
+    density, colored = _summed(gaussians, covariances, origin, cell, shape)
+    centers = np.round((gaussians.means - origin) / cell).astype(int)
     corners, faces = surface_nets(density, level * float(np.median(density[tuple(centers.T)])))
     return Surface(corners * cell + origin, faces, _colors_at(corners, density, colored))
 
@@ -79,10 +75,9 @@ def gaussian_surface(arrays: Gaussians, *, resolution: int = 128, level: float =
 def surface_nets(
     values: Float[np.ndarray, "X Y Z"], level: float
 ) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    """Vertices, in units of cells, and triangles of where ``values`` crosses ``level``; outside is
-    below it.
+    """Return vertices, in units of cells, and triangles of the level set; outside is below it.
 
-    The surface is open where the values at the grid's own sides are above the level.
+    The surface is open where values at the sides of the grid are above the level.
     """
     inside = values > level
     count = sum(inside[_corner(bits)].astype(np.int8) for bits in range(8))
@@ -93,43 +88,25 @@ def surface_nets(
     return cells + _crossings(values, cells, level), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
-def write_obj(path: str | os.PathLike, surface: Surface) -> None:
-    """Write an OBJ with the colours behind the positions ("v x y z r g b"), as MeshLab, Blender and
-    trimesh read it.
-
-    Raises:
-        UserError: vertices or colours that aren't finite, or the file can't be written.
-    """
-    if not (np.isfinite(surface.vertices).all() and np.isfinite(surface.colors).all()):
-        raise UserError(f"{str(path)!r} isn't written: some of its vertices hold NaN or infinity")
-    with atomic_file(path) as file:
-        np.savetxt(
-            file,
-            np.concatenate([surface.vertices, surface.colors], axis=1),
-            fmt="v %.6g %.6g %.6g %.4f %.4f %.4f",
-        )
-        np.savetxt(file, surface.faces + 1, fmt="f %d %d %d")
-
-
 # The grid
 # --------------------------------------------------------------------------------------------------
 
 
 def _summed(
-    arrays: Gaussians,
+    gaussians: Gaussians,
     covariances: Float[np.ndarray, "N 3 3"],
     origin: Float[np.ndarray, "3"],
     cell: float,
     shape: tuple[int, ...],
 ) -> tuple[Float[np.ndarray, "X Y Z"], Float[np.ndarray, "X Y Z 3"]]:
-    """Opacity, and opacity times colour, summed at the nodes of a grid."""
+    """Sum opacity, and opacity times colour, at the nodes of a grid."""
     widened = covariances + cell**2 * np.eye(3)
-    gaussians = _Gaussians(
-        places=(arrays.means - origin) / cell,
+    in_cells = _InCells(
+        places=(gaussians.means - origin) / cell,
         precisions=np.moveaxis(np.linalg.inv(widened / cell**2), 0, -1),
-        opacities=1 / (1 + np.exp(-arrays.logit_opacities.astype(np.float64))),
+        opacities=1 / (1 + np.exp(-gaussians.logit_opacities.astype(np.float64))),
         weights=np.concatenate(
-            [np.ones((len(arrays.means), 1)), sh0_colors(arrays.sh[:, 0])], axis=1
+            [np.ones((len(gaussians.means), 1)), sh0_colors(gaussians.sh[:, 0])], axis=1
         ),
     )
     half_sides = np.ceil(REACH * np.sqrt(widened[:, range(3), range(3)].max(axis=1)) / cell).astype(
@@ -137,28 +114,28 @@ def _summed(
     )
     sums = np.zeros((*shape, 4))
     for half_side in np.unique(half_sides[half_sides <= SMALL]):
-        _add_many(sums, gaussians, np.flatnonzero(half_sides == half_side), int(half_side))
+        _add_many(sums, in_cells, np.flatnonzero(half_sides == half_side), int(half_side))
     for row in np.flatnonzero(half_sides > SMALL):
-        _add_one(sums, gaussians, row, int(half_sides[row]))
+        _add_one(sums, in_cells, row, int(half_sides[row]))
     inner = np.zeros((*shape, 1))
     inner[1:-1, 1:-1, 1:-1] = 1
     sums *= inner
     return sums[..., 0], sums[..., 1:]
 
 
-class _Gaussians(NamedTuple):
-    """In units of cells."""
+class _InCells(NamedTuple):
+    """Gaussians in units of cells."""
 
     places: Float[np.ndarray, "N 3"]
     precisions: Float[np.ndarray, "3 3 N"]
     opacities: Float[np.ndarray, " N"]
     weights: Float[np.ndarray, "N 4"]
-    """What is summed: 1, red, green, blue."""
+    """1, red, green, blue: what is summed, times the opacity."""
 
 
 def _add_many(
     sums: Float[np.ndarray, "X Y Z 4"],
-    gaussians: _Gaussians,
+    gaussians: _InCells,
     rows: Int[np.ndarray, " M"],
     half_side: int,
 ) -> None:
@@ -184,9 +161,9 @@ def _add_many(
 
 
 def _add_one(
-    sums: Float[np.ndarray, "X Y Z 4"], gaussians: _Gaussians, row: int, half_side: int
+    sums: Float[np.ndarray, "X Y Z 4"], gaussians: _InCells, row: int, half_side: int
 ) -> None:
-    """Add one Gaussian, however large."""
+    """Add one Gaussian of any size."""
     place, shape = gaussians.places[row], np.array(sums.shape[:3])
     first, last = (np.round(place).astype(int) + sign * half_side for sign in (-1, 1))
     box = tuple(slice(a, b) for a, b in zip(first.clip(0), (last + 1).clip(0, shape), strict=True))
@@ -197,7 +174,7 @@ def _add_one(
 
 
 def _falloff(away: Sequence[np.ndarray], precision: Float[np.ndarray, "3 3 *k"]) -> np.ndarray:
-    """exp(-1/2 d^T P d), for the three parts of d."""
+    """Compute exp(-1/2 d^T P d) from the three components of d."""
     x, y, z = away
     xx, xy, xz, yy, yz, zz = (
         precision[i, j].astype(np.float32)
@@ -208,9 +185,9 @@ def _falloff(away: Sequence[np.ndarray], precision: Float[np.ndarray, "3 3 *k"])
     )
 
 
-def _covariances(arrays: Gaussians) -> Float[np.ndarray, "N 3 3"]:
+def _covariances(gaussians: Gaussians) -> Float[np.ndarray, "N 3 3"]:
     w, x, y, z = (
-        arrays.quats / np.maximum(np.linalg.norm(arrays.quats, axis=1, keepdims=True), 1e-12)
+        gaussians.quats / np.maximum(np.linalg.norm(gaussians.quats, axis=1, keepdims=True), 1e-12)
     ).T.astype(np.float64)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -218,7 +195,8 @@ def _covariances(arrays: Gaussians) -> Float[np.ndarray, "N 3 3"]:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     scaled = (
-        np.moveaxis(np.array(rows), -1, 0) * np.exp(arrays.log_scales.astype(np.float64))[:, None]
+        np.moveaxis(np.array(rows), -1, 0)
+        * np.exp(gaussians.log_scales.astype(np.float64))[:, None]
     )
     return scaled @ scaled.transpose(0, 2, 1)
 
@@ -228,14 +206,14 @@ def _covariances(arrays: Gaussians) -> Float[np.ndarray, "N 3 3"]:
 
 
 def _corner(bits: int) -> tuple[slice, ...]:
-    """The view of a grid of nodes that gives each cell its corner x + 2 y + 4 z."""
+    """Return the slices of a grid of nodes that select corner x + 2 y + 4 z of each cell."""
     return tuple(slice(1, None) if bits >> axis & 1 else slice(None, -1) for axis in range(3))
 
 
 def _crossings(
     values: Float[np.ndarray, "X Y Z"], cells: Int[np.ndarray, "V 3"], level: float
 ) -> Float[np.ndarray, "V 3"]:
-    """The mean place, in its cell, of the crossings on the twelve edges of each cell."""
+    """Return the mean position, within each cell, of the crossings on its edges."""
     place, count = np.zeros((len(cells), 3)), np.zeros(len(cells))
     at = [values[_corner(bits)][tuple(cells.T)] for bits in range(8)]
     for start in range(8):
@@ -254,8 +232,8 @@ def _crossings(
 def _quads(
     inside: np.ndarray, number: Int[np.ndarray, "x y z"], axis: int
 ) -> Int[np.ndarray, "Q 4"]:
-    """The four cells around each edge along ``axis`` that is crossed, counterclockwise seen from
-    outside.
+    """Return the four cells around each edge along ``axis`` that is crossed, counterclockwise seen
+    from outside.
     """
     u, v = (axis + 1) % 3, (axis + 2) % 3
     along = np.moveaxis(inside, (axis, u, v), (0, 1, 2))[:, 1:-1, 1:-1]
@@ -274,7 +252,7 @@ def _colors_at(
     density: Float[np.ndarray, "X Y Z"],
     colored: Float[np.ndarray, "X Y Z 3"],
 ) -> Float[np.ndarray, "V 3"]:
-    """The colour at each vertex: the mean over its cell's corners, by opacity."""
+    """Return the colour at each vertex: the mean over its cell's corners, weighted by opacity."""
     cell = tuple(np.floor(corners).astype(int).T)
     total = sum(density[_corner(bits)][cell] for bits in range(8))
     color = sum(colored[_corner(bits)][cell] for bits in range(8))

@@ -145,7 +145,7 @@ class TrainCameras(IterableDataset, Updateable):
             (u + torch.arange(batch_size)) / batch_size if self.cfg.batch_uniform_azimuth else u
         )
         index = (sector * len(self.pool.azimuth)).long().clamp_max(len(self.pool.azimuth) - 1)
-        return Orbit(*(values[index] for values in self.pool))
+        return self.pool.rows(index)
 
     def _ranges(self, step: int) -> OrbitRanges:
         """Widen elevation and azimuth from the evaluation view to the full range over
@@ -207,7 +207,7 @@ class EvalCameras(Dataset, Updateable):
 
     def collate(self, indices: list[int]) -> dict[str, Any]:
         index = torch.tensor(indices)
-        orbit = Orbit(*(values[index] for values in self.orbit))
+        orbit = self.orbit.rows(index)
         c2w, cfg = orbit.c2w, self.cfg
         batch = make_batch(
             orbit,

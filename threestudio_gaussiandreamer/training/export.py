@@ -7,9 +7,10 @@ from typing import Any, Optional
 
 from ..exporters.base import read_gaussians
 from ..formats.gaussian_files import StoredCloud, write_cloud
+from ..formats.obj import write_obj
 from ..formats.ply import write_points
 from ..gaussians.point_cloud import PointCloud
-from ..gaussians.surface import Surface, write_obj
+from ..gaussians.surface import Surface
 from ..gaussians.views import EPS2D
 from ..host import find
 from ..prune import PruneOptions, prune_to_budget, write_report

@@ -106,7 +106,7 @@ class HeldOut:
             module.eval()
         images, backgrounds = [], []
         for start in range(0, self.cfg.views, chunk):
-            part = Orbit(*(values[start : start + chunk] for values in self.orbit))
+            part = self.orbit.rows(slice(start, start + chunk))
             out = renderer(**orbit_batch(part, self.cfg.size * renderer.cfg.downsample))
             images.append(out["comp_rgb"].cpu())
             backgrounds.append(out["comp_rgb_bg"].cpu().mean((1, 2)))

@@ -1,0 +1,63 @@
+"""PLY files for tests: random content, any header, and values that the writer leaves out."""
+
+from pathlib import Path
+
+import numpy as np
+
+from threestudio_gaussiandreamer.formats.ply import gaussian_columns, gaussian_properties
+from threestudio_gaussiandreamer.formats.ply_table import write_table
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
+
+
+def write_raw_gaussians(path: Path, gaussians: Gaussians, comments: tuple[str, ...] = ()) -> None:
+    """Write Gaussians as they are, NaN and infinity included."""
+    properties = gaussian_properties(gaussians.sh.shape[1])
+    write_table(path, properties, gaussian_columns(gaussians), comments)
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+def gaussians(count=50, degree=0, seed=0):
+    """Draw Gaussians of normally distributed values."""
+    shapes = [(count, 3), (count, 4), (count, 3), (count,), (count, (degree + 1) ** 2, 3)]
+    return Gaussians(
+        *(rng(seed + i).normal(size=shape).astype(np.float32) for i, shape in enumerate(shapes))
+    )
+
+
+def cloud(count=50, normals=True):
+    """Draw coloured points, whose normals equal their positions."""
+    values = rng(9).normal(size=(count, 3)).astype(np.float32)
+    return PointCloud(
+        points=values,
+        colors=rng(8).random((count, 3), np.float32),
+        normals=values if normals else None,
+    )
+
+
+def header(
+    encoding="ascii", count=2, properties=("float x", "float y", "float z"), before="", after=""
+):
+    """Return the header of a PLY file as other programs write it."""
+    lines = [f"property {entry}" for entry in properties]
+    return "\n".join(
+        [
+            "ply",
+            f"format {encoding} 1.0",
+            *filter(None, [before]),
+            f"element vertex {count}",
+            *lines,
+            after,
+            "end_header\n",
+        ]
+    )
+
+
+def saved(folder, content, name="file.ply"):
+    """Write a file of any content; return its path."""
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode("latin-1"))
+    return path
