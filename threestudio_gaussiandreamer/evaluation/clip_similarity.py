@@ -27,6 +27,7 @@ from jaxtyping import Float, Int
 from .. import register_parts
 from ..cameras import Orbit
 from ..core import images as files_of_pictures
+from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.files import existing_file, json_text
 from ..core.streams import numpy_generator
@@ -344,17 +345,8 @@ def evaluate(
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line; returns the exit code: 0 done, 2 something the user can mend."""
-    try:
-        args = parse(argv)
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    try:
-        run(args)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    """Run one command line; return the exit code of :func:`core.command.run_command`."""
+    return run_command(parse, run, argv)
 
 
 if __name__ == "__main__":

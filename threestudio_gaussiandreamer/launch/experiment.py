@@ -17,9 +17,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Optional
 
+from ..core.command import exit_code
 from ..core.errors import Terminated, UserError
+from ..core.output import tolerant_output
 from .options import PROGRAM, announce_device, choose_gpu, find_config, parse_arguments
-from .output import tolerant_output
 from .signals import raised_signals
 
 NOISE = (
@@ -87,25 +88,6 @@ def foreign_exit(stop: SystemExit) -> UserError:
     """Make the error for a ``sys.exit()`` that isn't ours, whose code may be that of success."""
     *_, place = traceback.extract_tb(stop.__traceback__)
     return UserError(f"{place.filename}:{place.lineno} ended the run with sys.exit({stop.code!r})")
-
-
-def exit_code(error: Exception, verbose: bool) -> int:
-    """Say what ended a run, in one message.
-
-    Raises:
-        Exception: ``error`` itself, if it is a mistake of the program.
-    """
-    if not isinstance(error, (UserError, BrokenPipeError)):
-        raise error
-    if verbose:
-        traceback.print_exc()
-    if isinstance(error, UserError):
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    # the reader of the output has gone, as in `| head`; without this, flushing would fail at exit
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    print(f"stopped: the reader of the output has closed it ({error.strerror})", file=sys.stderr)
-    return 128 + signal.SIGPIPE
 
 
 def run(args: argparse.Namespace, argv: Sequence[str]) -> int:

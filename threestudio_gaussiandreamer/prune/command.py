@@ -11,13 +11,12 @@ budget or a stricter one removes nothing."""
 
 import argparse
 import os
-import signal
-import sys
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, Optional
 
+from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.files import require_writable
 from ..core.options import check_options
@@ -67,20 +66,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line; return the exit code: 0 done, 2 a mistake of the user, 130 Ctrl-C."""
-    try:
-        args = parse(argv)
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    try:
-        run(args)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
-        return 128 + signal.SIGINT
-    return 0
+    """Run one command line; return the exit code of :func:`core.command.run_command`."""
+    return run_command(parse, run, argv)
 
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:

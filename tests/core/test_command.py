@@ -1,0 +1,47 @@
+"""Exit codes and messages of the package's commands."""
+
+import os
+
+import pytest
+
+from threestudio_gaussiandreamer.core.command import run_command
+from threestudio_gaussiandreamer.core.errors import UserError
+
+
+def raising(error):
+    def run(args):
+        raise error
+
+    return run
+
+
+def test_the_work_gets_what_was_parsed():
+    seen = []
+    assert run_command(len, seen.append, ["a", "b"]) == 0 and seen == [2]
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (UserError("no such file"), 2, "error: no such file\n"),
+        (KeyboardInterrupt(), 130, "stopped\n"),
+        (BrokenPipeError(32, "Broken pipe"), 141, "the reader of the output has closed it"),
+    ],
+)
+def test_what_ends_a_command_is_one_message(error, code, message, capsys, monkeypatch):
+    monkeypatch.setattr(os, "dup2", lambda *descriptors: None)
+    assert run_command(len, raising(error), []) == code
+    assert message in capsys.readouterr().err
+
+
+def test_a_mistake_of_the_program_keeps_its_traceback():
+    with pytest.raises(ZeroDivisionError):
+        run_command(len, raising(ZeroDivisionError()), [])
+
+
+@pytest.mark.parametrize(("asked", "code"), [(0, 0), (None, 0), (2, 2)])
+def test_usage_has_argparses_code(asked, code):
+    def parse(argv):
+        raise SystemExit(asked)
+
+    assert run_command(parse, len) == code
