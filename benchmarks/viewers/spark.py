@@ -1,17 +1,17 @@
 """What Spark shows of a cloud, against our own render: dB on the held-out views.
 
-    python -m benchmarks.viewers.spark --modules ~/npm/node_modules \\
-        bounded:toy.glb:outputs/demo/.../save/it1200-export/gaussians.ply
+    cloud=outputs/demo/.../save/it1200-export/gaussians.ply
+    python -m benchmarks.viewers.spark --modules ~/npm/node_modules bounded:toy.glb:$cloud
 
 Each cloud is given as variant:mesh:file (the mesh is the truth; a bare name is a bundled one) and
 drawn at 256^2 by Spark in headless Chromium and by our renderer, both as the demo draws (dilation
-0.1) and as Spark does by default (a dilation of 0.3 square pixels that keeps a Gaussian's energy). Rows
-go to docs/charts/spark.csv. ``benchmarks/viewers/browser.py`` says what to install.
+0.1) and as Spark does by default (a dilation of 0.3 square pixels that keeps a Gaussian's energy).
+Rows go to docs/charts/spark.csv. ``benchmarks/viewers/browser.py`` says what to install.
 """
 
 import argparse
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,23 +49,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("clouds", nargs="+", metavar="VARIANT:MESH:FILE")
     parser.add_argument("--modules", type=Path, required=True, help="the folder node_modules")
+    parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS))
     arguments = parser.parse_args()
     if lacking := missing(arguments.modules):
         parser.error(lacking)
     register_parts()
     for given in arguments.clouds:
         variant, mesh, file = given.split(":")
-        for row in rows(mesh, Path(file), arguments.modules):
+        for row in rows(mesh, Path(file), arguments.modules, arguments.settings):
             print(variant, row, flush=True)
             append_rows("spark", COLUMNS.split(","), [{"variant": variant, **row}])
 
 
-def rows(mesh: str, file: Path, modules: Path) -> Iterator[dict[str, Any]]:
-    """Measure one file with each of ``SETTINGS``."""
+def rows(mesh: str, file: Path, modules: Path, settings: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Measure one file with some of ``SETTINGS``."""
     stored = read_cloud(str(file))
     world = stored.in_axes(WORLD_UP).gaussians
     above = float((sh0_to_rgb(world.sh[:, 0]) > 1 + 1e-4).any(axis=1).mean())
-    for name, (options, drawn) in SETTINGS.items():
+    for name in settings:
+        options, drawn = SETTINGS[name]
         # before colours were bounded, our own render didn't clamp them
         ours, truth = held_out_pictures(mesh, world, SIZE, bound_colors=False, **drawn)
         pixels = draw_with_spark(

@@ -9,11 +9,11 @@ from tests.helpers.ply_files import write_raw_gaussians
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.ply import read_gaussians, write_gaussians
 from threestudio_gaussiandreamer.formats.spz import COLOR_REACH
-from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
+from threestudio_gaussiandreamer.gaussians.sh import C0, rgb_to_sh0, sh0_to_rgb, sh_to_colors
 from threestudio_gaussiandreamer.gaussians.views import psnr_to_original, render_all
 from threestudio_gaussiandreamer.host import get_device
 from threestudio_gaussiandreamer.prune import PruneOptions, command
-from threestudio_gaussiandreamer.prune.pipeline import views_of
+from threestudio_gaussiandreamer.prune.pipeline import constant_sh_limit, views_of
 from threestudio_gaussiandreamer.splatting import rasterize
 
 
@@ -216,3 +216,23 @@ def test_views_turn_with_the_axes_of_the_file(tmp_path):
         heights["y"], heights["-y"], atol=0.05
     )
     assert heights["z"].max() > 1 > -1 > heights["z"].min()
+
+
+def test_recovered_colours_stay_in_the_range_that_viewers_show():
+    """In [0, 1], in what the input has beyond it, and in what the file holds."""
+    shown = 0.5 / C0
+    cloud = ball()._replace(sh=torch.full((2, 1, 3), 0.3))
+    assert constant_sh_limit(cloud, ".ply") == pytest.approx(shown)
+    assert constant_sh_limit(cloud, ".spz") == pytest.approx(shown)
+    bright = cloud._replace(sh=torch.tensor([2.0, -4.0]).view(2, 1, 1).expand(2, 1, 3))
+    assert constant_sh_limit(bright, ".ply") == 4
+    assert constant_sh_limit(bright, ".spz") == COLOR_REACH
+
+
+def test_recovery_makes_no_colour_that_viewers_clip(tmp_path):
+    white = ball()
+    white.sh[:] = rgb_to_sh0(torch.tensor(1.0))
+    write_gaussians(tmp_path / "in.ply", white.arrays())
+    run(tmp_path / "in.ply", tmp_path / "out.ply", "--count", "300")
+    colors = sh0_to_rgb(read_gaussians(tmp_path / "out.ply").sh[:, 0])
+    assert len(colors) == 300 and colors.min() > -1e-6 and colors.max() < 1 + 1e-6

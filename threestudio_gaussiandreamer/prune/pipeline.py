@@ -7,7 +7,6 @@ rounding included. All views are from around and outside: right for an object, n
 
 import bisect
 import logging
-import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,6 +24,7 @@ from ..formats.spz import COLOR_REACH
 from ..gaussians.axes import WORLD_UP, rotation_between
 from ..gaussians.gaussians import Gaussians, drawable
 from ..gaussians.recover import Recovery, Round
+from ..gaussians.sh import rgb_to_sh0
 from ..gaussians.simplify import Budget, rounds_to, simplify
 from ..gaussians.stored_state import require_cloud
 from ..gaussians.views import (
@@ -240,7 +240,7 @@ def _simplify(
         val_views,
         steps=options.steps,
         as_stored=after_file,
-        sh_reach=COLOR_REACH if suffix == ".spz" else math.inf,
+        sh_reach=constant_sh_limit(cloud, suffix),
     )
     rounds = None if budget.count is None else rounds_to(budget.count, len(cloud.means))
     with tqdm(desc="pruning", unit="round", total=rounds, disable=None) as bar:
@@ -251,6 +251,16 @@ def _simplify(
 
         fewer = simplify(cloud, budget, recovery, report=report)
     return stored._replace(gaussians=fewer.arrays()), recovery.quality(fewer)
+
+
+def constant_sh_limit(cloud: Gaussians, suffix: str) -> float:
+    """Return the largest absolute constant harmonic that recovery may give a Gaussian.
+
+    Viewers show colours in [0, 1] only: recovered colours stay in that range, or in the input's
+    where that is larger, and in what the file holds.
+    """
+    largest = max(float(rgb_to_sh0(torch.ones(()))), float(cloud.sh[:, 0].abs().amax()))
+    return min(largest, COLOR_REACH) if suffix == ".spz" else largest
 
 
 def views_of(stored: StoredCloud, options: PruneOptions) -> list[Views]:
