@@ -21,7 +21,7 @@ import torch
 from benchmarks.splatting.bench_splatting import make_camera, make_scene
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0
 from threestudio_gaussiandreamer.guidance.base import ScoreDistillation, _bad_items
-from threestudio_gaussiandreamer.splatting import RasterizeOptions, api, rasterize
+from threestudio_gaussiandreamer.splatting import RasterizeOptions, rasterize
 from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.finite import (
     CHECK_EVERY,
@@ -105,14 +105,14 @@ class Bench:
 
     def arguments_are_checked(self) -> None:
         gaussians, cameras = self.tensors()
-        api._check_tensors(gaussians | cameras)
-        api._check_shapes(gaussians | cameras)
-        api._check_numbers(self.size, self.size, RasterizeOptions())
-        api._check_finite("drop", {})
+        validation.check_tensors(gaussians | cameras)
+        validation.check_shapes(gaussians | cameras)
+        validation.check_numbers(self.size, self.size, RasterizeOptions())
+        validation.check_finite("drop", {})
 
     def everything_is_finite(self) -> None:
         gaussians, cameras = self.tensors()
-        api._check_finite("error", gaussians | cameras)
+        validation.check_finite("error", gaussians | cameras)
 
     @torch.no_grad()
     def log_scales_are_clamped(self) -> None:

@@ -33,6 +33,7 @@ from threestudio_gaussiandreamer.gaussians.sh import sh0_to_rgb
 from threestudio_gaussiandreamer.splatting import rasterize, reference
 from threestudio_gaussiandreamer.splatting.options import RasterizeOptions
 from threestudio_gaussiandreamer.splatting.projection import project
+from threestudio_gaussiandreamer.splatting.validation import as_scene, named
 
 ROOT = Path(__file__).resolve().parents[2]
 CSV = ROOT / "docs/charts/rasteriser.csv"
@@ -179,7 +180,8 @@ def truth(scene: Scene, size: int) -> Truth:
     viewmat, K = (x[None].double() for x in make_camera(size))
     leaves = [x.double().requires_grad_() for x in scene]
     options = RasterizeOptions(alpha_min=0.0, stop=0.0)
-    splats = project(*leaves, viewmat, K, size, size, options)
+    inputs = as_scene(named(*leaves, viewmat, K, background=None), size, size)
+    splats = project(inputs, options)
     ordered = reference.sort(splats, leaves[4][None], 0)
     centres = reference.pixel_centres(size, size, splats.depths)[pixels]
     chunks = centres.split(64)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from threestudio_gaussiandreamer.splatting import Rasterized, rasterize
+from threestudio_gaussiandreamer.splatting.scene import Scene
 
 # float32 against float64 without the worst 0.5 % of the rows (thresholds that fall the other way).
 SINGLE = 2e-5
@@ -31,6 +32,14 @@ class Cloud(NamedTuple):
 
     def leaves(self) -> "Cloud":
         return Cloud(*(x.detach().clone().requires_grad_() for x in self))
+
+
+def scene_of(cloud: Cloud, viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Scene:
+    """Return what backends take; the background is black."""
+    background = cloud.means.new_zeros(len(viewmats), cloud.colors.shape[-1])
+    gaussians = dict(zip(NAMES, cloud, strict=True))
+    cameras = {"viewmats": viewmats, "Ks": Ks, "background": background}
+    return Scene(**gaussians, **cameras, width=width, height=height)
 
 
 def random_cloud(

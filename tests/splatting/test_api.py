@@ -13,8 +13,8 @@ from threestudio_gaussiandreamer import splatting
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import (
     PRESETS,
-    api,
     available_backends,
+    backends,
     rasterize,
     torch_backend,
 )
@@ -151,7 +151,7 @@ def test_presets_in_order_of_accuracy():
     assert errors[0] > errors[1] > errors[2]
 
 
-@pytest.mark.parametrize("backend", list(api.BACKENDS))
+@pytest.mark.parametrize("backend", list(backends.BACKENDS))
 def test_autocast_changes_nothing(backend):
     if backend not in usable():
         pytest.skip(available_backends()[backend])
@@ -206,7 +206,7 @@ def test_background_of_each_view_or_of_all():
 
 
 @pytest.mark.parametrize("only", ["colors", "opacities", "background"])
-@pytest.mark.parametrize("backend", list(api.BACKENDS))
+@pytest.mark.parametrize("backend", list(backends.BACKENDS))
 def test_means2d_reports_its_gradient_whenever_anything_is_differentiated(only, backend):
     if backend not in usable():
         pytest.skip(available_backends()[backend])
@@ -256,7 +256,7 @@ def test_auto_prefers_the_native_library_and_says_once_when_it_cannot(monkeypatc
     assert chosen == ["cpu", "torch"] and not caplog.records
 
     monkeypatch.setattr(cpu, "unavailable", lambda: "no compiler was found")
-    api._warn_once.cache_clear()
+    backends._warn_once.cache_clear()
     with caplog.at_level(logging.WARNING):
         call(backend="auto"), call(backend="auto")
     assert chosen[2:] == ["torch"] * 2
@@ -265,4 +265,4 @@ def test_auto_prefers_the_native_library_and_says_once_when_it_cannot(monkeypatc
         for record in caplog.records
         if "no compiler was found" in record.getMessage()
     ] and len(caplog.records) == 1
-    api._warn_once.cache_clear()
+    backends._warn_once.cache_clear()

@@ -1,17 +1,17 @@
 """The CUDA backend without a GPU: its kernels run on the host, thread by thread, against the
 float64 specification.
 
-`cuda_shim/machine.py` stands in for the GPU and runs the text that NVRTC compiles; the Python
+`cuda_shim/device.py` stands in for the GPU and runs the text that NVRTC compiles; the Python
 around it is the product's, too."""
 
 import pytest
 import torch
 
-from tests.helpers.cuda_shim.machine import ORDERS, HostMachine, unavailable
+from tests.helpers.cuda_shim.device import ORDERS, HostDevice, unavailable
 from tests.helpers.splatting_contract import BACKGROUND, KernelContract, draw
 from tests.helpers.splatting_scenes import NAMES, Cloud, cameras, cotangents, equal, random_cloud
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.splatting import api, rasterize
+from threestudio_gaussiandreamer.splatting import backends, rasterize
 from threestudio_gaussiandreamer.splatting.cuda import backend as cuda
 from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver
 from threestudio_gaussiandreamer.splatting.cuda import memory as cuda_memory
@@ -20,21 +20,23 @@ pytestmark = pytest.mark.skipif(unavailable() is not None, reason=str(unavailabl
 
 
 @pytest.fixture(autouse=True)
-def machine(monkeypatch):
-    """The backend on tensors of the CPU, on a machine that tests may exchange; nothing learnt from
+def device(monkeypatch):
+    """The backend on tensors of the CPU, on a device that tests may exchange; nothing learnt from
     earlier calls.
     """
-    machines = [HostMachine()]
+    devices = [HostDevice()]
     monkeypatch.setitem(
-        api.BACKENDS, "cuda", api.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,))
+        backends.BACKENDS,
+        "cuda",
+        backends.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,)),
     )
     monkeypatch.setattr(cuda_driver, "unavailable", lambda: None)
-    monkeypatch.setattr(cuda_driver, "machine", lambda device: machines[-1])
-    monkeypatch.setattr(cuda, "_demands", {})
+    monkeypatch.setattr(cuda_driver, "device", lambda device: devices[-1])
+    monkeypatch.setattr(cuda, "_estimates", {})
 
-    def exchange(**options) -> HostMachine:
-        machines.append(HostMachine(**options))
-        return machines[-1]
+    def exchange(**options) -> HostDevice:
+        devices.append(HostDevice(**options))
+        return devices[-1]
 
     return exchange
 
@@ -48,9 +50,9 @@ class TestCudaKernels(KernelContract):
 # ---- the same bits -------------------------------------------------------------------------------
 
 
-def scene(machine, cloud=None, **options):
-    """A picture of 3 x 2 tiles per view with everything in it, on a fresh machine."""
-    machine(**options)
+def scene(device, cloud=None, **options):
+    """A picture of 3 x 2 tiles per view with everything in it, on a fresh device."""
+    device(**options)
     cloud = random_cloud(300, seed=8, size=0.1) if cloud is None else cloud
     return draw(
         "cuda", cloud, cameras(3, 40, 24), 40, 24, BACKGROUND, camera_gradient=True, absgrad=True
@@ -71,21 +73,21 @@ CLOUDS = {"thin": None, "opaque": opaque_cloud()}
 
 
 @pytest.mark.parametrize("cloud", CLOUDS.values(), ids=CLOUDS)
-def test_the_order_of_the_threads_changes_no_bit(machine, cloud):
+def test_the_order_of_the_threads_changes_no_bit(device, cloud):
     """A barrier that is missing, or a sum in the order of arrival, would show."""
-    one, *others = (scene(machine, cloud, order=order) for order in (*ORDERS, "forward"))
+    one, *others = (scene(device, cloud, order=order) for order in (*ORDERS, "forward"))
     assert all(same(one, other) for other in others)
 
 
 @pytest.mark.parametrize("cloud", CLOUDS.values(), ids=CLOUDS)
-def test_nothing_is_read_before_it_is_written(machine, monkeypatch, cloud):
+def test_nothing_is_read_before_it_is_written(device, monkeypatch, cloud):
     """Torch fills what it allocates with NaN, the stand-in the shared memory."""
-    plain = scene(machine, cloud)
+    plain = scene(device, cloud)
     monkeypatch.setattr(torch.utils.deterministic, "fill_uninitialized_memory", True)
     torch.use_deterministic_algorithms(True)
     try:
         assert torch.empty(1).isnan()
-        spoilt = scene(machine, cloud)
+        spoilt = scene(device, cloud)
     finally:
         torch.use_deterministic_algorithms(False)
     assert same(plain, spoilt)
@@ -97,7 +99,7 @@ def test_the_stand_in_shows_faults(kernel):
     out = {order: torch.zeros(64, dtype=torch.int32) for order in ORDERS}
     try:
         for order in ORDERS:
-            HostMachine(order).launch(kernel, (1, 1), 64, out[order])
+            HostDevice(order).launch(kernel, (1, 1), 64, out[order])
     except AssertionError as fault:
         assert kernel == "faulty_barrier" and "threads that don't meet" in str(fault)
     else:
@@ -118,28 +120,28 @@ def lists(monkeypatch):
 
 
 def test_a_picture_that_needs_more_room_than_expected_is_right_to_the_bit(
-    machine, monkeypatch, lists
+    device, monkeypatch, lists
 ):
     """Drawn without lists, differentiated with whole ones; once the number has arrived there is
     room.
     """
     monkeypatch.setattr(cuda_memory, "STEP", 64)
-    known = scene(machine)
-    for demand in cuda._demands.values():
-        demand.per_gaussian = 0.5  # as if earlier pictures had needed less
-    short, host = scene(machine, arrived=False), cuda_driver.machine(None)
+    known = scene(device)
+    for estimate in cuda._estimates.values():
+        estimate.per_gaussian = 0.5  # as if earlier pictures had needed less
+    short, host = scene(device, arrived=False), cuda_driver.device(None)
     assert same(known, short)
-    assert same(known, scene(machine, arrived=False))
+    assert same(known, scene(device, arrived=False))
     host.arrived = True
-    assert same(known, scene(machine))
+    assert same(known, scene(device))
     assert [x.capacity >= 1904 for x in lists] == [True, False, False, True], (
-        "the picture has 1904 entries"
+        "the scene has 1904 intersections"
     )
 
 
-def test_only_the_first_picture_of_a_size_waits(machine):
+def test_only_the_first_picture_of_a_size_waits(device):
     cloud, camera = random_cloud(50).to(torch.float32), cameras(2, 40, 24, dtype=torch.float32)
-    host = machine()
+    host = device()
     host.arrived = False
     with torch.no_grad():
         for waits in (1, 1, 1):
@@ -154,10 +156,10 @@ def test_only_the_first_picture_of_a_size_waits(machine):
 
 def test_room_follows_what_is_needed():
     """Up at once, down slowly, and in proportion to the Gaussians."""
-    demand, host = cuda_memory.Demand(views=2), HostMachine()
+    estimate, host = cuda_memory.CapacityEstimate(views=2), HostDevice()
 
     def room(*totals, gaussians=1000):
-        return demand.room(host.read_later(torch.tensor(totals).cumsum(0)), gaussians)
+        return estimate.capacity(host.read_async(torch.tensor(totals).cumsum(0)), gaussians)
 
     assert 6_000_000 < room(3_000_000, 1_000_000) < 6_010_000
     assert 3_000_000 * 0.99 < room(10, 10, gaussians=500) < 3_000_000
@@ -167,30 +169,30 @@ def test_room_follows_what_is_needed():
 
 
 @pytest.mark.parametrize("most", [1500, 900])
-def test_short_memory_means_fewer_views_at_a_time(machine, monkeypatch, most):
-    """Three views need 1904 entries, each of them about 600. The same bits; the second call doesn't
-    even try all at once.
+def test_short_memory_means_fewer_views_at_a_time(device, monkeypatch, most):
+    """Three views have 1904 intersections, each of them about 600. The same bits; the second call
+    doesn't even try all at once.
     """
     monkeypatch.setattr(cuda_memory, "STEP", 64)
-    known, tries = scene(machine), []
+    known, tries = scene(device), []
     for _ in range(2):
-        short = scene(machine, most_entries=most)
+        short = scene(device, most_intersections=most)
         assert same(known, short)
-        launched = cuda_driver.machine(None).launched
+        launched = cuda_driver.device(None).launched
         assert 1 < launched.count("blend") <= 3 and 1 < launched.count("blend_backward_absolute")
         tries.append(launched.count("list_tiles"))
     assert tries[0] == tries[1] + 1
 
 
-def test_memory_that_is_short_in_the_backward_pass_only(machine, monkeypatch):
+def test_memory_that_is_short_in_the_backward_pass_only(device, monkeypatch):
     monkeypatch.setattr(cuda_memory, "STEP", 64)
-    known, host = scene(machine), machine()
+    known, host = scene(device), device()
     cloud, camera = (
         random_cloud(300, seed=8, size=0.1).to(torch.float32).leaves(),
         [x.float() for x in cameras(3, 40, 24)],
     )
     out = rasterize(*cloud, *camera, 40, 24, background=BACKGROUND, backend="cuda")
-    host.most_entries = 1500
+    host.most_intersections = 1500
     torch.autograd.backward([out.image, out.alpha, out.depth], cotangents(out))
     assert host.launched.count("blend_backward") > 1
     assert all(
@@ -198,13 +200,13 @@ def test_memory_that_is_short_in_the_backward_pass_only(machine, monkeypatch):
     )
 
 
-def test_without_memory_for_one_view_there_is_a_picture_but_no_gradient(machine, caplog):
+def test_without_memory_for_one_view_there_is_a_picture_but_no_gradient(device, caplog):
     cloud, camera = (
         random_cloud(300, seed=8, size=0.1).to(torch.float32).leaves(),
         cameras(1, 40, 24, dtype=torch.float32),
     )
     known = rasterize(*cloud, *camera, 40, 24, backend="cuda")
-    machine(most_entries=10)
+    device(most_intersections=10)
     cuda._report_short_memory.cache_clear()
     short = rasterize(*cloud, *camera, 40, 24, backend="cuda")
     assert "memory is too short" in caplog.text
@@ -215,9 +217,9 @@ def test_without_memory_for_one_view_there_is_a_picture_but_no_gradient(machine,
         short.image.sum().backward()
 
 
-def test_more_entries_than_can_be_numbered_is_short_memory():
+def test_more_intersections_than_can_be_numbered_is_short_memory():
     with pytest.raises(torch.cuda.OutOfMemoryError):
-        cuda_memory.whole_steps(2**31)
+        cuda_memory.round_up_capacity(2**31)
 
 
 def test_more_splats_than_can_be_numbered_are_refused():
@@ -227,8 +229,8 @@ def test_more_splats_than_can_be_numbered_are_refused():
         cuda._check_count(70_000, 1)
 
 
-def test_without_gradients_nothing_is_kept(machine):
-    host = machine()
+def test_without_gradients_nothing_is_kept(device):
+    host = device()
     out = rasterize(
         *random_cloud(30).to(torch.float32),
         *cameras(1, 12, 12, dtype=torch.float32),

@@ -13,10 +13,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from tests.helpers.cuda_shim.machine import library, unavailable
+from tests.helpers.cuda_shim.device import library, unavailable
 from tests.helpers.splatting_scenes import cameras, equal, random_cloud, run
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.splatting import api, available_backends
+from threestudio_gaussiandreamer.splatting import available_backends, backends
 from threestudio_gaussiandreamer.splatting.cuda import backend as cuda
 from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver
 from threestudio_gaussiandreamer.splatting.cuda import nvrtc
@@ -286,9 +286,11 @@ def test_a_picture_by_way_of_the_driver(driver, monkeypatch, compiled):
     within rounding.
     """
     monkeypatch.setitem(
-        api.BACKENDS, "cuda", api.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,))
+        backends.BACKENDS,
+        "cuda",
+        backends.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,)),
     )
-    monkeypatch.setattr(cuda, "_demands", {})
+    monkeypatch.setattr(cuda, "_estimates", {})
     assert available_backends()["cuda"] is None
     cloud, camera = random_cloud(60).to(torch.float32), cameras(2, 20, 20, dtype=torch.float32)
     with ThreadPoolExecutor(1) as pool:
@@ -313,7 +315,7 @@ def test_code_that_the_driver_refuses_is_named(driver, monkeypatch):
         match=r"loading blend.cu for sm_90 \(NVRTC of CUDA .*, driver of CUDA 99.0\): "
         r".*invalid \(200\)",
     ):
-        cuda_driver.machine(torch.device("cuda")).launch("blend", (1, 1), 256)
+        cuda_driver.device(torch.device("cuda")).launch("blend", (1, 1), 256)
 
 
 @needs_nvrtc

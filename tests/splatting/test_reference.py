@@ -20,6 +20,7 @@ from tests.helpers.splatting_scenes import (
     psnr,
     random_cloud,
     run,
+    scene_of,
 )
 from tests.splatting.reference_cases import ROUNDING, SPECIFICATION
 from threestudio_gaussiandreamer.splatting import rasterize, reference
@@ -62,14 +63,8 @@ def test_the_jacobian_is_clamped_30_percent_beyond_the_image(side, beyond):
     limit = ((width - centre) / focal if side > 0 else centre / focal) + 0.3 * 0.5 * width / focal
     Ks = torch.tensor([[[focal, 0, centre], [0, focal, 5.0], [0, 0, 1]]], dtype=torch.float64)
     cloud = one_gaussian((side * beyond * limit * z, 0.0, z), (0.1, 0.2, 3.0))
-    splats = project(
-        *cloud,
-        torch.eye(4, dtype=torch.float64)[None],
-        Ks,
-        width,
-        10,
-        RasterizeOptions(**NO_CUTOFFS),
-    )
+    viewmats = torch.eye(4, dtype=torch.float64)[None]
+    splats = project(scene_of(cloud, viewmats, Ks, width, 10), RasterizeOptions(**NO_CUTOFFS))
     variance_x = (focal / z) ** 2 * (0.1**2 + (min(beyond, 1) * limit) ** 2 * 3.0**2) + 0.3
     variance_y = (focal / z) ** 2 * 0.2**2 + 0.3
     assert splats.conics[0, 0].tolist() == pytest.approx(

@@ -11,6 +11,7 @@ from tests.helpers.splatting_scenes import (
     one_gaussian,
     random_cloud,
     run,
+    scene_of,
 )
 from tests.splatting.torch_backend_cases import compare
 from threestudio_gaussiandreamer.splatting import rasterize, tiles, torch_backend
@@ -84,7 +85,7 @@ def test_tile_lists_are_complete_and_tight(stretch):
         random_cloud(300, seed=9, size=0.05, stretch=stretch),
         cameras(1, width, height),
     )
-    splats = project(*cloud, viewmats, Ks, width, height, options)
+    splats = project(scene_of(cloud, viewmats, Ks, width, height), options)
     order = splats.depths[0].argsort()[splats.visible[0][splats.depths[0].argsort()]]
     means2d, conics, opacities, _, extents = (x[0, order] for x in splats[:5])
     grid = tiles.make_grid(1, width, height)

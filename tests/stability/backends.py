@@ -5,8 +5,8 @@ where they can be compiled for it.
 import pytest
 import torch
 
-from tests.helpers.cuda_shim.machine import HostMachine, unavailable
-from threestudio_gaussiandreamer.splatting import api, available_backends
+from tests.helpers.cuda_shim.device import HostDevice, unavailable
+from threestudio_gaussiandreamer.splatting import available_backends, backends
 from threestudio_gaussiandreamer.splatting.cuda import backend as cuda
 from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver
 
@@ -22,10 +22,12 @@ def cuda_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets the backend "cuda" draw tensors of the CPU, its kernels run thread by thread
     (test_splatting_cuda.py).
     """
-    machine = HostMachine()
+    host = HostDevice()
     monkeypatch.setitem(
-        api.BACKENDS, "cuda", api.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,))
+        backends.BACKENDS,
+        "cuda",
+        backends.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,)),
     )
     monkeypatch.setattr(cuda_driver, "unavailable", lambda: None)
-    monkeypatch.setattr(cuda_driver, "machine", lambda device: machine)
-    monkeypatch.setattr(cuda, "_demands", {})
+    monkeypatch.setattr(cuda_driver, "device", lambda device: host)
+    monkeypatch.setattr(cuda, "_estimates", {})

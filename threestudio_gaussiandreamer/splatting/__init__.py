@@ -1,7 +1,9 @@
 """Differentiable splatting of 3-D Gaussians: one formula, several executions."""
 
-from .api import PRESETS, available_backends, rasterize
+from .api import rasterize
+from .backends import available_backends
 from .options import RasterizeOptions
 from .output import Rasterized
+from .validation import PRESETS
 
 __all__ = ["PRESETS", "Rasterized", "RasterizeOptions", "available_backends", "rasterize"]

@@ -1,6 +1,6 @@
 """What every backend returns, and the last stage of the torch ones: background and downsampling."""
 
-from typing import NamedTuple, Optional
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -27,12 +27,10 @@ class Rasterized(NamedTuple):
     ]  # the largest alpha_i T_i over the pixels of the view; no gradient
 
 
-def track_means2d(splats: Splats, others: tuple[Optional[Tensor], ...], absgrad: bool) -> Tensor:
+def track_means2d(splats: Splats, others: tuple[Tensor, ...], absgrad: bool) -> Tensor:
     """``splats.means2d`` prepared to report its gradient whenever anything is differentiated."""
     means2d = splats.means2d
-    if torch.is_grad_enabled() and any(
-        x is not None and x.requires_grad for x in (*splats, *others)
-    ):
+    if torch.is_grad_enabled() and any(x.requires_grad for x in (*splats, *others)):
         means2d = means2d if means2d.requires_grad else means2d.requires_grad_()
         means2d.retain_grad()
         if absgrad:
@@ -44,7 +42,7 @@ def compose(
     sums: Float[Tensor, "B H W C+2"],
     splats: Splats,
     contribution: Tensor,
-    background: Optional[Tensor],
+    background: Tensor,
     options: RasterizeOptions,
 ) -> Rasterized:
     """Background behind the sums of (colour, depth, 1) weighted with ``alpha_i T_i``, then the box
@@ -55,8 +53,7 @@ def compose(
     if options.downsample > 1:
         sums = _box(sums, options.downsample)
     image, depth, alpha = sums[..., :-2], sums[..., -2:-1], sums[..., -1:]
-    if background is not None:
-        image = image + (1 - alpha) * background[:, None, None]
+    image = image + (1 - alpha) * background[:, None, None]
     return Rasterized(image, alpha, depth, splats.means2d, splats.radii, contribution)
 
 

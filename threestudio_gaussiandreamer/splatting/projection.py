@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .options import RasterizeOptions
+from .scene import Scene
 
 SMALLEST_QUATERNION = 1e-12
 FRUSTUM_MARGIN = 0.3
@@ -40,24 +41,16 @@ class Splats(NamedTuple):
         return self.extents.amax(-1)
 
 
-def project(
-    means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, " N"],
-    colors: Float[Tensor, "*views N C"],
-    viewmats: Float[Tensor, "B 4 4"],
-    Ks: Float[Tensor, "B 3 3"],
-    width: int,
-    height: int,
-    options: RasterizeOptions,
-) -> Splats:
-    """All Gaussians in all views; differentiable in means, quats, scales, opacities and viewmats.
+def project(scene: Scene, options: RasterizeOptions) -> Splats:
+    """Project all Gaussians into all views; differentiable in means, quats, scales, opacities and
+    viewmats.
 
     A first pass without gradients finds what is visible. The second sees only those: whatever else
     there is becomes a harmless Gaussian *before* the formulas, so that its NaN or overflow can't
-    reach a gradient (0 * NaN is NaN). Colours are only looked at: a Gaussian with a colour that
-    isn't finite is invisible."""
+    reach a gradient (0 * NaN is NaN). A Gaussian with a colour that isn't finite is invisible; the
+    colours aren't used otherwise."""
+    means, quats, scales, opacities, viewmats, colors, _, Ks = scene.tensors
+    width, height = scene.size
     finite = torch.stack([_finite(x) for x in (means, quats, scales, opacities)]).all(0)
     means, quats, scales, opacities = (_keep(finite, x) for x in (means, quats, scales, opacities))
     cameras_finite = _finite(viewmats[:, :3]) & _finite(

@@ -14,6 +14,7 @@ from torch.utils.checkpoint import checkpoint
 from .options import RasterizeOptions
 from .output import Rasterized, compose, track_means2d
 from .projection import Splats, project
+from .scene import Scene
 
 CHUNK_BYTES = 2**29
 TENSORS_PER_PAIR = 24
@@ -23,28 +24,19 @@ def unavailable() -> Optional[str]:
     """None: plain torch runs everywhere."""
 
 
-def rasterize(
-    means,
-    quats,
-    scales,
-    opacities,
-    colors,
-    viewmats,
-    Ks,
-    width,
-    height,
-    background,
-    options: RasterizeOptions,
-) -> Rasterized:
-    """All views; arguments as in `splatting.rasterize`, already validated."""
-    splats = project(means, quats, scales, opacities, colors, viewmats, Ks, width, height, options)
-    splats = splats._replace(means2d=track_means2d(splats, (colors, background), options.absgrad))
-    colors = colors.expand(len(viewmats), -1, -1)
+def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
+    """Draw all views of a validated scene."""
+    splats = project(scene, options)
+    tracked = (scene.colors, scene.background)
+    splats = splats._replace(means2d=track_means2d(splats, tracked, options.absgrad))
+    colors = scene.colors.expand(len(scene.viewmats), -1, -1)
     views = [
-        render_view(splats, colors, view, width, height, options) for view in range(len(viewmats))
+        render_view(splats, colors, view, *scene.size, options)
+        for view in range(len(scene.viewmats))
     ]
     sums, contribution = (torch.stack(x) for x in zip(*views, strict=True))
-    return compose(sums.unflatten(1, (height, width)), splats, contribution, background, options)
+    sums = sums.unflatten(1, (scene.height, scene.width))
+    return compose(sums, splats, contribution, scene.background, options)
 
 
 class Sorted(NamedTuple):

@@ -22,6 +22,7 @@ from torch.utils.checkpoint import checkpoint
 from .options import RasterizeOptions
 from .output import Rasterized, compose, track_means2d
 from .projection import Splats, project
+from .scene import Scene
 from .tiles import TILE, Bounds, Grid, Lists, bound, list_splats, make_grid, slices
 
 SPLATS_PER_STEP = 64
@@ -31,47 +32,38 @@ PROJECTED_AT_ONCE = 2**18
 PIXELS = TILE * TILE
 SHAPE_COLUMNS = 6
 FAINTEST = 1e-30
+GAUSSIANS = ("means", "quats", "scales", "opacities", "colors")
 
 
 def unavailable() -> Optional[str]:
     """None: plain torch runs everywhere."""
 
 
-def rasterize(
-    means,
-    quats,
-    scales,
-    opacities,
-    colors,
-    viewmats,
-    Ks,
-    width,
-    height,
-    background,
-    options: RasterizeOptions,
-) -> Rasterized:
-    """All views; arguments as in `splatting.rasterize`, already validated."""
-    splats = _project(
-        (means, quats, scales, opacities, colors), viewmats, Ks, width, height, options
-    )
-    splats = splats._replace(means2d=track_means2d(splats, (colors, background), options.absgrad))
+def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
+    """Draw all views of a validated scene."""
+    splats = _project(scene, options)
+    tracked = (scene.colors, scene.background)
+    splats = splats._replace(means2d=track_means2d(splats, tracked, options.absgrad))
     absgrad = getattr(splats.means2d, "absgrad", None)
-    sums, contribution = _Blend.apply(*splats, colors, absgrad, width, height, options)
-    return compose(sums, splats, contribution, background, options)
+    sums, contribution = _Blend.apply(*splats, scene.colors, absgrad, *scene.size, options)
+    return compose(sums, splats, contribution, scene.background, options)
 
 
-def _project(gaussians, viewmats, Ks, width, height, options) -> Splats:
+def _project(scene: Scene, options: RasterizeOptions) -> Splats:
     """`project`, of many Gaussians in parts that backward computes again: autograd keeps a hundred
     numbers of each.
     """
-    size = max(1, PROJECTED_AT_ONCE // len(viewmats))
-    parts = list(zip(*(x.split(size, -1 if x.dim() == 1 else -2) for x in gaussians), strict=True))
-    if len(parts) == 1:
-        return project(*gaussians, viewmats, Ks, width, height, options)
-    again = {"use_reentrant": False, "preserve_rng_state": False}
-    projected = [
-        checkpoint(project, *part, viewmats, Ks, width, height, options, **again) for part in parts
+    size = max(1, PROJECTED_AT_ONCE // len(scene.viewmats))
+    if len(scene.means) <= size:
+        return project(scene, options)
+    gaussians = {name: getattr(scene, name) for name in GAUSSIANS}
+    split = (x.split(size, -1 if x.dim() == 1 else -2) for x in gaussians.values())
+    parts = [
+        scene._replace(**dict(zip(gaussians, part, strict=True)))
+        for part in zip(*split, strict=True)
     ]
+    again = {"use_reentrant": False, "preserve_rng_state": False}
+    projected = [checkpoint(project, part, options, **again) for part in parts]
     return Splats(*(torch.cat(x, 1) for x in zip(*projected, strict=True)))
 
 

@@ -77,12 +77,12 @@ template <class Visit> SPLAT_FN void for_each_of_part(const View& view, const De
   }
 }
 
-// Sets each slice's first slot and the number of entries.
+// Sets each slice's first slot and the number of intersections.
 inline void number_slots(View& view) {
-  view.entry_count = 0;
-  for (Slice& slice : view.slices) slice.first_slot = int32_t(view.entry_count), view.entry_count += slice.slots;
-  check_memory(view.entry_count * int64_t(sizeof(Entry) + sizeof(uint64_t) + sizeof(float) * ROW));
-  if (view.entry_count > INT32_MAX) throw OutOfMemory{view.entry_count * int64_t(sizeof(float) * ROW)};
+  view.intersection_count = 0;
+  for (Slice& slice : view.slices) slice.first_slot = int32_t(view.intersection_count), view.intersection_count += slice.slots;
+  check_memory(view.intersection_count * int64_t(sizeof(Intersection) + sizeof(uint64_t) + sizeof(float) * ROW));
+  if (view.intersection_count > INT32_MAX) throw OutOfMemory{view.intersection_count * int64_t(sizeof(float) * ROW)};
 }
 
 inline void count_tiles(View& view, const DepthOrder& order, int64_t part) {
@@ -92,7 +92,7 @@ inline void count_tiles(View& view, const DepthOrder& order, int64_t part) {
                    [&](uint32_t gaussian) { for_each_tile(view, gaussian, [&](int tile) { counts[tile]++; }); });
 }
 
-// From the counts per (part, tile) to where each part writes its first entry of each tile.
+// From the counts per (part, tile) to where each part writes its first intersection of each tile.
 inline void scan_histogram(View& view, int parts) {
   int32_t sum = 0;
   for (int tile = 0; tile < view.tiles(); tile++) {
@@ -110,7 +110,7 @@ inline void fill_tiles(View& view, const DepthOrder& order, int64_t part) {
   int32_t* next = view.histogram.data() + part * view.tiles();
   for_each_of_part(view, order, part, [&](uint32_t gaussian) {
     int32_t slot = int32_t(view.slot_begin(gaussian));
-    for_each_tile(view, gaussian, [&](int tile) { view.entries[next[tile]++] = {int32_t(gaussian), slot++}; });
+    for_each_tile(view, gaussian, [&](int tile) { view.intersections[next[tile]++] = {int32_t(gaussian), slot++}; });
   });
 }
 
@@ -118,7 +118,7 @@ inline void fill_tiles(View& view, const DepthOrder& order, int64_t part) {
 inline void deal_to_tiles(View& view, const uint64_t* keys, int64_t visible, int threads) {
   const DepthOrder order = {keys, visible, int(std::min<int64_t>(threads, visible / SLICE + 1))};
   view.histogram.reserve(size_t(order.parts) * view.tiles());
-  view.entries.reserve(view.entry_count), view.tile_begin.reserve(view.tiles() + 1);
+  view.intersections.reserve(view.intersection_count), view.tile_begin.reserve(view.tiles() + 1);
   parallel_for(order.parts, threads, 1, [&](int64_t part) { count_tiles(view, order, part); });
   scan_histogram(view, order.parts);
   parallel_for(order.parts, threads, 1, [&](int64_t part) { fill_tiles(view, order, part); });

@@ -53,13 +53,13 @@ inline void raise_contributions(const View& view, int first, int count, const fl
     for (int l = 0; l < LANES; l++) rows[l] = load(peaks + (i + l) * LANES);
     transpose(rows);
     for (int l = 1; l < LANES; l++) rows[0] = maximum(rows[0], rows[l]);
-    const Entry* entries = view.entries.data() + first + i;
-    for (int l = 0; l < std::min(LANES, count - i); l++) raise_to(contribution + entries[l].gaussian, rows[0][l]);
+    const Intersection* intersections = view.intersections.data() + first + i;
+    for (int l = 0; l < std::min(LANES, count - i); l++) raise_to(contribution + intersections[l].gaussian, rows[0][l]);
   }
 }
 
-// Blends all entries of a tile into `planes`; notes in the view which blocks each of them touches.
-inline void blend_entries(const ForwardCall& call, View& view, const TileFrame& frame, Planes& planes) {
+// Blends all intersections of a tile into `planes`; notes in the view which blocks each of them touches.
+inline void blend_list(const ForwardCall& call, View& view, const TileFrame& frame, Planes& planes) {
   const BlendLimits limits = limits_of(call.settings);
   uint64_t* masks = call.keep ? view.block_masks.data() : nullptr;
   BlendScratch scratch;
@@ -85,7 +85,7 @@ inline void blend_tile(const ForwardCall& call, View& view, int tile) {
   Planes local;
   Planes& planes = call.keep && !empty ? view.planes[tile] : local;
   std::memset(&planes, 0, sizeof planes);
-  if (!empty) blend_entries(call, view, frame, planes);
+  if (!empty) blend_list(call, view, frame, planes);
   write_tile(call, view.index, frame, planes);
 }
 

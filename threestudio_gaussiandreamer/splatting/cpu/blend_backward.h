@@ -156,12 +156,12 @@ inline Vec3<float> background_sum(const float* alpha, const UpstreamPlanes& up) 
 
 inline void store_sums(const View& view, const float* sums, int first, int count, float* slots) {
   for (int i = 0; i < count; i++)
-    std::memcpy(slots + int64_t(view.entries[first + i].slot) * ROW, sums + i * ROW, sizeof(float) * ROW);
+    std::memcpy(slots + int64_t(view.intersections[first + i].slot) * ROW, sums + i * ROW, sizeof(float) * ROW);
 }
 
-// The rows of sums of all entries of one tile, each into its slot; those behind the last chunk that counted are zero.
+// The rows of sums of all intersections of one tile, each into its slot; those behind the last chunk that counted are zero.
 template <bool ABSOLUTE>
-inline void blend_entries_backward(const BackwardCall& call, View& view, const TileFrame& frame, BackwardScratch& scratch) {
+inline void blend_list_backward(const BackwardCall& call, View& view, const TileFrame& frame, BackwardScratch& scratch) {
   const BlendLimits limits = limits_of(call.settings);
   LiveStrips live;
   start_transmittance(view, frame, scratch.transmittance);
@@ -178,7 +178,7 @@ inline void blend_entries_backward(const BackwardCall& call, View& view, const T
   }
 }
 
-// One tile of one view: fills the slots of its entries, returns d loss / d background.
+// One tile of one view: fills the slots of its intersections, returns d loss / d background.
 inline Vec3<float> blend_tile_backward(const BackwardCall& call, View& view, int tile) {
   const TileFrame frame = frame_of(view, tile);
   BackwardScratch scratch;
@@ -189,9 +189,9 @@ inline Vec3<float> blend_tile_backward(const BackwardCall& call, View& view, int
   }
   start_behind(view.planes[tile], background_of(call.scene, view.index), scratch);
   if (call.out.absgrad)
-    blend_entries_backward<true>(call, view, frame, scratch);
+    blend_list_backward<true>(call, view, frame, scratch);
   else
-    blend_entries_backward<false>(call, view, frame, scratch);
+    blend_list_backward<false>(call, view, frame, scratch);
   return background_sum(view.planes[tile].alpha, scratch.upstream);
 }
 

@@ -8,7 +8,7 @@
 namespace splat {
 
 struct ForwardCall {
-  const SplatScene& scene;
+  const Scene& scene;
   const SplatSettings& settings;
   const SplatPictures& out;
   bool keep;  // what a backward pass needs
@@ -16,13 +16,13 @@ struct ForwardCall {
 
 // What only lives during a backward pass.
 struct Workspace {
-  Buffer<float> slots;       // (entries of all views, ROW): gradient sums of a splat in a tile
+  Buffer<float> slots;       // (intersections of all views, ROW): gradient sums of a splat in a tile
   Buffer<float> background;  // (views, tiles, 3)
   Buffer<float> viewmats;    // (slices of Gaussians, views, 16)
 };
 
 struct BackwardCall {
-  const SplatScene& scene;
+  const Scene& scene;
   const SplatSettings& settings;
   const SplatUpstream& upstream;
   const SplatGradients& out;

@@ -13,13 +13,13 @@ template <class T> struct Layers {
 };
 
 template <class T>
-Layers<T> layers_of(T* image, T* alpha, T* depth, const SplatScene& scene, const SplatSettings& settings, int view) {
+Layers<T> layers_of(T* image, T* alpha, T* depth, const Scene& scene, const SplatSettings& settings, int view) {
   const int width = scene.width / settings.downsample, height = scene.height / settings.downsample;
   const auto of_view = [&](T* all, int channels) { return all ? all + int64_t(width) * height * channels * view : nullptr; };
   return {of_view(image, 3), of_view(alpha, 1), of_view(depth, 1), width, height};
 }
 
-inline Vec3<float> background_of(const SplatScene& scene, int view) {
+inline Vec3<float> background_of(const Scene& scene, int view) {
   const float* background = scene.background + 3 * view;
   return {background[0], background[1], background[2]};
 }

@@ -11,14 +11,14 @@ SPLAT_FN Vec3<Floats> load_vec3(const float* p, int count) { return load_items<3
 
 SPLAT_FN Floats load_scalars(const float* p, int count) { return load_items<1>(p, count, load<Floats>); }
 
-SPLAT_FN Gaussian<Floats> load_gaussians(const SplatScene& scene, const SplatSettings& settings, Group group) {
+SPLAT_FN Gaussian<Floats> load_gaussians(const Scene& scene, const SplatSettings& settings, Group group) {
   const auto [first, count] = group;
   const Floats opacities = load_scalars(scene.opacities + first, count);
   return {load_vec3(scene.means + 3 * first, count), load_vec3(scene.scales + 3 * first, count),
           load_items<4>(scene.quats + 4 * first, count, load4), drawn_opacity(opacities, std::log2(settings.alpha_min))};
 }
 
-SPLAT_FN Vec3<Floats> load_colors(const SplatScene& scene, int view, Group group) {
+SPLAT_FN Vec3<Floats> load_colors(const Scene& scene, int view, Group group) {
   const int64_t offset = scene.colors_per_view ? scene.gaussians * view : 0;
   return load_vec3(scene.colors + 3 * (offset + group.first), group.count);
 }

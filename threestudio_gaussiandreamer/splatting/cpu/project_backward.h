@@ -39,7 +39,7 @@ struct Shapes {
   Mat3<Floats> axes;  // in the world
 };
 
-SPLAT_FN Shapes load_shapes(const SplatScene& scene, const SplatSettings& settings, Group group) {
+SPLAT_FN Shapes load_shapes(const Scene& scene, const SplatSettings& settings, Group group) {
   const Gaussian<Floats> g = load_gaussians(scene, settings, group);
   const Rotation<Floats> rotation = quat_to_rotation(g.quat);
   return {g, rotation, world_axes(rotation.matrix, g.scale)};

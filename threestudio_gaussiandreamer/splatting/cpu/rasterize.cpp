@@ -22,7 +22,7 @@ static Pool<Workspace>& workspaces() { return of_process<Pool<Workspace>>(); }
 static void blend_views(const ForwardCall& call, Views& views) {
   const int tiles = views[0].tiles();
   for (int v = 0; call.keep && v < call.scene.views; v++)
-    views[v].block_masks.reserve(views[v].entry_count), views[v].planes.reserve(tiles);
+    views[v].block_masks.reserve(views[v].intersection_count), views[v].planes.reserve(tiles);
   parallel_for(int64_t(tiles) * call.scene.views, call.settings.threads, TILE_GRAIN,
                [&](int64_t i) { blend_tile(call, views[i / tiles], int(i % tiles)); });
 }
@@ -32,12 +32,12 @@ static void forward(const ForwardCall& call, Views& views) {
   blend_views(call, views);
 }
 
-static int64_t slices_of(const SplatScene& scene) { return (scene.gaussians + BACKWARD_SLICE - 1) / BACKWARD_SLICE; }
+static int64_t slices_of(const Scene& scene) { return (scene.gaussians + BACKWARD_SLICE - 1) / BACKWARD_SLICE; }
 
 // Numbers the slots of all views and makes room for whatever the backward pass writes on its way.
 static void prepare(BackwardCall& call) {
   int64_t slots = 0;
-  for (int v = 0; v < call.scene.views; v++) call.first_slots.push_back(slots), slots += call.views[v].entry_count;
+  for (int v = 0; v < call.scene.views; v++) call.first_slots.push_back(slots), slots += call.views[v].intersection_count;
   check_memory(slots * ROW * int64_t(sizeof(float)));
   call.work.slots.reserve(slots * ROW);
   call.work.background.reserve(3 * int64_t(call.views[0].tiles()) * call.scene.views);
@@ -102,7 +102,7 @@ template <class Body> static int64_t guarded(const Body& body) {
 
 extern "C" {
 
-int64_t splat_forward(const SplatScene* scene, const SplatSettings* settings, const SplatPictures* out, SplatState** state) {
+int64_t splat_forward(const splat::Scene* scene, const SplatSettings* settings, const SplatPictures* out, SplatState** state) {
   return splat::guarded([&] {
     std::unique_ptr<SplatState> own = splat::states().take();
     splat::forward({*scene, *settings, *out, state != nullptr}, own->views);
@@ -113,7 +113,7 @@ int64_t splat_forward(const SplatScene* scene, const SplatSettings* settings, co
   });
 }
 
-int64_t splat_backward(SplatState* state, const SplatScene* scene, const SplatSettings* settings, const SplatUpstream* upstream,
+int64_t splat_backward(SplatState* state, const splat::Scene* scene, const SplatSettings* settings, const SplatUpstream* upstream,
                        const SplatGradients* out) {
   return splat::guarded([&] {
     std::unique_ptr<splat::Workspace> work = splat::workspaces().take();

@@ -3,19 +3,7 @@
 
 #include <cstdint>
 
-struct SplatScene {
-  const float* means;            // (N, 3)
-  const float* quats;            // (N, 4) w x y z, any length
-  const float* scales;           // (N, 3) standard deviations
-  const float* opacities;        // (N)
-  const float* viewmats;         // (B, 4, 4) world to camera, OpenCV
-  const float* colors;           // (N, 3) or, with colors_per_view, (B, N, 3)
-  const float* background;       // (B, 3)
-  const float* Ks;               // (B, 3, 3) pixels
-  int64_t gaussians;             // N
-  int32_t views, width, height;  // B and the rendered size
-  int32_t colors_per_view;
-};
+#include "splat_scene.h"
 
 struct SplatSettings {
   float near, far, eps2d, alpha_min, alpha_max, stop;
@@ -38,7 +26,7 @@ struct SplatUpstream {
 
 // What a backward pass fills; those that may be null aren't computed then.
 struct SplatGradients {
-  float *means, *quats, *scales, *opacities;  // as in SplatScene
+  float *means, *quats, *scales, *opacities;  // as in splat::Scene
   float* viewmats;                            // may be null
   float *colors, *background;
   float* means2d;  // (B, N, 2)
@@ -52,8 +40,8 @@ struct SplatState;
 extern "C" {
 // 0, or the bytes of memory that would have been needed. With `state` not null it receives what a backward pass needs, to be
 // given back by `splat_release`.
-int64_t splat_forward(const SplatScene*, const SplatSettings*, const SplatPictures*, SplatState** state);
-int64_t splat_backward(SplatState*, const SplatScene*, const SplatSettings*, const SplatUpstream*, const SplatGradients*);
+int64_t splat_forward(const splat::Scene*, const SplatSettings*, const SplatPictures*, SplatState** state);
+int64_t splat_backward(SplatState*, const splat::Scene*, const SplatSettings*, const SplatUpstream*, const SplatGradients*);
 void splat_release(SplatState*);  // null is ignored
 // The best build for this processor: "v4", "v3" or "base".
 const char* splat_best_isa();

@@ -11,7 +11,7 @@ constexpr int CHECK_EVERY = 4;  // splats between two looks at whether all pixel
 
 struct TileFrame {
   int left, top;
-  int begin, end;  // entries
+  int begin, end;  // intersections
   bool inside;     // all of its pixels belong to the image
 };
 
@@ -32,9 +32,9 @@ struct SplatLanes {
   Floats x, y, a, b, c, log2_opacity, depth, red, green, blue, inverse_a, tilt, slant, extent_x, extent_y, level;
 };
 
-SPLAT_FN SplatLanes load_splats(const View& view, const TileFrame& frame, int entry, int count) {
+SPLAT_FN SplatLanes load_splats(const View& view, const TileFrame& frame, int at, int count) {
   SplatLanes lanes;
-  load_columns<ROW>([&](int l) { return &view.splats[view.entries[entry + std::min(l, count - 1)].gaussian].x; }, &lanes.x);
+  load_columns<ROW>([&](int l) { return &view.splats[view.intersections[at + std::min(l, count - 1)].gaussian].x; }, &lanes.x);
   lanes.x -= float(frame.left), lanes.y -= float(frame.top);
   return lanes;
 }
@@ -116,7 +116,7 @@ template <bool FIND>
 SPLAT_FN void stage(const View& view, const TileFrame& frame, int first, int count, uint64_t* masks, Staged& staged) {
   for (int i = 0; i < count; i += LANES) {
     for (int l = 0; l < LANES; l++)
-      __builtin_prefetch(&view.splats[view.entries[std::min(first + i + l + PREFETCH, frame.end - 1)].gaussian]);
+      __builtin_prefetch(&view.splats[view.intersections[std::min(first + i + l + PREFETCH, frame.end - 1)].gaussian]);
     const SplatLanes splats = load_splats(view, frame, first + i, count - i);
     store_local(splats, staged.splats + i);
     if (FIND) block_masks(splats, staged.touching + i);

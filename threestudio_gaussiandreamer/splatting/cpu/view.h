@@ -39,7 +39,7 @@ struct Slice {
 };
 
 // A Gaussian in a tile.
-struct Entry {
+struct Intersection {
   int32_t gaussian, slot;
 };
 
@@ -50,20 +50,20 @@ struct Planes {
 
 struct View {
   int index, tiles_x, tiles_y;
-  int64_t entry_count;
+  int64_t intersection_count;
   Camera camera;
   Buffer<Splat> splats;        // (N)
   Buffer<Coverage> coverages;  // (N), and one more behind each slice
   std::vector<Slice> slices;
   Buffer<uint64_t> keys, spare_keys;  // depth << 32 | Gaussian
   Buffer<int32_t> histogram;
-  Buffer<int32_t> tile_begin;    // (tiles + 1) into entries
-  Buffer<Entry> entries;         // by tile, then by depth
-  Buffer<uint64_t> block_masks;  // per entry, the blocks of the tile that it touches
+  Buffer<int32_t> tile_begin;    // (tiles + 1) into intersections
+  Buffer<Intersection> intersections;         // by tile, then by depth
+  Buffer<uint64_t> block_masks;  // per intersection, the blocks of the tile that it touches
   Buffer<Planes> planes;         // (tiles) before the background; those of empty tiles aren't set
 
   // Room for everything whose size doesn't depend on where the Gaussians are.
-  void prepare(const SplatScene& scene, int view) {
+  void prepare(const Scene& scene, int view) {
     index = view, tiles_x = (scene.width + TILE - 1) / TILE, tiles_y = (scene.height + TILE - 1) / TILE;
     slices.resize((scene.gaussians + SLICE - 1) / SLICE);
     const size_t padded = slices.size() * SLICE;

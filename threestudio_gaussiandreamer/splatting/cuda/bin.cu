@@ -1,4 +1,4 @@
-// Stages 3 to 5: deal the splats, sorted by depth, to the tiles that they reach. An entry is a splat in a tile; entries are
+// Stages 3 to 5: deal the splats, sorted by depth, to the tiles that they reach. An intersection is a pair of a splat and a tile; they are
 // numbered front to back, so a stable sort by tile leaves the list of each tile front to back.
 #include "reach.h"
 
@@ -37,7 +37,7 @@ count_tiles(splat::Scene scene, const splat::Splat* splats, const splat::Index* 
   counts[at] = count;
 }
 
-// Stage 4: tile and owner (view * N + Gaussian) of each entry. `ends` is the running sum of the counts. What doesn't fit into
+// Stage 4: tile and owner (view * N + Gaussian) of each intersection. `ends` is the running sum of the counts. What doesn't fit into
 // the capacity is left out; the blend notices and does without the lists.
 extern "C" __global__ void __launch_bounds__(128)
 list_tiles(splat::Scene scene, const splat::Splat* splats, const splat::Index* order, const int* counts,
@@ -49,17 +49,17 @@ list_tiles(splat::Scene scene, const splat::Splat* splats, const splat::Index* o
   const int tiles_x = tiles_along(scene.width), tiles_y = tiles_along(scene.height), first_tile = blockIdx.y * tiles_x * tiles_y;
   const Range rows = tile_rows(*splat, tiles_y);
   const Index end = minimum(ends[at], capacity);
-  Index entry = ends[at] - counts[at];
+  Index at_tile = ends[at] - counts[at];
   for (int row = rows.begin; row < rows.end; row++) {
     const Range columns = tile_columns(*splat, row, tiles_x);
-    for (int column = columns.begin; column < columns.end && entry < end; column++, entry++) {
-      tiles[entry] = first_tile + row * tiles_x + column;
-      owners[entry] = int(index);
+    for (int column = columns.begin; column < columns.end && at_tile < end; column++, at_tile++) {
+      tiles[at_tile] = first_tile + row * tiles_x + column;
+      owners[at_tile] = int(index);
     }
   }
 }
 
-// Stage 5: where the entries of each tile begin, in entries sorted by tile; `begins` has one more element than there are tiles.
+// Stage 5: where the intersections of each tile begin, sorted by tile; `begins` has one more element than there are tiles.
 extern "C" __global__ void __launch_bounds__(128)
 find_tiles(const int* sorted_tiles, splat::Index capacity, int tiles, splat::Index* begins) {
   using namespace splat;

@@ -3,7 +3,7 @@
 
 namespace splat {
 
-struct Pictures {
+struct Images {
   float *image, *alpha, *depth;  // (B, H, W, 3), (B, H, W), (B, H, W) after the downsampling
   Quad* color_depth;             // (B, height, width) rendered pixels, or null: what a backward pass needs
   float* transmittance;
@@ -45,7 +45,7 @@ SPLAT_FN float box(float x) {
 }
 
 SPLAT_FN void write_pixel(const Scene& scene, const Settings& settings, const Pixel& pixel, int view, const Sums& sums,
-                          const Pictures& out) {
+                          const Images& out) {
   if (out.color_depth && pixel.inside) {
     const Index at = (Index(view) * scene.height + pixel.y) * scene.width + pixel.x;
     out.color_depth[at] = sums.color_depth, out.transmittance[at] = sums.transmittance;
@@ -64,7 +64,7 @@ SPLAT_FN void write_pixel(const Scene& scene, const Settings& settings, const Pi
 }  // namespace splat
 
 extern "C" __global__ void __launch_bounds__(256, 3)
-blend(splat::Scene scene, splat::Settings settings, splat::Lists lists, splat::Pictures out, unsigned* contribution) {
+blend(splat::Scene scene, splat::Settings settings, splat::Lists lists, splat::Images out, unsigned* contribution) {
   using namespace splat;
   __shared__ BlendShared shared;
   const TileFrame frame = frame_of(scene, lists);

@@ -1,4 +1,4 @@
-// The adjoint of stage 6: from the gradients of the pixels to one row of sums per entry (splat in a tile).
+// The adjoint of stage 6: from the gradients of the pixels to one row of sums per intersection (splat in a tile).
 //
 // The splats are blended front to back once more. What lies behind splat i is then the pixel's total minus what came so far,
 // so neither lists per pixel nor a division by T are needed. Per pair of splat and pixel only u = d loss / d ln(alpha) and the
@@ -148,13 +148,13 @@ SPLAT_FN void write_rows(const BackwardShared& shared, const Lists& lists, Index
   Quad sum = {};
   for (int patch = 0; patch < PATCHES; patch++)
     if (shared.summed[patch] >> slot & 1) sum = sum + reinterpret_cast<const Quad*>(&shared.parts[patch][slot])[quad];
-  reinterpret_cast<Quad*>(rows + lists.entries[first + slot])[quad] = sum;
+  reinterpret_cast<Quad*>(rows + lists.sorted[first + slot])[quad] = sum;
 }
 
-// Entries behind the last splat that any pixel of the tile saw.
+// Intersections behind the last splat that any pixel of the tile saw.
 SPLAT_FN void clear_rows(const Lists& lists, Index first, Index end, Row* rows) {
   for (Index i = first * ROW_QUADS + threadIdx.x; i < end * ROW_QUADS; i += TILE_PIXELS)
-    reinterpret_cast<Quad*>(rows + lists.entries[i / ROW_QUADS])[i % ROW_QUADS] = {};
+    reinterpret_cast<Quad*>(rows + lists.sorted[i / ROW_QUADS])[i % ROW_QUADS] = {};
 }
 
 template <bool ABSOLUTE>

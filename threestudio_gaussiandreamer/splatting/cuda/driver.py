@@ -42,8 +42,8 @@ def unavailable() -> Optional[str]:
     return nvrtc.unavailable() or _unsuitable()
 
 
-def machine(device: torch.device) -> "Gpu":
-    """The GPU that holds tensors of this device."""
+def device(device: torch.device) -> "Gpu":
+    """Return the GPU that holds tensors of this device."""
     return _gpu(torch.cuda.current_device() if device.index is None else device.index)
 
 
@@ -75,9 +75,9 @@ class Gpu:
             )
         _check(status, f"launching the kernel {name}")
 
-    def read_later(self, ends: Tensor) -> "Later":
+    def read_async(self, ends: Tensor) -> "Readback":
         with torch.cuda.device(self.index):
-            return Later(ends)
+            return Readback(ends)
 
     def _function(self, name: str) -> ctypes.c_void_p:
         """The kernel, with the context in which it lives made current: a thread that torch hasn't
@@ -108,7 +108,7 @@ class Gpu:
         return self.modules[unit]
 
 
-class Later:
+class Readback:
     """Whole numbers on their way from the GPU, without making anybody wait for them."""
 
     def __init__(self, ends: Tensor):

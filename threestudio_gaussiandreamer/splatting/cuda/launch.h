@@ -6,7 +6,7 @@
 
 namespace splat {
 
-using Index = long long;  // views times Gaussians, pixels or entries: may not fit 32 bits
+using Index = long long;  // views times Gaussians, pixels or intersections: may not fit 32 bits
 
 constexpr unsigned FULL = 0xffffffffu;  // all lanes of a warp
 constexpr int WARP = 32;
@@ -16,19 +16,6 @@ constexpr int TILE = 16, TILE_PIXELS = TILE * TILE;
 constexpr int PATCH_WIDTH = 8, PATCH_HEIGHT = 4, PATCHES_PER_ROW = TILE / PATCH_WIDTH, PATCHES = TILE_PIXELS / WARP;
 
 constexpr int CULLED = 0x7fffffff;  // depth key behind all others
-
-// Row-major float32 arrays of N Gaussians and B views.
-struct Scene {
-  const float* means;       // (N, 3)
-  const float* quats;       // (N, 4) w x y z, any length
-  const float* scales;      // (N, 3) standard deviations
-  const float* opacities;   // (N)
-  const float* colors;      // (N, 3) or, with colors_per_view, (B, N, 3)
-  const float* viewmats;    // (B, 4, 4) world to camera, OpenCV
-  const float* background;  // (B, 3)
-  const float* Ks;          // (B, 3, 3) pixels
-  int gaussians, views, width, height, colors_per_view;
-};
 
 struct Settings {
   float near, far, eps2d, log2_alpha_min, alpha_max, stop;

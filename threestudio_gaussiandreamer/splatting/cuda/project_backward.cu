@@ -1,4 +1,4 @@
-// The adjoints of stages 5 to 1: each splat adds up the rows of its entries, each Gaussian takes its splats' gradients through
+// The adjoints of stages 5 to 1: each splat adds up the rows of its intersections, each Gaussian takes its splats' gradients through
 // the projection, view after view. Every sum has a fixed order.
 #include "launch.h"
 
@@ -60,7 +60,7 @@ SPLAT_FN void store_screen(const Gradients& out, Index at, const Vec2<float>& me
 
 }  // namespace splat
 
-// Rows of the entries to sums (B, N) of rows; those of invisible Gaussians stay as they are. One warp per rank: 8 rows at a
+// Rows of the intersections to sums (B, N) of rows; those of invisible Gaussians stay as they are. One warp per rank: 8 rows at a
 // time, a quad per lane, so that a Gaussian that covers the screen takes no thread thousands of steps.
 extern "C" __global__ void __launch_bounds__(128, 8)
 sum_rows(splat::Scene scene, const int* depth_keys, const splat::Index* order, const int* counts, const splat::Index* ends,

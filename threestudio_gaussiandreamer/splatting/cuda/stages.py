@@ -2,7 +2,8 @@
 for the GPU.
 
 project, rank (sort by depth), count tiles, list them, sort by tile, find each tile's list, blend;
-and their adjoints. Sorts and running sums are torch's. An entry is a splat in a tile."""
+and their adjoints. Sorts and running sums are torch's. An intersection is a pair of a splat and a
+tile that it reaches."""
 
 import ctypes
 import math
@@ -12,16 +13,17 @@ import torch
 from torch import Tensor
 
 from ..options import RasterizeOptions
+from ..scene import Scene, address
 
 TILE, BLEND_THREADS, THREADS, WARP = 16, 256, 128, 32
 SPLAT, ROW = 16, 12  # floats
-NOWHERE = 2**31 - 1  # the tile of an entry that isn't used
+NOWHERE = 2**31 - 1  # the tile of an intersection that isn't used
 CAMERA_SUMS = 12
 
 Argument = Union[Tensor, ctypes.Structure, ctypes._SimpleCData]
 
 
-class Later(Protocol):
+class AsyncReadback(Protocol):
     """Numbers on their way from the GPU."""
 
     def ready(self) -> bool: ...
@@ -30,52 +32,21 @@ class Later(Protocol):
         """Waits if it must."""
 
 
-class Machine(Protocol):
-    """What runs kernels: `cuda_driver.Gpu`, or a stand-in."""
+class Device(Protocol):
+    """What runs kernels: `driver.Gpu`, or a stand-in."""
 
     def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Argument) -> None:
         """Queues a kernel; ``arguments`` are tensors, structures and C numbers."""
 
-    def read_later(self, numbers: Tensor) -> Later: ...
+    def read_async(self, numbers: Tensor) -> AsyncReadback: ...
 
 
-class Frame(NamedTuple):
-    """What a call is told besides tensors."""
+class LaunchContext(NamedTuple):
+    """What a call is told besides its scene."""
 
-    width: int
-    height: int
     options: RasterizeOptions
     tracked: bool
-    machine: Machine
-
-    @property
-    def tiles(self) -> int:
-        return -(-self.width // TILE) * -(-self.height // TILE)
-
-
-class Inputs(NamedTuple):
-    """Float32, contiguous, three channels; in the order of ``splat::Scene``."""
-
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    colors: Tensor
-    viewmats: Tensor
-    background: Tensor
-    Ks: Tensor
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Views and Gaussians."""
-        return len(self.viewmats), len(self.means)
-
-    def of_views(self, first: int, last: int) -> "Inputs":
-        per_view = {
-            name: getattr(self, name)[first:last] for name in ("viewmats", "background", "Ks")
-        }
-        colors = self.colors[first:last] if self.colors.dim() == 3 else self.colors
-        return self._replace(colors=colors, **per_view)
+    device: Device
 
 
 class Splats(NamedTuple):
@@ -94,10 +65,10 @@ class Splats(NamedTuple):
 
 
 class Lists(NamedTuple):
-    """The entries by tile; ``capacity`` is the length of the first two."""
+    """The intersections by tile; ``capacity`` is the length of the first two."""
 
-    owners: Tensor  # int32, view * N + Gaussian of each entry
-    entries: Tensor  # int64, sorted by tile, front to back in each
+    owners: Tensor  # int32, view * N + Gaussian of each
+    sorted: Tensor  # int64, which of them, sorted by tile, front to back in each
     begins: Tensor  # (B * tiles + 1) int64
 
     @property
@@ -105,8 +76,8 @@ class Lists(NamedTuple):
         return len(self.owners)
 
 
-class Pictures(NamedTuple):
-    """In the order of ``splat::Pictures``. The last two are what a backward pass needs of each
+class Images(NamedTuple):
+    """In the order of ``splat::Images``. The last two are what a backward pass needs of each
     rendered pixel, or None.
     """
 
@@ -117,8 +88,8 @@ class Pictures(NamedTuple):
     transmittance: Optional[Tensor]  # (B, height, width)
 
 
-class Upstream(NamedTuple):
-    """In the order of ``splat::Upstream``: gradients of the pictures, None for zero, and what the
+class BlendUpstream(NamedTuple):
+    """In the order of ``splat::Upstream``: gradients of the images, None for zero, and what the
     forward pass kept.
     """
 
@@ -142,11 +113,15 @@ class Gradients(NamedTuple):
     viewmats: Optional[Tensor]  # (blocks, B, CAMERA_SUMS), each block's part
 
 
-def project(inputs: Inputs, means2d: Tensor, frame: Frame) -> tuple[Splats, Tensor, Tensor]:
+def tiles_per_view(scene: Scene) -> int:
+    return -(-scene.width // TILE) * -(-scene.height // TILE)
+
+
+def project(scene: Scene, means2d: Tensor, context: LaunchContext) -> tuple[Splats, Tensor, Tensor]:
     """Stages 1 to 3; also radii (B, N) and zeros (B, N) for the contributions. Fills
     ``means2d``.
     """
-    launch, shape, new = frame.machine.launch, inputs.shape, inputs.means.new_empty
+    launch, shape, new = context.device.launch, scene.shape, scene.means.new_empty
     splats, depth_keys, radii, contribution = (
         new(*shape, SPLAT),
         new(shape, dtype=torch.int32),
@@ -155,33 +130,38 @@ def project(inputs: Inputs, means2d: Tensor, frame: Frame) -> tuple[Splats, Tens
     )
     outputs = (splats, depth_keys, means2d.detach(), radii, contribution)
     launch(
-        "project", _per_gaussian(shape), THREADS, _scene(inputs, frame), _settings(frame), *outputs
+        "project",
+        _per_gaussian(shape),
+        THREADS,
+        scene.struct(),
+        _settings(context.options),
+        *outputs,
     )
     order = depth_keys.sort(dim=1, stable=True).indices
     counts = torch.zeros_like(depth_keys)
-    launch(
-        "count_tiles", _per_gaussian(shape), THREADS, _scene(inputs, frame), splats, order, counts
-    )
+    launch("count_tiles", _per_gaussian(shape), THREADS, scene.struct(), splats, order, counts)
     ends = counts.flatten().cumsum(0, dtype=torch.int64).view(shape)
     return Splats(splats, depth_keys, order, counts, ends), radii, contribution
 
 
-def list_entries(inputs: Inputs, splats: Splats, capacity: int, frame: Frame) -> Lists:
-    """Stages 4 and 5. Entries that don't fit are left out; `blend` notices.
+def list_intersections(
+    scene: Scene, splats: Splats, capacity: int, context: LaunchContext
+) -> Lists:
+    """Stages 4 and 5. Intersections that don't fit are left out; `blend` notices.
 
     Raises:
         torch.cuda.OutOfMemoryError: there is no memory for so many.
     """
     launch, room, tiles = (
-        frame.machine.launch,
+        context.device.launch,
         ctypes.c_int64(capacity),
-        len(splats.ends) * frame.tiles,
+        len(splats.ends) * tiles_per_view(scene),
     )
     tile_of = torch.full((capacity,), NOWHERE, dtype=torch.int32, device=splats.ends.device)
     owners = torch.empty_like(tile_of)
-    arguments = (_scene(inputs, frame), splats.splats, *splats[2:], room, tile_of, owners)
-    launch("list_tiles", _per_gaussian(inputs.shape), THREADS, *arguments)
-    sorted_tiles, entries = tile_of.sort(stable=True)
+    arguments = (scene.struct(), splats.splats, *splats[2:], room, tile_of, owners)
+    launch("list_tiles", _per_gaussian(scene.shape), THREADS, *arguments)
+    sorted_tiles, by_tile = tile_of.sort(stable=True)
     begins = splats.ends.new_empty(tiles + 1)
     launch(
         "find_tiles",
@@ -192,62 +172,74 @@ def list_entries(inputs: Inputs, splats: Splats, capacity: int, frame: Frame) ->
         ctypes.c_int(tiles),
         begins,
     )
-    return Lists(owners, entries, begins)
+    return Lists(owners, by_tile, begins)
 
 
-def no_lists(splats: Splats, frame: Frame) -> Lists:
+def no_lists(scene: Scene, splats: Splats) -> Lists:
     """With these `blend` looks at every Gaussian in every tile."""
     empty = splats.ends.new_empty(0)
-    return Lists(empty.int(), empty, splats.ends.new_zeros(len(splats.ends) * frame.tiles + 1))
+    return Lists(
+        empty.int(), empty, splats.ends.new_zeros(len(splats.ends) * tiles_per_view(scene) + 1)
+    )
 
 
 def blend(
-    inputs: Inputs,
+    scene: Scene,
     splats: Splats,
     lists: Lists,
-    pictures: Pictures,
+    pictures: Images,
     contribution: Tensor,
-    frame: Frame,
+    context: LaunchContext,
 ) -> None:
     """Stage 6, with whole lists or without: the result is the same to the bit. Fills the pictures,
     raises the contributions.
     """
     arguments = (
-        _settings(frame),
+        _settings(context.options),
         _lists(splats, lists),
-        _Pictures(*map(_address, pictures)),
+        _Images(*map(address, pictures)),
         contribution,
     )
-    frame.machine.launch(
+    context.device.launch(
         "blend",
-        (frame.tiles, len(inputs.viewmats)),
+        (tiles_per_view(scene), len(scene.viewmats)),
         BLEND_THREADS,
-        _scene(inputs, frame),
+        scene.struct(),
         *arguments,
     )
 
 
 def blend_backward(
-    inputs: Inputs, splats: Splats, lists: Lists, total: int, upstream: Upstream, frame: Frame
+    scene: Scene,
+    splats: Splats,
+    lists: Lists,
+    total: int,
+    upstream: BlendUpstream,
+    context: LaunchContext,
 ) -> Tensor:
     """The adjoints of stages 6 to 4: a row of sums for each splat (B, N, ROW); those of invisible
     ones aren't set.
 
-    The lists must hold all of the ``total`` entries.
+    The lists must hold all of the ``total`` intersections.
 
     Raises:
         torch.cuda.OutOfMemoryError: there is no memory for their rows.
     """
-    launch, shape = frame.machine.launch, inputs.shape
-    rows, sums = inputs.means.new_empty(max(total, 1), ROW), inputs.means.new_empty(*shape, ROW)
-    name = "blend_backward_absolute" if frame.options.absgrad else "blend_backward"
-    arguments = (_settings(frame), _lists(splats, lists), _Upstream(*map(_address, upstream)), rows)
-    launch(name, (frame.tiles, shape[0]), BLEND_THREADS, _scene(inputs, frame), *arguments)
+    launch, shape = context.device.launch, scene.shape
+    rows, sums = scene.means.new_empty(max(total, 1), ROW), scene.means.new_empty(*shape, ROW)
+    name = "blend_backward_absolute" if context.options.absgrad else "blend_backward"
+    arguments = (
+        _settings(context.options),
+        _lists(splats, lists),
+        _Upstream(*map(address, upstream)),
+        rows,
+    )
+    launch(name, (tiles_per_view(scene), shape[0]), BLEND_THREADS, scene.struct(), *arguments)
     launch(
         "sum_rows",
         _per_gaussian((shape[0], shape[1] * WARP)),
         THREADS,
-        _scene(inputs, frame),
+        scene.struct(),
         *splats[1:],
         rows,
         sums,
@@ -256,24 +248,31 @@ def blend_backward(
 
 
 def project_backward(
-    inputs: Inputs, splats: Splats, sums: Tensor, gradients: Gradients, frame: Frame
+    scene: Scene, splats: Splats, sums: Tensor, gradients: Gradients, context: LaunchContext
 ) -> None:
     """The adjoint of stage 1, which fills ``gradients``."""
-    arguments = (_settings(frame), splats.depth_keys, sums, _Gradients(*map(_address, gradients)))
-    frame.machine.launch(
+    arguments = (
+        _settings(context.options),
+        splats.depth_keys,
+        sums,
+        _Gradients(*map(address, gradients)),
+    )
+    context.device.launch(
         "project_backward",
-        _per_gaussian((1, inputs.shape[1])),
+        _per_gaussian((1, scene.shape[1])),
         THREADS,
-        _scene(inputs, frame),
+        scene.struct(),
         *arguments,
     )
 
 
-def empty_gradients(inputs: Inputs, absgrad: bool, viewmats: bool) -> Gradients:
-    new, (views, gaussians) = inputs.means.new_empty, inputs.shape
+def empty_gradients(scene: Scene, absgrad: bool, viewmats: bool) -> Gradients:
+    """Make room for the gradients; for those that aren't wanted there is none."""
+    new, (views, gaussians) = scene.means.new_empty, scene.shape
     parts = new(-(-gaussians // THREADS), views, CAMERA_SUMS) if viewmats else None
     screen = new(views, gaussians, 2), new(views, gaussians, 2) if absgrad else None
-    return Gradients(*(torch.empty_like(x) for x in inputs[:5]), *screen, parts)
+    own = (*scene[:4], scene.colors)
+    return Gradients(*(torch.empty_like(x) for x in own), *screen, parts)
 
 
 def viewmats_gradient(parts: Tensor) -> Tensor:
@@ -290,14 +289,6 @@ def _per_gaussian(shape: tuple[int, int]) -> tuple[int, int]:
 # ---- what kernels are told: *.h ------------------------------------------------------------------
 
 
-class _Scene(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_void_p) for name in Inputs._fields]
-    _fields_ += [
-        (name, ctypes.c_int)
-        for name in ("gaussians", "views", "width", "height", "colors_per_view")
-    ]
-
-
 class _Settings(ctypes.Structure):
     _fields_ = [
         (name, ctypes.c_float)
@@ -309,37 +300,24 @@ class _Settings(ctypes.Structure):
 class _Lists(ctypes.Structure):
     _fields_ = [
         (name, ctypes.c_void_p)
-        for name in ("splats", "order", "ends", "owners", "entries", "begins")
+        for name in ("splats", "order", "ends", "owners", "sorted", "begins")
     ]
     _fields_ += [("capacity", ctypes.c_int64)]
 
 
-class _Pictures(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_void_p) for name in Pictures._fields]
+class _Images(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_void_p) for name in Images._fields]
 
 
 class _Upstream(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_void_p) for name in Upstream._fields]
+    _fields_ = [(name, ctypes.c_void_p) for name in BlendUpstream._fields]
 
 
 class _Gradients(ctypes.Structure):
     _fields_ = [(name, ctypes.c_void_p) for name in Gradients._fields]
 
 
-def _scene(inputs: Inputs, frame: Frame) -> _Scene:
-    views, gaussians = inputs.shape
-    return _Scene(
-        *map(_address, inputs),
-        gaussians,
-        views,
-        frame.width,
-        frame.height,
-        inputs.colors.dim() == 3,
-    )
-
-
-def _settings(frame: Frame) -> _Settings:
-    o = frame.options
+def _settings(o: RasterizeOptions) -> _Settings:
     log2_alpha_min = math.log2(o.kernel_alpha_min)
     return _Settings(
         o.near, o.far, o.eps2d, log2_alpha_min, o.alpha_max, o.stop, o.antialias, o.downsample
@@ -347,10 +325,4 @@ def _settings(frame: Frame) -> _Settings:
 
 
 def _lists(splats: Splats, lists: Lists) -> _Lists:
-    return _Lists(
-        *map(_address, (splats.splats, splats.order, splats.ends, *lists)), lists.capacity
-    )
-
-
-def _address(tensor: Optional[Tensor]) -> Optional[int]:
-    return None if tensor is None else tensor.data_ptr()
+    return _Lists(*map(address, (splats.splats, splats.order, splats.ends, *lists)), lists.capacity)

@@ -7,21 +7,21 @@ namespace splat {
 
 constexpr int CHUNK = 128, GROUPS = CHUNK / WARP;  // splats staged at a time
 
-// All entries of all views, as stages 1 to 5 left them.
+// All tile intersections of all views, as stages 1 to 5 left them.
 struct Lists {
   const Splat* splats;    // (B, N)
   const Index* order;     // (B, N) Gaussians front to back
-  const Index* ends;      // (B, N) running sum of the counts; the last one is how many entries there should be
+  const Index* ends;      // (B, N) running sum of the counts; the last one is how many there should be
   const int* owners;      // (capacity) view * N + Gaussian
-  const Index* entries;   // (capacity) sorted by tile
-  const Index* begins;    // (B * tiles + 1) into `entries`
+  const Index* sorted;    // (capacity) which of them, by tile
+  const Index* begins;    // (B * tiles + 1) into `sorted`
   Index capacity;
 };
 
 struct TileFrame {
   int view, left, top;
   Index begin, end;   // of the list
-  bool unlisted;      // the entries didn't fit: every Gaussian of the view is on the list
+  bool unlisted;      // the intersections didn't fit: every Gaussian of the view is on the list
 };
 
 SPLAT_FN TileFrame frame_of(const Scene& scene, const Lists& lists) {
@@ -35,7 +35,7 @@ SPLAT_FN TileFrame frame_of(const Scene& scene, const Lists& lists) {
 
 // view * N + Gaussian of item `i` of a list.
 SPLAT_FN Index owner_of(const Scene& scene, const Lists& lists, const TileFrame& frame, Index i) {
-  if (!frame.unlisted) return lists.owners[lists.entries[i]];
+  if (!frame.unlisted) return lists.owners[lists.sorted[i]];
   const Index first = Index(frame.view) * scene.gaussians;
   return first + lists.order[first + i];
 }

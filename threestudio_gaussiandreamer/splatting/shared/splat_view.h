@@ -3,11 +3,11 @@
 #pragma once
 
 #include "splat_math.h"
+#include "splat_scene.h"
 
 namespace splat {
 
-// `scene` is either kernel's: it has viewmats, Ks, width and height.
-template <class Scene> SPLAT_FN Camera make_camera(const Scene& scene, int view) {
+SPLAT_FN Camera make_camera(const Scene& scene, int view) {
   const float* v = scene.viewmats + 16 * view;
   const float* k = scene.Ks + 9 * view;
   const float width = scene.width, height = scene.height, margin_x = 0.15f * width / k[0], margin_y = 0.15f * height / k[4];

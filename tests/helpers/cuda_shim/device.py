@@ -58,31 +58,33 @@ def library() -> ctypes.CDLL:
 class Now:
     """Numbers that are there, though the caller is told so only when the test says."""
 
-    def __init__(self, machine: "HostMachine", ends: Tensor):
-        self.machine, self.ends = machine, ends.clone()
+    def __init__(self, device: "HostDevice", ends: Tensor):
+        self.device, self.ends = device, ends.clone()
 
     def ready(self) -> bool:
-        return self.machine.arrived
+        return self.device.arrived
 
     def values(self) -> list[int]:
-        self.machine.waits += 1
+        self.device.waits += 1
         return [end - begin for begin, end in pairwise([0, *self.ends.tolist()])]
 
 
-class HostMachine:
-    """Like `cuda_driver.Gpu`, for tensors on the CPU.
+class HostDevice:
+    """Like `driver.Gpu`, for tensors on the CPU.
 
     Args:
         order: in which the threads of a block run between two barriers: "forward", "backward" or
             "shuffled".
-        most_entries: more than that, in lists or in rows, are answered as if memory were short.
+        most_intersections: more, in lists or in rows, are answered as if memory were short.
         arrived: whether numbers that are read later are said to be there.
     """
 
-    def __init__(self, order: str = "forward", most_entries: int = NOWHERE, arrived: bool = True):
-        self.order, self.most_entries, self.arrived, self.waits = (
+    def __init__(
+        self, order: str = "forward", most_intersections: int = NOWHERE, arrived: bool = True
+    ):
+        self.order, self.most_intersections, self.arrived, self.waits = (
             ORDERS[order],
-            most_entries,
+            most_intersections,
             arrived,
             0,
         )
@@ -92,7 +94,7 @@ class HostMachine:
         self.launched.append(name)
         if (
             name in ("list_tiles", "blend_backward", "blend_backward_absolute")
-            and max(map(_length, arguments)) > self.most_entries
+            and max(map(_length, arguments)) > self.most_intersections
         ):
             raise torch.cuda.OutOfMemoryError("no memory, says the test")
         values = [ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else x for x in arguments]
@@ -100,13 +102,13 @@ class HostMachine:
         if library().shim_launch(name.encode(), *grid, threads, self.order, pointers):
             raise AssertionError(f"{name}: {library().shim_error().decode()}")
 
-    def read_later(self, ends: Tensor) -> Now:
+    def read_async(self, ends: Tensor) -> Now:
         return Now(self, ends)
 
 
 def _length(argument) -> int:
-    """How many entries, or rows of entries, it has room for."""
-    entries = isinstance(argument, Tensor) and (
+    """Return how many intersections, or rows of them, it has room for."""
+    is_list = isinstance(argument, Tensor) and (
         argument.dim() == 1 or argument.dim() == 2 and argument.shape[1] == 12
     )
-    return len(argument) if entries else 0
+    return len(argument) if is_list else 0

@@ -1,0 +1,135 @@
+"""The autograd function of the compiled kernels, CPU and CUDA.
+
+Kernels draw three colour channels; other numbers of channels are drawn three at a time."""
+
+from typing import Any, NamedTuple, Optional, Protocol
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from . import torch_backend
+from .channels import CHANNELS, groups, narrow, widen
+from .options import RasterizeOptions
+from .output import Rasterized
+from .scene import TENSORS, Scene
+
+
+class Drawn(NamedTuple):
+    """What a kernel draws, in up to three channels; pixels after the downsampling."""
+
+    image: Tensor  # (B, H, W, 3)
+    alpha: Tensor  # (B, H, W, 1)
+    depth: Tensor  # (B, H, W, 1)
+    radii: Tensor  # (B, N)
+    contribution: Tensor  # (B, N)
+
+
+class Upstream(NamedTuple):
+    """d loss / d images, contiguous; None is zero."""
+
+    image: Optional[Tensor]
+    alpha: Optional[Tensor]
+    depth: Optional[Tensor]
+
+
+class Wanted(NamedTuple):
+    """Which of the optional gradients are needed."""
+
+    viewmats: bool
+    background: bool
+
+
+class SceneGradients(NamedTuple):
+    """d loss / d fields of a Scene, d loss / d means2d (B, N, 2), and the sums over pixels of its
+    absolute value.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    viewmats: Optional[Tensor]
+    colors: Tensor
+    background: Optional[Tensor]
+    means2d: Tensor
+    absgrad: Optional[Tensor]
+
+
+class Kernel(Protocol):
+    """One call of a compiled backend: its options, and what it runs on."""
+
+    def forward(self, scene: Scene, means2d: Tensor) -> tuple[Drawn, tuple[Tensor, ...], Any]:
+        """Draw a scene of three channels.
+
+        Args:
+            means2d: (B, N, 2), to be filled.
+
+        Returns:
+            The images; what backward needs, as tensors to save, and as any other object.
+        """
+
+    def backward(
+        self,
+        scene: Scene,
+        means2d: Tensor,
+        saved: tuple[Tensor, ...],
+        state: Any,
+        upstream: Upstream,
+        wanted: Wanted,
+    ) -> SceneGradients:
+        """Differentiate; ``saved`` and ``state`` are what `forward` returned."""
+
+
+def rasterize(kernel: Kernel, scene: Scene, options: RasterizeOptions) -> Rasterized:
+    """Draw a scene of any number of channels with a kernel that draws three."""
+    if scene.channels > CHANNELS and options.absgrad:
+        # A sum of absolute values doesn't split into groups of channels.
+        return torch_backend.rasterize(scene, options)
+    tracked = scene.tracked
+    means2d = scene.means.new_zeros(*scene.shape, 2).requires_grad_(tracked)
+    if tracked and options.absgrad:
+        means2d.absgrad = torch.zeros_like(means2d, requires_grad=False)
+    drawn = [
+        Drawn(*_Rasterize.apply(kernel, scene.size, means2d, *part.tensors))
+        for part in groups(scene)
+    ]
+    image = torch.cat([part.image for part in drawn], -1) if len(drawn) > 1 else drawn[0].image
+    return Rasterized(image, *drawn[0][1:3], means2d, *drawn[0][3:])
+
+
+class _Rasterize(torch.autograd.Function):
+    """A kernel on up to three channels. ``means2d`` is filled in place, and is an input so that
+    autograd passes its gradient on.
+    """
+
+    @staticmethod
+    def forward(ctx, kernel: Kernel, size: tuple[int, int], means2d: Tensor, *tensors: Tensor):
+        scene = Scene(*tensors, *size)
+        ctx.kernel, ctx.size, ctx.means2d, ctx.channels = kernel, size, means2d, scene.channels
+        scene = scene._replace(colors=widen(scene.colors), background=widen(scene.background))
+        drawn, saved, ctx.state = kernel.forward(scene, means2d)
+        ctx.save_for_backward(*scene.tensors, *saved)
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(drawn.radii, drawn.contribution)
+        return narrow(drawn.image, ctx.channels), *drawn[1:]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *grads: Optional[Tensor]):
+        saved = ctx.saved_tensors
+        scene = Scene(*saved[:TENSORS], *ctx.size)
+        channels = (CHANNELS, 1, 1)
+        upstream = Upstream(
+            *(None if d is None else widen(d, n) for d, n in zip(grads[:3], channels, strict=True))
+        )
+        needed = Scene(*ctx.needs_input_grad[-TENSORS:], *ctx.size)
+        wanted = Wanted(needed.viewmats, needed.background)
+        found = ctx.kernel.backward(
+            scene, ctx.means2d, saved[TENSORS:], ctx.state, upstream, wanted
+        )
+        if found.absgrad is not None:
+            ctx.means2d.absgrad += found.absgrad
+        colors, background = (narrow(x, ctx.channels) for x in (found.colors, found.background))
+        per_input = (*found[:4], found.viewmats, colors, background, None)
+        return None, None, found.means2d, *per_input

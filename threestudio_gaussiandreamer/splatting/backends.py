@@ -1,0 +1,92 @@
+"""Which backends there are, which of them can run, and which one draws."""
+
+import functools
+import importlib
+import logging
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Optional
+
+import torch
+from torch import Tensor
+
+from ..core.errors import UserError, unknown
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A module of this package with ``rasterize(scene, options)`` and ``unavailable()``, and what
+    tensors it takes.
+    """
+
+    module: str
+    devices: Optional[tuple[str, ...]] = None  # None: any
+    dtypes: tuple[torch.dtype, ...] = (torch.float32, torch.float64)
+
+    def load(self) -> ModuleType:
+        return importlib.import_module(f".{self.module}", __package__)
+
+    def refuses(self, tensor: Tensor) -> Optional[str]:
+        """Say why it can't take tensors like this one, or return None."""
+        if self.devices is not None and tensor.device.type not in self.devices:
+            return f"it takes tensors on {' or '.join(self.devices)}, these are on {tensor.device}"
+        if tensor.dtype not in self.dtypes:
+            return f"it takes {' or '.join(map(str, self.dtypes))}, these are {tensor.dtype}"
+        return self.load().unavailable()
+
+
+# In order of preference for "auto"; the specification is only used when it is asked for.
+BACKENDS = {
+    "cpu": Backend("cpu.backend", devices=("cpu",), dtypes=(torch.float32,)),
+    "cuda": Backend("cuda.backend", devices=("cuda",), dtypes=(torch.float32,)),
+    "torch": Backend("torch_backend"),
+    "reference": Backend("reference"),
+}
+
+
+def available_backends() -> dict[str, Optional[str]]:
+    """Return every backend by name with None, or with the reason why it can't run here."""
+    return {name: backend.load().unavailable() for name, backend in BACKENDS.items()}
+
+
+def choose_backend(name: str, tensor: Tensor) -> Backend:
+    """Return the backend of that name, or for "auto" the first one that takes such tensors.
+
+    Raises:
+        UserError: there is none of that name, or it can't run or take such tensors.
+    """
+    if name not in ("auto", *BACKENDS):
+        raise unknown("backend", name, ["auto", *BACKENDS])
+    refusals = {name: backend.refuses(tensor) for name, backend in BACKENDS.items()}
+    usable = [name for name, reason in refusals.items() if reason is None]
+    if name == "auto":
+        _report_slow_path(usable[0], tensor)
+    elif refusals[name] is not None:
+        raise UserError(
+            f"the backend {name!r} can't run: {refusals[name]}. Use backend='auto', or one of "
+            f"{', '.join(usable)}."
+        )
+    return BACKENDS[usable[0] if name == "auto" else name]
+
+
+def _report_slow_path(chosen: str, tensor: Tensor) -> None:
+    """Say once for each reason that the kernel made for this device isn't used though the tensors
+    would suit it.
+    """
+    for name, backend in BACKENDS.items():
+        if (
+            name != chosen
+            and tensor.device.type in (backend.devices or ())
+            and tensor.dtype in backend.dtypes
+        ):
+            _warn_once(
+                f"splatting in plain torch, many times slower than backend {name!r}, which "
+                f"can't run: {backend.refuses(tensor)}."
+            )
+
+
+@functools.cache
+def _warn_once(message: str) -> None:
+    log.warning(message)
