@@ -19,11 +19,11 @@ SCRIPT = """
     from threestudio_gaussiandreamer.launch.config import load_config
     from threestudio_gaussiandreamer.host import find, pl
     from threestudio_gaussiandreamer.launch.ddp import ReplicatedStrategy
-    from tests.training import test_system
+    from tests.training import runs
 
     register_parts()
     pl.seed_everything(0)
-    overrides = [*test_system.SMALL, *test_system.DENSIFY, "exp_root_dir={folder}"]
+    overrides = [*runs.SMALL, *runs.DENSIFY, "exp_root_dir={folder}"]
     overrides += ["system.geometry.prior.path={mesh}"]
     cfg = load_config("{config}", cli_args=overrides)
     data, system = find(cfg.data_type)(cfg.data), find(cfg.system_type)(cfg.system)
@@ -58,11 +58,11 @@ def test_alone_everything_is_left_as_it_is():
 def test_two_processes_hold_the_same_cloud_and_see_different_cameras(tmp_path):
     import trimesh
 
-    from tests.training import test_system
+    from tests.training import runs
 
     mesh = tmp_path / "box.glb"
     trimesh.creation.box().export(mesh)
-    config = test_system.mocked_config(tmp_path, mesh)
+    config = runs.mocked_config(tmp_path, mesh)
     script = tmp_path / "train.py"
     script.write_text(
         textwrap.dedent(

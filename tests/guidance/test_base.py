@@ -206,7 +206,10 @@ def test_one_known_picture_is_approached_as_the_closed_form_says(models, predict
     # below 2e-6
     assert relative(mine, adjoint(guide, expected, 64)) < 1e-5
     closer = rgb.detach() - 1e-3 * mine / mine.abs().max()
-    distance = lambda image: (guide.encode(image.movedim(-1, 1)) - bank).square().sum()  # noqa: E731
+
+    def distance(image):
+        return (guide.encode(image.movedim(-1, 1)) - bank).square().sum()
+
     assert distance(closer) < distance(rgb.detach())
 
 

@@ -3,11 +3,14 @@
 import pytest
 import torch
 
+from tests.training.runs import launch, trial
+from threestudio_gaussiandreamer.training import system
 from threestudio_gaussiandreamer.training.finite import (
     NonFiniteParameters,
     optimizer_tensors,
     require_finite,
 )
+from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
@@ -34,3 +37,61 @@ def test_the_state_of_an_optimiser_is_part_of_it():
     assert parameter.isfinite().all()
     with pytest.raises(NonFiniteParameters, match="1 of the 2 numbers of means.exp_avg_sq"):
         require_finite(optimizer_tensors(optimizer), step=1)
+
+
+NON_FINITE = {  # each makes a run's parameters or moments NaN or infinite in its first steps
+    "eps": ["system.optimizer.args.eps=0"],
+    "loss": ["system.loss.lambda_sds=1e38"],
+}
+
+
+@pytest.mark.parametrize("cause", NON_FINITE)
+def test_a_run_that_turns_non_finite_stops_and_saves_nothing_of_it(
+    tmp_path, painted_box, monkeypatch, capsys, cause
+):
+    monkeypatch.setattr(system, "CHECK_EVERY", 3)
+    steps = ["trainer.max_steps=5", "trainer.val_check_interval=5"]
+    assert launch(tmp_path, painted_box, *steps, *NON_FINITE[cause]) == 2
+    errors = capsys.readouterr().err
+    assert errors.count("are NaN or infinite: the run stops") == 1 and "step 3:" in errors
+    assert not [*tmp_path.rglob("*.ckpt"), *tmp_path.rglob("it*")]
+
+
+@pytest.mark.slow
+def test_a_non_finite_state_never_replaces_a_good_checkpoint(tmp_path, painted_box, monkeypatch):
+    """The checkpoint of the step before stays; resumed from it, the run ends as it should."""
+    step = GaussianDreamerSystem.training_step
+
+    def poisoned(self, batch, batch_idx):
+        step(self, batch, batch_idx)
+        if self.global_step == 3:
+            self.geometry.means.data[5, 1] = torch.nan
+
+    monkeypatch.setattr(GaussianDreamerSystem, "training_step", poisoned)
+    every = [
+        "checkpoint.every_n_train_steps=1",
+        "trainer.max_steps=4",
+        "trainer.val_check_interval=4",
+    ]
+    assert launch(tmp_path, painted_box, *every) == 2
+    last = trial(tmp_path) / "ckpts" / "last.ckpt"
+    found = torch.load(last, weights_only=True)
+    assert found["global_step"] == 2 and found["state_dict"]["geometry.means"].isfinite().all()
+    monkeypatch.undo()
+    assert launch(tmp_path, painted_box, *every, f"resume={last}") == 0
+
+
+@pytest.mark.parametrize("stage", ["--test", "--export"])
+def test_a_cloud_that_is_not_finite_is_neither_shown_nor_exported(
+    tmp_path, painted_box, monkeypatch, capsys, stage
+):
+    ensure_cloud = GaussianDreamerSystem.ensure_cloud
+
+    def poisoned(self):
+        ensure_cloud(self)
+        self.geometry.sh0.data[7] = torch.inf
+
+    monkeypatch.setattr(GaussianDreamerSystem, "ensure_cloud", poisoned)
+    assert launch(tmp_path, painted_box, stage=stage) == 2
+    assert "3 of the 600 numbers of geometry.sh0 are NaN or infinite" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("it*"))

@@ -1,0 +1,109 @@
+"""What runs export: the cloud as it is and pruned, from training and from a checkpoint."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from tests.training.runs import cloud_of, launch, trial
+from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
+from threestudio_gaussiandreamer.formats.ply import read_gaussians
+from threestudio_gaussiandreamer.formats.spz import read_spz
+
+
+def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted_box):
+    options = [
+        "system.prune.count=90",
+        "system.prune.size=32",
+        "system.prune.steps=3",
+        "system.exporter.formats=[ply,spz]",
+    ]
+    assert (
+        launch(
+            tmp_path, painted_box, *options, "trainer.max_steps=4", "trainer.val_check_interval=4"
+        )
+        == 0
+    )
+    export = trial(tmp_path) / "save" / "it4-export"
+    assert len(read_gaussians(export / "gaussians.ply").means) == 200
+    first = read_gaussians(export / "pruned" / "gaussians.ply")
+    assert len(first.means) == len(read_spz(export / "pruned" / "gaussians.spz").means) == 90
+    report = json.loads((export / "pruned" / "report.json").read_text())
+    assert (
+        report["options"]["eps2d"] == 0.1 and not report["options"]["antialias"]
+    )  # as the demo draws
+    assert (
+        report["after"]["gaussians"] == 90 and (export / "pruned" / "report.png").stat().st_size > 0
+    )
+    shutil.rmtree(export)
+    resume = [
+        f"resume={trial(tmp_path) / 'ckpts' / 'last.ckpt'}",
+        "system.exporter.save_video=false",
+    ]
+    assert launch(tmp_path, painted_box, *options, *resume, stage="--export") == 0
+    (again,) = trial(tmp_path).parent.glob("*/save/it4-export/pruned/gaussians.ply")
+    assert all(
+        a.tobytes() == b.tobytes() for a, b in zip(read_gaussians(again), first, strict=True)
+    )
+
+
+def test_pruned_exports_note_what_they_have_spent(tmp_path, painted_box, capsys):
+    options = [
+        "system.prune.psnr=25",
+        "system.prune.size=32",
+        "system.prune.steps=3",
+        "system.exporter.formats=[ply,spz]",
+    ]
+    assert (
+        launch(
+            tmp_path, painted_box, *options, "trainer.max_steps=2", "trainer.val_check_interval=2"
+        )
+        == 0
+    )
+    files = trial(tmp_path) / "save" / "it2-export" / "pruned"
+    said = capsys.readouterr().out
+    for name in ("gaussians.ply", "gaussians.spz"):
+        assert str(files / name) in said  # where everything is
+        assert read_cloud(str(files / name)).pruned_to == 25
+
+
+def test_test_validate_and_export_use_the_checkpoint_and_no_prior(tmp_path, painted_box):
+    mesh = tmp_path / "box.glb"
+    mesh.write_bytes(painted_box.read_bytes())
+    assert launch(tmp_path, mesh, "trainer.max_steps=3", "trainer.val_check_interval=3") == 0
+    save, last = trial(tmp_path) / "save", trial(tmp_path) / "ckpts" / "last.ckpt"
+    trained = (save / "it3-test" / "1.png").read_bytes()
+    for path in (
+        *save.glob("it3-test/*"),
+        *save.glob("it3-export/*"),
+        save / "it3-0.png",
+        save / "it3-test.mp4",
+    ):
+        path.unlink()
+    mesh.unlink()  # neither prior nor target is needed any more
+    for stage in ("--test", "--validate", "--export"):
+        assert launch(tmp_path, mesh, f"resume={last}", stage=stage) == 0
+    assert (save / "it3-test" / "1.png").read_bytes() == trained
+    assert (save / "it3-0.png").is_file()
+    exported = read_gaussians(save / "it3-export" / "gaussians.ply")
+    means = cloud_of(last)["geometry.means"].numpy()
+    assert np.array_equal(exported.means, means[:, [1, 2, 0]] * np.float32([1, -1, -1]))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["system.prune.count=0"], "system.prune.count: expected a whole number from 1 on"),
+        (
+            ["system.prune.count=9", "system.prune.psnr=40"],
+            "system.prune.psnr: give one budget; count is one too",
+        ),
+        (["system.prune.bytes=lots"], "system.prune.bytes: expected a size such as 500kB"),
+    ],
+)
+def test_a_wrong_pruning_budget_is_found_before_the_run(
+    tmp_path, painted_box, capsys, options, said
+):
+    assert launch(tmp_path, painted_box, *options) == 2
+    assert said in capsys.readouterr().err
