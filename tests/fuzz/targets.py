@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Optional
 import numpy as np
 import torch
 
-from tests.fuzz import checkpoint_content, config_values, mutations, oracles
+from tests.fuzz import checkpoint_content, config_values, gltf_features, mutations, oracles
 from tests.fuzz.mutations import BINARY, TEXT, Mutator, Packing
 from tests.fuzz.oracles import Illegal
 from threestudio_gaussiandreamer import register_parts
@@ -367,6 +367,11 @@ def exercise_glb(path: Path) -> None:
         require_same_surface(load_mesh(path), corners)
 
 
+def exercise_gltf_features(path: Path) -> None:
+    problem = gltf_features.exercise(path, exercise_mesh)
+    require(problem is None, str(problem))
+
+
 def require_same_surface(mesh: Any, corners: np.ndarray) -> None:
     """The triangles that a file says, in the product's pose: y up and z in front become z up and x
     in front, the box is [-1, 1].
@@ -659,6 +664,9 @@ TARGETS: dict[str, Target] = {
     "ply-points": Target(".ply", point_plys, exercise_points_ply, packing=mutations.PLY),
     "ply-mesh": Target(".ply", lambda: meshes("ply"), exercise_ply_mesh, packing=mutations.PLY),
     "glb": Target(".glb", lambda: meshes("glb"), exercise_glb, packing=mutations.GLB),
+    "gltf-features": Target(
+        ".glb", gltf_features.seeds, exercise_gltf_features, [gltf_features.other_file]
+    ),
     "obj": Target(".obj", lambda: meshes("obj"), exercise_obj, TEXT),
     "stl": Target(".stl", lambda: meshes("stl"), exercise_mesh),
     "off": Target(".off", lambda: meshes("off"), exercise_mesh, TEXT),
