@@ -7,8 +7,8 @@ import json
 import pytest
 import torch
 
-from tests.helpers.pruning import FAST, ball, run
 from tests.helpers.ply_files import write_raw_gaussians
+from tests.helpers.pruning import FAST, ball, run
 from threestudio_gaussiandreamer.formats.gaussian_files import PRUNED, read_cloud
 from threestudio_gaussiandreamer.formats.ply import read_comments, read_gaussians, write_gaussians
 from threestudio_gaussiandreamer.gaussians import recover

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.helpers.pruning import FAST, ball, run
 from tests.helpers.ply_files import write_raw_gaussians
+from tests.helpers.pruning import FAST, ball, run
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.ply import read_gaussians, write_gaussians
 from threestudio_gaussiandreamer.formats.spz import COLOR_REACH
