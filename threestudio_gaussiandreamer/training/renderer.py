@@ -17,7 +17,7 @@ train_normals  normals in training too; otherwise only in validation, test and e
 """
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Optional
 
 import torch
 import torch.nn.functional as F
@@ -78,15 +78,20 @@ class SplattingRenderer(Rasterizer):
     def forward(
         self, c2w: Tensor, fovy: Tensor, height: int, width: int, **batch: Any
     ) -> dict[str, Any]:
-        """Render B views, in float32 whatever the trainer's precision is: half of it would move
+        """Render B views, in float32 whatever the trainer's precision is: half precision would move
         cameras by thousandths.
 
-        Args: ``c2w`` (B, 4, 4) OpenGL, ``fovy`` (B,) radians, ``height`` and ``width`` in pixels,
-            before ``downsample``.
-        Returns: ``comp_rgb`` (B, H, W, 3), ``opacity`` and ``depth`` (B, H, W, 1), ``comp_normal``
-            (B, H, W, 3) in [0, 1],
-        ``comp_rgb_bg``, the background, (B, 1, 1, 3) or (B, H, W, 3), ``rasterized`` with what
-        densification needs, and ``gaussian_opacities`` (N,), which pruning differentiates by."""
+        Args:
+            c2w: (B, 4, 4) OpenGL.
+            fovy: (B,) radians.
+            height, width: pixels, before ``downsample``.
+
+        Returns:
+            ``comp_rgb`` (B, H, W, 3), ``opacity`` and ``depth`` (B, H, W, 1), ``comp_normal``
+            (B, H, W, 3) in [0, 1], ``comp_rgb_bg``, the background, (B, 1, 1, 3) or (B, H, W, 3),
+            ``rasterized`` for density control, and ``gaussian_opacities`` (N,), which the removal
+            error is differentiated by.
+        """
         device = self.geometry.means.device
         with torch.autocast(device.type, enabled=False):
             return self._render(
@@ -96,37 +101,13 @@ class SplattingRenderer(Rasterizer):
     def _render(
         self, c2w: Tensor, fovy: Tensor, height: int, width: int, batch: dict[str, Any]
     ) -> dict[str, Any]:
-        cfg = self.cfg
-        viewmats, Ks = cameras.to_opencv(c2w, fovy, height, width)
-        flat = (
-            self.background.color(len(c2w)) if isinstance(self.background, FlatBackground) else None
-        )
+        ours = isinstance(self.background, FlatBackground)
+        flat = self.background.color(len(c2w)) if ours else None
         opacities = self.geometry.opacities()
-        out = rasterize(
-            self.geometry.means,
-            self.geometry.quats,
-            self.geometry.scales(),
-            opacities,
-            self.geometry.colors(c2w[:, :3, 3]),
-            viewmats,
-            Ks,
-            width,
-            height,
-            background=flat,
-            near=cfg.near,
-            far=cfg.far,
-            eps2d=cfg.eps2d,
-            antialias=cfg.antialias,
-            preset=cfg.preset,
-            downsample=cfg.downsample,
-            backend=cfg.backend,
-            absgrad=self.training and getattr(self.geometry, "wants_absgrad", False),
-        )
-        image, background = (
-            (out.image, flat[:, None, None])
-            if flat is not None
-            else self._composite(out, c2w, fovy, batch)
-        )
+        out = self._rasterize(c2w, fovy, (height, width), opacities, flat)
+        image, background = out.image, None if flat is None else flat[:, None, None]
+        if background is None:
+            image, background = self._composite(out, c2w, fovy, batch)
         depth = out.depth / out.alpha.clamp_min(1e-6)
         pictures = {
             "comp_rgb": image,
@@ -134,11 +115,41 @@ class SplattingRenderer(Rasterizer):
             "depth": depth,
             "comp_rgb_bg": background,
             "rasterized": out,
+            "gaussian_opacities": opacities,
         }
-        pictures["gaussian_opacities"] = opacities
-        if cfg.train_normals or not self.training:
+        if self.cfg.train_normals or not self.training:
             pictures["comp_normal"] = normals_from_depth(depth, out.alpha, c2w, fovy)
         return pictures
+
+    def _rasterize(
+        self,
+        c2w: Float[Tensor, "B 4 4"],
+        fovy: Float[Tensor, " B"],
+        size: tuple[int, int],
+        opacities: Float[Tensor, " N"],
+        background: Optional[Float[Tensor, "B 3"]],
+    ) -> Rasterized:
+        """Rasterize the cloud at (height, width) = ``size``, before ``downsample``."""
+        cfg, cloud, (height, width) = self.cfg, self.geometry, size
+        viewmats, Ks = cameras.to_opencv(c2w, fovy, height, width)
+        colors = cloud.colors(c2w[:, :3, 3])
+        gaussians = cloud.means, cloud.quats, cloud.scales(), opacities, colors
+        return rasterize(
+            *gaussians,
+            viewmats,
+            Ks,
+            width,
+            height,
+            background=background,
+            near=cfg.near,
+            far=cfg.far,
+            eps2d=cfg.eps2d,
+            antialias=cfg.antialias,
+            preset=cfg.preset,
+            downsample=cfg.downsample,
+            backend=cfg.backend,
+            absgrad=self.training and getattr(cloud, "wants_absgrad", False),
+        )
 
     def _composite(
         self, out: Rasterized, c2w: Tensor, fovy: Tensor, batch: dict[str, Any]
