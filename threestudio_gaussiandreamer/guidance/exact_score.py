@@ -1,8 +1,8 @@
 """Guidance ``exact-score-guidance``: the optimal denoiser of a mesh's pictures, in closed form; no
 weights, no prompt.
 
-It stands in for a diffusion model where the pipeline is to be measured or shown offline, and says
-nothing about the quality of a real one. The data distribution is a mixture of narrow Gaussians
+It replaces a diffusion model to measure or demonstrate the pipeline offline, and says nothing about
+the quality of a real one. The data distribution is a mixture of narrow Gaussians
 around ray-cast pictures of the mesh (formulas and limits: ``exact_score.py``), composited on the
 render's own background.
 
@@ -26,17 +26,17 @@ std                 width s of each mode, in the units of the space (pixels in [
 temperature         of the responsibilities; 1 = exact, larger = smoother
 bank_*              number of views, their ranges (degrees, world units) and their seed
 bank_includes_view  the bank stands for all views, so the camera's own is one of them, with the
-                    weight of any other; without it the nearest view of the bank is a floor that
-                    hides what is to be measured
+                    weight of any other; without it the error can't fall below that of the
+                    nearest view of the bank
 supersample         rays per pixel and axis; max_cached_targets: pictures of view-exact kept in
                     memory (4 bytes a pixel)
 guidance_scale      1 = none (the default here); otherwise the unconditional mixture is the bank,
                     with this view in it
 ==================  ================================================================================
 
-A score that doesn't know the camera doesn't know its distance either: a faint start is drawn to far
-views before it is drawn to the right side. To measure the faces alone, give cameras and bank one
-distance and one angle of view."""
+A mixture over the bank doesn't depend on the camera's distance either, so a faint start first moves
+towards far views. To measure multi-face alone, give cameras and bank the same single distance and
+angle of view."""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Optional, Tuple

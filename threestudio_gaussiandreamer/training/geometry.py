@@ -21,21 +21,21 @@ bound_colors        keep colours in [0, 1], which is all that viewers show: the 
 lr_*                learning rate of each attribute: a number or a schedule; lr_sh_rest for the
                     bands above degree 0
 densify             enabled, start, stop, every (steps), grad_threshold, split_scale, min_opacity,
-                    max_scale (world units); absgrad: judge by the sum of the pixels' absolute
-                    gradients, in which opposite pulls don't cancel (AbsGS, Ye et al. 2024; several
-                    times larger, so give a threshold to match)
+                    max_scale (world units); absgrad: compare the sum of the pixels' absolute
+                    gradients, in which opposite signs don't cancel (AbsGS, Ye et al. 2024), with
+                    the threshold; it is several times larger
 budget              how many Gaussians a run ends with: a number, null or none (no limit but
                     ``max_gaussians``), or ``auto``: each round drops as many as cost no more than
                     its share of ``prune.quality`` or, where no truth is known, ``prune.likeness``;
-                    under a budget, duplicates in the start are merged (``merging.py``)
+                    under a budget, duplicates in the start are merged (``merge.py``)
 prune               how the budget is met (``importance.py``): start, stop, every (steps), keep (the
                     share that a round keeps; less only where there are too few rounds for a budget
                     that is a number), score (removal, contribution; opacity, random: to compare
                     with), quality (dB that all rounds may lose against the truth), likeness (dB
                     between the renders before and after a round, at least); ``auto`` leaves out the
-                    first half of the rounds: what looks superfluous early may be needed later
-max_gaussians       exact cap, reached by dropping what shows least (of untrained points: any,
-                    evenly); min_gaussians: the floor that pruning never passes
+                    first half of the rounds, since early in training importance changes much
+max_gaussians       largest count: those with the least importance are dropped (of untrained points:
+                    a uniform choice); min_gaussians: the least count that pruning leaves
 keep_attributes     with gaussians-prior: start from all attributes of that cloud, not only from
                     points and colours
 ==================  ================================================================================

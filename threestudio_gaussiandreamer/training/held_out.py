@@ -1,10 +1,9 @@
-"""Held-out scoring: the cloud against ray-cast truth on views that no bank holds, with a picture to
-look at.
+"""Held-out scores: the cloud against ray-cast views of the mesh that training has not seen.
 
-The truth comes from a ray caster on the mesh, never from our splatting, and is composited on the
-background that the render has. Score: PSNR and SSIM, averaged over the views; share of views that
-show another side of the object (multi-face); share of the opacity that floats away from the surface
-(floater mass); share of pixels with a colour that no screen shows (out of gamut)."""
+The truth is cast on the mesh, never rendered by our splatting, and composited over the background
+of the render. Scores: PSNR and SSIM, averaged over the views; share of views that show another side
+of the object (multi-face); share of the opacity far from the surface (floater mass); share of
+pixels with a colour outside [0, 1] (out of gamut)."""
 
 import json
 import time
@@ -147,8 +146,8 @@ CLOCKS = ("seconds", "cpu_seconds")
 
 
 class Measurements:
-    """What a run measured, with the training seconds that led there; kept in ``metrics.json`` and
-    continued on resume.
+    """The scores of a run and its seconds of training; kept in ``metrics.json`` and continued on
+    resume.
 
     ``cpu_seconds``, the processor time of all threads, doesn't grow when other programs hold the
     processor."""

@@ -1,11 +1,11 @@
-"""System ``gaussiandreamer-system``: a prior becomes a cloud, score distillation improves it, the
-result is looked at and measured.
+"""System ``gaussiandreamer-system``: take Gaussians from a prior, train them by score distillation,
+then render, measure and export them.
 
-The life of a run, in the host's order: ``configure_optimizers`` prepares prompt, guidance and
-cloud; ``training_step`` renders, asks the guidance for its losses, steps the optimiser, then
+In the host's order: ``configure_optimizers`` builds prompt processor and guidance and runs the
+prior; ``training_step`` renders, gets the losses from the guidance, steps the optimiser, then
 densifies and prunes (after the step, so that no update is lost and a checkpoint written after it
-holds the cloud that the next step starts from); validation writes a grid of pictures, test a
-turntable, and where the guidance knows the truth the cloud is scored on views that no bank holds.
+holds the cloud that the next step starts from); validation saves a grid of pictures, test a
+turntable. Where the guidance knows the truth, the cloud is scored on held-out views.
 
 =============  =====================================================================================
 option         meaning
@@ -17,9 +17,9 @@ optimizer      name (a torch optimiser) and args; the learning rates belong to t
                background
 evaluation     views, size (pixels), supersample, every (steps; 0: only at start and end): PSNR and
                SSIM on held-out views
-prune          a budget that the export is made for once more: count, bytes (of the SPZ file where
-               that is exported, else of the PLY), psnr (dB to the cloud before) or within (dB lost
-               of quality); quality, size, steps: as the prune command; eps2d, antialias: the
+prune          a budget for a second, pruned export: count, bytes (of the SPZ file where that is
+               exported, else of the PLY), psnr (dB to the cloud before) or within (dB lost of
+               quality); quality, size, steps: as the prune command; eps2d, antialias: the
                renderer's, unless given
 =============  =====================================================================================
 """
