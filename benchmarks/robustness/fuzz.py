@@ -28,6 +28,8 @@ ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks/results/fuzz.csv"
 SILENCE = 60
 """Seconds without a word after which a process counts as hanging; an input has 10."""
+STARTUP = 600
+"""Seconds for the first word: a busy machine takes minutes to import all that is tried."""
 ROOM = 3 << 30
 """Bytes of address space that a process may add to what its libraries take."""
 STEPS_OF_A_LIFE = 25
@@ -206,13 +208,15 @@ class Watched:
         ]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
+        patience = STARTUP
         try:
             while not enough(self):
                 line = (
                     process.stdout.readline()
-                    if select.select([process.stdout], [], [], SILENCE)[0]
+                    if select.select([process.stdout], [], [], patience)[0]
                     else "hang"
                 )
+                patience = SILENCE
                 if line in ("", "hang"):
                     return (
                         count
