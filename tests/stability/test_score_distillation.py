@@ -228,7 +228,7 @@ def test_timesteps_stay_inside_the_table(percents, measured):
 def test_a_range_that_is_empty_after_annealing_is_named(measured):
     """Not at the step where the two schedules cross, but before any work."""
     crossing = {"min_step_percent": 0.6, "max_step_percent": [500, 0.98, 0.55, 501]}
-    with pytest.raises(UserError, match="min_step_percent 0.6 is above max_step_percent 0.55"):
+    with pytest.raises(UserError, match="min_step_percent: 0.6 is above max_step_percent, 0.55"):
         check_part("system.guidance", "stability-spoilt-guidance", crossing)
     with pytest.raises(UserError, match="min_step_percent"):
         sds.step_range(0.98, 0.5)
