@@ -33,6 +33,12 @@ NOTES = {
     "batch": "As many steps as fit into the seconds of the demo.",
     "rates": "Times the learning rates of the demo.",
     "grown": "1,250 Gaussians grown to 2,500 by cloning and splitting.",
+    "colors": "Ways to keep colours in what viewers show. `psnr`: drawn with each Gaussian's "
+    "colour clamped to [0, 1], as viewers do; `unclamped`: drawn as stored; `above_1`: share of "
+    "Gaussians with a channel above 1. Only the first and the chosen way are in the code.",
+    "spark": "Held-out dB of our own render and of Spark 2.2 in Chromium, and between the two, by "
+    "`benchmarks/viewers/spark.py`. `up`: the file's axis; unbounded clouds are from before "
+    "`bound_colors`, in z-up files.",
 }
 
 
@@ -209,6 +215,8 @@ def page() -> str:
     runs = [section(chart.title, name, run_table(name)) for name, chart in RUNS.items()]
     attributes = other_table("attributes", ("experiment", "variant", "x"))
     known = ("method", "truth", "start", "seed", "gaussians", "psnr")
+    colors = ("variant", "config", "object", "above_1", "largest", "unclamped", "psnr")
+    spark = ("variant", "drawn", "object", "up", "above_1", "ours", "spark", "spark_to_ours")
     seconds = ("scene", "x", "budget", "gaussians", "psnr", "seconds", "threads")
     others = [
         section("Growing by gradients", "grown", run_table("grown")),
@@ -217,6 +225,8 @@ def page() -> str:
         section("A scene of known size", "known_answer", plain_table("known_answer", known)),
         section("What a viewer's dilation makes of a cloud", "viewers",
                 other_table("viewers", ("variant", "x", "size"))),
+        section("Colours that viewers show", "colors", plain_table("colors", colors)),
+        section("What Spark shows", "spark", plain_table("spark", spark)),
         section("Seconds of the prune command", "prune", plain_table("prune", seconds)),
         ablation("The paper's ablations", "ablations"),
         ablation("Faces under a view-blind score", "faces"),
