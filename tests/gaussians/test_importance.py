@@ -7,7 +7,7 @@ import torch
 
 from threestudio_gaussiandreamer.cameras import orbit_c2w, to_opencv
 from threestudio_gaussiandreamer.core.streams import generator
-from threestudio_gaussiandreamer.gaussians import importance as parsimony
+from threestudio_gaussiandreamer.gaussians import importance
 from threestudio_gaussiandreamer.gaussians.densify import Rules, Statistics, densify_and_prune
 from threestudio_gaussiandreamer.splatting import rasterize
 from threestudio_gaussiandreamer.training.density import DensityControl, QualityResult
@@ -97,14 +97,17 @@ def test_those_with_the_lowest_scores_go_first(sampled):
     assert torch.equal(geometry.means, expected)
 
 
-@pytest.mark.parametrize("name", parsimony.SCORES)
+@pytest.mark.parametrize("name", importance.SCORES)
 def test_each_score_ranks_by_what_it_says(name):
     contribution, removal = (
         torch.tensor([0.1, 0.2, 0.3]),
         torch.tensor([4.0, 0.25, 0.36]),
     )  # roots: 2, 0.5, 0.6
-    logits, seen = torch.tensor([3.0, 1.0, 2.0]), parsimony.Seen(contribution, removal)
-    scores = [parsimony.score(name, logits, seen, generator(0, "s", step)) for step in (0, 0, 1)]
+    logits = torch.tensor([3.0, 1.0, 2.0])
+    stats = importance.VisibilityStats(contribution, removal)
+    scores = [
+        importance.importance_by(name, logits, stats, generator(0, "s", step)) for step in (0, 0, 1)
+    ]
     expected = {
         "opacity": logits,
         "contribution": contribution,
@@ -116,9 +119,9 @@ def test_each_score_ranks_by_what_it_says(name):
 
 
 def test_unsampled_the_contribution_ranks():
-    seen = parsimony.Seen(torch.tensor([0.1, 0.3, 0.2]), torch.zeros(3))
-    assert parsimony.score(
-        "removal", torch.zeros(3), seen, generator(0, "s")
+    stats = importance.VisibilityStats(torch.tensor([0.1, 0.3, 0.2]), torch.zeros(3))
+    assert importance.importance_by(
+        "removal", torch.zeros(3), stats, generator(0, "s")
     ).argsort().tolist() == [0, 2, 1]
 
 
@@ -150,7 +153,7 @@ def test_the_removal_error_is_that_of_leaving_each_gaussian_out():
         without = [drawn(geometry, opacities * (torch.arange(12) != row)) for row in range(12)]
         exact = torch.stack([(image - images).square().sum() for image in without])
     samples = torch.stack(
-        [parsimony.removal_error(images, opacities, generator(0, "r", i)) for i in range(3000)]
+        [importance.removal_error(images, opacities, generator(0, "r", i)) for i in range(3000)]
     )
     error = (samples.mean(0) - exact).abs() / (samples.std(0) / 3000**0.5 + 1e-12)
     assert exact.amin() > 1e-4 and error.amax() < 4  # standard errors
@@ -249,7 +252,7 @@ def test_a_gaussian_that_hides_its_own_colour_shows_nothing():
         sh=torch.tensor([[1.0, 1.0, 1.0]] * 2 + [[-1.0, 1.0, 0.0]])[:, None],
     )
     opacities = geometry.opacities().detach().double().requires_grad_()
-    removal = parsimony.removal_error(drawn(geometry, opacities)[:1], opacities, generator(0, "r"))
+    removal = importance.removal_error(drawn(geometry, opacities)[:1], opacities, generator(0, "r"))
     assert removal[0] < 1e-3 * removal[2]
 
 
@@ -304,7 +307,7 @@ def test_pruning_after_densifying_keeps_track_of_rows():
         Rules(min_opacity=0.0),
         generator(0, "s"),
     )
-    both = parsimony.pruned(first.values, geometry.contribution[first.parents], 7, first)
+    both = importance.keep_highest(first.values, geometry.contribution[first.parents], 7, first)
     assert len(both.parents) == len(both.is_new) == 7
     untouched = ~both.is_new
     assert torch.equal(both.values["sh0"][untouched], params["sh0"][both.parents[untouched]])
@@ -321,9 +324,9 @@ def test_auto_finds_the_smallest_count_that_holds(needed):
         assert kept[-asked[-1] :].all()  # the best ones
         return asked[-1] >= needed
 
-    count = parsimony.smallest_count(contribution, 80, holds)
-    assert max(needed, 80) <= count <= max(needed, 80) + 20 / 2**parsimony.PROBES + 1
-    assert len(asked) <= parsimony.PROBES + 1
+    count = importance.smallest_count(contribution, 80, holds)
+    assert max(needed, 80) <= count <= max(needed, 80) + 20 / 2**importance.BISECTIONS + 1
+    assert len(asked) <= importance.BISECTIONS + 1
 
 
 def test_auto_by_contribution_never_drops_the_top_gaussian_of_a_pixel():
@@ -345,7 +348,7 @@ def test_a_weight_above_one_half_is_the_largest_of_its_pixel():
     weights = rasterize(*inputs, torch.eye(60), viewmats, Ks, 24, 24, backend="torch")
     top = torch.zeros(60, dtype=torch.bool)
     top[weights.image.argmax(-1).unique()] = True
-    above = weights.contribution[0] > parsimony.TOP_OF_A_PIXEL
+    above = weights.contribution[0] > importance.TOP_OF_A_PIXEL
     assert above.any() and (top | ~above).all()
 
 

@@ -1,11 +1,11 @@
-"""Duplicates become one: pairs of Gaussians that cover the same place in the same colour are
-replaced by one with their moments.
+"""Merge duplicates: a pair of Gaussians that cover the same place in the same colour becomes one
+Gaussian with their moments.
 
-Pruning can't do this. Of two copies each is the front one in some view, so that both contribute,
-and where both stay they share the opacity that one could have. What a pair costs is how much the
-merged Gaussian is larger than its parts, in position and in colour, per weight (Runnalls 2007,
+Pruning can't do this: each of two copies is in front in some view, so both contribute, and they
+share the opacity that one could have. The cost of a pair is how much the merged Gaussian is larger
+than its parts, in position and in colour, per weight (Runnalls 2007,
 "Kullback-Leibler approach to Gaussian mixture reduction", the bound B(i, j) over w_i + w_j), the
-colour as a dimension of its own with the standard deviation ``COLOR_TOLERANCE``:
+colour as an additional dimension with the standard deviation ``COLOR_TOLERANCE``:
 
     cost = 1/2 (log |S| - f log |S_i| - (1 - f) log |S_j| + log(1 + f (1 - f) |c_i - c_j|^2 /
     tolerance^2))
@@ -26,17 +26,17 @@ from .densify import Change
 from .sh import C0
 
 DUPLICATE = 0.07
-"""The cost up to which two Gaussians count as one: merging all such pairs leaves clouds 50 dB alike
-or more, untrained ones too.
+"""Largest cost of a pair that is merged: merging all such pairs leaves a PSNR of 50 dB or more to
+the original, for untrained clouds too.
 """
 COLOR_TOLERANCE = 0.1
 NEIGHBOURS = 4
 LOG_THINNEST = -12.0
-"""Axes are taken to be no thinner than this beside the longest: float64 can't tell."""
+"""Axes are clamped to this logarithm of their ratio to the longest, the precision of float64."""
 
 
 class _Shapes(NamedTuple):
-    """What merging looks at, float64 on the CPU."""
+    """What the costs depend on, float64 on the CPU."""
 
     means: Float[Tensor, "N 3"]
     covariances: Float[Tensor, "N 3 3"]
@@ -47,13 +47,13 @@ class _Shapes(NamedTuple):
 
 
 def merge_duplicates(params: Mapping[str, Tensor], *, at_least: int = 1) -> Change:
-    """The cloud without duplicates; merged Gaussians are new, and come from the first of their
+    """Merge all duplicates; merged Gaussians are new, and their parent is the first of their
     pair.
 
     Args:
         params: means, log_scales, quats, logit_opacities and spherical harmonics, under names with
             "sh".
-        at_least: how many Gaussians stay, whatever duplicates there are.
+        at_least: how many Gaussians stay at least, whatever duplicates there are.
     """
     rows = torch.arange(len(params["means"]), device=params["means"].device)
     change = Change(
@@ -75,8 +75,8 @@ def merge_duplicates(params: Mapping[str, Tensor], *, at_least: int = 1) -> Chan
 def duplicates(
     params: Mapping[str, Tensor], spent: Float[Tensor, " N"]
 ) -> tuple[Int[Tensor, "P 2"], Float[Tensor, " P"]]:
-    """Pairs of rows that count as one, the cheapest first, no row in two pairs; and their costs,
-    with what each has ``spent`` before.
+    """Find pairs of rows to merge, the cheapest first, no row in two pairs; return them and their
+    costs, with what each row has ``spent`` in earlier merges.
     """
     shapes = _shapes(params)
     pairs = _neighbours(shapes.means)
@@ -111,7 +111,7 @@ def _shapes(params: Mapping[str, Tensor]) -> _Shapes:
 
 
 def _neighbours(means: Float[Tensor, "N 3"]) -> Int[Tensor, "P 2"]:
-    """Every finite Gaussian with each of its nearest, the smaller row first, each pair once."""
+    """Pair every finite Gaussian with its nearest ones, smaller row first, each pair once."""
     from scipy.spatial import cKDTree
 
     rows = means.isfinite().all(1).nonzero()[:, 0]
@@ -133,7 +133,7 @@ def _neighbours(means: Float[Tensor, "N 3"]) -> Int[Tensor, "P 2"]:
 def _moments(
     shapes: _Shapes, pairs: Int[Tensor, "P 2"]
 ) -> tuple[Float[Tensor, " P"], Float[Tensor, "P 3"], Float[Tensor, "P 3 3"]]:
-    """The first's share f, mean and covariance of each pair together."""
+    """Return the first's share f of the weight, the mean and the covariance of each pair."""
     i, j = pairs.unbind(1)
     f = shapes.weights[i] / (shapes.weights[i] + shapes.weights[j])
     apart = shapes.means[i] - shapes.means[j]
@@ -159,7 +159,7 @@ def _costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
 def _merged(
     change: Change, spent: Tensor, pairs: Int[Tensor, "P 2"], costs: Float[Tensor, " P"]
 ) -> tuple[Change, Tensor]:
-    """The first of each pair takes the place of both."""
+    """Replace the first of each pair by both, and remove the second."""
     values, device = change.values, change.parents.device
     for name, merged in _together(values, pairs).items():
         values[name][pairs[:, 0].to(device)] = merged.to(values[name])
@@ -176,8 +176,8 @@ def _merged(
 
 
 def _together(params: Mapping[str, Tensor], pairs: Int[Tensor, "P 2"]) -> dict[str, Tensor]:
-    """One Gaussian for each pair: moments as above, the light that both stop, the mean of their
-    harmonics.
+    """Make one Gaussian of each pair: moments as above, an opacity that absorbs as much light as
+    both, the weighted mean of their harmonics.
     """
     from scipy.spatial.transform import Rotation
 

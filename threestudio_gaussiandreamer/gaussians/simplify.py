@@ -16,7 +16,7 @@ from torch import Tensor
 from ..core.errors import UserError
 from ..core.streams import generator
 from .gaussians import Gaussians
-from .importance import Seen, removal_error, score
+from .importance import VisibilityStats, importance_by, removal_error
 from .merge import merge_duplicates
 from .recover import Recovery, Round
 from .views import Views, draw, row_batches
@@ -52,7 +52,8 @@ def view_importance(cloud: Gaussians, views: Views, seed: int = 0) -> Float[Tens
         image, contributed = draw(cloud, views, rows, opacities)
         contribution = torch.maximum(contribution, contributed.amax(0))
         removal = removal + removal_error(image, opacities, rng)
-    return score("removal", cloud.logit_opacities, Seen(contribution, removal), rng)
+    stats = VisibilityStats(contribution, removal)
+    return importance_by("removal", cloud.logit_opacities, stats, rng)
 
 
 def simplify(

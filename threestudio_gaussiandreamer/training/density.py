@@ -255,17 +255,17 @@ class DensityControl:
         cloud, cfg = self.cloud, self.cfg.prune
         values = cloud.parameters_by_name() if first is None else first.values
         rows = slice(None) if first is None else first.parents
-        seen = importance.Seen(cloud.contribution[rows], cloud.removal[rows])
+        stats = importance.VisibilityStats(cloud.contribution[rows], cloud.removal[rows])
         rng = generator(run_seed(), "prune", step)
-        scores = importance.score(cfg.score, values["logit_opacities"], seen, rng)
+        scores = importance.importance_by(cfg.score, values["logit_opacities"], stats, rng)
         share = self.kept_share(len(scores), step)
         count, measured = importance.next_count(len(scores), share, min_count(self.cfg)), {}
         if self.cfg.budget == AUTO and (first is not None or check is None):
             count = len(scores)  # no view has shown what densification made
         elif self.cfg.budget == AUTO:
-            top = importance.top_count(seen.contribution) if cfg.score == "contribution" else 0
+            top = importance.top_count(stats.contribution) if cfg.score == "contribution" else 0
             count, measured = fewest_that_hold(scores, max(count, top), check)
-        return importance.pruned(values, scores, count, first), measured
+        return importance.keep_highest(values, scores, count, first), measured
 
 
 def fewest_that_hold(
