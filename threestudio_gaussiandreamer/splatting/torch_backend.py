@@ -16,7 +16,7 @@ from typing import NamedTuple, Optional
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import pad, threshold, threshold_
+from torch.nn.functional import pad
 from torch.utils.checkpoint import checkpoint
 
 from .options import RasterizeOptions
@@ -24,14 +24,23 @@ from .output import Rasterized, compose, track_means2d
 from .projection import Splats, project
 from .scene import Scene
 from .tiles import TILE, Bounds, Grid, Lists, bound, list_splats, make_grid, slices
+from .torch_blocks import (
+    PIXELS,
+    Block,
+    absolute_gradients,
+    composite,
+    from_tiles,
+    product,
+    splat_gradients,
+    subtract_one_by_one,
+    to_tiles,
+)
 
 SPLATS_PER_STEP = 64
 ELEMENTS_PER_BLOCK = 2**20
 KEPT_SLICES = 4
 PROJECTED_AT_ONCE = 2**18
-PIXELS = TILE * TILE
 SHAPE_COLUMNS = 6
-FAINTEST = 1e-30
 GAUSSIANS = ("means", "quats", "scales", "opacities", "colors")
 
 
@@ -80,22 +89,6 @@ class Table(NamedTuple):
     lists: list[Lists]  # of the first slices, kept by the forward pass for the backward pass
     grid: Grid
     capped: bool  # whether any opacity exceeds alpha_max
-
-
-class Block(NamedTuple):
-    """Part of a step: G tiles with K splats each; lists that end are filled up with the splat that
-    draws nothing.
-    """
-
-    tiles: Tensor  # (G,)
-    splats: Tensor  # (G * K,)
-    mean_x: Tensor  # (G, K) from the tile's middle; so are the others
-    mean_y: Tensor
-    a: Tensor
-    k: Tensor
-    c: Tensor
-    opacity: Tensor
-    features: Tensor  # (G, C + 2, K)
 
 
 class _Blend(torch.autograd.Function):
@@ -204,12 +197,10 @@ def _forward(
     sums = table.columns.new_zeros(table.grid.tiles, (len(table.columns) - SHAPE_COLUMNS) * PIXELS)
     largest = table.columns.new_zeros(table.columns.shape[1])
     for block in _march(table, transmittances, options):
-        _, _, weights = _composite(block, transmittances, options)
-        sums.index_add_(
-            0, block.tiles, _product(block.features, weights.transpose(1, 2)).flatten(1)
-        )
+        _, _, weights = composite(block, transmittances, options)
+        sums.index_add_(0, block.tiles, product(block.features, weights.transpose(1, 2)).flatten(1))
         largest.scatter_reduce_(0, block.splats, weights.amax(1).flatten(), "amax")
-    return _from_tiles(sums, table.grid, width, height), largest
+    return from_tiles(sums, table.grid, width, height), largest
 
 
 def _backward(
@@ -225,24 +216,24 @@ def _backward(
     dividing again and again."""
     height, width = grad.shape[1:3]
     transmittances = _start(table, width, height)
-    cotangents = _to_tiles(grad, table.grid)
-    left = (cotangents * _to_tiles(sums, table.grid)).sum(1)
+    cotangents = to_tiles(grad, table.grid)
+    left = (cotangents * to_tiles(sums, table.grid)).sum(1)
     columns = torch.zeros_like(table.columns)
     absolutes = columns.new_zeros(2, columns.shape[1])
     for block in _march(table, transmittances, options):
-        alphas, behind, weights = _composite(block, transmittances, options)
+        alphas, behind, weights = composite(block, transmittances, options)
         cotangent = cotangents.index_select(0, block.tiles)
-        gains = _product(cotangent.transpose(1, 2), block.features).mul_(weights)
-        features = _product(cotangent, weights)
-        rest = _subtract_one_by_one(gains, left, block.tiles)
+        gains = product(cotangent.transpose(1, 2), block.features).mul_(weights)
+        features = product(cotangent, weights)
+        rest = subtract_one_by_one(gains, left, block.tiles)
         slopes = gains.addcmul_(weights.div_(behind), rest, value=-1)
         if table.capped:
             slopes *= alphas < options.alpha_max
-        grads = torch.cat([_splat_gradients(block, slopes), features], 1)
+        grads = torch.cat([splat_gradients(block, slopes), features], 1)
         columns.index_add_(1, block.splats, grads.transpose(0, 1).flatten(1))
         if absolute:
             absolutes.index_add_(
-                1, block.splats, _absolute_gradients(block, slopes).transpose(0, 1).flatten(1)
+                1, block.splats, absolute_gradients(block, slopes).transpose(0, 1).flatten(1)
             )
     return columns, absolutes
 
@@ -250,11 +241,11 @@ def _backward(
 def _start(table: Table, width: int, height: int) -> Tensor:
     """Transmittance (tiles, PIXELS) before the first splat: 1 inside the image, 0 outside."""
     ones = table.columns.new_ones(table.grid.views, height, width, 1)
-    return _to_tiles(ones, table.grid)[:, 0]
+    return to_tiles(ones, table.grid)[:, 0]
 
 
 def _march(table: Table, transmittances: Tensor, options: RasterizeOptions) -> Iterator[Block]:
-    """Blocks front to back; whoever takes one moves the transmittances behind it (`_composite`)
+    """Blocks front to back; whoever takes one moves the transmittances behind it (`composite`)
     before taking the next.
     """
     for lists in _lists(table, transmittances, options):
@@ -294,12 +285,14 @@ def _unfinished(transmittances: Tensor, options: RasterizeOptions) -> Tensor:
 
 
 def _block(table: Table, lists: Lists, part: Tensor, depth: int, length: int) -> Block:
-    """Entries ``depth`` to ``depth + length - 1`` of the lists named by ``part``."""
+    """Return the intersections ``depth`` to ``depth + length - 1`` of the lists named by
+    ``part``.
+    """
     places = depth + torch.arange(length, device=part.device)
-    entries = (lists.starts[part, None] + places).clamp(max=len(lists.splats) - 1)
+    positions = (lists.starts[part, None] + places).clamp(max=len(lists.splats) - 1)
     nothing = table.columns.shape[1] - 1
     splats = torch.where(
-        places < lists.counts[part, None], lists.splats[entries].long(), nothing
+        places < lists.counts[part, None], lists.splats[positions].long(), nothing
     ).flatten()
     columns = table.columns.index_select(1, splats).view(-1, len(part), length)
     tiles = lists.tiles[part]
@@ -307,143 +300,3 @@ def _block(table: Table, lists: Lists, part: Tensor, depth: int, length: int) ->
     mean_x, mean_y, *conic_and_opacity = columns[:SHAPE_COLUMNS]
     features = columns[SHAPE_COLUMNS:].transpose(0, 1).contiguous()
     return Block(tiles, splats, mean_x - middle_x, mean_y - middle_y, *conic_and_opacity, features)
-
-
-def _alphas(block: Block, options: RasterizeOptions) -> Tensor:
-    """(G, PIXELS, K): ``min(alpha_max, opacity exp(-q / 2))``, or zero below alpha_min.
-
-    ``q / 2 = (x(column) - y(row))^2 + z(row)``: only the square is as large as the block.
-    """
-    steep = (block.a / 2).sqrt()[:, None]
-    from_x, from_y = _offsets(block.mean_x), _offsets(block.mean_y)
-    x, y = steep * from_x, steep * block.k[:, None] * from_y
-    top = block.opacity.clamp(min=FAINTEST).log()[:, None] - block.c[:, None] / 2 * from_y**2
-    root = x[:, None] - y[:, :, None]
-    alphas = (
-        torch.addcmul(top[:, :, None], root, root, value=-1).exp_().clamp_(max=options.alpha_max)
-    )
-    return threshold_(alphas, _just_below(options.alpha_min, alphas), 0.0).flatten(1, 2)
-
-
-def _composite(
-    block: Block, transmittances: Tensor, options: RasterizeOptions
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Alphas, ``T_{i+1}`` and weights ``alpha_i T_i``, each (G, PIXELS, K); moves the tiles'
-    transmittances behind the block.
-
-    Weights are zero where ``T_i < stop``; the transmittance goes on as if no pixel stopped. One
-    that is too small to divide by becomes infinity: what is behind it can't be seen."""
-    alphas = _alphas(block, options)
-    chain = alphas.new_empty(*alphas.shape[:2], alphas.shape[2] + 1)
-    chain[..., 0] = transmittances.index_select(0, block.tiles)
-    torch.sub(alphas.new_ones(()), alphas, out=chain[..., 1:])
-    torch.cumprod(chain, -1, out=chain)
-    transmittances.index_copy_(0, block.tiles, chain[..., -1])
-    weights = threshold(chain[..., :-1], _just_below(options.stop, chain), 0.0).mul_(alphas)
-    return alphas, threshold_(chain[..., 1:], FAINTEST, torch.inf), weights
-
-
-def _subtract_one_by_one(gains: Tensor, left: Tensor, tiles: Tensor) -> Tensor:
-    """What is ``left`` behind each splat, (G, PIXELS, K), when the gains are taken off front to
-    back; updates ``left``.
-    """
-    rest = torch.cat([left.index_select(0, tiles)[..., None], gains.neg()], -1)
-    torch.cumsum(rest, -1, out=rest)
-    left.index_copy_(0, tiles, rest[..., -1])
-    return rest[..., 1:]
-
-
-def _splat_gradients(block: Block, slopes: Tensor) -> Tensor:
-    """(G, 6, K): gradients of mean x, y, a, k, c, opacity from ``slopes``, the gradient of the
-    exponent ``log(opacity) - q / 2``.
-
-    They are linear in the six moments of the slopes over the tile's pixels, (1, x, y, x^2, x y,
-    y^2) from its middle."""
-    s, sx, sy, sxx, sxy, syy = _product(_monomials(slopes), slopes).unbind(1)
-    k, y = block.k, -block.mean_y
-    t = -block.mean_x - k * y  # d.x - k d.y at the middle; elsewhere x - k y is added
-    st, sty, sd = sx - k * sy, sxy - k * syy, sy + y * s
-    slopes_t = st + t * s
-    slopes_tt = sxx - k * sxy - k * sty + t * (2 * st + t * s)
-    slopes_td = sty + t * sy + y * slopes_t
-    slopes_dd = syy + y * (sy + sd)
-    grad_x = block.a * slopes_t
-    grad_y = block.c * sd - k * grad_x
-    return torch.stack(
-        [
-            grad_x,
-            grad_y,
-            -slopes_tt / 2,
-            block.a * slopes_td,
-            -slopes_dd / 2,
-            s / block.opacity.clamp(min=FAINTEST),
-        ],
-        1,
-    )
-
-
-def _absolute_gradients(block: Block, slopes: Tensor) -> Tensor:
-    """(G, 2, K): sums over the pixels of |gradient of mean x| and |gradient of mean y|."""
-    from_x, from_y = _offsets(block.mean_x)[:, None], _offsets(block.mean_y)[:, :, None]
-    slopes = slopes.view(len(slopes), TILE, TILE, -1)
-    k, c = block.k[:, None, None], block.c[:, None, None]
-    along_x = block.a[:, None, None] * (from_x - k * from_y)
-    return torch.stack(
-        [
-            (slopes * along_x).abs().sum((1, 2)),
-            (slopes * (c * from_y - k * along_x)).abs().sum((1, 2)),
-        ],
-        1,
-    )
-
-
-def _product(a: Tensor, b: Tensor) -> Tensor:
-    """Matrix products of a batch. A single one is done twice: alone, threads would share it and
-    their number would round it.
-    """
-    return a @ b if len(b) > 1 else (a @ b.repeat(2, 1, 1))[:1]
-
-
-def _offsets(means: Tensor) -> Tensor:
-    """(G, TILE, K): pixel centres of a row or column minus the means (G, K), both from the tile's
-    middle.
-    """
-    return _centres(means)[:, None] - means[:, None]
-
-
-def _centres(like: Tensor) -> Tensor:
-    return torch.arange(TILE, dtype=like.dtype, device=like.device) - (TILE - 1) / 2
-
-
-def _monomials(like: Tensor) -> Tensor:
-    """(6, PIXELS): 1, x, y, x^2, x y, y^2 at the pixel centres, from the tile's middle."""
-    y, x = (
-        axis.flatten() for axis in torch.meshgrid(_centres(like), _centres(like), indexing="ij")
-    )
-    return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
-
-
-def _just_below(bound: float, like: Tensor) -> float:
-    """The number that ``x > number`` means ``x >= bound`` in the type of ``like``: torch's fast
-    threshold is exclusive.
-    """
-    bound = torch.tensor(bound, dtype=like.dtype)
-    return torch.nextafter(bound, torch.tensor(-torch.inf, dtype=like.dtype)).item()
-
-
-def _to_tiles(image: Tensor, grid: Grid) -> Tensor:
-    """(B, H, W, F) to (tiles, F, PIXELS), zeros outside the image."""
-    views, height, width, features = image.shape
-    image = pad(image, (0, 0, 0, grid.columns * TILE - width, 0, grid.rows * TILE - height))
-    image = image.view(views, grid.rows, TILE, grid.columns, TILE, features)
-    return image.permute(0, 1, 3, 5, 2, 4).reshape(grid.tiles, features, PIXELS)
-
-
-def _from_tiles(tiles: Tensor, grid: Grid, width: int, height: int) -> Tensor:
-    """The inverse of `_to_tiles`."""
-    tiles = tiles.view(grid.views, grid.rows, grid.columns, -1, TILE, TILE).permute(
-        0, 1, 4, 2, 5, 3
-    )
-    return tiles.reshape(grid.views, grid.rows * TILE, grid.columns * TILE, -1)[
-        :, :height, :width
-    ].contiguous()
