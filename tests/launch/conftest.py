@@ -1,10 +1,11 @@
-"""Runs of the tiny system, in this process."""
+"""Runs of the tiny system and of a tiny demo, in this process."""
 
 import pytest
 
 import threestudio_gaussiandreamer
 from tests.helpers import tiny_parts
 from tests.helpers.tiny_runs import only_run
+from tests.launch.bad_input_cases import DEMO, SMALL
 from threestudio_gaussiandreamer.launch.experiment import main
 
 
@@ -30,3 +31,25 @@ def launch(tmp_path, monkeypatch, capsys):
 def trained(launch):
     assert launch("--train")[0] == 0
     return only_run()
+
+
+@pytest.fixture
+def launch_demo(tmp_path, monkeypatch, capsys):
+    """``launch_demo(overrides...)`` trains a tiny demo in an empty folder; returns (exit code,
+    stderr).
+    """
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+
+    def run(*overrides: str, stage: str = "--train", config: str = str(DEMO)) -> tuple[int, str]:
+        code = main(["--config", config, stage, "--gpu", "cpu", *SMALL, *overrides])
+        return code, capsys.readouterr().err
+
+    return run
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tiny.yaml").write_text(tiny_parts.CONFIG)
+    return tmp_path

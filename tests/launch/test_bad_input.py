@@ -3,57 +3,16 @@ behind, no traceback.
 """
 
 import dataclasses
-import json
-import os
-import shutil
-import signal
-from pathlib import Path
 
 import pytest
-import torch
 
-from tests.helpers.checkpoints import whole_checkpoint
+from tests.launch.bad_input_cases import assert_refused
 from threestudio_gaussiandreamer import host, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.option_types import check_types
-from threestudio_gaussiandreamer.launch import experiment, folder_lock
-from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_part
-from threestudio_gaussiandreamer.training import held_out as evaluate
-from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 register_parts()
-DEMO = Path(__file__).parents[2] / "configs" / "demo.yaml"
-SMALL = [
-    "data.width=16", "data.height=16", "data.eval_width=16", "data.eval_height=16",
-    "data.n_test_views=2", "data.train_views=4", "system.geometry.prior.num_points=80",
-    "system.geometry.prior.color_smoothing=0", "system.geometry.grow.num_candidates=200",
-    "system.evaluation.size=16", "system.evaluation.views=2", "trainer.enable_progress_bar=false",
-    "trainer.max_steps=2", "use_timestamp=false", "tag=t",
-]  # fmt: skip
-TRIAL = Path("outputs/demo/t")
-
-
-@pytest.fixture
-def launch(tmp_path, monkeypatch, capsys):
-    """``launch(overrides...)`` trains a tiny demo in an empty folder; returns (exit code,
-    stderr).
-    """
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-
-    def run(*overrides: str, stage: str = "--train", config: str = str(DEMO)) -> tuple[int, str]:
-        code = experiment.main(["--config", config, stage, "--gpu", "cpu", *SMALL, *overrides])
-        return code, capsys.readouterr().err
-
-    return run
-
-
-def assert_refused(code: int, err: str, message: str) -> None:
-    """One message, no traceback, nothing written, and the prior hasn't run."""
-    assert code == 2 and "Traceback" not in err and not Path("outputs").exists(), err
-    assert message in err and sum(line.startswith("error: ") for line in err.splitlines()) == 1
-    assert "the cloud starts" not in err
 
 
 # -- values ----------------------------------------------------------------------------------------
@@ -242,8 +201,8 @@ def assert_refused(code: int, err: str, message: str) -> None:
         ("system.geometry.weights=last.ckpt", "expected <checkpoint>:<module>"),
     ],
 )
-def test_a_wrong_value_is_refused_before_any_work(launch, override, message):
-    assert_refused(*launch(override), message)
+def test_a_wrong_value_is_refused_before_any_work(launch_demo, override, message):
+    assert_refused(*launch_demo(override), message)
 
 
 BAD_VALUES = ([1, 2, 3, 4, 5, 6, 7], {"a": 1}, float("nan"), None, "abc", -1)
@@ -318,229 +277,3 @@ def test_types_that_fit_are_taken():
     ):
         with pytest.raises(UserError):
             check_types(Outer, wrong)
-
-
-# -- files -----------------------------------------------------------------------------------------
-
-PLY = (
-    b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty "
-    b"float z\nend_header\n"
-)
-FILES = {
-    "empty.glb": b"",
-    "text.glb": b"hello there, this is no mesh",
-    "empty.obj": b"# nothing\n",
-    "nan.obj": b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
-    "flat.obj": b"v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n",
-    "index.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n",
-    "mesh.yaml": b"a: 1\n",
-}
-
-
-@pytest.mark.parametrize("name", ["missing.glb", "", *FILES])
-def test_a_mesh_that_is_none_is_refused(launch, name):
-    if name in FILES:
-        Path(name).write_bytes(FILES[name])
-    code, err = launch(f"system.guidance.mesh={name}")
-    assert_refused(code, err, name or "path")
-
-
-@pytest.mark.parametrize(
-    "prior", ["gaussians-prior", "point-cloud-prior", "mesh-prior", "body-prior"]
-)
-@pytest.mark.parametrize(
-    "content",
-    [
-        None,
-        b"",
-        b"hello",
-        b"ply\nformat asc",
-        PLY + b"nan nan nan\n",
-        PLY + b"a b c\n",
-        PLY.replace(b" 1\n", b" 99999999999\n"),
-    ],
-)
-def test_a_file_that_no_prior_can_read_is_refused(tmp_path, prior, content):
-    path = tmp_path / "start.ply"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(UserError, match="start.ply|PointCloudPrior"):
-        host.find(prior)({"path": str(path)})("a fox")
-
-
-def checkpoint(**changes: object) -> dict:
-    lightnings = {"pytorch-lightning_version": "2.0.0", "loops": {}, "optimizer_states": []}
-    return {"state_dict": {}, "epoch": 0, "global_step": 1, **lightnings, **changes}
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (checkpoint(state_dict=[1]), "its state_dict is of type list"),
-        (checkpoint(global_step=None), "its global_step is of type NoneType"),
-        (
-            {k: v for k, v in checkpoint().items() if k != "pytorch-lightning_version"},
-            "which Lightning writes",
-        ),
-        (
-            whole_checkpoint() | {"state_dict": {"other": torch.ones(3)}},
-            "was made by another configuration",
-        ),
-        (checkpoint(loops={"x": 1}), "its loops have no fit_loop"),
-        (checkpoint(optimizer=os.system), "could run code when read, so it isn't read: "),
-    ],
-)
-def test_a_foreign_checkpoint_is_refused(launch, content, message):
-    torch.save(content, "foreign.ckpt")
-    # the loops are for training alone
-    for stage in ("--train",) if content.get("loops") else ("--train", "--export"):
-        code, err = launch("resume=foreign.ckpt", stage=stage)
-        assert_refused(code, err, message)
-        assert "weights_only" not in err  # torch's advice to read it all the same
-
-
-def test_a_damaged_score_file_is_measured_anew(tmp_path):
-    for content in (b"{bro", b"\xff", b"[1]"):
-        (tmp_path / "metrics.json").write_bytes(content)
-        assert evaluate.Measurements(None, tmp_path).values == {}
-
-
-def test_a_file_in_the_place_of_a_folder_is_named(launch):
-    TRIAL.mkdir(parents=True)
-    (TRIAL / "save").touch()
-    code, err = launch()
-    assert code == 2 and f"cannot write {TRIAL}/save" in err and "Traceback" not in err
-
-
-def test_a_full_disk_is_named(launch, monkeypatch):
-    def full(*args: object, **kwargs: object) -> None:
-        raise OSError(28, "No space left on device", "picture.png")
-
-    monkeypatch.setattr(evaluate, "_write_png", full)
-    code, err = launch()
-    assert (
-        code == 2
-        and "cannot write picture.png: No space left on device" in err
-        and "Traceback" not in err
-    )
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"a: !!python/object/apply:os.system ['touch pwned']", "isn't valid YAML"),
-        (b"\x89PNG\r\n\x1a\n", "can't be read"),
-        (b"a:\n\tb: 1", "line 2, column 1"),
-        (b"name: a\nname: b", "duplicate key"),
-        (b"", "data_type is empty"),
-        (b"system: []", "system is a list in one and a section in another"),
-        (b"seed: " + 5000 * b"9", "isn't valid YAML: Exceeds the limit"),
-        (b"#" * (1 << 21), "the configuration bad.yaml is larger than 1 MiB"),
-        (b"data: [1, 2]", "data is a list in one and a section in another"),
-    ],
-)
-def test_a_configuration_that_is_none_is_refused(launch, content, message):
-    Path("bad.yaml").write_bytes(content)
-    assert_refused(*launch(config="bad.yaml"), message)
-    assert not Path("pwned").exists()
-
-
-# -- prompts ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "prompt", ["1984", "a fox: red", "${x}", "../../x", "-x", "🦊" * 1000, "two\nlines", " "]
-)
-def test_a_prompt_arrives_verbatim_and_stays_in_the_output_root(launch, prompt):
-    tagged_by_the_prompt = [option for option in SMALL if not option.startswith("tag=")]
-    options = [
-        *tagged_by_the_prompt,
-        f"system.prompt_processor.prompt={prompt}",
-        "trainer.max_steps=0",
-        "trainer.limit_test_batches=0",
-    ]
-    assert experiment.main(["--config", str(DEMO), "--train", "--gpu", "cpu", *options]) == 0
-    assert os.listdir() == ["outputs"]
-    (parsed,) = Path("outputs").glob("demo/*/configs/parsed.yaml")
-    assert load_config(parsed).system.prompt_processor.prompt == prompt
-
-
-# -- extensions and signals ------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("source", "message"),
-    [
-        ("x = '\0'", "null bytes"),
-        ("def f(:", "custom/part.py:1: invalid syntax"),
-        ("import nothing", "custom/part.py:1: ModuleNotFoundError"),
-    ],
-)
-def test_an_extension_that_fails_is_named(launch, source, message):
-    Path("custom").mkdir()
-    Path("custom/part.py").write_text(source)
-    code, err = launch()
-    assert_refused(code, err, message)
-    assert "custom/part.py" in err
-
-
-def test_a_signal_while_the_test_views_are_rendered_leaves_a_checkpoint_and_says_how_to_go_on(
-    launch, monkeypatch, capsys
-):
-    with monkeypatch.context() as patch:
-        patch.setattr(
-            GaussianDreamerSystem, "test_step", lambda *args: os.kill(os.getpid(), signal.SIGINT)
-        )
-        code = experiment.main(["--config", str(DEMO), "--train", "--gpu", "cpu", *SMALL])
-    out = capsys.readouterr().out
-    last = TRIAL / "ckpts" / "last.ckpt"
-    assert code == 130 and "to go on: " in out and f"resume={last}" in out
-    shutil.rmtree(TRIAL / "save")
-    assert launch(f"resume={last}")[0] == 0
-    assert (TRIAL / "save" / "it2-export" / "gaussians.ply").is_file()
-
-
-# -- runs that meet --------------------------------------------------------------------------------
-
-
-def test_a_second_run_in_a_folder_is_refused_while_the_first_one_trains(launch):
-    TRIAL.mkdir(parents=True)
-    first = folder_lock.claim(TRIAL)
-    code, err = launch()
-    first.release()
-    assert code == 2 and f"another run is training in {TRIAL}" in err and not list(TRIAL.iterdir())
-    assert launch()[0] == 0
-
-
-def test_a_run_that_is_resumed_at_its_end_is_measured(launch):
-    """Also where the result's numbers aren't: in another folder, or because the first run was
-    killed before it had them.
-    """
-    assert launch()[0] == 0
-    code, err = launch(f"resume={TRIAL}/ckpts/last.ckpt", "tag=other")
-    assert code == 0 and "nothing is left to train" in err
-    first, other = (
-        json.loads((folder / "save/metrics.json").read_text())["result"]
-        for folder in (TRIAL, TRIAL.with_name("other"))
-    )
-    assert (other["step"], other["psnr"]) == (first["step"], first["psnr"])
-
-
-@pytest.mark.parametrize("stage", ["validate", "test", "export"])
-def test_nothing_to_resume_is_nothing_to_show(stage, launch):
-    """Only training can start anew; an untrained cloud would pass for the result."""
-    assert_refused(
-        *launch("resume=auto", stage=f"--{stage}"),
-        f"resume=auto: there is no checkpoint to --{stage}",
-    )
-
-
-def test_a_closed_pipe_is_no_traceback(monkeypatch, capsys):
-    closed = []
-    monkeypatch.setattr(
-        experiment, "run", lambda *args: (_ for _ in ()).throw(BrokenPipeError(32, "Broken pipe"))
-    )
-    monkeypatch.setattr(os, "dup2", lambda _, to: closed.append(to))
-    assert experiment.main(["--config", str(DEMO), "--train"]) == 128 + signal.SIGPIPE
-    assert closed == [1] and "the reader of the output has closed it" in capsys.readouterr().err

@@ -1,0 +1,7 @@
+"""What the tests of config share."""
+
+from threestudio_gaussiandreamer.launch.config import load_config
+
+
+def load(*overrides: str):
+    return load_config("tiny.yaml", cli_args=overrides)

@@ -1,0 +1,187 @@
+"""Misspelt keys and broken extensions are named."""
+
+import copy
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.helpers import tiny_parts
+from tests.launch.config_cases import load
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.config_check import check_config
+from threestudio_gaussiandreamer.launch.extensions import load_extensions
+
+# -- the check -------------------------------------------------------------------------------------
+
+
+def keys_of(node: dict, prefix: str = "") -> list[str]:
+    inner = [
+        key
+        for name, value in node.items()
+        if isinstance(value, dict)
+        for key in keys_of(value, f"{prefix}{name}.")
+    ]
+    return [prefix + name for name in node] + inner
+
+
+# without references, so that only the misspelling is wrong
+PLAIN = yaml.safe_load(
+    tiny_parts.CONFIG.replace("${trainer.max_steps}", "6").replace(
+        "${rmspace:${system.prompt_processor.prompt},_}", "x"
+    )
+)
+
+
+@pytest.mark.parametrize("key", keys_of(PLAIN))
+def test_every_misspelt_key_is_rejected_with_the_right_one(folder, key):
+    content = copy.deepcopy(PLAIN)
+    section, _, leaf = key.rpartition(".")
+    parent = content
+    for name in filter(None, section.split(".")):
+        parent = parent[name]
+    misspelt = leaf[:-1]
+    parent[misspelt] = parent.pop(leaf)
+    Path("misspelt.yaml").write_text(yaml.safe_dump(content))
+    wrong, right = (f"{section}.{name}" if section else name for name in (misspelt, leaf))
+    with pytest.raises(UserError, match=f"unknown key {wrong!r}.*{right!r}"):
+        check_config(load_config("misspelt.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        (
+            "system.geometry.sise=3",
+            "unknown key 'system.geometry.sise': did you mean 'system.geometry.size'?",
+        ),
+        (
+            "system.geometry.prior.cuont=3",
+            "unknown key 'system.geometry.prior.cuont': did you mean "
+            "'system.geometry.prior.count'?",
+        ),
+        ("system.geometry.size=big", "system.geometry.size: Value 'big'"),
+        (
+            "system.geometry.prior.count=0",
+            "system.geometry.prior.count: expected at least 1, got 0",
+        ),
+        (
+            "system.geometry.prior_type=tiny-piror",
+            "system.geometry.prior_type: unknown part 'tiny-piror': did you mean 'tiny-prior'",
+        ),
+        ("system.geometry_type=tiny-geomerty", "system.geometry_type: unknown part"),
+        (
+            "system_type=tiny-sistem",
+            "system_type: unknown part 'tiny-sistem': did you mean 'tiny-system'",
+        ),
+        ("data_type=", "data_type"),
+        ("data.veiws=3", "unknown key 'data.veiws'"),
+        ("system.geometry=3", "system.geometry"),
+        (
+            "system.loss.sds=1",
+            "unknown key 'system.loss.sds': weights of losses are called lambda_<loss>",
+        ),
+        ("system.loss.lambda_sparsty=1", "did you mean 'system.loss.lambda_sparsity'"),
+        ("system.loss.lambda_fit=[1,2]", "system.loss.lambda_fit has 2 elements"),
+        ("system.loggers.wadb.enable=true", "unknown key 'system.loggers.wadb'"),
+        ("system.loggers.wandb.enabled=true", "unknown key 'system.loggers.wandb.enabled'"),
+        ("trainer.max_step=3", "unknown key 'trainer.max_step': did you mean 'trainer.max_steps'"),
+        ("trainer.max_steps=many", "trainer.max_steps is 'many' (str); expected one of: int"),
+        ("trainer.max_steps=2.5", "trainer.max_steps is 2.5 (float)"),
+        ("trainer.precision=17", "trainer: Precision 17 is invalid"),
+        ("trainer.accelerator=cpu", "trainer.accelerator is set by --gpu"),
+        ("trainer.logger=false", "trainer.logger is set by the launcher"),
+        ("checkpoint.every_n_steps=3", "unknown key 'checkpoint.every_n_steps'"),
+        ("checkpoint.every_n_epochs=1", "checkpoint: Combination of parameters"),
+        ("checkpoint.dirpath=x", "checkpoint.dirpath is set by exp_root_dir"),
+    ],
+)
+def test_a_mistake_is_named_by_its_path(folder, override, message):
+    with pytest.raises(UserError, match=re.escape(message)):
+        check_config(load(override))
+
+
+def test_a_valid_configuration_passes(folder):
+    check_config(
+        load(
+            "system.loss.lambda_sparsity=[0,0.0,1.0,5]",
+            "trainer.limit_val_batches=1",
+            "trainer.max_time=00:01:00:00",
+        )
+    )
+    check_config(load_config("tiny.yaml", cli_args=["system.exporter_type=dummy-exporter"]))
+
+
+# -- extensions ------------------------------------------------------------------------------------
+
+
+def test_extensions_of_both_kinds_are_loaded_and_others_left_out(folder):
+    part = (
+        "from threestudio_gaussiandreamer.host import BaseObject, "
+        "register\n@register('{0}')\nclass Part(BaseObject): pass\n"
+    )
+    (folder / "custom" / "my-package").mkdir(parents=True)
+    (folder / "custom" / "my-package" / "__init__.py").write_text("from . import inner")
+    (folder / "custom" / "my-package" / "inner.py").write_text(part.format("package-prior"))
+    (folder / "custom" / "single_prior.py").write_text(part.format("single-prior"))
+    for name in ("old_disabled.py", ".hidden.py", "notes.txt"):
+        (folder / "custom" / name).write_text("raise RuntimeError")
+    for name in ("folder_disabled", "no_init", "__pycache__"):
+        (folder / "custom" / name).mkdir()
+    assert load_extensions() == ["my-package", "custom/single_prior"]
+    from threestudio_gaussiandreamer.host import find
+
+    assert (
+        find("package-prior").__module__ == "my-package.inner"
+        and find("single-prior").__module__ == "custom/single_prior"
+    )
+    # a second run in this process doesn't execute them again
+    assert load_extensions() == ["my-package", "custom/single_prior"] and find("single-prior")
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (
+            "import os\nimport nothing_of_this_name\n",
+            r"custom/broken.py:2: ModuleNotFoundError: No module named 'nothing_of_this_name'",
+        ),
+        ("x = 1\ny = (\n", r"custom/broken.py:2: '\(' was never closed"),
+        ("def f():\n    raise KeyError('a')\n\nf()\n", r"custom/broken.py:2: KeyError: 'a'"),
+        (
+            "from threestudio_gaussiandreamer.host import "
+            "register\n@register('solid-color-background')\nclass A: pass\n",
+            r"custom/broken.py:2: UserError: the name 'solid-color-background' is taken",
+        ),
+    ],
+)
+def test_a_broken_extension_is_an_error_with_file_line_and_cause(folder, source, message):
+    (folder / "custom").mkdir()
+    (folder / "custom" / "broken.py").write_text(source)
+    with pytest.raises(
+        UserError, match=f"the extension custom/broken.py can't be imported: .*{message}"
+    ):
+        load_extensions()
+
+
+def test_another_part_forgets_the_options_that_only_the_earlier_one_has():
+    """Trying another prior or guidance takes one override; options of the new part are kept, a
+    misspelt one is still an error.
+    """
+    register_parts()
+    demo = Path(__file__).parents[2] / "configs" / "demo.yaml"
+    cfg = load_config(
+        demo, cli_args=["system.geometry.prior_type=random-prior", "system.geometry.prior.size=0.5"]
+    )
+    assert dict(cfg.system.geometry.prior) == {"num_points": 8000, "size": 0.5}
+    check_config(cfg)
+    wrong = load_config(
+        demo, cli_args=["system.geometry.prior_type=random-prior", "system.geometry.prior.sise=0.5"]
+    )
+    with pytest.raises(UserError, match="system.geometry.prior.size"):
+        check_config(wrong)
+    same = load_config(demo, cli_args=["system.geometry.prior_type=mesh-prior"])
+    assert "path" in same.system.geometry.prior
