@@ -45,8 +45,8 @@ def compose(
     background: Tensor,
     options: RasterizeOptions,
 ) -> Rasterized:
-    """Background behind the sums of (colour, depth, 1) weighted with ``alpha_i T_i``, then the box
-    filter of the downsampling.
+    """Put the background behind the sums of (colour, depth, 1) weighted with ``alpha_i T_i``,
+    and apply the box filter of the downsampling.
 
     ``alpha = sum_i alpha_i T_i = 1 - T_end``, so ``image = colour + (1 - alpha) background``.
     """

@@ -111,7 +111,7 @@ def _to_camera(means, quats, scales, viewmats) -> tuple[Tensor, Tensor]:
 
 
 def _to_screen(t, axes, opacities, Ks, width, height, options) -> tuple[Tensor, ...]:
-    """The fields of `Splats` up to ``extents``; not finite where a Gaussian can't be drawn."""
+    """Return the fields of `Splats` up to ``extents``; not finite for what can't be drawn."""
     u0, u1 = _project_axes(t, axes, Ks, width, height)
     conics, variances, compensation = _invert_covariance(u0, u1, options.eps2d)
     depths = t[..., 2]
@@ -199,7 +199,7 @@ def _visible(means2d, conics, opacities, depths, extents, width, height, options
 
 
 def _finite(x) -> Tensor:
-    """Whether all of each item of the first dimension is finite; works for no items too."""
+    """Tell whether all of each item of the first dimension is finite; works for no items too."""
     finite = x.isfinite()
     while finite.dim() > 1:
         finite = finite.all(-1)

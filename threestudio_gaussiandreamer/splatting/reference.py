@@ -21,7 +21,7 @@ TENSORS_PER_PAIR = 24
 
 
 def unavailable() -> Optional[str]:
-    """None: plain torch runs everywhere."""
+    """Return None: plain torch runs everywhere."""
 
 
 def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
@@ -52,7 +52,7 @@ class Sorted(NamedTuple):
 def render_view(
     splats: Splats, colors: Tensor, view: int, width: int, height: int, options: RasterizeOptions
 ) -> tuple[Tensor, Tensor]:
-    """The sums of `blend` (H*W, C + 2) of one view and each Gaussian's contribution (N,)."""
+    """Return the sums of `blend` (H*W, C + 2) of one view and each contribution (N,)."""
     front_to_back = sort(splats, colors, view)
     absgrad = splats.means2d.absgrad[view] if hasattr(splats.means2d, "absgrad") else None
     chunks = pixel_centres(width, height, splats.depths).split(_pixels_per_chunk(front_to_back))
@@ -68,7 +68,7 @@ def render_view(
 
 
 def sort(splats: Splats, colors: Tensor, view: int) -> Sorted:
-    """Visible Gaussians by the depth of their mean, ties by index."""
+    """Sort the visible Gaussians by the depth of their mean, ties by index."""
     visible = splats.visible[view].nonzero()[:, 0]
     ids = visible[splats.depths[view, visible].argsort(stable=True)]
     means2d, conics, opacities, depths = (x[view, ids] for x in splats[:4])
@@ -84,8 +84,8 @@ def sort(splats: Splats, colors: Tensor, view: int) -> Sorted:
 def blend(
     pixels: Tensor, splats: Sorted, options: RasterizeOptions, absgrad: Optional[Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Front-to-back alpha compositing (Porter and Duff 1984; Kerbl et al. 2023, eq. 3) of M
-    Gaussians at P pixels.
+    """Composite M Gaussians at P pixels, front to back (Porter and Duff 1984; Kerbl et al. 2023,
+    eq. 3).
 
     ``alpha_i = min(alpha_max, opacity_i exp(-q_i / 2))``, zero below ``alpha_min``; ``T_i =
     prod_{j<i} (1 - alpha_j)``; the Gaussians with ``T_i >= stop`` count, so the one that brings T
@@ -105,7 +105,7 @@ def blend(
 
 
 def _accumulate(total: Tensor, ids: Tensor, values: Tensor) -> None:
-    """A hook's body: what a hook returns would replace the gradient."""
+    """Add and return None: what a hook returns would replace the gradient."""
     total.index_add_(0, ids, values)
 
 

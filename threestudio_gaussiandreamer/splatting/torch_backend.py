@@ -45,7 +45,7 @@ GAUSSIANS = ("means", "quats", "scales", "opacities", "colors")
 
 
 def unavailable() -> Optional[str]:
-    """None: plain torch runs everywhere."""
+    """Return None: plain torch runs everywhere."""
 
 
 def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
@@ -92,7 +92,7 @@ class Table(NamedTuple):
 
 
 class _Blend(torch.autograd.Function):
-    """Sums of features weighted with alpha_i T_i (B, H, W, C + 2), and contributions (B, N)."""
+    """Sum features weighted with alpha_i T_i (B, H, W, C + 2); also return contributions (B, N)."""
 
     @staticmethod
     def forward(
@@ -163,7 +163,7 @@ class _Blend(torch.autograd.Function):
 def _tabulate(
     means2d, conics, opacities, depths, extents, visible, colors, width, height, options
 ) -> Table:
-    """The visible splats of all views by depth, ties by index."""
+    """Tabulate the visible splats of all views by depth, ties by index."""
     views, gaussians = visible.shape
     ids = visible.flatten().nonzero()[:, 0]
     ids = ids[depths.flatten()[ids].argsort(stable=True)]
@@ -192,7 +192,7 @@ def _tabulate(
 def _forward(
     table: Table, width: int, height: int, options: RasterizeOptions
 ) -> tuple[Tensor, Tensor]:
-    """The sums (B, H, W, C + 2), and each splat's largest weight (S + 1,)."""
+    """Return the sums (B, H, W, C + 2) and each splat's largest weight (S + 1,)."""
     transmittances = _start(table, width, height)
     sums = table.columns.new_zeros(table.grid.tiles, (len(table.columns) - SHAPE_COLUMNS) * PIXELS)
     largest = table.columns.new_zeros(table.columns.shape[1])
@@ -206,8 +206,8 @@ def _forward(
 def _backward(
     table: Table, sums: Tensor, grad: Tensor, absolute: bool, options: RasterizeOptions
 ) -> tuple[Tensor, Tensor]:
-    """Gradients of the table's columns, and (2, S + 1) sums over pixels of the absolute gradient of
-    the mean.
+    """Return gradients of the table's columns, and (2, S + 1) sums over pixels of the absolute
+    gradient of the mean.
 
     With ``g_i = <grad, features_i>`` the loss is ``L = sum_i g_i alpha_i T_i``, hence
     ``alpha_i dL/dalpha_i = w_i g_i - w_i / T_{i+1} sum_{j>i} w_j g_j`` with ``w_i = alpha_i T_i``.
@@ -239,14 +239,14 @@ def _backward(
 
 
 def _start(table: Table, width: int, height: int) -> Tensor:
-    """Transmittance (tiles, PIXELS) before the first splat: 1 inside the image, 0 outside."""
+    """Return the initial transmittances (tiles, PIXELS): 1 inside the image, 0 outside."""
     ones = table.columns.new_ones(table.grid.views, height, width, 1)
     return to_tiles(ones, table.grid)[:, 0]
 
 
 def _march(table: Table, transmittances: Tensor, options: RasterizeOptions) -> Iterator[Block]:
-    """Blocks front to back; whoever takes one moves the transmittances behind it (`composite`)
-    before taking the next.
+    """Yield blocks front to back; the caller updates the transmittances with each (`composite`)
+    before it takes the next.
     """
     for lists in _lists(table, transmittances, options):
         active, depth = torch.arange(len(lists.tiles), device=lists.tiles.device), 0
@@ -264,8 +264,8 @@ def _march(table: Table, transmittances: Tensor, options: RasterizeOptions) -> I
 
 
 def _lists(table: Table, transmittances: Tensor, options: RasterizeOptions) -> Iterator[Lists]:
-    """The tile lists of one slice after the other, made for the tiles that are still unfinished
-    when its turn comes.
+    """Yield the tile lists of one slice after the other, made for the tiles that are still
+    unfinished when its turn comes.
     """
     for i, (first, last) in enumerate(table.slices):
         if i == len(table.lists) < KEPT_SLICES:

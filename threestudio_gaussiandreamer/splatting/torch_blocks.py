@@ -122,8 +122,8 @@ def absolute_gradients(block: Block, slopes: Tensor) -> Tensor:
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """Matrix products of a batch. A single one is done twice: alone, threads would share it and
-    their number would round it.
+    """Multiply the matrices of a batch. A single one is done twice: alone, threads would share it
+    and their number would change the rounding.
     """
     return a @ b if len(b) > 1 else (a @ b.repeat(2, 1, 1))[:1]
 
@@ -164,7 +164,7 @@ def to_tiles(image: Tensor, grid: Grid) -> Tensor:
 
 
 def from_tiles(tiles: Tensor, grid: Grid, width: int, height: int) -> Tensor:
-    """The inverse of `to_tiles`."""
+    """Invert `to_tiles`."""
     tiles = tiles.view(grid.views, grid.rows, grid.columns, -1, TILE, TILE).permute(
         0, 1, 4, 2, 5, 3
     )

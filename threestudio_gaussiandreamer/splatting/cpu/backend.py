@@ -27,7 +27,7 @@ BUILDS = ("v4", "v3", "base")  # best first
 
 
 def unavailable() -> Optional[str]:
-    """Why the library can't be used on this machine, or None."""
+    """Say why the library can't be used on this machine, or return None."""
     try:
         _library()
     except (OSError, UserError) as error:
@@ -126,8 +126,8 @@ class _State:
         self.library, self.handle = library, handle
 
     def as_tensor(self) -> Tensor:
-        """Something to save for backward: autograd lets go of it with the other saved tensors, long
-        before the context dies.
+        """Return a tensor that owns this, to be saved for backward: autograd frees it with the
+        other saved tensors, long before the context.
         """
         tensor = torch.empty(0)
         tensor.owner = self
@@ -147,7 +147,7 @@ def _check(needed: int) -> None:
 
 
 def usable_builds() -> list[str]:
-    """The builds that are installed and that this processor runs, best first."""
+    """List the builds that are installed and that this processor runs, best first."""
     if not _path("base").exists():
         return []
     best = _load("base").splat_best_isa().decode()
@@ -156,7 +156,7 @@ def usable_builds() -> list[str]:
 
 @functools.cache
 def _library() -> ctypes.CDLL:
-    """The build that GAUSSIANDREAMER_ISA names, else the best one."""
+    """Load the build that GAUSSIANDREAMER_ISA names, else the best one."""
     forced, usable = os.environ.get("GAUSSIANDREAMER_ISA"), usable_builds()
     if forced and forced not in BUILDS:
         raise unknown("instruction set in GAUSSIANDREAMER_ISA", forced, BUILDS)

@@ -100,7 +100,7 @@ class CudaKernel(NamedTuple):
         upstream: Upstream,
         wanted: Wanted,
     ) -> SceneGradients:
-        """Differentiate; waits for the numbers of intersections."""
+        """Differentiate; wait for the numbers of intersections."""
         alpha, *kept = saved
         found = empty_gradients(scene, self.context.options.absgrad, wanted.viewmats)
         if kept:

@@ -34,7 +34,7 @@ LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 
 @functools.cache
 def unavailable() -> Optional[str]:
-    """Why no GPU can be used, or None; found out once."""
+    """Say why no GPU can be used, or return None; find out once."""
     if torch.version.cuda is None:
         return f"this torch ({torch.__version__}) is built without CUDA; install a CUDA build of it"
     if not torch.cuda.is_available():
@@ -60,7 +60,7 @@ class Gpu:
         self.functions: dict[str, ctypes.c_void_p] = {}
 
     def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Argument) -> None:
-        """Queues a kernel on torch's current stream of the device; ``arguments`` are tensors,
+        """Queue a kernel on torch's current stream of the device; ``arguments`` are tensors,
         structures and C numbers.
         """
         values = [ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else x for x in arguments]
@@ -109,7 +109,7 @@ class Gpu:
 
 
 class Readback:
-    """Whole numbers on their way from the GPU, without making anybody wait for them."""
+    """Integers that are copied from the GPU asynchronously."""
 
     def __init__(self, ends: Tensor):
         """``ends`` are running sums; what is asked for are their steps."""
@@ -122,7 +122,7 @@ class Readback:
         return self.arrived.query()
 
     def values(self) -> list[int]:
-        """Waits if it must."""
+        """Return the numbers; wait until they have arrived."""
         self.arrived.synchronize()
         return [end - begin for begin, end in pairwise([0, *self.ends.tolist()])]
 
@@ -133,15 +133,15 @@ def _gpu(index: int) -> Gpu:
 
 
 def driver_version() -> tuple[int, int]:
-    """Major and minor of the newest CUDA release that the driver knows."""
+    """Return major and minor of the newest CUDA release that the driver knows."""
     release = ctypes.c_int()
     _check(_driver().cuDriverGetVersion(ctypes.byref(release)), "asking for the driver's version")
     return release.value // 1000, release.value % 1000 // 10
 
 
 def _unsuitable() -> Optional[str]:
-    """What is wrong with GPU or driver. Machine code runs on every driver of its major release or a
-    later one.
+    """Say what is wrong with GPU or driver. Machine code runs on every driver of its major
+    release or a later one.
     """
     try:
         nvrtc.target_for(torch.cuda.get_device_capability())
@@ -161,7 +161,7 @@ def _release(version: tuple[int, int]) -> str:
 
 
 def _primary_context(index: int) -> ctypes.c_void_p:
-    """The context that torch works in."""
+    """Return the context that torch works in."""
     torch.cuda.init()
     device, context = ctypes.c_int(), ctypes.c_void_p()
     _check(_driver().cuInit(0), "starting the driver")

@@ -44,7 +44,7 @@ class Compiled(NamedTuple):
 
 
 def unavailable() -> Optional[str]:
-    """Why nothing can be compiled, or None."""
+    """Say why nothing can be compiled, or return None."""
     try:
         _library()
     except OSError as error:
@@ -52,14 +52,14 @@ def unavailable() -> Optional[str]:
 
 
 def version() -> tuple[int, int]:
-    """Major and minor of the CUDA release that the compiler belongs to."""
+    """Return major and minor of the CUDA release that the compiler belongs to."""
     major, minor = ctypes.c_int(), ctypes.c_int()
     _check(_library().nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)))
     return major.value, minor.value
 
 
 def architectures() -> list[int]:
-    """Compute capabilities that the compiler knows, times ten: 75, 80, ..."""
+    """List compute capabilities that the compiler knows, times ten: 75, 80, ..."""
     count = ctypes.c_int()
     _check(_library().nvrtcGetNumSupportedArchs(ctypes.byref(count)))
     known = (ctypes.c_int * count.value)()
@@ -105,7 +105,7 @@ def machine_code(unit: str, target: str) -> bytes:
 
 
 def compile_unit(unit: str, target: str) -> Compiled:
-    """Compiles ``<unit>.cu``.
+    """Compile ``<unit>.cu``.
 
     Raises:
         UserError: the compiler rejects it.
@@ -148,7 +148,7 @@ def source(unit: str) -> str:
 
 @functools.cache
 def headers() -> dict[str, str]:
-    """Name to text of whatever a unit may include."""
+    """Return the text of each file that a unit may include, by name."""
     return {
         path.name: path.read_text()
         for path in (*sorted(KERNELS.glob("*.h")), *sorted(SHARED.glob("*.h")))
@@ -163,7 +163,7 @@ def options_of(unit: str, target: str) -> tuple[str, ...]:
 
 
 def cache_folder() -> Path:
-    """Where compiled kernels are kept.
+    """Return where compiled kernels are kept.
 
     Raises:
         RuntimeError: neither the variables nor the system say where the user's home is, as in some
@@ -180,7 +180,7 @@ def cache_folder() -> Path:
 
 
 def _key(unit: str, target: str) -> str:
-    """Changes with whatever changes the machine code."""
+    """Return a key that changes with whatever changes the machine code."""
     parts = [
         source(unit),
         *headers(),
@@ -192,7 +192,7 @@ def _key(unit: str, target: str) -> str:
 
 
 def _read(name: str) -> Optional[bytes]:
-    """The content if it is whole: the file ends with a digest of what comes before."""
+    """Return the content if it is whole: the file ends with a digest of what comes before."""
     try:
         data = (cache_folder() / name).read_bytes()
     except (OSError, RuntimeError):
@@ -202,7 +202,7 @@ def _read(name: str) -> Optional[bytes]:
 
 
 def _write(name: str, content: bytes) -> None:
-    """A cache that can't be written costs the next start some seconds, nothing else."""
+    """Write, and ignore failure: without the cache the next start takes some seconds more."""
     try:
         path = cache_folder() / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -217,7 +217,7 @@ def _write(name: str, content: bytes) -> None:
 
 @functools.cache
 def _library() -> ctypes.CDLL:
-    """The first candidate that loads."""
+    """Return the first candidate that loads."""
     failures = []
     for candidate in _candidates():
         try:

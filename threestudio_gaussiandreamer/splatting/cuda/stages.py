@@ -29,14 +29,14 @@ class AsyncReadback(Protocol):
     def ready(self) -> bool: ...
 
     def values(self) -> list[int]:
-        """Waits if it must."""
+        """Return the numbers; wait until they have arrived."""
 
 
 class Device(Protocol):
     """What runs kernels: `driver.Gpu`, or a stand-in."""
 
     def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Argument) -> None:
-        """Queues a kernel; ``arguments`` are tensors, structures and C numbers."""
+        """Queue a kernel; ``arguments`` are tensors, structures and C numbers."""
 
     def read_async(self, numbers: Tensor) -> AsyncReadback: ...
 
@@ -59,7 +59,7 @@ class Splats(NamedTuple):
     ends: Tensor  # (B, N) int64, their running sum through all views
 
     def of_views(self, first: int, last: int) -> "Splats":
-        """The same of some views as if there were no others."""
+        """Select some views, as if there were no others."""
         part = Splats(*(x[first:last] for x in self))
         return part._replace(ends=part.ends - self.ends[first - 1, -1]) if first else part
 
@@ -118,7 +118,7 @@ def tiles_per_view(scene: Scene) -> int:
 
 
 def project(scene: Scene, means2d: Tensor, context: LaunchContext) -> tuple[Splats, Tensor, Tensor]:
-    """Stages 1 to 3; also radii (B, N) and zeros (B, N) for the contributions. Fills
+    """Run stages 1 to 3; also return radii (B, N) and zeros (B, N) for the contributions. Fills
     ``means2d``.
     """
     launch, shape, new = context.device.launch, scene.shape, scene.means.new_empty
@@ -147,7 +147,7 @@ def project(scene: Scene, means2d: Tensor, context: LaunchContext) -> tuple[Spla
 def list_intersections(
     scene: Scene, splats: Splats, capacity: int, context: LaunchContext
 ) -> Lists:
-    """Stages 4 and 5. Intersections that don't fit are left out; `blend` notices.
+    """Run stages 4 and 5. Intersections that don't fit are left out; `blend` notices.
 
     Raises:
         torch.cuda.OutOfMemoryError: there is no memory for so many.
@@ -176,7 +176,7 @@ def list_intersections(
 
 
 def no_lists(scene: Scene, splats: Splats) -> Lists:
-    """With these `blend` looks at every Gaussian in every tile."""
+    """Return empty lists, with which `blend` tests every Gaussian in every tile."""
     empty = splats.ends.new_empty(0)
     return Lists(
         empty.int(), empty, splats.ends.new_zeros(len(splats.ends) * tiles_per_view(scene) + 1)
@@ -191,8 +191,8 @@ def blend(
     contribution: Tensor,
     context: LaunchContext,
 ) -> None:
-    """Stage 6, with whole lists or without: the result is the same to the bit. Fills the pictures,
-    raises the contributions.
+    """Run stage 6, with whole lists or without: the result is the same to the bit. Fill the images,
+    raise the contributions.
     """
     arguments = (
         _settings(context.options),
@@ -217,8 +217,8 @@ def blend_backward(
     upstream: BlendUpstream,
     context: LaunchContext,
 ) -> Tensor:
-    """The adjoints of stages 6 to 4: a row of sums for each splat (B, N, ROW); those of invisible
-    ones aren't set.
+    """Run the adjoints of stages 6 to 4: a row of sums for each splat (B, N, ROW); those of
+    invisible ones aren't set.
 
     The lists must hold all of the ``total`` intersections.
 
@@ -250,7 +250,7 @@ def blend_backward(
 def project_backward(
     scene: Scene, splats: Splats, sums: Tensor, gradients: Gradients, context: LaunchContext
 ) -> None:
-    """The adjoint of stage 1, which fills ``gradients``."""
+    """Run the adjoint of stage 1, which fills ``gradients``."""
     arguments = (
         _settings(context.options),
         splats.depth_keys,
@@ -276,13 +276,13 @@ def empty_gradients(scene: Scene, absgrad: bool, viewmats: bool) -> Gradients:
 
 
 def viewmats_gradient(parts: Tensor) -> Tensor:
-    """The blocks' parts added up; the last row of a viewmat isn't read."""
+    """Add up the blocks' parts; the last row of a viewmat isn't read."""
     rows = parts.sum(0, dtype=torch.float64).float().view(-1, 3, 4)
     return torch.nn.functional.pad(rows, (0, 0, 0, 1))
 
 
 def _per_gaussian(shape: tuple[int, int]) -> tuple[int, int]:
-    """The grid for one thread per view and Gaussian."""
+    """Return the grid for one thread per view and Gaussian."""
     return -(-shape[1] // THREADS), shape[0]
 
 
