@@ -80,8 +80,8 @@ def longest_side(points: Float[np.ndarray, "P 3"]) -> float:
 def growing_box(
     points: Float[np.ndarray, "P 3"], reach: float
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """The bounding box (low, high), each side at least ``2 * reach``: a flat cloud grows a slab,
-    not copies of itself.
+    """Return the bounding box (low, high), each side at least ``2 * reach``: a flat cloud grows a
+    slab, not copies of itself.
     """
     low, high = points.min(axis=0), points.max(axis=0)
     padding = np.maximum(reach - (high - low) / 2, 0.0)
@@ -95,7 +95,7 @@ def perturbed_colors(
     clamp: bool,
     generator: np.random.Generator,
 ) -> Float[np.ndarray, "R 3"]:
-    """``colors`` plus uniform noise per channel."""
+    """Return ``colors`` plus uniform noise per channel."""
     noisy = colors + generator.uniform(*color_range, size=colors.shape)
     return (noisy.clip(0.0, 1.0) if clamp else noisy).astype(np.float32)
 
@@ -103,7 +103,7 @@ def perturbed_colors(
 def nearest_distance_scales(
     points: Float[np.ndarray, "P 3"], rule: str = "nearest"
 ) -> Float[np.ndarray, " P"]:
-    """The first size (standard deviation) of the Gaussian at each point: the distance to its
+    """Return the first size (standard deviation) of the Gaussian at each point: the distance to its
     neighbours.
 
     Positive and finite whatever the cloud: a point that has an exact copy gets the median (the
@@ -131,7 +131,7 @@ def nearest_distance_scales(
 
 
 def isolated(points: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
-    """Marks the points whose nearest other point is beyond ``ISOLATED_FACTOR`` times the 99th
+    """Mark the points whose nearest other point is beyond ``ISOLATED_FACTOR`` times the 99th
     percentile of such distances.
     """
     points = _checked(points)
@@ -167,7 +167,7 @@ def _check_options(
 
 
 def _checked(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-    """The points in float64, so that squares of tiny distances don't vanish."""
+    """Return the points in float64, so that squares of tiny distances don't vanish."""
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise UserError(
@@ -185,8 +185,8 @@ def _checked(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
 def _within_reach(
     points: Float[np.ndarray, "P 3"], candidates: Float[np.ndarray, "Q 3"], reach: float
 ) -> tuple[Int[np.ndarray, " R"], Int[np.ndarray, " R"]]:
-    """Indices of the candidates nearer than ``reach`` to a point, and of the point nearest to each
-    of them.
+    """Return indices of the candidates nearer than ``reach`` to a point, and of the point nearest
+    to each of them.
     """
     from scipy.spatial import cKDTree
 
@@ -250,7 +250,7 @@ def _isolation_cap(distances: Float[np.ndarray, " D"]) -> float:
 
 
 def _as_float32(distances: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
-    """The distances as float32, still positive and finite."""
+    """Return the distances as float32, still positive and finite."""
     limits = np.finfo(np.float32)
     return distances.clip(limits.tiny, limits.max).astype(np.float32)
 

@@ -62,7 +62,7 @@ def load_mesh(
 
 
 def find_mesh(path: str | Path) -> Path:
-    """The path itself, or the bundled mesh of that bare name where there is no such file."""
+    """Return the path itself, or the bundled mesh of that bare name where there is no such file."""
     bundled = ASSETS / Path(path).name
     return (
         bundled
@@ -72,7 +72,7 @@ def find_mesh(path: str | Path) -> Path:
 
 
 def bundled_meshes() -> list[str]:
-    """The bare names of the meshes that come along."""
+    """Return the bare names of the meshes in the package."""
     return sorted(file.name for file in ASSETS.glob("*.glb"))
 
 
@@ -121,7 +121,9 @@ def _surfaces(path: Path) -> list[Mesh]:
 
 
 def _drop_bad_vertices(mesh: Mesh, path: Path) -> Mesh:
-    """Without the faces that touch a non-finite vertex, and without vertices that no face uses."""
+    """Return the mesh without the faces that touch a non-finite vertex, and without vertices that
+    no face uses.
+    """
     finite = np.isfinite(mesh.vertices).all(axis=1)
     if (bad := int((~finite).sum())) > MAX_NON_FINITE * len(finite):
         raise UserError(
@@ -142,8 +144,8 @@ def _drop_bad_vertices(mesh: Mesh, path: Path) -> Mesh:
 
 
 def _normalise(mesh: Mesh, rotation: np.ndarray, scale: float, path: Path) -> np.ndarray:
-    """The vertices rotated, with the box's centre at the origin and its longest half side equal to
-    ``scale``.
+    """Return the vertices rotated, with the box's centre at the origin and its longest half side
+    equal to ``scale``.
     """
     if not len(mesh.vertices):
         raise UserError(
@@ -158,8 +160,8 @@ def _normalise(mesh: Mesh, rotation: np.ndarray, scale: float, path: Path) -> np
 
 
 def pose_rotation(extension: str, up: str, front: Optional[str]) -> np.ndarray:
-    """The rotation (3, 3) from the file's axes to front = +x, up = +z: its rows are front, up x
-    front and up.
+    """Return the rotation (3, 3) from the file's axes to front = +x, up = +z: its rows are front,
+    up x front and up.
     """
     up = ("+z" if extension in Z_UP_FORMATS else "+y") if up == "auto" else up
     if up not in AXES:

@@ -66,8 +66,7 @@ class MeshCaster:
         supersample: int = 2,
         progress: str = "",
     ) -> Float[np.ndarray, "N H W 4"]:
-        """``render`` of several (c2w, fovy) on all cores (embree and numpy's gathers release the
-        GIL).
+        """Render several (c2w, fovy) on all cores (embree and numpy's gathers release the GIL).
 
         ``progress`` names a progress bar, for terminals only; without it there is none.
         """
@@ -100,7 +99,7 @@ class MeshCaster:
     def _bands(
         self, image: Float[np.ndarray, "H W 4"], c2w: np.ndarray, fovy: float, supersample: int
     ) -> list[Callable[[], None]]:
-        """What has to be called to draw one picture, each a group of its rows, in any order."""
+        """Return calls that draw one picture, each a group of its rows, in any order."""
         height, width = image.shape[:2]
         c2w = np.asarray(c2w, dtype=np.float64)
         focal = height / (2 * math.tan(fovy / 2))
@@ -121,7 +120,7 @@ class MeshCaster:
     def _bounds(
         self, c2w: np.ndarray, focal: float, height: int, width: int
     ) -> tuple[int, int, int, int]:
-        """The pixel rectangle (top, bottom, left, right) outside which no ray can hit: the
+        """Return the pixel rectangle (top, bottom, left, right) outside which no ray can hit: the
         vertices' on the screen.
         """
         x, y, z = ((self._vertices - c2w[:3, 3]) @ c2w[:3, :3]).T
@@ -162,13 +161,13 @@ def _require_size(height: int, width: int, supersample: int) -> None:
 
 
 def _samples(start: int, end: int, supersample: int) -> Float[np.ndarray, " S"]:
-    """The places of a regular grid in the pixels start ... end - 1."""
+    """Return the places of a regular grid in the pixels start ... end - 1."""
     return start + (np.arange((end - start) * supersample) + 0.5) / supersample
 
 
 def _row_groups(top: int, bottom: int, rays_per_row: int) -> list[tuple[int, int]]:
-    """Groups of pixel rows with at most RAYS_PER_CAST rays, or one row: memory doesn't grow with
-    size and supersample.
+    """Return groups of pixel rows with at most RAYS_PER_CAST rays, or one row: memory doesn't grow
+    with size and supersample.
     """
     if not rays_per_row:
         return []

@@ -55,8 +55,8 @@ class ZBuffer:
         rows: Float[np.ndarray, " H"],
         columns: Float[np.ndarray, " W"],
     ) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
-        """The nearest face at each sample, -1 = none, and the weights of its three corners (0 where
-        there is none).
+        """Return the nearest face at each sample, -1 = none, and the weights of its three corners
+        (0 where there is none).
 
         Args:
             c2w: OpenGL camera to world.
@@ -90,7 +90,9 @@ class _Rays(NamedTuple):
 def _triangles(
     corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarray, columns: np.ndarray
 ) -> Triangles:
-    """The triangles that cover a sample's place with their box and aren't seen from the edge."""
+    """Return the triangles that cover a sample's place with their box and aren't seen from the
+    edge.
+    """
     box = _boxes(corners, focal, rows, columns)
     index = np.flatnonzero((box[:, 0] < box[:, 1]) & (box[:, 2] < box[:, 3]))
     a, b, c = np.moveaxis(corners[index], 1, 0)
@@ -104,8 +106,8 @@ def _triangles(
 def _boxes(
     corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarray, columns: np.ndarray
 ) -> Int[np.ndarray, "F 4"]:
-    """The samples around each triangle: (first row, end, first column, end), empty where it is
-    behind the camera.
+    """Return the samples around each triangle: (first row, end, first column, end), empty where it
+    is behind the camera.
     """
     points = _in_front(corners)
     with np.errstate(invalid="ignore"):  # NaN is a point that isn't there
@@ -127,8 +129,8 @@ def _boxes(
 
 
 def _in_front(corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "F P 3"]:
-    """The corners of what lies beyond the near plane: of those before it the NaN, and where edges
-    cross it the crossings.
+    """Return the corners of what lies beyond the near plane: of those before it the NaN, and where
+    edges cross it the crossings.
     """
     behind = -corners[..., 2] < NEAR
     if not behind.any():
@@ -144,8 +146,8 @@ def _in_front(corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "F P 3"]
 def _pairs(
     box: Int[np.ndarray, "T 4"], width: int
 ) -> Iterator[tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]]:
-    """Every (triangle, sample) with the sample in the triangle's box, a limited number at a time,
-    in the triangles' order.
+    """Return every (triangle, sample) with the sample in the triangle's box, a limited number at a
+    time, in the triangles' order.
     """
     across = box[:, 3] - box[:, 2]
     ends = np.cumsum((box[:, 1] - box[:, 0]) * across)

@@ -43,7 +43,7 @@ POINT_BYTES = 128
 
 
 def is_color(value: Any) -> bool:
-    """Whether ``value`` is null, "grey", "random" or three numbers in [0, 1]."""
+    """Return whether ``value`` is null, "grey", "random" or three numbers in [0, 1]."""
     if value is None or value in ("grey", "random"):
         return True
     return is_numbers(value, 3) and all(0 <= number <= 1 for number in value)
@@ -94,7 +94,7 @@ class Prior(BaseObject):
         """
 
     def __call__(self, prompt: str) -> PointCloud:
-        """The points for ``prompt``: float32, finite, colours in [0, 1], z up, +x the front.
+        """Return the points for ``prompt``: float32, finite, colours in [0, 1], z up, +x the front.
 
         Raises:
             UserError: the source is missing, unreadable, empty, or more than 5 % of it is not
@@ -113,8 +113,8 @@ class Prior(BaseObject):
         return int(self.cfg.ground_points) if self.cfg.ground else 0
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
-        """The object's points, which need not be checked yet; ``generator`` is the only source of
-        randomness.
+        """Return the object's points, which need not be checked yet; ``generator`` is the only
+        source of randomness.
         """
         raise NotImplementedError(f"{type(self).__name__}.generate")
 
@@ -126,14 +126,15 @@ class Prior(BaseObject):
 def chosen_colors(
     color: Any, count: int, generator: np.random.Generator
 ) -> Float[np.ndarray, "P 3"]:
-    """``count`` colours: uniformly random in [0, 1], grey, or all the same."""
+    """Return ``count`` colours: uniformly random in [0, 1], grey, or all the same."""
     if color == "random":
         return generator.random((count, 3), np.float32)
     return np.tile(np.float32([GREY] * 3 if color == "grey" else list(color)), (count, 1))
 
 
 def validated(cloud: PointCloud, name: str) -> PointCloud:
-    """``cloud`` as float32 without the rows that are not finite, its colours clipped to [0, 1].
+    """Return ``cloud`` as float32 without the rows that are not finite, its colours clipped to [0,
+    1].
 
     Raises:
         UserError: no points, arrays that don't fit each other, or more than 5 % of rows that are
@@ -169,7 +170,7 @@ def report_non_finite(bad: int, count: int, name: str) -> None:
 
 
 def without_rows(cloud: PointCloud, keep: Bool[np.ndarray, " P"]) -> PointCloud:
-    """The kept points, and the faces all of whose corners are kept."""
+    """Return the kept points, and the faces all of whose corners are kept."""
     if keep.all():
         return cloud
     faces = cloud.faces

@@ -20,8 +20,8 @@ from .turntable import save_turntable
 
 
 def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud:
-    """``prior(prompt)``, from ``save/prior/points.npz`` when the same prior, options, prompt and
-    seed left it there.
+    """Return ``prior(prompt)``, from ``save/prior/points.npz`` when the same prior, options, prompt
+    and seed left it there.
 
     ``points.ply`` and ``turntable.gif`` beside it are for people and viewers; without a
     ``save_dir`` nothing is cached."""
@@ -46,7 +46,7 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
 
 
 def cache_key(prior: Any, prompt: str) -> str:
-    """A digest of everything that the prior's result depends on."""
+    """Return a digest of everything that the prior's result depends on."""
     options = (
         OmegaConf.to_container(prior.cfg) if OmegaConf.is_config(prior.cfg) else vars(prior.cfg)
     )
@@ -55,8 +55,8 @@ def cache_key(prior: Any, prompt: str) -> str:
 
 
 def read_cache(path: Path, key: str) -> Optional[PointCloud]:
-    """The cached cloud when it was made by the same prior; None when there is none, another one, or
-    a damaged file.
+    """Return the cached cloud when it was made by the same prior; None when there is none, another
+    one, or a damaged file.
     """
     if not path.is_file():
         return None

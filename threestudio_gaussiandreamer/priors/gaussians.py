@@ -49,7 +49,7 @@ class GaussiansPrior(Prior):
         return self.cloud(self._read())
 
     def gaussians(self, prompt: str) -> Gaussians:
-        """Every attribute of the trained Gaussians, whatever the prompt.
+        """Return every attribute of the trained Gaussians, whatever the prompt.
 
         Raises:
             UserError: missing, damaged or empty, as :meth:`__call__`; or ``ground``, which has no
@@ -64,7 +64,7 @@ class GaussiansPrior(Prior):
 
     @staticmethod
     def cloud(arrays: Gaussians) -> PointCloud:
-        """The coloured centres of Gaussians."""
+        """Return the coloured centres of Gaussians."""
         return PointCloud(points=arrays.means, colors=sh0_colors(arrays.sh[:, 0]))
 
     def _read(self) -> Gaussians:

@@ -25,7 +25,7 @@ RHO = 7.0
 
 
 def karras_sigmas(steps: int, sigma_min: float, sigma_max: float) -> list[float]:
-    """``steps`` noise levels from ``sigma_max`` to ``sigma_min``, then 0; evenly spaced in
+    """Return ``steps`` noise levels from ``sigma_max`` to ``sigma_min``, then 0; evenly spaced in
     ``sigma^(1/7)`` (eq. 5).
     """
     high, low = sigma_max ** (1 / RHO), sigma_min ** (1 / RHO)
@@ -46,8 +46,8 @@ def linear_alphas_cumprod(steps: int = 1024) -> Float[np.ndarray, "T"]:
 
 
 def timestep_of(sigma: float, alphas_cumprod: Float[np.ndarray, "T"]) -> int:
-    """The timestep whose noise is nearest below ``sigma``: abar is interpolated linearly and the
-    result cut to an integer.
+    """Return the timestep whose noise is nearest below ``sigma``: abar is interpolated linearly and
+    the result cut to an integer.
     """
     level = 1 / (sigma**2 + 1)
     index = np.interp(
@@ -63,7 +63,7 @@ def guided_denoiser(
     scale: float = 1.0,
     prediction: Literal["sample", "epsilon"] = "epsilon",
 ) -> Denoiser:
-    """A denoiser from a network of discrete timesteps.
+    """Return a denoiser from a network of discrete timesteps.
 
     Args:
         network: with ``scale`` other than 1 it gets each item twice, first for the prompt, then for
@@ -101,7 +101,7 @@ def sample_heun(
     generator: torch.Generator,
     progress: str = "",
 ) -> Tensor:
-    """Karras et al.'s Algorithm 2: second-order steps from pure noise to a sample.
+    """Run Karras et al.'s Algorithm 2: second-order steps from pure noise to a sample.
 
     Args:
         noise: standard normal, of the sample's shape and on its device.

@@ -106,7 +106,7 @@ def face_normals(mesh: Mesh) -> Float[np.ndarray, "F 3"]:
 
 
 def smoothed_colors(cloud: PointCloud, neighbours: int) -> Float[np.ndarray, "P 3"]:
-    """Each colour averaged over the ``neighbours`` nearest points, itself among them."""
+    """Return each colour averaged over the ``neighbours`` nearest points, itself among them."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(cloud.points)

@@ -170,7 +170,7 @@ class MotionPrior(Prior):
         return meshes[best]
 
     def _body_of_motion(self, prompt: str) -> Mesh:
-        """The body of the chosen frame, in the world's pose."""
+        """Return the body of the chosen frame, in the world's pose."""
         motions, model = read_motions(self.cfg.motion), load_body_model(self.cfg.body_model)
         if motions.texts:
             info(f"{self.cfg.motion}: {', '.join(sorted(set(motions.texts)))}")
@@ -208,7 +208,7 @@ class MotionPrior(Prior):
         return text or prompt
 
     def _best(self, meshes: list[Mesh], text: str, names: list[str]) -> int:
-        """The index of the mesh whose pictures fit ``text`` best, by CLIP."""
+        """Return the index of the mesh whose pictures fit ``text`` best, by CLIP."""
         device = chosen_device(self.cfg.device, self.device)
         pictures = np.concatenate([body_pictures(mesh) for mesh in meshes])
         scores = (
@@ -226,7 +226,8 @@ class MotionPrior(Prior):
 def offered_frames(
     motions: Motions, sample: Optional[int], frame: Any, num_frames: int
 ) -> list[Choice]:
-    """The frames to choose from: the given one, or ``num_frames`` of each motion that is meant.
+    """Return the frames to choose from: the given one, or ``num_frames`` of each motion that is
+    meant.
 
     Raises:
         UserError: there is no such motion or frame.
@@ -273,8 +274,8 @@ def world_meshes(
     scale: float,
     face_front: bool,
 ) -> list[Mesh]:
-    """The fitted bodies with z up, centred, their longest half side ``scale``, looking along +x
-    with ``face_front``.
+    """Return the fitted bodies with z up, centred, their longest half side ``scale``, looking along
+    +x with ``face_front``.
     """
     meshes = []
     for vertices, joints in zip(posed_vertices(model, fit), targets, strict=True):
@@ -293,7 +294,7 @@ def z_up(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
 
 
 def facing(joints: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "3 3"]:
-    """The turn about the world's z that makes a body with these joints (y up) look along +x.
+    """Return the turn about the world's z that makes a body with these joints (y up) look along +x.
 
     It looks at right angles to the line through its hips and to that through its shoulders; one
     that lies with these upright has no such direction and isn't turned."""
@@ -308,7 +309,7 @@ def facing(joints: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def body_pictures(mesh: Mesh) -> Float[np.ndarray, "V H W 3"]:
-    """A grey, shaded body before white, from the front and from both sides of it."""
+    """Return a grey, shaded body before white, from the front and from both sides of it."""
     vertices = mesh.vertices / np.abs(mesh.vertices).max()
     caster = MeshCaster(shaded(Mesh(vertices, mesh.faces)))
     azimuths = torch.tensor(VIEW_AZIMUTHS)
@@ -322,7 +323,7 @@ def body_pictures(mesh: Mesh) -> Float[np.ndarray, "V H W 3"]:
 
 
 def shaded(mesh: Mesh) -> Mesh:
-    """``mesh`` with each vertex grey by how much it looks at the light (Lambert)."""
+    """Return ``mesh`` with each vertex grey by how much it looks at the light (Lambert)."""
     normals = np.zeros_like(mesh.vertices)
     for corner in range(3):
         np.add.at(normals, mesh.faces[:, corner], face_normals(mesh))

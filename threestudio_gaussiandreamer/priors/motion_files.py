@@ -39,7 +39,7 @@ class Motions(NamedTuple):
 
 
 def read_motions(path: str) -> Motions:
-    """The motions of an NPZ or NPY file.
+    """Return the motions of an NPZ or NPY file.
 
     Raises:
         UserError: missing, pickled, of another layout, without frames, or not finite; the message

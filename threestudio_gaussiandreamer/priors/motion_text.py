@@ -59,7 +59,8 @@ PROGRESSIVES = {progressive(verb): verb for verb in VERBS}
 
 
 def reduced_prompt(prompt: str) -> Optional[str]:
-    """The motion of ``prompt`` as a sentence about someone; None when no verb of motion is found.
+    """Return the motion of ``prompt`` as a sentence about someone; None when no verb of motion is
+    found.
 
     A verb of the kind "kicks" comes before one of the kind "kicking", which may belong to the
     subject ("a flying fox jumps"), and both before one of the kind "kick", which may be a noun, and
@@ -72,7 +73,7 @@ def reduced_prompt(prompt: str) -> Optional[str]:
 
 
 def _verb(word: str, forms: dict[str, str]) -> str:
-    """The verb as it follows the subject."""
+    """Return the verb as it follows the subject."""
     if forms is PROGRESSIVES:
         return f"is {word}"
     return third_person(forms[word])

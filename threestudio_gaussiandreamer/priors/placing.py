@@ -18,7 +18,7 @@ FRONT = one_of(HORIZONTAL)
 
 
 def placed(cloud: PointCloud, *, front: str, scale: float, normalize: bool) -> PointCloud:
-    """``cloud``, whose z is up, turned so that ``front`` is +x, and scaled.
+    """Return ``cloud``, whose z is up, turned so that ``front`` is +x, and scaled.
 
     Args:
         scale: world units for one unit of the cloud; with ``normalize`` half the longest side of
@@ -37,7 +37,7 @@ def placed(cloud: PointCloud, *, front: str, scale: float, normalize: bool) -> P
 
 
 def chosen_device(name: str, default: torch.device) -> torch.device:
-    """The device called ``name``, or the run's for "auto".
+    """Return the device called ``name``, or the run's for "auto".
 
     Raises:
         UserError: there is no such device.
@@ -55,5 +55,5 @@ def chosen_device(name: str, default: torch.device) -> torch.device:
 
 
 def torch_generator(generator: np.random.Generator) -> torch.Generator:
-    """A CPU generator of torch whose seed is drawn from ``generator``."""
+    """Return a CPU generator of torch whose seed is drawn from ``generator``."""
     return torch.Generator().manual_seed(int(generator.integers(2**62)))

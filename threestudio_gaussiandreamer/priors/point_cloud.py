@@ -79,14 +79,14 @@ def to_world(path: Path, up: str, front: Optional[str]) -> Float[np.ndarray, "3 
 
 
 def axes_kind(path: Path) -> str:
-    """The mesh format whose axes the file's are by default: those of point clouds have z up, as
-    PLY.
+    """Return the mesh format whose axes the file's are by default: those of point clouds have z up,
+    as PLY.
     """
     return "ply" if path.suffix.lower() in READERS else path.suffix.lower().lstrip(".")
 
 
 def load_points(path: Path) -> PointCloud:
-    """The points of ``path`` as they are stored, by its extension.
+    """Return the points of ``path`` as they are stored, by its extension.
 
     Raises:
         UserError: an unknown extension, an unreadable file, or one without points.
@@ -100,15 +100,15 @@ def load_points(path: Path) -> PointCloud:
 
 
 def rotated(cloud: PointCloud, rotation: Float[np.ndarray, "3 3"]) -> PointCloud:
-    """Points and normals turned by ``rotation``."""
+    """Return points and normals turned by ``rotation``."""
     normals = None if cloud.normals is None else cloud.normals @ rotation.T
     with np.errstate(invalid="ignore"):  # infinity times zero: such rows are dropped later
         return cloud._replace(points=cloud.points @ rotation.T, normals=normals)
 
 
 def normalized(cloud: PointCloud, scale: float) -> PointCloud:
-    """The centre of the box in the origin, half its longest side ``scale``; rows that are not
-    finite don't count.
+    """Move the box's centre to the origin, make half its longest side ``scale``; rows that are
+    not finite don't count.
     """
     points = np.asarray(cloud.points, np.float64)
     finite = points[np.isfinite(points).all(axis=1)]
@@ -127,8 +127,8 @@ def read_ply(path: Path) -> PointCloud:
 
 
 def read_npz(path: Path) -> PointCloud:
-    """Arrays ``points`` (P, 3), ``colors`` (P, 3) and ``normals`` (P, 3), of which only the first
-    must be there.
+    """Read arrays ``points`` (P, 3), ``colors`` (P, 3) and ``normals`` (P, 3), of which only the
+    first must be there.
     """
     arrays = read_arrays(path, "point cloud", ["points"], ["colors", "normals"])
     return _cloud(path, arrays["points"], arrays.get("colors"), arrays.get("normals"))
@@ -139,8 +139,8 @@ def read_npy(path: Path) -> PointCloud:
 
 
 def read_text(path: Path) -> PointCloud:
-    """Numbers separated by blanks, commas or semicolons; a first line that isn't numbers, and lines
-    with #, are skipped.
+    """Read numbers separated by blanks, commas or semicolons; a first line that isn't numbers,
+    and lines with #, are skipped.
     """
     lines = (
         path.read_text("utf-8", errors="replace").replace(",", " ").replace(";", " ").splitlines()

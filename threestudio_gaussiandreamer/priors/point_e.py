@@ -186,7 +186,7 @@ class PointEPrior(Prior):
     def _sampled(
         self, denoise: Any, count: int, stage: int, rng: torch.Generator, device: torch.device
     ) -> Float[Tensor, "1 6 N"]:
-        """``count`` points in Point-E's units: positions, and colours up to 255."""
+        """Return ``count`` points in Point-E's units: positions, and colours up to 255."""
         noise = torch.randn(1, CHANNELS, count, generator=rng).to(device)
         sigmas = karras_sigmas(
             self.cfg.num_steps, self.cfg.sigma_min, float(self.cfg.sigma_max[stage])
@@ -199,13 +199,13 @@ class PointEPrior(Prior):
 
 
 def mean_of(network: Network) -> Network:
-    """``network`` without the half of its output that is the variance."""
+    """Return ``network`` without the half of its output that is the variance."""
     return lambda z, timesteps: network(z, timesteps)[:, :CHANNELS]
 
 
 def load_network(kind: Kind, path: str) -> Any:
-    """The network of this kind with the weights of ``path``, its sizes read off them, in evaluation
-    mode.
+    """Return the network of this kind with the weights of ``path``, its sizes read off them, in
+    evaluation mode.
 
     Raises:
         UserError: the file can't be read, or holds another model.

@@ -138,7 +138,7 @@ class Upsampler(PointTransformer):
         timesteps: Real[Tensor, " B"],
         coarse: Float[Tensor, "B 6 M"],
     ) -> Float[Tensor, "B 12 N"]:
-        """``coarse`` in the points' own units: positions, and colours up to 255."""
+        """Return ``coarse`` in the points' own units: positions, and colours up to 255."""
         no_image = self.clip_embed(
             points.new_zeros(len(points), 1, self.clip_embed[0].normalized_shape[0])
         )
@@ -161,8 +161,8 @@ def timestep_embedding(timesteps: Real[Tensor, " B"], width: int) -> Float[Tenso
 
 
 def sizes_of(state: dict[str, Tensor]) -> dict[str, int]:
-    """``width`` and ``layers`` of the model whose weights these are; zeros where they are none of
-    Point-E's.
+    """Return ``width`` and ``layers`` of the model whose weights these are; zeros where they are
+    none of Point-E's.
     """
     blocks = {name.split(".")[2] for name in state if name.startswith("backbone.resblocks.")}
     norm = state.get("ln_pre.weight")

@@ -26,14 +26,16 @@ from .base import SCALE, Prior, chosen_colors, is_color, points
 
 
 def in_sphere(count: int, generator: np.random.Generator) -> Float[np.ndarray, "P 3"]:
-    """Points uniform in the unit ball: a uniform direction, and a radius whose cube is uniform."""
+    """Return points uniform in the unit ball: a uniform direction, and a radius whose cube is
+    uniform.
+    """
     directions = generator.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return directions * np.cbrt(generator.random((count, 1)))
 
 
 def in_box(count: int, generator: np.random.Generator) -> Float[np.ndarray, "P 3"]:
-    """Points uniform in the cube [-1, 1]³."""
+    """Return points uniform in the cube [-1, 1]³."""
     return generator.uniform(-1.0, 1.0, (count, 3))
 
 

@@ -149,8 +149,8 @@ class ShapEPrior(Prior):
     def _sample(
         self, folder: Path, prompt: str, device: torch.device, rng: torch.Generator
     ) -> Float[Tensor, "1 N D"]:
-        """Latents of the shape, from text features through the text-to-latent network; both are
-        dropped on return.
+        """Return latents of the shape, from text features through the text-to-latent network; both
+        are dropped on return.
         """
         condition = self._condition(folder, prompt, device)
         prior = self._part(folder, "prior", device)
@@ -179,7 +179,7 @@ class ShapEPrior(Prior):
     def _decode(
         self, folder: Path, latents: Float[Tensor, "1 N D"], device: torch.device
     ) -> PointCloud:
-        """The surface where the signed distance is 0, in Shap-E's own space."""
+        """Return the surface where the signed distance is 0, in Shap-E's own space."""
         renderer = self._part(folder, "shap_e_renderer", device)
         return decoded(
             renderer,
@@ -190,8 +190,8 @@ class ShapEPrior(Prior):
         )
 
     def _part(self, folder: Path, part: str, device: torch.device) -> Any:
-        """One network, always in float32: in half precision the renderer's encoding of positions
-        loses all detail.
+        """Return one network, always in float32: in half precision the renderer's encoding of
+        positions loses all detail.
         """
         from diffusers import PriorTransformer
         from diffusers.pipelines.shap_e.renderer import ShapERenderer
@@ -201,8 +201,8 @@ class ShapEPrior(Prior):
 
 
 def read_schedule(folder: Path) -> tuple[Float[np.ndarray, "T"], str]:
-    """The abar of each timestep, and what the network predicts ("sample" or "epsilon"), from the
-    model's own scheduler.
+    """Return the abar of each timestep, and what the network predicts ("sample" or "epsilon"), from
+    the model's own scheduler.
     """
     from diffusers import HeunDiscreteScheduler
 
@@ -243,7 +243,8 @@ def decoded(
     query_batch_size: int,
     colors: str,
 ) -> PointCloud:
-    """The mesh of ``latents`` by marching cubes, with the texture field's colours at its vertices.
+    """Return the mesh of ``latents`` by marching cubes, with the texture field's colours at its
+    vertices.
 
     Raises:
         UserError: the latents are not finite, or the signed distance is negative everywhere.
@@ -273,8 +274,8 @@ def decoded(
 
 
 def _refuse_empty(decoder: Any, inputs: tuple, mesh: Any) -> None:
-    """A hook behind marching cubes: what follows it in the renderer can't cope with a mesh without
-    vertices.
+    """Refuse a mesh without faces, as a hook behind marching cubes: what follows it in the renderer
+    can't cope with a mesh without vertices.
     """
     if not len(mesh.faces):
         raise UserError(

@@ -52,7 +52,7 @@ def load_original_prior(prior: nn.Module, path: str) -> None:
 
 
 def to_diffusers(state: dict[str, Tensor], heads: int) -> dict[str, Tensor]:
-    """OpenAI's names and layouts to those of ``PriorTransformer``.
+    """Convert OpenAI's names and layouts to those of ``PriorTransformer``.
 
     Raises:
         UserError: a name is none of Shap-E's text model.
@@ -76,7 +76,7 @@ def to_diffusers(state: dict[str, Tensor], heads: int) -> dict[str, Tensor]:
 
 
 def _converted(name: str, value: Tensor, heads: int) -> dict[str, Tensor]:
-    """What one entry becomes: one or three entries, or none for an unknown name."""
+    """Return what one entry becomes: one or three entries, or none for an unknown name."""
     if name == "pos_emb":
         return {"positional_embedding": value[None]}
     if packed := PACKED.fullmatch(name):

@@ -131,7 +131,7 @@ def fit_bodies(
     fit_shape: bool = True,
     iterations: int = 300,
 ) -> BodyFit:
-    """Bodies whose joints are where ``targets`` has them.
+    """Return bodies whose joints are where ``targets`` has them.
 
     Args:
         targets: 22 or 24 joints in SMPL's order, metres, y up; the last two of 24 are used when the
@@ -168,7 +168,7 @@ def energy(
     wanted: Float[Tensor, "F K 3"],
     pose_weight: float,
 ) -> Tensor:
-    """What is minimised, summed over the frames; see the module."""
+    """Return what is minimised, summed over the frames; see the module."""
     found = posed_joints(model, pose, shape, translation)[:, : wanted.shape[1]]
     data = ((found - wanted) / SCALE).square().sum()
     return (
@@ -198,8 +198,8 @@ def posed_joints(
     shape: Float[Tensor, "F B"],
     translation: Float[Tensor, "F 3"],
 ) -> Float[Tensor, "F J 3"]:
-    """Where the joints are; cheaper than the whole body, since vertices are needed for the shape
-    only.
+    """Return where the joints are; cheaper than the whole body, since vertices are needed for the
+    shape only.
     """
     from smplx.lbs import batch_rigid_transform, batch_rodrigues
 
@@ -216,7 +216,7 @@ def posed_joints(
 
 @torch.no_grad()
 def posed_vertices(model: BodyModel, fit: BodyFit) -> Float[np.ndarray, "F V 3"]:
-    """The surfaces of the fitted bodies: metres, y up."""
+    """Return the surfaces of the fitted bodies: metres, y up."""
     from smplx.lbs import lbs
 
     vertices, _ = lbs(
@@ -239,8 +239,8 @@ def _joint_directions(model: BodyModel) -> Float[Tensor, "J 3 B"]:
 def _placed(
     model: BodyModel, wanted: Float[Tensor, "F K 3"]
 ) -> tuple[Float[Tensor, "F 3"], Float[Tensor, "F 3"]]:
-    """The rotation (axis-angle) and translation that bring the resting trunk nearest to the wanted
-    one (Kabsch 1976).
+    """Return the rotation (axis-angle) and translation that bring the resting trunk nearest to the
+    wanted one (Kabsch 1976).
     """
     from scipy.spatial.transform import Rotation
 
@@ -260,8 +260,8 @@ def _placed(
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """For thousands of tiny operations: on a busy machine, threads that wait for each other make
-    them a hundred times slower.
+    """Use one thread for thousands of tiny operations: on a busy machine, threads that wait for
+    each other make them a hundred times slower.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

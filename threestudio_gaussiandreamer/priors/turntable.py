@@ -44,8 +44,8 @@ def save_turntable(
 def turntable(
     cloud: PointCloud, *, views: int = 24, size: int = 256
 ) -> UInt8[np.ndarray, "V S S 3"]:
-    """Pictures of ``cloud`` on white from ``views`` azimuths, the first from the front; all of it
-    is in each.
+    """Return pictures of ``cloud`` on white from ``views`` azimuths, the first from the front; all
+    of it is in each.
     """
     points = np.asarray(cloud.points, np.float32)
     centre = (points.min(axis=0) + points.max(axis=0)) / 2

@@ -20,8 +20,8 @@ NAMED = 4
 
 
 def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
-    """The tensors of a checkpoint by name; it is unpickled with ``weights_only``, so that it can't
-    run code.
+    """Return the tensors of a checkpoint by name; it is unpickled with ``weights_only``, so that it
+    can't run code.
 
     Args:
         kind: what the file is, for messages ("Shap-E checkpoint").
@@ -85,7 +85,7 @@ def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> N
 
 
 def named(names: Iterable[str]) -> str:
-    """The first few of ``names``, sorted."""
+    """Return the first few of ``names``, sorted."""
     names = sorted(names)
     return ", ".join(names[:NAMED]) + (
         f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
