@@ -1,4 +1,4 @@
-"""Arrays to 8 bit RGB pictures, and pictures to files: colour maps, grids, captions, videos."""
+"""8 bit RGB images from arrays, and image and video files: colour maps, grids, captions."""
 
 import os
 import struct
@@ -10,18 +10,29 @@ import numpy as np
 from .errors import UserError
 from .files import atomic_file
 
-# knots of the colour maps at equal distances over [0,1]
 _COLOR_MAPS = {
     "jet": "000080 0000ff 0080ff 00ffff 80ff80 ffff00 ff8000 ff0000 800000",
     "magma": "000004 1c1044 4f127b 812581 b5367a e55064 fb8761 fec287 fcfdbf",
+}
+"""Knots at equal distances over [0, 1]."""
+_MP4_OPTIONS = {
+    "codec": "libx264",
+    "pixelformat": "yuv420p",
+    "macro_block_size": 1,
+    # the index comes first, so that a browser plays the video before all of it is loaded
+    "output_params": ["-movflags", "+faststart"],
 }
 
 
 def rgb(
     image: np.ndarray, *, data_format: str = "HWC", data_range: tuple[float, float] = (0, 1)
 ) -> np.ndarray:
-    """(H,W,C) or (C,H,W) to uint8 (H, W*ceil(C/3), 3): channels three by three side by side,
-    missing ones black.
+    """Convert (H,W,C) or (C,H,W) to uint8 (H, W*ceil(C/3), 3).
+
+    Channels lie side by side, three by three; missing ones are black.
+
+    Raises:
+        ValueError: ``data_format`` is neither "HWC" nor "CHW".
     """
     if data_format not in ("HWC", "CHW"):
         raise ValueError(f"data_format is {data_format!r}; expected 'HWC' or 'CHW'")
@@ -39,7 +50,14 @@ def grayscale(
     data_range: Optional[tuple[float, float]] = None,
     cmap: Optional[str] = "jet",
 ) -> np.ndarray:
-    """(H,W) to uint8 (H,W,3); without ``data_range`` from the smallest value to the largest."""
+    """Convert (H,W) to uint8 (H,W,3) by a colour map, or to grey without one.
+
+    Args:
+        data_range: values of the first and the last colour; by default the smallest and largest.
+
+    Raises:
+        ValueError: an unknown colour map.
+    """
     image = np.nan_to_num(image)
     values = _normalize(image, data_range or (image.min(), image.max()))
     if cmap is None:
@@ -60,10 +78,12 @@ def grayscale(
 
 
 def grid(cells: list, *, align: Any = "max") -> np.ndarray:
-    """A row of ``{"type", "img", "kwargs"}``, or a list of rows, as one picture.
+    """Compose a row of ``{"type", "img", "kwargs"}``, or a list of rows, into one image.
 
-    ``align`` is the size of every cell: "max" or "min" of the cells, a number of pixels, or
-    (height, width)."""
+    Args:
+        align: the size of every cell: "max" or "min" of the cells, a number of pixels, or
+            (height, width).
+    """
     if isinstance(cells[0], list):
         rows = [grid(row, align=align) for row in cells]
         width = max(row.shape[1] for row in rows)
@@ -77,7 +97,7 @@ def grid(cells: list, *, align: Any = "max") -> np.ndarray:
 
 
 def with_texts(image: np.ndarray, texts: list) -> np.ndarray:
-    """The picture with one line of text at the top of each of ``len(texts)`` equal bands."""
+    """Draw one line of text at the top of each of ``len(texts)`` equal bands of the image."""
     from PIL import Image, ImageDraw
 
     canvas = Image.fromarray(image)
@@ -94,14 +114,14 @@ def with_texts(image: np.ndarray, texts: list) -> np.ndarray:
 
 
 def read(path: str | os.PathLike) -> np.ndarray:
-    """Read one picture as uint8 (H,W,3)."""
+    """Read an image as uint8 (H,W,3)."""
     from PIL import Image
 
     return np.asarray(Image.open(path).convert("RGB"))
 
 
 def write(path: str | os.PathLike, image: np.ndarray) -> None:
-    """One picture, uint8 or uint16, in the format of the extension.
+    """Write an image, uint8 or uint16, in the format of the extension.
 
     Raises:
         UserError: the disk is full or the folder can't be written.
@@ -113,18 +133,10 @@ def write(path: str | os.PathLike, image: np.ndarray) -> None:
         file.write(content)
 
 
-MP4_OPTIONS = {
-    "codec": "libx264",
-    "pixelformat": "yuv420p",
-    "macro_block_size": 1,
-    # the index comes first, so that a browser plays the video before all of it is loaded
-    "output_params": ["-movflags", "+faststart"],
-}
-
-
 def write_video(path: str, frames: list[Path], *, fps: int) -> None:
-    """Write the pictures as an mp4 (H.264, yuv420p, index first) or gif; odd sizes are padded to
-    even ones, which H.264 asks for.
+    """Write the images as an mp4 (H.264, yuv420p, index first) or gif.
+
+    An mp4 of odd size is padded to an even one, which H.264 requires.
 
     Raises:
         UserError: the disk is full, or there is no ffmpeg.
@@ -132,7 +144,7 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
     import imageio.v2 as imageio
 
     mp4, part = path.endswith(".mp4"), Path(path).with_name(f".part-{Path(path).name}")
-    options = {"fps": fps, **MP4_OPTIONS} if mp4 else {"duration": 1000 / fps, "loop": 0}
+    options = {"fps": fps, **_MP4_OPTIONS} if mp4 else {"duration": 1000 / fps, "loop": 0}
     try:
         with imageio.get_writer(part, mode="I", **options) as writer:
             for frame in frames:
@@ -161,12 +173,12 @@ def _require_whole_mp4(path: Path) -> None:
             names.append(name)
             place += length or size - place  # 0: to the end
     if place != size or b"moov" not in names:
-        raise OSError("ffmpeg ended in the middle of it; is the disk full?")
+        raise OSError("ffmpeg ended before the file was complete; is the disk full?")
 
 
 def _normalize(image: np.ndarray, data_range: tuple[float, float]) -> np.ndarray:
     low, high = data_range
-    # a constant picture is black, not 0/0
+    # a constant image is black, not 0/0
     return (np.clip(np.nan_to_num(image), low, high) - low) / ((high - low) or 1)
 
 
