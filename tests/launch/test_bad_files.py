@@ -115,7 +115,7 @@ def test_a_file_in_the_place_of_a_folder_is_named(launch_demo):
     TRIAL.mkdir(parents=True)
     (TRIAL / "save").touch()
     code, err = launch_demo()
-    assert code == 2 and f"cannot write {TRIAL}/save" in err and "Traceback" not in err
+    assert code == 2 and f"{TRIAL}/save is no folder" in err and "Traceback" not in err
 
 
 def test_a_full_disk_is_named(launch_demo, monkeypatch):

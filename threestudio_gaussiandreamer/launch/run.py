@@ -249,6 +249,8 @@ class Run:
 
     def discard_if_unused(self) -> None:
         """Remove the folder again if this run made it and has nothing to show for it."""
+        if self.claimed.first_made is None:
+            return
         trained = self.trainer is not None and self.trainer.global_step > max(self.resumed_step, 0)
         results = [*self.folder.glob("save/it*"), *self.folder.glob("ckpts/*.ckpt")]
         if not trained and not results:
