@@ -82,7 +82,9 @@ def test_f12_a_checkpoint_holds_the_cloud_and_its_statistics(fault):
             for name in (*PARAMETERS, *STATISTICS)
         )
 
-    ours = lambda: (trained(), GaussianCloud({"prior_type": "a-prior-that-does-not-exist"}))  # noqa: E731
+    def ours():
+        return trained(), GaussianCloud({"prior_type": "a-prior-that-does-not-exist"})
+
     fault(
         deviation,
         ours=ours,
@@ -105,7 +107,9 @@ def test_f16_growing_leaves_the_process_generators_alone(fault):
             not torch.equal(torch.get_rng_state(), torch_state)
         )
 
-    ours = lambda cloud: grow(cloud, num_candidates=1000, generator=np.random.default_rng(0))  # noqa: E731
+    def ours(cloud):
+        return grow(cloud, num_candidates=1000, generator=np.random.default_rng(0))
+
     fault(deviation, ours=ours, emulation=reseeding, unit="generators moved")
 
 
