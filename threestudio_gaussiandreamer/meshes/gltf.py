@@ -7,8 +7,8 @@ coordinates, KHR_texture_transform, and COLOR_0. Not read, and refused by name: 
 (Draco, meshopt), instances by EXT_mesh_gpu_instancing, basisu and DDS textures, and any other
 extension that the file requires. Lines are left out; lights, normals and animations aren't shown.
 
-Kept libraries read less: trimesh none of the above that isn't plain, and pygltflib parses the JSON
-only."""
+trimesh passes over or misreads most of this, and pygltflib parses the JSON only, so accessors,
+scenes and materials are read here."""
 
 import logging
 from pathlib import Path

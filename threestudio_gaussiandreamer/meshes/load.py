@@ -20,12 +20,11 @@ from ..core.errors import UserError, unknown
 from ..core.files import existing_file
 from .gltf import read_gltf
 from .merge import merged
-from .mesh import Mesh, face_areas
+from .mesh import MAX_NON_FINITE, Mesh, face_areas
 from .trimesh_reader import read_with_trimesh
 
 GLTF_FORMATS = ("glb", "gltf")
 Z_UP_FORMATS = ("ply", "stl", "off", "xyz")
-MAX_NON_FINITE = 0.05
 AXES = {
     sign + name: (1 if sign == "+" else -1) * np.eye(3)[i]
     for sign in "+-"
@@ -43,8 +42,8 @@ def load_mesh(
     """Read a mesh file, merge its scene, and bring it into the world's pose.
 
     Args:
-        path: a file that trimesh reads (GLB, glTF, OBJ, PLY, STL, OFF, ...), or the bare name of a
-            bundled one.
+        path: GLB or glTF, a file that trimesh reads (OBJ, PLY, STL, OFF, ...), or the bare name of
+            a bundled one.
         scale: half the longest side of the result's box, world units, > 0.
         up, front: the file's axes, "+x" ... "-z"; see the module for the defaults.
 

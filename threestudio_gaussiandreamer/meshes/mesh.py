@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from ..gaussians.grow import distinct
 
 GREY = 0.5
+MAX_NON_FINITE = 0.05
+"""Share of vertices or colours that may be NaN or infinite; more mean that the file is broken."""
 REPEAT, MIRROR, CLAMP = range(3)
 
 

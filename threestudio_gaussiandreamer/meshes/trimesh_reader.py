@@ -12,11 +12,10 @@ from .budget import Budget, fail
 from .check import check_mesh_file
 from .colors import linear_to_srgb, unit_rgb
 from .gltf import LARGEST_UV
-from .mesh import GREY, Mesh
+from .mesh import GREY, MAX_NON_FINITE, Mesh
 from .side_files import SideFiles
 from .textures import decode_image
 
-MAX_NON_FINITE = 0.05
 UNSET_COLOR = (102, 102, 102)
 """What trimesh writes where a material names no colour; it would only darken the texture."""
 

@@ -9,7 +9,7 @@ path          the posed body as a mesh file; the package brings none, since SMPL
 scale         half the longest side (the height, when it stands), world units; the released code's
               is about 1.7
 up, front     the file's axes, ``+x`` to ``-z``; ``auto`` and null: by the kind of file (see
-              ``meshes.py``)
+              ``meshes/load.py``)
 num_points    points uniform over the surface (the released code), or 0 for the vertices (the paper)
 color         ``random`` (the paper), ``grey``, [r, g, b] in [0, 1], or null for the mesh's own
               colours

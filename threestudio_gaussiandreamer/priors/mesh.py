@@ -8,7 +8,7 @@ path              GLB, glTF, OBJ, PLY, STL, OFF, ... with texture, vertex colour
                   none (grey)
 scale             half the longest side of the result, world units
 up, front         the file's axes, ``+x`` to ``-z``; ``auto`` and null: by the kind of file (see
-                  ``meshes.py``)
+                  ``meshes/load.py``)
 num_points        0: the mesh's vertices, as the paper takes them from Shap-E; else points uniform
                   over the surface
 color_smoothing   average each colour over this many nearest points: the coarse colours of a

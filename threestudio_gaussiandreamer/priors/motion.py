@@ -19,7 +19,7 @@ motion_text        the motion of the prompt; null: found by the rules of ``motio
 fit_shape          fit SMPL's shape too; else its mean shape
 max_residual_mm    the mean distance of the joints from the motion's above which a fit is an error
 face_front         turn the body to look at azimuth 0; else it looks where the motion left it
-up, front          of the candidates' files, ``+x`` to ``-z`` (see ``meshes.py``)
+up, front          of the candidates' files, ``+x`` to ``-z`` (see ``meshes/load.py``)
 scale              half the longest side, world units
 num_points         points uniform over the surface (the released code), or 0 for the vertices (the
                    paper)
