@@ -21,7 +21,7 @@ def unit_rgb(colors: Shaped[np.ndarray, "N C"]) -> Float[np.ndarray, "N 3"]:
 
 
 def linear_to_srgb(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Apply the curve of IEC 61966-2-1; glTF's factors are linear, its textures are not."""
+    """Return display values by the curve of IEC 61966-2-1; negative ones stay on its line."""
     return np.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - 0.055
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055
     ).astype(np.float32)

@@ -56,6 +56,7 @@ from ..core.memory import count_of, require_memory
 from ..core.options import in_range, one_of, positive
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
+from ..meshes.colors import linear_to_srgb
 from ..models.clip import load_text_encoder, load_tokenizer, text_condition
 from ..models.extras import require_extra
 from ..models.hub import Source, locate
@@ -268,7 +269,7 @@ def decoded(
     )
     return PointCloud(
         points=mesh.verts.float().cpu().numpy(),
-        colors=linear if colors == "linear" else display_colors(linear),
+        colors=linear if colors == "linear" else linear_to_srgb(linear),
         faces=mesh.faces.cpu().numpy(),
     )
 
@@ -282,12 +283,3 @@ def _refuse_empty(decoder: Any, inputs: tuple, mesh: Any) -> None:
             "Shap-E found no surface for this prompt: try another seed, another prompt or a "
             "larger grid_size"
         )
-
-
-def display_colors(linear: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-    """Linear light as display values (IEC 61966-2-1): the inverse of what the decoder does to its
-    texture field.
-    """
-    return np.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055
-    ).astype(np.float32)
