@@ -12,7 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.fuzz.targets import TARGETS, Misread, Target, mutant
+from tests.fuzz.target import Misread, Target
+from tests.fuzz.targets import TARGETS, mutant
 from threestudio_gaussiandreamer.core.errors import UserError
 
 SECONDS = 10.0

@@ -1,10 +1,7 @@
-"""Damaged versions of good files, drawn from a seed: what disks, networks, other programs and
-enemies make of them.
+"""Damage good files at random, from a seed.
 
-A file is taken apart where its format packs or protects what is inside (zip, gzip, the chunks of
-GLB), one part is damaged, and the file is put together again with lengths and checksums that fit,
-so that the damage reaches the reader behind them. Half of the mutants are damaged as they lie on
-the disk."""
+Half of the mutants of packed formats (zip, gzip, GLB) are unpacked, damaged inside and packed again
+with lengths and checksums that fit, so that the damage reaches the reader behind them."""
 
 import io
 import json

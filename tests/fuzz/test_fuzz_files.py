@@ -10,7 +10,8 @@ import pytest
 
 from tests.fuzz.judge import judged, outcomes
 from tests.fuzz.mutations import BINARY, TEXT, mutant
-from tests.fuzz.targets import TARGETS, Misread, Target, seeds
+from tests.fuzz.target import Misread, Target
+from tests.fuzz.targets import TARGETS, seeds
 from threestudio_gaussiandreamer.core.errors import UserError
 
 pytestmark = pytest.mark.slow
