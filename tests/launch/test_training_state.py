@@ -61,6 +61,15 @@ IMPOSSIBLE = [
     (at("state_dict", "geometry.quats", value=lambda t: t[:4]), "has the shape .4, 4.; expected"),
     (at("state_dict", 3, value=torch.zeros(1)), "3 in its state_dict is of type Tensor"),
     (at("guidance", value=[1]), "its guidance isn't a mapping of tensors"),
+    (at("guidance", value=torch.zeros(3)), "its guidance isn't a mapping of tensors"),
+    (
+        at(
+            *(*FIT, "epoch_loop.automatic_optimization.optim_progress", "optimizer", "step"),
+            *("total", "completed"),
+            value={},
+        ),
+        "isn't one of Lightning's: TypeError",
+    ),
     (at("global_step", value=-1), "its global_step is -1"),
     (at("global_step", value=10**20), "its global_step is 1000"),
     (at("global_step", value=10**400), "its global_step is an integer of 1329 bits"),

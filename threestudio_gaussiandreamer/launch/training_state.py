@@ -92,13 +92,13 @@ def _check_loops(checkpoint: Mapping[str, Any], what: str) -> None:
         raise UserError(f"{what}: its fit_loop has no {missing[0]}")
     try:
         trainer.fit_loop.load_state_dict(fit)
+        epoch = trainer.fit_loop.epoch_loop
+        counted = epoch.automatic_optimization.optim_progress.optimizer_steps
+        counted += epoch.manual_optimization.optim_step_progress.total.completed
     except Exception as error:  # Lightning looks keys up, and trusts what it finds
         raise UserError(
             f"{what}: its fit_loop isn't one of Lightning's: {type(error).__name__} {error}"
         ) from error
-    epoch = trainer.fit_loop.epoch_loop
-    counted = epoch.automatic_optimization.optim_progress.optimizer_steps
-    counted += epoch.manual_optimization.optim_step_progress.total.completed
     if counted != step:
         raise UserError(f"{what}: its loops are at step {counted}, its global_step is {step}")
 

@@ -115,7 +115,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         if "geometry.means" in checkpoint["state_dict"]:
             names = {name: f"geometry.{name}" for name in SHAPES}
             require_cloud(checkpoint["state_dict"], names, what)
-        learnt = checkpoint.get("guidance") or {}
+        learnt = checkpoint.get("guidance")
+        learnt = {} if learnt is None else learnt
         if not isinstance(learnt, Mapping) or not all(
             isinstance(value, Tensor) for value in learnt.values()
         ):
