@@ -1,7 +1,4 @@
-"""Damage good files at random, from a seed.
-
-Half of the mutants of packed formats (zip, gzip, GLB) are unpacked, damaged inside and packed again
-with lengths and checksums that fit, so that the damage reaches the reader behind them."""
+"""Damage good files at random, from a seed; half of the packed ones (zip, gzip, GLB) inside."""
 
 import io
 import json

@@ -14,7 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from tests.helpers.splatting_contract import KernelContract, draw
+from tests.helpers.splatting_contract import KernelContract
+from tests.helpers.splatting_draws import draw
 from tests.helpers.splatting_scenes import cameras, equal, random_cloud
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import rasterize

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from tests.helpers.cuda_shim.device import ORDERS, HostDevice, unavailable
-from tests.helpers.splatting_contract import BACKGROUND, KernelContract, draw
+from tests.helpers.splatting_contract import KernelContract
+from tests.helpers.splatting_draws import BACKGROUND, draw
 from tests.helpers.splatting_scenes import NAMES, Cloud, cameras, cotangents, equal, random_cloud
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import backends, rasterize

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.stability.rows import FAULTS, OTHERS, ROWS
+from tests.stability.faults import FAULTS
+from tests.stability.rows import OTHERS, ROWS
 
 FOLDER = Path(__file__).parent
 

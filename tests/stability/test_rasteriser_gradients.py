@@ -8,7 +8,7 @@ import itertools
 import pytest
 import torch
 
-from tests.helpers.splatting_contract import draw
+from tests.helpers.splatting_draws import draw
 from tests.helpers.splatting_scenes import (
     NAMES,
     NO_CUTOFFS,

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from tests.helpers.splatting_contract import draw
+from tests.helpers.splatting_draws import draw
 from tests.helpers.splatting_scenes import (
     cameras,
     front_camera,

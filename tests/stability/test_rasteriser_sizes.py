@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from tests.helpers.splatting_contract import draw
+from tests.helpers.splatting_draws import draw
 from tests.helpers.splatting_scenes import (
     NAMES,
     Cloud,
