@@ -2,9 +2,9 @@
 
 World: right-handed, z up; azimuth 0 = +x is the front, azimuth 90 = +y. Angles of a view
 (elevation, azimuth) are in degrees, ``fovy`` is vertical and in radians. The host's cameras are
-OpenGL: the columns of ``c2w`` are right, up, back. Inside the maths cameras are OpenCV:
-``viewmats`` world to camera with x right, y down, z forward; ``Ks`` in pixels, pixel centres at
-+0.5. Images are (B, H, W, C) with row 0 on top."""
+OpenGL: the columns of ``c2w`` are right, up, back. The rasteriser's cameras are OpenCV:
+``viewmats`` map world to camera coordinates with x right, y down, z forward; ``Ks`` are in pixels,
+with pixel centres at +0.5. Images are (B, H, W, C) with row 0 at the top."""
 
 import math
 from typing import Any, NamedTuple
@@ -34,7 +34,7 @@ class Orbit(NamedTuple):
         return orbit_c2w(self.elevation, self.azimuth, self.distance)
 
     def rows(self, index: Any) -> "Orbit":
-        """Select cameras by whatever indexes a field."""
+        """Select cameras; ``index`` is anything that indexes a tensor's first dimension."""
         return Orbit(*(values[index] for values in self))
 
 
@@ -43,7 +43,7 @@ def orbit_positions(
     azimuth_deg: Float[Tensor, " B"],
     distance: Float[Tensor, " B"],
 ) -> Float[Tensor, "B 3"]:
-    """Points at ``distance`` from the origin, in world units."""
+    """Convert spherical to Cartesian coordinates, both in world units."""
     elevation, azimuth = torch.deg2rad(elevation_deg), torch.deg2rad(azimuth_deg)
     horizontal = distance * torch.cos(elevation)
     return torch.stack(
@@ -59,10 +59,10 @@ def orbit_positions(
 def look_at(
     position: Float[Tensor, "B 3"], center: Float[Tensor, "B 3"], up: Float[Tensor, "B 3"]
 ) -> Float[Tensor, "B 4 4"]:
-    """OpenGL ``c2w`` of cameras at ``position`` that look at ``center``; straight up or down takes
-    +x as the picture's top.
+    """Return the OpenGL ``c2w`` of cameras at ``position`` that look at ``center``.
 
-    A camera in the centre itself looks along -x, as one in front of it does.
+    A camera that looks along ``up`` has +x as the top of its image. One at ``center`` itself looks
+    along -x.
     """
     offset = center - position
     nowhere = offset.norm(dim=-1, keepdim=True) < 1e-12
@@ -89,8 +89,14 @@ def orbit_c2w(
     center: Float[Tensor, "B 3"] | None = None,
     up: Float[Tensor, "B 3"] | None = None,
 ) -> Float[Tensor, "B 4 4"]:
-    """OpenGL ``c2w`` of cameras on a sphere around the origin, looking at ``center`` (default: the
-    origin).
+    """Return the OpenGL ``c2w`` of cameras on spheres around the origin.
+
+    Args:
+        elevation_deg: degrees above the horizon.
+        azimuth_deg: degrees from +x towards +y.
+        distance: from the origin, world units.
+        center: the points that the cameras look at; by default the origin.
+        up: by default +z.
     """
     position = orbit_positions(elevation_deg, azimuth_deg, distance)
     center = torch.zeros_like(position) if center is None else center
@@ -105,12 +111,12 @@ def orbit_c2w(
 
 
 def focal_length(fovy: Float[Tensor, " B"], height: int) -> Float[Tensor, " B"]:
-    """Focal length in pixels, the same for both axes: ``f = H / (2 tan(fovy / 2))``."""
+    """Return the focal length in pixels, for both axes: ``f = H / (2 tan(fovy / 2))``."""
     return 0.5 * height / torch.tan(0.5 * fovy)
 
 
 def intrinsics(fovy: Float[Tensor, " B"], height: int, width: int) -> Float[Tensor, "B 3 3"]:
-    """Pinhole matrices in pixels with the principal point in the image's centre."""
+    """Return pinhole matrices in pixels, with the principal point at the image's centre."""
     Ks = torch.zeros(len(fovy), 3, 3, dtype=fovy.dtype, device=fovy.device)
     Ks[:, 0, 0] = Ks[:, 1, 1] = focal_length(fovy, height)
     Ks[:, 0, 2], Ks[:, 1, 2], Ks[:, 2, 2] = 0.5 * width, 0.5 * height, 1.0
@@ -120,16 +126,18 @@ def intrinsics(fovy: Float[Tensor, " B"], height: int, width: int) -> Float[Tens
 def to_opencv(
     c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int
 ) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 3 3"]]:
-    """The host's OpenGL cameras as ``(viewmats, Ks)``: flip the camera's y and z axes, invert the
-    rigid motion.
+    """Convert the host's OpenGL cameras to ``(viewmats, Ks)``: flip the camera's y and z axes, then
+    invert the rigid motion.
     """
     flip = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=c2w.dtype, device=c2w.device)
     return world_to_camera(c2w * flip), intrinsics(fovy, height, width)
 
 
 def world_to_camera(c2w: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 4 4"]:
-    """The inverse of rigid motions, each by its transpose: one that is no rotation spoils itself
-    alone, and raises nothing.
+    """Invert rigid motions by transposing their rotations.
+
+    A matrix that isn't a rigid motion gets a wrong inverse, but raises no error and leaves the
+    other items of the batch correct.
     """
     rotation = c2w[:, :3, :3].transpose(1, 2)
     inverse = torch.zeros_like(c2w)
@@ -146,8 +154,10 @@ def ray_directions(
     width: int,
     normalize: bool = True,
 ) -> Float[Tensor, "B H W 3"]:
-    """World directions through the pixel centres; unit length, or forward component 1 without
-    ``normalize``.
+    """Return the directions of the rays through the pixel centres, in world coordinates.
+
+    Args:
+        normalize: scale to unit length; otherwise the component along the view axis is 1.
     """
     rows = torch.arange(height, dtype=c2w.dtype, device=c2w.device) + 0.5 - 0.5 * height
     columns = torch.arange(width, dtype=c2w.dtype, device=c2w.device) + 0.5 - 0.5 * width
@@ -163,7 +173,7 @@ def ray_directions(
 def projection(
     fovy: Float[Tensor, " B"], aspect: float, near: float = 0.01, far: float = 100.0
 ) -> Float[Tensor, "B 4 4"]:
-    """threestudio's projection matrices (y negated: the top row has NDC y = -1)."""
+    """Return threestudio's projection matrices (y negated: the top row has NDC y = -1)."""
     tan = torch.tan(0.5 * fovy)
     matrix = torch.zeros(len(fovy), 4, 4, dtype=fovy.dtype, device=fovy.device)
     matrix[:, 0, 0], matrix[:, 1, 1] = 1.0 / (tan * aspect), -1.0 / tan
@@ -176,7 +186,9 @@ def projection(
 
 
 class OrbitRanges(NamedTuple):
-    """Ranges that training views are drawn from; the paper's by default."""
+    """Ranges from which training views are drawn, in degrees and world units; the defaults are the
+    paper's.
+    """
 
     elevation: tuple[float, float] = (-10.0, 60.0)
     azimuth: tuple[float, float] = (-180.0, 180.0)
@@ -189,9 +201,9 @@ def sample_orbit(
 ) -> Orbit:
     """Draw ``batch`` training views.
 
-    As in threestudio, with probability one half the elevations of a batch are uniform in angle,
-    otherwise uniform on the sphere (uniform in the sine); with ``uniform_azimuth`` the batch covers
-    the whole azimuth range, one view per sector."""
+    As in threestudio, the elevations of a batch are uniform in angle with probability 1/2, and
+    otherwise uniform on the sphere (uniform in the sine). With ``uniform_azimuth`` the azimuth
+    range is divided into ``batch`` equal sectors with one view in each."""
     by_angle, u = torch.rand(1, generator=rng) < 0.5, torch.rand(4, batch, generator=rng)
     low, high = (math.sin(math.radians(e)) for e in ranges.elevation)
     elevation = (
@@ -209,8 +221,10 @@ def _lerp(ends: tuple[float, float], u: Tensor) -> Tensor:
 
 
 def held_out_orbit(count: int = 24) -> Orbit:
-    """The views that a run is scored on: fixed, all around, four heights, three distances, fovy 50
-    degrees; in no bank.
+    """Return the fixed views that a run is evaluated on; they are never used for training.
+
+    Their azimuths are evenly spaced over 360 degrees, at four elevations and three distances, with
+    a vertical field of view of 50 degrees.
     """
     index = torch.arange(count)
     elevation = torch.tensor([0.0, 15.0, 30.0, 45.0])[index % 4]
@@ -221,10 +235,11 @@ def held_out_orbit(count: int = 24) -> Orbit:
 
 
 def camera_pool(count: int, ranges: OrbitRanges, seed: int, stream: str = "camera-pool") -> Orbit:
-    """``count`` fixed training views: stratified in azimuth, each drawn from its own stream."""
+    """Draw ``count`` fixed training views, stratified in azimuth, from streams of their own."""
     rng = generator(seed, stream)
     pool = sample_orbit(count, ranges, rng)
-    # one elevation rule for the whole pool would bias it: mix both
+    # sample_orbit chooses one elevation distribution per call: mix two calls, so that a pool
+    # usually has both
     other = sample_orbit(count, ranges, generator(seed, stream, 1))
     mix = torch.rand(count, generator=rng) < 0.5
     return pool._replace(elevation=torch.where(mix, pool.elevation, other.elevation))

@@ -12,9 +12,9 @@ SSIM_WINDOW = 11
 
 
 def psnr(image: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
-    """Compute -10 log10 of the mean squared error over all that is given, images in [0, 1], in dB.
+    """Compute -10 log10 of the mean squared error over all elements, for images in [0, 1], in dB.
 
-    Within 100 and -100 dB; an error that isn't finite counts as the largest.
+    The result is clamped to [-100, 100] dB; an error that isn't finite gives -100 dB.
     """
     error = (image - truth).square().mean().nan_to_num(nan=torch.inf)
     return -10 * error.clamp(10 ** (-MAX_PSNR / 10), 10 ** (MAX_PSNR / 10)).log10()
@@ -23,13 +23,13 @@ def psnr(image: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]) -> Floa
 def ssim(
     image: Float[Tensor, "*batch H W C"], truth: Float[Tensor, "*batch H W C"]
 ) -> Float[Tensor, "*batch"]:
-    """Structural similarity of images in [0, 1], one per image (Wang et al. 2004, eq. 13).
+    """Compute the structural similarity of pairs of images in [0, 1] (Wang et al. 2004, eq. 13).
 
-    11 x 11 Gaussian window of sigma 1.5 around every pixel, the image reflected at its border, K1
-    0.01, K2 0.03, mean over pixels and channels: torchmetrics' default, which a test compares.
+    The window is an 11 x 11 Gaussian with sigma 1.5, images are padded by reflection, K1 is 0.01
+    and K2 0.03, and the mean is over pixels and channels, as in torchmetrics' defaults.
 
     Raises:
-        UserError: a side too short to be reflected.
+        UserError: a side has fewer than 6 pixels, too few for the reflection.
     """
     if min(image.shape[-3:-1]) <= SSIM_WINDOW // 2:
         raise UserError(
@@ -55,12 +55,19 @@ def multi_face_rate(
     threshold: float = 45.0,
     size: int = 32,
 ) -> float:
-    """The share of views whose nearest bank view is more than ``threshold`` degrees of azimuth
-    away.
+    """Compute the fraction of views whose most similar bank image is from an azimuth more than
+    ``threshold`` degrees away.
 
-    Nearest by squared error at ``size`` x ``size`` pixels; renders and bank lie on the same
-    background. Azimuths in degrees. A bank from other heights and distances confuses views of like
-    outline: best it has the views' own cameras, turned around."""
+    Similarity is the squared error at ``size`` x ``size`` pixels, so both sets of images need the
+    same background. The rate is most reliable where the bank has the elevations and distances of
+    the views: images from other ones may match by their outline alone.
+
+    Args:
+        renders: images of the Gaussians, in [0, 1].
+        bank_images: images of the known object, of any size.
+        view_azimuths: of the renders, degrees.
+        bank_azimuths: of the bank images, degrees.
+    """
     views, bank = (
         _shrunk(images, size).flatten(1) for images in (renders, bank_images.to(renders))
     )
@@ -72,7 +79,7 @@ def multi_face_rate(
 
 
 def azimuth_difference(a: Float[Tensor, "*n"], b: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """The angle between two azimuths, degrees in [0, 180]."""
+    """Return the angle between two azimuths in degrees, in [0, 180]."""
     return ((a - b + 180) % 360 - 180).abs()
 
 
@@ -83,23 +90,29 @@ def floater_mass(
     extent: float,
     share: float = 0.02,
 ) -> float:
-    """The opacity-weighted share of Gaussians farther than ``share`` of ``extent`` (the box's
-    longest side) from the surface.
+    """Compute the opacity-weighted fraction of Gaussians that are far from the surface.
+
+    Args:
+        distances: from the surface, world units.
+        opacities: in [0, 1].
+        extent: longest side of the object's box, world units.
+        share: a Gaussian is far beyond this fraction of ``extent``.
     """
     total = opacities.sum()
     return (opacities[distances > share * extent].sum() / total).item() if total > 0 else 0.0
 
 
 def out_of_gamut(images: Float[Tensor, "*batch 3"]) -> float:
-    """The share of pixels with a colour outside of [0, 1] by more than half a grey level: what no
-    screen shows, and guidance overdoes.
+    """Compute the fraction of pixels with a channel more than half a grey level outside [0, 1].
+
+    A display clips such colours; large guidance scales produce them.
     """
     beyond = 0.5 / 255
     return ((images < -beyond) | (images > 1 + beyond)).any(-1).double().mean().item()
 
 
 def _window_mean(images: Float[Tensor, "*batch H W C"]) -> Float[Tensor, "*batch H W C"]:
-    """The Gaussian-weighted mean of the window around each pixel, separably."""
+    """Compute the Gaussian-weighted mean of the window around each pixel, one axis at a time."""
     offsets = torch.arange(SSIM_WINDOW, device=images.device, dtype=images.dtype) - SSIM_WINDOW // 2
     kernel = torch.softmax(-(offsets**2) / (2 * 1.5**2), dim=0)
     planes = images.movedim(-1, -3).reshape(-1, 1, *images.shape[-3:-1])
@@ -109,5 +122,5 @@ def _window_mean(images: Float[Tensor, "*batch H W C"]) -> Float[Tensor, "*batch
 
 
 def _shrunk(images: Float[Tensor, "n H W C"], size: int) -> Float[Tensor, "n s s C"]:
-    """Images at ``size`` x ``size``, each pixel the mean of what it covers."""
+    """Resize images to ``size`` x ``size`` by averaging."""
     return F.adaptive_avg_pool2d(images.movedim(-1, 1), (size, size)).movedim(1, -1)

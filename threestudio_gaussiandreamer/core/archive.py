@@ -1,8 +1,8 @@
 """Headers of the zip archives that ``torch.save`` writes, checked before anything is allocated.
 
-An archive of torch's holds its records uncompressed, so what it unpacks to is no larger than the
-file. Its pickle may call only what puts tensors and containers together: ``weights_only`` also
-allows calls such as ``bytearray(10**10)``."""
+``torch.save`` stores its records uncompressed, so the unpacked archive is no larger than the file.
+The pickle in it may only call the functions that rebuild tensors and containers; torch's own
+``weights_only`` also allows calls that allocate memory, such as ``bytearray(10**10)``."""
 
 import os
 import pickletools
@@ -20,16 +20,16 @@ ALLOWED_CALLS = re.compile(
     r"|torch\._utils (_rebuild_tensor|_rebuild_tensor_v2|_rebuild_parameter\w*)"
 )
 WATCHED_MODULES = re.compile(r"torch\b|builtins\b|_codecs\b|collections\b")
-"""What other modules hold isn't torch's to call either; its own message names it."""
+"""Modules whose names are checked here; ``weights_only`` refuses names of all other modules."""
 MAX_OPCODES = 10_000_000
 
 
 def require_plain_archive(path: Path) -> None:
-    """Check that an archive of ``torch.save`` unpacks to no more than its size.
+    """Check that reading an archive of ``torch.save`` allocates no more than the file's size.
 
     Raises:
-        UserError: compressed or overlapping records, a call that no checkpoint needs, or no
-            archive.
+        UserError: the file is no zip archive, its records are compressed or overlap, or its pickle
+            calls a function that isn't in ``ALLOWED_CALLS``.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -61,7 +61,7 @@ def _require_plain_pickle(content: bytes, path: Path) -> None:
 
 
 def _called(content: bytes) -> Iterator[str]:
-    """Every name that a pickle looks up, as "module name"."""
+    """Yield every global that a pickle looks up, as "module name"."""
     for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
         if opcode.name == "GLOBAL":
             yield str(argument)

@@ -1,8 +1,8 @@
-"""Checkpoint files: written so that a crash leaves the earlier one whole, read so that damage is
-noticed and no code runs.
+"""Checkpoint files. A crash while writing leaves the previous file intact; reading verifies a
+checksum and runs no code from the file.
 
-A file is what ``torch.save`` writes, a zip archive, with ``sha256:<hex>`` of everything before it
-as the archive's comment. Plain ``torch.load`` reads it."""
+A file is the zip archive that ``torch.save`` writes, with ``sha256:<hex>`` as the archive's
+comment, the hash of all bytes before the digest. ``torch.load`` can read it too."""
 
 import hashlib
 import io
@@ -31,17 +31,18 @@ _END_OF_ARCHIVE = b"PK\x05\x06"
 _END_RECORD_BYTES = 22
 _BLOCK_BYTES = 1 << 20
 MAX_COUNT = 10**12
-"""Steps of a training run; more are a damaged number."""
+"""Largest number of steps or epochs; a larger one is taken for damage."""
 SHARING = 2
-"""How many times a file's size its tensors may be together, where some share their numbers."""
+"""Largest total size of the tensors, in units of the file's size: tensors may share a storage, so
+the total may exceed the file.
+"""
 
 
 def save_file(path: str | os.PathLike, content: Any) -> None:
-    """Write ``content`` to ``path``; the earlier file stays until the new one is whole, and then
-    beside it as ``<stem>-prev``.
+    """Write ``content`` to ``path`` atomically; an existing file is kept as ``<stem>-prev``.
 
     Raises:
-        UserError: the disk is full or the folder can't be written; the earlier file is untouched.
+        UserError: the disk is full or the folder can't be written; an existing file is unchanged.
     """
     path = Path(path)
     buffer = io.BytesIO()
@@ -53,10 +54,10 @@ def save_file(path: str | os.PathLike, content: Any) -> None:
 
 
 def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
-    """What :func:`save_file` or ``torch.save`` wrote; never executes code from the file.
+    """Read what :func:`save_file` or ``torch.save`` wrote, without executing code from the file.
 
     Raises:
-        UserError: no such file, a damaged one, or one that isn't a checkpoint.
+        UserError: there is no such file, or it is damaged or no checkpoint.
     """
     path = Path(os.path.expanduser(path))
     if not path.is_file():
@@ -68,7 +69,7 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
     try:
         content = torch.load(path, map_location=map_location, weights_only=True)
     except pickle.UnpicklingError as error:
-        # torch's own first line advises to read it all the same
+        # the first line of torch's message advises to load the file with weights_only=False
         found = re.search(r"GLOBAL (\S+)", str(error))
         what = f": {found[1]}" if found else ""
         raise UserError(
@@ -76,15 +77,17 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
         ) from error
     except (
         Exception
-    ) as error:  # where a pickle is damaged, torch's reader of it raises what it likes
+    ) as error:  # torch's unpickler raises exceptions of many types for a damaged file
         raise UserError(f"{path} isn't a checkpoint, or is damaged: {_reason(error)}") from error
     _require_stored(content, path)
     return content
 
 
 def _require_stored(content: Any, path: Path) -> None:
-    """Raise UserError for tensors that repeat a few numbers to more than the file could hold:
-    whoever copies them fills the memory.
+    """Raise UserError if the tensors are much larger than the file.
+
+    An expanded tensor (stride 0) announces any size with a few stored numbers; copying it to a
+    contiguous tensor would exhaust the memory.
     """
     size, total = os.path.getsize(path), 0
     for tensor in _tensors(content):
@@ -97,7 +100,7 @@ def _require_stored(content: Any, path: Path) -> None:
 
 
 def _tensors(content: Any) -> Iterator[torch.Tensor]:
-    """Every tensor below ``content``, once; containers may hold themselves."""
+    """Yield every tensor in nested containers once; a container may contain itself."""
     pending, seen = [content], set()
     while pending:
         item = pending.pop()
@@ -111,14 +114,16 @@ def _tensors(content: Any) -> Iterator[torch.Tensor]:
 
 
 def previous_of(path: str | os.PathLike) -> Path:
-    """Where :func:`save_file` keeps the file that it replaces."""
+    """Return the path at which :func:`save_file` keeps the file that it replaces."""
     path = Path(path)
     return path.with_name(f"{path.stem}-prev{path.suffix}")
 
 
 def newest_readable(folder: str | os.PathLike) -> Optional[tuple[Path, int]]:
-    """The whole checkpoint with most steps among a folder's, of equal ones ``last.ckpt``, and its
-    step; says what is damaged.
+    """Return the intact checkpoint of a folder with the highest step, and that step; None if there
+    is none.
+
+    Among equal steps ``last.ckpt`` is preferred. Damaged files are reported in the log.
     """
     by_step = sorted(
         Path(folder).glob("*.ckpt"),
@@ -134,15 +139,17 @@ def newest_readable(folder: str | os.PathLike) -> Optional[tuple[Path, int]]:
 
 
 def _claimed_step(path: Path) -> float:
-    """The step that a checkpoint says it is from, its tensors unread and its checksum unchecked;
-    infinity where it says none.
+    """Read the step of a checkpoint without its tensors and without verifying the checksum.
+
+    Returns infinity if it can't be read, so that :func:`newest_readable` loads and reports that
+    file first.
     """
     try:
         require_plain_archive(path)
         return int(
             torch.load(path, map_location="cpu", weights_only=True, mmap=True)["global_step"]
         )
-    except Exception:  # whatever is wrong with it, who reads it whole will say
+    except Exception:  # load_checkpoint will report what is wrong with the file
         return math.inf
 
 
@@ -152,11 +159,14 @@ def load_module_weights(
     ignore_modules: Optional[list[str]] = None,
     map_location: Any = "cpu",
 ) -> tuple[dict, int, int]:
-    """Parameters of one module (its prefix removed), or of all but the ignored ones, with the epoch
-    and step of a checkpoint.
+    """Read the parameters of one module (its prefix removed), or of all but the ignored modules.
+
+    Returns:
+        parameters, epoch and step of the checkpoint.
 
     Raises:
-        UserError: the file is missing, damaged or no checkpoint, or has nothing for that module.
+        UserError: the file is missing, damaged or no checkpoint, or has no parameters of that
+            module.
     """
     checkpoint = load_checkpoint(path, map_location)
     state = checkpoint["state_dict"]
@@ -177,10 +187,10 @@ def load_module_weights(
 
 
 def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:
-    """A training checkpoint: a dict with at least ``state_dict``, ``epoch`` and ``global_step``.
+    """Read a training checkpoint: a dict with ``state_dict``, ``epoch``, ``global_step`` and more.
 
     Raises:
-        UserError: as :func:`load_file`, or the file holds something else.
+        UserError: as in :func:`load_file`, or one of these keys is missing or of a wrong type.
     """
     checkpoint = load_file(path, map_location)
     missing = {"state_dict", "epoch", "global_step"} - set(
@@ -211,14 +221,14 @@ def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:
 
 
 def is_count(value: Any) -> bool:
-    """Whether ``value`` can count steps or epochs."""
+    """Return whether ``value`` is a valid number of steps or epochs."""
     return is_whole(value) and 0 <= value <= MAX_COUNT
 
 
 def _prepare_folder(path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # what a process that was killed while saving has left
+        # temporary files of processes that were killed while saving
         for stale in path.parent.glob(f".{glob_escape(path.name)}.*.tmp"):
             stale.unlink(missing_ok=True)
     except OSError as error:
@@ -228,7 +238,7 @@ def _prepare_folder(path: Path) -> None:
 
 
 def _with_checksum(archive: bytes) -> bytes:
-    """A zip archive that ends without a comment, with its checksum as the comment."""
+    """Append the checksum to a zip archive as its comment; the archive must not have one."""
     if archive[-_END_RECORD_BYTES:][:4] != _END_OF_ARCHIVE or not archive.endswith(b"\0\0"):
         raise RuntimeError("torch.save did not write a zip archive without a comment")
     marked = archive[:-2] + _COMMENT_BYTES.to_bytes(2, "little") + _MARK
@@ -251,8 +261,10 @@ def _verify(path: Path) -> None:
 
 
 def _verify_foreign(path: Path, tail: bytes) -> None:
-    """A file of plain torch: a whole archive by its end, and each record by the checksum that torch
-    writes but doesn't read.
+    """Verify a file without our checksum, as plain ``torch.save`` writes it.
+
+    The end of the archive must be there, and each record must match its CRC-32, which
+    ``torch.load`` doesn't check.
     """
     if tail[-_END_RECORD_BYTES:][:4] != _END_OF_ARCHIVE or not tail.endswith(b"\0\0"):
         raise UserError(
@@ -283,8 +295,8 @@ def _keep_previous(path: Path) -> None:
         return
     kept = previous_of(path)
     if kept.exists() and kept.samefile(path):
-        # a kill fell after this, the last time; renaming one name of a file to another would leave
-        # both
+        # The last save was killed after os.replace below: both names are hard links to one file,
+        # and renaming one of them to the other would do nothing.
         return
     temporary = kept.with_name(f".{kept.name}.tmp")
     temporary.unlink(missing_ok=True)

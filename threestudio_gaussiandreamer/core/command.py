@@ -1,5 +1,5 @@
-"""What every command of the package does around its work: exit codes, and one message for what the
-user can mend."""
+"""Run a command-line program: exit codes, and errors in the user's input as one message without a
+traceback."""
 
 import os
 import signal
@@ -20,11 +20,11 @@ def run_command(
     """Parse a command line and run it.
 
     Args:
-        parse: from the arguments (None: this process's) to what ``run`` takes.
-        run: does the work.
+        parse: parses the arguments; None means those of this process.
+        run: does the work; its argument is what ``parse`` returned.
 
     Returns:
-        the exit code: 0 done; 2 a mistake of the user; 130 Ctrl-C; 141 a closed pipe.
+        the exit code: 0 for success, 2 for wrong input, 130 for Ctrl-C, 141 for a closed pipe.
     """
     try:
         args = parse(argv)
@@ -43,10 +43,10 @@ def run_command(
 
 
 def exit_code(error: Exception, verbose: bool = False) -> int:
-    """Say what ended a command, in one message.
+    """Print one message about the error that ended a command, and return the exit code.
 
     Raises:
-        Exception: ``error`` itself, if it is a mistake of the program.
+        Exception: ``error`` itself, unless it is a UserError or BrokenPipeError.
     """
     if not isinstance(error, (UserError, BrokenPipeError)):
         raise error
@@ -55,7 +55,7 @@ def exit_code(error: Exception, verbose: bool = False) -> int:
     if isinstance(error, UserError):
         print(f"error: {error}", file=sys.stderr)
         return 2
-    # the reader of the output has gone, as in `| head`; without this, flushing would fail at exit
+    # The reader has closed the pipe, as `| head` does; without this, Python's flush at exit fails.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     print(f"stopped: the reader of the output has closed it ({error.strerror})", file=sys.stderr)
     return 128 + signal.SIGPIPE

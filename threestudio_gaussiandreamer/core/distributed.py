@@ -1,7 +1,7 @@
-"""Several processes that train one cloud: each renders its own views, gradients and statistics are
-combined.
+"""Data-parallel training: each process renders its own views; gradients and statistics are reduced
+over all processes.
 
-Every function does nothing in a process that trains alone.
+In a single-process run these functions return their input unchanged.
 """
 
 from collections.abc import Iterable
@@ -16,27 +16,28 @@ def is_active() -> bool:
 
 
 def rank() -> int:
-    """The number of this process among those that train together."""
+    """Return the rank of this process; 0 in a single-process run."""
     return dist.get_rank() if is_active() else 0
 
 
 def all_sum(tensor: Tensor) -> Tensor:
-    """The sum over all processes, in place."""
+    """Sum over all processes, in place."""
     if is_active():
         dist.all_reduce(tensor, op=dist.ReduceOp.SUM)
     return tensor
 
 
 def all_max(tensor: Tensor) -> Tensor:
-    """The elementwise maximum over all processes, in place."""
+    """Take the elementwise maximum over all processes, in place."""
     if is_active():
         dist.all_reduce(tensor, op=dist.ReduceOp.MAX)
     return tensor
 
 
 def average_gradients(parameters: Iterable[torch.nn.Parameter]) -> None:
-    """Make every process step with the mean gradient, so that the clouds stay equal; a missing
-    gradient counts as zero.
+    """Replace gradients by their mean over all processes, so that the parameters stay identical.
+
+    A gradient that is None counts as zero.
     """
     if not is_active():
         return

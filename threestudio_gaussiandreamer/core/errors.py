@@ -1,5 +1,5 @@
-"""Errors that are the user's to mend: one clear message, exit code 2, a traceback only with
-``--verbose``.
+"""Errors in the user's input. Commands print their message, show a traceback only with
+``--verbose``, and exit with code 2.
 """
 
 import difflib
@@ -7,20 +7,21 @@ from collections.abc import Iterable
 
 
 class UserError(ValueError):
-    """Something the user gave can't be used; the message names it, what was expected, and what to
-    do.
+    """Report invalid input; the message names it, what was expected, and what to do.
 
-    Library callers see an ordinary ``ValueError``; the launcher prints the message alone and exits
-    with 2."""
+    In library use this is an ordinary ``ValueError``; commands print the message alone and exit
+    with code 2."""
 
 
 class Terminated(SystemExit):
-    """A signal asked the process to end; a ``sys.exit()`` in an extension is a mistake instead."""
+    """Raised when a signal asks the process to end; distinct from a ``sys.exit()`` in an extension,
+    which is an error.
+    """
 
 
 def unknown(kind: str, name: str, choices: Iterable[str]) -> UserError:
-    """The error for a name that isn't among ``choices``: lists the nearest ones, or all when none
-    is near.
+    """Make the error for a name that isn't among ``choices``; its message lists the most similar
+    choices, or all of them if none is similar.
     """
     choices = sorted(map(str, choices))
     near = difflib.get_close_matches(str(name), choices, n=3, cutoff=0.6)

@@ -1,7 +1,7 @@
-"""One memory budget per file: how much reading it may allocate, checked from its header.
+"""Limit the memory that reading a file may allocate, in proportion to the file's size.
 
-A few bytes of a compressed file can announce gigabytes. What a reader needs is known from the
-header, so it is compared with the file's size before anything is allocated."""
+A small compressed file can announce gigabytes of data. Readers compute the memory that they need
+from the header and check it here before they allocate anything."""
 
 from .errors import UserError
 from .memory import size_text

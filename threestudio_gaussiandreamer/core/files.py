@@ -1,6 +1,4 @@
-"""Reading and writing files so that a mistake is one clear message and a crash leaves nothing
-half-written.
-"""
+"""Check paths with clear error messages, and write files atomically."""
 
 import json
 import math
@@ -16,15 +14,15 @@ from .errors import UserError
 
 
 def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] = ()) -> Path:
-    """Return ``path`` as a :class:`Path` if a file is there; ``kind`` ("mesh", "PLY file") names it
-    in the message.
+    """Return ``path`` as a :class:`Path` after checking that it is an existing file.
 
     Args:
+        kind: what the file is, for the message ("mesh", "PLY file").
         bundled: bare names of packaged files, for the message only.
 
     Raises:
-        UserError: nothing, or no file, is there; the message lists the files of that folder with
-            near names.
+        UserError: the path doesn't exist or is no regular file; the message lists the files of its
+            folder with similar names.
     """
     try:
         path = Path(path).expanduser()
@@ -33,14 +31,14 @@ def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] =
         reason = "is a folder, not a file" if path.is_dir() else "does not exist"
         neighbours = near_names(path, bundled)
     except (OSError, ValueError, RuntimeError) as error:
-        # a name too long, a NUL inside, the home folder of an unknown user
+        # the name is too long or contains NUL, or "~user" names an unknown user
         raise UserError(f"{kind} {str(path)!r}: not a usable file name ({error}).") from error
     raise UserError(f"{kind} {str(path)!r} {reason}{neighbours}")
 
 
 def near_names(path: Path, bundled: Collection[str] = ()) -> str:
-    """Write the end of a "missing" message: the files beside ``path`` with near names or of its
-    kind, or a bundled one that may be meant.
+    """Return the end of the message for a missing file: files in its folder with similar names or
+    the same extension, or a bundled file with a similar name.
     """
     folder = path.parent
     names = (
@@ -63,16 +61,15 @@ def near_names(path: Path, bundled: Collection[str] = ()) -> str:
 
 @contextmanager
 def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[BinaryIO]:
-    """Open a binary file that appears under ``path`` whole, on success, or not at all; what was
-    there stays until then.
+    """Open a binary file for writing that replaces ``path`` only if the block succeeds.
 
-    The content goes to a temporary file beside it, which takes the name when it is whole.
+    The content is written to a temporary file in the same folder, which is renamed at the end.
 
     Args:
-        durable: wait until it is on the disk, so that it is whole also after a loss of power.
+        durable: also flush it to the disk, so that it is complete even after a power failure.
 
     Raises:
-        UserError: the folder is missing or unwritable, the disk is full, ...
+        UserError: the folder is missing or can't be written, or the disk is full.
     """
     path = Path(path)
     temporary = path.with_name(f".{_shortened(path.name)}.{os.getpid()}-{get_ident()}.tmp")
@@ -110,20 +107,20 @@ def _without_infinities(content: Any) -> Any:
 
 
 def _shortened(name: str, size: int = 100) -> str:
-    """Cut a file's name to at most ``size`` bytes, so that more can be appended to it."""
+    """Cut a file name to at most ``size`` bytes, to stay within the limit with a suffix added."""
     return name.encode(errors="surrogateescape")[:size].decode(errors="ignore")
 
 
 def require_writable(path: str | os.PathLike, what: str) -> None:
-    """Check that a file can be written under a name, before the work that makes its content.
+    """Check that a file can be written, before the work that makes its content.
 
     Args:
-        path: the file, which need not exist; one that does will be replaced.
-        what: names it in messages.
+        path: the file; it may exist already.
+        what: names the file in messages.
 
     Raises:
-        UserError: the name holds NUL or is too long, its folder is missing or can't be written, or
-            a folder has that name.
+        UserError: the name contains NUL or is too long, its folder is missing or can't be written,
+            or the path is a folder.
     """
     path = Path(path)
     try:
@@ -148,8 +145,8 @@ def _quoted(path: Path) -> str:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the renaming itself durable, where the system lets a folder be opened (not on
-    Windows).
+    """Flush a folder to the disk, so that a renaming in it is durable; does nothing on systems that
+    can't open folders (Windows).
     """
     try:
         descriptor = os.open(folder, os.O_RDONLY)

@@ -19,7 +19,7 @@ _MP4_OPTIONS = {
     "codec": "libx264",
     "pixelformat": "yuv420p",
     "macro_block_size": 1,
-    # the index comes first, so that a browser plays the video before all of it is loaded
+    # put the index first, so that a browser can start to play before it has the whole file
     "output_params": ["-movflags", "+faststart"],
 }
 
@@ -160,7 +160,7 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
 
 
 def _require_whole_mp4(path: Path) -> None:
-    """Raise OSError unless the boxes fill the file and the index is among them.
+    """Raise OSError unless the boxes of the MP4 fill the file and its index (moov) is among them.
 
     imageio doesn't report when ffmpeg ends early, for instance on a full disk."""
     names, place, size = [], 0, path.stat().st_size
@@ -168,10 +168,10 @@ def _require_whole_mp4(path: Path) -> None:
         while place + 8 <= size:
             file.seek(place)
             length, name = struct.unpack(">I4s", file.read(8))
-            if length == 1:  # the length of a large box follows
+            if length == 1:  # a 64-bit length follows
                 (length,) = struct.unpack(">Q", file.read(8))
             names.append(name)
-            place += length or size - place  # 0: to the end
+            place += length or size - place  # length 0: the box extends to the end of the file
     if place != size or b"moov" not in names:
         raise OSError("ffmpeg ended before the file was complete; is the disk full?")
 

@@ -1,16 +1,16 @@
-"""Text that OmegaConf must not read as an interpolation."""
+"""Escape text that OmegaConf would otherwise read as an interpolation."""
 
 import re
 from typing import Any
 
 
 def escape(value: Any) -> Any:
-    """``value`` such that OmegaConf gives the same text back: each ``${`` of a string, also inside
-    lists and dicts, escaped.
+    """Escape each ``${`` in a string, or in the strings of nested lists and dicts, so that
+    OmegaConf resolves it to the original text.
     """
     if isinstance(value, str):
-        # Backslashes mean themselves, except right before "${"; the look behind lets a row of them
-        # be tried from its start only, which takes linear time.
+        # Backslashes are literal except right before "${". The lookbehind makes a run of them match
+        # from its start only, which keeps the search linear in its length.
         return re.sub(r"(?<!\\)(\\*)\$\{", lambda match: 2 * match[1] + r"\${", value)
     if isinstance(value, dict):
         return {key: escape(item) for key, item in value.items()}

@@ -1,4 +1,4 @@
-"""Messages to the user, on rank zero only; the launcher decides where they go."""
+"""Log messages from rank 0 only; the launcher configures the handlers."""
 
 import logging
 import os
@@ -24,7 +24,7 @@ def _log(level: int, *args: object, **kwargs: object) -> None:
 
 
 def get_rank() -> int:
-    """The rank of this process among those that train together; 0 when it is alone."""
+    """Return the rank of this process from its environment variables; 0 if none is set."""
     ranks = (
         os.environ.get(key) for key in ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
     )

@@ -1,4 +1,4 @@
-"""The memory of this machine, and refusals of what can't fit into it, before any work."""
+"""Reject options that need more memory than this machine has, before any work."""
 
 import os
 from functools import cache
@@ -13,9 +13,7 @@ CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 @cache
 def memory_bytes() -> int:
-    """Bytes of memory that this process can have: the largest of the machine's (or its container's)
-    and each GPU's.
-    """
+    """Return the bytes of the largest memory: the machine's (or its container's) or one GPU's."""
     import torch
 
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
@@ -33,14 +31,15 @@ def _main_memory() -> int:
 
 
 def require_memory(options: str, needed: float, what: str) -> None:
-    """Check that something of about ``needed`` bytes can be held at all.
+    """Check that ``needed`` bytes fit into memory.
 
     Args:
-        options: the names of the options that it is from, as a message begins.
-        what: it, such as "24 pictures of 256 x 256 pixels".
+        options: the names of the options that determine the size; the message begins with them.
+        needed: approximate size, bytes.
+        what: names the data in the message, such as "24 pictures of 256 x 256 pixels".
 
     Raises:
-        UserError: it is larger than the whole memory.
+        UserError: ``needed`` exceeds :func:`memory_bytes`.
     """
     if needed > memory_bytes():
         raise UserError(
@@ -50,7 +49,12 @@ def require_memory(options: str, needed: float, what: str) -> None:
 
 
 def count_of(things: str, low: int, bytes_each: int) -> Rule:
-    """A rule for a field: whole numbers from ``low`` to as many ``things`` as the memory holds."""
+    """Return a rule for counts: whole numbers of at least ``low``, limited by the memory.
+
+    Args:
+        things: what is counted, for messages.
+        bytes_each: memory that one of them takes.
+    """
 
     def check(path: str, value: Any) -> None:
         if not is_whole(value) or value < low:
@@ -61,7 +65,7 @@ def count_of(things: str, low: int, bytes_each: int) -> Rule:
 
 
 def size_text(count: float) -> str:
-    """A number of bytes with its unit, such as "24 GB"."""
+    """Format a number of bytes with a unit, such as "24 GB"."""
     for unit in ("bytes", "kB", "MB", "GB"):
         if count < 1000:
             return f"{count:.3g} {unit}"

@@ -1,6 +1,4 @@
-"""Options in groups: a dataclass inside a part's ``Config`` keeps its defaults when a YAML gives
-only some of its keys.
-"""
+"""Nested dataclasses in a part's ``Config``: keys that a YAML doesn't give keep their defaults."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -8,11 +6,11 @@ from typing import Any
 
 
 def adopt_nested(config: Any) -> None:
-    """Turn mappings given for dataclass-typed fields into those dataclasses; call it from
+    """Convert mappings in dataclass-typed fields to those dataclasses; call it from
     ``__post_init__``.
 
-    The host builds ``Config(**mapping)``, which would leave a plain mapping, without the defaults
-    of the keys that it lacks.
+    The host builds ``Config(**mapping)``, which leaves a nested mapping as it is, without the
+    defaults of its missing keys.
 
     Raises:
         TypeError: a key that the dataclass doesn't have.

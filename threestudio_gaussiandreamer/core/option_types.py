@@ -1,5 +1,5 @@
-"""Types of options beyond what OmegaConf checks: it takes a list for a number, any length for a
-tuple, and NaN for a float.
+"""Check types of options more strictly than OmegaConf, which accepts a list in place of a number, a
+tuple of any length, and NaN for a float.
 """
 
 import dataclasses
@@ -15,8 +15,8 @@ SCALARS = {int: "a whole number", float: "a number", bool: "true or false", str:
 
 
 def check_types(config_class: Any, values: Mapping, prefix: str = "") -> None:
-    """Compare ``values`` with the annotations of the dataclass ``config_class``; keys that it lacks
-    aren't looked at.
+    """Check ``values`` against the annotations of the dataclass ``config_class``; unknown keys are
+    ignored.
 
     Raises:
         UserError: a list or section in place of a single value or the other way round, a tuple of
@@ -45,14 +45,14 @@ def _check(path: str, value: Any, annotation: Any) -> None:
 
 
 def _check_optional(path: str, value: Any, choices: tuple) -> None:
-    """``Optional[X]``; of other unions OmegaConf knows more."""
+    """Check a value of type ``Optional[X]``; other unions are left to OmegaConf."""
     inner = [choice for choice in choices if choice is not type(None)]
     if len(inner) == 1 and value is not None:
         _check(path, value, inner[0])
 
 
 def _check_scalar(path: str, value: Any, kind: type) -> None:
-    """Texts that may stand for a number are OmegaConf's to convert."""
+    """Check a single value; strings are accepted for numbers, since OmegaConf converts them."""
     not_bool = kind is bool and not isinstance(value, str) and value not in (0, 1)
     if _is_container(value) or value is None or not_bool:
         raise UserError(
@@ -75,7 +75,7 @@ def _check_sequence(path: str, value: Any, kind: type, items: tuple) -> None:
             _check(f"{path}[{i}]", item, annotation)
             if annotation in (int, float) and isinstance(
                 item, str
-            ):  # of a tuple's items OmegaConf checks and converts none
+            ):  # OmegaConf neither checks nor converts the items of a tuple
                 raise UserError(f"{path}[{i}]: expected {SCALARS[annotation]}, got {item!r}")
 
 
@@ -87,4 +87,4 @@ def _is_finite(text: str) -> bool:
     try:
         return -FLOAT32_MAX <= float(text) <= FLOAT32_MAX
     except ValueError:
-        return True  # no number at all, which OmegaConf says better
+        return True  # not a number: OmegaConf's own error is clearer

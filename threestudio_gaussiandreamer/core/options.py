@@ -3,10 +3,10 @@
     scale: float = field(default=1.0, metadata=positive())
     mode: str = field(default="fixed", metadata=one_of(MODES))
 
-:func:`check_options` looks at every field, then calls ``Config.check(cfg)`` where the class has
-one: a static method for rules across fields, which raises UserError with a message that begins with
-the option's name. The walker puts the path of the section before it. None passes where it is the
-default of a field. Every number has to be one that float32 or int64 can hold."""
+:func:`check_options` checks every field, then calls ``Config.check(cfg)`` where the class has one:
+a static method for rules across fields, which raises UserError with a message that begins with the
+option's name; the walker prepends the path of the section. None is accepted where it is the default
+of a field. Every number must be representable in float32 or int64."""
 
 import dataclasses
 import string
@@ -17,14 +17,14 @@ from .errors import UserError, unknown
 from .schedule import parse_schedule
 
 RULE = "option"
-"""The key of a field's metadata under which its rule stands."""
+"""The key of a field's rule in its metadata."""
 FLOAT32_MAX = 3.4028234663852886e38
 FLOAT32_TINY = 1.1754943508222875e-38
-"""Smallest normal number: a positive option below it would be zero on the way."""
+"""Smallest normal float32: smaller positive options could be rounded to zero."""
 NAME = string.ascii_letters + string.digits + "_"
 INT64_MAX = 2**63 - 1
 SHOWN = 80
-"""Characters of a wrong value that a message repeats."""
+"""Maximum length of a value in a message, characters."""
 
 Rule = dict[str, Callable[[str, Any], None]]
 
@@ -33,12 +33,12 @@ Rule = dict[str, Callable[[str, Any], None]]
 
 
 def rule(check: Callable[[str, Any], None]) -> Rule:
-    """Metadata of a field whose values ``check(path, value)`` accepts, or raises UserError."""
+    """Return field metadata with ``check(path, value)``, which raises UserError for a bad value."""
     return {RULE: check}
 
 
 def satisfies(expected: str, holds: Callable[[Any], bool]) -> Rule:
-    """Values for which ``holds`` is true; a message says that ``expected`` was expected."""
+    """Accept values for which ``holds`` is true; ``expected`` describes them in the message."""
 
     def check(path: str, value: Any) -> None:
         if not holds(value):
@@ -48,24 +48,24 @@ def satisfies(expected: str, holds: Callable[[Any], bool]) -> Rule:
 
 
 def positive(unit: str = "") -> Rule:
-    """Numbers above 0, in float32 too."""
+    """Accept numbers that are above 0, also after conversion to float32."""
     return satisfies(f"a number above 0{_of(unit)}", is_positive)
 
 
 def at_least(low: float, unit: str = "") -> Rule:
-    """Numbers of ``low`` or more."""
+    """Accept numbers of ``low`` or more."""
     return satisfies(f"{low:g} or more{_of(unit)}", lambda v: is_number(v) and v >= low)
 
 
 def in_range(low: float, high: float, unit: str = "") -> Rule:
-    """Numbers from ``low`` to ``high``, both included."""
+    """Accept numbers from ``low`` to ``high``, both included."""
     return satisfies(
         f"a number from {low:g} to {high:g}{_of(unit)}", lambda v: is_number(v) and low <= v <= high
     )
 
 
 def between(low: float, high: float, unit: str = "") -> Rule:
-    """Numbers between ``low`` and ``high``, both excluded."""
+    """Accept numbers between ``low`` and ``high``, both excluded."""
     return satisfies(
         f"a number between {low:g} and {high:g}{_of(unit)}",
         lambda v: is_number(v) and low < v < high,
@@ -73,7 +73,7 @@ def between(low: float, high: float, unit: str = "") -> Rule:
 
 
 def one_of(choices: Collection[str] | Callable[[], Collection[str]]) -> Rule:
-    """Names among ``choices``, or among what they return when called."""
+    """Accept names among ``choices``, which may be a function that returns them."""
 
     def check(path: str, value: Any) -> None:
         known = choices() if callable(choices) else choices
@@ -84,7 +84,7 @@ def one_of(choices: Collection[str] | Callable[[], Collection[str]]) -> Rule:
 
 
 def schedule(min: float = -FLOAT32_MAX, max: float = FLOAT32_MAX) -> Rule:
-    """Numbers and schedules of ``core/schedule.py`` with values from ``min`` to ``max``."""
+    """Accept numbers and schedules (``core/schedule.py``) with values from ``min`` to ``max``."""
 
     def check(path: str, value: Any) -> None:
         values = parse_schedule(value, path).values
@@ -97,7 +97,7 @@ def schedule(min: float = -FLOAT32_MAX, max: float = FLOAT32_MAX) -> Rule:
 
 
 def interval(low: float = -FLOAT32_MAX, high: float = FLOAT32_MAX, what: str = "numbers") -> Rule:
-    """Pairs [a, b] with a <= b, both from ``low`` to ``high``."""
+    """Accept pairs [a, b] with ``low`` <= a <= b <= ``high``; ``what`` describes the numbers."""
     bounds = [f"from {low:g}"] * (low > -FLOAT32_MAX) + [f"to {high:g}"] * (high < FLOAT32_MAX)
     return satisfies(
         " ".join([f"[low, high], {what}", *bounds, "with low <= high"]),
@@ -106,7 +106,7 @@ def interval(low: float = -FLOAT32_MAX, high: float = FLOAT32_MAX, what: str = "
 
 
 def each(item: Rule) -> Rule:
-    """Lists whose every item satisfies another rule."""
+    """Accept lists in which every item satisfies the rule ``item``."""
 
     def check(path: str, values: Any) -> None:
         if not is_list(values):
@@ -118,7 +118,7 @@ def each(item: Rule) -> Rule:
 
 
 def required(purpose: str) -> Rule:
-    """Texts that aren't empty; ``purpose`` says what to give."""
+    """Accept non-empty text; ``purpose`` is the message for empty text."""
 
     def check(path: str, value: Any) -> None:
         if not value:
@@ -135,7 +135,7 @@ def _of(unit: str) -> str:
 
 
 def is_number(value: Any) -> bool:
-    """Whether ``value`` is a number that float32 can hold, to its precision."""
+    """Return whether ``value`` is a finite number within float32's range."""
     return (
         isinstance(value, (int, float))
         and not isinstance(value, bool)
@@ -144,17 +144,17 @@ def is_number(value: Any) -> bool:
 
 
 def is_positive(value: Any) -> bool:
-    """Whether ``value`` is a number above 0, in float32 too."""
+    """Return whether ``value`` is a number above 0, also after conversion to float32."""
     return is_number(value) and value >= FLOAT32_TINY
 
 
 def is_whole(value: Any) -> bool:
-    """Whether ``value`` is an int that fits 64 bits, and no bool."""
+    """Return whether ``value`` is an int (not a bool) that fits into 64 bits."""
     return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= INT64_MAX
 
 
 def is_list(value: Any) -> bool:
-    """Whether ``value`` is a list, tuple or OmegaConf's list."""
+    """Return whether ``value`` is a list, a tuple or OmegaConf's list."""
     return isinstance(value, Sequence) and not isinstance(value, (str, bytes))
 
 
@@ -172,7 +172,7 @@ def shown(value: Any) -> str:
 
 
 def _digits(value: int) -> str:
-    """An integer as text; Python refuses to write one of more than 4300 digits."""
+    """Format an integer; Python raises an error for one of more than 4300 digits."""
     return repr(value) if value.bit_length() < 256 else f"an integer of {value.bit_length()} bits"
 
 
@@ -198,11 +198,11 @@ def require_representable(path: str, value: Any) -> None:
 
 
 def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
-    """Check the typed options ``cfg`` against what the fields of ``config_class`` declare.
+    """Check the options ``cfg`` against the rules that the fields of ``config_class`` declare.
 
     Args:
         cfg: an instance of the dataclass, or OmegaConf's mapping of it.
-        prefix: what the names of options begin with in messages, such as "system.geometry.".
+        prefix: prepended to the names of options in messages, such as "system.geometry.".
 
     Raises:
         UserError: the first value out of range; the message begins with its path.
@@ -224,7 +224,7 @@ def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
 
 
 def _located(message: str, prefix: str, names: Collection[str]) -> str:
-    """``message`` with the path of its option; a part of another package may give that itself."""
+    """Prepend the option's path to ``message``, unless the message begins with it already."""
     if message.startswith(prefix):
         return message
     begins_with_option = message[: len(message) - len(message.lstrip(NAME))] in names

@@ -1,4 +1,4 @@
-"""Standard output and error of a run: no failure to show a message ends the work."""
+"""Keep a run alive when its standard output or standard error can't be written any more."""
 
 import contextlib
 import errno
@@ -9,10 +9,10 @@ from typing import Any, Optional
 
 
 class TolerantFile(io.FileIO):
-    """A file descriptor that goes on accepting text after writing has failed once: the terminal was
-    closed, or the disk of a redirected output is full.
+    """A raw file that discards everything after the first write error, for instance when the
+    terminal was closed, or when the output is redirected to a disk that is full.
 
-    A closed pipe still raises BrokenPipeError, since its reader wants no more.
+    A closed pipe still raises BrokenPipeError, which ends the command as usual.
     """
 
     lost = False
@@ -26,7 +26,7 @@ class TolerantFile(io.FileIO):
             raise
         except OSError as error:
             self.lost = True
-            # after a hang-up the other stream is gone too
+            # EIO: the terminal is gone, and with it standard error
             if error.errno != errno.EIO and self.fileno() == 1:
                 print(
                     f"standard output can't be written ({error.strerror}): going on without it",
@@ -37,8 +37,8 @@ class TolerantFile(io.FileIO):
 
 @contextlib.contextmanager
 def tolerant_output() -> Iterator[None]:
-    """Let ``sys.stdout`` and ``sys.stderr`` tolerate failures, and characters that their encoding
-    doesn't have, which are written as escapes.
+    """Replace ``sys.stdout`` and ``sys.stderr`` by streams that ignore write errors, and that
+    escape characters which their encoding doesn't have.
     """
     earlier = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = map(_tolerant, earlier)
@@ -51,7 +51,9 @@ def tolerant_output() -> Iterator[None]:
 
 
 def _tolerant(stream: Any) -> Any:
-    """Open a stream's file as a :class:`TolerantFile`; a stream of another kind is returned."""
+    """Reopen a stream's descriptor as a :class:`TolerantFile`; return streams without one as they
+    are.
+    """
     buffer = getattr(stream, "buffer", None)
     is_unbuffered = isinstance(buffer, io.FileIO)  # python -u, or PYTHONUNBUFFERED
     if not isinstance(buffer if is_unbuffered else getattr(buffer, "raw", None), io.FileIO):

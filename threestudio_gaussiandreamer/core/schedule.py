@@ -1,5 +1,5 @@
-"""Values that change during training: ``C(value, epoch, global_step)`` and the check of what may be
-written for one.
+"""Values that change during training: ``C(value, epoch, global_step)``, and checks of schedules in
+configurations.
 
 ==========================================  ========================================================
 ``5`` or ``0.5``                            constant
@@ -32,11 +32,15 @@ class Schedule(NamedTuple):
 
 
 def C(value: Any, epoch: int, global_step: int, interpolation: str = "linear") -> float:
-    """The value of a schedule at this moment of training; ``interpolation`` is "linear" or "exp"
-    (between positive values).
+    """Evaluate a schedule at a step of training.
+
+    Args:
+        value: a number or a schedule in one of the forms above.
+        interpolation: between two knots, "linear" or "exp" (linear in the logarithm; the values
+            must be positive).
 
     Raises:
-        UserError: ``value`` is no schedule.
+        UserError: ``value`` is no schedule, or the interpolation is unknown.
     """
     if _is_number(value):
         return _finite(value, "the schedule")
@@ -45,15 +49,15 @@ def C(value: Any, epoch: int, global_step: int, interpolation: str = "linear") -
 
 
 def C_max(value: Any) -> float:
-    """The largest value that a schedule takes."""
+    """Return the largest value of a schedule."""
     return max(parse_schedule(value).values)
 
 
 def validate_schedule(value: Any, name: str = "the schedule", minimum: float = -math.inf) -> Any:
-    """``value`` itself when it can be given to :func:`C` and never falls below ``minimum``.
+    """Return ``value`` after checking that it is a schedule with values of ``minimum`` or more.
 
     Raises:
-        UserError: it can't, or does; the message names it by ``name``.
+        UserError: it isn't; the message begins with ``name``.
     """
     lowest = min(parse_schedule(value, name).values)
     if lowest < minimum:
@@ -62,7 +66,7 @@ def validate_schedule(value: Any, name: str = "the schedule", minimum: float = -
 
 
 def parse_schedule(value: Any, name: str = "the schedule") -> Schedule:
-    """The knots that ``value`` (a number, list, tuple or ListConfig) stands for.
+    """Convert a number, list, tuple or ListConfig to the knots of a schedule.
 
     Raises:
         UserError: wrong length, something that isn't a finite number, or steps that don't increase.
@@ -75,7 +79,7 @@ def parse_schedule(value: Any, name: str = "the schedule") -> Schedule:
     if len(knots) < 4 or len(knots) % 2:
         raise UserError(f"{name} has {len(knots)} elements: {value}; expected {FORMS}")
     knots = [_finite(knot, name) for knot in knots]
-    # the first pair is (step, value), all later ones (value, step)
+    # the first pair is (step, value), all later pairs are (value, step)
     steps, values, ends = [knots[0], *knots[3::2]], [knots[1], *knots[2::2]], knots[3::2]
     return Schedule(_increasing(steps, name), values, in_epochs=_in_epochs(ends, name))
 

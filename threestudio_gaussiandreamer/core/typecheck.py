@@ -1,9 +1,9 @@
 """``--typecheck``: every call of this package is checked against the array shapes and types in its
 annotations.
 
-jaxtyping's import hook wraps each function and binds the names of dimensions; what a single value
-must be is decided here. Only arrays are checked: configurations hold OmegaConf's lists and mappings
-where an annotation says ``list``, and numbers convert."""
+jaxtyping's import hook decorates each function with :func:`check` and binds the names of
+dimensions. Only arrays are checked: configurations hold OmegaConf's lists and mappings where an
+annotation says ``list``, and an int may be given for a float."""
 
 import functools
 import inspect
@@ -16,15 +16,13 @@ import jaxtyping
 
 
 def install() -> None:
-    """Check everything of this package that is imported from now on; for the launcher and for
-    tests.
-    """
+    """Check the functions of all modules of this package that are imported after this call."""
     jaxtyping.install_import_hook(__package__.partition(".")[0], f"{__name__}.check")
 
 
 def check(function: Callable) -> Callable:
-    """``function``, raising TypeError when an array among its arguments or results isn't what its
-    annotation says.
+    """Wrap ``function`` so that it raises TypeError when an array among its arguments or its result
+    doesn't match the annotation.
     """
     signature = inspect.signature(function)
 
@@ -52,7 +50,7 @@ def _require(value: Any, annotation: Any, what: str) -> None:
 
 
 def matches(value: Any, annotation: Any) -> bool:
-    """Whether ``value`` is an array as annotated; true for annotations that speak of no array."""
+    """Return whether ``value`` matches its annotation; True if that contains no array type."""
     if not _speaks_of_arrays(annotation):
         return True
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
