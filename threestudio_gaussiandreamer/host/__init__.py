@@ -1,7 +1,7 @@
 """The host that parts register into: threestudio when it is importable, otherwise the built-in one.
 
-Only this file knows which. Everything else imports these names from here; they mean the same in
-both hosts.
+This is the only module that selects the host. All others import these names from here, with the
+same meaning in both hosts.
 """
 
 import os
@@ -14,11 +14,10 @@ from ..core.streams import derive_seed
 
 
 def _threestudio_is_importable() -> bool:
-    """Tell whether ``import threestudio`` works; a folder of that name on the path that is no
-    package doesn't count.
+    """Return whether ``import threestudio`` gives the package, and not just a folder of that name.
 
     Raises:
-        UserError: threestudio is there but broken: which host is meant can't be guessed.
+        UserError: threestudio is installed, but importing it fails; the intended host is ambiguous.
     """
     try:
         import threestudio
@@ -54,8 +53,8 @@ if _threestudio_is_importable():
     NAME = "threestudio"
 
     def run_seed() -> int:
-        """Return the seed of this run, the same in every process of it; 0 without one."""
-        # threestudio gives each process the seed of the run plus its rank
+        """Return the seed of this run, the same in all its processes; 0 if none is set."""
+        # threestudio seeds each process with the run's seed plus the rank of the process
         return int(os.environ.get("PL_GLOBAL_SEED", get_rank())) - get_rank()
 
     def names() -> list[str]:
@@ -66,7 +65,7 @@ if _threestudio_is_importable():
         """Return the class registered as ``name``.
 
         Raises:
-            UserError: no part has that name; the message lists the near ones.
+            UserError: no part has that name; the message lists similar ones.
         """
         try:
             return threestudio.find(name)
@@ -74,8 +73,8 @@ if _threestudio_is_importable():
             raise unknown("part", name, names()) from None
 
     def register(name: str) -> Callable[[type], type]:
-        """Return a class decorator that enters the class under ``name``; entering the same class
-        twice is harmless.
+        """Return a class decorator that registers the class as ``name``; registering the same class
+        again has no effect.
         """
 
         def enter(cls: type) -> type:
@@ -90,8 +89,8 @@ if _threestudio_is_importable():
         return enter
 
     def register_builtin(name: str) -> Callable[[type], type]:
-        """Return :func:`register`'s decorator in the built-in host, and one without effect here,
-        where threestudio has its own part of that name.
+        """Return a class decorator that has no effect, since threestudio has its own part of this
+        name. In the built-in host it is :func:`register`.
         """
         return lambda cls: cls
 
@@ -115,13 +114,13 @@ else:
     register_builtin = register
 
     def run_seed() -> int:
-        """Return the seed of this run, the same in every process of it; 0 without one."""
+        """Return the seed of this run, the same in all its processes; 0 if none is set."""
         return int(os.environ.get("PL_GLOBAL_SEED", 0))
 
 
 def item_seed() -> int:
-    """Return the seed of what differs between processes that train one cloud together: cameras,
-    noise, backgrounds.
+    """Return the seed for cameras, noise and backgrounds, which differs between the processes that
+    train one cloud together.
     """
     return run_seed() if rank() == 0 else derive_seed(run_seed(), "rank", rank())
 

@@ -1,5 +1,5 @@
-"""The typed configuration of a part, as the launcher checks it in both hosts and the built-in one
-builds it."""
+"""Typed configurations of parts: the launcher checks them in both hosts, and the built-in host
+builds its parts from them."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -17,7 +17,7 @@ def parse_structured(config_class: Any, values: Any = None) -> DictConfig:
     """Fill the dataclass ``config_class`` with ``values`` and check their types; ranges are
     checked by ``core/options.py``.
 
-    A ``${`` in a string is text: interpolations are resolved by now.
+    A ``${`` in a string is literal text, since interpolations have been resolved before.
 
     Raises:
         UserError: an unknown key, a value of the wrong type or a missing one; the message begins

@@ -1,8 +1,8 @@
-"""CLIP from transformers' files: the text features that Point-E and Shap-E are conditioned on, and
-how well pictures fit a text.
+"""CLIP in transformers' format: text features, which condition Point-E and Shap-E, and the
+similarity of pictures and texts.
 
-Folders and model ids as in ``hub.py``. The published 3D models were trained with OpenAI's ViT-L/14
-(``openai/clip-vit-large-patch14``); pictures may be compared with any CLIP.
+``hub.py`` resolves folders and model ids. The published 3D models were trained with OpenAI's
+ViT-L/14 (``openai/clip-vit-large-patch14``); similarities can be computed with any CLIP.
 """
 
 from collections.abc import Collection
@@ -25,13 +25,21 @@ from .model_files import (
 )
 
 MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
-"""Of CLIP's training pictures, per channel; the same for all of OpenAI's and OpenCLIP's models."""
+"""Mean and standard deviation of CLIP's training pictures per channel, used by all of OpenAI's and
+OpenCLIP's models.
+"""
 
 
 def clip_source(
     model: str, *, option: str = "system.geometry.prior.clip", allow_bin: Optional[bool] = None
 ) -> Source:
-    """A whole CLIP in a folder or on the hub, as an option names it."""
+    """Describe a CLIP with both encoders and its tokenizer, in a folder or on the hub.
+
+    Args:
+        model: the folder or hub id.
+        option: the option that ``model`` is the value of, for messages.
+        allow_bin: see :func:`.model_files.component_weights`.
+    """
 
     def picks(names: Collection[str]) -> list[str]:
         needed = component_files(names, "", allow_bin=allow_bin)
@@ -44,8 +52,8 @@ def clip_source(
 def load_text_encoder(
     folder: Path, component: str = "", *, allow_bin: Optional[bool] = None
 ) -> Any:
-    """transformers' ``CLIPTextModelWithProjection`` in float32, in evaluation mode; also from the
-    files of a whole CLIP.
+    """Load transformers' ``CLIPTextModelWithProjection`` in float32 and evaluation mode. The files
+    may also be those of a CLIP with both encoders.
     """
     from transformers import CLIPTextModelWithProjection
 
@@ -59,8 +67,9 @@ def load_tokenizer(folder: Path, component: str = "") -> Any:
 
 
 def token_ids(tokenizer: Any, text: str) -> Tensor:
-    """(1, L) token ids, cut to the model's length. Without padding: CLIP's attention is causal, so
-    what follows the end of the text has no influence on it.
+    """Return token ids (1, L), truncated to the model's length.
+
+    They aren't padded: CLIP's attention is causal, so padding would not change the features.
     """
     return tokenizer(
         text, truncation=True, max_length=min(tokenizer.model_max_length, 77), return_tensors="pt"
@@ -69,15 +78,16 @@ def token_ids(tokenizer: Any, text: str) -> Tensor:
 
 @torch.no_grad()
 def text_condition(tokenizer: Any, encoder: Any, text: str) -> Float[Tensor, "1 D"]:
-    """The text's features with unit variance: normalised, times sqrt(D). No prompt is a vector of
-    zeros.
+    """Return the text's features, scaled to length sqrt(D), so that their variance is about 1.
+
+    Point-E and Shap-E take zeros in their place for the unconditional prediction.
     """
     features = encoder(token_ids(tokenizer, text).to(encoder.device)).text_embeds.float()
     return features / features.norm(dim=-1, keepdim=True) * features.shape[-1] ** 0.5
 
 
 class PictureText:
-    """A whole CLIP, loaded: how well pictures fit texts."""
+    """Load a CLIP with both encoders and compute similarities of pictures and texts."""
 
     def __init__(
         self, source: Source, device: torch.device, *, allow_bin: Optional[bool] = None
@@ -93,7 +103,7 @@ class PictureText:
     def similarities(
         self, pictures: Float[np.ndarray, "N H W 3"], text: str, *, batch: int = 32
     ) -> Float[np.ndarray, "N"]:
-        """The cosine between each picture (values in [0, 1]) and ``text``."""
+        """Return the cosine similarity of each picture (values in [0, 1]) and ``text``."""
         wanted = _unit(
             _features(
                 self._model.get_text_features(token_ids(self._tokenizer, text).to(self._device))
@@ -124,8 +134,8 @@ def picture_similarities(
     device: torch.device,
     batch: int = 32,
 ) -> Float[np.ndarray, "N"]:
-    """The cosine between each picture (values in [0, 1]) and ``text``; the model is loaded for this
-    and freed.
+    """Return the cosine similarity of each picture (values in [0, 1]) and ``text``; the model is
+    loaded for this call and freed.
     """
     scores = PictureText(source, device).similarities(pictures, text, batch=batch)
     free_memory()
@@ -133,7 +143,7 @@ def picture_similarities(
 
 
 def _features(output: Any) -> Tensor:
-    """transformers 4 gives the tensor, 5 an object that has it."""
+    """Return the features as a tensor: transformers 4 returns it, 5 an object that contains it."""
     return output if isinstance(output, Tensor) else output.pooler_output
 
 

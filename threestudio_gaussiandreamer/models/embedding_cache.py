@@ -1,4 +1,4 @@
-"""Text embeddings on the disk: one safetensors file per (model, text), whole or absent."""
+"""Cache text embeddings on disk: one safetensors file per (model, text), written atomically."""
 
 import hashlib
 import json
@@ -14,7 +14,9 @@ from ..core.files import atomic_file
 from ..host import debug
 
 FORMAT = 1
-"""Goes into the key: raise it when what is stored for the same model and text changes."""
+"""Version of the cache's content, part of the key: increase it when an encoder's output for the
+same model and text changes.
+"""
 
 Encode = Callable[[list[str]], list[Float[Tensor, "N F"]]]
 
@@ -23,9 +25,8 @@ class EmbeddingCache:
     """The embeddings of one model's text encoder in ``folder``.
 
     Args:
-        folder: where the files are; made when first written to.
-        model: what the embeddings depend on beside the text, ``hub.fingerprint`` of tokenizer and
-            text encoder.
+        folder: contains the files; created on the first write.
+        model: ``model_files.fingerprint`` of the tokenizer and the text encoder.
     """
 
     def __init__(self, folder: str, model: str) -> None:
@@ -36,7 +37,7 @@ class EmbeddingCache:
         return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()}.safetensors"
 
     def read(self, text: str) -> Optional[Float[Tensor, "N F"]]:
-        """The embedding of ``text``; None when it isn't there or its file is damaged."""
+        """Return the embedding of ``text``; None if it isn't cached or its file is damaged."""
         from safetensors import SafetensorError
         from safetensors.torch import load
 
@@ -50,10 +51,10 @@ class EmbeddingCache:
             return None
 
     def write(self, text: str, embedding: Float[Tensor, "N F"]) -> None:
-        """Keep one embedding; after a crash in the middle the file is as before.
+        """Store one embedding atomically: a crash leaves the earlier file, or none.
 
         Raises:
-            UserError: the folder can't be made or written.
+            UserError: the folder can't be created or written.
         """
         from safetensors.torch import save
 
@@ -71,7 +72,7 @@ class EmbeddingCache:
             )
 
     def embed(self, texts: list[str], encode: Encode) -> list[Float[Tensor, "N F"]]:
-        """The embeddings of ``texts``; only those that aren't here yet are encoded, and kept."""
+        """Return the embeddings of ``texts``; those that aren't cached are encoded and stored."""
         found = {text: self.read(text) for text in texts}
         missing = [text for text, embedding in found.items() if embedding is None]
         if missing:

@@ -1,4 +1,4 @@
-"""Optional dependencies: what to install when a part needs one that isn't there."""
+"""Optional dependencies: the check that they are installed."""
 
 from importlib import import_module
 
@@ -6,8 +6,8 @@ from ..core.errors import UserError
 
 
 def require_extra(extra: str, *modules: str) -> None:
-    """Raise UserError, which says what to install, unless all ``modules`` of the package's
-    ``extra`` can be imported.
+    """Raise UserError, with the command that installs ``extra``, unless all of its ``modules`` can
+    be imported.
     """
     for module in modules:
         try:

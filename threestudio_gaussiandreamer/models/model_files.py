@@ -1,5 +1,4 @@
-"""What a model's folder holds in the formats of diffusers and transformers, which of its files are
-needed, and loading them.
+"""Select the needed files of a model in diffusers' or transformers' format, and load them.
 
 A model of several components has a sub-folder for each (``unet``, ``vae``, ``text_encoder``, ...);
 one of a single network has its files in the folder itself, and that component is called "". Weights
@@ -17,15 +16,15 @@ from typing import Any, NamedTuple, Optional
 from ..core.errors import UserError
 
 WITHOUT_WEIGHTS = {"tokenizer": "tokenizer_config.json", "scheduler": "scheduler_config.json"}
-"""Components that are all configuration, and the file that they can't be without."""
+"""Components without weights, and the file that each must have."""
 VOCABULARIES = ({"tokenizer.json"}, {"vocab.json", "merges.txt"}, {"spiece.model"})
-"""What the words of a tokenizer may be in."""
+"""Sets of files, of which any one holds a tokenizer's vocabulary."""
 WEIGHTS = re.compile(
     r"(?:diffusion_pytorch_model|model)(?P<early>\.fp16)?(?:-\d{5}-of-(?P<shards>\d{5}))?(?P<late>\.fp16)?\.safetensors"
 )
 PICKLED = ("diffusion_pytorch_model.bin", "pytorch_model.bin")
 SAMPLE = 1 << 16
-"""Bytes of each of the sixteen places at which a weight file is sampled for its fingerprint."""
+"""Bytes of each of the sixteen samples of a weight file that enter its fingerprint."""
 
 
 class Weights(NamedTuple):
@@ -33,13 +32,13 @@ class Weights(NamedTuple):
 
     files: list[str]
     variant: Optional[str]
-    """None or "fp16"."""
+    """None, or "fp16" for half precision."""
     safe: bool
-    """Whether it is safetensors."""
+    """Whether the files are safetensors."""
 
 
 def files_below(folder: Path) -> list[str]:
-    """The files of a model's folder, as paths relative to it ("unet/config.json")."""
+    """List the files of a model's folder, as paths relative to it ("unet/config.json")."""
     return sorted(
         path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
     )
@@ -52,10 +51,10 @@ def needed_files(
     half: bool = False,
     allow_bin: Optional[bool] = None,
 ) -> list[str]:
-    """Those of a model's files that loading these components reads; see :func:`component_weights`.
+    """Return the files that are read to load these components; see :func:`component_weights`.
 
     Raises:
-        UserError: they aren't all there; the message names what each component lacks.
+        UserError: files are missing; the message lists them for each component.
     """
     needed, problems = ["model_index.json"] if "model_index.json" in names else [], []
     for component in components:
@@ -71,10 +70,10 @@ def needed_files(
 def component_files(
     names: Collection[str], component: str, *, half: bool = False, allow_bin: Optional[bool] = None
 ) -> list[str]:
-    """The files that loading one component reads.
+    """Return the files that are read to load one component.
 
     Raises:
-        UserError: they aren't all there.
+        UserError: files are missing.
     """
     prefix, own = _own(names, component)
     small = [prefix + name for name in own if name.endswith((".json", ".txt", ".model"))]
@@ -91,7 +90,7 @@ def component_files(
 
 
 def require_vocabulary(names: Collection[str], component: str) -> None:
-    """Raise UserError unless a tokenizer's words are among ``names``."""
+    """Raise UserError unless ``names`` has the files of a tokenizer's vocabulary."""
     prefix, own = _own(names, component)
     if not any(vocabulary <= set(own) for vocabulary in VOCABULARIES):
         raise UserError(
@@ -103,16 +102,16 @@ def require_vocabulary(names: Collection[str], component: str) -> None:
 def component_weights(
     names: Collection[str], component: str, *, half: bool = False, allow_bin: Optional[bool] = None
 ) -> Weights:
-    """The weight files of one component: of the wanted precision where that set is complete, else
-    of the other one.
+    """Select the weight files of one component: in the preferred precision if that set is complete,
+    else in the other one.
 
     Args:
-        half: prefer half-precision files where there are both.
-        allow_bin: take a ``.bin`` where there is nothing else; None: as False, where no option of
-            the user's is called so.
+        half: prefer half precision.
+        allow_bin: accept ``.bin`` files if there is no safetensors. None is as False, for callers
+            whose users have no such option.
 
     Raises:
-        UserError: no complete set of files that may be read.
+        UserError: there is no complete set of files that may be read.
     """
     prefix, own = _own(names, component)
     complete = {}
@@ -129,8 +128,8 @@ def component_weights(
 
 
 def _own(names: Collection[str], component: str) -> tuple[str, list[str]]:
-    """The prefix of a component's files, and what follows it in the names of those that lie
-    directly there.
+    """Return the prefix of a component's files ("unet/"), and the names of the files directly in
+    its folder, without the prefix.
     """
     prefix = f"{component}/" if component else ""
     own = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
@@ -138,7 +137,7 @@ def _own(names: Collection[str], component: str) -> tuple[str, list[str]]:
 
 
 def _complete_set(own: list[str], variant: Optional[str]) -> list[str]:
-    """One file, or all shards; empty when some are missing."""
+    """Return the single weight file, or all shards; an empty list if some are missing."""
     matches = {name: WEIGHTS.fullmatch(name) for name in own}
     found = {
         name: match
@@ -169,11 +168,11 @@ def _without_weights(prefix: str, own: list[str], allow_bin: Optional[bool]) -> 
 
 
 def fingerprint(folder: Path, components: Iterable[str]) -> str:
-    """A digest of what these components are, whatever the folder is called: small files whole,
-    weight files sampled with their size.
+    """Return a digest of the content of these components, independent of the folder's name.
 
-    Sixteen samples of 64 KiB tell two sets of trained weights apart in milliseconds; they don't
-    find a single changed byte."""
+    Files up to 1 MiB are read whole; of larger ones the size and about sixteen evenly spaced
+    samples of 64 KiB. That takes milliseconds and distinguishes differently trained weights, but
+    may not notice a single changed byte."""
     digest = hashlib.sha256()
     for component in sorted(components):
         for path in sorted(path for path in (folder / component).rglob("*") if path.is_file()):
@@ -201,12 +200,14 @@ def load_network(
     allow_bin: Optional[bool] = None,
     **options: Any,
 ) -> Any:
-    """One network by ``from_pretrained`` of diffusers or transformers, from this disk, in
-    evaluation mode, on the CPU.
+    """Load a network with ``from_pretrained`` of diffusers or transformers from local files.
 
     Args:
         half, allow_bin: see :func:`component_weights`.
-        options: more for ``from_pretrained``, such as the type of the weights.
+        options: further arguments of ``from_pretrained``, such as ``dtype``.
+
+    Returns:
+        the network on the CPU, in evaluation mode.
 
     Raises:
         UserError: its files are damaged, lack weights, or are not what the libraries expect.
@@ -219,7 +220,7 @@ def load_network(
     }
     with _quiet_transformers():
         network, report = _from_pretrained(loader, folder, component, options)
-    # both libraries would go on with random numbers, after a warning
+    # both libraries only warn, and initialise missing weights at random
     if missing := sorted(report["missing_keys"]):
         raise UserError(
             f"{_name(loader, folder, component)} lacks weights: "
@@ -229,7 +230,7 @@ def load_network(
 
 
 def load_settings(loader: Any, folder: Path, component: str = "", **options: Any) -> Any:
-    """A tokenizer or a scheduler by ``from_pretrained``, from this disk.
+    """Load a tokenizer or a scheduler with ``from_pretrained`` from local files.
 
     Raises:
         UserError: its files are damaged or not what the libraries expect.
@@ -256,8 +257,8 @@ def _name(loader: Any, folder: Path, component: str) -> str:
 
 @contextmanager
 def _quiet_transformers() -> Iterator[None]:
-    """Without its table of the weights that a file has and the wanted part doesn't, as a whole
-    CLIP's for its text half.
+    """Suppress transformers' table of weights that a file has in excess of the loaded network, as
+    when only the text encoder of a CLIP is loaded.
     """
     from transformers.utils import logging
 
@@ -270,7 +271,7 @@ def _quiet_transformers() -> Iterator[None]:
 
 
 def free_memory() -> None:
-    """Give back what models held that nothing refers to any more, also on the GPU."""
+    """Collect garbage, and return the GPU memory that PyTorch caches to the device."""
     import torch
 
     gc.collect()

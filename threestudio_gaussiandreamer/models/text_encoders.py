@@ -1,8 +1,8 @@
-"""Running a model's text encoder: CLIP for Stable Diffusion, T5 for DeepFloyd IF. It is loaded,
-used once, and freed.
+"""Encode texts with a model's text encoder: CLIP for Stable Diffusion, T5 for DeepFloyd IF. The
+encoder is loaded for one call and freed.
 
-Both follow diffusers' own pipelines: padded to the model's length, too long texts cut with a
-warning, no gradients, float32 out."""
+As in diffusers' pipelines, texts are padded to the model's length, and longer ones truncated with a
+warning. The result is float32, without gradients."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -17,12 +17,12 @@ from .extras import require_extra
 from .model_files import free_memory, load_network, load_settings
 
 LENGTH = 77
-"""Tokens that CLIP, and DeepFloyd IF with its T5, were trained with."""
+"""Number of tokens that CLIP, and DeepFloyd IF with T5, were trained with."""
 
 
 def encode_clip(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
-    """The last hidden states of Stable Diffusion's text encoder, float32 on the CPU, one (N, F) per
-    text.
+    """Return the last hidden states of Stable Diffusion's text encoder, one (N, F) per text,
+    float32 on the CPU.
     """
     from transformers import CLIPTextModel
 
@@ -33,7 +33,8 @@ def encode_clip(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
         encoder = load_network(CLIPTextModel, folder, "text_encoder", dtype=torch.float32).to(
             device
         )
-        # some models were trained to ignore the padding, most (all of Stable Diffusion's) to see it
+        # Some models were trained with a mask that hides the padding; most, including all of Stable
+        # Diffusion's, were trained without.
         mask = (
             tokens.attention_mask.to(device)
             if getattr(encoder.config, "use_attention_mask", False)
@@ -45,15 +46,14 @@ def encode_clip(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
 
 
 def encode_t5(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
-    """The last hidden states of DeepFloyd IF's T5 encoder, float32 on the CPU, one (77, F) per
-    text.
+    """Return the last hidden states of DeepFloyd IF's T5 encoder, one (77, F) per text, float32 on
+    the CPU.
 
-    In half precision on a GPU, where nothing else is loaded yet: IF's encoder then takes about 11
-      GB, in float32 19 GB.
+    On a GPU the encoder runs in half precision and takes about 11 GB; float32 takes 19 GB.
     """
     require_extra(
         "diffusion", "sentencepiece", "google.protobuf"
-    )  # without them transformers takes the tokenizer for another kind
+    )  # without these modules transformers chooses another tokenizer class
     from transformers import T5EncoderModel
 
     tokenizer = _tokenizer(folder)
@@ -78,7 +78,7 @@ def encode_t5(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
 def _tokenizer(folder: Path) -> Any:
     from transformers import AutoTokenizer
 
-    # unless told not to, transformers would offer to run code that lies in the folder
+    # without this argument transformers asks whether to run code from the folder
     return load_settings(AutoTokenizer, folder, "tokenizer", trust_remote_code=False)
 
 
@@ -97,8 +97,8 @@ def _tokenize(tokenizer: Any, texts: list[str], length: int) -> Any:
 
 @torch.no_grad()
 def _freed(run: Callable[[torch.device], Tensor]) -> Tensor:
-    """``run`` on this run's device, or on the CPU when the GPU's memory doesn't suffice; what it
-    loaded is gone afterwards.
+    """Call ``run`` with this run's device, or with the CPU if the GPU's memory doesn't suffice;
+    free its memory afterwards.
     """
     device = get_device()
     try:

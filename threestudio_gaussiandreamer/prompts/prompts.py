@@ -4,9 +4,9 @@
 option           meaning
 ===============  ===================================================================================
 prompt           the text
-prompt_file      a UTF-8 file whose whole content is the prompt, but for one line end at its end:
-                 nothing needs quoting; in place of ``prompt``
-negative_prompt  kept beside it; nothing here reads it
+prompt_file      a UTF-8 file whose content is the prompt, except for one line break at its end;
+                 in place of ``prompt``. Nothing in it needs to be quoted
+negative_prompt  passed on to the guidance as text; this package's guidances don't read it
 ===============  ===================================================================================
 """
 
@@ -18,24 +18,24 @@ from ..core.files import existing_file
 from ..host import BaseObject, register
 
 DIRECTIONS = ("side", "front", "back", "overhead")
-"""In the order of threestudio's view-dependent prompts."""
+"""The view directions in the order of threestudio's view-dependent prompts."""
 MAX_PROMPT_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
 class PlainPrompt:
-    """What the processor gives to the guidance: text alone."""
+    """The output of the prompt processor: texts without embeddings."""
 
     prompt: str
     negative_prompt: str = ""
 
     @property
     def prompts_vd(self) -> List[str]:
-        """The prompt for each of ``DIRECTIONS``: "a fox, side view", ..."""
+        """Prompts with each of ``DIRECTIONS``: "a fox, side view", ..."""
         return [f"{self.prompt}, {direction} view" for direction in DIRECTIONS]
 
     def get_text_embeddings(self, *args: object, **kwargs: object) -> NoReturn:
-        """Raises UserError: a guidance that wants embeddings needs another prompt processor."""
+        """Raise UserError: a guidance that needs embeddings needs another prompt processor."""
         raise UserError(
             "plain-prompt-processor has no text encoder, but the guidance asks for text "
             "embeddings: "
@@ -46,7 +46,7 @@ class PlainPrompt:
 
 @register("plain-prompt-processor")
 class PlainPromptProcessor(BaseObject):
-    """Holds the prompt; calling it gives a :class:`PlainPrompt`."""
+    """Hold the prompt as text; a call returns a :class:`PlainPrompt`."""
 
     @dataclass
     class Config(BaseObject.Config):
@@ -69,10 +69,10 @@ class PlainPromptProcessor(BaseObject):
 
 
 def read_prompt(path: str) -> str:
-    """The content of a prompt file, verbatim but for one line end at its end.
+    """Read a prompt file verbatim, except for one line break at its end.
 
     Raises:
-        UserError: missing, not UTF-8, or larger than any prompt.
+        UserError: the file is missing, isn't UTF-8, or is larger than ``MAX_PROMPT_BYTES``.
     """
     file = existing_file(path, "prompt file")
     try:

@@ -1,10 +1,10 @@
-"""Text embeddings per view: what a prompt processor with a text encoder gives to a guidance, with
-threestudio's interface.
+"""Text embeddings per view, the output of prompt processors with a text encoder. The interface is
+threestudio's.
 
-A view's direction (side, front, back or overhead) picks the prompt "a fox, front view"; with
-Perp-Neg (Armandpour et al. 2023) a view between two directions gets their interpolated embedding,
-and the other directions as negative prompts whose weights decay with the angle. Angles are in
-degrees, azimuth 0 is the front."""
+The direction of a view (side, front, back or overhead) selects the prompt, such as "a fox, front
+view". With Perp-Neg (Armandpour et al. 2023) a view between two directions gets their interpolated
+embedding, and the other directions as negative prompts whose weights decay with the angle. Angles
+are in degrees; azimuth 0 is the front."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ Coefficients = Tuple[float, float, float]
 
 
 class Direction(NamedTuple):
-    """One view direction; a later one of a list takes precedence where two apply."""
+    """One view direction. If a view satisfies the conditions of several, the last one applies."""
 
     name: str
     prompt: Callable[[str], str]
     negative_prompt: Callable[[str], str]
     condition: Condition
-    """(elevation, azimuth, camera_distances), each (B,), to (B,) bool."""
+    """Maps (elevation, azimuth, camera_distances), each (B,), to bool (B,): which views have it."""
 
 
 def view_directions(
@@ -37,13 +37,13 @@ def view_directions(
     *,
     prefix: bool = False,
 ) -> List[Direction]:
-    """threestudio's four directions in its order: side, front, back, overhead.
+    """Return threestudio's four directions in its order: side, front, back, overhead.
 
     Args:
         front_threshold, back_threshold: half the width of the front and the back, degrees of
             azimuth.
-        overhead_threshold: elevation from which a view is overhead, degrees.
-        prefix: "front view of a fox" instead of "a fox, front view".
+        overhead_threshold: elevation above which a view is overhead, degrees.
+        prefix: write "front view of a fox" instead of "a fox, front view".
     """
     conditions: Dict[str, Condition] = {
         "side": lambda elevation, azimuth, distance: torch.ones_like(elevation, dtype=torch.bool),
@@ -65,7 +65,7 @@ def _prompt_maker(name: str, prefix: bool) -> Callable[[str], str]:
 
 
 def shifted(azimuth: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
-    """The azimuth in [-180, 180)."""
+    """Return the azimuth, in degrees, shifted to [-180, 180)."""
     return (azimuth + 180) % 360 - 180
 
 
@@ -96,7 +96,7 @@ class PromptEmbeddings:
         azimuth: Float[Tensor, " B"],
         camera_distances: Float[Tensor, " B"],
     ) -> Int[Tensor, " B"]:
-        """The row of ``*_vd`` of each view."""
+        """Return the index of each view's direction, which is its row of ``*_vd``."""
         indices = torch.zeros_like(elevation, dtype=torch.long)
         for direction in self.directions:
             indices[direction.condition(elevation, azimuth, camera_distances)] = self.direction2idx[
@@ -111,7 +111,13 @@ class PromptEmbeddings:
         camera_distances: Float[Tensor, " B"],
         view_dependent_prompting: bool = True,
     ) -> Float[Tensor, "2*B N F"]:
-        """The prompts of all views, then their negative prompts."""
+        """Return the embeddings of the views' prompts, then those of their negative prompts.
+
+        Args:
+            elevation, azimuth: degrees.
+            view_dependent_prompting: use the prompt of each view's direction; else the same prompt
+                for all.
+        """
         if view_dependent_prompting:
             rows = self.direction_indices(elevation, azimuth, camera_distances).to(
                 self.text_embeddings_vd.device
@@ -129,15 +135,16 @@ class PromptEmbeddings:
         camera_distances: Float[Tensor, " B"],
         view_dependent_prompting: bool = True,
     ) -> Tuple[Float[Tensor, "4*B N F"], Float[Tensor, "B 2"]]:
-        """The prompts of all views, their negative prompts, then two Perp-Neg rows per view; and
-        the weights of those two, <= 0.
+        """Return the embeddings of the views' prompts, of their negative prompts, then two Perp-Neg
+        rows per view; and the weights of those two, which are <= 0.
 
-        The rows of one view stand together (view 0 first, view 0 second, view 1 first, ...), as
-        threestudio has them. Its own guidances evaluate them on the latents of other views when
-        there is more than one; ours pair them by view.
+        The two Perp-Neg rows of a view are adjacent (view 0 first, view 0 second, view 1 first,
+        ...), as in threestudio. With more than one view threestudio's guidances combine them with
+        the latents of other views; this package's guidances pair them by view.
 
         Raises:
-            UserError: without view-dependent prompting there are no directions to keep apart.
+            UserError: ``view_dependent_prompting`` is off, which leaves no directions to
+                distinguish.
         """
         if not view_dependent_prompting:
             raise UserError(
@@ -162,8 +169,8 @@ class PromptEmbeddings:
     def _interpolation(
         self, angle: Float[Tensor, " B"]
     ) -> Tuple[Int[Tensor, "B 2"], Float[Tensor, " B"]]:
-        """The two directions that a view lies between, and how close it is to the first of them, in
-        [0, 1].
+        """Return the two directions that each view lies between, and the weight of the first one in
+        the interpolation, in [0, 1].
         """
         side, front, back = (self.direction2idx[name] for name in ("side", "front", "back"))
         in_front = angle < 90
@@ -191,6 +198,6 @@ class PromptEmbeddings:
 
 
 def decay(coefficients: Coefficients, r: Tensor) -> Tensor:
-    """a exp(-b r) + c."""
+    """Compute a exp(-b r) + c."""
     a, b, c = coefficients
     return a * torch.exp(-b * r) + c
