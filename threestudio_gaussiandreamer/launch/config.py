@@ -25,8 +25,8 @@ from .run_folder import name_folders
 
 @dataclass
 class ExperimentConfig:
-    """What a YAML file may hold at its top level; the second block is computed, and accepted from a
-    ``parsed.yaml``.
+    """The keys at the top level of a YAML file. Those from ``exp_dir`` to ``n_gpus`` are computed;
+    they are accepted because a ``parsed.yaml`` has them.
     """
 
     name: str = "default"
@@ -54,8 +54,8 @@ class ExperimentConfig:
 
 
 def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus: int = 1) -> Any:
-    """The run that these YAML files (later ones win) and ``key=value`` overrides describe; makes no
-    folder.
+    """Merge YAML files, of which later ones take precedence, and ``key=value`` overrides into the
+    configuration of a run. No folder is created.
 
     Returns:
         an :class:`ExperimentConfig` as a DictConfig without interpolations.
@@ -78,8 +78,8 @@ def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus:
 
 
 def dump_config(path: str | os.PathLike, cfg: Any) -> None:
-    """Write a configuration so that :func:`load_config` reads the same run back; what it was
-    resumed from, and that its folder was new, is left out.
+    """Write a configuration from which :func:`load_config` restores the same run, without
+    ``resume`` and ``new_folder``.
     """
     plain = OmegaConf.create(OmegaConf.to_container(cfg, resolve=False))
     if "resume" in plain:
@@ -90,8 +90,8 @@ def dump_config(path: str | os.PathLike, cfg: Any) -> None:
 
 
 def _with_prompt_from_file(source: DictConfig) -> DictConfig:
-    """``prompt_processor.prompt_file`` replaced by a ``prompt`` that is the file's text, so that
-    the tag can be made of it.
+    """Replace ``prompt_processor.prompt_file`` by a ``prompt`` with the file's text, so that the
+    tag can refer to it.
     """
     try:
         section = OmegaConf.select(source, "system.prompt_processor")
@@ -120,19 +120,19 @@ def _merge(sources: list[DictConfig]) -> DictConfig:
             f"the configurations can't be merged: {clash} is a list in one and a section in another"
         ) from error
     for section in ("data", "system", "trainer", "checkpoint"):
-        # "trainer:" with nothing below it is null in YAML
+        # YAML reads "trainer:" without content as null
         if section in merged and merged._get_node(section)._is_none():
             merged[section] = {}
     return merged
 
 
 def _forget_replaced_parts(earlier: DictConfig, later: DictConfig, path: str = "") -> None:
-    """Where ``later`` names another part (``x_type``), drop the options of ``earlier``'s ``x`` that
-    the new part doesn't have.
+    """Remove options from ``earlier`` that are invalid after a merge with ``later``, in place.
 
-    So ``system.geometry.prior_type=random-prior`` is all that it takes to try another prior; what
-    ``later`` itself gives stays. What ``later`` leaves open (``???``) has to be given anew, even if
-    ``earlier`` has a value (OmegaConf would keep that)."""
+    If ``later`` changes a part (``x_type``), the options in ``earlier``'s section ``x`` that the
+    new part doesn't have are removed, so that ``system.geometry.prior_type=random-prior`` suffices
+    to select another prior. If ``later`` has a mandatory value (``???``), ``earlier``'s value is
+    removed too, which OmegaConf's merge would keep."""
     for key in later:
         if OmegaConf.is_missing(later, key):
             earlier._content.pop(key, None)
@@ -158,7 +158,7 @@ def _keep_options_of(section: Any, type_name: Any, path: str) -> None:
 
 
 def _clash(a: DictConfig, b: DictConfig, section: str = "") -> Optional[str]:
-    """The first key that is a list in one and a section in the other."""
+    """Return the first key that is a list in one of the two and a section in the other."""
     for key in a:
         one, other = a._get_node(key), b._get_node(key) if key in b else None
         if isinstance(one, (DictConfig, ListConfig)) and isinstance(
@@ -182,8 +182,7 @@ def _require_mandatory(cfg: DictConfig) -> None:
 
 
 def _missing_keys(node: DictConfig, section: str = "") -> list[str]:
-    # OmegaConf.missing_keys resolves interpolations on its way, which fails when one leads to a
-    # "???"
+    # not OmegaConf.missing_keys, which resolves interpolations and fails if one refers to "???"
     if node._is_none() or node._is_interpolation():
         return []
     children = {f"{section}{key}": node._get_node(key) for key in node}
@@ -217,8 +216,8 @@ def _explain(error: OmegaConfBaseException) -> str:
 
 
 def register_resolvers() -> None:
-    """The functions that a YAML may call as ``${name:...}``; those that threestudio has registered
-    stay.
+    """Register the functions that a YAML file may call as ``${name:...}``. Those that threestudio
+    has registered are kept.
     """
     resolvers = {
         "calc_exp_lr_decay_rate": lambda factor, n: factor ** (1.0 / n),

@@ -1,7 +1,6 @@
-"""The check of a whole configuration before any work: every key at every depth, every type, every
-registered name.
+"""Check a whole configuration before any work: keys at every depth, types and registered names.
 
-A section ``x`` belongs to the part that the key ``x_type`` beside it names: ``data_type`` and
+The key ``x_type`` names the part that the section ``x`` beside it configures: ``data_type`` and
 ``data``, ``system.geometry_type`` and ``system.geometry``, ``system.geometry.prior_type`` and
 ``system.geometry.prior``. The keys of a section are the fields of its part's ``Config``."""
 
@@ -48,11 +47,11 @@ LAUNCHER_SETS = {
     "default_root_dir": "exp_root_dir",
     "dirpath": "exp_root_dir, name and tag",
 }
-# what would start or look for other processes
+# left out when the trainer is built for the check, since they start or look for other processes
 NEEDS_PROCESSES = ("strategy", "num_nodes", "sync_batchnorm")
-# these start processes that don't load the custom parts, and wait for each other without end
+# refused: they start processes that don't import custom parts, and then wait forever
 SPAWNING = ("ddp_spawn", "ddp_fork", "ddp_notebook")
-# what Lightning takes and fails on later
+# smallest valid values, which Lightning itself doesn't check before training
 AT_LEAST = {
     "log_every_n_steps": 0,
     "num_sanity_val_steps": -1,
@@ -74,25 +73,27 @@ KINDS: dict[str, type] = {
     "guidance": ScoreDistillation,
     "prompt_processor": TextEncoderPromptProcessor,
 }
-"""The base class of each kind of part, by the name of its section. A part of another package may
-have another base; only one of a different kind is refused.
+"""The base class of each kind of part, by the name of its section.
+
+Parts of other packages may have other base classes; a part is refused only if it derives from the
+base class of a different kind.
 """
 LOGGER_KEYS = ("enable", "project", "name")
 
 
 def check_config(cfg: Any) -> None:
-    """Check what :func:`config.load_config` returned against the registered parts and Lightning's
+    """Check the result of :func:`config.load_config` against the registered parts and Lightning's
     signatures.
 
     Raises:
-        UserError: the first mistake: an unknown key or name (with the nearest valid one), a value
-            of the wrong type or out of range; the message begins with the full dotted path.
+        UserError: an unknown key or name (with the nearest valid one), or a value of the wrong type
+            or out of range. The message is about the first error and begins with its dotted path.
     """
     for section in cfg:
         require_representable(section, cfg[section])
     if not 0 <= cfg.seed < 2**32:
         raise UserError(f"seed is {cfg.seed}; expected a whole number from 0 to 2^32 - 1")
-    # before the parts, whose schedules may end with the trainer's steps
+    # the trainer first, since schedules of parts may refer to its number of steps
     _check_arguments("trainer", cfg.trainer, pl.Trainer)
     _check_trainer_ranges(cfg.trainer)
     check_part("data", cfg.data_type, cfg.data)
@@ -110,7 +111,7 @@ def check_config(cfg: Any) -> None:
 
 
 def check_part(path: str, type_name: Any, values: Any) -> None:
-    """Check one section against the part ``type_name``, and the sections of parts inside it."""
+    """Check one section against the part ``type_name``, and the sections of its own parts."""
     part = _find(f"{path}_type", type_name)
     _check_kind(f"{path}_type", type_name, part)
     config_class = getattr(part, "Config", None)
@@ -145,7 +146,7 @@ def _find(path: str, type_name: Any) -> type:
 
 
 def _check_kind(path: str, type_name: str, part: Any) -> None:
-    """Raise UserError where a section names a part that is known to be of another kind."""
+    """Raise UserError if the part of a section is known to be of another kind."""
     kind = path.rpartition(".")[2].removesuffix("_type")
     found = _kind_of(part)
     if kind not in KINDS or found in (None, kind):
@@ -178,7 +179,7 @@ def _typed(path: str, values: Any, config_class: type) -> DictConfig:
         raise UserError(f"{path}.{error}") from error
     try:
         check_options(config_class, cfg, f"{path}.")
-    except OmegaConfBaseException as error:  # a default of "???"
+    except OmegaConfBaseException as error:  # the default is "???"
         raise UserError(f"{path}.{error.full_key or error.key}: no value is given") from error
     return cfg
 
@@ -193,7 +194,9 @@ def _mapping(path: str, values: Any) -> Any:
 
 
 def _unknown_key(path: str, key: str, choices: Collection[str]) -> UserError:
-    """As ``errors.unknown``, but near by the last name alone: whole paths are always alike."""
+    """Make the error for an unknown key, as ``errors.unknown`` does, but compare only the last
+    component, since keys of one section share all others.
+    """
     near = difflib.get_close_matches(key, choices, n=3, cutoff=0.6)
     hint = (
         f"did you mean {' or '.join(repr(f'{path}.{name}') for name in near)}?"
@@ -240,8 +243,9 @@ def _check_arguments(section: str, values: Any, owner: type) -> None:
 
 
 def _check_type(path: str, value: Any, annotation: Any) -> None:
-    """Plain types only: what else Lightning accepts (objects, literals) it checks itself when it is
-    built.
+    """Raise UserError unless ``value`` has one of the plain types that ``annotation`` allows.
+
+    If the annotation also allows objects or literals, nothing is checked here: :func:`build` does.
     """
     accepted = _plain_types(annotation)
     if not accepted or (
@@ -256,8 +260,8 @@ def _check_type(path: str, value: Any, annotation: Any) -> None:
 
 
 def _plain_types(annotation: Any) -> set[type]:
-    """The types of an annotation like ``Optional[Union[int, float]]``; empty when it holds anything
-    but plain ones.
+    """Return the types of an annotation such as ``Optional[Union[int, float]]``; an empty set if it
+    has other types than int, float, bool, str and None.
     """
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         inner = [_plain_types(argument) for argument in typing.get_args(annotation)]
@@ -297,11 +301,10 @@ def _check_file_name(path: str, name: Any) -> None:
 
 
 def _check_monitor(cfg: Any) -> None:
-    """Lightning misses a quantity that nobody logs only when it is to be compared, after the first
-    validation.
+    """Check that ``checkpoint.monitor`` is logged; Lightning fails only after the first validation.
 
-    A system that knows what it logs has a function ``logged`` from its configuration to those
-    names."""
+    Systems may have a static method ``logged`` that returns the logged names for a configuration;
+    without it nothing is checked."""
     monitor, system = cfg.checkpoint.get("monitor"), find(cfg.system_type)
     logged = getattr(system, "logged", None)
     if monitor is None or logged is None:
@@ -317,17 +320,17 @@ def _check_monitor(cfg: Any) -> None:
 
 
 def build(section: str, owner: type, arguments: dict) -> Any:
-    """``owner(**arguments)``: Lightning checks combinations and literals only then.
+    """Construct ``owner(**arguments)``, in which Lightning checks combinations and literals.
 
     Raises:
-        UserError: it doesn't accept them.
+        UserError: the constructor fails.
     """
     try:
         return owner(**arguments)
-    except Exception as error:  # Lightning raises also OverflowError, AttributeError, ImportError
+    except Exception as error:  # Lightning also raises OverflowError, AttributeError, ImportError
         raise UserError(f"{section}: {str(error) or type(error).__name__}") from error
 
 
 def plain(section: Any) -> dict:
-    """A section as plain Python values, for a call with ``**``."""
+    """Convert a section to plain Python values."""
     return typing.cast(dict, OmegaConf.to_container(section, resolve=True))

@@ -1,8 +1,8 @@
-"""Where a configuration comes from: YAML files and ``key=value`` overrides, read as OmegaConf
-mappings before they are merged.
+"""Read the sources of a configuration, YAML files and ``key=value`` overrides, as OmegaConf
+mappings.
 
-What is text stays text: ``system.prompt_processor.prompt=1984`` and ``prompt=${x}`` on the command
-line mean these very characters."""
+Keys for text are read verbatim: on the command line ``system.prompt_processor.prompt=1984`` is the
+text "1984", and ``prompt=${x}`` isn't an interpolation."""
 
 import os
 import re
@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from ..core.errors import UserError
 from ..core.interpolation import escape
 
-# keys whose value is the user's own words, never YAML
+# keys whose value is text, never YAML
 TOP_LEVEL_TEXT = ("name", "tag", "description")
 PROMPT_TEXT = (
     "prompt",
@@ -27,11 +27,10 @@ PROMPT_TEXT = (
     "prompt_back",
     "prompt_overhead",
 )
-# a path may hold what YAML reads as a comment or a mapping; only null and interpolations are still
-# special
+# Values of these keys are paths. They aren't read as YAML, since a path may contain "#" or ": ";
+# only null and interpolations have a meaning.
 PATH_ENDINGS = ("path", "mesh", "_file", "_dir", "resume", "weights")
-# stands for "${" of a text while interpolations are resolved; a character of Unicode's private use
-# area
+# replaces "${" in texts while interpolations are resolved; U+E000 is for private use
 PROTECTED = "$\ue000{"
 MOST_DEPTH = 32
 MOST_NODES = 10_000
@@ -39,12 +38,12 @@ MOST_BYTES = 1 << 20
 
 
 def read_yaml(path: str | os.PathLike) -> DictConfig:
-    """One YAML file as a mapping; prompts that look like numbers or booleans (``prompt: 1984``) are
-    still text.
+    """Read a YAML file as a mapping. Prompts that look like numbers or booleans (``prompt: 1984``)
+    are text.
 
     Raises:
-        UserError: the file is missing, isn't UTF-8, isn't YAML, or isn't a mapping; with line and
-            column.
+        UserError: the file is missing, isn't UTF-8, isn't valid YAML (with line and column), or
+            isn't a mapping.
     """
     try:
         source = _read_text(Path(path))
@@ -69,11 +68,11 @@ def read_yaml(path: str | os.PathLike) -> DictConfig:
 
 
 def _read_text(path: Path) -> str:
-    """The text of a configuration file, unless it is too large to be one.
+    """Read the text of a configuration file.
 
     Raises:
-        UserError: it has more than ``MOST_BYTES``.
-        OSError, UnicodeDecodeError: it can't be read.
+        UserError: the file has more than ``MOST_BYTES``.
+        OSError, UnicodeDecodeError: it can't be read or isn't UTF-8.
     """
     with open(path, "rb") as file:
         content = file.read(MOST_BYTES + 1)
@@ -83,11 +82,11 @@ def _read_text(path: Path) -> str:
 
 
 def parse_overrides(arguments: Iterable[str]) -> DictConfig:
-    """``key.of.section=value`` arguments as a mapping. Values are YAML, except text and paths,
-    which are taken as they are.
+    """Parse ``section.key=value`` arguments into a mapping. Values are YAML, except texts and
+    paths, which are read verbatim.
 
     Raises:
-        UserError: an argument that isn't ``key=value``, or whose value isn't YAML.
+        UserError: an argument isn't ``key=value``, or its value isn't valid YAML.
     """
     overrides = OmegaConf.create({})
     for argument in arguments:
@@ -110,7 +109,7 @@ def parse_overrides(arguments: Iterable[str]) -> DictConfig:
 
 
 def is_text(key: str) -> bool:
-    """Whether the value of this dotted key is the user's own words."""
+    """Return whether the value of this dotted key is text, which isn't read as YAML."""
     section, _, leaf = key.rpartition(".")
     return key in TOP_LEVEL_TEXT or (section.endswith("prompt_processor") and leaf in PROMPT_TEXT)
 
@@ -128,8 +127,11 @@ def _override(overrides: DictConfig, key: str, value: str) -> None:
 
 
 def _valid_text(key: str, value: str) -> str:
-    """The value of a key, which is to be written into ``parsed.yaml``; Python takes other bytes
-    than UTF-8 for lone surrogates.
+    """Return ``value`` if ``parsed.yaml`` can hold it.
+
+    Raises:
+        UserError: key or value isn't valid UTF-8, which Python decodes to lone surrogates, or the
+            key has too many levels.
     """
     try:
         (key + value).encode()
@@ -141,11 +143,11 @@ def _valid_text(key: str, value: str) -> str:
 
 
 def require_modest(source: str, what: str) -> None:
-    """Raise UserError where YAML is nested so deeply, or by aliases of aliases stands for so much,
-    that reading it ends in a crash.
+    """Raise UserError for YAML so deeply nested, or expanding through aliases to so many values,
+    that constructing it would crash.
 
-    The parser's events come one by one, so nothing is built to find out; libyaml's own recursion
-    would end the process."""
+    Only the parser's events are counted, and no value is constructed. The pure Python parser is
+    used, since deep recursion in libyaml ends the process."""
     for depth, values in _extent(source):
         if depth > MOST_DEPTH or values >= MOST_NODES:
             raise UserError(
@@ -155,8 +157,8 @@ def require_modest(source: str, what: str) -> None:
 
 
 def _extent(source: str) -> Iterator[tuple[int, int]]:
-    """At each event of the parser: how deep it is, also in interpolations, and for how many values
-    the innermost section stands so far.
+    """Yield at each event of the parser the depth, of sections or of nested interpolations, and
+    the number of values in the innermost section so far, with aliases expanded.
     """
     sections: list[tuple[Optional[str], int]] = [(None, 0)]
     anchored: dict[Optional[str], int] = {}
@@ -168,14 +170,14 @@ def _extent(source: str) -> Iterator[tuple[int, int]]:
                 sections.pop() if isinstance(event, yaml.CollectionEndEvent) else (event.anchor, 1)
             )
             if isinstance(event, yaml.AliasEvent):
-                count = anchored.get(anchor, MOST_NODES)  # of itself, which never ends
+                count = anchored.get(anchor, MOST_NODES)  # an alias of a section that contains it
             anchored[anchor] = count
             sections[-1] = (sections[-1][0], sections[-1][1] + count)
         yield max(len(sections), getattr(event, "value", "").count("${")), sections[-1][1]
 
 
 def _require_words(content: DictConfig | ListConfig, what: str) -> None:
-    """Raise UserError for a key that isn't a text, such as ``on``, which is ``true`` in YAML."""
+    """Raise UserError for a key that isn't a string, such as ``on``, which is ``true`` in YAML."""
     if content._is_none() or content._is_missing() or content._is_interpolation():
         return
     for key in content if isinstance(content, DictConfig) else range(len(content)):
@@ -196,13 +198,18 @@ def _yaml_problem(error: Exception) -> str:
 
 
 def _restore_text(content: DictConfig, node: Any, section: str = "") -> None:
-    """Give text keys that YAML read as a number or boolean their words back; ``node`` is the file
-    as written.
+    """Replace values of text keys that YAML has converted to numbers or booleans by the characters
+    in the file.
+
+    Args:
+        content: the mapping, changed in place.
+        node: the unconverted YAML node of ``content``.
+        section: the dotted path of ``content``, with a final dot.
     """
     if not isinstance(node, yaml.MappingNode):
         return
     for key_node, value_node in node.value:
-        if key_node.value not in content:  # an anchor's merge, or a key that isn't a word
+        if key_node.value not in content:  # a merge key ("<<"), or a key that isn't a string
             continue
         key = f"{section}{key_node.value}"
         if isinstance(value_node, yaml.MappingNode):
@@ -214,11 +221,11 @@ def _restore_text(content: DictConfig, node: Any, section: str = "") -> None:
 
 
 def protect(text: str) -> str:
-    """``text`` as a value that resolving leaves alone, also where another value refers to it;
-    :func:`unprotect` ends it.
+    """Replace ``${`` in a text, so that it isn't resolved as an interpolation, also where another
+    value refers to this one. :func:`unprotect` restores it.
 
     Raises:
-        UserError: it is ``???``, which means in every configuration that a value is missing.
+        UserError: the text is ``???``, OmegaConf's marker of a missing value.
     """
     if text == MISSING:
         raise UserError(
@@ -229,8 +236,8 @@ def protect(text: str) -> str:
 
 
 def _protect_escaped(text: str) -> str:
-    """A string of a YAML whose every ``${`` is escaped holds no interpolation: it is text, as in a
-    ``parsed.yaml``.
+    """Unescape and protect a YAML string in which every ``${`` is escaped, as in a ``parsed.yaml``;
+    return other strings unchanged.
     """
     if "${" not in text or re.search(r"(?<!\\)(\\\\)*\$\{", text):
         return text
@@ -238,12 +245,12 @@ def _protect_escaped(text: str) -> str:
 
 
 def unprotect(text: str) -> str:
-    # after resolving, a "${" that is left is somebody's text
+    # all interpolations have been resolved, so a remaining "${" is literal
     return escape(text.replace(PROTECTED, "${"))
 
 
 def map_strings(node: DictConfig | ListConfig, change: Callable[[str], str]) -> None:
-    """Replace every string below ``node`` by ``change`` of it; interpolations stay unresolved."""
+    """Replace every string below ``node`` by ``change(string)``; interpolations stay unresolved."""
     if node._is_none() or node._is_missing() or node._is_interpolation():
         return
     for key in node if isinstance(node, DictConfig) else range(len(node)):

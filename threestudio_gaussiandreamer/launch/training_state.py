@@ -1,5 +1,5 @@
-"""The check of what a checkpoint says about a training run, before any work: Lightning restores
-impossible content without a word, or fails in the middle of it."""
+"""Check the training state in a checkpoint before any work: Lightning restores invalid content
+without an error, or fails halfway."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -14,14 +14,14 @@ from ..core.options import is_number, shown
 from ..host import pl
 
 MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer")
-"""State of torch's optimisers that has one number for each of the parameter."""
+"""Entries of torch's optimiser state that have the shape of the parameter."""
 TYPES = {
     "pytorch-lightning_version": str,
     "callbacks": Mapping,
     "lr_schedulers": (list, tuple),
     "hyper_parameters": Mapping,
 }
-"""What Lightning reads besides, where a checkpoint has it."""
+"""Types of further entries that Lightning reads if a checkpoint has them."""
 OLDEST = "2.0"
 CHECKPOINT_STATE = {
     **dict.fromkeys(
@@ -33,18 +33,18 @@ CHECKPOINT_STATE = {
         ("best_model_score", "current_score", "kth_value"), (Tensor, int, float, type(None))
     ),
 }
-"""What ModelCheckpoint restores, and its types."""
+"""Types of the entries that ModelCheckpoint restores."""
 
 
 def check_training_state(checkpoint: Mapping[str, Any], optimizer: Mapping, what: str) -> None:
-    """Check the loops, the optimisers and the rest of what Lightning restores.
+    """Check the loops, the optimisers and all else that Lightning restores.
 
     Args:
         optimizer: the section ``system.optimizer``: name and args.
         what: the file, for messages.
 
     Raises:
-        UserError: a type, count or shape that no run writes.
+        UserError: a type, count or shape is none that a run writes.
     """
     for key in TYPES.keys() & checkpoint.keys():
         if not isinstance(checkpoint[key], TYPES[key]):
@@ -59,7 +59,7 @@ def check_training_state(checkpoint: Mapping[str, Any], optimizer: Mapping, what
 
 
 def _check_version(version: str, what: str) -> None:
-    """Lightning rewrites checkpoints of earlier versions, those before 2.0 in ways of their own."""
+    """Raise UserError for a checkpoint of Lightning 1, whose conversion isn't supported."""
     if not re.match(r"[2-9]\d*\.\d+", version):
         raise UserError(
             f"{what}: its pytorch-lightning_version is {shown(version)}; expected {OLDEST} or later"
@@ -67,7 +67,9 @@ def _check_version(version: str, what: str) -> None:
 
 
 def _check_callback(state: Any, name: str) -> None:
-    """Types of what Lightning's ModelCheckpoint restores; other callbacks' state is free."""
+    """Check the types of the entries that ModelCheckpoint restores; the state of other callbacks
+    isn't checked further.
+    """
     if not isinstance(state, Mapping):
         raise UserError(f"{name} is of type {type(state).__name__}")
     for key in CHECKPOINT_STATE.keys() & state.keys():
@@ -95,7 +97,7 @@ def _check_loops(checkpoint: Mapping[str, Any], what: str) -> None:
         epoch = trainer.fit_loop.epoch_loop
         counted = epoch.automatic_optimization.optim_progress.optimizer_steps
         counted += epoch.manual_optimization.optim_step_progress.total.completed
-    except Exception as error:  # Lightning looks keys up, and trusts what it finds
+    except Exception as error:  # Lightning doesn't check keys and types
         raise UserError(
             f"{what}: its fit_loop isn't one of Lightning's: {type(error).__name__} {error}"
         ) from error
@@ -104,7 +106,9 @@ def _check_loops(checkpoint: Mapping[str, Any], what: str) -> None:
 
 
 def _leaves(node: Mapping, path: str) -> Iterator[tuple[str, Any]]:
-    """Every value below a mapping with its path; a loop's own ``state_dict`` is free."""
+    """Yield every value below a mapping with its path, except what a loop stores itself under
+    ``state_dict``.
+    """
     for key, value in node.items():
         if str(key).endswith("state_dict"):
             continue
@@ -170,10 +174,11 @@ def _check_moment(value: Any, parameter: Any, name: str) -> None:
 
 
 def _rehearse(optimizer: Mapping, state: Mapping, parameters: Mapping, what: str) -> None:
-    """Restore an optimiser on zeros and step once with zero gradients: what it lacks shows now.
+    """Restore the state into an optimiser of zeros and make a step with zero gradients, so that
+    missing or invalid entries fail here.
 
     Raises:
-        UserError: torch doesn't take the state, or the step isn't finite.
+        UserError: torch doesn't accept the state, or the step fails.
     """
     kind = getattr(torch.optim, str(optimizer.get("name", "Adam")), None)
     if kind is None:
@@ -186,7 +191,7 @@ def _rehearse(optimizer: Mapping, state: Mapping, parameters: Mapping, what: str
         rehearsed = kind(groups, lr=0.0)
         rehearsed.load_state_dict(dict(state))
         rehearsed.step()
-    except Exception as error:  # torch looks keys up, and trusts what it finds
+    except Exception as error:  # torch doesn't check keys and types
         raise UserError(
             f"{what}: {kind.__name__} can't go on from its optimizer_states: "
             f"{type(error).__name__} {error}"
@@ -194,7 +199,7 @@ def _rehearse(optimizer: Mapping, state: Mapping, parameters: Mapping, what: str
 
 
 def _zeros(index: Any, group: Mapping, moments: Mapping, parameters: Mapping) -> Tensor:
-    """A parameter of the shape that it has in the run, with a zero gradient."""
+    """Return a parameter of zeros with a zero gradient, in the shape that it has in the run."""
     known = parameters.get(f"geometry.{group.get('name')}")
     entry = moments.get(index, {}) if _is_index(index) else {}
     like = next((entry[key] for key in MOMENTS if isinstance(entry.get(key), Tensor)), known)
