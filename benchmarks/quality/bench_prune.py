@@ -20,7 +20,7 @@ import torch
 
 from benchmarks.quality.known_answer import torus
 from benchmarks.quality.runs import append_rows, measured_in
-from benchmarks.splatting.bench_splatting import make_scene
+from benchmarks.splatting.bench_scenes import make_scene
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians

@@ -18,7 +18,7 @@ from typing import Callable
 
 import torch
 
-from benchmarks.splatting.bench_splatting import make_camera, make_scene
+from benchmarks.splatting.bench_scenes import make_camera, make_scene
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0
 from threestudio_gaussiandreamer.guidance.base import ScoreDistillation, _bad_items
 from threestudio_gaussiandreamer.splatting import RasterizeOptions, rasterize

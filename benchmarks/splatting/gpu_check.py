@@ -46,7 +46,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.splatting.bench_splatting import Scene, describe_machine, make_camera, make_scene
+from benchmarks.splatting.bench_scenes import Scene, make_camera, make_scene
+from benchmarks.splatting.bench_splatting import describe_machine
 
 ROOT = Path(__file__).resolve().parents[2]
 
