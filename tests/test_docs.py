@@ -66,7 +66,8 @@ def test_files_that_are_named_exist(name):
     ours.
     """
     for path in re.findall(
-        r"`((?:configs|tests|benchmarks|docs|threestudio_gaussiandreamer|custom/threestudio)[\w./-]*)`",
+        r"`((?:configs|tests|benchmarks|docs|threestudio_gaussiandreamer|custom/threestudio)"
+        r"[\w./-]*)`",
         TEXTS[name],
     ):
         assert (ROOT / path).exists(), f"{name} names {path}"

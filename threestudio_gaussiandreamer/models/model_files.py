@@ -20,7 +20,8 @@ WITHOUT_WEIGHTS = {"tokenizer": "tokenizer_config.json", "scheduler": "scheduler
 VOCABULARIES = ({"tokenizer.json"}, {"vocab.json", "merges.txt"}, {"spiece.model"})
 """Sets of files, of which any one holds a tokenizer's vocabulary."""
 WEIGHTS = re.compile(
-    r"(?:diffusion_pytorch_model|model)(?P<early>\.fp16)?(?:-\d{5}-of-(?P<shards>\d{5}))?(?P<late>\.fp16)?\.safetensors"
+    r"(?:diffusion_pytorch_model|model)(?P<early>\.fp16)?(?:-\d{5}-of-(?P<shards>\d{5}))?"
+    r"(?P<late>\.fp16)?\.safetensors"
 )
 PICKLED = ("diffusion_pytorch_model.bin", "pytorch_model.bin")
 SAMPLE = 1 << 16
