@@ -121,7 +121,8 @@ COMMANDS = [
     "--config\ngaussiandreamer\n--test\n--verbose\nsystem.prompt_processor.prompt=1984\nname=a "
     "b\nuse_timestamp=false\n"
     "system.guidance.max_step_percent=[0,0.98,0.5,500]\n"
-    "system.geometry.lr_means=1e-4\nsystem.exporter.formats=[ply,points]\ncheckpoint.save_last=true\n"
+    "system.geometry.lr_means=1e-4\nsystem.exporter.formats=[ply,points]\n"
+    "checkpoint.save_last=true\n"
     "data.batch_size=${seed}\nseed=2",
 ]
 
