@@ -1,17 +1,17 @@
-"""CLIP similarity as the paper measures it: how well pictures of a result fit its prompt.
+"""CLIP similarity of pictures of a result and its prompt, measured as in the paper.
 
 ``python -m threestudio_gaussiandreamer.evaluation.clip_similarity RUN_OR_PLY ... --clip FOLDER
 [--prompt TEXT] [--output FOLDER]``
 
-The paper's protocol (appendix; Instant3D's): 120 views evenly around at radius 4 and elevation 15
-degrees, ten of them drawn at random, the mean of their similarities with the text. Here for each of
-several seeds: a seed draws ten views of every result, its score is the mean over the results, and
-what is reported is mean and standard deviation over the seeds.
+The paper's protocol (appendix; from Instant3D): of 120 views at radius 4 and elevation 15 degrees,
+evenly spaced in azimuth, ten are drawn at random, and their similarities with the text averaged.
+This module repeats that for several seeds: each seed draws ten views of every result, and its score
+is the mean over the results. Mean and standard deviation over the seeds are reported.
 
 A similarity is 100 times the cosine of CLIP's features of picture and text. The paper gives no
-formula; its 27.23 (ViT-L/14) and 41.88 (ViT-bigG-14) are of that size. Nor does it give the field
-of view, the size and the background: 70 degrees, 1024 pixels and the run's own (black) are the
-released code's. The views are 3 degrees apart from -180; none is there twice."""
+formula, but its values, 27.23 (ViT-L/14) and 41.88 (ViT-bigG-14), have that magnitude. It doesn't
+give field of view, size and background either; 70 degrees, 1024 pixels and the run's background
+(black) are those of the released code. The azimuths are -180, -177, ..., 177 degrees."""
 
 import argparse
 import math
@@ -40,8 +40,8 @@ THUMBNAIL = 160
 
 
 class Protocol(NamedTuple):
-    """Which pictures are compared; the defaults are the paper's, or the released code's where it
-    says nothing.
+    """The views that are compared. The defaults are the paper's, or the released code's if the
+    paper gives none.
     """
 
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
@@ -64,9 +64,7 @@ class Protocol(NamedTuple):
         )
 
     def draw(self, seed: int, item: int) -> Int[np.ndarray, " drawn"]:
-        """The views that ``seed`` takes of result number ``item``, in ascending order, none
-        twice.
-        """
+        """Draw the indices of the views of result number ``item``, distinct and ascending."""
         return np.sort(
             numpy_generator(seed, "clip-views", item=item).choice(
                 self.views, self.drawn, replace=False
@@ -75,18 +73,18 @@ class Protocol(NamedTuple):
 
 
 class Scored(NamedTuple):
-    """One result's scores."""
+    """The scores of one result."""
 
     per_seed: Float[np.ndarray, " S"]
     thumbnails: list[np.ndarray]
-    """The first seed's views, uint8."""
+    """The views of the first seed, uint8."""
 
 
 def open_clip(folder: str) -> PictureText:
-    """The CLIP in a local folder in transformers' format.
+    """Load the CLIP in a local folder in transformers' format.
 
     Raises:
-        UserError: no folder, or it isn't complete.
+        UserError: there is no such folder, or files are missing.
     """
     if not Path(folder).expanduser().is_dir():
         raise UserError(
@@ -99,7 +97,7 @@ def open_clip(folder: str) -> PictureText:
 
 
 def score(result: Result, prompt: str, item: int, clip: PictureText, protocol: Protocol) -> Scored:
-    """The similarities of the views that the seeds draw, each of which is rendered once."""
+    """Score one result with all seeds; a view that several seeds draw is rendered once."""
     draws = [protocol.draw(seed, item) for seed in protocol.seeds]
     needed = np.unique(np.concatenate(draws))
     orbit = protocol.orbit.rows(needed)
@@ -131,7 +129,7 @@ def report(
     clip: str,
     protocol: Protocol,
 ) -> dict[str, Any]:
-    """What is written as JSON."""
+    """Return the content of ``clip.json``."""
     seeds = np.stack([scored.per_seed for scored in scores])
     each = [
         {"result": str(result.ply), "prompt": prompt, **_mean_and_spread(scored.per_seed)}
@@ -147,13 +145,13 @@ def report(
 
 
 def _mean_and_spread(per_seed: Float[np.ndarray, " S"]) -> dict[str, Any]:
-    """Over the seeds; one seed has no spread."""
+    """Return mean and standard deviation over the seeds; the latter is None for a single seed."""
     spread = float(per_seed.std(ddof=1)) if len(per_seed) > 1 else None
     return {"mean": float(per_seed.mean()), "std": spread, "per_seed": per_seed.tolist()}
 
 
 def contact_sheet(prompts: Sequence[str], scores: Sequence[Scored]) -> np.ndarray:
-    """A row of the first seed's views for each result, its prompt and score written over it."""
+    """Draw a row of the first seed's views for each result, and its prompt and score over them."""
     rows = []
     for prompt, scored in zip(prompts, scores, strict=True):
         rows.append(
@@ -182,12 +180,12 @@ def _thumbnail(image: Float[np.ndarray, "H W 3"]) -> np.ndarray:
 def prompts_for(
     results: Sequence[Result], prompt: Optional[str], prompts_file: Optional[str]
 ) -> list[str]:
-    """The text of each result: the given one, the file's lines in the results' order, or what its
-    run was asked for.
+    """Return the prompt of each result: ``prompt``, the file's lines in the order of the results,
+    or the prompts of their runs.
 
     Raises:
-        UserError: both are given, a result's text is unknown, or the file has another number of
-            lines.
+        UserError: both are given, the prompt of a result is unknown, or the numbers of lines and
+            results differ.
     """
     if prompt is not None and prompts_file is not None:
         raise UserError("both --prompt and --prompts-file: give one of them")
@@ -209,11 +207,10 @@ def prompts_for(
 
 
 def read_prompts(path: str) -> list[str]:
-    """The lines of a list of prompts, as T3Bench's ``data/prompt_single.txt``; empty ones don't
-    count.
+    """Read the non-empty lines of a list of prompts, such as T3Bench's ``data/prompt_single.txt``.
 
     Raises:
-        UserError: missing or not UTF-8.
+        UserError: the file is missing or isn't UTF-8.
     """
     file = existing_file(path, "list of prompts")
     try:
@@ -269,10 +266,10 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
 
 
 def protocol_of(args: argparse.Namespace) -> Protocol:
-    """The checked options.
+    """Check the options and return them as a :class:`Protocol`.
 
     Raises:
-        UserError: a number out of range.
+        UserError: a number is out of range.
     """
     if not 1 <= args.drawn <= args.views:
         raise UserError(f"--drawn {args.drawn}: expected 1 to {args.views}, the number of views")
@@ -290,7 +287,7 @@ def protocol_of(args: argparse.Namespace) -> Protocol:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Everything that can be wrong shows before the first picture is rendered."""
+    """Evaluate the results; options, results and prompts are checked before the first render."""
     register_parts()
     protocol = protocol_of(args)
     results = [find_result(place) for place in args.results]
@@ -319,8 +316,10 @@ def evaluate(
     protocol: Protocol,
     output: Path,
 ) -> dict[str, Any]:
-    """Score all results, write ``clip.json`` and ``clip.png``, print the numbers; returns what the
-    JSON holds.
+    """Score all results, print the scores, and write ``clip.json`` and ``clip.png``.
+
+    Returns:
+        the content of ``clip.json``.
     """
     clip, scores = open_clip(clip_folder), []
     for item, (result, prompt) in enumerate(zip(results, prompts, strict=True)):

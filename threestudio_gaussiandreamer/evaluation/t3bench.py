@@ -1,19 +1,20 @@
-"""Results as T3Bench's own scripts take them: a mesh, and its views as pictures, in the folders
-that it looks into.
+"""Write results for T3Bench's scripts: meshes, and pictures of their views, in the folders where
+the scripts look for them.
 
 Its ``run_eval_quality.py`` and ``run_caption.py`` look for a mesh of each prompt of
 ``data/prompt_<group>.txt`` in ``outputs_mesh_t3/<method>_<group>/<prompt with _ for
 spaces>*/save/it*-export/model.obj``, have ``render/meshrender.py`` or ``render/meshrender_cap.py``
-draw it, and score the pictures ``<vertex>_<camera>.png`` and ``<vertex>.png``. The mesh written
-here is the surface of the Gaussians (``surface.py``), and that is all the published scripts need.
-What Gaussians show beyond their surface is in the pictures, rendered by our rasteriser with the
-same cameras: the two scripts in the folder ``render_gaussians``, put in the place of those in
-``render``, hand them over.
+render it, and score the pictures ``<vertex>_<camera>.png`` and ``<vertex>.png``. The mesh written
+here is the surface of the Gaussians (``surface.py``), which is all that the published scripts need.
+To score the Gaussians themselves, replace the two scripts in ``render`` by those written to
+``render_gaussians``: they copy pictures that this package's rasteriser has rendered with the same
+cameras.
 
-Quality: 162 vertices of an icosphere of radius 2.2, five fields of view each. Captions: the 12
-vertices of an icosahedron at 2.2^2, 60 degrees (its script multiplies by the radius twice). 512
-pixels, black behind; the object centred on the mean of its points and scaled to [-1, 1]. Of a mesh
-that means the vertices; of Gaussians the centres of those that are at least ``MIN_OPACITY`` opaque.
+Cameras for quality: the 162 vertices of an icosphere of radius 2.2, with five fields of view each.
+Cameras for captions: the 12 vertices of an icosahedron of radius 2.2^2 (T3Bench's script multiplies
+by the radius twice), with 60 degrees. Pictures have 512 pixels each way and a black background.
+The object is centred at the mean of its points and scaled to [-1, 1]; the points are the vertices
+of a mesh, or the centres of Gaussians with an opacity of at least ``MIN_OPACITY``.
 """
 
 import math
@@ -67,10 +68,15 @@ def write_t3bench(
     group: str,
     size: int = 512,
 ) -> None:
-    """Write everything below ``folder``, a checkout of T3Bench; none of its own files is touched.
+    """Write meshes, pictures and scripts into ``folder``, a checkout of T3Bench, without changing
+    its own files.
+
+    Args:
+        method, group: parts of the name of the results' folder.
+        size: height and width of the pictures, pixels.
 
     Raises:
-        UserError: a prompt can't be the name of a folder, or nothing can be written.
+        UserError: a prompt has a slash, so that it can't name a folder, or a file can't be written.
     """
     if bad := [prompt for prompt in prompts if "/" in prompt]:
         raise UserError(
@@ -134,7 +140,11 @@ def _write_views(
     fovy: Sequence[float],
     size: int,
 ) -> None:
-    """The pictures ``names``, from ``positions`` to the origin; the fields of view take turns."""
+    """Write the pictures ``names`` of views from ``positions`` towards the origin.
+
+    Args:
+        fovy: fields of view in radians, repeated cyclically over the positions.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     angles, remaining = torch.tensor(fovy).repeat(len(positions) // len(fovy)), iter(names)
     for images in pictures.render(towards_origin(positions), angles, size, chunk=8):
@@ -155,14 +165,16 @@ def caption_names() -> list[str]:
 
 
 def icosphere(subdivisions: int, radius: float) -> Float[np.ndarray, "V 3"]:
-    """The vertices in trimesh's order, which T3Bench's script also takes for neighbours."""
+    """Return the vertices of an icosphere in trimesh's order, on which T3Bench's script relies."""
     import trimesh
 
     return np.asarray(trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius).vertices)
 
 
 def towards_origin(positions: Float[np.ndarray, "V 3"]) -> Float[torch.Tensor, "V 4 4"]:
-    """OpenGL ``c2w`` with +z up in the picture; +y near the poles, as in T3Bench."""
+    """Return OpenGL ``c2w`` matrices of cameras that look at the origin, with +z up, or +y near the
+    poles, as in T3Bench.
+    """
     place = torch.from_numpy(positions).float()
     at_pole = (place[:, 2] / place.norm(dim=1)).abs() >= NEAR_POLE
     up = torch.where(at_pole[:, None], torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 0.0, 1.0]))
@@ -170,7 +182,7 @@ def towards_origin(positions: Float[np.ndarray, "V 3"]) -> Float[torch.Tensor, "
 
 
 def normalized(arrays: Gaussians) -> Gaussians:
-    """The cloud moved and scaled so that the centres of its visible Gaussians have mean 0 and lie
+    """Translate and scale a cloud so that the centres of its visible Gaussians have mean 0 and lie
     in [-1, 1]^3.
     """
     visible = opaque(arrays, MIN_OPACITY)

@@ -1,5 +1,5 @@
-"""What the launcher does around training: the record of the run, the progress bar, and stopping
-without losing a step.
+"""Lightning callbacks of the launcher: the record of the run, the progress bar, and checkpoints
+when a signal stops training.
 """
 
 import contextlib
@@ -17,15 +17,15 @@ from .config import dump_config
 from .signals import interrupt, restore_handlers, set_handlers
 
 SECONDS_BETWEEN = 60.0
-"""Seconds of training that a crash may lose."""
+"""Shortest time between two checkpoints, seconds: a crash loses about as much training."""
 SHARE_OF_TIME = 0.01
-"""Largest share of the time that goes into checkpoints."""
+"""Largest share of the running time that is spent on writing checkpoints."""
 SOURCE_ENDINGS = (".py", ".yaml", ".h", ".cpp", ".cu")
 
 
 class Stopped(BaseException):
-    """Training was asked to stop by a signal and has written a checkpoint. Not an Exception, so
-    that no handler of exceptions on the way swallows it.
+    """Raised when a signal has stopped training and a checkpoint is written. It derives from
+    BaseException, so that handlers of Exception don't catch it.
     """
 
     def __init__(self, signum: int, step: int) -> None:
@@ -34,13 +34,13 @@ class Stopped(BaseException):
 
 
 class RunRecord(pl.Callback):
-    """Writes ``configs/raw.yaml``, ``configs/parsed.yaml``, ``code/`` and ``cmd.txt`` when training
+    """Write ``configs/raw.yaml``, ``configs/parsed.yaml``, ``code/`` and ``cmd.txt`` when training
     starts.
 
     Args:
         folder: the run's folder.
-        cfg: the configuration as it runs.
-        sources: the YAML files that it was made of, and their content.
+        cfg: the merged and resolved configuration.
+        sources: the YAML files that were merged, and their content.
         command: the command line.
     """
 
@@ -53,22 +53,22 @@ class RunRecord(pl.Callback):
         if trainer.is_global_zero:
             self.save_configs()
             self.save_code()
-            # a run that is resumed has more than one
+            # append, since a resumed run has several command lines
             with open(self.folder / "cmd.txt", "a") as file:
                 file.write(self.command + "\n")
 
     def save_configs(self) -> None:
-        """Write the configuration as it was given and as it runs."""
+        """Write the configuration before and after merging and resolving."""
         configs = self.folder / "configs"
         configs.mkdir(parents=True, exist_ok=True)
         for i, (path, content) in enumerate(self.sources):
-            # resumed from its own parsed.yaml, the run keeps the file that it was started with
+            # not if the run is resumed from its own parsed.yaml: keep the original raw.yaml
             if path.resolve().parent != configs.resolve():
                 (configs / (f"raw-{i}.yaml" if i else "raw.yaml")).write_bytes(content)
         dump_config(configs / "parsed.yaml", self.cfg)
 
     def save_code(self) -> None:
-        """Write the sources of this package and of the extensions, as they ran."""
+        """Copy the sources of this package and of the extensions."""
         package = Path(__file__).parents[1]
         copy_sources(package, self.folder / "code" / package.name)
         if Path("custom").is_dir():
@@ -84,7 +84,7 @@ def copy_sources(source: Path, destination: Path) -> None:
         for name in names:
             path = Path(folder, name)
             if name.startswith(".") or not name.endswith(SOURCE_ENDINGS) or not path.is_file():
-                continue  # also an editor's lock, which links to nothing, or a FIFO
+                continue  # such as an editor's lock (a broken link) or a FIFO
             try:
                 content = path.read_bytes()
             except OSError as error:
@@ -96,8 +96,8 @@ def copy_sources(source: Path, destination: Path) -> None:
 
 
 class ProgressBar(pl.callbacks.TQDMProgressBar):
-    """Lightning's bar without the version number; redrawn every 100 steps where the output is no
-    terminal.
+    """Lightning's progress bar without the version number. If the output isn't a terminal, it is
+    printed every 100 steps.
     """
 
     def __init__(self) -> None:
@@ -111,17 +111,17 @@ class ProgressBar(pl.callbacks.TQDMProgressBar):
         return metrics
 
     def on_exception(self, trainer: Any, pl_module: Any, exception: BaseException) -> None:
-        # what is said next begins on its own line
+        # end the bar's line, so that the next message starts on its own
         print(file=sys.stderr)
 
 
 class LastCheckpoint(pl.callbacks.Checkpoint):
-    """Writes ``last.ckpt`` at the last step, about every :data:`SECONDS_BETWEEN`, and when a signal
-    asks to stop: the step is finished, then :class:`Stopped` is raised. A second signal stops at
-    once.
+    """Write ``last.ckpt`` after the last step, about every :data:`SECONDS_BETWEEN`, and after a
+    stop signal: the current step is finished, the file written and :class:`Stopped` raised. A
+    second signal stops immediately.
 
-    As a ``Checkpoint`` it comes after all other callbacks, exactly where ModelCheckpoint saves, so
-    its file is an ordinary one from the middle of a run."""
+    Lightning calls subclasses of ``Checkpoint`` after all other callbacks, so this one saves the
+    same state as ModelCheckpoint."""
 
     def __init__(self, last: Path, checkpoint_io: AtomicCheckpointIO) -> None:
         self.last, self.checkpoint_io = last, checkpoint_io
@@ -157,7 +157,7 @@ class LastCheckpoint(pl.callbacks.Checkpoint):
             self._restore_handlers()
             interrupt(signum)
         self.signum = signum
-        # print() may not be entered again from a handler; a closed terminal takes no message
+        # not print(), which isn't reentrant in signal handlers; OSError if the terminal is closed
         with contextlib.suppress(OSError):
             os.write(
                 2,
@@ -170,8 +170,8 @@ class LastCheckpoint(pl.callbacks.Checkpoint):
             raise Stopped(self.signum or signal.SIGTERM, trainer.global_step)
 
     def _save(self, trainer: Any) -> None:
-        """Write the checkpoint, and set the time of the next one so that saving takes at most
-        :data:`SHARE_OF_TIME`.
+        """Write the checkpoint, and schedule the next one so that saving takes at most
+        :data:`SHARE_OF_TIME` of the running time.
         """
         started = time.monotonic()
         if self.checkpoint_io.saved_step(self.last) != trainer.global_step:
@@ -185,5 +185,5 @@ class LastCheckpoint(pl.callbacks.Checkpoint):
 
 
 def _any_process(trainer: Any, decision: bool) -> bool:
-    """Tell whether any of the processes that train together decides so."""
+    """Return whether ``decision`` is true in any of the processes that train together."""
     return trainer.strategy.reduce_boolean_decision(decision, all=False)

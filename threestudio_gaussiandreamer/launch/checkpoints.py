@@ -1,5 +1,5 @@
-"""Lightning's door to checkpoint files: written whole or not at all, the earlier one kept, never
-unpickled into code.
+"""Lightning's checkpoint I/O: files are written atomically and loaded with ``weights_only``, so
+that they can't run code.
 """
 
 import os
@@ -11,7 +11,7 @@ from ..host import pl
 
 
 class AtomicCheckpointIO(pl.plugins.CheckpointIO):
-    """Saves through a temporary file that is synced and renamed, with a checksum; see
+    """Save checkpoints with a checksum into a temporary file that is synced and renamed; see
     :mod:`.core.checkpoint_file`.
     """
 
@@ -21,8 +21,11 @@ class AtomicCheckpointIO(pl.plugins.CheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike, storage_options: Any = None
     ) -> None:
-        """Save a checkpoint; raises UserError, with the earlier file untouched, when the disk is
-        full or the folder can't be written.
+        """Save a checkpoint atomically.
+
+        Raises:
+            UserError: the disk is full or the folder can't be written; an existing file is left
+                unchanged.
         """
         save_file(path, checkpoint)
         self.saved_steps[os.path.abspath(path)] = checkpoint.get("global_step", -1)
@@ -30,8 +33,10 @@ class AtomicCheckpointIO(pl.plugins.CheckpointIO):
     def load_checkpoint(
         self, path: str | os.PathLike, map_location: Any = None, weights_only: Any = True
     ) -> dict[str, Any]:
-        """Load a checkpoint; raises UserError when the file is missing, damaged or foreign.
-        ``weights_only`` is always true, whatever is asked.
+        """Load a checkpoint, always with ``weights_only``, whatever the argument's value.
+
+        Raises:
+            UserError: the file is missing, damaged, or no checkpoint.
         """
         return load_file(path, "cpu" if map_location is None else map_location)
 
@@ -39,5 +44,7 @@ class AtomicCheckpointIO(pl.plugins.CheckpointIO):
         Path(path).unlink(missing_ok=True)
 
     def saved_step(self, path: str | os.PathLike) -> int:
-        """Return the step that this process last wrote to ``path``; -1 for none."""
+        """Return the step of the checkpoint that this process last wrote to ``path``; -1 if it has
+        written none.
+        """
         return self.saved_steps.get(os.path.abspath(path), -1)

@@ -1,10 +1,10 @@
-"""Lightning's strategy for several GPUs: processes that hold the same cloud and average gradients,
-without DDP's wrapper.
+"""Lightning's strategy for several GPUs: every process has a copy of the cloud, and gradients are
+averaged without DistributedDataParallel.
 
-DistributedDataParallel binds its buckets to the parameters that it sees first; densification
-replaces them. The cloud is small, so the system averages the gradients itself
-(``distributed.average_gradients``), and every process densifies alike from statistics that are
-combined over all of them."""
+DistributedDataParallel ties its buckets to the parameters of its first iteration, which
+densification replaces. The cloud is small, so the system averages the gradients itself
+(``distributed.average_gradients``). The statistics for densification are combined over all
+processes, so that they make the same changes."""
 
 import torch
 
@@ -12,10 +12,10 @@ from ..host import pl
 
 
 class ReplicatedStrategy(pl.strategies.DDPStrategy):
-    """Launches and connects processes as DDP does; the module isn't wrapped."""
+    """Launch and connect processes as DDP does, without wrapping the module."""
 
     def _setup_model(self, model: torch.nn.Module) -> torch.nn.Module:
         return model
 
     def configure_ddp(self) -> None:
-        """Do nothing: no module is wrapped, and no hooks are registered."""
+        """Leave the module unwrapped, and register no communication hooks."""

@@ -1,9 +1,10 @@
-"""The launcher: from a command line to a trained, tested and exported cloud.
+"""The launcher: train, validate, test or export a run from the command line.
 
 ``python launch.py --config demo.yaml --train key=value ...``, or the console script
 ``gaussiandreamer`` with the same arguments. A run is a list of stages: choose the device, load the
-extensions, load and check the configuration, build data and system, make the folder, train, test.
-What the user can mend ends it with one message and exit code 2, before anything is written."""
+extensions, load and check the configuration, make the folder, build data and system, train, test.
+Errors that the user can correct end it with one message and exit code 2; those that are found
+before training leave no files."""
 
 import argparse
 import logging
@@ -24,8 +25,8 @@ from .options import PROGRAM, announce_device, choose_gpu, find_config, parse_ar
 from .signals import raised_signals
 
 NOISE = (
-    # Lightning's advice that doesn't apply to an endless stream of cameras made on the fly, or to a
-    # run that is resumed
+    # warnings of Lightning that don't apply to an infinite dataset of computed cameras, or to a run
+    # that is resumed
     ".*does not have many workers.*",
     ".*Checkpoint directory .* exists and is not empty.*",
     ".*checkpoint that ended before the epoch ended.*",
@@ -42,10 +43,10 @@ def console() -> None:
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line (default: this process's); returns the exit code.
+    """Run one command line (default: ``sys.argv``) and return the exit code.
 
-    0 done; 2 something the user can mend, said in one message; 129, 130, 141 and 143 stopped by
-    SIGHUP, Ctrl-C, a closed pipe and SIGTERM."""
+    The code is 0 on success, 2 after an error that the user can correct, and 129, 130, 141 or 143
+    if SIGHUP, Ctrl-C, a closed pipe or SIGTERM stopped the run."""
     limit_openmp_spin()
     argv = list(sys.argv[1:] if argv is None else argv)
     try:
@@ -60,8 +61,8 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
 
 
 def run_until_signal(args: argparse.Namespace, argv: Sequence[str]) -> int:
-    """Run the stages; a signal that asks to stop decides the exit code, whatever became of the
-    exception that it raised.
+    """Run the stages. After a stop signal the exit code is that of the signal, even if other code
+    has caught or replaced the exception that the handler raised.
     """
     received: Sequence[int] = ()
     try:
@@ -70,7 +71,7 @@ def run_until_signal(args: argparse.Namespace, argv: Sequence[str]) -> int:
             sys.stdout.flush()
             if not received:
                 return code
-    except KeyboardInterrupt:  # of a caller's own handler too
+    except KeyboardInterrupt:  # also raised by handlers that a caller has installed
         received = received or [signal.SIGINT]
     except Terminated as stop:
         received = received or [stop.code - 128]
@@ -85,28 +86,28 @@ def run_until_signal(args: argparse.Namespace, argv: Sequence[str]) -> int:
 
 
 def foreign_exit(stop: SystemExit) -> UserError:
-    """Make the error for a ``sys.exit()`` that isn't ours, whose code may be that of success."""
+    """Make the error for a ``sys.exit()`` in a library or extension, whose code may be 0."""
     *_, place = traceback.extract_tb(stop.__traceback__)
     return UserError(f"{place.filename}:{place.lineno} ended the run with sys.exit({stop.code!r})")
 
 
 def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
-    """Run the stages of the module's docstring; returns the exit code."""
+    """Run the stages that the module's docstring lists; return the exit code."""
     config_paths = [find_config(name) for name in args.config]
     choose_gpu(args.gpu)
     if args.typecheck:
         from ..core import typecheck
 
         typecheck.install()
-    # torch and Lightning are imported from here on, so that --help and mistakes in the arguments
-    # cost no seconds
+    # torch and Lightning are imported only here, so that --help and invalid arguments are answered
+    # immediately
     from .. import register_parts
     from .config import load_config
     from .config_check import check_config
     from .extensions import load_extensions
 
     configure_logging(args.verbose)
-    # read once, since a file may be changed or removed while the parts are built
+    # read only once, since the file may change while the parts are built
     sources = [(path, read_source(path)) for path in config_paths]
     n_gpus = announce_device(args.gpu)
     register_parts()

@@ -1,9 +1,9 @@
 """Extensions of the user: every module in ``./custom`` is imported, so that its ``@register``
 decorators run.
 
-As in threestudio a folder with an ``__init__.py`` is loaded under its own name (hyphens are fine,
-relative imports work), a single ``part.py`` as ``custom/part``; names that end in ``_disabled`` or
-begin with a dot are left out."""
+As in threestudio, a folder with an ``__init__.py`` is imported under its own name, which may have
+hyphens, and may use relative imports; a file ``part.py`` is imported as ``custom/part``. Names that
+end in ``_disabled`` or begin with a dot are skipped."""
 
 import importlib.util
 import sys
@@ -15,7 +15,7 @@ from ..host import info
 
 
 def load_extensions(folder: Path = Path("custom")) -> list[str]:
-    """Import all extensions in ``folder``, by name; returns their module names.
+    """Import all extensions in ``folder``, sorted by name, and return their module names.
 
     Raises:
         UserError: the folder can't be read, or an extension fails to import; the message names the
@@ -64,7 +64,7 @@ def _load(entry: Path) -> str:
 
 
 def _cause(error: BaseException, entry: Path) -> str:
-    """Say ``file:line: what``, where the line is the innermost one inside the extension."""
+    """Describe an error as ``file:line: message``, with the innermost line in the extension."""
     what = f"{type(error).__name__}: {error}"
     if isinstance(error, SyntaxError) and error.lineno:
         return f"{error.filename}:{error.lineno}: {error.msg}"

@@ -20,11 +20,11 @@ from ..core.errors import UserError
 SUBFOLDERS = ("ckpts", "configs", "code", "save", "tb_logs", "csv_logs")
 FILES = ("ckpts/last.ckpt", "configs/parsed.yaml", "cmd.txt")
 LONGEST_RESULT = 200
-"""Bytes of the longest path that a run writes below its folder, generously."""
+"""Upper bound of the length of paths that a run writes below its folder, bytes."""
 
 
 class RunFolder:
-    """A folder that this process has made or found.
+    """The folder of a run, created by this process or found.
 
     Attributes:
         path: the folder.
@@ -39,8 +39,8 @@ class RunFolder:
         self.path, self.first_made, self.descriptor = path, first_made, descriptor
 
     def discard(self) -> None:
-        """Remove the folder if this process made it, and the parents that were made with it as long
-        as they are empty. Without the lock only an empty folder is removed.
+        """Remove the folder if this process created it, and the parents that were created with it
+        if they are empty. If the folder isn't locked, it is removed only if it is empty.
         """
         if self.first_made is None:
             return
@@ -54,7 +54,7 @@ class RunFolder:
                     folder.rmdir()
 
     def release(self) -> None:
-        """Give up the lock, which the system does too when a process ends, however it ends."""
+        """Release the lock. The operating system also releases it when the process ends."""
         if self.descriptor is not None:
             os.close(self.descriptor)
             self.descriptor = None
@@ -73,32 +73,34 @@ def claim_new(path: Path) -> tuple[RunFolder, int]:
         candidate = path if number == 1 else path.with_name(f"{path.name}-{number}")
         first_made = make_folder(candidate)
         if first_made is not None:
-            with contextlib.suppress(FolderInUse):  # a run that was told this name was faster
+            with contextlib.suppress(
+                FolderInUse
+            ):  # another run has claimed this name in the meantime
                 return RunFolder(candidate, first_made, _lock(candidate)), number
     raise AssertionError("unreachable")
 
 
 def claim(path: Path) -> RunFolder:
-    """Make ``path`` unless it is there, and lock it.
+    """Create ``path`` unless it exists, and lock it.
 
     Raises:
         UserError: another run uses it, or no folder can be made there.
     """
     while True:
         first_made = make_folder(path)
-        with contextlib.suppress(FileNotFoundError):  # its maker has just removed it again
+        with contextlib.suppress(FileNotFoundError):  # the run that created it has just removed it
             return RunFolder(path, first_made, _lock(path))
 
 
 def make_folder(path: Path) -> Optional[Path]:
-    """Make a folder and its missing parents; the existence of ``path`` itself is decided by the
-    system's ``mkdir``, so of several processes one makes it.
+    """Create a folder and its missing parents. ``mkdir`` is atomic, so of several processes exactly
+    one creates ``path``.
 
     Returns:
-        the topmost folder that was missing, or None if ``path`` was there already.
+        the topmost created folder, or None if ``path`` existed already.
 
     Raises:
-        UserError: it can't be made.
+        UserError: it can't be created.
     """
     try:
         missing = [folder for folder in (path, *path.parents) if not folder.exists()]
@@ -117,7 +119,7 @@ def _make_parent(path: Path, attempts: int = 10) -> None:
     for attempt in range(attempts):
         try:
             return path.parent.mkdir(parents=True, exist_ok=True)
-        except FileNotFoundError:  # another run has just removed a folder that it had made
+        except FileNotFoundError:  # another run has just removed a parent that it had created
             if attempt == attempts - 1:
                 raise
 
@@ -145,7 +147,10 @@ def require_writable(folder: Path) -> None:
 
 
 def _require_replaceable(folder: Path) -> None:
-    """Raise OSError where something else is in the place of a file or folder of an earlier run."""
+    """Raise OSError if a path that a run writes exists, but can't be replaced.
+
+    A path for a folder must be a writable folder, and a path for a file not a folder.
+    """
     for name in SUBFOLDERS:
         path = folder / name
         if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
@@ -158,14 +163,14 @@ def _require_replaceable(folder: Path) -> None:
 
 
 def _require_short(folder: Path, existing: Path) -> None:
-    """Raise OSError where the system takes the folder's name but not those of the files in it."""
+    """Raise OSError if paths of files in the folder would exceed the system's limits."""
     longest = os.pathconf(existing, "PC_PATH_MAX") if hasattr(os, "pathconf") else 260
     if len(os.fsencode(folder)) + LONGEST_RESULT > longest:
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
 
 
 def unwritable(folder: Path, error: Exception, where: str = "") -> UserError:
-    """Make the error for a folder that the results can't be written to."""
+    """Make the error for a folder into which the results can't be written."""
     why = getattr(error, "strerror", None) or str(error)
     return UserError(
         f"the output folder {folder} can't be written: {why}{where}; choose another exp_root_dir"
@@ -173,7 +178,7 @@ def unwritable(folder: Path, error: Exception, where: str = "") -> UserError:
 
 
 class FolderInUse(UserError):
-    """Another process holds the lock."""
+    """Raised if another process has locked the folder."""
 
 
 def _lock(path: Path) -> Optional[int]:

@@ -1,5 +1,5 @@
-"""Arguments of the launcher, and what they mean before torch is imported: which GPUs, which
-configuration files.
+"""Arguments of the launcher, and the choice of GPUs and configuration files, which comes before
+torch is imported.
 """
 
 import argparse
@@ -12,7 +12,7 @@ from typing import Optional
 
 from ..core.errors import UserError, unknown
 
-# how this process was started, for the lines that say how to go on
+# how this process was started, for messages that show a command to resume the run
 PROGRAM = {
     "launch.py": ["python", sys.argv[0]],
     "gaussiandreamer": ["gaussiandreamer"],
@@ -28,13 +28,13 @@ STAGES = {
 
 
 def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
-    """Parse threestudio's options; what isn't an option is an override ``key=value``.
+    """Parse threestudio's options; all other arguments are overrides ``key=value``.
 
     Returns:
         config, stage, gpu, verbose, typecheck, and overrides, a list of strings.
 
     Raises:
-        SystemExit: ``--help``, or a mistake, which has been printed.
+        SystemExit: after ``--help``, or for an invalid argument, with a printed message.
     """
     parser = argparse.ArgumentParser(
         prog=" ".join(PROGRAM),
@@ -80,7 +80,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def choose_gpu(gpu: Optional[str]) -> None:
-    """Set which GPUs CUDA shows to this process; call it before torch is imported.
+    """Set which GPUs are visible to this process; must be called before torch is imported.
 
     Raises:
         UserError: ``gpu`` is neither "cpu" nor a list of numbers.
@@ -101,11 +101,10 @@ def choose_gpu(gpu: Optional[str]) -> None:
 
 
 def announce_device(gpu: Optional[str]) -> int:
-    """Count the GPUs that this process sees; say when it runs on the CPU without having been asked
-    to.
+    """Return the number of visible GPUs; log a message if the run falls back to the CPU.
 
     Raises:
-        UserError: GPUs were asked for that aren't there.
+        UserError: requested GPUs don't exist.
     """
     import torch
 
@@ -129,11 +128,11 @@ def _require_gpus(gpu: str, count: int, version: str, built_for: Optional[str]) 
 
 
 def find_config(name: str) -> Path:
-    """Find the YAML file that ``--config name`` means: a path, else a bare name in ``configs/``
-    here or among the packaged ones.
+    """Find the YAML file for ``--config name``: ``name`` is a path, or a bare name in one of
+    :func:`config_folders`.
 
     Raises:
-        UserError: there is none; the message lists near names.
+        UserError: there is no such file; the message lists similar names.
     """
     try:
         path = Path(name).expanduser()
@@ -155,8 +154,8 @@ def find_config(name: str) -> Path:
 
 
 def config_folders() -> list[Path]:
-    """List where bare names are looked up: ``./configs``, the checkout's ``configs/``, the
-    installed package's ``configs/``.
+    """List the folders in which bare names are looked up: ``./configs``, and ``configs/`` of the
+    checkout or of the installed package.
     """
     package = Path(__file__).resolve().parents[1]
     folders = [Path("configs"), package / "configs"]

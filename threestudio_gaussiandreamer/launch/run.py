@@ -1,4 +1,4 @@
-"""One run: its folder, its parts, its trainer, and the stage that was asked for.
+"""One run: its folder, its parts, its trainer and the selected stage.
 
 ``outputs/<name>/<tag>@<time>/{ckpts, configs/{raw,parsed}.yaml, code, save, tb_logs, csv_logs,
 cmd.txt}``"""
@@ -26,13 +26,13 @@ from .options import PROGRAM
 from .run_folder import renumber
 from .training_state import check_training_state
 
-# what ends a run that can't write its results
+# errors of the file system that end a run with a message instead of a traceback
 WRITE_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM),
     *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG),
 )
-# without the first Lightning refuses to read a checkpoint; without the others it would train on
-# from step 0, or with a fresh optimiser
+# Lightning refuses a checkpoint without the first key; without the others it would resume at step 0
+# or with a new optimiser
 LIGHTNINGS_KEY = "pytorch-lightning_version"
 TRAINING_KEYS = (LIGHTNINGS_KEY, "loops", "optimizer_states")
 
@@ -41,10 +41,10 @@ class Run:
     """A checked configuration and the stage to run on it.
 
     Args:
-        cfg: what ``config.load_config`` returned and ``config_check.check_config`` accepted.
+        cfg: returned by ``config.load_config`` and checked by ``config_check.check_config``.
         args: the parsed arguments; ``stage`` is "train", "validate", "test" or "export".
-        sources: the YAML files and their content, to be kept beside the results.
-        command: the command line, to be kept too.
+        sources: the YAML files and their content, stored beside the results.
+        command: the command line, stored beside the results.
         n_gpus: GPUs to use; 0 for the CPU.
     """
 
@@ -68,15 +68,15 @@ class Run:
 
     @property
     def last(self) -> Path:
-        """The checkpoint that a stopped run goes on from."""
+        """The checkpoint from which a stopped run is resumed."""
         return self.folder / "ckpts" / "last.ckpt"
 
     def run(self) -> int:
-        """Build everything, then run the stage; returns the exit code.
+        """Build everything, run the stage and return the exit code.
 
         Raises:
-            UserError: something the user can mend; a folder that was made for this run and holds no
-                result is removed again.
+            UserError: an error that the user can correct. A folder that was created for this run
+                and has no results is removed.
         """
         try:
             self.start()
@@ -89,7 +89,7 @@ class Run:
         except BaseException as stop:
             self.discard_if_unused()
             interrupted = isinstance(stop, (KeyboardInterrupt, SystemExit))
-            # between training and its end, while the test views are rendered
+            # interrupted after training, while the test views are rendered
             if interrupted and self.args.stage == "train" and self.last.is_file():
                 print(f"to go on: {self.resume_command()}", flush=True)
             raise
@@ -98,11 +98,11 @@ class Run:
         return 0
 
     def start(self) -> None:
-        """Do everything before the first long work: checks, the folder, then the parts."""
+        """Check the checkpoint and the folder, create the folder, build the parts and trainer."""
         checkpoint = self.read_resume()
         require_writable(self.folder)
         self.claim_folder()
-        # one seed for all processes: what they draw differently, they draw by their rank
+        # the same seed in all processes; streams that must differ also depend on the rank
         pl.seed_everything(self.cfg.seed, workers=True)
         self.data = find(self.cfg.data_type)(self.cfg.data)
         self.system = find(self.cfg.system_type)(
@@ -114,8 +114,8 @@ class Run:
         self.trainer = self.build_trainer()
 
     def read_resume(self) -> Optional[tuple[int, int]]:
-        """Return the epoch and step of the checkpoint to resume from, which is read whole here so
-        that damage shows early.
+        """Return the epoch and step of the checkpoint to resume from; None without one. The file is
+        read completely, so that damage is found before any work.
         """
         if self.cfg.resume is None:
             if self.args.stage != "train":
@@ -145,10 +145,10 @@ class Run:
         return checkpoint["epoch"], self.resumed_step
 
     def check_content(self, checkpoint: dict[str, Any]) -> None:
-        """Check what the system and Lightning are going to restore.
+        """Check the content that the system and Lightning will restore.
 
         Raises:
-            UserError: content that no run writes, such as a cloud without Gaussians.
+            UserError: the content is none that a run writes, such as a cloud without Gaussians.
         """
         check_checkpoint = getattr(find(self.cfg.system_type), "check_checkpoint", None)
         if check_checkpoint is not None:
@@ -178,7 +178,7 @@ class Run:
         self.trainer.predict(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
 
     def summarize(self) -> None:
-        """Print what the system says about where its results are."""
+        """Print the system's summary, which lists its results."""
         summary = self.system.summary() if hasattr(self.system, "summary") else None
         if summary and self.trainer.is_global_zero:
             print(summary, flush=True)
@@ -217,7 +217,8 @@ class Run:
         return loggers + list(self.system.get_loggers())
 
     def training_callbacks(self, checkpoint_io: AtomicCheckpointIO) -> list:
-        # a resumed run goes on writing last.ckpt, instead of last-v1.ckpt beside a stale one
+        # without the version counter a resumed run overwrites last.ckpt instead of adding
+        # last-v1.ckpt
         checkpointing = {"enable_version_counter": False, **plain(self.cfg.checkpoint)}
         return [
             pl.callbacks.ModelCheckpoint(dirpath=str(self.last.parent), **checkpointing),
@@ -229,13 +230,13 @@ class Run:
     # -- the folder --------------------------------------------------------------------------------
 
     def claim_folder(self) -> None:
-        """Make the folder if need be, and keep other runs from training in it.
+        """Create the run's folder if it doesn't exist, and lock it against other training runs.
 
-        Processes of one run share the folder of the first. What only reads a checkpoint may write
-        its pictures beside a run that trains.
+        Only the first process of a run does so. Stages other than training don't lock an existing
+        folder, so they may write pictures into it while another run trains there.
 
         Raises:
-            UserError: another run trains in it, or it can't be made.
+            UserError: another run trains in the folder, or it can't be created.
         """
         evaluates_there = self.args.stage != "train" and self.folder.is_dir()
         if get_rank() or evaluates_there:
@@ -248,7 +249,7 @@ class Run:
             self.claimed = claim(self.folder)
 
     def discard_if_unused(self) -> None:
-        """Remove the folder again if this run made it and has nothing to show for it."""
+        """Remove the folder if this run created it, has made no step and has written no results."""
         if self.claimed.first_made is None:
             return
         trained = self.trainer is not None and self.trainer.global_step > max(self.resumed_step, 0)
@@ -264,12 +265,12 @@ class Run:
 
 @contextlib.contextmanager
 def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
-    """Translate Lightning's ways of ending.
+    """Convert exceptions that Lightning raises in this context.
 
     Raises:
-        UserError: the checkpoint's parameters or optimiser aren't those of this configuration, or
-            the trainer's options don't go together with what is to be run.
-        KeyboardInterrupt: Ctrl-C outside of training, of which Lightning makes a SystemExit(1).
+        UserError: the checkpoint's parameters or optimiser don't match the configuration, or the
+            trainer's options are incompatible with the system or with each other.
+        KeyboardInterrupt: Ctrl-C outside of training, which Lightning converts to SystemExit(1).
     """
     try:
         yield
@@ -295,11 +296,13 @@ def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def write_errors(folder: Path) -> Iterator[None]:
-    """Turn the system's errors while results are written below ``folder`` into one message, also
-    those of a logger's thread.
+    """Convert OSErrors of this context, and of the loggers' threads, to one message.
+
+    Args:
+        folder: of the run's results, for messages.
 
     Raises:
-        UserError: the disk is full, or something else is where a file or folder is to be made.
+        UserError: the disk is full, access is denied, or a path exists as something else.
     """
 
     def said(error: OSError) -> str:
@@ -309,7 +312,7 @@ def write_errors(folder: Path) -> Iterator[None]:
         )
 
     def in_a_thread(failure: Any) -> None:
-        # the logger raises it again at its next line
+        # only a warning, since the logger raises the error again when it next writes
         warn(said(failure.exc_value)) if _is_write_error(failure.exc_value) else earlier(failure)
 
     earlier, threading.excepthook = threading.excepthook, in_a_thread
@@ -328,13 +331,13 @@ def _is_write_error(error: Optional[BaseException]) -> bool:
 
 
 def _raised_by_lightning(error: Exception) -> bool:
-    """Tell whether Lightning itself raised an error, rather than something that it called."""
+    """Return whether Lightning itself raised an error, rather than code that it called."""
     *_, (frame, _) = traceback.walk_tb(error.__traceback__)
     return frame.f_globals.get("__name__", "").startswith(pl.__name__)
 
 
 def is_mismatch(error: Exception) -> bool:
-    """Tell whether this is how torch and Lightning say that a state doesn't fit."""
+    """Return whether this is an error of torch or Lightning about a state that doesn't match."""
     said = str(error)
     return any(
         part in said

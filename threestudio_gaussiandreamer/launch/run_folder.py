@@ -1,5 +1,5 @@
-"""The name of a run's folder: ``exp_root_dir/name/tag@time``, and the checkpoint that
-``resume=auto`` goes on from. ``folder_lock.py`` makes the folder."""
+"""Choose the name of a run's folder, ``exp_root_dir/name/tag@time``, and the checkpoint for
+``resume=auto``. ``folder_lock.py`` creates the folder."""
 
 import hashlib
 import os
@@ -26,12 +26,11 @@ WINDOWS_DEVICES = {
 
 
 def name_folders(cfg: Any) -> None:
-    """Fill in ``exp_dir``, ``timestamp``, ``trial_name`` and ``trial_dir``; a run that is resumed
-    from its ``parsed.yaml`` keeps its time, and so its folder.
+    """Set ``exp_dir``, ``timestamp``, ``trial_name`` and ``trial_dir``. A run that is resumed from
+    its ``parsed.yaml`` keeps its timestamp, and thus its folder.
 
     Raises:
-        UserError: no tag and no time to name the folder after, or a part of the path that is no
-            name of a folder.
+        UserError: there is neither tag nor timestamp, or a component of the path is invalid.
     """
     tag = safe_name(cfg.tag) if cfg.tag else ""
     cfg.exp_root_dir = escape(_home_expanded(cfg.exp_root_dir))
@@ -83,11 +82,11 @@ def _require_folder_name(tag: str, timestamp: str) -> None:
 
 
 def safe_name(text: str) -> str:
-    """Turn ``text`` into one folder name: itself if it is harmless, else a slug of at most 64 bytes
-    and a hash of the text.
+    """Convert ``text`` to a valid folder name: unchanged if it is valid on all systems and at most
+    64 bytes long, else a slug of at most 64 bytes and a hash of the text.
 
-    Harmless means letters, digits and ``-_.,+=()'!`` or inner spaces, no leading dot or hyphen, and
-    no device of Windows."""
+    Valid characters are letters, digits, ``-_.,+=()'!`` and inner spaces. A name may not begin with
+    a dot or hyphen or end with a dot, or be that of a Windows device."""
     slug = "".join(
         c if c.isalnum() or c in SLUG_CHARACTERS else "_"
         for c in unicodedata.normalize("NFC", text)
@@ -104,11 +103,10 @@ def _set_trial(cfg: Any, trial_name: str) -> None:
 
 
 def _resume_newest(cfg: Any, tag: str) -> None:
-    """Resolve ``resume=auto``: go on with this run if it was started before, else with the newest
-    of its tag, else start.
+    """Resolve ``resume=auto`` to the checkpoint of this run's own folder, else to that of the
+    newest run with the same tag, else to None.
 
-    In its folder it is the readable checkpoint with most steps: where the last one is damaged, the
-      one before it.
+    Of a folder's checkpoints, the readable one with the largest step is chosen.
     """
     cfg.resume = None
     newest_first = sorted(Path(cfg.exp_dir).glob(f"{glob_escape(tag)}@*"), reverse=True)

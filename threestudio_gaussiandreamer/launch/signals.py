@@ -13,9 +13,7 @@ Handler = Callable[[int, Any], Any]
 
 
 def stop_signals() -> list[int]:
-    """List the signals that ask a run to stop. SIGHUP is left out where it is ignored, as under
-    ``nohup``.
-    """
+    """List the signals that stop a run; without SIGHUP if it is ignored, as under ``nohup``."""
     signals = [signal.SIGINT, signal.SIGTERM]
     hang_up = getattr(signal, "SIGHUP", None)  # not on Windows
     if hang_up is not None and signal.getsignal(hang_up) != signal.SIG_IGN:
@@ -24,9 +22,9 @@ def stop_signals() -> list[int]:
 
 
 def set_handlers(handler: Handler) -> dict[int, Any]:
-    """Let ``handler`` answer the stop signals; returns the earlier handlers.
+    """Install ``handler`` for the stop signals; return the earlier handlers.
 
-    Outside of the main thread, where signals don't arrive, nothing is changed.
+    Outside of the main thread, in which Python doesn't allow this, nothing is changed.
     """
     if threading.current_thread() is not threading.main_thread():
         return {}
@@ -34,7 +32,7 @@ def set_handlers(handler: Handler) -> dict[int, Any]:
 
 
 def restore_handlers(handlers: dict[int, Any]) -> None:
-    """Put back what :func:`set_handlers` returned."""
+    """Restore the handlers that :func:`set_handlers` returned."""
     for signum, handler in handlers.items():
         signal.signal(signum, handler)
 
@@ -46,12 +44,11 @@ def interrupt(signum: int) -> NoReturn:
 
 @contextlib.contextmanager
 def raised_signals() -> Iterator[list[int]]:
-    """Let stop signals raise exceptions, so that ``finally`` blocks run; afterwards all handlers
-    are what they were.
+    """Let stop signals raise exceptions in this context, so that ``finally`` blocks run.
 
     Yields:
-        the signals that have arrived: an exception raised while a module is imported may come out
-        as another one, or not at all.
+        the list of received signals. It is needed because an exception raised during an import may
+        be replaced by another one, or be lost.
     """
     received: list[int] = []
 

@@ -1,7 +1,7 @@
 """Prune a finished cloud to a budget: ``python -m threestudio_gaussiandreamer.prune IN OUT``.
 
-``options.py`` says what may be asked for, ``pipeline.py`` reads and prunes, ``report.py`` measures
-and writes the report, ``command.py`` is the command line."""
+``options.py`` has the options, ``pipeline.py`` reads and prunes, ``report.py`` measures and writes
+the report, ``command.py`` is the command line."""
 
 from .command import main
 from .options import PruneOptions

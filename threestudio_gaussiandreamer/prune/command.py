@@ -1,13 +1,14 @@
 """Prune a finished cloud to a budget: ``python -m threestudio_gaussiandreamer.prune.command IN OUT
 --psnr 40``.
 
-IN is a PLY or SPZ file of Gaussians, ours or any other tool's, or a checkpoint, ours or gsplat's;
-OUT a PLY or SPZ file. From PLY to PLY the axes stay as they are; otherwise a PLY is written -y up,
-as viewers expect it. Beside OUT are written OUT.json, the report, and OUT.png, before (top) and
-after.
+IN is a PLY or SPZ file of Gaussians of any program, or a checkpoint of this package or of gsplat;
+OUT is a PLY or SPZ file. From PLY to PLY the axes are kept; otherwise a PLY is written with -y up,
+as viewers expect. The report is written to OUT.json, and views of the cloud before (top) and after
+pruning to OUT.png.
 
-The PSNR already lost is stored in OUT, so pruning it again counts from the original cloud: the same
-budget or a stricter one removes nothing."""
+OUT stores the PSNR to the original cloud that ``--psnr`` or ``--within`` has guaranteed, so that
+pruning it again counts from the original: with the same budget or a stricter one nothing is
+removed."""
 
 import argparse
 import os
@@ -71,7 +72,7 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
 
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
-    """Parse a command line; exit where it isn't one."""
+    """Parse a command line; exits for ``--help`` and for invalid arguments."""
     parser = argparse.ArgumentParser(
         prog="python -m threestudio_gaussiandreamer.prune.command",
         description="Prune a finished cloud of Gaussians to a budget; beside OUT: OUT.json, "
@@ -91,10 +92,10 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    """Check everything that can be known before the work, prune, write; return the report.
+    """Check options and files, prune, and write the files; return the report.
 
     Raises:
-        UserError: a wrong option, a file that can't be read or written, or a budget that can't be
+        UserError: an option is invalid, a file can't be read or written, or the budget can't be
             met.
     """
     options = PruneOptions(

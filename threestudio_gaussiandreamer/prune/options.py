@@ -1,6 +1,6 @@
-"""What a pruning may be asked for, and how its numbers are read.
+"""The options of pruning, and the parsing of their values.
 
-Errors are multiplied and added as mean squared errors: those of independent losses add up."""
+PSNRs are combined through their mean squared errors, which add up for independent errors."""
 
 import math
 import re
@@ -20,7 +20,7 @@ LOSSES = (1e-3, 30.0)
 
 @dataclass
 class PruneOptions:
-    """A budget, at most one of the first four, and how it is met."""
+    """A budget, which is at most one of the first four options, and how pruning meets it."""
 
     count: Any = None
     """How many Gaussians to keep."""
@@ -29,14 +29,14 @@ class PruneOptions:
     psnr: Any = None
     """The smallest PSNR to the original, dB."""
     within: Any = None
-    """The largest loss against the truth, dB, to which the original has the PSNR ``quality``."""
+    """The largest loss of PSNR to the ground truth, dB; the original's PSNR is ``quality``."""
     quality: float = field(default=35.0, metadata=in_range(-200, 200, "dB"))
     size: int = field(default=256, metadata=in_range(16, 4096, "pixels"))
-    """Pixels each way of the views that quality is measured in."""
+    """Height and width of the views in which PSNR is measured, pixels."""
     steps: int = field(default=60, metadata=in_range(1, 100_000))
-    """Of recovery after each round."""
+    """Optimisation steps that recover quality after each round of pruning."""
     eps2d: Optional[float] = field(default=None, metadata=at_least(0, "square pixels"))
-    """Screen-space dilation of the viewer, square pixels; None is that of most viewers."""
+    """Screen-space dilation of the viewer, square pixels; None for the value of most viewers."""
     antialias: Optional[bool] = None
 
     @property
@@ -45,7 +45,7 @@ class PruneOptions:
 
     @staticmethod
     def check(cfg: "PruneOptions") -> None:
-        """Check the rules across fields, and what users write as text.
+        """Check that at most one budget is given, and its value.
 
         Raises:
             UserError: more than one budget, or a number out of its range.
@@ -59,11 +59,11 @@ class PruneOptions:
 def budget_of(
     options: PruneOptions, where: str, count_within: Callable[[int], int] = lambda size: size
 ) -> Budget:
-    """Return the budget that the options ask for.
+    """Convert the options to a budget in Gaussians or in PSNR to the original.
 
     Args:
-        where: what the names of options begin with in messages.
-        count_within: how many Gaussians fit into so many bytes.
+        where: the prefix of options' names in messages.
+        count_within: returns how many Gaussians fit into a number of bytes.
 
     Raises:
         UserError: a number out of its range.
@@ -87,10 +87,10 @@ def budget_of(
 
 
 def parse_number(value: Any, option: str, unit: str = "") -> float:
-    """Read a finite number, with or without its unit.
+    """Parse a finite number, with or without its unit.
 
     Raises:
-        UserError: it is no such number.
+        UserError: ``value`` is no finite number.
     """
     text = str(value).strip()
     try:
@@ -103,10 +103,10 @@ def parse_number(value: Any, option: str, unit: str = "") -> float:
 
 
 def parse_count(value: Any, option: str) -> int:
-    """Read a whole number from 1 on.
+    """Parse a whole number of at least 1.
 
     Raises:
-        UserError: it is no such number.
+        UserError: ``value`` is no such number.
     """
     found = parse_number(value, option)
     if found < 1 or found != int(found):
@@ -115,10 +115,10 @@ def parse_count(value: Any, option: str) -> int:
 
 
 def parse_bytes(value: Any, option: str) -> int:
-    """Read a size such as 500kB or 2MB; k, M and G are powers of 1000.
+    """Parse a size such as 500kB or 2MB into bytes; k, M and G are powers of 1000.
 
     Raises:
-        UserError: it is no size.
+        UserError: ``value`` is no size.
     """
     found = re.fullmatch(r"\s*([\d.]+)\s*(k|m|g)?b?\s*", str(value).lower())
     if not found:
@@ -128,10 +128,10 @@ def parse_bytes(value: Any, option: str) -> int:
 
 
 def parse_loss(value: Any, where: str) -> float:
-    """Read ``within``, dB.
+    """Parse ``within``, a loss in dB.
 
     Raises:
-        UserError: it is out of its range.
+        UserError: it is outside the range :data:`LOSSES`.
     """
     loss = parse_number(value, f"{where}within", "dB")
     if not LOSSES[0] <= loss <= LOSSES[1]:
@@ -145,27 +145,33 @@ def parse_loss(value: Any, where: str) -> float:
 
 
 def psnr_for_loss(loss: float, quality: float) -> float:
-    """Return the PSNR to the original at which the PSNR to the truth falls by ``loss`` from
+    """Return the PSNR to the original at which the PSNR to the ground truth is ``loss`` below
     ``quality``, all in dB.
 
-    With independent errors ``10^(loss / 10) = 1 + 10^((quality - psnr) / 10)``.
+    For independent errors ``10^(loss / 10) = 1 + 10^((quality - psnr) / 10)``.
     """
     return quality - 10 * math.log10(10 ** (loss / 10) - 1)
 
 
 def remaining_psnr_budget(asked: float, spent: float) -> Optional[float]:
-    """Return the PSNR to a cloud pruned to ``spent`` dB that is ``asked`` dB to its original; None
-    where nothing is left.
+    """Return the PSNR budget for pruning a cloud again.
+
+    Args:
+        asked: required PSNR to the original cloud, dB.
+        spent: PSNR of the already pruned cloud to the original, dB.
+
+    Returns:
+        the required PSNR to the already pruned cloud, dB; None if it may lose nothing more.
     """
     left = error_of(asked) - error_of(spent)
     return -10 * math.log10(left) if left > LEAST_ERROR else None
 
 
 def combined_psnr(*psnrs: float) -> float:
-    """Return the PSNR after several independent losses."""
+    """Return the PSNR that results from several independent errors, dB."""
     return -10 * math.log10(sum(map(error_of, psnrs)))
 
 
 def error_of(psnr: float) -> float:
-    """Return the mean squared error of a PSNR, at least the smallest that is measured."""
+    """Return the mean squared error of a PSNR in dB, at least ``LEAST_ERROR``."""
     return max(10 ** (-psnr / 10), LEAST_ERROR)

@@ -1,9 +1,10 @@
 """Read a cloud of Gaussians and prune it to a budget.
 
-Three sets of views have none in common: Gaussians are ranked in and fitted to the training views;
-the validation views decide whether a budget of quality is met, with two standard errors to spare;
-the report measures on the test views. The latter two see what a file of the asked format stores,
-rounding included. All views are from around and outside: right for an object, not for a room."""
+Three disjoint sets of views are used: Gaussians are ranked and optimised on the training views; the
+validation views decide whether a PSNR budget is met, with a margin of two standard errors; the
+report measures on the test views. Validation and test views are rendered from the values that a
+file of the output format stores, so they include its rounding. All cameras are around the cloud and
+look inwards, which suits objects but not rooms."""
 
 import bisect
 import logging
@@ -62,7 +63,7 @@ CHECKPOINTS = {
         "sh_rest": "shN",
     },
 }
-"""Where the Gaussians are in a checkpoint of ours, and of gsplat's trainer."""
+"""The names of the Gaussians' tensors in checkpoints of this package and of gsplat's trainer."""
 
 
 class PruneResult(NamedTuple):
@@ -79,11 +80,14 @@ class PruneResult(NamedTuple):
 
 
 def read(path: str, up: Optional[str] = None) -> StoredCloud:
-    """Read the Gaussians in a file or a checkpoint; ``up`` overrides the axis that a file states.
+    """Read the Gaussians of a file or a checkpoint.
+
+    Args:
+        up: overrides the up axis that the file states.
 
     Raises:
-        UserError: there is no file, it holds fewer than two Gaussians, or harmonics that can't be
-            drawn.
+        UserError: there is no such file, or it has fewer than two Gaussians or spherical harmonics
+            that can't be rendered.
     """
     file = existing_file(path, "file of Gaussians or checkpoint")
     if file.suffix in (".ckpt", ".pt", ".pth"):
@@ -99,10 +103,10 @@ def read(path: str, up: Optional[str] = None) -> StoredCloud:
 
 
 def from_checkpoint(file: Path) -> Gaussians:
-    """Read the Gaussians in a training checkpoint.
+    """Read the Gaussians of a training checkpoint.
 
     Raises:
-        UserError: there are none.
+        UserError: it has none.
     """
     content = load_file(file)
     for key, names in CHECKPOINTS.items():
@@ -125,15 +129,20 @@ def from_checkpoint(file: Path) -> Gaussians:
 def prune_to_budget(
     stored: StoredCloud, options: PruneOptions, suffix: str, where: str
 ) -> PruneResult:
-    """Prune a cloud to its budget as a file of the format ``suffix``.
+    """Prune a cloud to the budget of ``options``.
 
-    The PSNR already lost is stored in the file, so pruning again counts from the original.
+    A guaranteed PSNR to the original cloud is stored in the result (``pruned_to``), so that pruning
+    again counts from the original.
+
+    Args:
+        suffix: of the file to be written, ".ply" or ".spz".
+        where: the prefix of options' names in messages.
 
     Raises:
-        UserError: a budget that can't be met, or values that the format can't hold.
+        UserError: the budget can't be met, or the format can't store the values.
     """
     started = time.perf_counter()
-    file_size(stored, suffix)  # fails for what the format can't hold, before any work
+    file_size(stored, suffix)  # raises for values that the format can't store, before any work
     asked = budget_of(options, where, lambda size: _count_within(size, stored, suffix, where))
     after, reached = _simplify(stored, _remaining_budget(asked, stored), options, suffix)
     if options.bytes is not None:
@@ -155,8 +164,8 @@ def prune_to_budget(
 def _note(
     stored: StoredCloud, after: StoredCloud, asked: Budget, spent: float, met: bool
 ) -> Optional[float]:
-    """Return the PSNR to the original that the file states; None where it isn't known to last, as
-    after pruning to a count.
+    """Return the PSNR to the original that is stored in the file; None if there is no guarantee for
+    it, as after pruning to a count.
     """
     if asked.psnr is not None:
         return asked.psnr if met else spent
@@ -165,8 +174,8 @@ def _note(
 
 
 def _remaining_budget(asked: Budget, stored: StoredCloud) -> Budget:
-    """Return what earlier pruning has left of a budget of quality: maybe nothing, so that all
-    Gaussians stay.
+    """Return the part of a PSNR budget that earlier pruning has not used; if all of it is used, a
+    budget that keeps all Gaussians.
     """
     if asked.psnr is None or stored.pruned_to is None:
         return asked
@@ -184,7 +193,7 @@ def _count_within(size: int, stored: StoredCloud, suffix: str, where: str) -> in
     """Return the largest count whose evenly strided subset encodes to at most ``size`` bytes.
 
     Raises:
-        UserError: not even one Gaussian does.
+        UserError: a single Gaussian takes more.
     """
     whole = len(stored.gaussians.means)
 
@@ -208,8 +217,10 @@ def _shrink(
     suffix: str,
     where: str,
 ) -> tuple[StoredCloud, float]:
-    """Prune on until the file has at most ``limit`` bytes: what is left compresses worse than the
-    subset that the count was estimated from.
+    """Prune further until the file has at most ``limit`` bytes.
+
+    This is needed because the remaining Gaussians may compress worse than the subset from which the
+    count was estimated.
     """
     while (size := file_size(after, suffix)) > limit:
         count = len(after.gaussians.means)
@@ -222,8 +233,8 @@ def _shrink(
 def _simplify(
     stored: StoredCloud, budget: Budget, options: PruneOptions, suffix: str
 ) -> tuple[StoredCloud, float]:
-    """Prune within a budget; return the cloud, and a lower bound of the PSNR of its file to the
-    given one, dB.
+    """Prune within a budget; return the cloud, and a lower bound of its stored values' PSNR to the
+    given cloud, dB.
     """
     from tqdm import tqdm
 
@@ -254,17 +265,17 @@ def _simplify(
 
 
 def constant_sh_limit(cloud: Gaussians, suffix: str) -> float:
-    """Return the largest absolute constant harmonic that recovery may give a Gaussian.
+    """Return the largest absolute coefficient of the constant harmonic that recovery may set.
 
-    Viewers show colours in [0, 1] only: recovered colours stay in that range, or in the input's
-    where that is larger, and in what the file holds.
+    Viewers clamp colours to [0, 1], so recovered colours stay in that range, or in the input's if
+    it is larger, and within what the file can store.
     """
     largest = max(float(rgb_to_sh0(torch.ones(()))), float(cloud.sh[:, 0].abs().amax()))
     return min(largest, COLOR_REACH) if suffix == ".spz" else largest
 
 
 def views_of(stored: StoredCloud, options: PruneOptions) -> list[Views]:
-    """Return training, validation and test views, rendered as the options say that viewers do."""
+    """Return training, validation and test views, with the viewer's rendering of ``options``."""
     cloud = stored.gaussians.tensors(get_device())
     to_z_up = torch.from_numpy(rotation_between(stored.up, "z"))
     eps2d = EPS2D if options.eps2d is None else options.eps2d

@@ -1,4 +1,4 @@
-"""Measure a pruning on views that nothing was fitted to, and write the report beside the file."""
+"""Measure a pruned cloud on the test views, and write the report beside the file."""
 
 import statistics
 import time
@@ -20,12 +20,12 @@ from .options import PruneOptions
 from .pipeline import PruneResult, views_of
 
 REPORTS = (".json", ".png")
-"""Written beside OUT: their names are OUT's and these endings."""
+"""Suffixes of the report's files, appended to the name of OUT."""
 SHEET_VIEWS, TIMED_VIEWS = 6, 5
 
 
 class Cost(NamedTuple):
-    """What a cloud is, and what it costs."""
+    """Size and rendering cost of a cloud."""
 
     gaussians: int
     bytes: int
@@ -35,10 +35,10 @@ class Cost(NamedTuple):
 def write_report(
     path: str, result: PruneResult, suffix: str, options: PruneOptions
 ) -> dict[str, Any]:
-    """Print the report and write ``path``.json and ``path``.png; return what the JSON holds.
+    """Print the report, write ``path``.json and ``path``.png, and return the content of the JSON.
 
     Raises:
-        UserError: a file can't be written; earlier ones are untouched.
+        UserError: a file can't be written; an existing one is left unchanged.
     """
     views = views_of(result.before, options)[-1]
     grey = views._replace(backgrounds=None)
@@ -79,7 +79,7 @@ def _cost(cloud: Gaussians, size: int, views: Views) -> Cost:
 
 
 def sheet(images: list[Float[Tensor, "V H W 3"]]) -> UInt8[ndarray, "rows columns 3"]:
-    """Lay out six views, from below to above, in a row for each set of images, as bytes."""
+    """Arrange six views, ordered by elevation, in a row for each set of images, as bytes."""
     rows = [
         torch.cat(list(views[torch.linspace(0, len(views) - 1, SHEET_VIEWS).long()]), 1)
         for views in images
