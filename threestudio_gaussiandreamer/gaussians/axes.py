@@ -28,7 +28,7 @@ AXES = {
     "-y": np.diag([1.0, -1.0, -1.0]),
     "z": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
 }
-"""By the axis that is up: the rotation to the axes right, up, front."""
+"""Rotation to the axes (right, up, front), by the name of the axis that is up."""
 FRONTS = {"y": "+z", "-y": "-z", "z": "+x"}
 
 
@@ -43,7 +43,7 @@ def rotate(gaussians: Gaussians, rotation: Float[np.ndarray, "3 3"]) -> Gaussian
     Raises:
         UserError: spherical harmonics above degree 3.
     """
-    with np.errstate(invalid="ignore", over="ignore"):  # of rows that can't be drawn
+    with np.errstate(invalid="ignore", over="ignore"):  # rows with NaN or infinity are allowed
         return gaussians._replace(
             means=(gaussians.means @ rotation.T).astype(np.float32),
             quats=_rotate_quats(gaussians.quats, rotation),
@@ -65,7 +65,7 @@ def _rotate_quats(
 def _rotate_sh(
     sh: Float[np.ndarray, "N K 3"], rotation: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "N K 3"]:
-    """Return harmonics that have in direction R d the values that these have in direction d."""
+    """Rotate harmonics: the result has in direction R d the value of ``sh`` in direction d."""
     degree = round(sh.shape[1] ** 0.5) - 1
     if degree == 0:
         return sh
@@ -80,8 +80,9 @@ def _rotate_sh(
 
 @cache
 def _sh_rotation(rotation: tuple[tuple[float, ...], ...], degree: int) -> Float[np.ndarray, "K K"]:
-    """Fit the matrix of coefficients at random directions; exact, since the harmonics of each
-    degree rotate among themselves.
+    """Compute the matrix that rotates coefficients, by least squares over random directions.
+
+    The fit is exact: rotated harmonics of a degree are linear combinations of that degree's.
     """
     directions = np.random.default_rng(0).normal(size=(64, 3))
     rotated, original = (

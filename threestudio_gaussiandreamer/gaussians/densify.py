@@ -1,9 +1,9 @@
 """Densify and prune: which Gaussians are cloned, split and dropped, as pure functions of the cloud
 and its statistics.
 
-A change of the cloud is a :class:`Change`: for every row the old row that it comes from, and
-whether the Gaussian is new. Applying it to the parameters, the optimiser's moments and the
-statistics is then one gather each, so the moments of a Gaussian follow it.
+A :class:`Change` gives for every new row the old row that it comes from and whether the Gaussian is
+new. Parameters, optimiser moments and statistics are then updated by one gather each, so a
+Gaussian keeps its moments.
 
 Statistics are per view and unscaled. ``gradient`` is the norm of the loss's gradient with respect
 to the projected centre in normalised device units (half the image is 1), of the loss of one view
@@ -11,9 +11,9 @@ to the projected centre in normalised device units (half the image is 1), of the
 depend on resolution, batch size or a loss scale. ``contribution`` is the largest sigma_i T_i over
 the pixels of recent views (RadSplat, Niemeyer et al. 2024).
 
-Clone and split rules: Kerbl et al. 2023, section 5.2. Their opacity reset, which sets all opacities
-near zero now and then to find floaters, isn't there: score distillation doesn't rebuild what a
-reset erases, and pruning by contribution finds floaters too."""
+Clone and split rules: Kerbl et al. 2023, section 5.2. Their periodic opacity reset, which removes
+floaters, isn't implemented: score distillation doesn't recover the opacities that a reset lowers,
+and pruning by contribution removes floaters as well."""
 
 import logging
 from typing import Mapping, NamedTuple
@@ -27,13 +27,13 @@ logger = logging.getLogger(__name__)
 PARAMETERS = ("means", "log_scales", "quats", "logit_opacities", "sh0", "sh_rest")
 SPLIT_SHRINK = 1.6  # the two children of a split are this much smaller
 LOG_SCALE_RANGE = (-20.0, 10.0)
-"""Where the exponential and its square are well within float32: sizes beyond are drawn, and split,
-as if at these bounds.
+"""Range in which the exponential and its square are within float32; logarithms outside are clamped
+to it for rendering and splitting.
 """
 
 
 class Change(NamedTuple):
-    """A new cloud described by where its rows come from."""
+    """A new cloud of M Gaussians, with the old row of each."""
 
     parents: Int[Tensor, " M"]
     """The old row of each new Gaussian."""
@@ -56,7 +56,7 @@ class Rules(NamedTuple):
 
 
 class Statistics(NamedTuple):
-    """What the training steps since the last densification saw, per Gaussian."""
+    """Per-Gaussian statistics of the training steps since the last densification."""
 
     gradient: Float[Tensor, " N"]
     contribution: Float[Tensor, " N"]
@@ -80,11 +80,12 @@ def screen_gradients(
 def densify_and_prune(
     params: Mapping[str, Tensor], stats: Statistics, rules: Rules, rng: torch.Generator
 ) -> Change:
-    """Clone small and split large Gaussians with a large gradient at their centre, drop faint and
-    huge ones, and respect cap and floor.
+    """Clone small and split large Gaussians whose positional gradient is above the threshold, and
+    drop those with a low opacity or a large scale.
 
-    A Gaussian that no view has seen has no gradient and is never selected. Faint ones are neither
-    cloned nor split, and the room that they leave under the cap goes to others in the same round.
+    A Gaussian that no view has seen has no gradient and is neither cloned nor split; nor are those
+    with a low opacity. The number of Gaussians stays within ``max_gaussians``, counted after the
+    low opacities are dropped, and ``min_gaussians``.
     """
     faint = torch.sigmoid(params["logit_opacities"].detach()) < rules.min_opacity
     above_threshold = (stats.gradient > rules.grad_threshold) & ~faint
@@ -102,8 +103,8 @@ def densify_and_prune(
 def _affordable(
     above_threshold: Bool[Tensor, " N"], gradient: Float[Tensor, " N"], room: int
 ) -> Bool[Tensor, " N"]:
-    """Choose the rows above the threshold with the largest gradients that fit into ``room`` more
-    Gaussians (each adds exactly one).
+    """Select at most ``room`` of the rows above the threshold, those with the largest gradients;
+    each clone or split adds one Gaussian.
     """
     if int(above_threshold.sum()) <= room:
         return above_threshold
@@ -143,8 +144,8 @@ def clone_and_split(
 def keep(
     change: Change, wanted: Bool[Tensor, " M"], contribution: Float[Tensor, " M"], rules: Rules
 ) -> Change:
-    """Drop the unwanted rows; at least ``min_gaussians`` and at most ``max_gaussians`` stay, those
-    that contribute most.
+    """Drop the unwanted rows, but keep at least ``min_gaussians`` and at most ``max_gaussians``,
+    those with the largest contribution.
     """
     # two stable sorts: every wanted row before every unwanted one, so that the floor is filled from
     # the best unwanted rows
@@ -193,8 +194,8 @@ def update_optimizer(
     new: Mapping[str, nn.Parameter],
     change: Change,
 ) -> None:
-    """Put the ``new`` parameters in the place of the ``old``; moments follow their Gaussian, those
-    of new ones are zero.
+    """Replace the ``old`` parameters by the ``new`` ones; Gaussians keep their moments, and the
+    moments of new Gaussians are zero.
     """
     replaced = {id(old[name]): new[name] for name in new}
     for group in optimizer.param_groups:

@@ -16,8 +16,8 @@ from .sh import MAX_DEGREE
 logger = logging.getLogger(__name__)
 Array = np.ndarray | Tensor
 MAX_LOG = 87.0
-"""Logits and logarithms of scales are stored within this: exp(-87) is about the smallest normal
-float32, and the sigmoid of +-87 is 1 and 0.
+"""Largest absolute value of stored logits and logarithms of scales: exp(-87) is about the smallest
+normal float32, and the sigmoid of +-87 rounds to 1 and 0.
 """
 
 
@@ -37,7 +37,7 @@ class Gaussians(NamedTuple):
 
     @classmethod
     def of(cls, source: Any) -> "Gaussians":
-        """Collect the attributes of these names, for instance those of a geometry."""
+        """Collect the attributes of ``source`` that have the names of the fields."""
         return cls(*(getattr(source, name) for name in cls._fields))
 
     @property
@@ -49,7 +49,7 @@ class Gaussians(NamedTuple):
         return Gaussians(*map(function, self))
 
     def rows(self, index: Any) -> "Gaussians":
-        """Select Gaussians by whatever indexes the fields' first dimension."""
+        """Select Gaussians; ``index`` is anything that indexes the fields' first dimension."""
         return self.map(lambda values: values[index])
 
     def arrays(self) -> "Gaussians":
@@ -62,8 +62,8 @@ class Gaussians(NamedTuple):
 
 
 def usable(gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
-    """Tell which Gaussians can be drawn: all values are finite, but for opacities of 0 or 1 and
-    flat axes, whose logarithms are infinite.
+    """Return which Gaussians can be drawn: all their values are finite, except that logits may be
+    infinite (opacity 0 or 1) and logarithms of scales may be -inf (scale 0).
     """
     columns = [
         np.isfinite(gaussians.means),
@@ -76,10 +76,11 @@ def usable(gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
 
 
 def drawable(gaussians: Gaussians, name: str) -> Gaussians:
-    """Leave out the Gaussians that can't be drawn, with a warning; ``name`` says where they are.
+    """Remove the Gaussians that can't be drawn, with a warning; ``name`` names their file in
+    messages.
 
     Raises:
-        UserError: harmonics above degree 3, which neither the rasteriser nor SPZ has.
+        UserError: harmonics above degree 3, which neither the rasteriser nor SPZ supports.
     """
     if gaussians.sh_degree > MAX_DEGREE:
         raise UserError(
@@ -95,8 +96,8 @@ def drawable(gaussians: Gaussians, name: str) -> Gaussians:
 
 
 def finite(gaussians: Gaussians, name: str) -> Gaussians:
-    """Return Gaussians of which every value is finite: those that can't be drawn are left out, and
-    logits and logarithms stay finite, those of scales also when a reader takes the exponential.
+    """Remove the Gaussians that can't be drawn, and clamp logits and logarithms of scales to
+    [-MAX_LOG, MAX_LOG], so that all values and the scales themselves are finite in float32.
     """
     gaussians = drawable(gaussians, name)
     return gaussians._replace(
@@ -106,8 +107,6 @@ def finite(gaussians: Gaussians, name: str) -> Gaussians:
 
 
 def opaque(gaussians: Gaussians, min_opacity: float) -> Bool[np.ndarray, " N"]:
-    """Tell which Gaussians have an opacity of at least ``min_opacity``, in [0, 1]; at 0 all whose
-    opacity is a number.
-    """
+    """Return which Gaussians have an opacity, in [0, 1], of at least ``min_opacity`` (NaN: no)."""
     with np.errstate(divide="ignore"):
         return gaussians.logit_opacities >= np.log(min_opacity) - np.log1p(-min_opacity)

@@ -3,8 +3,8 @@ Algorithm 1.
 
 Stage 1 draws points uniformly in the bounding box of the prior's points; stage 2 keeps those nearer
 than a radius to one of them and gives each the colour of that point plus noise; stage 3 takes the
-distance to the nearest point as the size of the Gaussian. Everything is in units of the cloud
-itself, so a prior in millimetres grows as one in metres."""
+distance to the nearest point as the size of the Gaussian. Lengths are relative to the size of the
+cloud, so the result doesn't depend on its unit."""
 
 import logging
 from typing import Optional
@@ -18,15 +18,18 @@ from .point_cloud import PointCloud
 logger = logging.getLogger(__name__)
 
 SCALE_RULES = {"nearest": 1, "rms3": 3}
-"""How many neighbours each rule of the first scales averages over."""
+"""Number of neighbours over which each rule for the initial scales averages."""
 ISOLATED_FACTOR = 10.0
-"""A point is isolated, and its size capped, beyond this many times the 99th percentile of all
-distances.
+"""A point is isolated if its nearest neighbour is farther away than this many times the 99th
+percentile of such distances; its scale is capped at that length.
 """
 FLOOR_FRACTION = 1e-4
-"""Points nearer than this fraction of the median distance are copies but for rounding."""
+"""Distances below this fraction of the median are taken for rounding errors between copies of a
+point.
+"""
 FEW_POINTS_FRACTION = 0.1
-"""Size of each Gaussian, in units of the bounding radius, where there are fewer than four points.
+"""Scale of each Gaussian, in units of the bounding radius, if there are fewer than four distinct
+points.
 """
 
 
@@ -80,8 +83,8 @@ def longest_side(points: Float[np.ndarray, "P 3"]) -> float:
 def growing_box(
     points: Float[np.ndarray, "P 3"], reach: float
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Return the bounding box (low, high), each side at least ``2 * reach``: a flat cloud grows a
-    slab, not copies of itself.
+    """Return the bounding box (low, high), with each side at least ``2 * reach``, so that points
+    also grow off the plane of a flat cloud.
     """
     low, high = points.min(axis=0), points.max(axis=0)
     padding = np.maximum(reach - (high - low) / 2, 0.0)
@@ -103,13 +106,12 @@ def perturbed_colors(
 def nearest_distance_scales(
     points: Float[np.ndarray, "P 3"], rule: str = "nearest"
 ) -> Float[np.ndarray, " P"]:
-    """Return the first size (standard deviation) of the Gaussian at each point: the distance to its
-    neighbours.
+    """Return the initial scale (standard deviation) of the Gaussian at each point, from the
+    distance to its neighbours.
 
-    Positive and finite whatever the cloud: a point that has an exact copy gets the median (the
-      copy's distance, zero,
-    says nothing about the surface), an isolated one at most ``ISOLATED_FACTOR`` times the 99th
-    percentile, and fewer than four distinct points a fraction of their bounding radius.
+    The result is positive and finite for every cloud. A point with an exact copy, whose distance is
+    zero, gets the median distance. An isolated point gets at most ``ISOLATED_FACTOR`` times the
+    99th percentile, and fewer than four distinct points get a fraction of their bounding radius.
 
     Args:
         points: (P, 3) in any unit, which is the unit of the result.
@@ -167,7 +169,9 @@ def _check_options(
 
 
 def _checked(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-    """Return the points in float64, so that squares of tiny distances don't vanish."""
+    """Check the points and convert them to float64, in which squares of tiny distances don't
+    underflow.
+    """
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise UserError(
@@ -190,7 +194,7 @@ def _within_reach(
     """
     from scipy.spatial import cKDTree
 
-    first, _, _ = distinct(points)  # a leaf full of copies would be searched copy by copy
+    first, _, _ = distinct(points)  # the tree is slow with many copies of one point
     distances, nearest = cKDTree(points[first]).query(
         candidates, distance_upper_bound=reach, workers=-1
     )
@@ -208,8 +212,11 @@ def _within_reach(
 def distinct(
     points: Float[np.ndarray, "P 3"],
 ) -> tuple[Int[np.ndarray, " D"], Int[np.ndarray, " P"], Int[np.ndarray, " D"]]:
-    """Index of the first point at each distinct place, the place of each point, and how many points
-    are there.
+    """Group equal points.
+
+    Returns:
+        index of the first point at each of the D positions, the position of each point, and the
+        number of points at each position.
     """
     order = np.lexsort(points.T)
     is_new = np.ones(len(points), bool)
@@ -222,7 +229,7 @@ def distinct(
 def _neighbour_distances(
     points: Float[np.ndarray, "D 3"], neighbours: int
 ) -> Float[np.ndarray, " D"]:
-    """Root mean square distance to the nearest ``neighbours`` other points."""
+    """Compute the root mean square distance to the nearest ``neighbours`` other points."""
     from scipy.spatial import cKDTree
 
     distances, _ = cKDTree(points).query(points, k=neighbours + 1, workers=-1)
@@ -230,8 +237,8 @@ def _neighbour_distances(
 
 
 def _bounded(distances: Float[np.ndarray, " D"]) -> Float[np.ndarray, " D"]:
-    """Cap the distances of isolated points, and floor those of copies that differ by a rounding
-    error.
+    """Clamp distances to the cap for isolated points, and from below for points that are copies up
+    to rounding.
     """
     cap = _isolation_cap(distances)
     if count := int((distances > cap).sum()):

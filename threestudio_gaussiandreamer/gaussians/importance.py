@@ -1,21 +1,22 @@
 """Importance of Gaussians, and gradual pruning by it inside the training loop.
 
-A round keeps the share of the Gaussians with the highest importance, down to a budget, and training
-goes on between rounds, so that those that stay take over from those that went. Two quantities are
-collected between rounds:
+Each round keeps a fraction of the Gaussians, those with the highest importance, until a budget is
+reached. Training continues between rounds, so that the remaining Gaussians compensate for the
+removed ones. Two quantities are collected between rounds:
 
 - the *contribution*, the largest weight sigma_i T_i over the pixels of all views, a by-product of
   rendering (RadSplat, Niemeyer et al. 2024);
 - the *removal error*, the squared change of the views if that Gaussian alone were removed, which is
-  also small where what lies behind has the same colour: :func:`removal_error`.
+  also small in front of a background of the same colour: :func:`removal_error`.
 
-The score ``removal`` is the root of the removal error times the contribution. Each term alone ranks
-some redundant Gaussians high; their product does not.
+The score ``removal`` is the square root of the removal error times the contribution. Each term
+alone ranks some redundant Gaussians high; their product does not.
 
-Ranked by the contribution, the top Gaussian of a pixel goes last, and under ``auto`` never
-(SafeguardGS, Lee et al. 2024): the weights of one pixel sum to at most 1, so one above 1/2 belongs
-to its top. Such a Gaussian may hold a single pixel that its neighbours would show as well; keeping
-them all costs half a dB (docs/results.md), so ``removal`` doesn't."""
+The score ``contribution`` protects the Gaussian with the largest weight in a pixel: it is pruned
+last, and with the budget ``auto`` never (SafeguardGS, Lee et al. 2024). Since the weights of a
+pixel sum to at most 1, a weight above 1/2 is the largest. The score ``removal`` doesn't protect
+these Gaussians: their neighbours can often render that pixel as well, and to keep all of them costs
+half a dB (docs/results.md)."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -27,19 +28,17 @@ from torch import Tensor
 from .densify import Change, prune_to
 
 SCORES = ("removal", "contribution", "opacity", "random")
-"""What Gaussians can be ranked by; the last two are controls to compare with."""
+"""Scores by which Gaussians can be ranked; the last two are baselines for comparison."""
 SAMPLES = 12
-"""How often the removal error is sampled between two rounds, about: each sample costs a backward
-pass.
-"""
+"""Approximate number of samples of the removal error per round; each costs a backward pass."""
 TOP_OF_A_PIXEL = 0.5
 """A weight above this is the largest of its pixel."""
 BISECTIONS = 4
-"""Of :func:`smallest_count`, which so finds the count within 1/16 of what a round may drop."""
+"""Bisection steps of :func:`smallest_count`: the count is found to within 1/16 of its range."""
 
 
 class VisibilityStats(NamedTuple):
-    """What each Gaussian contributed to the views since the last round."""
+    """Statistics of the views since the last round, per Gaussian."""
 
     contribution: Float[Tensor, " N"]
     removal: Float[Tensor, " N"]
@@ -61,13 +60,13 @@ def importance_by(
 def removal_error(
     images: Float[Tensor, "B H W C"], opacities: Float[Tensor, " N"], rng: torch.Generator
 ) -> Float[Tensor, " N"]:
-    """Sample, without bias, the squared change of the views without each Gaussian, summed over
-    pixels and channels.
+    """Draw an unbiased estimate of the removal error of each Gaussian: the squared change of the
+    views without it, summed over pixels and channels.
 
-    A pixel I_p is linear in the opacity o of each Gaussian, so that d_p = o dI_p/do is exactly what
-    it alone adds (but for pixels in which its alpha is capped, and has no gradient). With signs z_p
-    drawn at random, the mean of (sum_p z_p d_p)^2 is sum_p d_p^2 (Hutchinson 1989): one backward
-    pass for all Gaussians.
+    A pixel I_p is linear in the opacity o of each Gaussian, so d_p = o dI_p/do is exactly the
+    change if that Gaussian alone is removed (except in pixels where its alpha is capped, which have
+    no gradient). For random signs z_p, the expectation of (sum_p z_p d_p)^2 is sum_p d_p^2
+    (Hutchinson 1989), so one backward pass serves all Gaussians.
 
     Args:
         images: rendered views, whose graph is kept.
@@ -79,26 +78,26 @@ def removal_error(
 
 
 def next_count(count: int, keep: float, budget: int) -> int:
-    """Return the count after a round that keeps the share ``keep``: never below the budget, and
-    never above what is there.
+    """Return the count after a round that keeps the fraction ``keep``, but not fewer than
+    ``budget`` or more than ``count``.
     """
     return min(count, max(budget, int(keep * count)))
 
 
 def top_count(contribution: Float[Tensor, " N"]) -> int:
-    """Count the known top Gaussians of pixels; they are the first by contribution."""
+    """Count the Gaussians with a weight above ``TOP_OF_A_PIXEL`` in some pixel."""
     return int((contribution > TOP_OF_A_PIXEL).sum())
 
 
 def smallest_count(
     scores: Float[Tensor, " N"], least: int, acceptable: Callable[[Bool[Tensor, " N"]], bool]
 ) -> int:
-    """Find the smallest count, at least ``least``, with acceptable quality.
+    """Find by bisection the smallest count, at least ``least``, with acceptable quality.
 
     Args:
-        scores: the highest are kept.
-        acceptable: tells whether the quality is when only the marked Gaussians are drawn; taken to
-            be monotone, and called at most ``BISECTIONS + 1`` times.
+        scores: the Gaussians with the highest scores are kept.
+        acceptable: returns whether the quality is acceptable when only the marked Gaussians are
+            drawn; assumed to be monotone in the count, called at most ``BISECTIONS + 1`` times.
     """
     order = torch.argsort(scores, descending=True, stable=True)
     high = len(scores)
@@ -112,7 +111,7 @@ def smallest_count(
 
 
 def mark_first(order: Tensor, count: int) -> Bool[Tensor, " N"]:
-    """Mark the first ``count`` rows of an order."""
+    """Return a mask of the first ``count`` rows in ``order``."""
     marked = torch.zeros_like(order, dtype=torch.bool)
     marked[order[:count]] = True
     return marked
@@ -125,7 +124,10 @@ def keep_highest(
     first: Change | None = None,
 ) -> Change:
     """Return the change that keeps the ``count`` rows of ``params`` with the highest scores, in
-    their order; where ``params`` are what the change ``first`` made, that change and this one.
+    their order.
+
+    Args:
+        first: an earlier change that resulted in ``params``; the two are composed.
     """
     change = prune_to(params, scores, count)
     return (

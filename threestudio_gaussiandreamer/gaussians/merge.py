@@ -1,11 +1,11 @@
-"""Merge duplicates: a pair of Gaussians that cover the same place in the same colour becomes one
-Gaussian with their moments.
+"""Merge duplicates: replace two Gaussians of nearly the same position, shape and colour by one with
+the moments of both.
 
-Pruning can't do this: each of two copies is in front in some view, so both contribute, and they
-share the opacity that one could have. The cost of a pair is how much the merged Gaussian is larger
-than its parts, in position and in colour, per weight (Runnalls 2007,
-"Kullback-Leibler approach to Gaussian mixture reduction", the bound B(i, j) over w_i + w_j), the
-colour as an additional dimension with the standard deviation ``COLOR_TOLERANCE``:
+Pruning can't remove duplicates: each of two copies is in front in some views, so both contribute.
+The cost of a pair is the bound B(i, j) of Runnalls 2007 ("Kullback-Leibler approach to Gaussian
+mixture reduction") over w_i + w_j. It measures how much larger the merged Gaussian is than its
+parts, in position and in colour; colour is treated as an additional dimension with the standard
+deviation ``COLOR_TOLERANCE``:
 
     cost = 1/2 (log |S| - f log |S_i| - (1 - f) log |S_j| + log(1 + f (1 - f) |c_i - c_j|^2 /
     tolerance^2))
@@ -32,11 +32,13 @@ the original, for untrained clouds too.
 COLOR_TOLERANCE = 0.1
 NEIGHBOURS = 4
 LOG_THINNEST = -12.0
-"""Axes are clamped to this logarithm of their ratio to the longest, the precision of float64."""
+"""Smallest logarithm of the ratio of an axis to the longest one; shorter axes are clamped to it, so
+that covariances are well conditioned in float64.
+"""
 
 
 class _Shapes(NamedTuple):
-    """What the costs depend on, float64 on the CPU."""
+    """Properties of the Gaussians that the costs depend on, float64 on the CPU."""
 
     means: Float[Tensor, "N 3"]
     covariances: Float[Tensor, "N 3 3"]
@@ -47,13 +49,13 @@ class _Shapes(NamedTuple):
 
 
 def merge_duplicates(params: Mapping[str, Tensor], *, at_least: int = 1) -> Change:
-    """Merge all duplicates; merged Gaussians are new, and their parent is the first of their
-    pair.
+    """Merge all duplicates; a merged Gaussian is marked as new, with the first of its pair as the
+    parent.
 
     Args:
-        params: means, log_scales, quats, logit_opacities and spherical harmonics, under names with
-            "sh".
-        at_least: how many Gaussians stay at least, whatever duplicates there are.
+        params: means, log_scales, quats, logit_opacities and the spherical harmonics (sh, or sh0
+            and sh_rest).
+        at_least: the number of Gaussians is not reduced below this.
     """
     rows = torch.arange(len(params["means"]), device=params["means"].device)
     change = Change(
@@ -75,17 +77,22 @@ def merge_duplicates(params: Mapping[str, Tensor], *, at_least: int = 1) -> Chan
 def duplicates(
     params: Mapping[str, Tensor], spent: Float[Tensor, " N"]
 ) -> tuple[Int[Tensor, "P 2"], Float[Tensor, " P"]]:
-    """Find pairs of rows to merge, the cheapest first, no row in two pairs; return them and their
-    costs, with what each row has ``spent`` in earlier merges.
+    """Find disjoint pairs of rows to merge, those with the lowest cost first.
+
+    Args:
+        spent: cost of the earlier merges that each row results from.
+
+    Returns:
+        the pairs, and their costs including ``spent``.
     """
     shapes = _shapes(params)
     pairs = _neighbours(shapes.means)
     costs = _costs(shapes, pairs) + spent[pairs].amax(
         1
-    )  # or a chain of cheap steps would lead anywhere
+    )  # accumulated, so that a sequence of small merges can't change the result by much
     order = costs.argsort(stable=True)[
         : int((costs <= DUPLICATE).sum())
-    ]  # NaN, the cost of what isn't finite, comes last
+    ]  # NaN, the cost of Gaussians that aren't finite, is sorted to the end
     taken, chosen = set(), []
     for row, (first, second) in zip(order.tolist(), pairs[order].tolist(), strict=True):
         if first not in taken and second not in taken:
@@ -111,7 +118,7 @@ def _shapes(params: Mapping[str, Tensor]) -> _Shapes:
 
 
 def _neighbours(means: Float[Tensor, "N 3"]) -> Int[Tensor, "P 2"]:
-    """Pair every finite Gaussian with its nearest ones, smaller row first, each pair once."""
+    """Pair every finite Gaussian with its nearest neighbours, each pair once, smaller row first."""
     from scipy.spatial import cKDTree
 
     rows = means.isfinite().all(1).nonzero()[:, 0]
@@ -122,8 +129,8 @@ def _neighbours(means: Float[Tensor, "N 3"]) -> Int[Tensor, "P 2"]:
     pairs = torch.stack([torch.arange(len(rows))[:, None].expand_as(nearest), nearest], -1).reshape(
         -1, 2
     )
-    # of many copies in one place all have the same few nearest, which would leave one or two pairs
-    # a round
+    # Many copies of one point all have the same few nearest neighbours, hence only one or two
+    # disjoint pairs; pairs of neighbours in sorted order are added for them.
     order = torch.from_numpy(np.lexsort(points.T))
     pairs = torch.cat([pairs, torch.stack([order[:-1], order[1:]], 1)])
     pairs = pairs[pairs[:, 0] != pairs[:, 1]].sort(1).values.unique(dim=0)
@@ -133,7 +140,9 @@ def _neighbours(means: Float[Tensor, "N 3"]) -> Int[Tensor, "P 2"]:
 def _moments(
     shapes: _Shapes, pairs: Int[Tensor, "P 2"]
 ) -> tuple[Float[Tensor, " P"], Float[Tensor, "P 3"], Float[Tensor, "P 3 3"]]:
-    """Return the first's share f of the weight, the mean and the covariance of each pair."""
+    """Return the mean and the covariance of each pair, after the first one's share f of the
+    weight.
+    """
     i, j = pairs.unbind(1)
     f = shapes.weights[i] / (shapes.weights[i] + shapes.weights[j])
     apart = shapes.means[i] - shapes.means[j]
@@ -159,7 +168,7 @@ def _costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
 def _merged(
     change: Change, spent: Tensor, pairs: Int[Tensor, "P 2"], costs: Float[Tensor, " P"]
 ) -> tuple[Change, Tensor]:
-    """Replace the first of each pair by both, and remove the second."""
+    """Replace the first row of each pair by the merged Gaussian, and remove the second."""
     values, device = change.values, change.parents.device
     for name, merged in _together(values, pairs).items():
         values[name][pairs[:, 0].to(device)] = merged.to(values[name])
@@ -176,8 +185,8 @@ def _merged(
 
 
 def _together(params: Mapping[str, Tensor], pairs: Int[Tensor, "P 2"]) -> dict[str, Tensor]:
-    """Make one Gaussian of each pair: moments as above, an opacity that absorbs as much light as
-    both, the weighted mean of their harmonics.
+    """Compute the merged Gaussian of each pair: mean and covariance by :func:`_moments`, opacity
+    a + b - a b, and the weighted mean of the harmonics.
     """
     from scipy.spatial.transform import Rotation
 
@@ -185,8 +194,8 @@ def _together(params: Mapping[str, Tensor], pairs: Int[Tensor, "P 2"]) -> dict[s
     f, means, covariances = _moments(shapes, pairs)
     summed, product = shapes.opacities[pairs].sum(1), shapes.opacities[pairs].prod(1)
     opacities = summed - product
-    # one behind the other they fall off more slowly than each: their light 1 - (1 - a g)(1 - b g),
-    # integrated over the plane
+    # The composited alpha of the pair, 1 - (1 - a g)(1 - b g), falls off more slowly than g: scale
+    # the covariance so that its integral over the plane is the same.
     variances, axes = torch.linalg.eigh(
         covariances * ((summed - 0.5 * product) / opacities)[:, None, None]
     )

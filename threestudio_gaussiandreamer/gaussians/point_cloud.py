@@ -1,4 +1,4 @@
-"""The point cloud that a prior returns and that the Gaussians start from."""
+"""The point cloud that a prior returns, from which the Gaussians are initialised."""
 
 from typing import NamedTuple, Optional
 
@@ -18,7 +18,7 @@ class PointCloud(NamedTuple):
     """(F, 3) int64 into ``points``, where the points are the vertices of a mesh."""
 
     def followed_by(self, other: "PointCloud") -> "PointCloud":
-        """Append the points of ``other``; ``faces`` stays valid, normals need to be in both."""
+        """Append the points of ``other``, without its faces; normals are kept if both have them."""
         both = self.normals is not None and other.normals is not None
         return PointCloud(
             points=np.concatenate([self.points, other.points]).astype(np.float32),

@@ -1,7 +1,7 @@
-"""Recovery: fit Gaussians that have just lost some to the images that they showed before.
+"""Recovery: after pruning, fit the remaining Gaussians to images of the original ones.
 
-The loss is the mean squared error to these images, the optimiser Adam. There is no diffusion model
-and no prompt, so recovery can't drift away from what was there."""
+The loss is the mean squared error to these images, minimised with Adam. No diffusion model is
+involved, so the appearance stays that of the original."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -22,12 +22,12 @@ LEARNING_RATES = {
     "logit_opacities": 2e-2,
     "sh": 5e-3,
 }
-"""Adam's for Gaussians that have just lost a fifth of their number; that of the means in units of
-the cloud's radius.
+"""Learning rates of Adam after a round that prunes 20 %; that of the means is in units of the
+cloud's radius.
 """
 LR_SCALES = (1.0, 1 / 4, 1 / 16, 1 / 64)
-"""Learning-rate multipliers, tried from largest to smallest: near the optimum Adam's steps are as
-long as far from it, and mostly noise.
+"""Learning-rate multipliers, tried from largest to smallest: the length of Adam's steps doesn't
+decrease near an optimum, so a small error needs a small rate.
 """
 VIEWS_PER_STEP = 4
 
@@ -37,7 +37,7 @@ class Round(NamedTuple):
 
     cloud: Gaussians
     psnr: float
-    """:func:`psnr_lower_bound` of the validation views to what they showed before any round, dB."""
+    """:func:`psnr_lower_bound` of the validation views to images of the original, dB."""
 
     @property
     def count(self) -> int:
@@ -45,17 +45,18 @@ class Round(NamedTuple):
 
 
 class Recovery:
-    """Recovers Gaussians after each round of pruning, and never makes them worse.
+    """Recovers Gaussians after each round of pruning; never lowers the validation PSNR.
 
     Args:
         original: the Gaussians before the first round, whose images are the targets.
         train_views: the views that are fitted.
-        val_views: other views, on which a recovery is accepted or rejected: the fitted ones improve
-            even where the others lose a dB.
-        steps: of Adam per recovery.
-        seed: of the order of the views.
-        as_stored: what the file to be written makes of the Gaussians; quality is measured after it.
-        sh_reach: largest absolute value of the constant harmonic that the file holds.
+        val_views: other views, on which a recovery is accepted or rejected, since the PSNR of the
+            fitted views improves even when that of others falls by a dB.
+        steps: Adam steps per recovery.
+        seed: for the order of the views.
+        as_stored: converts Gaussians to what is read back from the file that will be written;
+            quality is measured on the result.
+        sh_reach: largest absolute value of the constant harmonic that the file can store.
     """
 
     def __init__(
@@ -79,8 +80,9 @@ class Recovery:
     def __call__(self, cloud: Gaussians, round_number: int) -> Round:
         """Recover with the largest learning rates that don't lower the validation PSNR.
 
-        The Gaussians are returned unchanged where all of them do. A round needs about the rates of
-        the round before, so the search begins one step above those."""
+        If all rates that are tried lower it, the Gaussians are returned without a recovery.
+        Successive rounds need similar rates, so the search starts one step above the previous
+        round's."""
         cloud = best = clamp_constant_sh(cloud, self.sh_reach)
         reached = self.quality(cloud)
         for tried in range(self.first_scale, len(LR_SCALES)):
@@ -100,7 +102,7 @@ class Recovery:
         return Round(best, reached)
 
     def quality(self, cloud: Gaussians) -> float:
-        """Return a lower bound of the PSNR to the original, after what a file makes of it, dB."""
+        """Return a lower bound of the PSNR of ``as_stored(cloud)`` to the original, dB."""
         return psnr_lower_bound(self.as_stored(cloud), self.val_views, self.val_images)
 
 
@@ -122,9 +124,9 @@ def recover(
     """Fit Gaussians to images; return new ones.
 
     Args:
-        views: of the images.
-        steps: of Adam, each on four views; the rates fall linearly to zero.
-        seed: of the order of the views.
+        views: the views of the images.
+        steps: Adam steps, each on four views; the rates fall linearly to zero.
+        seed: for the order of the views.
         sh_reach: largest absolute value of the constant harmonics.
         lr_scale: multiplies ``LEARNING_RATES``.
     """

@@ -1,4 +1,4 @@
-"""View-dependent colour as real spherical harmonics of degree 0 to 3, evaluated outside the blend.
+"""View-dependent colour as real spherical harmonics of degree 0 to 3, evaluated before blending.
 
 Coefficients are in the order and with the signs that 3D Gaussian splatting files use: (l, m) = (0,
 0), (1, -1), (1, 0), (1, 1), (2, -2), ..., with the Condon-Shortley phase, so odd m carry a minus
@@ -53,20 +53,19 @@ def sh_to_colors(
 def sh_to_unclamped_colors(
     sh: Float[Tensor, "N K C"], dirs: Float[Tensor, "*views N 3"]
 ) -> Float[Tensor, "*views N C"]:
-    """Compute what :func:`sh_to_colors` clamps; arguments and errors are the same."""
+    """Compute the colours of :func:`sh_to_colors` without the clamp; same arguments and errors."""
     if sh.shape[-2] not in COEFFICIENTS:
         raise UserError(
             "sh must have the shape (N, K, C) with K = 1, 4, 9 or 16 for degree 0 to 3; got "
             f"{tuple(sh.shape)}."
         )
     basis = sh_basis(dirs, COEFFICIENTS.index(sh.shape[-2]))
-    # A sum of products stays in the tensors' own precision under autocast, which a matrix product
-    # would not.
+    # Not a matrix product, which autocast would compute in a lower precision.
     return 0.5 + sum(b[..., None] * sh[:, k] for k, b in enumerate(basis))
 
 
 class _Bounded(torch.autograd.Function):
-    """Clamp to [0, 1], with the gradient that leads back from beyond a bound."""
+    """Clamp to [0, 1]; outside, pass on gradients whose descent leads back into the range."""
 
     @staticmethod
     def forward(ctx: Any, colors: Tensor) -> Tensor:
@@ -83,8 +82,9 @@ class _Bounded(torch.autograd.Function):
 def bounded_colors(colors: Float[Tensor, "*batch C"]) -> Float[Tensor, "*batch C"]:
     """Clamp colours to [0, 1], the range that viewers show.
 
-    At a bound and beyond it, a gradient is passed on if its descent leads into the range, and is 0
-    if it leads out of it: clamp's own is always 0 beyond a bound, where a colour would stay.
+    At a bound and beyond it, a gradient is passed on if a descent step leads towards the range, and
+    is 0 otherwise. The gradient of ``torch.clamp`` is always 0 beyond a bound, so that colours
+    outside could never return.
     """
     return _Bounded.apply(colors)
 

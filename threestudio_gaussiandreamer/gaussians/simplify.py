@@ -1,10 +1,10 @@
-"""Fewer Gaussians for the same images: prune by importance, round by round, and recover by
-self-distillation.
+"""Reduce the number of Gaussians at the same image quality: prune by importance in rounds, and
+recover after each round by fitting images of the original.
 
-First duplicates are merged (``merge.py``). Then each round keeps the best 0.8 by their importance
-in the training views (the score ``removal`` of ``importance.py``), computed again every round, and
-fits what stays to what these views showed before (``recover.py``). Pruning more than that at once
-loses to training so few from scratch; rounds don't."""
+First duplicates are merged (``merge.py``). Then each round computes the importance in the training
+views (the score ``removal`` of ``importance.py``), keeps the best 80 %, and fits them to images of
+the original (``recover.py``). Pruning many more at once gives worse results than training with the
+smaller number from the start."""
 
 from collections.abc import Callable
 from typing import NamedTuple, Optional
@@ -22,23 +22,23 @@ from .recover import Recovery, Round
 from .views import Views, draw, row_batches
 
 KEEP = 0.8
-"""The smallest share that a round keeps."""
+"""Smallest fraction that a round keeps."""
 SMALLEST_DROP = 0.02
-"""The search ends with rounds that drop less than this share: they don't pay for a recovery."""
+"""The search ends when a round would drop less than this fraction, too little for a recovery."""
 
 Ranking = Callable[[Gaussians, Views, int], Float[Tensor, " N"]]
 
 
 class Budget(NamedTuple):
-    """Where to stop: at a count, or where the validation views would fall below a PSNR, dB; at most
-    one of both.
+    """Where to stop: at a number of Gaussians, or before the PSNR of the validation views, in dB,
+    falls below a bound; at most one of the two is given.
     """
 
     count: Optional[int] = None
     psnr: Optional[float] = None
 
     def met_by(self, done: Round) -> bool:
-        """Tell whether the quality after a round is within the budget."""
+        """Return whether the quality after a round is within the budget."""
         return self.psnr is None or done.psnr >= self.psnr
 
 
@@ -67,19 +67,19 @@ def simplify(
     """Prune in rounds down to the smallest cloud that meets the budget.
 
     Args:
-        recovery: fits what stays after each round, and measures its quality.
+        recovery: fits the remaining Gaussians after each round, and measures the quality.
         report: called after each round that was kept.
-        rank: importance of each Gaussian in some views, given a seed.
+        rank: returns the importance of each Gaussian, given the cloud, views and a seed.
 
     Raises:
-        UserError: no view shows any of the Gaussians, so that they can't be ranked.
+        UserError: no Gaussian is visible in any view, so that they can't be ranked.
     """
     search = _Search(budget, recovery, report, rank)
     return search.run(cloud)
 
 
 class _Search:
-    """The rounds of :func:`simplify`: the smallest cloud so far, and its Gaussians' importance."""
+    """State of :func:`simplify`: the smallest cloud so far, and its Gaussians' importance."""
 
     def __init__(
         self,
@@ -108,7 +108,7 @@ class _Search:
         self.scores = self.rank(cloud, self.recovery.train_views, self.recovery.seed)
 
     def _fit_within_reach(self) -> None:
-        """Fit colours that the file can't hold, before any Gaussian goes."""
+        """Run a recovery before the first round if some colours exceed the file's range."""
         if float(self.cloud.sh[:, 0].abs().amax()) > self.recovery.sh_reach:
             self._take(self.recovery(self.cloud, self.rounds).cloud)
 
@@ -119,8 +119,9 @@ class _Search:
             self._try(merged)
 
     def _prune(self) -> None:
-        """Prune as long as rounds are kept; halve the share that a round drops after each one that
-        isn't, and don't try the same count again.
+        """Prune in rounds; after a round that is rejected, halve the fraction that a round drops.
+
+        Ends when the next count isn't above the last rejected one, or nothing is left to drop.
         """
         keep, failed = KEEP, 0
         while failed < (count := self._next_count(keep)) < len(self.cloud.means):
@@ -130,7 +131,7 @@ class _Search:
                 keep, failed = 0.5 * (1 + keep), count
 
     def _try(self, fewer: Gaussians) -> bool:
-        """Recover; keep the result if it is within the budget, and tell whether it is."""
+        """Recover; keep the result if it is within the budget, and return whether it is."""
         done = self.recovery(fewer, self.rounds)
         if not self.budget.met_by(done):
             return False
@@ -140,8 +141,8 @@ class _Search:
         return True
 
     def _next_count(self, keep: float) -> int:
-        """Return what a round leaves: all that are there where nothing is left to do, or too
-        little for a round.
+        """Return the number of Gaussians after the next round; the present number if there is
+        nothing left to prune, or less than ``SMALLEST_DROP``.
         """
         here = len(self.cloud.means)
         if self.budget.count is not None:

@@ -1,4 +1,4 @@
-"""The check of Gaussians that a checkpoint brings, before they are copied or drawn."""
+"""Check the Gaussians of a checkpoint before they are used."""
 
 from collections.abc import Mapping
 from math import isqrt
@@ -17,7 +17,7 @@ SHAPES: dict[str, tuple[int, ...]] = {
     "sh0": (1, 3),
     "sh_rest": (-1, 3),
 }
-"""Of each parameter behind the number of Gaussians; -1 for any."""
+"""Shape of each parameter without its first dimension, the number of Gaussians; -1 is any size."""
 
 
 def require_cloud(
@@ -31,12 +31,14 @@ def require_cloud(
 
     Args:
         state: tensors by their name in the file.
-        names: where each of ``SHAPES`` is in it; one that is missing there isn't looked at.
-        what: the file, for the message.
+        names: the name in ``state`` of each key of ``SHAPES``; those that ``state`` lacks are
+            skipped.
+        what: names the file in messages.
+        allow_non_finite: accept NaN and infinity.
 
     Raises:
-        UserError: no Gaussian, shapes that don't go together, another type than floating point, or
-            NaN or infinity.
+        UserError: there are no Gaussians, shapes don't agree, a tensor isn't floating point, or
+            values are NaN or infinite.
     """
     found = {name: state[stored] for name, stored in names.items() if stored in state}
     count = len(found["means"]) if _has_rows(found.get("means")) else 0

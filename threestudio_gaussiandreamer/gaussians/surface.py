@@ -4,10 +4,11 @@ The opacity is summed on a grid of cells of side h,
 
     d(x) = sum_i o_i exp(-1/2 (x - m_i)^T (S_i + h^2 I)^-1 (x - m_i)),
 
-where h^2 widens Gaussians smaller than a cell, so that its corners sample them. The surface is the
-level set of d at a share of its median over the centres of the Gaussians, so that it doesn't depend
-on how many of them overlap. Surface nets (Gibson 1998) give one vertex for each cell that is
-crossed, at the mean of the crossings of its edges, and one quad around each edge that is crossed.
+where h^2 widens Gaussians smaller than a cell enough to be sampled by the grid. The surface is the
+level set of d at a fraction of its median over the centres of the Gaussians, so that it doesn't
+depend on how many of them overlap. Surface nets (Gibson 1998) give one vertex for each cell that
+the surface crosses, at the mean of the crossings of its edges, and one quad around each edge that
+is crossed.
 The mesh is closed, and thicker than the object by about sqrt(s^2 + h^2), where s is the Gaussians'
 standard deviation across it."""
 
@@ -21,12 +22,12 @@ from .gaussians import Gaussians, opaque
 from .sh import sh0_colors
 
 REACH = 3.0
-"""Standard deviations beyond which a Gaussian doesn't count: exp(-4.5) is 1 %."""
+"""Standard deviations beyond which a Gaussian is ignored: exp(-4.5) is 1 %."""
 MIN_OPACITY = 0.02
-"""Fainter Gaussians are left out."""
+"""Gaussians with a lower opacity are left out."""
 HALF_HEIGHT = 1.25
-"""Standard deviations within which the surface of a single Gaussian lies: half of its opacity is at
-1.18.
+"""Standard deviations within which the surface of a single Gaussian lies: its opacity falls to half
+at 1.18.
 """
 NODES_AT_ONCE = 4_000_000
 SMALL = 8
@@ -75,9 +76,10 @@ def gaussian_surface(gaussians: Gaussians, *, resolution: int = 128, level: floa
 def surface_nets(
     values: Float[np.ndarray, "X Y Z"], level: float
 ) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    """Return vertices, in units of cells, and triangles of the level set; outside is below it.
+    """Return the vertices, in units of cells, and the triangles of a level set; values below
+    ``level`` are outside.
 
-    The surface is open where values at the sides of the grid are above the level.
+    The surface is open where values at the boundary of the grid are above ``level``.
     """
     inside = values > level
     count = sum(inside[_corner(bits)].astype(np.int8) for bits in range(8))
@@ -139,7 +141,7 @@ def _add_many(
     rows: Int[np.ndarray, " M"],
     half_side: int,
 ) -> None:
-    """Add Gaussians of one size, a few million nodes at a time."""
+    """Add Gaussians with the same extent in cells, up to ``NODES_AT_ONCE`` nodes at a time."""
     shape = np.array(sums.shape[:3])
     offsets = np.stack(
         np.meshgrid(*[np.arange(-half_side, half_side + 1)] * 3, indexing="ij"), axis=-1

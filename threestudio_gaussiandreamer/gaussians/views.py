@@ -1,8 +1,7 @@
-"""Fixed views around Gaussians: where they are, what they show, and how far two sets of Gaussians
-are apart in them.
+"""Fixed views around Gaussians: cameras, their images, and the PSNR between two sets of Gaussians.
 
-Recovery, pruning and the choice of initial points compare Gaussians with their former selves in
-such views, not with training images."""
+Recovery, pruning and the choice of initial points compare Gaussians with an earlier version of
+themselves in such views, not with training images."""
 
 import math
 from typing import NamedTuple, Optional
@@ -20,21 +19,21 @@ from .gaussians import Gaussians
 from .sh import sh_to_colors
 
 LEAST_ERROR, MOST_ERROR = 10 ** (-MAX_PSNR / 10), 10 ** (MAX_PSNR / 10)
-"""Range of mean squared errors: what is less can't be told from the rounding of float32."""
+"""Range of mean squared errors; smaller ones are below the rounding errors of float32."""
 FOVY = math.radians(50.0)
 EPS2D = 0.3
-"""The screen-space dilation of viewers, square pixels."""
+"""Screen-space dilation, square pixels; the value that viewers use."""
 NEAR = 0.01
-"""The nearest depth that is drawn, in units of the cloud's radius: clouds come in millimetres and
-in kilometres. There is no farthest depth.
+"""Near plane, in units of the cloud's radius, since the unit of a cloud is unknown. There is no far
+plane.
 """
 MAX_RADIUS = 1e15
-"""Of a cloud, in its units: squares of distances stay in float32's range."""
+"""Largest radius of a cloud, in its units: squares of distances stay within float32's range."""
 VIEWS_PER_CALL = 4
 
 
 class Views(NamedTuple):
-    """V square views from all around, and how they are rendered."""
+    """V square views from all directions, and how they are rendered."""
 
     viewmats: Float[Tensor, "V 4 4"]
     Ks: Float[Tensor, "V 3 3"]
@@ -42,19 +41,20 @@ class Views(NamedTuple):
     size: int
     """Pixels each way."""
     near: float = NEAR
-    """The nearest depth that is drawn."""
+    """Near plane, in the cloud's units."""
     backgrounds: Optional[Float[Tensor, "V 3"]] = None
-    """The background of each view; None is grey."""
+    """Background colour of each view; None is grey."""
     eps2d: float = EPS2D
     """Screen-space dilation, square pixels."""
     antialias: bool = False
 
 
 def bounds(cloud: Gaussians) -> tuple[Float[Tensor, "3"], float]:
-    """Return the centre and the radius of what is visible.
+    """Return the centre and the radius of the visible Gaussians.
 
-    The centre is the opacity-weighted median of the positions; a ball of that radius around it
-    holds 99 % of the opacity, counting each Gaussian at its centre plus one standard deviation.
+    The centre is the opacity-weighted median of the positions. The ball of that radius around it
+    holds 99 % of the opacity, where the distance of each Gaussian is that of its mean plus one
+    standard deviation along its longest axis.
     """
     weights = cloud.logit_opacities.sigmoid()
     centre = torch.stack([_quantile(axis, weights, 0.5) for axis in cloud.means.unbind(1)])
@@ -76,20 +76,20 @@ def views_around(
     turn: float = 0.0,
     to_z_up: Optional[Float[Tensor, "3 3"]] = None,
 ) -> Views:
-    """Place views around Gaussians on a golden-angle spiral, alternately near and far.
+    """Place views around Gaussians on a golden-angle spiral, at two alternating distances.
 
     Each view has its own random background, so that Gaussians of the background's colour still
     have a removal error and opacities are observed.
 
     Args:
         cloud: the Gaussians to look at.
-        count: how many views.
-        size: of their images, pixels each way.
-        turn: azimuth of the first view, degrees; other turns give other views.
-        to_z_up: the rotation from the cloud's axes to axes with z up.
+        count: number of views.
+        size: width and height of their images, pixels.
+        turn: azimuth of the first view, degrees.
+        to_z_up: rotation from the cloud's axes to axes with z up.
 
     Raises:
-        UserError: the Gaussians reach too far to be rendered.
+        UserError: the radius of the cloud exceeds ``MAX_RADIUS``.
     """
     centre, radius = bounds(cloud)
     _require_renderable(cloud, radius)
@@ -129,8 +129,8 @@ def draw(
     """Render some of the views; return images and each Gaussian's contribution to them.
 
     Args:
-        rows: (B,) which of the views.
-        opacities: used instead of the cloud's own, to be differentiated by.
+        rows: (B,) indices of the views.
+        opacities: used instead of the cloud's own, for gradients with respect to them.
     """
     opacities = cloud.logit_opacities.sigmoid() if opacities is None else opacities
     dirs = torch.nn.functional.normalize(cloud.means.detach() - views.positions[rows, None], dim=-1)
@@ -161,7 +161,7 @@ def render_all(cloud: Gaussians, views: Views) -> Float[Tensor, "V H W 3"]:
 
 
 def row_batches(views: Views) -> tuple[Tensor, ...]:
-    """Split the rows of the views into those that are rendered together."""
+    """Return the indices of the views in batches of ``VIEWS_PER_CALL``."""
     return torch.arange(len(views.viewmats)).split(VIEWS_PER_CALL)
 
 
@@ -171,9 +171,9 @@ def psnr_to_original(cloud: Gaussians, views: Views, images: Float[Tensor, "V H 
 
 
 def psnr_lower_bound(cloud: Gaussians, views: Views, images: Float[Tensor, "V H W 3"]) -> float:
-    """Return a PSNR that views other than these reach too, dB.
+    """Estimate a lower bound of the PSNR in views other than these, dB.
 
-    Two standard errors over the views are added to their mean squared error."""
+    It is the PSNR at the mean squared error of the views plus two standard errors."""
     errors = (render_all(cloud, views) - images).square().mean((1, 2, 3))
     errors = errors.nan_to_num(nan=MOST_ERROR).clamp_max(MOST_ERROR)
     upper = float(errors.mean() + 2 * errors.std() / math.sqrt(len(errors)))
