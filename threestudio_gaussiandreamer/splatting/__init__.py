@@ -1,4 +1,4 @@
-"""Differentiable splatting of 3-D Gaussians: one formula, several executions."""
+"""Differentiable splatting of 3-D Gaussians: one image model, several backends."""
 
 from .api import rasterize
 from .backends import available_backends

@@ -1,4 +1,4 @@
-"""`rasterize`: checks what the user gave, chooses the backend, and calls it."""
+"""`rasterize`: checks its arguments, chooses a backend, and calls it."""
 
 from typing import Optional
 
@@ -44,25 +44,25 @@ def rasterize(
         quats: rotations wxyz, any length; zero means no rotation.
         scales: standard deviations along the rotated axes, world units (not their logarithms).
         opacities: in [0, 1].
-        colors: any number of channels, of the Gaussians (N, C) or of each view (B, N, C).
+        colors: any number of channels, shared by the views (N, C) or per view (B, N, C).
         viewmats: world to camera, OpenCV (x right, y down, z forward).
-        Ks: intrinsics in pixels of the size below, centres at +0.5; without skew and without
-            gradient.
-        width, height: pixels to render, before downsampling.
-        background: colour behind everything, (C,) or (B, C); None is black.
+        Ks: intrinsics in pixels of the rendered size, pixel centres at +0.5; skew is ignored, and
+            there is no gradient.
+        width, height: rendered size in pixels, before downsampling.
+        background: background colour, (C,) or (B, C); None is black.
         near, far: a Gaussian whose mean isn't strictly between these depths is dropped.
-        eps2d: added to both variances on screen, square pixels.
-        antialias: make up for that dilation in the opacity, so that a small Gaussian keeps its
-            energy at any distance.
-        preset: smallest alpha that counts: fast 1/255, balanced 1/1024, accurate 1/65536.
-        alpha_min: that number itself, instead of a preset.
+        eps2d: dilation, added to both screen-space variances, square pixels.
+        antialias: reduce the opacity to compensate for the dilation, so that a small Gaussian
+            keeps its energy at any distance.
+        preset: smallest alpha that is blended: fast 1/255, balanced 1/1024, accurate 1/65536.
+        alpha_min: smallest alpha that is blended; overrides the preset.
         alpha_max: largest alpha of one Gaussian in one pixel; no gradient above it.
-        stop: a pixel is finished with the Gaussian that brings its transmittance below this.
-        downsample: 2 averages 2 x 2 pixels after rendering.
-        absgrad: also collect ``means2d.absgrad``, the sum over pixels of the absolute gradient.
-        backend: "cpu", "cuda", "torch", "reference", or "auto": the fastest for where the tensors
-            are.
-        non_finite: "drop" ignores Gaussians that hold NaN or infinity; "error" names them.
+        stop: the Gaussian that brings a pixel's transmittance below this is the last one blended.
+        downsample: 1, or 2 to average 2 x 2 pixels after rendering.
+        absgrad: also compute ``means2d.absgrad``, the sum over pixels of the absolute gradient.
+        backend: "cpu", "cuda", "torch", "reference", or "auto", the fastest one for the tensors'
+            device and type.
+        non_finite: "drop" ignores Gaussians with NaN or infinity; "error" raises UserError.
 
     Returns:
         Rasterized: image, alpha, depth, means2d, radii, contribution. Always float32, or float64
@@ -71,7 +71,7 @@ def rasterize(
     Raises:
         UserError: an argument has the wrong shape, type, device or value, or the backend can't run.
 
-    The image model is the one of `reference.py` and `projection.py`.
+    `reference.py` and `projection.py` specify the image model.
     """
     alpha_min = smallest_alpha(preset, alpha_min)
     options = RasterizeOptions(

@@ -1,6 +1,6 @@
 """The autograd function of the compiled kernels, CPU and CUDA.
 
-Kernels draw three colour channels; other numbers of channels are drawn three at a time."""
+Kernels render three colour channels; other numbers of channels are rendered in groups of three."""
 
 from typing import Any, NamedTuple, Optional, Protocol
 
@@ -16,7 +16,7 @@ from .scene import TENSORS, Scene
 
 
 class Drawn(NamedTuple):
-    """What a kernel draws, in up to three channels; pixels after the downsampling."""
+    """Output of a kernel, with up to three channels; sizes are after the downsampling."""
 
     image: Tensor  # (B, H, W, 3)
     alpha: Tensor  # (B, H, W, 1)
@@ -26,7 +26,7 @@ class Drawn(NamedTuple):
 
 
 class Upstream(NamedTuple):
-    """d loss / d images, contiguous; None is zero."""
+    """Gradients of the loss with respect to the images, contiguous; None means zero."""
 
     image: Optional[Tensor]
     alpha: Optional[Tensor]
@@ -41,8 +41,8 @@ class Wanted(NamedTuple):
 
 
 class SceneGradients(NamedTuple):
-    """d loss / d fields of a Scene, d loss / d means2d (B, N, 2), and the sums over pixels of its
-    absolute value.
+    """Gradients of the loss with respect to the fields of a Scene and to means2d (B, N, 2), and the
+    sums over pixels of the latter's absolute value.
     """
 
     means: Tensor
@@ -57,7 +57,7 @@ class SceneGradients(NamedTuple):
 
 
 class Kernel(Protocol):
-    """One call of a compiled backend: its options, and what it runs on."""
+    """One call of a compiled backend, with its options and device."""
 
     def forward(self, scene: Scene, means2d: Tensor) -> tuple[Drawn, tuple[Tensor, ...], Any]:
         """Draw a scene of three channels.
@@ -66,7 +66,7 @@ class Kernel(Protocol):
             means2d: (B, N, 2), to be filled.
 
         Returns:
-            The images; what backward needs, as tensors to save, and as any other object.
+            The images, the tensors to save for backward, and any other state for backward.
         """
 
     def backward(
@@ -82,9 +82,9 @@ class Kernel(Protocol):
 
 
 def rasterize(kernel: Kernel, scene: Scene, options: RasterizeOptions) -> Rasterized:
-    """Draw a scene of any number of channels with a kernel that draws three."""
+    """Render a scene with any number of channels by a kernel for three."""
     if scene.channels > CHANNELS and options.absgrad:
-        # A sum of absolute values doesn't split into groups of channels.
+        # |sum over channels| can't be computed from groups of channels.
         return torch_backend.rasterize(scene, options)
     tracked = scene.tracked
     means2d = scene.means.new_zeros(*scene.shape, 2).requires_grad_(tracked)
@@ -99,8 +99,8 @@ def rasterize(kernel: Kernel, scene: Scene, options: RasterizeOptions) -> Raster
 
 
 class _Rasterize(torch.autograd.Function):
-    """A kernel on up to three channels. ``means2d`` is filled in place, and is an input so that
-    autograd passes its gradient on.
+    """Runs a kernel on up to three channels. ``means2d`` is an input that is filled in place, so
+    that autograd stores its gradient in the caller's tensor.
     """
 
     @staticmethod

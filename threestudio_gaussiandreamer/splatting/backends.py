@@ -1,4 +1,4 @@
-"""Which backends there are, which of them can run, and which one draws."""
+"""The table of backends, which of them are available, and the choice of one."""
 
 import functools
 import importlib
@@ -17,8 +17,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Backend:
-    """A module of this package with ``rasterize(scene, options)`` and ``unavailable()``, and what
-    tensors it takes.
+    """A module of this package with ``rasterize(scene, options)`` and ``unavailable()``, and the
+    devices and types of tensors that it supports.
     """
 
     module: str
@@ -29,7 +29,7 @@ class Backend:
         return importlib.import_module(f".{self.module}", __package__)
 
     def refuses(self, tensor: Tensor) -> Optional[str]:
-        """Say why it can't take tensors like this one, or return None."""
+        """Return why the backend can't be used with tensors like this one, or None if it can."""
         if self.devices is not None and tensor.device.type not in self.devices:
             return f"it takes tensors on {' or '.join(self.devices)}, these are on {tensor.device}"
         if tensor.dtype not in self.dtypes:
@@ -37,7 +37,7 @@ class Backend:
         return self.load().unavailable()
 
 
-# In order of preference for "auto"; the specification is only used when it is asked for.
+# In order of preference for "auto", which never gets to "reference", since "torch" always runs.
 BACKENDS = {
     "cpu": Backend("cpu.backend", devices=("cpu",), dtypes=(torch.float32,)),
     "cuda": Backend("cuda.backend", devices=("cuda",), dtypes=(torch.float32,)),
@@ -47,15 +47,16 @@ BACKENDS = {
 
 
 def available_backends() -> dict[str, Optional[str]]:
-    """Return every backend by name with None, or with the reason why it can't run here."""
+    """Map the name of each backend to None, or to the reason why it can't run on this machine."""
     return {name: backend.load().unavailable() for name, backend in BACKENDS.items()}
 
 
 def choose_backend(name: str, tensor: Tensor) -> Backend:
-    """Return the backend of that name, or for "auto" the first one that takes such tensors.
+    """Return the backend with this name, or for "auto" the first one that supports the tensor.
 
     Raises:
-        UserError: there is none of that name, or it can't run or take such tensors.
+        UserError: there is no backend with this name, or it can't run or doesn't support the
+            tensor's device or type.
     """
     if name not in ("auto", *BACKENDS):
         raise unknown("backend", name, ["auto", *BACKENDS])
@@ -72,9 +73,7 @@ def choose_backend(name: str, tensor: Tensor) -> Backend:
 
 
 def _report_slow_path(chosen: str, tensor: Tensor) -> None:
-    """Say once for each reason that the kernel made for this device isn't used though the tensors
-    would suit it.
-    """
+    """Warn, once per reason, that a compiled backend which supports the tensor isn't available."""
     for name, backend in BACKENDS.items():
         if (
             name != chosen

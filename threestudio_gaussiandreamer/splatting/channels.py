@@ -1,4 +1,4 @@
-"""Kernels blend three colour channels; other numbers of channels are drawn three at a time."""
+"""Split colours into groups of three channels, which is what the compiled kernels blend."""
 
 from typing import Optional
 
@@ -11,9 +11,10 @@ CHANNELS = 3
 
 
 def groups(scene: Scene) -> list[Scene]:
-    """Split a scene by channels, up to three in each.
+    """Split a scene into scenes of at most three channels.
 
-    A Gaussian with one colour that isn't finite is dropped, so every group has to show it.
+    A Gaussian with a channel that isn't finite becomes NaN in every group, so that all groups drop
+    it.
     """
     if scene.channels <= CHANNELS:
         return [scene]
@@ -23,8 +24,8 @@ def groups(scene: Scene) -> list[Scene]:
 
 
 def widen(x: Tensor, channels: int = CHANNELS) -> Tensor:
-    """Make contiguous, with zeros for the channels that are missing."""
-    x, missing = x.contiguous(), channels - x.shape[-1]  # padding keeps some other layouts
+    """Pad the channels with zeros and return a contiguous tensor."""
+    x, missing = x.contiguous(), channels - x.shape[-1]  # pad may keep a non-contiguous layout
     return torch.nn.functional.pad(x, (0, missing)) if missing else x
 
 

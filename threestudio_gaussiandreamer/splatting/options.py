@@ -1,9 +1,9 @@
-"""What every splatting backend is told."""
+"""Options that are passed to every splatting backend."""
 
 from dataclasses import dataclass
 
 NO_ALPHA_MIN = 2.0**-100
-"""What compiled kernels get for ``alpha_min = 0``: smaller alphas change no float32 image."""
+"""Value for compiled kernels if ``alpha_min`` is 0; smaller alphas don't change a float32 image."""
 
 
 @dataclass(frozen=True)
@@ -22,5 +22,5 @@ class RasterizeOptions:
 
     @property
     def kernel_alpha_min(self) -> float:
-        """Return ``alpha_min`` as compiled kernels take it: its logarithm has to be finite."""
+        """Return a positive ``alpha_min``, since compiled kernels take its logarithm."""
         return max(self.alpha_min, 2 * NO_ALPHA_MIN) if self.alpha_min > 0 else NO_ALPHA_MIN

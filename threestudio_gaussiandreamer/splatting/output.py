@@ -1,4 +1,4 @@
-"""What every backend returns, and the last stage of the torch ones: background and downsampling."""
+"""The output of every backend, and the last stage of the torch ones: background, downsampling."""
 
 from typing import NamedTuple
 
@@ -28,7 +28,7 @@ class Rasterized(NamedTuple):
 
 
 def track_means2d(splats: Splats, others: tuple[Tensor, ...], absgrad: bool) -> Tensor:
-    """``splats.means2d`` prepared to report its gradient whenever anything is differentiated."""
+    """Return ``splats.means2d`` set up to retain its gradient if any input requires one."""
     means2d = splats.means2d
     if torch.is_grad_enabled() and any(x.requires_grad for x in (*splats, *others)):
         means2d = means2d if means2d.requires_grad else means2d.requires_grad_()
@@ -45,8 +45,8 @@ def compose(
     background: Tensor,
     options: RasterizeOptions,
 ) -> Rasterized:
-    """Put the background behind the sums of (colour, depth, 1) weighted with ``alpha_i T_i``,
-    and apply the box filter of the downsampling.
+    """Composite the sums of (colour, depth, 1), weighted by ``alpha_i T_i``, over the background,
+    after downsampling them with a box filter.
 
     ``alpha = sum_i alpha_i T_i = 1 - T_end``, so ``image = colour + (1 - alpha) background``.
     """
@@ -58,6 +58,6 @@ def compose(
 
 
 def _box(x: Tensor, size: int) -> Tensor:
-    """(B, H, W, C) averaged over size x size boxes."""
+    """Average (B, H, W, C) over boxes of ``size`` x ``size`` pixels."""
     batch, height, width, channels = x.shape
     return x.reshape(batch, height // size, size, width // size, size, channels).mean((2, 4))

@@ -21,12 +21,12 @@ ZERO = torch.zeros(())
 
 
 class Splats(NamedTuple):
-    """Gaussians as the blend sees them; invisible ones hold zeros and get zero gradients.
+    """Projected Gaussians, the input of the blend; invisible ones are zero with zero gradients.
 
     ``conics`` are (a, k, c) of the completed square ``d' cov^-1 d = a (d.x - k d.y)^2 + c d.y^2``,
-    that is ``a = cov.yy / det``, ``k = cov.xy / cov.yy``, ``c = 1 / cov.yy``. Unlike the three
-    entries of ``cov^-1`` it doesn't cancel for a needle: its error is that of ``d.x - k d.y``
-    alone."""
+    that is ``a = cov.yy / det``, ``k = cov.xy / cov.yy``, ``c = 1 / cov.yy``. Unlike the form with
+    the entries of ``cov^-1``, this has no cancellation for thin Gaussians other than that in
+    ``d.x - k d.y``."""
 
     means2d: Float[Tensor, "B N 2"]  # pixels, centres at +0.5
     conics: Float[Tensor, "B N 3"]
@@ -37,7 +37,7 @@ class Splats(NamedTuple):
 
     @property
     def radii(self) -> Float[Tensor, "B N"]:
-        """Pixels: the larger half extent; 0 when invisible, inf when ``alpha_min`` is 0."""
+        """The larger half extent, pixels; 0 for invisible ones, inf if ``alpha_min`` is 0."""
         return self.extents.amax(-1)
 
 
@@ -45,17 +45,17 @@ def project(scene: Scene, options: RasterizeOptions) -> Splats:
     """Project all Gaussians into all views; differentiable in means, quats, scales, opacities and
     viewmats.
 
-    A first pass without gradients finds what is visible. The second sees only those: whatever else
-    there is becomes a harmless Gaussian *before* the formulas, so that its NaN or overflow can't
-    reach a gradient (0 * NaN is NaN). A Gaussian with a colour that isn't finite is invisible; the
-    colours aren't used otherwise."""
+    A first pass without gradients finds the visible Gaussians. The second pass replaces the inputs
+    of all others by constants *before* the formulas, so that no NaN or overflow reaches a gradient
+    (0 * NaN is NaN). A Gaussian with a colour that isn't finite is invisible; the colours aren't
+    used otherwise."""
     means, quats, scales, opacities, viewmats, colors, _, Ks = scene.tensors
     width, height = scene.size
     finite = torch.stack([_finite(x) for x in (means, quats, scales, opacities)]).all(0)
     means, quats, scales, opacities = (_keep(finite, x) for x in (means, quats, scales, opacities))
     cameras_finite = _finite(viewmats[:, :3]) & _finite(
         Ks[:, [0, 1, 0, 1], [0, 1, 2, 2]]
-    )  # what is read of them
+    )  # only the entries that are used
     viewmats, Ks = (
         _keep(cameras_finite, viewmats, torch.eye(4)),
         _keep(cameras_finite, Ks, torch.eye(3)),
@@ -73,17 +73,17 @@ def project(scene: Scene, options: RasterizeOptions) -> Splats:
     t, axes = _keep(visible, t, torch.tensor([0.0, 0.0, 1.0])), _keep(visible, axes, torch.eye(3))
     Ks = _keep(
         visible.any(1), Ks, torch.eye(3)
-    )  # one that shows nothing may overflow whatever it is given
+    )  # the intrinsics of a view without visible Gaussians may overflow even with constants
     splats = _to_screen(t, axes, opacities, Ks, width, height, options)
     return Splats(*(_keep(visible, x) for x in splats), visible)
 
 
 def quats_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices of quaternions wxyz of any length; below 1e-12 the identity, with zero
-    gradient.
+    """Convert quaternions wxyz of any length to rotation matrices.
 
-    Dividing by the largest entry first keeps the squares of tiny and huge quaternions inside
-    float32; the rotation doesn't depend on that divisor, so it takes no gradient."""
+    Quaternions whose entries are all below 1e-12 give the identity, with zero gradient. Dividing by
+    the largest entry first keeps squares within float32's range; the rotation doesn't depend on
+    that divisor, so it is detached."""
     largest = quats.detach().abs().amax(-1, keepdim=True)
     usable = largest >= SMALLEST_QUATERNION
     q = torch.where(
@@ -99,19 +99,21 @@ def quats_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batc
 
 
 def _to_camera(means, quats, scales, viewmats) -> tuple[Tensor, Tensor]:
-    """Camera coordinates ``t`` (B, N, 3) of the means, and ``axes`` (B, N, 3, 3): columns are the
-    scaled axes in that frame.
+    """Return the means ``t`` (B, N, 3) in camera coordinates, and ``axes`` (B, N, 3, 3), whose
+    columns are the scaled axes in camera coordinates.
     """
     rotations, translations = viewmats[:, None, :3, :3], viewmats[:, None, :3, 3]
     axes = quats_to_rotations(quats) * scales[:, None, :]
-    # Written out, because the rounding of a library's matrix product may depend on the number of
+    # Explicit sums, because the rounding of a library's matrix product may depend on the number of
     # threads.
     t = translations + sum(rotations[..., j] * means[:, j, None] for j in range(3))
     return t, sum(rotations[..., j, None] * axes[:, None, j] for j in range(3))
 
 
 def _to_screen(t, axes, opacities, Ks, width, height, options) -> tuple[Tensor, ...]:
-    """Return the fields of `Splats` up to ``extents``; not finite for what can't be drawn."""
+    """Return the fields of `Splats` up to ``extents``; they aren't finite where a Gaussian can't be
+    projected.
+    """
     u0, u1 = _project_axes(t, axes, Ks, width, height)
     conics, variances, compensation = _invert_covariance(u0, u1, options.eps2d)
     depths = t[..., 2]
@@ -129,11 +131,10 @@ def _to_screen(t, axes, opacities, Ks, width, height, options) -> tuple[Tensor, 
 
 
 def _project_axes(t, axes, Ks, width, height) -> tuple[Tensor, Tensor]:
-    """The two rows of ``J @ axes``: d(pixel x) and d(pixel y) along each scaled axis of the
-    Gaussian.
+    """Compute the two rows of ``J @ axes``: the change of pixel x and y along each scaled axis.
 
-    ``J = [[fx/z, 0, -fx x/z^2], [0, fy/z, -fy y/z^2]]`` with x/z and y/z clamped to the image
-    widened by 30 % of half the field of view, outside of which the linearisation explodes. The
+    ``J = [[fx/z, 0, -fx x/z^2], [0, fy/z, -fy y/z^2]]`` with x/z and y/z clamped to the image plus
+    a margin of 15 % of its size on each side, beyond which the linearisation is unbounded. The
     gradient is that of the clamped formula."""
     z, rows = t[..., 2], []
     for i, size in ((0, width), (1, height)):
@@ -147,13 +148,12 @@ def _project_axes(t, axes, Ks, width, height) -> tuple[Tensor, Tensor]:
 
 
 def _invert_covariance(u0, u1, eps2d) -> tuple[Tensor, Tensor, Tensor]:
-    """Conics, variances (cov.xx, cov.yy) and ``sqrt(det before / det after the dilation)`` of ``cov
-    = U U' + eps2d I``.
+    """Compute the conics, the variances (cov.xx, cov.yy) and ``sqrt(det(U U') / det(cov))`` of
+    ``cov = U U' + eps2d I``.
 
     By Lagrange's identity ``det(U U') = |u0 x u1|^2``, so with ``v = u1 / sqrt(cov.yy)``
-    ``det / cov.yy = |u0 x v|^2 + eps2d (1 + |u0|^2 / cov.yy)``: a sum of squares, which can neither
-    cancel nor go negative, and whose factors stay in float32's range where ``det`` itself
-    overflows."""
+    ``det / cov.yy = |u0 x v|^2 + eps2d (1 + |u0|^2 / cov.yy)``. All terms are positive, so there is
+    no cancellation, and they stay within float32's range where ``det`` itself overflows."""
     before_xx, before_yy = (u0 * u0).sum(-1), (u1 * u1).sum(-1)
     xx, xy, yy = before_xx + eps2d, (u0 * u1).sum(-1), before_yy + eps2d
     area = torch.linalg.vector_norm(torch.linalg.cross(u0, u1 / yy.sqrt()[..., None]), dim=-1)
@@ -163,8 +163,8 @@ def _invert_covariance(u0, u1, eps2d) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _compensation(area, dilation) -> Tensor:
-    """``area / sqrt(area^2 + dilation)``, in two forms whose gradients don't cancel: below and
-    above ``area^2 = dilation``.
+    """Compute ``area / sqrt(area^2 + dilation)``, by one formula below and another above
+    ``area^2 = dilation``, so that neither has cancellation in its gradient.
     """
     small = area * area < dilation
     ratio = area * torch.where(small, dilation, 1).rsqrt()
@@ -173,8 +173,8 @@ def _compensation(area, dilation) -> Tensor:
 
 
 def _extents(variances, opacities, alpha_min) -> Tensor:
-    """Half sizes of the box around ``opacity exp(-q/2) >= alpha_min``: ``sqrt(2 ln(opacity /
-    alpha_min) variance)``.
+    """Compute the half sizes of the box around ``opacity exp(-q/2) >= alpha_min``:
+    ``sqrt(2 ln(opacity / alpha_min) variance)``.
     """
     if alpha_min == 0:
         return torch.full_like(variances, torch.inf)
@@ -182,8 +182,8 @@ def _extents(variances, opacities, alpha_min) -> Tensor:
 
 
 def _visible(means2d, conics, opacities, depths, extents, width, height, options) -> Tensor:
-    """In front of the camera, representable, opaque enough for a pixel, and with a box that meets
-    the image.
+    """Return which Gaussians are between the near and far planes, finite, have an opacity of at
+    least ``alpha_min``, and a box that overlaps the image.
     """
     in_range = (depths > options.near) & (depths < options.far)
     drawable = (
@@ -199,7 +199,7 @@ def _visible(means2d, conics, opacities, depths, extents, width, height, options
 
 
 def _finite(x) -> Tensor:
-    """Tell whether all of each item of the first dimension is finite; works for no items too."""
+    """Return whether all values of each item of the first dimension are finite; allows 0 items."""
     finite = x.isfinite()
     while finite.dim() > 1:
         finite = finite.all(-1)
@@ -207,7 +207,7 @@ def _finite(x) -> Tensor:
 
 
 def _keep(mask, x, otherwise=ZERO) -> Tensor:
-    """``x`` where the mask of its leading dimensions holds, else the constant."""
+    """Select ``x`` where the mask over its leading dimensions is true, else ``otherwise``."""
     return torch.where(mask.reshape(mask.shape + (1,) * (x.dim() - mask.dim())), x, otherwise.to(x))
 
 

@@ -1,9 +1,9 @@
-"""The specification of the image model: every pixel against every visible Gaussian, differentiated
-by autograd.
+"""The specification of the image model: every pixel evaluates every visible Gaussian, and autograd
+differentiates.
 
-Three stages: `project` (projection.py), `sort`, `blend`. It exists to be read and to be the truth
-in tests, in float32 and float64; there are no tiles, and memory is bounded by treating the pixels
-in chunks. ``alpha_min=0, alpha_max=1, stop=0`` turn the cut-offs off."""
+Three stages: `project` (projection.py), `sort`, `blend`. Written for readability and as the
+reference in tests, in float32 and float64. There are no tiles; pixels are processed in chunks to
+bound the memory. ``alpha_min=0, alpha_max=1, stop=0`` disable the cut-offs."""
 
 from typing import NamedTuple, Optional
 
@@ -40,7 +40,7 @@ def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
 
 
 class Sorted(NamedTuple):
-    """The visible Gaussians of one view, front to back; M of them."""
+    """The M visible Gaussians of one view, front to back."""
 
     ids: Tensor  # (M,)
     means2d: Tensor  # (M, 2)
@@ -52,7 +52,7 @@ class Sorted(NamedTuple):
 def render_view(
     splats: Splats, colors: Tensor, view: int, width: int, height: int, options: RasterizeOptions
 ) -> tuple[Tensor, Tensor]:
-    """Return the sums of `blend` (H*W, C + 2) of one view and each contribution (N,)."""
+    """Return the sums of `blend` (H*W, C + 2) for one view, and the contributions (N,)."""
     front_to_back = sort(splats, colors, view)
     absgrad = splats.means2d.absgrad[view] if hasattr(splats.means2d, "absgrad") else None
     chunks = pixel_centres(width, height, splats.depths).split(_pixels_per_chunk(front_to_back))
@@ -88,7 +88,7 @@ def blend(
     eq. 3).
 
     ``alpha_i = min(alpha_max, opacity_i exp(-q_i / 2))``, zero below ``alpha_min``; ``T_i =
-    prod_{j<i} (1 - alpha_j)``; the Gaussians with ``T_i >= stop`` count, so the one that brings T
+    prod_{j<i} (1 - alpha_j)``. Gaussians with ``T_i >= stop`` are blended, so the one that brings T
     below ``stop`` is the last. Returns ``sum_i features_i alpha_i T_i`` (P, C + 2) and ``max_pixels
     alpha_i T_i`` (M,)."""
     offsets = pixels[:, None] - splats.means2d
@@ -105,12 +105,12 @@ def blend(
 
 
 def _accumulate(total: Tensor, ids: Tensor, values: Tensor) -> None:
-    """Add and return None: what a hook returns would replace the gradient."""
+    """Add in place and return None, since a tensor returned by a hook replaces the gradient."""
     total.index_add_(0, ids, values)
 
 
 def pixel_centres(width: int, height: int, like: Tensor) -> Tensor:
-    """(H*W, 2) x, y of the pixel centres, row by row from the top."""
+    """Return x, y of the pixel centres (H*W, 2), row by row from the top."""
     y, x = torch.meshgrid(
         torch.arange(height).to(like) + 0.5, torch.arange(width).to(like) + 0.5, indexing="ij"
     )
@@ -118,11 +118,10 @@ def pixel_centres(width: int, height: int, like: Tensor) -> Tensor:
 
 
 def _blend_in_bounded_memory(bounded: bool, *arguments) -> tuple[Tensor, Tensor]:
-    """`blend`, repeated in backward rather than remembered when ``bounded``."""
+    """Call `blend`; if ``bounded``, recompute it in backward instead of storing intermediates."""
     if not bounded:
         return blend(*arguments)
-    # Without arguments, because absgrad changes in backward, which checkpoint forbids of what it is
-    # handed.
+    # A closure, because absgrad is modified in backward, which checkpoint forbids for arguments.
     return checkpoint(lambda: blend(*arguments), use_reentrant=False, preserve_rng_state=False)
 
 

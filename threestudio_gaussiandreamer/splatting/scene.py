@@ -1,4 +1,4 @@
-"""The inputs of a rasterisation, as every backend takes them and as compiled kernels read them."""
+"""The inputs of a rasterisation, for all backends, and as a C struct for the compiled kernels."""
 
 import ctypes
 from typing import NamedTuple, Optional
@@ -12,7 +12,8 @@ TENSORS = 8  # fields of a Scene, before the size of its images
 
 class Scene(NamedTuple):
     """N Gaussians with C colour channels and B cameras, validated: contiguous tensors on one
-    device, all float32 or, but for kernels, all float64. The order of fields is ``splat::Scene``'s.
+    device, all float32, or all float64 for the torch backends. The fields are in the order of the
+    struct ``splat::Scene``.
     """
 
     means: Float[Tensor, "N 3"]
@@ -59,7 +60,7 @@ class Scene(NamedTuple):
         return self._replace(colors=colors, **per_view)
 
     def struct(self) -> "SceneStruct":
-        """Return what kernels read; the tensors must outlive it."""
+        """Return the C struct with pointers to the tensors, which must outlive it."""
         views, gaussians = self.shape
         per_view = self.colors.dim() == 3
         return SceneStruct(*map(address, self.tensors), gaussians, views, *self.size, per_view)
@@ -76,5 +77,5 @@ class SceneStruct(ctypes.Structure):
 
 
 def address(tensor: Optional[Tensor]) -> Optional[int]:
-    """Return where a tensor's data are; None for none."""
+    """Return the address of a tensor's data; None for None."""
     return None if tensor is None else tensor.data_ptr()

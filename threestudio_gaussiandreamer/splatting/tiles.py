@@ -1,7 +1,8 @@
-"""Which splats may touch which tile of the screen, front to back, in bounded memory; torch on any
-device.
+"""Lists of the splats that may reach a pixel of each screen tile, front to back, in bounded memory;
+in torch, on any device.
 
-The tiles of all views form one grid, views stacked from top to bottom, so one pass serves a batch.
+The tiles of all views form one grid, with the views stacked vertically, so that one pass processes
+the batch.
 """
 
 from itertools import pairwise
@@ -13,8 +14,8 @@ from torch import Tensor
 TILE = 8
 CANDIDATES_PER_SLICE = 2**22
 CANDIDATES_PER_TEST = 2**17
-# Widens the bounds of the float32 tests; the blend decides each pixel exactly, so a splat too many
-# costs time only.
+# Margin for the rounding of the float32 tests. The blend evaluates each pixel exactly, so a splat
+# that is listed in vain only costs time.
 SLACK = 1e-3
 
 
@@ -30,12 +31,12 @@ class Grid(NamedTuple):
         return self.views * self.rows * self.columns
 
     def origins(self, tiles: Tensor) -> tuple[Tensor, Tensor]:
-        """x and y (G,) of the upper left corners, in pixels of the tiles' own view."""
+        """Return x and y (G,) of the upper left corners, in pixels of each tile's own view."""
         return tiles % self.columns * TILE, tiles // self.columns % self.rows * TILE
 
 
 class Bounds(NamedTuple):
-    """S splats in their order, with what the tests need."""
+    """Data of S splats, front to back, that the overlap tests need."""
 
     # (6, S): mean x, y in pixels of the view; conic a, k, c; the largest q at which alpha >=
     # alpha_min
@@ -47,8 +48,8 @@ class Bounds(NamedTuple):
 
 
 class Lists(NamedTuple):
-    """The splats of each tile: tile i has ``splats[starts[i] : starts[i] + counts[i]]``, front to
-    back; longest list first.
+    """Lists of splats: that of ``tiles[i]`` is ``splats[starts[i] : starts[i] + counts[i]]``, front
+    to back; the longest list is first.
     """
 
     tiles: Tensor
@@ -62,8 +63,8 @@ def make_grid(views: int, width: int, height: int) -> Grid:
 
 
 def bound(means2d, conics, opacities, extents, views, grid: Grid, alpha_min: float) -> Bounds:
-    """Tile rectangles around alpha >= alpha_min; ``views`` (S,) says which image a splat belongs
-    to.
+    """Compute the rectangle of tiles around alpha >= alpha_min for each splat; ``views`` (S,) are
+    the indices of their views.
     """
     limit = means2d.new_tensor([grid.columns, grid.rows])
     extents = extents * (1 + SLACK) + SLACK
@@ -81,8 +82,8 @@ def bound(means2d, conics, opacities, extents, views, grid: Grid, alpha_min: flo
 
 
 def slices(bounds: Bounds) -> list[tuple[int, int]]:
-    """First and last + 1 splat of parts that are drawn one behind the other, each with a bounded
-    number of candidates.
+    """Split the splats, front to back, into ranges (first, last + 1) with a bounded number of
+    candidate tiles each.
     """
     size = bounds.rectangles[2:] - bounds.rectangles[:2]
     part = size.clamp(min=0).prod(0).cumsum(0) // CANDIDATES_PER_SLICE
@@ -91,10 +92,10 @@ def slices(bounds: Bounds) -> list[tuple[int, int]]:
 
 
 def list_splats(bounds: Bounds, first: int, last: int, unfinished: Tensor, grid: Grid) -> Lists:
-    """Pairs of a splat ``first`` to ``last - 1`` and an unfinished tile of which it reaches a pixel
-    centre, sorted by tile.
+    """List the splats ``first`` to ``last - 1`` for each tile of which they reach a pixel centre.
 
-    ``unfinished`` (tiles,) bool.
+    Args:
+        unfinished: (tiles,) bool; other tiles get no list.
     """
     left, top, right, bottom = bounds.rectangles[:, first:last]
     width, height = (right - left).clamp(min=0), (bottom - top).clamp(min=0)
@@ -116,7 +117,9 @@ def list_splats(bounds: Bounds, first: int, last: int, unfinished: Tensor, grid:
 def _test(
     shapes: Tensor, boxes: Tensor, splats: Tensor, first: int, unfinished: Tensor, grid: Grid
 ) -> tuple[Tensor, Tensor]:
-    """Tiles and splats of the candidates ``first``, ``first + 1``, ... that pass the exact test."""
+    """Return tiles and splats of those candidates that pass :func:`_reaches`; candidates are
+    numbered from ``first``.
+    """
     left, top, width, first_candidate, first_row = boxes.index_select(1, splats)
     within = torch.arange(first, first + len(splats), device=splats.device) - first_candidate
     row = torch.div(within, width, rounding_mode="floor")
@@ -130,12 +133,12 @@ def _test(
 
 
 def _reaches(shapes, left, top) -> Tensor:
-    """Whether ``q = a (d.x - k d.y)^2 + c d.y^2`` gets as low as the splat's level on the box of
-    the tile's pixel centres.
+    """Return whether the minimum of ``q = a (d.x - k d.y)^2 + c d.y^2`` over the box of the tile's
+    pixel centres is at most the splat's level.
 
-    The minimum of a convex q over a box lies, unless the centre is inside, on the box's sides
-    nearest to the centre, where the other coordinate has its closed-form optimum: ``d.x = k d.y``
-    for given d.y; for given d.x, ``d.y = d.x a k / (a k^2 + c)``."""
+    Unless the splat's centre is inside the box, the minimum of the convex q lies on one of the two
+    sides nearest to that centre. On a side the other coordinate has a closed-form optimum:
+    ``d.x = k d.y`` for given d.y, and ``d.y = d.x a k / (a k^2 + c)`` for given d.x."""
     mean_x, mean_y, a, k, c, level = shapes
     x0, y0 = left - mean_x, top - mean_y
     x1, y1 = x0 + (TILE - 1), y0 + (TILE - 1)

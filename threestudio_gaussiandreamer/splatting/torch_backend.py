@@ -1,13 +1,14 @@
 """The image model in plain torch, exact and in bounded memory, for machines without a compiled
 kernel; any device.
 
-Each tile of 8 x 8 pixels has a list of splats. All tiles walk through their lists together, 64
-splats per step, as blocks (tiles, pixels, splats) of bounded size; a tile leaves when its list ends
-or its pixels are finished. Backward walks the same way and computes the blocks again, so nothing
-the size of pixels x splats is ever stored. Lists are made for a slice of the splats at a time,
-front to back, so they are bounded too.
+Each tile of 8 x 8 pixels has a list of splats. All tiles process their lists simultaneously, 64
+splats per step, in blocks (tiles, pixels, splats) of bounded size; a tile is removed when its list
+ends or its pixels are finished. Backward proceeds in the same order and recomputes the blocks, so
+no tensor of size pixels x splats is stored. Lists are made for one slice of the splats at a time,
+front to back, which bounds their size too.
 
-On a CPU the result has the same bits for any number of threads, but for gradients of the cameras.
+On a CPU the results, except for gradients of the cameras, are bitwise identical for any number of
+threads.
 """
 
 from collections.abc import Iterator
@@ -59,8 +60,8 @@ def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
 
 
 def _project(scene: Scene, options: RasterizeOptions) -> Splats:
-    """`project`, of many Gaussians in parts that backward computes again: autograd keeps a hundred
-    numbers of each.
+    """Call `project`, for many Gaussians in parts that are recomputed in backward, since autograd
+    stores about a hundred numbers per Gaussian and view.
     """
     size = max(1, PROJECTED_AT_ONCE // len(scene.viewmats))
     if len(scene.means) <= size:
@@ -77,8 +78,8 @@ def _project(scene: Scene, options: RasterizeOptions) -> Splats:
 
 
 class Table(NamedTuple):
-    """The visible splats of all views, front to back, one column each; the last column is a splat
-    that draws nothing.
+    """The visible splats of all views, front to back, one column each; the last column is padding,
+    a splat with opacity 0.
     """
 
     ids: Tensor  # (S,) view * N + Gaussian
@@ -92,7 +93,7 @@ class Table(NamedTuple):
 
 
 class _Blend(torch.autograd.Function):
-    """Sum features weighted with alpha_i T_i (B, H, W, C + 2); also return contributions (B, N)."""
+    """Sum features weighted by alpha_i T_i (B, H, W, C + 2); also return contributions (B, N)."""
 
     @staticmethod
     def forward(
@@ -211,9 +212,9 @@ def _backward(
 
     With ``g_i = <grad, features_i>`` the loss is ``L = sum_i g_i alpha_i T_i``, hence
     ``alpha_i dL/dalpha_i = w_i g_i - w_i / T_{i+1} sum_{j>i} w_j g_j`` with ``w_i = alpha_i T_i``.
-    Front to back the sum is what is left of L at the pixel, which starts as <grad, sums>, and T is
-    the same running product as in forward; back to front, as usual, T would have to be recovered by
-    dividing again and again."""
+    Front to back, the sum over j > i is the remainder of L at the pixel, which starts as <grad,
+    sums>, and T is the same cumulative product as in forward. Back to front, as usual, T would have
+    to be recovered by repeated division."""
     height, width = grad.shape[1:3]
     transmittances = _start(table, width, height)
     cotangents = to_tiles(grad, table.grid)
@@ -264,8 +265,8 @@ def _march(table: Table, transmittances: Tensor, options: RasterizeOptions) -> I
 
 
 def _lists(table: Table, transmittances: Tensor, options: RasterizeOptions) -> Iterator[Lists]:
-    """Yield the tile lists of one slice after the other, made for the tiles that are still
-    unfinished when its turn comes.
+    """Yield the tile lists of each slice in turn, for the tiles that are unfinished by then; those
+    of the first slices are kept for backward.
     """
     for i, (first, last) in enumerate(table.slices):
         if i == len(table.lists) < KEPT_SLICES:

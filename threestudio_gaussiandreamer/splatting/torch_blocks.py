@@ -1,7 +1,7 @@
-"""The arithmetic of the torch backend within a block, G tiles with K splats each: alphas, weights
-and their gradients; and how images are laid out in tiles.
+"""Alphas, weights and their gradients within a block of the torch backend, G tiles with K splats
+each; conversion of images to and from tiles.
 
-Everything is as large as a block at most, and on a CPU has the same bits for any number of
+No intermediate is larger than a block. On a CPU the results are bitwise identical for any number of
 threads."""
 
 from typing import NamedTuple
@@ -18,13 +18,13 @@ FAINTEST = 1e-30
 
 
 class Block(NamedTuple):
-    """Part of a step: G tiles with K splats each; lists that end are filled up with the splat that
-    draws nothing.
+    """Part of a step: G tiles with K splats each; shorter lists are padded with a splat of opacity
+    0.
     """
 
     tiles: Tensor  # (G,)
     splats: Tensor  # (G * K,)
-    mean_x: Tensor  # (G, K) from the tile's middle; so are the others
+    mean_x: Tensor  # (G, K), as are those up to opacity; means relative to the tile's centre
     mean_y: Tensor
     a: Tensor
     k: Tensor
@@ -34,9 +34,9 @@ class Block(NamedTuple):
 
 
 def _alphas(block: Block, options: RasterizeOptions) -> Tensor:
-    """(G, PIXELS, K): ``min(alpha_max, opacity exp(-q / 2))``, or zero below alpha_min.
+    """Compute ``min(alpha_max, opacity exp(-q / 2))``, or zero below alpha_min: (G, PIXELS, K).
 
-    ``q / 2 = (x(column) - y(row))^2 + z(row)``: only the square is as large as the block.
+    With ``q / 2 = (x(column) - y(row))^2 + z(row)``, only the square has the size of the block.
     """
     steep = (block.a / 2).sqrt()[:, None]
     from_x, from_y = _offsets(block.mean_x), _offsets(block.mean_y)
@@ -52,11 +52,12 @@ def _alphas(block: Block, options: RasterizeOptions) -> Tensor:
 def composite(
     block: Block, transmittances: Tensor, options: RasterizeOptions
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Alphas, ``T_{i+1}`` and weights ``alpha_i T_i``, each (G, PIXELS, K); moves the tiles'
-    transmittances behind the block.
+    """Compute alphas, ``T_{i+1}`` and weights ``alpha_i T_i``, each (G, PIXELS, K); update the
+    tiles' transmittances to those behind the block.
 
-    Weights are zero where ``T_i < stop``; the transmittance goes on as if no pixel stopped. One
-    that is too small to divide by becomes infinity: what is behind it can't be seen."""
+    Weights are zero where ``T_i < stop``, but the transmittances continue to decrease there. A
+    ``T_{i+1}`` that is too small to divide by is returned as infinity, which makes the quotient
+    zero."""
     alphas = _alphas(block, options)
     chain = alphas.new_empty(*alphas.shape[:2], alphas.shape[2] + 1)
     chain[..., 0] = transmittances.index_select(0, block.tiles)
@@ -68,8 +69,8 @@ def composite(
 
 
 def subtract_one_by_one(gains: Tensor, left: Tensor, tiles: Tensor) -> Tensor:
-    """What is ``left`` behind each splat, (G, PIXELS, K), when the gains are taken off front to
-    back; updates ``left``.
+    """Subtract the gains from ``left`` one after another, front to back; return the remainder
+    behind each splat, (G, PIXELS, K), and update ``left``.
     """
     rest = torch.cat([left.index_select(0, tiles)[..., None], gains.neg()], -1)
     torch.cumsum(rest, -1, out=rest)
@@ -78,14 +79,14 @@ def subtract_one_by_one(gains: Tensor, left: Tensor, tiles: Tensor) -> Tensor:
 
 
 def splat_gradients(block: Block, slopes: Tensor) -> Tensor:
-    """(G, 6, K): gradients of mean x, y, a, k, c, opacity from ``slopes``, the gradient of the
-    exponent ``log(opacity) - q / 2``.
+    """Compute the gradients (G, 6, K) of mean x, y, a, k, c and opacity from ``slopes``, the
+    gradients of the exponent ``log(opacity) - q / 2``.
 
-    They are linear in the six moments of the slopes over the tile's pixels, (1, x, y, x^2, x y,
-    y^2) from its middle."""
+    They are linear in the six moments of the slopes over the tile's pixels, those of (1, x, y, x^2,
+    x y, y^2) relative to its centre."""
     s, sx, sy, sxx, sxy, syy = product(_monomials(slopes), slopes).unbind(1)
     k, y = block.k, -block.mean_y
-    t = -block.mean_x - k * y  # d.x - k d.y at the middle; elsewhere x - k y is added
+    t = -block.mean_x - k * y  # d.x - k d.y at the tile's centre; elsewhere x - k y is added
     st, sty, sd = sx - k * sy, sxy - k * syy, sy + y * s
     slopes_t = st + t * s
     slopes_tt = sxx - k * sxy - k * sty + t * (2 * st + t * s)
@@ -107,7 +108,7 @@ def splat_gradients(block: Block, slopes: Tensor) -> Tensor:
 
 
 def absolute_gradients(block: Block, slopes: Tensor) -> Tensor:
-    """(G, 2, K): sums over the pixels of |gradient of mean x| and |gradient of mean y|."""
+    """Sum |gradient of mean x| and |gradient of mean y| over the pixels: (G, 2, K)."""
     from_x, from_y = _offsets(block.mean_x)[:, None], _offsets(block.mean_y)[:, :, None]
     slopes = slopes.view(len(slopes), TILE, TILE, -1)
     k, c = block.k[:, None, None], block.c[:, None, None]
@@ -122,15 +123,15 @@ def absolute_gradients(block: Block, slopes: Tensor) -> Tensor:
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """Multiply the matrices of a batch. A single one is done twice: alone, threads would share it
-    and their number would change the rounding.
+    """Multiply batches of matrices. A batch of one is duplicated: the product of a single pair may
+    be split among threads, so that its rounding would depend on their number.
     """
     return a @ b if len(b) > 1 else (a @ b.repeat(2, 1, 1))[:1]
 
 
 def _offsets(means: Tensor) -> Tensor:
-    """(G, TILE, K): pixel centres of a row or column minus the means (G, K), both from the tile's
-    middle.
+    """Subtract the means (G, K) from the pixel centres of a row or column, both relative to the
+    tile's centre: (G, TILE, K).
     """
     return _centres(means)[:, None] - means[:, None]
 
@@ -140,7 +141,7 @@ def _centres(like: Tensor) -> Tensor:
 
 
 def _monomials(like: Tensor) -> Tensor:
-    """(6, PIXELS): 1, x, y, x^2, x y, y^2 at the pixel centres, from the tile's middle."""
+    """Return 1, x, y, x^2, x y, y^2 at the pixel centres relative to the tile's: (6, PIXELS)."""
     y, x = (
         axis.flatten() for axis in torch.meshgrid(_centres(like), _centres(like), indexing="ij")
     )
@@ -148,15 +149,15 @@ def _monomials(like: Tensor) -> Tensor:
 
 
 def _just_below(bound: float, like: Tensor) -> float:
-    """The number that ``x > number`` means ``x >= bound`` in the type of ``like``: torch's fast
-    threshold is exclusive.
+    """Return the largest number below ``bound`` in the type of ``like``, since torch's
+    ``threshold`` keeps only values strictly above its bound.
     """
     bound = torch.tensor(bound, dtype=like.dtype)
     return torch.nextafter(bound, torch.tensor(-torch.inf, dtype=like.dtype)).item()
 
 
 def to_tiles(image: Tensor, grid: Grid) -> Tensor:
-    """(B, H, W, F) to (tiles, F, PIXELS), zeros outside the image."""
+    """Convert (B, H, W, F) to (tiles, F, PIXELS), with zeros outside the image."""
     views, height, width, features = image.shape
     image = pad(image, (0, 0, 0, grid.columns * TILE - width, 0, grid.rows * TILE - height))
     image = image.view(views, grid.rows, TILE, grid.columns, TILE, features)

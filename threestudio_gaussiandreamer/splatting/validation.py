@@ -1,4 +1,4 @@
-"""What `rasterize` checks of its arguments, and the scene that it makes of them."""
+"""Check the arguments of `rasterize`, and convert them to a `Scene`."""
 
 from numbers import Integral, Real
 from typing import Optional
@@ -16,7 +16,7 @@ GAUSSIANS = ("means", "quats", "scales", "opacities", "colors")
 
 
 def smallest_alpha(preset: str, alpha_min: Optional[float]) -> float:
-    """Return ``alpha_min``, or where it is None that of the preset.
+    """Return ``alpha_min``, or the preset's value if it is None.
 
     Raises:
         UserError: there is no such preset.
@@ -27,7 +27,7 @@ def smallest_alpha(preset: str, alpha_min: Optional[float]) -> float:
 
 
 def named(means, quats, scales, opacities, colors, viewmats, Ks, background) -> dict[str, Tensor]:
-    """Return the tensors by name, those of the Gaussians first; without the background if None."""
+    """Return the tensors by name, the Gaussians' first; a background of None is left out."""
     gaussians = (means, quats, scales, opacities, colors)
     tensors = dict(zip(GAUSSIANS, gaussians, strict=True)) | {"viewmats": viewmats, "Ks": Ks}
     return tensors if background is None else tensors | {"background": background}
@@ -36,7 +36,7 @@ def named(means, quats, scales, opacities, colors, viewmats, Ks, background) -> 
 def check(
     tensors: dict[str, Tensor], width: int, height: int, options: RasterizeOptions, policy: str
 ) -> None:
-    """Check everything that a user gives, but for the backend.
+    """Check all arguments of `rasterize` except the backend.
 
     Raises:
         UserError: a tensor has the wrong type, device or shape, a number is out of its range, or,
@@ -49,8 +49,9 @@ def check(
 
 
 def as_scene(tensors: dict[str, Tensor], width: int, height: int) -> Scene:
-    """Convert checked tensors: contiguous and float32, or float64 where all Gaussians are; only the
-    cameras are narrowed in silence.
+    """Convert checked tensors to contiguous float32, or to float64 if all Gaussians' tensors are.
+
+    Cameras and background may have another type than the Gaussians.
 
     Raises:
         UserError: some Gaussians' tensors are float64 and others aren't.
@@ -73,7 +74,11 @@ def as_scene(tensors: dict[str, Tensor], width: int, height: int) -> Scene:
 
 
 def check_tensors(tensors: dict[str, Tensor]) -> None:
-    """All are floating-point tensors on the device of the means."""
+    """Check that all are floating-point tensors on the device of the means.
+
+    Raises:
+        UserError: one isn't.
+    """
     for name, tensor in tensors.items():
         if not isinstance(tensor, Tensor):
             raise UserError(f"{name} must be a torch.Tensor; got {type(tensor).__name__}.")
@@ -89,7 +94,11 @@ def check_tensors(tensors: dict[str, Tensor]) -> None:
 
 
 def check_shapes(tensors: dict[str, Tensor]) -> None:
-    """N comes from the means, B from the viewmats, C from the colours."""
+    """Check shapes, with N from the means, B from the viewmats and C from the colours.
+
+    Raises:
+        UserError: a shape doesn't match, or there is no view or no channel.
+    """
     n, views = _length(tensors, "means", "(N, 3)"), _length(tensors, "viewmats", "(B, 4, 4)")
     channels = tensors["colors"].shape[-1] if tensors["colors"].dim() else 0
     if views == 0 or channels == 0:
@@ -172,7 +181,7 @@ def check_finite(policy: str, tensors: dict[str, Tensor]) -> None:
         for name, tensor in tensors.items():
             if (
                 tensor.detach().sum().isfinite()
-            ):  # then all of them are: one fast pass settles the usual case
+            ):  # a finite sum implies finite values, so the usual case takes one pass
                 continue
             bad = (~tensor.isfinite()).nonzero()
             if len(bad):
