@@ -9,10 +9,11 @@ The data are narrow Gaussians around K known images, p(x0) = sum_k pi_k N(x_k, s
     D       = E[x0 | z] = m + (a s^2 / v) (z - a m)             denoised
     eps_hat = (z - a D) / sigma = sigma (z - a m) / v = -sigma grad log p_t(z)
 
-The distances are differences summed in float64: expanding |z|^2 - 2 z x + |x|^2 in float32 costs
-about a nat at 512^2. The rest has the type of z. A closed form memorises: it retrieves the nearest
-image unless d is a few hundred (Scarvelis et al. 2023, "Closed-Form Diffusion Models"), so look at
-the perplexity of the responsibilities."""
+Distances are sums of squared differences in float64: expanding them to |z|^2 - 2 z x + |x|^2 in
+float32 gives errors of about one nat in the logits at 512 x 512 pixels. The rest has the type of z.
+The closed-form denoiser memorises: unless d is at most a few hundred, it returns the nearest image
+(Scarvelis et al. 2023, "Closed-Form Diffusion Models"). The perplexity of the responsibilities
+measures this."""
 
 import math
 from typing import NamedTuple, Optional
@@ -26,11 +27,11 @@ from ..core.errors import UserError
 from . import sds
 
 CHUNK_ELEMENTS = 2**21
-"""Elements of a float64 temporary (16 MiB) while distances are summed."""
+"""Largest number of elements of a float64 temporary (16 MiB) for the distances."""
 
 
 class Denoised(NamedTuple):
-    """What the exact score knows of noisy images z (B, d)."""
+    """Result of :func:`denoise` for noisy images z (B, d)."""
 
     eps: Float[Tensor, "B d"]
     """The optimal prediction of the noise."""
@@ -39,14 +40,18 @@ class Denoised(NamedTuple):
     responsibilities: Float[Tensor, "B K"]
     """float64, rows sum to 1."""
     perplexity: Float[Tensor, " B"]
-    """exp of the responsibilities' entropy: how many images share z, in [1, K]; float64."""
+    """exp of the responsibilities' entropy, in [1, K]: the effective number of images that could
+    have given z; float64.
+    """
 
 
 def squared_distances(
     z: Float[Tensor, "B d"], bank: Float[Tensor, "*batch K d"], abar: Float[Tensor, " B"]
 ) -> Float[Tensor, "B K"]:
-    """Compute |z - sqrt(abar) x_k|^2 in float64; the bank is shared, (K, d), or per item, (B, K,
-    d).
+    """Compute |z - sqrt(abar) x_k|^2 in float64.
+
+    Args:
+        bank: the images x_k, shared (K, d) or per item (B, K, d).
     """
     bank = bank.expand(len(z), -1, -1)
     scaled = abar.double().sqrt().to(z.device).reshape(-1, 1, 1)
@@ -67,8 +72,8 @@ def responsibilities(
 ) -> Float[Tensor, "B K"]:
     """Compute gamma = softmax((log pi - distances / 2v) / temperature) in float64.
 
-    ``log_prior`` needs no normalisation; -inf leaves an image out. A temperature above 1 smooths
-    (and isn't exact any more)."""
+    ``log_prior`` need not be normalised; -inf excludes an image. A temperature above 1 smooths the
+    responsibilities, which then are no longer exact."""
     logits = -distances / (2 * variance.to(distances)[:, None])
     if log_prior is not None:
         logits = logits + log_prior.to(logits)
@@ -89,10 +94,12 @@ def denoise(
 
     Args:
         abar: per item, in (0, 1).
-        bank: the images x_k, shared or per item.
-        std: s, the width of each mode, >= 0.
-        distances: ``squared_distances(z, bank, abar)`` where the caller has them (two mixtures of
-            one bank).
+        bank: the images x_k, shared (K, d) or per item (B, K, d).
+        std: s, the standard deviation of each mode, >= 0.
+        log_prior: log pi_k, not necessarily normalised; by default uniform.
+        temperature: 1 is exact; see :func:`responsibilities`.
+        distances: ``squared_distances(z, bank, abar)`` if they are already known, for instance
+            for two mixtures of one bank.
     """
     variance = mode_variance(abar, std)
     if distances is None:
@@ -122,7 +129,7 @@ def log_density(
     std: float = 0.0,
     log_prior: Optional[Float[Tensor, "*prior K"]] = None,
 ) -> Float[Tensor, " B"]:
-    """Compute log p_t(z), float64, with the ``log_prior`` normalised (uniform without one)."""
+    """Compute log p_t(z) in float64; ``log_prior`` is normalised here, and uniform by default."""
     variance = mode_variance(abar, std).to(z.device)
     distances = squared_distances(z, bank, abar)
     log_prior = torch.zeros_like(distances[:1]) if log_prior is None else log_prior
@@ -141,12 +148,13 @@ def mode_variance(abar: Float[Tensor, " B"], std: float) -> Float[Tensor, " B"]:
 
 
 class LinearLatent(NamedTuple):
-    """Average pooling over ``factor`` x ``factor``, a colour matrix, and a scale: the pixels'
-    stand-in for a VAE.
+    """A linear replacement for a VAE: average pooling over ``factor`` x ``factor`` pixels, a colour
+    matrix, and a scale.
 
-    ``y = scale * matrix @ pool(2 rgb - 1)``. With factor 1, no matrix and scale 1 it is the space
-    of a pixel model. The score is defined on y, so the adjoint that autograd applies is exact;
-    nothing outside its row space is supervised."""
+    ``y = scale * matrix @ pool(2 rgb - 1)``. With factor 1, no matrix and scale 1 this is the space
+    of a pixel-space diffusion model. The score is defined on y, so the gradient by autograd is
+    exact; components of an image in the null space of the map, such as details within a pooled
+    pixel, get no gradient."""
 
     factor: int = 1
     matrix: Optional[Float[Tensor, "c 3"]] = None
@@ -158,13 +166,13 @@ class LinearLatent(NamedTuple):
         return self.encode_pooled(F.avg_pool2d(rgb, self.factor) if self.factor > 1 else rgb)
 
     def encode_pooled(self, rgb: Float[Tensor, "B 3 h w"]) -> Float[Tensor, "B c h w"]:
-        """Encode images that are pooled already."""
+        """Encode images in [0, 1] that have already been pooled."""
         latents = _recolored(2 * rgb - 1, self.matrix)
         return latents if self.scale == 1 else self.scale * latents
 
     def decode(self, latents: Float[Tensor, "B c h w"]) -> Float[Tensor, "B 3 H W"]:
-        """Compute the least-squares image in [0, 1]: pseudo-inverse of the colours, each pooled
-        pixel repeated.
+        """Decode to images in [0, 1] with the pseudo-inverse of the colour matrix, repeating each
+        pooled pixel ``factor`` x ``factor`` times.
         """
         inverse = None if self.matrix is None else torch.linalg.pinv(self.matrix.double())
         rgb = (_recolored(latents, inverse) / self.scale + 1) / 2
@@ -175,8 +183,10 @@ class LinearLatent(NamedTuple):
         )
 
     def normalised(self, rgb: Float[Tensor, "K 3 h w"]) -> "LinearLatent":
-        """Scale the latent to unit variance on pooled images (as Stable Diffusion's is on
-        photographs).
+        """Return a latent scaled to unit variance on pooled images in [0, 1].
+
+        Raises:
+            UserError: the images are all of one colour.
         """
         std = self._replace(scale=1.0).encode_pooled(rgb).std()
         if not std > 0:
@@ -191,10 +201,14 @@ def _recolored(
 
 
 def color_matrix(channels: int) -> Optional[Float[Tensor, "c 3"]]:
-    """Return orthonormal columns from RGB to ``channels`` >= 3: None, the identity, for 3; a
-    tetrahedron's corners for 4; else a fixed draw.
+    """Return a matrix with orthonormal columns from RGB to ``channels`` channels.
 
-    For 4 the first channel is the luminance and the others are opponent colours.
+    For 3 channels it is None, the identity. For 4 its rows are the corners of a tetrahedron: the
+    first channel is a luminance, the others are opponent colours. For more it is random with a
+    fixed seed.
+
+    Raises:
+        UserError: fewer than 3 channels.
     """
     if channels < 3:
         raise UserError(f"a latent of colours needs at least 3 channels, not {channels}")

@@ -4,8 +4,8 @@ Notation of DDPM (Ho et al. 2020): ``abar`` is the cumulative product of 1 - bet
 
     z = sqrt(abar) x + sqrt(1 - abar) eps.
 
-``abar`` is given per item, (B,), in float64 where it comes from the table; roots are taken before
-rounding to z's type."""
+``abar`` is given per item, (B,), usually in float64; square roots are taken before the conversion
+to z's type."""
 
 from collections.abc import Callable
 
@@ -22,27 +22,27 @@ WEIGHTS: dict[str, Callable[[Tensor], Tensor]] = {
     "uniform": torch.ones_like,
     "fantasia3d": lambda abar: abar.sqrt() * (1 - abar),
 }
-"""w(t): sigma_t^2 of DreamFusion (Poole et al. 2022), none, and a_t sigma_t^2 of Fantasia3D (Chen
-et al. 2023).
+"""The weights w(t): sigma_t^2 of DreamFusion (Poole et al. 2022), 1, and a_t sigma_t^2 of
+Fantasia3D (Chen et al. 2023), with a_t = sqrt(abar) and sigma_t^2 = 1 - abar.
 """
 
 
 def sd_alphas_cumprod(
     num_train: int = 1000, *, beta_start: float = 0.00085, beta_end: float = 0.012
 ) -> Float[Tensor, " T"]:
-    """Compute Stable Diffusion's "scaled linear" schedule, in which sqrt(beta) is linear in t.
-    float64.
+    """Compute abar of Stable Diffusion's "scaled linear" schedule, in which sqrt(beta) is linear in
+    t; float64.
     """
     betas = torch.linspace(beta_start**0.5, beta_end**0.5, num_train, dtype=torch.float64) ** 2
     return torch.cumprod(1 - betas, dim=0)
 
 
 def step_range(min_percent: float, max_percent: float, num_train: int = 1000) -> tuple[int, int]:
-    """Convert a range given in shares of ``num_train`` to its first and last timestep, both clamped
-    to [1, num_train - 1].
+    """Convert a range in fractions of ``num_train`` to its first and last timestep, both clamped to
+    [1, num_train - 1].
 
     Raises:
-        UserError: a share outside [0, 1], or the minimum above the maximum.
+        UserError: a fraction is outside [0, 1], or the minimum is above the maximum.
     """
     for name, percent in (("min_step_percent", min_percent), ("max_step_percent", max_percent)):
         if not 0 <= percent <= 1:
@@ -69,11 +69,12 @@ def timesteps(
     num_train: int = 1000,
     stream: str = "timestep",
 ) -> Int[Tensor, " B"]:
-    """Draw one timestep per item, uniform on [min_step, max_step] clamped to [1, num_train - 1];
-    item b doesn't depend on ``batch``.
+    """Draw one timestep per item, uniform on [min_step, max_step] clamped to [1, num_train - 1].
+
+    Each item has its own random stream, so its timestep doesn't depend on ``batch``.
 
     Raises:
-        UserError: ``min_step`` above ``max_step``.
+        UserError: ``min_step`` is above ``max_step``.
     """
     if min_step > max_step:
         raise UserError(f"the smallest timestep {min_step} is above the largest {max_step}")
@@ -109,10 +110,10 @@ def predict_x0(
 def classifier_free(
     eps_cond: Float[Tensor, "B *d"], eps_uncond: Float[Tensor, "B *d"], scale: float
 ) -> Float[Tensor, "B *d"]:
-    """Compute eps_u + scale (eps_c - eps_u), so 1 is no guidance (Ho and Salimans 2022 with scale =
-    1 + w).
+    """Compute eps_u + scale (eps_c - eps_u), where a scale of 1 is no guidance (Ho and Salimans
+    2022, scale = 1 + w).
 
-    threestudio writes eps_c + g (eps_c - eps_u): its g = 100 is scale = 101 here.
+    threestudio's formula is eps_c + g (eps_c - eps_u): its g = 100 is scale = 101 here.
     """
     return eps_uncond + scale * (eps_cond - eps_uncond)
 
@@ -125,8 +126,9 @@ def weight(name: str, abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
 
 
 def sds_loss(x: Float[Tensor, "B *d"], grad: Float[Tensor, "B *d"]) -> Float[Tensor, ""]:
-    """Compute 0.5 sum grad^2 / B, with the gradient grad / B at x: threestudio's 0.5 sum |x -
-    stop(x - grad)|^2 / B without its rounding.
+    """Compute 0.5 sum grad^2 / B, a loss whose gradient with respect to x is grad / B.
+
+    This is threestudio's 0.5 sum |x - stop(x - grad)|^2 / B without the rounding of x - grad.
     """
     return _GivenGradient.apply(x, grad.detach())
 
@@ -164,8 +166,10 @@ def ddim_sample(
     *,
     steps: int = 20,
 ) -> Float[Tensor, "B *d"]:
-    """Denoise z from each item's own timestep ``t`` to x0 in ``steps`` equal steps; ``predict(z,
-    t)`` gives eps.
+    """Denoise z from each item's timestep ``t`` to x0 in ``steps`` equal steps of DDIM.
+
+    Args:
+        predict: returns eps for (z, t).
     """
     for index in range(steps):
         now, later = (

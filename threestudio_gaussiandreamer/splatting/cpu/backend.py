@@ -1,9 +1,9 @@
 """The native CPU backend: three builds of one C++ source, called through ctypes.
 
 The library is built by ``pip install`` (see ``setup.py``) once per instruction set: v4 (AVX-512, 16
-lanes), v3 (AVX2, 8 lanes) and base (4 lanes, any processor). The best one for this machine is
-loaded; the environment variable GAUSSIANDREAMER_ISA forces one. It uses as many threads as torch
-does."""
+lanes), v3 (AVX2, 8 lanes) and base (4 lanes, any processor). The best one that the processor
+supports is loaded; the environment variable GAUSSIANDREAMER_ISA selects another. It uses as many
+threads as torch does."""
 
 import ctypes
 import functools
@@ -27,7 +27,7 @@ BUILDS = ("v4", "v3", "base")  # best first
 
 
 def unavailable() -> Optional[str]:
-    """Say why the library can't be used on this machine, or return None."""
+    """Return why the library can't be used on this machine, or None if it can."""
     try:
         _library()
     except (OSError, UserError) as error:
@@ -49,7 +49,7 @@ class CpuKernel(NamedTuple):
     library: ctypes.CDLL
 
     def forward(self, scene: Scene, means2d: Tensor) -> tuple[Drawn, tuple[Tensor, ...], None]:
-        """Draw; the only tensor to save stands for the library's state."""
+        """Render; the only tensor to save is a handle of the library's state."""
         drawn, state = self._draw(scene, means2d)
         return drawn, (state.as_tensor(),), None
 
@@ -74,8 +74,8 @@ class CpuKernel(NamedTuple):
         upstream: Upstream,
         wanted: Wanted,
     ) -> SceneGradients:
-        """Differentiate; draw once more where hooks on saved tensors (checkpointing, offloading)
-        have replaced the one that stands for the state.
+        """Differentiate; render again if hooks on saved tensors (checkpointing, offloading) have
+        replaced the tensor that owns the state.
         """
         owner = getattr(saved[0], "owner", None) or self._draw(scene, means2d)[1]
         found = SceneGradients(
@@ -126,8 +126,8 @@ class _State:
         self.library, self.handle = library, handle
 
     def as_tensor(self) -> Tensor:
-        """Return a tensor that owns this, to be saved for backward: autograd frees it with the
-        other saved tensors, long before the context.
+        """Return an empty tensor with a reference to this object, to be saved for backward:
+        autograd frees saved tensors right after backward, earlier than the context.
         """
         tensor = torch.empty(0)
         tensor.owner = self
@@ -147,7 +147,7 @@ def _check(needed: int) -> None:
 
 
 def usable_builds() -> list[str]:
-    """List the builds that are installed and that this processor runs, best first."""
+    """List the installed builds that this processor supports, best first."""
     if not _path("base").exists():
         return []
     best = _load("base").splat_best_isa().decode()

@@ -1,17 +1,17 @@
-"""The CUDA backend: all views in every launch, without waiting for the GPU, and the same bits in
-every run.
+"""The CUDA backend: every launch processes all views, the forward pass doesn't synchronise with the
+GPU, and results are bitwise reproducible.
 
-How many tile intersections (pairs of a splat and a tile) a scene has is only known on the GPU, so
-their lists get the capacity that earlier calls of this size needed, and a half more. A scene that
-needs still more is drawn exactly all the same, slower and without lists; its backward pass makes
-whole ones, and later calls have more capacity. Where memory is short, fewer views are treated at a
+The number of tile intersections (pairs of a splat and a tile) is only known on the GPU. Their lists
+therefore get 1.5 times the capacity that earlier calls of the same size needed. A scene that needs
+more is still rendered exactly, but without lists, which is slower; its backward pass makes complete
+lists, and later calls get a larger capacity. If memory is short, fewer views are processed at a
 time.
 
 Only the first call of a size waits for the number. A backward pass waits until the GPU has counted
-the intersections of its own forward pass, which precedes whatever computed the loss; it must know,
-since gradients without whole lists would be wrong.
+the intersections of its forward pass, since gradients from incomplete lists would be wrong; the
+count is usually there long before the loss.
 
-No sum is taken in the order in which threads happen to finish."""
+All sums are computed in a fixed order."""
 
 import functools
 import logging
@@ -53,7 +53,7 @@ log = logging.getLogger(__name__)
 
 
 def unavailable() -> Optional[str]:
-    """Say why no GPU can be used, or return None; compile nothing."""
+    """Return why the backend can't be used, or None if it can; compiles nothing."""
     return driver.unavailable()
 
 
@@ -80,7 +80,7 @@ class CudaKernel(NamedTuple):
     def forward(
         self, scene: Scene, means2d: Tensor
     ) -> tuple[Drawn, tuple[Tensor, ...], Optional[AsyncReadback]]:
-        """Draw; the state is how many intersections each view has."""
+        """Render; the state for backward is the number of intersections of each view."""
         if not len(scene.means):
             images = _background_alone(scene, self.context)
             return Drawn(*images[:3], *means2d.new_zeros(2, *scene.shape)), (images.alpha,), None
@@ -100,7 +100,7 @@ class CudaKernel(NamedTuple):
         upstream: Upstream,
         wanted: Wanted,
     ) -> SceneGradients:
-        """Differentiate; wait for the numbers of intersections."""
+        """Differentiate; waits for the numbers of intersections."""
         alpha, *kept = saved
         found = empty_gradients(scene, self.context.options.absgrad, wanted.viewmats)
         if kept:
@@ -124,11 +124,11 @@ def _draw(
     contribution: Tensor,
     context: LaunchContext,
 ) -> Lists:
-    """Fill the images; return the lists, as far as their capacity allowed.
+    """Fill the images; return the lists, which are incomplete if the capacity was too small.
 
-    They get the capacity that earlier calls suggest. Where there is no memory for it, parts of the
-    views get just what they need, and their lists are freed at once; a view for which even that is
-    too much is drawn without."""
+    The capacity is estimated from earlier calls. If there is no memory for it, the views are halved
+    until each part fits; a part's lists have the exact size, and are freed after it is rendered. A
+    single view that doesn't fit is rendered without lists."""
     views, gaussians = scene.shape
     key = (scene.means.device, views, *scene.size)
     estimate = _estimates.setdefault(key, CapacityEstimate(views))
@@ -170,11 +170,11 @@ def _sums_of_rows(
     upstream: BlendUpstream,
     context: LaunchContext,
 ) -> Tensor:
-    """Run `blend_backward` on all views, or, where memory is short, on some at a time, whose lists
-    are then made once more.
+    """Run `blend_backward` on all views, or on fewer at a time if memory is short; lists that are
+    incomplete are made again.
 
     Raises:
-        UserError: there isn't even memory for one view.
+        UserError: there is no memory for a single view.
     """
     views = len(totals)
 
@@ -208,13 +208,13 @@ def _empty_images(scene: Scene, context: LaunchContext) -> Images:
 
 
 def _shown_size(scene: Scene, context: LaunchContext) -> tuple[int, int, int]:
-    """Return views, rows and columns after the downsampling."""
+    """Return the number of views, rows and columns after downsampling."""
     scale = context.options.downsample
     return len(scene.viewmats), scene.height // scale, scene.width // scale
 
 
 def _background_alone(scene: Scene, context: LaunchContext) -> Images:
-    """Return the images of no Gaussians; no kernel is launched."""
+    """Return the images of an empty scene; no kernel is launched."""
     size, new = _shown_size(scene, context), scene.means.new_zeros
     image = new(*size, CHANNELS) + scene.background[:, None, None]
     return Images(image, new(*size, 1), new(*size, 1), None, None)

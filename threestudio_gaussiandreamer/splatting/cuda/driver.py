@@ -1,8 +1,8 @@
-"""Kernels on an NVIDIA GPU: loads what `nvrtc` compiled and launches it on torch's current stream,
-through the driver's C interface.
+"""Load the kernels that `nvrtc` compiled, and launch them on torch's current stream, through the
+CUDA driver API.
 
-ctypes is all it takes: a few functions of a library that every driver brings, so neither
-cuda-bindings nor a toolkit is needed."""
+The few functions needed are called through ctypes from the driver's own library, so neither
+cuda-bindings nor a CUDA toolkit is required."""
 
 import ctypes
 import functools
@@ -17,7 +17,7 @@ from ...core.errors import UserError
 from . import nvrtc
 from .stages import Argument
 
-# The unit that each kernel stands in.
+# The .cu file of each kernel.
 UNITS = {
     "project": "project",
     "count_tiles": "bin",
@@ -34,7 +34,7 @@ LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 
 @functools.cache
 def unavailable() -> Optional[str]:
-    """Say why no GPU can be used, or return None; find out once."""
+    """Return why no GPU can be used, or None if one can; the answer is cached."""
     if torch.version.cuda is None:
         return f"this torch ({torch.__version__}) is built without CUDA; install a CUDA build of it"
     if not torch.cuda.is_available():
@@ -80,8 +80,8 @@ class Gpu:
             return Readback(ends)
 
     def _function(self, name: str) -> ctypes.c_void_p:
-        """The kernel, with the context in which it lives made current: a thread that torch hasn't
-        used yet, such as autograd's, has none.
+        """Return a kernel, and make its context current, since a new thread, such as autograd's,
+        has no current context.
         """
         _check(_driver().cuCtxSetCurrent(self.context), "using the GPU")
         if name not in self.functions:
@@ -109,10 +109,10 @@ class Gpu:
 
 
 class Readback:
-    """Integers that are copied from the GPU asynchronously."""
+    """Integers that are copied from the GPU asynchronously, given as cumulative sums."""
 
     def __init__(self, ends: Tensor):
-        """``ends`` are running sums; what is asked for are their steps."""
+        """Start the copy of ``ends``, cumulative sums of the numbers."""
         self.ends = torch.empty(len(ends), dtype=ends.dtype, pin_memory=True)
         self.ends.copy_(ends.contiguous(), non_blocking=True)
         self.arrived = torch.cuda.Event()
@@ -122,7 +122,7 @@ class Readback:
         return self.arrived.query()
 
     def values(self) -> list[int]:
-        """Return the numbers; wait until they have arrived."""
+        """Wait for the copy, and return the differences of the cumulative sums."""
         self.arrived.synchronize()
         return [end - begin for begin, end in pairwise([0, *self.ends.tolist()])]
 
@@ -133,15 +133,16 @@ def _gpu(index: int) -> Gpu:
 
 
 def driver_version() -> tuple[int, int]:
-    """Return major and minor of the newest CUDA release that the driver knows."""
+    """Return (major, minor) of the newest CUDA release that the driver supports."""
     release = ctypes.c_int()
     _check(_driver().cuDriverGetVersion(ctypes.byref(release)), "asking for the driver's version")
     return release.value // 1000, release.value % 1000 // 10
 
 
 def _unsuitable() -> Optional[str]:
-    """Say what is wrong with GPU or driver. Machine code runs on every driver of its major
-    release or a later one.
+    """Return why the GPU or the driver can't run the kernels, or None.
+
+    Machine code runs on drivers of the same major CUDA release or a later one.
     """
     try:
         nvrtc.target_for(torch.cuda.get_device_capability())
@@ -161,13 +162,13 @@ def _release(version: tuple[int, int]) -> str:
 
 
 def _primary_context(index: int) -> ctypes.c_void_p:
-    """Return the context that torch works in."""
+    """Return the device's primary context, which torch uses too."""
     torch.cuda.init()
     device, context = ctypes.c_int(), ctypes.c_void_p()
     _check(_driver().cuInit(0), "starting the driver")
     _check(
         _driver().cuDeviceGet(ctypes.byref(device), index), "finding the GPU"
-    )  # both number what CUDA_VISIBLE_DEVICES shows
+    )  # torch and the driver both number the devices in CUDA_VISIBLE_DEVICES
     _check(_driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), device), "using the GPU")
     return context
 

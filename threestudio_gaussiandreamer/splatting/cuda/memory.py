@@ -1,5 +1,5 @@
-"""Room for the lists of the CUDA backend, whose length only the GPU knows, and what is done where
-memory is short.
+"""Estimate the capacity for the lists of the CUDA backend, whose length only the GPU knows, and
+retry with fewer views if memory is short.
 """
 
 import math
@@ -13,21 +13,21 @@ import torch
 from ...core.errors import UserError
 
 HEADROOM = 1.5
-STEP = 4096  # intersections; rounding up lets torch's allocator meet few sizes
-MOST = 2**31 - 1 - STEP  # intersections; torch's sort and the kernels' grids count no further
-FORGET = 0.99  # how much of a demand is remembered from one call to the next
+STEP = 4096  # intersections; rounding up makes torch's caching allocator reuse blocks
+MOST = 2**31 - 1 - STEP  # intersections; torch's sort and the kernels use 32-bit indices
+FORGET = 0.99  # decay of the estimate per call
 LIST_BYTES = (
     4 + 4 + 4 + 8 + 20
-)  # per intersection: tile, owner, sorted tile, position, and what sorting takes
+)  # per intersection: tile, owner, sorted tile, position, and the temporaries of the sort
 ROW_BYTES = 4 * 12  # per intersection: the backward pass's row of sums
 Result = TypeVar("Result")
 
 
 def round_up_capacity(intersections: int) -> int:
-    """Return a capacity for at least so many intersections.
+    """Round a number of intersections up to the next capacity.
 
     Raises:
-        torch.cuda.OutOfMemoryError: so many can't be numbered, let alone kept.
+        torch.cuda.OutOfMemoryError: the number exceeds 32-bit indices.
     """
     if intersections > MOST:
         raise torch.cuda.OutOfMemoryError(f"{intersections} intersections")
@@ -35,24 +35,29 @@ def round_up_capacity(intersections: int) -> int:
 
 
 class CapacityEstimate:
-    """How many intersections per Gaussian scenes of one size have needed. Numbers arrive late, and
-    any thread may ask.
+    """Estimates the intersections per Gaussian from earlier calls with the same size.
+
+    Numbers arrive from the GPU asynchronously. Methods are thread-safe.
     """
 
     def __init__(self, views: int):
         self.views = views
         self.per_gaussian: Optional[float] = None
-        self.too_much = math.inf  # the least capacity that there was no memory for
+        self.too_much = math.inf  # the smallest capacity for which there was no memory
         self.pending: deque = deque()
         self.lock = threading.Lock()
 
     def capacity(self, totals, gaussians: int) -> int:
-        """Return the capacity for a call; ``totals`` (see `stages.AsyncReadback`) will say how many
-        intersections it has.
+        """Return the capacity for a call.
+
+        Args:
+            totals: the call's own numbers of intersections, still being copied from the GPU
+                (`stages.AsyncReadback`).
+            gaussians: the number of Gaussians.
 
         Raises:
-            torch.cuda.OutOfMemoryError: so much has failed before, and there are parts to try
-            instead.
+            torch.cuda.OutOfMemoryError: this capacity has failed before, and there are several
+                views, so that parts of them can be tried instead.
         """
         with self.lock:
             self.pending.append((totals, gaussians))
@@ -64,12 +69,12 @@ class CapacityEstimate:
         return capacity
 
     def refuse(self, gaussians: int) -> None:
-        """Remember that there was no memory for the capacity that was given."""
+        """Record that there was no memory for the capacity of this many Gaussians."""
         with self.lock:
             self.too_much = min(self.too_much, self._capacity(gaussians))
 
     def _learn(self, totals, gaussians: int) -> None:
-        """Follow at once when more is needed, slowly when less is."""
+        """Update the estimate: at once to a larger number, slowly to a smaller one."""
         self.per_gaussian = max(
             FORGET * (self.per_gaussian or 0.0), sum(totals.values()) / gaussians
         )
@@ -80,11 +85,11 @@ class CapacityEstimate:
 
 
 def halve_on_oom(work: Callable[[int, int], Result], first: int, last: int) -> list[Result]:
-    """Return ``work(first, last)``, or where memory is short for it, that of halves of these views,
-    one after another.
+    """Call ``work(first, last)``; if memory is short, call it for each half of the views instead,
+    recursively. Return the results in order.
 
     Raises:
-        torch.cuda.OutOfMemoryError: a single view doesn't fit either.
+        torch.cuda.OutOfMemoryError: a single view doesn't fit.
     """
     try:
         return [work(first, last)]
@@ -93,12 +98,12 @@ def halve_on_oom(work: Callable[[int, int], Result], first: int, last: int) -> l
             raise
     middle = (
         first + last
-    ) // 2  # outside of the handler: the error holds on to what the attempt had allocated
+    ) // 2  # outside the except block, where the traceback would keep the attempt's tensors alive
     return halve_on_oom(work, first, middle) + halve_on_oom(work, middle, last)
 
 
 def too_large(intersections: int) -> UserError:
-    """Return the error for one view that doesn't fit alone."""
+    """Make the error for a single view that doesn't fit into the GPU's memory."""
     needed, free = (
         intersections * (LIST_BYTES + ROW_BYTES) / 2**30,
         torch.cuda.mem_get_info()[0] / 2**30 if torch.cuda.is_available() else 0.0,

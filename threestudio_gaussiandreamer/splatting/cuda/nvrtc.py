@@ -1,9 +1,9 @@
-"""CUDA text to machine code at run time: NVIDIA's run-time compiler through ctypes, and a cache on
-the disk of what it made.
+"""Compile CUDA C++ at run time with NVRTC, called through ctypes, and cache the result on disk.
 
-Neither a compiler nor a CUDA toolkit is needed. The library libnvrtc comes with every CUDA build of
-torch; the variable GAUSSIANDREAMER_NVRTC names another one. Compiled kernels are kept in
-GAUSSIANDREAMER_CACHE, else in the user's cache folder, by a hash of everything that goes into them.
+Neither a compiler nor a CUDA toolkit is needed: every CUDA build of torch comes with libnvrtc. The
+environment variable GAUSSIANDREAMER_NVRTC names another library. Compiled kernels are kept in the
+folder GAUSSIANDREAMER_CACHE, by default in the user's cache folder, under a hash of sources,
+options and compiler version.
 """
 
 import ctypes
@@ -24,14 +24,14 @@ from ...core.errors import UserError
 from ...core.files import atomic_file
 
 KERNELS = Path(__file__).parent
-SHARED = KERNELS.parent / "shared"  # the formulas: the very files that the CPU kernel includes
+SHARED = KERNELS.parent / "shared"  # formulas, which the CPU kernel includes too
 OPTIONS = (
     "--std=c++17",
     "--ptxas-options=-v",
     "--generate-line-info",
 )  # lines are for profilers and sanitizers
-# Blending divides by 1 - alpha and takes powers once per pair of splat and pixel; denormals can't
-# be seen there.
+# Blending divides by 1 - alpha and takes powers once per pair of splat and pixel; subnormal numbers
+# and the last bit of a quotient are not visible there.
 UNIT_OPTIONS = {name: ("--ftz=true", "--prec-div=false") for name in ("blend", "blend_backward")}
 OLDEST_ARCHITECTURE = 75
 DIGEST = hashlib.sha256().digest_size
@@ -44,7 +44,7 @@ class Compiled(NamedTuple):
 
 
 def unavailable() -> Optional[str]:
-    """Say why nothing can be compiled, or return None."""
+    """Return why the compiler can't be used, or None if it can."""
     try:
         _library()
     except OSError as error:
@@ -52,14 +52,14 @@ def unavailable() -> Optional[str]:
 
 
 def version() -> tuple[int, int]:
-    """Return major and minor of the CUDA release that the compiler belongs to."""
+    """Return (major, minor) of the compiler's CUDA release."""
     major, minor = ctypes.c_int(), ctypes.c_int()
     _check(_library().nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)))
     return major.value, minor.value
 
 
 def architectures() -> list[int]:
-    """List compute capabilities that the compiler knows, times ten: 75, 80, ..."""
+    """List the compute capabilities that the compiler supports, times ten: 75, 80, ..."""
     count = ctypes.c_int()
     _check(_library().nvrtcGetNumSupportedArchs(ctypes.byref(count)))
     known = (ctypes.c_int * count.value)()
@@ -68,13 +68,14 @@ def architectures() -> list[int]:
 
 
 def target_for(capability: tuple[int, int]) -> str:
-    """What to compile for: "sm_90", machine code, for an architecture that the compiler knows.
+    """Return the compilation target for a device of this compute capability.
 
-    For a newer one "compute_..." of the newest that it knows: that is PTX, an assembly text which
-    the driver finishes.
+    It is machine code ("sm_90") if the compiler supports the device. For a newer device it is PTX
+    for the newest architecture that the compiler supports ("compute_..."), which the driver
+    compiles.
 
     Raises:
-        UserError: the device is older than what the kernels, or the compiler, can do.
+        UserError: the device is older than what the kernels or the compiler support.
     """
     device, known = 10 * capability[0] + capability[1], architectures()
     older = [
@@ -92,9 +93,7 @@ def target_for(capability: tuple[int, int]) -> str:
 
 
 def machine_code(unit: str, target: str) -> bytes:
-    """``<unit>.cu`` compiled for a target of `target_for`, from the disk if it has been compiled
-    before.
-    """
+    """Return ``<unit>.cu`` compiled for a target of `target_for`, from the cache if it is there."""
     name = f"{unit}-{target}-{_key(unit, target)}"
     found = _read(name)
     if found is None:
@@ -148,7 +147,7 @@ def source(unit: str) -> str:
 
 @functools.cache
 def headers() -> dict[str, str]:
-    """Return the text of each file that a unit may include, by name."""
+    """Return the text of each header that a ``.cu`` file may include, by name."""
     return {
         path.name: path.read_text()
         for path in (*sorted(KERNELS.glob("*.h")), *sorted(SHARED.glob("*.h")))
@@ -180,7 +179,7 @@ def cache_folder() -> Path:
 
 
 def _key(unit: str, target: str) -> str:
-    """Return a key that changes with whatever changes the machine code."""
+    """Return a hash of everything that determines the machine code."""
     parts = [
         source(unit),
         *headers(),
@@ -202,7 +201,7 @@ def _read(name: str) -> Optional[bytes]:
 
 
 def _write(name: str, content: bytes) -> None:
-    """Write, and ignore failure: without the cache the next start takes some seconds more."""
+    """Write to the cache; log a failure and go on, since kernels can be compiled again."""
     try:
         path = cache_folder() / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -217,7 +216,7 @@ def _write(name: str, content: bytes) -> None:
 
 @functools.cache
 def _library() -> ctypes.CDLL:
-    """Return the first candidate that loads."""
+    """Load the first candidate that can be loaded."""
     failures = []
     for candidate in _candidates():
         try:
@@ -234,8 +233,8 @@ def _library() -> ctypes.CDLL:
 
 
 def _candidates() -> list[str]:
-    """What the variable names; else what pip installed, the release that torch was built with
-    first; else what the loader finds.
+    """List paths or names to load: only the one in GAUSSIANDREAMER_NVRTC if it is set; otherwise
+    those that pip installed, beginning with torch's CUDA release, then those of the system.
     """
     named = os.environ.get("GAUSSIANDREAMER_NVRTC")
     if named:

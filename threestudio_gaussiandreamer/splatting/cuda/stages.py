@@ -1,9 +1,9 @@
-"""The stages of the CUDA backend: which kernel of ``*.cu`` gets which tensors. Nothing here waits
-for the GPU.
+"""The stages of the CUDA backend: each allocates tensors and launches kernels of ``*.cu``, without
+waiting for the GPU.
 
-project, rank (sort by depth), count tiles, list them, sort by tile, find each tile's list, blend;
-and their adjoints. Sorts and running sums are torch's. An intersection is a pair of a splat and a
-tile that it reaches."""
+The stages are: 1 project; 2 sort by depth; 3 count tiles; 4 list intersections and sort them by
+tile; 5 find each tile's list; 6 blend; and their adjoints. Sorts and cumulative sums are torch's.
+An intersection is a pair of a splat and a tile that it reaches."""
 
 import ctypes
 import math
@@ -24,7 +24,7 @@ Argument = Union[Tensor, ctypes.Structure, ctypes._SimpleCData]
 
 
 class AsyncReadback(Protocol):
-    """Numbers on their way from the GPU."""
+    """Numbers that are being copied from the GPU."""
 
     def ready(self) -> bool: ...
 
@@ -33,7 +33,7 @@ class AsyncReadback(Protocol):
 
 
 class Device(Protocol):
-    """What runs kernels: `driver.Gpu`, or a stand-in."""
+    """Interface of `driver.Gpu`, which launches kernels."""
 
     def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Argument) -> None:
         """Queue a kernel; ``arguments`` are tensors, structures and C numbers."""
@@ -42,7 +42,7 @@ class Device(Protocol):
 
 
 class LaunchContext(NamedTuple):
-    """What a call is told besides its scene."""
+    """Options and device of a call; ``tracked`` tells whether a backward pass may follow."""
 
     options: RasterizeOptions
     tracked: bool
@@ -50,26 +50,26 @@ class LaunchContext(NamedTuple):
 
 
 class Splats(NamedTuple):
-    """What the first stages leave of B views of N Gaussians."""
+    """Output of stages 1 to 3 for B views of N Gaussians."""
 
     splats: Tensor  # (B, N, SPLAT)
-    depth_keys: Tensor  # (B, N) int32, ordered as the depths; 2**31 - 1 for what isn't visible
+    depth_keys: Tensor  # (B, N) int32, in the order of depths; 2**31 - 1 for invisible splats
     order: Tensor  # (B, N) int64, the Gaussians of each view front to back
-    counts: Tensor  # (B, N) int32, how many tiles each of them reaches, in that order
-    ends: Tensor  # (B, N) int64, their running sum through all views
+    counts: Tensor  # (B, N) int32, the number of tiles that each reaches, in the order of `order`
+    ends: Tensor  # (B, N) int64, cumulative sum of the counts over all views
 
     def of_views(self, first: int, last: int) -> "Splats":
-        """Select some views, as if there were no others."""
+        """Select the views ``first`` to ``last - 1``; ``ends`` restarts at the first of them."""
         part = Splats(*(x[first:last] for x in self))
         return part._replace(ends=part.ends - self.ends[first - 1, -1]) if first else part
 
 
 class Lists(NamedTuple):
-    """The intersections by tile; ``capacity`` is the length of the first two."""
+    """The intersections sorted by tile; ``capacity`` is the length of the first two tensors."""
 
-    owners: Tensor  # int32, view * N + Gaussian of each
-    sorted: Tensor  # int64, which of them, sorted by tile, front to back in each
-    begins: Tensor  # (B * tiles + 1) int64
+    owners: Tensor  # int32, view * N + Gaussian of each intersection
+    sorted: Tensor  # int64, indices into owners sorted by tile, front to back in each tile
+    begins: Tensor  # (B * tiles + 1) int64, start of each tile in sorted
 
     @property
     def capacity(self) -> int:
@@ -77,20 +77,20 @@ class Lists(NamedTuple):
 
 
 class Images(NamedTuple):
-    """In the order of ``splat::Images``. The last two are what a backward pass needs of each
-    rendered pixel, or None.
+    """Output of stage 6, in the order of the struct ``splat::Images``. The last two are kept for
+    backward, else None.
     """
 
     image: Tensor  # (B, H, W, 3)
     alpha: Tensor  # (B, H, W, 1)
     depth: Tensor  # (B, H, W, 1)
-    color_depth: Optional[Tensor]  # (B, height, width, 4) in front of the background
+    color_depth: Optional[Tensor]  # (B, height, width, 4) without the background
     transmittance: Optional[Tensor]  # (B, height, width)
 
 
 class BlendUpstream(NamedTuple):
-    """In the order of ``splat::Upstream``: gradients of the images, None for zero, and what the
-    forward pass kept.
+    """Input of stage 6's adjoint, in the order of the struct ``splat::Upstream``: gradients of the
+    images, None for zero, and what the forward pass kept.
     """
 
     image: Optional[Tensor]
@@ -101,7 +101,7 @@ class BlendUpstream(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """In the order of ``splat::Gradients``."""
+    """Output of stage 1's adjoint, in the order of the struct ``splat::Gradients``."""
 
     means: Tensor
     quats: Tensor
@@ -118,8 +118,8 @@ def tiles_per_view(scene: Scene) -> int:
 
 
 def project(scene: Scene, means2d: Tensor, context: LaunchContext) -> tuple[Splats, Tensor, Tensor]:
-    """Run stages 1 to 3; also return radii (B, N) and zeros (B, N) for the contributions. Fills
-    ``means2d``.
+    """Run stages 1 to 3 and fill ``means2d``; also return radii (B, N) and contributions (B, N),
+    which are still zero.
     """
     launch, shape, new = context.device.launch, scene.shape, scene.means.new_empty
     splats, depth_keys, radii, contribution = (
@@ -147,7 +147,7 @@ def project(scene: Scene, means2d: Tensor, context: LaunchContext) -> tuple[Spla
 def list_intersections(
     scene: Scene, splats: Splats, capacity: int, context: LaunchContext
 ) -> Lists:
-    """Run stages 4 and 5. Intersections that don't fit are left out; `blend` notices.
+    """Run stages 4 and 5. Intersections beyond the capacity are left out; `blend` detects that.
 
     Raises:
         torch.cuda.OutOfMemoryError: there is no memory for so many.
@@ -191,8 +191,10 @@ def blend(
     contribution: Tensor,
     context: LaunchContext,
 ) -> None:
-    """Run stage 6, with whole lists or without: the result is the same to the bit. Fill the images,
-    raise the contributions.
+    """Run stage 6: fill the images, and raise the contributions.
+
+    If the lists are incomplete, every splat is tested in every tile; the result is bitwise the
+    same.
     """
     arguments = (
         _settings(context.options),
@@ -217,10 +219,10 @@ def blend_backward(
     upstream: BlendUpstream,
     context: LaunchContext,
 ) -> Tensor:
-    """Run the adjoints of stages 6 to 4: a row of sums for each splat (B, N, ROW); those of
-    invisible ones aren't set.
+    """Run the adjoints of stages 6 to 4: return a row of sums for each splat (B, N, ROW); rows of
+    invisible splats aren't set.
 
-    The lists must hold all of the ``total`` intersections.
+    The lists must be complete: they hold all of the ``total`` intersections.
 
     Raises:
         torch.cuda.OutOfMemoryError: there is no memory for their rows.
@@ -267,7 +269,7 @@ def project_backward(
 
 
 def empty_gradients(scene: Scene, absgrad: bool, viewmats: bool) -> Gradients:
-    """Make room for the gradients; for those that aren't wanted there is none."""
+    """Allocate the gradients; those that aren't needed are None."""
     new, (views, gaussians) = scene.means.new_empty, scene.shape
     parts = new(-(-gaussians // THREADS), views, CAMERA_SUMS) if viewmats else None
     screen = new(views, gaussians, 2), new(views, gaussians, 2) if absgrad else None
@@ -276,7 +278,7 @@ def empty_gradients(scene: Scene, absgrad: bool, viewmats: bool) -> Gradients:
 
 
 def viewmats_gradient(parts: Tensor) -> Tensor:
-    """Add up the blocks' parts; the last row of a viewmat isn't read."""
+    """Sum the blocks' parts (blocks, B, CAMERA_SUMS) to (B, 4, 4); the last row's gradient is 0."""
     rows = parts.sum(0, dtype=torch.float64).float().view(-1, 3, 4)
     return torch.nn.functional.pad(rows, (0, 0, 0, 1))
 
@@ -286,7 +288,7 @@ def _per_gaussian(shape: tuple[int, int]) -> tuple[int, int]:
     return -(-shape[1] // THREADS), shape[0]
 
 
-# ---- what kernels are told: *.h ------------------------------------------------------------------
+# ---- structs of the kernels: *.h -----------------------------------------------------------------
 
 
 class _Settings(ctypes.Structure):
