@@ -1,13 +1,13 @@
-"""Score distillation: the path that every guidance shares, from a render to the gradient of its
-latent.
+"""Score distillation: the computation that all guidances share, from a render to the gradient of
+its latent.
 
     x = encode(render),  z = sqrt(abar) x + sqrt(1 - abar) eps,  grad = w(t) (eps_hat(z, t) - eps),
                          dloss/dx = grad / B
 
 A guidance is a subclass that says how to ``encode`` and ``decode``, what to ``condition`` on, and
-how to ``predict`` the noise; it may work in half precision inside, here everything is float32.
-Timesteps and noise are functions of (seed, step, item), so a resumed run draws what the run that
-never stopped draws.
+how to ``predict`` the noise. Its networks may run in half precision; this module computes in
+float32. Timesteps and noise are functions of (seed, step, item), so a resumed run draws the same
+values as an uninterrupted one.
 
 ==================  ================================================================================
 option              meaning
@@ -45,11 +45,11 @@ GUIDANCE_SCALE = in_range(-1e6, 1e6)
 
 
 class NonFiniteScore(UserError):
-    """The score model kept returning NaN or infinity: going on would train nothing."""
+    """The score model returned NaN or infinity in ``max_bad_steps`` consecutive steps."""
 
 
 class Noised(NamedTuple):
-    """A batch of latents on their way to the score model."""
+    """A batch of noisy latents, the input of the score model."""
 
     t: Int[Tensor, " B"]
     abar: Float[Tensor, " B"]
@@ -59,7 +59,7 @@ class Noised(NamedTuple):
 
 
 class ScoreDistillation(BaseObject, ABC):
-    """Base of all guidances; see the module."""
+    """Base class of all guidances; see the module's docstring."""
 
     @dataclass
     class Config(BaseObject.Config):
@@ -96,40 +96,40 @@ class ScoreDistillation(BaseObject, ABC):
 
     @abstractmethod
     def condition(self, prompt_utils: Any, **batch: Any) -> Any:
-        """Return what ``predict`` needs of prompt and views; called without gradients."""
+        """Return the conditions on prompt and views for ``predict``; called without gradients."""
 
     @abstractmethod
     def predict(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Any
     ) -> tuple[Float[Tensor, "B c h w"], Optional[Float[Tensor, "B c h w"]]]:
-        """Predict the noise in z, conditional and unconditional (None where no guidance is asked
-        for); called without gradients.
+        """Predict the noise in z, conditional and unconditional (None if ``guidance_scale`` is 1);
+        called without gradients.
         """
 
     @classmethod
     def preflight(cls, cfg: Any) -> None:
-        """Check in seconds whether a guidance of this configuration can have what it needs; called
-        before any long work.
+        """Check within seconds that a guidance of this configuration can be built; called before
+        any long work.
 
         Raises:
-            UserError: what is missing, and what to do.
+            UserError: a requirement, such as a model's file, is missing; the message says what to
+                do.
         """
 
     REPORTS: tuple[str, ...] = ()
-    """The names of what :meth:`report` returns, so that ``checkpoint.monitor`` may be one of them.
-    """
+    """The keys of :meth:`report`, which ``checkpoint.monitor`` may name."""
 
     LOSSES: tuple[str, ...] = ("sds",)
-    """The losses that a step returns, without their ``loss_``."""
+    """Names of the losses that a step returns, without the prefix ``loss_``."""
 
     KNOWS_TRUTH = False
-    """Whether its instances have a ``truth``, see :mod:`.known_truth`."""
+    """Whether instances have an attribute ``truth``, see :mod:`.known_truth`."""
 
     def report(self) -> dict[str, float]:
-        """Return more numbers to log about the last step."""
+        """Return further numbers about the last step, to be logged."""
         return {}
 
-    # The shared path
+    # The shared computation
     # ----------------------------------------------------------------------------------------------
 
     def configure(self) -> None:
@@ -140,7 +140,7 @@ class ScoreDistillation(BaseObject, ABC):
 
     @property
     def guided(self) -> bool:
-        """Whether the unconditional score is needed."""
+        """Whether classifier-free guidance is on, which needs the unconditional score."""
         return self.cfg.guidance_scale != 1
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
@@ -164,7 +164,7 @@ class ScoreDistillation(BaseObject, ABC):
         guidance_eval: bool = False,
         **batch: Any,
     ) -> dict[str, Any]:
-        """Return the loss whose gradient is the score distillation gradient, and what to log.
+        """Return the loss whose gradient is the score distillation gradient, and values to log.
 
         Args:
             rgb: renders in [0, 1]; or latents, with ``rgb_as_latents``.
@@ -172,12 +172,13 @@ class ScoreDistillation(BaseObject, ABC):
             batch: the host's batch, and ``comp_rgb_bg``.
 
         Returns:
-            ``loss_sds``, ``grad_norm`` and that of each item, ``grad_norm_0`` ..., ``min_step``,
-            ``max_step``, ``bad_items`` of this step [, ``eval``] and :meth:`report`'s.
+            ``loss_sds``; ``grad_norm`` of the batch, and ``grad_norm_0``, ... of each item;
+            ``min_step``, ``max_step``; ``bad_items``, the number of items whose score isn't finite;
+            the entries of :meth:`report`; and ``eval``, if requested.
 
         Raises:
-            NonFiniteScore: some item's score wasn't finite in each of the last ``max_bad_steps``
-                steps.
+            NonFiniteScore: in each of the last ``max_bad_steps`` steps the score of at least one
+                item wasn't finite.
         """
         with torch.autocast(rgb.device.type, enabled=False):
             images = rgb.float().movedim(-1, 1).contiguous()
@@ -186,7 +187,7 @@ class ScoreDistillation(BaseObject, ABC):
                 noised = self.add_noise(latents)
                 condition = self.condition(prompt_utils, **batch)
                 grad, bad = self._gradient(noised, condition)
-            if not guidance_eval:  # looking at pictures is no step
+            if not guidance_eval:  # an evaluation isn't a training step
                 self._count_bad(bad)
             loss = _masked_loss(images, latents, grad, bad)
             norms = grad.flatten(1).norm(dim=1)
@@ -231,8 +232,10 @@ class ScoreDistillation(BaseObject, ABC):
         )
 
     def _gradient(self, noised: Noised, condition: Any) -> tuple[Tensor, Tensor]:
-        """Compute w(t) (eps_hat - eps), clipped, zero for items where it isn't finite; and which
-        those are, (B,) bool.
+        """Compute w(t) (eps_hat - eps), clipped to ``grad_clip``.
+
+        Returns:
+            the gradient, zero for items in which it isn't finite, and a mask of those, (B,) bool.
         """
         eps = self.predict_noise(noised.z, noised.t, condition)
         weight = sds.weight(self.cfg.weighting_strategy, noised.abar)
@@ -259,17 +262,18 @@ class ScoreDistillation(BaseObject, ABC):
                 "they are left out"
             )
 
-    # Looking at what the score model sees
+    # Pictures of the score model's inputs and predictions
     # ---------------------------------------------------------------------------------
 
     @torch.no_grad()
     def evaluate(self, noised: Noised, prompt_utils: Any, **batch: Any) -> dict[str, Any]:
-        """Render pictures (B, H, W, 3) in [0, 1], as the host's ``guidance_evaluation_save`` takes
-        them.
+        """Decode pictures for the host's ``guidance_evaluation_save``.
 
-        ``imgs_noisy`` the noisy latents; ``imgs_1step`` denoised at once with guidance;
-        ``imgs_1orig`` denoised at once by the conditional score alone; ``imgs_final`` denoised in
-        ``eval_steps`` steps; with ``texts``, ``noise_levels`` and ``bs``."""
+        Returns:
+            pictures (B, H, W, 3) in [0, 1]: ``imgs_noisy``, the noisy latents; ``imgs_1step``,
+            denoised in one step with guidance; ``imgs_1orig``, denoised in one step with the
+            conditional score only; ``imgs_final``, denoised in ``eval_steps`` steps; and ``texts``,
+            ``noise_levels`` and ``bs``, the number of items."""
         count = (
             len(noised.t)
             if self.cfg.max_items_eval < 1
@@ -299,8 +303,8 @@ class ScoreDistillation(BaseObject, ABC):
 
 
 def _bad_items(grad: Tensor) -> Tensor:
-    """Return which items hold NaN or infinity, (B,) bool. A sum is finite only if all its terms
-    are, which settles the usual case.
+    """Return which items contain NaN or infinity, (B,) bool. If the sum over all elements is finite
+    then so are the elements, so the usual case needs a single reduction.
     """
     if grad.sum().isfinite():
         return torch.zeros(len(grad), dtype=torch.bool, device=grad.device)
@@ -308,11 +312,11 @@ def _bad_items(grad: Tensor) -> Tensor:
 
 
 def _masked_loss(images: Tensor, latents: Tensor, grad: Tensor, bad: Tensor) -> Tensor:
-    """Compute the loss without the bad items, whose ``grad`` is zero, and whose render gets a
-    gradient of exactly zero.
+    """Compute the loss without the bad items. Their ``grad`` is zero, and the gradients of their
+    renders are set to exactly zero.
     """
     if bad.any() and images.requires_grad:
-        # Zero times an infinite derivative of the encoder would be NaN on its way to the render.
+        # If the encoder's derivative is infinite, the product with a zero gradient is NaN.
         images.register_hook(lambda gradient: gradient.masked_fill(bad.reshape(-1, 1, 1, 1), 0.0))
     return sds.sds_loss(latents, grad)
 
@@ -342,8 +346,8 @@ def _captions(levels: list[float], batch: dict[str, Any]) -> list[str]:
 
 
 def _knots(*schedules: Any) -> set[int]:
-    """Return a set of steps that has all those at which a schedule bends (and, which is harmless,
-    its values too).
+    """Return a set that contains all steps at which the slope of a schedule changes. It also has
+    the values of the schedules, which does no harm.
     """
     return {
         0,

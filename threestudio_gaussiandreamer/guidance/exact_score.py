@@ -62,11 +62,11 @@ MODES = ("view-exact", "direction-bins", "view-agnostic")
 SPACES = ("pixel", "latent")
 MAX_MODE_BYTES = 2**31
 BANK_BYTES = 16
-"""Of a pixel of the bank, as it is cast."""
+"""Memory per pixel of the bank while it is cast, bytes."""
 
 
 class Bank(NamedTuple):
-    """Pictures of the mesh from all around, at one size."""
+    """Pictures of the mesh from random views around it, at one size."""
 
     rgba: UInt8[Tensor, "K H W 4"]
     """Premultiplied."""
@@ -76,12 +76,12 @@ class Bank(NamedTuple):
 
 
 class Mixture(NamedTuple):
-    """What one item is compared with."""
+    """The modes of one item's mixture distribution."""
 
     modes: Float[Tensor, "K c h w"]
     log_prior: Optional[Float[Tensor, " K"]]
-    """0 or -inf: which modes the conditional mixture has; None = all, and no unconditional one is
-    asked for.
+    """0 for the modes of the conditional mixture, -inf for others, which belong only to the
+    unconditional mixture; None if all are conditional and no unconditional mixture is needed.
     """
 
 
@@ -146,7 +146,7 @@ class ExactScoreGuidance(ScoreDistillation):
         )
         self.bank_orbit = camera_pool(cfg.bank_views, ranges, cfg.bank_seed, "bank")
 
-    # The path of score distillation
+    # Score distillation
     # ---------------------------------------------------------------------------------------
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B c h w"]:
@@ -165,7 +165,9 @@ class ExactScoreGuidance(ScoreDistillation):
         fovy: Tensor,
         **batch: Any,
     ) -> list[Mixture]:
-        """Return the mixture of each item; needs ``encode`` before, which sets the size."""
+        """Return the mixture of each item. ``encode`` must be called before, since it sets the size
+        of the pictures.
+        """
         if self._size is None:
             raise UserError(
                 "exact-score-guidance compares pictures: give it renders, not latents "
@@ -191,8 +193,8 @@ class ExactScoreGuidance(ScoreDistillation):
         return cond, torch.cat([item[1].eps for item in items]).view_as(z)
 
     def report(self) -> dict[str, float]:
-        """Return how many pictures share a noisy latent on average: 1 is retrieval of the nearest
-        one.
+        """Return the perplexity of the responsibilities, the effective number of modes per noisy
+        latent: at 1 only the nearest picture counts.
         """
         return {"perplexity": self._perplexity}
 
@@ -220,8 +222,8 @@ class ExactScoreGuidance(ScoreDistillation):
         members: Bool[Tensor, " K"],
         background: Float[Tensor, "bh bw 3"],
     ) -> Mixture:
-        """Join the camera's own view, if any, and the bank's; conditional are the own view and the
-        bank's ``members``.
+        """Build a mixture of the camera's own view, if any, and the bank's views. The own view and
+        the bank's ``members`` are its conditional modes.
         """
         own_views = [] if own is None else [own]
         if members.all() or not self.guided:
@@ -240,14 +242,14 @@ class ExactScoreGuidance(ScoreDistillation):
         return Mixture(modes, torch.where(conditional, 0.0, -torch.inf))
 
     def _members(self, batch: dict[str, Any], count: int) -> Bool[Tensor, "B K"]:
-        """Return which views of the bank the conditional mixture of each item has."""
+        """Return a mask of the bank's views in the conditional mixture of each item."""
         if self.cfg.mode == "view-exact":
             return torch.zeros(count, self.cfg.bank_views, dtype=torch.bool)
         if self.cfg.mode == "view-agnostic":
             return torch.ones(count, self.cfg.bank_views, dtype=torch.bool)
         bank = direction_indices(self.bank_orbit.elevation, self.bank_orbit.azimuth)
         members = bank == direction_indices(batch["elevation"], batch["azimuth"]).cpu()[:, None]
-        # a bank that stays below 60 degrees has no overhead views
+        # if no view of the bank has this direction, as overhead below 60 degrees, take all
         return torch.where(members.any(dim=1, keepdim=True), members, torch.ones_like(members))
 
     def _own_views(
@@ -257,7 +259,7 @@ class ExactScoreGuidance(ScoreDistillation):
         return self._latent().encode(composite(rgba, background))[:, None]
 
     def bank(self, height: int, width: int) -> Bank:
-        """Return the bank at a picture size; that of the last size is kept."""
+        """Return the bank at a picture size, in pixels; the bank of the last size is cached."""
         if (height, width) not in self._banks:
             self._banks = {(height, width): self._cast_bank(height, width)}
         return self._banks[height, width]

@@ -1,5 +1,5 @@
-"""Guidances that other packages register: called as threestudio's systems call them, whichever of
-its signatures they have.
+"""Call guidances of other packages as threestudio's systems do, with any of the signatures that its
+guidances have.
 """
 
 import inspect
@@ -26,12 +26,12 @@ def call_guidance(
 ) -> dict[str, Any]:
     """Call ``guidance`` with these renders.
 
-    All get ``prompt_utils``, the whole batch and the options, or as much of them as they take: one
-    by an image (zero123) knows no prompt. threestudio passes the prompt as the second argument,
-    which may thus have any name.
+    A guidance gets those of ``prompt_utils``, the entries of the batch and the options that its
+    signature accepts; image-conditioned ones (zero123), for example, have no prompt. threestudio
+    passes the prompt as the second positional argument, so that argument may have any name.
 
     Raises:
-        UserError: it returns no dict, or a ``loss_*`` that isn't one number.
+        UserError: the guidance returns no dict, or a ``loss_*`` that isn't a single number.
     """
     call = guidance.forward if isinstance(guidance, nn.Module) else guidance.__call__
     arguments = inspect.signature(call).parameters
@@ -50,8 +50,8 @@ def call_guidance(
 
 
 def _checked(out: Any, name: str, device: torch.device) -> dict[str, Any]:
-    """Check what a guidance returned and make every ``loss_*`` a tensor of one number: some return
-    plain numbers for a loss that is off.
+    """Check the output of a guidance, and convert every ``loss_*`` to a scalar tensor, since some
+    guidances return plain numbers for disabled losses.
     """
     if not isinstance(out, dict):
         raise UserError(
@@ -74,14 +74,14 @@ def _checked(out: Any, name: str, device: torch.device) -> dict[str, Any]:
 
 @contextmanager
 def own_randomness(step: int) -> Iterator[None]:
-    """Seed torch's global generators with (seed, step), for guidances that draw from them; their
-    state is restored afterwards.
+    """Seed torch's global generators with (seed, step) in this context, for guidances that draw
+    from them; restore their state afterwards.
 
-    So a resumed run draws what the run that never stopped drew, and looking at pictures in between
-    changes nothing."""
+    A resumed run thus draws the same values as an uninterrupted one, and rendering validation
+    pictures doesn't change the values that training draws."""
     devices = [torch.cuda.current_device()] if torch.cuda.is_available() else []
     with torch.random.fork_rng(devices):
-        # without a GPU torch.manual_seed notes a stack trace for each kind that isn't there: a
+        # without a GPU torch.manual_seed records a stack trace for each missing device kind: a
         # millisecond each step
         gpu = devices or torch.backends.mps.is_available()
         (torch.manual_seed if gpu else torch.default_generator.manual_seed)(
@@ -90,36 +90,38 @@ def own_randomness(step: int) -> Iterator[None]:
         yield
 
 
-# What a guidance itself learns, as VSD its LoRA
+# Parameters that a guidance trains itself, such as the LoRA of VSD
 # ---------------------------------------------------------------------------------
 
 
 def trainable_parameters(guidance: Any) -> dict[str, nn.Parameter]:
-    """Return the parameters that a guidance trains, by name; none for most."""
+    """Return the parameters that a guidance trains, by name; empty for most guidances."""
     named = guidance.named_parameters() if isinstance(guidance, nn.Module) else ()
     return {name: parameter for name, parameter in named if parameter.requires_grad}
 
 
 def trainable_groups(guidance: Any, lr: float) -> list[dict[str, Any]]:
-    """Return the optimiser's group of what a guidance learns; none for most.
+    """Return an optimiser group of the parameters that a guidance trains; none for most guidances.
 
     Args:
-        lr: its learning rate.
+        lr: learning rate of the group.
     """
     learning = list(trainable_parameters(guidance).values())
     return [{"params": learning, "name": "guidance", "lr": lr}] if learning else []
 
 
 def learnt_weights(guidance: Any) -> dict[str, Tensor]:
-    """Return what a guidance has learnt, for a checkpoint; its frozen weights are the model's."""
+    """Return the trained parameters of a guidance, for a checkpoint. Frozen weights aren't stored,
+    since they are those of the published model.
+    """
     return {name: parameter.detach() for name, parameter in trainable_parameters(guidance).items()}
 
 
 def restore_learnt(guidance: Any, weights: dict[str, Tensor]) -> None:
-    """Put back what :func:`learnt_weights` gave.
+    """Restore parameters that :func:`learnt_weights` returned.
 
     Raises:
-        UserError: the guidance learns something else.
+        UserError: names or shapes differ from the parameters that the guidance trains.
     """
     own = trainable_parameters(guidance)
     if {name: parameter.shape for name, parameter in own.items()} != {

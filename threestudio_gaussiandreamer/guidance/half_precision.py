@@ -1,5 +1,5 @@
-"""Half-precision networks between float32 tensors: their type, and gradients that neither overflow
-nor vanish on the way back.
+"""Half-precision networks with float32 inputs and outputs: their dtype, and a scaling of gradients
+that prevents overflow and underflow in the backward pass.
 """
 
 from collections.abc import Callable
@@ -10,29 +10,33 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
 PEAK = 64.0
-"""A gradient enters a half-precision network with a largest element in [PEAK, 2 PEAK): float16 goes
-up to 65504, and down to 6e-8, so that it may grow a thousandfold inside and elements a hundred
-million times smaller still count.
+"""Gradients are scaled so that their largest element is in [PEAK, 2 PEAK) when they enter the
+backward pass of a half-precision network.
+
+float16 represents magnitudes from 6e-8 to 65504. Inside the network gradients may thus grow by a
+factor of 500, and elements 10^9 times smaller than the largest don't vanish.
 """
 
 
 def weights_type(half: bool, device: torch.device) -> torch.dtype:
-    """Return float16 on a GPU when ``half`` is asked for, else float32: the CPU gains nothing from
-    half precision.
+    """Return float16 on a GPU if ``half`` is set, else float32. On the CPU half precision has no
+    advantage.
     """
     return torch.float16 if half and device.type == "cuda" else torch.float32
 
 
 class PerItemLossScale:
-    """Loss scale of each item inside a half-precision network, for one forward and backward pass.
+    """A separate loss scale for each item, for one forward and backward pass of a half-precision
+    network.
 
-    ``leave`` scales each item's gradient by a power of two before it goes back through the network,
-    ``enter`` undoes that in float32 behind it. Both are the identity forwards. The loss may thus
-    have any scale, a gradient scaler's 65536 included.
+    ``enter`` is applied to the input of the network and ``leave`` to its output; both are the
+    identity in the forward pass. In the backward pass ``leave`` multiplies the gradient of each
+    item by a power of two, and ``enter`` divides by it in float32. The loss may thus have any
+    scale, also a gradient scaler's 65536.
 
     Args:
-        on_result: told, when the gradient has come back, which items' isn't finite, (B,) bool;
-            those are set to zero.
+        on_result: called in the backward pass with a mask, (B,) bool, of items whose gradient isn't
+            finite; those gradients are set to zero.
     """
 
     def __init__(self, on_result: Callable[[Bool[Tensor, " B"]], None]) -> None:

@@ -1,8 +1,8 @@
-"""What a guidance knows of the object that it asks for, where that is more than a prompt.
+"""The ground truth of guidances that have one, such as a mesh.
 
-A guidance with an attribute ``truth`` (a :class:`KnownTruth`) has its runs measured: dB in the
-progress bar, the truth beside validation pictures, ``budget: auto`` judged against it, and, where
-the truth is a mesh, scores on held-out views.
+If a guidance has an attribute ``truth`` (a :class:`KnownTruth`), its runs are compared with it: the
+progress bar shows PSNR, validation pictures show the ground truth, ``budget: auto`` measures the
+loss of PSNR against it, and, if it is a mesh, held-out views are scored.
 """
 
 from collections.abc import Callable
@@ -20,10 +20,10 @@ PictureSize = Callable[[int, int], tuple[int, int]]
 
 
 class KnownTruth(Protocol):
-    """Pictures of the object from any camera."""
+    """Renders the ground truth from any camera."""
 
     mesh: Optional[MeshCaster]
-    """Casts the mesh from held-out cameras; None where the truth isn't a mesh."""
+    """Ray casts the mesh from held-out cameras; None if the ground truth isn't a mesh."""
 
     def render(
         self,
@@ -32,36 +32,36 @@ class KnownTruth(Protocol):
         *,
         size: Optional[tuple[int, int]] = None,
     ) -> Float[Tensor, "B H W 3"]:
-        """Return what the views of a batch should show.
+        """Render the ground truth from the views of a batch.
 
         Args:
-            batch: with ``c2w``, ``fovy``, ``height`` and ``width``.
-            background: of the renders, (B, 1, 1, 3) or (B, H, W, 3); black without one.
-            size: (height, width) of the pictures; the batch's without one.
+            batch: has ``c2w``, ``fovy``, ``height`` and ``width``.
+            background: (B, 1, 1, 3) or (B, H, W, 3); None for black.
+            size: (height, width) of the pictures, pixels; None for the batch's size.
         """
 
     def prefetch(
         self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int
     ) -> None:
-        """Render these views in advance, where it saves time: training will ask for most of them at
-        this size.
+        """Render these views in advance, if that saves time. Called if training will need most of
+        them, at this size.
         """
 
 
 def truth_of(guidance: Any) -> Optional[KnownTruth]:
-    """Return what a guidance, maybe another package's, knows of the truth; None for most."""
+    """Return the ground truth of a guidance, also of other packages'; None if it has none."""
     return getattr(guidance, "truth", None)
 
 
 class MeshTruth:
-    """A :class:`KnownTruth` by ray casting, which keeps the pictures of the last cameras.
+    """A :class:`KnownTruth` that ray casts a mesh and caches the pictures of recent cameras.
 
     Args:
-        mesh: casts the mesh.
+        mesh: casts rays at the mesh.
         supersample: rays per pixel and axis.
-        max_cached: pictures that are kept, as bytes.
-        prefetch_size: returns the size of the picture that training needs for a render of
-            (height, width) pixels; None where it needs none.
+        max_cached: largest number of cached pictures, which are stored as uint8.
+        prefetch_size: maps (height, width) of a render to the size of the picture that training
+            needs for it; None if training needs no pictures.
     """
 
     def __init__(
@@ -92,7 +92,9 @@ class MeshTruth:
     def prefetch(
         self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int
     ) -> None:
-        """Cast these views in large groups, which takes a third of the time, if all can be kept."""
+        """Cast these views in large batches, which takes a third of the time, if all fit into the
+        cache.
+        """
         if self._prefetch_size is None or len(c2w) > self.pictures.capacity:
             return
         height, width = self._prefetch_size(height, width)
@@ -104,7 +106,7 @@ class MeshTruth:
 def background_of(
     background: Optional[Tensor], batch: int, device: torch.device
 ) -> Float[Tensor, "B bh bw 3"]:
-    """Return the renders' background, detached; black without one."""
+    """Return the background of the renders, detached, or black if it is None."""
     if background is None:
         return torch.zeros(batch, 1, 1, 3, device=device)
     return background.detach().float().expand(batch, -1, -1, -1)
@@ -113,7 +115,7 @@ def background_of(
 def composite(
     rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B bh bw 3"]
 ) -> Float[Tensor, "B 3 H W"]:
-    """Composite premultiplied pictures over the background, which is resized to them."""
+    """Composite premultiplied pictures over the background, which is resized to their size."""
     background = background.movedim(-1, 1)
     if background.shape[-2:] != (1, 1):
         background = resized(background, tuple(rgba.shape[1:3]))

@@ -61,8 +61,8 @@ class StableDiffusionGuidance(TextToImageDistillation):
         self._bad_backwards = 0
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B 4 h w"]:
-        """A draw from the VAE's posterior, a function of (seed, step, item), at unit variance;
-        float32.
+        """Draw latents from the VAE's posterior, scaled to unit variance, float32. The draw is a
+        function of (seed, step, item).
         """
         images = self.resized(rgb, self.image_size) * 2 - 1
         if self.dtype == torch.float32:
@@ -88,13 +88,13 @@ class StableDiffusionGuidance(TextToImageDistillation):
 
     def decode(self, latents: Float[Tensor, "B 4 h w"]) -> Float[Tensor, "B 3 s s"]:
         latents = (latents / self.vae.config.scaling_factor).to(self.dtype)
-        # one at a time: the memory is needed elsewhere, and this is only looked at
+        # one at a time, since memory matters more than the speed of pictures for display
         images = torch.cat([self.vae.decode(latent).sample for latent in latents.split(1)]).float()
         return (images / 2 + 0.5).clamp(0, 1)
 
     def _count_bad_backwards(self, bad: Bool[Tensor, " B"]) -> None:
-        """Count backward passes in which the encoder's gradient of some items wasn't finite, so
-        that they were left out; stop when that goes on.
+        """Count consecutive backward passes in which the encoder's gradient of some items wasn't
+        finite and was set to zero; raise NonFiniteScore after ``max_bad_steps``.
         """
         count = int(bad.sum())
         self._bad_backwards = self._bad_backwards + 1 if count else 0

@@ -1,5 +1,5 @@
-"""What guidances by a text-to-image diffusion model share: loading its UNet, its noise schedule,
-and one forward pass for all prompts.
+"""The base class of guidances by text-to-image diffusion models: it loads the UNet and the noise
+schedule, and evaluates all prompts in one forward pass.
 
 ==================================  ================================================================
 option                              meaning
@@ -47,24 +47,25 @@ from .base import ScoreDistillation
 from .half_precision import weights_type
 
 TERMINAL_ABAR = 2.0**-24
-"""In the place of an ``abar`` of exactly 0, the last step of a schedule with zero terminal signal:
-``predict_x0`` divides by its root.
+"""Replaces an ``abar`` of exactly 0, which schedules with zero terminal SNR have at the last step,
+since ``predict_x0`` divides by its square root.
 """
 
 
 class Condition(NamedTuple):
-    """The prompts of B views: k rows for each."""
+    """The text embeddings of B views, k rows per view."""
 
     embeddings: Float[Tensor, "kB N F"]
-    """All prompts, all negative prompts, then with Perp-Neg two more for each view, view by view.
+    """Prompts of all views, negative prompts of all views, and with Perp-Neg two further rows for
+    each view, adjacent.
     """
     negative_weights: Optional[Float[Tensor, "B 2"]]
-    """The weights of those two, <= 0; None without Perp-Neg."""
+    """The weights of the two Perp-Neg rows, <= 0; None without Perp-Neg."""
 
 
 class TextToImageDistillation(ScoreDistillation):
-    """Score distillation from a UNet that is conditioned on text embeddings; a subclass knows its
-    images.
+    """Score distillation from a UNet that is conditioned on text embeddings. Subclasses define how
+    images are encoded.
     """
 
     @dataclass
@@ -113,8 +114,8 @@ class TextToImageDistillation(ScoreDistillation):
         self.load(folder)
 
     def set_schedule(self, folder: Path) -> None:
-        """The noise schedule that the model was trained with, in float64, and what its UNet
-        predicts.
+        """Read the noise schedule of the model's training, float64, and the prediction type of its
+        UNet.
         """
         from diffusers import DDPMScheduler
 
@@ -138,7 +139,7 @@ class TextToImageDistillation(ScoreDistillation):
         self.update_step(0, 0)
 
     def load(self, folder: Path) -> None:
-        """Load the networks; a subclass adds its own."""
+        """Load the networks; subclasses extend this with their own."""
         from diffusers import UNet2DConditionModel
 
         cfg = self.cfg
@@ -158,8 +159,8 @@ class TextToImageDistillation(ScoreDistillation):
             self.unet = torch.compile(self.unet)
 
     def size_of_images(self, factor: int = 1) -> int:
-        """Height and width that the model sees, pixels: what is asked for, or what it was trained
-        with, ``factor`` times its latents.
+        """Return height and width of the images for the model, pixels: ``image_size``, or
+        ``factor`` times the latent size that the model was trained with.
 
         Raises:
             UserError: neither is known.
@@ -173,8 +174,8 @@ class TextToImageDistillation(ScoreDistillation):
         return self.cfg.image_size or trained * factor
 
     def require_text_to_image(self, channels: int) -> None:
-        """Raise UserError unless the UNet takes a picture of so many channels and a text, and
-        nothing else.
+        """Raise UserError unless the inputs of the UNet are an image of ``channels`` channels and
+        text embeddings only.
         """
         config = self.unet.config
         wanted = {
@@ -215,12 +216,15 @@ class TextToImageDistillation(ScoreDistillation):
             ) from error
         cpu_offload(self.unet, execution_device=self.device)
 
-    # The path of score distillation
+    # Score distillation
     # ---------------------------------------------------------------------------------------
 
     def condition(self, prompt_utils: Any, **batch: Any) -> Condition:
-        """The text embeddings of these views; ``prompt_utils`` is ours or threestudio's
-        ``PromptProcessorOutput``.
+        """Return the text embeddings of the batch's views.
+
+        Args:
+            prompt_utils: a :class:`.view_prompts.PromptEmbeddings`, or threestudio's
+                ``PromptProcessorOutput``.
         """
         if not hasattr(prompt_utils, "get_text_embeddings"):
             raise UserError(
@@ -278,20 +282,20 @@ class TextToImageDistillation(ScoreDistillation):
     def noise(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], embeddings: Float[Tensor, "kB N F"]
     ) -> Float[Tensor, "kB c h w"]:
-        """Predict the noise with the UNet, float32, for each row of ``embeddings`` on the latent of
-        its view, in one forward pass.
+        """Predict the noise, float32, for each row of ``embeddings`` and the latent of its view, in
+        one forward pass of the UNet.
         """
         rows = view_of_row(len(z), len(embeddings)).to(z.device)
         z, t = z[rows], t[rows]
         output = self.unet(
             z.to(self.dtype), t, encoder_hidden_states=embeddings.to(self.dtype)
         ).sample.float()
-        # a model may predict the variance of the reverse step beside it
+        # models may also predict the variance of the reverse step, in further channels
         return PREDICTIONS[self.prediction_type](output[:, : z.shape[1]], z, self._abar[t])
 
     def resized(self, images: Float[Tensor, "B 3 H W"], size: int) -> Float[Tensor, "B 3 s s"]:
-        """Resize images to the model's size; with antialiasing when shrunk more than twofold, since
-        bilinear sampling skips pixels.
+        """Resize images to the model's size, with antialiasing if they shrink by more than a factor
+        of 2, since bilinear sampling would skip pixels.
         """
         if images.shape[-2:] == (size, size):
             return images
@@ -313,15 +317,13 @@ PREDICTIONS = {
         (z - sds.per_item(abar.sqrt(), z) * output) / sds.per_item((1 - abar).sqrt(), z)
     ),
 }
-"""What the network puts out, as noise: it may predict the noise, v = sqrt(abar) eps - sqrt(1 -
-abar) x0 (Salimans and Ho 2022), or x0.
+"""Conversions of the network's output to the noise, by prediction type: the noise itself,
+v = sqrt(abar) eps - sqrt(1 - abar) x0 (Salimans and Ho 2022), or x0.
 """
 
 
 def view_of_row(views: int, rows: int) -> Int[Tensor, " kB"]:
-    """Return which view each row of a :class:`Condition` belongs to: 0..B-1, 0..B-1, then 0, 0, 1,
-    1, ...
-    """
+    """Return the view of each row of a :class:`Condition`: 0..B-1, 0..B-1, then 0, 0, 1, 1, ..."""
     order = torch.arange(views)
     return torch.cat([order, order, order.repeat_interleave(2)])[:rows]
 
@@ -335,7 +337,7 @@ def perp_neg(
     """Compute eps_u + d + sum_i w_i (n_i - proj_d n_i), where d = eps_c - eps_u, n_i = eps_i -
     eps_u (Armandpour et al. 2023, eq. 9).
 
-    Guided with scale s this is eps_u + s (d + ...), the paper's formula.
+    Classifier-free guidance with scale s turns this into eps_u + s (d + ...), the paper's formula.
     """
     wanted = (cond - uncond)[:, None]
     unwanted = negative - uncond[:, None]
@@ -352,8 +354,10 @@ def rescaled(
     abar: Float[Tensor, " B"],
     share: float,
 ) -> Float[Tensor, "B c h w"]:
-    """Rescale the guided noise so that its x0 has the standard deviation of the conditional x0, by
-    ``share`` (0 none, 1 all).
+    """Rescale the guided noise so that its x0 has the standard deviation of the conditional x0.
+
+    Args:
+        share: 0 for no effect, 1 for the full rescaling; linear between.
     """
     x0, reference = sds.predict_x0(z, guided, abar), sds.predict_x0(z, cond, abar)
     factor = _deviation(reference) / _deviation(x0)

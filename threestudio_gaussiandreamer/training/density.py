@@ -35,16 +35,16 @@ from .density_options import AUTO, min_count, rounds_of
 
 
 class QualityResult(NamedTuple):
-    """How one batch of views looks without some of the Gaussians."""
+    """The quality of one batch of views if some of the Gaussians are removed."""
 
     margin: Float[Tensor, ""]
-    """dB between what is lost and what may be lost; negative where too much is."""
+    """The allowed loss minus the actual loss, dB; negative if too much is lost."""
     measured: dict[str, float]
     """dB by their name in the logs."""
 
 
 QualityCheck = Callable[[Bool[Tensor, " N"]], QualityResult]
-"""Measures the quality with only the marked Gaussians."""
+"""Measures the quality if only the marked Gaussians are rendered."""
 
 
 class DensityOutcome(NamedTuple):
@@ -52,7 +52,7 @@ class DensityOutcome(NamedTuple):
 
     before: int
     after: int
-    """Gaussians."""
+    """Number of Gaussians after the changes."""
     replaced: bool
     """Whether the cloud has new parameters."""
     measured: dict[str, float]
@@ -82,13 +82,13 @@ class DensityControl:
 
     @property
     def prune_rounds(self) -> range:
-        """The numbers of finished steps after which a round of pruning is due."""
+        """The steps after which a round of pruning takes place."""
         rounds = rounds_of(self.cfg.prune)
         return rounds[len(rounds) // 2 :] if self.cfg.budget == AUTO else rounds
 
     def kept_share(self, count: int, step: int) -> float:
-        """Return the share of ``count`` Gaussians that the round at ``step`` keeps: ``prune.keep``,
-        or less where the remaining rounds couldn't meet the budget otherwise.
+        """Return the fraction of ``count`` Gaussians that the round at ``step`` keeps:
+        ``prune.keep``, or less if the remaining rounds couldn't meet the budget otherwise.
         """
         left = sum(later >= step for later in self.prune_rounds)
         if self.cfg.budget in (None, AUTO) or not left:
@@ -97,14 +97,14 @@ class DensityControl:
 
     @property
     def affordable_loss(self) -> float:
-        """dB that one round of ``auto`` may lose: since later steps may not recover it, all rounds
-        together lose at most ``prune.quality``.
+        """The loss that one round of ``auto`` is allowed, dB. All rounds share ``prune.quality``
+        equally, since later steps may not recover what a round loses.
         """
         return self.cfg.prune.quality / max(1, len(self.prune_rounds))
 
     def schedule_problem(self, step: int, max_steps: int) -> Optional[str]:
-        """Describe why the budget won't be met by the rounds between ``step`` and ``max_steps``
-        (-1: no end), or only in larger rounds than ``prune.keep``; None where it is met.
+        """Describe why the rounds between ``step`` and ``max_steps`` (-1: unlimited) can't meet the
+        budget, or only if they keep less than ``prune.keep``; return None if they meet it.
         """
         end = max_steps if max_steps > 0 else math.inf
         budget, rounds, count = self.cfg.budget, self.prune_rounds, len(self.cloud)
@@ -121,7 +121,7 @@ class DensityControl:
         return self._shortage([round_ for round_ in rounds if step < round_ <= end])
 
     def _shortage(self, to_come: list[int]) -> Optional[str]:
-        """Describe why these rounds are too few for the budget; None where they aren't."""
+        """Describe why these rounds are too few for the budget; return None if they suffice."""
         budget, keep, count = self.cfg.budget, self.cfg.prune.keep, len(self.cloud)
         if not to_come:
             return (
@@ -141,7 +141,11 @@ class DensityControl:
 
     def before_backward(self, pictures: dict[str, Any], step: int) -> None:
         """Add a sample of the removal error in these renders to the statistics, if the next round
-        of pruning uses it; ``step`` counts the steps finished before this one.
+        of pruning uses it.
+
+        Args:
+            pictures: output of the renderer.
+            step: number of finished optimiser steps.
         """
         if not self.samples_removal(step):
             return
@@ -155,7 +159,7 @@ class DensityControl:
             importance.removal_error(image, pictures["gaussian_opacities"], rng)
         )
         if self.cloud.wants_absgrad:
-            # the sample's backward pass has added to it, and the statistics are of the loss
+            # the sample's backward pass has added to absgrad, but the statistics are of the loss
             pictures["rasterized"].means2d.absgrad.zero_()
 
     def samples_removal(self, step: int) -> bool:
@@ -174,7 +178,7 @@ class DensityControl:
         statistics.
 
         Args:
-            out: what was rendered, with gradients at ``means2d``.
+            out: output of the rasteriser, with gradients at ``means2d``.
             width, height: pixels.
             loss_scale: the factor of automatic mixed precision on the gradients.
         """
@@ -192,12 +196,12 @@ class DensityControl:
     def after_step(
         self, optimizer: torch.optim.Optimizer, step: int, check: Optional[QualityCheck] = None
     ) -> DensityOutcome:
-        """Densify and prune where the schedules say so.
+        """Densify and prune if the schedules have a round at ``step``.
 
         Args:
-            optimizer: its parameters and state rows follow the Gaussians.
-            step: finished optimiser steps.
-            check: for ``budget: auto``; without it nothing is pruned then.
+            optimizer: its parameters and rows of its state are updated with the Gaussians.
+            step: number of finished optimiser steps.
+            check: required for ``budget: auto``, which prunes nothing without it.
         """
         before, measured = len(self.cloud), {}
         change = self._densify(step)
@@ -208,8 +212,8 @@ class DensityControl:
         return DensityOutcome(before, len(self.cloud), change is not None, measured)
 
     def _densify(self, step: int) -> Optional[Change]:
-        """Return the change of a due round of densification; None where nothing is cloned, split or
-        dropped.
+        """Return the change by a round of densification at ``step``; None if there is no round or
+        nothing is cloned, split or dropped.
         """
         if not self.cfg.densify.enabled or step not in rounds_of(self.cfg.densify):
             return None
@@ -219,7 +223,7 @@ class DensityControl:
         return change if change.is_new.any() or len(change.parents) < len(self.cloud) else None
 
     def densified(self, step: int) -> Change:
-        """Clone, split and drop by the statistics."""
+        """Clone, split and drop Gaussians according to the statistics."""
         cfg, cloud = self.cfg.densify, self.cloud
         rules = Rules(
             cfg.grad_threshold,
@@ -238,8 +242,8 @@ class DensityControl:
         )
 
     def _cap(self) -> int:
-        """Return how many Gaussians densification may lead to: under a budget no more than that, or
-        than there are.
+        """Return the largest number of Gaussians after densification: ``max_gaussians``, and with a
+        budget at most the larger of the budget and the current number (for ``auto`` the latter).
         """
         budget, count = self.cfg.budget, len(self.cloud)
         if budget is None:
@@ -249,8 +253,13 @@ class DensityControl:
     def _prune(
         self, step: int, first: Optional[Change], check: Optional[QualityCheck]
     ) -> tuple[Change, dict[str, float]]:
-        """Make one round towards the budget, after the change ``first`` if there is one; returns
-        the change from the cloud as it is, and what ``auto`` measured.
+        """Prune once towards the budget.
+
+        Args:
+            first: the change by densification at the same step, to which pruning is applied.
+
+        Returns:
+            the combined change of the current cloud, and the values that ``auto`` has measured.
         """
         cloud, cfg = self.cloud, self.cfg.prune
         values = cloud.parameters_by_name() if first is None else first.values
@@ -261,7 +270,7 @@ class DensityControl:
         share = self.kept_share(len(scores), step)
         count, measured = importance.next_count(len(scores), share, min_count(self.cfg)), {}
         if self.cfg.budget == AUTO and (first is not None or check is None):
-            count = len(scores)  # no view has shown what densification made
+            count = len(scores)  # new Gaussians haven't been rendered, so have no statistics
         elif self.cfg.budget == AUTO:
             top = importance.top_count(stats.contribution) if cfg.score == "contribution" else 0
             count, measured = fewest_that_hold(scores, max(count, top), check)
@@ -271,14 +280,16 @@ class DensityControl:
 def fewest_that_hold(
     scores: Float[Tensor, " N"], least: int, check: QualityCheck
 ) -> tuple[int, dict[str, float]]:
-    """Find the fewest Gaussians, at least ``least``, with which the quality holds, and what was
-    measured with them (nothing where all stay).
+    """Find the smallest number of Gaussians, at least ``least``, that passes ``check``.
+
+    Returns:
+        the number, and the values that were measured with it (empty if all Gaussians are kept).
     """
     measured: dict[int, dict[str, float]] = {}
 
     def holds(kept: Bool[Tensor, " N"]) -> bool:
         result = check(kept)
-        # every process renders other views, and all have to decide alike
+        # processes render different views, but must make the same decision
         if not all_sum(result.margin) >= 0:
             return False
         measured[int(kept.sum())] = result.measured
@@ -289,13 +300,13 @@ def fewest_that_hold(
 
 
 class RenderedQuality:
-    """The :data:`QualityCheck` by renders of one batch of views: the loss of dB against the truth
-    where it is known, elsewhere the PSNR between the renders.
+    """A :data:`QualityCheck` that renders one batch of views. It measures the loss of PSNR to the
+    ground truth if there is one, else the PSNR between the renders.
 
     Args:
-        control: whose cloud is rendered, and whose options say what may be lost.
-        render: returns the renderer's pictures of the cloud as it is drawn now.
-        truth: returns what these pictures should show, (B, H, W, 3), or None.
+        control: has the cloud to render, and the options for the allowed loss.
+        render: renders the current cloud.
+        truth: given the renders, returns the ground truth (B, H, W, 3), or None.
     """
 
     def __init__(
@@ -308,7 +319,7 @@ class RenderedQuality:
 
     @cached_property
     def whole(self) -> dict[str, Any]:
-        """The pictures with all Gaussians."""
+        """The renders with all Gaussians."""
         return self.render()
 
     @cached_property
@@ -317,7 +328,7 @@ class RenderedQuality:
 
     @torch.no_grad()
     def __call__(self, kept: Bool[Tensor, " N"]) -> QualityResult:
-        """Render with only the ``kept`` Gaussians and compare."""
+        """Measure the quality of renders with only the ``kept`` Gaussians."""
         whole = self.whole["comp_rgb"]
         with self.control.cloud.showing_only(kept):
             fewer = self.render()["comp_rgb"]

@@ -1,7 +1,7 @@
-"""Stop a run whose parameters or optimiser state aren't finite, before anything of it is written.
+"""Stop a run whose parameters or optimiser state aren't finite, before they are saved.
 
-NaN doesn't heal: Adam's moments keep it, and the rasteriser leaves the Gaussian out, so a run that
-went on would end without an error and with holes.
+Adam's moments stay NaN once they are, and the rasteriser skips Gaussians with NaN. Without this
+check such a run would end without an error, and with holes in the object.
 """
 
 from collections.abc import Iterable, Iterator
@@ -12,7 +12,7 @@ from torch import Tensor
 from ..core.errors import UserError
 
 CHECK_EVERY = 25
-"""Optimiser steps between two checks, each of which waits for the device once."""
+"""Optimiser steps between two checks, each of which synchronises with the device once."""
 
 Named = Iterable[tuple[str, Tensor]]
 
@@ -37,17 +37,18 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer) -> Iterator[tuple[str, T
 
 @torch.no_grad()
 def require_finite(tensors: Named, step: int) -> None:
-    """Check that no tensor holds NaN or infinity; waits for the device once.
+    """Check that no tensor contains NaN or infinity; synchronises with the device once.
 
     Args:
         tensors: (name, values of any shape).
         step: finished optimiser steps, for the message.
 
     Raises:
-        NonFiniteParameters: names the first tensor that isn't finite, and how much of it.
+        NonFiniteParameters: the message has the name of the first tensor that isn't finite, and the
+            number of its bad values.
     """
     named = list(tensors)
-    # in float64 a sum of float32 can't overflow: it is finite exactly if all of its terms are
+    # a float64 sum of float32 values can't overflow, so it is finite if and only if all of them are
     sums = [values.sum(dtype=torch.float64).to(named[0][1].device) for _, values in named]
     if not sums or torch.stack(sums).isfinite().all():
         return

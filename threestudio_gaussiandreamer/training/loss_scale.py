@@ -1,5 +1,5 @@
-"""The loss scale of automatic mixed precision: a factor on all gradients, which is halved, and the
-step left out, where it makes them infinite.
+"""The loss scale of automatic mixed precision: a factor on all gradients. If it makes them
+infinite, it is halved and the step is skipped.
 """
 
 from typing import Any
@@ -8,19 +8,19 @@ from ..host import warn
 
 
 class LossScale:
-    """Follows the scale through a run and counts the steps that were left out."""
+    """Track the loss scale of a run, and count the skipped steps."""
 
     def __init__(self) -> None:
         self.skipped_steps = 0
 
     def value(self, trainer: Any) -> float:
-        """Return the factor on the gradients now; 1 without mixed precision."""
+        """Return the current factor on the gradients; 1 without mixed precision."""
         scaler = getattr(trainer.precision_plugin, "scaler", None)
         return 1.0 if scaler is None else float(scaler.get_scale())
 
     def has_skipped(self, trainer: Any, before: float) -> bool:
-        """Return whether the step that began at the scale ``before`` was left out; if so, count it
-        and say so.
+        """Return whether the step that began with the scale ``before`` was skipped; if so, count
+        and report it.
         """
         if self.value(trainer) >= before:
             return False

@@ -17,10 +17,10 @@ REGULARISERS = ("sparsity", "opaque")
 def weighted_losses(
     guided: Mapping[str, Any], alpha: Float[Tensor, "B H W 1"], weights: Mapping[str, float]
 ) -> dict[str, Tensor]:
-    """Multiply the ``loss_*`` of a guidance, and the regularisers with a weight, by their weights.
+    """Compute the weighted ``loss_*`` of a guidance, and the weighted regularisers.
 
     Raises:
-        UserError: a weight without a loss, or a loss without a weight.
+        UserError: there is a weight without a loss, or a loss without a weight.
     """
     raw = {k.removeprefix("loss_"): v for k, v in guided.items() if k.startswith("loss_")}
     check_weights(weights, raw)
@@ -29,7 +29,7 @@ def weighted_losses(
 
 
 def loggable(guided: Mapping[str, Any]) -> dict[str, Any]:
-    """Select what is one number and no loss; guidances also return pictures and latents."""
+    """Select the scalars that aren't losses; guidances also return pictures and latents."""
     return {k: v for k, v in guided.items() if not k.startswith("loss_") and _is_one_number(v)}
 
 
@@ -38,8 +38,8 @@ def _is_one_number(value: Any) -> bool:
 
 
 def logged_names(guidance: type, options: Iterable[str]) -> Optional[set[str]]:
-    """Name what a run logs with the weights ``options``; None for a class of guidance that doesn't
-    say what it returns.
+    """Return the names that a run with the loss weights ``options`` logs; None if the class of the
+    guidance doesn't declare what it returns.
     """
     if not issubclass(guidance, ScoreDistillation):
         return None
@@ -50,11 +50,10 @@ def logged_names(guidance: type, options: Iterable[str]) -> Optional[set[str]]:
 
 
 def check_losses(guidance: type, options: Iterable[str]) -> None:
-    """Check the keys of ``system.loss``, where the class of the guidance says which losses it
-    returns.
+    """Check the keys of ``system.loss``, if the class of the guidance declares its losses.
 
     Raises:
-        UserError: a key that isn't ``lambda_*``, or see :func:`check_weights`.
+        UserError: a key isn't ``lambda_*``, or see :func:`check_weights`.
     """
     for name in options:
         if not name.startswith("lambda_"):
@@ -62,7 +61,7 @@ def check_losses(guidance: type, options: Iterable[str]) -> None:
                 f"unknown key 'system.loss.{name}': weights of losses are called "
                 "lambda_<loss>, such as lambda_sds"
             )
-    known = getattr(guidance, "LOSSES", None)  # another package's guidance may have it too
+    known = getattr(guidance, "LOSSES", None)  # also of guidances that aren't ScoreDistillation
     if known is not None:
         check_weights([name.removeprefix("lambda_") for name in options], known)
 
@@ -84,8 +83,8 @@ def check_weights(weights: Iterable[str], losses: Iterable[str]) -> None:
 
 
 def regulariser(name: str, alpha: Float[Tensor, "B H W 1"]) -> Float[Tensor, ""]:
-    """Compute threestudio's term on the rendered alpha: ``sparsity`` is mean sqrt(alpha^2 + 0.01),
-    ``opaque`` the entropy, which is least at 0 and 1.
+    """Compute one of threestudio's regularisers of the rendered alpha: ``sparsity`` is mean
+    sqrt(alpha^2 + 0.01), ``opaque`` the entropy, which is smallest if every alpha is 0 or 1.
     """
     if name == "sparsity":
         return (alpha**2 + 0.01).sqrt().mean()

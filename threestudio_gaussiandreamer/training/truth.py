@@ -1,4 +1,4 @@
-"""What views of a run should show, where its guidance knows it; see ``guidance/known_truth.py``."""
+"""Ground-truth pictures of a run's views, for guidances that have them (``known_truth.py``)."""
 
 import math
 from typing import Any, Optional
@@ -14,8 +14,8 @@ from .renderer import SplattingRenderer
 def true_views(
     guidance: Any, batch: dict[str, Any], out: dict[str, Any]
 ) -> Optional[Float[Tensor, "B H W 3"]]:
-    """Render what a batch should show, on the background and at the size of its renders ``out``;
-    None where ``guidance`` doesn't know.
+    """Render the ground truth of a batch, with the background and size of its renders ``out``; None
+    if ``guidance`` has none.
     """
     truth = truth_of(guidance)
     if truth is None:
@@ -24,8 +24,8 @@ def true_views(
 
 
 def prefetch_truth(system: Any) -> None:
-    """Render the truth from all cameras of a fixed pool at once, if the run of ``system`` will
-    come to most of them.
+    """Render the ground truth for all cameras of a fixed pool in advance, if the run of ``system``
+    will use most of them.
     """
     truth, trainer = truth_of(system.guidance), system.trainer
     if truth is None or not isinstance(trainer.datamodule, GaussianDreamerDataModule):
