@@ -1,8 +1,8 @@
-"""What all exporters share.
+"""The base class of exporters.
 
-An exporter is one file: a subclass of the host's ``Exporter`` registered as ``<format>-exporter``,
-whose call returns a list of ``ExporterOutput(save_name, save_type, params)``; the system writes
-each with its ``save_<save_type>(name, **params)``."""
+Each exporter has its own module: a subclass of the host's ``Exporter``, registered as
+``<format>-exporter``. A call returns a list of ``ExporterOutput(save_name, save_type, params)``,
+and the system writes each with its method ``save_<save_type>(name, **params)``."""
 
 import os
 from dataclasses import dataclass, field
@@ -15,15 +15,15 @@ from ..gaussians.gaussians import Gaussians, finite
 from ..host import BaseGeometry, Exporter
 
 NAME_BYTES = 255
-"""The longest name of a file on common file systems."""
+"""The longest file name on common file systems, bytes."""
 
 
 RESERVED = ("pruned", "report.json", "report.png")
-"""What a run itself writes into the folder of its exports."""
+"""Names that a run itself uses in the export folder."""
 
 
 def require_file_name(option: str, name: str) -> None:
-    """Raise UserError unless ``name`` is that of a file inside the export folder.
+    """Raise UserError unless ``name`` is a valid name of a file directly in the export folder.
 
     Args:
         option: the path of the option, for the message.
@@ -40,11 +40,11 @@ def require_file_name(option: str, name: str) -> None:
 
 SAVE_NAME = rule(require_file_name)
 UP = one_of(AXES)
-"""The axis of a file that is up."""
+"""The rule for the option ``up``, the axis of the file that points up."""
 
 
 class FileExporter(Exporter):
-    """An exporter of one file."""
+    """Base class of exporters that write one file."""
 
     @dataclass
     class Config(Exporter.Config):
@@ -52,19 +52,19 @@ class FileExporter(Exporter):
 
     cfg: Config
     shared: Optional[Gaussians] = None
-    """The Gaussians that a bundle has read for all its formats."""
+    """Set by the bundle exporter, which reads the Gaussians once for all formats."""
 
     def configure(self, geometry: BaseGeometry, *args: object, **kwargs: object) -> None:
         check_options(self.Config, self.cfg)
         super().configure(geometry, *args, **kwargs)
 
     def gaussians(self) -> Gaussians:
-        """Return what is to be exported, in the world's axes; every value is finite."""
+        """Return the Gaussians to export, in the world's axes; all values are finite."""
         return read_gaussians(self.geometry) if self.shared is None else self.shared
 
 
 def read_gaussians(geometry: BaseGeometry) -> Gaussians:
-    """Read the Gaussians of a geometry as finite float32 arrays; those that can't be drawn are left
-    out, with a warning.
+    """Read the Gaussians of a geometry as float32 arrays. Those with values that aren't finite are
+    skipped with a warning.
     """
     return finite(Gaussians.of(geometry).arrays(), "export")

@@ -6,8 +6,8 @@ option        meaning
 formats       names of registered exporters without their ``-exporter``: ``ply``, ``spz``,
               ``points``, ``surface``, ...
 options       options of some of them: ``{ply: {pad_sh_degree: 3}}``
-up            the axis that is up in all formats that leave a choice (``ply``, ``surface``): ``z``
-              for this package's world; by default what the viewers of each format expect
+up            the up axis in all formats that have this option (``ply``, ``surface``): ``z`` for
+              this package's world; by default the axis that viewers of each format expect
 save_video    also render the turntable
 ============  ======================================================================================
 """
@@ -42,7 +42,7 @@ def available_formats() -> list[str]:
 
 @register("gaussiandreamer-exporter")
 class BundleExporter(Exporter):
-    """The files of every format, in the order of ``formats``."""
+    """Export the files of all formats, in the order of ``formats``."""
 
     @dataclass
     class Config(Exporter.Config):
@@ -59,8 +59,8 @@ class BundleExporter(Exporter):
             """Check formats and their options.
 
             Raises:
-                UserError: wrong options of a format, options of one that isn't asked for, or
-                    two formats that write the same file.
+                UserError: options of a format are invalid, there are options of a format that isn't
+                    in ``formats``, or two formats write the same file.
             """
             for name in cfg.options:
                 if name not in cfg.formats:
@@ -96,7 +96,7 @@ class BundleExporter(Exporter):
 
 
 def options_of(name: str, cfg: Any) -> Any:
-    """Return the options of one format, with the bundle's ``up`` where it has such an option."""
+    """Return the options of one format, with the bundle's ``up`` if the format has that option."""
     options, known = cfg.options.get(name, {}), find(name + SUFFIX).Config.__dataclass_fields__
     if cfg.up is None or "up" not in known or not isinstance(options, Mapping):
         return options
@@ -117,8 +117,8 @@ def _checked(name: str, options: Any) -> Any:
 
 
 def _require_own_files(formats: Iterable[tuple[str, Any]]) -> None:
-    """Raise UserError if two formats write the same file, also where the file system takes upper
-    and lower case for the same.
+    """Raise UserError if two formats write the same file. Names that differ only in case count as
+    the same, as on some file systems.
     """
     writers: dict[str, str] = {}
     for name, cfg in formats:

@@ -1,12 +1,12 @@
-"""``ply-exporter``: the Gaussians as a PLY that every viewer of 3D Gaussian splatting reads.
+"""``ply-exporter``: the Gaussians as a PLY file in the format of 3D Gaussian splatting viewers.
 
 ==============  ===================================================================================
 option          meaning
 ==============  ===================================================================================
 save_name       name of the file in the export folder
-up              the file's axis that is up: ``-y``, which all viewers expect (the front towards
-                their default camera), ``z`` for this package's world, ``y``
-pad_sh_degree   append zero harmonics up to this degree, for importers that insist on degree 3
+up              the file's up axis: ``-y``, which all viewers expect (the front then faces their
+                default camera), ``z`` for this package's world, or ``y``
+pad_sh_degree   append zero harmonics up to this degree, for importers that require degree 3
 save_video      also render the turntable
 ==============  ===================================================================================
 """

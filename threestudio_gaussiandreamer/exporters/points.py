@@ -1,11 +1,11 @@
 """``points-exporter``: the centres of the Gaussians as a coloured point cloud, for programs that
-know no Gaussians.
+don't support Gaussians.
 
 ===========  ==================================================================================
 option       meaning
 ===========  ==================================================================================
 save_name    name of the file in the export folder
-min_opacity  leave out Gaussians fainter than this; 0 keeps all, in their order
+min_opacity  skip Gaussians with a lower opacity; 0 keeps all. The order is preserved
 save_video   also render the turntable
 ===========  ==================================================================================
 

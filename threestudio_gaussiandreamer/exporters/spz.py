@@ -8,8 +8,8 @@ save_name    name of the file in the export folder
 save_video   also render the turntable
 ===========  ==================================================================================
 
-About 17 bytes a Gaussian; what its rounding costs is in docs/results.md. The file is y up,
-as SPZ demands."""
+A Gaussian takes about 17 bytes; docs/results.md has the PSNR that is lost by rounding. The file has
+y up, as the SPZ format requires."""
 
 from dataclasses import dataclass, field
 from typing import List

@@ -1,19 +1,19 @@
-"""``surface-exporter``: the cloud's surface as a mesh with coloured vertices, an OBJ.
+"""``surface-exporter``: the surface of the cloud as a mesh with vertex colours, an OBJ file.
 
 ===========  ==================================================================================
 option       meaning
 ===========  ==================================================================================
 save_name    name of the file in the export folder; T3Bench looks for ``model.obj``
-up           the file's axis that is up: ``y`` (the front towards +z), as most programs read OBJ, or
-             ``z`` for this package's world, which T3Bench expects
+up           the file's up axis: ``y`` (the front faces +z), as most programs read OBJ, or ``z`` for
+             this package's world, which T3Bench expects
 resolution   cells along the longest side of the object
-level        share of the summed opacity's median at the centres at which the surface is; lower is
-             thicker
+level        isovalue of the surface, as a fraction of the median of the summed opacity at the
+             centres of the Gaussians; lower values make the object thicker
 save_video   also render the turntable
 ===========  ==================================================================================
 
-The colours are those of the constant harmonic. A mesh loses what Gaussians show of hair, smoke and
-glass."""
+The colours are those of the constant harmonic. A surface can't represent hair, smoke and glass as
+Gaussians do."""
 
 from dataclasses import dataclass, field
 from typing import List

@@ -1,5 +1,5 @@
-"""What every 3D prior is: a prompt to a checked, coloured point cloud, with an optional layer of
-ground below it.
+"""The base class of 3D priors, which map a prompt to a validated, coloured point cloud, with an
+optional layer of ground below it.
 
 ===============  ===================================================================================
 option           meaning (all priors have these)
@@ -11,8 +11,8 @@ ground_size      side of the square they fill, in units of the longest side of t
 ground_height    its z in world units, or ``auto``: the bottom of the object
 ===============  ===================================================================================
 
-A prior is one file: a subclass of :class:`Prior` with :meth:`~Prior.generate`, registered under a
-name."""
+Each prior has its own module: a registered subclass of :class:`Prior` that implements
+:meth:`~Prior.generate`."""
 
 import logging
 from dataclasses import dataclass, field
@@ -39,7 +39,7 @@ GREY = 0.5
 
 
 POINT_BYTES = 128
-"""Of a point: places, colours and the parameters of its Gaussian, at least."""
+"""Memory per point, bytes, at least: position, colour and the parameters of its Gaussian."""
 
 
 def is_color(value: Any) -> bool:
@@ -50,7 +50,7 @@ def is_color(value: Any) -> bool:
 
 
 def points(low: int) -> Rule:
-    """Numbers of points, from ``low`` to what the memory holds."""
+    """Return the rule for numbers of points, from ``low`` to what fits into memory."""
     return count_of("points", low, POINT_BYTES)
 
 
@@ -70,8 +70,8 @@ def require_axes(cfg: Any, kind: str) -> None:
 
 
 class Prior(BaseObject):
-    """``prior(prompt)`` gives the points that the Gaussians start from; the same prompt and seed
-    give the same points.
+    """Base class of priors. ``prior(prompt)`` returns the initial points, which depend only on the
+    options, the prompt and the seed.
     """
 
     @dataclass
@@ -87,10 +87,10 @@ class Prior(BaseObject):
         check_options(self.Config, self.cfg)
 
     def preflight(self) -> None:
-        """Look in seconds whether ``generate`` can have what it needs; called before any long work.
+        """Check within seconds that ``generate`` can run; called before any long work.
 
         Raises:
-            UserError: what is missing, and what to do.
+            UserError: a requirement, such as a file, is missing; the message says what to do.
         """
 
     def __call__(self, prompt: str) -> PointCloud:
@@ -109,12 +109,14 @@ class Prior(BaseObject):
         return cloud.followed_by(ground)
 
     def ground_count(self) -> int:
-        """Return how many points at the end of the cloud are ground, which doesn't grow."""
+        """Return the number of ground points, which are last in the cloud and aren't grown."""
         return int(self.cfg.ground_points) if self.cfg.ground else 0
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
-        """Return the object's points, which need not be checked yet; ``generator`` is the only
-        source of randomness.
+        """Return the object's points; :meth:`__call__` validates them.
+
+        Args:
+            generator: the only source of randomness.
         """
         raise NotImplementedError(f"{type(self).__name__}.generate")
 
@@ -160,7 +162,7 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
 
 
 def report_non_finite(bad: int, count: int, name: str) -> None:
-    """Say that rows are dropped, or raise UserError when there are too many of them."""
+    """Log that rows are dropped, or raise UserError if there are too many of them."""
     if bad > MAX_NON_FINITE * count:
         raise UserError(
             f"{bad} of the {count} points of {name} are NaN or infinite (at most 5 % may be): "

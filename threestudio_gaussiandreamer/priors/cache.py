@@ -1,6 +1,4 @@
-"""The prior's result beside the run's other files: it is computed once, and a run that starts again
-in its folder reads it.
-"""
+"""Cache the output of the prior in the run's folder, from which a restarted run reads it."""
 
 import hashlib
 import json
@@ -20,11 +18,11 @@ from .turntable import save_turntable
 
 
 def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud:
-    """Return ``prior(prompt)``, from ``save/prior/points.npz`` when the same prior, options, prompt
-    and seed left it there.
+    """Return ``prior(prompt)``, read from ``save/prior/points.npz`` if that file is of the same
+    prior, options, prompt and seed.
 
-    ``points.ply`` and ``turntable.gif`` beside it are for people and viewers; without a
-    ``save_dir`` nothing is cached."""
+    ``points.ply`` and ``turntable.gif`` are written beside it, for inspection. If ``save_dir`` is
+    None, nothing is read or written."""
     if save_dir is None:
         return prior(prompt)
     path, key = Path(save_dir) / "prior" / "points.npz", cache_key(prior, prompt)
@@ -46,7 +44,7 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
 
 
 def cache_key(prior: Any, prompt: str) -> str:
-    """Return a digest of everything that the prior's result depends on."""
+    """Return a digest of everything that the prior's output depends on."""
     options = (
         OmegaConf.to_container(prior.cfg) if OmegaConf.is_config(prior.cfg) else vars(prior.cfg)
     )
@@ -55,9 +53,7 @@ def cache_key(prior: Any, prompt: str) -> str:
 
 
 def read_cache(path: Path, key: str) -> Optional[PointCloud]:
-    """Return the cached cloud when it was made by the same prior; None when there is none, another
-    one, or a damaged file.
-    """
+    """Return the cached cloud; None if there is none, its key differs, or the file is damaged."""
     if not path.is_file():
         return None
     try:

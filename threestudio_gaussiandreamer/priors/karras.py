@@ -1,11 +1,11 @@
 """Sampling a diffusion model of 3D data as Point-E and Shap-E were sampled: Karras noise levels,
 Heun steps, guidance.
 
-The networks know discrete timesteps of a "variance preserving" process, ``z_t = sqrt(abar_t) x0 +
-sqrt(1 - abar_t) eps``; the sampler works on ``x = x0 + sigma eps``, which is ``z_t / sqrt(abar_t)``
-at ``sigma^2 = (1 - abar_t) / abar_t``. Written from Karras et al. 2022, "Elucidating the design
-space of diffusion-based generative models", Algorithm 2, and from reading how the published models
-are driven (openai/point-e, openai/shap-e, MIT)."""
+The networks were trained with discrete timesteps of a variance-preserving process, ``z_t =
+sqrt(abar_t) x0 + sqrt(1 - abar_t) eps``; the sampler works on ``x = x0 + sigma eps``, which equals
+``z_t / sqrt(abar_t)`` at ``sigma^2 = (1 - abar_t) / abar_t``. Implemented from Algorithm 2 of
+Karras et al. 2022, "Elucidating the design space of diffusion-based generative models", with the
+conventions of the published samplers (openai/point-e, openai/shap-e, MIT)."""
 
 import math
 from collections.abc import Callable
@@ -17,9 +17,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 Denoiser = Callable[[Tensor, float], Tensor]
-"""(x, sigma) to the estimate of x0, same shape."""
+"""Maps (x, sigma) to the estimate of x0, of the same shape."""
 Network = Callable[[Tensor, Tensor], Tensor]
-"""(z (N, ...), timesteps (N,)) to what the network predicts, same shape."""
+"""Maps (z (N, ...), timesteps (N,)) to the network's prediction, of the same shape as z."""
 
 RHO = 7.0
 
@@ -33,7 +33,7 @@ def karras_sigmas(steps: int, sigma_min: float, sigma_max: float) -> list[float]
 
 
 def cosine_alphas_cumprod(steps: int = 1024) -> Float[np.ndarray, "T"]:
-    """abar of the cosine schedule (Nichol and Dhariwal 2021, eq. 17), with every beta at most
+    """Return abar of the cosine schedule (Nichol and Dhariwal 2021, eq. 17), with betas clipped to
     0.999.
     """
     curve = np.cos((np.arange(steps + 1) / steps + 0.008) / 1.008 * np.pi / 2) ** 2
@@ -41,18 +41,21 @@ def cosine_alphas_cumprod(steps: int = 1024) -> Float[np.ndarray, "T"]:
 
 
 def linear_alphas_cumprod(steps: int = 1024) -> Float[np.ndarray, "T"]:
-    """abar of the linear schedule (Ho et al. 2020), stretched from 1000 to ``steps`` timesteps."""
+    """Return abar of the linear schedule (Ho et al. 2020), rescaled from 1000 to ``steps``
+    timesteps.
+    """
     return np.cumprod(1 - np.linspace(0.1 / steps, 20 / steps, steps))
 
 
 def timestep_of(sigma: float, alphas_cumprod: Float[np.ndarray, "T"]) -> int:
-    """Return the timestep whose noise is nearest below ``sigma``: abar is interpolated linearly and
-    the result cut to an integer.
+    """Return the largest timestep whose noise level is at most ``sigma``, or 0.
+
+    The fractional timestep is interpolated linearly in abar and truncated.
     """
     level = 1 / (sigma**2 + 1)
     index = np.interp(
         -level, -alphas_cumprod, np.arange(len(alphas_cumprod))
-    )  # interp wants rising values
+    )  # np.interp requires increasing values
     return int(index)
 
 
@@ -66,12 +69,12 @@ def guided_denoiser(
     """Return a denoiser from a network of discrete timesteps.
 
     Args:
-        network: with ``scale`` other than 1 it gets each item twice, first for the prompt, then for
-            no prompt.
-        scale: 1 = no guidance; else ``x0 = x0_none + scale (x0_prompt - x0_none)``. Each estimate
-            is clamped to [-1, 1] before they are combined, and the result isn't: so the published
-            models were sampled.
-        prediction: what the network gives, x0 or the noise.
+        network: if ``scale`` isn't 1, its batch has each item twice, first with the prompt, then
+            without.
+        scale: 1 for no guidance; else ``x0 = x0_none + scale (x0_prompt - x0_none)``. As in the
+            published samplers, each estimate is clamped to [-1, 1] before they are combined, and
+            the result isn't clamped.
+        prediction: whether the network predicts x0 or the noise.
     """
 
     def estimate(x: Tensor, sigma: float) -> Tensor:
@@ -105,11 +108,11 @@ def sample_heun(
 
     Args:
         noise: standard normal, of the sample's shape and on its device.
-        sigmas: falling, ending with 0 (:func:`karras_sigmas`).
-        churn: noise added anew at each step, the paper's S_churn; 0 makes the sampler
-            deterministic.
+        sigmas: decreasing noise levels that end with 0 (:func:`karras_sigmas`).
+        churn: the paper's S_churn, the amount of noise that is added at each step; 0 makes the
+            sampler deterministic.
         generator: a CPU generator for that noise.
-        progress: names a progress bar on a terminal; without it there is none.
+        progress: title of a progress bar on terminals; if empty, there is no bar.
     """
     from tqdm import tqdm
 

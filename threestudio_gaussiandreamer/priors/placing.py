@@ -1,5 +1,5 @@
-"""What the priors with a network share: their axes and size in the world, their device, their
-randomness.
+"""Functions for priors with a network: placing their points in the world, choosing a device, and
+random generators.
 """
 
 import numpy as np
@@ -18,11 +18,12 @@ FRONT = one_of(HORIZONTAL)
 
 
 def placed(cloud: PointCloud, *, front: str, scale: float, normalize: bool) -> PointCloud:
-    """Return ``cloud``, whose z is up, turned so that ``front`` is +x, and scaled.
+    """Return ``cloud``, which has z up, rotated so that ``front`` becomes +x, and scaled.
 
     Args:
-        scale: world units for one unit of the cloud; with ``normalize`` half the longest side of
-            the box, which is centred.
+        scale: world units per unit of the cloud; with ``normalize``, half the longest side of the
+            bounding box in world units.
+        normalize: centre the bounding box at the origin, and scale it to ``scale``.
     """
     axis = AXES[front]
     points = (

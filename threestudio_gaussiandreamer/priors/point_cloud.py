@@ -1,5 +1,5 @@
-"""``point-cloud-prior``: coloured points from a file, for instance a scan or what another
-text-to-3D model gave.
+"""``point-cloud-prior``: coloured points from a file, such as a scan or the output of another
+text-to-3D model.
 
 ============  ======================================================================================
 option        meaning
@@ -46,7 +46,7 @@ logger = logging.getLogger(__name__)
 
 @register("point-cloud-prior")
 class PointCloudPrior(Prior):
-    """The points of a file."""
+    """Read points from a file."""
 
     @dataclass
     class Config(Prior.Config):
@@ -79,17 +79,17 @@ def to_world(path: Path, up: str, front: Optional[str]) -> Float[np.ndarray, "3 
 
 
 def axes_kind(path: Path) -> str:
-    """Return the mesh format whose axes the file's are by default: those of point clouds have z up,
-    as PLY.
+    """Return the mesh format whose default axes apply to the file. Formats of point clouds have z
+    up, as PLY.
     """
     return "ply" if path.suffix.lower() in READERS else path.suffix.lower().lstrip(".")
 
 
 def load_points(path: Path) -> PointCloud:
-    """Return the points of ``path`` as they are stored, by its extension.
+    """Read the points of a file in its own axes; the extension determines the format.
 
     Raises:
-        UserError: an unknown extension, an unreadable file, or one without points.
+        UserError: the extension is unknown, or the file can't be read or has no points.
     """
     try:
         return READERS.get(path.suffix.lower(), read_mesh_points)(path)
@@ -100,15 +100,15 @@ def load_points(path: Path) -> PointCloud:
 
 
 def rotated(cloud: PointCloud, rotation: Float[np.ndarray, "3 3"]) -> PointCloud:
-    """Return points and normals turned by ``rotation``."""
+    """Return the cloud with points and normals rotated."""
     normals = None if cloud.normals is None else cloud.normals @ rotation.T
-    with np.errstate(invalid="ignore"):  # infinity times zero: such rows are dropped later
+    with np.errstate(invalid="ignore"):  # infinity times zero is NaN; such rows are dropped later
         return cloud._replace(points=cloud.points @ rotation.T, normals=normals)
 
 
 def normalized(cloud: PointCloud, scale: float) -> PointCloud:
-    """Move the box's centre to the origin, make half its longest side ``scale``; rows that are
-    not finite don't count.
+    """Translate and scale the cloud so that its bounding box is centred at the origin and half its
+    longest side is ``scale``. Rows that are not finite are ignored for the box.
     """
     points = np.asarray(cloud.points, np.float64)
     finite = points[np.isfinite(points).all(axis=1)]
@@ -127,9 +127,7 @@ def read_ply(path: Path) -> PointCloud:
 
 
 def read_npz(path: Path) -> PointCloud:
-    """Read arrays ``points`` (P, 3), ``colors`` (P, 3) and ``normals`` (P, 3), of which only the
-    first must be there.
-    """
+    """Read the arrays ``points`` (P, 3) and optionally ``colors`` (P, 3) and ``normals`` (P, 3)."""
     arrays = read_arrays(path, "point cloud", ["points"], ["colors", "normals"])
     return _cloud(path, arrays["points"], arrays.get("colors"), arrays.get("normals"))
 
@@ -158,7 +156,7 @@ def _is_row(line: str) -> bool:
 
 
 def read_mesh_points(path: Path) -> PointCloud:
-    """Return the vertices of a mesh file, and its points, where its scene places them."""
+    """Return the vertices and points of a mesh file, transformed by its scene graph."""
     extension, known = path.suffix.lower().lstrip("."), mesh_formats()
     if extension not in known:
         raise unknown("point cloud format", path.suffix, [*READERS, *("." + e for e in known)])
@@ -171,7 +169,7 @@ def read_mesh_points(path: Path) -> PointCloud:
 
 
 def _from_columns(path: Path, rows: np.ndarray) -> PointCloud:
-    """x y z, x y z r g b, or (as PTS files have it) x y z intensity r g b."""
+    """Interpret columns as x y z, x y z r g b, or x y z intensity r g b (PTS)."""
     if rows.ndim != 2 or rows.shape[1] not in (3, 6, 7):
         raise UserError(
             f"point cloud {str(path)!r} has shape {rows.shape}: rows of x y z or x y z r g b "
@@ -199,7 +197,7 @@ def _cloud(
     return PointCloud(
         points=np.asarray(
             points, np.float64
-        ),  # as the file has them: far from the origin float32 would round before they are centred
+        ),  # not float32, which would round points far from the origin before they are centred
         colors=unit_colors(colors.astype(np.float32), colors.dtype),
         normals=None if normals is None else np.asarray(normals, np.float32),
     )

@@ -1,5 +1,4 @@
-"""``point-e-prior``: OpenAI's Point-E, text to 4096 coloured points; the paper's other text-to-3D
-model.
+"""``point-e-prior``: 4096 coloured points by OpenAI's Point-E, the paper's second text-to-3D model.
 
 ==================  ================================================================================
 option              meaning
@@ -8,29 +7,29 @@ checkpoint          ``base_40m_textvec.pt`` as OpenAI publishes it, or Cap3D's
                     ``pointE_finetuned_with_330kdata.pth``
 upsampler           ``upsample_40m.pt``; null: stop at the coarse points
 clip                OpenAI's CLIP ViT-L/14 in transformers' format, a folder or an id of the hub
-prompt              asked of Point-E in place of the run's prompt
+prompt              replaces the run's prompt for Point-E
 guidance_scale      of the coarse points; 1 = none, 3 in the published sampler. The upsampler isn't
                     guided
-num_points          the coarse points; 1024
-num_upsampled       the further points; 3072
+num_points          number of coarse points; 1024
+num_upsampled       number of points that the upsampler adds; 3072
 num_steps           noise levels of each stage; 64
-sigma_min           the lowest noise of both stages; 1e-3
-sigma_max           the highest of the coarse points and of the further ones; 120 and 160
-churn               noise added anew at each step, likewise; 3 and 0
-scale               world units for one of Point-E's, whose points lie in [-0.5, 0.5]; with
+sigma_min           lowest noise level of both stages; 1e-3
+sigma_max           highest noise levels of the base model and of the upsampler; 120 and 160
+churn               S_churn of Karras et al. for the base model and the upsampler; 3 and 0
+scale               world units per unit of Point-E, whose points lie in [-0.5, 0.5]; with
                     ``normalize``: half the longest side
 normalize           centre the box and make its longest half side ``scale``
-front               the axis of Point-E's space that looks at azimuth 0
+front               the axis of Point-E's space that faces azimuth 0
 device              ``auto``: the run's GPU, or the CPU, where it takes minutes
 ground, ...         see ``priors/base.py``
 ==================  ================================================================================
 
-There is no diffusers pipeline and no package of Point-E: ``point_e_model.py`` has the networks,
-``karras.py`` the sampler. The files are downloaded by the user (addresses in ``docs/models.md``)
-and read with ``weights_only``.
+Diffusers has no pipeline for Point-E, so the networks are implemented in ``point_e_model.py`` and
+the sampler in ``karras.py``. The user downloads the files (addresses in ``docs/models.md``); they
+are loaded with ``weights_only``.
 
-Points and colours come as they are sampled, without faces. Axes as Shap-E's, which was trained on
-renders of the same scenes: z up, front -y, turned to +x."""
+The result has no faces. The axes are those of Shap-E, which was trained on renders of the same
+scenes: z up and front -y, which is rotated to +x."""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Optional
@@ -64,7 +63,7 @@ from .weights import load_exactly, read_state_dict
 
 SCALES = torch.tensor([2.0] * 3 + [2 / 255] * 3)[:, None]
 BIASES = torch.tensor([0.0] * 3 + [-1.0] * 3)[:, None]
-"""The networks work on ``points * SCALES + BIASES``, which lies in [-1, 1]."""
+"""The inputs of the networks are ``points * SCALES + BIASES``, which is in [-1, 1]."""
 
 
 class Kind(NamedTuple):
@@ -74,7 +73,7 @@ class Kind(NamedTuple):
     title: str
     file: str
     projection: str
-    """The weight that only this kind has, and whose columns are the features of its condition."""
+    """Name of a weight that identifies this network; its columns are the condition's features."""
 
 
 BASE = Kind(BaseModel, "Point-E base checkpoint", "base_40m_textvec.pt", "clip_embed.weight")
@@ -94,7 +93,7 @@ PAIR = satisfies(
 
 @register("point-e-prior")
 class PointEPrior(Prior):
-    """The points that Point-E imagines for the prompt."""
+    """Sample points for the prompt with Point-E."""
 
     @dataclass
     class Config(Prior.Config):
@@ -125,10 +124,10 @@ class PointEPrior(Prior):
     cfg: Config
 
     def preflight(self) -> None:
-        """Check in seconds that all files can be had, before any long work.
+        """Check within seconds that all files exist or can be downloaded.
 
         Raises:
-            UserError: what is missing, and what to do.
+            UserError: a file is missing; the message says what to do.
         """
         existing_file(self.cfg.checkpoint, BASE.title)
         if self.cfg.upsampler:
@@ -199,16 +198,17 @@ class PointEPrior(Prior):
 
 
 def mean_of(network: Network) -> Network:
-    """Return ``network`` without the half of its output that is the variance."""
+    """Return ``network`` restricted to the mean, the first half of its output channels. The second
+    half is the variance.
+    """
     return lambda z, timesteps: network(z, timesteps)[:, :CHANNELS]
 
 
 def load_network(kind: Kind, path: str) -> Any:
-    """Return the network of this kind with the weights of ``path``, its sizes read off them, in
-    evaluation mode.
+    """Load a network of this kind in evaluation mode. Its sizes are those of the weights' shapes.
 
     Raises:
-        UserError: the file can't be read, or holds another model.
+        UserError: the file can't be read, or is of another model.
     """
     state = read_state_dict(path, kind.title)
     sizes, projection = sizes_of(state), state.get(kind.projection)
