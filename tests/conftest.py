@@ -17,11 +17,13 @@ from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 
 
 @pytest.fixture(autouse=True, scope="session")
-def heard_ctrl_c():
-    """A shell's background job starts with Ctrl-C ignored; the tests that send one need Python's
-    own answer to it.
+def default_signals():
+    """Restore the default handlers of Ctrl-C and SIGHUP, which a shell's background job and nohup
+    ignore; tests send both.
     """
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    if hasattr(signal, "SIGHUP"):
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(autouse=True)

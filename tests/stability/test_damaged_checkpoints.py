@@ -110,7 +110,7 @@ HANDMADE = {
     ),
     "a mean more": (
         lambda c: c["state_dict"].update({"geometry.means": torch.zeros(121, 3)}),
-        "geometry.quats",
+        "geometry.log_scales",
     ),
     "means as a list": (
         lambda c: c["state_dict"].update({"geometry.means": [1.0, 2.0]}),

@@ -28,6 +28,7 @@ from threestudio_gaussiandreamer.core.checkpoint_file import (
     save_file,
 )
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.training import system
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 register_parts()
@@ -186,14 +187,15 @@ def test_a_disk_that_is_full_by_then(hook, tmp_path, monkeypatch, measured):
     """When the prior is kept, the cloud scored, views and the video written, the cloud exported:
     never a success with half a file.
     """
-    original = getattr(GaussianDreamerSystem, hook)
+    owner = system if hook == "export" else GaussianDreamerSystem
+    original = getattr(owner, hook)
     with contextlib.ExitStack() as full:
 
         def wrapped(self, *args):
             full.enter_context(file_size_limit(100))
             return original(self, *args)
 
-        monkeypatch.setattr(GaussianDreamerSystem, hook, wrapped)
+        monkeypatch.setattr(owner, hook, wrapped)
         ended = launch(tmp_path, "trainer.max_steps=1", "data.eval_width=64", "data.eval_height=64")
     assert (
         ended.code == 2 and sum(line.startswith("error: ") for line in ended.err.splitlines()) == 1

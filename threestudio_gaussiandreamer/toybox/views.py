@@ -112,13 +112,13 @@ class Shards:
 
     def _get(self, index: int) -> Shard:
         self.ensure(index)
-        with np.load(self.path(index)) as file:
+        with np.load(self.path(index), allow_pickle=False) as file:
             return Shard(**{name: file[name] for name in Shard._fields})
 
     def _get_light(self, index: int) -> Shard:
         """Read everything but the pictures, which are nearly all of a shard."""
         self.ensure(index)
-        with np.load(self.path(index)) as file:
+        with np.load(self.path(index), allow_pickle=False) as file:
             values = {name: file[name] for name in Shard._fields if name != "rgba"}
         return Shard(rgba=np.zeros((0, SIZE, SIZE, 4), np.uint8), **values)
 
