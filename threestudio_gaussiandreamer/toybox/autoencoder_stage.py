@@ -1,7 +1,7 @@
-"""Training the autoencoder on clean pictures and on renders of rough Gaussians.
+"""Train the autoencoder on clean pictures and on renders of rough Gaussians.
 
-Score distillation encodes renders of half-transparent Gaussians in its first iterations, and needs
-useful gradients there.
+In its first iterations, score distillation encodes renders of semi-transparent Gaussians, for which
+the encoder's gradients must be useful.
 """
 
 import functools
@@ -33,7 +33,7 @@ from .views import (
 
 RANDOM_BACKGROUNDS = 0.15
 SPLAT_SHARE = 0.2
-"""Of the pictures, renders of rough Gaussians."""
+"""Fraction of the pictures that are renders of rough Gaussians."""
 FULL_EVERY = 4
 """Every fourth step trains on pictures of the full size, a quarter as many; the others on pictures
 of half the size. Crops would be as cheap, but group normalisation computes other statistics on

@@ -35,8 +35,8 @@ class ClipBatch(NamedTuple):
 class ClipStage(Stage):
     """Minimise CLIP's contrastive loss (Radford et al. 2021) and that of attribute classifiers.
 
-    The classifiers are dropped afterwards. They make small towers bind colours to parts long before
-    contrast alone does.
+    The classifiers are dropped afterwards. With them, small encoders learn to associate colours
+    with parts much earlier than with the contrastive loss alone.
     """
 
     name = "clip"
@@ -152,7 +152,7 @@ def contrastive(
 
 
 IGNORED = -100
-"""A class that no loss counts."""
+"""The label of classes that losses ignore."""
 
 
 def text_labels(batch: ClipBatch) -> Int[Tensor, "T L"]:

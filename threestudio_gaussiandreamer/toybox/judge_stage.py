@@ -1,4 +1,4 @@
-"""Training the judge, on a data stream and a seed of its own."""
+"""Train the judge, a classifier that evaluates the other networks, on data of a separate seed."""
 
 import functools
 from collections.abc import Iterator
@@ -18,7 +18,8 @@ from .text_batches import label_tensor
 from .views import Shards, held_out_shard, row_batches, with_backgrounds
 
 SEED_OFFSET = 1000
-"""Added to the seed, so that no picture of the teacher's is among the judge's."""
+"""Added to the seed, so that the judge and the other networks have no training pictures in common.
+"""
 
 
 class JudgeBatch(NamedTuple):

@@ -1,9 +1,10 @@
-"""The training loop of all of the toybox's networks.
+"""The training loop of all networks of the toybox.
 
-It can be killed at any time and resumed, averages the weights, and writes curves and sample sheets.
+It saves checkpoints from which it can be resumed, keeps an exponential moving average of the
+weights, and writes loss curves and contact sheets of samples.
 
-Everything that a step draws is a function of (seed, stage, step), so a resumed training is the one
-that was never stopped.
+All random draws are functions of (seed, stage, step), so a resumed training gives the same result
+as an uninterrupted one.
 """
 
 import logging
@@ -27,7 +28,9 @@ from ..core.images import write as write_picture
 
 EMA_DECAY = 0.999
 WARMUP, DECAY_START = 200, 10_000
-"""Steps over which the learning rate rises, and after which it falls as their inverse root."""
+"""Steps of the linear warm-up of the learning rate, and the step from which it decreases with the
+inverse square root of the step.
+"""
 CLIP_GRADIENT = 1.0
 log = logging.getLogger(__name__)
 
@@ -37,44 +40,44 @@ class Options:
     """The options of a training."""
 
     folder: Path
-    """Shards, checkpoints, curves and sheets."""
+    """The folder for shards, checkpoints, curves and sheets."""
     seed: int = 0
     device: str = "cpu"
     pool: int = 40
-    """Shards that a stage goes round in."""
+    """Number of shards that a stage visits cyclically."""
     shard_objects: int = 256
     precision: str = "float32"
-    """Or "bfloat16": autocast, for GPUs."""
+    """Either "float32", or "bfloat16" for autocast on GPUs."""
     save_seconds: float = 300.0
     sheet_seconds: float = 1200.0
     batch: Optional[int] = None
-    """In place of each stage's own."""
+    """Batch size; None for the default of each stage."""
 
     def shards_folder(self) -> Path:
         return self.folder / "shards"
 
 
 class Stage(ABC):
-    """One network and how it is trained; ``model`` is what is optimised and averaged."""
+    """The training of one network; ``model`` is optimised, and its weights are averaged."""
 
     name: ClassVar[str]
     batch_size: ClassVar[int]
     learning_rate: ClassVar[float]
     images: ClassVar[int]
-    """How many a full training sees."""
+    """Number of images in a full training."""
 
     def __init__(self, options: Options) -> None:
         self.options = options
         self.device = torch.device(options.device)
         self.batch = options.batch or self.batch_size
         self.constants: dict[str, float] = {}
-        """Numbers that the trained network only fits with; kept in the checkpoint."""
+        """Constants that are needed to use the trained network; stored in the checkpoint."""
         torch.manual_seed(options.seed)
         self.model = self.build().to(self.device)
 
     @abstractmethod
     def build(self) -> nn.Module:
-        """Make a new network with random weights, and load what its training depends on."""
+        """Build the network with random weights, and load the networks that its training uses."""
 
     @abstractmethod
     def batches(self, step: int) -> Iterator[Any]:
@@ -82,10 +85,10 @@ class Stage(ABC):
 
     @abstractmethod
     def loss(self, model: nn.Module, batch: Any, step: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss of one batch, and numbers to log beside it."""
+        """Return the loss of one batch, and further scalars to log."""
 
     def frozen(self) -> tuple[str, ...]:
-        """Return prefixes of the parameters that no longer change, since others depend on them."""
+        """Return name prefixes of parameters that are frozen, since trained networks use them."""
         return ()
 
     def evaluate(self, model: nn.Module) -> dict[str, float]:
@@ -93,7 +96,7 @@ class Stage(ABC):
         return {}
 
     def sheet(self, model: nn.Module) -> Optional[np.ndarray]:
-        """Draw what the model does, uint8 (H, W, 3), where that can be shown."""
+        """Return a picture of the model's outputs, uint8 (H, W, 3); None if there is none."""
         return None
 
     def depends(self) -> dict[str, str]:
@@ -103,20 +106,20 @@ class Stage(ABC):
 
 @dataclass
 class Progress:
-    """What is saved beside the weights."""
+    """The state of a training that is saved beside the weights."""
 
     step: int = 0
     images: int = 0
     seconds: float = 0.0
     history: list[dict[str, float]] = field(default_factory=list)
-    """Means over LOG_EVERY steps."""
+    """Means of the metrics over LOG_EVERY steps each."""
 
 
 LOG_EVERY = 50
 
 
 class Training:
-    """Trains one stage up to a number of images."""
+    """Train one stage up to a number of images, resuming from its checkpoint if there is one."""
 
     def __init__(self, stage: Stage) -> None:
         self.stage = stage
@@ -137,7 +140,7 @@ class Training:
         return checkpoint_path(self.stage.options.folder, self.stage.name)
 
     def run(self, images: Optional[int] = None) -> Progress:
-        """Train until ``images`` were seen; SIGTERM and SIGINT save and stop."""
+        """Train until ``images`` have been seen; SIGTERM and SIGINT save a checkpoint and stop."""
         target = images or self.stage.images
         earlier = {
             number: signal.signal(number, self._on_signal)
@@ -172,10 +175,10 @@ class Training:
         self.save()
 
     def train_step(self, batch: Any) -> dict[str, Tensor]:
-        """Make one step of the optimiser and of the average.
+        """Update the weights and their average once.
 
         Raises:
-            UserError: the gradient isn't finite; nothing is changed then.
+            UserError: the gradient isn't finite; weights and average aren't changed.
         """
         progress, device = self.progress, self.stage.device.type
         for group in self.optimizer.param_groups:
@@ -201,7 +204,7 @@ class Training:
         """Write the checkpoint and the curves.
 
         Raises:
-            UserError: the disk is full or the folder can't be written; the earlier file stays.
+            UserError: the disk is full or the folder can't be written; an existing file is kept.
         """
         content = {
             "model": self.model.state_dict(),
@@ -237,7 +240,7 @@ class Training:
 
     @torch.no_grad()
     def _freeze(self) -> None:
-        """Set the frozen parameters to their averages, which is what others were trained with."""
+        """Freeze parameters at their averages, with which dependent networks were trained."""
         prefixes = self.stage.frozen()
         averages = dict(self.ema.module.named_parameters())
         for name, parameter in self.model.named_parameters():
@@ -300,9 +303,9 @@ def _average(averages: list[Tensor], current: list[Tensor], count: Any) -> None:
 
 
 def rate_factor(step: int) -> float:
-    """Return a step's learning rate as a share of the stage's.
+    """Return the factor on the stage's learning rate at a step.
 
-    It rises linearly, is constant, and then falls as the inverse root of the steps.
+    It increases linearly to 1, is constant, and then decreases with the step's inverse square root.
     """
     return min(1.0, (step + 1) / WARMUP) * min(1.0, (DECAY_START / (step + 1)) ** 0.5)
 

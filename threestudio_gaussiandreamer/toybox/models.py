@@ -103,7 +103,9 @@ def unet() -> Any:
 
 @torch.no_grad()
 def _start_with_little_noise(network: Any) -> None:
-    """Initialise the posterior's deviation to exp(-3): at 1 it would drown the first colours."""
+    """Initialise the posterior's standard deviation to exp(-3); at 1 the noise would exceed the
+    signal at the start of training.
+    """
     for convolution in (network.quant_conv, network.post_quant_conv):
         nn.init.dirac_(convolution.weight)
         nn.init.zeros_(convolution.bias)
@@ -115,8 +117,8 @@ def _start_with_little_noise(network: Any) -> None:
 def start_as_identity(network: nn.Module) -> None:
     """Initialise every block of a diffusers network to pass its input on unchanged.
 
-    Residual branches start at zero and resampling convolutions as plain averages, so that colours
-    reach the other end from the first step on: training needs far fewer steps.
+    Residual branches start at zero and resampling convolutions as averages, so that colours pass
+    through from the first step, and training needs far fewer steps.
     """
     for name, module in network.named_modules():
         if name.endswith(("conv2", "proj_out")):
@@ -148,7 +150,7 @@ def scheduler() -> Any:
 
 
 def points_model() -> BaseModel:
-    """Make a small one of Point-E's base models."""
+    """Make a small model with the architecture of Point-E's base model."""
     return BaseModel(width=POINTS_WIDTH, layers=POINTS_LAYERS, features=FEATURES)
 
 
@@ -168,7 +170,7 @@ class AttributeHeads(nn.Module):
 class Judge(nn.Module):
     """A convolutional classifier of pictures in [0, 1], (B, 3, 128, 128), into LABELS.
 
-    It shares neither architecture nor data nor seed with the models that it judges.
+    It shares neither architecture nor training data nor seed with the models that it evaluates.
     """
 
     CHANNELS = (24, 48, 96, 128)

@@ -1,4 +1,4 @@
-"""What the kinds share: random proportions, anchors for accessories, common parts."""
+"""Helpers of the kinds: random proportions, anchors of accessories, common parts."""
 
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ class Anchors(NamedTuple):
 
 
 class Model(NamedTuple):
-    """What a kind's program gives."""
+    """The output of a kind's function."""
 
     shapes: list[Shape]
     anchors: Anchors

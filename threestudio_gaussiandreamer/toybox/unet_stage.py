@@ -20,7 +20,9 @@ from .text_batches import open_tokenizer, token_ids, training_prompts, view_prom
 from .views import Shards, held_out_shard, row_batches, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.05
-"""Few: where half of the pictures had one, score distillation grew a haze around the object."""
+"""Fraction of pictures with a random background. It is small because with a fraction of 0.5 score
+distillation produced haze around the object.
+"""
 SNR_GAMMA = 5.0
 LATENT_SCALE = "latent_scale"
 SAMPLES, SAMPLE_STEPS, SAMPLE_GUIDANCE = 24, 25, 3.0
@@ -58,7 +60,7 @@ class UNetStage(Stage):
 
     @property
     def scale(self) -> float:
-        """What latents are multiplied with to have unit variance."""
+        """The factor that scales latents to unit variance."""
         return self.constants[LATENT_SCALE]
 
     def depends(self) -> dict[str, str]:

@@ -1,9 +1,8 @@
-"""Pictures of the toybox's objects, in shards that are functions of (seed, shard) and kept on the
-disk.
+"""Pictures of the toybox's objects, in shards on disk that are functions of (seed, shard).
 
-A shard holds some objects, several views of each as premultiplied RGBA bytes, and points on each
-surface. The background is chosen when a shard is used, so that one set of pictures serves models
-that want different ones.
+A shard has a number of objects, several views of each as premultiplied RGBA bytes, and points on
+each surface. The pictures are composited over backgrounds when a shard is read, so that the same
+shards can be used with different backgrounds.
 """
 
 import math
@@ -29,19 +28,21 @@ SIZE = 128
 """Height and width of the pictures, pixels."""
 FOVY_DEG = 45.0
 DISTANCE = (2.1, 2.4)
-"""Nearest and farthest camera: the size in the picture varies by 14 %, and the whole sphere around
-an object is seen.
+"""Range of camera distances, world units. The size of an object in the picture varies by 14 %, and
+its bounding sphere is always completely visible.
 """
 ELEVATION, OVERHEAD_ELEVATION, OVERHEAD_SHARE = (-10.0, 60.0), (60.0, 80.0), 0.06
-"""Degrees; the paper's range, and a few views from above, so that "overhead view" has a meaning."""
+"""Elevations in degrees: the paper's range, and that of a small share of views from above, which
+are needed to learn "overhead view".
+"""
 BACKGROUND = (0.5, 0.5, 0.5)
-"""Behind nearly all pictures; no object has this colour."""
+"""Background of nearly all pictures; no object has this colour."""
 OBJECTS, VIEWS, POINTS = 256, 4, 1024
-"""Of one shard: objects, views of each, and points on each surface."""
+"""Objects per shard, views per object, and points per object."""
 LIGHT_SHARDS = 64
-"""Kept in memory without their pictures, 3 MB each."""
+"""Number of shards that are cached in memory without their pictures, 3 MB each."""
 HELD_OUT_OBJECTS = 64
-"""Withheld from training; what a training is measured on."""
+"""Number of objects for evaluation, which are withheld from training."""
 
 LABELS: dict[str, tuple[str, ...]] = {
     "kind": tuple(KINDS),
@@ -53,11 +54,11 @@ LABELS: dict[str, tuple[str, ...]] = {
     "accessory_color": (*COLORS, "none"),
     "quadrant": ("front", "left", "back", "right"),
 }
-"""What there is to recognise in a picture, and the classes of each."""
+"""The attributes of a picture that classifiers recognise, and their classes."""
 
 
 class Shard(NamedTuple):
-    """N = objects x views pictures; the views of an object stand together."""
+    """N = objects x views pictures; the views of an object are adjacent."""
 
     rgba: UInt8[np.ndarray, "N 128 128 4"]
     """Premultiplied colour and coverage."""
@@ -65,20 +66,20 @@ class Shard(NamedTuple):
     """Classes in the order of LABELS."""
     elevation: Float[np.ndarray, " N"]
     azimuth: Float[np.ndarray, " N"]
-    """Degrees."""
+    """Azimuth of the camera, degrees."""
     points: Float[np.ndarray, "O P 6"]
-    """Positions in the world and colours in [0, 1] of places uniform over each object's surface;
-    float16.
+    """Points uniform over each object's surface, float16: world positions, and colours in [0, 1].
     """
 
 
 class Shards:
-    """The shards of one seed, made when first asked for.
+    """The shards of one seed, rendered on first use.
 
     Args:
-        folder: where they are kept, 70 MB each.
-        held_out: of objects withheld from training.
-        objects, views: of one shard.
+        folder: contains the files, 70 MB each.
+        held_out: whether the objects are those withheld from training.
+        objects: number of objects per shard.
+        views: number of views per object.
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class Shards:
         return self.folder / f"{sort}-{self.seed}-{self.objects}x{self.views}-{index:05d}.npz"
 
     def ensure(self, index: int) -> None:
-        """Render shard ``index`` into its file unless a whole one is there."""
+        """Render shard ``index`` into its file, unless that exists and is complete."""
         path = self.path(index)
         if _is_whole(path):
             return
@@ -116,7 +117,7 @@ class Shards:
             return Shard(**{name: file[name] for name in Shard._fields})
 
     def _get_light(self, index: int) -> Shard:
-        """Read everything but the pictures, which are nearly all of a shard."""
+        """Read a shard without its pictures, which take nearly all of its size."""
         self.ensure(index)
         with np.load(self.path(index), allow_pickle=False) as file:
             values = {name: file[name] for name in Shard._fields if name != "rgba"}
@@ -150,17 +151,17 @@ class Shards:
 
 
 def _is_whole(path: Path) -> bool:
-    """Tell whether a file is a zip archive with its end, which a truncated one lacks."""
+    """Return whether a file is a complete zip archive; a truncated one lacks the end record."""
     return path.is_file() and zipfile.is_zipfile(path)
 
 
 def held_out_shard(folder: Path, seed: int) -> Shard:
-    """Return the pictures of the withheld objects that a training is measured on."""
+    """Return the shard of withheld objects for evaluation."""
     return Shards(folder, seed, held_out=True, objects=HELD_OUT_OBJECTS).get(0)
 
 
 def draw_orbit(count: int, rng: np.random.Generator) -> Orbit:
-    """Draw ``count`` views, one in each sector of the azimuth, the first sector anywhere."""
+    """Draw ``count`` views, one in each of as many azimuth sectors, with a random first sector."""
     azimuth = (
         rng.uniform(0, 360) + 360 / count * (np.arange(count) + rng.uniform(0, 1, count))
     ) % 360 - 180
@@ -174,14 +175,14 @@ def draw_orbit(count: int, rng: np.random.Generator) -> Orbit:
 
 
 def render(mesh: Mesh, orbit: Orbit, size: int = SIZE) -> Float[np.ndarray, "N s s 4"]:
-    """Render premultiplied RGBA of the mesh from these cameras, in [0, 1]."""
+    """Ray cast the mesh from these cameras; return premultiplied RGBA in [0, 1]."""
     cameras = zip(orbit_c2w(*orbit[:3]).numpy(), orbit.fovy.tolist(), strict=True)
     caster = MeshCaster(mesh)
     return np.stack([caster.render(c2w, fovy, size, size) for c2w, fovy in cameras])
 
 
 def surface_points(mesh: Mesh, rng: np.random.Generator) -> Float[np.ndarray, "P 6"]:
-    """Sample POINTS places on the surface with their colours, float16."""
+    """Sample POINTS points with colours uniformly on the surface, float16."""
     places, faces, barycentric = sample_surface(mesh, POINTS, rng)
     return np.concatenate([places, surface_colors(mesh, faces, barycentric)], axis=1).astype(
         np.float16
@@ -208,10 +209,11 @@ def attributes_of(row: Int[np.ndarray, " L"]) -> Attributes:
 def with_backgrounds(
     rgba: UInt8[np.ndarray, "N H W 4"], rng: np.random.Generator, *, random_share: float
 ) -> Float[torch.Tensor, "N 3 H W"]:
-    """Composite the pictures over BACKGROUND, or a share of them over random backgrounds.
+    """Composite pictures over BACKGROUND, and a share of them over random backgrounds.
 
     Args:
-        random_share: of pictures over a random plain colour or a gradient of two.
+        random_share: fraction of pictures whose background is a random colour or a gradient between
+            two.
 
     Returns:
         Pictures in [0, 1], float32.
@@ -241,10 +243,10 @@ def row_batches(
 ) -> Iterator[tuple[int, Int[np.ndarray, " B"]]]:
     """Yield (shard, rows) of each batch from ``step`` on, a function of (seed, stream, step).
 
-    Each pass over a shard is a permutation of its rows; the rest that fills no batch is left out.
+    Each pass over a shard visits its rows in random order; an incomplete last batch is dropped.
 
     Args:
-        pool: number of shards that are visited in turn.
+        pool: number of shards that are visited cyclically.
         per_object: rows are objects instead of pictures.
     """
     rows = shards.objects * (1 if per_object else shards.views)

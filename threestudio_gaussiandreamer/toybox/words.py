@@ -1,5 +1,5 @@
-"""Prompts of the toybox's objects: synonyms, templates, and the directions as our prompt processors
-write them.
+"""Prompts for the toybox's objects: synonyms, templates, and view directions in the form of the
+prompt processors.
 """
 
 import re
@@ -37,7 +37,7 @@ COLOR_WORDS: dict[str, tuple[str, ...]] = {
     "pink": ("pink", "rose"),
     "yellow": ("yellow", "golden"),
 }
-"""Other words for colours; the rest have only their own."""
+"""Synonyms of colours; colours that aren't listed have none."""
 PARTS: dict[str, str] = {
     "fox": "ears and tail",
     "rabbit": "ears",
@@ -56,7 +56,7 @@ PARTS: dict[str, str] = {
     "mushroom": "stem",
     "robot": "head",
 }
-"""What the role "part" of each kind is called."""
+"""The word for the role "part" of each kind."""
 PLURALS = ("ears", "wings", "legs")
 ACCESSORY_WORDS: dict[str, tuple[str, ...]] = {
     "hat": ("hat", "cap"),
@@ -74,11 +74,11 @@ OPENINGS = (
     "a 3d model of a {}",
     "{}",
 )
-"""Around the object; "a {}" is drawn most often."""
+"""Templates for the object's description; "a {}" is drawn most often."""
 DIRECTIONS = ("side", "front", "back", "overhead")
 FRONT_HALF = BACK_HALF = 45.0
 OVERHEAD = 60.0
-"""Degrees, the prompt processors' thresholds."""
+"""Thresholds of the prompt processors, degrees."""
 EMPTY_SHARE, PLAIN_SHARE, PREFIX_SHARE = 0.1, 0.2, 0.04
 """Shares of prompts that are empty, that name no direction, and that name it in front ("side view
 of ...").
@@ -86,7 +86,11 @@ of ...").
 
 
 def direction(elevation: float, azimuth: float) -> str:
-    """Return the direction of a view in degrees, with the prompt processors' thresholds."""
+    """Return the direction of a view, with the prompt processors' thresholds.
+
+    Args:
+        elevation, azimuth: degrees.
+    """
     angle = abs((azimuth + 180) % 360 - 180)
     if elevation > OVERHEAD:
         return "overhead"
@@ -129,7 +133,7 @@ def prompt_of(
 
 
 def vocabulary() -> list[str]:
-    """Return all words that prompts consist of, sorted."""
+    """Return all words that occur in prompts, sorted."""
     return sorted(set(re.findall(r"[a-z]+|\d|,", " ".join(_phrases()))))
 
 

@@ -1,14 +1,13 @@
-"""The toybox's objects as functions of (seed, index): what an object is (:class:`Attributes`), and
-its mesh.
+"""The toybox's objects as functions of (seed, index): their :class:`Attributes` and meshes.
 
 An object has a kind, a colour, a pattern in a second colour, and at most one extra: a part in a
-colour of its own, or an accessory. Meshes lie in the world's pose (z up, front +x), centred, inside
-a sphere of radius :data:`RADIUS`. Light is baked into the vertex colours, since the ray caster
-draws a mesh's own colours: the same from every view, so that Gaussians without view-dependent
-colour can show it.
+different colour, or an accessory. Meshes are in world axes (z up, front +x), centred, and inside a
+sphere of radius :data:`RADIUS`. Shading is baked into the vertex colours, since the ray caster
+applies none. It doesn't depend on the view, so Gaussians without view-dependent colour can
+represent it.
 
 Some combinations of attributes are withheld from all training (:func:`withheld`), to measure
-generalisation on.
+generalisation.
 """
 
 import hashlib
@@ -23,8 +22,8 @@ from .kinds import ACCESSORIES, KINDS, Model, Proportions, accessory
 from .shapes import Shape, joined
 
 RADIUS = 0.8
-"""Of the sphere around every object, world units: half the longest side that Point-E's scale of 1.6
-gives.
+"""Radius of the bounding sphere of all objects, world units: half the longest side of objects from
+Point-E at its default scale of 1.6.
 """
 COLORS: dict[str, tuple[float, float, float]] = {
     "red": (0.86, 0.11, 0.12),
@@ -46,27 +45,27 @@ DETAILS: dict[str, tuple[float, float, float]] = {
     "warm": (0.93, 0.47, 0.16),
     "glass": (0.63, 0.82, 0.94),
 }
-"""Colours of details that no prompt names."""
+"""Colours of details that prompts never mention."""
 PATTERNS = ("plain", "striped", "dotted", "checkered", "two-tone")
 PART_SHADE = 0.82
-"""A part without a colour of its own is the body's, darker."""
+"""Factor on the body's colour for a part that has no own colour."""
 LIGHT = np.array([0.25, -0.35, 0.9]) / np.linalg.norm([0.25, -0.35, 0.9])
 AMBIENT = 0.70
 CELL = 16
-"""Texels of a pattern's period."""
+"""Texels per period of a pattern."""
 PERIODS = 8
-"""Periods of the pattern in the texture; more on a surface repeat the last one's colour."""
+"""Periods of the pattern in the texture; a surface with more repeats the last texel's colour."""
 WITHHELD_SHARE = 0.04
 
 
 class Attributes(NamedTuple):
-    """What a prompt can say of an object."""
+    """The attributes of an object that a prompt can mention."""
 
     kind: str
     color: str
     pattern: str = "plain"
     second: Optional[str] = None
-    """The pattern's colour; None when plain."""
+    """The pattern's colour; None if there is no pattern."""
     part: Optional[str] = None
     """The colour of the kind's part (a roof, a handle, ...); None = the body's."""
     accessory: Optional[str] = None
@@ -98,10 +97,10 @@ def _draw(rng: np.random.Generator) -> Attributes:
 
 
 def withheld(attributes: Attributes) -> bool:
-    """Tell whether no training sees this combination of kind, colour, pattern and extra.
+    """Return whether this combination of kind, colour, pattern and extra is withheld from training.
 
-    All second colours of a combination are withheld together. Plain objects without any extra are
-    never withheld: the words are learnt from them.
+    The colours of pattern, part and accessory aren't considered. Objects without pattern and extra
+    are never withheld, since the words are learnt from them.
     """
     extra = attributes.accessory or ("part" if attributes.part else "none")
     if attributes.pattern == "plain" and extra == "none":
@@ -148,7 +147,7 @@ def object_mesh(attributes: Attributes, rng: np.random.Generator) -> Mesh:
 
 
 def _centred(vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
-    """Move the box's centre to the origin and scale the farthest vertex to RADIUS."""
+    """Centre the bounding box at the origin, and scale the farthest vertex to distance RADIUS."""
     vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     return vertices * (RADIUS / np.linalg.norm(vertices, axis=1).max())
 
@@ -184,7 +183,7 @@ def texture(attributes: Attributes) -> Float[np.ndarray, "H W 3"]:
 
 
 def _pattern_mask(pattern: str) -> np.ndarray:
-    """Mark where the second colour is, (128, 128) bool; row 0 on top."""
+    """Return the mask of the second colour, (128, 128) bool; row 0 is the top."""
     y, x = (np.indices((CELL, CELL)) + 0.5) / CELL
     cells = {
         "plain": np.zeros((CELL, CELL), bool),
