@@ -73,7 +73,7 @@ VIEW_AZIMUTHS = (-40.0, 0.0, 40.0)
 VIEW_ELEVATION, VIEW_DISTANCE, VIEW_FOVY = 10.0, 3.2, math.radians(40)
 PICTURE_SIZE = 224
 ROUGH, FINE = 80, 300
-"""Iterations of the fit for a picture, to about 15 mm, and for the result, to 1."""
+"""Iterations of the fit for CLIP's pictures (error about 15 mm) and for the result (1 mm)."""
 LIGHT = np.array([0.7, 0.35, 0.62])
 
 
@@ -121,10 +121,10 @@ class MotionPrior(Prior):
     cfg: Config
 
     def preflight(self) -> None:
-        """Check in seconds that all files can be had and read, before any long work.
+        """Check within seconds that all files exist or can be downloaded, and can be read.
 
         Raises:
-            UserError: what is missing, and what to do.
+            UserError: a file is missing or invalid; the message says what to do.
         """
         if self.cfg.candidates:
             for path in self.cfg.candidates:
@@ -186,7 +186,7 @@ class MotionPrior(Prior):
             )
         fit, meshes = self._fitted(
             model, targets[[best]], FINE
-        )  # alone, so that it doesn't depend on what else was offered
+        )  # fitted separately, so that the result doesn't depend on the other choices
         report_residuals(fit.residuals[0], names[best], self.cfg.max_residual_mm)
         return meshes[0]
 
@@ -226,8 +226,12 @@ class MotionPrior(Prior):
 def offered_frames(
     motions: Motions, sample: Optional[int], frame: Any, num_frames: int
 ) -> list[Choice]:
-    """Return the frames to choose from: the given one, or ``num_frames`` of each motion that is
-    meant.
+    """Return the frames to choose from.
+
+    Args:
+        sample: index of a motion; None for all.
+        frame: index of a frame, which is then the only choice, or "clip".
+        num_frames: number of evenly spaced frames of each motion, for "clip".
 
     Raises:
         UserError: there is no such motion or frame.
@@ -254,7 +258,11 @@ def offered_frames(
 
 
 def report_residuals(residuals: Float[np.ndarray, "K"], name: str, limit: float) -> None:
-    """Log how near the body's joints are to the motion's; raise UserError when they are not."""
+    """Log the distances of the body's joints from the motion's, millimetres.
+
+    Raises:
+        UserError: the mean distance exceeds ``limit``.
+    """
     worst = int(residuals.argmax())
     found = f"{residuals.mean():.1f} mm mean, {residuals[worst]:.1f} mm at the {JOINTS[worst]}"
     if residuals.mean() > limit:
@@ -274,8 +282,10 @@ def world_meshes(
     scale: float,
     face_front: bool,
 ) -> list[Mesh]:
-    """Return the fitted bodies with z up, centred, their longest half side ``scale``, looking along
-    +x with ``face_front``.
+    """Return the fitted bodies with z up, centred, and with ``scale`` as half the longest side.
+
+    Args:
+        face_front: rotate each body about the z axis, so that it faces +x.
     """
     meshes = []
     for vertices, joints in zip(posed_vertices(model, fit), targets, strict=True):
@@ -289,15 +299,16 @@ def world_meshes(
 
 
 def z_up(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """From y up, front +z, to z up, front +x."""
+    """Rotate points from y up, front +z, to z up, front +x."""
     return points[:, [2, 0, 1]]
 
 
 def facing(joints: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the turn about the world's z that makes a body with these joints (y up) look along +x.
+    """Return the rotation about the world's z axis after which a body with these joints (y up)
+    faces +x.
 
-    It looks at right angles to the line through its hips and to that through its shoulders; one
-    that lies with these upright has no such direction and isn't turned."""
+    The front is horizontal and perpendicular to the sum of the vectors from the left to the right
+    hip and shoulder. If that sum is vertical or zero, the body isn't rotated."""
     joints = z_up(joints)
     across = (joints[list(RIGHT)] - joints[list(LEFT)]).sum(axis=0)
     forward = np.cross([0.0, 0.0, 1.0], across)[:2]
@@ -309,7 +320,7 @@ def facing(joints: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def body_pictures(mesh: Mesh) -> Float[np.ndarray, "V H W 3"]:
-    """Return a grey, shaded body before white, from the front and from both sides of it."""
+    """Render the body in shaded grey on white, from the front and from both sides of the front."""
     vertices = mesh.vertices / np.abs(mesh.vertices).max()
     caster = MeshCaster(shaded(Mesh(vertices, mesh.faces)))
     azimuths = torch.tensor(VIEW_AZIMUTHS)
@@ -323,7 +334,7 @@ def body_pictures(mesh: Mesh) -> Float[np.ndarray, "V H W 3"]:
 
 
 def shaded(mesh: Mesh) -> Mesh:
-    """Return ``mesh`` with each vertex grey by how much it looks at the light (Lambert)."""
+    """Return ``mesh`` with grey vertex colours by Lambertian shading."""
     normals = np.zeros_like(mesh.vertices)
     for corner in range(3):
         np.add.at(normals, mesh.faces[:, corner], face_normals(mesh))

@@ -1,8 +1,8 @@
-"""Reading what a text-to-motion model wrote: positions of joints, their texts and lengths, without
-running a pickle.
+"""Read the output of a text-to-motion model, joint positions, texts and lengths, without loading
+pickles.
 
-MDM's ``results.npy`` is a pickled dict, and a pickle runs whatever code it holds, so it is refused
-with the line that turns it into an NPZ on the user's own machine. What is read:
+MDM's ``results.npy`` is a pickled dict, and loading a pickle can run code, so it is refused with a
+message that has the command for converting it to an NPZ. Supported files:
 
 * NPZ with ``motion`` (S, J, 3, F), and optionally ``text`` (S,) strings and ``lengths`` (S,)
 frames; * NPY with (S, J, 3, F), or one motion as (J, 3, F) or (F, J, 3).
@@ -35,7 +35,7 @@ class Motions(NamedTuple):
     """Metres, y up."""
     texts: Optional[list[str]]
     lengths: list[int]
-    """Frames of each sample that mean something; the rest is padding."""
+    """Number of valid frames of each sample; later frames are padding."""
 
 
 def read_motions(path: str) -> Motions:
@@ -62,7 +62,7 @@ def read_motions(path: str) -> Motions:
 
 
 def _sample_frame_joint(motion: np.ndarray, path: str) -> Float[np.ndarray, "S F J 3"]:
-    """Any of the layouts as (samples, frames, joints, 3)."""
+    """Convert any of the layouts to (samples, frames, joints, 3)."""
     shape = motion.shape
     if motion.dtype.kind not in "fiu":
         raise UserError(f"motion file {path!r} holds {motion.dtype}, not numbers: {EXPECTED}")

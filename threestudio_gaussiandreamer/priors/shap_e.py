@@ -74,7 +74,7 @@ GRID_BYTES = 32
 
 @register("shap-e-prior")
 class ShapEPrior(Prior):
-    """The vertices of the mesh that Shap-E imagines for the prompt."""
+    """Sample a mesh for the prompt with Shap-E, and return its vertices and faces."""
 
     @dataclass
     class Config(Prior.Config):
@@ -275,8 +275,8 @@ def decoded(
 
 
 def _refuse_empty(decoder: Any, inputs: tuple, mesh: Any) -> None:
-    """Refuse a mesh without faces, as a hook behind marching cubes: what follows it in the renderer
-    can't cope with a mesh without vertices.
+    """Raise UserError for a mesh without faces. This is a forward hook of the marching cubes,
+    because the renderer's next steps fail on a mesh without vertices.
     """
     if not len(mesh.faces):
         raise UserError(

@@ -168,7 +168,7 @@ def energy(
     wanted: Float[Tensor, "F K 3"],
     pose_weight: float,
 ) -> Tensor:
-    """Return what is minimised, summed over the frames; see the module."""
+    """Compute the objective of the fit, summed over the frames; see the module's docstring."""
     found = posed_joints(model, pose, shape, translation)[:, : wanted.shape[1]]
     data = ((found - wanted) / SCALE).square().sum()
     return (
@@ -180,7 +180,7 @@ def energy(
 
 
 def beyond_limits(pose: Float[Tensor, "F J 3"]) -> Tensor:
-    """Squared radians by which rotations leave ``LIMITS``, summed."""
+    """Return the sum of squares of the angles, in radians, by which rotations exceed ``LIMITS``."""
     rows = [
         (joint, axis, low * DEGREES, high * DEGREES)
         for joint, axes in LIMITS.items()
@@ -260,8 +260,8 @@ def _placed(
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Use one thread for thousands of tiny operations: on a busy machine, threads that wait for
-    each other make them a hundred times slower.
+    """Limit torch to one thread in this context. The fit consists of thousands of tiny operations,
+    which thread synchronisation makes a hundred times slower on a busy machine.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -272,7 +272,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def _minimise(moved: list[Tensor], loss: Callable[[], Tensor], iterations: int) -> None:
-    """L-BFGS over ``moved``, in place."""
+    """Minimise ``loss`` over the tensors ``moved`` with L-BFGS, in place."""
     for tensor in moved:
         tensor.requires_grad_(True)
     optimiser = torch.optim.LBFGS(

@@ -1,4 +1,4 @@
-"""What a prior gave, to look at: its points as small Gaussians, seen from all around."""
+"""Render a turntable of a prior's points as small Gaussians, for inspection."""
 
 import math
 import os
@@ -15,11 +15,11 @@ from ..splatting import rasterize
 
 ELEVATION, FOVY = 15.0, math.radians(40)
 MARGIN = 1.3
-"""The camera's distance, in units of that at which the points alone would fill the picture."""
+"""Camera distance, relative to that at which the points exactly fill the picture."""
 SIZE = 0.8
-"""Of a point, in units of the distance to its neighbours: just no holes between them."""
+"""Size of a point relative to the distance to its neighbours: the smallest without visible gaps."""
 MILLISECONDS = 80
-"""That each picture is shown."""
+"""Duration of each frame, milliseconds."""
 
 
 def save_turntable(

@@ -1,5 +1,5 @@
-"""Reading published ``.pt`` and ``.pth`` files of weights: tensors only, and every name accounted
-for.
+"""Read published ``.pt`` and ``.pth`` files of weights: tensors only, whose names must match those
+of the network exactly.
 """
 
 import pickle
@@ -14,9 +14,9 @@ from ..core.errors import UserError
 from ..core.files import existing_file
 
 WRAPPER = "model_state_dict"
-"""The key of the weights where a file of training holds more than them."""
+"""The key of the weights in training checkpoints, which have further entries."""
 NAMED = 4
-"""How many names a message lists."""
+"""Number of names that a message lists."""
 
 
 def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
@@ -32,7 +32,7 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
     file = existing_file(path, kind)
     if zipfile.is_zipfile(file):
         require_plain_archive(file)
-    try:  # a zip is mapped, so what isn't wanted, as an optimiser's state, is never read
+    try:  # zip files are memory-mapped, so that unused tensors (optimiser state) aren't read
         content = torch.load(
             file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file)
         )
@@ -42,9 +42,7 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
             "unpickled, since that could run code:"
             f" {str(error).strip().splitlines()[0][:200]}"
         ) from error
-    except (
-        Exception
-    ) as error:  # where a pickle is damaged, torch's reader of it raises what it likes
+    except Exception as error:  # torch raises various exceptions for damaged pickles
         raise UserError(
             f"{kind} {path!r} can't be read: {type(error).__name__}: {str(error).strip()[:200]}"
         ) from error
@@ -58,10 +56,10 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
 
 
 def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> None:
-    """Put ``state`` into ``module``, converted to its dtype.
+    """Load ``state`` into ``module``, converted to its dtype.
 
     Raises:
-        UserError: a name is missing or unknown, or a shape differs; the message lists a few.
+        UserError: names are missing or unknown, or shapes differ; the message lists some of them.
     """
     own = module.state_dict()
     missing, unknown = own.keys() - state.keys(), state.keys() - own.keys()

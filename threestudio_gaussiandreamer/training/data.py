@@ -1,12 +1,12 @@
 """Data module ``gaussiandreamer-datamodule``: random training cameras, a ring of validation and
 test cameras.
 
-Same batch keys, units and config keys as threestudio's ``random-camera-datamodule`` (whose name it
-also answers to in the built-in host), with three differences. Rays aren't built unless ``rays:
-true``: splatting doesn't read them, and at 4 x 1024^2 they cost half a second of CPU time per step.
-A batch is a function of (seed, step), so a resumed run sees the cameras that the run that never
-stopped sees. And the batch that trains step k was made for step k: no prefetched batch with the
-previous resolution, no degenerate third batch.
+Batch keys, units and options are those of threestudio's ``random-camera-datamodule``, under whose
+name it is also registered in the built-in host. There are three differences. Rays are computed only
+with ``rays: true``, since splatting doesn't need them, and at 4 x 1024^2 they take half a second of
+CPU time per step. A batch is a function of (seed, step), so a resumed run has the same cameras as
+an uninterrupted one. Step k is trained with the batch of step k: no batch is prefetched with the
+previous resolution, and there is no degenerate third batch.
 
 ========================  ==========================================================================
 option                    meaning
@@ -111,9 +111,7 @@ class TrainCameras(IterableDataset, Updateable):
             step += 1
 
     def collate(self, step: int) -> dict[str, Any]:
-        """The batch that trains ``step``: a function of (seed, step), different in each process
-        that trains along.
-        """
+        """Return the batch for ``step``, a function of (seed, step) and the rank of the process."""
         height, width, batch_size = self.sizes[
             bisect.bisect_right(self.cfg.resolution_milestones, step)
         ]
@@ -189,7 +187,7 @@ class EvalCameras(Dataset, Updateable):
     def __init__(self, cfg: CameraConfig, split: str) -> None:
         self.cfg = cfg
         count = cfg.n_val_views if split == "val" else cfg.n_test_views
-        # 360 degrees is the first view again, which would stand still for a frame in a looped video
+        # without 360 degrees, which would repeat the first view in a looped video
         azimuth = torch.linspace(0.0, 360.0, count + 1)[:-1]
         same = torch.ones(count)
         self.orbit = Orbit(
@@ -240,8 +238,7 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         )
 
     def train_dataloader(self) -> DataLoader:
-        # Lightning asks for the loader after it restored the loops and before it fetches the first
-        # batch
+        # Lightning calls this after restoring its loops and before fetching the first batch
         self.train_dataset.start_step = (
             self.trainer.global_step if self.trainer is not None else self.train_dataset.start_step
         )

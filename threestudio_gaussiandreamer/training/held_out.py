@@ -1,9 +1,9 @@
-"""Held-out scores: the cloud against ray-cast views of the mesh that training has not seen.
+"""Held-out scores: compare the cloud with ray-cast views of the mesh that aren't used in training.
 
-The truth is cast on the mesh, never rendered by our splatting, and composited over the background
-of the render. Scores: PSNR and SSIM, averaged over the views; share of views that show another side
-of the object (multi-face); share of the opacity far from the surface (floater mass); share of
-pixels with a colour outside [0, 1] (out of gamut)."""
+The ground truth is ray cast, independently of the splatting rasteriser, and composited over the
+background of the render. Scores: PSNR and SSIM, averaged over the views; fraction of views that
+show another side of the object (multi-face); fraction of the opacity far from the surface (floater
+mass); fraction of pixels with a colour outside [0, 1] (out of gamut)."""
 
 import json
 import time
@@ -31,7 +31,9 @@ from .camera_options import MAX_SIDE
 from .data import make_batch
 
 VIEW_BYTES = 40
-"""Of a pixel: its truth with coverage, that on the background, and the render, in float32."""
+"""Memory per pixel, bytes: ground truth with coverage (16), ground truth over the background (12)
+and render (12), in float32.
+"""
 
 
 @dataclass
@@ -55,11 +57,11 @@ def orbit_batch(orbit: Orbit, size: int) -> dict[str, Any]:
 
 
 class HeldOut:
-    """The held-out views and their truth, cast at first use by ``caster`` (a
-    :class:`raycast.MeshCaster`).
+    """The held-out views and their ground truth, which ``caster`` (a :class:`raycast.MeshCaster`)
+    casts on first use.
     """
 
-    RING = 24  # azimuths that the multi-face meter compares with
+    RING = 24  # number of azimuths that the multi-face rate compares with
     RING_SIZE = 32
 
     def __init__(self, cfg: EvaluationConfig, caster: Any) -> None:
@@ -77,8 +79,8 @@ class HeldOut:
 
     @cached_property
     def rings(self) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """For each height and distance that occurs: the views (rows), all-around azimuths, and
-        their truth (R, h, w, 4).
+        """For each distinct pair of elevation and distance: the indices of its held-out views,
+        ``RING`` azimuths in degrees, and the ground truth at those, (R, h, w, 4).
         """
         azimuth, rings = 360.0 * torch.arange(self.RING) / self.RING, []
         places = torch.stack([self.orbit.elevation, self.orbit.distance], 1)
@@ -97,8 +99,10 @@ class HeldOut:
 
     @torch.no_grad()
     def render(self, renderer: Any, chunk: int = 4) -> tuple[Tensor, Tensor]:
-        """Render the cloud's pictures (V, H, W, 3), not clamped, and return the background (V, 3)
-        of each too, on the CPU.
+        """Render the held-out views.
+
+        Returns:
+            unclamped pictures (V, H, W, 3) and their background colours (V, 3), on the CPU.
         """
         modes = [(module, module.training) for module in (renderer, renderer.background)]
         for module, _ in modes:
@@ -119,7 +123,7 @@ class HeldOut:
     def multi_face(
         self, images: Float[Tensor, "V H W 3"], backgrounds: Float[Tensor, "V 3"]
     ) -> float:
-        """Compute the share of views that look like another side of the object, more than 45
+        """Return the fraction of views that are most similar to a ground-truth view more than 45
         degrees of azimuth away.
         """
         wrong = 0.0
@@ -131,8 +135,8 @@ class HeldOut:
         return wrong / len(images)
 
     def floaters(self, means: Float[Tensor, "N 3"], opacities: Float[Tensor, " N"]) -> float:
-        """Compute the opacity-weighted share of Gaussians farther from the surface than 2 % of the
-        longest side of its box.
+        """Return the opacity-weighted fraction of Gaussians whose distance from the surface exceeds
+        2 % of the longest side of its bounding box.
         """
         distances = torch.from_numpy(self.surface_distance(means.double().cpu().numpy()))
         return floater_mass(
@@ -146,11 +150,10 @@ CLOCKS = ("seconds", "cpu_seconds")
 
 
 class Measurements:
-    """The scores of a run and its seconds of training; kept in ``metrics.json`` and continued on
-    resume.
+    """The scores and training time of a run, stored in ``metrics.json`` and continued on resume.
 
-    ``cpu_seconds``, the processor time of all threads, doesn't grow when other programs hold the
-    processor."""
+    ``seconds`` is wall-clock time. ``cpu_seconds`` is the processor time of all threads, which
+    excludes time that other programs use the processor."""
 
     def __init__(self, held_out: HeldOut, folder: Path) -> None:
         self.held_out, self.folder = held_out, folder
@@ -163,14 +166,14 @@ class Measurements:
         self._started = _now()
 
     def stop_clock(self) -> None:
-        """Add the time since the clock was started to the training seconds."""
+        """Add the time since :meth:`start_clock` to the training time."""
         if self._started is not None:
             self.seconds += _now() - self._started
             self._started = None
 
     @contextmanager
     def paused_clock(self) -> Iterator[None]:
-        """Count no time in this context: rendering pictures isn't training."""
+        """Exclude the time in this context from the training time."""
         running = self._started is not None
         self.stop_clock()
         try:
@@ -181,8 +184,11 @@ class Measurements:
 
     @torch.no_grad()
     def score(self, key: str, renderer: Any, step: int) -> dict[str, Any]:
-        """Score the renderer's cloud under ``key`` ("prior", "result", or "curve", which collects);
-        no time is counted while it runs.
+        """Score the renderer's cloud, and store the scores in ``metrics.json``.
+
+        Args:
+            key: "prior" or "result", or "curve", a list to which the scores are appended.
+            step: number of finished optimiser steps.
         """
         with self.paused_clock():
             return self._score(key, renderer, step)
@@ -220,8 +226,8 @@ class Measurements:
             file.write(json_text(self.values, indent=2).encode())
 
     def _save_pictures(self, key: str, renders: Tensor, truth: Tensor) -> None:
-        """Save rows of six views: ``held_out/<key>.png``, ``truth.png``, and ``compare.png`` with
-        prior, result and truth.
+        """Save rows of six views to the folder ``held_out``: ``<key>.png``, ``truth.png``, and
+        ``compare.png`` with prior, result and ground truth.
         """
         folder = self.folder / "held_out"
         folder.mkdir(parents=True, exist_ok=True)
@@ -234,7 +240,7 @@ class Measurements:
             _write_png(folder / "compare.png", np.concatenate(pictures, 0))
 
     def table(self) -> str:
-        """Tabulate prior and result: dB, SSIM, Gaussians, seconds."""
+        """Format a table of the main scores of prior and result."""
         lines = ["              dB     SSIM   multi-face   Gaussians   seconds"]
         for key in ("prior", "result"):
             if key in self.values:
@@ -252,7 +258,7 @@ def _now() -> np.ndarray:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    """Read the mapping in a JSON file; empty when there is none, or a damaged one."""
+    """Read a mapping from a JSON file; return an empty one if the file is missing or damaged."""
     try:
         values = json.loads(path.read_text())
     except (OSError, ValueError):

@@ -1,5 +1,5 @@
-"""The first Gaussians of a run: points are grown, and each becomes one Gaussian; or those of a
-trained cloud are taken over.
+"""Initialise the Gaussians of a run: grow the prior's points and place a Gaussian on each, or take
+those of a trained cloud.
 """
 
 import logging
@@ -78,8 +78,8 @@ def _capped(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Choose at most ``max_gaussians`` points, seeded and uniformly.
 
-    They are equally opaque and not trained yet, so a choice by contribution to first renders would
-    only prefer the outer ones, and leave holes (tests/stability measures both).
+    All points have the same opacity and aren't trained yet, so that selecting by contribution to
+    renders would prefer outer ones and leave holes (tests/stability measures both).
     """
     if len(points) <= max_gaussians:
         return points, colors
@@ -94,8 +94,8 @@ def _capped(
 
 
 def most_visible(cloud: Gaussians, max_gaussians: int, device: torch.device) -> Gaussians:
-    """Choose at most ``max_gaussians`` of a trained cloud: those that show most in views from all
-    around, which are rendered on ``device``.
+    """Select at most ``max_gaussians`` of a trained cloud: those with the largest contribution to
+    views from all around, which are rendered on ``device``.
     """
     if len(cloud.means) <= max_gaussians:
         return cloud

@@ -1,4 +1,4 @@
-"""Rows of pictures for validation, as the host's ``save_image_grid`` takes them."""
+"""Rows of validation pictures, in the format of the host's ``save_image_grid``."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -23,8 +23,12 @@ def render_panels(out: Mapping[str, Any]) -> list[Panel]:
 
 
 def score_panels(evaluated: Mapping[str, Any], size: tuple[int, int]) -> list[Panel]:
-    """Arrange what the score model makes of the first view, resized to (height, width): noisy,
-    denoised in one step, denoised in many.
+    """Arrange the score model's pictures of the first view: noisy, denoised in one step, and
+    denoised in many.
+
+    Args:
+        evaluated: output of :meth:`.ScoreDistillation.evaluate`.
+        size: (height, width) to which they are resized, pixels.
     """
     images = [evaluated[name][:1].movedim(-1, 1) for name in SCORE_PICTURES]
     images = [F.interpolate(x, size, mode="bilinear", align_corners=False) for x in images]
