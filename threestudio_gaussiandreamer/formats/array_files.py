@@ -1,8 +1,8 @@
-"""Read NPY and NPZ files, which may come from anywhere: no pickles, a memory budget, and one
-message whatever is wrong.
+"""Read NPY and NPZ files from untrusted sources: without pickles, within a memory budget, and with
+one type of error for every kind of damage.
 
-``numpy.load`` trusts the header: it allocates what that announces, ignores what is left over, and
-raises errors of many kinds where the file is damaged."""
+``numpy.load`` trusts the header: it allocates the size that the header gives, ignores trailing
+data, and raises many types of errors for damaged files."""
 
 import math
 import os
@@ -21,28 +21,28 @@ MOST_DEFLATE_SAVES = 1032
 """Bytes that one byte of a deflate stream stands for at most (zlib's technical notes)."""
 PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 CONVERTED_BYTES = 16
-"""Memory that is counted per number for what callers make of it: two copies in float64."""
+"""Memory per number that is added to the budget for callers, which make two float64 copies."""
 
 
 class PickledArray(UserError):
-    """An array of Python objects, which would be unpickled."""
+    """Raised for an array of Python objects, which would have to be unpickled."""
 
 
 def read_arrays(
     path: str | os.PathLike, kind: str, required: Sequence[str], optional: Collection[str] = ()
 ) -> dict[str, np.ndarray]:
-    """Read the arrays of these names from an NPZ; the one array of an NPY is the first that is
-    required.
+    """Read named arrays from an NPZ, or the single array of an NPY, which gets the first required
+    name.
 
     Args:
         kind: what the file is, for messages ("motion file").
-        optional: names that may be missing; other arrays of the file are not read.
+        required: names of arrays that must be in the file.
+        optional: names of arrays that may be missing; other arrays are not read.
 
     Raises:
-        PickledArray: one of them holds Python objects; it is not unpickled, since that could run
-            code.
-        UserError: not such a file, damaged, without a required array, or one that announces more
-            than the memory budget of its size.
+        PickledArray: an array holds Python objects; it isn't unpickled, since that could run code.
+        UserError: the file is neither NPZ nor NPY, is damaged, lacks a required array, or needs
+            more memory than the budget of its size.
     """
     path, where = Path(path), f"{kind} {str(path)!r}"
     try:
@@ -81,7 +81,7 @@ def _read_archive(
 def _require_memory(
     archive: zipfile.ZipFile, wanted: dict[str, zipfile.ZipInfo], where: str
 ) -> None:
-    """Check what all headers together announce, before any array is unpacked."""
+    """Check the total size in the headers before any array is unpacked."""
     needed = 0
     for info in wanted.values():
         with _open_member(archive, info, where) as file:
@@ -106,7 +106,7 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str) ->
 
 
 def _read_array(file: IO[bytes], size: int, where: str) -> np.ndarray:
-    """Read the array in a stream of ``size`` bytes, which it has to fill exactly."""
+    """Read the array in a stream; header and data must have ``size`` bytes together."""
     shape, dtype = _read_header(file, size)
     if dtype.hasobject:
         raise PickledArray(
@@ -127,7 +127,7 @@ def _read_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype]
     if int.from_bytes(file.read(length_bytes), "little") > size:
         raise ValueError("the header is longer than the file")
     file.seek(-length_bytes, os.SEEK_CUR)
-    # version 3 differs from 2 only in that names of fields may be Unicode: plain arrays have none
+    # version 3 differs from 2 only in Unicode names of fields, which plain arrays don't have
     read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
     shape, _, dtype = read(file)
     return shape, dtype

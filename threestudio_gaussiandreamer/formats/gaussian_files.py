@@ -1,8 +1,9 @@
-"""Files of Gaussians, PLY or SPZ by the name's ending, with their axes and what was pruned.
+"""Read and write files of Gaussians, PLY or SPZ by extension, with their axes and the PSNR to which
+they were pruned.
 
-Every file says in which axes it is: a PLY in a comment of its header, SPZ by definition (y up).
-A PLY without that comment, as other programs write it, is read as -y up, the axes of 3D Gaussian
-splatting and its viewers; those are also what is written unless another axis is asked for."""
+The axes of a file are known: a PLY has them in a comment of its header, and SPZ is y up by
+definition. A PLY without that comment, as other programs write it, is read as -y up, the axes of 3D
+Gaussian splatting and its viewers. The same axes are written by default."""
 
 import re
 from pathlib import Path
@@ -17,18 +18,18 @@ from .spz import SPZ_UP, read_spz, read_spz_comment, spz_arrays, spz_bytes, writ
 
 UP, PRUNED = "up:", "pruned to the likeness, dB:"
 DEFAULT_UP = {".ply": VIEWER_UP, ".spz": SPZ_UP}
-"""The axis that is up in a file that doesn't say, by format; the keys are all formats."""
+"""The up axis of a file without a comment about it, by format; the keys are all formats."""
 
 
 class StoredCloud(NamedTuple):
-    """Gaussians and what their file says about them."""
+    """Gaussians with the metadata of their file."""
 
     gaussians: Gaussians
     """As arrays."""
     up: str = WORLD_UP
     """The axis that is up, a key of ``AXES``."""
     pruned_to: Optional[float] = None
-    """PSNR to the original cloud, dB, that it has been pruned to."""
+    """PSNR to the original cloud, dB, after the pruning so far; None if it wasn't pruned."""
 
     def in_axes(self, up: str) -> "StoredCloud":
         """Return the same cloud in coordinates with another axis up."""
@@ -39,10 +40,13 @@ class StoredCloud(NamedTuple):
 
 
 def require_format(name: str, option: str) -> str:
-    """Return the ending of a file name that a format is known for.
+    """Return the extension of a file name after checking that it is a known format.
+
+    Args:
+        option: names the option in the message.
 
     Raises:
-        UserError: another one; ``option`` is what the name was given for.
+        UserError: the extension is unknown.
     """
     suffix = Path(name).suffix.lower()
     if suffix not in DEFAULT_UP:
@@ -53,13 +57,13 @@ def require_format(name: str, option: str) -> str:
 
 
 def read_cloud(path: str, *, up: Optional[str] = None) -> StoredCloud:
-    """Read the Gaussians of a file that can be drawn.
+    """Read the Gaussians of a file, without those that can't be drawn.
 
     Args:
-        up: the file's axis that is up, whatever the file says.
+        up: overrides the up axis that the file states.
 
     Raises:
-        UserError: no such file, of an unknown format, or damaged.
+        UserError: there is no such file, its format is unknown, or it is damaged.
     """
     file = existing_file(path, "file of Gaussians")
     require_format(file.name, "IN")
@@ -68,8 +72,9 @@ def read_cloud(path: str, *, up: Optional[str] = None) -> StoredCloud:
 
 
 def read_stored(file: Path, *, up: Optional[str] = None) -> StoredCloud:
-    """Read all Gaussians of a file, also those that can't be drawn: as SPZ if that is its name's
-    ending, otherwise as PLY; see :func:`read_cloud`.
+    """Read all Gaussians of a file, including those that can't be drawn; see :func:`read_cloud`.
+
+    The file is read as SPZ if that is its extension, otherwise as PLY.
     """
     if file.suffix.lower() == ".spz":
         gaussians, notes = read_spz(file), read_spz_comment(file).split("; ")
@@ -82,36 +87,37 @@ def read_stored(file: Path, *, up: Optional[str] = None) -> StoredCloud:
 
 
 def stated_up(notes: list[str]) -> Optional[str]:
-    """Return the axis that is up by a file's comments; None where they don't say."""
+    """Return the up axis in a file's comments, or None if they have none."""
     stated = _note(notes, UP)
     return stated if stated in AXES else None
 
 
 def ply_up(path: Path) -> str:
-    """Return the axis that is up in a PLY of Gaussians."""
+    """Return the up axis of a PLY of Gaussians, by default that of viewers."""
     return stated_up(read_comments(path)) or VIEWER_UP
 
 
 def _note(notes: list[str], key: str) -> str:
-    """Return what the last note of this kind says; empty where there is none."""
+    """Return the text after ``key`` in the last note that begins with it; empty if none does."""
     return next(
         (note.removeprefix(key).strip() for note in reversed(notes) if note.startswith(key)), ""
     )
 
 
 def _number(text: str) -> Optional[float]:
-    """Parse a number of a note, which any program may have written."""
+    """Parse the number in a note, or return None; the file may be from another program."""
     return float(text) if re.fullmatch(r"\d{1,4}(\.\d{1,9})?", text) else None
 
 
 def write_cloud(path: str, cloud: StoredCloud, suffix: Optional[str] = None) -> None:
-    """Write a cloud: PLY in its own axes, SPZ in those of the format.
+    """Write a cloud: PLY in the cloud's axes, SPZ in those of the format.
 
     Args:
-        suffix: ``.ply`` or ``.spz``; by default that of the name.
+        suffix: ``.ply`` or ``.spz``; by default the extension of ``path``.
 
     Raises:
-        UserError: an unknown format, harmonics that it can't hold, or the file can't be written.
+        UserError: the format is unknown or doesn't support the harmonics' degree, or the file can't
+            be written.
     """
     if (suffix or require_format(path, "OUT")) == ".ply":
         write_gaussians(path, cloud.gaussians, ply_notes(cloud))
@@ -120,24 +126,24 @@ def write_cloud(path: str, cloud: StoredCloud, suffix: Optional[str] = None) -> 
 
 
 def ply_notes(cloud: StoredCloud) -> list[str]:
-    """Return the comments that a PLY keeps about a cloud."""
+    """Return the comments about a cloud in the header of its PLY."""
     return [f"{UP} {cloud.up}", *filter(None, [spz_note(cloud)])]
 
 
 def spz_note(cloud: StoredCloud) -> str:
-    """Return the comment that an SPZ file keeps about a cloud; its axes need none."""
+    """Return the comment about a cloud in its SPZ file: the PSNR of pruning, or nothing."""
     return "" if cloud.pruned_to is None else f"{PRUNED} {cloud.pruned_to:.6g}"
 
 
 def file_size(cloud: StoredCloud, suffix: str) -> int:
-    """Return the size in bytes of the file that :func:`write_cloud` makes."""
+    """Return the size in bytes of the file that :func:`write_cloud` would write."""
     if suffix == ".spz":
         return len(spz_bytes(cloud.in_axes(SPZ_UP).gaussians, comment=spz_note(cloud)))
     return gaussians_size(*cloud.gaussians.sh.shape[:2], ply_notes(cloud))
 
 
 def as_stored(cloud: StoredCloud, suffix: str) -> StoredCloud:
-    """Return the cloud as it is read from a file of this format; SPZ changes the order too."""
+    """Return the cloud as it would be read back from a file of this format; SPZ also reorders it."""
     if suffix == ".ply":
         return cloud
     packed = spz_bytes(cloud.in_axes(SPZ_UP).gaussians)

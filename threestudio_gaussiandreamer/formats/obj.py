@@ -10,11 +10,11 @@ from ..gaussians.surface import Surface
 
 
 def write_obj(path: str | os.PathLike, surface: Surface) -> None:
-    """Write an OBJ with the colours behind the positions ("v x y z r g b"), as MeshLab, Blender and
-    trimesh read it.
+    """Write an OBJ with colours after the positions ("v x y z r g b"), which MeshLab, Blender and
+    trimesh can read.
 
     Raises:
-        UserError: vertices or colours that aren't finite, or the file can't be written.
+        UserError: vertices or colours aren't finite, or the file can't be written.
     """
     if not (np.isfinite(surface.vertices).all() and np.isfinite(surface.colors).all()):
         raise UserError(f"{str(path)!r} isn't written: some of its vertices hold NaN or infinity")

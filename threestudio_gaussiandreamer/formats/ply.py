@@ -1,10 +1,9 @@
 """PLY files of 3D Gaussians and of coloured points.
 
-Gaussians are written in the layout that every viewer of 3D Gaussian splatting reads (little-endian
-float32): ``x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3``, where
-``f_dc``/``f_rest`` are spherical harmonics (``f_rest`` channel by channel), ``opacity`` is a logit,
-``scale`` a logarithm and ``rot`` a quaternion wxyz. ``f_rest`` may be missing in files that are
-read."""
+Gaussians are written in the usual layout of 3D Gaussian splatting (little-endian float32):
+``x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3``, where ``f_dc``/``f_rest`` are
+spherical harmonics (``f_rest`` channel by channel), ``opacity`` is a logit, ``scale`` a logarithm
+and ``rot`` a quaternion wxyz. When reading, ``f_rest`` may be missing."""
 
 import logging
 import os
@@ -37,7 +36,7 @@ GAUSSIAN = (*MEANS, *SH_CONSTANT, "opacity", *LOG_SCALES, *QUATS)
 COLORS = ("red", "green", "blue")
 EXACT_COLORS = ("float_red", "float_green", "float_blue")
 COMPRESSED = "packed_position"
-"""A property that only compressed PLY files have."""
+"""A property by which compressed PLY files are recognised."""
 
 
 # --------------------------------------------------------------------------------------------------
@@ -47,14 +46,14 @@ COMPRESSED = "packed_position"
 def write_gaussians(
     path: str | os.PathLike, gaussians: Gaussians, comments: Sequence[str] = ()
 ) -> None:
-    """Write Gaussians as float32, whole or not at all, those that can't be drawn left out.
+    """Write Gaussians as float32, atomically, without those that can't be drawn.
 
     Args:
         path: the file; its folder must exist.
         comments: ASCII lines for the header.
 
     Raises:
-        ValueError: arrays whose shapes don't agree.
+        ValueError: the shapes of the arrays don't agree.
         UserError: the file can't be written.
     """
     gaussians = finite(_as_float32(gaussians), str(path))
@@ -63,7 +62,7 @@ def write_gaussians(
 
 
 def gaussians_size(count: int, harmonics: int, comments: Sequence[str] = ()) -> int:
-    """Return the size in bytes of the file that :func:`write_gaussians` makes of ``count``
+    """Return the size in bytes of the file that :func:`write_gaussians` writes for ``count``
     Gaussians with (degree + 1)^2 ``harmonics`` each.
     """
     properties = gaussian_properties(harmonics)
@@ -78,7 +77,7 @@ def gaussian_properties(harmonics: int) -> list[tuple[str, str]]:
 
 
 def gaussian_columns(gaussians: Gaussians) -> Float[np.ndarray, "N P"]:
-    """Return the rows of a file of Gaussians."""
+    """Return the values of the columns of :func:`gaussian_properties`; normals are zero."""
     count, harmonics = gaussians.sh.shape[:2]
     by_channel = gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (harmonics - 1))
     columns = [
@@ -94,7 +93,7 @@ def gaussian_columns(gaussians: Gaussians) -> Float[np.ndarray, "N P"]:
 
 
 def read_comments(path: str | os.PathLike) -> list[str]:
-    """Return the comments in the header of a PLY file; none where it is no PLY file."""
+    """Return the comments in the header of a PLY file; empty if it isn't a PLY file."""
     with open(path, "rb") as file:
         head = file.read(MAX_HEADER_BYTES).partition(b"end_header")[0].decode("latin-1")
     lines = head.splitlines() if head.startswith("ply") else []
@@ -102,22 +101,20 @@ def read_comments(path: str | os.PathLike) -> list[str]:
 
 
 def padded_sh(sh: Float[np.ndarray, "N K 3"], degree: int) -> Float[np.ndarray, "N L 3"]:
-    """Append zero harmonics up to ``degree``; those above it stay."""
+    """Pad harmonics with zeros up to ``degree``; higher ones are kept."""
     missing = max((degree + 1) ** 2 - sh.shape[1], 0)
     return np.pad(sh, ((0, 0), (0, missing), (0, 0)))
 
 
 def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
-    """Write coloured points, whole or not at all: ``x y z``, normals where known, ``red green
-    blue`` as bytes.
+    """Write coloured points atomically: ``x y z``, normals if there are any, and colours.
 
-    The bytes are what every viewer understands; ``float_red float_green float_blue`` after them
-    hold the colours exactly, so that reading gives the same cloud bit for bit. Faces are not
-    written.
+    Colours are written twice: as bytes ``red green blue``, which viewers read, and as ``float_red
+    float_green float_blue``, so that reading gives exactly the same colours. Faces are not written.
 
     Raises:
-        ValueError: arrays whose shapes don't agree.
-        UserError: points or colours that aren't finite, or the file can't be written.
+        ValueError: the shapes of the arrays don't agree.
+        UserError: points or colours aren't finite, or the file can't be written.
     """
     if not (np.isfinite(cloud.points).all() and np.isfinite(cloud.colors).all()):
         raise UserError(f"{str(path)!r} isn't written: some of its points hold NaN or infinity")
@@ -168,15 +165,15 @@ def _as_bytes(colors: Float[np.ndarray, "P 3"]) -> np.ndarray:
 
 
 def read_gaussians(path: str | os.PathLike, *, allow_non_finite: bool = False) -> Gaussians:
-    """Read trained Gaussians, of any degree of spherical harmonics, in the file's axes.
+    """Read Gaussians with any degree of spherical harmonics, in the file's axes.
 
     Args:
         path: the file.
-        allow_non_finite: return rows that are not :func:`usable` too.
+        allow_non_finite: also return rows that are not :func:`usable`.
 
     Raises:
-        UserError: no such file, not a PLY, not of Gaussians, damaged, or with values that are not
-            usable.
+        UserError: there is no such file, it is no PLY of Gaussians, is damaged, or has rows that
+            are not usable.
     """
     table = PlyTable.read(path)
     _require_gaussians(table)
@@ -189,16 +186,17 @@ def read_gaussians(path: str | os.PathLike, *, allow_non_finite: bool = False) -
 
 
 def read_points(path: str | os.PathLike, *, allow_non_finite: bool = False) -> PointCloud:
-    """Read coloured points; those without colours are grey (0.5), those of Gaussians have the
-    colours of the constant harmonic.
+    """Read coloured points.
+
+    Points without colours become grey (0.5); Gaussians get the colour of the constant harmonic.
 
     Args:
         path: the file.
-        allow_non_finite: return rows with NaN or infinity too.
+        allow_non_finite: also return rows with NaN or infinity.
 
     Raises:
-        UserError: no such file, not a PLY, without positions, damaged, or with values that are not
-            finite.
+        UserError: there is no such file, it is no PLY, has no positions, is damaged, or has values
+            that aren't finite.
     """
     table = PlyTable.read(path)
     if missing := [name for name in MEANS if name not in table]:
@@ -212,7 +210,7 @@ def read_points(path: str | os.PathLike, *, allow_non_finite: bool = False) -> P
 
 
 def is_gaussian_ply(path: str | os.PathLike) -> bool:
-    """Tell whether the file is a PLY whose vertices have the properties of Gaussians."""
+    """Return whether the file is a PLY whose vertices have the properties of Gaussians."""
     try:
         with open(path, "rb") as file:
             header = read_header(file, str(path))
@@ -228,7 +226,7 @@ def is_gaussian_ply(path: str | os.PathLike) -> bool:
 
 
 def _require_gaussians(table: PlyTable) -> None:
-    """Raise UserError unless all properties of Gaussians are there; warn of others."""
+    """Raise UserError if a property of Gaussians is missing; warn about unknown ones."""
     if missing := [name for name in GAUSSIAN if name not in table]:
         table.fail(f"the Gaussians lack {', '.join(missing)}.{_format_hint(table)}")
     known = {*GAUSSIAN, *NORMALS, *COLORS}
@@ -240,7 +238,7 @@ def _require_gaussians(table: PlyTable) -> None:
 
 
 def _format_hint(table: PlyTable) -> str:
-    """Say which other kind of PLY a file is, where its properties tell."""
+    """Return a hint for the message if the properties are those of another kind of PLY."""
     if COMPRESSED in table:
         return (
             " It is a compressed PLY (PlayCanvas' compressed.ply), which isn't read here: convert "
@@ -296,5 +294,5 @@ def unit_colors(
     if np.issubdtype(stored_type, np.integer):
         return colors / np.float32(np.iinfo(stored_type).max if stored_type.itemsize < 4 else 255)
     finite = colors[np.isfinite(colors)]
-    # Floats beyond any rounding of 1 are bytes that a program or a text file keeps as floats.
+    # Floats well above 1 are byte values that were stored as floats, as in some text files.
     return colors / np.float32(255) if finite.size and 2 < finite.max() <= 255 else colors

@@ -18,8 +18,8 @@ rotations   N u32: the number of the largest component, and sign and 9 bit of ea
 harmonics   N x (K - 1) x 3 u8: 128 sh + 128, of which 5 bit are used at degree 1, 4 above
 ==========  ========================================================================================
 
-What the header announces is checked against the file's size before it is unpacked. What rounding
-costs: docs/results.md."""
+The size in the header is checked against the file's size before anything is unpacked. The loss by
+rounding is measured in docs/results.md."""
 
 import logging
 import os
@@ -41,13 +41,13 @@ HEADER = struct.Struct("<4sIIBBBB")
 MAGIC, VERSION = b"NGSP", 3
 SPZ_UP = "y"
 STEPS_PER_SIZE = 32
-"""Positions are kept to this part of the median Gaussian's size: where the curve of
-docs/results.md has become flat.
+"""Resolution of positions: steps per median size of the Gaussians. More steps hardly improve the
+PSNR (docs/results.md).
 """
 MIN_STEPS_PER_SIZE = 2
 INLIERS, OUTLIER = 0.99, 256
-"""Where the farthest positions would leave the median Gaussian fewer than ``MIN_STEPS_PER_SIZE``
-steps, those are clipped that are ``OUTLIER`` times farther than a share ``INLIERS`` of all.
+"""If the range of the farthest position would leave fewer than ``MIN_STEPS_PER_SIZE`` steps per
+median size, positions beyond ``OUTLIER`` times the ``INLIERS`` quantile of distances are clipped.
 """
 MOST_DEFLATE_SAVES = 1032
 """Bytes that one byte of a deflate stream stands for at most (zlib's technical notes)."""
@@ -55,14 +55,16 @@ MAX_OPACITY_BYTE = 254
 COLOR_SCALE = 0.15
 MAX_FIXED = 2**23 - 1
 COLOR_REACH = 0.5 / COLOR_SCALE
-"""The largest constant harmonic that is stored, either way: colours from -0.44 to 1.44."""
+"""Largest absolute value of a stored constant harmonic: colours from -0.44 to 1.44."""
 MIN_LOG_SCALE, MAX_LOG_SCALE = -10.0, 255 / 16 - 10
 SH_BITS = (5, 4, 4)
-"""By degree from 1 on."""
+"""Bits per coefficient, for degree 1, 2 and 3."""
 DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 180, 9
-"""Memory that reading takes per Gaussian, and per harmonic of it, measured with some room."""
+"""Bytes of memory that reading takes per Gaussian, and per harmonic of it, with a safety margin."""
 OPACITY_MARGIN = 1 / 2040
-"""Opacities are read no closer to 0 and 1, an eighth of a step, where the logit is infinite."""
+"""Opacities that are read are clamped to this distance from 0 and 1, an eighth of a step, since
+their logits are infinite there.
+"""
 
 
 class SpzHeader(NamedTuple):
@@ -78,13 +80,15 @@ class SpzHeader(NamedTuple):
 
     @property
     def blocks(self) -> list[int]:
-        """Return bytes per Gaussian: positions, alphas, colours, scales, rotations, harmonics."""
+        """Bytes per Gaussian of positions, alphas, colours, scales, rotations and harmonics."""
         return [9, 1, 3, 3, 4 if self.version == 3 else 3, 3 * ((self.degree + 1) ** 2 - 1)]
 
 
 def write_spz(path: str | os.PathLike, gaussians: Gaussians, *, comment: str = "") -> None:
-    """Write :func:`spz_bytes`, whole or not at all; what the format can't hold is left out or
-    clipped, with a warning.
+    """Write :func:`spz_bytes` atomically.
+
+    Gaussians that aren't finite are left out, and values beyond the format's range are clipped,
+    each with a warning.
 
     Raises:
         UserError: harmonics above degree 3, or the file can't be written.
@@ -104,15 +108,17 @@ def write_spz(path: str | os.PathLike, gaussians: Gaussians, *, comment: str = "
 
 
 def spz_bytes(gaussians: Gaussians, *, comment: str = "") -> bytes:
-    """Encode Gaussians as an SPZ file of version 3, in the order of a Morton curve, along which
-    neighbours resemble each other. Positions and scales beyond the format's range are clipped.
+    """Encode Gaussians as an SPZ file of version 3.
+
+    They are sorted along a Morton curve, which improves the compression. Positions and scales
+    beyond the format's range are clipped.
 
     Args:
         gaussians: in the axes right, up, back.
-        comment: kept in the header of gzip, which readers ignore; ASCII.
+        comment: ASCII text for the gzip header, which other readers ignore.
 
     Raises:
-        UserError: NaN or infinite values, or harmonics above degree 3.
+        UserError: values are NaN or infinite, or harmonics are above degree 3.
     """
     if not usable(gaussians).all():
         raise UserError("an SPZ file can't hold Gaussians with NaN or infinite values")
@@ -136,7 +142,7 @@ def spz_bytes(gaussians: Gaussians, *, comment: str = "") -> bytes:
 
 
 def out_of_range(gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
-    """Tell which Gaussians have a position or a scale that is clipped."""
+    """Return which Gaussians have a position or a scale above the format's range."""
     reach = MAX_FIXED * 2.0 ** -_fractional_bits(gaussians)
     far = (np.abs(gaussians.means) > reach).any(axis=1)
     return far | (gaussians.log_scales > MAX_LOG_SCALE + 1 / 32).any(axis=1)
@@ -146,7 +152,7 @@ def read_spz(path: str | os.PathLike) -> Gaussians:
     """Read the Gaussians of an SPZ file of version 2 or 3, in its axes: right, up, back.
 
     Raises:
-        UserError: no such file, not an SPZ file of these versions, or damaged.
+        UserError: there is no such file, it is no SPZ file of these versions, or it is damaged.
     """
     path = existing_file(path, "SPZ file")
     try:
@@ -156,7 +162,7 @@ def read_spz(path: str | os.PathLike) -> Gaussians:
 
 
 def spz_arrays(packed: bytes, name: str = "") -> Gaussians:
-    """Decode the bytes of an SPZ file, called ``name`` in messages; see :func:`read_spz`."""
+    """Decode the bytes of an SPZ file; ``name`` is for messages. See :func:`read_spz`."""
     header, data = _unpacked(packed, name)
     ends = np.cumsum([size * header.count for size in header.blocks])
     parts = [
@@ -175,7 +181,7 @@ def spz_arrays(packed: bytes, name: str = "") -> Gaussians:
 
 
 def read_spz_comment(path: str | os.PathLike) -> str:
-    """Read the comment that :func:`spz_bytes` keeps; empty where there is none."""
+    """Read the comment that :func:`spz_bytes` writes; empty if there is none."""
     with open(path, "rb") as file:
         head = file.read(4096)
     has_comment_alone = head[:2] == b"\x1f\x8b" and head[3:4] == b"\x10"
@@ -183,7 +189,7 @@ def read_spz_comment(path: str | os.PathLike) -> str:
 
 
 def _unpacked(packed: bytes, name: str) -> tuple[SpzHeader, Int[np.ndarray, " B"]]:
-    """Unpack header and blocks, no more than the header announces."""
+    """Unpack the header, and no more data than its counts require."""
     if packed[:4] == MAGIC:
         _fail(
             name,
@@ -197,7 +203,7 @@ def _unpacked(packed: bytes, name: str) -> tuple[SpzHeader, Int[np.ndarray, " B"
         size = sum(header.blocks) * header.count
         data = stream.decompress(stream.unconsumed_tail, size) if size else b""
         while not stream.eof and stream.decompress(stream.unconsumed_tail, 1 << 16):
-            # to the end, where the checksum is: extensions may follow what the header announces
+            # read on to the checksum at the end: extensions may follow the blocks
             pass
     except (zlib.error, struct.error) as error:
         _fail(name, f"it isn't an SPZ file, or damaged ({error}).")
@@ -226,9 +232,7 @@ def _check_header(header: SpzHeader, packed_size: int, name: str) -> None:
 
 
 def _gzip(data: bytes, comment: str) -> bytes:
-    """Compress to one gzip member (RFC 1952) without a time, so that equal clouds give equal
-    files.
-    """
+    """Compress to one gzip member (RFC 1952) without a time stamp, so that files are reproducible."""
     deflate = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
     note = comment.encode("ascii") + b"\0" if comment else b""
     head = struct.pack("<4BIBB", 0x1F, 0x8B, 8, 16 if comment else 0, 0, 2, 255)
@@ -245,7 +249,7 @@ def _gzip(data: bytes, comment: str) -> bytes:
 
 
 def _morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
-    """Return rows in the order of the interleaved bits of their positions, 10 bits an axis."""
+    """Return the rows in Morton order: by the interleaved bits of positions, 10 bits per axis."""
     means = means.astype(np.float64)
     low, high = means.min(axis=0, initial=np.inf), means.max(axis=0, initial=-np.inf)
     cells = ((means - low) / np.maximum(high - low, 1e-12) * 1023).astype(np.int64)
@@ -258,8 +262,8 @@ def _morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
 
 
 def _fractional_bits(gaussians: Gaussians) -> int:
-    """Choose the bits behind the point: by the Gaussians' size, fewer where positions are so large
-    that they need more bits before it.
+    """Choose the number of fractional bits from the Gaussians' size; fewer if large positions need
+    more of the 23 bits for the integer part.
     """
     if not len(gaussians.means):
         return 1  # some readers refuse 0
@@ -274,7 +278,7 @@ def _fractional_bits(gaussians: Gaussians) -> int:
 
 
 def _room(reach: float) -> int:
-    """Return how many of 23 bits are left behind the point for coordinates up to ``reach``."""
+    """Return how many of 23 bits can be fractional for coordinates up to ``reach``."""
     return 23 - ceil(log2(max(reach, 2.0**-40) * (1 + 1e-6)))
 
 
@@ -321,7 +325,7 @@ def _from_first_three(block: Int[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4"]
 def _harmonics(
     colors: Int[np.ndarray, "N 3"], rest: Int[np.ndarray, "N R"]
 ) -> Float[np.ndarray, "N K 3"]:
-    """Decode the constant harmonic and the others, in place, since this is most of the memory."""
+    """Decode the harmonics; in place, since they are most of the memory."""
     sh = np.empty((len(colors), 1 + rest.shape[1] // 3, 3), np.float32)
     sh[:, 0] = (colors / np.float32(255) - np.float32(0.5)) / np.float32(COLOR_SCALE)
     sh[:, 1:] = rest.reshape(len(rest), -1, 3) if rest.size else 0
@@ -331,7 +335,9 @@ def _harmonics(
 
 
 def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Int[np.ndarray, "N K 3"]:
-    """Encode with zero at 128, in multiples of the step of each degree, which pack better."""
+    """Encode harmonics with zero at 128, rounded to the step of each degree, which compresses
+    better.
+    """
     degrees = np.sqrt(np.arange(1, rest.shape[1] + 1)).astype(int) - 1
     steps = 2 ** (8 - np.array(SH_BITS))[degrees][:, None]
     return _to_byte(np.floor((np.rint(128 * rest) + 128 + steps // 2) / steps) * steps)
