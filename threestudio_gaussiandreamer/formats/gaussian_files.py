@@ -143,7 +143,7 @@ def file_size(cloud: StoredCloud, suffix: str) -> int:
 
 
 def as_stored(cloud: StoredCloud, suffix: str) -> StoredCloud:
-    """Return the cloud as it would be read back from a file of this format; SPZ also reorders it."""
+    """Return the cloud as it would be read back from a file of this format; SPZ reorders it too."""
     if suffix == ".ply":
         return cloud
     packed = spz_bytes(cloud.in_axes(SPZ_UP).gaussians)

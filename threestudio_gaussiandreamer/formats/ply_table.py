@@ -53,7 +53,7 @@ class Property(NamedTuple):
 
 
 class Element(NamedTuple):
-    """An element of the header: so many rows of these properties."""
+    """An element of the header: ``count`` rows of these properties."""
 
     name: str
     count: int
@@ -81,7 +81,7 @@ def write_table(
     rows: np.ndarray,
     comments: Sequence[str] = (),
 ) -> None:
-    """Write a binary file, whole or not at all.
+    """Write a binary file atomically.
 
     Args:
         properties: name and PLY type of each column.
@@ -228,7 +228,7 @@ def _add_property(words: list[str], elements: list[Element], path: str) -> None:
 
 
 def _seek_vertices(file: BinaryIO, header: Header, path: str) -> Element:
-    """Skip the elements that lie before the vertices."""
+    """Skip the elements before the vertices; return the vertices' element."""
     for element in header.elements:
         if element.name == "vertex":
             if element.has_lists:
@@ -244,7 +244,7 @@ def _seek_vertices(file: BinaryIO, header: Header, path: str) -> Element:
 
 def _skip(file: BinaryIO, element: Element, encoding: str, path: str) -> None:
     remaining = _remaining(file)
-    if element.count > remaining and element.properties:  # each row has a byte at least
+    if element.count > remaining and element.properties:  # each row takes at least one byte
         _fail(
             path,
             f"{element.count} rows of {element.name!r} are announced, but {remaining} bytes "
@@ -261,7 +261,8 @@ def _skip(file: BinaryIO, element: Element, encoding: str, path: str) -> None:
 def _skip_lines(file: BinaryIO, element: Element, path: str) -> None:
     """Skip the lines of an element, and blank ones between them.
 
-    Each must hold as many numbers as the header states: otherwise the vertices begin elsewhere.
+    Each line must have as many numbers as the header states; otherwise the position of the first
+    vertex would be wrong.
     """
     count = element.count if element.properties else 0
     while count and (line := file.readline()):
@@ -290,7 +291,11 @@ def _skip_lists(file: BinaryIO, element: Element, order: str, path: str) -> None
     start, data = file.tell(), file.read()
     try:
         size = _size_of_lists(data, element, order)
-    except (struct.error, ValueError, OverflowError):  # NaN and infinity have no int
+    except (
+        struct.error,
+        ValueError,
+        OverflowError,
+    ):  # OverflowError and ValueError: int() of infinity and NaN
         size = len(data) + 1
     if size > len(data):
         _fail(
@@ -304,7 +309,8 @@ def _size_of_lists(data: bytes, element: Element, order: str) -> int:
     """Return how many bytes the rows of an element take.
 
     Raises:
-        struct.error, ValueError, OverflowError: a length outside of the data, or not a length.
+        struct.error, ValueError, OverflowError: the data end before a length, or a length is
+            negative, NaN or infinite.
     """
     kinds = [(entry.count_type, np.dtype(entry.type).itemsize) for entry in element.properties]
     readers = [
@@ -342,11 +348,11 @@ def _read_rows(
 
 
 def _read_text_rows(file: BinaryIO, vertices: Element, path: str) -> dict[str, np.ndarray]:
-    """Read one vertex per line; integers become floats too, so that a NaN among them is kept."""
+    """Read one vertex per line, also integers as float64, so that a NaN among them is kept."""
     width = len(vertices.properties)
     _require_room(
         file, vertices, max(vertices.count * 2 * width - 1, 0), path
-    )  # a digit and a blank per number
+    )  # at least a digit and a separator per number
     rows = _parse_text(file, vertices.count, path) if vertices.count else np.empty((0, width))
     if rows.shape != (vertices.count, width):
         _fail(
@@ -365,7 +371,7 @@ def _read_text_rows(file: BinaryIO, vertices: Element, path: str) -> dict[str, n
 
 def _parse_text(file: BinaryIO, count: int, path: str) -> Float[np.ndarray, "N C"]:
     try:
-        with warnings.catch_warnings():  # numpy warns of missing rows, which the caller reports
+        with warnings.catch_warnings():  # NumPy warns about missing rows, which the caller reports
             warnings.simplefilter("ignore", UserWarning)
             return np.loadtxt(
                 file, np.float64, comments=None, max_rows=count, ndmin=2, encoding="latin-1"
@@ -375,7 +381,7 @@ def _parse_text(file: BinaryIO, count: int, path: str) -> Float[np.ndarray, "N C
 
 
 def _report_what_follows(file: BinaryIO, header: Header, vertices: Element, path: Path) -> None:
-    """Warn when data follow the vertices that the header states: its count may be wrong."""
+    """Warn if data follow the last vertex, since the count in the header may be wrong."""
     if header.elements[-1] is vertices and (rest := _remaining(file)) and file.read(4096).strip():
         logger.warning(
             "PLY file %r: %d bytes follow the %d vertices that its header announces",

@@ -87,8 +87,8 @@ class SpzHeader(NamedTuple):
 def write_spz(path: str | os.PathLike, gaussians: Gaussians, *, comment: str = "") -> None:
     """Write :func:`spz_bytes` atomically.
 
-    Gaussians that aren't finite are left out, and values beyond the format's range are clipped,
-    each with a warning.
+    Gaussians that aren't finite are left out, with a warning. Values beyond the format's range are
+    clipped, with a warning for positions and for scales above the range.
 
     Raises:
         UserError: harmonics above degree 3, or the file can't be written.
@@ -232,7 +232,7 @@ def _check_header(header: SpzHeader, packed_size: int, name: str) -> None:
 
 
 def _gzip(data: bytes, comment: str) -> bytes:
-    """Compress to one gzip member (RFC 1952) without a time stamp, so that files are reproducible."""
+    """Compress to one gzip member (RFC 1952) without a time stamp, to make files reproducible."""
     deflate = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
     note = comment.encode("ascii") + b"\0" if comment else b""
     head = struct.pack("<4BIBB", 0x1F, 0x8B, 8, 16 if comment else 0, 0, 2, 255)
