@@ -158,7 +158,7 @@ class GaussianCloud(BaseGeometry):
         means = state_dict.get(prefix + "means")
         if (
             isinstance(means, Tensor) and means.dim() and len(means) != len(self)
-        ):  # otherwise torch says what is wrong with it
+        ):  # otherwise torch reports the invalid entry
             self._allocate(len(means), self.means.device)
         if prefix + "means" in state_dict:
             if len(self):
@@ -236,7 +236,7 @@ class GaussianCloud(BaseGeometry):
         return cloud
 
     def merge_duplicates(self) -> None:
-        """Replace Gaussians that show the same by one, as far as the budget asks for fewer."""
+        """Merge groups of near-identical Gaussians, until the budget is met or none are left."""
         merged = merge_duplicates(self.parameters_by_name(), at_least=min_count(self.cfg)).values
         if len(merged["means"]) < len(self):
             logger.info(
@@ -267,7 +267,7 @@ class GaussianCloud(BaseGeometry):
 
     @torch.no_grad()
     def warn_of_clamped_sizes(self) -> None:
-        """Say once that some Gaussians are drawn at the bounds of ``LOG_SCALE_RANGE``."""
+        """Warn once if some Gaussians have scales at the bounds of ``LOG_SCALE_RANGE``."""
         low, high = LOG_SCALE_RANGE
         clamped = ((self.log_scales < low) | (self.log_scales > high)).any(-1)
         if self._warned or not clamped.any():
@@ -311,7 +311,7 @@ class GaussianCloud(BaseGeometry):
 
     @contextlib.contextmanager
     def showing_only(self, kept: Bool[Tensor, " N"]) -> Iterator[None]:
-        """Draw only the marked Gaussians in this context; the others get no opacity."""
+        """Render only the marked Gaussians in this context, by setting other opacities to 0."""
         logits = self.logit_opacities.detach().clone()
         with torch.no_grad():
             self.logit_opacities[~kept] = -100.0
@@ -322,7 +322,7 @@ class GaussianCloud(BaseGeometry):
                 self.logit_opacities.copy_(logits)
 
     def apply_change(self, change: Change, optimizer: torch.optim.Optimizer) -> None:
-        """Replace the cloud by ``change``, move the optimiser's rows along and clear the
+        """Apply ``change`` to the cloud and to the rows of the optimiser's state, and reset the
         statistics.
         """
         old = self.parameters_by_name()

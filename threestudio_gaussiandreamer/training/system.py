@@ -64,7 +64,7 @@ from .pictures import render_panels, rgb_panel, score_panels
 from .truth import prefetch_truth, true_views
 
 GUIDANCE_LR = 1e-4
-"""Of what a guidance trains itself, such as the LoRA of variational score distillation."""
+"""Learning rate of parameters that a guidance trains itself, such as the LoRA of VSD."""
 
 
 @register("gaussiandreamer-system")
@@ -97,8 +97,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     @staticmethod
     def logged(cfg: Any) -> Optional[set[str]]:
-        """Name what a run of this configuration logs, for ``checkpoint.monitor``; None where its
-        guidance doesn't say before it runs.
+        """Return the names that a run of this configuration logs, for ``checkpoint.monitor``; None
+        if the class of its guidance doesn't declare them.
         """
         return logged_names(find(cfg.guidance_type), cfg.loss)
 
@@ -145,7 +145,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         return make_optimizer(self.cfg.optimizer, groups)
 
     def preflight(self) -> None:
-        """Check that prior and guidance can have what they need, before models are loaded."""
+        """Check the requirements of prior and guidance, such as files, before loading models."""
         prior = None if len(self.geometry) else self.geometry.prior()
         if hasattr(prior, "preflight"):
             prior.preflight()
@@ -181,7 +181,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         require_finite([*self.named_parameters(), *of_optimizers], self.true_global_step)
 
     def ensure_cloud(self) -> None:
-        """Run the prior, unless a checkpoint brought the cloud."""
+        """Run the prior, unless the cloud has been loaded from a checkpoint."""
         if len(self.geometry):
             return
         prompt = self.prompt_utils or find(self.cfg.prompt_processor_type)(
@@ -240,7 +240,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.report(out, batch, losses, loss)
 
     def control_density(self, optimizer: torch.optim.Optimizer, batch: dict[str, Any]) -> None:
-        """Densify and prune where it is due; log what a round of ``budget: auto`` cost."""
+        """Densify and prune on schedule; log the quality that a round of ``budget: auto`` lost."""
         check = RenderedQuality(
             self.density, lambda: self(batch), lambda out: true_views(self.guidance, batch, out)
         )
@@ -256,7 +256,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             part.set_learning_rates(optimizer, self.true_current_epoch, self.true_global_step)
 
     def losses(self, out: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Weigh every ``loss_*`` that the guidance returns, and the regularisers of alpha."""
+        """Return the weighted losses of the guidance and the regularisers of alpha, by name."""
         guided = self.guide(out, batch)
         if self._log_now():
             numbers = loggable(guided).items()
@@ -281,7 +281,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     def report(
         self, out: dict[str, Any], batch: dict[str, Any], losses: dict[str, Tensor], loss: Tensor
     ) -> None:
-        """Log loss, number of Gaussians and, where the truth is known, dB, every
+        """Log losses, number of Gaussians and, if there is a ground truth, PSNR, every
         ``log_every_n_steps``.
         """
         if not self._log_now():
@@ -307,7 +307,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     # -- measuring ---------------------------------------------------------------------------------
 
     def score(self, key: str) -> None:
-        """Score the cloud on the held-out views, where the truth is known."""
+        """Score the cloud on the held-out views, if the ground truth is a mesh."""
         if self.measurements:
             scores = self.measurements.score(key, self.renderer, self.global_step)
             log_scores(self.loggers, scores)
@@ -321,12 +321,12 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             self.measurements.stop_clock()
 
     def on_fit_end(self) -> None:
-        # also of a run that was resumed at its last step, which has no training to end
+        # not in on_train_end, which isn't called for a run that is resumed at its last step
         super().on_fit_end()
         self.score("result")
 
     def summary(self) -> str:
-        """List the results and what was measured; printed when a run has ended."""
+        """List the files of results and the scores; printed at the end of a run."""
         lines = exported_files(Path(self._save_dir or "."))
         return "\n".join([*lines, *(["", self.measurements.table()] if self.measurements else [])])
 
