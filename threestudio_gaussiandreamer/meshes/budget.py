@@ -1,7 +1,8 @@
-"""The memory that one mesh file may take, charged from its headers before anything is allocated.
+"""Limit the memory that loading a mesh may allocate, by the sizes in the headers.
 
-A small file can announce a lot: a PNG of one colour, a thousand nodes that show one mesh, an
-accessor of a billion zeros. The budget is one sum for the whole file and the files it names."""
+A small file can expand to a large size: a PNG of one colour, a thousand nodes that instance one
+mesh, an accessor of a billion zeros. There is one budget for a mesh file and the files that it
+references."""
 
 from pathlib import Path
 from typing import NoReturn
@@ -9,22 +10,24 @@ from typing import NoReturn
 from ..core.errors import UserError
 
 FIXED_BYTES = 640 << 20
-"""What any file may take: one texture of 8192 x 8192, or three million triangles."""
+"""Budget of every file: one texture of 8192 x 8192, or three million triangles."""
 BYTES_PER_BYTE = 64
-"""What each byte that is stored may take besides."""
+"""Additional budget per byte of the file."""
 BYTES_PER_TEXEL = 8
 BYTES_PER_VERTEX = 200
 BYTES_PER_FACE = 150
-"""Peaks while a part is decoded, merged, cleaned and brought into its pose."""
+"""Peak memory while a part is decoded, merged, cleaned and transformed."""
 
 
 def fail(path: Path, problem: str) -> NoReturn:
-    """Raise UserError: the mesh ``path`` can't be read, and why."""
+    """Raise UserError with the reason why the mesh ``path`` can't be read."""
     raise UserError(f"can't read the mesh {str(path)!r}: {problem}")
 
 
 class Budget:
-    """Bytes that the mesh ``path`` may still take; a side file adds to them, content takes away."""
+    """The remaining memory budget of the mesh ``path``, bytes: increased by the size of every file
+    that is read, reduced by decoded content.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -33,15 +36,15 @@ class Budget:
         self.add_file(path.stat().st_size)
 
     def add_file(self, size: int) -> None:
-        """Allow what a file of ``size`` bytes may take besides."""
+        """Increase the budget for a file of ``size`` bytes."""
         self.left += BYTES_PER_BYTE * size
         self.total += BYTES_PER_BYTE * size
 
     def spend(self, size: int, what: str) -> None:
-        """Take ``size`` bytes for ``what``.
+        """Deduct ``size`` bytes; ``what`` names the content in the message.
 
         Raises:
-            UserError: the file's content would take more than the budget.
+            UserError: the budget is exceeded.
         """
         self.left -= size
         if self.left < 0:
@@ -52,10 +55,10 @@ class Budget:
             )
 
     def spend_geometry(self, vertices: int, faces: int) -> None:
-        """Take the bytes of one part of the scene.
+        """Deduct the bytes of one part of the scene.
 
         Raises:
-            UserError: the file's content would take more than the budget.
+            UserError: the budget is exceeded.
         """
         size = BYTES_PER_VERTEX * vertices + BYTES_PER_FACE * faces
         self.spend(size, f"a part with {vertices} vertices and {faces} faces")

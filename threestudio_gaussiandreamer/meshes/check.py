@@ -1,5 +1,5 @@
-"""Checks of OBJ and PLY files before trimesh reads them: what it would guess at, or skip in
-silence.
+"""Check OBJ and PLY files before trimesh reads them, for damage that it would ignore silently or
+read wrongly.
 """
 
 import functools
@@ -9,7 +9,8 @@ from pathlib import Path
 from ..formats.ply_table import PlyTable
 from .budget import fail
 
-# No text fits a pattern here in two ways: otherwise a long line would take quadratic time.
+# No text matches one of these patterns in two ways: backtracking on a long line would take
+# quadratic time.
 NUMBER = rb"[-+]?(?:\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?|nan|inf)"
 CORNER = rb"-?[1-9]\d*(?:/(?:-?[1-9]\d*)?){0,2}"
 ENTRY = rb"(?:[ \t]+%b)" % NUMBER
@@ -18,10 +19,10 @@ RELATIVE_FACE = re.compile(rb"^f .*-", re.MULTILINE)
 
 
 def check_mesh_file(path: Path) -> None:
-    """Check what a reader could only guess at; other formats are left to their reader.
+    """Check an OBJ or PLY file; other formats are left to their reader.
 
     Raises:
-        UserError: the file is damaged, or uses what trimesh reads wrongly.
+        UserError: the file is damaged, or uses a feature that trimesh reads wrongly.
     """
     extension = path.suffix.lower()
     if extension == ".ply":
@@ -31,8 +32,8 @@ def check_mesh_file(path: Path) -> None:
 
 
 def _check_obj(data: bytes, path: Path) -> None:
-    """Check that lines of vertices and faces are whole: trimesh stops reading numbers at the first
-    that isn't one.
+    """Check that lines of vertices and faces are valid, since trimesh stops reading at the first
+    text that isn't a number; reject relative indices.
     """
     text = data.replace(b"\\\r\n", b"").replace(b"\\\n", b"")
     first = FIRST_VERTEX.search(text)
@@ -52,11 +53,11 @@ def _check_obj(data: bytes, path: Path) -> None:
 
 @functools.cache
 def _wrong_obj_line(width: int) -> re.Pattern[bytes]:
-    """Return a pattern of lines that begin as one of vertices or faces and aren't.
+    """Return a pattern of lines that begin like a vertex or face but are not valid.
 
-    A vertex has 3 numbers, or 6 with its colour; or all of them have as many as the first, 4 (with
-    a weight) or 7 (with alpha): trimesh cuts the numbers of all vertices into rows as wide as the
-    first if only their total fits."""
+    A vertex has 3 numbers, or 6 with its colour. If the first vertex has 4 (with a weight) or 7
+    (with alpha), all must have as many: trimesh splits the numbers of all vertices into rows of the
+    first one's width without checking each line."""
     vertex = b"%b{%d}" % (ENTRY, width) if width in (4, 7) else b"%b{3}(?:%b{3})?" % (ENTRY, ENTRY)
     right = rb"v(?= )%b|vt(?= )%b{2,3}|vn(?= )%b{3}|vp .*|f(?= )(?:[ \t]+%b){3,}" % (
         vertex,

@@ -11,7 +11,7 @@ log = logging.getLogger(__name__)
 
 
 def unit_rgb(colors: Shaped[np.ndarray, "N C"]) -> Float[np.ndarray, "N 3"]:
-    """Return integer or float colours as RGB in [0, 1]; one that isn't finite becomes grey."""
+    """Convert integer or float colours to RGB in [0, 1]; colours that aren't finite become grey."""
     colors = np.asarray(colors)[:, :3]
     if colors.dtype.kind in "ui":
         return colors.astype(np.float32) / np.iinfo(colors.dtype).max

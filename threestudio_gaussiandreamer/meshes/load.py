@@ -1,10 +1,10 @@
-"""Triangle meshes from files, in the world's pose: z up, front = +x, centred, longest half side =
-``scale``.
+"""Load triangle meshes in the world's pose: z up, front = +x, box centred at the origin, half the
+longest side of the box = ``scale``.
 
-Shared by the mesh prior (points on the surface) and the ray caster (target images); both ask
-:func:`~threestudio_gaussiandreamer.meshes.mesh.surface_colors`. Colours are those a viewer shows
-without lights: texture times vertex colour, else vertex, face or material colour, else grey 0.5.
-All values are display values (sRGB) in [0, 1]; a texture's alpha channel is ignored.
+The mesh prior (points on the surface) and the ray caster (target images) both get colours from
+:func:`~threestudio_gaussiandreamer.meshes.mesh.surface_colors`. They are unlit: texture times
+vertex colour, else vertex, face or material colour, else grey 0.5. All values are display values
+(sRGB) in [0, 1]; a texture's alpha channel is ignored.
 
 ``up="auto"`` is +y for glTF, OBJ and other modelling formats and +z for PLY, STL and OFF. The front
 is the axis after the up axis (x -> y -> z -> x), which is +z for y-up files, as glTF says, and +x
@@ -39,17 +39,17 @@ log = logging.getLogger(__name__)
 def load_mesh(
     path: str | Path, *, scale: float = 1.0, up: str = "auto", front: Optional[str] = None
 ) -> Mesh:
-    """Read a mesh file, merge its scene, and bring it into the world's pose.
+    """Read a mesh file, merge the parts of its scene, and transform it to the world's pose.
 
     Args:
         path: GLB or glTF, a file that trimesh reads (OBJ, PLY, STL, OFF, ...), or the bare name of
             a bundled one.
         scale: half the longest side of the result's box, world units, > 0.
-        up, front: the file's axes, "+x" ... "-z"; see the module for the defaults.
+        up, front: the file's axes, "+x" ... "-z"; the module's docstring describes the defaults.
 
     Raises:
-        UserError: missing, unreadable, unknown format, no faces, > 5 % non-finite vertices, no
-            extent, bad ``up``/``front``.
+        UserError: the file is missing, damaged or of an unknown format, has no faces or no area, or
+            more than 5 % of its vertices aren't finite; or ``up`` or ``front`` is invalid.
     """
     path = existing_file(find_mesh(path), "mesh", bundled_meshes())
     if not scale > 0:
@@ -61,7 +61,7 @@ def load_mesh(
 
 
 def find_mesh(path: str | Path) -> Path:
-    """Return the path itself, or the bundled mesh of that bare name where there is no such file."""
+    """Return the bundled mesh if ``path`` is its bare name and not a file itself, else ``path``."""
     bundled = ASSETS / Path(path).name
     return (
         bundled
@@ -80,18 +80,18 @@ def bundled_meshes() -> list[str]:
 
 
 def read_parts(path: Path) -> list[Mesh]:
-    """Read the parts of a mesh file where its scene places them, still in the file's pose; parts of
-    points have no faces.
+    """Read the parts of a mesh file, transformed by its scene graph, in the file's axes; parts that
+    consist of points have no faces.
 
     Raises:
-        UserError: unknown format, damaged, or too large (``budget.py``).
+        UserError: the format is unknown, or the file is damaged or too large (``budget.py``).
     """
     extension = _extension(path)
     return read_gltf(path) if extension in GLTF_FORMATS else read_with_trimesh(path)
 
 
 def mesh_formats() -> set[str]:
-    """Return the extensions of the formats that are read, without dots."""
+    """Return the extensions of the supported formats, without dots."""
     from trimesh.exchange.load import mesh_formats as of_trimesh
 
     return of_trimesh() | set(GLTF_FORMATS)
@@ -120,9 +120,7 @@ def _surfaces(path: Path) -> list[Mesh]:
 
 
 def _drop_bad_vertices(mesh: Mesh, path: Path) -> Mesh:
-    """Return the mesh without the faces that touch a non-finite vertex, and without vertices that
-    no face uses.
-    """
+    """Remove faces with a vertex that isn't finite, and vertices that no face uses."""
     finite = np.isfinite(mesh.vertices).all(axis=1)
     if (bad := int((~finite).sum())) > MAX_NON_FINITE * len(finite):
         raise UserError(
@@ -143,8 +141,8 @@ def _drop_bad_vertices(mesh: Mesh, path: Path) -> Mesh:
 
 
 def _normalise(mesh: Mesh, rotation: np.ndarray, scale: float, path: Path) -> np.ndarray:
-    """Return the vertices rotated, with the box's centre at the origin and its longest half side
-    equal to ``scale``.
+    """Return the vertices centred at the origin, scaled so that half the longest side of their box
+    is ``scale``, and rotated.
     """
     if not len(mesh.vertices):
         raise UserError(

@@ -1,4 +1,4 @@
-"""One mesh of the several parts of a file."""
+"""Merge the parts of a file into one mesh."""
 
 from typing import Any
 
@@ -8,8 +8,10 @@ from .mesh import GREY, Mesh, Tile
 
 
 def merged(parts: list[Mesh]) -> Mesh:
-    """Return one mesh; textures are put one after the other, face colours onto corners of their
-    own.
+    """Concatenate the parts to one mesh.
+
+    Textures are concatenated to one array with a tile for each. Parts with face colours get three
+    separate vertices per face, with vertex colours.
     """
     if len(parts) == 1:
         return parts[0]
@@ -29,7 +31,7 @@ def merged(parts: list[Mesh]) -> Mesh:
 
 
 def _unwelded(part: Mesh) -> Mesh:
-    """Return a face-coloured part with three vertices of its own for each face."""
+    """Convert face colours to vertex colours, with three separate vertices per face."""
     if part.face_colors is None:
         return part
     corners = part.faces.reshape(-1)
@@ -42,8 +44,8 @@ def _unwelded(part: Mesh) -> Mesh:
 
 
 def _vertex_factor(part: Mesh) -> np.ndarray:
-    """Return what multiplies the texture (1 where nothing does), or the colour itself where there
-    is no texture.
+    """Return the vertex colours (V, 3); by default 1 for parts with a texture, which they multiply,
+    and grey for others.
     """
     if part.vertex_colors is not None:
         return part.vertex_colors
@@ -51,7 +53,9 @@ def _vertex_factor(part: Mesh) -> np.ndarray:
 
 
 def _textures(parts: list[Mesh]) -> dict[str, Any]:
-    """Return the textures, each once, with a tile for each way in which a part looks one up."""
+    """Return the fields of the merged texture: each texture is stored once, with a tile for each
+    combination of texture, wrapping and filter.
+    """
     starts, total = {}, 0
     for part in parts:
         if part.texture is not None and id(part.texture) not in starts:

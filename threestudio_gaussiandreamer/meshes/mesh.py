@@ -1,4 +1,4 @@
-"""The type of a triangle mesh, the colour at places on its surface, and points on it."""
+"""The type of a triangle mesh, colours at points of its surface, and sampling of the surface."""
 
 from typing import NamedTuple, Optional
 
@@ -14,40 +14,40 @@ REPEAT, MIRROR, CLAMP = range(3)
 
 
 class Tile(NamedTuple):
-    """A texture inside ``Mesh.texture``, and how it is looked up."""
+    """A texture inside ``Mesh.texture``, with its wrapping and filter."""
 
     start: int
-    """Index of its first texel in the texture's flattened rows."""
+    """Index of its first texel in ``Mesh.texture.reshape(-1, 3)``."""
     width: int
     height: int
     wrap_u: int = REPEAT
     wrap_v: int = REPEAT
     nearest: bool = False
-    """The colour of the texel itself; else bilinear between texel centres."""
+    """Nearest-neighbour lookup; otherwise bilinear between texel centres."""
 
 
 class Mesh(NamedTuple):
-    """A triangle mesh and what colours it; see :func:`surface_colors` for how they combine."""
+    """A triangle mesh with its colours, which :func:`surface_colors` combines."""
 
     vertices: Float[np.ndarray, "V 3"]
     """float64, world units."""
     faces: Int[np.ndarray, "F 3"]
     uv: Optional[Float[np.ndarray, "V 2"]] = None
-    """v grows upwards in the texture; outside [0, 1] the tile's wrapping says what is shown."""
+    """v increases upwards in the texture; the tile's wrapping applies outside [0, 1]."""
     texture: Optional[UInt8[np.ndarray, "H W 3"] | Float[np.ndarray, "H W 3"]] = None
-    """Bytes, or floats in [0, 1]; row 0 on top; with ``tiles`` the texels of several textures, one
-    after the other.
+    """Bytes, or floats in [0, 1]; row 0 at the top. With ``tiles`` it holds the texels of several
+    textures one after another.
     """
     vertex_colors: Optional[Float[np.ndarray, "V 3"]] = None
     face_colors: Optional[Float[np.ndarray, "F 3"]] = None
     tiles: tuple[Tile, ...] = ()
-    """The textures; empty: ``texture`` is one, which repeats."""
+    """The textures in ``texture``; empty if it is a single one, with repeat wrapping."""
     tile_index: Optional[Int[np.ndarray, " F"]] = None
-    """The tile of each face, -1 = not textured; None = the first one for all faces."""
+    """The tile of each face, -1 for no texture; None means the first tile for all faces."""
 
     @property
     def has_colors(self) -> bool:
-        """Whether the file said anything about colour."""
+        """Whether the mesh has any colours."""
         return any(
             colors is not None for colors in (self.texture, self.vertex_colors, self.face_colors)
         )
@@ -60,11 +60,11 @@ class Mesh(NamedTuple):
 def surface_colors(
     mesh: Mesh, face_index: Int[np.ndarray, " M"], barycentric: Float[np.ndarray, "M 3"]
 ) -> Float[np.ndarray, "M 3"]:
-    """Return the colour at M places on the surface, float32 in [0, 1].
+    """Return the colours at M points of the surface, float32 in [0, 1].
 
     Args:
         face_index: rows of ``mesh.faces``.
-        barycentric: weights of the face's three corners, each row sums to 1.
+        barycentric: weights of the face's three corners; each row sums to 1.
     """
     weights = barycentric.astype(np.float32)
     if mesh.texture is None:
@@ -76,8 +76,8 @@ def surface_colors(
 
 
 def vertex_surface_colors(mesh: Mesh) -> Float[np.ndarray, "V 3"]:
-    """Return the colour at each vertex: where a texture has a seam or faces differ, that of one of
-    its faces.
+    """Return the colour at each vertex; at a texture seam, or where its faces have different
+    colours, that of one of them.
     """
     if not len(mesh.faces):
         return _vertex_colors(mesh)
@@ -93,7 +93,7 @@ def _vertex_colors(mesh: Mesh) -> np.ndarray:
 
 
 def _flat_colors(mesh: Mesh, face_index: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return vertex colours interpolated, else face colours, else grey."""
+    """Return interpolated vertex colours, else face colours, else grey."""
     if mesh.vertex_colors is not None:
         return np.einsum("mk,mkc->mc", weights, mesh.vertex_colors[mesh.faces[face_index]])
     if mesh.face_colors is not None:
@@ -102,7 +102,7 @@ def _flat_colors(mesh: Mesh, face_index: np.ndarray, weights: np.ndarray) -> np.
 
 
 def _texture_colors(mesh: Mesh, face_index: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the colour of each face's tile; 1 where a face has no texture."""
+    """Look up the texture of each point's face; 1 for faces without a texture."""
     uv = np.einsum("mk,mkc->mc", weights, mesh.uv[mesh.faces[face_index]])
     texels = mesh.texture.reshape(-1, 3)
     if mesh.tile_index is None:
@@ -117,7 +117,7 @@ def _texture_colors(mesh: Mesh, face_index: np.ndarray, weights: np.ndarray) -> 
 
 
 def _looked_up(texels: np.ndarray, uv: np.ndarray, tile: Tile) -> np.ndarray:
-    """Return the colours of ``tile`` at uv (M, 2), v upwards."""
+    """Look up the colours of ``tile`` at uv (M, 2), v upwards."""
     u, v = _wrapped(uv[:, 0], tile.wrap_u), _wrapped(1 - uv[:, 1], tile.wrap_v)
     x, y = u * tile.width - 0.5, v * tile.height - 0.5
     if tile.nearest:
@@ -139,7 +139,7 @@ def _texel(texels: np.ndarray, index: np.ndarray) -> Float[np.ndarray, "M 3"]:
 
 
 def _wrapped(coordinate: np.ndarray, wrap: int) -> np.ndarray:
-    """Return the coordinate inside [0, 1] that shows the same texel."""
+    """Map coordinates to [0, 1] by the wrapping mode."""
     if wrap == CLAMP:
         return coordinate.clip(0, 1)
     if wrap == MIRROR:
@@ -150,7 +150,7 @@ def _wrapped(coordinate: np.ndarray, wrap: int) -> np.ndarray:
 def _neighbour(first: np.ndarray, offset: int, size: int, wrap: int) -> np.ndarray:
     """Return the column or row ``offset`` after ``first``, which is in [-1, size - 1].
 
-    Beyond an edge lies the other edge where the texture repeats, else the edge itself.
+    Beyond an edge it is the opposite edge if the texture repeats, else the edge itself.
     """
     index = first.astype(np.int64) + offset
     return index % size if wrap == REPEAT else index.clip(0, size - 1)
@@ -163,11 +163,12 @@ def _neighbour(first: np.ndarray, offset: int, size: int, wrap: int) -> np.ndarr
 def sample_surface(
     mesh: Mesh, count: int, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw ``count`` places uniformly over the surface: points (count, 3), face_index (count,) and
-    barycentric (count, 3).
+    """Draw ``count`` points uniformly from the surface.
 
-    Faces without area get none, and where faces repeat each other only the first does: their
-    surface is there once.
+    Of duplicate faces only the first is sampled, so that their area counts once.
+
+    Returns:
+        points (count, 3), face_index (count,) and barycentric (count, 3).
     """
     areas = face_areas(mesh) * ~repeated_faces(mesh)
     face_index = generator.choice(len(areas), size=count, p=areas / areas.sum())
@@ -179,9 +180,10 @@ def sample_surface(
 
 
 class SurfaceDistance:
-    """Distances from a surface, by the nearest of ``samples`` points on it.
+    """Computes distances from a surface as those to the nearest of ``samples`` points on it.
 
-    Too large by about the spacing of the samples, sqrt(area / samples): some 0.5 % of the box.
+    They are overestimated by at most about the spacing of the samples, sqrt(area / samples), which
+    is some 0.5 % of the box.
     """
 
     def __init__(self, mesh: Mesh, *, samples: int = 200_000) -> None:
@@ -201,8 +203,8 @@ def face_areas(mesh: Mesh) -> Float[np.ndarray, " F"]:
 
 
 def repeated_faces(mesh: Mesh) -> Bool[np.ndarray, " F"]:
-    """Mark each face with the corners of an earlier one, whichever way round and even if the
-    vertices are other copies.
+    """Return which faces have the same corner positions as an earlier face, in any order and with
+    any vertex indices.
     """
     _, place, _ = distinct(mesh.vertices)
     corners = np.sort(place[mesh.faces], axis=1)

@@ -1,8 +1,7 @@
-"""Target images by ray casting a mesh: what training is scored against, made without our own
-splatting.
+"""Render target images by ray casting a mesh, independently of the splatting.
 
-Colours are the mesh's own, without lights, from both sides of a face. Cameras are the host's
-(OpenGL ``c2w``; see ``cameras.py``): the ray through pixel (i, j) of an H x W image has the camera
+Colours are unlit, and faces are visible from both sides. Cameras are the host's (OpenGL ``c2w``;
+see ``cameras.py``): the ray through pixel (i, j) of an H x W image has the camera
 direction ``((j + 0.5 - W/2)/f, -(i + 0.5 - H/2)/f, -1)`` with ``f = H / (2 tan(fovy/2))``."""
 
 import functools
@@ -27,9 +26,7 @@ log = logging.getLogger(__name__)
 
 
 class MeshCaster:
-    """Casts rays at one mesh; what that needs is built once, ``render`` may be called from several
-    threads.
-    """
+    """Casts rays at one mesh, whose acceleration structure is built once; thread-safe."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
@@ -44,12 +41,12 @@ class MeshCaster:
         width: int,
         supersample: int = 2,
     ) -> Float[np.ndarray, "H W 4"]:
-        """Premultiplied colour and coverage in [0, 1], float32, each pixel the mean of a regular
-        supersample^2 grid.
+        """Render premultiplied colour and coverage in [0, 1], float32.
 
         Args:
             c2w: OpenGL camera to world.
             fovy: vertical field of view in radians, in (0, pi).
+            supersample: each pixel is the mean of a regular supersample x supersample grid.
         """
         _require_size(height, width, supersample)
         image = np.zeros((height, width, 4), dtype=np.float32)
@@ -66,16 +63,19 @@ class MeshCaster:
         supersample: int = 2,
         progress: str = "",
     ) -> Float[np.ndarray, "N H W 4"]:
-        """Render several (c2w, fovy) on all cores (embree and numpy's gathers release the GIL).
+        """Render several cameras (c2w, fovy) in threads on all cores; see :meth:`render`.
 
-        ``progress`` names a progress bar, for terminals only; without it there is none.
+        Embree and NumPy's indexing release the GIL.
+
+        Args:
+            progress: label of a progress bar, shown in terminals only; empty for no bar.
         """
         from tqdm import tqdm
 
         _require_size(height, width, supersample)
         cameras = list(cameras)
         images = np.zeros((len(cameras), height, width, 4), dtype=np.float32)
-        # bands instead of pictures, so that one picture occupies all cores too
+        # one task per band of rows instead of per picture, so that one picture uses all cores too
         bands = [
             fill
             for image, camera in zip(images, cameras, strict=True)
@@ -99,7 +99,7 @@ class MeshCaster:
     def _bands(
         self, image: Float[np.ndarray, "H W 4"], c2w: np.ndarray, fovy: float, supersample: int
     ) -> list[Callable[[], None]]:
-        """Return calls that draw one picture, each a group of its rows, in any order."""
+        """Return functions that each render a band of rows into ``image``, in any order."""
         height, width = image.shape[:2]
         c2w = np.asarray(c2w, dtype=np.float64)
         focal = height / (2 * math.tan(fovy / 2))
@@ -120,8 +120,8 @@ class MeshCaster:
     def _bounds(
         self, c2w: np.ndarray, focal: float, height: int, width: int
     ) -> tuple[int, int, int, int]:
-        """Return the pixel rectangle (top, bottom, left, right) outside which no ray can hit: the
-        vertices' on the screen.
+        """Return the bounding rectangle (top, bottom, left, right) of the projected vertices, in
+        pixels; the whole image if some are behind the camera.
         """
         x, y, z = ((self._vertices - c2w[:3, 3]) @ c2w[:3, :3]).T
         if (-z).min() < NEAR:
@@ -134,7 +134,7 @@ class MeshCaster:
     def _cast(
         self, c2w: np.ndarray, focal: float, rows: np.ndarray, columns: np.ndarray
     ) -> Float[np.ndarray, "H W 4"]:
-        """Colour and coverage 1 where a sample shows the mesh, zeros elsewhere."""
+        """Return colour and coverage 1 for samples whose ray hits the mesh, zeros for others."""
         face_index, barycentric = self._hits(c2w, focal, rows, columns)
         seen = face_index >= 0
         colors = np.zeros((*seen.shape, 4), dtype=np.float32)
@@ -146,8 +146,8 @@ class MeshCaster:
 def over_background(
     rgba: Float[np.ndarray | Tensor, "... 4"], background: Float[np.ndarray | Tensor, "... 3"]
 ) -> Float[np.ndarray | Tensor, "... 3"]:
-    """Premultiplied ``rgba`` over ``background``: C + (1 - coverage) background. Takes numpy arrays
-    and tensors alike.
+    """Composite premultiplied ``rgba`` over ``background``, for NumPy arrays or tensors:
+    C + (1 - coverage) background.
     """
     return rgba[..., :3] + (1 - rgba[..., 3:]) * background
 
@@ -161,13 +161,13 @@ def _require_size(height: int, width: int, supersample: int) -> None:
 
 
 def _samples(start: int, end: int, supersample: int) -> Float[np.ndarray, " S"]:
-    """Return the places of a regular grid in the pixels start ... end - 1."""
+    """Return the coordinates of a regular grid of samples in the pixels start ... end - 1."""
     return start + (np.arange((end - start) * supersample) + 0.5) / supersample
 
 
 def _row_groups(top: int, bottom: int, rays_per_row: int) -> list[tuple[int, int]]:
-    """Return groups of pixel rows with at most RAYS_PER_CAST rays, or one row: memory doesn't grow
-    with size and supersample.
+    """Split pixel rows into groups (start, end) of at most RAYS_PER_CAST rays, or of one row, to
+    bound the memory.
     """
     if not rays_per_row:
         return []
@@ -175,9 +175,9 @@ def _row_groups(top: int, bottom: int, rays_per_row: int) -> list[tuple[int, int
     return [(start, min(start + size, bottom)) for start in range(top, bottom, size)]
 
 
-# Casters: functions (c2w (4, 4), focal, rows (H,), columns (W,)) -> nearest face (H, W), -1 = none,
-# and barycentric (H, W, 3); rows and columns are the places of the samples in pixels from the
-# centre of the picture, rows downwards.
+# Type of ray casters: (c2w (4, 4), focal, rows (H,), columns (W,)) -> index of the nearest face
+# (H, W), -1 for none, and barycentric weights (H, W, 3). Rows and columns are the coordinates of
+# the samples in pixels relative to the image's centre, rows downwards.
 Hits = Callable[
     [np.ndarray, float, np.ndarray, np.ndarray],
     tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]],
@@ -220,14 +220,14 @@ def _embree_hits(
     u, v = hits["u"], hits["v"]
     barycentric = np.stack(
         [1 - u - v, u, v], axis=1
-    )  # embree's u and v weigh the second and the third corner
+    )  # embree's u and v are the weights of the second and the third corner
     shape = len(rows), len(columns)
     return hits["primID"].reshape(shape), barycentric.reshape(*shape, 3)
 
 
 class TargetCache:
-    """Pictures of a mesh from cameras seen before, as bytes; the one not asked for the longest
-    makes room.
+    """Cache of up to ``capacity`` images of a mesh by camera, as bytes; evicts the least recently
+    used one.
     """
 
     def __init__(self, caster: MeshCaster, supersample: int, capacity: int) -> None:
@@ -237,7 +237,7 @@ class TargetCache:
     def __call__(
         self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int
     ) -> UInt8[Tensor, "B H W 4"]:
-        """Premultiplied colour and coverage of each camera, on the cameras' device."""
+        """Return premultiplied colour and coverage for each camera, on the cameras' device."""
         cameras = list(zip(c2w.detach().float().cpu().numpy(), fovy.detach().tolist(), strict=True))
         keys = [(matrix.tobytes(), angle, height, width) for matrix, angle in cameras]
         missing = {

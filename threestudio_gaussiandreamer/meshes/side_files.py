@@ -1,4 +1,4 @@
-"""Files that a mesh names beside itself: buffers of glTF, materials of OBJ, textures of both."""
+"""Files that a mesh file references: buffers of glTF, materials of OBJ, textures of both."""
 
 import logging
 import os
@@ -20,11 +20,11 @@ class SideFiles:
     def read(self, name: str) -> Optional[bytes]:
         """Return the content of the file ``name``; log a warning and return None if there is none.
 
-        The name may have the separators of Windows; a file of its last part beside the mesh is
-        taken where its folder is missing.
+        The name is relative to the mesh's folder and may have the separators of Windows. If there
+        is no such file, one with the same base name next to the mesh is read.
 
         Raises:
-            UserError: not a regular file (a FIFO would block), or unreadable.
+            UserError: it is no regular file (a FIFO would block), or can't be read.
         """
         relative = name.strip().replace("\\", "/").lstrip("/")
         for candidate in (relative, relative.rpartition("/")[2]):
@@ -38,7 +38,7 @@ class SideFiles:
         return None
 
     def _content(self, path: Path) -> bytes:
-        # without O_NONBLOCK, opening a FIFO waits for somebody to write to it
+        # without O_NONBLOCK, opening a FIFO blocks until another process opens it for writing
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
         with open(descriptor, "rb") as file:
             status = os.fstat(descriptor)

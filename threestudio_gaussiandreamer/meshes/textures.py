@@ -1,4 +1,4 @@
-"""Pictures of textures as arrays of 8-bit RGB."""
+"""Decode textures to arrays of 8-bit RGB."""
 
 import io
 import struct
@@ -12,26 +12,26 @@ from .budget import BYTES_PER_TEXEL, Budget, fail
 
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TGA", "TIFF")
 UNREADABLE = (OSError, ValueError, SyntaxError, EOFError, OverflowError, struct.error)
-"""What Pillow raises for damaged files."""
+"""Exceptions that Pillow raises for damaged files."""
 ROWS_AT_ONCE = 256
-"""Rows that are converted at a time, so that the picture is in memory twice and not four times."""
+"""Rows converted at a time, which limits the peak memory to two copies of the image, not four."""
 
 
 def decode_texture(data: bytes, name: str, budget: Budget) -> UInt8[np.ndarray, "H W 3"]:
-    """Return the picture of an image file; alpha is ignored, 16-bit values are rounded to 8.
+    """Decode an image file; alpha is ignored, 16-bit values are rounded to 8 bits.
 
     Args:
         data: content of a file in one of ``FORMATS``.
         name: names the texture in messages.
 
     Raises:
-        UserError: unreadable, or larger than the budget.
+        UserError: it can't be decoded, or exceeds the budget.
     """
     from PIL import Image
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the budget's business
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # see budget.spend
             image = Image.open(io.BytesIO(data), formats=FORMATS)
     except (*UNREADABLE, Image.DecompressionBombError) as error:
         fail(budget.path, f"the texture {name} can't be read: {error}")
@@ -39,10 +39,10 @@ def decode_texture(data: bytes, name: str, budget: Budget) -> UInt8[np.ndarray, 
 
 
 def decode_image(image: Any, name: str, budget: Budget) -> UInt8[np.ndarray, "H W 3"]:
-    """Return the picture of an image that Pillow has opened and not yet decoded.
+    """Decode an image that Pillow has opened but not yet loaded.
 
     Raises:
-        UserError: of another format than ``FORMATS``, damaged, or larger than the budget.
+        UserError: its format isn't one of ``FORMATS``, it is damaged, or it exceeds the budget.
     """
     if image.format not in FORMATS:
         fail(budget.path, f"the texture {name} is {image.format}, not one of {', '.join(FORMATS)}")

@@ -17,23 +17,25 @@ from .side_files import SideFiles
 from .textures import decode_image
 
 UNSET_COLOR = (102, 102, 102)
-"""What trimesh writes where a material names no colour; it would only darken the texture."""
+"""trimesh's default for materials without a colour; ignored, since it would darken the texture."""
 
 log = logging.getLogger(__name__)
 
 
 def read_with_trimesh(path: Path) -> list[Mesh]:
-    """Read the parts of a file where its scene places them; parts of points have no faces.
+    """Read the parts of a file, transformed by its scene graph; parts that consist of points have
+    no faces.
 
     Raises:
-        UserError: damaged, too large for its budget, or it names what is no regular file.
+        UserError: the file is damaged, exceeds its budget, or references something that isn't a
+            regular file.
     """
     try:
         check_mesh_file(path)
         return [_require_fitting(part, path) for part in _parts(path, Budget(path))]
     except UserError:
         raise
-    except Exception as error:  # each of trimesh's readers fails in its own way
+    except Exception as error:  # trimesh's readers raise exceptions of many types
         fail(path, f"{type(error).__name__}: {error}")
 
 
@@ -60,9 +62,9 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
 
 
 class _Resolver:
-    """Gives trimesh the files that a mesh names.
+    """Resolver through which trimesh reads the files that a mesh references.
 
-    trimesh swallows what is raised here, so the first refusal is kept.
+    trimesh catches the exceptions raised here, so the first UserError is kept in ``refused``.
     """
 
     def __init__(self, path: Path, budget: Budget) -> None:
@@ -84,8 +86,8 @@ class _Resolver:
     __getitem__ = get
 
     def picture(self, image: Any) -> np.ndarray:
-        """Return the picture of an image that trimesh has opened, decoded once."""
-        if id(image) not in self._pictures:  # the image is kept, so that its id stays its own
+        """Decode an image that trimesh has opened; each image is decoded once."""
+        if id(image) not in self._pictures:  # the image is kept, so that its id isn't reused
             name = str(image.info.get("file_path", ""))[:80]
             self._pictures[id(image)] = image, decode_image(image, repr(name), self.budget)
         return self._pictures[id(image)][1]
@@ -114,7 +116,7 @@ def _surface(geometry: Any, path: Path, budget: Budget) -> Mesh:
 
 
 def _colored(part: Mesh, geometry: Any, files: _Resolver) -> Mesh:
-    """Return the part with its colours, of whichever kind."""
+    """Return the part with the texture, vertex colours or face colours of trimesh's geometry."""
     visual = geometry.visual
     if not len(part.faces):
         colors = getattr(geometry, "colors", None)
@@ -130,8 +132,8 @@ def _colored(part: Mesh, geometry: Any, files: _Resolver) -> Mesh:
 
 
 def _vertex_colors(geometry: Any, path: Path) -> np.ndarray:
-    """Return the vertices' colours, grey where a PLY's own aren't finite: trimesh makes those black
-    without a word.
+    """Return the vertices' colours, with grey for those in a PLY that aren't finite, which trimesh
+    silently converts to black.
     """
     colors = unit_rgb(geometry.visual.vertex_colors)
     stored = geometry.metadata.get("_ply_raw", {}).get("vertex", {"properties": ()})
@@ -152,7 +154,9 @@ def _vertex_colors(geometry: Any, path: Path) -> np.ndarray:
 
 
 def _with_material(part: Mesh, visual: Any, files: _Resolver) -> Mesh:
-    """Return the part with its texture tinted by the material's colour, else with that colour."""
+    """Return the part with its texture multiplied by the material's colour, or with that colour
+    alone.
+    """
     texture, tint = _texture(visual.material, files), _tint(visual.material)
     if tint is not None:
         part = part._replace(vertex_colors=np.broadcast_to(tint, part.vertices.shape))
@@ -163,17 +167,17 @@ def _with_material(part: Mesh, visual: Any, files: _Resolver) -> Mesh:
 
 
 def _texture(material: Any, files: _Resolver) -> Optional[np.ndarray]:
-    """Return the picture of a material's colours; None where it has none.
+    """Return the colour texture of a material, or None if it has none.
 
-    Where an OBJ has coordinates without a material, trimesh makes up a grey image, which has no
-    file format.
+    For an OBJ with coordinates but without a material trimesh creates a grey image, which is
+    recognised by its missing file format and ignored.
     """
     image = getattr(material, "image", getattr(material, "baseColorTexture", None))
     return None if getattr(image, "format", None) is None else files.picture(image)
 
 
 def _tint(material: Any) -> Optional[np.ndarray]:
-    """Return the material's colour (3,) in [0, 1] as a display value; None where it has none."""
+    """Return the material's colour (3,) as sRGB values in [0, 1], or None if it has none."""
     linear = hasattr(material, "baseColorFactor")
     tint = getattr(material, "baseColorFactor" if linear else "diffuse", None)
     if tint is None or tuple(np.asarray(tint)[:3]) == UNSET_COLOR:
@@ -183,7 +187,7 @@ def _tint(material: Any) -> Optional[np.ndarray]:
 
 
 def _require_fitting(part: Mesh, path: Path) -> Mesh:
-    """Return the part itself if what colours it has a row for each vertex or face."""
+    """Return the part after checking that its colours have one row per vertex or face."""
     count = {
         "uv": (len(part.vertices), 2),
         "vertex_colors": (len(part.vertices), 3),

@@ -1,13 +1,14 @@
-"""A z-buffer in plain numpy: which triangle a camera sees at every sample, where there is no ray
-caster for it.
+"""A z-buffer in NumPy: finds the triangle that is visible at each sample, as a fallback where
+embree isn't installed.
 
-No triangle is divided by its depth. With corners a, b, c in camera coordinates and the ray d = (x,
-y, -1), the three edge functions d . (b x c), d . (c x a), d . (a x b) all have the sign of det(a,
-b, c) exactly where the ray meets the triangle in front of the camera; in proportion they are the
-barycentric weights on the surface, and their sum over the determinant is 1 / depth (Olano and Greer
-1997, "Triangle Scan Conversion using 2D Homogeneous Coordinates"). So perspective is correct,
-triangles through the plane of the camera need no clipping, and neighbours leave no gap: their
-common edge has the same function up to its sign."""
+Triangles are rasterised in homogeneous coordinates, without a division by depth (Olano and Greer
+1997, "Triangle Scan Conversion using 2D Homogeneous Coordinates"). With corners a, b, c in camera
+coordinates and the ray d = (x, y, -1), the three edge functions d . (b x c), d . (c x a),
+d . (a x b) all have the sign of det(a, b, c) exactly if the ray hits the triangle in front of the
+camera. They are proportional to the barycentric weights, and their sum over the determinant is
+1 / depth. Hence the interpolation is perspective-correct, triangles that cross the camera's plane
+need no clipping, and adjacent triangles leave no gap, since their edge functions of the common edge
+differ in sign only."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -17,33 +18,31 @@ from jaxtyping import Float, Int
 
 NEAR = 1e-6
 PAIRS_PER_STEP = 2**17
-"""(triangle, sample) pairs that are tested at once: the arrays stay in the cache, and memory
-doesn't grow with the picture.
-"""
+"""(triangle, sample) pairs that are tested at once, to bound the memory and use the CPU's cache."""
 SLACK = 1e-6
-"""Pixels around a triangle's box, so that its rounding never decides what the edge functions
-should.
+"""Margin around a triangle's box in pixels, so that its rounding errors don't exclude samples that
+the edge functions would include.
 """
 
 
 class Triangles(NamedTuple):
-    """What may be seen of a mesh in one picture."""
+    """The triangles of a mesh that may be visible in one image."""
 
     face_index: Int[np.ndarray, " T"]
     edges: Float[np.ndarray, "T 3 3"]
-    """The edge function opposite each corner as a vector to multiply the ray by, >= 0 inside, world
-    units squared.
+    """The edge function opposite each corner, as a vector whose dot product with the ray is >= 0
+    inside; world units squared.
     """
     volume: Float[np.ndarray, " T"]
     """|det(a, b, c)|: the sum of the edge functions is volume / depth."""
     box: Int[np.ndarray, "T 4"]
-    """First and last row, first and last column of the samples around it; the last ones are
+    """The samples in the triangle's box: first row, end row, first column, end column; ends are
     exclusive.
     """
 
 
 class ZBuffer:
-    """The visible faces of one triangle mesh, from both sides; for several threads."""
+    """Finds the visible faces of one triangle mesh, from both sides; thread-safe."""
 
     def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
         self.vertices, self.faces = vertices.astype(np.float64), faces
@@ -55,14 +54,14 @@ class ZBuffer:
         rows: Float[np.ndarray, " H"],
         columns: Float[np.ndarray, " W"],
     ) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
-        """Return the nearest face at each sample, -1 = none, and the weights of its three corners
-        (0 where there is none).
+        """Return the nearest face at each sample, -1 for none, and the weights of its three corners
+        (0 for none).
 
         Args:
             c2w: OpenGL camera to world.
-            focal: pixels.
-            rows, columns: ascending places of the samples in pixels from the centre of the picture,
-                rows downwards.
+            focal: focal length, pixels.
+            rows, columns: ascending coordinates of the samples in pixels relative to the image's
+                centre, rows downwards.
         """
         rays = _Rays(-rows / focal, columns / focal)
         corners = ((self.vertices - c2w[:3, 3]) @ c2w[:3, :3])[self.faces]
@@ -90,9 +89,7 @@ class _Rays(NamedTuple):
 def _triangles(
     corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarray, columns: np.ndarray
 ) -> Triangles:
-    """Return the triangles that cover a sample's place with their box and aren't seen from the
-    edge.
-    """
+    """Return the triangles whose box contains a sample and that aren't seen exactly edge-on."""
     box = _boxes(corners, focal, rows, columns)
     index = np.flatnonzero((box[:, 0] < box[:, 1]) & (box[:, 2] < box[:, 3]))
     a, b, c = np.moveaxis(corners[index], 1, 0)
@@ -106,11 +103,11 @@ def _triangles(
 def _boxes(
     corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarray, columns: np.ndarray
 ) -> Int[np.ndarray, "F 4"]:
-    """Return the samples around each triangle: (first row, end, first column, end), empty where it
-    is behind the camera.
+    """Return the box of samples around each triangle (first row, end, first column, end), empty for
+    triangles behind the camera.
     """
     points = _in_front(corners)
-    with np.errstate(invalid="ignore"):  # NaN is a point that isn't there
+    with np.errstate(invalid="ignore"):  # NaN marks a missing point
         across, down = (
             focal * points[..., 0] / -points[..., 2],
             focal * points[..., 1] / points[..., 2],
@@ -129,8 +126,8 @@ def _boxes(
 
 
 def _in_front(corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "F P 3"]:
-    """Return the corners of what lies beyond the near plane: of those before it the NaN, and where
-    edges cross it the crossings.
+    """Clip triangles at the near plane: return their corners, NaN for those on the camera's side of
+    it, and the points where edges cross it, NaN for edges that don't.
     """
     behind = -corners[..., 2] < NEAR
     if not behind.any():
@@ -146,8 +143,8 @@ def _in_front(corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "F P 3"]
 def _pairs(
     box: Int[np.ndarray, "T 4"], width: int
 ) -> Iterator[tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]]:
-    """Return every (triangle, sample) with the sample in the triangle's box, a limited number at a
-    time, in the triangles' order.
+    """Yield all pairs (triangle, sample) with the sample in the triangle's box, in the order of the
+    triangles, up to ``PAIRS_PER_STEP`` at a time.
     """
     across = box[:, 3] - box[:, 2]
     ends = np.cumsum((box[:, 1] - box[:, 0]) * across)
@@ -168,8 +165,8 @@ def _draw(
     nearest: Int[np.ndarray, " S"],
     inverse_depth: Float[np.ndarray, " S"],
 ) -> None:
-    """Put those pairs into the buffers (in place) that lie inside and nearer than what is there;
-    the first of equals stays.
+    """Update the buffers in place with the pairs whose sample is inside the triangle and nearer
+    than before; at equal depth the first triangle is kept.
     """
     total = 0.0
     for corner in range(3):
@@ -188,7 +185,7 @@ def _draw(
 def _weights(
     triangles: Triangles, rays: _Rays, nearest: Int[np.ndarray, " S"]
 ) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
-    """Face indices and barycentric weights of the triangles that were seen."""
+    """Return the face indices and barycentric weights of the nearest triangles."""
     sample = np.flatnonzero(nearest >= 0)
     edges = triangles.edges[nearest[sample]]
     values = np.stack([rays.times(edges[:, corner], sample) for corner in range(3)], axis=1)
