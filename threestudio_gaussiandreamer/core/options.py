@@ -159,12 +159,12 @@ def is_list(value: Any) -> bool:
 
 
 def is_numbers(value: Any, count: int) -> bool:
-    """Whether ``value`` is a list of ``count`` numbers."""
+    """Return whether ``value`` is a list of ``count`` numbers."""
     return is_list(value) and len(value) == count and all(map(is_number, value))
 
 
 def shown(value: Any) -> str:
-    """``value`` as a message repeats it."""
+    """Format ``value`` for a message, shortened to ``SHOWN`` characters."""
     text = (
         _digits(value) if isinstance(value, int) else repr(list(value) if is_list(value) else value)
     )

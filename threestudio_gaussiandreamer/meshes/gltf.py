@@ -1,14 +1,14 @@
 """Triangle meshes and points of glTF 2.0 files (``.glb``, ``.gltf``), in the scene's axes.
 
-Read are: the default scene with its transforms; triangles, strips, fans and points, with or without
-indices; all component types, normalised, strided and sparse; the default weights of morph targets;
-skins in the pose of their joints; base colours with factor, texture, sampler, any set of texture
-coordinates, KHR_texture_transform, and COLOR_0. Not read, and refused by name: compressed geometry
-(Draco, meshopt), instances by EXT_mesh_gpu_instancing, basisu and DDS textures, and any other
-extension that the file requires. Lines are left out; lights, normals and animations aren't shown.
+Supported: the default scene with its transforms; triangles, strips, fans and points, with or
+without indices; all component types, normalised, strided and sparse; morph targets with their
+default weights; skins in the pose of their joints; base colours with factor, texture, sampler, any
+set of texture coordinates, KHR_texture_transform, and COLOR_0. Files are rejected if they have
+compressed geometry (Draco, meshopt), instances by EXT_mesh_gpu_instancing, basisu or DDS textures,
+or require any other unknown extension. Lines, lights, normals and animations are ignored.
 
-trimesh passes over or misreads most of this, and pygltflib parses the JSON only, so accessors,
-scenes and materials are read here."""
+Accessors, scenes and materials are decoded here, since trimesh ignores or misreads most of these
+features, and pygltflib only parses the JSON."""
 
 import logging
 from pathlib import Path
@@ -27,20 +27,22 @@ from .mesh import Mesh
 
 POINTS, LINES, TRIANGLES, STRIP, FAN = 0, (1, 2, 3), 4, 5, 6
 LARGEST_UV = 2.0**20
-"""Beyond it float32 coordinates hardly tell texels apart; sums of larger ones may overflow."""
+"""Texture coordinates are clamped to this: the resolution of larger float32 numbers is too low to
+distinguish texels, and sums of very large ones overflow.
+"""
 MALFORMED = (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError)
 
 log = logging.getLogger(__name__)
 
 
 def read_gltf(path: Path) -> list[Mesh]:
-    """Read the parts of the default scene; parts of points have no faces.
+    """Read the parts of the default scene; parts that consist of points have no faces.
 
     Raises:
-        UserError: damaged, too large for its budget, or with content that isn't read here.
+        UserError: the file is damaged, exceeds its budget, or has content that isn't supported.
     """
     try:
-        with np.errstate(over="ignore", invalid="ignore"):  # what isn't finite is dropped later
+        with np.errstate(over="ignore", invalid="ignore"):  # dropped later
             return _Scene(Document(path)).parts()
     except UserError:
         raise
@@ -51,7 +53,7 @@ def read_gltf(path: Path) -> list[Mesh]:
 
 
 class _Scene:
-    """The meshes of a document where its default scene places them."""
+    """The meshes of a document, transformed by the nodes of its default scene."""
 
     def __init__(self, document: Document) -> None:
         self.document, self.materials = document, Materials(document)
@@ -75,7 +77,7 @@ class _Scene:
     def _part(
         self, index: int, node: dict[str, Any], primitive: dict[str, Any], weights: np.ndarray
     ) -> Optional[Mesh]:
-        """Return one primitive in its place; None where there is nothing to show."""
+        """Return one primitive, transformed to the world; None for lines or without positions."""
         mode, attributes = primitive.get("mode", TRIANGLES), primitive["attributes"]
         if mode in LINES or "POSITION" not in attributes:
             return None

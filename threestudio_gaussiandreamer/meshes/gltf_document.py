@@ -39,7 +39,7 @@ HARMLESS_EXTENSIONS = {
         "sheen specular transmission volume"
     ).split()
 }
-"""They change lights and reflections, which aren't shown here, or nothing that is seen."""
+"""Extensions that are ignored, since they don't affect unlit colours or geometry."""
 
 
 class Numbers(NamedTuple):
@@ -65,7 +65,7 @@ class Document:
         path: a ``.glb`` or ``.gltf`` file.
 
     Raises:
-        UserError: not glTF 2.0, damaged, or it requires an extension that isn't read.
+        UserError: the file isn't glTF 2.0, is damaged, or requires an unsupported extension.
     """
 
     def __init__(self, path: Path) -> None:
@@ -79,11 +79,11 @@ class Document:
         self._check_extensions()
 
     def fail(self, problem: str) -> NoReturn:
-        """Raise UserError: the file can't be read, and why."""
+        """Raise UserError with the reason why the file can't be read."""
         fail(self.path, problem)
 
     def entry(self, kind: str, index: Any) -> dict[str, Any]:
-        """Return the object of this index in the list ``kind`` ("nodes", "meshes", ...)."""
+        """Return the object with this index in the list ``kind`` ("nodes", "meshes", ...)."""
         entries = self.json.get(kind, [])
         if not isinstance(entries, list) or type(index) is not int:
             self.fail(f"its JSON isn't that of a glTF file: {kind} {str(index)[:40]!r}")
@@ -92,10 +92,10 @@ class Document:
         return entries[index]
 
     def numbers(self, values: Any, count: int, what: str) -> Float[np.ndarray, " count"]:
-        """Return a list of the JSON as float64.
+        """Convert a list of the JSON to float64.
 
         Raises:
-            UserError: not ``count`` numbers.
+            UserError: it isn't a list of ``count`` numbers; ``what`` names it in the message.
         """
         usual = isinstance(values, (list, tuple)) and len(values) == count
         if not usual or not all(type(value) in (int, float) for value in values):
@@ -109,7 +109,7 @@ class Document:
         """Return a count or an offset of an entry.
 
         Raises:
-            UserError: missing without a default, or not an integer of 0 or more.
+            UserError: it is missing and has no default, or is no integer of 0 or more.
         """
         value = entry.get(key, default)
         if type(value) is not int or value < 0:

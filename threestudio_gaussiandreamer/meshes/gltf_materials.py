@@ -16,7 +16,7 @@ WRAPS = {10497: REPEAT, 33648: MIRROR, 33071: CLAMP}
 NEAREST = 9728
 UNREAD_IMAGES = ("KHR_texture_basisu", "MSFT_texture_dds")
 UNSET_FACTOR = [0.4, 0.4, 0.4]
-"""What trimesh writes where a material names no colour; it would only darken the texture."""
+"""trimesh's default for materials without a colour; ignored, since it would darken the texture."""
 
 log = logging.getLogger(__name__)
 
