@@ -238,8 +238,8 @@ def camera_pool(count: int, ranges: OrbitRanges, seed: int, stream: str = "camer
     """Draw ``count`` fixed training views, stratified in azimuth, from streams of their own."""
     rng = generator(seed, stream)
     pool = sample_orbit(count, ranges, rng)
-    # sample_orbit chooses one elevation distribution per call: mix two calls, so that a pool
-    # usually has both
+    # sample_orbit chooses one elevation distribution per call: mix two calls, which have different
+    # ones with probability 1/2
     other = sample_orbit(count, ranges, generator(seed, stream, 1))
     mix = torch.rand(count, generator=rng) < 0.5
     return pool._replace(elevation=torch.where(mix, pool.elevation, other.elevation))
