@@ -64,7 +64,7 @@ def test_a_stage_is_measured_on_withheld_objects(folder, name):
 
 def test_sigterm_saves_and_stops(folder, tmp_path):
     run = training(copied(folder, tmp_path / "run"), "judge")
-    step = run.train_step
+    step, earlier = run.train_step, signal.getsignal(signal.SIGTERM)
 
     def interrupted(batch):
         signal.raise_signal(signal.SIGTERM)
@@ -74,7 +74,7 @@ def test_sigterm_saves_and_stops(folder, tmp_path):
     run.run(1000)
     assert run.progress.images == 4
     assert load_file(run.path)["images"] == 4
-    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    assert signal.getsignal(signal.SIGTERM) == earlier
 
 
 def test_a_full_disk_is_said_and_leaves_the_earlier_checkpoint(folder, tmp_path, monkeypatch):

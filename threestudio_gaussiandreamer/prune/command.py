@@ -1,4 +1,4 @@
-"""Prune a finished cloud to a budget: ``python -m threestudio_gaussiandreamer.prune.command IN OUT
+"""Prune a finished cloud to a budget: ``python -m threestudio_gaussiandreamer.prune IN OUT
 --psnr 40``.
 
 IN is a PLY or SPZ file of Gaussians of any program, or a checkpoint of this package or of gsplat;
@@ -74,7 +74,7 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     """Parse a command line; exits for ``--help`` and for invalid arguments."""
     parser = argparse.ArgumentParser(
-        prog="python -m threestudio_gaussiandreamer.prune.command",
+        prog="python -m threestudio_gaussiandreamer.prune",
         description="Prune a finished cloud of Gaussians to a budget; beside OUT: OUT.json, "
         "the report, and OUT.png, before and after.",
     )
