@@ -8,8 +8,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from ..gaussians.grow import distinct
 
 GREY = 0.5
+"""Colour of a source that has none."""
 MAX_NON_FINITE = 0.05
-"""Share of vertices or colours that may be NaN or infinite; more mean that the file is broken."""
+"""Share of vertices, points or colours that may be NaN or infinite; more mean a broken file."""
 REPEAT, MIRROR, CLAMP = range(3)
 
 

@@ -28,15 +28,9 @@ from ..core.streams import numpy_generator
 from ..gaussians.point_cloud import PointCloud
 from ..host import BaseObject, run_seed
 from ..meshes.load import pose_rotation
+from ..meshes.mesh import GREY, MAX_NON_FINITE
 
 logger = logging.getLogger(__name__)
-
-MAX_NON_FINITE = 0.05
-"""More bad points than this fraction mean that the source is broken, not that it has a few stray
-rows.
-"""
-GREY = 0.5
-
 
 POINT_BYTES = 128
 """Memory per point, bytes, at least: position, colour and the parameters of its Gaussian."""

@@ -38,8 +38,8 @@ from ..gaussians.grow import longest_side
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.load import mesh_formats, pose_rotation, read_parts
-from ..meshes.mesh import vertex_surface_colors
-from .base import GREY, PATH, SCALE, Prior, require_axes
+from ..meshes.mesh import GREY, vertex_surface_colors
+from .base import PATH, SCALE, Prior, require_axes
 
 logger = logging.getLogger(__name__)
 
