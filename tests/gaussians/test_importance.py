@@ -14,6 +14,18 @@ from threestudio_gaussiandreamer.training.density import DensityControl, Quality
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 
+def one_camera():
+    """Camera of 32 x 32 pixels, as (viewmats, Ks)."""
+    c2w = orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0]))
+    return to_opencv(c2w, torch.tensor([0.8]), 32, 32)
+
+
+def drawn_from(geometry, opacities, viewmats):
+    """Inputs of `rasterize`, colours as the camera sees them."""
+    colors = geometry.colors(viewmats[:, 3, :3])
+    return geometry.means, geometry.quats, geometry.scales(), opacities, colors
+
+
 def cloud(n, **options):
     geometry = GaussianCloud({"min_gaussians": 1, **options})
     rng = torch.Generator().manual_seed(0)
@@ -175,20 +187,9 @@ def pictures(out, opacities, background=(0.0, 0.0, 0.0)):
 def test_the_colour_of_the_background_hides_nobody():
     geometry = cloud(12, budget=5)
     geometry.sh0.data[0] = -0.5 / 0.28209479177387814  # black, as the background
-    viewmats, Ks = to_opencv(
-        orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])),
-        torch.tensor([0.8]),
-        32,
-        32,
-    )
+    viewmats, Ks = one_camera()
     opacities = geometry.opacities()
-    inputs = (
-        geometry.means,
-        geometry.quats,
-        geometry.scales(),
-        opacities,
-        geometry.colors(viewmats[:, 3, :3]),
-    )
+    inputs = drawn_from(geometry, opacities, viewmats)
     out = rasterize(*inputs, viewmats, Ks, 32, 32)
     DensityControl(geometry).before_backward(pictures(out, opacities), 60)
     assert out.contribution[0, 0] > 0.1 and geometry.removal[0] > 0.01 * geometry.removal.median()
@@ -196,23 +197,12 @@ def test_the_colour_of_the_background_hides_nobody():
 
 @pytest.mark.parametrize("backend", ["auto", "torch", "reference"])
 def test_sampling_leaves_the_gradients_of_the_loss_alone(backend):
-    viewmats, Ks = to_opencv(
-        orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])),
-        torch.tensor([0.8]),
-        32,
-        32,
-    )
+    viewmats, Ks = one_camera()
     left = []
     for budget in (None, 5):
         geometry = cloud(12, budget=budget, densify={"enabled": True, "absgrad": True})
         opacities = geometry.opacities()
-        inputs = (
-            geometry.means,
-            geometry.quats,
-            geometry.scales(),
-            opacities,
-            geometry.colors(viewmats[:, 3, :3]),
-        )
+        inputs = drawn_from(geometry, opacities, viewmats)
         out = rasterize(*inputs, viewmats, Ks, 32, 32, absgrad=True, backend=backend)
         DensityControl(geometry).before_backward(pictures(out, opacities), 60)
         assert geometry.removal.any() == (budget is not None)
