@@ -5,7 +5,7 @@ BIN     = $(VENV)/bin
 ENVIRON = OMP_WAIT_POLICY=passive
 WORKERS ?= auto
 PYTEST  = $(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
-# without the CPU kernel (no C++ compiler) plain torch draws, and the demo is smaller
+# without the CPU kernel (no C++ compiler) plain torch renders, and the demo is smaller
 SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import available_backends as b; print("--config configs/demo-small.yaml" if b()["cpu"] else "")')
 
 .PHONY: demo test test-slow test-all docs stability fuzz long-run ablations bench gpu-check train-toybox toybox-sheet charts measure-charts clean
@@ -21,11 +21,11 @@ test-slow: $(VENV)/ready-for-tests ## kills, fuzzing, emulated kernels and runs 
 
 test-all: test test-slow           ## both, as CI runs them
 
-stability: $(VENV)/ready-for-tests          ## every known way to fail, provoked and measured: docs/stability.md
+stability: $(VENV)/ready-for-tests          ## every known failure, provoked and measured: docs/stability.md
 	$(ENVIRON) $(BIN)/python -m pytest tests/stability --stability-report stability.json; status=$$?; \
-	$(BIN)/python -m tests.stability.report stability.json docs/stability.md; rm -f stability.json; exit $$status
+	$(BIN)/python -m tests.stability.report stability.json; rm -f stability.json; exit $$status
 
-fuzz: $(VENV)/ready-for-tests               ## damaged files at every door, hostile Gaussians, random lives of a cloud; about half an hour
+fuzz: $(VENV)/ready-for-tests               ## damaged files for every reader, extreme Gaussians, random densification; about half an hour
 	$(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.robustness.fuzz
 
 long-run: $(VENV)/ready            ## 20,000 steps with 50 random kills, against the undisturbed run; a quarter of an hour
@@ -37,7 +37,7 @@ ablations: $(VENV)/ready           ## the paper's ablations as a table, measured
 bench: $(VENV)/ready-for-tests     ## the rasteriser's speed and memory, beside gsplat's torch functions
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.bench_splatting
 
-gpu-check: $(VENV)/ready-for-tests ## everything that waits for an NVIDIA GPU: correctness, speed beside gsplat, a training step
+gpu-check: $(VENV)/ready-for-tests ## what needs an NVIDIA GPU: correctness, speed beside gsplat, a training step
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.gpu_check
 
 docs: $(VENV)/ready-for-tests      ## the generated parts of README and docs/: architecture, measured tables
@@ -45,7 +45,7 @@ docs: $(VENV)/ready-for-tests      ## the generated parts of README and docs/: a
 	$(BIN)/python -m benchmarks.tables
 
 TOYBOX = .toybox
-train-toybox: $(VENV)/ready-for-models       ## small models of generated objects, from nothing; hours on a CPU, continues after a stop
+train-toybox: $(VENV)/ready-for-models       ## train small models on generated objects, from scratch; hours on a CPU, resumable
 	$(ENVIRON) $(BIN)/python -m threestudio_gaussiandreamer.toybox.train $(TOYBOX)
 
 toybox-sheet: $(VENV)/ready-for-models       ## docs/images/toybox-world.png: 100 objects of the toybox
@@ -59,11 +59,10 @@ charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbe
 # the meshes to measure on: make measure-charts OBJECTS="toy.glb path/to/spot.glb path/to/duck.glb"
 OBJECTS = toy.glb
 
-measure-charts: $(VENV)/ready-for-charts     ## the numbers anew, about two hours a mesh; runs that are in the CSVs are not repeated
+measure-charts: $(VENV)/ready-for-charts     ## repeat the measurements, about two hours a mesh; runs that are in the CSVs are skipped
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.runs --objects $(OBJECTS)
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.chart_runs
-	$(ENVIRON) $(BIN)/python -m benchmarks.quality.failure_table
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.attributes --objects $(OBJECTS) --seeds 0 1 2 3 4
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.after_run --objects $(OBJECTS) --seeds 0 1 2 3 4
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.viewers --objects $(OBJECTS)

@@ -56,12 +56,12 @@ COLOURS = [f"C{index}" for index in range(7)] + [
 ]
 SECONDS = "CPU seconds of training, one thread"
 RUNS = {
-    "time": Chart("What each kind of score buys per second", "cpu_seconds", SECONDS, curves=True),
+    "time": Chart("Quality over time for each kind of score", "cpu_seconds", SECONDS, curves=True),
     "count": Chart(
         "How many Gaussians a scene needs", "gaussians", "Gaussians at the end", curves=False
     ),
     "size": Chart(
-        "What rendering larger buys",
+        "Effect of the rendered size",
         "cpu_seconds",
         SECONDS,
         curves=False,
@@ -69,7 +69,7 @@ RUNS = {
         labels_x=True,
     ),
     "large": Chart(
-        "What rendering at 1024² and shrinking to 512² buys",
+        "Effect of rendering at 1024² and shrinking to 512²",
         "cpu_seconds",
         SECONDS,
         curves=False,
@@ -83,9 +83,9 @@ RUNS = {
         per_variant="x",
         marks_paper=True,
     ),
-    "iterations": Chart("What more steps buy", "x", "steps", curves=False),
+    "iterations": Chart("Effect of the number of steps", "x", "steps", curves=False),
     "rates": Chart(
-        "What the learning rates buy",
+        "Effect of the learning rates",
         "x",
         "times the learning rates of demo.yaml",
         curves=False,
@@ -93,7 +93,7 @@ RUNS = {
         common="demo.yaml",
     ),
     "dilation": Chart(
-        "What a smaller screen-space dilation buys", "x", "dilation, square pixels", curves=False
+        "Effect of a smaller screen-space dilation", "x", "dilation, square pixels", curves=False
     ),
     "quality": Chart(
         "Draft, default and best",
@@ -104,7 +104,7 @@ RUNS = {
         chosen_on=(TUNED_ON, "duck"),
     ),
     "preset": Chart(
-        "What the rasteriser's presets buy", "cpu_seconds", SECONDS, curves=True, marks_paper=True
+        "Effect of the rasteriser's presets", "cpu_seconds", SECONDS, curves=True, marks_paper=True
     ),
 }
 

@@ -1,19 +1,15 @@
-"""How the method fails and what each remedy buys, from docs/charts/*.csv as `runs.py` measured
-them: the tables of docs/failures.md.
+"""The tables of docs/failures.md: how score distillation fails and what each remedy gains.
 
-    python -m benchmarks.quality.failure_table
-
-A cell is the median dB over the seeds, its range, and the share that belongs to the failure; gains
-are against the failure itself."""
+A cell is the median dB over the seeds with its range, and the share that shows the failure; gains
+are relative to the failing variant. `runs.py` measures, `make docs` writes the page.
+"""
 
 import statistics
 from typing import NamedTuple
 
 from benchmarks.quality.chart_runs import ends, grouped, objects_of
-from benchmarks.quality.runs import ROOT, rows_of
+from benchmarks.quality.runs import rows_of
 
-PAGE = ROOT / "docs/failures.md"
-MARKS = "<!-- tables -->", "<!-- end of the tables -->"
 SHARES = {"multi_face": "multi-face", "out_of_gamut": "out of gamut", "floater_mass": "floaters"}
 
 
@@ -40,15 +36,15 @@ FAILURES = [
         },
     ),
     Failure(
-        "Multi-face, front and back of one shape",
+        "Multi-face, an object whose front and back differ in colour only",
         "multi_face",
-        "front and back alike: grey prior",
+        "same shape: grey prior",
         {
-            "a view-dependent score": "front and back alike: grey prior + view-dependent score",
-            "a prior with colours": "front and back alike: coloured prior",
-            "both": "front and back alike: coloured prior + view-dependent score",
+            "a view-dependent score": "same shape: grey prior + view-dependent score",
+            "a prior with colours": "same shape: coloured prior",
+            "both": "same shape: coloured prior + view-dependent score",
         },
-        chart="alike",
+        chart="front_back",
     ),
     Failure(
         "Prior without colours",
@@ -60,35 +56,35 @@ FAILURES = [
         },
     ),
     Failure(
-        "Prior of the wrong shape (a grey ball)",
+        "Prior of the wrong shape (a grey sphere)",
         "floater_mass",
-        "wrong shape: a grey ball",
-        {"another prior or sample": "right shape"},
+        "wrong shape: a grey sphere",
+        {"a prior of the right shape": "right shape"},
     ),
     Failure(
         "Over-saturation at guidance 100",
         "out_of_gamut",
         "over-saturation: guidance 100",
         {
-            "`max_step_percent` that falls to 0.55 (the default)": "over-saturation: annealed",
+            "`max_step_percent` falling to 0.55 (the default)": "over-saturation: annealed",
             "and `grad_clip: [0, 1.5, 2.0, 1000]`": "over-saturation: annealed, clipped",
             "and `guidance_scale: 7.5`": "over-saturation: guidance 7.5, annealed, clipped",
         },
     ),
     Failure(
-        "Blur, from timesteps up to 0.98 throughout",
+        "Blur from timesteps up to 0.98 throughout",
         "multi_face",
         "blur: timesteps up to 0.98 throughout",
-        {"`max_step_percent` that falls to 0.55 (the default)": "multi-face: prior"},
+        {"`max_step_percent` falling to 0.55 (the default)": "multi-face: prior"},
     ),
     Failure(
-        "Blur, from a coarse latent (4²)",
+        "Blur from a coarse latent (4²)",
         "multi_face",
         "blur: coarse latent",
-        {"a fine one (16²)": "multi-face: prior"},
+        {"a latent of 16²": "multi-face: prior"},
     ),
     Failure(
-        "Blur and floaters, from a screen-space dilation of 0.3 square pixels",
+        "Blur and floaters from a screen-space dilation of 0.3 square pixels",
         "floater_mass",
         "plain 0.3",
         {"`renderer.eps2d: 0.1` (the demo's)": "plain 0.1"},
@@ -112,12 +108,9 @@ class Ends(NamedTuple):
     gaussians: list[float]
 
 
-def main() -> None:
-    before, _, rest = PAGE.read_text().partition(MARKS[0])
-    after = rest.partition(MARKS[1])[2]
-    tables = "\n\n".join(filter(None, map(table, FAILURES)))
-    PAGE.write_text(f"{before}{MARKS[0]}\n\n{tables}\n\n{MARKS[1]}{after}")
-    print(PAGE.relative_to(ROOT))
+def tables() -> str:
+    """Return all tables of docs/failures.md."""
+    return "\n" + "\n\n".join(filter(None, map(table, FAILURES))) + "\n"
 
 
 def table(failure: Failure) -> str:
@@ -127,7 +120,9 @@ def table(failure: Failure) -> str:
         return ""
     worst = {name: measured(failure, failure.without, name) for name in objects}
     lines = [f"| {failure.title} | {' | '.join(objects)} |", "| --- |" + " --- |" * len(objects)]
-    lines.append(f"| as it fails | {' | '.join(cell(worst[name], failure) for name in objects)} |")
+    lines.append(
+        f"| without remedy | {' | '.join(cell(worst[name], failure) for name in objects)} |"
+    )
     for remedy, variant in failure.remedies.items():
         cells = [cell(measured(failure, variant, name), failure, worst[name]) for name in objects]
         lines.append(f"| {remedy} | {' | '.join(cells)} |")
@@ -157,7 +152,3 @@ def cell(here: Ends, failure: Failure, worst: Ends | None = None) -> str:
     if failure.chart == "count":
         text += f", {statistics.median(here.gaussians):.0f} Gaussians"
     return f"{text}, {100 * statistics.median(here.share):.1f} % {SHARES[failure.share]}"
-
-
-if __name__ == "__main__":
-    main()

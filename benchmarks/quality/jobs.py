@@ -1,5 +1,5 @@
-"""What is run for each chart and table: variants of configs/demo.yaml as lists of :class:`Job`;
-`runs.py` runs them.
+"""The runs of each chart and table: variants of configs/demo.yaml as :class:`Job`; `runs.py` runs
+them.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -22,7 +22,7 @@ SECOND_STAGE = 500
 """The step from which the demo draws smaller timesteps."""
 COUNTS = (5000, 2500, 1500, 1000)
 STEPS_A_ROUND = PruneOptions.steps
-"""Of recovery in the prune command."""
+"""Recovery steps of the prune command per round."""
 NO_BUDGET = {"system.geometry.budget": "null"}
 PAPER_START = {"system.geometry.init_opacity": 0.1, "system.geometry.grow.radius": 0.01}
 SHARP_PAPER = PAPER_RATES | NO_BUDGET | PAPER_START
@@ -39,7 +39,7 @@ RATES = {
 }
 """Learning rates of demo.yaml, at the start and the end of a run."""
 SLOWER_MEANS = {"slower means": 0.5, "means at 0.8": 0.8}
-"""The share of their rate that positions begin with: the smaller, the more Gaussians stay on the
+"""Factors of the initial learning rate of positions: the smaller, the more Gaussians stay on the
 surface.
 """
 BINS = VIEW_BLIND | {"system.guidance.mode": "direction-bins"}
@@ -65,7 +65,7 @@ class Job(NamedTuple):
 
 
 def steps(count: int) -> dict[str, Any]:
-    """A run of ``count`` steps with its schedules in proportion."""
+    """Return the options of a run of ``count`` steps, with its schedules in proportion."""
     second = SECOND_STAGE * count // STEPS
     schedule = [second, 0.98, 0.55, second + 1]
     rounds = {
@@ -80,7 +80,7 @@ def steps(count: int) -> dict[str, Any]:
 
 
 def falling(names: Iterable[str], count: int, factor: float = 1.0) -> dict[str, str]:
-    """Some of the demo's learning rates, ``factor`` times as high, for a run of ``count`` steps."""
+    """Return some of the demo's learning rates, ``factor`` times as high, for ``count`` steps."""
     return {
         f"system.geometry.{name}": falling_rate(*(factor * rate for rate in RATES[name]), count)
         for name in names
@@ -88,13 +88,13 @@ def falling(names: Iterable[str], count: int, factor: float = 1.0) -> dict[str, 
 
 
 def falling_rate(start: float, end: float, count: int) -> str:
-    """A learning rate that falls over ``count`` steps."""
+    """Return the schedule of a learning rate that decays over ``count`` steps."""
     return f"[0,{start:g},{end:g},{count}]"
 
 
 def scratch(count: int) -> dict[str, Any]:
-    """The start of the demo with ``count`` Gaussians: four fifths from the prior, one fifth
-    grown.
+    """Return the options that start the demo with ``count`` Gaussians: four fifths from the prior,
+    one fifth grown.
     """
     return NO_BUDGET | {
         "system.geometry.prior.num_points": count * 4 // 5,
@@ -104,7 +104,7 @@ def scratch(count: int) -> dict[str, Any]:
 
 
 def time_jobs() -> Iterator[Job]:
-    """What each kind of score, and the prior, buys per second."""
+    """Each kind of score, with a prior and from a random start, over time."""
     yield Job("time", "view-exact, demo.yaml", 0, {})
     yield Job("time", "view-exact, the paper's recipe", 0, PAPER)
     yield Job("time", "direction bins", 0, BINS)
@@ -113,7 +113,7 @@ def time_jobs() -> Iterator[Job]:
 
 
 def count_jobs() -> Iterator[Job]:
-    """What a number of Gaussians can do, by the way it was reached; all with the same steps."""
+    """Quality against the number of Gaussians, for each way to reach it, at equal steps."""
     yield Job("count", "no pruning", 10000, NO_BUDGET)
     yield Job("count", "the paper's recipe", 10000, PAPER)
     yield Job("count", "the paper's recipe, dilation 0.1", 10000, SHARP_PAPER)
@@ -124,7 +124,7 @@ def count_jobs() -> Iterator[Job]:
     ungrown = {"system.geometry.prior.num_points": 10000, "system.geometry.grow.enabled": "false"}
     yield Job(
         "count",
-        "by removal error, nothing grown",
+        "by removal error, without growing",
         COUNTS[-2],
         ungrown | {"system.geometry.budget": COUNTS[-2]},
     )
@@ -186,21 +186,18 @@ def grown_jobs() -> Iterator[Job]:
 
 
 def size_jobs() -> Iterator[Job]:
-    """Pixels rendered, and whether rendering twice as large and shrinking pays for its four times
-    as many.
-    """
+    """Sizes of the renders, and rendering twice as large and shrinking."""
     for size in (64, 128, 256):
-        yield Job(
-            "size", "rendered and guided alike", size, {"data.width": size, "data.height": size}
-        )
+        own = {"data.width": size, "data.height": size}
+        yield Job("size", "rendered and guided at the same size", size, own)
     for size in (64, 128):
         large = {"data.width": 2 * size, "data.height": 2 * size, "system.renderer.downsample": 2}
         yield Job("size", "rendered twice as large, shrunk", size, large)
 
 
 def large_jobs() -> Iterator[Job]:
-    """The same at 512^2 with 20,000 Gaussians; what shrinking does to the dilation, and its seconds
-    spent on steps, each alone.
+    """The same at 512^2 with 20,000 Gaussians; the smaller dilation that shrinking implies, and the
+    same seconds spent on more steps, each alone.
     """
     own = {"data.width": 512, "data.height": 512, "system.evaluation.size": 512}
     many = own | scratch(20000)
@@ -230,7 +227,7 @@ def batch_jobs() -> Iterator[Job]:
 
 
 def iteration_jobs() -> Iterator[Job]:
-    """Runs of their own: a longer run is not the continuation of a shorter one."""
+    """Separate runs: a longer run doesn't continue a shorter one, because schedules differ."""
     for rates, name in (({}, "demo.yaml"), (PAPER, "the paper's recipe")):
         for count in (150, 300, 600, 1200):
             yield Job("iterations", name, count, steps(count) | rates)
@@ -257,9 +254,7 @@ def preset_jobs() -> Iterator[Job]:
 
 
 def dilation_jobs() -> Iterator[Job]:
-    """Gaussians are widened on the screen by 0.3 square pixels nearly everywhere; a pixel's own box
-    has a twelfth.
-    """
+    """Dilations between the usual 0.3 square pixels and less than a pixel's own box (1/12)."""
     for dilation in (0.03, 0.1, 0.3):
         for antialias, name in ((False, "plain"), (True, "antialiased")):
             yield Job(
@@ -280,7 +275,7 @@ def dilation_jobs() -> Iterator[Job]:
 
 
 def quality_jobs() -> Iterator[Job]:
-    """The demo as it is, its quick and its good variant, at its own size."""
+    """The demo, its draft and its best variant, at their own size."""
     own = {"data.width": 256, "data.height": 256, "system.evaluation.size": 256}
     for name, overlay, count in (
         ("draft", "demo-draft", 255),
@@ -302,8 +297,8 @@ def quality_jobs() -> Iterator[Job]:
 
 
 def failure_jobs() -> Iterator[Job]:
-    """How the method fails, and what each remedy buys: 96^2 and 600 steps, so that 15 runs of each
-    are affordable.
+    """Each failure of the method, and each remedy: 96^2 and 600 steps, so that 15 runs of each are
+    affordable.
     """
     # bounded colours can't be out of gamut, which is what over-saturation is measured by
     unbounded = {"system.geometry.bound_colors": "false"}
@@ -324,23 +319,23 @@ def failure_jobs() -> Iterator[Job]:
         | CLIPPED
         | unbounded
         | {"system.guidance.guidance_scale": 8.5},
-        "wrong shape: a grey ball": BALL,
+        "wrong shape: a grey sphere": BALL,
         "right shape": {},
     }
     for name, options in variants.items():
         yield Job("failures", name, 0, SMALL | steps(600) | options)
 
 
-def alike_jobs() -> Iterator[Job]:
+def front_back_jobs() -> Iterator[Job]:
     """The paper's limit: an object whose front and back differ little in shape."""
     variants = {
-        "front and back alike: grey prior": VIEW_BLIND | GREY,
-        "front and back alike: grey prior + view-dependent score": BINS | GREY,
-        "front and back alike: coloured prior": VIEW_BLIND,
-        "front and back alike: coloured prior + view-dependent score": BINS,
+        "same shape: grey prior": VIEW_BLIND | GREY,
+        "same shape: grey prior + view-dependent score": BINS | GREY,
+        "same shape: coloured prior": VIEW_BLIND,
+        "same shape: coloured prior + view-dependent score": BINS,
     }
     for name, options in variants.items():
-        yield Job("alike", name, 0, SMALL | steps(600) | options)
+        yield Job("front_back", name, 0, SMALL | steps(600) | options)
 
 
 JOBS: dict[str, Callable[[], Iterator[Job]]] = {
@@ -356,7 +351,7 @@ JOBS: dict[str, Callable[[], Iterator[Job]]] = {
     "dilation": dilation_jobs,
     "quality": quality_jobs,
     "failures": failure_jobs,
-    "alike": alike_jobs,
+    "front_back": front_back_jobs,
 }
-OWN_OBJECTS = {"alike": ["benchmarks/scenes/ball.ply"]}
+OWN_OBJECTS = {"front_back": ["benchmarks/scenes/ball.ply"]}
 """What a chart is made on, where it isn't the objects that are asked for."""

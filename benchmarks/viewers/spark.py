@@ -1,4 +1,4 @@
-"""What Spark shows of a cloud, against our own render: dB on the held-out views.
+"""Rendering in Spark of a cloud, against our own render: dB on the held-out views.
 
     cloud=outputs/demo/.../save/it1200-export/gaussians.ply
     python -m benchmarks.viewers.spark --modules ~/npm/node_modules bounded:toy.glb:$cloud

@@ -3,12 +3,14 @@ written from.
 """
 
 import ast
+import json
 import re
 from pathlib import Path
 
 import pytest
 
 from tests.stability.faults import FAULTS
+from tests.stability.report import RESULTS
 from tests.stability.rows import OTHERS, ROWS
 
 FOLDER = Path(__file__).parent
@@ -33,6 +35,13 @@ NOT_YET: set[str] = set()
 def test_every_row_has_a_test():
     missing = set(ROWS) - rows_with_a_test()
     assert {group for group, _ in missing} == NOT_YET, sorted(missing)
+
+
+def test_every_result_names_a_row_and_tests_that_exist():
+    for entry in json.loads(RESULTS.read_text()):
+        assert (entry["group"], entry["name"]) in ROWS
+        for file, _, name in (test.partition("::") for test in entry["tests"]):
+            assert f"def {name}(" in (FOLDER / f"{file}.py").read_text(), f"{file}::{name}"
 
 
 def test_the_table_is_complete(shared_folder):

@@ -250,7 +250,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     parser.add_argument(
         "--t3bench",
         metavar="FOLDER",
-        help="also write T3Bench's views of every result; see docs/models.md",
+        help="also write T3Bench's views of every result; see docs/evaluation.md",
     )
     parser.add_argument(
         "--t3bench-group",

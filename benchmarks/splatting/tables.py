@@ -1,0 +1,105 @@
+"""The tables of docs/rasteriser.md, from docs/charts/rasteriser.csv and
+benchmarks/results/splatting.csv.
+"""
+
+from pathlib import Path
+
+from benchmarks.markdown import markdown, read
+
+ROOT = Path(__file__).resolve().parents[2]
+ACCURACY, SPEED = ROOT / "docs/charts/rasteriser.csv", ROOT / "benchmarks/results/splatting.csv"
+SCENES = ("initial", "trained", "fog", "needles", "deep", "near plane")
+PRESETS = {"fast": "1/255", "balanced": "1/1024", "accurate": "1/65536"}
+THRESHOLDS = ("1/64", "1/255", "1/1024", "1/4096", "1/16384", "1/65536", "0")
+CONTENDERS = {
+    "cpu": "CPU kernel",
+    "cpu-v3": "CPU kernel, AVX2 build",
+    "torch": "plain torch",
+    "gsplat": "gsplat's plain torch",
+    "prototype": "AVX-512 prototype (intrinsics)",
+}
+
+
+def presets() -> str:
+    """Return PSNR of each preset on each scene, gradient error and time on a trained cloud."""
+    return accuracy("preset", {f"`{name}`": name for name in PRESETS}, PRESETS)
+
+
+def thresholds() -> str:
+    """Return the same for each smallest alpha."""
+    return accuracy("alpha_min", {name: name for name in THRESHOLDS})
+
+
+def accuracy(group: str, settings: dict[str, str], alphas: dict[str, str] | None = None) -> str:
+    """Return a table of settings at 512²: PSNR on each scene, gradient error and time of `trained`.
+
+    Args:
+        group: of the settings in the CSV.
+        settings: name in the table to name in the CSV.
+        alphas: smallest alpha of each setting, where its name doesn't tell.
+    """
+    rows = [row for row in read(ACCURACY) if (row["size"], row["group"]) == ("512", group)]
+    cells = {(row["setting"], row["scene"]): row for row in rows}
+    fastest = milliseconds(fast_preset())
+    table = []
+    for title, setting in settings.items():
+        trained = cells[setting, "trained"]
+        psnr = (f"{float(cells[setting, scene]['psnr']):.1f}" for scene in SCENES)
+        ratio = f"{milliseconds(trained) / fastest:.1f}"
+        alpha = [alphas[setting]] if alphas else []
+        table.append((title, *alpha, *psnr, f"{float(trained['l2']):.1%}", ratio))
+    names = ("preset", "smallest alpha") if alphas else ("smallest alpha",)
+    return markdown((*names, *SCENES, "worst gradient, trained", "time, trained"), table)
+
+
+def fast_preset() -> dict[str, str]:
+    """Return the row that times are relative to."""
+    place = ("512", "preset", "fast", "trained")
+    columns = ("size", "group", "setting", "scene")
+    return next(row for row in read(ACCURACY) if tuple(row[c] for c in columns) == place)
+
+
+def milliseconds(row: dict[str, str]) -> float:
+    """Return the time of forward and backward."""
+    return float(row["forward_ms"]) + float(row["backward_ms"])
+
+
+def contenders() -> str:
+    """Return milliseconds of forward and backward for 100,000 Gaussians, and peak memory."""
+    rows = {
+        (row["contender"], row["size"], row["threads"]): row
+        for row in read(SPEED)
+        if row["gaussians"] == "100000"
+    }
+    threads = sorted({key[2] for key in rows}, key=int)
+    places = [(size, count) for size in ("512", "1024") for count in threads]
+    table = []
+    for contender, title in CONTENDERS.items():
+        found = [rows.get((contender, *place)) for place in places]
+        cells = [f"{float(row['both_ms']):.1f}" if row else "" for row in found]
+        memory = [float(row["memory_mb"]) for row in found if row]
+        table.append((title, *cells, f"{max(memory):.0f} MB"))
+    head = [f"{size}², {count} thread{'s' * (count != '1')}" for size, count in places]
+    return f"{conditions(list(rows.values()))}\n\n{markdown(('', *head, 'peak memory'), table)}"
+
+
+def conditions(rows: list[dict[str, str]]) -> str:
+    """Return what was timed, on which machine and under which load."""
+    machine = SPEED.read_text().partition("\n")[0].removeprefix("# ")
+    loads = sorted(float(row["load"]) for row in rows)
+    return (
+        "Milliseconds of forward and backward of one view, 100,000 Gaussians, preset `fast` "
+        f"({machine}; system load {loads[0]} to {loads[-1]}):"
+    )
+
+
+def speedup() -> str:
+    """Return how many times faster the CPU kernel is than gsplat's plain torch, 512²."""
+    ms = {
+        (row["threads"], row["contender"]): float(row["both_ms"])
+        for row in read(SPEED)
+        if (row["gaussians"], row["size"]) == ("100000", "512")
+    }
+    threads = sorted({key[0] for key in ms}, key=int)
+    times = " / ".join(f"{ms[n, 'gsplat'] / ms[n, 'cpu']:.0f}" for n in threads)
+    return f"{times} times faster ({' / '.join(threads)} threads)"
