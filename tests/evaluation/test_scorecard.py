@@ -1,0 +1,86 @@
+"""The scorecard of finished runs: rows, intervals, comparisons, and messages for wrong input."""
+
+import csv
+import json
+
+import pytest
+import torch
+
+from tests.evaluation.clip_similarity_cases import blob, save
+from tests.helpers import tiny_3d_models as tiny
+from threestudio_gaussiandreamer.evaluation.scorecard import main
+from threestudio_gaussiandreamer.toybox import export, models
+
+PROMPTS = ("a red fox", "a red fox", "a blue mug with white dots", "a zebra")
+
+
+def finished(folder, prompts):
+    """Folders of finished runs with one cloud each."""
+    for number, prompt in enumerate(prompts):
+        run = folder / "gaussiandreamer" / f"run{number}"
+        save(run / "save/it5-export/gaussians.ply", blob(seed=number))
+        (run / "configs").mkdir()
+        config = {"system": {"prompt_processor": {"prompt": prompt}}}
+        (run / "configs/parsed.yaml").write_text(json.dumps(config))
+    return folder
+
+
+@pytest.fixture
+def judge(tmp_path):
+    torch.manual_seed(0)
+    export.write_judge(tmp_path / "judge.safetensors", models.Judge().state_dict())
+    return str(tmp_path / "judge.safetensors")
+
+
+def test_rows_and_intervals_over_prompts(tmp_path, judge, capsys):
+    runs = finished(tmp_path / "runs", PROMPTS)
+    arguments = ["--metrics", "judge,janus", "--judge", judge, "--output", str(tmp_path / "out")]
+    assert main([str(runs), *arguments]) == 0
+    with open(tmp_path / "out/scorecard.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["prompt"] for row in rows] == list(PROMPTS)
+    assert rows[3]["kind"] == "nan" and rows[2]["multi_face"] == "nan"
+    content = json.loads((tmp_path / "out/scorecard.json").read_text())
+    assert content["kind"]["mean"]["count"] == 2  # two prompts have known words
+    assert content["multi_face"]["mean"]["count"] == 1  # and a mug has no front
+    assert "kind" in capsys.readouterr().out
+
+
+def test_clip_of_two_folders_is_compared_by_prompt(tmp_path):
+    pytest.importorskip("transformers")
+    clip = str(tiny.clip(tmp_path / "clip"))
+    first, second = finished(tmp_path / "a", PROMPTS[:2]), finished(tmp_path / "b", PROMPTS[1:3])
+    arguments = ["--metrics", "clip,directions", "--clip", clip, "--size", "24"]
+    arguments += ["--against", str(second), "--output", str(tmp_path / "out")]
+    assert main([str(first), *arguments]) == 0
+    content = json.loads((tmp_path / "out/scorecard.json").read_text())
+    clip_score = content["clip"]
+    assert clip_score["difference"]["count"] == 1  # the fox is in both
+    assert -100 <= clip_score["mean"]["mean"] <= 100
+    assert 0 <= content["wrong_direction"]["against"]["mean"] <= 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{}", "--metrics", "clop"], "clip"),
+        (["{}", "--metrics", ","], "--metrics is empty"),
+        (["{}", "--metrics", "clip"], "--clip FOLDER"),
+        (["{}", "--metrics", "judge", "--judge", "none.safetensors"], "none.safetensors"),
+        (["{}", "--metrics", "judge", "--size", "0", "--judge", "{judge}"], "--size 0"),
+        (["{}/no", "--metrics", "judge", "--judge", "{judge}"], "no folder"),
+        (["{}/configs", "--metrics", "judge", "--judge", "{judge}"], "holds no finished run"),
+        (["{}", "--metrics", "judge", "--judge", "{judge}", "--output", "{judge}"], "--output"),
+    ],
+)
+def test_wrong_input_is_named(tmp_path, judge, capsys, arguments, message):
+    run = finished(tmp_path / "runs", PROMPTS[:1]) / "gaussiandreamer/run0"
+    arguments = [a.replace("{judge}", judge).replace("{}", str(run)) for a in arguments]
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_run_without_a_prompt_is_named(tmp_path, judge, capsys):
+    run = finished(tmp_path / "runs", [""])
+    assert main([str(run), "--metrics", "judge", "--judge", judge]) == 2
+    assert "has no prompt" in capsys.readouterr().err

@@ -1,0 +1,74 @@
+"""The judge's probabilities become recognised attributes and a share of views with a wrong side."""
+
+import math
+
+import pytest
+import torch
+
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.toybox import export, models, recognition
+from threestudio_gaussiandreamer.toybox.views import LABELS, label_row
+from threestudio_gaussiandreamer.toybox.world import Attributes
+
+FOX = Attributes("fox", "red", "striped", "white", None, "hat", "blue")
+
+
+def sure(attributes, sides=None):
+    """Probabilities of a judge that is sure of these attributes in all eight views."""
+    azimuths = recognition.views().azimuth.tolist()
+    rows = torch.tensor([label_row(attributes, azimuth).tolist() for azimuth in azimuths])
+    if sides is not None:
+        rows[:, list(LABELS).index("quadrant")] = torch.tensor(sides)
+    return {
+        name: torch.nn.functional.one_hot(rows[:, column], len(classes)).float()
+        for column, (name, classes) in enumerate(LABELS.items())
+    }
+
+
+def test_all_attributes_are_recognised_from_the_right_sides():
+    assert all(recognition.recognized(sure(FOX), FOX).values())
+    assert recognition.multi_face(sure(FOX), FOX) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "missed"),
+    [
+        ({"kind": "bear"}, "kind"),
+        ({"color": "black"}, "colors"),
+        ({"second": "black"}, "colors"),
+        ({"pattern": "dotted"}, "pattern"),
+        ({"accessory": None, "accessory_color": None}, "accessory"),
+        ({"accessory_color": "green"}, "accessory"),
+        ({"part": "green"}, "accessory"),
+    ],
+)
+def test_one_wrong_attribute_is_missed_alone(change, missed):
+    found = recognition.recognized(sure(FOX._replace(**change)), FOX)
+    assert [name for name, right in found.items() if not right] == [missed]
+
+
+def test_faces_on_all_sides():
+    assert recognition.multi_face(sure(FOX, sides=[0] * 8), FOX) == 0.75
+    mug = Attributes("mug", "red")
+    assert math.isnan(recognition.multi_face(sure(mug), mug))
+
+
+def test_an_exported_judge_is_loaded(tmp_path):
+    torch.manual_seed(0)
+    judge = models.Judge()
+    export.write_judge(tmp_path / "judge.safetensors", judge.state_dict())
+    loaded = recognition.load_judge(tmp_path / "judge.safetensors")
+    pictures = torch.rand(2, 3, 128, 128)
+    for name, values in recognition.probabilities(judge, pictures).items():
+        torch.testing.assert_close(
+            recognition.probabilities(loaded, pictures)[name], values, atol=1e-2, rtol=0
+        )
+
+
+@pytest.mark.parametrize("content", [None, b"", b"\x08\0\0\0\0\0\0\0{}      "])
+def test_a_missing_or_foreign_judge_is_named(tmp_path, content):
+    path = tmp_path / "judge.safetensors"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UserError, match="judge"):
+        recognition.load_judge(path)

@@ -1,0 +1,177 @@
+"""Metrics of finished assets: numbers computed from renders of a cloud and from its prompt.
+
+=============  ===============================================================  =================
+metric         columns                                                          needs
+=============  ===============================================================  =================
+clip           clip: 100 times the cosine of CLIP's features of picture and     ``--clip`` FOLDER
+               prompt, by the paper's protocol; 3 seeds of 10 of 120 views
+directions     wrong_direction: share of views from front, side and back that   ``--clip`` FOLDER
+               CLIP assigns to the prompt of another direction
+judge          kind, colors, pattern, accessory: 1 where the toybox's judge     ``--judge`` FILE
+               recognises what the prompt names
+janus          multi_face: share of views that the judge takes for views from   ``--judge`` FILE
+               another quadrant
+=============  ===============================================================  =================
+
+A metric that isn't defined for a prompt, such as the judge's for words that the toybox doesn't
+know, is NaN.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from argparse import Namespace
+from functools import lru_cache
+from pathlib import Path
+from typing import ClassVar, NamedTuple, Optional
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..cameras import Orbit
+from ..gaussians.gaussians import Gaussians
+from ..models.clip import PictureText
+from ..prompts.view_prompts import view_directions
+from ..toybox import recognition
+from ..toybox.models import Judge
+from ..toybox.prompt_attributes import attributes_in
+from ..toybox.views import BACKGROUND, SIZE
+from .clip_similarity import Protocol, open_clip, score
+from .results import Pictures, Result
+
+Color = tuple[float, float, float]
+
+
+class Asset(NamedTuple):
+    """A finished cloud."""
+
+    result: Result
+    prompt: str
+    gaussians: Gaussians
+    item: int
+    """Its number, from which random views are drawn."""
+
+
+class Metric(ABC):
+    """One family of columns; constructed once, before the first render."""
+
+    columns: ClassVar[tuple[str, ...]]
+
+    @abstractmethod
+    def __init__(self, args: Namespace) -> None:
+        """Load what the metric needs.
+
+        Raises:
+            UserError: a file is missing; the message names it.
+        """
+
+    @abstractmethod
+    def score(self, asset: Asset) -> dict[str, float]:
+        """Return the columns of one asset."""
+
+
+@lru_cache(maxsize=1)
+def shared_clip(folder: str) -> PictureText:
+    """Load a CLIP once for all metrics that use it."""
+    return open_clip(folder)
+
+
+class Clip(Metric):
+    """The paper's CLIP similarity."""
+
+    columns = ("clip",)
+
+    def __init__(self, args: Namespace) -> None:
+        self.clip = shared_clip(args.clip)
+        self.protocol = Protocol(seeds=(0, 1, 2), size=args.size)
+
+    def score(self, asset: Asset) -> dict[str, float]:
+        scored = score(asset.result, asset.prompt, asset.item, self.clip, self.protocol)
+        return {"clip": float(scored.per_seed.mean())}
+
+
+class Directions(Metric):
+    """CLIP's share of views that look like another direction."""
+
+    columns = ("wrong_direction",)
+    AZIMUTHS = {"front": (-15, 15), "side": (75, 105, -75, -105), "back": (165, -165)}
+
+    def __init__(self, args: Namespace) -> None:
+        self.clip, self.size = shared_clip(args.clip), args.size
+
+    def score(self, asset: Asset) -> dict[str, float]:
+        azimuth = torch.tensor([float(a) for group in self.AZIMUTHS.values() for a in group])
+        same, protocol = torch.ones_like(azimuth), Protocol()
+        orbit = Orbit(
+            protocol.elevation_deg * same,
+            azimuth,
+            protocol.radius * same,
+            math.radians(protocol.fovy_deg) * same,
+        )
+        pictures = rendered(asset, orbit, self.size)
+        texts = {d.name: d.prompt(asset.prompt) for d in view_directions(45, 45, 60)}
+        found = np.stack(
+            [self.clip.similarities(pictures, texts[name]) for name in self.AZIMUTHS], axis=1
+        ).argmax(axis=1)
+        wanted = [i for i, group in enumerate(self.AZIMUTHS.values()) for _ in group]
+        return {"wrong_direction": float(np.mean(found != wanted))}
+
+
+class Recognized(Metric):
+    """The attributes of the prompt that the toybox's judge recognises."""
+
+    columns = ("kind", "colors", "pattern", "accessory")
+
+    def __init__(self, args: Namespace) -> None:
+        self.judge = shared_judge(args.judge)
+
+    def score(self, asset: Asset) -> dict[str, float]:
+        wanted = attributes_in(asset.prompt)
+        if wanted is None:
+            return dict.fromkeys(self.columns, math.nan)
+        found = recognition.recognized(judged(self.judge, asset), wanted)
+        return {name: float(found[name]) for name in self.columns}
+
+
+class Janus(Metric):
+    """The judge's share of views that look like another quadrant."""
+
+    columns = ("multi_face",)
+
+    def __init__(self, args: Namespace) -> None:
+        self.judge = shared_judge(args.judge)
+
+    def score(self, asset: Asset) -> dict[str, float]:
+        wanted = attributes_in(asset.prompt)
+        if wanted is None:
+            return {"multi_face": math.nan}
+        return {"multi_face": recognition.multi_face(judged(self.judge, asset), wanted)}
+
+
+METRICS: dict[str, type[Metric]] = {
+    "clip": Clip,
+    "directions": Directions,
+    "judge": Recognized,
+    "janus": Janus,
+}
+
+
+@lru_cache(maxsize=1)
+def shared_judge(path: str) -> Judge:
+    """Load a judge once for all metrics that use it."""
+    return recognition.load_judge(Path(path).expanduser())
+
+
+def judged(judge: Judge, asset: Asset) -> dict[str, Tensor]:
+    """Return the judge's probabilities in its views of an asset."""
+    pictures = rendered(asset, recognition.views(), SIZE, background=BACKGROUND)
+    return recognition.probabilities(judge, torch.from_numpy(pictures).movedim(-1, 1))
+
+
+def rendered(
+    asset: Asset, orbit: Orbit, size: int, *, background: Optional[Color] = None
+) -> Float[np.ndarray, "V s s 3"]:
+    """Render an asset in [0, 1], on the run's background unless another is given."""
+    pictures = Pictures(asset.gaussians, background or asset.result.background)
+    return np.concatenate(list(pictures.render(orbit.c2w, orbit.fovy, size)))

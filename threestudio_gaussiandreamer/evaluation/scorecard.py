@@ -1,0 +1,194 @@
+"""Score finished assets and compare two folders of them.
+
+``python -m threestudio_gaussiandreamer.evaluate FOLDER [FOLDER ...] --metrics clip,judge,janus
+[--clip FOLDER] [--against FOLDER]``
+
+A folder is a run's, or holds runs at any depth. ``scorecard.csv`` has a row for each asset,
+``scorecard.json`` the means over the prompts with their bootstrap intervals, and with ``--against``
+the paired differences over the prompts that both folders have. ``asset_metrics.py`` lists the
+metrics.
+"""
+
+import argparse
+import csv
+import io
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Optional
+
+import numpy as np
+from tqdm import tqdm
+
+from .. import register_parts
+from ..core.command import run_command
+from ..core.errors import UserError, unknown
+from ..core.files import atomic_file, json_text, require_writable
+from ..toybox.recognition import BUNDLED
+from .asset_metrics import METRICS, Asset, Metric
+from .intervals import Estimate, bootstrap, paired, per_prompt
+from .results import Result, find_result, read_result
+
+FILES = ("scorecard.csv", "scorecard.json")
+Rows = list[dict[str, Any]]
+
+
+def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m threestudio_gaussiandreamer.evaluate",
+        description="Score finished assets by their renders and prompts.",
+    )
+    add = parser.add_argument
+    add("folders", nargs="+", metavar="FOLDER", help="a run's folder, or one that holds runs")
+    add("--metrics", default="clip", help=f"comma-separated, of {', '.join(METRICS)}")
+    add("--against", metavar="FOLDER", help="also score these runs, and print paired differences")
+    add("--clip", help="folder of a CLIP in transformers' format, for clip and directions")
+    add("--judge", default=str(BUNDLED), help="file of a judge, for judge and janus")
+    add("--size", type=int, default=1024, help="of the pictures for CLIP, pixels")
+    add("--output", default="evaluation", help="folder for scorecard.csv and scorecard.json")
+    return parser.parse_args(argv)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Score all assets; files, prompts and output are checked before the first render."""
+    register_parts()
+    metrics = open_metrics(args)
+    first = find_results(args.folders)
+    second = find_results([args.against]) if args.against else []
+    output = output_folder(args.output)
+    rows = [list(scored(results, metrics)) for results in (first, second)]
+    content = summary(metrics, *rows)
+    write(output, rows[0] + rows[1], content)
+    print("\n".join([*table(content), str(output / "scorecard.csv")]))
+
+
+def open_metrics(args: argparse.Namespace) -> list[Metric]:
+    """Load the metrics of ``--metrics``.
+
+    Raises:
+        UserError: a name isn't known, or a file that a metric needs is missing.
+    """
+    names = [name.strip() for name in args.metrics.split(",") if name.strip()]
+    for name in names:
+        if name not in METRICS:
+            raise unknown("metric", name, METRICS)
+    if not names:
+        raise UserError(f"--metrics is empty: expected some of {', '.join(METRICS)}")
+    if args.size < 1:
+        raise UserError(f"--size {args.size}: expected a positive number of pixels")
+    if not args.clip and (needing := [name for name in names if name in ("clip", "directions")]):
+        raise UserError(
+            f"--metrics {needing[0]} needs --clip FOLDER, for instance after `hf download "
+            "openai/clip-vit-large-patch14 --local-dir clip`"
+        )
+    return [METRICS[name](args) for name in names]
+
+
+def find_results(folders: Sequence[str]) -> list[Result]:
+    """Find the finished runs in these folders, sorted by path.
+
+    Raises:
+        UserError: a folder doesn't exist or holds no finished run, or a run's prompt is unknown.
+    """
+    found = []
+    for folder in folders:
+        if not Path(folder).expanduser().is_dir():
+            raise UserError(f"{folder!r} is no folder: expected a run's, or one that holds runs")
+        runs = list(run_folders(Path(folder).expanduser()))
+        if not runs:
+            raise UserError(f"{folder!r} holds no finished run, which has a save/it*-export folder")
+        found += [find_result(str(place)) for place in runs]
+    if unasked := [result for result in found if not result.prompt]:
+        raise UserError(
+            f"{str(unasked[0].ply)!r} has no prompt in its run's configs/parsed.yaml: metrics of "
+            "the scorecard compare renders with prompts"
+        )
+    return found
+
+
+def run_folders(folder: Path) -> Iterator[Path]:
+    """Yield the folders of finished runs, without descending into them."""
+    for place, names, _ in os.walk(folder):
+        names.sort()
+        if any(Path(place).glob("save/it*-export/*.ply")):
+            names.clear()
+            yield Path(place)
+
+
+def output_folder(path: str) -> Path:
+    """Make the folder of the reports.
+
+    Raises:
+        UserError: it can't be made or written into.
+    """
+    folder = Path(path).expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"--output {path} can't be made: {error.strerror or error}") from error
+    for name in FILES:
+        require_writable(folder / name, "--output")
+    return folder
+
+
+def scored(results: Sequence[Result], metrics: Sequence[Metric]) -> Iterator[dict[str, Any]]:
+    """Yield a row of the table for each result."""
+    for item, result in enumerate(tqdm(results, unit="asset", disable=None)):
+        asset = Asset(result, result.prompt or "", read_result(result), item)
+        row: dict[str, Any] = {"asset": str(result.ply.parents[2]), "prompt": asset.prompt}
+        for metric in metrics:
+            row |= metric.score(asset)
+        yield row
+
+
+def summary(metrics: Sequence[Metric], first: Rows, second: Rows) -> dict[str, Any]:
+    """Return the content of ``scorecard.json``."""
+    content: dict[str, Any] = {}
+    for column in (name for metric in metrics for name in metric.columns):
+        means = [prompt_means(rows, column) for rows in (first, second)]
+        entry = {"mean": estimate(means[0])}
+        if second:
+            entry |= {"against": estimate(means[1]), "difference": paired(*means)}
+        content[column] = {name: value._asdict() for name, value in entry.items()}
+    return content
+
+
+def prompt_means(rows: Rows, column: str) -> dict[str, float]:
+    values = np.array([row[column] for row in rows], float)
+    return per_prompt([row["prompt"] for row in rows], values)
+
+
+def estimate(means: dict[str, float]) -> Estimate:
+    return bootstrap(np.array(list(means.values()), float))
+
+
+def write(output: Path, rows: Rows, content: dict[str, Any]) -> None:
+    """Write ``scorecard.csv`` and ``scorecard.json``."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    for name, body in zip(FILES, (text.getvalue(), json_text(content, indent=2)), strict=True):
+        with atomic_file(output / name) as file:
+            file.write(body.encode())
+
+
+def table(content: dict[str, Any]) -> list[str]:
+    """Return the lines to print: mean, interval and number of prompts of each column."""
+    lines = []
+    for column, entries in content.items():
+        for name, value in entries.items():
+            label = column if name == "mean" else f"  {name}"
+            interval = f"[{value['low']:.3f}, {value['high']:.3f}]"
+            lines.append(f"{label:<18} {value['mean']:8.3f} {interval:>20} n={value['count']}")
+    return lines
+
+
+def main(argv: Optional[Sequence[str]] = None) -> int:
+    """Run one command line; return the exit code of :func:`core.command.run_command`."""
+    return run_command(parse, run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

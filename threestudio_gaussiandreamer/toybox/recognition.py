@@ -1,0 +1,100 @@
+"""Recognise the toybox's attributes in pictures of a result with the judge.
+
+===========  ===================================================================================
+kind         whether the most probable kind is the prompt's, by the mean of the views' probabilities
+colors       the same for the body's and the pattern's colour, both
+pattern      the same for the pattern
+accessory    the same for the coloured part, the accessory and its colour, all three
+multi_face   share of the views that the judge takes for views from another quadrant; NaN for
+             objects that look alike from all sides
+===========  ===================================================================================
+"""
+
+import math
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..cameras import Orbit
+from ..core.errors import UserError
+from .models import Judge
+from .views import DISTANCE, FOVY_DEG, LABELS
+from .world import Attributes
+
+BUNDLED = Path(__file__).parents[1] / "assets" / "toybox" / "judge.safetensors"
+ELEVATION_DEG = 15.0
+OFFSETS_DEG = (-22.5, 22.5)
+"""Azimuths of the views from each quadrant, from its middle; the quadrants' borders, at 45 degrees,
+are ambiguous.
+"""
+ALIKE_FROM_ALL_SIDES = ("mug", "mushroom")
+
+
+def load_judge(path: Path) -> Judge:
+    """Load a judge that ``toybox.export`` wrote.
+
+    Raises:
+        UserError: there is no such file, or it doesn't hold a judge.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    judge = Judge()
+    try:
+        weights = load_file(str(path))
+        judge.load_state_dict({name: value.float() for name, value in weights.items()})
+    except FileNotFoundError:
+        raise UserError(
+            f"there is no judge at {str(path)!r}: train one (make train-toybox), export it "
+            "(python -m threestudio_gaussiandreamer.toybox.export), and give its file as --judge"
+        ) from None
+    except (OSError, SafetensorError, RuntimeError) as error:
+        raise UserError(f"{str(path)!r} isn't a judge of the toybox: {error}") from error
+    return judge.eval()
+
+
+def views() -> Orbit:
+    """Return the eight views that the judge sees, two of each quadrant in the order of LABELS."""
+    azimuth = torch.tensor([90.0 * side + offset for side in range(4) for offset in OFFSETS_DEG])
+    same = torch.ones_like(azimuth)
+    return Orbit(
+        ELEVATION_DEG * same,
+        (azimuth + 180) % 360 - 180,
+        sum(DISTANCE) / 2 * same,
+        math.radians(FOVY_DEG) * same,
+    )
+
+
+@torch.no_grad()
+def probabilities(judge: Judge, pictures: Float[Tensor, "V 3 s s"]) -> dict[str, Tensor]:
+    """Return each attribute's probabilities (V, classes) in pictures in [0, 1]."""
+    return {name: logits.softmax(dim=-1) for name, logits in judge(pictures).items()}
+
+
+def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, bool]:
+    """Return for each attribute of the prompt whether the pictures show it.
+
+    Attributes that the prompt leaves out count too: the judge has to find none.
+    """
+    right = {}
+    for name, value in wanted._asdict().items():
+        index = LABELS[name].index(value or "none")
+        right[name] = int(found[name].mean(dim=0).argmax()) == index
+    return {
+        "kind": right["kind"],
+        "colors": right["color"] and right["second"],
+        "pattern": right["pattern"],
+        "accessory": right["part"] and right["accessory"] and right["accessory_color"],
+    }
+
+
+def multi_face(found: dict[str, Tensor], wanted: Attributes) -> float:
+    """Return the share of :func:`views` recognised as views from another quadrant; NaN for kinds
+    without a front.
+    """
+    if wanted.kind in ALIKE_FROM_ALL_SIDES:
+        return math.nan
+    sides = torch.arange(4).repeat_interleave(len(OFFSETS_DEG))
+    return float((found["quadrant"].argmax(dim=-1) != sides).float().mean())
