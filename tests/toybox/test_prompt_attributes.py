@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in, unknown_words
-from threestudio_gaussiandreamer.toybox.words import describe, vocabulary
+from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
+from threestudio_gaussiandreamer.toybox.words import describe
 from threestudio_gaussiandreamer.toybox.world import Attributes, draw_attributes
 
 
@@ -34,8 +34,3 @@ def test_other_prompts(prompt, attributes):
 @pytest.mark.parametrize("prompt", ["", "a fox", "something red", "狐狸", "a " * 2000])
 def test_prompts_without_kind_or_colour_name_no_attributes(prompt):
     assert attributes_in(prompt) is None
-
-
-def test_unknown_words_are_listed_once_in_order():
-    prompt = "a red zebra, a 3d zebra with Wings and wheels"
-    assert unknown_words(prompt, vocabulary()) == ["zebra", "wheels"]

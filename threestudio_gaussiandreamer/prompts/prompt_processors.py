@@ -49,6 +49,7 @@ from ..models.extras import require_extra
 from ..models.hub import find_model
 from ..models.model_files import fingerprint
 from ..models.text_encoders import encode_clip, encode_t5
+from .known_words import warn_of_unknown_words
 from .prompts import read_prompt
 from .view_prompts import PromptEmbeddings, view_directions
 
@@ -116,6 +117,7 @@ class TextEncoderPromptProcessor(BaseObject):
             half=half,
             revision=self.cfg.revision,
         )
+        warn_of_unknown_words(folder, self.prompt)
         self._output = self._encoded(folder)
 
     def _encoded(self, folder: Path) -> PromptEmbeddings:

@@ -51,12 +51,6 @@ def attributes_in(prompt: str) -> Optional[Attributes]:
     )
 
 
-def unknown_words(prompt: str, known: Iterable[str]) -> list[str]:
-    """Return the words and digits of a prompt that aren't in ``known``, in order, each once."""
-    words, known = re.findall(r"[^\W\d_]+|\d", prompt.lower()), set(known)
-    return list(dict.fromkeys(word for word in words if word not in known))
-
-
 def _words(prompt: str) -> list[str]:
     return re.findall(r"[^\W_]+", prompt.lower())
 

@@ -7,13 +7,17 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..prompts.known_words import WORDS_FILE
+
 START, END = "<|startoftext|>", "<|endoftext|>"
 LENGTH = 32
 """Tokens of a prompt, start and end included; longer ones are cut."""
 
 
 def write_tokenizer(folder: Path, words: Sequence[str]) -> None:
-    """Write the vocabulary, merges and configuration of a CLIPTokenizer into ``folder``."""
+    """Write the vocabulary, merges and configuration of a CLIPTokenizer into ``folder``, and the
+    list of ``words`` that prompts/known_words.py reads.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     merges = word_merges(words)
     letters = byte_letters()
@@ -27,6 +31,7 @@ def write_tokenizer(folder: Path, words: Sequence[str]) -> None:
     _write_json(folder / "vocab.json", {token: index for index, token in enumerate(tokens)})
     lines = ["#version: 0.2", *(" ".join(pair) for pair in merges)]
     (folder / "merges.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (folder / Path(WORDS_FILE).name).write_text("\n".join(words) + "\n", encoding="utf-8")
     special = {"bos_token": START, "eos_token": END, "unk_token": END, "pad_token": END}
     _write_json(folder / "special_tokens_map.json", special)
     settings = {
