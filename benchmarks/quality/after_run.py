@@ -20,17 +20,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchmarks.quality import runs
 from benchmarks.quality.jobs import NO_BUDGET, STEPS_A_ROUND
-from benchmarks.quality.runs import (
-    RENDERER,
-    SIZE,
-    STEPS,
-    append_rows,
-    measured_in,
-    object_name,
-    rows_of,
-    train,
-)
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.gaussians import importance
@@ -49,7 +40,7 @@ from threestudio_gaussiandreamer.prune import PruneOptions
 from threestudio_gaussiandreamer.prune.pipeline import views_of
 
 COUNTS = (2500, 1500)
-DRAWN = PruneOptions(size=SIZE, eps2d=RENDERER["eps2d"])
+DRAWN = PruneOptions(size=runs.SIZE, eps2d=runs.RENDERER["eps2d"])
 """As the cloud was in training."""
 COLUMNS = "variant,x,object,seed,psnr,machine,commit".split(",")
 
@@ -60,11 +51,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     arguments = parser.parse_args()
     register_parts()
-    done = measured_in("after_run", "object", "seed")
+    done = runs.measured_in("after_run", "object", "seed")
     for seed in arguments.seeds:
         for mesh in arguments.objects:
-            if (object_name(mesh), str(seed)) not in done:
-                append_rows("after_run", COLUMNS, measured(mesh, seed))
+            if (runs.object_name(mesh), str(seed)) not in done:
+                runs.append_rows("after_run", COLUMNS, measured(mesh, seed))
     print(table())
 
 
@@ -72,12 +63,15 @@ def measured(mesh: str, seed: int) -> list[dict[str, Any]]:
     """Rows of the CSV: what was done, to how many, and the dB that it led to."""
     with tempfile.TemporaryDirectory() as folder:
         stored = read_cloud(
-            str(train(Path(folder), mesh, seed, NO_BUDGET) / f"it{STEPS}-export/gaussians.ply")
+            str(
+                runs.train(Path(folder), mesh, seed, NO_BUDGET)
+                / f"it{runs.STEPS}-export/gaussians.ply"
+            )
         )
     cloud = stored.gaussians.tensors(get_device())
     train_views, val_views, tests = views_of(stored, DRAWN)
     pictures = render_all(cloud, tests)
-    place = {"object": object_name(mesh), "seed": seed}
+    place = {"object": runs.object_name(mesh), "seed": seed}
     return [
         place
         | {
@@ -137,7 +131,7 @@ RANKS = {
 
 def table() -> str:
     """Medians over the seeds, as Markdown."""
-    rows = rows_of("after_run")
+    rows = runs.rows_of("after_run")
     objects = list(dict.fromkeys(row["object"] for row in rows))
     lines = [f"| to | {' | '.join(objects)} |", f"| --- |{' ---: |' * len(objects)}"]
     for variant, count in dict.fromkeys((row["variant"], row["x"]) for row in rows):

@@ -19,8 +19,9 @@ from typing import Callable
 import torch
 
 from benchmarks.splatting.bench_scenes import make_camera, make_scene
+from tests.helpers.pixel_guidance import PixelGuidance
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0
-from threestudio_gaussiandreamer.guidance.base import ScoreDistillation, _bad_items
+from threestudio_gaussiandreamer.guidance.base import _bad_items
 from threestudio_gaussiandreamer.splatting import RasterizeOptions, rasterize
 from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.finite import (
@@ -34,19 +35,8 @@ RESULTS = Path(__file__).parents[1] / "results/guards.csv"
 LOG_EVERY = 10  # steps between two looks at the cloud's sizes, as in configs/demo.yaml
 
 
-class Pixels(ScoreDistillation):
-    """The shared path without a score model: the noise that was added comes back with the picture's
-    difference from grey.
-    """
-
-    def encode(self, rgb, **batch):
-        return 2 * rgb - 1
-
-    def decode(self, latents):
-        return (latents + 1) / 2
-
-    def condition(self, prompt_utils, **batch):
-        return None
+class Pixels(PixelGuidance):
+    """The shared path of score distillation: the prediction is the noised picture itself."""
 
     def predict(self, z, t, condition):
         return z, None

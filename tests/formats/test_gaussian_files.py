@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.helpers.ply_files import write_raw_gaussians
+from tests.helpers.ply_files import gaussians, write_raw_gaussians
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import (
     PRUNED,
@@ -18,20 +18,8 @@ from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 
 
 def cloud(count=60, degree=0):
-    rng = np.random.default_rng(0)
-    shapes = {
-        "means": (3,),
-        "sh": ((degree + 1) ** 2, 3),
-        "logit_opacities": (),
-        "log_scales": (3,),
-        "quats": (4,),
-    }
-    values = {
-        name: rng.normal(size=(count, *shape)).astype(np.float32) * 0.5
-        for name, shape in shapes.items()
-    }
-    values["log_scales"] -= 2
-    return Gaussians(**values)
+    values = Gaussians(*(0.5 * values for values in gaussians(count, degree)))
+    return values._replace(log_scales=values.log_scales - 2)
 
 
 @pytest.mark.parametrize("up", AXES)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.helpers.ply_files import gaussians
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.spz import (
     DECODED_BYTES,
@@ -27,20 +28,9 @@ packed = functools.partial(gzip.compress, mtime=0)
 
 
 def cloud(count=300, degree=0, seed=0):
-    rng = np.random.default_rng(seed)
-    shapes = {
-        "means": (3,),
-        "sh": ((degree + 1) ** 2, 3),
-        "logit_opacities": (),
-        "log_scales": (3,),
-        "quats": (4,),
-    }
-    values = {
-        name: rng.normal(size=(count, *shape)).astype(np.float32) for name, shape in shapes.items()
-    }
-    values["log_scales"] -= 4
-    values["sh"][:, 1:] *= 0.2
-    return Gaussians(**values)
+    values = gaussians(count, degree, seed)
+    values.sh[:, 1:] *= 0.2
+    return values._replace(log_scales=values.log_scales - 4)
 
 
 def in_file_order(arrays, read):

@@ -89,6 +89,19 @@ def _places(content: Any) -> Iterator[tuple[Any, Any]]:
             yield from _places(content[key])
 
 
+def geometry_of(checkpoint: dict[str, Any], path: Path) -> GaussianCloud:
+    """Return the cloud of a checkpoint that was read from ``path``."""
+    geometry = GaussianCloud({})
+    state = {
+        key.removeprefix("geometry."): value
+        for key, value in checkpoint["state_dict"].items()
+        if key.startswith("geometry.")
+    }
+    with lightning_errors(str(path)):
+        geometry.load_state_dict(state)
+    return geometry
+
+
 def exercise(path: Path, require: Callable[[GaussianCloud], None]) -> None:
     """What is accepted goes on: the cloud is drawn, and steps with its optimiser.
 
@@ -100,14 +113,8 @@ def exercise(path: Path, require: Callable[[GaussianCloud], None]) -> None:
     for key in ("loops", "optimizer_states"):
         checkpoint.setdefault(key, None)  # the launcher asks for them before
     check_training_state(checkpoint, {"name": "Adam"}, str(path))
-    geometry = GaussianCloud({})
-    state = {
-        key.removeprefix("geometry."): value
-        for key, value in checkpoint["state_dict"].items()
-        if key.startswith("geometry.")
-    }
+    geometry = geometry_of(checkpoint, path)
     with lightning_errors(str(path)):
-        geometry.load_state_dict(state)
         optimizer = torch.optim.Adam(geometry.parameter_groups(), lr=1e-3)
         optimizer.load_state_dict(checkpoint["optimizer_states"][0])
     if len(geometry):

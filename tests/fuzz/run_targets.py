@@ -12,15 +12,14 @@ from typing import Any
 
 import torch
 
-from tests.fuzz import oracles
+from tests.fuzz import checkpoint_content, oracles
 from tests.fuzz.cloud_targets import some_gaussians
 from tests.fuzz.target import ROOT, cloud_of, require, require_picture, strictly
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, save_file
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch import config, experiment
 from threestudio_gaussiandreamer.launch.config_check import check_config
-from threestudio_gaussiandreamer.launch.run import Run, lightning_errors
-from threestudio_gaussiandreamer.training.geometry import GaussianCloud
+from threestudio_gaussiandreamer.launch.run import Run
 
 # ---- checkpoints ---------------------------------------------------------------------------------
 
@@ -65,14 +64,7 @@ def exercise_checkpoint(path: Path) -> None:
         all(t.numel() * t.element_size() <= path.stat().st_size for t in tensors),
         "a tensor is larger than the file",
     )
-    geometry = GaussianCloud({})
-    state = {
-        key.removeprefix("geometry."): value
-        for key, value in checkpoint["state_dict"].items()
-        if key.startswith("geometry.")
-    }
-    with lightning_errors(str(path)):
-        geometry.load_state_dict(state)
+    geometry = checkpoint_content.geometry_of(checkpoint, path)
     if len(geometry):
         require_picture(geometry)
 

@@ -263,29 +263,24 @@ def test_auto_leaves_out_the_first_half_of_its_rounds():
     )
 
 
+DENSIFY_EVERY_STEP = {
+    "enabled": True,
+    "start": 0,
+    "stop": 100,
+    "every": 1,
+    "grad_threshold": 0.0,
+    "min_opacity": 0.0,
+}
+
+
 def test_growth_stays_within_what_the_budget_leaves():
-    hot = {
-        "enabled": True,
-        "start": 0,
-        "stop": 100,
-        "every": 1,
-        "grad_threshold": 0.0,
-        "min_opacity": 0.0,
-    }
-    geometry = cloud(100, budget=50, prune=EVERY_STEP, densify=hot)
+    geometry = cloud(100, budget=50, prune=EVERY_STEP, densify=DENSIFY_EVERY_STEP)
     assert rounds(geometry, 6) == [80, 64, 51, 50, 50, 50]
 
 
 def test_a_budget_gives_room_to_grow_up_to_it():
-    hot = {
-        "enabled": True,
-        "start": 0,
-        "stop": 100,
-        "every": 1,
-        "grad_threshold": 0.0,
-        "min_opacity": 0.0,
-    }
-    assert max(rounds(cloud(40, budget=50, prune=EVERY_STEP | {"start": 99}, densify=hot), 3)) == 50
+    late = EVERY_STEP | {"start": 99}
+    assert max(rounds(cloud(40, budget=50, prune=late, densify=DENSIFY_EVERY_STEP), 3)) == 50
 
 
 def test_pruning_after_densifying_keeps_track_of_rows():

@@ -21,15 +21,9 @@ class ImageDouble:
     """The signature of threestudio's zero123, which knows no prompt."""
 
     def __call__(
-        self,
-        rgb,
-        elevation,
-        azimuth,
-        camera_distances,
-        rgb_as_latents=False,
-        guidance_eval=False,
-        **kwargs,
-    ):
+        self, rgb, elevation, azimuth, camera_distances,
+        rgb_as_latents=False, guidance_eval=False, **kwargs,
+    ):  # fmt: skip
         return {"loss_sds": rgb.sum() + elevation.sum(), "kwargs": kwargs}
 
 
@@ -65,17 +59,9 @@ class LearningDouble(nn.Module):
         self.lora = nn.Linear(3, 3, bias=False)
 
     def forward(
-        self,
-        rgb,
-        prompt_utils,
-        elevation,
-        azimuth,
-        camera_distances,
-        mvp_mtx,
-        c2w,
-        rgb_as_latents=False,
-        **kwargs,
-    ):
+        self, rgb, prompt_utils, elevation, azimuth, camera_distances,
+        mvp_mtx, c2w, rgb_as_latents=False, **kwargs,
+    ):  # fmt: skip
         return {
             "loss_vsd": rgb.sum(),
             "loss_lora": (self.lora(rgb.detach()) - self.frozen(rgb.detach())).square().mean(),

@@ -31,18 +31,9 @@ class MultiviewDouble(BaseObject):
     seen: list = []
 
     def __call__(
-        self,
-        rgb,
-        prompt_utils,
-        elevation,
-        azimuth,
-        camera_distances,
-        c2w,
-        rgb_as_latents=False,
-        fovy=None,
-        comp_rgb_bg=None,
-        **kwargs,
-    ):
+        self, rgb, prompt_utils, elevation, azimuth, camera_distances,
+        c2w, rgb_as_latents=False, fovy=None, comp_rgb_bg=None, **kwargs,
+    ):  # fmt: skip
         self.seen.append(
             (prompt_utils, {"elevation", "azimuth", "camera_distances", "c2w", "fovy", *kwargs})
         )

@@ -8,16 +8,8 @@ import pytest
 import torch
 from torch import nn
 
+from tests.helpers import tiny_guidance as tiny
 from tests.helpers import tiny_models
-from tests.helpers.tiny_guidance import (
-    BATCH,
-    TIMESTEPS,
-    Recorder,
-    gradient,
-    guidance,
-    relative,
-    renders,
-)
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
 from threestudio_gaussiandreamer.guidance.text_to_image import perp_neg, rescaled, view_of_row
@@ -36,10 +28,10 @@ def test_one_forward_pass_and_no_decoding_per_step(models, prompts):
         ({}, True, 16),
         ({"guidance_scale": 1.0}, False, 4),
     ):
-        guide = guidance(models, **options)
-        guide.unet = recorder = Recorder(guide.unet)
+        guide = tiny.guidance(models, **options)
+        guide.unet = recorder = tiny.Recorder(guide.unet)
         guide.vae.decode = lambda *args: pytest.fail("decoded in a training step")
-        gradient(guide, prompts[perp], renders())
+        tiny.gradient(guide, prompts[perp], tiny.renders())
         assert [len(args[0]) for args, _ in recorder.calls] == [rows]
 
 
@@ -69,26 +61,33 @@ class HostPrompts:
 @pytest.mark.parametrize("recon_std_rescale", [0.0, 0.7])
 @pytest.mark.parametrize("whose", ["ours", "threestudio's"])
 def test_perp_neg_of_four_views_is_that_of_each_alone(models, prompts, whose, recon_std_rescale):
-    guide = guidance(models, recon_std_rescale=recon_std_rescale)
+    guide = tiny.guidance(models, recon_std_rescale=recon_std_rescale)
     prompt_utils = prompts[True] if whose == "ours" else HostPrompts(prompts[True])
     z = torch.randn(4, 4, 8, 8, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        together = guide.predict_noise(z, TIMESTEPS, guide.condition(prompt_utils, **BATCH))
-        views = [{name: values[i : i + 1] for name, values in BATCH.items()} for i in range(4)]
+        together = guide.predict_noise(
+            z, tiny.TIMESTEPS, guide.condition(prompt_utils, **tiny.BATCH)
+        )
+        views = [{name: values[i : i + 1] for name, values in tiny.BATCH.items()} for i in range(4)]
         conditions = [guide.condition(prompt_utils, **view) for view in views]
         alone = [
-            guide.predict_noise(z[i : i + 1], TIMESTEPS[i : i + 1], conditions[i]) for i in range(4)
+            guide.predict_noise(z[i : i + 1], tiny.TIMESTEPS[i : i + 1], conditions[i])
+            for i in range(4)
         ]
         # another batch size rounds differently, and guidance 100 magnifies that
-        assert relative(together, torch.cat(alone).double()) < 1e-5
+        assert tiny.relative(together, torch.cat(alone).double()) < 1e-5
         tiled = guide.noise(
             torch.cat([z] * 4),
-            torch.cat([TIMESTEPS] * 4),
-            guide.condition(prompt_utils, **BATCH).embeddings,
+            torch.cat([tiny.TIMESTEPS] * 4),
+            guide.condition(prompt_utils, **tiny.BATCH).embeddings,
         )
-        paired = guide.noise(z, TIMESTEPS, guide.condition(prompt_utils, **BATCH).embeddings)
+        paired = guide.noise(
+            z, tiny.TIMESTEPS, guide.condition(prompt_utils, **tiny.BATCH).embeddings
+        )
     torch.testing.assert_close(tiled[:8], paired[:8])
-    assert relative(tiled[8:], paired[8:].double()) > 0.1, "pairing by blocks would have passed too"
+    assert tiny.relative(tiled[8:], paired[8:].double()) > 0.1, (
+        "pairing by blocks would have passed too"
+    )
 
 
 def test_rows_are_paired_by_view():
@@ -129,16 +128,16 @@ def test_rescaling_restores_the_contrast_of_the_conditional_picture():
 
 
 def test_prompts_that_do_not_fit_are_said(models, prompts):
-    guide = guidance(models)
+    guide = tiny.guidance(models)
     with pytest.raises(UserError, match="stable-diffusion-prompt-processor"):
-        guide(renders(), PlainPrompt("a fox"), **BATCH)
+        guide(tiny.renders(), PlainPrompt("a fox"), **tiny.BATCH)
     with pytest.raises(UserError, match="needs text embeddings"):
-        guide(renders(), None, **BATCH)
+        guide(tiny.renders(), None, **tiny.BATCH)
     guide.text_width = 1024
     with pytest.raises(
         UserError, match="32 channels, .* takes 1024: .*the same pretrained_model_name_or_path"
     ):
-        guide(renders(), prompts[False], **BATCH)
+        guide(tiny.renders(), prompts[False], **tiny.BATCH)
 
 
 # Randomness and schedules
@@ -146,21 +145,23 @@ def test_prompts_that_do_not_fit_are_said(models, prompts):
 
 
 def test_the_same_step_draws_the_same_and_looking_changes_nothing(models, prompts):
-    guide, rgb = guidance(models), renders()
+    guide, rgb = tiny.guidance(models), tiny.renders()
     guide.update_step(0, 7)
-    before, _ = gradient(guide, prompts[False], rgb)
-    gradient(guide, prompts[False], rgb, guidance_eval=True)
+    before, _ = tiny.gradient(guide, prompts[False], rgb)
+    tiny.gradient(guide, prompts[False], rgb, guidance_eval=True)
     guide.update_step(0, 8)
-    other, _ = gradient(guide, prompts[False], rgb)
-    resumed = guidance(models)
+    other, _ = tiny.gradient(guide, prompts[False], rgb)
+    resumed = tiny.guidance(models)
     resumed.update_step(0, 7)
-    again, _ = gradient(resumed, prompts[False], rgb)
+    again, _ = tiny.gradient(resumed, prompts[False], rgb)
     assert torch.equal(before, again)
     assert not torch.equal(before, other)
 
 
 def test_schedules_of_timesteps_and_clip(models, prompts):
-    guide = guidance(models, max_step_percent=[500, 0.98, 0.55, 501], grad_clip=[0, 1.5, 2.0, 1000])
+    guide = tiny.guidance(
+        models, max_step_percent=[500, 0.98, 0.55, 501], grad_clip=[0, 1.5, 2.0, 1000]
+    )
     for step, max_step, clip in (
         (0, 980, 1.5),
         (500, 980, 1.75),
@@ -168,7 +169,7 @@ def test_schedules_of_timesteps_and_clip(models, prompts):
         (2000, 550, 2.0),
     ):
         guide.update_step(0, step)
-        out = gradient(guide, prompts[False], renders())[1]
+        out = tiny.gradient(guide, prompts[False], tiny.renders())[1]
         assert (out["min_step"], out["max_step"]) == (20, max_step)
         assert guide.grad_clip == pytest.approx(clip)
         # no element of the 4 x 4 x 8 x 8 gradient is above the clip
@@ -183,10 +184,10 @@ def test_the_models_own_schedule_is_used(models, tmp_path):
         beta_schedule="linear", beta_start=0.001, beta_end=0.01, rescale_betas_zero_snr=True
     )
     schedule.save_pretrained(folder / "scheduler")
-    guide = guidance({"epsilon": folder})
+    guide = tiny.guidance({"epsilon": folder})
     assert guide.alphas_cumprod[0] > 0.99
     assert 0 < guide.alphas_cumprod[-1] < 1e-6  # zero terminal signal, without a division by zero
-    guide = guidance(models)
+    guide = tiny.guidance(models)
     expected = torch.cumprod(
         1 - torch.linspace(0.00085**0.5, 0.012**0.5, 1000, dtype=torch.float64) ** 2, 0
     )
@@ -213,16 +214,16 @@ class Spoiling(nn.Module):
 
 
 def test_a_bad_item_is_left_out_and_the_others_are_untouched(models, prompts):
-    guide, rgb = guidance(models), renders()
-    clean, _ = gradient(guide, prompts[False], rgb)
+    guide, rgb = tiny.guidance(models), tiny.renders()
+    clean, _ = tiny.gradient(guide, prompts[False], rgb)
     guide.unet = Spoiling(guide.unet, [1])
-    spoilt, out = gradient(guide, prompts[False], rgb)
+    spoilt, out = tiny.gradient(guide, prompts[False], rgb)
     assert out["bad_items"] == 1
     assert torch.equal(spoilt[[0, 2, 3]], clean[[0, 2, 3]])
     assert not spoilt[1].any()
     with pytest.raises(NonFiniteScore, match="10 steps in a row"):
         for _ in range(9):
-            gradient(guide, prompts[False], rgb)
+            tiny.gradient(guide, prompts[False], rgb)
 
 
 # Looking
@@ -231,16 +232,16 @@ def test_a_bad_item_is_left_out_and_the_others_are_untouched(models, prompts):
 
 @pytest.mark.parametrize("items, shown", [(3, 3), (9, 4), (0, 4), (-1, 4)])
 def test_so_many_items_are_shown(models, prompts, items, shown):
-    out = guidance(models, max_items_eval=items, eval_steps=1)(
-        renders(), prompts[False], **BATCH, guidance_eval=True
+    out = tiny.guidance(models, max_items_eval=items, eval_steps=1)(
+        tiny.renders(), prompts[False], **tiny.BATCH, guidance_eval=True
     )["eval"]
     assert out["bs"] == len(out["imgs_final"]) == shown
 
 
 @pytest.mark.parametrize("perp", [False, True])
 def test_the_pictures_of_the_evaluation(models, prompts, perp):
-    guide = guidance(models, max_items_eval=3, eval_steps=2)
-    out = guide(renders(), prompts[perp], **BATCH, guidance_eval=True)["eval"]
+    guide = tiny.guidance(models, max_items_eval=3, eval_steps=2)
+    out = guide(tiny.renders(), prompts[perp], **tiny.BATCH, guidance_eval=True)["eval"]
     assert out["bs"] == 3 and len(out["texts"]) == 3
     for name in ("imgs_noisy", "imgs_1step", "imgs_1orig", "imgs_final"):
         assert out[name].shape == (3, 64, 64, 3)

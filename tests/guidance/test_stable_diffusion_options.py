@@ -7,13 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from tests.helpers import tiny_models
-from tests.helpers.tiny_guidance import (
-    Recorder,
-    gradient,
-    guidance,
-    relative,
-    renders,
-)
+from tests.helpers.tiny_guidance import Recorder, gradient, guidance, relative, renders
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.guidance import stable_diffusion
 from threestudio_gaussiandreamer.host import NAME, find

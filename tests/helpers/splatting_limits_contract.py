@@ -169,15 +169,7 @@ class LimitsContract:
             random_cloud(30, seed=11).to(torch.float32).leaves(),
             [x.to(torch.float32) for x in cameras(1, 12, 12)],
         )
-        out = rasterize(*cloud, *camera, 12, 12, backend=backend, absgrad=True)
-        gradients = cotangents(out)
-        torch.autograd.backward([out.image, out.alpha, out.depth], gradients, retain_graph=True)
-        once = cloud.means.grad.clone(), out.means2d.grad.clone(), out.means2d.absgrad.clone()
-        torch.autograd.backward([out.image, out.alpha, out.depth], gradients)
-        for first, both in zip(
-            once, (cloud.means.grad, out.means2d.grad, out.means2d.absgrad), strict=True
-        ):
-            assert torch.equal(2 * first, both)
+        require_backward_twice_adds_up(cloud, camera, backend, exact=True)
 
     def test_absgrad_is_zero_before_anything_flowed_back(self, backend):
         """A loss may leave out a picture that was drawn."""

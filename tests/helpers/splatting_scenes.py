@@ -1,6 +1,7 @@
 """Clouds and cameras for the tests of splatting, and how far apart two results are."""
 
 import math
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -67,19 +68,48 @@ HOSTILE = {
 }
 
 
-def hostile_cloud(seed: int, n: int) -> Cloud:
-    """Half of the entries are picked from HOSTILE, the others are ordinary; the second half's means
-    coincide with the first's.
+def hostile_cloud(seed: int, n: int, hostile: dict[str, list[float]] = HOSTILE) -> Cloud:
+    """Half of the entries are picked from ``hostile``, the others are ordinary; the second half's
+    means coincide with the first's.
     """
     g = torch.Generator().manual_seed(seed)
     cloud = random_cloud(n, seed)
     for name, x in zip(NAMES, cloud, strict=True):
-        values = torch.tensor(HOSTILE[name], dtype=torch.float64)
+        values = torch.tensor(hostile[name], dtype=torch.float64)
         picked = values[torch.randint(len(values), x.shape, generator=g)]
+        # A value that isn't finite removes the whole Gaussian; rarely enough that most stay.
         rare = picked.isfinite() | (torch.rand(x.shape, generator=g) < 0.1)
         x.copy_(torch.where((torch.rand(x.shape, generator=g) < 0.5) & rare, picked, x))
     cloud.means[n // 2 :] = cloud.means[: n - n // 2].clone()
     return cloud
+
+
+def stacks_on_one_pixel(n: int = 10_000) -> Iterator[Cloud]:
+    """Clouds of ``n`` Gaussians that project to one pixel, of mixed and of low opacity."""
+    g = torch.Generator().manual_seed(5)
+    offsets, depths = torch.randn(n, 2, generator=g), torch.rand(n, 1, generator=g)
+    means = torch.cat([0.05 * offsets, 2 + depths], 1).double()
+    for opacities in (0.01 + 0.89 * torch.rand(n, generator=g), torch.full((n,), 0.002)):
+        yield random_cloud(n, seed=5)._replace(means=means, opacities=opacities.double())
+
+
+def require_backward_twice_adds_up(
+    cloud: Cloud, camera: Sequence[Tensor], backend: str, *, exact: bool
+) -> None:
+    """Fail unless a second backward pass adds the first one's gradients again.
+
+    Args:
+        camera: view matrix and intrinsics of a view of 12 x 12 pixels.
+        exact: to the bit, else up to rounding.
+    """
+    out = rasterize(*cloud, *camera, 12, 12, backend=backend, absgrad=True)
+    gradients = cotangents(out)
+    torch.autograd.backward([out.image, out.alpha, out.depth], gradients, retain_graph=True)
+    once = cloud.means.grad.clone(), out.means2d.grad.clone(), out.means2d.absgrad.clone()
+    torch.autograd.backward([out.image, out.alpha, out.depth], gradients)
+    twice = cloud.means.grad, out.means2d.grad, out.means2d.absgrad
+    same = torch.equal if exact else torch.allclose
+    assert all(same(2 * first, both) for first, both in zip(once, twice, strict=True))
 
 
 def cameras(

@@ -80,18 +80,21 @@ def test_a_checkpoint_is_read(tmp_path):
     )
 
 
-def test_gsplats_checkpoints_are_read(source, tmp_path):
-    cloud = ball()
-    splats = {
+def gsplats_names(cloud):
+    """The values of ``cloud`` under the names of gsplat's checkpoints."""
+    return {
         "means": cloud.means,
         "quats": cloud.quats,
         "scales": cloud.log_scales,
         "opacities": cloud.logit_opacities,
+        "sh0": cloud.sh,
+        "shN": torch.zeros(len(cloud.means), 0, 3),
     }
-    torch.save(
-        {"step": 7, "splats": splats | {"sh0": cloud.sh, "shN": torch.zeros(600, 0, 3)}},
-        tmp_path / "ckpt.pt",
-    )
+
+
+def test_gsplats_checkpoints_are_read(source, tmp_path):
+    cloud = ball()
+    torch.save({"step": 7, "splats": gsplats_names(cloud)}, tmp_path / "ckpt.pt")
     write_cloud(str(tmp_path / "in.ply"), StoredCloud(cloud.arrays()).in_axes("-y"))
     for name in ("ckpt.pt", "in.ply"):
         run(tmp_path / name, tmp_path / f"{name}.ply", "--count", "300")
@@ -131,15 +134,7 @@ def test_gaussians_that_cannot_be_drawn_are_left_out(tmp_path, caplog):
     cloud = ball()
     cloud.means[3], cloud.sh[5] = float("nan"), float("inf")
     write_raw_gaussians(tmp_path / "in.ply", cloud.arrays())
-    splats = {
-        "means": cloud.means,
-        "quats": cloud.quats,
-        "scales": cloud.log_scales,
-        "opacities": cloud.logit_opacities,
-    }
-    torch.save(
-        {"splats": splats | {"sh0": cloud.sh, "shN": torch.zeros(600, 0, 3)}}, tmp_path / "in.pt"
-    )
+    torch.save({"splats": gsplats_names(cloud)}, tmp_path / "in.pt")
     for name in ("in.ply", "in.pt"):
         assert (
             run(tmp_path / name, tmp_path / "out.ply", "--count", "300", "--up", "z")["before"][

@@ -7,17 +7,7 @@ import types
 import pytest
 import torch
 
-from tests.helpers.splatting_scenes import (
-    NAMES,
-    Cloud,
-    cameras,
-    cotangents,
-    error,
-    front_camera,
-    one_gaussian,
-    random_cloud,
-    run,
-)
+from tests.helpers import splatting_scenes as scenes
 from tests.splatting.reference_cases import ROUNDING, SPECIFICATION
 from threestudio_gaussiandreamer.splatting.projection import quats_to_rotations
 
@@ -25,33 +15,34 @@ from threestudio_gaussiandreamer.splatting.projection import quats_to_rotations
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", scenes.NAMES)
 def test_a_gaussian_that_is_not_finite_is_as_if_it_weren_t_there(name, value):
     """Pixels and gradients are the same bits as with a transparent Gaussian in its place; its own
     are zeros, not NaN.
     """
-    cloud, camera = random_cloud(15, seed=12), cameras(2, 8, 6)
-    transparent = Cloud(*(x.clone() for x in cloud))
+    cloud, camera = scenes.random_cloud(15, seed=12), scenes.cameras(2, 8, 6)
+    transparent = scenes.Cloud(*(x.clone() for x in cloud))
     transparent.opacities[4] = 0
     getattr(cloud, name)[4, ...] = value
     with_it, without = (
-        run(c, *camera, 8, 6, camera_gradient=True, **SPECIFICATION) for c in (cloud, transparent)
+        scenes.run(c, *camera, 8, 6, camera_gradient=True, **SPECIFICATION)
+        for c in (cloud, transparent)
     )
     assert (
         torch.equal(with_it.out.image, without.out.image) and (with_it.out.radii[:, 4] == 0).all()
     )
     for attribute, grad in with_it.grads.items():
         assert torch.equal(grad, without.grads[attribute]), attribute
-    assert all((with_it.grads[attribute][4] == 0).all() for attribute in NAMES)
+    assert all((with_it.grads[attribute][4] == 0).all() for attribute in scenes.NAMES)
 
 
 @pytest.mark.parametrize(
     "offset, drawn", [(-0.1, False), (-1e-7, False), (0.0, False), (1e-7, True), (0.1, True)]
 )
 def test_near_plane(offset, drawn):
-    out = run(
-        one_gaussian((0.0, 0.0, 0.5 + offset), 0.01),
-        *front_camera(8, 8, 4.0),
+    out = scenes.run(
+        scenes.one_gaussian((0.0, 0.0, 0.5 + offset), 0.01),
+        *scenes.front_camera(8, 8, 4.0),
         8,
         8,
         near=0.5,
@@ -65,26 +56,29 @@ def test_near_plane(offset, drawn):
     "mean", [(0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (1.0, 1.0, 0.0), (0.0, 0.0, 1e38), (1e38, 0.0, 1.0)]
 )
 def test_at_or_behind_the_camera_or_absurdly_far(mean):
-    cloud = Cloud(
-        *(torch.cat(pair) for pair in zip(one_gaussian(mean), one_gaussian(), strict=True))
+    cloud = scenes.Cloud(
+        *(
+            torch.cat(pair)
+            for pair in zip(scenes.one_gaussian(mean), scenes.one_gaussian(), strict=True)
+        )
     ).to(torch.float32)
-    camera = front_camera(6, 6, 5.0)
+    camera = scenes.front_camera(6, 6, 5.0)
     with_it, alone = (
-        run(cloud, *camera, 6, 6, far=1e30, **SPECIFICATION),
-        run(cloud.pick([1]), *camera, 6, 6, far=1e30, **SPECIFICATION),
+        scenes.run(cloud, *camera, 6, 6, far=1e30, **SPECIFICATION),
+        scenes.run(cloud.pick([1]), *camera, 6, 6, far=1e30, **SPECIFICATION),
     )
     assert torch.equal(with_it.out.image, alone.out.image) and with_it.out.radii[0, 0] == 0
-    assert all((with_it.grads[name][0] == 0).all() for name in NAMES)
+    assert all((with_it.grads[name][0] == 0).all() for name in scenes.NAMES)
 
 
 def test_a_camera_that_is_not_finite_spoils_its_own_view_only():
-    cloud, (viewmats, Ks) = random_cloud(10, seed=13), cameras(2, 6, 5)
+    cloud, (viewmats, Ks) = scenes.random_cloud(10, seed=13), scenes.cameras(2, 6, 5)
     background = torch.tensor([0.3, 0.5, 0.7], dtype=torch.float64)
     broken = viewmats.clone()
     broken[0, 1, 2] = math.nan
     bad, good = (
-        run(cloud, broken, Ks, 6, 5, background, **SPECIFICATION),
-        run(cloud, viewmats, Ks, 6, 5, background, **SPECIFICATION),
+        scenes.run(cloud, broken, Ks, 6, 5, background, **SPECIFICATION),
+        scenes.run(cloud, viewmats, Ks, 6, 5, background, **SPECIFICATION),
     )
     assert torch.equal(bad.out.image[1], good.out.image[1])
     assert torch.equal(bad.out.image[0], background.expand(5, 6, 3))
@@ -95,31 +89,32 @@ def test_a_camera_that_is_not_finite_spoils_its_own_view_only():
 @pytest.mark.parametrize("place", [(0, 0), (0, 2)])
 def test_a_camera_whose_numbers_overflow_spoils_its_own_view_only(place, backend):
     cloud, (viewmats, Ks) = (
-        random_cloud(10, seed=13).to(torch.float32),
-        cameras(2, 6, 5, dtype=torch.float32),
+        scenes.random_cloud(10, seed=13).to(torch.float32),
+        scenes.cameras(2, 6, 5, dtype=torch.float32),
     )
     elsewhere, absurd = Ks.clone(), Ks.clone()
     elsewhere[0, 0, 2], absurd[0][place] = 1e6, 1e30
     good, bad = (
-        run(cloud, viewmats, K, 6, 5, antialias=True, backend=backend) for K in (elsewhere, absurd)
+        scenes.run(cloud, viewmats, K, 6, 5, antialias=True, backend=backend)
+        for K in (elsewhere, absurd)
     )
     assert torch.equal(bad.out.image, good.out.image)
-    assert all(torch.equal(bad.grads[name], good.grads[name]) for name in NAMES)
+    assert all(torch.equal(bad.grads[name], good.grads[name]) for name in scenes.NAMES)
 
 
 @pytest.mark.parametrize(
     "cloud",
     [
-        random_cloud(0),
-        random_cloud(5)._replace(means=torch.full((5, 3), 100.0, dtype=torch.float64)),
+        scenes.random_cloud(0),
+        scenes.random_cloud(5)._replace(means=torch.full((5, 3), 100.0, dtype=torch.float64)),
     ],
 )
 def test_nothing_to_see_is_the_background_with_zero_gradients(cloud):
     background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
-    result = run(cloud, *cameras(2, 6, 4), 6, 4, background, **SPECIFICATION)
+    result = scenes.run(cloud, *scenes.cameras(2, 6, 4), 6, 4, background, **SPECIFICATION)
     assert torch.equal(result.out.image, background.expand(2, 4, 6, 3))
     assert (result.out.alpha == 0).all() and (result.out.depth == 0).all()
-    for name, leaf in zip(NAMES, cloud, strict=True):
+    for name, leaf in zip(scenes.NAMES, cloud, strict=True):
         assert result.grads[name].shape == leaf.shape and (result.grads[name] == 0).all()
     assert result.grads["means2d"].shape == (2, len(cloud.means), 2)
 
@@ -154,7 +149,7 @@ def test_float32_keeps_every_needle_and_disc_that_float64_keeps():
         .repeat_interleave(len(scales) // 3, 0)
     )
     means = torch.tensor([0.1, -0.2, 2.0], dtype=torch.float64).expand(len(scales), 3)
-    cloud = Cloud(
+    cloud = scenes.Cloud(
         means,
         quats,
         scales,
@@ -163,7 +158,7 @@ def test_float32_keeps_every_needle_and_disc_that_float64_keeps():
     )
     options = SPECIFICATION | {"stop": 0.0, "alpha_min": 1e-5}
     wide, narrow = (
-        run(cloud.to(dtype), *front_camera(16, 16, 20.0), 16, 16, **options)
+        scenes.run(cloud.to(dtype), *scenes.front_camera(16, 16, 20.0), 16, 16, **options)
         for dtype in (torch.float64, torch.float32)
     )
     assert torch.equal(wide.out.radii > 0, narrow.out.radii > 0) and (wide.out.radii > 0).all()
@@ -206,9 +201,12 @@ def test_gsplat_draws_the_same_and_has_the_same_gradients(gsplat, antialias):
     isn't, so it is off here.
     """
     width, height, views = 10, 8, 2
-    cloud, (viewmats, Ks) = random_cloud(25, seed=14, size=0.25), cameras(views, width, height)
+    cloud, (viewmats, Ks) = (
+        scenes.random_cloud(25, seed=14, size=0.25),
+        scenes.cameras(views, width, height),
+    )
     cloud.opacities[:3] = 0.9999  # reaches the cap
-    ours = run(
+    ours = scenes.run(
         cloud,
         viewmats,
         Ks,
@@ -232,15 +230,17 @@ def test_gsplat_draws_the_same_and_has_the_same_gradients(gsplat, antialias):
         means2d.detach(), conics.detach(), opacities.detach(), depths.detach(), width, height
     )
     image, alpha = gsplat.accumulate(means2d, conics, opacities, features, *ids, width, height)
-    assert error(ours.out.means2d, means2d) < ROUNDING
+    assert scenes.error(ours.out.means2d, means2d) < ROUNDING
     assert (
-        error(ours.out.image, image[..., :3]) < ROUNDING
-        and error(ours.out.depth, image[..., 3:]) < ROUNDING
+        scenes.error(ours.out.image, image[..., :3]) < ROUNDING
+        and scenes.error(ours.out.depth, image[..., 3:]) < ROUNDING
     )
-    assert error(ours.out.alpha, alpha) < ROUNDING
-    torch.autograd.backward([image[..., :3], alpha, image[..., 3:]], list(cotangents(ours.out)))
-    for name, leaf in zip(NAMES, leaves, strict=True):
-        assert error(ours.grads[name], leaf.grad) < ROUNDING, name
+    assert scenes.error(ours.out.alpha, alpha) < ROUNDING
+    torch.autograd.backward(
+        [image[..., :3], alpha, image[..., 3:]], list(scenes.cotangents(ours.out))
+    )
+    for name, leaf in zip(scenes.NAMES, leaves, strict=True):
+        assert scenes.error(ours.grads[name], leaf.grad) < ROUNDING, name
 
 
 def pairs_of_gsplat(means2d, conics, opacities, depths, width, height):

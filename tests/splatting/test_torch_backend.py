@@ -121,29 +121,7 @@ def test_random_clouds(seed, n, size, stretch, shape):
     )
 
 
-HOSTILE = {
-    "means": [0.0, 0.3, -0.7, 3.0, -3.0, 1e4, 1e30, math.nan, math.inf],
-    "quats": [0.0, 1.0, -1.0, 1e-20, 1e-40, 1e20, math.nan],
-    "scales": [1e-8, 1e-4, 1e-2, 0.3, 1.0, 100.0, 1e4, 0.0, math.inf],
-    "opacities": [0.0, 1 / 1024, 0.5, 0.9, 1.0, math.nan],
-    "colors": [0.0, 1.0, -2.0, 1e3, math.nan],
-}
-
-
-def hostile_cloud(seed: int, n: int) -> Cloud:
-    """Half of the entries are picked from HOSTILE, the others are ordinary; some Gaussians
-    coincide.
-    """
-    g = torch.Generator().manual_seed(seed)
-    cloud = random_cloud(n, seed)
-    for name, x in zip(NAMES, cloud, strict=True):
-        values = torch.tensor(HOSTILE[name], dtype=torch.float64)
-        picked = values[torch.randint(len(values), x.shape, generator=g)]
-        # A value that isn't finite removes the whole Gaussian; rarely enough that most stay.
-        rare = picked.isfinite() | (torch.rand(x.shape, generator=g) < 0.1)
-        x.copy_(torch.where((torch.rand(x.shape, generator=g) < 0.5) & rare, picked, x))
-    cloud.means[n // 2 :] = cloud.means[: n - n // 2].clone()
-    return cloud
+WITH_BRIGHT_COLORS = HOSTILE | {"colors": [*HOSTILE["colors"], 1e3]}
 
 
 @repeatable
@@ -152,7 +130,7 @@ def test_hostile_clouds(seed, n, antialias):
     """Needles, discs, points, behind the camera, NaN, coincident, transparent, opaque: equal in
     float64, finite in float32.
     """
-    cloud, camera = hostile_cloud(seed, n), cameras(2, 19, 13)
+    cloud, camera = hostile_cloud(seed, n, WITH_BRIGHT_COLORS), cameras(2, 19, 13)
     both = [
         run(cloud, *camera, 19, 13, backend=b, antialias=antialias) for b in ("torch", "reference")
     ]
@@ -227,16 +205,8 @@ def test_ten_thousand_gaussians_on_one_pixel():
     """Float32 gradients of a deep stack: T is never divided by (1 - alpha) along the list, so
     nothing drifts (bar: 1e-4).
     """
-    g = torch.Generator().manual_seed(5)
-    cloud = random_cloud(10_000, seed=5)
-    means = torch.cat(
-        [0.05 * torch.randn(10_000, 2, generator=g), 2 + torch.rand(10_000, 1, generator=g)], 1
-    ).double()
-    for opacities in (
-        0.01 + 0.89 * torch.rand(10_000, generator=g).double(),
-        torch.full((10_000,), 0.002).double(),
-    ):
-        stack, camera = cloud._replace(means=means, opacities=opacities), front_camera(3, 3, 4.0)
+    camera = front_camera(3, 3, 4.0)
+    for stack in stacks_on_one_pixel():
         truth = run(stack, *camera, 3, 3, backend="reference")
         ours = run(stack.to(torch.float32), *camera, 3, 3, backend="torch")
         assert error(ours.out.image, truth.out.image) < 1e-5

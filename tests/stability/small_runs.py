@@ -15,9 +15,6 @@ from unittest import mock
 import torch
 from torch import Tensor
 
-from threestudio_gaussiandreamer.core import streams
-from threestudio_gaussiandreamer.diffusion import sds
-from threestudio_gaussiandreamer.guidance.base import ScoreDistillation
 from threestudio_gaussiandreamer.launch import experiment
 
 DEMO = Path(__file__).parents[2] / "configs" / "demo.yaml"
@@ -30,25 +27,6 @@ SMALL = [
     "trainer.enable_progress_bar=false", "trainer.log_every_n_steps=1",
     "trainer.limit_val_batches=0", "use_timestamp=false", "tag=t",
 ]  # fmt: skip
-
-
-class TowardsGrey(ScoreDistillation):
-    """The shared path without a score model: the gradient is w x for latents x, which are the
-    pixels in [-1, 1].
-    """
-
-    def encode(self, rgb, **batch):
-        return 2 * rgb - 1
-
-    def decode(self, latents):
-        return (latents + 1) / 2
-
-    def condition(self, prompt_utils, **batch):
-        return None
-
-    def predict(self, z, t, condition):
-        noise = streams.normal_per_item(tuple(z.shape), 0, "noise", self.step)
-        return noise + sds.predict_x0(z, noise, self.alphas_cumprod[t]), None
 
 
 class Ended(NamedTuple):

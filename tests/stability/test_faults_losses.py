@@ -7,9 +7,9 @@ import pytest
 import torch
 import yaml
 
+from tests.helpers.pixel_guidance import TowardsGrey
 from tests.stability.faults_training_cases import started
 from tests.stability.rows import row
-from tests.stability.small_runs import TowardsGrey
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore

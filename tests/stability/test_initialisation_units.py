@@ -9,16 +9,7 @@ import scipy.spatial
 import scipy.stats
 import torch
 
-from tests.stability.initialisation_cases import (
-    ball_mesh,
-    colored,
-    picture,
-    rng,
-    sphere,
-    started,
-    write_obj,
-    write_ply,
-)
+from tests.stability import initialisation_cases as cases
 from tests.stability.rows import row
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.gaussians.grow import (
@@ -57,7 +48,7 @@ def initialized_from(path: Path) -> tuple[GaussianCloud, int]:
 
 
 def write_npz(path: Path, points: np.ndarray) -> Path:
-    np.savez(path, points=points, colors=rng().random(points.shape))
+    np.savez(path, points=points, colors=cases.rng().random(points.shape))
     return path
 
 
@@ -66,8 +57,10 @@ def write_npz(path: Path, points: np.ndarray) -> Path:
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 def test_neither_unit_nor_place_matters(unit, kind, tmp_path, measured):
     """Millimetres, metres, kilometres, each where it is and 10 000 units away."""
-    points, faces = ball_mesh()
-    write = write_npz if kind == "npz" else lambda path, points: write_obj(path, points, faces)
+    points, faces = cases.ball_mesh()
+    write = (
+        write_npz if kind == "npz" else lambda path, points: cases.write_obj(path, points, faces)
+    )
     (tmp_path / "b").mkdir()
     usual, expected = initialized_from(write(tmp_path / f"a.{kind}", points))
     for shift in (0.0, 1e4):
@@ -76,7 +69,7 @@ def test_neither_unit_nor_place_matters(unit, kind, tmp_path, measured):
         n = min(len(usual), len(other))
         assert torch.allclose(other.means[:n], usual.means[:n], atol=1e-4)
         measured(
-            psnr(picture(other, usual), picture(usual)).min(),
+            psnr(cases.picture(other, usual), cases.picture(usual)).min(),
             "dB",
             what="same picture",
             at_least=50.0,
@@ -89,10 +82,10 @@ def test_neither_unit_nor_place_matters(unit, kind, tmp_path, measured):
 def test_growing_has_no_unit(unit, shift, measured):
     """Of points that stay where they are."""
     options = {"num_candidates": 20_000, "radius": 0.05}
-    cloud = colored(sphere())
+    cloud = cases.colored(cases.sphere())
     counts = [
-        len(grow(cloud._replace(points=points), **options, generator=rng()).points)
-        for points in (sphere(), sphere() * unit + shift)
+        len(grow(cloud._replace(points=points), **options, generator=cases.rng()).points)
+        for points in (cases.sphere(), cases.sphere() * unit + shift)
     ]
     measured(
         abs((counts[1] - 1000) / (counts[0] - 1000) - 1) * 100,
@@ -109,30 +102,35 @@ def test_growing_has_no_unit(unit, shift, measured):
 @pytest.mark.parametrize("axes", [(0, 1), (2,), ()], ids=["plane", "line", "point"])
 def test_a_flat_prior_grows_a_slab_within_the_caps(axes, measured):
     points = np.full((500, 3), 0.25)
-    points[:, axes] = rng().uniform(-1, 1, (500, len(axes)))
+    points[:, axes] = cases.rng().uniform(-1, 1, (500, len(axes)))
     reach = 0.05 * (longest_side(points) or 1.0)
     flat = [axis for axis in range(3) if axis not in axes]
     options = {"num_candidates": 50_000, "radius": 0.05, "max_points": 2000}
-    geometry = started(colored(points), grow={"enabled": True, **options})
+    geometry = cases.started(cases.colored(points), grow={"enabled": True, **options})
     measured(len(geometry) - 500, "grown, of at most 2000", at_most=2000)
     offsets = (geometry.means[500:, flat] - 0.25).abs().detach()
     assert (
         offsets.max() <= 1.0001 * reach and (offsets.amax(0) > 0.9 * reach).all()
     )  # it fills the slab, and no more
-    assert picture(geometry).isfinite().all() and geometry.log_scales.isfinite().all()
+    assert cases.picture(geometry).isfinite().all() and geometry.log_scales.isfinite().all()
     assert (
-        len(started(colored(points), grow={"enabled": True, **options}, max_gaussians=700)) == 700
+        len(
+            cases.started(
+                cases.colored(points), grow={"enabled": True, **options}, max_gaussians=700
+            )
+        )
+        == 700
     )
 
 
 @row("A2", "No grown point")
 def test_a_cube_alone(measured):
-    geometry = started(
-        colored(CUBE), grow={"enabled": True, "num_candidates": 100_000, "radius": 0.0025}
+    geometry = cases.started(
+        cases.colored(CUBE), grow={"enabled": True, "num_candidates": 100_000, "radius": 0.0025}
     )
     assert torch.equal(geometry.means, torch.from_numpy(CUBE).float())
     assert torch.allclose(geometry.colors(torch.zeros(1, 3)), torch.tensor(0.5))
-    assert picture(geometry).isfinite().all()
+    assert cases.picture(geometry).isfinite().all()
     measured(len(geometry), "Gaussians, the vertices", at_most=8)
 
 
@@ -140,7 +138,7 @@ def uneven_square() -> tuple[np.ndarray, np.ndarray]:
     """A square of 162 triangles of very different sizes, and a tenth more without area: on a line,
     and with a corner twice.
     """
-    ticks = np.concatenate([[0.0], np.sort(rng(3).random(8)) ** 2, [1.0]])
+    ticks = np.concatenate([[0.0], np.sort(cases.rng(3).random(8)) ** 2, [1.0]])
     points = np.array([(x, y, 0.0) for x in ticks for y in ticks])
     corner = (10 * np.arange(9)[:, None] + np.arange(9)).reshape(-1, 1)
     faces = np.concatenate([corner + [0, 10, 1], corner + [10, 11, 1]])
@@ -166,12 +164,14 @@ def test_a_surface_is_sampled_uniformly_whatever_its_faces(repeated, tmp_path, m
     if repeated == "with copied vertices":
         again, points = again + len(points), np.concatenate([points, points])
     faces = faces if repeated == "not" else np.concatenate([faces, again])
-    mesh = load_mesh(write_ply(tmp_path / "square.ply", points, faces=faces))
-    sampled, face_index, _ = sample_surface(mesh, 5000, rng())
+    mesh = load_mesh(cases.write_ply(tmp_path / "square.ply", points, faces=faces))
+    sampled, face_index, _ = sample_surface(mesh, 5000, cases.rng())
     assert (face_areas(mesh) == 0).sum() >= 18 and (face_areas(mesh)[face_index] > 0).all()
     measured(uniformity(sampled), what="p of the worse axis", at_least=0.01)
     if repeated != "not":
-        twice = rng().choice(len(mesh.faces), 5000, p=face_areas(mesh) / face_areas(mesh).sum())
+        twice = cases.rng().choice(
+            len(mesh.faces), 5000, p=face_areas(mesh) / face_areas(mesh).sum()
+        )
         assert uniformity(mesh.vertices[mesh.faces[twice]].mean(1)) < 0.01  # the test can fail
 
 
@@ -192,7 +192,7 @@ def test_noise_stays_in_its_range_and_colours_in_theirs(color_range, mean, measu
 
     def grown(color: float, **more) -> np.ndarray:
         return grow_points(
-            colored(sphere(), color), GaussianCloud({"grow": options | more}).cfg.grow
+            cases.colored(cases.sphere(), color), GaussianCloud({"grow": options | more}).cfg.grow
         ).colors[1000:]
 
     noise = grown(0.5) - 0.5

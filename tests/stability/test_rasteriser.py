@@ -9,20 +9,8 @@ import math
 import pytest
 import torch
 
+from tests.helpers import splatting_scenes as scenes
 from tests.helpers.splatting_draws import draw
-from tests.helpers.splatting_scenes import (
-    NAMES,
-    NO_CUTOFFS,
-    Cloud,
-    cameras,
-    equal,
-    error,
-    front_camera,
-    one_gaussian,
-    psnr,
-    random_cloud,
-    run,
-)
 from tests.stability.backends import each_backend
 from tests.stability.rasteriser_cases import BACKGROUND
 from tests.stability.rows import row
@@ -39,13 +27,13 @@ def test_near_plane(backend, measured):
     """Everything is compared in float32: 0.01 is the nearest float to it, on both sides of the
     comparison.
     """
-    near, scene = torch.tensor(0.01).item(), random_cloud(20, seed=1)
+    near, scene = torch.tensor(0.01).item(), scenes.random_cloud(20, seed=1)
     scene.means[:, 2] += 3
-    camera, wrong = front_camera(24, 16, 12.0), 0
+    camera, wrong = scenes.front_camera(24, 16, 12.0), 0
     alone = draw(backend, scene, camera, 24, 16, BACKGROUND)
     offsets = [sign * 10.0**-k for k in range(1, 8) for sign in (-1, 1)]
     for z in (0.0, -0.0, -1.0, near, *(near + offset for offset in offsets)):
-        one = one_gaussian((0.0, 0.0, z), scale=0.05)
+        one = scenes.one_gaussian((0.0, 0.0, z), scale=0.05)
         both = draw(backend, joined(one, scene), camera, 24, 16, BACKGROUND)
         assert finite(both)
         drawn = torch.tensor(z, dtype=torch.float32).item() > near
@@ -55,7 +43,7 @@ def test_near_plane(backend, measured):
             assert all(
                 (both.grads[name][0] == 0).all()
                 and torch.equal(both.grads[name][1:], alone.grads[name])
-                for name in NAMES
+                for name in scenes.NAMES
             )
     measured(wrong, "of 18", what="wrongly culled", at_most=0)
 
@@ -83,8 +71,8 @@ def test_spill_of_the_clamped_jacobian(backend, measured):
         )  # rounding
         out = draw(
             backend,
-            one_gaussian((x, 0.0, z), scale, 0.9),
-            front_camera(width, width, focal),
+            scenes.one_gaussian((x, 0.0, z), scale, 0.9),
+            scenes.front_camera(width, width, focal),
             width,
             width,
         ).out
@@ -98,19 +86,22 @@ def test_no_needle_is_lost_in_float32(backend, measured):
     """10 000 : 1 at any angle, from 1e-3 to 1e2 wide."""
     n, g = 600, torch.Generator().manual_seed(0)
     length = 10.0 ** (5 * torch.rand(n, 1, generator=g).double() - 3)
-    cloud = random_cloud(n, seed=2)._replace(
+    cloud = scenes.random_cloud(n, seed=2)._replace(
         scales=length * torch.tensor([1.0, 1e-4, 1e-4]).double()
     )
     cloud.means[:] = torch.tensor([0.05, -0.1, 2.0])
-    ours = draw(backend, cloud, front_camera(16, 16, 12.0), 16, 16).out.radii > 0
-    truth = run(cloud, *front_camera(16, 16, 12.0), 16, 16, backend="reference").out.radii > 0
+    ours = draw(backend, cloud, scenes.front_camera(16, 16, 12.0), 16, 16).out.radii > 0
+    truth = (
+        scenes.run(cloud, *scenes.front_camera(16, 16, 12.0), 16, 16, backend="reference").out.radii
+        > 0
+    )
     measured((ours ^ truth).sum(), f"of {n}", what="lost or gained", at_most=0)
 
 
 @row("A1", "Zero/denormal quaternion")
 @each_backend
 def test_quaternions_without_length(backend, measured):
-    cloud, camera = random_cloud(30, seed=7), cameras(1, 20, 20)
+    cloud, camera = scenes.random_cloud(30, seed=7), scenes.cameras(1, 20, 20)
     identity = draw(
         backend, cloud._replace(quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(30, 1)), camera, 20, 20
     )
@@ -132,7 +123,7 @@ def test_the_length_of_a_quaternion_changes_nothing(backend, measured):
 
     For -q and for powers of two the product is exact, and so is the picture.
     """
-    cloud, camera = random_cloud(30, seed=7).to(torch.float32), cameras(1, 20, 20)
+    cloud, camera = scenes.random_cloud(30, seed=7).to(torch.float32), scenes.cameras(1, 20, 20)
     once = draw(backend, cloud, camera, 20, 20).out.image
     for factor in (-1.0, 4.0, 2.0**-30):
         assert torch.equal(
@@ -152,7 +143,7 @@ def test_opacities_at_their_ends(backend, measured):
     """
     geometry = GaussianCloud({})
     logits = torch.tensor([-math.inf, -40.0, -8.0, 0.0, 6.0, 40.0, math.inf])
-    scene = random_cloud(7, seed=3).to(torch.float32)
+    scene = scenes.random_cloud(7, seed=3).to(torch.float32)
     arrays = {
         "means": scene.means,
         "log_scales": scene.scales.log(),
@@ -166,10 +157,13 @@ def test_opacities_at_their_ends(backend, measured):
     )
     faint = geometry.opacities().detach() < 1 / 1024
     scene = scene._replace(opacities=geometry.opacities().detach())
-    whole, camera = draw(backend, scene, cameras(2, 24, 16), 24, 16), cameras(2, 24, 16)
+    whole, camera = (
+        draw(backend, scene, scenes.cameras(2, 24, 16), 24, 16),
+        scenes.cameras(2, 24, 16),
+    )
     rest = draw(backend, scene.pick(~faint), camera, 24, 16)
     assert finite(whole) and faint.sum() == 3 and torch.equal(whole.out.image, rest.out.image)
-    assert all((whole.grads[name][faint] == 0).all() for name in NAMES)
+    assert all((whole.grads[name][faint] == 0).all() for name in scenes.NAMES)
     raw = scene._replace(opacities=torch.sigmoid(logits))  # and unclamped, as anyone may call it
     assert finite(draw(backend, raw, camera, 24, 16))
     measured("finite; nothing below alpha_min")
@@ -187,10 +181,12 @@ def needles() -> list[tuple[Cloud, torch.Tensor]]:
     clouds = []
     for scales in itertools.combinations_with_replacement(steps, 3):
         for quat in torch.randn(5, 4, generator=g):
-            cloud = one_gaussian((0.1, -0.2, 2.0), scales, 0.8)._replace(quats=quat[None].double())
+            cloud = scenes.one_gaussian((0.1, -0.2, 2.0), scales, 0.8)._replace(
+                quats=quat[None].double()
+            )
             out = rasterize(
                 *cloud.to(torch.float32).to(torch.float64),
-                *front_camera(16, 16, 20.0),
+                *scenes.front_camera(16, 16, 20.0),
                 16,
                 16,
                 backend="reference",
@@ -207,7 +203,7 @@ def test_needles_and_discs(backend, measured):
     """
     worst = 0.0
     for cloud, truth in needles():
-        alpha = draw(backend, cloud, front_camera(16, 16, 20.0), 16, 16).out.alpha.double()
+        alpha = draw(backend, cloud, scenes.front_camera(16, 16, 20.0), 16, 16).out.alpha.double()
         flipped = (alpha == 0) != (truth == 0)
         worst = max(worst, (alpha - truth).abs()[~flipped].max().item())
         assert (alpha - truth).abs().max() < 1.001 / 1024
@@ -248,7 +244,7 @@ def test_equal_depths_go_by_index(backend, measured):
     """64 in one plane: the picture is that of the permuted indices, in float64 by hand; the same
     bits over 10 runs.
     """
-    cloud, camera = stack([0.9] * 64, scale=1.0), front_camera(8, 8, 4.0)
+    cloud, camera = stack([0.9] * 64, scale=1.0), scenes.front_camera(8, 8, 4.0)
     colors = torch.rand(64, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for seed in range(3):
         order = torch.randperm(64, generator=torch.Generator().manual_seed(seed))
@@ -256,7 +252,7 @@ def test_equal_depths_go_by_index(backend, measured):
             draw(backend, cloud._replace(colors=colors[order]), camera, 8, 8)
             for _ in range(10 if seed == 0 else 1)
         ]
-        assert all(equal(results[0], other) for other in results[1:])
+        assert all(scenes.equal(results[0], other) for other in results[1:])
         alpha = results[0].out.alpha[0, 4, 4, 0].item()
         first = 0.9 * math.exp(
             -0.5 * 0.5 / (2**2 + 0.3)
@@ -292,13 +288,13 @@ def test_the_order_is_that_of_floats(backend, measured):
         means=depths[:, None] * torch.tensor([0, 0, 1.0]).double(),
         scales=0.2 * depths[:, None].repeat(1, 3),
     )
-    truth = run(
-        cloud, *front_camera(4, 4, 3.0), 4, 4, backend="reference", stop=0.0
+    truth = scenes.run(
+        cloud, *scenes.front_camera(4, 4, 3.0), 4, 4, backend="reference", stop=0.0
     )  # already in order
-    shuffled = draw(backend, cloud.pick(order), front_camera(4, 4, 3.0), 4, 4, stop=0.0)
-    measured(error(shuffled.out.image, truth.out.image), what="error", at_most=1e-5)
+    shuffled = draw(backend, cloud.pick(order), scenes.front_camera(4, 4, 3.0), 4, 4, stop=0.0)
+    measured(scenes.error(shuffled.out.image, truth.out.image), what="error", at_most=1e-5)
     measured(
-        error(shuffled.out.contribution, truth.out.contribution[:, order]),
+        scenes.error(shuffled.out.contribution, truth.out.contribution[:, order]),
         what="error of contributions",
         at_most=1e-5,
     )
@@ -308,7 +304,7 @@ def test_the_order_is_that_of_floats(backend, measured):
 
 
 def fog(n: int) -> Cloud:
-    return random_cloud(n, seed=8, size=0.4)._replace(
+    return scenes.random_cloud(n, seed=8, size=0.4)._replace(
         opacities=torch.full((n,), 0.0038, dtype=torch.float64)
     )
 
@@ -319,17 +315,17 @@ def test_fog(backend, measured):
     """Each Gaussian of opacity o loses what lies below alpha_min, the share alpha_min / o of it: at
     most N alpha_min in a pixel.
     """
-    n, camera = 2000, cameras(1, 12, 12)
-    cloud = random_cloud(n, seed=8, size=0.4)._replace(
+    n, camera = 2000, scenes.cameras(1, 12, 12)
+    cloud = scenes.random_cloud(n, seed=8, size=0.4)._replace(
         opacities=torch.full((n,), 0.0038, dtype=torch.float64)
     )
-    truth = run(cloud, *camera, 12, 12, backend="reference", **NO_CUTOFFS).out.image
+    truth = scenes.run(cloud, *camera, 12, 12, backend="reference", **scenes.NO_CUTOFFS).out.image
     images = {name: draw(backend, cloud, camera, 12, 12, preset=name).out.image for name in PRESETS}
     for name, alpha_min in PRESETS.items():
         assert (images[name] - truth).abs().max() <= n * alpha_min
-    measured(psnr(images["accurate"], truth), "dB", what="accurate", at_least=60)
-    measured(psnr(images["balanced"], truth), "dB", what="balanced")
-    measured(psnr(images["fast"], truth), "dB", what="fast")
+    measured(scenes.psnr(images["accurate"], truth), "dB", what="accurate", at_least=60)
+    measured(scenes.psnr(images["balanced"], truth), "dB", what="balanced")
+    measured(scenes.psnr(images["fast"], truth), "dB", what="fast")
 
 
 @row("A1", "Early stop")
@@ -338,7 +334,7 @@ def test_early_stop(backend, measured):
     out = draw(
         backend,
         stack([0.9, 0.905, 0.99, 0.5], scale=10.0),
-        front_camera(1, 1, 1.0),
+        scenes.front_camera(1, 1, 1.0),
         1,
         1,
         torch.ones(3),

@@ -274,6 +274,14 @@ def test_a_read_only_output_root_is_named_before_any_work(tmp_path, measured):
 # ---- signals -------------------------------------------------------------------------------------
 
 
+def require_resumed_equal(tmp_path, ended, whole, measured) -> None:
+    """Resume a stopped run to its end; fail unless it ends as the undisturbed run ``whole``."""
+    finished = launch(tmp_path, *EVERY_STEP, f"resume={ended.last}")
+    assert finished.code == 0, finished.err
+    differing = differences(whole.checkpoint(), finished.checkpoint())
+    measured(differing, "tensors", what="that differ after resuming", at_most=0)
+
+
 @row("A5", "Ctrl-C / SIGTERM")
 @pytest.mark.parametrize("name, code", [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
 @pytest.mark.parametrize("step", random.Random(5).sample(range(1, 5), 2))
@@ -288,14 +296,7 @@ def test_a_signal_at_a_random_step(name, code, step, whole, tmp_path, monkeypatc
     ), ended.err
     assert load_checkpoint(ended.last)["global_step"] == step
     assert not list(ended.folder.glob("save/*test*"))  # Lightning would go on to the test
-    finished = launch(tmp_path, *EVERY_STEP, f"resume={ended.last}")
-    assert finished.code == 0, finished.err
-    measured(
-        differences(whole.checkpoint(), finished.checkpoint()),
-        "tensors",
-        what="that differ after resuming",
-        at_most=0,
-    )
+    require_resumed_equal(tmp_path, ended, whole, measured)
 
 
 @row("A5", "Ctrl-C / SIGTERM")
@@ -314,14 +315,7 @@ def test_a_signal_while_views_are_validated(whole, tmp_path, monkeypatch, measur
             "trainer.val_check_interval=3",
         )
     assert ended.code == 143 and "stopped at step 3; to go on: " in ended.out, ended.err
-    finished = launch(tmp_path, *EVERY_STEP, f"resume={ended.last}")
-    assert finished.code == 0, finished.err
-    measured(
-        differences(whole.checkpoint(), finished.checkpoint()),
-        "tensors",
-        what="that differ after resuming",
-        at_most=0,
-    )
+    require_resumed_equal(tmp_path, ended, whole, measured)
 
 
 @row("A5", "Ctrl-C / SIGTERM")

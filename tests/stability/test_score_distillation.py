@@ -10,8 +10,9 @@ import pytest
 import torch
 from lightning.pytorch.plugins import MixedPrecision
 
+from tests.helpers.pixel_guidance import TowardsGrey
 from tests.stability.rows import row
-from tests.stability.small_runs import Ended, TowardsGrey, differences, launch
+from tests.stability.small_runs import Ended, differences, launch
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion import sds

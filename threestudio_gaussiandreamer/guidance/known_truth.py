@@ -16,7 +16,11 @@ from torch import Tensor
 from ..meshes.raycast import MeshCaster, TargetCache
 
 PIXELS_PER_CAST = 2**20
-PictureSize = Callable[[int, int], tuple[int, int]]
+Batch = dict[str, Any]
+Size = tuple[int, int]
+"""Height and width, pixels."""
+
+PictureSize = Callable[[int, int], Size]
 
 
 class KnownTruth(Protocol):
@@ -26,11 +30,7 @@ class KnownTruth(Protocol):
     """Ray casts the mesh from held-out cameras; None if the ground truth isn't a mesh."""
 
     def render(
-        self,
-        batch: dict[str, Any],
-        background: Optional[Tensor] = None,
-        *,
-        size: Optional[tuple[int, int]] = None,
+        self, batch: Batch, background: Optional[Tensor] = None, *, size: Optional[Size] = None
     ) -> Float[Tensor, "B H W 3"]:
         """Render the ground truth from the views of a batch.
 
@@ -76,11 +76,7 @@ class MeshTruth:
 
     @torch.no_grad()
     def render(
-        self,
-        batch: dict[str, Any],
-        background: Optional[Tensor] = None,
-        *,
-        size: Optional[tuple[int, int]] = None,
+        self, batch: Batch, background: Optional[Tensor] = None, *, size: Optional[Size] = None
     ) -> Float[Tensor, "B H W 3"]:
         """See :meth:`KnownTruth.render`."""
         height, width = size or (batch["height"], batch["width"])

@@ -24,44 +24,29 @@ Limits: the prompt is not read; the pose is the file's. At ``scale`` above 1.5 t
 of the paper's range (1.5 to 4.0) are inside the body."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Optional
+from typing import Any
 
 import numpy as np
 
 from ..core.files import existing_file
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
-from ..meshes.load import load_mesh
-from .base import COLOR, PATH, SCALE, Prior, chosen_colors, points, require_axes
-from .mesh import mesh_cloud
+from .base import COLOR, points
+from .mesh import MeshFilePrior, colored_cloud
 
 
 @register("body-prior")
-class BodyPrior(Prior):
+class BodyPrior(MeshFilePrior):
     """Points on a posed body, randomly coloured."""
 
     @dataclass
-    class Config(Prior.Config):
-        path: str = field(default="", metadata=PATH)
-        scale: float = field(default=1.0, metadata=SCALE)
-        up: str = "auto"
-        front: Optional[str] = None
+    class Config(MeshFilePrior.Config):
         num_points: int = field(default=50_000, metadata=points(0))
         color: Any = field(default="random", metadata=COLOR)
-
-        @staticmethod
-        def check(cfg: Any) -> None:
-            require_axes(cfg, Path(cfg.path).suffix.lower().lstrip("."))
 
     cfg: Config
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
-        cfg = self.cfg
-        mesh = load_mesh(
-            existing_file(cfg.path, "body mesh"), scale=cfg.scale, up=cfg.up, front=cfg.front
-        )
-        cloud = mesh_cloud(mesh, cfg.num_points, generator)
-        if cfg.color is not None:
-            cloud = cloud._replace(colors=chosen_colors(cfg.color, len(cloud.points), generator))
+        existing_file(self.cfg.path, "body mesh")
+        cloud = colored_cloud(self.load(), self.cfg, generator)
         return cloud._replace(points=cloud.points - cloud.points.mean(axis=0))

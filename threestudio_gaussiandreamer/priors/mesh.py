@@ -46,9 +46,8 @@ points times neighbours.
 """
 
 
-@register("mesh-prior")
-class MeshPrior(Prior):
-    """The vertices of a mesh, or points on its surface."""
+class MeshFilePrior(Prior):
+    """Base class of priors that read a triangle mesh from a file."""
 
     @dataclass
     class Config(Prior.Config):
@@ -57,9 +56,7 @@ class MeshPrior(Prior):
         up: str = "auto"
         front: Optional[str] = None
         num_points: int = field(default=0, metadata=points(0))
-        color_smoothing: int = field(default=0, metadata=at_least(0))
         color: Any = field(default=None, metadata=COLOR)
-        jitter: float = field(default=0.0, metadata=at_least(0))
 
         @staticmethod
         def check(cfg: Any) -> None:
@@ -67,20 +64,42 @@ class MeshPrior(Prior):
 
     cfg: Config
 
-    def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
+    def load(self) -> Mesh:
+        """Return the mesh, scaled and turned into the world's axes."""
         cfg = self.cfg
-        mesh = load_mesh(cfg.path, scale=cfg.scale, up=cfg.up, front=cfg.front)
+        return load_mesh(cfg.path, scale=cfg.scale, up=cfg.up, front=cfg.front)
+
+
+@register("mesh-prior")
+class MeshPrior(MeshFilePrior):
+    """The vertices of a mesh, or points on its surface."""
+
+    @dataclass
+    class Config(MeshFilePrior.Config):
+        color_smoothing: int = field(default=0, metadata=at_least(0))
+        jitter: float = field(default=0.0, metadata=at_least(0))
+
+    cfg: Config
+
+    def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
+        cfg, mesh = self.cfg, self.load()
         if cfg.color is None and not mesh.has_colors:
             logger.warning("%s has no colours: grey is used", cfg.path)
-        cloud = mesh_cloud(mesh, cfg.num_points, generator)
-        if cfg.color is not None:
-            cloud = cloud._replace(colors=chosen_colors(cfg.color, len(cloud.points), generator))
+        cloud = colored_cloud(mesh, cfg, generator)
         if cfg.color_smoothing > 1:
             cloud = cloud._replace(colors=smoothed_colors(cloud, cfg.color_smoothing))
         return cloud._replace(
             points=cloud.points
             + generator.normal(scale=cfg.jitter * cfg.scale, size=cloud.points.shape)
         )
+
+
+def colored_cloud(mesh: Mesh, cfg: Any, generator: np.random.Generator) -> PointCloud:
+    """Return :func:`mesh_cloud` of ``cfg.num_points`` in the colours of ``cfg.color``."""
+    cloud = mesh_cloud(mesh, cfg.num_points, generator)
+    if cfg.color is None:
+        return cloud
+    return cloud._replace(colors=chosen_colors(cfg.color, len(cloud.points), generator))
 
 
 def mesh_cloud(mesh: Mesh, num_points: int, generator: np.random.Generator) -> PointCloud:

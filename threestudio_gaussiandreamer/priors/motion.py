@@ -53,8 +53,8 @@ from ..meshes.raycast import MeshCaster, over_background
 from ..models.clip import clip_source, picture_similarities
 from ..models.extras import require_extra
 from ..models.hub import Source, locate
-from .base import COLOR, SCALE, Prior, chosen_colors, points
-from .mesh import face_normals, mesh_cloud
+from .base import COLOR, SCALE, Prior, points
+from .mesh import colored_cloud, face_normals
 from .motion_files import Motions, read_motions
 from .motion_text import reduced_prompt
 from .placing import chosen_device
@@ -143,11 +143,7 @@ class MotionPrior(Prior):
         mesh = (
             self._chosen_candidate(prompt) if self.cfg.candidates else self._body_of_motion(prompt)
         )
-        cloud = mesh_cloud(mesh, self.cfg.num_points, generator)
-        if self.cfg.color is not None:
-            cloud = cloud._replace(
-                colors=chosen_colors(self.cfg.color, len(cloud.points), generator)
-            )
+        cloud = colored_cloud(mesh, self.cfg, generator)
         return cloud._replace(points=cloud.points - cloud.points.mean(axis=0))
 
     def _needs_clip(self) -> bool:

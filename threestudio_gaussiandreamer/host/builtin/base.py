@@ -63,8 +63,10 @@ def update_end_if_possible(part: Any, epoch: int, global_step: int) -> None:
         part.do_update_step_end(epoch, global_step)
 
 
-class BaseObject(Updateable):
-    """A part without parameters: guidance, prompt processor, prior, exporter."""
+class Part(Updateable):
+    """What :class:`BaseObject` and :class:`BaseModule` have in common: a typed configuration and a
+    device.
+    """
 
     @dataclass
     class Config:
@@ -84,30 +86,26 @@ class BaseObject(Updateable):
         """
 
 
-class BaseModule(nn.Module, Updateable):
+class BaseObject(Part):
+    """A part without parameters: guidance, prompt processor, prior, exporter."""
+
+
+class BaseModule(Part, nn.Module):
     """A part with parameters: geometry, material, background, renderer.
 
     ``weights`` is ``path:module``: the entries of a checkpoint under ``module.`` are loaded after
     ``configure``."""
 
     @dataclass
-    class Config:
+    class Config(Part.Config):
         weights: Optional[str] = None
 
     cfg: Config
 
     def __init__(self, cfg: Any = None, *args: Any, **kwargs: Any) -> None:
-        super().__init__()
-        self.cfg = parse_structured(self.Config, cfg)
-        self.device = get_device()
-        self.configure(*args, **kwargs)
+        super().__init__(cfg, *args, **kwargs)
         if self.cfg.weights is not None:
             self._load_weights(self.cfg.weights)
-
-    def configure(self, *args: Any, **kwargs: Any) -> None:
-        """Build the part from ``self.cfg``; gets what the constructor got after the
-        configuration.
-        """
 
     def _load_weights(self, source: str) -> None:
         path, _, module_name = source.rpartition(":")

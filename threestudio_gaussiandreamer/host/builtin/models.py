@@ -122,7 +122,25 @@ class SubModules(NamedTuple):
     background: Optional[BaseBackground]
 
 
-class Renderer(BaseModule):
+class HasSubModules:
+    """Access to the system's parts under the names that threestudio gives them."""
+
+    sub_modules: SubModules
+
+    @property
+    def geometry(self) -> BaseGeometry:
+        return self.sub_modules.geometry
+
+    @property
+    def material(self) -> Optional[BaseMaterial]:
+        return self.sub_modules.material
+
+    @property
+    def background(self) -> Optional[BaseBackground]:
+        return self.sub_modules.background
+
+
+class Renderer(HasSubModules, BaseModule):
     """Cameras to pictures: ``renderer(**batch)`` gives a dict with ``comp_rgb`` (B,H,W,3),
     ``opacity`` (B,H,W,1), ...
     """
@@ -144,18 +162,6 @@ class Renderer(BaseModule):
     def forward(self, *args: Any, **kwargs: Any) -> Mapping[str, Any]:
         raise NotImplementedError(f"{type(self).__name__}.forward")
 
-    @property
-    def geometry(self) -> BaseGeometry:
-        return self.sub_modules.geometry
-
-    @property
-    def material(self) -> Optional[BaseMaterial]:
-        return self.sub_modules.material
-
-    @property
-    def background(self) -> Optional[BaseBackground]:
-        return self.sub_modules.background
-
 
 class Rasterizer(Renderer):
     """A renderer that projects primitives."""
@@ -170,7 +176,7 @@ class ExporterOutput:
     params: dict[str, Any]
 
 
-class Exporter(BaseObject):
+class Exporter(HasSubModules, BaseObject):
     """The trained parts to a list of files."""
 
     @dataclass
@@ -183,18 +189,6 @@ class Exporter(BaseObject):
         self, geometry: BaseGeometry, material: BaseMaterial, background: BaseBackground
     ) -> None:
         self.sub_modules = SubModules(geometry, material, background)
-
-    @property
-    def geometry(self) -> BaseGeometry:
-        return self.sub_modules.geometry
-
-    @property
-    def material(self) -> Optional[BaseMaterial]:
-        return self.sub_modules.material
-
-    @property
-    def background(self) -> Optional[BaseBackground]:
-        return self.sub_modules.background
 
     def __call__(self, *args: Any, **kwargs: Any) -> list[ExporterOutput]:
         raise NotImplementedError(f"{type(self).__name__}.__call__")
