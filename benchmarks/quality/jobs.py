@@ -122,47 +122,27 @@ def count_jobs() -> Iterator[Job]:
         yield Job("count", "by removal error", count, {"system.geometry.budget": count})
         yield Job("count", "from scratch", count, scratch(count))
     ungrown = {"system.geometry.prior.num_points": 10000, "system.geometry.grow.enabled": "false"}
-    yield Job(
-        "count",
-        "by removal error, without growing",
-        COUNTS[-2],
-        ungrown | {"system.geometry.budget": COUNTS[-2]},
-    )
+    middle = COUNTS[-2]
+    budget = {"system.geometry.budget": middle}
+    yield Job("count", "by removal error, without growing", middle, ungrown | budget)
     for count in COUNTS[-2:]:
-        for score in ("contribution", "opacity"):
-            yield Job(
-                "count",
-                f"by {score}",
-                count,
-                {"system.geometry.budget": count, "system.geometry.prune.score": score},
-            )
-        for name, share in SLOWER_MEANS.items():
-            start, end = RATES["lr_means"]
-            slower = {
-                "system.geometry.budget": count,
-                "system.geometry.lr_means": falling_rate(share * start, end, STEPS),
-            }
-            yield Job("count", f"by removal error, {name}", count, slower)
-        rounds = rounds_to(count, 10000)
-        pruned = NO_BUDGET | {"system.prune.count": count, "system.prune.size": 128}
-        yield Job(
-            "count",
-            "after the run, with recovery",
-            count,
-            steps(STEPS - rounds * STEPS_A_ROUND) | pruned,
-        )
-    yield Job(
-        "count",
-        "at random",
-        COUNTS[-2],
-        {"system.geometry.budget": COUNTS[-2], "system.geometry.prune.score": "random"},
-    )
-    yield Job(
-        "count",
-        "the paper's recipe, by removal error",
-        COUNTS[-2],
-        PAPER | {"system.geometry.budget": COUNTS[-2]},
-    )
+        yield from other_ways(count)
+    yield Job("count", "at random", middle, budget | {"system.geometry.prune.score": "random"})
+    yield Job("count", "the paper's recipe, by removal error", middle, PAPER | budget)
+
+
+def other_ways(count: int) -> Iterator[Job]:
+    """Other scores, slower means, and pruning after the run, all down to ``count``."""
+    budget = {"system.geometry.budget": count}
+    for score in ("contribution", "opacity"):
+        yield Job("count", f"by {score}", count, budget | {"system.geometry.prune.score": score})
+    for name, share in SLOWER_MEANS.items():
+        start, end = RATES["lr_means"]
+        slower = {"system.geometry.lr_means": falling_rate(share * start, end, STEPS)}
+        yield Job("count", f"by removal error, {name}", count, budget | slower)
+    trained = steps(STEPS - rounds_to(count, 10000) * STEPS_A_ROUND) | NO_BUDGET
+    pruned = {"system.prune.count": count, "system.prune.size": 128}
+    yield Job("count", "after the run, with recovery", count, trained | pruned)
 
 
 def grown_jobs() -> Iterator[Job]:

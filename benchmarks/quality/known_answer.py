@@ -192,11 +192,8 @@ class KnownCloud(BaseObject):
         }
 
 
-def found_by_auto(true: Gaussians, seed: int, steps: int, folder: Path) -> tuple[int, int, float]:
-    """Gaussians before and after, and dB to the truth."""
-    start = with_copies_and_floaters(true, seed)
-    write_cloud(str(folder / "true.ply"), StoredCloud(true.arrays()))
-    write_cloud(str(folder / "start.ply"), StoredCloud(start.arrays()))
+def auto_config(folder: Path, steps: int) -> dict[str, Any]:
+    """Return the demo's configuration with a known cloud as its truth and ``budget: auto``."""
     cfg = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())
     cfg["system"] |= {
         "guidance_type": "known-cloud-guidance",
@@ -213,21 +210,23 @@ def found_by_auto(true: Gaussians, seed: int, steps: int, folder: Path) -> tuple
         "prior": {"path": str(folder / "start.ply")},
         "budget": "auto",
     }
-    (folder / "known.yaml").write_text(yaml.safe_dump(cfg))
+    return cfg
+
+
+def found_by_auto(true: Gaussians, seed: int, steps: int, folder: Path) -> tuple[int, int, float]:
+    """Gaussians before and after, and dB to the truth."""
+    start = with_copies_and_floaters(true, seed)
+    write_cloud(str(folder / "true.ply"), StoredCloud(true.arrays()))
+    write_cloud(str(folder / "start.ply"), StoredCloud(start.arrays()))
+    (folder / "known.yaml").write_text(yaml.safe_dump(auto_config(folder, steps)))
     overrides = {
         "exp_root_dir": folder, "use_timestamp": "false", "tag": "run", "seed": seed,
         "data.width": SIZE, "data.height": SIZE, "data.n_test_views": 1, "data.eval_width": 64,
         "data.eval_height": 64, "trainer.max_steps": steps, "trainer.val_check_interval": 100000,
         "trainer.enable_progress_bar": "false",
     }  # fmt: skip
-    if launch(
-        [
-            "--config",
-            str(folder / "known.yaml"),
-            "--train",
-            *(f"{key}={value}" for key, value in overrides.items()),
-        ]
-    ):
+    arguments = ["--config", str(folder / "known.yaml"), "--train"]
+    if launch(arguments + [f"{key}={value}" for key, value in overrides.items()]):
         raise SystemExit("the training run failed")
     exported = read_cloud(str(folder / f"demo/run/save/it{steps}-export/gaussians.ply"))
     found = exported.in_axes(WORLD_UP).gaussians.tensors(get_device())

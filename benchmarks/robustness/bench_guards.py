@@ -22,7 +22,7 @@ from benchmarks.splatting.bench_scenes import make_camera, make_scene
 from tests.helpers.pixel_guidance import PixelGuidance
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0
 from threestudio_gaussiandreamer.guidance.base import _bad_items
-from threestudio_gaussiandreamer.splatting import RasterizeOptions, rasterize
+from threestudio_gaussiandreamer.splatting import RasterizeOptions, rasterize, validation
 from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.finite import (
     CHECK_EVERY,
@@ -160,14 +160,14 @@ def main() -> None:
         bench.sizes_are_looked_at: LOG_EVERY, bench.parameters_and_moments_are_finite: CHECK_EVERY,
     }  # fmt: skip
     rows = [
-        (f.__name__.replace("_", " "), milliseconds(f, 0.5) / every, step)
+        (f.__name__.replace("_", " "), milliseconds(f, options.seconds / 10) / every, step)
         for f, every in guards.items()
     ]
     rows.append(("all guards of a training step", sum(time for _, time, _ in rows), step))
     rows.append(
         (
             'non_finite="error" in a forward pass',
-            milliseconds(bench.everything_is_finite, 0.5),
+            milliseconds(bench.everything_is_finite, options.seconds / 10),
             forward,
         )
     )

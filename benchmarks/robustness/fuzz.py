@@ -196,16 +196,8 @@ class Watched:
         tick: Callable[[int], None],
     ) -> int:
         """The number to go on with."""
-        command = [
-            sys.executable,
-            "-m",
-            __spec__.name,
-            "--worker",
-            self.name,
-            str(self.seed),
-            str(first),
-            str(count),
-        ]
+        worker = ["--worker", self.name, str(self.seed), str(first), str(count)]
+        command = [sys.executable, "-m", __spec__.name, *worker]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
         patience = STARTUP

@@ -257,6 +257,19 @@ def draw(rows: list[dict[str, str]]) -> None:
         print(CSV.parent / axes.file)
 
 
+def draw_marks(
+    panel: Any, axes: Axes, rows: list[dict[str, str]], color: str, labelled: bool
+) -> None:
+    """Mark presets, stops and the peers' cut-offs; presets with their initial."""
+    for group, marker in (("preset", "D"), ("stop", "x"), ("peers' cut-offs", "^")):
+        marks = [row for row in rows if row["group"] == group]
+        label = group if labelled else None
+        panel.plot(*columns(axes, marks), marker, color=color, markersize=6, label=label)
+        for row in marks if group == "preset" else ():
+            beside = {"textcoords": "offset points", "xytext": (5, -3)}
+            panel.annotate(row["setting"][0], place(axes, row), **beside, fontsize=7)
+
+
 def draw_panel(panel: Any, axes: Axes, rows: list[dict[str, str]]) -> None:
     """For each size the smallest alpha as a line, the presets and other knobs as marks, and the
     front of all as a dashed line.
@@ -267,39 +280,11 @@ def draw_panel(panel: Any, axes: Axes, rows: list[dict[str, str]]) -> None:
             (row for row in here if row["group"] == "alpha_min"),
             key=lambda row: -smallest_alpha(row["setting"]),
         )
-        panel.plot(
-            *columns(axes, line),
-            "o-",
-            color=color,
-            markersize=3,
-            linewidth=1,
-            alpha=0.6,
-            label=f"alpha_min, {size}²",
-        )
-        panel.plot(
-            *front(axes, here),
-            "--",
-            color=color,
-            linewidth=0.8,
-            label="front of all settings" if index == 2 else None,
-        )
-        for group, marker in (("preset", "D"), ("stop", "x"), ("peers' cut-offs", "^")):
-            marks = [row for row in here if row["group"] == group]
-            panel.plot(
-                *columns(axes, marks),
-                marker,
-                color=color,
-                markersize=6,
-                label=group if index == 2 else None,
-            )
-            for row in marks if group == "preset" else ():
-                panel.annotate(
-                    row["setting"][0],
-                    place(axes, row),
-                    textcoords="offset points",
-                    xytext=(5, -3),
-                    fontsize=7,
-                )
+        thin = {"color": color, "markersize": 3, "linewidth": 1, "alpha": 0.6}
+        panel.plot(*columns(axes, line), "o-", label=f"alpha_min, {size}²", **thin)
+        label = "front of all settings" if index == 2 else None
+        panel.plot(*front(axes, here), "--", color=color, linewidth=0.8, label=label)
+        draw_marks(panel, axes, here, color, labelled=index == 2)
     panel.set_xscale("log")
     if axes.log:
         panel.set_yscale("log")

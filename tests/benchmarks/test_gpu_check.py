@@ -1,6 +1,5 @@
 """The check for machines with a GPU runs from end to end: here on the CPU, with everything tiny."""
 
-import importlib
 import json
 import subprocess
 import sys
@@ -9,6 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
+
+from benchmarks.splatting import bench_scenes, gpu_check, gpu_kernels, gpu_processes
 
 ROOT = Path(__file__).parents[2]
 
@@ -33,14 +34,9 @@ def test_every_section_runs_and_reports(tmp_path):
     assert report["compile"]["first"] > 0 and report["bench"]["fast"]["ms"] > 0
 
 
-@pytest.fixture
-def gpu_check(monkeypatch):
-    return importlib.import_module("benchmarks.splatting.gpu_check")
-
-
 @pytest.mark.slow
-def test_what_fails_is_recorded_and_the_rest_goes_on(gpu_check, monkeypatch, tmp_path):
-    monkeypatch.setattr(gpu_check, "GRADIENT_ERROR", 0.0)
+def test_what_fails_is_recorded_and_the_rest_goes_on(monkeypatch, tmp_path):
+    monkeypatch.setattr(gpu_kernels, "GRADIENT_ERROR", 0.0)
     monkeypatch.setattr(
         gpu_check, "SECTIONS", {name: gpu_check.SECTIONS[name] for name in ("correct", "bench")}
     )
@@ -56,9 +52,7 @@ def test_what_fails_is_recorded_and_the_rest_goes_on(gpu_check, monkeypatch, tmp
     )
 
 
-def test_each_section_leaves_its_numbers_whatever_the_next_one_does(
-    gpu_check, monkeypatch, tmp_path
-):
+def test_each_section_leaves_its_numbers_whatever_the_next_one_does(monkeypatch, tmp_path):
     def crash(args):
         raise SystemExit("as if somebody had ended the process")
 
@@ -71,24 +65,25 @@ def test_each_section_leaves_its_numbers_whatever_the_next_one_does(
     assert json.loads((tmp_path / "report.json").read_text())["compile"]["first"] == 1.0
 
 
-def test_a_part_that_hangs_ends_with_all_that_it_started(gpu_check):
+def test_a_part_that_hangs_ends_with_all_that_it_started():
     """As a compiler of a compiler does, or a program under compute-sanitizer: they hold the pipes,
     and nobody waits for them.
     """
     args = gpu_check.parse_arguments([])
     started = time.monotonic()
     with pytest.raises(RuntimeError, match=r"more than 1 s: so far"):
-        gpu_check.run(["sh", "-c", "echo so far; sleep 60 & sleep 60"], args, 1, {})
+        gpu_processes.run(["sh", "-c", "echo so far; sleep 60 & sleep 60"], args, 1, {})
     assert time.monotonic() - started < 30
 
 
-def test_no_part_begins_when_the_minutes_are_over(gpu_check):
+def test_no_part_begins_when_the_minutes_are_over():
     with pytest.raises(RuntimeError, match="minutes were over"):
-        gpu_check.run(["true"], gpu_check.parse_arguments(["--minutes", "0"]), 60, {})
+        gpu_processes.run(["true"], gpu_check.parse_arguments(["--minutes", "0"]), 60, {})
 
 
-def test_what_is_timed_is_drawing_alone(gpu_check, monkeypatch):
-    draw = gpu_check.drawer(gpu_check.on("cpu", gpu_check.make_scene(50)), 16, 1, "cpu")
+def test_what_is_timed_is_drawing_alone(monkeypatch):
+    scene = gpu_kernels.on("cpu", bench_scenes.make_scene(50))
+    draw = gpu_kernels.drawer(scene, 16, 1, "cpu")
     monkeypatch.setattr(torch, "randn", None)
     assert len(draw()) == 8
 

@@ -36,21 +36,10 @@ def trained(geometry, views, pictures):
 
     def draw(rows, opacities=None):
         opacities = geometry.opacities() if opacities is None else opacities
-        shape = (
-            geometry.means,
-            geometry.quats,
-            geometry.scales(),
-            opacities,
-            geometry.colors(views.positions[rows]),
-        )
-        return rasterize(
-            *shape,
-            views.viewmats[rows],
-            views.Ks[rows],
-            SIZE,
-            SIZE,
-            background=views.backgrounds[rows],
-        )
+        colors = geometry.colors(views.positions[rows])
+        cloud = geometry.means, geometry.quats, geometry.scales(), opacities, colors
+        camera = views.viewmats[rows], views.Ks[rows]
+        return rasterize(*cloud, *camera, SIZE, SIZE, background=views.backgrounds[rows])
 
     control = DensityControl(geometry)
     for step in range(1, STEPS + 1):
@@ -79,9 +68,7 @@ def trained(geometry, views, pictures):
             return QualityResult(control.affordable_loss - loss, {})
 
         control.after_step(adam, step, check)
-    return Gaussians(
-        geometry.means, geometry.quats, geometry.log_scales, geometry.logit_opacities, geometry.sh
-    )
+    return Gaussians.of(geometry)
 
 
 def test_auto_finds_the_true_number_with_visible_floaters_and_copies():

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from benchmarks.robustness import long_run
-from benchmarks.robustness.long_run import Life, Sample
+from benchmarks.robustness.supervisor import Life, Sample
 
 
 @pytest.mark.slow

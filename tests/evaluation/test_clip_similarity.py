@@ -66,23 +66,8 @@ def test_the_score_is_transformers_cosine_of_the_drawn_views(clip, plys, tmp_pat
     """Everything again by hand: render the drawn views, ask transformers, average."""
     from transformers import CLIPModel, CLIPTokenizer
 
-    assert (
-        main(
-            [
-                *plys,
-                "--clip",
-                clip,
-                "--prompt",
-                PROMPT,
-                "--output",
-                str(tmp_path / "out"),
-                *FAST,
-                "--size",
-                str(tiny.IMAGE_SIZE),
-            ]
-        )
-        == 0
-    )
+    options = ["--clip", clip, "--prompt", PROMPT, "--output", str(tmp_path / "out")]
+    assert main([*plys, *options, *FAST, "--size", str(tiny.IMAGE_SIZE)]) == 0
     model, tokenizer = CLIPModel.from_pretrained(clip).eval(), CLIPTokenizer.from_pretrained(clip)
     mean, std = (
         torch.tensor([0.48145466, 0.4578275, 0.40821073]),
@@ -181,42 +166,14 @@ def test_weights_in_several_files_are_the_same_clip(clip, plys, tmp_path):
 @pytest.mark.slow
 def test_a_runs_folder_brings_its_prompt_and_background(clip, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    sizes = [
-        "data.width=16",
-        "data.height=16",
-        "data.eval_width=16",
-        "data.eval_height=16",
-        "data.n_test_views=2",
-        "data.train_views=4",
-    ]
-    steps = [
-        "system.geometry.grow.num_candidates=200",
-        "system.evaluation.size=16",
-        "system.evaluation.views=2",
-        "trainer.max_steps=1",
-    ]
-    more = [
-        "system.background.color=[0.0,0.5,1.0]",
-        "system.prompt_processor.prompt=a {b} ${c} fox",
-        "use_timestamp=false",
-        "tag=t",
-    ]
-    assert (
-        launch(
-            [
-                "--config",
-                "demo.yaml",
-                "--train",
-                "--gpu",
-                "cpu",
-                *sizes,
-                *steps,
-                *more,
-                "trainer.enable_progress_bar=false",
-            ]
-        )
-        == 0
-    )
+    overrides = [
+        "data.width=16", "data.height=16", "data.eval_width=16", "data.eval_height=16",
+        "data.n_test_views=2", "data.train_views=4", "system.geometry.grow.num_candidates=200",
+        "system.evaluation.size=16", "system.evaluation.views=2", "trainer.max_steps=1",
+        "system.background.color=[0.0,0.5,1.0]", "system.prompt_processor.prompt=a {b} ${c} fox",
+        "use_timestamp=false", "tag=t", "trainer.enable_progress_bar=false",
+    ]  # fmt: skip
+    assert launch(["--config", "demo.yaml", "--train", "--gpu", "cpu", *overrides]) == 0
     result = results.find_result("outputs/demo/t")
     assert result.ply == Path("outputs/demo/t/save/it1-export/gaussians.ply")
     assert result.prompt == "a {b} ${c} fox" and result.background == (0.0, 0.5, 1.0)

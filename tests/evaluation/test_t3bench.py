@@ -65,22 +65,8 @@ def test_t3benchs_scripts_find_their_pictures(plys, tmp_path):
     import trimesh
 
     prompt, root = "A cat's blue hat", tmp_path / "T3Bench"
-    assert (
-        main(
-            [
-                plys[0],
-                "--prompt",
-                prompt,
-                "--t3bench",
-                str(root),
-                "--t3bench-method",
-                "dreamfusion",
-                "--t3bench-size",
-                "16",
-            ]
-        )
-        == 0
-    )
+    options = ["--t3bench-method", "dreamfusion", "--t3bench-size", "16"]
+    assert main([plys[0], "--prompt", prompt, "--t3bench", str(root), *options]) == 0
     runs = root / "outputs_mesh_t3/dreamfusion_single"
     meshes = list(runs.glob(f"{prompt.replace(' ', '_')}*/save/it*-export/model.obj"))
     assert len(meshes) == 1
@@ -95,14 +81,8 @@ def test_t3benchs_scripts_find_their_pictures(plys, tmp_path):
         for path in (meshes[0], missing):
             folder = tmp_path / f"{script}-{path.name}"
             folder.mkdir()
-            command = [
-                sys.executable,
-                f"render_gaussians/{script}",
-                "--path",
-                str(path),
-                "--name",
-                str(folder),
-            ]
+            arguments = ["--path", str(path), "--name", str(folder)]
+            command = [sys.executable, f"render_gaussians/{script}", *arguments]
             subprocess.run(command, check=True, cwd=root, env=os.environ | {"PYTHONPATH": ""})
             assert len(list(folder.iterdir())) == count
             shown = brightness(folder)

@@ -330,28 +330,9 @@ def json_value(data: bytes, rng: np.random.Generator) -> bytes:
         return data
     holder, key = places[rng.integers(len(places))]
     values = [
-        None,
-        True,
-        -1,
-        0,
-        1,
-        5,
-        2**31,
-        10**12,
-        1e300,
-        "x",
-        "",
-        [],
-        {},
-        [0],
-        [1e38] * 16,
-        {"a": 1},
-        5121,
-        5123,
-        5125,
-        5126,
-        "VEC3",
-    ]
+        None, True, -1, 0, 1, 5, 2**31, 10**12, 1e300, "x", "", [], {}, [0], [1e38] * 16, {"a": 1},
+        5121, 5123, 5125, 5126, "VEC3",
+    ]  # fmt: skip
     others = [container[name] for container, name in places]
     value = _choice(values if rng.random() < 0.6 else others, rng)
     if rng.random() < 0.1 and isinstance(holder, dict):

@@ -23,6 +23,7 @@ from tests.helpers.splatting_scenes import (
     one_gaussian,
     random_cloud,
     run,
+    stacks_on_one_pixel,
     trimmed_error,
 )
 from threestudio_gaussiandreamer.splatting import rasterize

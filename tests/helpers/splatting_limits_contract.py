@@ -14,6 +14,7 @@ from tests.helpers.splatting_scenes import (
     equal,
     error,
     random_cloud,
+    require_backward_twice_adds_up,
 )
 from threestudio_gaussiandreamer.splatting import rasterize
 

@@ -80,7 +80,7 @@ def stable_diffusion(
     """Stable Diffusion 2.1, tiny: UNet on 8x8x4 latents, VAE 64x64 to 8x8; ``prediction``: epsilon,
     v_prediction.
     """
-    from diffusers import AutoencoderKL, DDIMScheduler, PNDMScheduler, UNet2DConditionModel
+    from diffusers import AutoencoderKL, UNet2DConditionModel
 
     torch.manual_seed(seed)
     unet = UNet2DConditionModel(
@@ -95,20 +95,7 @@ def stable_diffusion(
     AutoencoderKL(**sizes.vae, **blocks, latent_channels=4).save_pretrained(folder / "vae")
     _rename(folder / "vae" / "diffusion_pytorch_model.safetensors", PUBLISHED_VAE_NAMES)
     clip_text_encoder(folder, sizes.text_width)
-    trained = {
-        "beta_start": 0.00085,
-        "beta_end": 0.012,
-        "beta_schedule": "scaled_linear",
-        "steps_offset": 1,
-        "set_alpha_to_one": False,
-    }
-    # as published: 2.1-base has the first, 2.1 (768, v-prediction) the second
-    scheduler = (
-        PNDMScheduler(**trained, skip_prk_steps=True)
-        if prediction == "epsilon"
-        else DDIMScheduler(**trained, clip_sample=False)
-    )
-    scheduler.register_to_config(prediction_type=prediction)
+    scheduler = _stable_diffusion_scheduler(prediction)
     scheduler.save_pretrained(folder / "scheduler")
     return _index(
         folder,
@@ -124,30 +111,32 @@ def stable_diffusion(
     )
 
 
+def _stable_diffusion_scheduler(prediction: str) -> Any:
+    """The published scheduler: 2.1-base has PNDM, 2.1 (768, v-prediction) has DDIM."""
+    from diffusers import DDIMScheduler, PNDMScheduler
+
+    trained = {
+        "beta_start": 0.00085,
+        "beta_end": 0.012,
+        "beta_schedule": "scaled_linear",
+        "steps_offset": 1,
+        "set_alpha_to_one": False,
+    }
+    scheduler = (
+        PNDMScheduler(**trained, skip_prk_steps=True)
+        if prediction == "epsilon"
+        else DDIMScheduler(**trained, clip_sample=False)
+    )
+    scheduler.register_to_config(prediction_type=prediction)
+    return scheduler
+
+
 def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
     """DeepFloyd IF, stage 1: UNet on 16x16 pixels with six output channels, T5 encoder."""
-    from diffusers import DDPMScheduler, UNet2DConditionModel
+    from diffusers import DDPMScheduler
 
     torch.manual_seed(seed)
-    unet = UNet2DConditionModel(
-        sample_size=16,
-        in_channels=3,
-        out_channels=6,
-        block_out_channels=(16, 32),
-        layers_per_block=1,
-        down_block_types=("ResnetDownsampleBlock2D", "SimpleCrossAttnDownBlock2D"),
-        mid_block_type="UNetMidBlock2DSimpleCrossAttn",
-        up_block_types=("SimpleCrossAttnUpBlock2D", "ResnetUpsampleBlock2D"),
-        cross_attention_dim=64,
-        encoder_hid_dim=TEXT_WIDTH,
-        attention_head_dim=8,
-        addition_embed_type="text",
-        addition_embed_type_num_heads=2,
-        cross_attention_norm="group_norm",
-        resnet_time_scale_shift="scale_shift",
-        norm_num_groups=8,
-        act_fn="gelu",
-    )
+    unet = _deep_floyd_unet()
     _listen_to_text(unet)
     unet.save_pretrained(folder / "unet")
     t5_text_encoder(folder)
@@ -169,6 +158,30 @@ def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
         feature_extractor=[None, None],
         watermarker=[None, None],
         requires_safety_checker=False,
+    )
+
+
+def _deep_floyd_unet() -> torch.nn.Module:
+    from diffusers import UNet2DConditionModel
+
+    return UNet2DConditionModel(
+        sample_size=16,
+        in_channels=3,
+        out_channels=6,
+        block_out_channels=(16, 32),
+        layers_per_block=1,
+        down_block_types=("ResnetDownsampleBlock2D", "SimpleCrossAttnDownBlock2D"),
+        mid_block_type="UNetMidBlock2DSimpleCrossAttn",
+        up_block_types=("SimpleCrossAttnUpBlock2D", "ResnetUpsampleBlock2D"),
+        cross_attention_dim=64,
+        encoder_hid_dim=TEXT_WIDTH,
+        attention_head_dim=8,
+        addition_embed_type="text",
+        addition_embed_type_num_heads=2,
+        cross_attention_norm="group_norm",
+        resnet_time_scale_shift="scale_shift",
+        norm_num_groups=8,
+        act_fn="gelu",
     )
 
 

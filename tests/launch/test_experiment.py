@@ -196,21 +196,13 @@ def test_launch_py_with_parts_dropped_into_custom(tmp_path):
         tiny_parts.CONFIG.replace("max_steps: 6", "max_steps: 100000000")
     )
     environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": ""}
-    command = [
-        sys.executable,
-        str(REPOSITORY / "launch.py"),
-        "--config",
-        "tiny.yaml",
-        "--train",
-        "trainer.limit_val_batches=0",
-    ]
+    arguments = ["--config", "tiny.yaml", "--train", "trainer.limit_val_batches=0"]
+    there = {"cwd": tmp_path, "env": environment, "text": True}
     process = subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        env=environment,
+        [sys.executable, str(REPOSITORY / "launch.py"), *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        text=True,
+        **there,
     )
     deadline = time.monotonic() + 120
     # the TensorBoard file appears when training begins
@@ -224,11 +216,9 @@ def test_launch_py_with_parts_dropped_into_custom(tmp_path):
     step = int(re.search(r"stopped at step (\d+)", out)[1])
     resumed = subprocess.run(
         [sys.executable, *resume[1:], f"trainer.max_steps={step + 3}"],
-        cwd=tmp_path,
-        env=environment,
         capture_output=True,
-        text=True,
         timeout=120,
+        **there,
     )
     assert resumed.returncode == 0, resumed.stderr
     (last,) = tmp_path.glob("outputs/tiny/*/ckpts/last.ckpt")

@@ -201,23 +201,11 @@ def test_gsplat_draws_the_same_and_has_the_same_gradients(gsplat, antialias):
     isn't, so it is off here.
     """
     width, height, views = 10, 8, 2
-    cloud, (viewmats, Ks) = (
-        scenes.random_cloud(25, seed=14, size=0.25),
-        scenes.cameras(views, width, height),
-    )
+    cloud = scenes.random_cloud(25, seed=14, size=0.25)
+    viewmats, Ks = scenes.cameras(views, width, height)
     cloud.opacities[:3] = 0.9999  # reaches the cap
-    ours = scenes.run(
-        cloud,
-        viewmats,
-        Ks,
-        width,
-        height,
-        preset="fast",
-        alpha_max=0.999,
-        stop=0.0,
-        antialias=antialias,
-        **SPECIFICATION,
-    )
+    options = {"preset": "fast", "alpha_max": 0.999, "stop": 0.0, "antialias": antialias}
+    ours = scenes.run(cloud, viewmats, Ks, width, height, **options, **SPECIFICATION)
 
     leaves = cloud.leaves()
     covariances, _ = gsplat._quat_scale_to_covar_preci(leaves.quats, leaves.scales, True, False)

@@ -9,18 +9,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.helpers.splatting_scenes import (
-    NAMES,
-    NO_CUTOFFS,
-    Cloud,
-    cameras,
-    error,
-    front_camera,
-    one_gaussian,
-    random_cloud,
-    run,
-    trimmed_error,
-)
+from tests.helpers import splatting_scenes as scenes
 from tests.splatting.torch_backend_cases import ROUNDING, compare
 from threestudio_gaussiandreamer.splatting import rasterize
 
@@ -38,8 +27,8 @@ repeatable = settings(
 @pytest.mark.parametrize("width, height", [(1, 1), (1, 7), (17, 33), (31, 16), (200, 1)])
 def test_sizes_that_are_no_multiple_of_a_tile(width, height):
     compare(
-        random_cloud(60, seed=width),
-        cameras(2, width, height),
+        scenes.random_cloud(60, seed=width),
+        scenes.cameras(2, width, height),
         width,
         height,
         background=torch.tensor([0.2, 0.5, 0.9]),
@@ -54,8 +43,8 @@ def test_sizes_that_are_no_multiple_of_a_tile(width, height):
         {"absgrad": True, "downsample": 2},
         {"alpha_max": 0.6, "absgrad": True},
         {"stop": 0.2},
-        NO_CUTOFFS,
-        NO_CUTOFFS | {"antialias": True, "eps2d": 0.1, "absgrad": True},
+        scenes.NO_CUTOFFS,
+        scenes.NO_CUTOFFS | {"antialias": True, "eps2d": 0.1, "absgrad": True},
         {
             "near": 2.9,
             "far": 3.2,
@@ -65,42 +54,44 @@ def test_sizes_that_are_no_multiple_of_a_tile(width, height):
     ids=str,
 )
 def test_options(options):
-    compare(random_cloud(150, seed=1, size=0.2), cameras(2, 22, 18), 22, 18, **options)
+    compare(
+        scenes.random_cloud(150, seed=1, size=0.2), scenes.cameras(2, 22, 18), 22, 18, **options
+    )
 
 
 def test_opacity_zero_has_a_gradient_without_alpha_min():
-    cloud = random_cloud(40, seed=8, size=0.2)
+    cloud = scenes.random_cloud(40, seed=8, size=0.2)
     cloud.opacities[::4], cloud.opacities[5] = 0, -0.1
-    ours, _ = compare(cloud, cameras(2, 22, 18), 22, 18, alpha_min=0)
+    ours, _ = compare(cloud, scenes.cameras(2, 22, 18), 22, 18, alpha_min=0)
     assert (ours.grads["opacities"][::4] != 0).all() and ours.grads["opacities"][5] == 0
 
 
 @pytest.mark.parametrize("channels", [1, 2, 5])
 @pytest.mark.parametrize("per_view", [False, True])
 def test_channels_shared_or_per_view(channels, per_view):
-    cloud = random_cloud(40, seed=2, channels=channels)
+    cloud = scenes.random_cloud(40, seed=2, channels=channels)
     if per_view:
         cloud = cloud._replace(
             colors=torch.rand(
                 3, 40, channels, generator=torch.Generator().manual_seed(0), dtype=torch.float64
             )
         )
-    compare(cloud, cameras(3, 14, 10), 14, 10)
+    compare(cloud, scenes.cameras(3, 14, 10), 14, 10)
 
 
 def test_views_do_not_see_each_other():
     """A batch is bit for bit the views drawn alone, as far as the projection in one call allows:
     rounding.
     """
-    cloud, (viewmats, Ks) = random_cloud(200, seed=3), cameras(4, 20, 12)
-    batch = run(cloud, viewmats, Ks, 20, 12, backend="torch").out
+    cloud, (viewmats, Ks) = scenes.random_cloud(200, seed=3), scenes.cameras(4, 20, 12)
+    batch = scenes.run(cloud, viewmats, Ks, 20, 12, backend="torch").out
     for view in range(4):
-        alone = run(
+        alone = scenes.run(
             cloud, viewmats[view : view + 1], Ks[view : view + 1], 20, 12, backend="torch"
         ).out
         assert (
-            error(batch.image[view], alone.image[0]) < ROUNDING
-            and error(batch.contribution[view], alone.contribution[0]) < ROUNDING
+            scenes.error(batch.image[view], alone.image[0]) < ROUNDING
+            and scenes.error(batch.contribution[view], alone.contribution[0]) < ROUNDING
         )
 
 
@@ -114,14 +105,14 @@ def test_views_do_not_see_each_other():
 )
 def test_random_clouds(seed, n, size, stretch, shape):
     compare(
-        random_cloud(n, seed, size=size, stretch=stretch),
-        cameras(1 + seed % 3, *shape),
+        scenes.random_cloud(n, seed, size=size, stretch=stretch),
+        scenes.cameras(1 + seed % 3, *shape),
         *shape,
         absgrad=True,
     )
 
 
-WITH_BRIGHT_COLORS = HOSTILE | {"colors": [*HOSTILE["colors"], 1e3]}
+WITH_BRIGHT_COLORS = scenes.HOSTILE | {"colors": [*scenes.HOSTILE["colors"], 1e3]}
 
 
 @repeatable
@@ -130,9 +121,10 @@ def test_hostile_clouds(seed, n, antialias):
     """Needles, discs, points, behind the camera, NaN, coincident, transparent, opaque: equal in
     float64, finite in float32.
     """
-    cloud, camera = hostile_cloud(seed, n, WITH_BRIGHT_COLORS), cameras(2, 19, 13)
+    cloud, camera = scenes.hostile_cloud(seed, n, WITH_BRIGHT_COLORS), scenes.cameras(2, 19, 13)
     both = [
-        run(cloud, *camera, 19, 13, backend=b, antialias=antialias) for b in ("torch", "reference")
+        scenes.run(cloud, *camera, 19, 13, backend=b, antialias=antialias)
+        for b in ("torch", "reference")
     ]
     for ours, truth in zip(both[0].out, both[1].out, strict=True):
         assert torch.allclose(ours, truth, rtol=1e-7, atol=1e-9)
@@ -140,7 +132,9 @@ def test_hostile_clouds(seed, n, antialias):
         assert torch.allclose(
             both[0].grads[name], truth, rtol=1e-6, atol=1e-7 * truth.abs().max().item()
         ), name
-    single = run(cloud.to(torch.float32), *camera, 19, 13, backend="torch", antialias=antialias)
+    single = scenes.run(
+        cloud.to(torch.float32), *camera, 19, 13, backend="torch", antialias=antialias
+    )
     assert all(x.isfinite().all() for x in (*single.out, *single.grads.values()))
 
 
@@ -149,12 +143,12 @@ def test_needles_and_discs_in_float32():
     float64 (stability.md A1).
     """
     steps = torch.tensor([1e-8, 1e-4, 1e-2, 1.0, 1e2, 1e4], dtype=torch.float64)
-    scales, camera = torch.cartesian_prod(steps, steps, steps), front_camera(16, 16, 20.0)
+    scales, camera = torch.cartesian_prod(steps, steps, steps), scenes.front_camera(16, 16, 20.0)
     quats = torch.randn(5, 4, generator=torch.Generator().manual_seed(2)).double()
     worst = 0.0
     for scale in scales.unique(dim=0)[::7]:
         for quat in quats:
-            cloud = one_gaussian((0.1, -0.2, 2.0), tuple(scale.tolist()), 0.8)._replace(
+            cloud = scenes.one_gaussian((0.1, -0.2, 2.0), tuple(scale.tolist()), 0.8)._replace(
                 quats=quat[None]
             )
             narrow, wide = (
@@ -167,19 +161,21 @@ def test_needles_and_discs_in_float32():
 
 @pytest.mark.parametrize("preset", ["fast", "balanced", "accurate"])
 def test_float32_gradients_of_a_larger_cloud(preset):
-    cloud, camera = random_cloud(2000, seed=4, size=0.04), cameras(1, 48, 40)
+    cloud, camera = scenes.random_cloud(2000, seed=4, size=0.04), scenes.cameras(1, 48, 40)
     cloud.opacities[:50] = 0.9999
     background = torch.tensor([0.2, 0.5, 0.9])
-    truth = run(cloud, *camera, 48, 40, background, preset=preset, backend="reference")
-    ours = run(cloud.to(torch.float32), *camera, 48, 40, background, preset=preset, backend="torch")
-    assert error(ours.out.depth, truth.out.depth) < SINGLE
-    for name in NAMES:
-        assert trimmed_error(ours.grads[name], truth.grads[name]) < SINGLE, name
+    truth = scenes.run(cloud, *camera, 48, 40, background, preset=preset, backend="reference")
+    ours = scenes.run(
+        cloud.to(torch.float32), *camera, 48, 40, background, preset=preset, backend="torch"
+    )
+    assert scenes.error(ours.out.depth, truth.out.depth) < SINGLE
+    for name in scenes.NAMES:
+        assert scenes.trimmed_error(ours.grads[name], truth.grads[name]) < SINGLE, name
 
 
 @pytest.mark.parametrize("n, antialias", [(2, False), (9, True)])
 def test_gradcheck(n, antialias):
-    cloud, (viewmats, Ks) = random_cloud(n, seed=n, size=0.3), cameras(2, 9, 5)
+    cloud, (viewmats, Ks) = scenes.random_cloud(n, seed=n, size=0.3), scenes.cameras(2, 9, 5)
     background = torch.rand(
         3, generator=torch.Generator().manual_seed(0), dtype=torch.float64, requires_grad=True
     )
@@ -193,7 +189,7 @@ def test_gradcheck(n, antialias):
             background=inputs[6],
             antialias=antialias,
             backend="torch",
-            **NO_CUTOFFS,
+            **scenes.NO_CUTOFFS,
         )
         return out.image, out.alpha, out.depth
 
@@ -205,38 +201,44 @@ def test_ten_thousand_gaussians_on_one_pixel():
     """Float32 gradients of a deep stack: T is never divided by (1 - alpha) along the list, so
     nothing drifts (bar: 1e-4).
     """
-    camera = front_camera(3, 3, 4.0)
-    for stack in stacks_on_one_pixel():
-        truth = run(stack, *camera, 3, 3, backend="reference")
-        ours = run(stack.to(torch.float32), *camera, 3, 3, backend="torch")
-        assert error(ours.out.image, truth.out.image) < 1e-5
+    camera = scenes.front_camera(3, 3, 4.0)
+    for stack in scenes.stacks_on_one_pixel():
+        truth = scenes.run(stack, *camera, 3, 3, backend="reference")
+        ours = scenes.run(stack.to(torch.float32), *camera, 3, 3, backend="torch")
+        assert scenes.error(ours.out.image, truth.out.image) < 1e-5
         for name in ("scales", "opacities", "colors", "means"):
-            assert trimmed_error(ours.grads[name], truth.grads[name]) < 1e-4, name
+            assert scenes.trimmed_error(ours.grads[name], truth.grads[name]) < 1e-4, name
 
 
 def test_the_gaussian_that_crosses_the_stop_counts():
-    cloud = Cloud(*(x.repeat(4, *[1] * (x.dim() - 1)) for x in one_gaussian(scale=10.0)))
+    cloud = scenes.Cloud(
+        *(x.repeat(4, *[1] * (x.dim() - 1)) for x in scenes.one_gaussian(scale=10.0))
+    )
     cloud = cloud._replace(opacities=torch.tensor([0.9, 0.905, 0.99, 0.5], dtype=torch.float64))
-    ours, _ = compare(cloud, front_camera(1, 1, 1.0), 1, 1)
+    ours, _ = compare(cloud, scenes.front_camera(1, 1, 1.0), 1, 1)
     assert ours.out.alpha.item() == pytest.approx(1 - 0.1 * 0.095 * 0.01, abs=1e-12)
 
 
 def test_a_pixel_behind_an_alpha_of_one_has_finite_gradients():
     """1 / (1 - alpha) is infinite there; nothing behind can be seen, so its share is left out."""
-    cloud = Cloud(*(x.repeat(3, *[1] * (x.dim() - 1)) for x in one_gaussian(opacity=1.0))).to(
-        torch.float32
+    cloud = scenes.Cloud(
+        *(x.repeat(3, *[1] * (x.dim() - 1)) for x in scenes.one_gaussian(opacity=1.0))
+    ).to(torch.float32)
+    result = scenes.run(
+        cloud, *scenes.front_camera(9, 9, 20.0), 9, 9, backend="torch", **scenes.NO_CUTOFFS
     )
-    result = run(cloud, *front_camera(9, 9, 20.0), 9, 9, backend="torch", **NO_CUTOFFS)
     assert result.out.alpha.max() == 1
     assert all(grad.isfinite().all() and grad.abs().max() < 1e3 for grad in result.grads.values())
 
 
 def test_a_gaussian_that_is_not_finite_leaves_the_same_bits_as_a_transparent_one():
-    cloud, camera = random_cloud(300, seed=6).to(torch.float32), cameras(2, 40, 24)
-    transparent = Cloud(*(x.clone() for x in cloud))
+    cloud, camera = scenes.random_cloud(300, seed=6).to(torch.float32), scenes.cameras(2, 40, 24)
+    transparent = scenes.Cloud(*(x.clone() for x in cloud))
     transparent.opacities[7] = 0
     cloud.scales[7, 1] = math.inf
-    with_it, without = (run(c, *camera, 40, 24, backend="torch") for c in (cloud, transparent))
+    with_it, without = (
+        scenes.run(c, *camera, 40, 24, backend="torch") for c in (cloud, transparent)
+    )
     assert torch.equal(with_it.out.image, without.out.image)
     assert all(torch.equal(grad, without.grads[name]) for name, grad in with_it.grads.items())
 
@@ -244,17 +246,17 @@ def test_a_gaussian_that_is_not_finite_leaves_the_same_bits_as_a_transparent_one
 def test_nothing_to_see_is_the_background_bit_for_bit():
     background = torch.tensor([0.1, 0.2, 0.3])
     for cloud in (
-        random_cloud(0),
-        random_cloud(5)._replace(means=torch.full((5, 3), 100.0).double()),
+        scenes.random_cloud(0),
+        scenes.random_cloud(5)._replace(means=torch.full((5, 3), 100.0).double()),
     ):
-        result = run(
-            cloud.to(torch.float32), *cameras(2, 10, 9), 10, 9, background, backend="torch"
+        result = scenes.run(
+            cloud.to(torch.float32), *scenes.cameras(2, 10, 9), 10, 9, background, backend="torch"
         )
         assert (
             torch.equal(result.out.image, background.expand(2, 9, 10, 3))
             and (result.out.alpha == 0).all()
         )
-        for name, leaf in zip(NAMES, cloud, strict=True):
+        for name, leaf in zip(scenes.NAMES, cloud, strict=True):
             assert torch.equal(result.grads[name], torch.zeros_like(leaf, dtype=torch.float32)), (
                 name
             )

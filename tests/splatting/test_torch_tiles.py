@@ -9,6 +9,7 @@ from tests.helpers.splatting_scenes import (
     front_camera,
     one_gaussian,
     random_cloud,
+    require_backward_twice_adds_up,
     run,
     scene_of,
 )

@@ -82,12 +82,9 @@ def test_f12_a_checkpoint_holds_the_cloud_and_its_statistics(fault):
             for name in (*PARAMETERS, *STATISTICS)
         )
 
-    def ours():
-        return trained(), GaussianCloud({"prior_type": "a-prior-that-does-not-exist"})
-
     fault(
         deviation,
-        ours=ours,
+        ours=lambda: (trained(), GaussianCloud({"prior_type": "a-prior-that-does-not-exist"})),
         emulation=lambda: (PlainCloud(trained()), PlainCloud()),
         unit="tensors lost",
     )

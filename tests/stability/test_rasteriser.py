@@ -173,7 +173,7 @@ def test_opacities_at_their_ends(backend, measured):
 
 
 @functools.cache
-def needles() -> list[tuple[Cloud, torch.Tensor]]:
+def needles() -> list[tuple[scenes.Cloud, torch.Tensor]]:
     """Every multiset of three scales in five rotations, which are all orders of the axes, and its
     float64 alpha.
     """
@@ -303,7 +303,7 @@ def test_the_order_is_that_of_floats(backend, measured):
 # ---- transparency --------------------------------------------------------------------------------
 
 
-def fog(n: int) -> Cloud:
+def fog(n: int) -> scenes.Cloud:
     return scenes.random_cloud(n, seed=8, size=0.4)._replace(
         opacities=torch.full((n,), 0.0038, dtype=torch.float64)
     )

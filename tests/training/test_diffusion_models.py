@@ -30,26 +30,21 @@ SIZES = [
 ]  # fmt: skip
 
 
+def guided_by(model):
+    return {"system.guidance.pretrained_model_name_or_path": model}
+
+
 @pytest.fixture(scope="module")
 def models(tmp_path_factory):
     """Every model that the configurations name, as options of what loads them."""
     folder = tmp_path_factory.mktemp("models")
     base, upsampler = tiny_3d_models.point_e(folder / "point-e")
     clip = tiny_3d_models.clip(folder / "clip")
+    velocity = tiny_models.stable_diffusion(folder / "v", prediction="v_prediction")
     return {
-        "epsilon": {
-            "system.guidance.pretrained_model_name_or_path": tiny_models.stable_diffusion(
-                folder / "epsilon"
-            )
-        },
-        "v_prediction": {
-            "system.guidance.pretrained_model_name_or_path": tiny_models.stable_diffusion(
-                folder / "v", prediction="v_prediction"
-            )
-        },
-        "deep_floyd": {
-            "system.guidance.pretrained_model_name_or_path": tiny_models.deep_floyd(folder / "if")
-        },
+        "epsilon": guided_by(tiny_models.stable_diffusion(folder / "epsilon")),
+        "v_prediction": guided_by(velocity),
+        "deep_floyd": guided_by(tiny_models.deep_floyd(folder / "if")),
         "shap_e": prior(
             model=tiny_3d_models.shap_e(folder / "shap-e"), num_inference_steps=2, grid_size=24
         ),

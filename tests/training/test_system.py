@@ -140,39 +140,16 @@ def test_a_stopped_and_resumed_run_equals_the_run_that_never_stopped(
     the cloud, with more validation.
     """
     options = [*changes, "checkpoint.every_n_train_steps=1"]
-    assert (
-        launch(
-            tmp_path / "whole",
-            painted_box,
-            *options,
-            "trainer.max_steps=9",
-            "trainer.val_check_interval=9",
-        )
-        == 0
-    )
-    assert (
-        launch(
-            tmp_path / "parts",
-            painted_box,
-            *options,
-            f"trainer.max_steps={stop}",
-            "trainer.val_check_interval=1",
-        )
-        == 0
-    )
+
+    def train(name, steps, val_interval, *more):
+        lengths = f"trainer.max_steps={steps}", f"trainer.val_check_interval={val_interval}"
+        assert launch(tmp_path / name, painted_box, *options, *lengths, *more) == 0
+
+    train("whole", 9, 9)
+    train("parts", stop, 1)
     last = trial(tmp_path / "parts") / "ckpts" / "last.ckpt"
     assert changes is DENSIFY or cloud_of(last)["geometry.removal"].any()  # stopped between samples
-    assert (
-        launch(
-            tmp_path / "parts",
-            painted_box,
-            *options,
-            "trainer.max_steps=9",
-            "trainer.val_check_interval=2",
-            f"resume={last}",
-        )
-        == 0
-    )
+    train("parts", 9, 2, f"resume={last}")
     whole, parts = (
         torch.load(trial(tmp_path / name) / "ckpts" / "last.ckpt", weights_only=True)
         for name in ("whole", "parts")

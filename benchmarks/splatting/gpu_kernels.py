@@ -1,0 +1,305 @@
+"""The kernels' sections of ``gpu_check``: correctness against plain torch in float64, time of the
+first picture, compute-sanitizer, and speed beside gsplat.
+"""
+
+import argparse
+import importlib.util
+import os
+import shutil
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchmarks.splatting.bench_scenes import Scene, make_camera, make_scene
+from benchmarks.splatting.gpu_processes import SECONDS, guarded, in_process, part_command, run
+
+TRIMMED = 0.005
+"""The share of Gaussians, those with the worst gradients, that is left out: a rounding turns a
+pixel's alpha over the cut.
+"""
+GRADIENT_ERROR, IMAGE_ERROR = 2e-5, 1e-4
+GSPLAT = ("gsplat", "ninja", "rich", "jaxtyping", "markdown-it-py", "mdurl", "pygments")
+"""It and what it needs; without pip's own search for dependencies, which would fetch another torch.
+"""
+SANITIZERS = {
+    # torch asks for functions that a driver may not have
+    "memcheck": ("--report-api-errors", "no"),
+    "racecheck": (),
+}
+SANITIZER_FOUND = 99
+
+
+# ---- correctness ---------------------------------------------------------------------------------
+
+
+def on(device: str, scene: Scene, dtype: torch.dtype = torch.float32) -> Scene:
+    """The scene as leaves of a graph."""
+    return Scene(*(x.detach().to(device, dtype).requires_grad_() for x in scene))
+
+
+def cameras(size: int, views: int, scene: Scene) -> tuple[Tensor, Tensor]:
+    viewmats, Ks = zip(
+        *(make_camera(size, azimuth=30.0 + 360.0 * view / views) for view in range(views)),
+        strict=True,
+    )
+    return torch.stack(viewmats).to(scene.means), torch.stack(Ks).to(scene.means)
+
+
+def cotangents(size: int, views: int, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
+    """Fixed gradients of image, depth and alpha."""
+    noise = torch.randn(views, size, size, 5, generator=torch.Generator().manual_seed(size)) / size
+    return tuple(x.contiguous() for x in noise.to(scene.means).split([3, 1, 1], -1))
+
+
+def drawer(
+    scene: Scene, size: int, views: int, backend: str, **options: Any
+) -> Callable[[], tuple[Tensor, ...]]:
+    """A function that gives image, depth, alpha and the gradients of all attributes, for a fixed
+    cotangent.
+    """
+    from threestudio_gaussiandreamer.splatting import rasterize
+
+    viewmats, Ks = cameras(size, views, scene)
+    upstream = cotangents(size // options.get("downsample", 1), views, scene)
+
+    def draw() -> tuple[Tensor, ...]:
+        out = rasterize(*scene, viewmats, Ks, size, size, backend=backend, **options)
+        pictures = (out.image, out.depth, out.alpha)
+        return (
+            *(x.detach() for x in pictures),
+            *torch.autograd.grad(pictures, list(scene), upstream),
+        )
+
+    return draw
+
+
+def correct(args: argparse.Namespace) -> dict[str, Any]:
+    """Each case against plain torch in float64, and against itself."""
+    cases = in_process("errors", args)
+    wrong = [f"{name}: {words}" for name, case in cases.items() for words in complaints(case)]
+    return {"relative_errors": cases} | ({"failed": wrong} if wrong else {})
+
+
+def complaints(case: dict[str, Any]) -> Iterator[str]:
+    """What rounding doesn't explain."""
+    if "failed" in case:
+        yield case["failed"]
+        return
+    if not case["same_bits"]:
+        yield "a second call gives other bits"
+    if not case["image"] <= IMAGE_ERROR:
+        yield f"image off by {case['image']:.2e}"
+    if not case["gradient"] <= GRADIENT_ERROR:
+        yield f"gradient by {case['gradient']:.2e}"
+
+
+def errors(args: argparse.Namespace) -> dict[str, Any]:
+    cases = [
+        (300, 33, 2, {}),
+        (2000, 64, 2, {"antialias": True}),
+        (2000, 64, 1, {"downsample": 2, "preset": "accurate"}),
+    ]
+    cases += [] if args.small else [(20_000, 256, 2, {}), (100_000, 512, 1, {"preset": "fast"})]
+    found = {}
+    for count, size, views, options in cases:
+        name = " ".join(
+            [
+                f"{count} at {size}^2 x {views}",
+                *(f"{key}={value}" for key, value in options.items()),
+            ]
+        )
+        found[name] = guarded(
+            lambda _, case=(count, size, views, options): errors_of(args, *case), args
+        )
+        print(name, found[name])
+    return found
+
+
+def errors_of(
+    args: argparse.Namespace, count: int, size: int, views: int, options: dict[str, Any]
+) -> dict[str, Any]:
+    scene = make_scene(count)
+    draw = drawer(on(args.device, scene), size, views, args.device, **options)
+    once, again = draw(), draw()
+    exact = drawer(on(args.device, scene, torch.float64), size, views, "torch", **options)()
+    return {
+        "image": max(relative(a, b) for a, b in zip(once[:3], exact[:3], strict=True)),
+        "gradient": max(trimmed(a, b) for a, b in zip(once[3:], exact[3:], strict=True)),
+        "same_bits": all(torch.equal(a, b) for a, b in zip(once, again, strict=True)),
+    }
+
+
+def relative(value: Tensor, exact: Tensor) -> float:
+    return float((value.double() - exact).norm() / exact.norm())
+
+
+def trimmed(value: Tensor, exact: Tensor) -> float:
+    """The relative error without the worst Gaussians."""
+    errors = (
+        (value.double() - exact).flatten(1).norm(dim=1)
+        if value.ndim > 1
+        else (value.double() - exact).abs()
+    )
+    kept = errors.sort().values[: max(1, int((1 - TRIMMED) * len(errors)))]
+    return float(kept.norm() / exact.norm())
+
+
+def compile_kernels(args: argparse.Namespace) -> dict[str, Any]:
+    """Seconds from the first call to its picture, in new processes: with an empty cache, and with
+    what that left.
+    """
+    with tempfile.TemporaryDirectory() as cache:
+        return {
+            name: in_process("first_picture", args, {"GAUSSIANDREAMER_CACHE": cache})["seconds"]
+            for name in ("first", "later")
+        }
+
+
+def first_picture(args: argparse.Namespace) -> dict[str, Any]:
+    draw = drawer(on(args.device, make_scene(1000)), 64, 1, args.device)
+    synchronize(args)
+    started = time.perf_counter()
+    draw()
+    synchronize(args)
+    return {"seconds": round(time.perf_counter() - started, 3)}
+
+
+def sanitize(args: argparse.Namespace) -> dict[str, Any]:
+    tool = shutil.which("compute-sanitizer") or next(
+        (p for p in ["/usr/local/cuda/bin/compute-sanitizer"] if os.path.exists(p)), None
+    )
+    if args.device != "cuda" or tool is None:
+        return {"skipped": "there is no compute-sanitizer on the path"}
+    return {
+        kind: guarded(lambda _, kind=kind: sanitize_with(tool, kind, args), args)
+        for kind in SANITIZERS
+    }
+
+
+def sanitize_with(tool: str, kind: str, args: argparse.Namespace) -> dict[str, Any]:
+    """What one of its tools says of a first picture; a machine where the tool can't run is no
+    failure of ours.
+    """
+    uncached = {
+        "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"
+    }  # torch's own allocator would hide what lies outside of a tensor
+    prefix = [tool, "--tool", kind, "--error-exitcode", str(SANITIZER_FOUND), *SANITIZERS[kind]]
+    with tempfile.TemporaryDirectory() as folder:
+        part = part_command("first_picture", args, Path(folder) / "found.json")
+        status, text = run(prefix + part, args, SECONDS["sanitize"], uncached)
+    verdict = {0: "clean", SANITIZER_FOUND: "failed"}.get(status, "unavailable")
+    return {verdict: text[-1500:] if status else True}
+
+
+# ---- speed ---------------------------------------------------------------------------------------
+
+
+def synchronize(args: argparse.Namespace) -> None:
+    if args.device == "cuda":
+        torch.cuda.synchronize()
+
+
+def timed(args: argparse.Namespace, call: Callable[[], Any], repetitions: int) -> dict[str, float]:
+    """Milliseconds of a call, its quartiles, and the most memory that it took beyond what was
+    there.
+    """
+    for _ in range(3):
+        call()
+    synchronize(args)
+    before, seconds = 0, []
+    if args.device == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+    for _ in range(repetitions):
+        started = time.perf_counter()
+        call()
+        synchronize(args)
+        seconds.append(time.perf_counter() - started)
+    low, middle, high = (round(1e3 * x, 3) for x in statistics.quantiles(seconds, n=4))
+    memory = (
+        {"mb": round((torch.cuda.max_memory_allocated() - before) / 2**20, 1)}
+        if args.device == "cuda"
+        else {}
+    )
+    return {"ms": middle, "q1": low, "q3": high} | memory
+
+
+def bench(args: argparse.Namespace) -> dict[str, Any]:
+    """Ours at every preset, and gsplat, forward with backward."""
+    found = in_process("speed", args)
+    if args.device != "cuda" or args.small:
+        return found | {"gsplat": {"skipped": "needs a GPU"}}
+    found["gsplat"] = guarded(gsplat, args)
+    if "failed" in found["gsplat"]:  # a peer that doesn't build here is no failure of ours
+        found["gsplat"] = {"unavailable": found["gsplat"]["failed"]}
+    else:
+        found["times_faster_than_gsplat"] = round(found["gsplat"]["ms"] / found["fast"]["ms"], 2)
+    return found
+
+
+def speed(args: argparse.Namespace) -> dict[str, Any]:
+    count, size, views = (500, 32, 2) if args.small else (100_000, 1024, 4)
+    scene, repetitions = on(args.device, make_scene(count)), 4 if args.small else 50
+    found: dict[str, Any] = {"gaussians": count, "size": size, "views": views}
+    for preset in ("fast", "balanced", "accurate"):
+        found[preset] = timed(
+            args, drawer(scene, size, views, args.device, preset=preset), repetitions
+        )
+        print(preset, found[preset])
+    return found
+
+
+def gsplat(args: argparse.Namespace) -> dict[str, Any]:
+    """gsplat as it is installed, else of PyPI in a folder of its own; its kernels are built at
+    first use, for this GPU alone.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        if importlib.util.find_spec("gsplat") is None:
+            pip = [
+                sys.executable,
+                "-m",
+                "pip",
+                "install",
+                "--quiet",
+                "--retries",
+                "1",
+                "--no-deps",
+                "--target",
+                folder,
+            ]
+            status, text = run([*pip, *GSPLAT], args, SECONDS["pip"], {})
+            if status:
+                raise RuntimeError(f"gsplat isn't installed and can't be: {text[-1000:]}")
+        paths = {
+            "PYTHONPATH": os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), folder])),
+            "PATH": os.pathsep.join(
+                [f"{folder}/bin", str(Path(sys.executable).parent), os.environ.get("PATH", "")]
+            ),  # ninja
+            "MAX_JOBS": str(os.cpu_count()),
+        }
+        return in_process("gsplat_steps", args, paths)
+
+
+def gsplat_steps(args: argparse.Namespace) -> dict[str, Any]:
+    os.environ["TORCH_CUDA_ARCH_LIST"] = "{}.{}".format(*torch.cuda.get_device_capability())
+    from gsplat import rasterization
+
+    scene = on(args.device, make_scene(100_000))
+    viewmats, Ks = cameras(1024, 4, scene)
+    image, depth, alpha = cotangents(1024, 4, scene)
+    upstream = torch.cat([image, depth], -1), alpha
+
+    def step() -> None:
+        pictures, alphas, _ = rasterization(
+            *scene, viewmats, Ks, 1024, 1024, render_mode="RGB+D", packed=False
+        )
+        torch.autograd.grad((pictures, alphas), list(scene), upstream)
+
+    return timed(args, step, 50)
