@@ -95,7 +95,17 @@ def test_held_out_views_are_fixed_distinct_and_in_no_pool():
     assert torch.cdist(held_out.c2w.flatten(1), pool.c2w.flatten(1)).min() > 1e-3
 
 
-def test_the_pool_covers_all_azimuths_and_both_elevation_rules():
+@pytest.mark.parametrize("seed", range(8))
+def test_every_pool_mixes_both_elevation_rules(seed):
+    """Uniform in angle and in the sine, half each; a pool of one rule is 0.05 from that."""
+    ranges = OrbitRanges(elevation=(-90.0, 90.0))
+    elevation = cameras.camera_pool(20_000, ranges, seed).elevation.double()
+    by_angle, by_sine = (elevation + 90) / 180, (torch.deg2rad(elevation).sin() + 1) / 2
+    shares = (by_angle + by_sine).sort().values / 2
+    assert (shares - torch.linspace(0, 1, len(shares)).double()).abs().max() < 0.015
+
+
+def test_the_pool_covers_all_azimuths():
     pool = cameras.camera_pool(200, OrbitRanges(), 3)
     assert (
         (pool.azimuth.diff() > -2).all() and pool.azimuth.min() < -175 and pool.azimuth.max() > 175

@@ -7,7 +7,7 @@ OpenGL: the columns of ``c2w`` are right, up, back. The rasteriser's cameras are
 with pixel centres at +0.5. Images are (B, H, W, C) with row 0 at the top."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Optional
 
 import torch
 import torch.nn.functional as F
@@ -197,14 +197,20 @@ class OrbitRanges(NamedTuple):
 
 
 def sample_orbit(
-    batch: int, ranges: OrbitRanges, rng: torch.Generator, uniform_azimuth: bool = True
+    batch: int,
+    ranges: OrbitRanges,
+    rng: torch.Generator,
+    uniform_azimuth: bool = True,
+    by_angle: Optional[bool] = None,
 ) -> Orbit:
     """Draw ``batch`` training views.
 
     As in threestudio, the elevations of a batch are uniform in angle with probability 1/2, and
-    otherwise uniform on the sphere (uniform in the sine). With ``uniform_azimuth`` the azimuth
-    range is divided into ``batch`` equal sectors with one view in each."""
-    by_angle, u = torch.rand(1, generator=rng) < 0.5, torch.rand(4, batch, generator=rng)
+    otherwise uniform on the sphere (uniform in the sine); ``by_angle`` sets which. With
+    ``uniform_azimuth`` the azimuth range is divided into ``batch`` equal sectors with one view in
+    each."""
+    drawn, u = _draw_by_angle(rng), torch.rand(4, batch, generator=rng)
+    by_angle = drawn if by_angle is None else by_angle
     low, high = (math.sin(math.radians(e)) for e in ranges.elevation)
     elevation = (
         _lerp(ranges.elevation, u[0])
@@ -214,6 +220,10 @@ def sample_orbit(
     sector = (u[1] + torch.arange(batch)) / batch if uniform_azimuth else u[1]
     fovy = torch.deg2rad(_lerp(ranges.fovy_deg, u[3]))
     return Orbit(elevation, _lerp(ranges.azimuth, sector), _lerp(ranges.distance, u[2]), fovy)
+
+
+def _draw_by_angle(rng: torch.Generator) -> bool:
+    return bool(torch.rand(1, generator=rng) < 0.5)
 
 
 def _lerp(ends: tuple[float, float], u: Tensor) -> Tensor:
@@ -235,11 +245,13 @@ def held_out_orbit(count: int = 24) -> Orbit:
 
 
 def camera_pool(count: int, ranges: OrbitRanges, seed: int, stream: str = "camera-pool") -> Orbit:
-    """Draw ``count`` fixed training views, stratified in azimuth, from streams of their own."""
+    """Draw ``count`` fixed training views, stratified in azimuth, from streams of their own.
+
+    The elevation of each view is uniform in angle with probability 1/2, and otherwise uniform on
+    the sphere: the distribution of many batches of :func:`sample_orbit`."""
     rng = generator(seed, stream)
     pool = sample_orbit(count, ranges, rng)
-    # sample_orbit chooses one elevation distribution per call: mix two calls, which have different
-    # ones with probability 1/2
-    other = sample_orbit(count, ranges, generator(seed, stream, 1))
+    by_angle = _draw_by_angle(generator(seed, stream))  # what the line above drew
+    other = sample_orbit(count, ranges, generator(seed, stream, 1), by_angle=not by_angle)
     mix = torch.rand(count, generator=rng) < 0.5
     return pool._replace(elevation=torch.where(mix, pool.elevation, other.elevation))
