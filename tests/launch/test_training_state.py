@@ -97,6 +97,10 @@ IMPOSSIBLE = [
     (at(*ADAM, "param_groups", 0, "betas", value="x"), "Adam can't go on"),
     (at(*ADAM, "state", 0, "exp_avg", value=lambda t: t[:3]), "has the shape .3, 3.; expected"),
     (at(*ADAM, "state", 0, "exp_avg_sq", value=NAN), "means.exp_avg_sq holds NaN"),
+    (
+        at(*ADAM, "state", 0, "exp_avg_sq", value=lambda t: t - 1),
+        "a step of Adam from its optimizer_states makes means NaN",
+    ),
     (without(*ADAM, "state", 0, "step"), "Adam can't go on from its optimizer_states: KeyError"),
     (at("pytorch-lightning_version", value=3), "pytorch-lightning_version is of type int"),
     (at("pytorch-lightning_version", value="x"), "is 'x'; expected 2.0 or later"),

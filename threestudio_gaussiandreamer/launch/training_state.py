@@ -12,6 +12,7 @@ from ..core.checkpoint_file import is_count
 from ..core.errors import UserError
 from ..core.options import is_number, shown
 from ..host import pl
+from ..training.finite import optimizer_tensors
 
 MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer")
 """Entries of torch's optimiser state that have the shape of the parameter."""
@@ -178,7 +179,7 @@ def _rehearse(optimizer: Mapping, state: Mapping, parameters: Mapping, what: str
     missing or invalid entries fail here.
 
     Raises:
-        UserError: torch doesn't accept the state, or the step fails.
+        UserError: torch doesn't accept the state, or the step fails or gives NaN or infinity.
     """
     kind = getattr(torch.optim, str(optimizer.get("name", "Adam")), None)
     if kind is None:
@@ -196,6 +197,12 @@ def _rehearse(optimizer: Mapping, state: Mapping, parameters: Mapping, what: str
             f"{what}: {kind.__name__} can't go on from its optimizer_states: "
             f"{type(error).__name__} {error}"
         ) from error
+    for name, value in optimizer_tensors(rehearsed):
+        if not value.isfinite().all():
+            raise UserError(
+                f"{what}: a step of {kind.__name__} from its optimizer_states makes {name} NaN or "
+                "infinite"
+            )
 
 
 def _zeros(index: Any, group: Mapping, moments: Mapping, parameters: Mapping) -> Tensor:
