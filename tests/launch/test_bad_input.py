@@ -188,7 +188,8 @@ register_parts()
             "trainer.accumulate_grad_batches=2",
             "trainer: Automatic gradient accumulation is not supported",
         ),
-        ("trainer.strategy=foo", "trainer: You selected an invalid strategy name"),
+        ("trainer.strategy=foo", "unknown trainer.strategy 'foo': choose from auto, ddp, "),
+        ("trainer.strategy=ddp_fork_find_unused_parameters_true", "can't start processes of this"),
         (
             "trainer.enable_checkpointing=false",
             "trainer.enable_checkpointing is set by the launcher",

@@ -51,6 +51,15 @@ def test_every_misspelt_key_is_rejected_with_the_right_one(folder, key):
         check_config(load_config("misspelt.yaml"))
 
 
+@pytest.mark.parametrize("strategy", ["deepspeed", "DeepSpeed_stage_2"])
+def test_a_strategy_whose_package_is_missing_is_refused(folder, monkeypatch, strategy):
+    from lightning.pytorch.strategies import deepspeed
+
+    monkeypatch.setattr(deepspeed, "_DEEPSPEED_AVAILABLE", False)
+    with pytest.raises(UserError, match="trainer.strategy: .*you must have DeepSpeed installed"):
+        check_config(load(f"trainer.strategy={strategy}"))
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [

@@ -96,6 +96,7 @@ def check_config(cfg: Any) -> None:
     # the trainer first, since schedules of parts may refer to its number of steps
     _check_arguments("trainer", cfg.trainer, pl.Trainer)
     _check_trainer_ranges(cfg.trainer)
+    _check_strategy(cfg.trainer.get("strategy"))
     check_part("data", cfg.data_type, cfg.data)
     check_part("system", cfg.system_type, cfg.system)
     _check_loss(cfg.system.get("loss"), getattr(find(cfg.system_type), "LOSSES", None))
@@ -278,11 +279,6 @@ def _check_trainer_ranges(trainer: Any) -> None:
             "trainer.max_time: expected a text such as '00:12:00:00' (days, hours, minutes, "
             f"seconds), got {trainer.max_time}"
         )
-    if trainer.get("strategy") in SPAWNING:
-        raise UserError(
-            f"trainer.strategy: {trainer.strategy} can't start processes of this program; give "
-            "--gpu 0,1,... alone, or ddp"
-        )
     if trainer.get("num_nodes", 1) != 1 and not CLUSTER & os.environ.keys():
         raise UserError(
             f"trainer.num_nodes: expected 1, got {trainer.num_nodes}; several machines need a "
@@ -293,6 +289,27 @@ def _check_trainer_ranges(trainer: Any) -> None:
             "trainer.val_check_interval: expected a number of steps above 0 (for no "
             "validation: trainer.limit_val_batches=0)"
         )
+
+
+def _check_strategy(name: Any) -> None:
+    """Check that Lightning has the strategy, and that what it needs is installed.
+
+    Raises:
+        UserError: it is unknown, can't be used here, or can't be constructed.
+    """
+    registry = pl.strategies.StrategyRegistry
+    known = registry.available_strategies()
+    name = "auto" if name is None else str(name).lower()
+    if name == "auto":
+        return
+    if name not in known:
+        raise unknown("trainer.strategy", name, ["auto", *known])
+    if name.startswith(SPAWNING):
+        raise UserError(
+            f"trainer.strategy: {name} can't start processes of this program; give --gpu 0,1,... "
+            "alone, or ddp"
+        )
+    build("trainer.strategy", registry.get, {"name": name})
 
 
 def _check_file_name(path: str, name: Any) -> None:
