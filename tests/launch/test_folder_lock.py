@@ -4,6 +4,7 @@ import fcntl
 import multiprocessing
 import os
 import signal
+import socket
 import time
 from pathlib import Path
 
@@ -92,7 +93,7 @@ def test_a_lock_of_a_removed_folder_is_not_taken_for_one_of_the_new_folder(folde
     first, flock = claim(folder), fcntl.flock
 
     def remove_then_lock(*arguments):
-        if first.descriptor is not None:
+        if first.lock is not None:
             first.discard()
             first.release()
         flock(*arguments)
@@ -100,7 +101,7 @@ def test_a_lock_of_a_removed_folder_is_not_taken_for_one_of_the_new_folder(folde
     monkeypatch.setattr(fcntl, "flock", remove_then_lock)
     second = claim(folder)
     assert second.first_made == Path("outputs") and folder.is_dir()
-    assert os.path.samestat(os.fstat(second.descriptor), os.stat(folder))
+    assert os.path.samestat(os.fstat(second.lock.descriptor), os.stat(folder))
 
 
 def test_parents_of_another_run_stay(folder):
@@ -113,17 +114,91 @@ def test_parents_of_another_run_stay(folder):
     assert other.first_made == other.path and os.listdir("outputs/tiny") == []
 
 
-def test_without_locks_only_an_empty_folder_is_removed(folder, monkeypatch):
-    def no_locks(*arguments):
+@pytest.fixture(params=["unsupported", "no fcntl"])
+def no_flock(request, monkeypatch):
+    """A file system, or an operating system, without locks of folders."""
+
+    def unsupported(*arguments):
         raise OSError(95, "Operation not supported")
 
-    monkeypatch.setattr(fcntl, "flock", no_locks)
-    claim(folder).discard()
-    assert not Path("outputs").exists()
-    claimed = claim(folder)
+    if request.param == "unsupported":
+        monkeypatch.setattr(fcntl, "flock", unsupported)
+    else:
+        monkeypatch.setattr(folder_lock, "fcntl", None)
+
+
+def test_without_flock_a_file_keeps_a_second_run_away(folder, no_flock):
+    first = claim(folder)
+    assert (folder / ".lock").read_text() == f"{socket.gethostname()} {os.getpid()}"
+    with pytest.raises(FolderInUse, match="another run is training in outputs/tiny/run.*remove"):
+        claim(folder)
+    assert claim_new(folder)[0].path == folder.with_name("run-2")
+    first.release()
+    assert list(folder.iterdir()) == []
+    claim(folder).release()
+
+
+def test_without_flock_the_file_of_a_killed_run_is_replaced(folder, no_flock):
+    def die():
+        claim(folder)
+        os.kill(os.getpid(), signal.SIGSTOP)
+
+    killed = stopped_child(die)
+    with pytest.raises(FolderInUse):
+        claim(folder)
+    os.kill(killed, signal.SIGKILL)
+    os.waitpid(killed, 0)
+    second = claim(folder)
+    assert os.listdir(folder) == [".lock"]
+    assert (folder / ".lock").read_text().endswith(f" {os.getpid()}")
+    second.release()
+
+
+@pytest.mark.parametrize("owner", ["another-machine 1", "", "x", f"{socket.gethostname()} 1"])
+def test_a_lock_file_whose_process_may_run_is_kept(folder, no_flock, owner):
+    folder.mkdir(parents=True)
+    (folder / ".lock").write_text(owner)
+    with pytest.raises(FolderInUse, match="remove outputs/tiny/run/.lock"):
+        claim(folder)
+    assert (folder / ".lock").read_text() == owner
+
+
+def test_a_lock_taken_while_a_stale_one_is_removed_is_put_back(folder, no_flock, monkeypatch):
+    """Another run replaces the stale file between reading and renaming it."""
+    folder.mkdir(parents=True)
+    (folder / ".lock").write_text(f"{socket.gethostname()} 999999999")
+    rename = Path.rename
+
+    def replace_then_rename(self, target):
+        (folder / ".lock").write_text("another-machine 1")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", replace_then_rename)
+    with pytest.raises(FolderInUse):
+        claim(folder)
+    assert os.listdir(folder) == [".lock"]
+    assert (folder / ".lock").read_text() == "another-machine 1"
+
+
+def test_without_flock_a_discarded_folder_is_removed_and_a_new_one_stays(folder, no_flock):
+    first = claim(folder)
     (folder / "cmd.txt").touch()
-    claimed.discard()
+    first.discard()
+    assert not Path("outputs").exists()
+    second = claim(folder)
+    first.release()  # what is there now is the second run's
+    assert (folder / ".lock").is_file()
+    second.release()
+
+
+def test_a_folder_that_is_not_locked_is_removed_only_if_it_is_empty(folder):
+    made = make_folder(folder)
+    (folder / "cmd.txt").touch()
+    RunFolder(folder, made).discard()
     assert (folder / "cmd.txt").is_file()
+    (folder / "cmd.txt").unlink()
+    RunFolder(folder, made).discard()
+    assert not Path("outputs").exists()
 
 
 def test_a_folder_that_was_there_is_never_removed(folder):

@@ -1,14 +1,18 @@
 """The folder of a run on disk: made by one process only, locked while it is in use, and removed
-only by the process that made it and still holds the lock."""
+only by the process that made it and still holds the lock.
+
+The lock is the operating system's lock of the folder, which ends with the process. File systems
+without such locks get a file with the name of the machine and the number of the process."""
 
 import contextlib
 import errno
 import os
 import shutil
+import socket
 import tempfile
 from itertools import count
 from pathlib import Path
-from typing import Optional
+from typing import NamedTuple, Optional
 
 try:
     import fcntl
@@ -23,6 +27,23 @@ LONGEST_RESULT = 200
 """Upper bound of the length of paths that a run writes below its folder, bytes."""
 
 
+LOCK_FILE = ".lock"
+"""Created in the folder where the file system has no locks; holds the owner."""
+
+
+class Lock(NamedTuple):
+    """A lock of a folder: its open descriptor, or a file in it."""
+
+    descriptor: Optional[int] = None
+    file: Optional[Path] = None
+
+    def release(self) -> None:
+        if self.descriptor is not None:
+            os.close(self.descriptor)
+        if self.file is not None:
+            self.file.unlink(missing_ok=True)
+
+
 class RunFolder:
     """The folder of a run, created by this process or found.
 
@@ -30,13 +51,13 @@ class RunFolder:
         path: the folder.
         first_made: the topmost folder that :func:`make_folder` made on the way to it; None if the
             folder was there before.
-        descriptor: the open, locked folder; None where it isn't locked.
+        lock: None where it isn't locked.
     """
 
     def __init__(
-        self, path: Path, first_made: Optional[Path] = None, descriptor: Optional[int] = None
+        self, path: Path, first_made: Optional[Path] = None, lock: Optional[Lock] = None
     ) -> None:
-        self.path, self.first_made, self.descriptor = path, first_made, descriptor
+        self.path, self.first_made, self.lock = path, first_made, lock
 
     def discard(self) -> None:
         """Remove the folder if this process created it, and the parents that were created with it
@@ -44,20 +65,31 @@ class RunFolder:
         """
         if self.first_made is None:
             return
-        if self.descriptor is not None:
-            shutil.rmtree(self.path, ignore_errors=True)
         with contextlib.suppress(OSError):  # not empty: another run has put something there
+            if self.lock is not None:
+                self._remove()
             for folder in (self.path, *self.path.parents):
                 if folder == self.first_made.parent:
                     break
                 if folder.exists():
                     folder.rmdir()
 
+    def _remove(self) -> None:
+        """Remove the folder. One with a lock file is renamed before, so that no other run takes it
+        while it is being removed.
+        """
+        doomed = self.path
+        if self.lock.file is not None:
+            doomed = self.path.with_name(f".{self.path.name}-{os.getpid()}")
+            self.path.rename(doomed)
+            self.lock = None  # the file is gone; one of this name is another run's
+        shutil.rmtree(doomed, ignore_errors=True)
+
     def release(self) -> None:
-        """Release the lock. The operating system also releases it when the process ends."""
-        if self.descriptor is not None:
-            os.close(self.descriptor)
-            self.descriptor = None
+        """Release the lock. The operating system releases its own also when the process ends."""
+        if self.lock is not None:
+            self.lock.release()
+            self.lock = None
 
 
 def claim_new(path: Path) -> tuple[RunFolder, int]:
@@ -181,32 +213,107 @@ class FolderInUse(UserError):
     """Raised if another process has locked the folder."""
 
 
-def _lock(path: Path) -> Optional[int]:
-    """Lock a folder; None where the file system has no locks.
+def _lock(path: Path) -> Lock:
+    """Lock a folder.
 
     Raises:
         FolderInUse: another process has locked it.
         FileNotFoundError: it was removed before it was locked.
-        UserError: it can't be opened.
+        UserError: it can't be opened, or no lock file can be written.
     """
-    if fcntl is None:
-        return None
     try:
-        descriptor = os.open(path, os.O_RDONLY)
+        descriptor = os.open(path, os.O_RDONLY) if fcntl is not None else None
     except PermissionError as error:
         raise unwritable(path, error) from error
+    if descriptor is None:
+        return _lock_by_file(path)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if os.path.samestat(os.fstat(descriptor), os.stat(path)):
-            return descriptor
+            return Lock(descriptor)
         raise FileNotFoundError(errno.ENOENT, "replaced by another folder", str(path))
     except (BlockingIOError, FileNotFoundError) as error:
         os.close(descriptor)
         if isinstance(error, FileNotFoundError):
             raise
-        raise FolderInUse(
-            f"another run is training in {path}: wait until it ends, or choose another tag"
-        ) from error
+        raise in_use(path) from error
     except OSError:  # a file system without locks
         os.close(descriptor)
-        return None
+        return _lock_by_file(path)
+
+
+def in_use(path: Path, advice: str = "") -> FolderInUse:
+    return FolderInUse(
+        f"another run is training in {path}: wait until it ends, or choose another tag{advice}"
+    )
+
+
+# -- lock files ------------------------------------------------------------------------------------
+
+
+def _lock_by_file(path: Path) -> Lock:
+    """Create the lock file, of which ``O_EXCL`` lets exactly one process succeed. The file of a
+    process of this machine that has ended is replaced.
+
+    Raises:
+        FolderInUse: another process has created it, and may still run.
+        FileNotFoundError: the folder was removed.
+        UserError: the file can't be created.
+    """
+    file, owner = path / LOCK_FILE, _owner(os.getpid())
+    while True:
+        try:
+            descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+        except FileExistsError:
+            _remove_stale(file)
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            raise unwritable(path, error) from error
+        else:
+            with open(descriptor, "w") as opened:
+                opened.write(owner)
+            return Lock(file=file)
+
+
+def _owner(process: int) -> str:
+    return f"{socket.gethostname()} {process}"
+
+
+def _remove_stale(file: Path) -> None:
+    """Remove the lock file of a process of this machine that has ended.
+
+    It is renamed first: of two processes that find it, one succeeds, and a lock that a third one
+    has taken in the meantime is put back.
+
+    Raises:
+        FolderInUse: its process may still run.
+    """
+    advice = f". If none does, on this machine or another, remove {file}"
+    mine = file.with_name(f"{LOCK_FILE}-{os.getpid()}")
+    try:
+        found = file.read_text()
+        if not _has_ended(found):
+            raise in_use(file.parent, advice)
+        file.rename(mine)
+        taken = mine.read_text()
+    except FileNotFoundError:  # released, or removed by another process
+        return
+    if taken != found:
+        with contextlib.suppress(OSError):
+            os.link(mine, file)
+    mine.unlink()
+
+
+def _has_ended(owner: str) -> bool:
+    """Return whether the process is one of this machine, and doesn't run any more."""
+    host, _, process = owner.rpartition(" ")
+    if host != socket.gethostname() or not process.isdecimal() or os.name != "posix":
+        return False
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return True
+    except (OSError, OverflowError):  # another user's
+        return False
+    return False
