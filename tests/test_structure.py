@@ -1,10 +1,13 @@
-"""Imports point inwards, the package is cheap to import, and its files and functions stay short."""
+"""Imports point inwards, the package is cheap to import, its files and functions stay short, and no
+code stands twice.
+"""
 
 import ast
+import re
 import statistics
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -34,6 +37,8 @@ LIBRARIES = {  # of ring 0, beyond MATHS_MAY_USE
 HOST = {"lightning", "pytorch_lightning", "omegaconf", "threestudio"}
 HEAVY = HOST | {"trimesh", "embreex", "diffusers", "transformers", "imageio", "PIL", "smplx"}
 LONGEST_FUNCTION, LONGEST_FILE, LONGEST_LINE, MODULES_AT_THE_TOP = 40, 400, 100, 5
+MOST_EQUAL_LINES = 5
+KERNEL_SOURCES = {".cpp", ".cu", ".cuh", ".h"}
 CODE = [
     path for top in (NAME, "tests", "benchmarks") for path in sorted((ROOT / top).rglob("*.py"))
 ]
@@ -106,25 +111,28 @@ def test_importing_the_package_is_cheap():
 # ---- lengths -------------------------------------------------------------------------------------
 
 
+def length_of(function: ast.AST) -> int:
+    """Return the number of lines of a function without its docstring."""
+    docstring = function.body[0] if ast.get_docstring(function) else None
+    lines = function.end_lineno - function.lineno + 1
+    return lines - (docstring.end_lineno - docstring.lineno + 1 if docstring else 0)
+
+
 def functions(path: Path) -> Iterator[tuple[str, int]]:
     """Yield name and number of lines, without docstring, of every function of a file."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            first = node.body[0]
-            docstring = first.end_lineno - first.lineno + 1 if ast.get_docstring(node) else 0
-            yield f"{named(path)}:{node.name}", node.end_lineno - node.lineno + 1 - docstring
+            yield f"{named(path)}:{node.name}", length_of(node)
 
 
 def test_functions_are_short():
-    lengths = dict(item for path in sources() for item in functions(path))
-    assert not {name: n for name, n in lengths.items() if n > LONGEST_FUNCTION}
-    assert statistics.median(lengths.values()) <= 10
+    lengths = [item for path in CODE for item in functions(path)]
+    assert not [(name, n) for name, n in lengths if n > LONGEST_FUNCTION]
+    assert statistics.median(n for _, n in lengths) <= 10
 
 
 def test_files_are_short():
-    """Of the package and its tests; a benchmark is one script."""
-    files = [path for path in CODE if path.relative_to(ROOT).parts[0] != "benchmarks"]
-    lengths = {named(path): len(path.read_text().splitlines()) for path in files}
+    lengths = {named(path): len(path.read_text().splitlines()) for path in CODE}
     assert not {name: n for name, n in lengths.items() if n > LONGEST_FILE}
 
 
@@ -136,6 +144,52 @@ def test_lines_are_short():
         if len(line) > LONGEST_LINE
     ]
     assert not found, found
+
+
+# ---- duplicates ----------------------------------------------------------------------------------
+
+
+def code_lines(path: Path) -> list[tuple[int, str]]:
+    """Return number and text of the lines of code: no blank lines, comments, imports, or lines of
+    punctuation alone; white space is folded.
+    """
+    lines = [" ".join(line.split()) for line in path.read_text().splitlines()]
+    return [
+        (number, line)
+        for number, line in enumerate(lines, 1)
+        if re.search(r"\w", line) and not line.startswith(("#", "//", "import ", "from "))
+    ]
+
+
+def duplicates(paths: Iterable[Path]) -> list[str]:
+    """Return the places of ``MOST_EQUAL_LINES`` + 1 lines of code that stand somewhere before."""
+    seen: dict[tuple[str, ...], str] = {}
+    found = []
+    for path in paths:
+        lines = code_lines(path)
+        for start in range(len(lines) - MOST_EQUAL_LINES):
+            window = lines[start : start + MOST_EQUAL_LINES + 1]
+            place = f"{named(path)}:{window[0][0]}"
+            first = seen.setdefault(tuple(line for _, line in window), place)
+            found += [f"{place} repeats {first}"] if first != place else []
+    return found
+
+
+def test_no_lines_of_code_stand_twice():
+    """A pair of the same letter: give the code one place, if its logic is the same."""
+    kernels = [path for path in PACKAGE.rglob("*") if path.suffix in KERNEL_SOURCES]
+    assert not duplicates([*CODE, *sorted(kernels)])
+
+
+def test_lines_that_stand_twice_are_found(tmp_path, monkeypatch):
+    monkeypatch.setattr("tests.test_structure.ROOT", tmp_path)
+    lines = [f"value{i} = {i}" for i in range(MOST_EQUAL_LINES + 1)]
+    (tmp_path / "a.py").write_text("\n".join(["import os", *lines]))
+    spaced = [part for line in lines for part in ("", "    " + line, "    # a comment", "    )")]
+    (tmp_path / "b.py").write_text("\n".join(["x = 1", *spaced]))
+    assert duplicates([tmp_path / "a.py", tmp_path / "b.py"]) == ["b.py:3 repeats a.py:2"]
+    (tmp_path / "b.py").write_text("\n".join(lines[1:]))
+    assert not duplicates([tmp_path / "a.py", tmp_path / "b.py"])
 
 
 # ---- the architecture page -----------------------------------------------------------------------
