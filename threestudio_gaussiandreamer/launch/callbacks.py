@@ -20,7 +20,7 @@ SECONDS_BETWEEN = 60.0
 """Shortest time between two checkpoints, seconds: a crash loses about as much training."""
 SHARE_OF_TIME = 0.01
 """Largest share of the running time that is spent on writing checkpoints."""
-SOURCE_ENDINGS = (".py", ".yaml", ".h", ".cpp", ".cu")
+SOURCE_ENDINGS = (".py", ".yaml", ".h", ".cpp", ".cu", ".html", ".css", ".js", ".glsl")
 
 
 class Stopped(BaseException):

@@ -1,0 +1,148 @@
+"""``python -m threestudio_gaussiandreamer.view``: any cloud becomes a page, drawn as its run has
+drawn it; mistakes end in one message.
+"""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers.ply_files import write_raw_gaussians
+from tests.view.clouds import cloud
+from threestudio_gaussiandreamer.formats.gaussian_files import write_cloud
+from threestudio_gaussiandreamer.view import page
+from threestudio_gaussiandreamer.view.command import main
+
+
+@pytest.fixture
+def source(tmp_path) -> Path:
+    path = tmp_path / "box.ply"
+    write_cloud(str(path), cloud(30))
+    return path
+
+
+@pytest.fixture
+def run_folder(tmp_path) -> Path:
+    """A run of 7 steps with an export."""
+    folder = tmp_path / "run"
+    (folder / "save" / "it7-export").mkdir(parents=True)
+    (folder / "configs").mkdir()
+    (folder / "configs" / "parsed.yaml").write_text(
+        "system:\n  renderer: {preset: fast, eps2d: 0.4, antialias: true, downsample: 2}\n"
+        "  prompt_processor: {prompt: a box}\n  background: {color: [0.0, 1.0, 0.0]}\n"
+        "  geometry: {bound_colors: false}\n"
+    )
+    scores = {"prior": {"step": 0, "psnr": 12.0}, "result": {"step": 7, "psnr": 31.25}}
+    (folder / "save" / "metrics.json").write_text(json.dumps(scores))
+    write_cloud(str(folder / "save" / "it7-export" / "gaussians.spz"), cloud(30))
+    return folder
+
+
+def meta(path: Path) -> dict:
+    return json.loads(re.search(r'id="meta">(.*?)</script>', path.read_text())[1])
+
+
+@pytest.mark.slow
+def test_the_command_writes_a_page(source):
+    command = [sys.executable, "-m", "threestudio_gaussiandreamer.view", str(source), "--html"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "box.html: 30 Gaussians" in done.stdout
+    found = meta(source.with_suffix(".html"))
+    assert found["title"] == "box.ply" and found["clouds"][0]["count"] == 30
+
+
+def test_options_say_how_a_cloud_is_drawn(source, tmp_path):
+    out = tmp_path / "out.html"
+    given = "--eps2d 0.1 --preset accurate --antialias --no-bound-colors --background 0080ff"
+    assert main([str(source), "--html", str(out), "--title", "a box", *given.split()]) == 0
+    found = meta(out)
+    settings = found["settings"]
+    assert settings["eps2d"] == 0.1 and settings["alphaMin"] == 1 / 65536
+    assert settings["antialias"] and not settings["boundColors"]
+    assert found["background"] == "#0080ff" and found["title"] == "a box"
+
+
+def test_a_cloud_of_a_run_is_drawn_as_the_run_has_drawn_it(run_folder):
+    export = run_folder / "save" / "it7-export" / "gaussians.spz"
+    assert main([str(export), "--html"]) == 0
+    found = meta(export.with_suffix(".html"))
+    settings = found["settings"]
+    assert settings["eps2d"] == pytest.approx(0.1) and settings["alphaMin"] == 1 / 255
+    assert settings["antialias"] and not settings["boundColors"]
+    assert found["title"] == "a box" and found["background"] == "#00ff00"
+    assert found["clouds"][0]["quality"] == "31.2 dB on held-out views"
+
+
+def test_the_scores_of_a_run_are_not_shown_for_another_step(run_folder):
+    other = run_folder / "save" / "it3-export"
+    (run_folder / "save" / "it7-export").rename(other)
+    assert main([str(other / "gaussians.spz"), "--html"]) == 0
+    assert meta(other / "gaussians.html")["clouds"][0]["quality"] == ""
+
+
+@pytest.mark.parametrize("damage", ["a: &x [1]\nb: *x", "- 1", "system: 3", "a: [", "\xff"])
+def test_a_damaged_configuration_leaves_the_defaults(run_folder, damage):
+    (run_folder / "configs" / "parsed.yaml").write_text(damage, encoding="latin-1")
+    export = run_folder / "save" / "it7-export" / "gaussians.spz"
+    assert main([str(export), "--html"]) == 0
+    found = meta(export.with_suffix(".html"))
+    assert found["settings"]["eps2d"] == 0.3 and found["title"] == "run"
+
+
+def test_a_checkpoint_of_gsplat_can_be_viewed(tmp_path):
+    gaussians = cloud(20).gaussians.tensors()
+    splats = {
+        "means": gaussians.means,
+        "quats": gaussians.quats,
+        "scales": gaussians.log_scales,
+        "opacities": gaussians.logit_opacities,
+        "sh0": gaussians.sh,
+        "shN": torch.zeros(20, 0, 3),
+    }
+    torch.save({"splats": splats}, tmp_path / "gsplat.pt")
+    assert main([str(tmp_path / "gsplat.pt"), "--html"]) == 0
+    assert meta(tmp_path / "gsplat.html")["clouds"][0]["count"] == 20
+
+
+def message(capsys, *argv: object) -> str:
+    """Run a command line that must fail; return what it says."""
+    assert main([str(argument) for argument in argv]) == 2
+    return capsys.readouterr().err
+
+
+def test_a_file_that_is_no_cloud(source, tmp_path, capsys):
+    text = tmp_path / "notes.txt"
+    text.write_text("hello")
+    assert ".ply" in message(capsys, text, "--html")
+    text.rename(tmp_path / "notes.ply")
+    assert "PLY" in message(capsys, tmp_path / "notes.ply", "--html")
+    assert "near names" in message(capsys, tmp_path / "boxx.ply", "--html")
+
+
+def test_mistakes_in_options(source, capsys):
+    assert "no folder" in message(capsys, source, "--html", source.parent / "a" / "out.html")
+    assert "--eps2d" in message(capsys, source, "--html", "--eps2d", "-1")
+    assert "--eps2d" in message(capsys, source, "--html", "--eps2d", "nan")
+    assert "--background" in message(capsys, source, "--html", "--background", "red")
+
+
+def test_an_empty_cloud_and_one_of_nan(tmp_path, capsys):
+    write_cloud(str(tmp_path / "empty.ply"), cloud(0))
+    assert "no Gaussians" in message(capsys, tmp_path / "empty.ply", "--html")
+    broken = cloud(5).gaussians
+    broken.means[:] = np.nan
+    write_raw_gaussians(tmp_path / "nan.ply", broken)
+    assert "no Gaussians" in message(capsys, tmp_path / "nan.ply", "--html")
+    assert not list(tmp_path.glob("*.html"))
+
+
+def test_too_many_gaussians(source, monkeypatch, capsys):
+    monkeypatch.setattr(page, "MAX_GAUSSIANS", 29)
+    said = message(capsys, source, "--html")
+    assert "has 30 Gaussians" in said and "prune" in said and "--count" in said

@@ -1,0 +1,73 @@
+"""The page's text: its size, what it may load, and prompts that look like code."""
+
+import html
+import json
+import re
+
+import numpy as np
+import pytest
+
+from tests.view.clouds import PROMPT, cloud, options
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.view import page as page_module
+from threestudio_gaussiandreamer.view.page import Shown, decibels, page, write_page
+
+
+def meta(text: str) -> dict:
+    return json.loads(re.search(r'id="meta">(.*?)</script>', text)[1])
+
+
+def test_5000_gaussians_and_their_prior_take_less_than_600_kB(tmp_path):
+    path = tmp_path / "view.html"
+    # a prior's Gaussians are isotropic and equally opaque
+    prior = cloud(10_000, stretch=0.0, size=0.01)
+    plain = prior.gaussians._replace(quats=np.tile(np.float32([1, 0, 0, 0]), (10_000, 1)))
+    plain = plain._replace(logit_opacities=np.full(10_000, -1, np.float32))
+    before = Shown(prior._replace(gaussians=plain), "prior")
+    write_page(path, Shown(cloud(5000), "result"), options(), before)
+    assert path.stat().st_size < 600_000
+
+
+def test_a_prompt_is_text_wherever_it_stands():
+    text = page(Shown(cloud(3), "result"), options())
+    assert html.escape(PROMPT) in text and PROMPT not in text
+    assert meta(text)["title"] == PROMPT
+    assert text.count("<script") == text.count("</script>") == 8  # four shaders, meta, data x 2
+
+
+def test_the_policy_forbids_requests_and_foreign_scripts():
+    text = page(Shown(cloud(3), "result"), options())
+    policy = html.unescape(re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1])
+    assert policy.startswith("default-src 'none'; script-src 'sha256-")
+    assert "http" not in policy and "unsafe" not in policy
+    # the only attributes that load something hold their content
+    assert set(re.findall(r'(?:src|href)="(.{5})', text)) == {"data:"}
+
+
+def test_the_page_knows_how_the_cloud_was_trained():
+    text = page(Shown(cloud(3), "result"), options(eps2d=0.1, antialias=True, alpha_min=1 / 255))
+    settings = meta(text)["settings"]
+    assert settings["eps2d"] == 0.1 and settings["antialias"] and settings["alphaMin"] == 1 / 255
+
+
+def test_gaussians_with_nan_are_left_out_with_a_warning(caplog):
+    broken = cloud(10)
+    broken.gaussians.means[3] = np.nan
+    text = page(Shown(broken, "result"), options())
+    assert meta(text)["clouds"][0]["count"] == 9 and "1 of 10 Gaussians" in caplog.text
+
+
+def test_an_empty_cloud_is_refused():
+    with pytest.raises(UserError, match="no Gaussians"):
+        page(Shown(cloud(0), "result"), options())
+
+
+def test_too_many_gaussians_are_refused_with_the_way_out(monkeypatch):
+    monkeypatch.setattr(page_module, "MAX_GAUSSIANS", 100)
+    with pytest.raises(UserError, match="prune it first.*threestudio_gaussiandreamer.prune"):
+        page(Shown(cloud(101), "result"), options())
+
+
+def test_unknown_dB_are_not_shown():
+    assert decibels(None) == decibels(float("nan")) == ""
+    assert decibels(33.213) == "33.2 dB on held-out views"

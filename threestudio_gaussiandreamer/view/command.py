@@ -1,0 +1,159 @@
+"""Look at a cloud or a run: ``python -m threestudio_gaussiandreamer.view cloud.ply --html``.
+
+PATH is a PLY or SPZ file of Gaussians of any program, or a checkpoint of this package or of gsplat.
+A cloud in the folder of a run is drawn as the run has drawn it, with its prompt; options override
+that. Other clouds are drawn with the defaults below."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Optional
+
+from ..core.command import run_command
+from ..core.errors import UserError
+from ..core.files import existing_file, require_writable
+from ..formats.gaussian_files import StoredCloud, read_cloud, require_format
+from ..gaussians.axes import AXES, WORLD_UP
+from ..gaussians.gaussians import drawable
+from ..gaussians.views import EPS2D, NEAR, bounds
+from ..prune.pipeline import from_checkpoint
+from ..splatting import PRESETS
+from .page import WHITE, PageOptions, Shown, decibels, require_page_size, write_page
+from .render import RenderSettings
+from .run_files import RunFiles
+
+CHECKPOINT_ENDINGS = (".ckpt", ".pt", ".pth")
+OPTIONS: dict[str, dict[str, Any]] = {
+    "--title": {"help": "what the page is called (default: the run's prompt, or the file's name)"},
+    "--eps2d": {
+        "type": float,
+        "help": f"screen-space dilation, square pixels (default: the run's, or {EPS2D:g})",
+    },
+    "--preset": {
+        "choices": PRESETS,
+        "help": "smallest alpha that is drawn (default: the run's, or balanced)",
+    },
+    "--antialias": {
+        "action": argparse.BooleanOptionalAction,
+        "help": "keep the energy of small Gaussians (default: the run's, or not)",
+    },
+    "--bound-colors": {
+        "action": argparse.BooleanOptionalAction,
+        "help": "clamp the colour of each Gaussian to [0, 1] (default: the run's, or yes)",
+    },
+    "--background": {
+        "metavar": "RRGGBB",
+        "help": "colour behind the cloud (default: the run's, or ffffff)",
+    },
+    "--up": {
+        "choices": AXES,
+        "help": "which axis of PATH is up (default: what the file says, else its format's custom)",
+    },
+}
+
+
+def main(argv: Optional[Sequence[str]] = None) -> int:
+    """Run one command line; return the exit code of :func:`core.command.run_command`."""
+    return run_command(parse, run, argv)
+
+
+def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
+    """Parse a command line; exits for ``--help`` and for invalid arguments."""
+    parser = argparse.ArgumentParser(
+        prog="python -m threestudio_gaussiandreamer.view",
+        description="Write a cloud of Gaussians as one HTML file that shows it in a browser.",
+    )
+    parser.add_argument("path", metavar="PATH", help="a PLY or SPZ file, or a checkpoint")
+    parser.add_argument(
+        "--html",
+        metavar="OUT",
+        nargs="?",
+        const="",
+        required=True,
+        help="the file to write (default: PATH with the ending .html)",
+    )
+    for name, settings in OPTIONS.items():
+        parser.add_argument(name, **settings)
+    return parser.parse_args(argv)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Write the page of a cloud.
+
+    Raises:
+        UserError: an option is invalid, the file can't be read, has too many Gaussians or none, or
+            the page can't be written.
+    """
+    source = existing_file(args.path, "file of Gaussians or checkpoint")
+    out = Path(args.html) if args.html else source.with_suffix(".html")
+    require_writable(out, "--html")
+    background = _color(args.background)
+    _require_dilation(args.eps2d)
+    stored = read_any(source, args.up)
+    require_page_size(len(stored.gaussians.means), args.path)
+    run_files = RunFiles.around(source)
+    options = PageOptions(
+        title=args.title or (run_files.prompt if run_files else source.name),
+        name=source.stem,
+        settings=_settings(args, run_files, stored),
+        background=background or (run_files and run_files.background) or WHITE,
+    )
+    quality = decibels(run_files.psnr("result")) if _is_result(source, run_files) else ""
+    write_page(out, Shown(stored, "result", quality), options)
+    print(f"{out}: {len(stored.gaussians.means):,} Gaussians, {out.stat().st_size / 1e6:.2f} MB")
+
+
+def read_any(source: Path, up: Optional[str] = None) -> StoredCloud:
+    """Read the Gaussians of a file or checkpoint, without those that can't be drawn.
+
+    Args:
+        up: overrides the up axis that the file states.
+
+    Raises:
+        UserError: the file is none of Gaussians, or damaged.
+    """
+    if source.suffix in CHECKPOINT_ENDINGS:
+        return StoredCloud(drawable(from_checkpoint(source), str(source)), up or WORLD_UP)
+    require_format(source.name, "PATH")
+    return read_cloud(str(source), up=up)
+
+
+def _settings(
+    args: argparse.Namespace, run_files: Optional[RunFiles], stored: StoredCloud
+) -> RenderSettings:
+    """Return the run's settings, or the defaults for a cloud of unknown units, overridden by the
+    options that are given.
+    """
+    if run_files is not None:
+        settings = run_files.settings
+    else:
+        settings = RenderSettings(near=NEAR * bounds(stored.gaussians.tensors())[1])
+    given = {name: getattr(args, name) for name in ("eps2d", "antialias", "bound_colors")}
+    if args.preset is not None:
+        given["alpha_min"] = PRESETS[args.preset]
+    return settings._replace(**{name: x for name, x in given.items() if x is not None})
+
+
+def _is_result(source: Path, run_files: Optional[RunFiles]) -> bool:
+    """Return whether the scores of a run are those of this file: an export of its last step."""
+    if run_files is None:
+        return False
+    steps = run_files.scores.get("result")
+    step = steps.get("step") if isinstance(steps, dict) else None
+    return source.resolve().parent == (run_files.save / f"it{step}-export").resolve()
+
+
+def _require_dilation(eps2d: Optional[float]) -> None:
+    if eps2d is not None and not 0 <= eps2d < 1e6:
+        raise UserError(f"--eps2d: expected a number of square pixels from 0 on, got {eps2d:g}")
+
+
+def _color(text: Optional[str]) -> Optional[tuple[float, float, float]]:
+    """Parse a colour such as ff8000; None if none is given."""
+    if text is None:
+        return None
+    try:
+        red, green, blue = bytes.fromhex(text.removeprefix("#"))
+    except ValueError as error:
+        raise UserError(f"--background: expected RRGGBB, such as ff8000, got {text!r}") from error
+    return (red / 255, green / 255, blue / 255)

@@ -1,0 +1,115 @@
+"""Pictures of a cloud by our own rasteriser, with the settings and cameras of the page."""
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..cameras import orbit_c2w, to_opencv
+from ..formats.gaussian_files import StoredCloud
+from ..gaussians.axes import WORLD_UP, rotation_between
+from ..gaussians.sh import bounded_colors, sh_to_unclamped_colors
+from ..gaussians.views import EPS2D, FOVY, NEAR, bounds
+from ..splatting import PRESETS, rasterize
+
+ELEVATION, AZIMUTH = 15.0, 30.0
+"""The first view, degrees: the front, from slightly above and to the right."""
+MARGIN = 1.05
+"""Of the first view around the cloud."""
+
+
+class RenderSettings(NamedTuple):
+    """What decides how Gaussians look, as the renderer that trained them has it."""
+
+    eps2d: float = EPS2D
+    """Screen-space dilation, square pixels."""
+    antialias: bool = False
+    alpha_min: float = PRESETS["balanced"]
+    bound_colors: bool = True
+    near: float = NEAR
+    """World units."""
+    far: float = 1e10
+
+    @classmethod
+    def of(cls, renderer: Any, bound_colors: bool) -> "RenderSettings":
+        """Collect the options of our renderer; the dilation is in square pixels of what it
+        returns, which downsampling has made smaller.
+        """
+        return cls(
+            eps2d=renderer.eps2d / renderer.downsample**2,
+            antialias=renderer.antialias,
+            alpha_min=PRESETS[renderer.preset],
+            bound_colors=bound_colors,
+            near=renderer.near,
+            far=renderer.far,
+        )
+
+
+class Pose(NamedTuple):
+    """A camera that looks at a point, in the world's axes."""
+
+    target: tuple[float, float, float]
+    distance: float
+    elevation: float = ELEVATION
+    """Degrees above the horizon."""
+    azimuth: float = AZIMUTH
+    """Degrees from +x towards +y."""
+    fovy: float = math.degrees(FOVY)
+    """Degrees."""
+
+
+def first_pose(cloud: StoredCloud) -> Pose:
+    """Return the pose that shows the whole cloud from the front."""
+    centre, radius = bounds(cloud.gaussians.tensors())
+    to_world = torch.from_numpy(rotation_between(cloud.up, WORLD_UP)).float()
+    target = (to_world @ centre).tolist()
+    return Pose(tuple(target), MARGIN * radius / math.sin(FOVY / 2))
+
+
+def render(
+    cloud: StoredCloud, settings: RenderSettings, poses: list[Pose], size: int
+) -> Float[Tensor, "V size size 4"]:
+    """Render square views: premultiplied colour, and alpha.
+
+    Args:
+        size: pixels each way.
+    """
+    return torch.cat([_render_view(cloud, settings, pose, size) for pose in poses])
+
+
+@torch.no_grad()
+def _render_view(
+    cloud: StoredCloud, settings: RenderSettings, pose: Pose, size: int
+) -> Float[Tensor, "1 size size 4"]:
+    gaussians = cloud.gaussians.tensors()
+    c2w = _camera(pose, cloud.up)
+    fovy = torch.tensor([math.radians(pose.fovy)])
+    colors = sh_to_unclamped_colors(gaussians.sh, gaussians.means - c2w[:, :3, 3])
+    out = rasterize(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.log_scales.exp(),
+        gaussians.logit_opacities.sigmoid(),
+        bounded_colors(colors) if settings.bound_colors else colors.clamp_min(0),
+        *to_opencv(c2w, fovy, size, size),
+        size,
+        size,
+        near=settings.near,
+        far=settings.far,
+        eps2d=settings.eps2d,
+        antialias=settings.antialias,
+        alpha_min=settings.alpha_min,
+    )
+    return torch.cat([out.image, out.alpha], -1)
+
+
+def _camera(pose: Pose, up: str) -> Float[Tensor, "1 4 4"]:
+    """Return the OpenGL camera of a pose in the axes of a cloud with the axis ``up`` up."""
+    target = torch.tensor([pose.target])
+    angles = [torch.tensor([x]) for x in (pose.elevation, pose.azimuth, pose.distance)]
+    c2w = orbit_c2w(*angles, center=torch.zeros(1, 3))
+    c2w[:, :3, 3] += target
+    c2w[:, :3] = torch.from_numpy(rotation_between(WORLD_UP, up)).float() @ c2w[:, :3]
+    return c2w

@@ -1,0 +1,182 @@
+// Draws Gaussians with WebGL2: instanced quads, blended back to front into a picture of half
+// floats, since 8 bits lose too much under many faint layers, then composited to the canvas.
+
+const TEXTURE_WIDTH = 4096;
+const UPLOAD_ROWS = 64;
+const SPLAT_UNIFORMS = [
+  "cloud", "harmonics", "cloudColumns", "harmonicColumns", "degree", "rotation", "translation",
+  "cameraPosition", "size", "focal", "near", "far", "eps2d", "alphaMin", "alphaMax", "antialias",
+  "boundColors",
+];
+
+function compiled(gl, type, source) {
+  const shader = gl.createShader(type);
+  gl.shaderSource(shader, source);
+  gl.compileShader(shader);
+  if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {
+    throw new Error(gl.getShaderInfoLog(shader));
+  }
+  return shader;
+}
+
+function linked(gl, vertex, fragment, uniforms) {
+  const program = gl.createProgram();
+  gl.attachShader(program, compiled(gl, gl.VERTEX_SHADER, vertex));
+  gl.attachShader(program, compiled(gl, gl.FRAGMENT_SHADER, fragment));
+  gl.bindAttribLocation(program, 0, "index");
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
+    throw new Error(gl.getProgramInfoLog(program));
+  }
+  const places = uniforms.map((name) => [name, gl.getUniformLocation(program, name)]);
+  return { program, at: Object.fromEntries(places) };
+}
+
+class Renderer {
+  // `sources` are the four shaders; `settings` are those that the cloud was trained with.
+  constructor(canvas, sources, settings) {
+    this.canvas = canvas;
+    this.settings = settings;
+    this.gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
+    if (!this.gl) throw new Error("no WebGL2");
+    const gl = this.gl;
+    this.splats = linked(gl, sources.splatVert, sources.splatFrag, SPLAT_UNIFORMS);
+    this.screen = linked(gl, sources.screenVert, sources.screenFrag, ["picture", "background"]);
+    this.format = gl.getExtension("EXT_color_buffer_float")
+      || gl.getExtension("EXT_color_buffer_half_float") ? gl.RGBA16F : gl.RGBA8;
+    this.picture = gl.createTexture();
+    this.framebuffer = gl.createFramebuffer();
+    this.pictureSize = [0, 0];
+    this.blank = gl.createVertexArray();
+  }
+
+  // Upload a cloud; returns what `draw` takes.
+  upload(columns, degree) {
+    const gl = this.gl, count = columns[0].length, each = (degree + 1) ** 2 - 1;
+    const width = Math.min(TEXTURE_WIDTH, gl.getParameter(gl.MAX_TEXTURE_SIZE));
+    const scene = { count, visible: 0, degree, order: gl.createBuffer() };
+    scene.cloudColumns = Math.floor(width / 4);
+    scene.cloud = this.texture(gl.RGBA32F, 4, scene.cloudColumns, count,
+      (first, last) => cloudTexels(columns, degree, first, last));
+    scene.harmonicColumns = each ? Math.floor(width / each) : 1;
+    scene.harmonics = each
+      ? this.texture(gl.RGBA16F, each, scene.harmonicColumns, count,
+        (first, last) => harmonicTexels(columns, degree, first, last))
+      : scene.cloud;
+    scene.vertices = gl.createVertexArray();
+    gl.bindVertexArray(scene.vertices);
+    gl.bindBuffer(gl.ARRAY_BUFFER, scene.order);
+    gl.bufferData(gl.ARRAY_BUFFER, 4 * count, gl.DYNAMIC_DRAW);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(0, 1);
+    return scene;
+  }
+
+  // A texture with `each` texels for every Gaussian and `columns` Gaussians a row, filled in parts.
+  texture(format, each, columns, count, texels) {
+    const gl = this.gl, rows = Math.ceil(count / columns);
+    if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
+      throw new Error(`the graphics card's textures are too small for ${count} Gaussians`);
+    }
+    const texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, format, each * columns, rows);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    for (let row = 0; row < rows; row += UPLOAD_ROWS) {
+      const height = Math.min(UPLOAD_ROWS, rows - row), first = row * columns;
+      const part = new Float32Array(4 * each * columns * height);
+      part.set(texels(first, Math.min(first + columns * height, count)));
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, each * columns, height, gl.RGBA, gl.FLOAT, part);
+    }
+    return texture;
+  }
+
+  setOrder(scene, sorted, visible) {
+    const gl = this.gl;
+    gl.bindBuffer(gl.ARRAY_BUFFER, scene.order);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, sorted, 0, visible);
+    scene.visible = visible;
+  }
+
+  // Draw to the canvas. With `scale` below 1 the Gaussians are drawn at fewer pixels.
+  draw(scene, camera, pose, background, scale) {
+    const gl = this.gl;
+    const size = [this.canvas.width, this.canvas.height].map((x) => Math.max(1, Math.round(x * scale)));
+    this.resize(size);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+    gl.viewport(0, 0, ...size);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    this.useSplats(scene, camera, size, focalLength(pose, ...size), scale);
+    gl.bindVertexArray(scene.vertices);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, scene.visible);
+    gl.disable(gl.BLEND);
+    this.composite(background);
+  }
+
+  useSplats(scene, camera, size, focal, scale) {
+    const gl = this.gl, { program, at } = this.splats, settings = this.settings;
+    gl.useProgram(program);
+    [scene.cloud, scene.harmonics].forEach((texture, unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+    });
+    gl.uniform1i(at.cloud, 0);
+    gl.uniform1i(at.harmonics, 1);
+    gl.uniform1i(at.cloudColumns, scene.cloudColumns);
+    gl.uniform1i(at.harmonicColumns, scene.harmonicColumns);
+    gl.uniform1i(at.degree, scene.degree);
+    gl.uniformMatrix3fv(at.rotation, true, camera.rotation.flat());
+    gl.uniform3fv(at.translation, camera.translation);
+    gl.uniform3fv(at.cameraPosition, camera.position);
+    gl.uniform2fv(at.size, size);
+    gl.uniform1f(at.focal, focal);
+    gl.uniform1f(at.near, settings.near);
+    gl.uniform1f(at.far, settings.far);
+    gl.uniform1f(at.eps2d, settings.eps2d * scale * scale);
+    gl.uniform1f(at.alphaMin, settings.alphaMin);
+    gl.uniform1f(at.alphaMax, settings.alphaMax);
+    gl.uniform1i(at.antialias, settings.antialias);
+    gl.uniform1i(at.boundColors, settings.boundColors);
+  }
+
+  composite(background) {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.useProgram(this.screen.program);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.picture);
+    gl.uniform1i(this.screen.at.picture, 0);
+    gl.uniform3fv(this.screen.at.background, background);
+    gl.bindVertexArray(this.blank);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  resize(size) {
+    if (size.every((x, i) => x === this.pictureSize[i])) return;
+    const gl = this.gl;
+    gl.deleteTexture(this.picture);
+    this.picture = gl.createTexture();
+    this.pictureSize = size;
+    gl.bindTexture(gl.TEXTURE_2D, this.picture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, this.format, ...size);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture, 0);
+  }
+
+  // The canvas as bytes RGBA, rows from the bottom; to be called in the task that has drawn it.
+  pixels() {
+    const gl = this.gl, { width, height } = this.canvas;
+    const bytes = new Uint8Array(4 * width * height);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    return bytes;
+  }
+}
