@@ -10,7 +10,7 @@ import re
 import pytest
 
 from benchmarks.robustness.fuzz import ROOM
-from tests.fuzz import judge
+from tests.fuzz import runner
 from tests.test_docs import TEXTS
 from threestudio_gaussiandreamer import metrics
 from threestudio_gaussiandreamer.core import file_memory
@@ -37,8 +37,8 @@ CONSTANTS = {
         f"the best {PruneConfig.keep:g} are kept",
     ],
     "docs/robustness.md": [
-        f"more than {judge.SECONDS:g} seconds of CPU time",
-        f"at most {judge.FIXED_BYTES >> 20} MiB plus {judge.PER_BYTE} times the file size",
+        f"more than {runner.SECONDS:g} seconds of CPU time",
+        f"at most {runner.FIXED_BYTES >> 20} MiB plus {runner.PER_BYTE} times the file size",
         f"limits the address space to {ROOM >> 30} GiB",
         f"at most {MOST_DEPTH} levels and {MOST_NODES:,} values",
         f"checked against {file_memory.FIXED_BYTES >> 20} MiB plus "

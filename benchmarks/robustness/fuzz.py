@@ -1,14 +1,13 @@
-"""Fuzzing, the long version: damaged files at every door, hostile Gaussians through every backend,
-random lives of a cloud.
+"""Fuzz every file reader with damaged files, every rasteriser backend with extreme Gaussians, and
+densification and pruning with random sequences of operations.
 
-    python -m benchmarks.robustness.fuzz                                   # `make fuzz`; about half
-                                                                an hour on one core
+    python -m benchmarks.robustness.fuzz                      # `make fuzz`: all targets
     python -m benchmarks.robustness.fuzz --only glb checkpoint --inputs 500 --seed 7
 
-Every kind runs in a process of its own, with a limit of memory, which is killed when nothing comes
-from it for a minute; it goes on with the next input then. An input that failed is kept in
-``--keep`` under its target's name and number: what it is made from is (seed, number) alone. Prints
-a table and writes ``benchmarks/results/fuzz.csv``. Exit code 1 if anything failed."""
+Each target runs in a process with a memory limit. If the process reports nothing for a minute, it
+is killed and another one continues with the next input. Inputs that failed are kept in ``--keep``
+under the target's name, seed and index, from which they can be generated again. Prints a table and
+writes ``benchmarks/results/fuzz.csv``. Exit code 1 if anything failed."""
 
 import argparse
 import csv
@@ -26,18 +25,18 @@ from typing import Any, NamedTuple
 ROOT = Path(__file__).resolve().parents[2]
 
 RESULTS = ROOT / "benchmarks/results/fuzz.csv"
-SILENCE = 60
-"""Seconds without a word after which a process counts as hanging; an input has 10."""
+TIMEOUT = 60
+"""Seconds without a report after which a process counts as hanging; an input has 10."""
 STARTUP = 600
-"""Seconds for the first word: a busy machine takes minutes to import all that is tried."""
+"""Seconds until the first report: imports take minutes on a busy machine."""
 ROOM = 3 << 30
-"""Bytes of address space that a process may add to what its libraries take."""
-STEPS_OF_A_LIFE = 25
-LIVES_AT_ONCE = 20
+"""Bytes of address space that a process may add to that of its libraries."""
+OPERATIONS = 25
+SEQUENCES_AT_ONCE = 20
 
 
 class Row(NamedTuple):
-    """A line of the table."""
+    """A row of the table."""
 
     target: str
     unit: str
@@ -47,16 +46,16 @@ class Row(NamedTuple):
     seconds: float
 
 
-# ---- in a process of its own ---------------------------------------------------------------------
+# ---- in the worker process -----------------------------------------------------------------------
 
 Report = Iterator[tuple[int, dict[str, Any]]]
-"""Of each number that was tried what came of it, by the name of a row: counts of "inputs", and
-"failures" in words.
+"""The index of each input, with its results by row name: counts of "inputs" and messages of
+"failures".
 """
 
 
 def try_files(name: str, seed: int, first: int, last: int) -> Report:
-    from tests.fuzz.judge import outcomes
+    from tests.fuzz.runner import outcomes
 
     for index, outcome in outcomes(name, range(first, last), seed):
         failures = [outcome.detail] if outcome.kind == "failed" else []
@@ -71,20 +70,18 @@ def try_files(name: str, seed: int, first: int, last: int) -> Report:
 
 
 def try_scenes(name: str, seed: int, first: int, last: int) -> Report:
-    """Each scene through every backend, and its well-posed part through all of them to be
-    compared.
-    """
+    """Render each scene with every backend, and compare all of them on its well-posed part."""
     import pytest
     import torch
 
-    from tests.fuzz.hostile import disagreement_on, fault_of, hostile_scene, well_posed
+    from tests.fuzz.scenes import disagreement_on, extreme_scene, fault_of, well_posed
     from tests.stability.backends import BACKENDS, cuda_on_the_host
 
     torch.set_num_threads(1)
     if "cuda" in BACKENDS:
         cuda_on_the_host(pytest.MonkeyPatch())
     for index in range(first, last):
-        scene = hostile_scene(seed * 1_000_000 + index)
+        scene = extreme_scene(seed * 1_000_000 + index)
         part = well_posed(scene)
         seconds, failures = {}, {}
         for backend in BACKENDS:
@@ -106,20 +103,20 @@ def try_scenes(name: str, seed: int, first: int, last: int) -> Report:
         )
 
 
-def _faults(judge: Callable[..., str | None], *arguments: Any) -> list[str]:
+def _faults(check: Callable[..., str | None], *arguments: Any) -> list[str]:
     try:
-        found = judge(*arguments)
+        found = check(*arguments)
     except Exception as error:
         found = f"crash: {type(error).__name__}: {error}"
     return [found] if found else []
 
 
-def try_lives(name: str, seed: int, first: int, last: int) -> Report:
+def try_sequences(name: str, seed: int, first: int, last: int) -> Report:
     import hypothesis
     import torch
     from hypothesis.stateful import run_state_machine_as_test
 
-    from tests.fuzz.sequences import CloudLife
+    from tests.fuzz.sequences import CloudSequence
 
     torch.set_num_threads(1)
     options = {
@@ -127,28 +124,28 @@ def try_lives(name: str, seed: int, first: int, last: int) -> Report:
         "database": None,
         "suppress_health_check": list(hypothesis.HealthCheck),
     }
-    for index in range(first, last, LIVES_AT_ONCE):
-        CloudLife.steps, failures = 0, []
+    for index in range(first, last, SEQUENCES_AT_ONCE):
+        CloudSequence.steps, failures = 0, []
         settings = hypothesis.settings(
-            max_examples=LIVES_AT_ONCE, stateful_step_count=STEPS_OF_A_LIFE, **options
+            max_examples=SEQUENCES_AT_ONCE, stateful_step_count=OPERATIONS, **options
         )
         try:
             run_state_machine_as_test(
-                hypothesis.seed(seed * 1_000_000 + index)(CloudLife), settings=settings
+                hypothesis.seed(seed * 1_000_000 + index)(CloudSequence), settings=settings
             )
         except Exception as error:
             failures.append(f"{type(error).__name__}: {error}")
-        yield index, {"inputs": {name: CloudLife.steps}, "failures": {name: failures}}
+        yield index, {"inputs": {name: CloudSequence.steps}, "failures": {name: failures}}
 
 
 def work(name: str, seed: int, first: int, last: int) -> None:
-    """Try these numbers; says what came of each as a line of JSON, and nothing else."""
-    spoken = os.fdopen(os.dup(1), "w", buffering=1)
+    """Try the inputs ``first`` to ``last``; print the results of each as a line of JSON."""
+    output = os.fdopen(os.dup(1), "w", buffering=1)
     nothing = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nothing, 1)
     os.dup2(nothing, 2)
     report = kind_of(name)(name, seed, first, last)
-    print(json.dumps({"ready": True}), file=spoken)
+    print(json.dumps({"ready": True}), file=output)
     libraries = (
         int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         if Path("/proc/self/statm").exists()
@@ -157,18 +154,18 @@ def work(name: str, seed: int, first: int, last: int) -> None:
     if libraries:
         resource.setrlimit(resource.RLIMIT_AS, (libraries + ROOM, resource.RLIM_INFINITY))
     for index, counts in report:
-        print(json.dumps({"index": index, **counts}), file=spoken)
+        print(json.dumps({"index": index, **counts}), file=output)
 
 
 def kind_of(name: str) -> Callable[[str, int, int, int], Report]:
-    return {"rasteriser": try_scenes, "densify and prune": try_lives}.get(name, try_files)
+    return {"rasteriser": try_scenes, "densify and prune": try_sequences}.get(name, try_files)
 
 
-# ---- watching it ---------------------------------------------------------------------------------
+# ---- in the main process -------------------------------------------------------------------------
 
 
-class Watched:
-    """One target's processes, one after the other, and the sums of what they report."""
+class TargetRun:
+    """One target's worker processes, one after the other, and the sums of their reports."""
 
     def __init__(self, name: str, seed: int, keep: Path) -> None:
         self.name, self.seed, self.keep = name, seed, keep
@@ -178,10 +175,10 @@ class Watched:
         self.seconds: dict[str, float] = {}
 
     def run(
-        self, count: int, enough: Callable[["Watched"], bool], tick: Callable[[int], None]
+        self, count: int, enough: Callable[["TargetRun"], bool], tick: Callable[[int], None]
     ) -> None:
-        """Numbers 0 to ``count``, or until there are enough; a process that ends before is followed
-        by one for the rest.
+        """Try inputs 0 to ``count``, or until there are enough; a process that ends early is
+        followed by another one.
         """
         first, started = 0, time.perf_counter()
         while first < count and not enough(self):
@@ -192,35 +189,35 @@ class Watched:
         self,
         first: int,
         count: int,
-        enough: Callable[["Watched"], bool],
+        enough: Callable[["TargetRun"], bool],
         tick: Callable[[int], None],
     ) -> int:
-        """The number to go on with."""
+        """Return the index to continue with."""
         worker = ["--worker", self.name, str(self.seed), str(first), str(count)]
         command = [sys.executable, "-m", __spec__.name, *worker]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
-        patience = STARTUP
+        timeout = STARTUP
         try:
             while not enough(self):
                 line = (
                     process.stdout.readline()
-                    if select.select([process.stdout], [], [], patience)[0]
+                    if select.select([process.stdout], [], [], timeout)[0]
                     else "hang"
                 )
-                patience = SILENCE
+                timeout = TIMEOUT
                 if line in ("", "hang"):
                     return (
                         count
                         if not line and process.wait() == 0
                         else self._lost(first, line, process, tick)
                     )
-                said = json.loads(line)
-                if "index" in said:
-                    self._add(said)
-                    tick(said["index"] + 1 - first)
-                    first = said["index"] + (
-                        LIVES_AT_ONCE if self.name == "densify and prune" else 1
+                report = json.loads(line)
+                if "index" in report:
+                    self._add(report)
+                    tick(report["index"] + 1 - first)
+                    first = report["index"] + (
+                        SEQUENCES_AT_ONCE if self.name == "densify and prune" else 1
                     )
             return count
         finally:
@@ -231,25 +228,25 @@ class Watched:
         self, index: int, line: str, process: subprocess.Popen, tick: Callable[[int], None]
     ) -> int:
         problem = (
-            f"nothing for {SILENCE} s" if line else f"the process ended with {process.returncode}"
+            f"no report for {TIMEOUT} s" if line else f"the process ended with {process.returncode}"
         )
         self._add({"index": index, "inputs": {self.name: 1}, "failures": {self.name: [problem]}})
         tick(1)
         return index + 1
 
-    def _add(self, said: dict[str, Any]) -> None:
+    def _add(self, report: dict[str, Any]) -> None:
         for kind, sums in (
             ("inputs", self.inputs),
             ("refused", self.refused),
             ("seconds", self.seconds),
         ):
-            for row, value in said.get(kind, {}).items():
+            for row, value in report.get(kind, {}).items():
                 sums[row] = sums.get(row, 0) + value
-        for row, failures in said["failures"].items():
+        for row, failures in report["failures"].items():
             self.failures[row] = self.failures.get(row, 0) + len(failures)
             for failure in failures:
-                print(f"{row} {said['index']}: {failure}", file=sys.stderr)
-                self._keep(said["index"], failure)
+                print(f"{row} {report['index']}: {failure}", file=sys.stderr)
+                self._keep(report["index"], failure)
 
     def _keep(self, index: int, failure: str) -> None:
         self.keep.mkdir(parents=True, exist_ok=True)
@@ -265,7 +262,7 @@ class Watched:
     def rows(self) -> list[Row]:
         units = {
             "rasteriser": "Gaussians, forward and backward",
-            "densify and prune": "steps of a life",
+            "densify and prune": "operations",
         }
         named = {
             row: f"{self.name}: {row}" if self.name == "rasteriser" else row for row in self.inputs
@@ -292,14 +289,14 @@ def main() -> int:
 
     rows, names = [], options.only or [*file_targets(), "rasteriser", "densify and prune"]
     for name in names:
-        watched, count = Watched(name, options.seed, Path(options.keep)), how_many(name, options)
+        target, count = TargetRun(name, options.seed, Path(options.keep)), how_many(name, options)
         with tqdm(
             desc=name, total=None if name == "rasteriser" else count, unit="input", disable=None
         ) as bar:
-            watched.run(count, enough_of(name, options), bar.update)
-        rows += watched.rows()
-        print("\n".join(map(line_of, watched.rows())), flush=True)
-        write(watched.rows(), options.seed)
+            target.run(count, enough_of(name, options), bar.update)
+        rows += target.rows()
+        print("\n".join(map(line_of, target.rows())), flush=True)
+        write(target.rows(), options.seed)
     return int(any(row.failures for row in rows))
 
 
@@ -312,20 +309,22 @@ def parse() -> argparse.Namespace:
         "--gaussians",
         type=int,
         default=1_000_000,
-        help="hostile Gaussians through each backend; 'agreement' has fewer",
+        help="extreme Gaussians through each backend; 'agreement' has fewer",
     )
     parser.add_argument(
-        "--lives",
+        "--sequences",
         type=int,
         default=1000,
-        help=f"random lives of a cloud, each of {STEPS_OF_A_LIFE} steps at most",
+        help=f"random sequences of at most {OPERATIONS} operations",
     )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", nargs="+", help="these targets alone; the CSV's other rows stay")
+    parser.add_argument(
+        "--only", nargs="+", help="only these targets; other rows of the CSV are kept"
+    )
     parser.add_argument(
         "--keep",
         default="outputs/fuzz-failures",
-        help="folder for inputs that failed; made when there is one",
+        help="folder for inputs that failed",
     )
     parser.add_argument("--worker", nargs=4, help=argparse.SUPPRESS)
     return parser.parse_args()
@@ -337,20 +336,18 @@ def file_targets() -> list[str]:
     return list(TARGETS)
 
 
-def enough_of(name: str, options: argparse.Namespace) -> Callable[[Watched], bool]:
-    """Of scenes there are enough when every backend has had its Gaussians; of the others all are
-    tried.
-    """
+def enough_of(name: str, options: argparse.Namespace) -> Callable[[TargetRun], bool]:
+    """Return whether a target is done early: scenes, when every backend has had its Gaussians."""
 
-    def enough(watched: Watched) -> bool:
-        drawn = [count for row, count in watched.inputs.items() if row != "agreement"]
+    def enough(target: TargetRun) -> bool:
+        drawn = [count for row, count in target.inputs.items() if row != "agreement"]
         return name == "rasteriser" and min(drawn, default=0) >= options.gaussians
 
     return enough
 
 
 def how_many(name: str, options: argparse.Namespace) -> int:
-    return {"rasteriser": options.gaussians // 100, "densify and prune": options.lives}.get(
+    return {"rasteriser": options.gaussians // 100, "densify and prune": options.sequences}.get(
         name, options.inputs
     )
 
@@ -363,7 +360,7 @@ def line_of(row: Row) -> str:
 
 
 def write(rows: list[Row], seed: int) -> None:
-    """The rows in the places of those of the same targets; the others stay."""
+    """Replace the rows of these targets in the CSV."""
     from benchmarks.splatting.bench_splatting import describe_machine
 
     device, _, commit = describe_machine().rpartition("; commit ")

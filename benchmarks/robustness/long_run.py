@@ -1,16 +1,13 @@
-"""A long run that is killed again and again: what does it lose, and does its memory grow? One
-command, within half an hour.
+"""Measure what a long run loses when it is killed repeatedly, and whether its memory grows.
 
-    python -m benchmarks.robustness.long_run                           # 20,000 steps and 50 kills:
-                                                            ten minutes or so on one core
-    python -m benchmarks.robustness.long_run --steps 400 --kills 3     # in a minute
+    python -m benchmarks.robustness.long_run                           # 20,000 steps and 50 kills
+    python -m benchmarks.robustness.long_run --steps 400 --kills 3     # a short version
 
-The same small run (configs/demo.yaml at 24^2 with 200 Gaussians, validated and saved every few
-steps) twice. Once undisturbed, its memory sampled; and once killed with SIGKILL at random moments,
-while it imports, loads, trains, validates or writes, and each time started again with the same
-command line, which holds `resume=auto`. Nobody looks on. It holds when every start goes on from the
-last checkpoint that was written, and the last cloud and its optimiser are the undisturbed run's to
-the bit."""
+A small run (configs/demo.yaml at 24^2 with 200 Gaussians, validated and saved every few steps) is
+trained twice: once uninterrupted, while its memory is sampled, and once killed with SIGKILL at
+random moments (importing, loading, training, validating, writing) and restarted with the same
+command line, which contains `resume=auto`. The test passes if every process continues from the last
+checkpoint written, and the final cloud and optimiser equal the uninterrupted run's to the bit."""
 
 import argparse
 import json
@@ -26,36 +23,34 @@ from typing import Any, Optional
 import numpy as np
 
 from benchmarks.quality.runs import commit, machine
-from benchmarks.robustness.supervisor import ROOT, Life, Sample, Supervisor, last_written
+from benchmarks.robustness.supervisor import ROOT, Sample, Segment, Supervisor, last_written
 
 SAMPLE_EVERY = 0.5  # seconds
 PROGRESS = 0.7
-"""The share of the steps that is expected to be done when the last kill falls; the rest is done in
-peace.
-"""
+"""Expected fraction of the steps at the last kill; the rest runs uninterrupted."""
 AT_MOST = 0.85
-"""A life that gets on faster is killed when it has written its part of this share, so that there is
-a run left for the others.
+"""Fraction of the steps at which the kills must be done: a process that is faster is killed
+earlier, when it has written its part.
 """
 
 
-# -- undisturbed -----------------------------------------------------------------------------------
+# -- the uninterrupted run -------------------------------------------------------------------------
 
 
-def undisturbed(run: Supervisor) -> list[Sample]:
-    """The run from start to end in one process, its memory sampled."""
+def uninterrupted(run: Supervisor) -> list[Sample]:
+    """Run from start to end in one process, and sample its memory."""
     process, started, samples = run.start(), time.monotonic(), []
     while process.poll() is None:
         if time.monotonic() > run.deadline:
             process.kill()
-            raise RuntimeError("not done in the given time")
+            raise RuntimeError("not finished within the time limit")
         resident = resident_megabytes(process.pid)
         if resident is not None:
             samples.append(Sample(time.monotonic() - started, last_written(run.folder), resident))
         time.sleep(SAMPLE_EVERY)
     if process.returncode:
         raise RuntimeError(
-            f"the undisturbed run failed ({process.returncode}):\n{run.said()[-3000:]}"
+            f"the uninterrupted run failed ({process.returncode}):\n{run.output()[-3000:]}"
         )
     return samples
 
@@ -69,8 +64,8 @@ def resident_megabytes(pid: int) -> Optional[float]:
 
 
 def memory_slope(samples: list[Sample], steps: int) -> dict[str, Any]:
-    """MB per 1000 steps, fitted to what was sampled in the second half, when caches are full and
-    the cloud has its size.
+    """Fit MB per 1000 steps to the samples of the second half, when caches are full and the cloud
+    has its final size.
     """
     steady = [sample for sample in samples if steps / 2 <= sample.step < steps]
     all_along = [sample for sample in samples if 0 < sample.step < steps]
@@ -96,57 +91,61 @@ def memory_slope(samples: list[Sample], steps: int) -> dict[str, Any]:
     }
 
 
-# -- killed ----------------------------------------------------------------------------------------
+# -- the interrupted run ---------------------------------------------------------------------------
 
 
 def killed(
     run: Supervisor, kills: int, startup: float, rate: float, rng: random.Random
-) -> list[Life]:
-    """Lives of the run, killed at moments uniform from its start to where it is expected to have
-    done its share of the steps.
+) -> list[Segment]:
+    """Run with kills: each process is killed at a time uniform between its start and the time at
+    which it should have done its share of the steps.
     """
-    longest = longest_life(startup, gain=PROGRESS * run.steps / kills / rate)
-    lives: list[Life] = []
-    while sum(life.killed for life in lives) < kills and (not lives or lives[-1].killed):
-        lives.append(
-            run.live(rng.uniform(0, longest), AT_MOST * run.steps * (len(lives) + 1) / kills)
+    longest = longest_segment(startup, gain=PROGRESS * run.steps / kills / rate)
+    segments: list[Segment] = []
+    while sum(segment.killed for segment in segments) < kills and (
+        not segments or segments[-1].killed
+    ):
+        segments.append(
+            run.run_segment(
+                rng.uniform(0, longest), AT_MOST * run.steps * (len(segments) + 1) / kills
+            )
         )
-        show(lives, kills)
-    if lives[-1].killed:
-        lives.append(run.live())
-    return lives
+        show(segments, kills)
+    if segments[-1].killed:
+        segments.append(run.run_segment())
+    return segments
 
 
-def longest_life(startup: float, gain: float) -> float:
-    """The seconds T for which lives that end uniformly on [0, T] train ``gain`` seconds on average:
-    (T - startup)^2 / 2T = gain.
+def longest_segment(startup: float, gain: float) -> float:
+    """Return the seconds T for which processes killed uniformly on [0, T] train ``gain`` seconds on
+    average: (T - startup)^2 / 2T = gain.
     """
     return startup + gain + math.sqrt(gain**2 + 2 * gain * startup)
 
 
-def show(lives: list[Life], kills: int) -> None:
+def show(segments: list[Segment], kills: int) -> None:
     if sys.stderr.isatty():
         print(
-            f"\rkill {len(lives)} of {kills}, step {lives[-1].reached} ",
+            f"\rkill {len(segments)} of {kills}, step {segments[-1].reached} ",
             end="",
             file=sys.stderr,
             flush=True,
         )
 
 
-def lost_steps(lives: list[Life]) -> int:
-    """Steps that had been written and were trained again: by how much a life went on from less than
-    what the one before left.
+def lost_steps(segments: list[Segment]) -> int:
+    """Count checkpointed steps that were trained again, because a process resumed from an earlier
+    one.
     """
     return sum(
         max(0, before.reached - after.started_from)
-        for before, after in zip(lives, lives[1:], strict=False)
+        for before, after in zip(segments, segments[1:], strict=False)
     )
 
 
 def startup_seconds(samples: list[Sample], every: int) -> tuple[float, float]:
-    """Seconds until the first step, and steps per second after it, from when checkpoints were
-    there.
+    """Return the seconds until the first step and the steps per second after it, from the times of
+    the checkpoints.
     """
     training = [sample for sample in samples if sample.step]
     first, last = (
@@ -167,16 +166,16 @@ def main(arguments: Optional[list[str]] = None) -> int:
     began = time.monotonic()
     deadline = began + 60 * options.minutes
     with tempfile.TemporaryDirectory() as folder:
-        calm, disturbed = (
+        reference, interrupted = (
             Supervisor(Path(folder, name), options.steps, options.every, deadline)
-            for name in ("calm", "killed")
+            for name in ("reference", "killed")
         )
-        for run in (calm, disturbed):
+        for run in (reference, interrupted):
             run.folder.mkdir()
-        samples = undisturbed(calm)
+        samples = uninterrupted(reference)
         startup, rate = startup_seconds(samples, options.every)
-        lives = killed(disturbed, options.kills, startup, rate, random.Random(options.seed))
-        result = report(options, calm, disturbed, samples, lives) | {
+        segments = killed(interrupted, options.kills, startup, rate, random.Random(options.seed))
+        result = report(options, reference, interrupted, samples, segments) | {
             "startup_seconds": round(startup, 2),
             "steps_per_second": round(rate, 1),
         }
@@ -200,7 +199,7 @@ def parse_arguments(arguments: Optional[list[str]]) -> argparse.Namespace:
         default=50,
         help="steps between checkpoints; ten times as many between validations",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the moments of the kills")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the times of the kills")
     parser.add_argument("--minutes", type=float, default=30, help="give up after this long")
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks/results/long_run.json")
     return parser.parse_args(arguments)
@@ -208,23 +207,25 @@ def parse_arguments(arguments: Optional[list[str]]) -> argparse.Namespace:
 
 def report(
     options: argparse.Namespace,
-    calm: Supervisor,
-    disturbed: Supervisor,
+    reference: Supervisor,
+    interrupted: Supervisor,
     samples: list[Sample],
-    lives: list[Life],
+    segments: list[Segment],
 ) -> dict[str, Any]:
-    hashes = calm.digest(), disturbed.digest()
-    kills = [life for life in lives if life.killed]
+    hashes = reference.digest(), interrupted.digest()
+    kills = [segment for segment in segments if segment.killed]
     result = {
         "steps": options.steps,
         "checkpoint_every": options.every,
         "kills": len(kills),
-        "kills_before_a_checkpoint": sum(life.reached == life.started_from for life in kills),
-        "written_steps_lost": lost_steps(lives),
+        "kills_before_a_checkpoint": sum(
+            segment.reached == segment.started_from for segment in kills
+        ),
+        "written_steps_lost": lost_steps(segments),
         "same_final_state": hashes[0] == hashes[1],
         "final_state": hashes[1],
-        "final_step": disturbed.newest_step(),
-        "half_written_files": len(disturbed.leftovers()),
+        "final_step": interrupted.newest_step(),
+        "half_written_files": len(interrupted.leftovers()),
         "memory": memory_slope(samples, options.steps),
         "machine": machine(),
         "commit": commit(),
@@ -241,13 +242,13 @@ def table(result: dict[str, Any]) -> str:
         "steps": f"{result['final_step']} of {result['steps']}",
         "killed with SIGKILL": f"{result['kills']} times "
         f"({result['kills_before_a_checkpoint']} before the process had written anything)",
-        "written steps lost": str(result["written_steps_lost"]),
+        "checkpointed steps lost": str(result["written_steps_lost"]),
         "final state": (
-            "the undisturbed run's to the bit"
+            "equal to the uninterrupted run's"
             if result["same_final_state"]
-            else "ANOTHER than the undisturbed run's"
+            else "DIFFERENT from the uninterrupted run's"
         ),
-        "half-written files left": str(result["half_written_files"]),
+        "partially written files": str(result["half_written_files"]),
         "memory": f"{slope:+.3f} +- {memory['standard_error']:.3f} MB per 1000 steps; peak "
         f"{memory['peak_mb']:.0f} MB",
         "time": f"{result['minutes']:.1f} minutes; {result['startup_seconds']:.1f} s to start, "

@@ -30,15 +30,15 @@ SCENE = [
 LOOK_EVERY = 0.02  # seconds
 
 
-class Life(NamedTuple):
-    """One process of the run, from its start to its end."""
+class Segment(NamedTuple):
+    """One process of the run, from its start to its end or kill."""
 
     seconds: float
     killed: bool
     started_from: int
-    """The step that it said it goes on from; 0 for anew."""
+    """The step from which it resumed; 0 if it started from the prior."""
     reached: int
-    """The step of the newest whole checkpoint when it had ended."""
+    """The step of the newest complete checkpoint at its end."""
 
 
 class Sample(NamedTuple):
@@ -46,11 +46,11 @@ class Sample(NamedTuple):
     step: int
     """Of the newest checkpoint."""
     megabytes: float
-    """Resident and its own: pages of libraries come and go as the machine likes."""
+    """Anonymous resident memory; pages of libraries vary with the machine."""
 
 
 class Supervisor:
-    """Starts the run in ``folder``, watches it, kills it, and reads what it has left."""
+    """Starts the run in ``folder``, watches it, kills it, and reads its files."""
 
     def __init__(self, folder: Path, steps: int, every: int, deadline: float) -> None:
         self.folder, self.steps, self.deadline = folder, steps, deadline
@@ -76,17 +76,16 @@ class Supervisor:
 
     def start(self) -> subprocess.Popen:
         environment = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive", **os.environ}
-        with open(self.folder / "said.txt", "wb") as said:
+        with open(self.folder / "output.txt", "wb") as output:
             return subprocess.Popen(
-                self.command, stdout=said, stderr=subprocess.STDOUT, cwd=ROOT, env=environment
+                self.command, stdout=output, stderr=subprocess.STDOUT, cwd=ROOT, env=environment
             )
 
-    def live(self, kill_after: float = math.inf, at_latest: float = math.inf) -> Life:
-        """One process, killed after that many seconds, or as soon as that step is written, or run
-        to its end.
+    def run_segment(self, kill_after: float = math.inf, at_latest: float = math.inf) -> Segment:
+        """Run one process: to its end, or until it is killed after so many seconds or at a step.
 
         Raises:
-            RuntimeError: it failed by itself, or the time for everything is over.
+            RuntimeError: the process failed, or the deadline has passed.
         """
         started, before = time.monotonic(), self.newest_step()
         process = self.start()
@@ -97,38 +96,38 @@ class Supervisor:
                 process.wait()
             time.sleep(LOOK_EVERY)
         if time.monotonic() > self.deadline:
-            raise RuntimeError("not done in the given time")
+            raise RuntimeError("not finished within the time limit")
         if process.returncode not in (0, -signal.SIGKILL):
-            raise RuntimeError(f"the run failed ({process.returncode}):\n{self.said()[-3000:]}")
-        return Life(
+            raise RuntimeError(f"the run failed ({process.returncode}):\n{self.output()[-3000:]}")
+        return Segment(
             time.monotonic() - started,
             process.returncode != 0,
             self.resumed_step(before),
             self.newest_step(),
         )
 
-    def said(self) -> str:
-        return (self.folder / "said.txt").read_text(errors="replace")
+    def output(self) -> str:
+        return (self.folder / "output.txt").read_text(errors="replace")
 
     def resumed_step(self, before: int) -> int:
-        """Where the process went on from, by its own words; ``before`` where it was killed earlier
-        than that.
+        """Return the step from which the process resumed, from its output; ``before`` if it was
+        killed before it printed one.
         """
-        chosen = re.search(r"resume=auto: going on from (.*) \(step (\d+)\)", self.said())
+        chosen = re.search(r"resume=auto: going on from (.*) \(step (\d+)\)", self.output())
         if chosen:
             return int(chosen[2])
-        return 0 if "starting from the prior" in self.said() else before
+        return 0 if "starting from the prior" in self.output() else before
 
     def newest_step(self) -> int:
         return self.newest()[1]
 
     def newest(self) -> tuple[Path, int]:
-        """The whole checkpoint with most steps of all trials, and its step; 0 without any."""
+        """Return the complete checkpoint with most steps, and its step; 0 without any."""
         found = [newest_readable(folder) for folder in self.folder.glob("long/*/ckpts")]
         return max(filter(None, found), key=lambda entry: entry[1], default=(self.folder, 0))
 
     def digest(self) -> str:
-        """Of everything that training has made: parameters, statistics, moments and the step."""
+        """Return a hash of the training state: parameters, statistics, moments and the step."""
         checkpoint = load_checkpoint(self.newest()[0])
         digest = hashlib.sha256(str(checkpoint["global_step"]).encode())
         states = checkpoint["optimizer_states"][0]["state"]
@@ -150,6 +149,6 @@ class Supervisor:
 
 
 def last_written(folder: Path) -> int:
-    """The step of the newest checkpoint by its name, which costs nothing to look at."""
+    """Return the step of the newest checkpoint, from its file name."""
     names = [path.stem for path in folder.glob("long/*/ckpts/epoch=*-step=*.ckpt")]
     return max((int(name.rpartition("=")[2]) for name in names), default=0)

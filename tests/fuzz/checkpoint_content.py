@@ -1,6 +1,5 @@
-"""Generator of handmade checkpoints: whole files with valid checksums whose content is impossible.
-
-One value anywhere in the content is replaced, removed, or exchanged with another one."""
+"""Generator of invalid checkpoints with valid checksums: one value anywhere in the content is
+replaced, removed, or exchanged with another one."""
 
 import copy
 import io
@@ -36,7 +35,7 @@ TENSORS: list[Callable[[Tensor], Tensor]] = [
     *(lambda t: t[None], lambda t: t.flatten(), lambda t: -t, lambda t: t.to(torch.complex64)),
     *(lambda t: t.to_sparse(), lambda t: t[:1].expand(10**6, *t.shape[1:]), lambda t: t.T),
 ]
-"""Changes of a tensor; those that don't apply to its shape leave it."""
+"""Changes of a tensor; one that doesn't apply to its shape leaves it unchanged."""
 
 
 @cache
@@ -52,7 +51,7 @@ def _bytes(content: Any) -> bytes:
 
 
 def other_content(data: bytes, rng: np.random.Generator) -> bytes:
-    """One value replaced."""
+    """Replace one value."""
     try:
         content = torch.load(io.BytesIO(data), weights_only=True)
     except Exception:  # spliced

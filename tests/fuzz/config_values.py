@@ -1,7 +1,7 @@
-"""Generator of hostile option values: overrides of the demo's configuration, one a line.
+"""Generator of extreme option values: overrides of the demo's configuration, one per line.
 
-Every option of every registered part, of the trainer and of the checkpoints is drawn; its value is
-a number at an extreme, a text, a list, a section, a name of any part, or a value of its own kind.
+Options of every registered part, of the trainer and of the checkpoints are drawn; the value is an
+extreme number, a text, a list, a section, the name of any part, or a value of the right type.
 """
 
 import copy
@@ -39,7 +39,7 @@ SUFFIXES = {
     "-datamodule": "data",
     "-system": "system",
 }
-"""Where parts are configured, by how their names end."""
+"""Section in which a part is configured, by the ending of its name."""
 TEXTS = [token.decode("latin-1") for token in TOKENS if b"\0" not in token and b"\n" not in token]
 LISTS = [
     *("[]", "[1]", "[1,2]", "[2,1]", "[0,0]", "[1,2,3]", "[0,1,0.5,10]", "[0,-1,1e38,5]"),
@@ -52,15 +52,15 @@ PLAIN = [
     *("9" * 19, "9" * 20, "9" * 400, "9" * 5000, "1" + "0" * 308 + ".0", ".nan", "-.inf"),
 ]
 MOST_PIXELS = 1 << 16
-"""Of a batch that is made to see whether what is accepted works."""
+"""Largest batch that is made to test an accepted configuration."""
 
 
 def seeds() -> list[bytes]:
     return [b"seed=3", b"system.geometry.prior_type=random-prior\nseed=5"]
 
 
-def hostile_option(data: bytes, rng: np.random.Generator) -> bytes:
-    """Another option with a hostile value."""
+def extreme_option(data: bytes, rng: np.random.Generator) -> bytes:
+    """Append an option with an extreme value."""
     lines = options()[rng.integers(len(options()))]
     key, values = lines[-1], [*PLAIN, *LISTS, *TEXTS, *(n.decode() for n in NUMBERS), *names()]
     chosen = values[rng.integers(len(values))]
@@ -69,7 +69,7 @@ def hostile_option(data: bytes, rng: np.random.Generator) -> bytes:
 
 @cache
 def options() -> list[tuple[str, ...]]:
-    """Each option's key, after the overrides that choose its part."""
+    """Return each option's key, after the overrides that choose its part."""
     found: list[tuple[str, ...]] = [
         (field.name,) for field in dataclasses.fields(config.ExperimentConfig)
     ]

@@ -1,4 +1,4 @@
-"""Damage good files at random, from a seed; half of the packed ones (zip, gzip, GLB) inside."""
+"""Damage valid files at random, from a seed; half of the packed ones (zip, gzip, GLB) inside."""
 
 import io
 import json
@@ -118,7 +118,7 @@ def delete_block(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def duplicate_block(data: bytes, rng: np.random.Generator) -> bytes:
-    """Once, or a thousand times: nesting and counts."""
+    """Repeat a block once or up to a thousand times."""
     start, end = _range(data, rng)
     times = 1 if rng.random() < 0.7 else min(1000, LARGEST // max(end - start, 1))
     return data[:end] + data[start:end] * times + data[end:]
@@ -130,7 +130,7 @@ def swap_blocks(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def overwrite_block(data: bytes, rng: np.random.Generator) -> bytes:
-    """With zeros, ones, noise, or what lies elsewhere in the file."""
+    """Overwrite with zeros, ones, noise, or another part of the file."""
     start, end = _range(data, rng)
     size, source = end - start, int(rng.integers(0, len(data)))
     fill = [bytes(size), b"\xff" * size, rng.bytes(size), data[source : source + size]][
@@ -140,7 +140,7 @@ def overwrite_block(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def extreme_number(data: bytes, rng: np.random.Generator) -> bytes:
-    """A binary integer or float of 1 to 8 bytes."""
+    """Write an extreme binary integer or float of 1 to 8 bytes."""
     if rng.random() < 0.5:
         size = int(rng.choice([1, 2, 4, 8]))
         number = (_choice(EXTREMES, rng) & (1 << 8 * size) - 1).to_bytes(
@@ -172,14 +172,12 @@ NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
 
 def other_number(data: bytes, rng: np.random.Generator) -> bytes:
-    """A number in the text replaced by an extreme one: lying counts."""
+    """Replace a number in the text by an extreme one, such as a wrong count."""
     return _replaced(NUMBER, data, rng, lambda old: _choice(NUMBERS, rng))
 
 
 def other_word(data: bytes, rng: np.random.Generator) -> bytes:
-    """A word replaced by another one of the file, or by a special token: another type, another
-    name.
-    """
+    """Replace a word by another word of the file or by a special token."""
     words = WORD.findall(data[:4096]) or [b"x"]
     return _replaced(
         WORD, data, rng, lambda old: _choice(words if rng.random() < 0.7 else TOKENS, rng)
@@ -187,7 +185,7 @@ def other_word(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def line_operation(data: bytes, rng: np.random.Generator) -> bytes:
-    """A line repeated, dropped, or exchanged with another one."""
+    """Repeat, drop or exchange a line."""
     lines = data.split(b"\n")
     i, j = (int(x) for x in rng.integers(0, len(lines), 2))
     action = rng.integers(3)
@@ -201,7 +199,7 @@ def line_operation(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _range(data: bytes, rng: np.random.Generator) -> tuple[int, int]:
-    """A block that is mostly short."""
+    """Draw a range of bytes, usually a short one."""
     start = int(rng.integers(0, len(data)))
     return start, min(start + int(2 ** rng.uniform(0, 10)), len(data))
 
@@ -209,7 +207,7 @@ def _range(data: bytes, rng: np.random.Generator) -> tuple[int, int]:
 def _replaced(
     pattern: re.Pattern, data: bytes, rng: np.random.Generator, new: Callable[[bytes], bytes]
 ) -> bytes:
-    """One match, near a random place, replaced."""
+    """Replace one match near a random position."""
     at = int(rng.integers(0, len(data)))
     match = pattern.search(data, at) or pattern.search(data)
     return data if match is None else data[: match.start()] + new(match[0]) + data[match.end() :]
@@ -239,20 +237,18 @@ TEXT: list[Mutator] = [
 
 
 def damaged(data: bytes, rng: np.random.Generator, mutators: list[Mutator]) -> bytes:
-    """One kind of damage, or up to four one after the other; at most ``LARGEST`` bytes more than
-    there were.
-    """
+    """Apply one to four kinds of damage; the result has at most ``LARGEST`` bytes more."""
     for _ in range(1 if rng.random() < 0.5 else int(rng.integers(2, MOST_OPERATIONS + 1))):
         if data:
             data = _choice(mutators, rng)(data, rng)[: len(data) + LARGEST]
     return data
 
 
-# ---- formats that pack what they hold ------------------------------------------------------------
+# ---- compressed and checksummed formats ----------------------------------------------------------
 
 
 class Packing(NamedTuple):
-    """How a file comes apart into named pieces, and how pieces become a file again."""
+    """Functions that split a file into named pieces and join them again."""
 
     unpack: Callable[[bytes], list[tuple[str, bytes]]]
     pack: Callable[[list[tuple[str, bytes]]], bytes]
@@ -318,9 +314,7 @@ PLY = Packing(_unply, _joined, text=("header",))
 
 
 def json_value(data: bytes, rng: np.random.Generator) -> bytes:
-    """One value of a JSON document replaced by one of another kind or size, or its key by
-    another.
-    """
+    """Replace one value of a JSON document by one of another type or size, or remove it."""
     try:
         document = json.loads(data)
         places = list(_places(document))
@@ -341,12 +335,12 @@ def json_value(data: bytes, rng: np.random.Generator) -> bytes:
         holder[key] = value
     try:
         return json.dumps(document).encode()
-    except (ValueError, RecursionError):  # it holds itself now
+    except (ValueError, RecursionError):  # the document contains itself
         return data
 
 
 def _places(document: Any) -> Iterator[tuple[Any, Any]]:
-    """Every (container, key) of a JSON document."""
+    """Yield every (container, key) of a JSON document."""
     if isinstance(document, (dict, list)):
         for key in document if isinstance(document, dict) else range(len(document)):
             yield document, key
@@ -359,7 +353,7 @@ def mutant(
     mutators: list[Mutator],
     packing: Optional[Packing],
 ) -> bytes:
-    """A damaged one of ``seeds``, or a part of one in another."""
+    """Return a damaged copy of one of ``seeds``, or a splice of two."""
     data = _choice(seeds, rng)
     if rng.random() < 0.05:
         other = _choice(seeds, rng)

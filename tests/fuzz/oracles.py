@@ -1,8 +1,7 @@
-"""Second readers, slow and strict, written from the formats' descriptions alone: what a damaged
-file may be read as.
+"""Strict reference readers, written from the formats' specifications only.
 
-Each takes a file's bytes and returns what they say, or raises :class:`Illegal` where no reading is
-legitimate. What the product makes of a file must be what is said here."""
+Each takes a file's bytes and returns their content, or raises :class:`Illegal` if the file is
+invalid. The package's readers must return the same content."""
 
 import ast
 import hashlib
@@ -38,7 +37,7 @@ TYPES |= {
 
 
 class Illegal(Exception):
-    """The bytes are no file of this format."""
+    """The bytes are not a valid file of this format."""
 
 
 # ---- PLY -----------------------------------------------------------------------------------------
@@ -56,7 +55,7 @@ class PlyVertices(NamedTuple):
 
 
 class _Rows:
-    """What is left of the body."""
+    """The unread rest of the body."""
 
     def __init__(self, encoding: str, body: bytes):
         self.order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[encoding]
@@ -136,7 +135,7 @@ def ply_vertices(data: bytes) -> PlyVertices:
                 count,
             )
             if len(elements) > 1 and elements[-1][0] != "vertex":
-                return PlyVertices(*vertices, leftover=False)  # what follows isn't looked at
+                return PlyVertices(*vertices, leftover=False)  # later elements aren't read
     if vertices is None:
         raise Illegal("no vertices")
     return PlyVertices(*vertices, leftover=rows.rest())
@@ -199,7 +198,7 @@ def obj_triangles(data: bytes) -> np.ndarray:
         elif words[:1] == ["f"]:
             triangles += _fan([_index(word, len(vertices)) for word in words[1:]])
     if any(index >= len(vertices) for triangle in triangles for index in triangle):
-        raise Illegal("a face names a vertex that isn't there")
+        raise Illegal("a face names a vertex that doesn't exist")
     return np.array(vertices, np.float64).reshape(-1, 3)[
         np.array(triangles, np.int64).reshape(-1, 3)
     ]
@@ -299,15 +298,15 @@ SIMPLE = {"POSITION", "NORMAL", "TEXCOORD_0", "COLOR_0"}
 
 
 def glb_triangles(data: bytes) -> Optional[np.ndarray]:
-    """The corners (F, 3, 3) in the world of a GLB (glTF 2.0) of plain triangles; None for what is
-    more than this reader knows.
+    """The corners (F, 3, 3) in the world of a GLB (glTF 2.0) of plain triangles; None for
+    features that this reader doesn't support.
     """
     document, binary = _glb_chunks(data)
     try:
         scene = document["scenes"][document.get("scene", 0)]
         triangles = [_placed(document, binary, node, np.eye(4), 0) for node in scene["nodes"]]
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError):
-        return None  # what trimesh makes of an incomplete document isn't for this reader to say
+        return None  # the result for an incomplete document isn't specified
     return np.concatenate(triangles) if triangles else None
 
 

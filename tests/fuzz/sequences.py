@@ -1,8 +1,8 @@
-"""Random lives of a cloud: optimiser steps, statistics, densification, pruning and resuming in any
-order, with hostile numbers.
+"""Random sequences of operations on a cloud: optimiser steps, statistics, densification, pruning
+and resuming in any order, with extreme values.
 
-Every Gaussian carries an id in its colour and in its rows of the optimiser, so that a row that goes
-astray is seen."""
+Every Gaussian has an id in its colour and in its rows of the optimiser state, which reveals
+misplaced rows."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ from threestudio_gaussiandreamer.splatting import Rasterized
 from threestudio_gaussiandreamer.training.density import DensityControl, QualityResult
 from threestudio_gaussiandreamer.training.geometry import STATISTICS, GaussianCloud
 
-HOSTILE = {
+EXTREMES = {
     "means": [0.0, 1e4, -1e30, 3e38],
     "log_scales": [-1e30, -1000.0, -104.0, 0.0, 88.7, 1000.0, 3e38],
     "quats": [0.0, 1e-42, 1e30, -3e38],
@@ -27,11 +27,11 @@ FLOORS, CAPS = (1, 2, 64), (64, 65, 90, 500)
 SEEDS = st.integers(0, 2**31 - 1)
 
 
-class CloudLife(RuleBasedStateMachine):
-    """What can happen to a cloud between two pictures."""
+class CloudSequence(RuleBasedStateMachine):
+    """Operations on a cloud, and the invariants that hold after each."""
 
     steps = 0
-    """Rules that were run, in all lives."""
+    """Operations that were run, in all sequences."""
 
     @initialize(
         count=st.integers(1, 90),
@@ -64,12 +64,12 @@ class CloudLife(RuleBasedStateMachine):
         self._mark(torch.ones(count, dtype=torch.bool))
         self._record_changes()
 
-    # -- what happens ------------------------------------------------------------------------------
+    # -- operations ------------------------------------------------------------------------------
 
     @rule(seed=SEEDS)
     def step(self, seed: int) -> None:
-        """An optimiser step, which leaves the ids alone."""
-        CloudLife.steps += 1
+        """Take an optimiser step that keeps the ids."""
+        CloudSequence.steps += 1
         g = torch.Generator().manual_seed(seed)
         for group in self.optimizer.param_groups:
             group["lr"] = 0.0 if group["name"] in ("sh0", "sh_rest") else 0.1
@@ -81,8 +81,8 @@ class CloudLife(RuleBasedStateMachine):
 
     @rule(seed=SEEDS, bad=st.booleans(), views=st.integers(1, 3))
     def see(self, seed: int, bad: bool, views: int) -> None:
-        """Gradients and contributions of a step; gradients may be NaN or infinite."""
-        CloudLife.steps += 1
+        """Record gradients and contributions of a step; gradients may be NaN or infinite."""
+        CloudSequence.steps += 1
         g, n = torch.Generator().manual_seed(seed), len(self.cloud)
         means2d = torch.zeros(views, n, 2, requires_grad=True)
         means2d.grad = torch.randn(views, n, 2, generator=g) * 10.0 ** torch.randint(
@@ -140,24 +140,24 @@ class CloudLife(RuleBasedStateMachine):
         self._round(budget=budget, densify={"grad_threshold": 0.0, "every": 1}, prune={"keep": 0.5})
 
     @rule(
-        name=st.sampled_from(sorted(HOSTILE)),
+        name=st.sampled_from(sorted(EXTREMES)),
         which=st.integers(0, 10),
         share=st.floats(0, 1),
         seed=SEEDS,
     )
-    def poison(self, name: str, which: int, share: float, seed: int) -> None:
-        """Numbers that are finite, and no more."""
-        CloudLife.steps += 1
+    def set_extreme(self, name: str, which: int, share: float, seed: int) -> None:
+        """Set parameters to extreme finite values."""
+        CloudSequence.steps += 1
         values, g = getattr(self.cloud, name), torch.Generator().manual_seed(seed)
         with torch.no_grad():
-            values[torch.rand(values.shape, generator=g) < share] = HOSTILE[name][
-                which % len(HOSTILE[name])
+            values[torch.rand(values.shape, generator=g) < share] = EXTREMES[name][
+                which % len(EXTREMES[name])
             ]
 
     @rule()
     def resume(self) -> None:
-        """As from a checkpoint: another cloud, another optimiser, the same numbers."""
-        CloudLife.steps += 1
+        """Copy the state into another cloud and optimiser, as a checkpoint does."""
+        CloudSequence.steps += 1
         other = GaussianCloud(self.cloud.cfg)
         other.load_state_dict(
             {key: value.clone() for key, value in self.cloud.state_dict().items()}
@@ -170,11 +170,11 @@ class CloudLife(RuleBasedStateMachine):
     @precondition(lambda self: hasattr(self, "cloud"))
     @rule()
     def draw(self) -> None:
-        CloudLife.steps += 1
+        CloudSequence.steps += 1
         require_picture(self.cloud)
         self.optimizer.zero_grad()
 
-    # -- what holds --------------------------------------------------------------------------------
+    # -- invariants --------------------------------------------------------------------------------
 
     @invariant()
     def everything_fits(self) -> None:
@@ -203,7 +203,7 @@ class CloudLife(RuleBasedStateMachine):
         for value, state in self.optimizer.state.items():
             assert state["exp_avg"].shape == value.shape == state["exp_avg_sq"].shape
             assert (state["exp_avg"].reshape(len(ids), -1) == ids[:, None]).all(), (
-                "a row of moments went astray"
+                "a row of moments is misplaced"
             )
 
     def _round(
@@ -214,8 +214,8 @@ class CloudLife(RuleBasedStateMachine):
         prune: dict | None = None,
         check: Any = None,
     ) -> None:
-        """One round of densification or pruning, or of both, and its bounds."""
-        CloudLife.steps += 1
+        """Run one round of densification, pruning or both, and check its bounds."""
+        CloudSequence.steps += 1
         cfg, before = self.cloud.cfg, len(self.cloud)
         old = {
             name: value.detach().clone() for name, value in self.cloud.parameters_by_name().items()
@@ -235,7 +235,9 @@ class CloudLife(RuleBasedStateMachine):
             self._check_change(change, old)
 
     def _check_change(self, change: Change, old: dict[str, Tensor]) -> None:
-        """Who stays is unchanged and in order; who is new has no moments yet, and gets an id."""
+        """Check that kept Gaussians are unchanged and in order and new ones have no moments; mark
+        the new ones.
+        """
         stays = ~change.is_new
         assert (change.parents[stays].diff() > 0).all(), "the order changed"
         for name, value in self.cloud.parameters_by_name().items():
@@ -261,7 +263,7 @@ class CloudLife(RuleBasedStateMachine):
         return self.cloud.sh0.detach()[:, 0, 0]
 
     def _mark(self, rows: Tensor) -> None:
-        """Give these rows new ids, in their colour and in their moments."""
+        """Give these rows new ids, in colour and moments."""
         with torch.no_grad():
             new = torch.arange(self.next_id, self.next_id + int(rows.sum()), dtype=torch.float32)
             self.cloud.sh0[rows] = new[:, None, None].expand(-1, 1, 3) * torch.tensor([1.0, 0, 0])

@@ -22,11 +22,11 @@ register_parts()
 
 
 class Misread(Exception):
-    """A damaged file was taken for something that it doesn't say."""
+    """A damaged file was read as something that it doesn't contain."""
 
 
 class Target(NamedTuple):
-    """One door."""
+    """One reader, or another entry point that takes untrusted input."""
 
     suffix: str
     seeds: Callable[[], list[bytes]]
@@ -34,8 +34,7 @@ class Target(NamedTuple):
     mutators: list[Mutator] = BINARY
     packing: Optional[Packing] = None
     traced: bool = True
-    """Whether memory is watched, which makes Python slow; of configurations the values are counted.
-    """
+    """Whether memory is traced, which is slow; configurations count their values instead."""
 
 
 def require(holds: bool, problem: str) -> None:
@@ -51,8 +50,8 @@ FOCAL = torch.tensor([[[12.0, 0, 6], [0, 12, 6], [0, 0, 1]]])
 
 
 def require_picture(geometry: GaussianCloud) -> None:
-    """No pixel and no gradient of a cloud is NaN; gradients may overflow where a colour is beyond
-    any picture.
+    """Require that no pixel and no gradient of a cloud is NaN; gradients may overflow for extreme
+    colours.
     """
     colors = geometry.colors(torch.tensor([[0.0, 0, -3]]))
     out = rasterize(
@@ -89,7 +88,7 @@ def cloud_of(arrays: Gaussians) -> GaussianCloud:
 
 
 def require_points(cloud: PointCloud) -> None:
-    """What every prior promises."""
+    """Require what every prior guarantees."""
     shapes = {np.shape(cloud.points), np.shape(cloud.colors), (len(cloud.points), 3)}
     require(len(shapes) == 1 and len(cloud.points) > 0, f"shapes {shapes}")
     require(
@@ -107,7 +106,7 @@ def require_points(cloud: PointCloud) -> None:
 
 
 def same(ours: np.ndarray, theirs: np.ndarray, what: str) -> None:
-    """Equal to the bit as float32, NaN like NaN."""
+    """Require equal float32 bits; NaN equals NaN."""
     with np.errstate(over="ignore", invalid="ignore"):
         ours, theirs = np.asarray(ours, np.float32), np.asarray(theirs).astype(np.float32)
     require(
@@ -117,7 +116,7 @@ def same(ours: np.ndarray, theirs: np.ndarray, what: str) -> None:
 
 
 def strictly(read: Callable[[bytes], Any], path: Path) -> Any:
-    """What a second reader says of a file that the product has read."""
+    """Return what the strict reader makes of a file that the package has read."""
     try:
         return read(path.read_bytes())
     except Illegal as error:
@@ -126,7 +125,7 @@ def strictly(read: Callable[[bytes], Any], path: Path) -> Any:
 
 @contextlib.contextmanager
 def messages() -> Iterator[list[str]]:
-    """What the product logs meanwhile."""
+    """Collect what the package logs."""
     records: list[str] = []
     handler = logging.Handler()
     handler.emit = lambda record: records.append(record.getMessage())

@@ -1,8 +1,8 @@
-"""Every fuzz target: good files, how to damage them, and what must hold.
+"""All fuzz targets: valid files, how to damage them, and what must hold.
 
-``exercise`` takes a damaged file through the product as far as a picture. It returns when the file
-was read, raises UserError when it was refused in one clear message, and :class:`Misread` when what
-was read isn't what the file says. Anything else is a crash."""
+``exercise`` reads a damaged file with the package and renders the result. It returns if the file
+was read, raises UserError if it was rejected, and :class:`Misread` if the result isn't the file's
+content. Any other exception is a crash."""
 
 import numpy as np
 
@@ -46,7 +46,7 @@ from tests.fuzz.target import Target, require_picture
 
 
 def mutant(name: str, seed: int, index: int) -> bytes:
-    """The damaged file of that number."""
+    """Return the damaged file with this index."""
     target = TARGETS[name]
     rng = np.random.default_rng([seed, index, *name.encode()])
     return mutations.mutant(seeds(name), rng, target.mutators, target.packing)
@@ -76,7 +76,7 @@ TARGETS: dict[str, Target] = {
         ".txt",
         config_values.seeds,
         config_values.exercise,
-        [config_values.hostile_option],
+        [config_values.extreme_option],
         traced=False,
     ),
     "checkpoint-content": Target(

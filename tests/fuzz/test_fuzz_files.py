@@ -1,5 +1,5 @@
-"""Damaged files at every door, a few of what `make fuzz` tries; and every one that was ever taken
-wrongly, kept in corpus/.
+"""A sample of `make fuzz`: damaged files for every reader, and corpus/, the files of earlier
+defects.
 """
 
 import time
@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.fuzz.judge import judged, outcomes
 from tests.fuzz.mutations import BINARY, TEXT, mutant
+from tests.fuzz.runner import outcome_of, outcomes
 from tests.fuzz.target import Misread, Target
 from tests.fuzz.targets import TARGETS, seeds
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -24,11 +24,11 @@ INPUTS = {
     "command-line": 15,
     "checkpoint": 30,
 }
-"""How many damaged files of a kind; of others 70."""
+"""Number of damaged files per target; 70 for the others."""
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_damaged_files_are_read_rightly_or_refused(name):
+def test_damaged_files_are_read_correctly_or_refused(name):
     ended = dict(outcomes(name, range(INPUTS.get(name, 70)), seed=1))
     failed = {index: outcome.detail for index, outcome in ended.items() if outcome.kind == "failed"}
     assert not failed, failed
@@ -36,19 +36,19 @@ def test_damaged_files_are_read_rightly_or_refused(name):
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_good_files_are_read(name):
-    assert [judged(TARGETS[name], data) for data in seeds(name)] == [("read", "")] * len(
+def test_valid_files_are_read(name):
+    assert [outcome_of(TARGETS[name], data) for data in seeds(name)] == [("read", "")] * len(
         seeds(name)
     )
 
 
 @pytest.mark.parametrize("path", CORPUS, ids=lambda path: f"{path.parent.name}-{path.stem}")
-def test_what_was_taken_wrongly_once_is_refused(path):
-    outcome = judged(TARGETS[path.parent.name], path.read_bytes())
+def test_a_file_of_an_earlier_defect_is_refused(path):
+    outcome = outcome_of(TARGETS[path.parent.name], path.read_bytes())
     assert outcome.kind == "refused", outcome
 
 
-# ---- can it fail? --------------------------------------------------------------------------------
+# ---- tests of the runner -------------------------------------------------------------------------
 
 
 def crash(path: Path) -> None:
@@ -64,29 +64,29 @@ def hang(path: Path) -> None:
 
 
 def misread(path: Path) -> None:
-    raise Misread("it isn't what it says")
+    raise Misread("another content")
 
 
-def believe(path: Path) -> None:
+def allocate(path: Path) -> None:
     np.ones(200 << 20, np.uint8)
 
 
-@pytest.mark.parametrize("door", [crash, hang, misread, believe])
-def test_a_faulty_door_is_seen(door, monkeypatch):
-    monkeypatch.setattr("tests.fuzz.judge.SECONDS", 0.2 if door is hang else 60)
-    outcome = judged(Target(".bin", list, door), b"0123")
+@pytest.mark.parametrize("reader", [crash, hang, misread, allocate])
+def test_a_faulty_reader_is_detected(reader, monkeypatch):
+    monkeypatch.setattr("tests.fuzz.runner.SECONDS", 0.2 if reader is hang else 60)
+    outcome = outcome_of(Target(".bin", list, reader), b"0123")
     assert outcome.kind == "failed"
     assert (
         outcome.detail.split(":")[0]
-        == {crash: "crash", hang: "hang", misread: "misread", believe: "memory"}[door]
+        == {crash: "crash", hang: "hang", misread: "misread", allocate: "memory"}[reader]
     )
 
 
-def test_a_refusal_is_none():
+def test_a_user_error_is_a_refusal():
     def refuse(path: Path) -> None:
         raise UserError("no")
 
-    assert judged(Target(".bin", list, refuse), b"0123") == ("refused", "no")
+    assert outcome_of(Target(".bin", list, refuse), b"0123") == ("refused", "no")
 
 
 @pytest.mark.parametrize("mutators", [BINARY, TEXT])

@@ -1,22 +1,22 @@
-"""Random lives of a cloud, a few of what `make fuzz` tries."""
+"""A sample of `make fuzz`: random sequences of operations on a cloud."""
 
 import pytest
 import torch
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis.stateful import run_state_machine_as_test
 
-from tests.fuzz.sequences import CloudLife
+from tests.fuzz.sequences import CloudSequence
 from threestudio_gaussiandreamer.gaussians import densify
 
 pytestmark = pytest.mark.slow
 
 
-def live(lives: int, **options) -> None:
+def run_sequences(count: int, **options) -> None:
     health = list(HealthCheck)
     run_state_machine_as_test(
-        CloudLife,
+        CloudSequence,
         settings=settings(
-            max_examples=lives,
+            max_examples=count,
             stateful_step_count=20,
             derandomize=True,
             deadline=None,
@@ -27,23 +27,23 @@ def live(lives: int, **options) -> None:
     )
 
 
-def test_no_life_breaks_a_cloud():
-    live(30)
+def test_no_sequence_breaks_a_cloud():
+    run_sequences(30)
 
 
-def test_a_split_beyond_floats_is_found(monkeypatch):
+def test_a_split_beyond_floats_is_detected(monkeypatch):
     """Without the limit of densify, a Gaussian of infinite size has children at infinity."""
     monkeypatch.setattr(densify, "LOG_SCALE_RANGE", (-1e30, 1e30))
-    life = CloudLife()
-    life.start(count=20, floor=1, cap=500, seed=0)
+    sequence = CloudSequence()
+    sequence.start(count=20, floor=1, cap=500, seed=0)
     with torch.no_grad():
-        life.cloud.log_scales.fill_(300.0)
+        sequence.cloud.log_scales.fill_(300.0)
     with pytest.raises(AssertionError, match="isn't finite"):
-        life.densify(seed=1, threshold=0.0, split=0.05, faint=0.0, huge=1e30)
-        life.everything_fits()
+        sequence.densify(seed=1, threshold=0.0, split=0.05, faint=0.0, huge=1e30)
+        sequence.everything_fits()
 
 
-def test_moments_that_go_astray_are_found(monkeypatch):
+def test_misplaced_moments_are_detected(monkeypatch):
     def rows(value, old, change):
         return (
             value[change.parents.roll(1)] if getattr(value, "shape", None) == old.shape else value
@@ -51,4 +51,4 @@ def test_moments_that_go_astray_are_found(monkeypatch):
 
     monkeypatch.setattr(densify, "_rows", rows)
     with pytest.raises(AssertionError):
-        live(200, phases=[Phase.generate])
+        run_sequences(200, phases=[Phase.generate])

@@ -1,6 +1,4 @@
-"""Hostile scenes for the rasteriser, drawn from a seed, and what every backend must hold on
-them.
-"""
+"""Extreme scenes for the rasteriser, drawn from a seed, and what every backend must satisfy."""
 
 import math
 from collections.abc import Sequence
@@ -16,17 +14,16 @@ from threestudio_gaussiandreamer.splatting import Rasterized, rasterize
 MAX = 3.4028235e38
 DENORMAL = 1e-42
 PIXELS_TIMES_GAUSSIANS = 2_000_000
-"""The most that one scene asks of the specification, which looks at every Gaussian in every pixel.
-"""
+"""Largest scene, since the specification evaluates every Gaussian at every pixel."""
 ROUNDING = 2e-5
-"""How far apart depths must be for float32 to tell their order, of means up to 50."""
+"""Smallest distance of depths whose order float32 resolves, for means up to 50."""
 FLIPS = 4 / 1024
-"""How far pixels may differ: float32 rounding may put the faintest contribution (1/1024) of a few
-Gaussians on either side.
+"""Tolerance of pixels: float32 rounding may put the faintest contribution (1/1024) of a few
+Gaussians on either side of the threshold.
 """
 GRADIENTS = 1e-2
-"""Relative distance of gradients without the worst hundredth of the Gaussians: those at a threshold
-(flips of alpha_min, the cap).
+"""Tolerance of gradients, relative, without the worst hundredth of the Gaussians: those at a
+threshold (alpha_min, the cap).
 """
 
 SIZES = (0.0, DENORMAL, 1e-30, 1e-8, 1e-4, 0.05, 1.0, 1e2, 1e4, 1e10, 1e30, MAX)
@@ -34,16 +31,16 @@ PLACES = (0.0, -0.0, DENORMAL, 0.01, -0.01, 0.3, 1.0, -1.0, 10.0, -1e4, 1e8, 1e2
 LENGTHS = (0.0, DENORMAL, 1e-30, 1e-13, 1e-12, 1e-3, 1.0, 5.0, 1e10, 1e20, 1e30, MAX)
 OPACITIES = (0.0, -0.0, DENORMAL, 1 / 1024, 1 / 255, 0.5, 1 - 2**-10, 1.0, 1.5, -1.0, 100.0)
 HARMONICS = (0.0, -0.0, DENORMAL, -1.0, 1.0, 1e4, -1e10)
-DAZZLING = (1e30, -1e30, MAX, -MAX)
-"""Harmonics whose pictures float32 can hold, though not the gradients: those of a colour c grow
-with c times focal length / depth.
+BRIGHT = (1e30, -1e30, MAX, -MAX)
+"""SH coefficients whose pixels are finite in float32, but not their gradients, which grow with
+colour times focal length / depth.
 """
 NOT_FINITE = (math.nan, math.inf, -math.inf)
 FOVS_DEG = (1e-3, 0.1, 1.0, 30.0, 60.0, 120.0, 179.0, 179.999)
 
 
 class Scene(NamedTuple):
-    """The arguments of `rasterize`, colours as spherical harmonics."""
+    """Arguments of `rasterize`, with colours as spherical harmonics."""
 
     cloud: Cloud
     """float32; ``colors`` are harmonics (N, K, 3)."""
@@ -56,7 +53,7 @@ class Scene(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """A picture and its gradients by the name of the argument."""
+    """A render, and the gradients by argument name."""
 
     out: Rasterized
     grads: dict[str, Tensor]
@@ -65,21 +62,21 @@ class Drawn(NamedTuple):
 # ---- scenes --------------------------------------------------------------------------------------
 
 
-def hostile_scene(seed: int, most: int = 4000) -> Scene:
-    """A scene of up to ``most`` Gaussians; a tenth of the scenes also holds NaN and infinity."""
+def extreme_scene(seed: int, most: int = 4000) -> Scene:
+    """Draw a scene of up to ``most`` Gaussians; a tenth of the scenes contains NaN and infinity."""
     g = torch.Generator().manual_seed(seed)
     count = _count(g, most)
     views = int(torch.randint(1, 5, (), generator=g))
     size = _size(g, max(count * views, 1))
-    cloud = _cloud(g, count, poisoned=bool(_chance(g, 0.1)))
+    cloud = _cloud(g, count, non_finite=bool(_chance(g, 0.1)))
     viewmats, Ks = _cameras(g, views, *size)
     background = torch.randn(3, generator=g) if _chance(g, 0.5) else None
     return Scene(cloud, viewmats, Ks, size, background, _options(g, size))
 
 
 def well_posed(scene: Scene) -> Scene:
-    """The part on which float32 backends must agree: finite, of moderate size and place, clear of
-    every plane and threshold.
+    """Select the Gaussians on which float32 backends must agree: finite, of moderate size and
+    position, clear of the near plane.
 
     Under a field of view of less than a degree or more than 150, neither rounding nor the clamped
     Jacobian is moderate."""
@@ -105,8 +102,8 @@ def well_posed(scene: Scene) -> Scene:
 
 
 def _of_mixed_depth(means: Tensor, depths: Tensor) -> Tensor:
-    """Marks Gaussians whose order by depth is a matter of rounding; those in the very same place go
-    by index everywhere.
+    """Mark Gaussians whose depth order depends on rounding; equal positions are ordered by index in
+    every backend.
     """
     order = depths.argsort(stable=True)
     near = depths[order].diff() < ROUNDING
@@ -123,7 +120,7 @@ def _chance(g: torch.Generator, share: float) -> bool:
 
 
 def _count(g: torch.Generator, most: int) -> int:
-    """Few or many: uniform in the logarithm, from 0."""
+    """Draw a count, uniform in the logarithm, or ``most``."""
     return (
         int(math.exp(torch.rand((), generator=g).item() * math.log(most + 1))) - 1
         if _chance(g, 0.4)
@@ -132,7 +129,7 @@ def _count(g: torch.Generator, most: int) -> int:
 
 
 def _size(g: torch.Generator, work: int) -> tuple[int, int]:
-    """1 x 1, odd, long or square, as large as the specification can bear."""
+    """Draw a size: 1 x 1, odd, elongated or square, limited by the specification's cost."""
     area = min(max(PIXELS_TIMES_GAUSSIANS // work, 1), 48 * 48)
     width = min(int(math.exp(torch.rand((), generator=g).item() * math.log(area + 1))), 200)
     width = max(round(math.sqrt(area)) if _chance(g, 0.5) else width, 1)
@@ -143,10 +140,8 @@ def _picked(g: torch.Generator, values: tuple[float, ...], shape: tuple[int, ...
     return torch.tensor(values)[torch.randint(len(values), shape, generator=g)]
 
 
-def _cloud(g: torch.Generator, count: int, poisoned: bool) -> Cloud:
-    """Ordinary Gaussians with hostile rows and entries among them; some rows are copies of
-    others.
-    """
+def _cloud(g: torch.Generator, count: int, non_finite: bool) -> Cloud:
+    """Draw ordinary Gaussians with extreme rows and entries; some rows are copies of others."""
     degree = int(torch.randint(0, 4, (), generator=g))
     cloud = Cloud(
         means=0.5 * torch.randn(count, 3, generator=g),
@@ -155,36 +150,36 @@ def _cloud(g: torch.Generator, count: int, poisoned: bool) -> Cloud:
         opacities=torch.rand(count, generator=g),
         colors=torch.randn(count, (degree + 1) ** 2, 3, generator=g),
     )
-    hostility = torch.rand((), generator=g).item() ** 2
+    share = torch.rand((), generator=g).item() ** 2
     for name, values in zip(NAMES, (PLACES, LENGTHS, SIZES, OPACITIES, HARMONICS), strict=True):
-        _poison(g, getattr(cloud, name), values, 0.3 * hostility)
-        if poisoned:
-            _poison(g, getattr(cloud, name), NOT_FINITE, 0.02)
+        _corrupt(g, getattr(cloud, name), values, 0.3 * share)
+        if non_finite:
+            _corrupt(g, getattr(cloud, name), NOT_FINITE, 0.02)
     if _chance(g, 0.1):
-        _poison(g, cloud.colors, DAZZLING, 0.3 * hostility)
+        _corrupt(g, cloud.colors, BRIGHT, 0.3 * share)
     if count:
-        copies = torch.rand(count, generator=g) < 0.3 * hostility
+        copies = torch.rand(count, generator=g) < 0.3 * share
         rows = torch.where(copies, torch.randint(count, (count,), generator=g), torch.arange(count))
         cloud = cloud.pick(rows)
     return cloud
 
 
-def _poison(g: torch.Generator, values: Tensor, hostile: tuple[float, ...], share: float) -> None:
-    """Put hostile numbers into single entries, and one and the same into whole rows."""
+def _corrupt(g: torch.Generator, values: Tensor, extremes: tuple[float, ...], share: float) -> None:
+    """Write extreme values into single entries, and one value into whole rows."""
     rows = torch.rand(len(values), generator=g) < share / 2
     same = (
-        _picked(g, hostile, (len(values),))
+        _picked(g, extremes, (len(values),))
         .reshape(-1, *[1] * (values.dim() - 1))
         .expand(values.shape)
     )
     values[rows] = same[rows]
     entries = torch.rand(values.shape, generator=g) < share / 4
-    values[entries] = _picked(g, hostile, tuple(values.shape))[entries]
+    values[entries] = _picked(g, extremes, tuple(values.shape))[entries]
 
 
 def _cameras(g: torch.Generator, views: int, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Around the cloud; in two scenes of five odd ones: inside of it or behind, any field of view,
-    the principal point anywhere.
+    """Draw cameras around the cloud; in two of five scenes unusual ones: inside or behind it, with
+    any field of view and principal point.
     """
     q = torch.nn.functional.normalize(
         torch.randn(views, 4, generator=g, dtype=torch.float64), dim=-1
@@ -221,12 +216,12 @@ def _options(g: torch.Generator, size: tuple[int, int]) -> dict[str, Any]:
     return options
 
 
-# ---- drawing and judging -------------------------------------------------------------------------
+# ---- rendering and checking ----------------------------------------------------------------------
 
 
 def draw(scene: Scene, backend: str, dtype: torch.dtype = torch.float32) -> Drawn:
-    """Forward and backward with fixed cotangents; gradients of the harmonics pass through the
-    colours, those of the cameras too.
+    """Render forward and backward with fixed cotangents; gradients reach SH coefficients and
+    cameras.
     """
     leaves = scene.cloud.to(dtype).leaves()
     viewmats, background = scene.viewmats.to(dtype, copy=True).requires_grad_(), scene.background
@@ -257,12 +252,11 @@ def draw(scene: Scene, backend: str, dtype: torch.dtype = torch.float32) -> Draw
 
 
 def fault(scene: Scene, drawn: Drawn) -> Optional[str]:
-    """What is wrong with a picture of any scene, in words: a value or gradient that isn't finite,
-    or alpha outside of [0, 1].
+    """Return the first problem of a render: a value or gradient that isn't finite, or alpha outside
+    [0, 1].
 
-    Two exceptions: radii may be infinite, of a Gaussian that is larger than float32 can say; and
-        the gradient of harmonics may be
-    NaN where the mean is, since no direction leads there.
+    Two exceptions: radii may be infinite for a Gaussian larger than float32, and the gradient of SH
+    coefficients may be NaN where the mean is, since it has no viewing direction.
     """
     for name in ("image", "alpha", "depth", "means2d", "contribution"):
         if not getattr(drawn.out, name).isfinite().all():
@@ -272,7 +266,7 @@ def fault(scene: Scene, drawn: Drawn) -> Optional[str]:
     if not ((drawn.out.alpha >= 0) & (drawn.out.alpha <= 1 + 1e-5)).all():
         return "alpha isn't in [0, 1]"
     placed = scene.cloud.means.isfinite().all(1)
-    if (scene.cloud.colors.abs() >= DAZZLING[0]).any():
+    if (scene.cloud.colors.abs() >= BRIGHT[0]).any():
         return None
     for name, grad in drawn.grads.items():
         if not (grad[placed] if name == "colors" else grad).isfinite().all():
@@ -281,9 +275,7 @@ def fault(scene: Scene, drawn: Drawn) -> Optional[str]:
 
 
 def disagreement(pictures: dict[str, Drawn]) -> Optional[str]:
-    """Which picture of one well-posed scene differs by more than rounding may from the last one, in
-    words.
-    """
+    """Return which render of a well-posed scene differs from the last one by more than rounding."""
     *others, (first, one) = pictures.items()
     for name, other in others:
         for part in ("image", "alpha"):
@@ -307,7 +299,7 @@ def fault_of(scene: Scene, backend: str) -> Optional[str]:
 
 
 def disagreement_on(scene: Scene, backends: Sequence[str]) -> Optional[str]:
-    """The specification is asked last, in float64."""
+    """Return the disagreement of backends on a scene; the specification, in float64, comes last."""
     return disagreement(
         {name: draw(scene, name) for name in backends}
         | {"float64": draw(scene, "reference", torch.float64)}

@@ -1,5 +1,5 @@
-"""Tries damaged files on a door, one after the other, each with a limit of time and memory, and
-says how each ended.
+"""Run damaged files through a target, one after the other, each with a limit of time and memory,
+and classify the outcomes.
 """
 
 import os
@@ -17,30 +17,30 @@ from tests.fuzz.targets import TARGETS, mutant
 from threestudio_gaussiandreamer.core.errors import UserError
 
 SECONDS = 10.0
-"""Of processor time that one file may take; the slowest good one takes a tenth of a second."""
+"""CPU time that one file may take; the slowest valid one takes a tenth of a second."""
 FIXED_BYTES, PER_BYTE = 24 << 20, 64
-"""What Python may allocate for a file: some for the work itself, and so many times the file."""
+"""Memory that Python may allocate for a file: fixed, and per byte of the file."""
 
 
 class Outcome(NamedTuple):
-    """How one input ended: "refused" with a clear message, "read" rightly, or "failed"."""
+    """The outcome of one input: "refused" with a UserError, "read" correctly, or "failed"."""
 
     kind: str
     detail: str = ""
 
 
 class Hang(BaseException):
-    """Not an Exception, which a product might catch."""
+    """The time limit; derives from BaseException so that the code under test can't catch it."""
 
 
 def outcomes(name: str, indices: Iterable[int], seed: int) -> Iterator[tuple[int, Outcome]]:
-    """How the damaged files of these numbers end."""
+    """Yield the outcome of each damaged file of these indices."""
     for index in indices:
-        yield index, judged(TARGETS[name], mutant(name, seed, index))
+        yield index, outcome_of(TARGETS[name], mutant(name, seed, index))
 
 
-def judged(target: Target, data: bytes) -> Outcome:
-    """How one file ends, in a folder of its own."""
+def outcome_of(target: Target, data: bytes) -> Outcome:
+    """Return the outcome of one file, in a temporary folder."""
     with tempfile.TemporaryDirectory() as folder, _in_folder(folder):
         path = Path(folder, "input" + target.suffix)
         path.write_bytes(data)
@@ -53,7 +53,7 @@ def judged(target: Target, data: bytes) -> Outcome:
 
 @contextmanager
 def _traced(traced: bool) -> Iterator[Callable[[], int]]:
-    """How many bytes Python and NumPy have allocated at most; 0 where nobody looks."""
+    """Yield a function that returns the peak memory of Python and NumPy, bytes; 0 if not traced."""
     if traced:
         tracemalloc.start()
     most = 0
@@ -75,7 +75,7 @@ def _run(target: Target, path: Path) -> Outcome:
     except Misread as error:
         return Outcome("failed", f"misread: {error}")
     except Hang:
-        return Outcome("failed", f"hang: more than {SECONDS:g} s of processor time")
+        return Outcome("failed", f"hang: more than {SECONDS:g} s of CPU time")
     except Exception as error:
         frame = traceback.extract_tb(error.__traceback__)[-1]
         return Outcome(
