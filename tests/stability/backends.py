@@ -1,5 +1,5 @@
-"""Which backends draw here: those of this machine, and the CUDA kernels on a stand-in for a GPU
-where they can be compiled for it.
+"""The backends that the stability tests use: those of this machine, and the CUDA kernels in
+emulation if they can be compiled for it.
 """
 
 import pytest
@@ -19,9 +19,7 @@ each_backend = pytest.mark.parametrize("backend", BACKENDS)
 
 
 def cuda_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lets the backend "cuda" draw tensors of the CPU, its kernels run thread by thread
-    (test_splatting_cuda.py).
-    """
+    """Make the backend "cuda" accept CPU tensors and run its kernels in emulation."""
     host = HostDevice()
     monkeypatch.setitem(
         backends.BACKENDS,

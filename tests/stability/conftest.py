@@ -1,6 +1,4 @@
-"""What the tests of stability share: `measured` and `fault`, and the report of what they
-measured.
-"""
+"""Fixtures of the stability tests: `measured` and `fault`, and the report of measured values."""
 
 import inspect
 import json
@@ -21,7 +19,7 @@ REPORT = pytest.StashKey[list]()
 
 
 class Measured:
-    """Records what a test measured and holds it to the row's bar."""
+    """Record what a test measured, and assert the row's bar."""
 
     def __init__(self, properties: list):
         self.properties = properties
@@ -35,11 +33,12 @@ class Measured:
         at_most: Optional[float] = None,
         at_least: Optional[float] = None,
     ) -> None:
-        """Record a number (of ``what``, in ``unit``) and assert its bound, or record a few words
-        that were asserted before.
+        """Record a number (quantity ``what``, in ``unit``) and assert its bound, or record a text
+        result that was asserted before.
 
-        Of several values of the same ``what`` the report shows the worst: the smallest if it must
-        be ``at_least``, else the largest."""
+        Of several values of the same ``what`` the report shows the worst: the smallest if
+        ``at_least`` is given, else the largest.
+        """
         worst = "min" if at_least is not None else "max"
         value = value if isinstance(value, str) else float(getattr(value, "item", lambda: value)())
         self.properties.append(
@@ -66,8 +65,8 @@ def measured(request) -> Measured:
 
 @pytest.fixture
 def said() -> Iterator[list[str]]:
-    """What the package says to the user, from the beginning of the test on; also where the launcher
-    has its own handler.
+    """Collect the package's log messages from the start of the test, also if the launcher has its
+    own handler.
     """
     messages: list[str] = []
     listener, logger = logging.Handler(), logging.getLogger("threestudio_gaussiandreamer")
@@ -82,12 +81,13 @@ def said() -> Iterator[list[str]]:
 
 @pytest.fixture
 def fault(request):
-    """``fault(deviation, ours=..., emulation=..., at_most=...)``: ours holds the bar, and the fault
-    in our own words breaks it.
+    """``fault(deviation, ours=..., emulation=..., at_most=...)``: assert that our implementation
+    holds the bar and that the emulated fault does not.
 
-    ``deviation`` is a function of an implementation; ``at_least`` instead of ``at_most`` where more
-    is better; ``raises`` names the exception of an emulation that crashes instead of giving a wrong
-    number."""
+    ``deviation`` is a function of an implementation; use ``at_least`` instead of ``at_most`` if
+    more is better; ``raises`` names the exception of an emulation that crashes instead of returning
+    a wrong number.
+    """
 
     def hold(
         deviation: Callable[[Any], float],
@@ -158,7 +158,7 @@ def pytest_runtest_makereport(item):
 
 
 def _plain(entry: dict) -> dict:
-    """JSON knows neither infinity nor NaN."""
+    """Replace infinity and NaN, which JSON does not support, by text."""
     value = entry["value"]
     return {
         **entry,
@@ -174,7 +174,7 @@ def pytest_sessionfinish(session) -> None:
 
 @pytest.fixture(scope="session")
 def whole(tmp_path_factory) -> Ended:
-    """A run that nothing happens to."""
+    """Return an uninterrupted run."""
     ended = launch(tmp_path_factory.mktemp("whole"), *EVERY_STEP)
     assert ended.code == 0, ended.err
     return ended

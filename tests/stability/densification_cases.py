@@ -1,4 +1,4 @@
-"""What the tests of densification share."""
+"""Helpers of the densification tests."""
 
 import numpy as np
 import torch
@@ -30,8 +30,8 @@ def started(n: int = 200, seed: int = 0, **options) -> GaussianCloud:
 
 
 class Training:
-    """The system's step, in its order, with the product's parts: towards the pictures of another
-    cloud, from four fixed cameras.
+    """The system's training step with the package's own parts, fitting renders of another cloud
+    from four fixed cameras.
     """
 
     def __init__(self, geometry: GaussianCloud, size: int = 32) -> None:
@@ -58,7 +58,7 @@ class Training:
         return renderer(self.c2w[views], self.fovy[views], self.size, self.size)
 
     def observe(self, views: slice, loss_scale: float = 1.0) -> None:
-        """Render, go backwards, and let the geometry see it; the mean over the batch of each view's
+        """Render, backpropagate and update the statistics; return the batch mean of each view's
         mean squared error.
         """
         out = self.render(self.geometry, views)
@@ -69,7 +69,7 @@ class Training:
         )
 
     def run(self, steps: int) -> list[int]:
-        """The count after each step."""
+        """Return the number of Gaussians after each step."""
         counts = []
         for _ in range(steps):
             self.observe(slice(None))

@@ -1,11 +1,11 @@
-"""Rows of group A0: faults found in the peers' own code, as (name, fault, bar, peers)."""
+"""Rows of group A0: defects in other projects' code, as (name, defect, bar, projects)."""
 
 FAULTS = [
     (
         "F1",
-        "clamped Jacobian: the gradient forgets that the clamp depends on depth",
+        "clamped Jacobian: the gradient ignores that the clamp depends on depth",
         "dL/dz within 1e-4 of autograd",
-        "diff-gaussian-rasterization `backward.cu:175,262`; gsplat has it right",
+        "diff-gaussian-rasterization `backward.cu:175,262`; gsplat is correct",
     ),
     (
         "F2",
@@ -87,14 +87,14 @@ FAULTS = [
     ),
     (
         "F15",
-        "growth depends on the unit and explodes for flat priors",
+        "growing depends on the unit and explodes for flat priors",
         "accepted share within 1 % from 1e-3 to 1e3; count <= cap",
         "`GaussianDreamer.py:168,180`",
     ),
     (
         "F16",
-        "growing reseeds the process",
-        "the process's generators are untouched",
+        "growing reseeds the global generators",
+        "the global generators are unchanged",
         "`GaussianDreamer.py:166`",
     ),
     (
@@ -112,24 +112,24 @@ FAULTS = [
     (
         "F19",
         "a negative loss is never back-propagated",
-        "the gradient of a negative loss arrives",
+        "a negative loss has a gradient",
         "`gaussian_mvdream.py:113,156`",
     ),
     (
         "F20",
-        "dead configuration key",
+        "a configuration key that is never read",
         "every learning rate in the config reaches the optimiser",
         "threestudio-gaussiandreamer `gaussian_base.py:222,541`",
     ),
     (
         "F21",
-        "cap by lottery",
-        "what contributes least goes first, exactly to the cap",
+        "the cap keeps a random subset",
+        "the smallest contributions are removed first, exactly to the cap",
         "`gaussian_base.py:871`",
     ),
     (
         "F22",
-        "broken score becomes zero in silence",
+        "a non-finite score becomes zero silently",
         "bad items masked and counted; a named error after 10 steps",
         "threestudio `stable_diffusion_guidance.py:418`",
     ),
@@ -147,8 +147,8 @@ FAULTS = [
     ),
     (
         "F25",
-        "paper and released code disagree",
-        "each preset holds its own numbers",
+        "paper and released code differ",
+        "each preset has its own values",
         "GaussianDreamer `arguments/__init__.py:73`",
     ),
     (
@@ -160,7 +160,7 @@ FAULTS = [
     (
         "F27",
         "one image size, crashes on a Gaussian behind the camera",
-        "any size; the others' picture unchanged",
+        "any size; the others' image unchanged",
         "torch-splatting `gauss_render.py:163,187,242`",
     ),
 ]

@@ -1,4 +1,4 @@
-"""What the tests of faults rasteriser share."""
+"""Helpers of the tests of rasteriser faults."""
 
 import torch
 
@@ -15,8 +15,8 @@ def central_difference(f, x: float, step: float = 1e-5) -> float:
 
 
 def slope_error(f, x: float, truth) -> float:
-    """How far autograd's derivative of ``f`` at ``x`` is from the finite difference of ``truth``,
-    relative.
+    """Return the relative error of autograd's derivative of ``f`` at ``x`` against the finite
+    difference of ``truth``.
     """
     leaf = torch.tensor(x, dtype=torch.float64).requires_grad_()
     (slope,) = torch.autograd.grad(f(leaf), leaf)

@@ -1,4 +1,4 @@
-"""What the tests of faults training share."""
+"""Helpers of the tests of training faults."""
 
 import numpy as np
 

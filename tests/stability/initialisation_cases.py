@@ -1,4 +1,4 @@
-"""What the tests of initialisation share."""
+"""Helpers of the initialisation tests."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def started(cloud: PointCloud, **options) -> GaussianCloud:
 
 
 def picture(geometry: GaussianCloud, frame: GaussianCloud | None = None) -> torch.Tensor:
-    """Three views of a cloud, from where they would show ``frame``."""
+    """Render three views of a cloud from cameras that frame ``frame``."""
     cloud, seen = (Gaussians.of(g).map(torch.Tensor.detach) for g in (geometry, frame or geometry))
     return render_all(cloud, views_around(seen, 3, 64))
 

@@ -1,4 +1,4 @@
-"""What the tests of rasteriser share."""
+"""Helpers of the rasteriser tests."""
 
 import torch
 

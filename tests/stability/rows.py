@@ -1,9 +1,9 @@
-"""Every way to fail that a test here provokes: its name, the bar that ours is held to, and what the
-peers do.
+"""The known failures that the stability tests provoke: name, bar, and what other projects do.
 
-Groups: A0 faults found in the peers' own code, A1 rasteriser, A2 geometry and first cloud, A3
-densification, A4 score distillation, A5 runs. A test says which row it is with `row`;
-`test_all_rows.py` fails while a row has none."""
+Groups: A0 defects in other projects' code, A1 rasteriser, A2 geometry and first cloud, A3
+densification, A4 score distillation, A5 runs. A test names its row with `row`; `test_all_rows.py`
+fails if a row has no test.
+"""
 
 import difflib
 from typing import NamedTuple, Optional
@@ -17,15 +17,13 @@ class Row(NamedTuple):
     group: str
     name: str
     title: str
-    """The fault in a line (A0), or empty."""
+    """One line about the defect (A0), or empty."""
     bar: str
     peers: str
 
 
 def row(group: str, name: str, *, bar: Optional[str] = None) -> pytest.MarkDecorator:
-    """Marks a test as the one (or one of several) of a row; a ``bar`` of its own needs a docstring
-    that proves it.
-    """
+    """Mark a test as one of a row; a ``bar`` of its own needs a docstring that justifies it."""
     if (group, name) not in ROWS:
         near = difflib.get_close_matches(
             name, [other for place, other in ROWS if place == group], n=3, cutoff=0.3
@@ -68,7 +66,7 @@ OTHERS = {
         ),
         (
             "Zero/denormal quaternion",
-            "identity, gradient 0 below 1e-12; no NaN; q, -q, 5q the same picture",
+            "identity, gradient 0 below 1e-12; no NaN; q, -q, 5q the same image",
             "gsplat: NaN (F7)",
         ),
         (
@@ -165,7 +163,7 @@ OTHERS = {
         ("No colours", "grey 0.5 and the perturbation, said in the log", "KeyError"),
         (
             "Units and pose",
-            "accepted share within 1 %; same picture within 50 dB after normalisation",
+            "accepted share within 1 %; same image within 50 dB after normalisation",
             "fixed 0.01 (F15)",
         ),
         (
@@ -189,7 +187,7 @@ OTHERS = {
         (
             "Explosion",
             "cap exact at every step; lowest contribution first",
-            "loss scale F11; MCMC caps +5 % per 100 steps; lottery F21",
+            "loss scale F11; MCMC caps +5 % per 100 steps; random subset F21",
         ),
         (
             "Collapse to 0",
@@ -211,7 +209,7 @@ OTHERS = {
         ("Saturated 0/0", "never seen: not selected, not NaN", "`grads.isnan() = 0`"),
         (
             "Opacity reset",
-            "recovers within 0.5 dB in 200 steps, or off by default",
+            "recovers within 0.5 dB in 200 steps, or is off by default",
             "off in both ports; wipes the asset under SDS",
         ),
         (
@@ -233,7 +231,7 @@ OTHERS = {
         ),
         (
             "GradScaler",
-            "rasteriser in float32; skipped steps counted; schedule not advanced in silence",
+            "rasteriser in float32; skipped steps counted; schedule not advanced silently",
             "65 536 overflows any fp16 gradient > 1",
         ),
         (
@@ -292,7 +290,7 @@ OTHERS = {
         ),
         (
             "Corrupted/foreign PLY",
-            "clean error or correct load; no allocation beyond the file",
+            "clean error or correct load; no allocation beyond the file size size",
             "plyfile tracebacks; UnityGS #179, #159; supersplat #41; splatapult #3",
         ),
         (
@@ -317,7 +315,7 @@ OTHERS = {
         ),
         (
             "Untrusted pickle",
-            "nothing executes at any door",
+            "no reader executes anything",
             "bare `torch.load` in threestudio `launch.py:240`, `misc.py:41`, `base.py:420`",
         ),
         ("Failed custom module", "named error at load", "`load_custom_module` prints and goes on"),

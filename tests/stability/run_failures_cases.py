@@ -1,4 +1,4 @@
-"""What the tests of run failures share."""
+"""Helpers of the tests of failing runs."""
 
 import torch
 

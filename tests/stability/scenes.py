@@ -1,6 +1,4 @@
-"""Small scenes, and pictures of them by the textbook: what truths and emulated faults are written
-with.
-"""
+"""Small scenes, and their images by the textbook formulas, for references and emulated faults."""
 
 import torch
 from torch import Tensor
@@ -13,7 +11,7 @@ def joined(*clouds: Cloud) -> Cloud:
 
 
 def stack(opacities: list[float], **options) -> Cloud:
-    """Gaussians of these opacities with the same shape in the same place."""
+    """Return Gaussians of these opacities with equal shape and position."""
     one = one_gaussian(**options)
     return Cloud(*(x.repeat(len(opacities), *[1] * (x.dim() - 1)) for x in one))._replace(
         opacities=torch.tensor(opacities).double()
@@ -21,7 +19,7 @@ def stack(opacities: list[float], **options) -> Cloud:
 
 
 def finite(result: Run) -> bool:
-    """Everything but the radii, which are infinite where no threshold bounds a Gaussian."""
+    """Return all outputs except the radii, which are infinite if no threshold bounds a Gaussian."""
     return all(
         x.isfinite().all()
         for x in (*result.out._replace(radii=result.out.alpha), *result.grads.values())
@@ -29,7 +27,7 @@ def finite(result: Run) -> bool:
 
 
 def pixels(width: int, height: int) -> Tensor:
-    """(height, width, 2) centres."""
+    """Return the pixel centres, (height, width, 2)."""
     return torch.stack(
         torch.meshgrid(torch.arange(width) + 0.5, torch.arange(height) + 0.5, indexing="xy"), -1
     ).double()
@@ -42,8 +40,8 @@ def clamped_slope(x: Tensor, z: Tensor, limit: float) -> Tensor:
 def clamped_alpha(
     mean: Tensor, scales: Tensor, width: int, focal: float, opacity: float, slope_of=clamped_slope
 ) -> Tensor:
-    """Alpha (width, width) of a Gaussian without rotation, by J at the clamped slope and an
-    inverse; the camera looks along z.
+    """Return the alpha (width, width) of an unrotated Gaussian, with J at the clamped slope; the
+    camera looks along z.
     """
     x, y, z = mean
     slopes = [slope_of(a, z, 1.3 * 0.5 * width / focal) for a in (x, y)]
@@ -62,8 +60,8 @@ def clamped_alpha(
 def plain_image(
     cloud: Cloud, width: int, height: int, focal: float, visible: Tensor, order: Tensor
 ) -> Tensor:
-    """Isotropic Gaussians one behind the other in ``order``, (height, width, 3); nothing is checked
-    but ``visible``.
+    """Composite isotropic Gaussians in ``order``, (height, width, 3); only ``visible`` is
+    respected.
     """
     image, T = torch.zeros(height, width, 3).double(), torch.ones(height, width).double()
     for i in order.tolist():

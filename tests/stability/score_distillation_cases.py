@@ -1,4 +1,4 @@
-"""What the tests of score distillation share."""
+"""Helpers of the score distillation tests."""
 
 import torch
 

@@ -1,6 +1,4 @@
-"""Runs of a few steps through the launcher, in this process: what the rows about training and files
-are provoked in.
-"""
+"""Short runs through the launcher, in this process, for the rows about training and files."""
 
 import contextlib
 import csv
@@ -34,7 +32,7 @@ class Ended(NamedTuple):
     out: str
     err: str
     folder: Path
-    """Of the trial."""
+    """The folder of the run."""
 
     @property
     def last(self) -> Path:
@@ -47,7 +45,7 @@ class Ended(NamedTuple):
         return json.loads((self.folder / "save" / "metrics.json").read_text())
 
     def logged(self, name: str) -> list[float]:
-        """What the run logged under a name, in order."""
+        """Return the values logged under a name, in order."""
         files = sorted(
             self.folder.glob("csv_logs/version_*/metrics.csv"),
             key=lambda path: int(path.parent.name.removeprefix("version_")),
@@ -57,9 +55,9 @@ class Ended(NamedTuple):
 
 
 def launch(folder: Path, *overrides: str, stage: str = "--train", config: Path = DEMO) -> Ended:
-    """One run of the small demo below ``folder``; the environment is afterwards what it was.
+    """Run the small demo below ``folder`` and restore the environment.
 
-    Without the prior's turntable, a picture for people that takes longer than all the rest.
+    The prior's turntable is off, because it takes longer than the rest.
     """
     out, err = io.StringIO(), io.StringIO()
     small = [
@@ -88,12 +86,14 @@ def launch(folder: Path, *overrides: str, stage: str = "--train", config: Path =
 
 
 def other_prior(overrides: Sequence[str]) -> bool:
-    """Whether the demo's prior, and so its options, is replaced."""
+    """Return whether the demo's prior, and so its options, is replaced."""
     return any(option.startswith("system.geometry.prior_type=") for option in overrides)
 
 
 def training_state(checkpoint: dict[str, Any]) -> dict[str, Tensor]:
-    """Everything that the next step depends on: parameters, statistics, moments, and the step."""
+    """Return everything that the next step depends on: parameters, statistics, moments and the
+    step.
+    """
     moments = checkpoint["optimizer_states"][0]["state"]
     found = {
         f"{i}.{name}": torch.as_tensor(value)
@@ -104,7 +104,7 @@ def training_state(checkpoint: dict[str, Any]) -> dict[str, Tensor]:
 
 
 def differences(a: dict[str, Any], b: dict[str, Any]) -> int:
-    """How many tensors of two checkpoints' training states aren't the same to the bit."""
+    """Count the tensors of two checkpoints' training states that differ in any bit."""
     one, other = training_state(a), training_state(b)
     return len(one.keys() ^ other.keys()) + sum(
         not torch.equal(one[name], other[name]) for name in one.keys() & other.keys()

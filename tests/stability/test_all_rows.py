@@ -1,6 +1,4 @@
-"""No row is left out: every one has a test, and the table holds every row of the list that it was
-written from.
-"""
+"""Every row has a test, and the table has every row of the list that it was written from."""
 
 import ast
 import json
@@ -17,7 +15,7 @@ FOLDER = Path(__file__).parent
 
 
 def rows_with_a_test() -> set[tuple[str, str]]:
-    """(group, name) of every ``@row(group, name)`` in this folder."""
+    """Return (group, name) of every ``@row(group, name)`` in this folder."""
     trees = [ast.parse(path.read_text()) for path in FOLDER.glob("test_*.py")]
     calls = [
         node
@@ -45,7 +43,7 @@ def test_every_result_names_a_row_and_tests_that_exist():
 
 
 def test_the_table_is_complete(shared_folder):
-    """Against the list of known failures, where it is at hand."""
+    """Compare with the list of known failures, if it is available."""
     path = shared_folder / "reference" / "stability.md"
     if not path.exists():
         pytest.skip("the list of known failures isn't here")

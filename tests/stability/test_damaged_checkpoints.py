@@ -1,4 +1,4 @@
-"""Damaged checkpoints are refused, or the one before is taken."""
+"""Damaged checkpoints are rejected, or the previous one is used."""
 
 import random
 from pathlib import Path
@@ -48,8 +48,8 @@ def test_no_damaged_byte_is_ever_loaded(how, times, tmp_path, measured):
 
 @pytest.fixture
 def stopped(tmp_path) -> Ended:
-    """A run of three steps whose last checkpoint, and the file that it is a copy of, are damaged;
-    that before it is whole.
+    """Return a run of three steps whose last checkpoint and its copy are damaged; the previous one
+    is intact.
     """
     ended = launch(tmp_path, "checkpoint.every_n_train_steps=1", "trainer.max_steps=3")
     assert ended.code == 0, ended.err
@@ -90,14 +90,14 @@ def test_resume_auto_takes_the_one_before_and_says_so(stopped, whole, tmp_path, 
 
 
 @row("A5", "Corrupted checkpoint")
-def test_resume_auto_without_a_checkpoint_starts_anew_and_says_so(tmp_path, measured):
+def test_resume_auto_without_a_checkpoint_starts_from_the_prior_and_says_so(tmp_path, measured):
     ended = launch(tmp_path, "trainer.max_steps=1", "resume=auto")
     assert ended.code == 0
     assert "no checkpoint of" in ended.err and "starting from the prior" in ended.err
     measured("says what it chose")
 
 
-HANDMADE = {
+INCONSISTENT = {
     "without loops": (lambda c: c.pop("loops"), "it has no loops"),
     "without optimizer_states": (lambda c: c.pop("optimizer_states"), "it has no optimizer_states"),
     "0-d means": (
@@ -129,12 +129,10 @@ HANDMADE = {
 
 
 @row("A5", "Corrupted checkpoint")
-@pytest.mark.parametrize("what", HANDMADE)
-def test_a_handmade_checkpoint_that_does_not_fit_is_named(what, whole, tmp_path, measured):
-    """Whole by its checksum, but not what a run can go on from: never trained from step 0, or with
-    half of it.
-    """
-    change, message = HANDMADE[what]
+@pytest.mark.parametrize("what", INCONSISTENT)
+def test_an_inconsistent_checkpoint_is_named(what, whole, tmp_path, measured):
+    """Its checksum is valid, but its content is not: untrained at step 0, or incomplete."""
+    change, message = INCONSISTENT[what]
     checkpoint = whole.checkpoint()
     change(checkpoint)
     save_file(tmp_path / "made.ckpt", checkpoint)

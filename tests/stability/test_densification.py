@@ -1,5 +1,5 @@
-"""A3: densifying and pruning that explodes, collapses, loses state or means something else; with
-the product's renderer and geometry.
+"""A3: densification and pruning that explode or collapse, with the package's renderer and
+geometry.
 """
 
 import math
@@ -39,7 +39,7 @@ def drawn(geometry: GaussianCloud) -> Gaussians:
 @pytest.mark.parametrize("limit", ["max_gaussians", "budget"])
 @pytest.mark.parametrize("absgrad", [False, True], ids=["gradient", "absgrad"])
 def test_threshold_zero_fills_the_cap_and_no_more(limit, absgrad, measured):
-    """Every Gaussian that was seen wants to grow at every step: 200, 400, then 500 for good."""
+    """Every visible Gaussian is selected at every step: 200, 400, then 500 from then on."""
     growing = EVERY_STEP | NO_LIMITS | {"grad_threshold": 0.0, "absgrad": absgrad}
     geometry = started(
         **{limit: 500}, densify=growing, prune={"start": 0, "stop": 10_000, "every": 1}
@@ -52,8 +52,8 @@ def test_threshold_zero_fills_the_cap_and_no_more(limit, absgrad, measured):
 @row("A3", "Explosion")
 @pytest.mark.parametrize("cap", [64, 123, 199])
 def test_above_the_cap_what_contributes_least_goes_first(cap, measured):
-    """A cloud that is larger than the cap, by contributions that the renders of one step gave;
-    nobody wants to grow.
+    """A cloud larger than the cap, ranked by the contributions of one step; no Gaussian is
+    selected.
     """
     geometry = started(max_gaussians=cap, densify=EVERY_STEP | NO_LIMITS | {"grad_threshold": 1e9})
     training = Training(geometry)
@@ -67,8 +67,8 @@ def test_above_the_cap_what_contributes_least_goes_first(cap, measured):
 
 @row("A3", "Explosion")
 def test_a_trained_cloud_that_is_too_large_keeps_what_contributes(tmp_path, measured, said):
-    """Half of 400 trained Gaussians are hidden or faint; a lottery would keep as many of them as of
-    the others.
+    """Half of 400 trained Gaussians are hidden or faint; a random choice would keep as many of them
+    as of the others.
     """
     trained = started(400)
     trained.means.data[::2] *= torch.linspace(0.1, 0.9, 200)[:, None]
@@ -103,11 +103,10 @@ def test_a_trained_cloud_that_is_too_large_keeps_what_contributes(tmp_path, meas
 
 @row("A3", "Explosion")
 def test_a_first_cloud_that_is_too_large_is_thinned_evenly(measured, said):
-    """A first cloud isn't trained: all are equally opaque, none is worth more than another, and
-    what lies outside hides the rest.
-
-    To rank by what each shows in its renders leaves holes that grow must fill again; an even choice
-    doesn't. Both, of 10 000 to 2500."""
+    """Before training all Gaussians are equally opaque and equally important, and the outer ones
+    hide the rest. Ranking by contribution leaves holes that growing must fill again; an even choice
+    does not. Both choices, of 10 000 to 2500.
+    """
     prior = {
         "prior_type": "mesh-prior",
         "prior": {"path": "toy.glb", "num_points": 8000, "color_smoothing": 40},
@@ -174,7 +173,7 @@ def test_no_opacity_can_exceed_one(measured):
 @row("A3", "Collapse to 0")
 @pytest.mark.parametrize("wrong", ["min_opacity=0.999", "max_scale=1e-6"])
 def test_a_run_that_would_lose_all_ends_with_the_floor(wrong, tmp_path, measured, said):
-    """The whole command, with rules that drop every Gaussian in each of three rounds."""
+    """Runs the command with rules that drop every Gaussian in each of three rounds."""
     rounds = [
         f"system.geometry.densify.{option}"
         for option in ("enabled=true", "start=1", "every=2", wrong)
@@ -191,7 +190,7 @@ def test_a_run_that_would_lose_all_ends_with_the_floor(wrong, tmp_path, measured
 @pytest.mark.parametrize("absgrad", [False, True], ids=["gradient", "absgrad"])
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_very_few_keep_their_shapes(n, absgrad, measured):
-    """Cloned, split and pruned after steps of training; the counts say that each happened."""
+    """Clones, splits and prunes after training steps; the counts show that each happened."""
     for split_scale, expected in ((1e9, 2 * n), (1e-9, 2 * n)):
         rules = (
             EVERY_STEP
@@ -217,9 +216,9 @@ def test_very_few_keep_their_shapes(n, absgrad, measured):
 @row("A3", "MCMC relocation with no live Gaussian / all-zero opacity")
 @pytest.mark.parametrize("budget", [None, 100, "auto"])
 @pytest.mark.parametrize("score", ["contribution", "opacity", "random"])
-def test_a_dead_cloud_is_survived(budget, score, measured):
-    """Nothing is relocated, so nothing is drawn from a distribution without mass: a dead cloud
-    shrinks to the floor and trains on.
+def test_a_transparent_cloud_shrinks_to_the_floor(budget, score, measured):
+    """Nothing is relocated, so no distribution without mass is sampled: a transparent cloud shrinks
+    to the floor and training continues.
     """
     prune = {"start": 1, "stop": 10_000, "every": 1, "score": score}
     geometry = started(

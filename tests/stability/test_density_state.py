@@ -1,4 +1,4 @@
-"""Densify and prune keep every row of state with its Gaussian."""
+"""Densification and pruning keep every row of optimiser state with its Gaussian."""
 
 import hashlib
 from pathlib import Path
@@ -24,7 +24,7 @@ register_parts()
 
 
 def seen_alike(geometry: GaussianCloud, gradient: torch.Tensor, contribution: torch.Tensor) -> None:
-    """Statistics as if one view had seen every Gaussian."""
+    """Set statistics as if one view had seen every Gaussian."""
     geometry.gradient_sum.copy_(gradient)
     geometry.gradient_count.fill_(1)
     geometry.contribution.copy_(contribution)
@@ -34,15 +34,15 @@ def seen_alike(geometry: GaussianCloud, gradient: torch.Tensor, contribution: to
 
 
 class Ledger:
-    """Gives every Gaussian an id, which its colour hides and the moments of all its parameters
-    spell, and looks at what is left of it.
+    """Give every Gaussian an id, stored in its colour and in the moments of all its parameters, and
+    check them later.
     """
 
     def __init__(self, geometry: GaussianCloud, optimizer: torch.optim.Optimizer) -> None:
         self.geometry, self.optimizer = geometry, optimizer
 
     def parameters(self) -> list[torch.nn.Parameter]:
-        """Those with state; spherical harmonics above degree 0 may have no numbers."""
+        """Return those with state; spherical harmonics above degree 0 may be empty."""
         return [
             parameter
             for parameter in self.geometry.parameters()
@@ -61,7 +61,7 @@ class Ledger:
         return self.geometry.sh0[:, 0, 0].detach().clone()
 
     def fresh(self) -> torch.Tensor:
-        """Which Gaussians have no past, the same by all their moments; every other has its own, bit
+        """Return which Gaussians have no moments; the moments of all others must be their own, bit
         for bit.
         """
         held = {
@@ -127,10 +127,10 @@ def test_moments_follow_their_gaussian(seed, measured):
         ]
         if steps:
             fresh = ledger.fresh()
-            assert len(left[~fresh].unique()) == int((~fresh).sum())  # nobody's past is there twice
+            assert len(left[~fresh].unique()) == int((~fresh).sum())  # no history is duplicated
             assert torch.isin(
                 left[fresh], ids[gradient > 0.6]
-            ).all()  # new ones come of those that were selected
+            ).all()  # new Gaussians derive from selected ones
             new += int(fresh.sum())
         gone += n - len(left.unique())
     assert new > 5 and gone > 5
@@ -138,13 +138,13 @@ def test_moments_follow_their_gaussian(seed, measured):
 
 
 @row("A3", "Lost step")
-def test_a_round_that_selects_nobody_is_none(measured):
-    """Five rounds between three prunings, for whose scores they must not count: parameters and
-    moments, bit for bit.
+def test_a_round_that_selects_no_gaussian_changes_nothing(measured):
+    """Five rounds between three prunings, whose scores must not count them: parameters and moments,
+    bit for bit.
     """
-    nobody = EVERY_STEP | NO_LIMITS | {"every": 2, "grad_threshold": 1e9}
+    none_selected = EVERY_STEP | NO_LIMITS | {"every": 2, "grad_threshold": 1e9}
     pruned = {"budget": 100, "prune": {"start": 0, "stop": 99, "every": 3}}
-    runs = [Training(started(**pruned)), Training(started(**pruned, densify=nobody))]
+    runs = [Training(started(**pruned)), Training(started(**pruned, densify=none_selected))]
     assert [training.run(10)[-1] for training in runs] == [102, 102]
     plain, idle = (training.geometry.parameters_by_name() for training in runs)
     moved = sum(int((plain[name] != idle[name]).sum()) for name in PARAMETERS)
@@ -159,7 +159,9 @@ def test_a_round_that_selects_nobody_is_none(measured):
 
 @row("A3", "Lost step")
 def test_a_round_takes_no_step_from_those_that_stay(measured):
-    """All of them are cloned after the third step: each original is where it would be without."""
+    """All are cloned after the third step; each original is where it would be without
+    densification.
+    """
     everybody = EVERY_STEP | NO_LIMITS | {"start": 3, "grad_threshold": 0.0, "split_scale": 1e9}
     runs = [Training(started()), Training(started(densify=everybody))]
     counts = [training.run(3) for training in runs]
@@ -174,7 +176,7 @@ def test_a_round_takes_no_step_from_those_that_stay(measured):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Ended:
-    """A run that nothing disturbs, with a checkpoint of every step."""
+    """Return an uninterrupted run with a checkpoint of every step."""
     return launch(
         tmp_path_factory.mktemp("whole"),
         *SCHEDULES,
@@ -188,7 +190,7 @@ def at_step(run: Ended, step: int) -> Path:
 
 
 def newcomers(run: Ended, step: int) -> int:
-    """How many Gaussians have no moments yet: the round at this very step made them."""
+    """Count the Gaussians without moments: those created at this step."""
     return int(
         (run.checkpoint(at_step(run, step))["optimizer_states"][0]["state"][0]["exp_avg_sq"] == 0)
         .all(1)
@@ -209,11 +211,12 @@ def cloud_hash(run: Ended) -> str:
 @row("A3", "Densify x resume")
 @pytest.mark.parametrize("k", [29, 30, 31, 35, 90])
 def test_resumed_anywhere_the_cloud_is_the_same(k, whole, tmp_path, measured):
-    """A tenth of the steps of the row: the stops lie before, at and after a round that densifies
-    and prunes, between rounds, at the last.
+    """A tenth of the row's steps: stops before, at and after a round that densifies and prunes,
+    between rounds, and at the last.
 
-    The stops' checkpoints are those of the undisturbed run, so that they are also shown to disturb
-    nothing."""
+    The checkpoints are those of the uninterrupted run, which shows that writing them changes
+    nothing.
+    """
     counts = [
         len(whole.checkpoint(at_step(whole, step))["state_dict"]["geometry.means"])
         for step in (29, 30, 31)

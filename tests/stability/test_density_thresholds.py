@@ -1,4 +1,4 @@
-"""What the densification threshold means, and what happens to opacities."""
+"""The meaning of the densification threshold, and opacity resets."""
 
 import math
 
@@ -22,14 +22,14 @@ register_parts()
 # ---- what the threshold means --------------------------------------------------------------------
 
 
-def judged(
+def accumulated(
     size: int = 128,
     batch: int = 4,
     loss_scale: float = 1.0,
     autocast: bool = False,
     absgrad: bool = False,
 ) -> GaussianCloud:
-    """The first cloud after the four views were seen, ``batch`` at a time."""
+    """Return the first cloud after the four views were processed, ``batch`` at a time."""
     geometry = started(densify=EVERY_STEP | NO_LIMITS | {"absgrad": absgrad})
     training = Training(geometry, size)
     with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
@@ -63,15 +63,15 @@ each_gradient = pytest.mark.parametrize("absgrad", [False, True], ids=["gradient
     ],
     ids=str,
 )
-def test_neither_precision_nor_batch_chooses(other, absgrad, measured):
-    """Half of the Gaussians lie above the threshold. The loss is the mean over the batch, as a
-    guidance's is.
+def test_neither_precision_nor_batch_affects_the_selection(other, absgrad, measured):
+    """Half of the Gaussians are above the threshold. The loss is the mean over the batch, like a
+    guidance's.
     """
-    usual = judged(absgrad=absgrad)
+    usual = accumulated(absgrad=absgrad)
     threshold = middle(usual)
     expected, found = (
         selected(usual, threshold),
-        selected(judged(**other, absgrad=absgrad), threshold),
+        selected(accumulated(**other, absgrad=absgrad), threshold),
     )
     assert 80 < len(expected) < 120
     measured(len(expected ^ found), "selected differently, of 200", at_most=0)
@@ -80,11 +80,11 @@ def test_neither_precision_nor_batch_chooses(other, absgrad, measured):
 @row("A3", "Threshold's meaning")
 @each_gradient
 @pytest.mark.parametrize("size", [128, 256])
-def test_resolution_hardly_chooses(size, absgrad, measured):
-    """Twice the resolution of a loss that doesn't depend on it; what changes is what the pixels'
-    dilation of 0.3 covers.
+def test_resolution_hardly_affects_the_selection(size, absgrad, measured):
+    """Twice the resolution, with a loss that does not depend on it; only the effect of the dilation
+    of 0.3 square pixels changes.
     """
-    usual, finer = judged(size, absgrad=absgrad), judged(2 * size, absgrad=absgrad)
+    usual, finer = accumulated(size, absgrad=absgrad), accumulated(2 * size, absgrad=absgrad)
     threshold = middle(usual)
     first, second, in_pixels = (
         selected(usual, threshold),
@@ -94,13 +94,13 @@ def test_resolution_hardly_chooses(size, absgrad, measured):
     measured(len(first & second) / len(first | second) * 100, "% overlap", at_least=90.0)
     assert len(first & in_pixels) < 0.9 * len(
         first | in_pixels
-    )  # a pixel is half as large there: the test can fail
+    )  # a pixel is half as large there, so the gradients in pixels differ
 
 
 @row("A3", "Saturated 0/0")
 @each_gradient
-def test_the_never_seen_are_never_selected(absgrad, measured):
-    """Fifty Gaussians out of every view, and a threshold that all others reach."""
+def test_gaussians_outside_every_view_are_never_selected(absgrad, measured):
+    """Fifty Gaussians outside every view, and a threshold that all others reach."""
     geometry = started(densify=EVERY_STEP | NO_LIMITS | {"absgrad": absgrad, "grad_threshold": 0.0})
     geometry.means.data[:50] = torch.tensor([0.0, 0.0, 1e4])
     training = Training(geometry)
@@ -119,8 +119,8 @@ def test_the_never_seen_are_never_selected(absgrad, measured):
 
 @row("A3", "Opacity reset")
 def test_nothing_resets_the_opacities(measured, monkeypatch):
-    """There is no such option, and 35 rounds (a reset comes every 3000 steps elsewhere) leave the
-    opacities as they are.
+    """There is no such option, and 35 rounds (others reset every 3000 steps) leave the opacities
+    unchanged.
     """
     with pytest.raises(UserError, match="opacity_reset"):
         check_config(load_config(DEMO, cli_args=["system.geometry.densify.opacity_reset=3000"]))
@@ -141,8 +141,8 @@ def test_nothing_resets_the_opacities(measured, monkeypatch):
 
 @row("A3", "Opacity reset")
 def test_a_reset_by_hand_is_recovered_from(measured):
-    """To 0.01, after 100 steps; with an absolute error, which score distillation doesn't give: it
-    pulls at what is still visible.
+    """To 0.01, after 100 steps; with an absolute error, because score distillation only acts on
+    what is still visible.
     """
     training = Training(started())
     training.optimizer.param_groups[3]["lr"] = 0.1

@@ -48,7 +48,7 @@ def ball_cloud():
 
 
 def pictures_and_gradients(cloud, c2w, fovy):
-    """The ordinary, first view's picture, and the cloud's gradients, of a loss on all views."""
+    """Return the first, ordinary view's image and the cloud's gradients of a loss on all views."""
     viewmats, Ks = cameras.to_opencv(c2w, fovy, 48, 48)
     cloud.zero_grad()
     colors = cloud.colors(c2w[:, :3, 3])
@@ -65,7 +65,7 @@ def pictures_and_gradients(cloud, c2w, fovy):
 
 @row("A4", "Extreme cameras in a batch")
 @pytest.mark.parametrize("name", EXTREME)
-def test_an_extreme_camera_leaves_the_others_pictures_alone(name, measured):
+def test_an_extreme_camera_does_not_affect_the_other_views(name, measured):
     cloud, (view, odd) = ball_cloud(), (orbit(ORDINARY), orbit(ORDINARY, EXTREME[name]))
     alone, _ = pictures_and_gradients(cloud, view.c2w, view.fovy)
     beside, gradients = pictures_and_gradients(cloud, odd.c2w, odd.fovy)
@@ -76,9 +76,7 @@ def test_an_extreme_camera_leaves_the_others_pictures_alone(name, measured):
 @row("A4", "Extreme cameras in a batch")
 @pytest.mark.parametrize("what", ["NaN", "infinite", "zero", "in the centre it looks at"])
 def test_a_degenerate_camera_affects_only_its_own_item(what, measured):
-    """Beyond the row: a camera that is none. Neither its picture nor its gradient is anything but
-    the background's.
-    """
+    """Beyond the row: an invalid camera. Its image is the background and it has no gradient."""
     cloud, view = ball_cloud(), orbit(ORDINARY)
     alone, expected = pictures_and_gradients(cloud, view.c2w, view.fovy)
     at_center = cameras.look_at(
@@ -93,7 +91,7 @@ def test_a_degenerate_camera_affects_only_its_own_item(what, measured):
     beside, gradients = pictures_and_gradients(cloud, c2w, view.fovy.repeat(2))
     batch = make_batch(
         orbit(ORDINARY, ORDINARY), c2w, c2w[:, :3, 3], 48, 48
-    )  # the inverse of one camera spoils no other
+    )  # one camera's inverse doesn't affect the others
     assert batch["mvp_mtx"][0].equal(
         make_batch(view, view.c2w, view.c2w[:, :3, 3], 48, 48)["mvp_mtx"][0]
     )
@@ -105,8 +103,8 @@ def test_a_degenerate_camera_affects_only_its_own_item(what, measured):
 
 
 def with_cameras(monkeypatch, change) -> None:
-    """Lets ``change(step, batch)`` return other cameras for each training batch, an :class:`Orbit`
-    or c2w matrices.
+    """Replace the cameras of each training batch by ``change(step, batch)``, an :class:`Orbit` or
+    c2w matrices.
     """
     collate = TrainCameras.collate
 
@@ -126,7 +124,7 @@ def with_cameras(monkeypatch, change) -> None:
 
 @row("A4", "Extreme cameras in a batch")
 def test_training_with_extreme_cameras_logs_each_items_gradient(tmp_path, monkeypatch, measured):
-    """The whole step, ray-cast truth included, in one batch of an ordinary camera and all the
+    """The whole step, with ray-cast targets, on a batch of an ordinary camera and all
     extreme ones.
     """
     views = [ORDINARY, *EXTREME.values()]
@@ -150,7 +148,7 @@ def test_training_with_extreme_cameras_logs_each_items_gradient(tmp_path, monkey
 
 @row("A4", "Empty view in a batch")
 @pytest.mark.parametrize("empty", [(1,), (0, 1)], ids=["one", "all"])
-def test_a_camera_that_looks_away(empty, tmp_path, monkeypatch, measured):
+def test_an_empty_view_in_a_batch(empty, tmp_path, monkeypatch, measured):
     def turned_around(step, batch):
         c2w = batch["c2w"].clone()
         c2w[list(empty), :3, 0] *= -1

@@ -1,4 +1,4 @@
-"""Extensions that fail are named."""
+"""Extensions that fail are named in the error message."""
 
 import sys
 from pathlib import Path
@@ -56,7 +56,7 @@ def test_a_signal_while_a_module_is_imported_is_not_its_fault(tmp_path, monkeypa
 def test_a_part_that_calls_sys_exit_in_the_middle_of_a_run_is_named(
     tmp_path, monkeypatch, measured
 ):
-    """``sys.exit()`` means success, which a run that somebody else has ended isn't."""
+    """``sys.exit()`` means success, but the run is incomplete."""
     monkeypatch.setattr(GaussianDreamerSystem, "training_step", lambda *args: sys.exit())
     ended = launch(tmp_path, "trainer.max_steps=1")
     assert (

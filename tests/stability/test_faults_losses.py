@@ -24,7 +24,7 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 
 @row("A0", "F19")
 def test_f19_a_negative_loss_is_back_propagated(fault):
-    """A whole training step of the system on a loss of -p^2, with everything around it stubbed."""
+    """A whole training step on a loss of -p^2, with all other parts stubbed."""
 
     def ours(parameter):
         kept = MagicMock(param_groups=[{"params": [parameter]}])  # its zero_grad clears nothing
@@ -52,7 +52,7 @@ def test_f19_a_negative_loss_is_back_propagated(fault):
 
 @row("A0", "F20")
 def test_f20_every_learning_rate_in_the_config_reaches_the_optimiser(fault):
-    """The emulation reads ``scaling_lr`` from a config that says ``scale_lr``, and takes its
+    """The emulation reads ``scaling_lr`` from a configuration that sets ``scale_lr``, and uses its
     default.
     """
 
@@ -103,7 +103,7 @@ def test_f25_each_preset_holds_its_own_numbers(fault):
 
 
 class Stub(TowardsGrey):
-    """NaN for the first item from step ``broken_from`` on."""
+    """Return NaN for the first item from step ``broken_from`` on."""
 
     broken_from = 0
 
@@ -114,9 +114,9 @@ class Stub(TowardsGrey):
 
 
 @row("A0", "F22")
-def test_f22_a_broken_score_is_seen(fault):
-    """The first of three items is NaN in every step: how many steps of twenty go by with nothing
-    said about it.
+def test_f22_a_non_finite_score_is_reported(fault):
+    """The first of three items is NaN in every step; counts the steps of twenty that give no
+    message.
     """
     rgb = torch.rand(3, 4, 4, 3, generator=torch.Generator().manual_seed(0))
 
@@ -136,7 +136,7 @@ def test_f22_a_broken_score_is_seen(fault):
     def nan_to_num(step):
         torch.nan_to_num(
             torch.full((3, 4, 4, 3), torch.nan)
-        )  # zero from here on, and the step a success
+        )  # zero from here on, and the step counts as a success
         return False
 
     def deviation(said):

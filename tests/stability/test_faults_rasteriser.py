@@ -1,5 +1,5 @@
-"""A0: faults of the peers' rasterisers. Each test holds ours to the bar and shows that the fault,
-in our own words, breaks it.
+"""A0: faults of other rasterisers. Each test holds ours to the bar and shows that an emulation of
+the fault breaks it.
 """
 
 import math
@@ -29,8 +29,8 @@ from threestudio_gaussiandreamer.splatting.projection import quats_to_rotations
 @row("A0", "F1")
 @each_backend
 def test_f1_the_clamp_of_the_jacobian_depends_on_depth(backend, fault):
-    """Twice as far out as the image; in the emulation the clamped x is a constant: lim z, without
-    the derivative of z.
+    """At twice the half-width of the image; the emulation treats the clamped x = lim z as a
+    constant, without its derivative by z.
     """
     width, focal, scales = 32, 20.0, torch.tensor([1.5, 0.8, 0.4]).double()
 
@@ -98,8 +98,8 @@ def test_f2_no_gaussians_show_the_background(backend, fault):
 @row("A0", "F3")
 @each_backend
 def test_f3_no_gradient_flows_through_the_cap(backend, fault):
-    """Opacity 0.95 under a cap of 0.5: raising it changes nothing. The emulation caps the value and
-    lets the gradient pass.
+    """Opacity 0.95 under a cap of 0.5: an increase changes nothing. The emulation caps the value
+    but passes the gradient.
     """
     cloud = one_gaussian(scale=5.0)
 
@@ -156,8 +156,8 @@ def test_f4_the_gaussian_that_crosses_the_stop_counts(backend, fault):
 @row("A0", "F5")
 @each_backend
 def test_f5_the_threshold_of_alpha(backend, fault):
-    """4000 Gaussians of opacity 0.1 on a sphere, as a run starts. The emulation draws with 1/255,
-    as everyone does.
+    """4000 Gaussians of opacity 0.1 on a sphere, like an initial cloud. The emulation uses the
+    common threshold of 1/255.
     """
     g = torch.Generator().manual_seed(0)
     means = torch.nn.functional.normalize(torch.randn(4000, 3, generator=g), dim=1)
@@ -187,13 +187,13 @@ def test_f5_the_threshold_of_alpha(backend, fault):
     "attribute, value", [("means", math.nan), ("scales", math.inf), ("opacities", math.nan)]
 )
 def test_f6_what_is_not_finite_is_culled(backend, attribute, value, fault):
-    """The emulation culls what lies before the near plane and what has no area: both comparisons
-    are false for NaN.
+    """The emulation culls what is before the near plane or without area; both comparisons are false
+    for NaN.
     """
     scene = random_cloud(6, seed=2)
     scene.means[:, 2] += 3
-    poisoned = Cloud(*(torch.cat([x, x[:1].clone()]) for x in scene))
-    getattr(poisoned, attribute)[6] = value
+    corrupted = Cloud(*(torch.cat([x, x[:1].clone()]) for x in scene))
+    getattr(corrupted, attribute)[6] = value
 
     def ours(cloud):
         leaves = cloud.to(torch.float32).leaves()
@@ -211,7 +211,7 @@ def test_f6_what_is_not_finite_is_culled(backend, attribute, value, fault):
         return [image.detach(), *(leaf.grad[:6] for leaf in leaves if leaf.grad is not None)]
 
     def changed(draw):
-        return sum(float((a != b).sum()) for a, b in zip(draw(poisoned), draw(scene), strict=True))
+        return sum(float((a != b).sum()) for a, b in zip(draw(corrupted), draw(scene), strict=True))
 
     fault(changed, ours=ours, emulation=comparisons_that_nan_passes, unit="numbers changed")
 
@@ -237,8 +237,8 @@ def test_f7_a_zero_quaternion_is_no_rotation(fault):
 
 @row("A0", "F8")
 def test_f8_tile_intersections_are_counted_in_64_bits(fault):
-    """524 288 over all of 1024 x 1024 in 16-pixel tiles is 2^31; ours has smaller tiles, so
-    more.
+    """524 288 Gaussians over all of 1024 x 1024 give 2^31 intersections with tiles of 16 pixels;
+    our tiles are smaller, so the count is larger.
     """
     n = 524_288
 

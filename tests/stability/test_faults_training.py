@@ -1,5 +1,5 @@
-"""A0: faults of the peers' training. Each test holds ours to the bar and shows that the fault, in
-our own words, breaks it.
+"""A0: faults of other training code. Each test holds ours to the bar and shows that an emulation of
+the fault breaks it.
 """
 
 from types import SimpleNamespace
@@ -24,9 +24,9 @@ from threestudio_gaussiandreamer.training.initialization import grow_points
 
 
 @row("A0", "F11")
-def test_f11_the_loss_scale_does_not_choose_who_is_densified(fault):
-    """Half of the gradients lie above the threshold; mixed precision multiplies all of them by 65
-    536 before they are read.
+def test_f11_the_loss_scale_does_not_affect_the_selection(fault):
+    """Half of the gradients are above the threshold; mixed precision multiplies all of them by 65
+    536.
     """
     g = torch.Generator().manual_seed(0)
     true = torch.randn(2, 1000, 2, generator=g) * torch.tensor([2e-4 / 64, 2e-4 / 64])
@@ -48,8 +48,8 @@ def test_f11_the_loss_scale_does_not_choose_who_is_densified(fault):
 
 @row("A0", "F12")
 def test_f12_a_checkpoint_holds_the_cloud_and_its_statistics(fault):
-    """The emulation keeps the cloud in a plain object, which a module's state doesn't reach. Ours
-    asks no prior when loading.
+    """The emulation keeps the cloud in a plain object, which is not in a module's state. Ours does
+    not run the prior on loading.
     """
 
     class PlainCloud(nn.Module):
@@ -114,8 +114,8 @@ def test_f16_growing_leaves_the_process_generators_alone(fault):
 
 
 @row("A0", "F14")
-def test_f14_no_grown_point(fault):
-    """A cube of side 2 has eight corners, and none of 100 candidates lies near one."""
+def test_f14_without_grown_points_the_input_is_returned(fault):
+    """A cube of side 2 has eight corners; none of 100 candidates is near one."""
     corners = np.float32([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
     def ours(points):
@@ -137,7 +137,7 @@ def test_f14_no_grown_point(fault):
 
 @row("A0", "F15")
 def test_f15_growth_does_not_depend_on_the_unit(fault):
-    """Metres, millimetres, kilometres: the share of candidates that is accepted."""
+    """Metres, millimetres, kilometres: the fraction of accepted candidates."""
 
     def ours(points):
         colors = np.zeros_like(points)
@@ -167,8 +167,8 @@ def test_f15_growth_does_not_depend_on_the_unit(fault):
 @row("A0", "F15")
 @pytest.mark.parametrize("axes", [(0, 1), (2,), ()], ids=["flat", "needle", "point"])
 def test_f15_a_degenerate_prior_does_not_explode(axes, fault):
-    """Every candidate in the box of a flat cloud lies near it, so only the cap holds; the emulation
-    has none.
+    """Every candidate in the box of a flat cloud is near it, so only the cap limits their number;
+    the emulation has none.
     """
     points = np.zeros((300, 3), np.float32)
     points[:, axes] = ball().points[:, axes]
@@ -211,7 +211,7 @@ def parameters(n: int) -> dict[str, torch.Tensor]:
 
 @row("A0", "F13")
 def test_f13_one_gaussian_keeps_its_shape(fault):
-    """Pruning nobody. The emulation squeezes the (1, 1) mask to a single truth value, which adds a
+    """Prunes no Gaussian. The emulation squeezes the (1, 1) mask to a scalar, which adds a
     dimension to what it indexes.
     """
 
@@ -232,10 +232,10 @@ def test_f13_one_gaussian_keeps_its_shape(fault):
 
 @row("A0", "F18")
 def test_f18_densification_loses_no_step(fault):
-    """Selecting nobody must change nothing. In the emulation the rows are replaced between backward
+    """Selecting no Gaussian must change nothing. The emulation replaces the rows between backward
     and step.
     """
-    nobody = {
+    none_selected = {
         "enabled": True,
         "start": 1,
         "stop": 9,
@@ -267,7 +267,7 @@ def test_f18_densification_loses_no_step(fault):
 
     plain = trajectory(step_first)
     fault(
-        lambda f: (trajectory(f, densify=nobody) - plain).abs().max(),
+        lambda f: (trajectory(f, densify=none_selected) - plain).abs().max(),
         ours=step_first,
         emulation=densify_first,
         unit="moved",
@@ -284,11 +284,11 @@ def test_f21_the_cap_takes_what_contributes_least(fault):
         rules = Rules(max_gaussians=200, min_opacity=0.0, max_scale=1e9, min_gaussians=1)
         return densify.densify_and_prune(params, stats, rules, generator(0, "s")).parents
 
-    def lottery(params):
+    def random_choice(params):
         return torch.randperm(500, generator=torch.Generator().manual_seed(0))[:200]
 
     def deviation(capped):
         kept = capped(parameters(500))
         return 1e9 if len(kept) != 200 else (1 - contribution[kept].sum() / best) * 100
 
-    fault(deviation, ours=ours, emulation=lottery, unit="% of the contribution lost")
+    fault(deviation, ours=ours, emulation=random_choice, unit="% of the contribution lost")

@@ -20,7 +20,7 @@ from threestudio_gaussiandreamer.splatting import rasterize
 @row("A0", "F10")
 @each_backend
 def test_f10_depth_has_a_gradient(backend, fault):
-    """The derivative of the rendered depth by the Gaussian's depth; in the emulation the backward
+    """The derivative of the rendered depth by the Gaussian's depth; the emulation's backward pass
     ignores it.
     """
 
@@ -54,8 +54,8 @@ def test_f10_depth_has_a_gradient(backend, fault):
 @row("A0", "F17")
 @each_backend
 def test_f17_a_sphere_is_round_on_a_wide_image(backend, fault):
-    """Both axes have one focal length; the emulation opens the width by the vertical field of
-    view.
+    """Both axes have one focal length; the emulation uses the vertical field of view for
+    the width.
     """
     fovy = torch.tensor([math.radians(50.0)])
 
@@ -97,9 +97,7 @@ def test_f26_behind_the_camera_is_nothing_and_equal_depths_go_by_index(backend, 
 
     def unclipped_and_unstable(cloud):
         z = cloud.means[:, 2]
-        backwards = torch.arange(
-            len(z) - 1, -1, -1
-        )  # a sort that keeps no order among equals may leave them so
+        backwards = torch.arange(len(z) - 1, -1, -1)  # an unstable sort may give this order
         return plain_image(
             cloud,
             8,
@@ -119,7 +117,9 @@ def test_f26_behind_the_camera_is_nothing_and_equal_depths_go_by_index(backend, 
 @row("A0", "F27")
 @each_backend
 def test_f27_any_size_and_a_gaussian_behind_the_camera(backend, fault):
-    """The emulation masks the means that are behind, not the covariances, and paints 256 x 256."""
+    """The emulation masks the means behind the camera but not the covariances, and renders 256 x
+    256.
+    """
     scene = joined(
         one_gaussian((0.0, 0.0, 2.0), 0.3),
         one_gaussian((0.0, 0.0, -2.0), 0.3),
@@ -149,7 +149,7 @@ def test_f27_any_size_and_a_gaussian_behind_the_camera(backend, fault):
 @row("A0", "F27")
 @each_backend
 def test_f27_the_size_that_was_asked_for(backend, fault):
-    """Widths from 1 to 40, of which 256 is none; a border of any width counts."""
+    """Widths from 1 to 40, none of which is 256; counts missing or extra columns."""
 
     def ours(width, height):
         cloud = one_gaussian(scale=5.0).to(torch.float32)

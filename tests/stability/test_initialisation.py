@@ -1,5 +1,5 @@
-"""A2: priors and first clouds that are degenerate, damaged, or in another unit; each is provoked
-through the product's own doors.
+"""A2: priors and first clouds that are degenerate, damaged, or in another unit, given through the
+package's own readers.
 """
 
 import itertools
@@ -43,7 +43,7 @@ each_rule = pytest.mark.parametrize("rule", SCALE_RULES)
 
 @row("A2", "Duplicate points: distance 0 -> log 0")
 @each_rule
-def test_copies_have_a_size(rule, measured):
+def test_duplicate_points_have_a_finite_scale(rule, measured):
     """10 000 copies of one point; and of 2000 points every second one 9 times more."""
     one_place = started(colored(np.full((10_000, 3), 0.3)), scale_rule=rule)
     distinct = sphere(2000)
@@ -62,9 +62,9 @@ def test_copies_have_a_size(rule, measured):
 
 @row("A2", "Duplicate points: distance 0 -> log 0")
 @each_rule
-def test_no_copy_is_ever_searched(rule, measured, monkeypatch):
-    """A tree of distinct points has one in a leaf and O(N log N) to find it; copies can't be
-    parted, and each would meet all others.
+def test_duplicates_are_not_in_the_search_tree(rule, measured, monkeypatch):
+    """A search tree of distinct points has one point per leaf and finds it in O(N log N); copies
+    can't be separated, so each would visit all others.
     """
     copies = []
 
@@ -77,7 +77,7 @@ def test_no_copy_is_ever_searched(rule, measured, monkeypatch):
     cloud = colored(np.concatenate([sphere(2000), np.full((8000, 3), 0.3)]))
     nearest_distance_scales(cloud.points, rule)
     grow(cloud, num_candidates=1000, radius=0.05, generator=rng())
-    assert len(copies) == 3  # for the sizes, for what is isolated, for the candidates
+    assert len(copies) == 3  # scales, isolated points, candidates
     measured(max(copies), "copies in a search tree", at_most=0)
 
 
@@ -101,8 +101,8 @@ def test_an_isolated_point_is_capped_and_flagged(rule, measured, said):
 
 @row("A2", "Isolated point: huge scale")
 def test_an_isolated_point_does_not_stretch_the_growing(measured):
-    """The box of all points would make the radius 500 times larger, and every candidate near the
-    object a floater.
+    """The bounding box of all points would make the radius 500 times larger, and every candidate
+    near the object a floater.
     """
     options = {"num_candidates": 20_000, "radius": 0.05}
     usual = grow(colored(sphere()), **options, generator=rng()).points[1000:]
@@ -120,7 +120,7 @@ def test_few_points(count, rule, measured):
     points = np.array([[0.0, 0, 0], [0.8, 0, 0], [0.4, 0.3, 0]])[:count]
     geometry = started(colored(points), scale_rule=rule)
     assert picture(geometry).isfinite().all()
-    bounding_radius = [1.0, 0.4, np.hypot(0.4, 0.15)][count - 1]  # of one point: the world's unit
+    bounding_radius = [1.0, 0.4, np.hypot(0.4, 0.15)][count - 1]  # one point: the unit of the world
     measured(geometry.scales().max() / bounding_radius, "bounding radii", at_most=0.11)
     measured(geometry.scales().min() / bounding_radius, "bounding radii, smallest", at_least=0.09)
 
@@ -141,8 +141,8 @@ NOTHING = {
 
 @row("A2", "Empty mesh, zero faces, one vertex")
 @pytest.mark.parametrize("name", NOTHING)
-def test_a_mesh_of_nothing_ends_the_run_at_its_start(name, tmp_path, measured):
-    """The whole command: a message that names the file, exit code 2, and no folder left."""
+def test_an_empty_mesh_ends_the_run_at_its_start(name, tmp_path, measured):
+    """The command gives a message that names the file, exit code 2, and no folder."""
     (tmp_path / name).write_text(NOTHING[name])
     ended = launch(tmp_path / "outputs", f"system.geometry.prior.path={tmp_path / name}")
     (message,) = [line for line in ended.err.splitlines() if line.startswith("error")]
@@ -151,7 +151,7 @@ def test_a_mesh_of_nothing_ends_the_run_at_its_start(name, tmp_path, measured):
 
 
 @row("A2", "Empty mesh, zero faces, one vertex")
-def test_a_cloud_of_nothing_is_named(tmp_path, measured):
+def test_an_empty_point_cloud_is_named(tmp_path, measured):
     path = write_ply(tmp_path / "empty.ply", np.zeros((0, 3)))
     with pytest.raises(UserError, match="empty|no points"):
         GaussianCloud({"prior_type": "point-cloud-prior", "prior": {"path": str(path)}}).initialize(
@@ -160,8 +160,8 @@ def test_a_cloud_of_nothing_is_named(tmp_path, measured):
     measured("points: named error")
 
 
-def poisoned(values: np.ndarray, share: float) -> np.ndarray:
-    """A share of the rows is NaN or infinite, in one of the columns."""
+def corrupted(values: np.ndarray, share: float) -> np.ndarray:
+    """Set a share of the rows to NaN or infinity, in one of the columns."""
     values = values.copy()
     for i, index in enumerate(rng(1).choice(len(values), int(share * len(values)), replace=False)):
         values[index, i % values.shape[1]] = (np.nan, np.inf, -np.inf)[i % 3]
@@ -202,15 +202,15 @@ def write_text(path: Path, points: np.ndarray, colors: np.ndarray) -> Path:
     [*itertools.product(SOURCES, ["vertices"]), *((source, "colours") for source in COLOURED)],
 )
 def test_a_few_bad_rows_are_counted_and_many_refused(source, what, tmp_path, measured, said):
-    """1 % of 642 is 6. Where the faces have to stay whole a vertex without a colour becomes grey,
-    else its point is dropped.
+    """1 % of 642 is 6. If the faces must be kept, a vertex without a colour becomes grey; otherwise
+    its point is dropped.
     """
     prior_type, write = SOURCES[source]
     points, faces = ball_mesh()
     arrays = {"vertices": points, "colours": rng().random(points.shape)}
 
     def initialized(share: float) -> GaussianCloud:
-        path = write(tmp_path, *(arrays | {what: poisoned(arrays[what], share)}).values(), faces)
+        path = write(tmp_path, *(arrays | {what: corrupted(arrays[what], share)}).values(), faces)
         geometry = GaussianCloud(
             {"prior_type": prior_type, "prior": {"path": str(path)}, "grow": {"enabled": False}}
         )

@@ -1,4 +1,4 @@
-"""The first cloud doesn't depend on the unit and place of the prior's points."""
+"""The first cloud doesn't depend on the unit and position of the prior's points."""
 
 import itertools
 from pathlib import Path
@@ -32,10 +32,10 @@ CUBE = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def initialized_from(path: Path) -> tuple[GaussianCloud, int]:
-    """The first cloud of a file, brought into the world's frame, and how many points grew."""
+    """Return the first cloud of a file in the world's frame, and the number of grown points."""
     prior = (
         {"normalize": True} if path.suffix == ".npz" else {"num_points": 2000, "color": "random"}
-    )  # grey on grey shows nothing
+    )  # a grey cloud on grey is invisible
     kind = "point-cloud-prior" if path.suffix == ".npz" else "mesh-prior"
     options = {
         "prior_type": kind,
@@ -56,7 +56,7 @@ def write_npz(path: Path, points: np.ndarray) -> Path:
 @pytest.mark.parametrize("kind", ["obj", "npz"])
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 def test_neither_unit_nor_place_matters(unit, kind, tmp_path, measured):
-    """Millimetres, metres, kilometres, each where it is and 10 000 units away."""
+    """Millimetres, metres, kilometres, each at its place and 10 000 units away."""
     points, faces = cases.ball_mesh()
     write = (
         write_npz if kind == "npz" else lambda path, points: cases.write_obj(path, points, faces)
@@ -79,8 +79,7 @@ def test_neither_unit_nor_place_matters(unit, kind, tmp_path, measured):
 @row("A2", "Units and pose")
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("shift", [0.0, 1e4])
-def test_growing_has_no_unit(unit, shift, measured):
-    """Of points that stay where they are."""
+def test_growing_does_not_depend_on_the_unit(unit, shift, measured):
     options = {"num_candidates": 20_000, "radius": 0.05}
     cloud = cases.colored(cases.sphere())
     counts = [
@@ -111,7 +110,7 @@ def test_a_flat_prior_grows_a_slab_within_the_caps(axes, measured):
     offsets = (geometry.means[500:, flat] - 0.25).abs().detach()
     assert (
         offsets.max() <= 1.0001 * reach and (offsets.amax(0) > 0.9 * reach).all()
-    )  # it fills the slab, and no more
+    )  # it fills the slab only
     assert cases.picture(geometry).isfinite().all() and geometry.log_scales.isfinite().all()
     assert (
         len(
@@ -124,7 +123,7 @@ def test_a_flat_prior_grows_a_slab_within_the_caps(axes, measured):
 
 
 @row("A2", "No grown point")
-def test_a_cube_alone(measured):
+def test_a_cube_without_grown_points(measured):
     geometry = cases.started(
         cases.colored(CUBE), grow={"enabled": True, "num_candidates": 100_000, "radius": 0.0025}
     )
@@ -135,9 +134,7 @@ def test_a_cube_alone(measured):
 
 
 def uneven_square() -> tuple[np.ndarray, np.ndarray]:
-    """A square of 162 triangles of very different sizes, and a tenth more without area: on a line,
-    and with a corner twice.
-    """
+    """Return a square of 162 triangles of very different sizes, and a tenth more without area."""
     ticks = np.concatenate([[0.0], np.sort(cases.rng(3).random(8)) ** 2, [1.0]])
     points = np.array([(x, y, 0.0) for x in ticks for y in ticks])
     corner = (10 * np.arange(9)[:, None] + np.arange(9)).reshape(-1, 1)
@@ -147,17 +144,17 @@ def uneven_square() -> tuple[np.ndarray, np.ndarray]:
 
 
 def uniformity(points: np.ndarray) -> float:
-    """The smaller p of the Kolmogorov-Smirnov tests that both coordinates are uniform on [-1,
-    1].
+    """Return the smaller p of the Kolmogorov-Smirnov tests that both coordinates are uniform on
+    [-1, 1].
     """
     return min(scipy.stats.kstest(axis, "uniform", (-1, 2)).pvalue for axis in points.T[:2])
 
 
 @row("A2", "Non-manifold, duplicate faces, degenerate triangles")
 @pytest.mark.parametrize("repeated", ["not", "same", "turned round", "with copied vertices"])
-def test_a_surface_is_sampled_uniformly_whatever_its_faces(repeated, tmp_path, measured):
-    """Repeated faces, which make every edge of theirs non-manifold, lie on one side: counted twice,
-    that side would be denser.
+def test_a_surface_is_sampled_uniformly_for_any_triangulation(repeated, tmp_path, measured):
+    """Repeated faces, whose edges are non-manifold, are on one side: counted twice, that side would
+    be denser.
     """
     points, faces = uneven_square()
     again = faces[:40] if repeated != "turned round" else faces[:40, ::-1]
@@ -172,7 +169,9 @@ def test_a_surface_is_sampled_uniformly_whatever_its_faces(repeated, tmp_path, m
         twice = cases.rng().choice(
             len(mesh.faces), 5000, p=face_areas(mesh) / face_areas(mesh).sum()
         )
-        assert uniformity(mesh.vertices[mesh.faces[twice]].mean(1)) < 0.01  # the test can fail
+        assert (
+            uniformity(mesh.vertices[mesh.faces[twice]].mean(1)) < 0.01
+        )  # the test detects a density that is off
 
 
 @row("A2", "Colour perturbation")
@@ -180,8 +179,8 @@ def test_a_surface_is_sampled_uniformly_whatever_its_faces(repeated, tmp_path, m
     "color_range, mean", [((0.0, 0.2), 0.1), ((-0.1, 0.1), 0.0)], ids=["the paper's", "zero mean"]
 )
 def test_noise_stays_in_its_range_and_colours_in_theirs(color_range, mean, measured):
-    """Middle grey shows the noise itself, its histogram flat to 5 standard errors; nearly white
-    shows the clamp.
+    """Middle grey shows the noise itself, whose histogram is flat to 5 standard errors; nearly
+    white shows the clamp.
     """
     options = {
         "enabled": True,

@@ -1,4 +1,4 @@
-"""Models that can't be had are named within seconds."""
+"""Models that are missing are named within seconds."""
 
 import ast
 import socket
@@ -39,9 +39,9 @@ def hang(*args, **kwargs):
 @pytest.mark.parametrize(
     "what", ["sockets blocked", "no answer to connecting", "no answer to a name", "HF_HUB_OFFLINE"]
 )
-def test_a_model_that_is_not_here_is_named_within_seconds(what, empty_cache, monkeypatch, measured):
-    """The message says what to place where. A name that nobody resolves is the long one: that call
-    knows no timeout.
+def test_a_missing_model_is_named_within_seconds(what, empty_cache, monkeypatch, measured):
+    """The message says which files to put where. Name resolution takes longest, because it has no
+    timeout.
     """
     if what == "HF_HUB_OFFLINE":
         monkeypatch.setenv("HF_HUB_OFFLINE", "1")
@@ -54,21 +54,21 @@ def test_a_model_that_is_not_here_is_named_within_seconds(what, empty_cache, mon
     if what != "HF_HUB_OFFLINE":
         assert hub.TIMEOUT <= 4.5
         if what != "sockets blocked":
-            monkeypatch.setattr(hub, "TIMEOUT", 0.5)  # what users wait is 8 times as long
+            monkeypatch.setattr(hub, "TIMEOUT", 0.5)  # users' timeouts are 8 times as long
     start = time.monotonic()
     with pytest.raises(
         UserError,
         match="hf download .*--local-dir models/model`; then set "
         ".*pretrained_model_name_or_path to that folder",
     ):
-        hub.find_model("nobody/model", ("unet", "vae"))
+        hub.find_model("missing/model", ("unet", "vae"))
     seconds = time.monotonic() - start
     scale = 1.0 if what in ("sockets blocked", "HF_HUB_OFFLINE") else hub_seconds() / 0.5
     measured(seconds * scale, "s", what="until the message", at_most=5.0)
 
 
 def hub_seconds() -> float:
-    """The timeout as users have it, whatever a test has made of it."""
+    """Return the timeout that users have, whatever a test has set."""
     tree = ast.parse((PACKAGE / "models/hub.py").read_text())
     return next(
         node.value.value

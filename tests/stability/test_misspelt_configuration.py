@@ -1,4 +1,4 @@
-"""Misspelt keys are refused with the right one; prompts stay text."""
+"""Misspelt keys are rejected with a suggestion; prompts stay text."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ register_parts()
 
 
 def keys_of(cfg, path=""):
-    """Every dotted key of a configuration but the names of sections' own parts, whose keys are
+    """Return every dotted key of a configuration except the sections' part names, whose keys are
     checked with them.
     """
     for key in cfg:
@@ -30,13 +30,13 @@ def keys_of(cfg, path=""):
 
 
 def misspelt(word: str) -> list[str]:
-    """One letter dropped, and two exchanged, in the middle of the word."""
+    """Return the word with one letter dropped, and with two letters exchanged, in its middle."""
     at = len(word) // 2
     return [word[:at] + word[at + 1 :], word[: at - 1] + word[at] + word[at - 1] + word[at + 1 :]]
 
 
 def refusal(cfg, section: str, wrong: str, name: str) -> str:
-    """The message about one more key in a configuration that is fine without it; empty if it is
+    """Return the message about one additional key in a valid configuration; empty if it is
     accepted.
     """
     part = OmegaConf.select(cfg, section) if section else cfg
@@ -72,7 +72,7 @@ FOX = ["system.prompt_processor.prompt=a fox"]
 @pytest.mark.slow
 @row("A5", "Wrong config keys")
 def test_every_key_misspelt_by_one_letter_is_refused_with_the_right_one(measured):
-    """Every key that the shipped files use, at every depth: the right word is in the message."""
+    """Every key of the shipped files, at every depth; the message contains the right word."""
     tried, failed = set(), []
     for name in ("demo.yaml", "gaussiandreamer.yaml", "gaussiandreamer-official.yaml"):
         cfg = load_config(DEMO.with_name(name), cli_args=FOX)
@@ -98,7 +98,7 @@ def test_every_key_misspelt_by_one_letter_is_refused_with_the_right_one(measured
 
 @row("A5", "Wrong config keys")
 def test_every_option_of_every_part_misspelt_is_refused_with_the_right_one(measured):
-    """Also those that no shipped file uses, groups within groups included."""
+    """Also options that no shipped file uses, nested groups included."""
     tried, failed = 0, []
     for place, config in test_configs.config_classes().items():
         name, _, group = place.partition(".")
@@ -127,7 +127,7 @@ def test_every_accepted_key_is_read(measured):
     measured(
         sum(field not in read for _, field in keys),
         f"of {len(keys)} keys",
-        what="read by nobody",
+        what="never read",
         at_most=0,
     )
 
@@ -137,7 +137,9 @@ def test_every_accepted_key_is_read(measured):
     "monitor, message",
     [("los", "did you mean 'loss'"), ("train/loss_sdss", "train/loss_sds"), ("val/psnr", "choose")],
 )
-def test_a_quantity_that_nobody_logs_is_named_before_any_work(monitor, message, tmp_path, measured):
+def test_a_metric_that_is_never_logged_is_named_before_any_work(
+    monitor, message, tmp_path, measured
+):
     ended = launch(
         tmp_path, "trainer.max_steps=2", f"checkpoint.monitor={monitor}", "checkpoint.save_top_k=1"
     )
@@ -207,8 +209,8 @@ PROMPTS = [
     ],
 )
 def test_a_prompt_stays_text_and_its_folder_below_the_root(prompt, source, tmp_path, measured):
-    """What is stored is the prompt to the letter, also after parsed.yaml was read back; a folder of
-    that name can be made.
+    """The prompt is stored verbatim, also after parsed.yaml was read back; a folder of its name can
+    be created.
     """
     if source == "prompt file":
         (tmp_path / "prompt.txt").write_bytes(prompt.encode())
@@ -227,14 +229,14 @@ def test_a_prompt_stays_text_and_its_folder_below_the_root(prompt, source, tmp_p
     slug, at, _ = folder.name.partition("@")
     assert (
         at and len(slug.encode()) <= 64 + 9
-    )  # and a hyphen and eight digits of its hash, where it isn't the prompt itself
+    )  # with a hyphen and eight digits of its hash, unless it is the prompt itself
     measured("verbatim, below the root")
 
 
 @row("A5", "Prompt as path / YAML")
 def test_different_prompts_have_different_folders(measured):
-    """Also those that are alike in their first 64 bytes, or once the letters that file systems
-    forbid are replaced.
+    """Also those that share their first 64 bytes, or become equal when forbidden characters are
+    replaced.
     """
     prompts = [
         *PROMPTS,

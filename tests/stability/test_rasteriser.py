@@ -1,5 +1,5 @@
-"""A1, forward: what is drawn at the limits of numbers, sizes and shapes, by every backend in
-float32 against float64.
+"""A1, forward: renders at the limits of numbers, sizes and shapes, by every backend, float32
+against float64.
 """
 
 import functools
@@ -24,9 +24,7 @@ from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 @row("A1", "At/behind near plane; centred on the camera (z=0)")
 @each_backend
 def test_near_plane(backend, measured):
-    """Everything is compared in float32: 0.01 is the nearest float to it, on both sides of the
-    comparison.
-    """
+    """All comparisons use float32: 0.01 means the nearest float to it, on both sides."""
     near, scene = torch.tensor(0.01).item(), scenes.random_cloud(20, seed=1)
     scene.means[:, 2] += 3
     camera, wrong = scenes.front_camera(24, 16, 12.0), 0
@@ -51,8 +49,8 @@ def test_near_plane(backend, measured):
 @row("A1", "Edge of image, huge Jacobian")
 @each_backend
 def test_spill_of_the_clamped_jacobian(backend, measured):
-    """No pixel is drawn outside of the ellipse that the clamped formula gives, here written once
-    more by hand.
+    """No pixel outside the ellipse of the clamped formula is covered; the formula is
+    repeated here.
     """
     width, focal, z, spilt = 32, 20.0, 2.0, 0
     for limits, scale in itertools.product(
@@ -83,7 +81,7 @@ def test_spill_of_the_clamped_jacobian(backend, measured):
 @row("A1", "det <= 0, float32 cancellation ac-b^2")
 @each_backend
 def test_no_needle_is_lost_in_float32(backend, measured):
-    """10 000 : 1 at any angle, from 1e-3 to 1e2 wide."""
+    """Aspect ratio 10 000 : 1 at any angle, from 1e-3 to 1e2 wide."""
     n, g = 600, torch.Generator().manual_seed(0)
     length = 10.0 ** (5 * torch.rand(n, 1, generator=g).double() - 3)
     cloud = scenes.random_cloud(n, seed=2)._replace(
@@ -100,7 +98,7 @@ def test_no_needle_is_lost_in_float32(backend, measured):
 
 @row("A1", "Zero/denormal quaternion")
 @each_backend
-def test_quaternions_without_length(backend, measured):
+def test_zero_and_denormal_quaternions(backend, measured):
     cloud, camera = scenes.random_cloud(30, seed=7), scenes.cameras(1, 20, 20)
     identity = draw(
         backend, cloud._replace(quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(30, 1)), camera, 20, 20
@@ -137,9 +135,9 @@ def test_the_length_of_a_quaternion_changes_nothing(backend, measured):
 
 @row("A1", "Opacity -> 0 and -> 1")
 @each_backend
-def test_opacities_at_their_ends(backend, measured):
-    """Stored logits: 0 and 1 become the bounds when loaded; too faint for a pixel is nothing in
-    both passes.
+def test_opacities_near_0_and_1(backend, measured):
+    """Stored logits: 0 and 1 become the bounds when loaded; a Gaussian below the threshold is
+    skipped in both passes.
     """
     geometry = GaussianCloud({})
     logits = torch.tensor([-math.inf, -40.0, -8.0, 0.0, 6.0, 40.0, math.inf])
@@ -164,7 +162,7 @@ def test_opacities_at_their_ends(backend, measured):
     rest = draw(backend, scene.pick(~faint), camera, 24, 16)
     assert finite(whole) and faint.sum() == 3 and torch.equal(whole.out.image, rest.out.image)
     assert all((whole.grads[name][faint] == 0).all() for name in scenes.NAMES)
-    raw = scene._replace(opacities=torch.sigmoid(logits))  # and unclamped, as anyone may call it
+    raw = scene._replace(opacities=torch.sigmoid(logits))  # and unclamped, as the function accepts
     assert finite(draw(backend, raw, camera, 24, 16))
     measured("finite; nothing below alpha_min")
 
@@ -174,8 +172,8 @@ def test_opacities_at_their_ends(backend, measured):
 
 @functools.cache
 def needles() -> list[tuple[scenes.Cloud, torch.Tensor]]:
-    """Every multiset of three scales in five rotations, which are all orders of the axes, and its
-    float64 alpha.
+    """Return every multiset of three scales in five rotations, which cover all orders of the axes,
+    and their float64 alpha.
     """
     steps, g = (1e-8, 1e-4, 1e-2, 1.0, 1e2, 1e4), torch.Generator().manual_seed(2)
     clouds = []
@@ -198,8 +196,8 @@ def needles() -> list[tuple[scenes.Cloud, torch.Tensor]]:
 @row("A1", "Needle, disc, scale 1e-8..1e4")
 @each_backend
 def test_needles_and_discs(backend, measured):
-    """The truth sees the scales and quaternions as float32 rounds them; a pixel may fall on the
-    other side of alpha_min.
+    """The reference uses scales and quaternions rounded to float32; a pixel may fall on the other
+    side of alpha_min.
     """
     worst = 0.0
     for cloud, truth in needles():
@@ -212,8 +210,8 @@ def test_needles_and_discs(backend, measured):
 
 @row("A1", "Needle, disc, scale 1e-8..1e4")
 def test_log_scales_are_clamped_in_the_parameterisation(measured, caplog):
-    """The float32 range of exp, with room for squares: nothing outside of [e^-20, e^10] leaves the
-    geometry; said once.
+    """To the float32 range of exp, with room for squares: scales stay in [e^-20, e^10], and a
+    warning is logged once.
     """
     geometry = GaussianCloud({})
     zeros = torch.zeros(3, 3)
@@ -241,8 +239,8 @@ def test_log_scales_are_clamped_in_the_parameterisation(measured, caplog):
 @row("A1", "Coincident depths")
 @each_backend
 def test_equal_depths_go_by_index(backend, measured):
-    """64 in one plane: the picture is that of the permuted indices, in float64 by hand; the same
-    bits over 10 runs.
+    """64 Gaussians in one plane: the image is that of the permuted indices, computed in float64;
+    equal bits over 10 runs.
     """
     cloud, camera = stack([0.9] * 64, scale=1.0), scenes.front_camera(8, 8, 4.0)
     colors = torch.rand(64, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -256,7 +254,7 @@ def test_equal_depths_go_by_index(backend, measured):
         alpha = results[0].out.alpha[0, 4, 4, 0].item()
         first = 0.9 * math.exp(
             -0.5 * 0.5 / (2**2 + 0.3)
-        )  # half a pixel off in both directions, 2 pixels wide
+        )  # offset by half a pixel in both directions, 2 pixels wide
         T = first * (1 - first) ** torch.arange(64).double()
         T[(1 - first) ** torch.arange(64).double() < 1e-4] = 0
         by_hand = (T[:, None] * colors[order]).sum(0)
@@ -270,8 +268,8 @@ def test_equal_depths_go_by_index(backend, measured):
 
 @row("A1", "Depth key: float bits as uint")
 @each_backend
-def test_the_order_is_that_of_floats(backend, measured):
-    """Neighbouring floats, and twenty orders of magnitude up to the far plane, shuffled."""
+def test_the_depth_order_is_that_of_floats(backend, measured):
+    """Adjacent floats, and twenty orders of magnitude up to the far plane, shuffled."""
     depths = [torch.tensor(2.0)]
     for i in range(1, 60):
         depths.append(
@@ -312,8 +310,8 @@ def fog(n: int) -> scenes.Cloud:
 @row("A1", "Fog: thousands of faint Gaussians on a pixel")
 @each_backend
 def test_fog(backend, measured):
-    """Each Gaussian of opacity o loses what lies below alpha_min, the share alpha_min / o of it: at
-    most N alpha_min in a pixel.
+    """Each Gaussian of opacity o loses the fraction alpha_min / o, which is below the threshold: at
+    most N alpha_min per pixel.
     """
     n, camera = 2000, scenes.cameras(1, 12, 12)
     cloud = scenes.random_cloud(n, seed=8, size=0.4)._replace(

@@ -1,5 +1,5 @@
-"""A1, backward: gradients at the limits, the same bits for any thread count, and what no pinhole
-sort can do.
+"""A1, backward: gradients at the limits, equal bits for any thread count, and artefacts of sorting
+by depth.
 """
 
 import functools
@@ -27,15 +27,13 @@ from tests.stability.rows import row
 from tests.stability.scenes import clamped_alpha, finite
 from threestudio_gaussiandreamer.splatting import rasterize, tiles
 
-EXACT = ["torch", "reference"]  # they take float64
+EXACT = ["torch", "reference"]  # those that support float64
 
 
 QUICK = [name for name in BACKENDS if name != "reference"]
 
 
-THREADED = [
-    name for name in QUICK if name != "cuda"
-]  # those that torch's number of threads concerns
+THREADED = [name for name in QUICK if name != "cuda"]  # those that use torch's threads
 
 
 # ---- the Jacobian's clamp ------------------------------------------------------------------------
@@ -44,11 +42,12 @@ THREADED = [
 @row("A1", "Edge of image, huge Jacobian", bar="float64: rel <= 1e-6; float32: rel <= 1e-4")
 @each_backend
 def test_gradients_at_the_clamp(backend, measured):
-    """1e-6 holds in float64. In float32 each of the some twenty operations on the way rounds by
-    6e-8, and off the image the exponent is a difference of terms hundreds of times larger than
-    itself: 20 x 6e-8 x 100 is about 1e-4.
+    """1e-6 holds in float64. In float32 each of about twenty operations rounds by 6e-8, and off the
+    image the exponent is a difference of terms hundreds of times larger than itself: 20 x 6e-8 x
+    100 is about 1e-4.
 
-    1.3 limits itself is the kink, where both one-sided slopes are right; it only has to be finite.
+    At 1.3 times the limit there is a kink, where both one-sided slopes are valid; there the
+    gradient only has to be finite.
     """
     width, focal, z = 16, 20.0, 1.5
     camera, weights = (
@@ -88,8 +87,8 @@ def test_gradients_at_the_clamp(backend, measured):
 
 @functools.cache
 def needles(antialias: bool):
-    """Every multiset of three scales in five rotations, which are all orders of the axes, with its
-    float64 gradients.
+    """Return every multiset of three scales in five rotations, which cover all orders of the axes,
+    with their float64 gradients.
     """
     steps, g = (1e-8, 1e-4, 1e-2, 1.0, 1e2, 1e4), torch.Generator().manual_seed(2)
     quats = torch.randn(5, 4, generator=g).double()
@@ -123,9 +122,9 @@ def needles(antialias: bool):
 @each_backend
 @pytest.mark.parametrize("antialias", [False, True])
 def test_gradients_of_needles_and_discs(backend, antialias, measured):
-    """Per element the bar is out of reach: one at 1e-6 of the largest is a sum of terms as large as
-    the largest, each rounded by 6e-8 of itself, so it is uncertain by 6 %, whoever sums. Norms of
-    an attribute hold it.
+    """Per element the bar cannot be met: an element at 1e-6 of the largest is a sum of terms as
+    large as the largest, each rounded by 6e-8 of itself, so it is uncertain by 6 % in any order of
+    summation. Norms of an attribute meet it.
     """
     for cloud, truth in needles(antialias):
         ours = draw(
@@ -147,9 +146,7 @@ def test_gradients_of_needles_and_discs(backend, antialias, measured):
 @row("A1", "Alpha cap and threshold, gradient discontinuity")
 @pytest.mark.parametrize("backend", EXACT)
 def test_interior_gradients_are_those_of_finite_differences(backend, measured):
-    """Some pixels capped, some below the threshold: a step of 1e-6 crosses neither, on either
-    side.
-    """
+    """Some pixels are capped, some below the threshold; a step of 1e-6 crosses neither limit."""
     cloud, camera = random_cloud(12, seed=3, size=0.3), cameras(1, 12, 12)
     options = {"alpha_max": 0.6, "backend": backend}
     directions = [
@@ -177,8 +174,8 @@ def test_interior_gradients_are_those_of_finite_differences(backend, measured):
 @row("A1", "Alpha cap and threshold, gradient discontinuity")
 @pytest.mark.parametrize("backend", QUICK)
 def test_few_pixels_cross_the_threshold(backend, measured):
-    """3000 faint Gaussians move by 1e-4 pixels, ten times; where a pixel flips it changes by more
-    than half of alpha_min.
+    """3000 faint Gaussians move by 1e-4 pixels, ten times; a pixel that crosses the threshold
+    changes by more than half of alpha_min.
     """
     cloud, (viewmats, Ks) = random_cloud(3000, seed=5, size=0.03), cameras(1, 48, 48)
     cloud = cloud._replace(
@@ -202,8 +199,8 @@ def test_few_pixels_cross_the_threshold(backend, measured):
 @row("A1", "Alpha cap and threshold, gradient discontinuity")
 @each_backend
 def test_the_jump_at_the_threshold_is_alpha_min(backend, measured):
-    """A Gaussian moves away from a pixel until that goes from the faintest alpha to none; bisected
-    to the last float.
+    """A Gaussian moves away from a pixel until its alpha drops from the smallest one to zero, found
+    by bisection to the last float.
     """
 
     def alpha(x: float) -> float:
@@ -258,8 +255,8 @@ def test_ten_thousand_on_one_pixel(backend, faint, measured):
 @row("A1", "Gradient check")
 @pytest.mark.parametrize("backend", EXACT)
 def test_gradcheck(backend, measured):
-    """20 clouds of 1 to 30; attributes, background and cameras at once, along random directions, of
-    image, alpha and depth.
+    """20 clouds of 1 to 30 Gaussians; attributes, background and cameras at once, along random
+    directions, of image, alpha and depth.
     """
     for seed in range(20):
         n = 1 + seed * 29 // 19
@@ -282,7 +279,7 @@ def test_gradcheck(backend, measured):
 @each_backend
 @pytest.mark.parametrize("preset", ["fast", "balanced"])
 def test_float32_gradients_with_the_cutoffs_on(backend, preset, measured):
-    """All rows count, also those that a threshold treats differently in the other float type."""
+    """All rows count, also those that a threshold treats differently in the other precision."""
     cloud, camera, background = (
         random_cloud(400, seed=4, size=0.1).to(torch.float32).to(torch.float64),
         cameras(2, 40, 30),
@@ -301,8 +298,8 @@ def test_float32_gradients_with_the_cutoffs_on(backend, preset, measured):
 @row("A1", "Determinism of reductions")
 @pytest.mark.parametrize("backend", THREADED)
 def test_the_same_bits_for_any_number_of_threads(backend, measured):
-    """Forward, backward and an optimiser's step, 100 times (10 in plain torch); ten runs with 1, 2,
-    4 and 8 threads.
+    """Forward, backward and an optimiser step, 100 times (10 in plain torch); ten runs with 1, 2, 4
+    and 8 threads.
     """
     target = torch.rand(1, 20, 40, 3, generator=torch.Generator().manual_seed(0))
     camera, threads, results = cameras(1, 40, 20, dtype=torch.float32), torch.get_num_threads(), []
@@ -343,8 +340,8 @@ def test_equal_depths_for_any_number_of_threads(backend, measured):
 
 @row("A1", "int32 overflow")
 def test_tile_lists_in_torch_are_made_in_parts(measured):
-    """600 000 splats over all of 1024 x 1024: 9.8e9 pairs of 8-pixel tiles, counted in 64 bits and
-    never listed at once.
+    """600 000 splats over all of 1024 x 1024: 9.8e9 pairs with 8-pixel tiles, counted in 64 bits
+    and never listed at once.
     """
     n, grid = 600_000, tiles.make_grid(1, 1024, 1024)
     whole = torch.tensor([[0], [0], [grid.columns], [grid.rows]]).expand(4, n)

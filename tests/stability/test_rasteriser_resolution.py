@@ -1,4 +1,4 @@
-"""Rasterise at other resolutions and orders."""
+"""Rendering at other resolutions and depth orders."""
 
 import math
 
@@ -25,7 +25,7 @@ TILTED = torch.tensor([[0.9, 0.2, 0.1, 0.4]], dtype=torch.float64)
 @row("A1", "Anti-aliasing across resolutions")
 @each_backend
 def test_energy_of_a_small_gaussian_with_distance(backend, measured):
-    """Sum of alpha times z^2, which a Gaussian that only moves away keeps."""
+    """The sum of alpha times z^2, which is constant for a Gaussian that only moves away."""
     energies = {}
     for antialias in (False, True):
         options = {"alpha_min": 1e-6, "antialias": antialias}
@@ -44,8 +44,8 @@ def test_energy_of_a_small_gaussian_with_distance(backend, measured):
 @row("A1", "Anti-aliasing across resolutions")
 @each_backend
 def test_antialiasing_of_a_cloud_of_subpixel_gaussians(backend, measured):
-    """Rendered small, against the box average of the same rendered 16 times larger, where every
-    Gaussian covers pixels.
+    """A small render, against the box average of one 16 times larger, in which every Gaussian
+    covers pixels.
     """
     cloud = random_cloud(3000, seed=2, size=0.006, stretch=0.3)
     with torch.no_grad():
@@ -63,8 +63,8 @@ def test_antialiasing_of_a_cloud_of_subpixel_gaussians(backend, measured):
 @row("A1", "Popping")
 @each_backend
 def test_popping_is_one_jump_of_the_analytic_size(backend, measured):
-    """Two crossing discs of opposite colours whose means change their order of depth as the camera
-    turns by 0.01 degrees a frame.
+    """Two crossing discs of opposite colours whose means swap their depth order as the camera turns
+    by 0.01 degrees per frame.
     """
     a1, a2 = 0.6, 0.7
     colors = torch.tensor([[1.0, 0, 0], [0, 0, 1.0]])

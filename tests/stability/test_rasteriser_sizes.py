@@ -1,4 +1,4 @@
-"""Rasterise pictures of any size, numbers of any kind and hostile clouds."""
+"""Rendering at any size, with any values, and of extreme clouds."""
 
 import itertools
 import math
@@ -31,7 +31,7 @@ from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 @row("A1", "0, 1, 2, 3 Gaussians; empty view; all culled")
 @each_backend
-def test_nothing_to_see(backend, measured):
+def test_empty_views(backend, measured):
     away = random_cloud(5)._replace(means=torch.full((5, 3), 100.0).double())
     for cloud in (random_cloud(0), away):
         result = draw(backend, cloud, cameras(2, 10, 8), 10, 8, BACKGROUND)
@@ -62,13 +62,14 @@ def test_nothing_to_see(backend, measured):
 @each_backend
 @pytest.mark.parametrize("width, height", [(1, 1), (1, 7), (17, 33), (31, 16), (1024, 1)])
 def test_any_size_is_a_crop_of_a_larger_one(backend, width, height, measured):
-    """1e-6 is below the rounding of where things are: a coordinate of 40 pixels is a float32 to
-    4e-6 pixels.
+    """1e-6 is below the rounding of positions: a coordinate of 40 pixels has a float32 spacing of
+    4e-6 pixels. A Gaussian one pixel wide changes by 0.6 of its opacity per pixel, 2e-6, and
+    several overlap at each pixel; in float64 the crop is exact to 1e-12
+    (test_splatting_reference.py).
 
-    A Gaussian one pixel wide changes by 0.6 of its opacity per pixel, 2e-6, and several lie on each
-    pixel; in float64 the crop is exact to 1e-12 (test_splatting_reference.py). The principal point
-    moves the window. All means lie in it: beyond 1.3 of it the Jacobian is clamped, by definition
-    of the image model in each image by its own size, so a crop differs there."""
+    The principal point moves the window. All means are inside it: beyond 1.3 of the half-width the
+    Jacobian is clamped by each image's own size, so a crop would differ there.
+    """
     g, focal = torch.Generator().manual_seed(0), 50.0
     cloud = random_cloud(60, seed=6, size=0.03)
     at = torch.rand(60, 2, generator=g).double() * torch.tensor([width, height])
@@ -118,13 +119,13 @@ def test_other_precisions(backend, measured):
 
 @row("A1", "NaN/Inf inputs")
 @each_backend
-def test_a_poisoned_gaussian_changes_no_bit_of_the_others(backend, measured):
+def test_a_non_finite_gaussian_changes_no_bit_of_the_others(backend, measured):
     cloud, camera, rest = random_cloud(300, seed=6), cameras(2, 40, 24), torch.arange(300) != 7
     without = draw(backend, cloud.pick(rest), camera, 40, 24)
     for name, value in itertools.product(NAMES, (math.nan, math.inf, -math.inf)):
-        poisoned = Cloud(*(x.clone() for x in cloud))
-        getattr(poisoned, name)[7] = value
-        with_it = draw(backend, poisoned, camera, 40, 24)
+        corrupted = Cloud(*(x.clone() for x in cloud))
+        getattr(corrupted, name)[7] = value
+        with_it = draw(backend, corrupted, camera, 40, 24)
         assert torch.equal(with_it.out.image, without.out.image) and torch.equal(
             with_it.out.alpha, without.out.alpha
         )
@@ -145,18 +146,18 @@ def test_training_stops_where_the_cloud_is_not_finite(measured):
 
 
 @row("A1", "NaN/Inf inputs")
-def test_a_poisoned_gaussian_is_named(measured):
-    """Attribute, how many, and where the first one is."""
+def test_a_non_finite_gaussian_is_named(measured):
+    """With attribute, count, and the index of the first one."""
     cloud, camera = (
         random_cloud(300, seed=6).to(torch.float32),
         cameras(1, 8, 8, dtype=torch.float32),
     )
     for name in NAMES:
-        poisoned = Cloud(*(x.clone() for x in cloud))
-        getattr(poisoned, name)[[7, 9]] = math.nan
-        count = getattr(poisoned, name)[[7, 9]].numel()
+        corrupted = Cloud(*(x.clone() for x in cloud))
+        getattr(corrupted, name)[[7, 9]] = math.nan
+        count = getattr(corrupted, name)[[7, 9]].numel()
         with pytest.raises(UserError, match=rf"{name} holds {count} .*\(7") as caught:
-            rasterize(*poisoned, *camera, 8, 8, non_finite="error")
+            rasterize(*corrupted, *camera, 8, 8, non_finite="error")
         assert "nan" in str(caught.value)
     measured("error: named with count and index")
 
@@ -169,9 +170,8 @@ def test_a_poisoned_gaussian_is_named(measured):
 @pytest.mark.skipif("cpu" not in BACKENDS, reason="the kernel isn't built")
 def test_more_tile_intersections_than_32_bits_count(measured):
     """At 1024 x 1024 the kernel's 32-pixel tiles make 6e8 pairs, which fit; here they are 3.9e10,
-    beyond any machine's memory.
-
-    Each pair takes 80 bytes: an entry, its block mask, and the row of its gradient sums.
+    beyond any machine's memory. Each pair takes 80 bytes: the index, its block mask, and the row of
+    its gradient sums.
     """
     n = 600_000
     cloud = Cloud(*(x.expand(n, *x.shape[1:]) for x in one_gaussian(scale=1e4).to(torch.float32)))
@@ -189,12 +189,12 @@ def test_more_tile_intersections_than_32_bits_count(measured):
     )
 
 
-# ---- hostile clouds, all at once -----------------------------------------------------------------
+# ---- extreme clouds ------------------------------------------------------------------------------
 
 
 @row("A1", "NaN/Inf inputs")
 @each_backend
-def test_hostile_clouds_give_finite_pictures_and_gradients(backend, measured):
+def test_extreme_clouds_give_finite_images_and_gradients(backend, measured):
     drawn = 0
     for seed in range(20):
         cloud = hostile_cloud(seed, 50)
@@ -210,4 +210,4 @@ def test_hostile_clouds_give_finite_pictures_and_gradients(backend, measured):
             )
         )
         drawn += 50
-    measured(0, f"of {drawn} hostile", what="not finite")
+    measured(0, f"of {drawn} extreme", what="not finite")

@@ -1,6 +1,4 @@
-"""A5: what happens to runs. Kills, full disks, damaged checkpoints, wrong keys, odd prompts,
-signals.
-"""
+"""A5: runs that are killed, interrupted, or run out of disk."""
 
 import contextlib
 import ctypes
@@ -35,9 +33,7 @@ register_parts()
 
 
 def at_step(monkeypatch, step, act) -> None:
-    """Lets ``act(system)`` happen after that many steps, before the checkpoint of that step is
-    written.
-    """
+    """Call ``act(system)`` after so many steps, before the checkpoint of that step is written."""
     training_step = GaussianDreamerSystem.training_step
 
     def wrapped(self, batch, batch_idx):
@@ -51,8 +47,8 @@ def at_step(monkeypatch, step, act) -> None:
 @pytest.mark.slow
 @row("A5", "Crash mid checkpoint")
 def test_killed_at_random_moments_of_200_saves(tmp_path, measured):
-    """After each kill the file is whole and no older than the last save that the child has told
-    of.
+    """After each kill the file is intact and not older than the last save that the child has
+    reported.
     """
     path, rng = tmp_path / "last.ckpt", random.Random(0)
     save_file(path, content(0))
@@ -61,7 +57,7 @@ def test_killed_at_random_moments_of_200_saves(tmp_path, measured):
         read_end, write_end = os.pipe()
         child = os.fork()
         if child == 0:
-            # only torch.save and files, which need no thread that the fork has lost
+            # only torch.save and files, which need none of the threads that a fork loses
             for step in range(saved + 1, 10_000):
                 save_file(path, content(step))
                 os.write(write_end, struct.pack("i", step))
@@ -84,15 +80,15 @@ def test_killed_at_random_moments_of_200_saves(tmp_path, measured):
     assert {entry.name for entry in tmp_path.iterdir()} <= {
         "last.ckpt",
         "last-prev.ckpt",
-    }  # what was half-written is gone
+    }  # partially written files are gone
     measured(kills, "kills", what="in 200 saves or more", at_least=20)
     measured(read_end_lost, "saves", what="lost", at_most=0)
 
 
 @row("A5", "Crash mid checkpoint")
 def test_a_file_written_in_place_is_lost_by_such_kills(tmp_path, measured):
-    """The test above can fail: the same kills of a child that saves as ``torch.save(content,
-    path)`` does leave damaged files.
+    """Shows that the test above can fail: the same kills of a child that saves with
+    ``torch.save(content, path)`` leave damaged files.
     """
     path, rng, lost = tmp_path / "last.ckpt", random.Random(0), 0
     for _ in range(20):
@@ -128,8 +124,8 @@ def file_size_limit(limit: int):
 
 @contextlib.contextmanager
 def permissions_count_for_root():
-    """Root may write where permissions forbid it, by two capabilities that a thread can put down
-    and take up again.
+    """Make permissions effective for root by dropping two capabilities of the thread for
+    a while.
     """
     if os.geteuid():
         yield
@@ -156,7 +152,7 @@ def permissions_count_for_root():
 
 
 def assert_stopped_cleanly(ended: Ended, message: str) -> None:
-    """One named error; the checkpoint of step 2 is whole and the newest, and nothing temporary is
+    """One named error; the checkpoint of step 2 is intact and the newest, and no temporary file is
     left.
     """
     assert ended.code == 2 and "Traceback" not in ended.err, ended.err
@@ -184,8 +180,8 @@ def test_a_full_disk_in_the_middle_of_a_run(tmp_path, monkeypatch, measured):
     "hook", ["ensure_cloud", "score", "on_test_start", "on_test_epoch_end", "export"]
 )
 def test_a_disk_that_is_full_by_then(hook, tmp_path, monkeypatch, measured):
-    """When the prior is kept, the cloud scored, views and the video written, the cloud exported:
-    never a success with half a file.
+    """While the prior is cached, the cloud evaluated, views and video written, or the cloud
+    exported: a partial file never counts as success.
     """
     owner = system if hook == "export" else GaussianDreamerSystem
     original = getattr(owner, hook)
@@ -214,9 +210,9 @@ def test_a_disk_that_is_full_by_then(hook, tmp_path, monkeypatch, measured):
 @row("A5", "Disk full, read-only")
 @pytest.mark.parametrize("kind", ["mp4", "gif", "png"])
 @pytest.mark.parametrize("limit", [0, 100, 3000])
-def test_half_a_video_is_none(kind, limit, tmp_path, measured):
-    """The encoder is a process of its own, which ends in silence: an mp4 counts as written when its
-    index is in it.
+def test_a_partial_video_is_an_error(kind, limit, tmp_path, measured):
+    """The encoder is a separate process that may end without an error: an mp4 counts as written
+    when it contains its index.
     """
     noise = np.random.default_rng(0).integers(0, 255, (4, 64, 64, 3), dtype=np.uint8)
     for i, frame in enumerate(noise):
@@ -295,13 +291,13 @@ def test_a_signal_at_a_random_step(name, code, step, whole, tmp_path, monkeypatc
         and f"resume={ended.last}" in ended.out
     ), ended.err
     assert load_checkpoint(ended.last)["global_step"] == step
-    assert not list(ended.folder.glob("save/*test*"))  # Lightning would go on to the test
+    assert not list(ended.folder.glob("save/*test*"))  # Lightning would continue with the test
     require_resumed_equal(tmp_path, ended, whole, measured)
 
 
 @row("A5", "Ctrl-C / SIGTERM")
 def test_a_signal_while_views_are_validated(whole, tmp_path, monkeypatch, measured):
-    """The checkpoint of that step, once the views are done; not that of the last one saved."""
+    """The checkpoint of that step is written once the views are done."""
     with monkeypatch.context() as patch:
         patch.setattr(
             GaussianDreamerSystem,
@@ -320,8 +316,8 @@ def test_a_signal_while_views_are_validated(whole, tmp_path, monkeypatch, measur
 
 @row("A5", "Ctrl-C / SIGTERM")
 def test_a_second_signal_stops_at_once(tmp_path, monkeypatch, measured):
-    """In the middle of a step: the checkpoint of the step before is what is left, and the run can
-    go on from it.
+    """In the middle of a step: the checkpoint of the previous step remains, and the run can be
+    resumed.
     """
 
     def impatient(system):

@@ -1,6 +1,4 @@
-"""A4: score distillation. Scores that aren't finite, mixed precision, guidance that is too strong,
-schedules, cameras, resuming.
-"""
+"""A4: score distillation. Non-finite scores, mixed precision, schedules, resuming."""
 
 import math
 import random
@@ -29,7 +27,7 @@ register_parts()
 
 @register("stability-spoilt-guidance")
 class Spoilt(TowardsGrey):
-    """At the steps in ``spoilt`` the score of those items is that value."""
+    """Replace the score of some items, at the steps in ``spoilt``, by a value."""
 
     spoilt: dict[int, dict[int, float]] = {}
 
@@ -97,8 +95,8 @@ def test_bad_steps_are_counted_and_the_tenth_in_a_row_ends_the_run(tmp_path, mon
 
 
 def scaled_run(folder, monkeypatch, scale, *options) -> Ended:
-    """A run in Lightning's 16-mixed with this loss scale; on a CPU it takes float16 only when it is
-    given the scaler.
+    """Run with Lightning's 16-mixed and this loss scale; on a CPU float16 needs an
+    explicit scaler.
     """
     plugin = MixedPrecision("16-mixed", "cpu", scaler=torch.amp.GradScaler("cpu", init_scale=scale))
     build = run.build
@@ -124,8 +122,8 @@ def three_steps(tmp_path_factory) -> Ended:
 def test_any_loss_scale_trains_the_same_bits_as_float32(
     scale, three_steps, tmp_path, monkeypatch, measured
 ):
-    """Powers of two are exact in float32, so the only differences would be halves: in cameras,
-    colours, the rasteriser, the score.
+    """Powers of two are exact in float32, so differences could only come from half precision in
+    cameras, colours, rasteriser or score.
     """
     ended = scaled_run(tmp_path, monkeypatch, scale, "trainer.max_steps=3")
     assert ended.code == 0, ended.err
@@ -139,8 +137,8 @@ def test_any_loss_scale_trains_the_same_bits_as_float32(
 
 @row("A4", "GradScaler")
 def test_steps_that_are_skipped_are_counted_and_said(tmp_path, monkeypatch, measured):
-    """At a loss scale of 2^127 gradients overflow until it was halved twice: what Adam left out is
-    what is said and logged.
+    """At a loss scale of 2^127 gradients overflow until it was halved twice; the log reports the
+    steps that Adam skipped.
     """
     ended = scaled_run(
         tmp_path,
@@ -210,7 +208,7 @@ def test_the_clip_at_its_knots(measured):
         {"a": 1},
     ],
 )
-def test_a_clip_that_is_no_schedule_is_refused_when_it_is_read(knots, measured):
+def test_an_invalid_clip_schedule_is_refused_when_it_is_read(knots, measured):
     with pytest.raises(UserError, match="system.guidance.grad_clip"):
         check_part("system.guidance", "stability-spoilt-guidance", {"grad_clip": knots})
     measured("bad lists refused by name")
@@ -227,7 +225,7 @@ def test_timesteps_stay_inside_the_table(percents, measured):
 
 @row("A4", "t edges")
 def test_a_range_that_is_empty_after_annealing_is_named(measured):
-    """Not at the step where the two schedules cross, but before any work."""
+    """Before any work, not at the step at which the two schedules cross."""
     crossing = {"min_step_percent": 0.6, "max_step_percent": [500, 0.98, 0.55, 501]}
     with pytest.raises(UserError, match="min_step_percent: 0.6 is above max_step_percent, 0.55"):
         check_part("system.guidance", "stability-spoilt-guidance", crossing)
@@ -239,8 +237,8 @@ def test_a_range_that_is_empty_after_annealing_is_named(measured):
 @row("A4", "t edges")
 @pytest.mark.parametrize("name", sorted(sds.WEIGHTS))
 def test_the_gradient_at_the_first_and_last_timestep_is_finite(name, measured):
-    """t = 0, where a/sigma is 34, is never drawn. What is recorded is how much of each weighting
-    falls on the first tenth.
+    """t = 0, where a/sigma is 34, is never drawn. Records which fraction of each weighting falls on
+    the first tenth of the timesteps.
     """
     abar = sds.sd_alphas_cumprod()
     pull = sds.weight(name, abar) * (abar / (1 - abar)).sqrt()
@@ -289,7 +287,9 @@ DENSIFYING = [
 
 
 def resumed(folder, whole: Ended, step: int, *options) -> Ended:
-    """A run that goes on from what the whole one had written after ``step``, in another folder."""
+    """Resume, in another folder, from the checkpoint that the uninterrupted run wrote after
+    ``step``.
+    """
     ended = launch(folder, *options, f"resume={whole.folder}/ckpts/epoch=0-step={step}.ckpt")
     assert ended.code == 0, ended.err
     return ended
@@ -306,8 +306,8 @@ def over_the_edge(tmp_path_factory) -> Ended:
 @row("A4", "Resume mid-schedule")
 @pytest.mark.parametrize("step", [4, 5, 6])
 def test_resumed_at_the_edge_of_every_schedule(step, over_the_edge, tmp_path, measured):
-    """Timesteps, clip, resolution, learning rate and weight all jump from step 5 to step 6, as the
-    paper's do from 500 to 501.
+    """Timesteps, clip, resolution, learning rate and weight all jump from step 5 to step 6, like
+    the paper's from 500 to 501.
     """
     ended = resumed(tmp_path, over_the_edge, step, *EDGE, *EVERY_STEP)
     measured(
@@ -320,7 +320,7 @@ def test_resumed_at_the_edge_of_every_schedule(step, over_the_edge, tmp_path, me
 
 @pytest.fixture(scope="module")
 def random_streams(tmp_path_factory) -> Ended:
-    """A run in which everything is drawn at every step: cameras, their shifts, timesteps, noise,
+    """A run that draws everything at every step: cameras, their shifts, timesteps, noise,
     backgrounds, splits.
     """
     ended = launch(tmp_path_factory.mktemp("streams"), *DENSIFYING, *EVERY_STEP)
@@ -343,11 +343,9 @@ def test_stopped_and_resumed_anywhere(step, random_streams, tmp_path, measured):
 
 @row("A4", "RNG")
 @pytest.mark.parametrize("views, every", [(1, 3), (3, 1)])
-def test_looking_at_more_pictures_changes_nothing(
-    views, every, random_streams, tmp_path, monkeypatch, measured
-):
-    """Neither the number of validation views nor what they draw from the process's own
-    generators.
+def test_validation_changes_nothing(views, every, random_streams, tmp_path, monkeypatch, measured):
+    """Neither the number of validation views nor what they draw from the process's own generators
+    matters.
     """
     looked = GaussianDreamerSystem.validation_step
     seen = []

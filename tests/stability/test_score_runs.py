@@ -24,7 +24,7 @@ RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 
 # ---- what guidance does to colours and faces -----------------------------------------------------
 
-# configs/demo.yaml's rates rise and fall over the whole run; a short one gets them in proportion
+# configs/demo.yaml's schedules span the whole run; a short one gets them in proportion
 RATES = {
     "means": (4e-4, 2e-5),
     "scales": (6e-2, 1e-3),
@@ -66,8 +66,8 @@ RANDOM_START = [
 
 
 def trained(folder, steps, size, *options) -> Ended:
-    """A run that is long enough to show where it goes: ``size`` pixels, timesteps up to 0.55 after
-    five twelfths of it.
+    """Train long enough for a result: ``size`` pixels, timesteps up to 0.55 after five twelfths of
+    the run.
     """
     middle = steps * 5 // 12
     rates = [
@@ -93,8 +93,8 @@ def trained(folder, steps, size, *options) -> Ended:
 @pytest.mark.slow
 @row("A4", "Guidance 100: over-saturation")
 def test_annealing_helps_and_clipping_helps_more(tmp_path, measured):
-    """The exact score of the toy in a latent, at guidance 100 and, as what can be reached, at
-    none.
+    """The exact score of the toy in a latent, at guidance 100 and, for comparison, without
+    guidance.
     """
     variants = {
         "as it is": [*STRONG, "system.guidance.max_step_percent=0.98"],
@@ -104,7 +104,7 @@ def test_annealing_helps_and_clipping_helps_more(tmp_path, measured):
     }
     results = {}
     for name, options in variants.items():
-        # bounded colours can't be out of gamut, by which over-saturation is measured
+        # over-saturation is measured out of gamut, which bounded colours can't be
         unbounded = "system.geometry.bound_colors=false"
         options = ["data.batch_size=4", unbounded, *POINTS, *options]
         results[name] = trained(tmp_path / name.replace(" ", "-"), 150, 48, *options).metrics()[
@@ -128,9 +128,9 @@ def test_annealing_helps_and_clipping_helps_more(tmp_path, measured):
 
 @pytest.mark.slow
 @row("A4", "Janus")
-def test_a_prior_keeps_the_faces_apart_and_a_random_start_does_not(tmp_path, measured):
-    """A score that knows no view, short runs; the meter is the package's own and in every run's
-    metrics.json.
+def test_a_prior_prevents_multiple_faces_and_a_random_start_does_not(tmp_path, measured):
+    """A view-blind score and short runs; measured with the package's metric, which is in every
+    run's metrics.json.
     """
     starts = {"prior": POINTS, "random": RANDOM_START}
     rates = {
@@ -170,10 +170,10 @@ def test_the_table_of_five_seeds(measured):
 
 @pytest.mark.slow
 @row("A4", "Colour drift, background shortcut")
-def test_the_cloud_is_the_same_thing_on_any_background(tmp_path, measured):
-    """What differs between backgrounds is the alpha error alone, mostly at the outline: with the
-    customary dilation of 0.3 square pixels instead of the demo's 0.1 the spread is 1.1 dB, and 2 to
-    3 dB where a run is trained on black alone, as the paper's code is.
+def test_the_cloud_does_not_depend_on_the_background(tmp_path, measured):
+    """Only the alpha error differs between backgrounds, mostly at the outline. With the usual
+    dilation of 0.3 square pixels instead of the demo's 0.1 the spread is larger, and larger still
+    for training on black alone, as in the paper's code.
     """
     ended = trained(
         tmp_path, 300, 96, "system.geometry.prior.num_points=3000", "data.train_views=60"

@@ -1,5 +1,5 @@
-"""A5: what comes from outside. Point clouds of others, pickles at every door, modules that fail,
-and no network.
+"""A5: untrusted input. PLY files of other programs, pickles in every file that is read, and no
+network.
 """
 
 import ast
@@ -87,7 +87,7 @@ BROKEN = {
 
 @row("A5", "Corrupted/foreign PLY")
 @pytest.mark.parametrize("what", FOREIGN)
-def test_a_ply_of_others_is_read_right(what, tmp_path, measured):
+def test_a_ply_of_another_program_is_read_correctly(what, tmp_path, measured):
     (tmp_path / "a.ply").write_bytes(FOREIGN[what])
     arrays, expected = read_gaussians(tmp_path / "a.ply"), numbers(9)
     assert np.array_equal(read_points(tmp_path / "a.ply").points, expected[:, :3])
@@ -101,20 +101,20 @@ def test_a_ply_of_others_is_read_right(what, tmp_path, measured):
 
 @row("A5", "Corrupted/foreign PLY")
 @pytest.mark.parametrize("what", BROKEN)
-def test_a_broken_ply_is_a_clean_error_in_little_memory(what, tmp_path, measured):
+def test_a_damaged_ply_is_an_error_in_little_memory(what, tmp_path, measured):
     (tmp_path / "a.ply").write_bytes(BROKEN[what])
     tracemalloc.start()
     with pytest.raises(UserError, match="a.ply"):
         read_gaussians(tmp_path / "a.ply")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    measured(peak / 1e6, "MB", what="peak memory for a file that lies", at_most=1.0)
+    measured(peak / 1e6, "MB", what="peak memory for a file with a wrong count", at_most=1.0)
 
 
 @row("A5", "Corrupted/foreign PLY")
 def test_500_mutants_are_read_or_refused_in_little_memory(tmp_path, measured):
-    """Bytes changed, taken out, repeated, cut off, in header and rows of each of the files above;
-    `make fuzz` also asks what was read.
+    """Bytes changed, removed, repeated or truncated, in header and rows of each of the files above;
+    `make fuzz` also checks what was read.
     """
     path, draw, ended, peak = (
         tmp_path / "a.ply",
@@ -125,7 +125,7 @@ def test_500_mutants_are_read_or_refused_in_little_memory(tmp_path, measured):
     for i in range(500):
         data = bytearray([*FOREIGN.values()][i % len(FOREIGN)])
         for _ in range(draw.integers(1, 4)):
-            # every second time in the header, which a choice among all bytes would seldom reach
+            # every second time in the header, which a uniform choice would seldom hit
             at = int(draw.integers(len(data) if i % 2 else data.find(b"end_header") % len(data)))
             change = [
                 bytes(draw.integers(0, 256, 1, np.uint8)),
@@ -156,11 +156,11 @@ def test_an_empty_cloud_is_read_as_one(tmp_path, measured):
     measured("N = 0 read")
 
 
-# ---- hostile files -------------------------------------------------------------------------------
+# ---- damaged files -------------------------------------------------------------------------------
 
 
 class Bomb:
-    """Makes a folder when it is unpickled."""
+    """Creates a folder when it is unpickled."""
 
     def __init__(self, path: Path):
         self.path = str(path)
@@ -191,9 +191,9 @@ def bomb_numpy(path: Path, bomb: Bomb, **names) -> Path:
     return path
 
 
-def refused(door) -> None:
+def refused(read) -> None:
     with pytest.raises(UserError):
-        door()
+        read()
 
 
 def tiny_text_model(folder: Path) -> Path:
@@ -226,7 +226,7 @@ def open_embedding(folder: Path, bomb: Bomb) -> None:
     pytest.importorskip("safetensors")
     cache = EmbeddingCache(str(folder), "a model")
     cache.path("a fox").write_bytes(pickle.dumps(bomb))
-    assert cache.read("a fox") is None  # made anew
+    assert cache.read("a fox") is None  # made again
 
 
 def open_prior_cache(folder: Path, bomb: Bomb) -> None:
@@ -239,14 +239,14 @@ def open_yaml(folder: Path, bomb: Bomb) -> None:
 
 
 def launched(option: str, stage: str = "--train"):
-    def door(folder: Path, bomb: Bomb) -> None:
+    def reader(folder: Path, bomb: Bomb) -> None:
         path = bomb_checkpoint(folder / "bomb.ckpt", bomb)
         ended = launch(folder / "out", option.format(path), "trainer.max_steps=1", stage=stage)
         assert ended.code == 2 and "could run code" in ended.err and "Traceback" not in ended.err, (
             ended.err
         )
 
-    return door
+    return reader
 
 
 def renamed_pickle(folder: Path, bomb: Bomb) -> None:
@@ -254,7 +254,7 @@ def renamed_pickle(folder: Path, bomb: Bomb) -> None:
     refused(lambda: load_body_model(str(folder / "body.npz")))
 
 
-DOORS = {
+READERS = {
     "resume": launched("resume={}"),
     "resume to export": launched("resume={}", "--export"),
     "system.weights": launched("system.weights={}"),
@@ -298,13 +298,13 @@ DOORS = {
 
 
 @row("A5", "Untrusted pickle")
-@pytest.mark.parametrize("door", DOORS)
-def test_nothing_that_is_opened_runs_code(door, tmp_path, measured):
+@pytest.mark.parametrize("reader", READERS)
+def test_nothing_that_is_opened_runs_code(reader, tmp_path, measured):
     bomb = Bomb(tmp_path / "exploded")
-    DOORS[door](tmp_path, bomb)
+    READERS[reader](tmp_path, bomb)
     assert not (tmp_path / "exploded").exists()
     pickle.loads(pickle.dumps(bomb))
-    assert (tmp_path / "exploded").exists()  # it would have been noticed
+    assert (tmp_path / "exploded").exists()  # the bomb works when it is unpickled
     measured("nothing executed")
 
 
@@ -344,8 +344,8 @@ def calls(path: Path):
 
 @row("A5", "Untrusted pickle")
 def test_every_load_in_the_package_is_the_safe_one(measured):
-    """Named ``torch.load`` and ``np.load``, so that none hides behind another name; benchmarks and
-    the launcher included.
+    """Calls are named ``torch.load`` and ``np.load``, so that none is hidden by another name;
+    benchmarks and launcher included.
     """
     unsafe, found = [], 0
     root = PACKAGE.parent

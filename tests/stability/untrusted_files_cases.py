@@ -1,4 +1,4 @@
-"""What the tests of untrusted files share."""
+"""Helpers of the tests of untrusted files."""
 
 from pathlib import Path
 
