@@ -1,5 +1,6 @@
 """8 bit RGB images from arrays, and image and video files: colour maps, grids, captions."""
 
+import io
 import os
 import struct
 from pathlib import Path
@@ -157,6 +158,30 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
         raise UserError(f"the video {path} could not be written: {error}") from error
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_animation(path: Path, frames: list[Path], size: int, seconds: float) -> None:
+    """Write pictures as an animated WebP that repeats.
+
+    Args:
+        size: the largest width and height, pixels; larger pictures are shrunk.
+        seconds: of one round.
+
+    Raises:
+        UserError: the disk is full or the folder can't be written.
+    """
+    from PIL import Image
+
+    pictures = [Image.open(frame).convert("RGB") for frame in frames]
+    for image in pictures:
+        image.thumbnail((size, size), Image.Resampling.LANCZOS)
+    options = {"duration": round(1000 * seconds / len(pictures)), "loop": 0}
+    content = io.BytesIO()
+    pictures[0].save(
+        content, "webp", save_all=True, append_images=pictures[1:], quality=80, method=2, **options
+    )
+    with atomic_file(path, durable=False) as file:
+        file.write(content.getvalue())
 
 
 def _require_whole_mp4(path: Path) -> None:

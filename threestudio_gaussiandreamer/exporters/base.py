@@ -18,7 +18,7 @@ NAME_BYTES = 255
 """The longest file name on common file systems, bytes."""
 
 
-RESERVED = ("pruned", "report.json", "report.png")
+RESERVED = ("pruned", "report.json", "report.png", "view.html", "poster.png")
 """Names that a run itself uses in the export folder."""
 
 

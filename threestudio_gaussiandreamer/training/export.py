@@ -14,9 +14,10 @@ from ..gaussians.surface import Surface
 from ..gaussians.views import EPS2D
 from ..host import find
 from ..prune import PruneOptions, prune_to_budget, write_report
+from .pages import write_pages
 from .renderer import SplattingRenderer
 
-SUMMARY = ("held_out/compare.png", "it*-test.mp4", "it*-export/*.*", "it*-export/pruned/*.*")
+SUMMARY = ("held_out/compare.png", "it*-test.*", "it*-export/*.*", "it*-export/pruned/*.*")
 """Files below the folder of results that the last message of a run names."""
 
 
@@ -53,6 +54,12 @@ class GaussianSavers:
 def export(system: Any) -> None:
     """Write what ``--export`` writes but for the video; a training run ends with it."""
     export_cloud(system, system.geometry, export_folder(system))
+    export_companions(system)
+
+
+def export_companions(system: Any) -> None:
+    """Write what accompanies the files of the exporter: the page, and the pruned cloud."""
+    write_pages(system, export_folder(system))
     export_pruned(system)
 
 

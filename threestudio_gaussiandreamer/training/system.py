@@ -21,6 +21,7 @@ prune          a budget for a second, pruned export: count, bytes (of the SPZ fi
                exported, else of the PLY), psnr (dB to the cloud before) or within (dB lost of
                quality); quality, size, steps: as the prune command; eps2d, antialias: the
                renderer's, unless given
+pages          write what shows the cloud in a browser, see ``pages.py``
 =============  =====================================================================================
 """
 
@@ -54,12 +55,13 @@ from ..prune import PruneOptions
 from .background import FlatBackground
 from .density import DensityControl, RenderedQuality
 from .events import log_picture, log_scores
-from .export import GaussianSavers, export, export_pruned, exported_files
+from .export import GaussianSavers, export, export_companions, exported_files
 from .finite import CHECK_EVERY, optimizer_tensors, require_finite
 from .held_out import EvaluationConfig, HeldOut, Measurements
 from .loss_scale import LossScale
 from .losses import check_losses, loggable, logged_names, weighted_losses
 from .optimizer import check_optimizer, make_optimizer
+from .pages import save_first_cloud, write_turntable
 from .pictures import render_panels, rgb_panel, score_panels
 from .truth import prefetch_truth, true_views
 
@@ -74,6 +76,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         exporter_type: str = "gaussiandreamer-exporter"
         evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
         prune: PruneOptions = field(default_factory=PruneOptions)
+        pages: bool = True
 
         def __post_init__(self) -> None:
             adopt_nested(self)
@@ -206,6 +209,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         if problem:
             warn(problem)
         if self.global_step == 0:
+            save_first_cloud(self)
             self.score("prior")
         if self.measurements:
             self.measurements.start_clock()
@@ -367,16 +371,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         )
 
     def on_test_epoch_end(self) -> None:
-        folder = f"it{self.true_global_step}-test"
-        self.save_img_sequence(
-            folder,
-            folder,
-            r"(\d+)\.png",
-            save_format="mp4",
-            fps=30,
-            name="test",
-            step=self.true_global_step,
-        )
+        write_turntable(self)
         if self.guidance is not None:
             export(self)
 
@@ -395,4 +390,4 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def on_predict_epoch_end(self) -> None:
         super().on_predict_epoch_end()
-        export_pruned(self)
+        export_companions(self)

@@ -52,13 +52,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line; return the exit code of :func:`core.command.run_command`."""
-    return run_command(parse, run, argv)
-
-
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
-    """Parse a command line; exits for ``--help`` and for invalid arguments."""
+    """Parse the arguments of the command; exits as :mod:`argparse` does."""
     parser = argparse.ArgumentParser(
         prog="python -m threestudio_gaussiandreamer.view",
         description="Write a cloud of Gaussians as one HTML file that shows it in a browser.",
@@ -101,6 +96,11 @@ def run(args: argparse.Namespace) -> None:
     quality = decibels(run_files.psnr("result")) if _is_result(source, run_files) else ""
     write_page(out, Shown(stored, "result", quality), options)
     print(f"{out}: {len(stored.gaussians.means):,} Gaussians, {out.stat().st_size / 1e6:.2f} MB")
+
+
+def main(argv: Optional[Sequence[str]] = None) -> int:
+    """Run the command; return the exit code of :func:`core.command.run_command`."""
+    return run_command(parse, run, argv)
 
 
 def read_any(source: Path, up: Optional[str] = None) -> StoredCloud:

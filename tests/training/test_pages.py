@@ -1,0 +1,75 @@
+"""What a run leaves to look at: a page that is the run's, with the first cloud, and pictures."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.training.runs import launch, trial
+from threestudio_gaussiandreamer.core.images import read
+from threestudio_gaussiandreamer.formats.spz import read_spz
+
+SHORT = ["trainer.max_steps=2", "trainer.val_check_interval=2"]
+
+
+def meta(path) -> dict:
+    return json.loads(re.search(r'id="meta">(.*?)</script>', path.read_text())[1])
+
+
+@pytest.fixture(scope="module")
+def save(tmp_path_factory, painted_box):
+    """The results of a run of two steps, and of ``--export`` after it."""
+    folder = tmp_path_factory.mktemp("pages")
+    options = ["system.prompt_processor.prompt=a <painted> box", "system.renderer.eps2d=0.2"]
+    assert launch(folder, painted_box, *options, *SHORT) == 0
+    return trial(folder) / "save"
+
+
+def test_a_run_ends_with_a_page_of_its_cloud(save):
+    found = meta(save / "it2-export" / "view.html")
+    assert found["title"] == "a <painted> box" and found["background"] == "#ffffff"
+    assert found["settings"]["eps2d"] == 0.2 and found["settings"]["alphaMin"] == 1 / 255
+    scores = json.loads((save / "metrics.json").read_text())
+    for shown, label in zip(found["clouds"], ("result", "prior"), strict=True):
+        assert shown["label"] == label and shown["count"] == 200
+        assert shown["quality"] == f"{scores[label]['psnr']:.1f} dB on held-out views"
+
+
+def test_the_first_cloud_is_kept(save):
+    assert len(read_spz(save / "prior" / "gaussians.spz").means) == 200
+
+
+def test_the_poster_has_a_transparent_background(save):
+    poster = np.asarray(Image.open(save / "it2-export" / "poster.png"))
+    assert poster.shape == (512, 512, 4)
+    assert poster[0, 0, 3] == 0 and poster[..., 3].max() > 60
+
+
+def test_the_turntable_is_an_animated_picture_too(save):
+    turntable = Image.open(save / "it2-test.webp")
+    assert turntable.n_frames == len(list((save / "it2-test").glob("*.png"))) == 3
+    expected = read(save / "it2-test" / "0.png").astype(float)
+    assert np.abs(np.asarray(turntable.convert("RGB")) - expected).mean() < 8
+
+
+def test_export_writes_the_page_again(save, painted_box, tmp_path):
+    resume = [f"resume={save.parent / 'ckpts' / 'last.ckpt'}", "system.exporter.save_video=false"]
+    assert launch(tmp_path, painted_box, *resume, stage="--export") == 0
+    (again,) = tmp_path.glob("*/*/save/it2-export/view.html")
+    assert [shown["label"] for shown in meta(again)["clouds"]] == ["result"]
+
+
+def test_pages_can_be_switched_off(painted_box, tmp_path):
+    assert launch(tmp_path, painted_box, "system.pages=false", *SHORT) == 0
+    save = trial(tmp_path) / "save"
+    assert not [*save.rglob("*.html"), *save.rglob("poster.png"), *save.rglob("prior/*.spz")]
+
+
+def test_a_page_for_too_many_gaussians_is_skipped_with_a_warning(
+    painted_box, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr("threestudio_gaussiandreamer.training.pages.MAX_GAUSSIANS", 100)
+    assert launch(tmp_path, painted_box, *SHORT) == 0
+    assert "no view.html is written for 200 Gaussians" in capsys.readouterr().err

@@ -1,0 +1,134 @@
+"""What a run leaves to look at: the page of its cloud, its poster, and the turntable.
+
+==========================  =======================================================================
+file in ``save/``           content
+==========================  =======================================================================
+it<step>-export/view.html   the cloud, and the first one to compare with, in a browser
+it<step>-export/poster.png  one view with a transparent background
+it<step>-test.mp4           the turntable of the test views
+it<step>-test.webp          fewer of them, for pages that play no video
+prior/gaussians.spz         the cloud that training has started with
+==========================  =======================================================================
+"""
+
+from pathlib import Path
+from typing import Any, Optional
+
+from ..core.files import atomic_file
+from ..core.images import write_animation
+from ..exporters.base import read_gaussians
+from ..formats.gaussian_files import StoredCloud, read_cloud, write_cloud
+from ..gaussians.axes import VIEWER_UP
+from ..gaussians.gaussians import Gaussians
+from ..host import warn
+from ..view.page import (
+    MAX_GAUSSIANS,
+    WHITE,
+    PageOptions,
+    Shown,
+    decibels,
+    write_page,
+)
+from ..view.poster import picture
+from ..view.render import RenderSettings, first_pose
+from ..view.run_files import RunFiles
+from .background import FlatBackground
+from .renderer import SplattingRenderer
+
+FIRST_CLOUD = "prior/gaussians.spz"
+PAGE, POSTER = "view.html", "poster.png"
+POSTER_SIZE = 512
+"""Pixels each way."""
+TURNTABLE_FRAMES, TURNTABLE_SIZE, TURNTABLE_SECONDS = 40, 256, 4.0
+"""Largest number of frames of the animated picture and its largest size in pixels."""
+
+
+def save_first_cloud(system: Any) -> None:
+    """Keep the cloud that training starts with, so that pages can show it beside the result."""
+    if system.cfg.pages and system._save_dir is not None and system.trainer.is_global_zero:
+        first = StoredCloud(read_gaussians(system.geometry))
+        write_cloud(system.get_save_path(FIRST_CLOUD), first, ".spz")
+
+
+def write_pages(system: Any, folder: str) -> None:
+    """Write the page and the poster of the cloud of ``system``, unless ``system.pages`` is off.
+
+    Args:
+        folder: of the exports, below the system's folder of results.
+    """
+    if not system.cfg.pages or not _is_cloud(system.geometry):
+        return
+    cloud = StoredCloud(read_gaussians(system.geometry)).in_axes(VIEWER_UP)
+    count = len(cloud.gaussians.means)
+    if not 0 < count <= MAX_GAUSSIANS:
+        warn(f"no {PAGE} is written for {count:,} Gaussians: it shows 1 to {MAX_GAUSSIANS:,}")
+        return
+    run = RunFiles(Path(system.get_save_dir()).parent)
+    options = _page_options(system, run)
+    result = Shown(cloud, "result", decibels(run.psnr("result", system.true_global_step)))
+    write_page(
+        Path(system.get_save_path(f"{folder}/{PAGE}")), result, options, _first_cloud(system, run)
+    )
+    with atomic_file(system.get_save_path(f"{folder}/{POSTER}"), durable=False) as file:
+        picture(cloud, options.settings, first_pose(cloud), POSTER_SIZE).save(file, "png")
+
+
+def write_turntable(system: Any) -> None:
+    """Write the pictures ``it<step>-test/<number>.png`` as a video, and fewer of them as WebP."""
+    step = system.true_global_step
+    name = f"it{step}-test"
+    options = {"save_format": "mp4", "fps": 30, "name": "test", "step": step}
+    system.save_img_sequence(name, name, r"(\d+)\.png", **options)
+    folder = Path(system.get_save_dir(), name)
+    if not system.cfg.pages:
+        return
+    frames = sorted(folder.glob("*.png"), key=lambda path: int(path.stem))
+    chosen = frames[:: -(-len(frames) // TURNTABLE_FRAMES) or 1]
+    if chosen:
+        write_animation(folder.with_suffix(".webp"), chosen, TURNTABLE_SIZE, TURNTABLE_SECONDS)
+
+
+def _page_options(system: Any, run: RunFiles) -> PageOptions:
+    renderer = system.renderer
+    settings = RenderSettings()
+    if isinstance(renderer, SplattingRenderer):
+        bound = getattr(system.geometry.cfg, "bound_colors", True)
+        settings = RenderSettings.of(renderer.cfg, bound_colors=bound)
+    return PageOptions(
+        title=_prompt(system) or run.folder.name,
+        name="gaussians",
+        settings=settings,
+        background=_background(system.background),
+    )
+
+
+def _prompt(system: Any) -> str:
+    """Return the prompt of a training run, else the text in the configuration."""
+    prompt = getattr(system.prompt_utils, "prompt", None)
+    return str(prompt or system.cfg.prompt_processor.get("prompt") or "")
+
+
+def _background(background: Any) -> tuple[float, float, float]:
+    """Return the colour that test views are shown on; white for backgrounds that aren't flat."""
+    if not isinstance(background, FlatBackground):
+        return WHITE
+    if background.cfg.mode == "learned":
+        red, green, blue = background.color(1)[0].tolist()
+    else:
+        red, green, blue = background.cfg.color
+    return (red, green, blue)
+
+
+def _first_cloud(system: Any, run: RunFiles) -> Optional[Shown]:
+    """Return the cloud that training has started with, if it is there and a page can show it."""
+    path = run.save / FIRST_CLOUD
+    if not path.is_file():
+        return None
+    cloud = read_cloud(str(path))
+    shown = 0 < len(cloud.gaussians.means) <= MAX_GAUSSIANS
+    return Shown(cloud, "prior", decibels(run.psnr("prior"))) if shown else None
+
+
+def _is_cloud(geometry: Any) -> bool:
+    """Return whether a geometry, which may be another extension's, has the Gaussians' fields."""
+    return all(hasattr(geometry, name) for name in Gaussians._fields)
