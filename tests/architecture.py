@@ -1,7 +1,7 @@
-"""Draw the package's rooms, rings and the way of a step: ``python -m tests.architecture``.
+"""Draw the package's rooms, rings and the path of a step: ``python -m tests.architecture``.
 
 Reads the source with :mod:`ast` and writes ``docs/images/architecture.svg`` and the tables between
-the markers of ``docs/architecture.md``; ``tests/test_structure.py`` fails when either is stale.
+the markers of ``docs/architecture.md``; ``tests/test_structure.py`` fails if either is stale.
 """
 
 import ast
@@ -41,7 +41,7 @@ RINGS = (
 
 
 class Step(NamedTuple):
-    """A station on the way from the command line to a training step."""
+    """A function on the path from the command line to a training step."""
 
     module: str
     function: str
@@ -65,17 +65,17 @@ WIDTH, MARGIN, BAND, BOX, GAP = 1000, 16, 96, 64, 10
 
 
 def room_of(path: Path) -> str:
-    """Name of the folder, or of the top-level module, that a source file belongs to."""
+    """Return the folder, or the top-level module, that a source file belongs to."""
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
 
 
 def sources() -> list[Path]:
-    """Every Python file of the package but its own ``__init__``."""
+    """Return every Python file of the package except its own ``__init__``."""
     return [path for path in sorted(PACKAGE.rglob("*.py")) if path != PACKAGE / "__init__.py"]
 
 
 def ring_of() -> dict[str, int]:
-    """Room to the index of its ring."""
+    """Map each room to the index of its ring."""
     return {room: index for index, ring in enumerate(RINGS) for room in ring.rooms}
 
 
@@ -98,7 +98,7 @@ def imports(path: Path) -> Iterator[tuple[str, bool]]:
 
 
 def arrows() -> dict[tuple[str, str], int]:
-    """Number of import statements from one room to another."""
+    """Count the import statements from one room to another."""
     found: dict[tuple[str, str], int] = {}
     for path in sources():
         for name, _ in imports(path):
@@ -109,7 +109,7 @@ def arrows() -> dict[tuple[str, str], int]:
 
 
 def purpose(room: str) -> str:
-    """First sentence of a room's docstring."""
+    """Return the first sentence of a room's docstring."""
     folder = PACKAGE / room
     text = (folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")).read_text()
     words = " ".join((ast.get_docstring(ast.parse(text)) or "").split("\n\n")[0].split())
@@ -121,7 +121,7 @@ def label(room: str) -> str:
 
 
 def places() -> dict[str, tuple[float, float, float]]:
-    """Left, top and width of each room's box; ring 0 is the lowest band."""
+    """Return left, top and width of each room's box; ring 0 is the lowest band."""
     found = {}
     for index, ring in enumerate(reversed(RINGS)):
         left, top = MARGIN + 108, MARGIN + index * (BAND + GAP) + (BAND - BOX) / 2
@@ -132,7 +132,9 @@ def places() -> dict[str, tuple[float, float, float]]:
 
 
 def svg() -> str:
-    """The picture: a band per ring, a box per room, an arrow per import between rings, the way."""
+    """Return the picture: a band per ring, a box per room, an arrow per import between rings, and
+    the path.
+    """
     height = MARGIN + len(RINGS) * (BAND + GAP) + 22 * ((len(STEPS) + 1) // 2) + 40
     shapes = [*_bands(), *_arrows(), *_boxes(), *_legend(height)]
     style = "text{font-family:Helvetica,Arial,sans-serif;fill:#111}"
@@ -208,7 +210,7 @@ def _legend(height: int) -> Iterator[str]:
 
 
 def rooms_table() -> str:
-    """Markdown table of every room: ring, purpose, modules."""
+    """Return a Markdown table of every room: ring, purpose, modules."""
     rows = ["| room | ring | what it is for | modules |", "| --- | --- | --- | --- |"]
     for index, ring in reversed(list(enumerate(RINGS))):
         for room in ring.rooms:
@@ -220,7 +222,7 @@ def rooms_table() -> str:
 
 
 def steps_list() -> str:
-    """Markdown list of the stations of a step, each linked to its file."""
+    """Return a Markdown list of the functions of a step, each linked to its file."""
     return "\n".join(
         f"{i}. [`{s.module}`](../{NAME}/{s.module}) `{s.function}`: {s.does}."
         for i, s in enumerate(STEPS, 1)
@@ -228,7 +230,7 @@ def steps_list() -> str:
 
 
 def page() -> str:
-    """The architecture page with its generated sections made from the code of today."""
+    """Return the architecture page with its generated sections made from the current code."""
     text = PAGE.read_text()
     for name, made in (("rooms", rooms_table()), ("steps", steps_list())):
         section = re.compile(rf"(<!-- {name} -->\n).*?(\n<!-- end -->)", re.DOTALL)

@@ -1,4 +1,4 @@
-"""What several test files share: small clouds, and a home without surprises."""
+"""Fixtures of all tests: small clouds, and an isolated environment."""
 
 import os
 
@@ -28,13 +28,15 @@ def default_signals():
 
 @pytest.fixture(autouse=True)
 def same_seed(monkeypatch):
-    """Runs seed through the environment; a test must not inherit another one's."""
+    """Unset the seed that runs put into the environment."""
     monkeypatch.setenv("PL_GLOBAL_SEED", "0")
 
 
 @pytest.fixture(autouse=True, scope="session")
 def small_turntables():
-    """Draw the turntables of priors in few pixels: the GIF costs as much as a short run."""
+    """Render the turntables of priors with few pixels, because the GIF takes as long as a short
+    run.
+    """
     from threestudio_gaussiandreamer.priors import cache
 
     small = functools.partial(cache.save_turntable, views=2, size=16)
@@ -45,7 +47,7 @@ def small_turntables():
 
 @pytest.fixture
 def sphere_points() -> PointCloud:
-    """400 points on a sphere of radius 0.7, coloured by their place."""
+    """Return 400 points on a sphere of radius 0.7, coloured by position."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(400, 3))
     points *= 0.7 / np.linalg.norm(points, axis=1, keepdims=True)
@@ -54,8 +56,8 @@ def sphere_points() -> PointCloud:
 
 @pytest.fixture
 def shared_folder() -> Path:
-    """A folder with real meshes beside the repository; a test that uses it skips where it isn't
-    there.
+    """Return a folder with real meshes beside the repository; tests that use it are skipped without
+    it.
     """
     folder = Path(os.environ.get("GAUSSIANDREAMER_SHARED", Path(__file__).parents[2] / "shared"))
     if not (folder / "assets").is_dir():

@@ -1,4 +1,4 @@
-"""The conventions, checked against hand-computed geometry."""
+"""The conventions, checked against computed geometry."""
 
 import math
 
@@ -97,7 +97,7 @@ def test_held_out_views_are_fixed_distinct_and_in_no_pool():
 
 @pytest.mark.parametrize("seed", range(8))
 def test_every_pool_mixes_both_elevation_rules(seed):
-    """Uniform in angle and in the sine, half each; a pool of one rule is 0.05 from that."""
+    """Uniform in angle and in the sine, half each; a pool of one rule differs from that by 0.05."""
     ranges = OrbitRanges(elevation=(-90.0, 90.0))
     elevation = cameras.camera_pool(20_000, ranges, seed).elevation.double()
     by_angle, by_sine = (elevation + 90) / 180, (torch.deg2rad(elevation).sin() + 1) / 2
@@ -128,7 +128,7 @@ def test_the_inverse_of_a_camera_is_exact_and_of_a_broken_one_its_own_trouble():
     assert torch.equal(cameras.world_to_camera(c2w)[:1], whole)
 
 
-def test_a_camera_in_the_centre_looks_as_one_in_front_does():
+def test_a_camera_at_the_centre_has_the_direction_of_one_in_front():
     up = torch.tensor([[0.0, 0.0, 1.0]])
     center = cameras.look_at(torch.zeros(1, 3), torch.zeros(1, 3), up)
     front = cameras.look_at(torch.tensor([[2.0, 0.0, 0.0]]), torch.zeros(1, 3), up)

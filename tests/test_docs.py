@@ -1,4 +1,4 @@
-"""What README and docs/ name exists, and their commands and code run."""
+"""Files that README and docs/ name exist, and their commands and code run."""
 
 import re
 import shlex
@@ -26,12 +26,12 @@ TINY = [
 
 
 def blocks(text: str, language: str) -> list[str]:
-    """The fenced blocks in this language; "" for those that name none."""
+    """Return the fenced blocks in this language; "" for those without one."""
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
 def launches() -> list[list[str]]:
-    """The arguments of every launch.py and gaussiandreamer in a block of commands."""
+    """Return the arguments of every launch.py and gaussiandreamer in a block of commands."""
     found = []
     for text in TEXTS.values():
         for block in blocks(text, "bash") + blocks(text, ""):
@@ -44,7 +44,7 @@ def launches() -> list[list[str]]:
 
 
 def anchors(text: str) -> set[str]:
-    """The anchors of a document's headings, as GitHub makes them."""
+    """Return the anchors of a document's headings, as GitHub makes them."""
     headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
@@ -62,8 +62,8 @@ def test_links_lead_somewhere(name):
 
 @pytest.mark.parametrize("name", TEXTS)
 def test_files_that_are_named_exist(name):
-    """Paths in backticks that begin with one of our folders; what a run writes or a user adds isn't
-    ours.
+    """Paths in backticks that begin with a folder of the repository, except what a run writes or a
+    user adds.
     """
     for path in re.findall(
         r"`((?:configs|tests|benchmarks|docs|threestudio_gaussiandreamer|custom/threestudio)"
@@ -86,7 +86,7 @@ def test_the_readme_shows_launches():
 
 @pytest.mark.parametrize("arguments", launches(), ids=" ".join)
 def test_a_launch_that_is_shown_is_accepted(arguments, tmp_path, monkeypatch):
-    """Configuration, options and names; what "..." stands for is the reader's."""
+    """Configuration, options and names; "..." stands for the user's own arguments."""
     args = parse_arguments([word for word in arguments if word != "..."])
     paths = [find_config(name).resolve() for name in args.config]
     overrides = [
@@ -97,7 +97,7 @@ def test_a_launch_that_is_shown_is_accepted(arguments, tmp_path, monkeypatch):
 
 
 def python_blocks() -> list[tuple[str, str]]:
-    """(file name in the first line, source) of the extensions that docs/ shows."""
+    """Return (file name in the first line, source) of the extensions in docs/."""
     found = [
         (re.match(r"# (custom/\S+\.py)\n", block), block)
         for text in TEXTS.values()

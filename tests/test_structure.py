@@ -196,7 +196,7 @@ def test_lines_that_stand_twice_are_found(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("step", STEPS, ids=lambda step: step.module)
-def test_a_station_of_the_step_exists(step):
+def test_every_function_of_the_step_exists(step):
     tree = ast.parse((PACKAGE / step.module).read_text())
     assert step.function in {getattr(node, "name", None) for node in ast.walk(tree)}
 

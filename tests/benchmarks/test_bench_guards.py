@@ -1,4 +1,4 @@
-"""The benchmark of the guards runs from end to end, with everything tiny."""
+"""The benchmark of the checks runs from end to end, at a tiny size."""
 
 import csv
 

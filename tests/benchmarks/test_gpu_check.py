@@ -1,4 +1,4 @@
-"""The check for machines with a GPU runs from end to end: here on the CPU, with everything tiny."""
+"""The GPU check runs from end to end on the CPU, at a tiny size."""
 
 import json
 import subprocess
@@ -66,8 +66,8 @@ def test_each_section_leaves_its_numbers_whatever_the_next_one_does(monkeypatch,
 
 
 def test_a_part_that_hangs_ends_with_all_that_it_started():
-    """As a compiler of a compiler does, or a program under compute-sanitizer: they hold the pipes,
-    and nobody waits for them.
+    """Like a compiler that starts another process, or a program under compute-sanitizer: such
+    children keep the pipes open, and no process waits for them.
     """
     args = gpu_check.parse_arguments([])
     started = time.monotonic()

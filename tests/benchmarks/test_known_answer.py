@@ -1,5 +1,5 @@
-"""Pictures of exactly M Gaussians: from 4 M, with duplicates and floaters, `budget: auto` and the
-prune command find no more than 1.2 M.
+"""On images of exactly M Gaussians, starting from 4 M with duplicates and floaters, `budget: auto`
+and the prune command keep at most 1.2 M.
 """
 
 import pytest
@@ -30,7 +30,7 @@ RATES = {
 
 
 def trained(geometry, views, pictures):
-    """The cloud after a short run towards the pictures: what the system does, without its host."""
+    """Fit a cloud to the images for a short run: the system's steps without its host."""
     adam = torch.optim.Adam(geometry.parameter_groups(), betas=(0.9, 0.99), eps=1e-15)
     rng = torch.Generator().manual_seed(0)
 

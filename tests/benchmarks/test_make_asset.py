@@ -1,4 +1,6 @@
-"""The script of the bundled mesh still makes it, and refuses what has no room in the texture."""
+"""The script of the bundled mesh still generates it, and rejects what does not fit into the
+texture.
+"""
 
 import numpy as np
 import pytest

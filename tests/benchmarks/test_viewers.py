@@ -1,8 +1,8 @@
-"""Spark in headless Chromium shows an exported file as our renderer does: upright, facing the
+"""Spark in headless Chromium renders an exported file like this package: upright, facing the
 camera, in the same colours.
 
-The folder node_modules with the npm packages of ``benchmarks/viewers/browser.py`` is named by the
-environment variable VIEWER_NODE_MODULES.
+The environment variable VIEWER_NODE_MODULES names the folder node_modules with the npm packages of
+``benchmarks/viewers/browser.py``.
 """
 
 import math

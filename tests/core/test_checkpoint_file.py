@@ -1,4 +1,4 @@
-"""Checkpoint files: whole or absent, damage noticed, no code executed."""
+"""Checkpoint files are complete or absent, damage is detected, and no code is executed."""
 
 import os
 import pickle
@@ -62,8 +62,8 @@ def test_the_file_that_is_replaced_is_kept(tmp_path):
 
 
 def test_a_kill_between_keeping_and_replacing_leaves_nothing_behind(tmp_path):
-    """Then the kept file and the last one are one file with two names, and renaming one to the
-    other does nothing at all.
+    """In that state the kept file and the last one are hard links to one file, and renaming one to
+    the other has no effect.
     """
     path = tmp_path / "last.ckpt"
     save_file(path, content(1))
@@ -122,8 +122,8 @@ def test_a_damaged_file_names_its_neighbours(tmp_path):
 
 
 def test_the_newest_of_a_folder_is_the_one_with_most_steps(tmp_path):
-    """Not by its name or time: a copy of a folder has neither in order, and a kill may fall between
-    two files of one save.
+    """Not by name or time: a copied folder doesn't preserve their order, and a kill may happen
+    between two files of one save.
     """
     for name, step in (("last", 4), ("epoch=0-step=6", 6), ("epoch=0-step=2", 2)):
         save_file(tmp_path / f"{name}.ckpt", content(step))
@@ -220,7 +220,7 @@ def repacked(path: Path, change: Callable[[str, bytes], bytes], compression: int
 
 
 def refused(path: Path, message: str, most_bytes: int = 8 << 20) -> None:
-    """The file is refused, and little is allocated for it."""
+    """Assert that the file is rejected with little memory."""
     tracemalloc.start()
     try:
         with pytest.raises(UserError, match=message):

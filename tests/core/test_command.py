@@ -34,7 +34,7 @@ def test_what_ends_a_command_is_one_message(error, code, message, capsys, monkey
     assert message in capsys.readouterr().err
 
 
-def test_a_mistake_of_the_program_keeps_its_traceback():
+def test_an_internal_error_keeps_its_traceback_in_verbose_mode():
     with pytest.raises(ZeroDivisionError):
         run_command(len, raising(ZeroDivisionError()), [])
 

@@ -46,7 +46,7 @@ SCRIPT = """
 """
 
 
-def test_alone_everything_is_left_as_it_is():
+def test_a_single_process_changes_nothing():
     parameter = torch.nn.Parameter(torch.zeros(2))
     parameter.grad = torch.ones(2)
     distributed.average_gradients([parameter])
@@ -55,7 +55,7 @@ def test_alone_everything_is_left_as_it_is():
 
 
 @pytest.mark.slow
-def test_two_processes_hold_the_same_cloud_and_see_different_cameras(tmp_path):
+def test_two_processes_keep_equal_clouds_and_use_different_cameras(tmp_path):
     import trimesh
 
     from tests.training import runs

@@ -1,4 +1,4 @@
-"""Text that OmegaConf must give back as it is."""
+"""Text that OmegaConf must return unchanged."""
 
 import time
 
@@ -14,8 +14,8 @@ def test_escaped_text_comes_back(text):
     assert OmegaConf.create({"text": escape(text)}).text == text
 
 
-def test_a_row_of_backslashes_takes_linear_time():
-    """100 kB from a file; where each backslash is tried as the first of its row, a minute."""
+def test_a_sequence_of_backslashes_takes_linear_time():
+    """100 kB from a file; a search that starts at every backslash takes a minute."""
     text = "\\" * 100_000
     started = time.process_time()
     assert escape(text) == text

@@ -1,4 +1,4 @@
-"""What can't fit into the memory is refused before any work."""
+"""Sizes that don't fit into memory are rejected before any work."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""A group of options given in part keeps the defaults of the rest."""
+"""Unspecified options of a partly specified group keep their defaults."""
 
 from dataclasses import dataclass, field
 

@@ -1,4 +1,4 @@
-"""Rules that fields of a ``Config`` declare, and the walker that checks them."""
+"""Rules declared at the fields of a ``Config``, and the function that checks them."""
 
 from dataclasses import dataclass, field
 from typing import Any, List, Optional, Tuple

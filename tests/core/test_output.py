@@ -1,4 +1,4 @@
-"""Standard output and error that can't be written: the work goes on."""
+"""If standard output or error can't be written, the work continues."""
 
 import io
 import os

@@ -1,4 +1,4 @@
-"""Draws are a function of (seed, stream, step, item) and of nothing else."""
+"""Draws are a function of (seed, stream, step, item) only."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""``--typecheck``: arrays are held to their annotations, everything else is left alone."""
+"""``--typecheck`` checks arrays against their annotations and ignores everything else."""
 
 import subprocess
 import sys
@@ -37,7 +37,7 @@ POINTS = torch.zeros(5, 3)
         (3, Any, True),
     ],
 )
-def test_what_fits(value, annotation, fits):
+def test_a_size_that_fits_into_memory(value, annotation, fits):
     assert matches(value, annotation) is fits
 
 

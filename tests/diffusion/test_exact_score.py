@@ -50,7 +50,7 @@ def test_eps_is_the_score_of_the_density(modes, dims, t, std, seed):
 
 @pytest.mark.parametrize("name", sorted(sds.WEIGHTS))
 def test_one_sharp_mode_gives_a_weighted_squared_error_without_noise(name):
-    """K = 1, s = 0: w (eps_hat - eps) = w (a / sigma) (x - x_1), whatever eps is."""
+    """K = 1, s = 0: w (eps_hat - eps) = w (a / sigma) (x - x_1), independent of eps."""
     x, target, noise = randn(3, 4, 50)
     abar = ABAR[torch.tensor([20, 300, 600, 980])]
     eps = denoise(sds.add_noise(x, noise, abar), abar, target[:, None]).eps
@@ -109,7 +109,7 @@ def test_ddim_from_noise_lands_on_an_image_of_the_bank():
 
 
 def test_denoised_and_eps_agree():
-    """z = a D + sigma eps_hat, always."""
+    """z = a D + sigma eps_hat."""
     bank, z, abar = randn(5, 9), randn(4, 9, seed=1), ABAR[torch.tensor([10, 200, 600, 990])]
     out = denoise(z, abar, bank, std=0.4)
     torch.testing.assert_close(sds.add_noise(out.denoised, out.eps, abar), z, rtol=0, atol=1e-12)
@@ -134,8 +134,8 @@ def test_perplexity_counts_the_modes_that_share_z():
 
 
 def test_classifier_free_guidance_acts_on_the_means():
-    """eps_u + s (eps_c - eps_u) is the eps of the mean m_u + s (m_c - m_u) (equal widths), and D
-    likewise.
+    """eps_u + s (eps_c - eps_u) is the eps of the mean m_u + s (m_c - m_u) for equal widths; the
+    same holds for D.
     """
     bank, z, abar, scale = (
         randn(6, 10),

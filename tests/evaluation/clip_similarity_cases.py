@@ -1,4 +1,4 @@
-"""What the tests of clip similarity share."""
+"""Helpers of the CLIP similarity tests."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 
 
 def blob(center=(0.0, 0.0, 0.0), color=(0.9, 0.1, 0.1), count=40, seed=0):
-    """A few opaque Gaussians around ``center``."""
+    """Return a few opaque Gaussians around ``center``."""
     rng = np.random.default_rng(seed)
     return Gaussians(
         means=np.float32(np.array(center) + 0.3 * rng.normal(size=(count, 3))),

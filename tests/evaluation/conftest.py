@@ -1,4 +1,4 @@
-"""Fixtures of evaluation."""
+"""Fixtures of the evaluation tests."""
 
 import pytest
 

@@ -63,7 +63,7 @@ def test_a_seed_draws_ten_different_views_of_every_result():
 
 
 def test_the_score_is_transformers_cosine_of_the_drawn_views(clip, plys, tmp_path):
-    """Everything again by hand: render the drawn views, ask transformers, average."""
+    """Repeats the computation: render the drawn views, use transformers' features, average."""
     from transformers import CLIPModel, CLIPTokenizer
 
     options = ["--clip", clip, "--prompt", PROMPT, "--output", str(tmp_path / "out")]
@@ -235,7 +235,7 @@ def test_it_is_a_command(plys, tmp_path):
 
 @pytest.mark.slow
 def test_shapes_and_types_hold(clip, plys, tmp_path):
-    """With every call checked, as ``--typecheck`` does for a run."""
+    """Every call is checked, as with ``--typecheck``."""
     arguments = [
         *plys,
         "--clip",

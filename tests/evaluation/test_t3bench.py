@@ -21,8 +21,8 @@ register_parts()
 
 
 def t3bench_pose(v):
-    """The camera of T3Bench's description: towards the centre, the picture's top towards +z, or +y
-    near the poles.
+    """Return the camera that T3Bench describes: towards the centre, the image's top towards +z, or
+    +y near the poles.
     """
     back = v / np.linalg.norm(v)
     up = np.array([0.0, 0.0, 1.0]) if abs(back[2]) < 0.99 else np.array([0.0, 1.0, 0.0])
@@ -61,7 +61,7 @@ def test_the_object_is_centred_and_scaled_without_what_is_invisible():
 
 @pytest.mark.slow
 def test_t3benchs_scripts_find_their_pictures(plys, tmp_path):
-    """The folders and the two calls of T3Bench's scripts, as they make them."""
+    """Makes the folders, and the two calls that T3Bench's scripts make."""
     import trimesh
 
     prompt, root = "A cat's blue hat", tmp_path / "T3Bench"

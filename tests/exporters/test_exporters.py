@@ -1,5 +1,5 @@
-"""Every registered exporter of ours keeps the same contract; its files read back as exported, the
-right way up.
+"""Every registered exporter of this package satisfies one contract; its files read back as
+exported, upright.
 """
 
 import importlib
@@ -39,7 +39,7 @@ EXPORTERS = sorted(
 
 
 class Cloud(BaseGeometry):
-    """What exporters read of a geometry: the parameters, with gradients."""
+    """The attributes of a geometry that exporters read: the parameters, with gradients."""
 
 
 def geometry(count=40, degree=1):
@@ -97,7 +97,7 @@ def test_gaussians_read_back_bit_for_bit(tmp_path, degree):
 @pytest.mark.parametrize("name", ["ply", "spz"])
 @pytest.mark.parametrize("degree", [0, 3])
 def test_gaussians_are_exported_in_the_axes_of_the_viewers(tmp_path, name, degree):
-    """One Gaussian high above the front: -y and -z of 3DGS' axes, +y and +z of SPZ's."""
+    """One Gaussian high above the front: -y and -z in 3DGS' axes, +y and +z in SPZ's."""
     source = geometry(1, degree)
     source.means.data[:] = torch.tensor([[4.0, 1.0, 2.0]])  # front, left, up in our world
     (output,) = build(f"{name}-exporter", source)()
@@ -115,7 +115,7 @@ def test_gaussians_are_exported_in_the_axes_of_the_viewers(tmp_path, name, degre
         torch.testing.assert_close(*colors, atol=rounding, rtol=0)
 
 
-def test_a_ply_of_ours_that_lost_its_note_is_read_the_right_way_up(tmp_path):
+def test_a_ply_without_its_comment_is_read_upright(tmp_path):
     source = geometry()
     (output,) = build("ply-exporter", source)()
     path = write(output, tmp_path)

@@ -1,4 +1,6 @@
-"""NPY and NPZ from strangers: what NumPy itself wrote is read to the bit, and nothing that lies."""
+"""NPY and NPZ from untrusted sources: what NumPy wrote is read to the bit; wrong headers are
+rejected.
+"""
 
 import io
 import tracemalloc
@@ -106,7 +108,7 @@ def test_damage_is_one_message_and_no_memory(tmp_path, content):
 
 
 def test_a_small_archive_of_large_arrays_is_refused_before_they_are_unpacked(tmp_path):
-    """Each array alone would be within the budget, all together aren't."""
+    """Each array alone is within the budget, all together are not."""
     arrays = {name: np.zeros(1_200_000, np.uint8) for name in "abc"}
     np.savez_compressed(tmp_path / "x.npz", **arrays)
     assert read_arrays(tmp_path / "x.npz", "file", ["a"])["a"].shape == (1_200_000,)

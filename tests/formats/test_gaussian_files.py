@@ -1,4 +1,6 @@
-"""Files of Gaussians: notes that survive, axes that are stated, and what other programs write."""
+"""Files of Gaussians: comments are kept, axes are stated, and files of other programs have their
+usual axes.
+"""
 
 import numpy as np
 import pytest
@@ -46,7 +48,7 @@ def test_an_spz_file_is_y_up_and_turns_back(tmp_path, up):
     assert (tmp_path / "a.spz").stat().st_size == file_size(stored, ".spz")
 
 
-def test_what_other_programs_write_has_the_custom_of_its_format(tmp_path):
+def test_files_of_other_programs_have_the_axes_of_their_format(tmp_path):
     write_gaussians(
         tmp_path / "a.ply",
         cloud(),

@@ -1,5 +1,5 @@
-"""gsply (MIT), written by others from the formats' descriptions, reads what we write. Optional:
-``pip install gsply``.
+"""gsply (MIT), an independent implementation, reads the package's files. Optional: ``pip install
+gsply``.
 """
 
 import numpy as np

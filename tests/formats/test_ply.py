@@ -1,4 +1,4 @@
-"""PLY files: bit-for-bit round trips, what other programs write, and what is damaged or lies."""
+"""PLY files: exact round trips, files of other programs, and damaged files."""
 
 import struct
 
@@ -162,7 +162,7 @@ class TestGaussians:
         with pytest.raises(UserError, match="lack scale_2"):
             ply.read_gaussians(saved(tmp_path, header("ascii", 0, two_dimensional)))
 
-    def test_a_compressed_ply_is_called_by_its_name(self, tmp_path):
+    def test_a_compressed_ply_is_named_in_the_message(self, tmp_path):
         """PlayCanvas' layout: chunks of bounds, then four packed numbers per Gaussian."""
         bounds = "\n".join(
             f"property float {end}_{axis}" for end in ("min", "max") for axis in "xyz"

@@ -1,4 +1,4 @@
-"""Damaged PLY files, and headers that announce what isn't there."""
+"""Damaged PLY files, and headers that announce missing data."""
 
 import os
 import struct
@@ -48,7 +48,7 @@ class TestDamage:
 
     @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
     @pytest.mark.parametrize("count", [3, 10**12, 10**18])
-    def test_a_lying_count_allocates_nothing(self, tmp_path, encoding, count):
+    def test_a_wrong_count_allocates_nothing(self, tmp_path, encoding, count):
         import tracemalloc
 
         data = b"1 2 3\n4 5 6\n" if encoding == "ascii" else bytes(24)
@@ -139,8 +139,8 @@ class TestDamage:
                 ply.read_points(name)
 
     def test_mutations_are_an_error_or_a_correct_load(self, tmp_path):
-        """Five hundred damaged files: whatever is loaded has consistent shapes, and nothing but
-        UserError comes out.
+        """Five hundred damaged files: what is loaded has consistent shapes, and the only exception
+        is UserError.
         """
         ply.write_gaussians(tmp_path / "gaussians.ply", gaussians(20, 1))
         ply.write_points(tmp_path / "points.ply", cloud(20))
@@ -166,7 +166,7 @@ class TestDamage:
 
 
 def mutated(content, generator):
-    """A copy with bytes changed, cut out, repeated or appended, preferably in the header."""
+    """Return a copy with bytes changed, removed, repeated or appended, preferably in the header."""
     content = bytearray(content)
     for _ in range(generator.integers(1, 4)):
         reach = len(content) if generator.random() < 0.5 else min(len(content), 400)

@@ -1,4 +1,4 @@
-"""SPZ files: laid out as published, close to what was stored, and no damage does harm."""
+"""SPZ files: laid out as published, close to what was stored, and safe to read when damaged."""
 
 import functools
 import gzip
@@ -34,7 +34,7 @@ def cloud(count=300, degree=0, seed=0):
 
 
 def in_file_order(arrays, read):
-    """The rows of ``arrays`` in the order in which ``read`` has them."""
+    """Return the rows of ``arrays`` in the order of ``read``."""
     rows = [np.abs(arrays.means - mean).sum(1).argmin() for mean in read.means]
     assert sorted(rows) == list(range(len(arrays.means)))
     return arrays.rows(rows)

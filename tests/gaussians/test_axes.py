@@ -1,4 +1,4 @@
-"""Gaussians in other axes: the same object seen by a camera that is rotated with it."""
+"""Gaussians in other axes: a camera that is rotated with the object sees the same image."""
 
 import numpy as np
 import pytest
@@ -52,8 +52,10 @@ def test_rotating_there_and_back_changes_nothing(degree):
 
 
 def test_front_and_top_of_the_world_in_each_file():
-    """Ours: front +x, left of the front +y, up +z. In -y-up files the front is towards -z: a camera
-    of these files, x right, y down, z forward, that stands before the front looks along +z."""
+    """The world has the front along +x, its left along +y, and +z up. In -y-up files the front is
+    along -z: a camera of these files (x right, y down, z forward) in front of the object looks
+    along +z.
+    """
     front, left, up = np.eye(3)
     for axis, expected in {
         "y": ([0, 0, 1], [1, 0, 0], [0, 1, 0]),

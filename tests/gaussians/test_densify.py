@@ -28,7 +28,7 @@ def statistics(n, gradient=0.0, contribution=None):
     )
 
 
-def test_small_hot_gaussians_are_cloned_and_large_ones_split():
+def test_selected_small_gaussians_are_cloned_and_large_ones_split():
     params = cloud(4)
     params["log_scales"].data[2:] = -1.0  # larger than split_scale
     stats = Statistics(torch.tensor([1.0, 0.0, 1.0, 0.0]), torch.ones(4))
@@ -115,7 +115,7 @@ def test_never_seen_gaussians_are_not_selected():
 
 
 def test_the_threshold_means_the_same_at_any_resolution_batch_and_loss_scale():
-    """The loss of a view doesn't change with these; its gradient in pixels, averaged and scaled,
+    """The loss of a view doesn't depend on these; its gradient in pixels, averaged and scaled,
     does.
     """
     device_units = torch.rand(1, 20, 2)
@@ -128,8 +128,8 @@ def test_the_threshold_means_the_same_at_any_resolution_batch_and_loss_scale():
 
 @pytest.mark.parametrize("seed", range(20))
 def test_moments_follow_their_gaussian_through_random_changes(seed):
-    """Every parameter carries its Gaussian's id in the moments; after any change they are where the
-    id is, fresh rows are zero.
+    """Every parameter has its Gaussian's id in the moments; after any change they match, and new
+    rows are zero.
     """
     g = torch.Generator().manual_seed(seed)
     params = cloud(30, seed)
@@ -170,8 +170,10 @@ def test_prune_to_keeps_the_best_in_their_order():
     assert change.parents.tolist() == [0, 1, 3]
 
 
-def test_what_the_faint_leave_is_given_to_others_in_the_same_round():
-    """Ten at a cap of ten, three of them faint: the three hottest of the others grow."""
+def test_the_room_of_faint_gaussians_is_used_in_the_same_round():
+    """Ten at a cap of ten, three of them faint: the three others with the largest gradients are
+    cloned.
+    """
     params, stats = cloud(10), Statistics(torch.linspace(1, 2, 10), torch.ones(10))
     params["logit_opacities"].data[:3] = -5.0
     change = densify.densify_and_prune(

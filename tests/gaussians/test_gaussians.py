@@ -1,4 +1,4 @@
-"""The type that holds Gaussians: one index, one function and one conversion for all its fields."""
+"""The type that holds Gaussians: indexing, mapping and conversion apply to all its fields."""
 
 import numpy as np
 import torch

@@ -1,5 +1,5 @@
-"""Algorithm 1 of the paper: growing, colour perturbation and the first sizes, also where the cloud
-is degenerate.
+"""Algorithm 1 of the paper: growing, colour perturbation and initial scales, degenerate clouds
+included.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ def rng(seed=0):
 
 
 def sphere(count=2000, seed=1):
-    """A coloured unit sphere with its normals."""
+    """Return a coloured unit sphere with its normals."""
     normals = rng(seed).normal(size=(count, 3))
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
     return PointCloud(
@@ -39,7 +39,7 @@ def moved(cloud, scale, shift=0.0):
 
 
 def algorithm_1(points, colors, num_candidates, radius, generator):
-    """The paper's pseudocode, line by line, in the unit of the points."""
+    """Follow the paper's pseudocode line by line, in the unit of the points."""
     low, high = points.min(0), points.max(0)
     grown, near = [], []
     for candidate in generator.uniform(low, high, size=(num_candidates, 3)):
@@ -241,7 +241,7 @@ class TestNearestDistanceScales:
         np.testing.assert_array_equal(scales[200:], scales[:100])
         np.testing.assert_array_equal(scales[100:200], alone[100:])
 
-    def test_zero_has_no_sign(self):
+    def test_minus_zero_equals_zero(self):
         points = rng().uniform(-1, 1, (10, 3))
         points[0], points[1] = 0.0, -0.0
         assert nearest_distance_scales(points).min() > 1e-3

@@ -1,5 +1,5 @@
-"""Gradual pruning: exact counts, what nobody would miss goes first, ``auto`` stops where the
-quality would suffer.
+"""Gradual pruning: exact counts, redundant Gaussians first; ``auto`` stops before the quality
+suffers.
 """
 
 import pytest
@@ -15,13 +15,13 @@ from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 
 def one_camera():
-    """Camera of 32 x 32 pixels, as (viewmats, Ks)."""
+    """Return a camera of 32 x 32 pixels as (viewmats, Ks)."""
     c2w = orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0]))
     return to_opencv(c2w, torch.tensor([0.8]), 32, 32)
 
 
 def drawn_from(geometry, opacities, viewmats):
-    """Inputs of `rasterize`, colours as the camera sees them."""
+    """Return arguments of `rasterize`, with the colours that the camera sees."""
     colors = geometry.colors(viewmats[:, 3, :3])
     return geometry.means, geometry.quats, geometry.scales(), opacities, colors
 
@@ -45,12 +45,12 @@ def optimizer(geometry):
 
 
 def accepts(holds):
-    """The check of a round of ``auto`` that accepts what ``holds(kept)`` is true for."""
+    """Return a check of ``auto`` that accepts a round if ``holds(kept)``."""
     return lambda kept: QualityResult(torch.tensor(1.0 if holds(kept) else -1.0), {})
 
 
 def rounds(geometry, steps, holds=None):
-    """The counts after each step of a schedule with a round at every one."""
+    """Return the counts after each step of a schedule with a round at every step."""
     adam, control, counts = optimizer(geometry), DensityControl(geometry), []
     for step in range(steps):
         geometry.gradient_sum += 1.0
@@ -69,8 +69,8 @@ def test_the_budget_is_reached_round_by_round_and_then_holds():
     assert rounds(cloud(100, budget=50, prune=EVERY_STEP), 6) == [80, 64, 51, 50, 50, 50]
 
 
-def test_a_budget_is_met_though_there_are_few_rounds():
-    """In equal shares, each smaller than the usual one."""
+def test_a_budget_is_met_with_few_rounds():
+    """Each round removes an equal, larger fraction."""
     assert rounds(cloud(100, budget=10, prune={"start": 0, "stop": 3, "every": 1}), 4) == [
         46,
         21,
@@ -79,7 +79,7 @@ def test_a_budget_is_met_though_there_are_few_rounds():
     ]
 
 
-def test_without_a_budget_nothing_goes():
+def test_without_a_budget_nothing_is_pruned():
     assert rounds(cloud(100, prune=EVERY_STEP), 3) == [100, 100, 100]
 
 
@@ -87,7 +87,7 @@ def test_without_a_budget_nothing_goes():
     ("given", "taken"),
     [("none", None), ("None", None), (None, None), (5e3, 5000), ("5e3", 5000), ("Auto", "auto")],
 )
-def test_a_budget_may_be_written_as_people_do(given, taken):
+def test_a_budget_may_have_a_unit(given, taken):
     assert GaussianCloud({"budget": given}).cfg.budget == taken
 
 
@@ -130,7 +130,7 @@ def test_each_score_ranks_by_what_it_says(name):
     assert torch.equal(scores[0], scores[2]) == (name != "random")
 
 
-def test_unsampled_the_contribution_ranks():
+def test_without_samples_the_contribution_ranks():
     stats = importance.VisibilityStats(torch.tensor([0.1, 0.3, 0.2]), torch.zeros(3))
     assert importance.importance_by(
         "removal", torch.zeros(3), stats, generator(0, "s")
@@ -173,7 +173,7 @@ def test_the_removal_error_is_that_of_leaving_each_gaussian_out():
 
 
 def pictures(out, opacities, background=(0.0, 0.0, 0.0)):
-    """What the renderer gives, as far as sampling reads it."""
+    """Return the part of a render that sampling reads."""
     behind = torch.tensor(background).reshape(1, 1, 1, 3)
     return {
         "comp_rgb": out.image + (1 - out.alpha) * behind,
@@ -184,7 +184,7 @@ def pictures(out, opacities, background=(0.0, 0.0, 0.0)):
     }
 
 
-def test_the_colour_of_the_background_hides_nobody():
+def test_gaussians_of_the_backgrounds_colour_have_a_removal_error():
     geometry = cloud(12, budget=5)
     geometry.sh0.data[0] = -0.5 / 0.28209479177387814  # black, as the background
     viewmats, Ks = one_camera()
@@ -229,8 +229,10 @@ def test_samples_are_taken_where_a_round_will_ask_for_them(step, due):
     )
 
 
-def test_a_gaussian_that_hides_its_own_colour_shows_nothing():
-    """The front one of two of one colour contributes most, and is missed by nobody."""
+def test_a_gaussian_over_its_own_colour_has_no_removal_error():
+    """Of two Gaussians of one colour the front one contributes most, but its removal changes
+    nothing.
+    """
     geometry = GaussianCloud({"min_gaussians": 1})
     c2w = orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0]))
     axis = to_opencv(c2w, torch.tensor([0.8]), 32, 32)[0][0, 2, :3]

@@ -1,4 +1,4 @@
-"""Duplicates become one Gaussian that looks like both; what is no duplicate stays as it is, bit for
+"""Duplicates are merged into one Gaussian that renders like both; all others are unchanged, bit for
 bit.
 """
 
@@ -13,7 +13,7 @@ from threestudio_gaussiandreamer.metrics import psnr
 
 
 def shell(count=60, seed=0):
-    """Coloured flat Gaussians on a sphere, far enough apart."""
+    """Return coloured flat Gaussians on a sphere that do not overlap."""
     rng = torch.Generator().manual_seed(seed)
     index = torch.arange(count) + 0.5
     up = 1 - 2 * index / count
@@ -32,7 +32,7 @@ def shell(count=60, seed=0):
 
 
 def copies(params, times):
-    """Each Gaussian ``times`` times in the same place, which together let through what it did."""
+    """Return each Gaussian ``times`` times at its position, with the same total transmittance."""
     through = 1 - params["logit_opacities"].sigmoid()
     split = params | {"logit_opacities": (1 - through ** (1 / times)).logit()}
     return {name: value.repeat(times, *[1] * (value.dim() - 1)) for name, value in split.items()}
@@ -51,7 +51,7 @@ def picture(params):
     return render_all(cloud, views_around(around, 6, 48))
 
 
-def test_a_pair_keeps_its_peak_and_its_light():
+def test_a_merged_pair_keeps_its_peak_and_its_integral():
     a, b, one = 0.6, 0.8, {name: value[:1] for name, value in shell().items()}
     pair = {name: torch.cat([value, value]) for name, value in one.items()} | {
         "logit_opacities": torch.tensor([a, b]).logit()
@@ -96,7 +96,7 @@ def test_copies_a_little_apart_become_one_that_looks_like_both():
     )  # where neighbours overlap, another one is in front
 
 
-def test_what_is_no_duplicate_stays_bit_for_bit():
+def test_other_gaussians_are_unchanged_bit_for_bit():
     params = shell()
     change = merge_duplicates(params)
     assert not change.is_new.any() and torch.equal(change.parents, torch.arange(60))
@@ -118,7 +118,7 @@ def test_another_colour_size_or_place_is_no_duplicate(name, offset):
     assert len(merge_duplicates(params).parents) == 2
 
 
-def test_a_floor_holds_and_the_cheapest_go_first():
+def test_the_floor_holds_and_the_least_important_are_pruned_first():
     params = copies(shell(), 2)
     params["sh0"][60:90] += 0.2  # duplicates still, but dearer ones
     change = merge_duplicates(params, at_least=90)
@@ -129,7 +129,9 @@ def test_a_floor_holds_and_the_cheapest_go_first():
 
 
 def test_many_copies_in_one_place_take_few_rounds(monkeypatch):
-    """All have the same nearest: pairs of these alone would be one or two a round."""
+    """All have the same nearest neighbour: merging only mutual pairs would merge one or two per
+    round.
+    """
     rounds = []
     monkeypatch.setattr(
         merging,
@@ -141,7 +143,7 @@ def test_many_copies_in_one_place_take_few_rounds(monkeypatch):
 
 
 def test_a_chain_of_neighbours_does_not_become_one():
-    """Each is like the next, but the first isn't like the last."""
+    """Each is similar to the next, but the first isn't similar to the last."""
     one = {name: value[:1].repeat(40, *[1] * (value.dim() - 1)) for name, value in shell().items()}
     one["quats"], one["log_scales"][:] = torch.tensor([[1.0, 0, 0, 0]]).repeat(40, 1), -2.0
     one["means"] = torch.arange(40)[:, None] * torch.tensor([[0.05, 0.0, 0.0]])

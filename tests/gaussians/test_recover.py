@@ -1,4 +1,4 @@
-"""Recovery makes Gaussians better, and never worse."""
+"""Recovery improves Gaussians and never makes them worse."""
 
 from types import SimpleNamespace
 
@@ -13,7 +13,7 @@ from threestudio_gaussiandreamer.gaussians.views import psnr_to_original, render
 
 
 def views(cloud, train, val, size=48):
-    """Training and validation views."""
+    """Return training and validation views."""
     sets = ((train, 0.0), (val, 45.0))
     return [views_around(cloud, count, size, turn=turn) for count, turn in sets]
 
@@ -38,8 +38,8 @@ def test_recovery_pays():
 
 
 @pytest.mark.parametrize("bearable", [1.0, 1 / 16, 0.0])
-def test_a_recovery_makes_nothing_worse(monkeypatch, bearable):
-    """It is repeated with smaller rates, and left out where none is small enough."""
+def test_a_recovery_never_lowers_the_quality(monkeypatch, bearable):
+    """It is repeated with smaller rates, and skipped if none is small enough."""
     cloud, scales = ball(), []
     train_views, val_views = views(cloud, 16, 8)
 

@@ -17,7 +17,7 @@ def directions(n=50, seed=0):
 
 
 def by_scipy(dirs, degree):
-    """Real harmonics out of associated Legendre functions (which hold the Condon-Shortley phase)
+    """Compute real harmonics from associated Legendre functions (with the Condon-Shortley phase)
     and cos, sin of m phi.
     """
     x, y, z = (dirs / dirs.norm(dim=-1, keepdim=True)).numpy().T
@@ -104,7 +104,7 @@ def test_bounded_colors_pass_gradients_that_lead_into_the_range():
     assert torch.equal(colors.grad, expected)
 
 
-def test_a_direction_without_length_is_harmless():
+def test_a_zero_direction_gives_finite_colours():
     dirs = torch.zeros(2, 3, requires_grad=True)
     colors = sh.sh_to_colors(torch.ones(2, 16, 3), dirs)
     colors.sum().backward()

@@ -1,4 +1,4 @@
-"""What is hidden goes first, and the search for the smallest cloud ends."""
+"""Hidden Gaussians are removed first, and the search for the smallest cloud terminates."""
 
 import pytest
 import torch
@@ -35,7 +35,7 @@ def test_hidden_gaussians_go_first():
 
 
 def recovery(cloud, size):
-    """Two steps, fitted to eight views and judged on eight others."""
+    """Recover with two steps on eight views, validated on eight others."""
     views = (views_around(cloud, 8, size, turn=turn) for turn in (0.0, 45.0))
     return Recovery(cloud, *views, steps=2)
 
@@ -49,7 +49,7 @@ def test_any_quality_ends_the_search():
 
 
 def test_a_round_that_failed_is_not_tried_again(monkeypatch):
-    """Below a hundred Gaussians a round of one can't become smaller."""
+    """Below a hundred Gaussians a round that removes one can't be smaller."""
     few, tried = keep_best(ball(), torch.arange(600.0), 20), []
     original = recover.recover
 

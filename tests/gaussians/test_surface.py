@@ -1,5 +1,5 @@
-"""The mesh of a cloud: closed, outwards, where the Gaussians are, with their colours; and as a run
-exports it.
+"""The mesh of a cloud: closed, oriented outwards, at the Gaussians, with their colours; and as
+exported by a run.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ CENTER = np.array([0.3, 0.0, -0.2])
 
 
 def ball(count=4000, radius=0.5, scale=0.02, opacity=4.0, hollow=True):
-    """Gaussians on, or in, a sphere, coloured by their place."""
+    """Return Gaussians on, or in, a sphere, coloured by position."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(count, 3))
     points *= (
@@ -40,7 +40,7 @@ def distances(surface):
 
 
 def test_surface_nets_of_a_sphere():
-    """Linear interpolation of a distance is exact to second order in the cell."""
+    """Linear interpolation of a distance is exact to second order in the cell size."""
     axes = np.meshgrid(*[np.linspace(-1, 1, 33)] * 3, indexing="ij")
     vertices, faces = surface_nets(0.7 - np.sqrt(sum(axis**2 for axis in axes)), 0.0)
     mesh = trimesh.Trimesh(vertices / 16 - 1, faces, process=False)
@@ -60,9 +60,9 @@ def test_a_solid_ball_is_one_closed_surface(resolution):
 
 
 @pytest.mark.parametrize(("count", "scale"), [(4000, 0.02), (16000, 0.02), (16000, 0.002)])
-def test_a_shell_lies_where_its_gaussians_are_however_many_overlap(count, scale):
-    """Of 1.2 standard deviations to each side, of the Gaussians and of a cell; unevenly spread
-    points add a little.
+def test_the_surface_is_at_the_gaussians_for_any_overlap(count, scale):
+    """Within 1.2 standard deviations of the Gaussians and a cell; unevenly spread points add a
+    little.
     """
     surface = gaussian_surface(ball(count, scale=scale), resolution=64)
     spread = np.hypot(scale, 1 / 64)
@@ -73,7 +73,7 @@ def test_a_shell_lies_where_its_gaussians_are_however_many_overlap(count, scale)
     )
 
 
-def test_what_is_faint_is_no_surface():
+def test_faint_gaussians_have_no_surface():
     arrays = ball()
     far = arrays._replace(means=arrays.means + 5, logit_opacities=arrays.logit_opacities - 10)
     both = Gaussians(*(np.concatenate(pair) for pair in zip(arrays, far, strict=True)))
@@ -95,7 +95,7 @@ def test_size_and_place_do_not_matter():
 
 
 def test_turned_and_flat_gaussians_lie_along_their_axes():
-    """One disc in the plane x = z, by a quarter turn of 45 degrees about y."""
+    """One disc in the plane x = z, rotated by 45 degrees about y."""
     half = np.deg2rad(45 / 2)
     disc = Gaussians(
         means=np.zeros((1, 3), np.float32),

@@ -1,4 +1,4 @@
-"""Fixtures of guidance."""
+"""Fixtures of the guidance tests."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from tests.helpers.tiny_guidance import (
 
 @pytest.fixture(scope="module")
 def mesh_path(tmp_path_factory):
-    """A ball, red in front, green behind, blue on top, with a nose."""
+    """Write a ball with a nose: red in front, green behind, blue on top."""
     import trimesh
 
     ball = trimesh.creation.icosphere(4, 1.0)

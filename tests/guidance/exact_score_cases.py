@@ -1,4 +1,4 @@
-"""What the tests of exact score share."""
+"""Helpers of the exact score tests."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The gradient of Stable Diffusion's guidance: against float64 by hand, in closed form, and in half
+"""The gradient of Stable Diffusion's guidance: against float64, in closed form, and in half
 precision.
 """
 
@@ -32,8 +32,8 @@ pytest.importorskip("diffusers")
 
 
 def reference_gradient(model, prediction, prompt_utils, rgb, *, scale, clip=None, step=0):
-    """The SDS gradient at the render in float64: item by item, one forward pass per prompt,
-    formulas of the papers.
+    """Compute the SDS gradient at the render in float64: item by item, one forward pass per prompt,
+    with the formulas of the papers.
     """
     from diffusers import AutoencoderKL, UNet2DConditionModel
 
@@ -100,8 +100,8 @@ def test_clip_scale_and_step_reach_the_gradient(models, prompts):
 
 
 class ExactUNet(nn.Module):
-    """The exact score of known latents behind the UNet's interface: of the first one for prompts of
-    ones, of all for prompts of zeros.
+    """The exact score of known latents with the interface of a UNet: of the first latent for
+    prompts of ones, of all for prompts of zeros.
     """
 
     def __init__(self, bank, std, alphas, prediction):
@@ -134,7 +134,7 @@ class ExactUNet(nn.Module):
 
 
 class LinearVAE(nn.Module):
-    """Average pooling and a colour matrix behind the VAE's interface."""
+    """Average pooling and a colour matrix with the interface of a VAE."""
 
     def __init__(self, matrix, factor):
         super().__init__()
@@ -163,8 +163,8 @@ def exact_guidance(models, prediction, bank, std, **options):
 
 
 def adjoint(guide, latent_gradient, size):
-    """What the linear encoder hands back to the render: the transposed matrix, spread over each
-    pooled square.
+    """Return the linear encoder's gradient with respect to the render: the transposed matrix,
+    spread over each pooled square.
     """
     matrix = guide.vae.matrix.double()
     pixels = (
@@ -178,9 +178,9 @@ def adjoint(guide, latent_gradient, size):
 
 @pytest.mark.parametrize("weighting", ["sds", "uniform", "fantasia3d"])
 @pytest.mark.parametrize("prediction", [*PREDICTIONS, "sample"])
-def test_one_known_picture_is_approached_as_the_closed_form_says(models, prediction, weighting):
-    """With one mode of no width the noise cancels: grad = w(t) a / sigma (x - x1), whatever noise
-    was drawn.
+def test_the_gradient_towards_one_known_image_is_the_closed_form(models, prediction, weighting):
+    """With one mode of zero width the noise cancels: grad = w(t) a / sigma (x - x1) for
+    any noise.
     """
     bank = torch.randn(1, 4, 8, 8, generator=torch.Generator().manual_seed(1))
     guide = exact_guidance(
@@ -216,9 +216,7 @@ def test_one_known_picture_is_approached_as_the_closed_form_says(models, predict
 @pytest.mark.parametrize("prediction", PREDICTIONS)
 @pytest.mark.parametrize("scale", [2.0, 100.0])
 def test_guidance_between_two_mixtures_is_the_closed_form(models, prediction, scale):
-    """One picture against five of them, of a width: the posterior worked out here, in float64
-    throughout.
-    """
+    """One image against five, of positive width; the posterior is computed here in float64."""
     draw = torch.Generator().manual_seed(2)
     bank, std = 0.3 * torch.randn(5, 4, 8, 8, generator=draw), 0.5
     guide = exact_guidance(
@@ -246,7 +244,7 @@ def test_guidance_between_two_mixtures_is_the_closed_form(models, prediction, sc
 
 @pytest.fixture
 def half(monkeypatch):
-    """float16 also on the CPU, where a run would use float32."""
+    """Use float16 on the CPU too, where a run would use float32."""
     monkeypatch.setattr(text_to_image, "weights_type", lambda half, device: torch.float16)
 
 

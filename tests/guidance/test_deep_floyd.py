@@ -1,5 +1,5 @@
-"""DeepFloyd IF's guidance: pixels, six output channels, T5 embeddings; its gradient against float64
-by hand.
+"""DeepFloyd IF's guidance: pixels, six output channels, T5 embeddings; its gradient against
+float64.
 """
 
 import pytest
@@ -54,7 +54,7 @@ def gradient(guide, prompt_utils, rgb, **options):
 
 
 def reference_gradient(model, prompt_utils, rgb, *, scale):
-    """The SDS gradient in float64, item by item, one forward pass per prompt."""
+    """Compute the SDS gradient in float64, item by item, one forward pass per prompt."""
     from diffusers import DDPMScheduler, UNet2DConditionModel
 
     unet = UNet2DConditionModel.from_pretrained(model, subfolder="unet").double().eval()
@@ -146,7 +146,7 @@ def test_embeddings_of_another_model_are_refused(model, prompts):
         guide(renders(), prompts[False], **BATCH)
 
 
-def test_the_default_is_gated_and_said_at_once(tmp_path, monkeypatch):
+def test_the_default_is_gated_which_is_reported_at_once(tmp_path, monkeypatch):
     tiny_models.nothing_cached(monkeypatch, tmp_path)
     assert deep_floyd.DeepFloydGuidance.Config().guidance_scale == 20.0
     with pytest.raises(UserError, match="DeepFloyd/IF-I-XL-v1.0.*HF_HUB_OFFLINE"):
@@ -159,7 +159,7 @@ def test_threestudios_name_finds_ours():
 
 
 def test_the_schedule_is_the_models_to_its_last_step(model):
-    """IF's cosine schedule ends at 2.4e-9, less than what stands for a signal of exactly 0."""
+    """IF's cosine schedule ends at 2.4e-9, below the value that replaces a signal of exactly 0."""
     from diffusers import DDPMScheduler
 
     expected = DDPMScheduler.from_pretrained(model, subfolder="scheduler").alphas_cumprod.double()

@@ -1,6 +1,4 @@
-"""The shared path of score distillation, on a stub that misbehaves on request, and the guidance
-with the exact score.
-"""
+"""The guidance with the exact score."""
 
 import math
 
@@ -89,7 +87,7 @@ def test_view_exact_without_width_is_a_weighted_squared_error(mesh_path):
 
 
 def test_a_batch_is_its_items(mesh_path):
-    """With noise drawn per item the first item's gradient doesn't know of the others."""
+    """Noise is drawn per item, so the first item's gradient doesn't depend on the others."""
     rgb = uniform(3, 16, 16, 3)
     options = {"mode": "view-agnostic", "space": "latent", "latent_size": 4, "guidance_scale": 3.0}
     views = batch(*VIEWS)
@@ -118,7 +116,7 @@ def test_every_mode_runs_on_constant_and_on_pixel_backgrounds_alike(mesh_path, m
 
 
 def descend(exact, rgb, views, steps=60):
-    """Gradient descent of free pictures; the learning rate undoes the mean weight."""
+    """Optimise free images by gradient descent; the learning rate cancels the mean weight."""
     rgb = rgb.clone()
     for at in range(steps):
         exact.update_step(0, at)
@@ -145,7 +143,7 @@ def test_view_exact_descends_to_the_truth_and_agnostic_to_some_view(mesh_path):
 
 
 def test_direction_bins_pull_towards_views_of_the_cameras_side(mesh_path):
-    """From grey, the picture of a camera behind the ball turns green, in front red."""
+    """From grey, the image of a camera behind the ball turns green, in front of it red."""
     binned = guidance(mesh_path, mode="direction-bins", bank_elevation_range=[0.0, 20.0])
     views = batch(0.0, 180.0)
     found, _ = descend(binned, 0.5 * torch.ones(2, 16, 16, 3), views, steps=80)

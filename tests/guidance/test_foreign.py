@@ -1,6 +1,4 @@
-"""Guidances of other packages by name, with threestudio's signatures; and whole runs of a few steps
-with tiny real models.
-"""
+"""Guidances of other packages by name, with threestudio's signatures."""
 
 import pytest
 import torch
@@ -18,7 +16,7 @@ from threestudio_gaussiandreamer.host import BaseModule, register
 
 
 class ImageDouble:
-    """The signature of threestudio's zero123, which knows no prompt."""
+    """The signature of threestudio's zero123, which takes no prompt."""
 
     def __call__(
         self, rgb, elevation, azimuth, camera_distances,
@@ -28,28 +26,28 @@ class ImageDouble:
 
 
 class StrictDouble:
-    """Takes three things of the batch and nothing else."""
+    """Takes three entries of the batch and nothing else."""
 
     def __call__(self, rgb, prompt_utils, elevation, azimuth, camera_distances):
         return {"loss_sds": rgb.sum(), "prompt_utils": prompt_utils}
 
 
 class WrappedDouble:
-    """Passes everything on, so that its signature says nothing."""
+    """Passes all arguments on, so that its signature is uninformative."""
 
     def __call__(self, *args, **kwargs):
         return OtherNameDouble()(*args, **{"prompt": kwargs.pop("prompt_utils"), **kwargs})
 
 
 class OtherNameDouble:
-    """Calls the prompt something else, which threestudio, passing it by place, doesn't notice."""
+    """Uses another name for the prompt, which threestudio passes by position."""
 
     def __call__(self, rgb, prompt, elevation, azimuth, camera_distances, **kwargs):
         return {"loss_sds": rgb.sum(), "prompt": prompt}
 
 
 class LearningDouble(nn.Module):
-    """VSD's: a module with frozen and trainable weights, a ``forward``, and a loss for the
+    """Like VSD: a module with frozen and trainable weights, a ``forward``, and a loss for the
     latter.
     """
 
@@ -70,7 +68,7 @@ class LearningDouble(nn.Module):
 
 @register("test-learning-guidance")
 class LearningPart(BaseModule):
-    """As VSD's: its first weights and its noise come from torch's global generator."""
+    """Like VSD's: its initial weights and its noise come from torch's global generator."""
 
     def configure(self):
         self.learner = LearningDouble()
@@ -128,7 +126,7 @@ def test_each_signature_gets_what_it_takes():
         (None, "returned NoneType"),
     ],
 )
-def test_what_no_run_could_use_is_named(returned, message):
+def test_content_that_no_run_can_use_is_named(returned, message):
     class Odd:
         def __call__(self, rgb):
             return returned

@@ -58,7 +58,7 @@ class MultiviewDouble(BaseObject):
 
 
 def config(path, **system):
-    """A run of three steps from random points; what a test varies is in ``system``."""
+    """Return the configuration of three steps from random points; tests vary ``system``."""
     cfg = yaml.safe_load((Path(__file__).parents[2] / "configs" / "demo.yaml").read_text())
     sizes = {
         "width": 16,
@@ -90,7 +90,7 @@ def config(path, **system):
 
 
 def diffusion(model, family="stable-diffusion"):
-    """What a user writes for the real weights."""
+    """Return the options that a user gives for the real weights."""
     return {
         "prompt_processor_type": f"{family}-prompt-processor",
         "prompt_processor": {
@@ -121,7 +121,7 @@ def checkpoint(folder):
 
 
 def flat(content, name=""):
-    """Every tensor of a checkpoint's part by its place."""
+    """Return every tensor of a part of a checkpoint by its path."""
     if isinstance(content, torch.Tensor):
         return {name: content}
     entries = (
@@ -139,8 +139,8 @@ def flat(content, name=""):
 
 
 def assert_resumes(path, folder, *options):
-    """Five steps at once, and three and two with more validation, end with the same checkpoint bit
-    for bit.
+    """Assert that five steps at once, and three and two with more validation, end with the same
+    checkpoint bit for bit.
     """
     assert run(path, folder / "whole", *options, "trainer.max_steps=5") == 0
     assert run(path, folder / "parts", *options, "trainer.val_check_interval=1") == 0
@@ -180,8 +180,8 @@ def test_a_guidance_that_learns_resumes_as_if_it_had_never_stopped(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
 def test_a_diffusion_model_resumes_as_if_it_had_never_stopped(tmp_path, monkeypatch, prediction):
-    """The random draws of its guidance (timesteps, noise, the VAE's) belong to the step, and
-    validation's pictures take none.
+    """The random draws of its guidance (timesteps, noise, the VAE's) are functions of the step, and
+    validation doesn't use them up.
     """
     pytest.importorskip("diffusers")
     monkeypatch.chdir(tmp_path)
@@ -218,7 +218,7 @@ def test_a_loss_without_a_weight_is_an_error(tmp_path, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction", "deep-floyd"])
 def test_a_run_with_a_tiny_real_model(tmp_path, monkeypatch, kind):
-    """Prompt, text encoder, VAE, UNet, SDS, test and export, through the configuration that a user
+    """Prompt, text encoder, VAE, UNet, SDS, test and export, with the configuration that a user
     writes for the real weights.
     """
     pytest.importorskip("diffusers")

@@ -1,4 +1,4 @@
-"""The path of score distillation that every guidance shares."""
+"""The computation that all guidances share."""
 
 import math
 
@@ -19,8 +19,8 @@ pytest.importorskip("embreex")
 
 
 class Stub(ScoreDistillation):
-    """Predicts the noise plus the latent (so that the gradient is w x), or what ``spoil`` makes of
-    it.
+    """Predict the noise plus the latent (so that the gradient is w x), or what ``spoil`` returns
+    for it.
     """
 
     spoil = staticmethod(lambda eps, step: eps)

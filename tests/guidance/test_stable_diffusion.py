@@ -1,4 +1,4 @@
-"""Stable Diffusion's guidance: Perp-Neg's pairing, schedules, failures of the model, options,
+"""Stable Diffusion's guidance: Perp-Neg's pairing, schedules, non-finite predictions, options,
 pictures.
 """
 
@@ -36,8 +36,8 @@ def test_one_forward_pass_and_no_decoding_per_step(models, prompts):
 
 
 class HostPrompts:
-    """threestudio's own pairing of rows: a loop over the views, two negative rows after each
-    other.
+    """threestudio's own pairing of rows: a loop over the views with two adjacent negative rows
+    each.
     """
 
     use_perp_neg = True
@@ -201,7 +201,7 @@ def test_the_models_own_schedule_is_used(models, tmp_path):
 
 
 class Spoiling(nn.Module):
-    """The UNet, with NaN in the predictions of some views."""
+    """A UNet with NaN in the predictions of some views."""
 
     def __init__(self, unet, views):
         super().__init__()
@@ -231,7 +231,7 @@ def test_a_bad_item_is_left_out_and_the_others_are_untouched(models, prompts):
 
 
 @pytest.mark.parametrize("items, shown", [(3, 3), (9, 4), (0, 4), (-1, 4)])
-def test_so_many_items_are_shown(models, prompts, items, shown):
+def test_the_number_of_shown_items(models, prompts, items, shown):
     out = tiny.guidance(models, max_items_eval=items, eval_steps=1)(
         tiny.renders(), prompts[False], **tiny.BATCH, guidance_eval=True
     )["eval"]

@@ -115,7 +115,7 @@ def test_values_out_of_range(models, name, value):
         guidance(models, **{name: value})
 
 
-def test_a_missing_model_is_said_at_once(tmp_path, monkeypatch):
+def test_a_missing_model_is_reported_at_once(tmp_path, monkeypatch):
     tiny_models.nothing_cached(monkeypatch, tmp_path)
     with pytest.raises(UserError, match="no such folder"):
         guidance({"epsilon": tmp_path / "none"})

@@ -1,4 +1,4 @@
-"""A whole checkpoint of a small run, as Lightning writes it, made without a run."""
+"""A complete checkpoint of a small run, as Lightning writes it, made without a run."""
 
 from typing import Any
 
@@ -14,7 +14,9 @@ CALLBACK = (
 
 
 def whole_checkpoint(count: int = 10, steps: int = 3) -> dict[str, Any]:
-    """What ``torch.load`` gives of a run with ``count`` Gaussians after ``steps`` steps."""
+    """Return what ``torch.load`` returns for a run with ``count`` Gaussians after
+    ``steps`` steps.
+    """
     geometry, optimizer = trained_cloud(count, steps)
     state = {f"geometry.{key}": value for key, value in geometry.state_dict().items()}
     return {
@@ -31,7 +33,7 @@ def whole_checkpoint(count: int = 10, steps: int = 3) -> dict[str, Any]:
 
 
 def trained_cloud(count: int, steps: int) -> tuple[GaussianCloud, torch.optim.Optimizer]:
-    """A random cloud, and an optimiser that has stepped."""
+    """Return a random cloud, and an optimiser that has stepped."""
     generator = torch.Generator().manual_seed(0)
     geometry = GaussianCloud({})
     shapes = {"means": (3,), "log_scales": (3,), "quats": (4,), "logit_opacities": ()}
@@ -51,7 +53,7 @@ def trained_cloud(count: int, steps: int) -> tuple[GaussianCloud, torch.optim.Op
 
 
 def fit_loop(steps: int) -> dict[str, Any]:
-    """The state of Lightning's training loop after so many steps of manual optimisation."""
+    """Return the state of Lightning's training loop after so many steps of manual optimisation."""
     trainer = pl.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
     epoch = trainer.fit_loop.epoch_loop
     progress = epoch.manual_optimization.optim_step_progress

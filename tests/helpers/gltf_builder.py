@@ -1,4 +1,4 @@
-"""GLB files made by hand: one textured triangle or quad with whatever feature a test is about."""
+"""GLB files built by tests: one textured triangle or quad with the feature under test."""
 
 import io
 import json
@@ -22,7 +22,7 @@ NEAREST = {"magFilter": 9728}
 
 
 class Gltf:
-    """A document that grows by calls; :meth:`glb` gives the file."""
+    """A document that is built by calls; :meth:`glb` returns the file."""
 
     def __init__(self, **document):
         self.document = {

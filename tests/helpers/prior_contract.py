@@ -1,4 +1,4 @@
-"""The contract that every prior keeps, as a class of tests to subclass."""
+"""The contract of every prior, as a class of tests to subclass."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def assert_valid(cloud):
 
 
 class PriorContract:
-    """Subclass it with a fixture ``make_prior(**options)`` that builds the prior."""
+    """Subclass this with a fixture ``make_prior(**options)`` that builds the prior."""
 
     def test_gives_a_valid_cloud(self, make_prior):
         prior = make_prior()

@@ -9,7 +9,7 @@ FAST = ["--size", "48", "--steps", "8"]
 
 
 def ball(count=600, bands=1):
-    """A coloured ball of thin shells: what is inside is hidden."""
+    """Return a coloured ball of thin shells, whose inside is hidden."""
     rng = torch.Generator().manual_seed(0)
     means = torch.nn.functional.normalize(torch.randn(count, 3, generator=rng), dim=1)
     means *= torch.where(torch.arange(count) % 3 == 0, 0.5, 1.0)[:, None]

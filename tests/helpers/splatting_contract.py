@@ -1,5 +1,5 @@
-"""What every kernel is held to, as a class of tests to subclass: the float64 specification, on
-ordinary and on hostile clouds.
+"""The contract of every kernel, as a class of tests to subclass: the float64 specification, on
+ordinary and extreme clouds.
 """
 
 import math
@@ -30,7 +30,7 @@ from threestudio_gaussiandreamer.splatting import rasterize
 
 
 class KernelContract(LimitsContract):
-    """Subclass it with a fixture ``backend`` that gives the name of a backend."""
+    """Subclass this with a fixture ``backend`` that returns the name of a backend."""
 
     @pytest.mark.parametrize("width, height", [(1, 1), (1, 7), (17, 33), (31, 16), (67, 2)])
     def test_sizes_that_are_no_multiple_of_a_tile(self, backend, width, height):
@@ -66,7 +66,7 @@ class KernelContract(LimitsContract):
 
     @pytest.mark.parametrize("antialias", [False, True])
     def test_opacity_zero_has_a_gradient_without_alpha_min(self, backend, antialias):
-        """``d alpha / d opacity`` doesn't vanish with the opacity; below zero nothing is drawn."""
+        """``d alpha / d opacity`` is not zero at opacity 0; below zero nothing is rendered."""
         cloud = random_cloud(40, seed=8, size=0.2)
         cloud.opacities[::4], cloud.opacities[5] = 0, -0.1
         options = {"alpha_min": 0, "antialias": antialias}
@@ -75,7 +75,7 @@ class KernelContract(LimitsContract):
         assert gradients[::4].abs().min() > 1e-3 * gradients.abs().max() and gradients[5] == 0
 
     def test_a_few_thousand_gaussians(self, backend):
-        """More than a chunk per tile, early stops, capped alphas; gradients of everything."""
+        """More than a chunk per tile, early termination, capped alphas; gradients of everything."""
         cloud = random_cloud(3000, seed=4, size=0.06)
         cloud.opacities[:150] = 0.9999
         compare(backend, cloud, cameras(1, 66, 50), 66, 50, BACKGROUND, preset="fast")
@@ -134,10 +134,11 @@ class KernelContract(LimitsContract):
     @given(seed=st.integers(0, 10**6), n=st.integers(1, 60), antialias=st.booleans())
     def test_hostile_clouds(self, backend, seed, n, antialias):
         """Needles, discs, behind the camera, NaN, infinite, coincident, transparent, opaque:
-        finite, and the picture is right.
+        finite, and the image is correct.
 
-        Some opacities are alpha_min itself, so whole pictures hang on one rounding; either outcome
-        is right."""
+        Some opacities are alpha_min itself, so whole images depend on one rounding; either outcome
+        is correct.
+        """
         cloud, camera = hostile_cloud(seed, n), cameras(2, 37, 13)
         ours = draw(backend, cloud, camera, 37, 13, antialias=antialias, camera_gradient=True)
         assert all(x.isfinite().all() for x in (*ours.out, *ours.grads.values()))
@@ -162,8 +163,8 @@ class KernelContract(LimitsContract):
         height=st.integers(1, 40),
     )
     def test_random_clouds(self, backend, seed, n, size, stretch, width, height):
-        """Any size and shape. Thresholds may fall the other way here and there, so the median error
-        is judged.
+        """Any size and shape. A few pixels may fall on the other side of a threshold, so the median
+        error is tested.
         """
         cloud, camera = (
             random_cloud(n, seed, size=size, stretch=stretch),
@@ -204,7 +205,7 @@ class KernelContract(LimitsContract):
         assert worst < 2e-5
 
     def test_gradient_of_a_needle(self, backend):
-        """1000 : 1 at an angle. Its covariance's determinant cancels in float32 unless it is
+        """1000 : 1 at an angle. The determinant of its covariance cancels in float32 unless it is
         factored.
         """
         cloud = one_gaussian((0.02, -0.03, 2.0), (0.5, 5e-4, 5e-4), 0.7)._replace(
@@ -216,7 +217,7 @@ class KernelContract(LimitsContract):
 
     @pytest.mark.parametrize("slope", [0.99, 1.29, 1.31, 5.0])
     def test_gradient_beyond_the_edge_of_the_image(self, backend, slope):
-        """Inside and outside of the clamp of the Jacobian, whose gradient keeps its z-term."""
+        """Inside and outside the clamp of the Jacobian, whose gradient keeps its z-term."""
         cloud = one_gaussian((2 * slope * 0.8, 0.1, 2.0), (1.5, 0.8, 0.4), 0.7)._replace(
             quats=torch.tensor([[0.9, 0.2, 0.1, 0.4]], dtype=torch.float64)
         )
@@ -242,7 +243,7 @@ class KernelContract(LimitsContract):
         assert ours.out.contribution[0, 3] == 0
 
     def test_equal_depths_are_drawn_by_index(self, backend):
-        """64 Gaussians in one plane: the first one wins, whatever the permutation."""
+        """64 Gaussians in one plane: the first is in front, for any permutation."""
         cloud = Cloud(
             *(x.repeat(64, *[1] * (x.dim() - 1)) for x in one_gaussian(scale=1.0, opacity=0.9))
         )
@@ -252,7 +253,7 @@ class KernelContract(LimitsContract):
             compare(backend, cloud._replace(colors=colors[order]), front_camera(8, 8, 4.0), 8, 8)
 
     def test_depth_order_is_exact(self, backend):
-        """Depths one float apart, and spread over twenty orders of magnitude."""
+        """Depths one float apart, and over twenty orders of magnitude."""
         depths = torch.tensor([2.0], dtype=torch.float32).repeat(40)
         for i in range(1, 40):
             depths[i] = (

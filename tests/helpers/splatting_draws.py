@@ -1,4 +1,4 @@
-"""Draw with a backend in float32, and compare with the specification in float64."""
+"""Render with a backend in float32, and compare with the specification in float64."""
 
 import torch
 from hypothesis import HealthCheck, settings
@@ -20,7 +20,7 @@ BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 def draw(
     backend: str, cloud: Cloud, camera, width: int, height: int, background=None, **options
 ) -> Run:
-    """Forward and backward in float32."""
+    """Run forward and backward in float32."""
     camera = [x.to(torch.float32) for x in camera]
     return run(
         cloud.to(torch.float32), *camera, width, height, background, backend=backend, **options
@@ -37,8 +37,8 @@ def compare(
     tolerance=SINGLE,
     **options,
 ) -> Run:
-    """Pictures and gradients, also of the cameras, within float32's rounding of the specification
-    in float64.
+    """Assert that images and gradients, those of the cameras included, are within float32 rounding
+    of the specification in float64.
     """
     truth = run(
         cloud,

@@ -1,4 +1,4 @@
-"""What every kernel does at its limits: hostile inputs, nothing to see, calls of autograd."""
+"""The contract of every kernel at its limits: extreme inputs, empty views, uses of autograd."""
 
 import math
 
@@ -20,7 +20,7 @@ from threestudio_gaussiandreamer.splatting import rasterize
 
 
 class LimitsContract:
-    """Subclass it with a fixture ``backend`` that gives the name of a backend."""
+    """Subclass this with a fixture ``backend`` that returns the name of a backend."""
 
     @pytest.mark.parametrize(
         "attribute, value",
@@ -100,7 +100,7 @@ class LimitsContract:
                     < 1e-6
                 )
 
-    def test_views_do_not_see_each_other(self, backend):
+    def test_views_are_independent(self, backend):
         cloud, (viewmats, Ks) = random_cloud(400, seed=3), cameras(4, 40, 24)
         batch = draw(backend, cloud, (viewmats, Ks), 40, 24).out
         for view in range(4):
@@ -113,8 +113,8 @@ class LimitsContract:
 
     @pytest.mark.parametrize("channels", [2, 3])
     def test_gradients_may_come_in_any_layout(self, backend, channels):
-        """As from a convolution: what follows the picture decides how the gradient of the picture
-        lies in memory.
+        """As from a convolution: the operation after the render decides the memory layout of its
+        gradient.
         """
         cloud, camera = (
             random_cloud(50, seed=14).to(torch.float32),
@@ -139,9 +139,7 @@ class LimitsContract:
         compare(backend, cloud, (viewmats, Ks), 12, 12)
 
     def test_several_forwards_before_their_backwards(self, backend):
-        """Each graph owns what its backward needs, whatever was drawn in between and in whichever
-        order they run.
-        """
+        """Each graph owns what its backward pass needs, for any order of calls."""
         clouds = [random_cloud(n, seed=n).to(torch.float32) for n in (300, 40, 900)]
         camera = [x.to(torch.float32) for x in cameras(2, 70, 40)]
         alone = [draw(backend, cloud, camera, 70, 40) for cloud in clouds]
@@ -158,7 +156,7 @@ class LimitsContract:
             )
 
     def test_hooks_on_saved_tensors_may_replace_them(self, backend):
-        """As checkpointing and offloading do: what the kernel kept is then made again."""
+        """As checkpointing and offloading do: what the kernel kept is recomputed."""
         cloud, camera = random_cloud(30, seed=13), cameras(1, 40, 12)
         plain = draw(backend, cloud, camera, 40, 12)
         with torch.autograd.graph.saved_tensors_hooks(torch.clone, lambda x: x):
@@ -172,8 +170,8 @@ class LimitsContract:
         )
         require_backward_twice_adds_up(cloud, camera, backend, exact=True)
 
-    def test_absgrad_is_zero_before_anything_flowed_back(self, backend):
-        """A loss may leave out a picture that was drawn."""
+    def test_absgrad_is_zero_without_a_gradient(self, backend):
+        """A loss may ignore a render."""
         cloud, camera = (
             random_cloud(5).to(torch.float32).leaves(),
             cameras(2, 12, 12, dtype=torch.float32),

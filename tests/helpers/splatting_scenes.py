@@ -1,4 +1,4 @@
-"""Clouds and cameras for the tests of splatting, and how far apart two results are."""
+"""Clouds and cameras for the splatting tests, and comparisons of results."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -36,7 +36,7 @@ class Cloud(NamedTuple):
 
 
 def scene_of(cloud: Cloud, viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Scene:
-    """Return what backends take; the background is black."""
+    """Return the arguments of backends, with a black background."""
     background = cloud.means.new_zeros(len(viewmats), cloud.colors.shape[-1])
     gaussians = dict(zip(NAMES, cloud, strict=True))
     cameras = {"viewmats": viewmats, "Ks": Ks, "background": background}
@@ -46,8 +46,8 @@ def scene_of(cloud: Cloud, viewmats: Tensor, Ks: Tensor, width: int, height: int
 def random_cloud(
     n: int, seed: int = 0, channels: int = 3, size: float = 0.15, stretch: float = 0.6
 ) -> Cloud:
-    """float64; in a ball of radius 1 around the origin, moderately stretched, of any opacity below
-    the cap.
+    """Draw a float64 cloud in a ball of radius 1 around the origin, moderately anisotropic, with
+    any opacity below the cap.
     """
     g = torch.Generator().manual_seed(seed)
     means = torch.randn(n, 3, generator=g, dtype=torch.float64) * 0.4
@@ -85,7 +85,7 @@ def hostile_cloud(seed: int, n: int, hostile: dict[str, list[float]] = HOSTILE) 
 
 
 def stacks_on_one_pixel(n: int = 10_000) -> Iterator[Cloud]:
-    """Clouds of ``n`` Gaussians that project to one pixel, of mixed and of low opacity."""
+    """Return clouds of ``n`` Gaussians that project to one pixel, of mixed and of low opacity."""
     g = torch.Generator().manual_seed(5)
     offsets, depths = torch.randn(n, 2, generator=g), torch.rand(n, 1, generator=g)
     means = torch.cat([0.05 * offsets, 2 + depths], 1).double()
@@ -120,8 +120,8 @@ def cameras(
     fov: float = 50.0,
     dtype=torch.float64,
 ) -> tuple[Tensor, Tensor]:
-    """Viewmats and Ks on a circle around the origin, each looking at it; ``fov`` vertical, degrees;
-    square pixels.
+    """Return viewmats and Ks on a circle around the origin that look at it; ``fov`` vertical,
+    degrees; square pixels.
     """
     focal = 0.5 * height / math.tan(math.radians(fov) / 2)
     Ks = torch.tensor(
@@ -144,20 +144,22 @@ def cameras(
 def front_camera(
     width: int, height: int, focal: float, dtype=torch.float64
 ) -> tuple[Tensor, Tensor]:
-    """At the origin, looking along +z: camera coordinates are world coordinates."""
+    """Return a camera at the origin that looks along +z, so that camera and world coordinates are
+    equal.
+    """
     Ks = torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], dtype=dtype)
     return torch.eye(4, dtype=dtype)[None], Ks
 
 
 def one_gaussian(mean=(0.0, 0.0, 2.0), scale=0.1, opacity=0.5, color=(1.0, 0.5, 0.25)) -> Cloud:
-    """float64, isotropic unless ``scale`` has three entries, identity rotation."""
+    """Return a float64 Gaussian without rotation, isotropic unless ``scale`` has three entries."""
     scales = scale if isinstance(scale, tuple) else (scale,) * 3
     rows = (mean, (1.0, 0, 0, 0), scales, opacity, color)
     return Cloud(*(torch.tensor([row], dtype=torch.float64) for row in rows))
 
 
 def cotangents(out: Rasterized, seed: int = 1) -> tuple[Tensor, ...]:
-    """Fixed random gradients of image, alpha and depth, the same numbers for every float type."""
+    """Return fixed random gradients of image, alpha and depth, equal for every precision."""
     g = torch.Generator().manual_seed(seed)
     return tuple(
         torch.randn(x.shape, generator=g, dtype=torch.float64).to(x.dtype)
@@ -182,7 +184,7 @@ def run(
     camera_gradient=False,
     **options,
 ) -> Run:
-    """Forward and backward in the cloud's float type with fixed cotangents."""
+    """Run forward and backward in the cloud's precision with fixed cotangents."""
     dtype = cloud.means.dtype
     leaves = cloud.leaves()
     viewmats = viewmats.detach().to(dtype).requires_grad_(camera_gradient)
@@ -202,13 +204,13 @@ def run(
 
 
 def error(a: Tensor, b: Tensor) -> float:
-    """Relative L2 distance of ``a`` from the truth ``b``."""
+    """Return the relative L2 distance of ``a`` from the reference ``b``."""
     return ((a.double() - b.double()).norm() / b.double().norm().clamp(min=1e-30)).item()
 
 
 def trimmed_error(a: Tensor, b: Tensor, kept: float = 0.995) -> float:
-    """The same without the worst rows: a Gaussian at a threshold may fall on its other side in
-    another float type.
+    """Return the same without the worst rows: a Gaussian at a threshold may fall on its other side
+    in another precision.
     """
     a, b = a.double().reshape(len(a), -1), b.double().reshape(len(b), -1)
     distance = (a - b).norm(dim=1)
@@ -221,8 +223,8 @@ def psnr(a: Tensor, b: Tensor) -> float:
 
 
 def assert_close(ours: Run, truth: Run, tolerance: float = SINGLE, radii: bool = True) -> None:
-    """Pictures and gradients of a float32 kernel within rounding of the specification in
-    float64.
+    """Assert that images and gradients of a float32 kernel are within rounding of the specification
+    in float64.
     """
     for name in ("image", "alpha", "depth", "means2d", "contribution"):
         picture, true = getattr(ours.out, name), getattr(truth.out, name)
@@ -240,6 +242,6 @@ def assert_close(ours: Run, truth: Run, tolerance: float = SINGLE, radii: bool =
 
 
 def equal(a: Run, b: Run) -> bool:
-    """To the bit."""
+    """Return whether all bits are equal."""
     outputs = all(torch.equal(x, y) for x, y in zip(a.out, b.out, strict=True))
     return outputs and all(torch.equal(grad, b.grads[name]) for name, grad in a.grads.items())

@@ -1,8 +1,9 @@
-"""Tiny models in the files of the real ones for the 3D priors: CLIP, Shap-E, Point-E and a body in
-SMPL's format.
+"""Tiny models with the file formats of the real ones for the 3D priors: CLIP, Shap-E, Point-E and a
+body in SMPL's format.
 
-Weights are random, but for two things that make results predictable: Shap-E's renderer gives one
-known shape whatever the latents, and the body's joints and limbs are where a person's are."""
+Weights are random except where results must be predictable: Shap-E's renderer gives one known shape
+for any latents, and the body's joints and limbs are at a person's positions.
+"""
 
 import itertools
 import json
@@ -26,8 +27,8 @@ SHAPE_HALF_SIDES = np.array([0.2, 0.3, 0.5])
 
 
 def clip(folder: Path, seed: int = 0) -> Path:
-    """A whole CLIP, as ``openai/clip-vit-large-patch14`` has it: one file of weights beside the
-    tokenizer's.
+    """Write a complete CLIP in the layout of ``openai/clip-vit-large-patch14``: one file of
+    weights, and the tokenizer's.
     """
     from transformers import CLIPConfig, CLIPModel
 
@@ -88,7 +89,7 @@ def _tokenizer(folder: Path) -> None:
 
 
 def shap_e(folder: Path, seed: int = 0) -> Path:
-    """What ``ShapEPipeline.save_pretrained`` writes; the scheduler has the published
+    """Write what ``ShapEPipeline.save_pretrained`` writes; the scheduler has the published
     configuration.
     """
     from diffusers import HeunDiscreteScheduler, ShapEPipeline
@@ -114,7 +115,7 @@ def shap_e(folder: Path, seed: int = 0) -> Path:
 
 
 def shap_e_prior(heads: int = 2, layers: int = 2):
-    """The text-to-latent network, tiny; the options are the published ones."""
+    """Make a tiny text-to-latent network with the published options."""
     from diffusers import PriorTransformer
 
     return PriorTransformer(
@@ -136,8 +137,8 @@ def shap_e_prior(heads: int = 2, layers: int = 2):
 
 
 def _shap_e_renderer():
-    """A renderer whose signed distance is that of an octahedron: 1 - |x|/a - |y|/b - |z|/c, its |.|
-    from pairs of SiLUs.
+    """Make a renderer whose signed distance is that of an octahedron: 1 - |x|/a - |y|/b - |z|/c,
+    with |.| from pairs of SiLUs.
     """
     from diffusers.pipelines.shap_e.renderer import ShapERenderer
 
@@ -181,11 +182,12 @@ def _shap_e_renderer():
 
 
 def marching_cubes_tables() -> tuple[torch.Tensor, torch.Tensor]:
-    """Triangles (256, 5, 3) of edges and which of them count (256, 5), for each set of positive
-    corners.
+    """Return triangles (256, 5, 3) of edges and a mask (256, 5) of the used ones, for each set of
+    positive corners.
 
     Corner x + 2y + 4z; edges 0-3 along x, 4-7 along y, 8-11 along z. Loops of crossed edges are cut
-    into fans."""
+    into fans.
+    """
     edges = [(c, c | 1 << axis) for axis in range(3) for c in range(8) if not c >> axis & 1]
     cases, masks = torch.zeros(256, 5, 3, dtype=torch.long), torch.zeros(256, 5, dtype=torch.bool)
     for case in range(256):
@@ -233,7 +235,7 @@ def _fan(loop: list[int]) -> list[tuple[int, int, int]]:
 
 
 def point_e(folder: Path, seed: int = 0) -> tuple[Path, Path]:
-    """``base_40m_textvec.pt`` and ``upsample_40m.pt``, one block each and with random last
+    """Write ``base_40m_textvec.pt`` and ``upsample_40m.pt``, with one block each and random last
     layers.
     """
     from threestudio_gaussiandreamer.priors.point_e_model import BaseModel, Upsampler
@@ -282,8 +284,8 @@ RING = 8
 
 
 def body_arrays(seed: int = 0) -> dict[str, np.ndarray]:
-    """A body of tubes around the bones, with the arrays of SMPL's file; two shape coefficients,
-    height and width.
+    """Return a body of tubes around the bones, with the arrays of SMPL's file; two shape
+    coefficients, height and width.
     """
     vertices, faces, owners = [], [], []
     for joint in range(1, 24):
@@ -314,7 +316,9 @@ def body_model(path: Path) -> Path:
 
 
 def _tube(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A closed tube of 4 cm radius: two rings, whose mean is the bone's end, and their centres."""
+    """Return a closed tube of 4 cm radius: two rings, whose means are the bone's ends, and their
+    centres.
+    """
     along = (end - start) / np.linalg.norm(end - start)
     side = np.cross(along, [0.0, 0.0, 1.0] if abs(along[2]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
@@ -333,7 +337,9 @@ def _tube(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _regressor(vertices: np.ndarray) -> np.ndarray:
-    """Each joint is the mean of the vertices that are its own: centres of tubes that end in it."""
+    """Return the regressor in which each joint is the mean of its own vertices: the centres of
+    tubes that end in it.
+    """
     regressor = (np.linalg.norm(vertices[None] - JOINTS[:, None], axis=-1) < 1e-9).astype(
         np.float64
     )

@@ -1,4 +1,4 @@
-"""Stable Diffusion's guidance with tiny models, for the tests of it."""
+"""Stable Diffusion's guidance with tiny models."""
 
 import torch
 from torch import nn
@@ -18,7 +18,7 @@ TIMESTEPS = torch.tensor([40, 400, 700, 950])
 
 
 def make_models(folder):
-    """A tiny Stable Diffusion for each of ``PREDICTIONS``."""
+    """Make a tiny Stable Diffusion for each of ``PREDICTIONS``."""
     return {
         prediction: tiny_models.stable_diffusion(folder / prediction, prediction=prediction)
         for prediction in PREDICTIONS
@@ -32,7 +32,7 @@ def guidance(models, prediction="epsilon", **options):
 
 
 def make_prompts(models):
-    """Embeddings of one prompt, without and with Perp-Neg; they don't depend on the prediction
+    """Make embeddings of one prompt, without and with Perp-Neg; they don't depend on the prediction
     type.
     """
     options = {
@@ -66,7 +66,7 @@ def relative(a, b):
 
 
 class Recorder(nn.Module):
-    """Passes calls on to a network and remembers their first arguments."""
+    """Forwards calls to a network and records their first arguments."""
 
     def __init__(self, network):
         super().__init__()

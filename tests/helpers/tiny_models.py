@@ -1,9 +1,10 @@
-"""Tiny random-weight models in the files of the real ones, made when a test asks for them: a folder
-each, in diffusers' format.
+"""Tiny models with random weights and the files of the real ones, each in a folder in diffusers'
+format.
 
 Every file is laid out as on the hub (safetensors weights, tokenizer files as published, scheduler
-configurations of the real models), so what loads these is what loads the real ones. Only the sizes
-differ, and what they draw is noise."""
+configurations of the real models), so the code that loads these loads the real ones. Only the sizes
+differ.
+"""
 
 import json
 from io import BytesIO
@@ -27,14 +28,14 @@ CORPUS = (
 
 
 def nothing_cached(monkeypatch, folder: Path) -> None:
-    """Hide the models that this machine may have in the hub's cache."""
+    """Hide the models in the hub's cache of this machine."""
     import huggingface_hub
 
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(folder / "empty"))
 
 
 class Sizes(NamedTuple):
-    """What tells a tiny Stable Diffusion from the published one."""
+    """The sizes in which a tiny Stable Diffusion differs from the published one."""
 
     unet: dict[str, Any]
     vae: dict[str, Any]
@@ -77,8 +78,8 @@ STABLE_DIFFUSION_2_1 = Sizes(
 def stable_diffusion(
     folder: Path, *, prediction: str = "epsilon", seed: int = 0, sizes: Sizes = TINY
 ) -> Path:
-    """Stable Diffusion 2.1, tiny: UNet on 8x8x4 latents, VAE 64x64 to 8x8; ``prediction``: epsilon,
-    v_prediction.
+    """Write a tiny Stable Diffusion 2.1: UNet on 8x8x4 latents, VAE 64x64 to 8x8; ``prediction``:
+    epsilon, v_prediction.
     """
     from diffusers import AutoencoderKL, UNet2DConditionModel
 
@@ -112,7 +113,7 @@ def stable_diffusion(
 
 
 def _stable_diffusion_scheduler(prediction: str) -> Any:
-    """The published scheduler: 2.1-base has PNDM, 2.1 (768, v-prediction) has DDIM."""
+    """Write the published scheduler: PNDM for 2.1-base, DDIM for 2.1 (768, v-prediction)."""
     from diffusers import DDIMScheduler, PNDMScheduler
 
     trained = {
@@ -132,7 +133,9 @@ def _stable_diffusion_scheduler(prediction: str) -> Any:
 
 
 def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
-    """DeepFloyd IF, stage 1: UNet on 16x16 pixels with six output channels, T5 encoder."""
+    """Write a tiny DeepFloyd IF, stage 1: UNet on 16x16 pixels with six output channels, T5
+    encoder.
+    """
     from diffusers import DDPMScheduler
 
     torch.manual_seed(seed)
@@ -186,8 +189,8 @@ def _deep_floyd_unet() -> torch.nn.Module:
 
 
 def _listen_to_text(unet: torch.nn.Module) -> None:
-    """Enlarge what the cross-attention brings in: with PyTorch's initial weights two prompts give
-    nearly the same picture.
+    """Scale up the output of the cross-attention: with PyTorch's initial weights two prompts give
+    nearly equal images.
     """
     for name, weight in unet.named_parameters():
         if name.endswith(("attn2.to_v.weight", "add_v_proj.weight")):
@@ -195,8 +198,8 @@ def _listen_to_text(unet: torch.nn.Module) -> None:
 
 
 def clip_text_encoder(folder: Path, width: int = TEXT_WIDTH) -> None:
-    """``text_encoder`` and ``tokenizer`` of Stable Diffusion 2.1: CLIP, padded with "!" (which one
-    of its two files denies).
+    """Write ``text_encoder`` and ``tokenizer`` of Stable Diffusion 2.1: CLIP, padded with "!",
+    which one of its two files contradicts.
     """
     from transformers import CLIPTextConfig, CLIPTextModel
 
@@ -238,7 +241,9 @@ def clip_text_encoder(folder: Path, width: int = TEXT_WIDTH) -> None:
 
 
 def t5_text_encoder(folder: Path) -> None:
-    """``text_encoder`` and ``tokenizer`` of DeepFloyd IF: T5 v1.1 and a sentencepiece model."""
+    """Write ``text_encoder`` and ``tokenizer`` of DeepFloyd IF: T5 v1.1 and a
+    sentencepiece model.
+    """
     from transformers import T5Config, T5EncoderModel
 
     tokenizer = folder / "tokenizer"
@@ -257,8 +262,8 @@ def t5_text_encoder(folder: Path) -> None:
 
 
 def _publish_clip(path: Path) -> None:
-    """The names of the published files: with the prefix that transformers 5 leaves out, and the
-    positions that were once saved.
+    """Write the names of the published files: with the prefix that transformers 5 omits, and the
+    positions that earlier versions saved.
     """
     from safetensors.torch import load_file, save_file
 
@@ -282,8 +287,8 @@ def _rename(path: Path, names: dict[str, str]) -> None:
 
 
 def _byte_vocabulary() -> dict[str, int]:
-    """CLIP's byte-level vocabulary without most of its merges: each byte, each byte at a word's
-    end, two merges, start and end.
+    """Return CLIP's byte-level vocabulary with few merges: each byte, each byte at a word's end,
+    two merges, start and end.
     """
     printable = [
         *range(ord("!"), ord("~") + 1),

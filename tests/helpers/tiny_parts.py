@@ -1,4 +1,4 @@
-"""A system of a few parameters with the whole life of a real one, for tests of the launcher; also
+"""A system of a few parameters with all hooks of a real one, for tests of the launcher; also
 loadable as an extension.
 """
 

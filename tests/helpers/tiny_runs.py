@@ -1,4 +1,4 @@
-"""What tests of the launcher look at in the results of runs of the tiny system."""
+"""Checks of the results of runs of the tiny system."""
 
 from pathlib import Path
 

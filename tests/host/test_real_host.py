@@ -39,7 +39,7 @@ SMALL = [
 
 
 def try_extension(tmp_path: Path, config: Path, *overrides: str) -> set[str]:
-    """Run all stages; returns the files they left."""
+    """Run all stages; return the files that they wrote."""
     environment = {
         **os.environ,
         "STAGES": "train test export validate resume",

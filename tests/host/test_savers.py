@@ -1,4 +1,4 @@
-"""The built-in host's savers: pictures, videos, arrays and meshes that can be read again."""
+"""The built-in host's savers: images, videos, arrays and meshes that can be read back."""
 
 import json
 from pathlib import Path

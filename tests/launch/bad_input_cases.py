@@ -1,4 +1,4 @@
-"""What the tests of bad input share."""
+"""Helpers of the bad input tests."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ SMALL = [
 
 
 def assert_refused(code: int, err: str, message: str) -> None:
-    """One message, no traceback, nothing written, and the prior hasn't run."""
+    """Assert one message, no traceback, nothing written, and that the prior hasn't run."""
     assert code == 2 and "Traceback" not in err and not Path("outputs").exists(), err
     assert message in err and sum(line.startswith("error: ") for line in err.splitlines()) == 1
     assert "the cloud starts" not in err

@@ -1,4 +1,4 @@
-"""What the tests of config share."""
+"""Helpers of the configuration tests."""
 
 from threestudio_gaussiandreamer.launch.config import load_config
 

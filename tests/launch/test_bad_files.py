@@ -1,4 +1,4 @@
-"""Damaged files, prompts, extensions and signals end in one message."""
+"""Damaged files, prompts, extensions and signals give one message."""
 
 import json
 import os
@@ -44,7 +44,7 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", ["missing.glb", "", *FILES])
-def test_a_mesh_that_is_none_is_refused(launch_demo, name):
+def test_an_invalid_mesh_is_refused(launch_demo, name):
     if name in FILES:
         Path(name).write_bytes(FILES[name])
     code, err = launch_demo(f"system.guidance.mesh={name}")
@@ -105,7 +105,7 @@ def test_a_foreign_checkpoint_is_refused(launch_demo, content, message):
         assert "weights_only" not in err  # torch's advice to read it all the same
 
 
-def test_a_damaged_score_file_is_measured_anew(tmp_path):
+def test_a_damaged_score_file_is_measured_again(tmp_path):
     for content in (b"{bro", b"\xff", b"[1]"):
         (tmp_path / "metrics.json").write_bytes(content)
         assert evaluate.Measurements(None, tmp_path).values == {}
@@ -145,7 +145,7 @@ def test_a_full_disk_is_named(launch_demo, monkeypatch):
         (b"data: [1, 2]", "data is a list in one and a section in another"),
     ],
 )
-def test_a_configuration_that_is_none_is_refused(launch_demo, content, message):
+def test_an_invalid_configuration_is_refused(launch_demo, content, message):
     Path("bad.yaml").write_bytes(content)
     assert_refused(*launch_demo(config="bad.yaml"), message)
     assert not Path("pwned").exists()
@@ -220,8 +220,8 @@ def test_a_second_run_in_a_folder_is_refused_while_the_first_one_trains(launch_d
 
 
 def test_a_run_that_is_resumed_at_its_end_is_measured(launch_demo):
-    """Also where the result's numbers aren't: in another folder, or because the first run was
-    killed before it had them.
+    """Also if the scores are missing: in another folder, or because the first run was killed before
+    it wrote them.
     """
     assert launch_demo()[0] == 0
     code, err = launch_demo(f"resume={TRIAL}/ckpts/last.ckpt", "tag=other")
@@ -234,15 +234,15 @@ def test_a_run_that_is_resumed_at_its_end_is_measured(launch_demo):
 
 
 @pytest.mark.parametrize("stage", ["validate", "test", "export"])
-def test_nothing_to_resume_is_nothing_to_show(stage, launch_demo):
-    """Only training can start anew; an untrained cloud would pass for the result."""
+def test_export_without_a_checkpoint_is_an_error(stage, launch_demo):
+    """Only training can start from the prior; an untrained cloud would be taken for the result."""
     assert_refused(
         *launch_demo("resume=auto", stage=f"--{stage}"),
         f"resume=auto: there is no checkpoint to --{stage}",
     )
 
 
-def test_a_closed_pipe_is_no_traceback(monkeypatch, capsys):
+def test_a_closed_pipe_gives_no_traceback(monkeypatch, capsys):
     closed = []
     monkeypatch.setattr(
         experiment, "run", lambda *args: (_ for _ in ()).throw(BrokenPipeError(32, "Broken pipe"))

@@ -1,6 +1,4 @@
-"""Wrong input as a stranger gives it: one message, exit code 2, before any long work, nothing left
-behind, no traceback.
-"""
+"""Wrong input: one message, exit code 2, before any long work, no files left, no traceback."""
 
 import dataclasses
 
@@ -218,8 +216,8 @@ BAD_VALUES = ([1, 2, 3, 4, 5, 6, 7], {"a": 1}, float("nan"), None, "abc", -1)
     ],
 )
 def test_no_option_of_any_part_ends_in_a_traceback(name):
-    """Whatever is written for an option, the check takes it or names it; what is no number or text
-    is never taken for one.
+    """The check accepts or names any value of any option; a value that is neither number nor text
+    is never accepted as one.
     """
     config = getattr(host.find(name), "Config", None)
     for field in dataclasses.fields(config) if config else ():

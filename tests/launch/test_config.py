@@ -1,4 +1,4 @@
-"""Configurations: loading, texts that stay texts, folders, and the check of every key."""
+"""Configurations: loading, text that stays text, folders, and the check of every key."""
 
 import os
 import re

@@ -177,8 +177,8 @@ def test_a_broken_extension_is_an_error_with_file_line_and_cause(folder, source,
 
 
 def test_another_part_forgets_the_options_that_only_the_earlier_one_has():
-    """Trying another prior or guidance takes one override; options of the new part are kept, a
-    misspelt one is still an error.
+    """Another prior or guidance needs one override: options of the new part are kept, misspelt ones
+    are still errors.
     """
     register_parts()
     demo = Path(__file__).parents[2] / "configs" / "demo.yaml"

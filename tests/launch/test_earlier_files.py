@@ -1,4 +1,4 @@
-"""Files that an earlier layout of the package wrote are read, resumed, exported and pruned."""
+"""Files written by an earlier layout of the package can be read, resumed, exported and pruned."""
 
 import shutil
 from pathlib import Path

@@ -176,7 +176,7 @@ def test_a_checkpoint_that_does_not_fit_is_named(launch, trained, damage):
     assert code == 2 and str(path) in err and "Traceback" not in err
 
 
-def test_a_bug_keeps_its_traceback(launch, monkeypatch):
+def test_an_internal_error_keeps_its_traceback(launch, monkeypatch):
     monkeypatch.setattr(tiny_parts.TinySystem, "configure", lambda self: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         launch("--train")
@@ -186,9 +186,9 @@ def test_a_bug_keeps_its_traceback(launch, monkeypatch):
 
 
 @pytest.mark.slow
-def test_launch_py_with_parts_dropped_into_custom(tmp_path):
-    """A real process: parts come from one file in custom/; the process gets a real Ctrl-C, and the
-    printed line goes on.
+def test_launch_py_with_parts_in_custom(tmp_path):
+    """In a real process: parts come from one file in custom/, the process gets a real Ctrl-C, and
+    the printed command resumes it.
     """
     (tmp_path / "custom").mkdir()
     (tmp_path / "custom" / "tiny_parts.py").write_text(Path(tiny_parts.__file__).read_text())

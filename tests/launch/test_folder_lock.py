@@ -1,4 +1,4 @@
-"""The folder of a run: made by one process, locked, and removed only by its maker."""
+"""The folder of a run is created by one process, locked, and removed only by its creator."""
 
 import fcntl
 import multiprocessing
@@ -40,7 +40,7 @@ def stop_before(monkeypatch, owner, name) -> None:
 
 
 def stopped_child(work) -> int:
-    """Fork a process that does ``work`` until it stops itself; returns its id.
+    """Fork a process that does ``work`` until it stops itself; return its id.
 
     It exits with 0, with 3 for a folder in use, else with 1.
     """
@@ -58,7 +58,7 @@ def stopped_child(work) -> int:
 
 
 def go_on(child: int) -> int:
-    """Continue a stopped child until it ends; returns its exit code."""
+    """Continue a stopped child until it ends; return its exit code."""
     os.kill(child, signal.SIGCONT)
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
@@ -67,7 +67,7 @@ def claim_and_discard(path: Path) -> None:
     claim(path).discard()
 
 
-def test_who_made_the_folder_but_lost_the_lock_leaves_it_alone(folder, monkeypatch):
+def test_the_creator_without_the_lock_does_not_remove_the_folder(folder, monkeypatch):
     with monkeypatch.context() as patch:
         stop_before(patch, fcntl, "flock")
         loser = stopped_child(lambda: claim_and_discard(folder))
@@ -89,7 +89,7 @@ def test_a_folder_that_is_about_to_be_removed_is_in_use(folder, monkeypatch):
 
 
 def test_a_lock_of_a_removed_folder_is_not_taken_for_one_of_the_new_folder(folder, monkeypatch):
-    """Between opening and locking, the folder's maker removes it and gives up the lock."""
+    """Between opening and locking, the folder's creator removes it and releases the lock."""
     first, flock = claim(folder), fcntl.flock
 
     def remove_then_lock(*arguments):
@@ -116,7 +116,7 @@ def test_parents_of_another_run_stay(folder):
 
 @pytest.fixture(params=["unsupported", "no fcntl"])
 def no_flock(request, monkeypatch):
-    """A file system, or an operating system, without locks of folders."""
+    """Simulate a file system, or an operating system, without locks of folders."""
 
     def unsupported(*arguments):
         raise OSError(95, "Operation not supported")

@@ -1,4 +1,4 @@
-"""Arguments before anything heavy is imported: usage, configuration files by name, GPUs."""
+"""Arguments, before heavy imports: usage, configuration files by name, GPUs."""
 
 import os
 import subprocess
@@ -109,7 +109,7 @@ def test_the_installed_package_brings_its_configurations(tmp_path, monkeypatch):
         ("", None, ""),
     ],
 )
-def test_what_cuda_shows(monkeypatch, environment, gpu, visible):
+def test_what_cuda_reports(monkeypatch, environment, gpu, visible):
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     if environment is not None:
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", environment)
@@ -118,7 +118,7 @@ def test_what_cuda_shows(monkeypatch, environment, gpu, visible):
 
 
 @pytest.mark.parametrize("gpu", ["", "gpu", "0,", "-1", "0 1"])
-def test_what_is_no_gpu(gpu):
+def test_an_invalid_gpu_is_named(gpu):
     with pytest.raises(UserError, match="expected cpu, or numbers of GPUs"):
         choose_gpu(gpu)
 

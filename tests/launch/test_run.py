@@ -1,4 +1,4 @@
-"""What a run keeps beside its results, and runs that meet in one folder."""
+"""What a run writes beside its results, and concurrent runs in one folder."""
 
 import datetime
 import fcntl
@@ -51,7 +51,7 @@ def test_a_source_that_can_not_be_read_is_left_out_of_the_copy_with_a_warning(
     assert files(tmp_path / "copy") == {"part.py"}
 
 
-def test_a_configuration_that_vanishes_is_kept_as_it_was_read(launch, monkeypatch):
+def test_a_deleted_configuration_is_stored_as_it_was_read(launch, monkeypatch):
     monkeypatch.setattr(
         tiny_parts.TinySystem, "post_configure", lambda self: os.unlink("tiny.yaml")
     )
@@ -70,7 +70,7 @@ def test_a_configuration_that_can_not_be_read_is_named(launch, monkeypatch):
 
 @pytest.mark.parametrize("strategy", [None, "auto", "ddp"])
 def test_several_gpus_train_replicas_of_one_cloud(launch, monkeypatch, strategy):
-    """Also where the configuration says what the default is: DDP's own wrapper would keep the
+    """Also if the configuration states the default explicitly: DDP's wrapper would keep the
     parameters that densification replaces.
     """
     built = []
@@ -95,8 +95,8 @@ ONE_FOLDER = ["use_timestamp=false", "tag=run"]
 
 
 def test_a_run_that_is_refused_leaves_the_folder_of_the_one_that_trains(launch, monkeypatch):
-    """The refused run made the folder and is stopped before it asks for the lock; it goes on while
-    the other one trains.
+    """The rejected run creates the folder and is stopped before it locks it; it continues while the
+    other one trains.
     """
     with monkeypatch.context() as patch:
         flock = fcntl.flock

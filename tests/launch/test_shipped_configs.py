@@ -1,4 +1,4 @@
-"""Every shipped configuration builds, and every key that is accepted is read by somebody."""
+"""Every shipped configuration builds, and every accepted key is read somewhere."""
 
 import ast
 import dataclasses
@@ -57,15 +57,13 @@ def test_a_shipped_configuration_is_valid_and_its_parts_can_be_built(name, tmp_p
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_the_prior_of_a_shipped_configuration_can_be_built(name, tmp_path):
-    """Built, not run: its options are accepted, and it looks for its files only when it is asked
-    to.
-    """
+    """Built, not run: its options are accepted, and it looks for its files only on preflight."""
     geometry = loaded(name, tmp_path).system.geometry
     assert isinstance(host.find(geometry.prior_type)(geometry.prior), Prior)
 
 
 @pytest.mark.parametrize("name", MANDATORY)
-def test_what_is_left_open_is_asked_for(name, tmp_path):
+def test_a_missing_value_is_requested(name, tmp_path):
     paths = [ROOT / "configs" / part for part in (OVERLAYS[name], name)]
     keys = [override.partition("=")[0] for override in MANDATORY[name]]
     with pytest.raises(UserError) as caught:
@@ -92,9 +90,9 @@ def test_a_body_may_be_chosen_among_meshes_instead(tmp_path):
     ]
 
 
-def test_overlays_add_up(tmp_path):
-    """An avatar on the ground in little memory: what belongs to another prior is left out, the rest
-    stays.
+def test_overlays_can_be_combined(tmp_path):
+    """An avatar on the ground with little memory: options of another prior are dropped, the rest is
+    kept.
     """
     names = [
         "gaussiandreamer.yaml",
@@ -182,8 +180,8 @@ def test_the_released_codes_numbers_are_the_codes(tmp_path):
 
 
 def config_classes():
-    """(part, Config) of everything registered by this package, with the dataclasses nested in
-    them.
+    """Return (part, Config) of everything registered by this package, nested dataclasses
+    included.
     """
     found = {}
     for name in host.names():
@@ -199,8 +197,8 @@ def config_classes():
 
 
 def names_that_are_read():
-    """Attributes, strings, keywords and parameters in the package's code, the bodies of dataclasses
-    aside.
+    """Return attributes, strings, keywords and parameters in the package's code, except in
+    dataclass bodies.
     """
     read = set()
     for path in PACKAGE.rglob("*.py"):

@@ -1,4 +1,4 @@
-"""Stopping by signals, checkpoints, and going on."""
+"""Stopping by signals, checkpoints, and resuming."""
 
 import contextlib
 import os
@@ -149,8 +149,8 @@ def test_under_nohup_a_hang_up_changes_nothing(launch):
 
 
 def test_a_closed_terminal_leaves_a_checkpoint(launch, monkeypatch):
-    """The process loses its terminal in the middle of a step: it is sent SIGHUP, and whatever it
-    writes from then on fails.
+    """The process loses its terminal in the middle of a step: it receives SIGHUP, and all later
+    writes fail.
     """
     child, terminal = pty.fork()
     if child == 0:
@@ -185,7 +185,7 @@ def test_a_signal_during_imports_ends_it_whatever_becomes_of_its_exception(
 
 
 def test_a_checkpoint_is_written_about_every_minute(launch, monkeypatch):
-    """So a run that is killed between its own checkpoints loses at most that much."""
+    """A run that is killed between its own checkpoints loses at most that much."""
     steps, clock = [], [0.0]
 
     def step_of_20_seconds(system, batch, batch_idx):

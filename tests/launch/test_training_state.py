@@ -1,4 +1,4 @@
-"""Checkpoints with a valid checksum and impossible content: one message before any work."""
+"""Checkpoints with a valid checksum and impossible content give one message before any work."""
 
 import math
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 
 def read(path: Any, content: dict) -> dict:
-    """Write, read and check, as a run does that is resumed."""
+    """Write, read and check, as a resumed run does."""
     save_file(path, content)
     checkpoint = load_checkpoint(path)
     GaussianDreamerSystem.check_checkpoint(checkpoint, str(path))
@@ -24,7 +24,7 @@ def read(path: Any, content: dict) -> dict:
 
 
 def at(*keys: Any, value: Any) -> Callable[[dict], None]:
-    """Replace what lies under these keys; call ``value`` with it where that is a function."""
+    """Replace the value under these keys; if ``value`` is a function, by its result."""
 
     def change(content: dict) -> None:
         *path, last = keys

@@ -1,4 +1,4 @@
-"""What the tests of meshes share."""
+"""Fixtures of the mesh tests."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""One budget of memory for everything in a mesh file."""
+"""One memory budget for everything in a mesh file."""
 
 import tracemalloc
 import zlib
@@ -13,7 +13,7 @@ from threestudio_gaussiandreamer.meshes.load import load_mesh
 
 
 def refused(made, saved):
-    """The message of a refusal, and the most that Python allocated before it."""
+    """Return the message of a rejection, and the peak memory before it."""
     path = saved(made)
     tracemalloc.start()
     try:
@@ -25,7 +25,7 @@ def refused(made, saved):
 
 
 def test_textures_count_together(saved, monkeypatch):
-    """Two pictures of half a megabyte in a file of few bytes: one fits, two don't."""
+    """Two images of half a megabyte in a small file: one fits, two do not."""
     monkeypatch.setattr(budget, "FIXED_BYTES", 700_000)
     monkeypatch.setattr(budget, "BYTES_PER_BYTE", 0)
     flat = np.zeros((256, 256, 3), np.uint8)
@@ -40,7 +40,9 @@ def test_textures_count_together(saved, monkeypatch):
 
 
 def test_instances_count(saved, monkeypatch):
-    """2,000 nodes that show one mesh are refused before they are made; the texture is kept once."""
+    """2,000 nodes that show one mesh are rejected before they are created; the texture is stored
+    once.
+    """
     monkeypatch.setattr(budget, "FIXED_BYTES", 1 << 20)
     monkeypatch.setattr(budget, "BYTES_PER_BYTE", 0)
     made = textured_quad(np.zeros((64, 64, 3), np.uint8))
@@ -53,7 +55,7 @@ def test_instances_count(saved, monkeypatch):
 
 
 def test_a_large_header_is_refused_before_anything_is_allocated(saved):
-    """A PNG of 12,000 x 12,000 pixels whose header alone is right."""
+    """A PNG that announces 12,000 x 12,000 pixels in its header."""
     data = bytearray(png(FOUR))
     data[16:24] = (12000).to_bytes(4, "big") * 2
     data[29:33] = zlib.crc32(bytes(data[12:29])).to_bytes(4, "big")

@@ -1,4 +1,4 @@
-"""glTF files made by hand, one feature each: positions and colours are what the standard says."""
+"""Generated glTF files with one feature each: positions and colours are those of the standard."""
 
 import numpy as np
 import pytest
@@ -118,7 +118,7 @@ def test_a_clamped_edge_isn_t_blended_with_the_other_one(saved):
 
 
 def test_wrapping_survives_a_merge_and_a_picture_is_kept_once(tmp_path):
-    """Two quads with one picture and other samplers, in the merged mesh that training sees."""
+    """Two quads with one image and different samplers, in the merged mesh that training uses."""
     uv = np.tile(np.float32([1.25, 0.25]), (4, 1))
     made = textured_quad(FOUR, uv=uv, sampler={"wrapS": 33071} | NEAREST)
     made.add("samplers", wrapS=33648, wrapT=33071, magFilter=9728)
@@ -148,7 +148,7 @@ def test_sparse_accessors(with_base, saved):
 
 @pytest.mark.parametrize("where", ["mesh", "node", "both"])
 def test_default_weights_of_morph_targets(where, saved):
-    """Those of the node come before those of the mesh."""
+    """Those of the node override those of the mesh."""
     made = Gltf()
     up, right = np.float32([[0, 0, 1]] * 4), made.sparse(4, [2], [[4, 0, 0]])
     targets = [{"POSITION": made.accessor(up)}, {"POSITION": right}]
@@ -169,7 +169,7 @@ def test_default_weights_of_morph_targets(where, saved):
     ids=["strip", "fan"],
 )
 def test_strips_and_fans(mode, faces, indexed, saved):
-    """All triangles of a strip are the same way round."""
+    """All triangles of a strip have the same orientation."""
     made = Gltf()
     order = np.array([4, 2, 0, 1, 3]) if indexed else np.arange(5)
     indices = {"indices": made.accessor(order.astype("u4"))} if indexed else {}
@@ -239,7 +239,7 @@ def test_points_are_for_point_clouds(saved):
 
 
 def test_a_point_cloud_of_a_mesh_has_its_texture_s_colours(saved):
-    """Coordinates outside of [0, 1] repeat, as they do for a mesh prior."""
+    """Coordinates outside [0, 1] repeat, as for a mesh prior."""
     uv = np.float32([[1.25, 0.25], [-0.25, 0.25], [3.25, 1.75], [0.75, -0.25]])
     path = saved(textured_quad(FOUR, uv=uv, sampler=NEAREST))
     cloud = PointCloudPrior({"path": str(path)})("a fox")
@@ -264,7 +264,7 @@ def test_extensions_that_change_no_colour_are_no_hindrance(saved):
 
 
 def changed(made, path, value):
-    """The document with one value replaced."""
+    """Return the document with one value replaced."""
     *way, last = path
     entry = made.document
     for key in way:

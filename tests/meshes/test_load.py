@@ -27,7 +27,7 @@ def saved(mesh, path):
 
 
 def textured_quad(image, uv=((0, 0), (1, 0), (1, 1), (0, 1)), y=0.0, size=1.0):
-    """A square in the xz plane, corners in the order of ``uv``."""
+    """Return a square in the xz plane, with corners in the order of ``uv``."""
     from PIL import Image
 
     corners = np.array([[0, y, 0], [1, y, 0], [1, y, 1], [0, y, 1]]) * [size, 1, size]
@@ -43,7 +43,7 @@ def center_color(mesh, face=0):
 
 
 def facing(mesh, direction):
-    """The index of the face whose normal points most along ``direction``."""
+    """Return the index of the face whose normal is closest to ``direction``."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
     return int((np.cross(b - a, c - a) @ np.asarray(direction)).argmax())
 
@@ -69,8 +69,8 @@ def test_units_do_not_matter(tmp_path, scale):
 
 
 def arrow(direction, side):
-    """A mesh whose farthest vertex along x, y, z tells the axes apart: long along ``direction``,
-    short along ``side``.
+    """Return a mesh whose farthest vertices distinguish the axes: long along ``direction``, short
+    along ``side``.
     """
     third = np.cross(direction, side)
     return trimesh.Trimesh(
@@ -244,7 +244,7 @@ def test_a_few_bad_vertices_are_dropped_with_a_count(tmp_path, caplog):
 
 def test_objects_as_programs_write_them_are_read(tmp_path):
     """Blanks, tabs, carriage returns, continued lines, exponents, colours, texture coordinates of
-    three, polygons, other statements.
+    three numbers, polygons, other statements.
     """
     text = (
         "# made by hand\r\nmtllib none.mtl\no box\nv 0 0.0 -.0 1 0 0\nv  1e0\t0 0 0 1 0 \nv 1 "
@@ -322,7 +322,7 @@ def test_what_cannot_be_used_is_named(tmp_path, name, content, message):
     ids=lambda line: line[:8].decode(),
 )
 def test_a_long_line_takes_linear_time(tmp_path, line):
-    """64 kB; where a number may be split in two ways, 16 kB took 25 s."""
+    """64 kB, of numbers that a regular expression could split in two ways."""
     (tmp_path / "a.obj").write_bytes(b"v 0 0 0\n" + line + b"\n")
     started = time.process_time()
     with pytest.raises(UserError, match="line 2 is no vertex or face"):

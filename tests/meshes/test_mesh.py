@@ -1,4 +1,4 @@
-"""Colours at places on a mesh, and points on its surface."""
+"""Colours at positions on a mesh, and points on its surface."""
 
 import numpy as np
 import pytest

@@ -27,7 +27,7 @@ COLORS = {
 
 @pytest.fixture(params=["embree", "zbuffer"], autouse=True)
 def caster_name(request, monkeypatch):
-    """Every test runs with both casters."""
+    """Run every test with both casters."""
     if request.param == "zbuffer":
         monkeypatch.setitem(
             sys.modules, "embreex.mesh_construction", None
@@ -46,7 +46,7 @@ def look(elevation, azimuth, distance):
 
 
 def cube(size=1.0):
-    """A cube with a colour of its own on each side."""
+    """Return a cube with one colour per side."""
     source = trimesh.creation.box((size, size, size))
     sides = source.face_normals.round().astype(int)
     names = ["+-"[int(side.sum() < 0)] + "xyz"[int(np.abs(side).argmax())] for side in sides]
@@ -67,7 +67,7 @@ def sphere(radius=1.0, subdivisions=5):
     [(2.0, 70.0, (96, 96)), (3.0, 40.0, (80, 120)), (5.0, 25.0, (96, 80))],
 )
 def test_the_silhouette_of_a_sphere(distance, fovy, size):
-    """Under perspective a sphere of radius r at distance d shows the angle asin(r / d): a disc of
+    """In perspective a sphere of radius r at distance d subtends the angle asin(r / d): a disc of
     radius f tan of it.
     """
     height, width = size
@@ -232,7 +232,7 @@ def test_sizes_are_checked():
         MeshCaster(cube()).render(look(0, 0, 3), 0.7, 0, 8)
 
 
-def test_a_missing_embree_is_said_once(caster_name, caplog):
+def test_a_missing_embree_is_reported_once(caster_name, caplog):
     raycast._report_slow_caster.cache_clear()
     with caplog.at_level(logging.WARNING, logger=raycast.__name__):
         MeshCaster(cube())

@@ -1,4 +1,4 @@
-"""Files that a mesh names beside itself, and the materials of OBJ files."""
+"""Files that a mesh references, and the materials of OBJ files."""
 
 import base64
 import json
@@ -18,7 +18,7 @@ HALF = 0.5
 
 
 def gltf_beside(tmp_path, uri="picture%20one.png"):
-    """A .gltf with its buffer as data and its picture in a file."""
+    """Write a .gltf with its buffer as a data URI and its image in a file."""
     made = textured_quad(FOUR, sampler=NEAREST)
     made.glb()
     data = base64.b64encode(made.binary).decode()
@@ -43,7 +43,7 @@ def test_a_missing_texture_is_named_and_leaves_grey(tmp_path, caplog):
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="FIFOs are of Unix")
 @pytest.mark.parametrize("kind", ["texture", "buffer", "mtl", "texture of an OBJ"])
 def test_a_fifo_beside_a_mesh_is_refused(kind, tmp_path):
-    """Opened plainly it would wait for a writer for ever."""
+    """Opening it would wait for a writer forever."""
     os.mkfifo(tmp_path / "fifo.png")
     path = gltf_beside(tmp_path, "fifo.png")
     if kind == "buffer":
@@ -85,7 +85,9 @@ def test_an_obj_with_coordinates_and_no_material_is_grey(head, tmp_path):
 
 @pytest.mark.parametrize("picture, expected", [(None, [1, 0.5, 0]), (np.uint16([[0x8080]]), 0.5)])
 def test_an_obj_s_material(picture, expected, tmp_path, caplog):
-    """A missing picture leaves the material's colour; one of 16 bits isn't clipped to white."""
+    """If an image is missing, the material's colour is used; 16-bit images aren't clipped
+    to white.
+    """
     kd = "Kd 1 0.5 0\n" if picture is None else ""
     (tmp_path / "a.mtl").write_text(f"newmtl m\n{kd}map_Kd p.png\n")
     (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + TRIANGLE)

@@ -23,15 +23,15 @@ def look(elevation, azimuth, distance):
 
 
 def draw(vertices, faces, c2w=None, rows=PLACES, columns=PLACES):
-    """The hits of a camera at the origin that looks along -z, unless given another."""
+    """Return the hits of a camera, by default at the origin along -z."""
     return ZBuffer(np.array(vertices, dtype=float), np.array(faces)).hits(
         np.eye(4) if c2w is None else c2w, FOCAL, rows, columns
     )
 
 
 def cast(vertices, faces, rows=PLACES, columns=PLACES):
-    """The nearest face of each sample by intersecting every ray with every triangle (Moeller and
-    Trumbore 1997), in float64.
+    """Return the nearest face of each sample by intersecting every ray with every triangle (Moeller
+    and Trumbore 1997), in float64.
     """
     y, x = np.meshgrid(-rows / FOCAL, columns / FOCAL, indexing="ij")
     rays = np.stack([x, y, -np.ones_like(x)], axis=-1)[:, :, None]
@@ -52,7 +52,7 @@ def cast(vertices, faces, rows=PLACES, columns=PLACES):
 
 
 def soup(seed, count=150):
-    """Random triangles on all sides of the camera, small and large: many cross its plane."""
+    """Return random triangles on all sides of the camera, small and large; many cross its plane."""
     rng = np.random.default_rng(seed)
     corners = rng.normal(size=(count, 1, 3)) * 2 + rng.normal(size=(count, 3, 3)) * rng.uniform(
         0.1, 0.6, (count, 1, 1)
@@ -92,8 +92,8 @@ def test_a_moved_camera_sees_what_a_moved_mesh_shows():
 
 
 def test_a_floor_below_the_camera_reaches_the_horizon_in_perspective():
-    """A huge floor at height -1 under a level camera: below the horizon all samples, and the
-    weights give the world's place back.
+    """A huge floor at height -1 under a level camera covers all samples below the horizon, and the
+    weights reproduce the world positions.
     """
     vertices = np.array([[-1e3, -1, 1e3], [1e3, -1, 1e3], [0, -1, -1e6]])
     face_index, weights = draw(vertices, [[0, 1, 2]], columns=PLACES / 20)
@@ -109,7 +109,7 @@ def test_a_floor_below_the_camera_reaches_the_horizon_in_perspective():
 
 
 def test_what_is_nearer_than_the_near_plane_is_not_seen():
-    """One corner of the triangle is before that plane; the rest of it is seen."""
+    """One corner of the triangle is before that plane; the rest of it is visible."""
     vertices = (
         np.array([[-1.0, -1, -1], [1, -1, -1], [0, 1, -1]])
         * np.array([[0.5], [2], [2]])
@@ -140,7 +140,7 @@ def test_both_sides_are_seen_and_the_nearer_one_wins():
 
 
 def test_neighbours_leave_no_gap_on_samples_of_their_edges():
-    """A fan whose edges run exactly through samples: its inside is covered wholly."""
+    """A fan whose edges pass exactly through samples: its inside is covered completely."""
     ring = [
         [x, y, -FOCAL / 2]
         for x, y in ((8, 0), (8, 8), (0, 8), (-8, 8), (-8, 0), (-8, -8), (0, -8), (8, -8))

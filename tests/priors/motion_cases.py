@@ -1,4 +1,4 @@
-"""What the tests of motion share."""
+"""Helpers of the motion tests."""
 
 import numpy as np
 import torch
@@ -15,7 +15,9 @@ def joints_of(body, pose, shape=None, translation=None):
 
 
 def walk(body, frames=6):
-    """A motion (F, 22, 3): standing, then raising the left knee while turning to the left."""
+    """Return a motion (F, 22, 3): standing, then raising the left knee while turning to
+    the left.
+    """
     pose = torch.zeros(frames, 24, 3, dtype=torch.float64)
     pose[:, 1, 0] = torch.linspace(0, -1.2, frames)
     pose[:, 4, 0] = torch.linspace(0, 1.0, frames)

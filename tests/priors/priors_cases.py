@@ -1,4 +1,4 @@
-"""What the tests of priors share."""
+"""Helpers of the prior tests."""
 
 import numpy as np
 

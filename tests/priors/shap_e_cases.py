@@ -1,4 +1,4 @@
-"""What the tests of shap e share."""
+"""Helpers of the Shap-E tests."""
 
 import torch
 

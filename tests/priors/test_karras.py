@@ -20,13 +20,13 @@ MEAN, SPREAD = 0.3, 0.5
 
 
 def gaussian_denoiser(x, sigma):
-    """E[x0 | x0 + sigma eps] of data that are normal with this mean and spread."""
+    """Return E[x0 | x0 + sigma eps] of normal data with this mean and standard deviation."""
     return MEAN + SPREAD**2 / (SPREAD**2 + sigma**2) * (x - MEAN)
 
 
 def flow_end(noise, sigma_max):
-    """Where the noise-free sampler ends: the probability flow keeps the place within the widening
-    normal distribution.
+    """Return the end point of the noise-free sampler: the probability flow keeps the quantile of
+    the widening normal distribution.
     """
     return MEAN + SPREAD / math.hypot(SPREAD, sigma_max) * (sigma_max * noise - MEAN)
 
@@ -73,9 +73,9 @@ def test_churn_keeps_the_distribution_and_needs_the_generator():
     assert torch.equal(sample, again) and not torch.allclose(sample, other)
 
 
-def test_a_network_of_timesteps_becomes_the_denoiser_it_stands_for():
-    """A network that knows the noise of normal data: its denoiser is the exact one at the noise of
-    each whole timestep.
+def test_a_network_of_timesteps_gives_the_exact_denoiser():
+    """A network that predicts the noise of normal data gives the exact denoiser at the noise level
+    of each integer timestep.
     """
     alphas_cumprod = karras.cosine_alphas_cumprod()
 
@@ -104,8 +104,8 @@ def test_timesteps_are_cut_and_bounded():
 
 
 def test_schedules():
-    """The ends that the formulas give; the linear one is Ho et al.'s, stretched from 1000 to 1024
-    timesteps.
+    """The end points given by the formulas; the linear schedule is Ho et al.'s, rescaled from 1000
+    to 1024 timesteps.
     """
     cosine, linear = karras.cosine_alphas_cumprod(), karras.linear_alphas_cumprod()
     assert (

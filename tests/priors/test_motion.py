@@ -120,8 +120,8 @@ def test_offered_frames():
 
 @pytest.mark.slow
 def test_clip_chooses_the_frame_and_the_text_is_the_motion(options, monkeypatch):
-    """Scores by hand in place of CLIP's; the fifth of the offered bodies wins, the second frame of
-    the second motion.
+    """With given scores instead of CLIP's, the fifth of the bodies wins, the second frame of the
+    second motion.
     """
     asked = []
 
@@ -143,9 +143,7 @@ def test_clip_chooses_the_frame_and_the_text_is_the_motion(options, monkeypatch)
 
 @pytest.mark.slow
 def test_clip_itself_chooses(options, clip):
-    """The tiny CLIP's choice is arbitrary, but it is that of its own scores, and the same each
-    time.
-    """
+    """The tiny CLIP's choice is arbitrary, but follows its scores and is repeatable."""
     prior = MotionPrior(options | {"num_frames": 3, "sample": 0})
     cloud = prior("Iron man kicks")
     assert_valid(cloud)
@@ -205,8 +203,8 @@ def test_candidates_are_chosen_for_the_prompt(tmp_path, clip, monkeypatch):
 
 
 def test_pictures_show_the_front_and_both_sides():
-    """A plate that looks along +x fills the middle picture and is narrower in the others; the
-    background is white.
+    """A plate facing +x fills the middle image and is narrower in the others; the background is
+    white.
     """
     plate = trimesh.creation.box(extents=[0.02, 1, 1])
     front, side = (
@@ -223,7 +221,7 @@ def test_pictures_show_the_front_and_both_sides():
 # body in the world
 
 
-def test_a_body_turned_anywhere_looks_along_plus_x(body):
+def test_a_rotated_body_is_turned_to_face_plus_x(body):
     pose = torch.zeros(4, 24, 3, dtype=torch.float64)
     pose[:, 0, 1] = torch.tensor([0.0, 1.0, 2.5, -1.5])
     for joints in joints_of(body, pose):
@@ -235,15 +233,15 @@ def test_a_body_turned_anywhere_looks_along_plus_x(body):
         assert turned[15, 2] > turned[0, 2] > turned[7, 2]  # head up
 
 
-def test_a_body_that_lies_on_its_side_is_not_turned():
+def test_a_body_on_its_side_is_not_rotated():
     joints = np.zeros((22, 3))
     joints[[1, 16], 1], joints[[2, 17], 1] = 0.1, -0.1  # hips and shoulders above each other
     np.testing.assert_array_equal(facing(joints), np.eye(3))
 
 
 def test_face_front_and_the_released_axes(options):
-    """The motion turns to its left while the knee rises; without turning back it looks along +y at
-    the end.
+    """The body turns to its left while the knee rises; without facing the front it ends
+    facing +y.
     """
     front = MotionPrior(options | {"sample": 0, "frame": 5, "num_points": 0})("")
     free = MotionPrior(options | {"sample": 0, "frame": 5, "num_points": 0, "face_front": False})(

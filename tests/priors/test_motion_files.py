@@ -1,4 +1,4 @@
-"""Motion files are read without pickles; damaged ones are refused."""
+"""Motion files are read without pickles; damaged ones are rejected."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Point-E on tiny weights under the published names, and the Karras sampler against a case with a
+"""Point-E with tiny weights under the published names, and the Karras sampler on a case with a
 known answer.
 """
 
@@ -69,8 +69,8 @@ SHARED = both(
 
 
 def test_names_and_shapes_are_the_published_ones():
-    """By the configurations ``base40M-textvec`` and ``upsample`` that openai/point-e publishes
-    beside its weights.
+    """Those of the configurations ``base40M-textvec`` and ``upsample`` that openai/point-e
+    publishes.
     """
     with torch.device("meta"):
         base, upsampler = BaseModel().state_dict(), Upsampler().state_dict()
@@ -104,7 +104,7 @@ def test_normalisation_of_the_upsampler_is_the_published_one():
 
 @torch.no_grad()
 def test_the_transformer_is_its_formula():
-    """One block of two heads, written out in numpy."""
+    """One block of two heads, written in numpy."""
     torch.manual_seed(0)
     model = PointTransformer(width=16, layers=1, heads=2).double()
     x = torch.randn(1, 5, 16, dtype=torch.float64)
@@ -153,7 +153,7 @@ def test_points_have_no_order_and_conditions_matter():
 
 @torch.no_grad()
 def test_the_upsampler_sees_an_empty_image():
-    """256 equal tokens, of which softmax attention would tell the number."""
+    """256 equal tokens; softmax attention would depend on their number."""
     torch.manual_seed(0)
     upsampler, seen = Upsampler(64, 1, 40), []
     upsampler.ln_pre.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
@@ -209,7 +209,7 @@ def test_prompt_seed_and_guidance_matter(files, monkeypatch):
 
 
 def known_sample(files, monkeypatch, **options):
-    """The prior around networks that always give one point each: x, y, z and a colour, in the
+    """Return the prior with networks that always give one point each: x, y, z and a colour, in the
     networks' units.
     """
 

@@ -70,7 +70,7 @@ class TestPointCloud:
         return find("point-cloud-prior")({"path": str(path), **options})("")
 
     def written(self, folder, name):
-        """The three points in one of the supported formats."""
+        """Write the three points in one of the supported formats."""
         path = folder / name
         rows = np.concatenate([self.POINTS, self.BYTES], axis=1)
         if path.suffix == ".npz":
@@ -111,7 +111,7 @@ class TestPointCloud:
         cloud = self.read(self.written(tmp_path, "a.ply"), normalize=True, scale=0.5)
         np.testing.assert_allclose(cloud.points, (self.POINTS - [1, 1, 2]) / 4, atol=1e-6)
 
-    def test_turned(self, tmp_path):
+    def test_rotated_axes(self, tmp_path):
         cloud = self.read(self.written(tmp_path, "a.xyz"), up="+y", front="+z")
         np.testing.assert_allclose(cloud.points, self.POINTS[:, [2, 0, 1]], atol=1e-6)
         with pytest.raises(UserError, match="up axis"):

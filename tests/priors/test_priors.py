@@ -1,4 +1,4 @@
-"""Every registered prior keeps the same contract; then what each one does of its own."""
+"""Every registered prior satisfies one contract; then the specifics of each."""
 
 import functools
 import importlib
@@ -65,7 +65,7 @@ class TestFiles:
 
 
 class Given(Prior):
-    """A prior that gives what it was told."""
+    """A prior that returns given points."""
 
     def generate(self, prompt, generator):
         return self.cloud
@@ -207,7 +207,7 @@ class TestMesh:
 
 
 class TestBody:
-    def test_upright_recentred_and_really_random(self, assets):
+    def test_points_are_upright_centred_and_random(self, assets):
         cloud = build("body-prior", assets, num_points=50_000)("")
         np.testing.assert_allclose(cloud.points.mean(axis=0), 0, atol=1e-6)
         np.testing.assert_allclose(
@@ -227,14 +227,14 @@ class TestBody:
 
 
 class TestRandom:
-    def test_a_ball_is_filled_uniformly(self, assets):
+    def test_a_sphere_is_filled_uniformly(self, assets):
         points = build("random-prior", assets, num_points=20_000, size=0.7)("").points
         radii = np.linalg.norm(points, axis=1) / 0.7
         assert radii.max() <= 1
         # Kolmogorov-Smirnov at 0.1 %: the volume within a radius grows with its cube.
         assert np.abs(np.sort(radii**3) - np.linspace(0, 1, 20_000)).max() < 1.95 / np.sqrt(20_000)
 
-    def test_a_box(self, assets):
+    def test_a_box_mesh(self, assets):
         points = build("random-prior", assets, num_points=20_000, shape="box", size=0.7)("").points
         assert 0.69 < np.abs(points).max() <= 0.7 and points.std() == pytest.approx(
             0.7 / np.sqrt(3), rel=0.02

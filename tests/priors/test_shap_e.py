@@ -1,5 +1,5 @@
-"""Shap-E on tiny weights in the published files: files, sampling, the mesh, its place in the world,
-Cap3D's checkpoint.
+"""Shap-E with tiny weights in the published files: files, sampling, the mesh and its pose, Cap3D's
+checkpoint.
 """
 
 import numpy as np
@@ -36,7 +36,7 @@ def test_registered(folder):
 
 
 def world(values):
-    """Shap-E's (x, y, z) in the prior's world: -y is the front."""
+    """Convert Shap-E's (x, y, z) to the prior's world: -y is the front."""
     return np.array([-values[1], values[0], values[2]])
 
 
@@ -128,7 +128,7 @@ def test_latents_that_are_not_finite_are_a_message(folder):
 
 
 def test_text_condition_is_the_pipelines_own(folder):
-    """Without padding, and through our loading; diffusers pads to 77 tokens."""
+    """Without padding, and with our loading; diffusers pads to 77 tokens."""
     from diffusers import ShapEPipeline
 
     pipeline = ShapEPipeline.from_pretrained(folder)
@@ -149,9 +149,9 @@ def test_a_prompt_beyond_77_tokens_is_cut(folder):
 
 
 def test_our_sampler_agrees_with_the_pipelines(copy):
-    """With noise levels given to its scheduler and a network that ignores time (its timesteps have
-    fractions, ours none) and stays within [-1, 1] (it clamps after guidance, the published code
-    before): then both are one algorithm.
+    """With noise levels given to its scheduler and a network that ignores time (its timesteps are
+    fractional, ours are not) and stays within [-1, 1] (it clamps after guidance, the published code
+    before), both are one algorithm.
     """
     from diffusers import PriorTransformer, ShapEPipeline
 
@@ -179,7 +179,7 @@ def test_our_sampler_agrees_with_the_pipelines(copy):
 
 
 def test_what_the_scheduler_would_do_by_itself(folder):
-    """The reason for our own sampler: the levels that the module's text names."""
+    """The levels stated in the module's docstring, which are the reason for our own sampler."""
     from diffusers import HeunDiscreteScheduler
 
     scheduler = HeunDiscreteScheduler.from_pretrained(folder, subfolder="scheduler")
@@ -241,8 +241,8 @@ def test_no_prompt_is_the_second_half_of_the_condition():
     assert seen[0].tolist() == [[1.0] * 5, [0.0] * 5]
 
 
-def test_networks_are_gone_afterwards(folder):
-    """The Stable Diffusion that follows needs the memory."""
+def test_networks_are_freed(folder):
+    """Stable Diffusion, which is loaded next, needs the memory."""
     import gc
 
     from diffusers import ModelMixin

@@ -17,7 +17,7 @@ from threestudio_gaussiandreamer.priors.shap_e_checkpoint import load_original_p
 
 
 def to_original(state, heads=2):
-    """diffusers' names to OpenAI's, written apart from the code under test."""
+    """Map diffusers' names to OpenAI's, independently of the code under test."""
     original = {}
     for name, value in state.items():
         if name in ("clip_mean", "clip_std") or any(part in name for part in ("to_k.", "to_v.")):
@@ -53,7 +53,7 @@ def to_original(state, heads=2):
 
 @pytest.fixture
 def finetuned(tmp_path):
-    """A network, and its weights as Cap3D writes them: the training's other states beside them."""
+    """Return a network, and its weights as Cap3D saves them, with the training state."""
     torch.manual_seed(3)
     prior = tiny.shap_e_prior()
     path = tmp_path / "shapE_finetuned_with_330kdata.pth"
@@ -114,8 +114,8 @@ class OriginalShapE(PointTransformer):
 
 @torch.no_grad()
 def test_converted_weights_are_the_same_network(tmp_path):
-    """The names could be mapped onto each other wrongly both ways; so the original architecture
-    itself is the witness.
+    """Two wrong maps of the names could be inverse to each other, so the original architecture is
+    evaluated.
     """
     torch.manual_seed(5)
     original, loaded = OriginalShapE(), tiny.shap_e_prior()

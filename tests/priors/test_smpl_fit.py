@@ -1,4 +1,4 @@
-"""SMPL from joints: the user's body file, and poses that are known found again."""
+"""SMPL from joints: the user's body file, and the recovery of known poses."""
 
 import pickle
 import subprocess
@@ -31,8 +31,8 @@ def body(body_file):
 
 
 def random_poses(count, seed=0, spread=0.25):
-    """Poses within the limits: rotations of some ``spread`` radians, and those with limits
-    somewhere between them.
+    """Return poses within the limits: rotations of about ``spread`` radians, those with limits
+    uniformly between them.
     """
     rng = torch.Generator().manual_seed(seed)
     pose = spread * torch.randn(count, 24, 3, generator=rng, dtype=torch.float64)
@@ -84,7 +84,7 @@ def test_a_pkl_is_refused_and_the_conversion_works(tmp_path, body_file):
 
 
 def test_bodies_with_hands_are_read(tmp_path, body):
-    """SMPL-H and SMPL-X have other joints after the 22nd, and come as NPZ."""
+    """SMPL-H and SMPL-X have other joints after the 22nd, and are distributed as NPZ."""
     arrays, more = tiny.body_arrays(), 28
     vertices = len(arrays["v_template"])
     arrays["posedirs"] = np.zeros((vertices, 3, 9 * 51))
@@ -144,8 +144,8 @@ def test_known_poses_are_found(body, joints):
 
 
 def test_the_surface_is_where_the_body_was(body):
-    """Not the joints alone: the bones' twist is the prior's, and for thin tubes it hardly moves the
-    surface.
+    """Not only the joints: the twist of the bones follows from the prior, and hardly moves the
+    surface of thin tubes.
     """
     pose = random_poses(3, seed=1, spread=0.1)
     fit = fit_bodies(body, joints_of(body, pose))
@@ -174,7 +174,7 @@ def test_smplx_agrees_that_posed_joints_are_those_of_the_body(body):
 
 
 def test_knees_bend_forwards(body):
-    """A leg that is bent the wrong way is not followed."""
+    """A leg that is bent backwards is not fitted."""
     pose = torch.zeros(2, 24, 3, dtype=torch.float64)
     pose[0, 4, 0], pose[1, 4, 0] = 1.2, -1.2
     fit = fit_bodies(body, joints_of(body, pose))
@@ -182,8 +182,8 @@ def test_knees_bend_forwards(body):
     assert fit.pose[1, 4, 0] > -0.1 and fit.residuals[1].mean() > 5
 
 
-def test_a_pose_without_evidence_is_the_resting_one(body):
-    """Wrists, head and toes have nothing after them among 22 joints."""
+def test_unconstrained_joints_keep_the_rest_pose(body):
+    """Wrists, head and toes have no joints after them among the 22."""
     fit = fit_bodies(body, joints_of(body, random_poses(2))[:, :22])
     for joint in (10, 11, 15, 20, 21, 22, 23):
         assert fit.pose[:, joint].abs().max() < 1e-3
@@ -197,8 +197,8 @@ def test_mean_shape_without_fit_shape(body):
 
 
 def test_energys_gradient(body):
-    """Differences of an energy of 1e5 in steps of 1e-6 have errors of about 1e-16 * 1e5 / 1e-6 =
-    1e-5, its curvature larger ones.
+    """Finite differences of an energy of 1e5 with steps of 1e-6 have errors of about 1e-16 * 1e5 /
+    1e-6 = 1e-5; its curvature adds larger ones.
     """
     pose, shape, translation = (
         0.3 * torch.randn(2, *s, dtype=torch.float64) for s in ((24, 3), (10,), (3,))

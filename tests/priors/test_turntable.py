@@ -1,4 +1,4 @@
-"""The picture of a prior: what it shows, and the file."""
+"""The turntable of a prior: its images, and the file."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from threestudio_gaussiandreamer.priors.turntable import save_turntable, turntab
 
 @pytest.fixture
 def sphere():
-    """20,000 points around a far centre: red on the +x side, blue on the +y side beyond it, else
+    """Return 20,000 points around a distant centre: red on the +x side, blue on the +y side, else
     green.
     """
     rng = np.random.default_rng(0)

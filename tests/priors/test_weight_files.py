@@ -1,5 +1,5 @@
 """The files of 3D models: which are needed and may be read, in folders, the hub's cache and on the
-hub. Shown with Shap-E's.
+hub. Tested with Shap-E's.
 """
 
 import os
@@ -42,7 +42,7 @@ def test_an_incomplete_folder_is_named(copy, missing):
 
 
 def to_bin(folder, part="shap_e_renderer"):
-    """As the hub's main branch has this part: a pickle only."""
+    """Convert this part to a pickle only, as on the hub's main branch."""
     from safetensors.torch import load_file
 
     weights = folder / part / "diffusion_pytorch_model.safetensors"
@@ -108,7 +108,7 @@ def empty_cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def online(empty_cache, monkeypatch):
-    """The library believes that there is a hub."""
+    """Make the library assume that the hub is reachable."""
     from huggingface_hub import constants
 
     monkeypatch.setenv("HF_HUB_OFFLINE", "0")

@@ -1,4 +1,4 @@
-"""Fixtures of prompts."""
+"""Fixtures of the prompt tests."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What the tests of prompt processors share."""
+"""Helpers of the prompt processor tests."""
 
 from threestudio_gaussiandreamer.host import find
 

@@ -1,4 +1,4 @@
-"""A model that lists its words answers other words with a warning, and any text without a crash."""
+"""A model that lists its words gives a warning for other words, and accepts any text."""
 
 import shutil
 from pathlib import Path

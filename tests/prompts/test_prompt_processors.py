@@ -1,5 +1,5 @@
-"""Prompts with text encoders: against diffusers' own pipelines, the cache and its crashes,
-directions, Perp-Neg, the library.
+"""Prompts with text encoders: agreement with diffusers' pipelines, the cache, directions, Perp-Neg,
+the library.
 """
 
 import gc
@@ -34,7 +34,7 @@ def in_an_empty_folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def no_encoder(monkeypatch):
-    """From here on, running a text encoder is a failure."""
+    """Make running a text encoder a failure from here on."""
     for name in ("CLIPTextModel", "T5EncoderModel"):
         monkeypatch.setattr(
             f"transformers.{name}.from_pretrained",
@@ -70,8 +70,8 @@ def test_the_embeddings_are_those_of_diffusers_deep_floyd(models):
 
 
 def test_stable_diffusion_2_is_padded_as_it_was_trained(models):
-    """Its tokenizer pads with "!" (0); one of its two files says otherwise, and reading that one
-    would spoil every prompt.
+    """Its tokenizer pads with "!" (0); one of its two files contradicts this, and reading that one
+    would change every embedding.
     """
     from transformers import AutoTokenizer
 
@@ -130,7 +130,7 @@ def test_spawn_gives_the_same(models):
     assert torch.equal(here.text_embeddings_vd, there.text_embeddings_vd)
 
 
-def test_a_damaged_model_is_said(tmp_path):
+def test_a_damaged_model_is_reported(tmp_path):
     folder = tmp_path / "broken"
     tiny_models.stable_diffusion(folder)
     (folder / "text_encoder" / "model.safetensors").write_bytes(b"not safetensors")
@@ -243,7 +243,7 @@ def test_the_prompt_library(models, tmp_path, layout):
         processor(models, prompt="lib:bald_eagel")
 
 
-def test_a_library_that_is_none(models, tmp_path):
+def test_an_invalid_prompt_library(models, tmp_path):
     with pytest.raises(UserError, match="prompt library .*does not exist"):
         processor(models, prompt="lib:fox")
     (tmp_path / "library.json").write_text('{"a": 1}')
@@ -259,7 +259,7 @@ def test_a_library_that_is_none(models, tmp_path):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_missing_model_is_said_at_once(kind, tmp_path, monkeypatch):
+def test_a_missing_model_is_reported_at_once(kind, tmp_path, monkeypatch):
     tiny_models.nothing_cached(monkeypatch, tmp_path)
     with pytest.raises(UserError, match="hf download|no such folder"):
         processor({kind: tmp_path / "none"}, kind)

@@ -120,7 +120,7 @@ EMBEDDINGS = (
 
 def test_perp_neg_by_hand():
     """A view between front and side, one between side and back, one from above; the numbers are
-    worked out here.
+    computed here.
     """
     out = perp_neg_output()
     embeddings, weights = out.get_text_embeddings_perp_neg(

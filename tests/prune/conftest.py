@@ -1,4 +1,4 @@
-"""A file to prune."""
+"""Fixtures of the pruning tests."""
 
 import pytest
 

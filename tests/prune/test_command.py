@@ -1,5 +1,5 @@
-"""The prune command: budgets are met on unseen views, a second run changes nothing, and mistakes
-cost no work.
+"""The prune command: budgets are met on unseen views, a second run changes nothing, and wrong
+options are rejected before any work.
 """
 
 import json
@@ -148,7 +148,7 @@ def test_a_wrong_budget_is_refused_before_any_work(source, tmp_path, capsys, opt
     assert said in capsys.readouterr().err and not (tmp_path / "out.ply").exists()
 
 
-def test_a_name_of_the_input_that_is_too_long(source, tmp_path, capsys):
+def test_an_input_name_that_is_too_long(source, tmp_path, capsys):
     assert prune.main([f"{tmp_path}/{'x' * 300}.ply", str(source), "--count", "9"]) == 2
     assert "not a usable file name" in capsys.readouterr().err
 

@@ -19,7 +19,7 @@ from threestudio_gaussiandreamer.prune.options import (
         (39.99999999, 40.0, None),
     ],
 )
-def test_what_is_left_of_a_budget(asked, spent, left):
+def test_the_remaining_budget(asked, spent, left):
     assert remaining_psnr_budget(asked, spent) == (left and pytest.approx(left, abs=5e-3))
     assert left is None or combined_psnr(spent, left) == pytest.approx(asked, abs=2e-3)
 

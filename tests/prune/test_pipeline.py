@@ -17,8 +17,8 @@ from threestudio_gaussiandreamer.prune.pipeline import constant_sh_limit, views_
 from threestudio_gaussiandreamer.splatting import rasterize
 
 
-def test_what_a_format_costs_is_spent_too(tmp_path):
-    """Also where the budget has been spent already, and where a count drops nothing."""
+def test_the_rounding_of_the_format_counts_towards_the_budget(tmp_path):
+    """Also if the budget is already used up, and if a count removes nothing."""
     bright = ball()
     bright.sh[:] *= 6
     write_gaussians(tmp_path / "in.ply", bright.arrays())
@@ -81,7 +81,7 @@ def test_a_checkpoint_is_read(tmp_path):
 
 
 def gsplats_names(cloud):
-    """The values of ``cloud`` under the names of gsplat's checkpoints."""
+    """Return the values of ``cloud`` under the names of gsplat's checkpoints."""
     return {
         "means": cloud.means,
         "quats": cloud.quats,
@@ -214,7 +214,7 @@ def test_views_turn_with_the_axes_of_the_file(tmp_path):
 
 
 def test_recovered_colours_stay_in_the_range_that_viewers_show():
-    """In [0, 1], in what the input has beyond it, and in what the file holds."""
+    """In [0, 1], in the input's range if that is larger, and in the format's range."""
     shown = 0.5 / C0
     cloud = ball()._replace(sh=torch.full((2, 1, 3), 0.3))
     assert constant_sh_limit(cloud, ".ply") == pytest.approx(shown)

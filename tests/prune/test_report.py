@@ -1,4 +1,4 @@
-"""The report is written whole or not at all."""
+"""The report is written completely or not at all."""
 
 import errno
 import json

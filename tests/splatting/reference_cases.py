@@ -1,4 +1,4 @@
-"""What the tests of reference share."""
+"""Helpers of the specification tests."""
 
 SPECIFICATION = {"backend": "reference"}
 

@@ -1,4 +1,4 @@
-"""The public function: what it accepts, what it refuses and how it says so, and who computes."""
+"""The public function: what it accepts and rejects, its messages, and the choice of the backend."""
 
 import logging
 import typing
@@ -51,7 +51,7 @@ def test_shapes_of_what_comes_back():
 
 @jaxtyping.jaxtyped(typechecker=None)
 def check_shapes(values: dict, hints: dict) -> None:
-    """Every tensor fits its annotation, and names such as N mean one size throughout."""
+    """Check every tensor against its annotation, with one size per name such as N."""
     for name, value in values.items():
         annotation = next(
             (a for a in typing.get_args(hints[name]) if a is not type(None)), hints[name]

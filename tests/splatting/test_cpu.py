@@ -1,5 +1,5 @@
-"""The native kernel against the float64 specification, in every build this machine can run: same
-pictures, same gradients, same bits.
+"""The CPU kernel against the float64 specification, in every build that this machine can run: equal
+images, gradients and bits.
 """
 
 import os
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(cpu.unavailable() is not None, reason=str(cpu.un
 
 @pytest.fixture
 def force(monkeypatch):
-    """A function that makes one build answer."""
+    """Return a function that selects one build."""
 
     def force(name):
         monkeypatch.setenv("GAUSSIANDREAMER_ISA", name)
@@ -53,9 +53,7 @@ class TestCpuKernel(KernelContract):
 
 @pytest.mark.parametrize("views", [1, 3])
 def test_the_number_of_threads_changes_no_bit(isa, views):
-    """Also not when there are more Gaussians than one task takes, or more threads than views; twice
-    each.
-    """
+    """Also with more Gaussians than one task takes, or more threads than views; twice each."""
     cloud, camera = random_cloud(9000, seed=10, size=0.03), cameras(views, 150, 90)
     background, threads, results = torch.tensor([0.2, 0.5, 0.9]), torch.get_num_threads(), []
     try:
@@ -72,9 +70,9 @@ def test_the_number_of_threads_changes_no_bit(isa, views):
 # ---- as a torch function -------------------------------------------------------------------------
 
 
-def test_backward_gives_the_memory_back(monkeypatch):
-    """What a backward pass needed goes with the saved tensors, not with the last tensor of the
-    graph.
+def test_backward_frees_its_memory(monkeypatch):
+    """The buffers of a backward pass are freed with the saved tensors, not with the graph's last
+    tensor.
     """
     states, as_tensor = weakref.WeakSet(), cpu._State.as_tensor
     monkeypatch.setattr(cpu._State, "as_tensor", lambda self: states.add(self) or as_tensor(self))
@@ -91,7 +89,7 @@ def test_backward_gives_the_memory_back(monkeypatch):
 
 
 def test_the_library_is_used_from_several_threads_at_once():
-    """Autograd and data loaders have threads of their own."""
+    """Autograd and data loaders use their own threads."""
     clouds = [random_cloud(200, seed=n) for n in range(4)]
     alone = [draw("cpu", cloud, cameras(2, 60, 40), 60, 40) for cloud in clouds]
     with ThreadPoolExecutor(4) as pool:
@@ -103,7 +101,7 @@ def test_the_library_is_used_from_several_threads_at_once():
 
 
 def run_python(text):
-    """Whatever can end a process, or forbid it something, happens in another one."""
+    """Run code that may end the process, or changes its limits, in another one."""
     scene = """
         import os, resource, signal, sys, torch
         from tests.helpers.splatting_scenes import cameras, random_cloud
@@ -129,7 +127,7 @@ def run_python(text):
 
 @pytest.mark.slow
 def test_a_forked_process_draws_with_threads_of_its_own():
-    """The parent's threads aren't in it, and what they held at that moment nobody lets go."""
+    """The parent's threads don't exist in it, and locks that they held are never released."""
     done = run_python("""
         for _ in range(100):
             draw()
@@ -145,7 +143,7 @@ def test_a_forked_process_draws_with_threads_of_its_own():
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_without_more_threads_those_that_there_are_do_the_work():
-    """A limit on processes or on address space, which a thread's stack takes."""
+    """With a limit on processes or on address space, which the stack of a thread needs."""
     done = run_python("""
         pages = int(open("/proc/self/statm").read().split()[0])
         resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 6 * 2**20,) * 2)
@@ -161,9 +159,7 @@ def test_denormals_of_the_process_are_not_flushed(isa):
 
 
 def test_more_memory_than_there_is_is_a_named_error():
-    """2.6e9 pairs of Gaussian and tile: more than 32 bits count, and more than any machine should
-    try.
-    """
+    """2.6e9 pairs of Gaussian and tile: beyond 32 bits, and beyond the memory of any machine."""
     cloud, camera = (
         random_cloud(40_000).to(torch.float32)._replace(scales=torch.full((40_000, 3), 1e3)),
         cameras(1, 8192, 8192, dtype=torch.float32),
@@ -192,7 +188,7 @@ def test_without_a_library_it_says_what_to_do(monkeypatch, tmp_path):
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
 def test_the_formulas_need_no_standard_header_and_work_on_single_floats(tmp_path):
-    """The CUDA kernels include the same header, compiled where no standard library is."""
+    """The CUDA kernels include the same header, without a standard library."""
     source = tmp_path / "one.cpp"
     source.write_text(
         '#include "splat_math.h"\nfloat f(splat::Vec3<float> u, splat::Vec3<float> v) { return '

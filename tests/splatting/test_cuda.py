@@ -1,8 +1,9 @@
-"""The CUDA backend without a GPU: its kernels run on the host, thread by thread, against the
-float64 specification.
+"""The CUDA backend in emulation: its kernels run on the host, thread by thread, against the float64
+specification.
 
-`cuda_shim/device.py` stands in for the GPU and runs the text that NVRTC compiles; the Python
-around it is the product's, too."""
+`cuda_shim/device.py` replaces the GPU and runs the source that NVRTC compiles; the Python code
+around it is the package's own.
+"""
 
 import pytest
 import torch
@@ -22,8 +23,8 @@ pytestmark = pytest.mark.skipif(unavailable() is not None, reason=str(unavailabl
 
 @pytest.fixture(autouse=True)
 def device(monkeypatch):
-    """The backend on tensors of the CPU, on a device that tests may exchange; nothing learnt from
-    earlier calls.
+    """Return the backend on CPU tensors, with a device that tests may replace; nothing is learnt
+    from earlier calls.
     """
     devices = [HostDevice()]
     monkeypatch.setitem(
@@ -52,7 +53,7 @@ class TestCudaKernels(KernelContract):
 
 
 def scene(device, cloud=None, **options):
-    """A picture of 3 x 2 tiles per view with everything in it, on a fresh device."""
+    """Render 3 x 2 tiles per view with all features, on a new device."""
     device(**options)
     cloud = random_cloud(300, seed=8, size=0.1) if cloud is None else cloud
     return draw(
@@ -65,7 +66,7 @@ def same(a, b) -> bool:
 
 
 def opaque_cloud() -> Cloud:
-    """Every tile sees the first of its chunks only."""
+    """Return a cloud of which every tile needs the first chunk only."""
     cloud = random_cloud(500, seed=9, size=0.9)
     return cloud._replace(opacities=torch.full_like(cloud.opacities, 0.99))
 
@@ -75,14 +76,14 @@ CLOUDS = {"thin": None, "opaque": opaque_cloud()}
 
 @pytest.mark.parametrize("cloud", CLOUDS.values(), ids=CLOUDS)
 def test_the_order_of_the_threads_changes_no_bit(device, cloud):
-    """A barrier that is missing, or a sum in the order of arrival, would show."""
+    """Detects a missing barrier, and sums in the order of arrival."""
     one, *others = (scene(device, cloud, order=order) for order in (*ORDERS, "forward"))
     assert all(same(one, other) for other in others)
 
 
 @pytest.mark.parametrize("cloud", CLOUDS.values(), ids=CLOUDS)
 def test_nothing_is_read_before_it_is_written(device, monkeypatch, cloud):
-    """Torch fills what it allocates with NaN, the stand-in the shared memory."""
+    """Torch fills allocations with NaN, the emulation shared memory."""
     plain = scene(device, cloud)
     monkeypatch.setattr(torch.utils.deterministic, "fill_uninitialized_memory", True)
     torch.use_deterministic_algorithms(True)
@@ -96,7 +97,7 @@ def test_nothing_is_read_before_it_is_written(device, monkeypatch, cloud):
 
 
 @pytest.mark.parametrize("kernel", ["faulty_barrier", "faulty_race"])
-def test_the_stand_in_shows_faults(kernel):
+def test_the_emulation_detects_faults(kernel):
     out = {order: torch.zeros(64, dtype=torch.int32) for order in ORDERS}
     try:
         for order in ORDERS:
@@ -112,7 +113,7 @@ def test_the_stand_in_shows_faults(kernel):
 
 @pytest.fixture
 def lists(monkeypatch):
-    """Those of every picture drawn."""
+    """Record the lists of every render."""
     drawn, draw = [], cuda._draw
     monkeypatch.setattr(
         cuda, "_draw", lambda *arguments: drawn.append(draw(*arguments)) or drawn[-1]
@@ -123,8 +124,8 @@ def lists(monkeypatch):
 def test_a_picture_that_needs_more_room_than_expected_is_right_to_the_bit(
     device, monkeypatch, lists
 ):
-    """Drawn without lists, differentiated with whole ones; once the number has arrived there is
-    room.
+    """Rendered without lists, differentiated with complete ones; when the count has arrived, the
+    capacity suffices.
     """
     monkeypatch.setattr(cuda_memory, "STEP", 64)
     known = scene(device)
@@ -155,8 +156,8 @@ def test_only_the_first_picture_of_a_size_waits(device):
     assert host.waits == 5
 
 
-def test_room_follows_what_is_needed():
-    """Up at once, down slowly, and in proportion to the Gaussians."""
+def test_capacity_follows_the_count():
+    """Up at once, down slowly, and proportional to the Gaussians."""
     estimate, host = cuda_memory.CapacityEstimate(views=2), HostDevice()
 
     def room(*totals, gaussians=1000):
@@ -171,8 +172,8 @@ def test_room_follows_what_is_needed():
 
 @pytest.mark.parametrize("most", [1500, 900])
 def test_short_memory_means_fewer_views_at_a_time(device, monkeypatch, most):
-    """Three views have 1904 intersections, each of them about 600. The same bits; the second call
-    doesn't even try all at once.
+    """Three views have 1904 intersections, about 600 each. The bits are the same, and the second
+    call doesn't try all at once.
     """
     monkeypatch.setattr(cuda_memory, "STEP", 64)
     known, tries = scene(device), []

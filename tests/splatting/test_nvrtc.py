@@ -1,5 +1,5 @@
-"""The CUDA kernels compile for every architecture without spilling, are compiled once, and are
-handed to the driver as it wants.
+"""The CUDA kernels compile for every architecture without spilling, are cached, and are loaded by
+the driver.
 """
 
 import contextlib
@@ -35,7 +35,7 @@ def cache(monkeypatch, tmp_path):
 
 @pytest.fixture
 def compiled(monkeypatch):
-    """The units that are compiled from now on."""
+    """Record the units that are compiled from now on."""
     units, compile_unit = [], nvrtc.compile_unit
     monkeypatch.setattr(
         nvrtc, "compile_unit", lambda unit, target: units.append(unit) or compile_unit(unit, target)
@@ -51,7 +51,7 @@ def units():
 
 
 def properties(log: str) -> dict[str, dict[str, int]]:
-    """By kernel: registers, shared bytes, spilled bytes and stack."""
+    """Return registers, shared bytes, spilled bytes and stack of each kernel."""
     found = {}
     for name, text in re.findall(
         r"Compiling entry function '(\w+)'(.*?)(?=Compiling entry function|\Z)", log, re.DOTALL
@@ -72,7 +72,7 @@ def properties(log: str) -> dict[str, dict[str, int]]:
 @needs_nvrtc
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_every_kernel_compiles_without_spills(architecture):
-    """And three blocks of each fit on a multiprocessor by their registers."""
+    """Three blocks of each fit on a multiprocessor by their registers."""
     seen = set()
     for unit in units():
         code, log = nvrtc.compile_unit(unit, f"sm_{architecture}")
@@ -90,7 +90,7 @@ def test_every_kernel_compiles_without_spills(architecture):
 
 @needs_nvrtc
 def test_shared_memory_is_read_four_floats_at_a_time():
-    """In PTX, which is what a device newer than the compiler gets."""
+    """In PTX, which a device newer than the compiler gets."""
     forward, backward = (
         nvrtc.compile_unit(unit, "compute_80").code.decode() for unit in ("blend", "blend_backward")
     )
@@ -150,7 +150,7 @@ def test_without_a_compiler_it_says_what_to_install(monkeypatch):
 
 
 def test_the_release_that_torch_was_built_with_is_tried_first(monkeypatch, tmp_path):
-    """Both may be installed; a driver of CUDA 12 can't load what the NVRTC of CUDA 13 makes."""
+    """Both may be installed; a driver of CUDA 12 can't load what the NVRTC of CUDA 13 produces."""
     for place in (
         "cu13/lib/libnvrtc.so.13",
         "cuda_nvrtc/lib/libnvrtc.so.12",
@@ -200,7 +200,7 @@ def test_a_cache_that_cannot_be_written_costs_time_only(tmp_path, monkeypatch, c
 
 @needs_nvrtc
 def test_a_user_without_a_home_compiles_at_every_start(monkeypatch, compiled, caplog):
-    """In a container whose number of a user nobody knows."""
+    """In a container whose user id has no entry."""
     for variable in ("GAUSSIANDREAMER_CACHE", "XDG_CACHE_HOME", "HOME"):
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.setattr(os, "getuid", lambda: 2**31 - 7)
@@ -243,8 +243,8 @@ def test_the_cache_is_where_the_user_keeps_caches(monkeypatch):
 
 @pytest.fixture
 def driver(monkeypatch, cache):
-    """A driver that runs kernels on the host, and a torch that sees one GPU of compute capability
-    9.0.
+    """Provide a driver that runs kernels on the host, and a torch that sees one GPU of compute
+    capability 9.0.
     """
     if unavailable() is not None:
         pytest.skip(unavailable())
@@ -282,8 +282,8 @@ def driver(monkeypatch, cache):
 
 @needs_nvrtc
 def test_a_picture_by_way_of_the_driver(driver, monkeypatch, compiled):
-    """Compiled, loaded, launched in autograd's thread too: the same bits as the torch backend's
-    within rounding.
+    """Compiled, loaded, and launched, in autograd's thread too: equal to the torch backend within
+    rounding.
     """
     monkeypatch.setitem(
         backends.BACKENDS,

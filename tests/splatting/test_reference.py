@@ -1,5 +1,5 @@
-"""The specification against closed forms, hand-written numpy, finite differences, and an
-implementation that isn't ours.
+"""The specification against closed forms, numpy loops, finite differences, and an independent
+implementation.
 """
 
 import math
@@ -38,7 +38,7 @@ def draw(cloud, camera, width, height, **options):
 
 
 def test_one_gaussian_is_the_pinhole_image_of_its_ellipse():
-    """Ahead on the axis, J is diagonal: variances (f s / z)^2 + eps2d, no correlation."""
+    """On the axis, J is diagonal: variances (f s / z)^2 + eps2d, no correlation."""
     focal, z = 40.0, 2.0
     cloud = one_gaussian((0.0, 0.0, z), (0.1, 0.2, 0.3), 0.6)
     out = draw(cloud, front_camera(16, 12, focal), 16, 12, **NO_CUTOFFS)
@@ -76,7 +76,7 @@ def test_the_jacobian_is_clamped_30_percent_beyond_the_image(side, beyond):
 
 
 def by_hand(cloud: Cloud, viewmat, K, width, height, alpha_min, alpha_max, stop, eps2d=0.3):
-    """Loops over pixels and Gaussians with textbook matrices: rotation by Rodrigues, covariance
+    """Loop over pixels and Gaussians with textbook matrices: rotation by Rodrigues, covariance
     inverted by numpy.
     """
     means, quats, scales, opacities, colors = (x.numpy() for x in cloud)
@@ -161,7 +161,7 @@ def test_permuting_gaussians_of_different_depth_permutes_the_results():
 
 
 def test_a_circle_stays_round_on_a_wide_image():
-    """stability.md F17: the same focal length in both directions whatever the aspect ratio."""
+    """stability.md F17: one focal length for both axes at any aspect ratio."""
     out = draw(one_gaussian(scale=0.2), front_camera(64, 32, 40.0), 64, 32, **NO_CUTOFFS)
     alpha = out.alpha[0, ..., 0].numpy()
     y, x = np.mgrid[:32, :64] + 0.5
@@ -218,7 +218,7 @@ def test_downsampling_is_the_mean_of_boxes():
 
 
 def test_radii_bound_what_is_drawn():
-    """Everything at alpha >= alpha_min lies within the radius, which is tight along one axis."""
+    """All pixels with alpha >= alpha_min are within the radius, which is tight along one axis."""
     out = draw(
         one_gaussian((0.1, -0.05, 2.0), (0.3, 0.1, 0.1), 0.9),
         front_camera(64, 64, 40.0),
@@ -234,8 +234,8 @@ def test_radii_bound_what_is_drawn():
 
 
 def test_fog_needs_the_accurate_preset():
-    """2000 Gaussians of opacity 0.0038 on the same pixels: below 1/255, so `fast` shows nothing at
-    all (stability.md A1).
+    """2000 Gaussians of opacity 0.0038 on the same pixels: below 1/255, so `fast` renders nothing
+    (stability.md A1).
     """
     cloud = random_cloud(2000, seed=8, size=0.4)._replace(
         opacities=torch.full((2000,), 0.0038, dtype=torch.float64)
@@ -257,7 +257,7 @@ def test_fog_needs_the_accurate_preset():
     "n, antialias, fast", [(1, False, False), (3, True, False), (12, False, True), (30, True, True)]
 )
 def test_gradients_of_all_inputs_equal_finite_differences(n, antialias, fast):
-    """gradcheck in float64, cut-offs off: attributes, background and cameras, through image, alpha
+    """gradcheck in float64, cutoffs off: attributes, background and cameras, through image, alpha
     and depth.
     """
     cloud, (viewmats, Ks) = random_cloud(n, seed=n, size=0.3), cameras(2, 5, 4)
@@ -297,7 +297,7 @@ def test_gradients_around_the_clamp_of_the_jacobian(limits):
 
 
 def test_no_gradient_flows_through_the_cap():
-    """Where opacity * G exceeds alpha_max the image doesn't move, and neither may the gradient
+    """Where opacity * G exceeds alpha_max the image is constant, so the gradient is zero
     (stability.md F3).
     """
     cloud = one_gaussian((0.03, 0.0, 2.0), 5.0, 0.95)

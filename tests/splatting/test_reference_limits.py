@@ -1,4 +1,4 @@
-"""What the specification can't draw, and an implementation that we didn't write."""
+"""Non-finite and degenerate inputs of the specification, and an independent implementation."""
 
 import math
 import sys
@@ -16,9 +16,9 @@ from threestudio_gaussiandreamer.splatting.projection import quats_to_rotations
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", scenes.NAMES)
-def test_a_gaussian_that_is_not_finite_is_as_if_it_weren_t_there(name, value):
-    """Pixels and gradients are the same bits as with a transparent Gaussian in its place; its own
-    are zeros, not NaN.
+def test_a_non_finite_gaussian_equals_a_transparent_one(name, value):
+    """Pixels and gradients have the same bits as with a transparent Gaussian instead; its own
+    gradients are zeros, not NaN.
     """
     cloud, camera = scenes.random_cloud(15, seed=12), scenes.cameras(2, 8, 6)
     transparent = scenes.Cloud(*(x.clone() for x in cloud))
@@ -71,7 +71,7 @@ def test_at_or_behind_the_camera_or_absurdly_far(mean):
     assert all((with_it.grads[name][0] == 0).all() for name in scenes.NAMES)
 
 
-def test_a_camera_that_is_not_finite_spoils_its_own_view_only():
+def test_a_non_finite_camera_affects_its_own_view_only():
     cloud, (viewmats, Ks) = scenes.random_cloud(10, seed=13), scenes.cameras(2, 6, 5)
     background = torch.tensor([0.3, 0.5, 0.7], dtype=torch.float64)
     broken = viewmats.clone()
@@ -87,7 +87,7 @@ def test_a_camera_that_is_not_finite_spoils_its_own_view_only():
 
 @pytest.mark.parametrize("backend", ["reference", "torch"])
 @pytest.mark.parametrize("place", [(0, 0), (0, 2)])
-def test_a_camera_whose_numbers_overflow_spoils_its_own_view_only(place, backend):
+def test_a_camera_that_overflows_affects_its_own_view_only(place, backend):
     cloud, (viewmats, Ks) = (
         scenes.random_cloud(10, seed=13).to(torch.float32),
         scenes.cameras(2, 6, 5, dtype=torch.float32),
@@ -170,8 +170,8 @@ def test_float32_keeps_every_needle_and_disc_that_float64_keeps():
 
 @pytest.fixture
 def gsplat(monkeypatch):
-    """gsplat's plain-torch twins; the two functions of nerfacc that they call, CUDA only there, in
-    plain torch here.
+    """Import gsplat's plain-torch functions; the two CUDA-only functions of nerfacc that they call
+    are replaced by plain torch.
     """
     torch_impl = pytest.importorskip("gsplat.cuda._torch_impl", reason="pip install gsplat")
 
@@ -197,8 +197,8 @@ def gsplat(monkeypatch):
 
 @pytest.mark.parametrize("antialias", [False, True])
 def test_gsplat_draws_the_same_and_has_the_same_gradients(gsplat, antialias):
-    """Its alphas: cap .999 and threshold 1/255 (our preset fast). Its stop is exclusive, ours
-    isn't, so it is off here.
+    """With its cap .999 and threshold 1/255 (our preset fast). Its early termination is exclusive,
+    ours is not, so it is off here.
     """
     width, height, views = 10, 8, 2
     cloud = scenes.random_cloud(25, seed=14, size=0.25)
@@ -232,8 +232,8 @@ def test_gsplat_draws_the_same_and_has_the_same_gradients(gsplat, antialias):
 
 
 def pairs_of_gsplat(means2d, conics, opacities, depths, width, height):
-    """(Gaussian, pixel, image) of every alpha >= 1/255, by image, pixel, depth: what its CUDA
-    helper would return.
+    """Return (Gaussian, pixel, image) of every alpha >= 1/255, by image, pixel, depth, as its CUDA
+    helper would.
     """
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     d = torch.stack([x, y], -1).reshape(1, -1, 1, 2) - means2d[:, None]

@@ -1,5 +1,5 @@
-"""The tiled torch backend against the specification: same numbers, bounded memory, whatever the
-cloud.
+"""The tiled torch backend against the specification: equal values in bounded memory, for
+any cloud.
 """
 
 import math
@@ -79,10 +79,8 @@ def test_channels_shared_or_per_view(channels, per_view):
     compare(cloud, scenes.cameras(3, 14, 10), 14, 10)
 
 
-def test_views_do_not_see_each_other():
-    """A batch is bit for bit the views drawn alone, as far as the projection in one call allows:
-    rounding.
-    """
+def test_views_are_independent():
+    """A batch equals its views rendered alone, up to the rounding of a joint projection."""
     cloud, (viewmats, Ks) = scenes.random_cloud(200, seed=3), scenes.cameras(4, 20, 12)
     batch = scenes.run(cloud, viewmats, Ks, 20, 12, backend="torch").out
     for view in range(4):
@@ -199,7 +197,7 @@ def test_gradcheck(n, antialias):
 
 def test_ten_thousand_gaussians_on_one_pixel():
     """Float32 gradients of a deep stack: T is never divided by (1 - alpha) along the list, so
-    nothing drifts (bar: 1e-4).
+    errors do not accumulate (bar: 1e-4).
     """
     camera = scenes.front_camera(3, 3, 4.0)
     for stack in scenes.stacks_on_one_pixel():
@@ -220,7 +218,7 @@ def test_the_gaussian_that_crosses_the_stop_counts():
 
 
 def test_a_pixel_behind_an_alpha_of_one_has_finite_gradients():
-    """1 / (1 - alpha) is infinite there; nothing behind can be seen, so its share is left out."""
+    """1 / (1 - alpha) is infinite there; what is behind is invisible, so its share is zero."""
     cloud = scenes.Cloud(
         *(x.repeat(3, *[1] * (x.dim() - 1)) for x in scenes.one_gaussian(opacity=1.0))
     ).to(torch.float32)

@@ -1,4 +1,4 @@
-"""How the torch backend works: tiles, blocks, threads."""
+"""Internals of the torch backend: tiles, blocks, threads."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ from threestudio_gaussiandreamer.splatting.projection import project
 
 
 def test_small_budgets_change_nothing(monkeypatch):
-    """Many slices, tests, blocks, steps and parts of the projection: the paths that only large
+    """Many slices, tests, blocks, steps and parts of the projection: code paths that only large
     scenes take.
     """
     cloud, camera = random_cloud(120, seed=7, size=0.3), cameras(2, 37, 29)
@@ -42,7 +42,9 @@ def test_small_budgets_change_nothing(monkeypatch):
 
 
 def test_blocks_and_saved_tensors_are_bounded(monkeypatch):
-    """Nothing of the size pixels x splats is kept for backward, and no block exceeds its budget."""
+    """No tensor of the size pixels x splats is kept for backward, and no block exceeds
+    its budget.
+    """
     cloud, camera = random_cloud(400, seed=8, size=1.0), cameras(1, 64, 64)
     sizes, saved = [], []
     original = torch_backend._block
@@ -62,9 +64,9 @@ def test_blocks_and_saved_tensors_are_bounded(monkeypatch):
     assert sum(saved) < 400_000
 
 
-def test_finished_tiles_leave(monkeypatch):
-    """3000 nearly opaque splats on every pixel: T < 1e-4 behind the second, so one step is enough
-    in both directions.
+def test_finished_tiles_are_skipped(monkeypatch):
+    """3000 nearly opaque splats on every pixel: T < 1e-4 behind the second, so one step suffices in
+    both passes.
     """
     cloud = Cloud(
         *(x.repeat(3000, *[1] * (x.dim() - 1)) for x in one_gaussian(scale=10.0, opacity=0.998))

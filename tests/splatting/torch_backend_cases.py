@@ -1,4 +1,4 @@
-"""What the tests of torch backend share."""
+"""Helpers of the torch backend tests."""
 
 import torch
 
@@ -13,7 +13,7 @@ ROUNDING = 1e-9
 
 
 def compare(cloud, camera, width, height, **options):
-    """Both in float64, every output and every gradient."""
+    """Compare every output and every gradient in float64."""
     ours, truth = (
         run(cloud, *camera, width, height, camera_gradient=True, backend=b, **options)
         for b in ("torch", "reference")

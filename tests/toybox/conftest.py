@@ -1,4 +1,4 @@
-"""What the tests of the toybox share: a small world, and a folder with trained stages."""
+"""Fixtures of the toybox tests: a small world, and a folder with trained stages."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from threestudio_gaussiandreamer.toybox import loop, models, views
 
 @pytest.fixture(scope="module")
 def small_world():
-    """Make pictures few and networks small, so that a step takes milliseconds."""
+    """Make images few and networks small, so that a step takes milliseconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(models, "UNET_CHANNELS", (16, 32))
         patch.setattr(models, "VAE_CHANNELS", (8, 8, 8, 8))

@@ -1,4 +1,6 @@
-"""The toybox's models in the published formats: the package's own parts load them as any model."""
+"""The toybox's models in the published formats: the package's own parts load them like
+any model.
+"""
 
 import json
 
@@ -116,7 +118,7 @@ def test_the_point_e_prior_loads_the_points_model(exported, trained):
     )
 
 
-def test_the_record_says_what_was_seen(exported):
+def test_the_record_lists_what_was_tested(exported):
     record = json.loads((exported / "training.json").read_text())
     assert set(record) == set(STAGES)
     assert record["clip"]["images"] == 8 and record["unet"]["steps"] == 1
@@ -150,6 +152,6 @@ def test_no_weights_are_said(tmp_path):
         warm_start.start_from(tmp_path, options(tmp_path), STAGES)
 
 
-def test_an_untrained_folder_is_said(tmp_path, capsys):
+def test_an_untrained_folder_is_reported(tmp_path, capsys):
     assert main([str(tmp_path / "nothing"), str(tmp_path / "models")]) == 2
     assert "train the stage 'clip' first" in capsys.readouterr().err

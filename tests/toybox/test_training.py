@@ -1,4 +1,4 @@
-"""Every stage of the toybox's training: it learns, resumes exactly, and says what is wrong."""
+"""Every stage of the toybox's training learns, resumes exactly, and reports errors."""
 
 import signal
 
@@ -210,7 +210,7 @@ def test_points_go_to_point_es_units_and_back():
     assert torch.allclose(points_stage.network_units(front)[0, :, 0], expected, atol=1e-6)
 
 
-def test_what_a_prompt_cannot_say_is_no_label(folder):
+def test_only_attributes_that_prompts_name_are_labels(folder):
     batch = next(STAGES["clip"](options(folder)).batches(0))
     labels = text_labels(batch._replace(has_text=torch.ones(4, dtype=torch.bool)))
     quadrant = list(LABELS).index("quadrant")
@@ -227,7 +227,7 @@ def test_what_a_prompt_cannot_say_is_no_label(folder):
         ("autoencoder", "unet", "encoder.", "decoder."),
     ],
 )
-def test_what_others_are_trained_on_no_longer_changes(folder, tmp_path, name, user, prefix, free):
+def test_networks_that_others_depend_on_are_frozen(folder, tmp_path, name, user, prefix, free):
     place = copied(folder, tmp_path / "run")
     training(place, user).run(4)
     before = loop.averaged_weights(place, name)

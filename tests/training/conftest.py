@@ -1,4 +1,4 @@
-"""The object that the runs of this folder are about."""
+"""The mesh that the runs of these tests reconstruct."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 
 @pytest.fixture(scope="module")
 def painted_box(tmp_path_factory):
-    """A box whose six sides have six colours, as a GLB."""
+    """Write a box whose six sides have six colours, as a GLB."""
     import trimesh
 
     box = trimesh.creation.box(extents=(1.0, 1.6, 1.2))

@@ -1,5 +1,5 @@
 """Runs of a few steps through the launcher: against the painted box of ``conftest.py``, or with a
-mocked guidance (copy this one for your own).
+mock guidance (copy it for your own tests).
 """
 
 from dataclasses import dataclass
@@ -46,9 +46,7 @@ class _Config(BaseObject.Config):
 
 @register("test-mock-guidance")
 class MockGuidance(BaseObject):
-    """threestudio's call: pulls every render towards one colour. A score model in your tests looks
-    like this.
-    """
+    """threestudio's interface: pulls every render towards one colour."""
 
     Config = _Config
 
@@ -90,7 +88,7 @@ def same(a, b):
 
 
 def mocked_config(folder, mesh, **system):
-    """The demo's YAML with the mock in the place of its guidance."""
+    """Return the demo's YAML with the mock as its guidance."""
     cfg = yaml.safe_load((CONFIGS / "demo.yaml").read_text())
     cfg["system"] |= {"guidance_type": "test-mock-guidance", "guidance": {}, **system}
     cfg["system"]["geometry"]["prior"]["path"] = str(mesh)

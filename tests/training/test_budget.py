@@ -1,4 +1,4 @@
-"""Runs under a budget: what they say, and how many Gaussians they end with."""
+"""Runs under a budget: their messages, and the number of Gaussians at the end."""
 
 import csv
 import re
@@ -10,8 +10,8 @@ from threestudio_gaussiandreamer.launch.experiment import main
 
 
 @pytest.mark.slow
-def test_a_budget_without_a_round_to_come_says_so(tmp_path, painted_box, capsys):
-    """Also of a run that goes on where its rounds are over."""
+def test_a_budget_without_remaining_rounds_gives_a_warning(tmp_path, painted_box, capsys):
+    """Also if a run is resumed after its rounds."""
     steps = ["trainer.max_steps=7", "trainer.val_check_interval=7"]
     assert launch(tmp_path, painted_box, *PRUNE, *steps) == 0
     assert "no round of pruning" not in "".join(capsys.readouterr())
@@ -30,8 +30,8 @@ def test_a_budget_without_a_round_to_come_says_so(tmp_path, painted_box, capsys)
 
 @pytest.mark.parametrize("known", [True, False])
 def test_auto_says_what_it_measured(tmp_path, painted_box, capsys, known):
-    """The loss against the truth; where a guidance knows none, how like the renders before and
-    after are.
+    """The loss against the ground truth; without one, the PSNR between the renders before and
+    after.
     """
     options = [
         "system.geometry.budget=auto",

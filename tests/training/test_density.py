@@ -1,4 +1,4 @@
-"""What a round of density control returns; which rounds it makes: ``test_geometry.py``,
+"""The outcome of a round of density control. Which rounds take place: ``test_geometry.py``,
 ``tests/gaussians/test_importance.py`` and ``tests/stability/test_densification.py``.
 """
 
@@ -45,7 +45,7 @@ def test_a_round_says_how_many_it_left():
 
 
 def test_a_round_of_auto_says_what_the_accepted_count_cost():
-    """Not what the last count that was tried cost."""
+    """Not the loss of the last count that was tried."""
 
     def check(kept):
         count = int(kept.sum())
@@ -64,7 +64,7 @@ def test_quality_that_is_lost_or_unknown_never_holds(margin):
 
 @pytest.mark.parametrize("known", [True, False])
 def test_quality_is_measured_against_the_truth_or_between_renders(known):
-    """The whole cloud is rendered once for all counts that a round tries."""
+    """All Gaussians are rendered once for all counts that a round tries."""
     density = control(budget="auto", prune={**EACH_STEP, "quality": 4.0, "likeness": 19.0})
     rendered = []
 

@@ -1,7 +1,7 @@
 """The shipped configurations, trained from the first stage to the last with tiny random models in
 the real ones' files.
 
-Nothing of the path is replaced: only the models and the sizes are smaller than what a user runs.
+Nothing on the path is replaced: only the models and sizes are smaller than those of a user.
 """
 
 import csv
@@ -36,7 +36,7 @@ def guided_by(model):
 
 @pytest.fixture(scope="module")
 def models(tmp_path_factory):
-    """Every model that the configurations name, as options of what loads them."""
+    """Write every model that the configurations name, and return the options that select them."""
     folder = tmp_path_factory.mktemp("models")
     base, upsampler = tiny_3d_models.point_e(folder / "point-e")
     clip = tiny_3d_models.clip(folder / "clip")
@@ -77,7 +77,9 @@ def prior(**options):
 
 
 def motion(folder):
-    """A motion of MDM's layout (samples, joints, 3, frames): the body raises an arm, in metres."""
+    """Return a motion in MDM's layout (samples, joints, 3, frames): the body raises an arm, in
+    metres.
+    """
     frames = np.repeat(tiny_3d_models.JOINTS[None, :22, :, None], 4, axis=3)
     frames[0, 20, 1] += np.linspace(0, 0.1, 4)
     np.savez(
@@ -90,7 +92,7 @@ def motion(folder):
 
 
 def bodies(folder):
-    """Two mesh files of the body, one of them squeezed."""
+    """Write two mesh files of the body, one of them squeezed."""
     import trimesh
 
     arrays = tiny_3d_models.body_arrays()
@@ -103,7 +105,7 @@ def bodies(folder):
 
 @pytest.fixture
 def seen(monkeypatch):
-    """(views, rows of text) of every forward pass of the UNet."""
+    """Record (views, rows of text) of every forward pass of the UNet."""
     calls, noise = [], TextToImageDistillation.noise
 
     def recorded(self, z, t, embeddings):
@@ -115,7 +117,7 @@ def seen(monkeypatch):
 
 
 def train(configs, options, *more):
-    """The command that a user types, in the current folder; returns the folder of its results."""
+    """Run the command of a user in the current folder; return the folder of its results."""
     words = [word for name in configs for word in ("--config", str(CONFIGS / name))]
     overrides = [f"{key}={value}" for key, value in options.items()]
     prompt = "system.prompt_processor.prompt=Iron man kicks with his left leg"
@@ -124,7 +126,7 @@ def train(configs, options, *more):
 
 
 def trained(folder):
-    """The result's Gaussians, and the prior's points that they started from."""
+    """Return the result's Gaussians, and the prior's points that they started from."""
     file = folder / "save" / f"it{STEPS}-export" / "gaussians.ply"
     cloud = read_cloud(str(file)).in_axes("z").gaussians
     with np.load(folder / "save" / "prior" / "points.npz") as start:
@@ -132,8 +134,9 @@ def trained(folder):
 
 
 def assert_trained(folder, rate, ground=0):
-    """All pictures, files and losses are there; every point of the prior moved, by what Adam takes
-    at this rate. The last ``ground`` points of the prior are the last Gaussians too.
+    """Assert that all images, files and losses exist, and that every point of the prior moved by
+    what Adam allows at this rate. The last ``ground`` points of the prior are the last Gaussians
+    too.
     """
     cloud, points = trained(folder)
     assert all(np.isfinite(values).all() for values in cloud)
@@ -205,8 +208,8 @@ def test_every_configuration_for_models_is_trained():
 
 @pytest.mark.slow
 def test_perp_neg_doubles_the_rows_and_the_run_repeats(models, seen, tmp_path, monkeypatch):
-    """Twice the same command gives the same Gaussians bit for bit, with Perp-Neg's two more rows
-    for each view.
+    """The same command twice gives the same Gaussians bit for bit, with Perp-Neg's two additional
+    rows per view.
     """
     options = models["shap_e"] | models["epsilon"]
     clouds = []

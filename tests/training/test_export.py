@@ -1,4 +1,4 @@
-"""What runs export: the cloud as it is and pruned, from training and from a checkpoint."""
+"""Exports of runs: the cloud as trained and pruned, from training and from a checkpoint."""
 
 import json
 import shutil

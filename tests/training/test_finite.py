@@ -29,7 +29,7 @@ def test_infinities_of_both_signs_and_numbers_whose_sum_overflows_are_told_apart
 
 
 def test_the_state_of_an_optimiser_is_part_of_it():
-    """A squared gradient that overflows leaves finite parameters that never move again."""
+    """A squared gradient that overflows leaves finite parameters that never change again."""
     parameter = torch.nn.Parameter(torch.zeros(2))
     optimizer = torch.optim.Adam([{"params": [parameter], "name": "means"}])
     parameter.grad = torch.tensor([1.0, 1e30])
@@ -59,7 +59,7 @@ def test_a_run_that_turns_non_finite_stops_and_saves_nothing_of_it(
 
 @pytest.mark.slow
 def test_a_non_finite_state_never_replaces_a_good_checkpoint(tmp_path, painted_box, monkeypatch):
-    """The checkpoint of the step before stays; resumed from it, the run ends as it should."""
+    """The checkpoint of the previous step is kept; a run resumed from it completes."""
     step = GaussianDreamerSystem.training_step
 
     def poisoned(self, batch, batch_idx):

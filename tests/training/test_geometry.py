@@ -1,4 +1,4 @@
-"""The cloud: its start from points, its size, its rates, its checkpoint."""
+"""The cloud: its start from points, its size, its learning rates, its checkpoint."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def started(cloud, **cfg):
 
 
 def seen(geometry, gradient=1.0, contribution=0.5, size=64):
-    """What a render of one view returns, with a gradient on every projected centre."""
+    """Return what a render of one view returns, with a gradient at every projected centre."""
     n = len(geometry)
     means2d = torch.zeros(1, n, 2, requires_grad=True)
     means2d.grad = torch.full((1, n, 2), gradient)
@@ -63,7 +63,9 @@ def test_growing_is_configured_and_seeded(sphere_points, monkeypatch):
 
 
 def test_the_object_grows_first_and_the_ground_is_added_then():
-    """The ground, wider than the object, would stretch the box and the radius, and grow itself."""
+    """The ground is wider than the object: it would enlarge the box and the radius, and would grow
+    itself.
+    """
     prior = {"num_points": 400, "size": 0.7}
     grow = {"num_candidates": 20_000, "radius": 0.04}
     options = {"prior_type": "random-prior", "grow": grow}
@@ -159,8 +161,8 @@ def test_a_step_leaves_the_stored_colours_in_the_range_that_viewers_show(sphere_
     assert torch.allclose(sh.sh0_to_rgb(geometry.sh0[:, 0]), colors.expand_as(stored), atol=1e-6)
 
 
-def test_a_colour_beyond_a_bound_comes_back(sphere_points):
-    """A stored cloud may have such colours; clamp's own gradient would leave them there."""
+def test_a_colour_outside_the_range_returns_to_it(sphere_points):
+    """A stored cloud may have such colours; the gradient of clamp would keep them there."""
     geometry = started(sphere_points, bound_colors=True)
     geometry.sh0.data[:] = sh.rgb_to_sh0(torch.tensor([-0.7, 0.5, 2.2]))
     optimizer = torch.optim.SGD([geometry.sh0], lr=100.0)
@@ -212,7 +214,7 @@ def test_densification_happens_at_its_steps_only_and_the_optimiser_follows(spher
     assert optimizer.state[geometry.means]["exp_avg"].shape == (1600, 3)
 
 
-def test_a_densification_that_selects_nobody_changes_nothing(sphere_points):
+def test_a_densification_that_selects_no_gaussian_changes_nothing(sphere_points):
     plain = started(sphere_points)
     idle = started(
         sphere_points,
@@ -264,7 +266,7 @@ def test_the_rasteriser_collects_absolute_gradients_where_they_decide(sphere_poi
 
 
 def test_a_trained_cloud_above_the_cap_keeps_what_contributes(sphere_points, tmp_path):
-    """All attributes of the best are kept bit for bit; every fourth is faint and goes."""
+    """All attributes of the best are kept bit for bit; every fourth is faint and is removed."""
     trained = started(sphere_points, init_opacity=0.9)
     trained.logit_opacities.data[::4] = -5.0
     write_cloud(str(tmp_path / "a.ply"), StoredCloud(Gaussians.of(trained).arrays()))

@@ -1,4 +1,6 @@
-"""Whole runs of a few steps: with a mocked guidance, against a known truth, killed and resumed."""
+"""Whole runs of a few steps: with a mock guidance, against a known ground truth, killed and
+resumed.
+"""
 
 import csv
 import json
@@ -76,7 +78,7 @@ def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, pai
 
 
 def tensorboard_events(folder):
-    """The scalars and pictures that a run has given to TensorBoard."""
+    """Return the scalars and images that a run has written for TensorBoard."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     return EventAccumulator(str(folder / "tb_logs" / "version_0")).Reload()
@@ -136,8 +138,8 @@ def test_looking_at_pictures_is_no_training_time(tmp_path, painted_box, monkeypa
 def test_a_stopped_and_resumed_run_equals_the_run_that_never_stopped(
     tmp_path, painted_box, changes, stop
 ):
-    """Bit for bit: Gaussians, moments, statistics; the stops lie before, at and after a change of
-    the cloud, with more validation.
+    """Bit for bit: Gaussians, moments, statistics; with stops before, at and after a change of the
+    cloud, and more validation.
     """
     options = [*changes, "checkpoint.every_n_train_steps=1"]
 
@@ -199,7 +201,7 @@ def test_a_learned_background_learns_and_is_in_the_checkpoint(tmp_path, painted_
     )  # on its way from grey to the mock's (0.9, 0.2, 0.1)
 
 
-def test_the_weight_of_a_loss_that_nobody_returns_is_named(tmp_path, painted_box, capsys):
+def test_the_weight_of_a_loss_that_is_never_returned_is_named(tmp_path, painted_box, capsys):
     assert (
         launch(tmp_path, painted_box, "system.loss.lambda_spasity=1.0", "trainer.max_steps=2") == 2
     )

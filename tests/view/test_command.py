@@ -1,5 +1,5 @@
-"""``python -m threestudio_gaussiandreamer.view``: any cloud becomes a page, drawn as its run has
-drawn it; mistakes end in one message.
+"""``python -m threestudio_gaussiandreamer.view``: any cloud becomes a page, rendered like its run;
+errors give one message.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""What a page stores of a cloud: every float to the bit, or rounded where it is for comparison."""
+"""The data of a page: every float to the bit, or rounded where it is for comparison."""
 
 import zlib
 

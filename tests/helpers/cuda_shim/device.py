@@ -1,5 +1,5 @@
-"""A stand-in for a GPU: runs the product's CUDA text on the host, so that the tests run kernels and
-glue as they are.
+"""An emulated GPU: compiles the package's CUDA source for the host, so that tests run kernels and
+launch code unchanged.
 """
 
 import ctypes
@@ -30,7 +30,7 @@ WARNINGS = ["-Wall", "-Wno-unknown-pragmas"]
 
 
 def unavailable() -> Optional[str]:
-    """Why the kernels can't be compiled for the host, or None."""
+    """Return why the kernels can't be compiled for the host, or None."""
     if not sys.platform.startswith("linux"):
         return "the fibres and the sections of the stand-in are Linux's"
     return None if shutil.which("g++") else "needs g++ to compile the kernels for the host"
@@ -41,7 +41,7 @@ ORDERS = {"forward": 0, "backward": 1, "shuffled": 2}
 
 @functools.cache
 def library() -> ctypes.CDLL:
-    """The kernels compiled for the host, once per process."""
+    """Return the kernels compiled for the host, once per process."""
     folder = tempfile.TemporaryDirectory()
     includes = [f"-I{path}" for path in (FOLDER, nvrtc.KERNELS, nvrtc.SHARED)]
     target = os.path.join(folder.name, "kernels.so")
@@ -56,7 +56,7 @@ def library() -> ctypes.CDLL:
 
 
 class Now:
-    """Numbers that are there, though the caller is told so only when the test says."""
+    """Values that have arrived, but are reported as such only when the test says so."""
 
     def __init__(self, device: "HostDevice", ends: Tensor):
         self.device, self.ends = device, ends.clone()
@@ -70,13 +70,13 @@ class Now:
 
 
 class HostDevice:
-    """Like `driver.Gpu`, for tensors on the CPU.
+    """Like `driver.Gpu`, for CPU tensors.
 
     Args:
-        order: in which the threads of a block run between two barriers: "forward", "backward" or
+        order: of the threads of a block between two barriers: "forward", "backward" or
             "shuffled".
-        most_intersections: more, in lists or in rows, are answered as if memory were short.
-        arrived: whether numbers that are read later are said to be there.
+        most_intersections: larger lists or rows raise an out-of-memory error.
+        arrived: whether values that are read later are reported as arrived.
     """
 
     def __init__(
