@@ -12,13 +12,15 @@ import torch
 from tests.helpers.ply_files import gaussians
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.spz import (
-    DECODED_BYTES,
-    DECODED_BYTES_PER_HARMONIC,
     read_spz,
     read_spz_comment,
     spz_arrays,
     spz_bytes,
     write_spz,
+)
+from threestudio_gaussiandreamer.formats.spz_container import (
+    DECODED_BYTES,
+    DECODED_BYTES_PER_HARMONIC,
 )
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
@@ -240,9 +242,9 @@ def with_header(version=3, count=2, degree=1, magic=b"NGSP"):
         (packed(b"short"), "isn't an SPZ file, or damaged"),
         (packed(BY_HAND)[:-20], "truncated or damaged"),
         (packed(BY_HAND)[:-8] + bytes(8), "incorrect data check"),
-        (b"NGSP" + bytes(40), "version 4"),
-        (with_header(magic=b"NGSX"), "isn't an SPZ file of version 2 or 3"),
-        (with_header(version=1), "isn't an SPZ file of version 2 or 3"),
+        (b"NGSP" + bytes(40), "isn't an SPZ file of version 2 to 4"),
+        (with_header(magic=b"NGSX"), "isn't an SPZ file of version 2 to 4"),
+        (with_header(version=1), "isn't an SPZ file of version 2 to 4"),
         (with_header(degree=4), "degree 4 are announced"),
         (with_header(count=3), "3 Gaussians need"),
         (with_header(count=2**32 - 1), "bytes can't hold them"),

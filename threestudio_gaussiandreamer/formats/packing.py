@@ -1,0 +1,76 @@
+"""Encodings that several compact formats of Gaussians share: bytes, logits, spatial order."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+OPACITY_MARGIN = 1 / 2040
+"""Opacities that are read from bytes are clamped to this distance from 0 and 1, an eighth of a
+step, since their logits are infinite there.
+"""
+
+
+def morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
+    """Return the rows in Morton order: by the interleaved bits of positions, 10 bits per axis."""
+    means = means.astype(np.float64)
+    low, high = means.min(axis=0, initial=np.inf), means.max(axis=0, initial=-np.inf)
+    cells = ((means - low) / np.maximum(high - low, 1e-12) * 1023).astype(np.int64)
+    bits = cells[:, :, None] >> np.arange(10) & 1
+    return (
+        (bits << (3 * np.arange(10) + np.arange(3)[:, None]))
+        .sum(axis=(1, 2))
+        .argsort(kind="stable")
+    )
+
+
+def unit_quats(quats: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
+    """Normalise in float64; a zero quaternion becomes the identity."""
+    quats = np.array(quats, np.float64)
+    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+    return np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1), [1.0, 0, 0, 0])
+
+
+def without_largest(
+    quats: Float[np.ndarray, "N 4"],
+) -> tuple[Int[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
+    """Return the index of each unit quaternion's largest component, and the other three in their
+    order, with the sign that makes the largest positive.
+    """
+    largest = np.abs(quats).argmax(axis=1)
+    signs = np.where(quats[np.arange(len(quats)), largest] < 0, -1, 1)
+    others = (quats * signs[:, None])[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    return largest, others
+
+
+def with_largest(
+    largest: Int[np.ndarray, " N"], others: Float[np.ndarray, "N 3"]
+) -> Float[np.ndarray, "N 4"]:
+    """Invert :func:`without_largest`; the result is float32."""
+    quats = np.empty((len(others), 4), np.float32)
+    missing = np.arange(4) == largest[:, None]
+    quats[~missing] = others.ravel()
+    quats[missing] = np.sqrt(np.clip(1 - (others**2).sum(axis=1), 0, 1))
+    return quats
+
+
+def opacities(logits: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    """Return opacities in [0, 1] as float64."""
+    from scipy.special import expit
+
+    return expit(logits.astype(np.float64))
+
+
+def logits_of_bytes(alphas: Int[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    """Return finite logits of opacities that are stored in steps of 1 / 255."""
+    return logits(alphas / 255, OPACITY_MARGIN)
+
+
+def logits(values: Float[np.ndarray, " N"], margin: float) -> Float[np.ndarray, " N"]:
+    """Return the logits of opacities, which are clamped to [margin, 1 - margin]; NaN stays."""
+    from scipy.special import logit
+
+    return logit(np.clip(values.astype(np.float64), margin, 1 - margin)).astype(np.float32)
+
+
+def to_byte(values: Float[np.ndarray, "*shape"]) -> Int[np.ndarray, "*shape"]:
+    """Round to integers, clipped to [0, 255]."""
+    return np.rint(np.clip(values, 0, 255)).astype("u1")
