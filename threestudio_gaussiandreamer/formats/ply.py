@@ -241,8 +241,8 @@ def _format_hint(table: PlyTable) -> str:
     """Return a hint for the message if the properties are those of another kind of PLY."""
     if COMPRESSED in table:
         return (
-            " It is a compressed PLY (PlayCanvas' compressed.ply), which isn't read here: convert "
-            "it, for instance by `splat-transform in.compressed.ply out.ply`."
+            " It is a compressed PLY: convert it by `python -m threestudio_gaussiandreamer.convert "
+            "in.compressed.ply out.ply`."
         )
     if set(MEANS) <= set(table.names) and not set(SH_CONSTANT) & set(table.names):
         return " It holds plain points: read it as a point cloud."

@@ -1,0 +1,117 @@
+"""Compressed PLYs: laid out as published, close to what was stored, and damage is refused."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from tests.helpers.object_clouds import assert_close, ball, in_order_of
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats.compressed_ply import (
+    LIMITS,
+    PACKED,
+    is_compressed_ply,
+    read_compressed_ply,
+    write_compressed_ply,
+)
+from threestudio_gaussiandreamer.formats.ply import write_gaussians
+from threestudio_gaussiandreamer.gaussians.sh import C0
+
+
+def header(chunks=1, count=1, limits=LIMITS, rest=0, encoding="binary_little_endian"):
+    lines = ["ply", f"format {encoding} 1.0", f"element chunk {chunks}"]
+    lines += [f"property float {name}" for name in limits]
+    lines += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
+    lines += [f"element sh {count}"] if rest else []
+    lines += [f"property uchar f_rest_{index}" for index in range(rest)]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode()
+
+
+BOUNDS = struct.pack("<18f", 0, 0, 0, 2, 4, 8, -5, -6, -7, -1, -2, -3, 0, 0.2, 0.4, 1, 0.8, 0.6)
+WORDS = struct.pack(
+    "<4I",
+    2047 << 21 | 0 << 11 | 1023,  # x at its maximum, y at its minimum, z about the middle
+    3 << 30 | 512 << 20 | 1023 << 10 | 0,  # z is the largest; w about 0, x 1/sqrt2, y -1/sqrt2
+    0 << 21 | 1023 << 11 | 2047,
+    255 << 24 | 0 << 16 | 128 << 8 | 51,
+)
+BY_HAND = header() + BOUNDS + WORDS
+
+
+def stored(folder, data):
+    (folder / "a.compressed.ply").write_bytes(data)
+    return folder / "a.compressed.ply"
+
+
+def test_a_file_put_together_by_hand_is_read(tmp_path):
+    read = read_compressed_ply(stored(tmp_path, BY_HAND))
+    np.testing.assert_allclose(read.means, [[2, 0, 8 * 1023 / 2047]], rtol=1e-6)
+    np.testing.assert_allclose(read.log_scales, [[-5, -2, -3]], rtol=1e-6)
+    half = 2**-0.5
+    np.testing.assert_allclose(read.quats, [[half / 1023, half, -half, 0]], atol=1e-3)
+    colors = 0.5 + C0 * read.sh[0, 0]
+    np.testing.assert_allclose(colors, [1, 0.2, 0.4 + 0.2 * 128 / 255], atol=1e-6)
+    np.testing.assert_allclose(1 / (1 + np.exp(-read.logit_opacities)), [0.2], atol=1e-6)
+
+
+def test_colours_without_limits_are_fractions(tmp_path):
+    data = header(limits=LIMITS[:12]) + BOUNDS[:48] + WORDS
+    colors = 0.5 + C0 * read_compressed_ply(stored(tmp_path, data)).sh[0, 0]
+    np.testing.assert_allclose(colors, [1, 0, 128 / 255], atol=1e-6)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("count", [1, 256, 600])
+def test_what_is_read_is_close_to_what_was_written(tmp_path, degree, count):
+    cloud, path = ball(count, degree), tmp_path / "a.compressed.ply"
+    write_compressed_ply(path, cloud, ["up: z"])
+    read = read_compressed_ply(path)
+    steps = {"means": 1.5e-3, "log_scales": 1e-3, "opacities": 3e-3, "sh": 0.016, "quats": 1e-5}
+    assert_close(in_order_of(cloud, read), read, **steps)
+    chunks = -(-count // 256)
+    assert path.stat().st_size == len(path.read_bytes().partition(b"end_header\n")[0]) + 11 + (
+        72 * chunks + (16 + 3 * ((degree + 1) ** 2 - 1)) * count
+    )
+
+
+def test_opacities_and_harmonics_at_the_ends_stay_finite(tmp_path):
+    cloud = ball(3, 1)
+    cloud.logit_opacities[:] = [80, -80, 0]
+    cloud.sh[0, 1], cloud.sh[1, 1] = 9, -9
+    write_compressed_ply(tmp_path / "a.ply", cloud)
+    read = read_compressed_ply(tmp_path / "a.ply")
+    assert all(np.isfinite(values).all() for values in read)
+    assert read.sh[:, 1].max() == 4 and read.sh[:, 1].min() == -4
+
+
+def test_the_two_layouts_are_told_apart(tmp_path):
+    write_gaussians(tmp_path / "plain.ply", ball(3))
+    write_compressed_ply(tmp_path / "small.ply", ball(3))
+    (tmp_path / "text.ply").write_text("no PLY")
+    found = [is_compressed_ply(tmp_path / f"{name}.ply") for name in ("plain", "small", "text")]
+    assert found == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (BY_HAND[:-1], "'vertex' are announced, but the file ends before"),
+        (header(count=2) + BOUNDS + WORDS, "'vertex' are announced, but the file ends before"),
+        (header(chunks=2) + BOUNDS + WORDS, "2 chunks don't fit 1 Gaussians"),
+        (header(10**12, 256 * 10**12), "'chunk' are announced, but the file ends before"),
+        (header(rest=10) + BOUNDS + WORDS, "properties aren't those of the format"),
+        (header(limits=LIMITS[::-1]) + BOUNDS + WORDS, "properties aren't those of the format"),
+        (header(encoding="ascii"), "it is text"),
+        (b"ply\nformat binary_little_endian 1.0\nend_header\n", "chunk, vertex, sh were expected"),
+        (BY_HAND.replace(b"uint packed_color", b"list uint uint packed_color"), "lists"),
+    ],
+    ids=range(9),
+)  # fmt: skip
+def test_damaged_files_are_refused(tmp_path, data, said):
+    with pytest.raises(UserError, match=said):
+        read_compressed_ply(stored(tmp_path, data))
+
+
+def test_what_follows_is_said(tmp_path, caplog):
+    read_compressed_ply(stored(tmp_path, BY_HAND + b"more"))
+    assert "4 bytes follow its elements" in caplog.text

@@ -1,0 +1,281 @@
+"""Compressed PLY, PlayCanvas' chunked layout: 16 bytes and 0.3 for a Gaussian of degree 0, and one
+byte for each further coefficient. Binary little-endian elements, in this order:
+
+==========  ========================================================================================
+chunk       18 float32 for 256 Gaussians each: minimum and maximum of positions, logarithms of
+            scales and colours (0.5 + C0 sh); files without the colours' six are read too
+vertex      4 u32: position and logarithm of the scale as 11, 10, 11 bits between the chunk's
+            limits; quaternion wxyz as the number of its largest component and 10 bits for each
+            other one, (q / sqrt(2) + 0.5); colour between the limits and opacity as 8 bits each
+sh          f_rest as bytes, where there are any: 256 (f_rest / 8 + 0.5)
+==========  ========================================================================================
+
+Described in PlayCanvas' manual, "The Compressed PLY Format"; axes as those of a PLY."""
+
+import logging
+import os
+from collections.abc import Sequence
+from math import ceil, sqrt
+from pathlib import Path
+from typing import BinaryIO, NoReturn
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..core.errors import UserError
+from ..core.files import atomic_file, existing_file
+from ..gaussians.gaussians import Gaussians, finite
+from ..gaussians.sh import COEFFICIENTS, rgb_to_sh0, sh0_to_rgb
+from .packing import (
+    logits_of_bytes,
+    morton_order,
+    opacities,
+    to_byte,
+    unit_quats,
+    with_largest,
+    without_largest,
+)
+from .ply_table import BYTE_ORDERS, Element, read_header
+
+logger = logging.getLogger(__name__)
+CHUNK = 256
+"""Gaussians of a chunk."""
+LIMITS = tuple(
+    f"{bound}_{name}"
+    for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+    for bound in ("min", "max")
+    for name in names
+)
+WITHOUT_COLORS = 12
+"""Number of limits in files of the format's first version."""
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+BITS = (11, 10, 11)
+SH_REACH = 4.0
+"""Stored coefficients lie between plus and minus this."""
+MAX_STORED_LOG = 20.0
+"""Other readers expect logarithms of scales within plus and minus this."""
+MAX_STORED_OPACITY = 254
+"""Opacities of byte 255 would have an infinite logit."""
+
+
+def write_compressed_ply(
+    path: str | os.PathLike, gaussians: Gaussians, comments: Sequence[str] = ()
+) -> None:
+    """Write a compressed PLY atomically, along a Morton curve, without Gaussians that can't be
+    drawn.
+
+    Args:
+        comments: ASCII lines for the header.
+
+    Raises:
+        UserError: harmonics above degree 3, or the file can't be written.
+    """
+    gaussians = finite(gaussians, str(path))
+    gaussians = gaussians.rows(morton_order(gaussians.means))
+    count, coefficients = len(gaussians.means), 3 * (gaussians.sh.shape[1] - 1)
+    values = _chunked_values(gaussians)
+    limits = _limits(values)
+    with atomic_file(path) as file:
+        file.write(_header(count, len(limits), coefficients, comments))
+        file.write(limits.astype("<f4").tobytes())
+        file.write(_packed(gaussians, values, limits).tobytes())
+        file.write(_harmonic_bytes(gaussians.sh[:, 1:]).tobytes())
+
+
+def is_compressed_ply(path: str | os.PathLike) -> bool:
+    """Return whether the file is a PLY with the elements of a compressed one."""
+    try:
+        with open(path, "rb") as file:
+            elements = {entry.name: entry for entry in read_header(file, str(path)).elements}
+    except (OSError, UserError):
+        return False
+    vertices = elements.get("vertex")
+    return "chunk" in elements and vertices is not None and _names(vertices)[:1] == PACKED[:1]
+
+
+def read_compressed_ply(path: str | os.PathLike) -> Gaussians:
+    """Read a compressed PLY, in the file's axes.
+
+    Raises:
+        UserError: there is no such file, it is no compressed PLY, or it is damaged.
+    """
+    path = existing_file(path, "compressed PLY")
+    try:
+        with open(path, "rb") as file:
+            elements = _read_elements(file, path)
+    except OSError as error:
+        raise UserError(f"cannot read {str(path)!r}: {error.strerror or error}.") from error
+    packed, limits = elements["vertex"], _chunk_limits(elements["chunk"])
+    chunks = np.arange(len(packed)) // CHUNK
+    position, rotation, scale, color = packed.T
+    colors = _between(_bytes_of(color)[:, :3] / 255, limits[:, 2], chunks)
+    rest = elements.get("sh", np.empty((len(packed), 0), np.uint8))
+    return Gaussians(
+        means=_between(_fractions(position), limits[:, 0], chunks).astype(np.float32),
+        quats=_quats(rotation),
+        log_scales=_between(_fractions(scale), limits[:, 1], chunks).astype(np.float32),
+        logit_opacities=logits_of_bytes(_bytes_of(color)[:, 3]),
+        sh=np.concatenate([rgb_to_sh0(colors)[:, None].astype(np.float32), _harmonics(rest)], 1),
+    )
+
+
+# ---- writing -------------------------------------------------------------------------------------
+
+
+def _header(count: int, chunks: int, coefficients: int, comments: Sequence[str]) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    lines += [f"element chunk {chunks}", *(f"property float {name}" for name in LIMITS)]
+    lines += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
+    if coefficients:
+        lines += [f"element sh {count}"]
+        lines += [f"property uchar f_rest_{index}" for index in range(coefficients)]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+
+
+def _chunked_values(gaussians: Gaussians) -> Float[np.ndarray, "C 256 3 3"]:
+    """Return positions, logarithms of scales and colours in whole chunks; the last Gaussian fills
+    up the last one.
+    """
+    scales = gaussians.log_scales.clip(-MAX_STORED_LOG, MAX_STORED_LOG)
+    values = np.stack([gaussians.means, scales, sh0_to_rgb(gaussians.sh[:, 0])], axis=1)
+    missing = -len(values) % CHUNK
+    values = np.pad(values, ((0, missing), (0, 0), (0, 0)), "edge") if missing else values
+    return values.astype(np.float32).reshape(-1, CHUNK, 3, 3)
+
+
+def _limits(values: Float[np.ndarray, "C 256 3 3"]) -> Float[np.ndarray, "C 3 2 3"]:
+    """Return minimum and maximum of each kind of value, chunk by chunk."""
+    return np.stack([values.min(axis=1), values.max(axis=1)], axis=2)
+
+
+def _packed(
+    gaussians: Gaussians,
+    values: Float[np.ndarray, "C 256 3 3"],
+    limits: Float[np.ndarray, "C 3 2 3"],
+) -> Int[np.ndarray, "N 4"]:
+    low, size = limits[:, None, :, 0], np.ptp(limits, axis=2)[:, None]
+    fractions = (values - low) / np.where(size > 0, size, 1)
+    count = len(gaussians.means)
+    position, scale, color = fractions.reshape(-1, 3, 3)[:count].transpose(1, 0, 2)
+    alpha = to_byte(255 * opacities(gaussians.logit_opacities)).clip(max=MAX_STORED_OPACITY)
+    rgba = np.concatenate([to_byte(255 * color), alpha[:, None]], axis=1)
+    words = [
+        _word(position, BITS),
+        _rotation_word(gaussians.quats),
+        _word(scale, BITS),
+        rgba[:, ::-1].copy().view("<u4")[:, 0],
+    ]
+    return np.stack(words, axis=1).astype("<u4")
+
+
+def _word(fractions: Float[np.ndarray, "N F"], bits: Sequence[int]) -> Int[np.ndarray, " N"]:
+    """Pack fractions in [0, 1] from the highest bits downwards."""
+    word = np.zeros(len(fractions), np.uint32)
+    for fraction, width in zip(fractions.T, bits, strict=True):
+        most = (1 << width) - 1
+        word = word << width | np.rint(np.clip(fraction, 0, 1) * most).astype(np.uint32)
+    return word
+
+
+def _rotation_word(quats: Float[np.ndarray, "N 4"]) -> Int[np.ndarray, " N"]:
+    largest, others = without_largest(unit_quats(quats))
+    return largest.astype(np.uint32) << 30 | _word(others / sqrt(2) + 0.5, (10, 10, 10))
+
+
+def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Int[np.ndarray, "N C"]:
+    by_channel = rest.transpose(0, 2, 1).reshape(len(rest), 3 * rest.shape[1])
+    return to_byte(np.floor(256 * (by_channel / (2 * SH_REACH) + 0.5)))
+
+
+# ---- reading -------------------------------------------------------------------------------------
+
+
+def _fail(path: Path, problem: str) -> NoReturn:
+    raise UserError(f"compressed PLY {str(path)!r}: {problem}")
+
+
+def _names(element: Element) -> tuple[str, ...]:
+    return tuple(entry.name for entry in element.properties)
+
+
+def _read_elements(file: BinaryIO, path: Path) -> dict[str, np.ndarray]:
+    """Read the elements as (rows, columns) after checking that they fit each other."""
+    header = read_header(file, str(path))
+    order = BYTE_ORDERS[header.encoding]
+    if not order:
+        _fail(path, "it is text; a binary file was expected.")
+    _check_layout(header.elements, path)
+    size = os.fstat(file.fileno()).st_size
+    found = {}
+    for element in header.elements:
+        kind = np.dtype(order + element.properties[0].type)
+        shape = element.count, len(element.properties)
+        needed = kind.itemsize * shape[0] * shape[1]
+        if needed > size - file.tell():
+            what = f"{element.count} rows of {element.name!r} are announced"
+            _fail(path, f"{what}, but the file ends before: it is truncated or damaged.")
+        found[element.name] = np.frombuffer(file.read(needed), kind).reshape(shape)
+    if more := size - file.tell():
+        logger.warning("compressed PLY %r: %d bytes follow its elements", str(path), more)
+    return found
+
+
+def _check_layout(elements: list[Element], path: Path) -> None:
+    shapes = {entry.name: (_names(entry), {p.type for p in entry.properties}) for entry in elements}
+    counts = {entry.name: entry.count for entry in elements}
+    if len(shapes) < len(elements) or not {"chunk", "vertex"} <= set(shapes) <= {
+        *("chunk", "vertex", "sh")
+    }:
+        _fail(path, f"its elements are {', '.join(shapes)[:80]}; chunk, vertex, sh were expected.")
+    known = [(names, {"f4"}) for names in (LIMITS, LIMITS[:WITHOUT_COLORS])]
+    rest = [tuple(f"f_rest_{i}" for i in range(3 * (k - 1))) for k in COEFFICIENTS[1:]]
+    fits = shapes["chunk"] in known and shapes["vertex"] == (PACKED, {"u4"})
+    if not fits or "sh" in shapes and shapes["sh"] not in [(names, {"u1"}) for names in rest]:
+        _fail(path, "its properties aren't those of the format, in the format's order.")
+    if any(entry.has_lists for entry in elements):
+        _fail(path, "it has lists, which the format hasn't.")
+    count = counts["vertex"]
+    if counts["chunk"] != ceil(count / CHUNK) or counts.get("sh", count) != count:
+        _fail(path, f"{counts['chunk']} chunks don't fit {count} Gaussians: it is damaged.")
+
+
+def _chunk_limits(chunks: Float[np.ndarray, "C L"]) -> Float[np.ndarray, "C 3 2 3"]:
+    """Return the limits as :func:`_limits` does; colours without limits are in [0, 1]."""
+    missing = len(LIMITS) - chunks.shape[1]
+    colors = np.tile(np.repeat(np.float64([0, 1]), 3), (len(chunks), 1))[:, :missing]
+    return np.concatenate([chunks.astype(np.float64), colors], axis=1).reshape(-1, 3, 2, 3)
+
+
+def _between(
+    fractions: Float[np.ndarray, "N 3"],
+    limits: Float[np.ndarray, "C 2 3"],
+    chunks: Int[np.ndarray, " N"],
+) -> Float[np.ndarray, "N 3"]:
+    with np.errstate(invalid="ignore", over="ignore"):  # limits of damaged files
+        low, high = limits[chunks, 0], limits[chunks, 1]
+        return low * (1 - fractions) + high * fractions
+
+
+def _fractions(words: Int[np.ndarray, " N"], bits: Sequence[int] = BITS) -> np.ndarray:
+    """Invert :func:`_word`: (N, F) in [0, 1]."""
+    shifts = np.cumsum(bits[::-1])[::-1] - bits
+    most = (1 << np.array(bits)) - 1
+    return (words.astype(np.int64)[:, None] >> shifts & most) / most
+
+
+def _quats(words: Int[np.ndarray, " N"]) -> Float[np.ndarray, "N 4"]:
+    others = (_fractions(words, (10, 10, 10)) - 0.5) * sqrt(2)
+    return with_largest(words.astype(np.int64) >> 30, others)
+
+
+def _bytes_of(words: Int[np.ndarray, " N"]) -> Int[np.ndarray, "N 4"]:
+    """Return the bytes from the highest to the lowest."""
+    return (words.astype(np.int64)[:, None] >> np.array([24, 16, 8, 0]) & 255).astype(np.uint8)
+
+
+def _harmonics(rest: Int[np.ndarray, "N C"]) -> Float[np.ndarray, "N K 3"]:
+    """Decode f_rest at the middle of each step; the ends are the limits themselves."""
+    fractions = (rest.astype(np.float32) + np.float32(0.5)) / 256
+    fractions[rest == 0], fractions[rest == 255] = 0, 1
+    values = (fractions - np.float32(0.5)) * np.float32(2 * SH_REACH)
+    return values.reshape(len(rest), 3, rest.shape[1] // 3).transpose(0, 2, 1)
