@@ -1,0 +1,185 @@
+"""SOG files: laid out as published, close to what was stored; bombs and damage are refused."""
+
+import io
+import json
+import struct
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.helpers.object_clouds import assert_close, ball, in_order_of
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats.sog import load_sog, read_sog, write_sog
+
+
+def members(path):
+    with zipfile.ZipFile(path) as archive:
+        return {info.filename: archive.read(info) for info in archive.infolist()}
+
+
+def repacked(path, packing=zipfile.ZIP_STORED, **changes):
+    """The file with members replaced, or dropped where they are None; meta is updated."""
+    content = members(path)
+    meta = json.loads(content["meta.json"])
+    for key, value in changes.pop("meta", {}).items():
+        meta[key] = value
+    content["meta.json"] = json.dumps(meta).encode()
+    content |= {name.replace("__", "."): value for name, value in changes.items()}
+    with zipfile.ZipFile(path, "w", packing) as archive:
+        for name, value in content.items():
+            if value is not None:
+                archive.writestr(name, value)
+    return path
+
+
+def image(size, lossless=True, frames=1, mode="RGBA"):
+    buffer, picture = io.BytesIO(), Image.new(mode, size)
+    more = {"save_all": True, "append_images": [Image.new(mode, size, 9)]} if frames > 1 else {}
+    picture.save(buffer, "WEBP", lossless=lossless, **more)
+    return buffer.getvalue()
+
+
+FILES = ["means_l.webp", "means_u.webp"]
+NO_PALETTE = {
+    "bands": 1,
+    "count": 0,
+    "codebook": [0] * 256,
+    "files": ["shN_centroids.webp", "shN_labels.webp"],
+}
+
+
+@pytest.fixture
+def path(tmp_path):
+    write_sog(tmp_path / "a.sog", ball(50, 1), notes=["pruned to the likeness, dB: 40"])
+    return tmp_path / "a.sog"
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("count", [1, 600])
+def test_what_is_read_is_close_to_what_was_written(tmp_path, degree, count):
+    cloud = ball(count, degree)
+    write_sog(tmp_path / "a.sog", cloud)
+    read = read_sog(tmp_path / "a.sog")
+    steps = {"means": 2e-5, "log_scales": 0.01, "opacities": 3e-3, "sh": 0.02, "quats": 1e-4}
+    assert_close(in_order_of(cloud, read), read, **steps)
+
+
+def test_the_mode_and_the_notes_are_kept(tmp_path):
+    write_sog(tmp_path / "a.sog", ball(9), antialiased=True, notes=["one", "two"])
+    assert load_sog(tmp_path / "a.sog")[1:] == (True, ["one", "two"])
+    assert json.loads(members(tmp_path / "a.sog")["meta.json"])["model"] == "antialiased"
+
+
+def test_the_images_are_laid_out_as_published(path):
+    """Decoded by Pillow, by the formulas of the specification."""
+    content, read = members(path), read_sog(path)
+    meta = json.loads(content["meta.json"])
+    pixels = {
+        name: np.asarray(Image.open(io.BytesIO(data)).convert("RGBA"), np.int64).reshape(-1, 4)[:50]
+        for name, data in content.items()
+        if name.endswith("l.webp") or name in ("means_u.webp", "quats.webp", "sh0.webp")
+    }
+    steps = pixels["means_u.webp"][:, :3] << 8 | pixels["means_l.webp"][:, :3]
+    low, high = (np.array(meta["means"][key]) for key in ("mins", "maxs"))
+    logs = low + (high - low) * steps / 65535
+    np.testing.assert_allclose(read.means, np.sign(logs) * (np.exp(np.abs(logs)) - 1), atol=1e-6)
+    book = np.array(meta["sh0"]["codebook"])
+    np.testing.assert_allclose(read.sh[:, 0], book[pixels["sh0.webp"][:, :3]], atol=1e-6)
+    tags = pixels["quats.webp"][:, 3]
+    assert ((tags >= 252) & (tags <= 255)).all() and len(set(tags)) == 4
+    assert content["meta.json"] and meta["count"] == 50 and meta["version"] == 2
+
+
+def test_files_are_reproducible(tmp_path):
+    for name in "ab":
+        write_sog(tmp_path / f"{name}.sog", ball(1100, 1))
+    assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
+
+
+def test_names_of_members_lead_nowhere(path, tmp_path):
+    means = members(path)["means_l.webp"]
+    name = "../../outside.webp"
+    meta = json.loads(members(path)["meta.json"])
+    meta["means"]["files"][0] = name
+    before = read_sog(path)
+    read = read_sog(repacked(path, meta=meta, **{name: means}))
+    np.testing.assert_array_equal(read.means, before.means)
+    assert not list(tmp_path.parent.glob("**/outside.webp"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"meta": {"count": 10**9}}, "1000000000 Gaussians would take .* of memory"),
+        ({"meta": {"count": 70}}, "has 8 x 8 pixels, too few for 70 Gaussians"),
+        ({"meta": {"count": -1}}, "count should be 0 or more"),
+        ({"meta": {"count": "9"}}, "count should be 0 or more"),
+        ({"meta": {"version": 1}}, "it is of version 1; version 2 was expected"),
+        ({"meta": {"means": None}}, "no section 'means'"),
+        ({"meta": {"sh0": {"codebook": [0.0] * 255, "files": ["sh0.webp"]}}}, "256 numbers"),
+        ({"meta": {"quats": {"files": []}}}, "names no image 0 of 'quats'"),
+        ({"meta": {"quats": {"files": ["sh0.webp"]}}}, "largest component has no number"),
+        ({"meta": {"means": {"mins": [0, 0, np.nan], "maxs": [1] * 3, "files": FILES}}}, "mins"),
+        ({"meta": {"shN": {"bands": 4}}}, "degree 4 are announced"),
+        ({"quats__webp": None}, "it has no 'quats.webp'"),
+        ({"meta__json": b"{"}, "isn't valid JSON"),
+        ({"meta__json": b"[" * 100_000}, "isn't valid JSON"),
+        ({"sh0__webp": b"RIFF"}, "isn't a WebP image"),
+        ({"sh0__webp": image((8, 8), lossless=False, mode="RGB")}, "isn't a lossless WebP"),
+        ({"sh0__webp": image((8, 8), frames=2)[:-9]}, "'sh0.webp' can't be decoded"),
+        ({"sh0__webp": image((4, 4))}, "4 x 4 pixels, too few for 50 Gaussians"),
+        ({"sh0__webp": image((8, 8), frames=2)}, "of another size|can't be decoded"),
+        ({"shN_centroids__webp": image((8, 8))}, "palette of 50 entries of degree 1 can't have"),
+        ({"shN_labels__webp": image((8, 8)), "meta": {"shN": NO_PALETTE}}, "entry 0 of a palette"),
+    ],
+    ids=range(21),
+)  # fmt: skip
+def test_damaged_files_are_refused(path, changes, said):
+    with pytest.raises(UserError, match=said):
+        read_sog(repacked(path, **changes))
+
+
+def test_what_is_no_archive_is_refused(tmp_path):
+    for data in (b"", b"PK\x03\x04", bytes(100)):
+        (tmp_path / "a.sog").write_bytes(data)
+        with pytest.raises(UserError, match="isn't a zip archive"):
+            read_sog(tmp_path / "a.sog")
+
+
+def peak_of(path, said):
+    tracemalloc.start()
+    with pytest.raises(UserError, match=said):
+        read_sog(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak
+
+
+def test_a_bomb_in_the_archive_costs_no_memory(path):
+    repacked(path, zipfile.ZIP_DEFLATED, sh0__webp=bytes(300_000_000))
+    assert peak_of(path, "has 300000000 bytes; at most") < 4 << 20
+
+
+def test_a_bomb_as_json_costs_no_memory(path):
+    repacked(path, zipfile.ZIP_DEFLATED, meta__json=b" " * 300_000_000)
+    assert peak_of(path, "'meta.json' has 300000000 bytes; at most") < 4 << 20
+
+
+def test_a_bomb_as_an_image_costs_no_memory(path):
+    """A lossless image of one colour, 16383 x 16383, takes a few bytes."""
+    bits = 16382 | 16382 << 14 | 1 << 28
+    body = b"VP8L" + struct.pack("<IBI", 20, 0x2F, bits) + bytes(15)
+    bomb = b"RIFF" + struct.pack("<I", 4 + len(body)) + b"WEBP" + body
+    repacked(path, sh0__webp=bomb)
+    assert peak_of(path, "16383 x 16383 pixels would take .* of memory") < 4 << 20
+
+
+def test_a_damaged_member_is_seen_by_its_checksum(path):
+    data = bytearray(path.read_bytes())
+    data[data.index(b"WEBPVP8L") + 40] ^= 1
+    path.write_bytes(bytes(data))
+    with pytest.raises(UserError, match="can't be unpacked"):
+        read_sog(path)
