@@ -25,3 +25,10 @@ def linear_to_srgb(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]
     return np.where(
         linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055
     ).astype(np.float32)
+
+
+def srgb_to_linear(display: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Invert :func:`linear_to_srgb` for values in [0, 1]."""
+    return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4).astype(
+        np.float32
+    )

@@ -11,6 +11,8 @@ Accessors, scenes and materials are decoded here, since trimesh ignores or misre
 features, and pygltflib only parses the JSON."""
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Optional
 
@@ -41,9 +43,16 @@ def read_gltf(path: Path) -> list[Mesh]:
     Raises:
         UserError: the file is damaged, exceeds its budget, or has content that isn't supported.
     """
+    with parse_errors(path):
+        return _Scene(Document(path)).parts()
+
+
+@contextmanager
+def parse_errors(path: Path) -> Iterator[None]:
+    """Turn the errors that the damaged glTF file ``path`` causes in the block into UserError."""
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # dropped later
-            return _Scene(Document(path)).parts()
+            yield
     except UserError:
         raise
     except OSError as error:

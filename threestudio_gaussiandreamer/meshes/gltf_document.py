@@ -21,6 +21,7 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 INDICES = ("u1", "<u2", "<u4")
 READ_EXTENSIONS = {
     "EXT_texture_webp",
+    "KHR_gaussian_splatting",
     "KHR_materials_pbrSpecularGlossiness",
     "KHR_mesh_quantization",
     "KHR_texture_transform",

@@ -1,0 +1,254 @@
+"""Gaussians in GLB files by the glTF extension KHR_gaussian_splatting, plain and uncompressed.
+
+Written to the release candidate in Khronos' repository, its revision of 15 April 2026: points with
+the kernel "ellipse" in the colour space "srgb_rec709_display"; scales and opacities are linear,
+quaternions xyzw, harmonics with the Condon-Shortley phase as in PLY files, all float32. ``COLOR_0``
+lets programs without the extension show coloured points. Axes are glTF's, y up, front +z.
+
+The extension has no place for antialiasing and notes, so they are in ``extras`` of the asset.
+Compressions of the extension, kernels other than "ellipse", and nodes that scale by different
+factors along the axes aren't read."""
+
+import json
+import logging
+import os
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.file_memory import require_file_memory
+from ..core.files import atomic_file, existing_file
+from ..gaussians.axes import rotate
+from ..gaussians.gaussians import Gaussians, finite
+from ..gaussians.sh import COEFFICIENTS, sh0_colors
+from ..meshes.colors import srgb_to_linear
+from ..meshes.gltf import parse_errors
+from ..meshes.gltf_document import Document
+from ..meshes.gltf_poses import world_matrices
+from .packing import logits, opacities, to_byte, unit_quats
+
+logger = logging.getLogger(__name__)
+GLB_UP = "y"
+EXTENSION = "KHR_gaussian_splatting"
+SPLATTING = {
+    "kernel": "ellipse",
+    "colorSpace": "srgb_rec709_display",
+    "projection": "perspective",
+    "sortingMethod": "cameraDistance",
+}
+FLOAT, BYTE, POINTS, ARRAY_BUFFER = 5126, 5121, 0, 34962
+TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+MARGIN = 2.0**-25
+"""Opacities that are read are clamped to this distance from 0 and 1; float32 below 1 has no less.
+"""
+DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 300, 72
+"""Bytes of memory that reading takes per Gaussian, and per harmonic of it, with a safety margin."""
+SAME_SCALE = 1e-4
+"""Largest relative difference of a node's scales that counts as rounding."""
+
+
+def write_glb(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence[str] = ()) -> None:
+    """Write a GLB atomically, without Gaussians that can't be drawn.
+
+    Args:
+        gaussians: with y up.
+        notes: ASCII lines for the asset's ``extras``, which other readers ignore.
+
+    Raises:
+        UserError: harmonics above degree 3, or the file can't be written.
+    """
+    gaussians = finite(gaussians, str(path))
+    attributes = _attributes(gaussians)
+    document = _document(attributes, gaussians.means, notes)
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    blocks = [values.tobytes() for values in attributes.values()]
+    binary = sum(map(len, blocks))
+    with atomic_file(path) as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + binary))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", binary, b"BIN\0"))
+        file.writelines(blocks)
+
+
+def read_glb(path: str | os.PathLike) -> Gaussians:
+    """Read the Gaussians of a GLB or glTF file; see :func:`load_glb`."""
+    return load_glb(path)[0]
+
+
+def load_glb(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
+    """Read the Gaussians of all nodes of the default scene, with y up, and the notes of our writer.
+
+    Raises:
+        UserError: there is no such file, it is damaged, holds no Gaussians, or some that aren't
+            supported.
+    """
+    path = existing_file(path, "GLB file")
+    with parse_errors(path):
+        document = Document(path)
+        worlds = world_matrices(document).items()
+        parts = [part for item in worlds for part in _parts(document, *item)]
+        if not parts and EXTENSION not in document.json.get("extensionsUsed", []):
+            document.fail(f"no primitive has the extension {EXTENSION}: it holds no Gaussians")
+        extras = document.json["asset"].get("extras")
+    notes = extras.get("notes") if isinstance(extras, dict) else None
+    return _merged(parts), [str(note) for note in notes] if isinstance(notes, list) else []
+
+
+# ---- writing -------------------------------------------------------------------------------------
+
+
+def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Return the attributes by semantic; rows are multiples of 4 bytes, as glTF asks for."""
+    opacity = opacities(gaussians.logit_opacities)[:, None]
+    fallback = np.concatenate([srgb_to_linear(sh0_colors(gaussians.sh[:, 0])), opacity], axis=1)
+    named = {
+        "POSITION": gaussians.means,
+        "COLOR_0": to_byte(255 * fallback),
+        f"{EXTENSION}:ROTATION": unit_quats(gaussians.quats)[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": np.exp(gaussians.log_scales),
+        f"{EXTENSION}:OPACITY": opacity,
+    }
+    harmonics = zip(_semantics(gaussians.sh.shape[1]), gaussians.sh.transpose(1, 0, 2), strict=True)
+    named |= dict(harmonics)
+    return {
+        name: np.ascontiguousarray(values, None if values.dtype == np.uint8 else "<f4")
+        for name, values in named.items()
+    }
+
+
+def _semantics(harmonics: int) -> list[str]:
+    """Name the attributes of (degree + 1)^2 harmonics, in their order."""
+    degrees = range(COEFFICIENTS.index(harmonics) + 1)
+    return [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{n}" for d in degrees for n in range(2 * d + 1)]
+
+
+def _document(
+    attributes: dict[str, np.ndarray], means: Float[np.ndarray, "N 3"], notes: Sequence[str]
+) -> dict[str, Any]:
+    """Return the JSON; an empty cloud is a scene without nodes, since accessors can't be empty."""
+    asset: dict[str, Any] = {"version": "2.0", "generator": "threestudio-gaussiandreamer"}
+    asset |= {"extras": {"notes": list(notes)}} if notes else {}
+    head = {"asset": asset, "extensionsUsed": [EXTENSION], "scene": 0}
+    if not len(means):
+        return head | {"scenes": [{"name": "no Gaussians"}]}
+    primitive = {
+        "attributes": {name: index for index, name in enumerate(attributes)},
+        "mode": POINTS,
+        "extensions": {EXTENSION: SPLATTING},
+    }
+    views, accessors, at = [], [], 0
+    for index, values in enumerate(attributes.values()):
+        place = {"buffer": 0, "byteOffset": at, "byteLength": values.nbytes}
+        views.append(place | {"target": ARRAY_BUFFER})
+        accessors.append(_accessor(index, values))
+        at += values.nbytes
+    accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
+    return head | {
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": at}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+
+
+def _accessor(view: int, values: np.ndarray) -> dict[str, Any]:
+    is_byte = values.dtype == np.uint8
+    return {
+        "bufferView": view,
+        "componentType": BYTE if is_byte else FLOAT,
+        "count": len(values),
+        "type": TYPES[values.shape[1]],
+        **({"normalized": True} if is_byte else {}),
+    }
+
+
+# ---- reading -------------------------------------------------------------------------------------
+
+
+def _parts(document: Document, node: int, world: Float[np.ndarray, "4 4"]) -> list[Gaussians]:
+    """Return the Gaussians of a node's primitives, in the world."""
+    entry = document.entry("nodes", node)
+    if "mesh" not in entry:
+        return []
+    primitives = document.entry("meshes", entry["mesh"])["primitives"]
+    ours = [item for item in primitives if EXTENSION in item.get("extensions", {})]
+    return [_placed(_read_primitive(document, item), world, document) for item in ours]
+
+
+def _read_primitive(document: Document, primitive: dict[str, Any]) -> Gaussians:
+    _check_extension(document, primitive)
+    attributes = primitive["attributes"]
+    count = document.count(attributes["POSITION"])
+    degrees = [d for d in range(1, len(COEFFICIENTS)) if _semantics((d + 1) ** 2)[-1] in attributes]
+    harmonics = COEFFICIENTS[max(degrees, default=0)]
+    needed = count * (DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * harmonics)
+    size, name = document.path.stat().st_size, f"GLB file {str(document.path)!r}"
+    require_file_memory(needed, size, name, f"{count} Gaussians")
+
+    def rows(semantic: str, kind: str) -> np.ndarray:
+        if semantic not in attributes:
+            document.fail(f"its Gaussians lack the attribute {semantic}")
+        values = document.accessor(attributes[semantic], (kind,)).floats()
+        if len(values) != count:
+            document.fail(f"{semantic} has {len(values)} rows for {count} Gaussians")
+        return values
+
+    scales = rows(f"{EXTENSION}:SCALE", "VEC3")
+    if (scales < 0).any():
+        document.fail("scales below 0: drafts of the extension before 2026 stored logarithms")
+    with np.errstate(divide="ignore"):
+        log_scales = np.log(scales)
+    return Gaussians(
+        means=rows("POSITION", "VEC3"),
+        quats=rows(f"{EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]],
+        log_scales=log_scales,
+        logit_opacities=logits(rows(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0], MARGIN),
+        sh=np.stack([rows(semantic, "VEC3") for semantic in _semantics(harmonics)], axis=1),
+    )
+
+
+def _check_extension(document: Document, primitive: dict[str, Any]) -> None:
+    extension = primitive["extensions"][EXTENSION]
+    if compressed := list(extension.get("extensions", {})):
+        document.fail(
+            f"its Gaussians are compressed by {compressed[0][:60]}, which isn't read here"
+        )
+    kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace")
+    if kernel != SPLATTING["kernel"]:
+        document.fail(f"its Gaussians have the kernel {str(kernel)[:40]!r}; 'ellipse' was expected")
+    if space != SPLATTING["colorSpace"]:
+        logger.warning("%s: colours of %r are read as sRGB", document.path, str(space)[:40])
+
+
+def _placed(gaussians: Gaussians, world: Float[np.ndarray, "4 4"], document: Document) -> Gaussians:
+    """Move Gaussians by a matrix that is a rotation, a translation and one scale."""
+    if np.array_equal(world, np.eye(4)):
+        return gaussians
+    scales = np.linalg.norm(world[:3, :3], axis=0)
+    scale = scales.mean()
+    rotation = world[:3, :3] / (scale if 0 < scale < np.inf else 1)
+    close = np.allclose(rotation.T @ rotation, np.eye(3), atol=SAME_SCALE)
+    if not close or np.linalg.det(rotation) < 0 or not np.isfinite(world).all():
+        document.fail("a node mirrors its Gaussians or scales them by different factors")
+    turned = rotate(gaussians, rotation)
+    return turned._replace(
+        means=(turned.means * scale + world[:3, 3]).astype(np.float32),
+        log_scales=(turned.log_scales + np.log(scale)).astype(np.float32),
+    )
+
+
+def _merged(parts: list[Gaussians]) -> Gaussians:
+    """Concatenate parts; harmonics that a part lacks are zero."""
+    if not parts:
+        shapes = (0, 3), (0, 4), (0, 3), (0,), (0, 1, 3)
+        return Gaussians(*(np.zeros(shape, np.float32) for shape in shapes))
+    most = max(part.sh.shape[1] for part in parts)
+    pads = [((0, 0), (0, most - part.sh.shape[1]), (0, 0)) for part in parts]
+    parts = [part._replace(sh=np.pad(part.sh, pad)) for part, pad in zip(parts, pads, strict=True)]
+    return Gaussians(*(np.concatenate(values) for values in zip(*parts, strict=True)))
