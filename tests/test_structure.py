@@ -32,10 +32,20 @@ RINGS = ring_of()
 MATHS_MAY_USE = {"torch", "numpy", "scipy", "jaxtyping"} | set(sys.stdlib_module_names)
 LIBRARIES = {  # of ring 0, beyond MATHS_MAY_USE
     "core": {"imageio", "PIL"},
+    "formats": {"PIL", "zstandard"},
     "meshes": {"trimesh", "embreex", "PIL", "tqdm"},
 }
 HOST = {"lightning", "pytorch_lightning", "omegaconf", "threestudio"}
-HEAVY = HOST | {"trimesh", "embreex", "diffusers", "transformers", "imageio", "PIL", "smplx"}
+HEAVY = HOST | {
+    "trimesh",
+    "embreex",
+    "diffusers",
+    "transformers",
+    "imageio",
+    "PIL",
+    "smplx",
+    "zstandard",
+}
 LONGEST_FUNCTION, LONGEST_FILE, LONGEST_LINE, MODULES_AT_THE_TOP = 40, 400, 100, 5
 MOST_EQUAL_LINES = 5
 KERNEL_SOURCES = {".cpp", ".cu", ".cuh", ".h"}

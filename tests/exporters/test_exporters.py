@@ -4,6 +4,7 @@ exported, upright.
 
 import importlib
 import pkgutil
+import sys
 
 import numpy as np
 import pytest
@@ -27,7 +28,10 @@ for module in pkgutil.iter_modules(exporters.__path__):
 
 WRITERS = {
     "ply": lambda path, stored: write_cloud(str(path), stored, ".ply"),
-    "spz": lambda path, stored: write_cloud(str(path), stored, ".spz"),
+    "spz": lambda path, stored, version: write_cloud(
+        str(path), stored, ".spz", spz_version=version
+    ),
+    "gaussians": lambda path, stored, suffix: write_cloud(str(path), stored, suffix),
     "points": lambda path, cloud: ply.write_points(path, cloud),
     "surface": lambda path, surface: write_obj(path, surface),
 }
@@ -273,3 +277,29 @@ class TestBundle:
         with pytest.raises(UserError, match=f"options.{'|'.join(options)}|options.points") as info:
             build("gaussiandreamer-exporter", formats=["ply", "spz", "points"], options=options)
         assert message in str(info.value)
+
+
+@pytest.mark.parametrize("name", ["compressed-ply", "sog", "glb"])
+def test_other_formats_read_back_the_right_way_up(tmp_path, name):
+    source = geometry(60, 1)
+    source.log_scales.data -= 3
+    (output,) = build(f"{name}-exporter", source)()
+    read = read_cloud(str(write(output, tmp_path))).in_axes("z").gaussians
+    means = source.means.detach().numpy()
+    order = [np.abs(means - mean).sum(axis=1).argmin() for mean in read.means]
+    assert sorted(order) == list(range(60))
+    np.testing.assert_allclose(read.means, means[order], atol=0.01)
+
+
+def test_the_version_of_spz_is_an_option(tmp_path):
+    pytest.importorskip("zstandard")
+    (output,) = build("spz-exporter", version=4)()
+    assert write(output, tmp_path).read_bytes()[:8] == b"NGSP\4\0\0\0"
+    with pytest.raises(UserError, match="version"):
+        build("spz-exporter", version=2)
+
+
+def test_a_version_that_cant_be_packed_is_found_before_the_run(monkeypatch):
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    with pytest.raises(UserError, match="pip install zstandard"):
+        build("gaussiandreamer-exporter", formats=["spz"], options={"spz": {"version": 4}})

@@ -107,3 +107,18 @@ def test_a_wrong_pruning_budget_is_found_before_the_run(
 ):
     assert launch(tmp_path, painted_box, *options) == 2
     assert said in capsys.readouterr().err
+
+
+def test_every_format_is_exported_and_says_that_it_was_trained_antialiased(tmp_path, painted_box):
+    options = [
+        "system.renderer.antialias=true",
+        "system.exporter.formats=[ply,compressed-ply,spz,sog,glb,usda]",
+    ]
+    steps = ["trainer.max_steps=1", "trainer.val_check_interval=1"]
+    assert launch(tmp_path, painted_box, *options, *steps) == 0
+    export = trial(tmp_path) / "save" / "it1-export"
+    suffixes = ["ply", "compressed.ply", "spz", "sog", "glb"]
+    stored = [read_cloud(str(export / f"gaussians.{suffix}")) for suffix in suffixes]
+    assert [cloud.antialiased for cloud in stored] == [True] * 5
+    assert [len(cloud.gaussians.means) for cloud in stored] == [200] * 5
+    assert "SplatRenderMode: mip" in (export / "gaussians.usda").read_text()

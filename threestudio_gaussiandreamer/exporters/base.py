@@ -6,13 +6,14 @@ and the system writes each with its method ``save_<save_type>(name, **params)``.
 
 import os
 from dataclasses import dataclass, field
-from typing import Optional
+from typing import List, Optional
 
 from ..core.errors import UserError
 from ..core.options import check_options, one_of, rule
+from ..formats.gaussian_files import FORMATS, StoredCloud
 from ..gaussians.axes import AXES
 from ..gaussians.gaussians import Gaussians, finite
-from ..host import BaseGeometry, Exporter
+from ..host import BaseGeometry, Exporter, ExporterOutput
 
 NAME_BYTES = 255
 """The longest file name on common file systems, bytes."""
@@ -68,3 +69,18 @@ def read_gaussians(geometry: BaseGeometry) -> Gaussians:
     skipped with a warning.
     """
     return finite(Gaussians.of(geometry).arrays(), "export")
+
+
+class CloudExporter(FileExporter):
+    """Base class of exporters that write all attributes of the Gaussians to one file."""
+
+    suffix = ""
+    """The format, a key of ``formats.gaussian_files.FORMATS``."""
+
+    def __call__(self) -> List[ExporterOutput]:
+        """Return one file of save_type "gaussians"; its params are ``{"stored": StoredCloud,
+        "suffix": str}``.
+        """
+        stored = StoredCloud(self.gaussians()).in_axes(FORMATS[self.suffix].up)
+        params = {"stored": stored, "suffix": self.suffix}
+        return [ExporterOutput(save_name=self.cfg.save_name, save_type="gaussians", params=params)]

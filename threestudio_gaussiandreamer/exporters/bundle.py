@@ -4,7 +4,7 @@
 option        meaning
 ============  ======================================================================================
 formats       names of registered exporters without their ``-exporter``: ``ply``, ``spz``,
-              ``points``, ``surface``, ...
+              ``compressed-ply``, ``sog``, ``glb``, ``usda``, ``points``, ``surface``
 options       options of some of them: ``{ply: {pad_sh_degree: 3}}``
 up            the up axis in all formats that have this option (``ply``, ``surface``): ``z`` for
               this package's world; by default the axis that viewers of each format expect

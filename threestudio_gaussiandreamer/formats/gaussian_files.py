@@ -1,11 +1,13 @@
-"""Read and write files of Gaussians, PLY or SPZ by extension, with their axes and the PSNR to which
-they were pruned.
+"""Read and write files of Gaussians of all formats, with the metadata that a file can hold: its
+axes, whether the cloud was trained with antialiasing, and the PSNR to which it was pruned.
 
-The axes of a file are known: a PLY has them in a comment of its header, and SPZ is y up by
+The axes of a file are known: a PLY has them in a comment of its header, the other formats by
 definition. A PLY without that comment, as other programs write it, is read as -y up, the axes of 3D
 Gaussian splatting and its viewers. The same axes are written by default."""
 
 import re
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Optional
 
@@ -13,12 +15,21 @@ from ..core.errors import UserError, unknown
 from ..core.files import existing_file
 from ..gaussians.axes import AXES, VIEWER_UP, WORLD_UP, rotate, rotation_between
 from ..gaussians.gaussians import Gaussians, drawable
+from . import spz
+from .compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
+from .glb import GLB_UP, load_glb, write_glb
 from .ply import gaussians_size, read_comments, read_gaussians, write_gaussians
-from .spz import SPZ_UP, read_spz, read_spz_comment, spz_arrays, spz_bytes, write_spz
+from .sog import SOG_UP, load_sog, write_sog
+from .splat import read_splat
+from .spz import SPZ_UP, load_spz, read_spz_comment, spz_arrays, spz_bytes, write_spz
+from .usda import USDA_UP, write_usda
 
 UP, PRUNED = "up:", "pruned to the likeness, dB:"
-DEFAULT_UP = {".ply": VIEWER_UP, ".spz": SPZ_UP}
-"""The up axis of a file without a comment about it, by format; the keys are all formats."""
+ANTIALIASED = "SplatRenderMode: mip"
+"""The comment by which Brush, SuperSplat and splat-transform tag clouds trained with antialiasing.
+"""
+RENDER_MODE = re.compile(r"splatrendermode: *(\w+)|antialiased ([01])", re.IGNORECASE)
+"""That comment, or Postshot's."""
 
 
 class StoredCloud(NamedTuple):
@@ -30,6 +41,8 @@ class StoredCloud(NamedTuple):
     """The axis that is up, a key of ``AXES``."""
     pruned_to: Optional[float] = None
     """PSNR to the original cloud, dB, after the pruning so far; None if it wasn't pruned."""
+    antialiased: bool = False
+    """Whether it was trained with antialiasing, and so has to be drawn with it."""
 
     def in_axes(self, up: str) -> "StoredCloud":
         """Return the same cloud in coordinates with another axis up."""
@@ -39,21 +52,98 @@ class StoredCloud(NamedTuple):
         return self._replace(gaussians=rotate(self.gaussians, rotation), up=up)
 
 
-def require_format(name: str, option: str) -> str:
-    """Return the extension of a file name after checking that it is a known format.
+# ---- formats -------------------------------------------------------------------------------------
+
+Content = tuple[Gaussians, list[str]]
+"""Gaussians in the file's axes, and notes about them."""
+
+
+class CloudFormat(NamedTuple):
+    """How files of an extension are read and written."""
+
+    up: str
+    """The axis that is up, in formats with ``any_up`` where no note says another one."""
+    read: Optional[Callable[[Path], Content]]
+    write: Optional[Callable[..., None]]
+    """Called with the path, the Gaussians and the notes; None where a format is only read."""
+    any_up: bool = False
+    """Whether a file states its axes in a note."""
+
+
+def _read_ply(path: Path) -> Content:
+    """Read a PLY of either layout."""
+    if is_compressed_ply(path):
+        return read_compressed_ply(path), read_comments(path)
+    return read_gaussians(path, allow_non_finite=True), read_comments(path)
+
+
+def _read_spz(path: Path) -> Content:
+    gaussians, antialiased = load_spz(path)
+    notes = [ANTIALIASED] if antialiased else []
+    return gaussians, read_spz_comment(path).split("; ") + notes
+
+
+def _read_sog(path: Path) -> Content:
+    gaussians, antialiased, notes = load_sog(path)
+    return gaussians, notes + ([ANTIALIASED] if antialiased else [])
+
+
+def _write_spz(
+    path: str, gaussians: Gaussians, notes: Sequence[str], version: int = spz.VERSION
+) -> None:
+    comment = "; ".join(note for note in notes if note != ANTIALIASED)
+    write_spz(path, gaussians, comment=comment, version=version, antialiased=ANTIALIASED in notes)
+
+
+def _write_sog(path: str, gaussians: Gaussians, notes: Sequence[str]) -> None:
+    others = [note for note in notes if note != ANTIALIASED]
+    write_sog(path, gaussians, antialiased=ANTIALIASED in notes, notes=others)
+
+
+FORMATS = {
+    ".ply": CloudFormat(VIEWER_UP, _read_ply, write_gaussians, any_up=True),
+    ".compressed.ply": CloudFormat(VIEWER_UP, _read_ply, write_compressed_ply, any_up=True),
+    ".spz": CloudFormat(SPZ_UP, _read_spz, _write_spz),
+    ".sog": CloudFormat(SOG_UP, _read_sog, _write_sog),
+    ".glb": CloudFormat(GLB_UP, load_glb, write_glb),
+    ".gltf": CloudFormat(GLB_UP, load_glb, None),
+    ".usda": CloudFormat(USDA_UP, None, write_usda),
+    ".splat": CloudFormat(VIEWER_UP, lambda path: (read_splat(path), []), None),
+}
+"""By extension."""
+READ = tuple(suffix for suffix, known in FORMATS.items() if known.read)
+WRITTEN = tuple(suffix for suffix, known in FORMATS.items() if known.write)
+PRUNED_FORMATS = (".ply", ".spz")
+"""Formats whose size and rounding :func:`file_size` and :func:`as_stored` know."""
+
+
+def suffix_of(name: str) -> str:
+    """Return the longest known extension of a file name in lower case, or what follows its last
+    dot.
+    """
+    known = [suffix for suffix in FORMATS if name.lower().endswith(suffix)]
+    return max(known, key=len, default=Path(name).suffix.lower())
+
+
+def require_format(name: str, option: str, formats: Collection[str] = WRITTEN) -> str:
+    """Return the extension of a file name after checking that it is one of ``formats``.
 
     Args:
         option: names the option in the message.
 
     Raises:
-        UserError: the extension is unknown.
+        UserError: the extension is another one.
     """
-    suffix = Path(name).suffix.lower()
-    if suffix not in DEFAULT_UP:
+    suffix = suffix_of(name)
+    if suffix not in formats:
+        *others, last = formats
         raise UserError(
-            f"{option}: expected the name of a {' or '.join(DEFAULT_UP)} file, got {name!r}"
+            f"{option}: expected the name of a {', '.join(others)} or {last} file, got {name!r}"
         )
     return suffix
+
+
+# ---- reading -------------------------------------------------------------------------------------
 
 
 def read_cloud(path: str, *, up: Optional[str] = None) -> StoredCloud:
@@ -66,7 +156,7 @@ def read_cloud(path: str, *, up: Optional[str] = None) -> StoredCloud:
         UserError: there is no such file, its format is unknown, or it is damaged.
     """
     file = existing_file(path, "file of Gaussians")
-    require_format(file.name, "IN")
+    require_format(file.name, "IN", READ)
     stored = read_stored(file, up=up)
     return stored._replace(gaussians=drawable(stored.gaussians, str(file)))
 
@@ -74,16 +164,16 @@ def read_cloud(path: str, *, up: Optional[str] = None) -> StoredCloud:
 def read_stored(file: Path, *, up: Optional[str] = None) -> StoredCloud:
     """Read all Gaussians of a file, including those that can't be drawn; see :func:`read_cloud`.
 
-    The file is read as SPZ if that is its extension, otherwise as PLY.
+    The format is that of the extension, or PLY where the extension is unknown.
     """
-    if file.suffix.lower() == ".spz":
-        gaussians, notes = read_spz(file), read_spz_comment(file).split("; ")
-    else:
-        gaussians, notes = read_gaussians(file, allow_non_finite=True), read_comments(file)
+    known = FORMATS.get(suffix_of(file.name), FORMATS[".ply"])
+    if known.read is None:
+        raise UserError(f"{str(file)!r}: files of this format are written here, but not read")
+    gaussians, notes = known.read(file)
     if up is not None and up not in AXES:
         raise unknown("axis", up, AXES)
-    up = up or stated_up(notes) or DEFAULT_UP.get(file.suffix.lower(), VIEWER_UP)
-    return StoredCloud(gaussians, up, _number(_note(notes, PRUNED)))
+    up = up or stated_up(notes) or known.up
+    return StoredCloud(gaussians, up, _number(_note(notes, PRUNED)), _stated_mode(notes))
 
 
 def stated_up(notes: list[str]) -> Optional[str]:
@@ -104,46 +194,62 @@ def _note(notes: list[str], key: str) -> str:
     )
 
 
+def _stated_mode(notes: list[str]) -> bool:
+    """Return whether the last note about it says that the cloud was trained with antialiasing."""
+    modes = [found for note in notes if (found := RENDER_MODE.fullmatch(note.strip()))]
+    return bool(modes) and "".join(filter(None, modes[-1].groups())).lower() in ("mip", "1")
+
+
 def _number(text: str) -> Optional[float]:
     """Parse the number in a note, or return None; the file may be from another program."""
     return float(text) if re.fullmatch(r"\d{1,4}(\.\d{1,9})?", text) else None
 
 
-def write_cloud(path: str, cloud: StoredCloud, suffix: Optional[str] = None) -> None:
-    """Write a cloud: PLY in the cloud's axes, SPZ in those of the format.
+# ---- writing -------------------------------------------------------------------------------------
+
+
+def write_cloud(
+    path: str,
+    cloud: StoredCloud,
+    suffix: Optional[str] = None,
+    *,
+    spz_version: int = spz.VERSION,
+) -> None:
+    """Write a cloud: a PLY in the cloud's axes, other formats in their own.
 
     Args:
-        suffix: ``.ply`` or ``.spz``; by default the extension of ``path``.
+        suffix: one of ``WRITTEN``; by default the extension of ``path``.
+        spz_version: 3 or 4.
 
     Raises:
         UserError: the format is unknown or doesn't support the harmonics' degree, or the file can't
             be written.
     """
-    if (suffix or require_format(path, "OUT")) == ".ply":
-        write_gaussians(path, cloud.gaussians, ply_notes(cloud))
-    else:
-        write_spz(path, cloud.in_axes(SPZ_UP).gaussians, comment=spz_note(cloud))
+    suffix = suffix or require_format(path, "OUT")
+    known = FORMATS[suffix]
+    stored = cloud if known.any_up else cloud.in_axes(known.up)
+    write = partial(known.write, version=spz_version) if suffix == ".spz" else known.write
+    write(path, stored.gaussians, _notes(stored, known))
 
 
-def ply_notes(cloud: StoredCloud) -> list[str]:
-    """Return the comments about a cloud in the header of its PLY."""
-    return [f"{UP} {cloud.up}", *filter(None, [spz_note(cloud)])]
-
-
-def spz_note(cloud: StoredCloud) -> str:
-    """Return the comment about a cloud in its SPZ file: the PSNR of pruning, or nothing."""
-    return "" if cloud.pruned_to is None else f"{PRUNED} {cloud.pruned_to:.6g}"
+def _notes(cloud: StoredCloud, known: CloudFormat) -> list[str]:
+    """Return what a file says about a cloud besides its Gaussians."""
+    pruned = [] if cloud.pruned_to is None else [f"{PRUNED} {cloud.pruned_to:.6g}"]
+    up = [f"{UP} {cloud.up}"] if known.any_up else []
+    return [*up, *pruned, *([ANTIALIASED] if cloud.antialiased else [])]
 
 
 def file_size(cloud: StoredCloud, suffix: str) -> int:
-    """Return the size in bytes of the file that :func:`write_cloud` would write."""
+    """Return the size in bytes of the PLY or SPZ file that :func:`write_cloud` would write."""
+    notes = _notes(cloud, FORMATS[suffix])
     if suffix == ".spz":
-        return len(spz_bytes(cloud.in_axes(SPZ_UP).gaussians, comment=spz_note(cloud)))
-    return gaussians_size(*cloud.gaussians.sh.shape[:2], ply_notes(cloud))
+        comment = "; ".join(note for note in notes if note != ANTIALIASED)
+        return len(spz_bytes(cloud.in_axes(SPZ_UP).gaussians, comment=comment))
+    return gaussians_size(*cloud.gaussians.sh.shape[:2], notes)
 
 
 def as_stored(cloud: StoredCloud, suffix: str) -> StoredCloud:
-    """Return the cloud as it would be read back from a file of this format; SPZ reorders it too."""
+    """Return the cloud as it would be read back from a PLY or SPZ file; SPZ reorders it too."""
     if suffix == ".ply":
         return cloud
     packed = spz_bytes(cloud.in_axes(SPZ_UP).gaussians)

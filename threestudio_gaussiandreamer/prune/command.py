@@ -1,7 +1,7 @@
 """Prune a finished cloud to a budget: ``python -m threestudio_gaussiandreamer.prune IN OUT
 --psnr 40``.
 
-IN is a PLY or SPZ file of Gaussians of any program, or a checkpoint of this package or of gsplat;
+IN is a file of Gaussians in any format that is read (docs/formats.md), or a checkpoint;
 OUT is a PLY or SPZ file. From PLY to PLY the axes are kept; otherwise a PLY is written with -y up,
 as viewers expect. The report is written to OUT.json, and views of the cloud before (top) and after
 pruning to OUT.png.
@@ -21,7 +21,7 @@ from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.files import require_writable
 from ..core.options import check_options
-from ..formats.gaussian_files import require_format, write_cloud
+from ..formats.gaussian_files import PRUNED_FORMATS, require_format, write_cloud
 from ..gaussians.axes import AXES, VIEWER_UP
 from ..gaussians.views import EPS2D
 from .options import PruneOptions
@@ -78,9 +78,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         description="Prune a finished cloud of Gaussians to a budget; beside OUT: OUT.json, "
         "the report, and OUT.png, before and after.",
     )
-    parser.add_argument(
-        "source", metavar="IN", help="a PLY or SPZ file of Gaussians, or a checkpoint"
-    )
+    parser.add_argument("source", metavar="IN", help="a file of Gaussians, or a checkpoint")
     parser.add_argument("output", metavar="OUT", help="the PLY or SPZ file to write")
     group = parser.add_argument_group("the budget, one of")
     budget = group.add_mutually_exclusive_group(required=True)
@@ -102,7 +100,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         **{option.name: getattr(args, option.name) for option in fields(PruneOptions)}
     )
     check_options(PruneOptions, options, "--")
-    suffix = require_format(args.output, "OUT")
+    suffix = require_format(args.output, "OUT", PRUNED_FORMATS)
     for ending in ("", *REPORTS):
         require_writable(args.output + ending, f"OUT{ending}")
     if _same_file(args.source, args.output):

@@ -9,6 +9,7 @@ from ..exporters.base import read_gaussians
 from ..formats.gaussian_files import StoredCloud, write_cloud
 from ..formats.obj import write_obj
 from ..formats.ply import write_points
+from ..formats.spz import VERSION
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.surface import Surface
 from ..gaussians.views import EPS2D
@@ -21,6 +22,10 @@ SUMMARY = ("held_out/compare.png", "it*-test.*", "it*-export/*.*", "it*-export/p
 """Files below the folder of results that the last message of a run names."""
 
 
+CLOUDS = ("ply", "spz", "gaussians")
+"""Types of exports that hold all attributes of the Gaussians."""
+
+
 class GaussianSavers:
     """The ``save_<save_type>`` that our exporters name, for a system of the host; each writes
     below the system's folder and returns the path.
@@ -29,15 +34,28 @@ class GaussianSavers:
     def save_ply(
         self, filename: str, stored: StoredCloud, pruned_to: Optional[float] = None
     ) -> str:
-        path = self.get_save_path(filename)
-        write_cloud(path, stored._replace(pruned_to=pruned_to), ".ply")
-        return path
+        return self.save_gaussians(filename, stored, ".ply", pruned_to)
 
     def save_spz(
-        self, filename: str, stored: StoredCloud, pruned_to: Optional[float] = None
+        self,
+        filename: str,
+        stored: StoredCloud,
+        pruned_to: Optional[float] = None,
+        version: int = VERSION,
+    ) -> str:
+        return self.save_gaussians(filename, stored, ".spz", pruned_to, spz_version=version)
+
+    def save_gaussians(
+        self,
+        filename: str,
+        stored: StoredCloud,
+        suffix: str,
+        pruned_to: Optional[float] = None,
+        **options: Any,
     ) -> str:
         path = self.get_save_path(filename)
-        write_cloud(path, stored._replace(pruned_to=pruned_to), ".spz")
+        stored = stored._replace(pruned_to=pruned_to, antialiased=is_antialiased(self))
+        write_cloud(path, stored, suffix, **options)
         return path
 
     def save_points(self, filename: str, cloud: PointCloud) -> str:
@@ -49,6 +67,12 @@ class GaussianSavers:
         path = self.get_save_path(filename)
         write_obj(path, surface)
         return path
+
+
+def is_antialiased(system: Any) -> bool:
+    """Return whether a system trains with antialiasing, which only our renderer has."""
+    renderer = getattr(system, "renderer", None)
+    return isinstance(renderer, SplattingRenderer) and bool(renderer.cfg.antialias)
 
 
 def export(system: Any) -> None:
@@ -80,7 +104,7 @@ def export_cloud(
     parts = {"geometry": geometry, "material": system.material, "background": system.background}
     exporter = find(system.cfg.exporter_type)(system.cfg.exporter, **parts)
     for out in exporter():
-        noted = {"pruned_to": pruned_to} if out.save_type in ("ply", "spz") else {}
+        noted = {"pruned_to": pruned_to} if out.save_type in CLOUDS else {}
         save = getattr(system, f"save_{out.save_type}")
         save(f"{folder}/{out.save_name}", **noted, **out.params)
 
@@ -110,7 +134,7 @@ def prune_options(system: Any) -> PruneOptions:
         # in square pixels of what is exported, which downsampling has made smaller
         options.eps2d = ours.eps2d / ours.downsample**2 if ours else EPS2D
     if options.antialias is None:
-        options.antialias = bool(ours and ours.antialias)
+        options.antialias = is_antialiased(system)
     return options
 
 

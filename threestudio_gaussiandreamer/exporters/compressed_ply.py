@@ -1,0 +1,28 @@
+"""``compressed-ply-exporter``: the Gaussians as PlayCanvas' compressed PLY, a quarter of the PLY's
+size, for SuperSplat and other web viewers.
+
+===========  ==================================================================================
+option       meaning
+===========  ==================================================================================
+save_name    name of the file in the export folder
+save_video   also render the turntable
+===========  ==================================================================================
+
+A Gaussian of degree 0 takes 16.3 bytes; docs/formats.md has the PSNR that is lost by rounding. The
+axes are those of the PLY, -y up."""
+
+from dataclasses import dataclass, field
+
+from ..host import register
+from .base import SAVE_NAME, CloudExporter
+
+
+@register("compressed-ply-exporter")
+class CompressedPlyExporter(CloudExporter):
+    suffix = ".compressed.ply"
+
+    @dataclass
+    class Config(CloudExporter.Config):
+        save_name: str = field(default="gaussians.compressed.ply", metadata=SAVE_NAME)
+
+    cfg: Config

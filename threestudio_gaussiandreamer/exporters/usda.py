@@ -1,0 +1,27 @@
+"""``usda-exporter``: the Gaussians as USD text, for Omniverse, Houdini and other programs that read
+OpenUSD 26.03.
+
+===========  ==================================================================================
+option       meaning
+===========  ==================================================================================
+save_name    name of the file in the export folder
+save_video   also render the turntable
+===========  ==================================================================================
+
+Nothing is rounded; y is up. The file is about three times as large as the PLY."""
+
+from dataclasses import dataclass, field
+
+from ..host import register
+from .base import SAVE_NAME, CloudExporter
+
+
+@register("usda-exporter")
+class UsdaExporter(CloudExporter):
+    suffix = ".usda"
+
+    @dataclass
+    class Config(CloudExporter.Config):
+        save_name: str = field(default="gaussians.usda", metadata=SAVE_NAME)
+
+    cfg: Config
