@@ -26,15 +26,7 @@ from ..core.errors import UserError
 from ..core.files import atomic_file, existing_file
 from ..gaussians.gaussians import Gaussians, finite
 from ..gaussians.sh import COEFFICIENTS, rgb_to_sh0, sh0_to_rgb
-from .packing import (
-    logits_of_bytes,
-    morton_order,
-    opacities,
-    to_byte,
-    unit_quats,
-    with_largest,
-    without_largest,
-)
+from . import packing
 from .ply_table import BYTE_ORDERS, Element, read_header
 
 logger = logging.getLogger(__name__)
@@ -54,8 +46,6 @@ SH_REACH = 4.0
 """Stored coefficients lie between plus and minus this."""
 MAX_STORED_LOG = 20.0
 """Other readers expect logarithms of scales within plus and minus this."""
-MAX_STORED_OPACITY = 254
-"""Opacities of byte 255 would have an infinite logit."""
 
 
 def write_compressed_ply(
@@ -71,7 +61,7 @@ def write_compressed_ply(
         UserError: harmonics above degree 3, or the file can't be written.
     """
     gaussians = finite(gaussians, str(path))
-    gaussians = gaussians.rows(morton_order(gaussians.means))
+    gaussians = gaussians.rows(packing.morton_order(gaussians.means))
     count, coefficients = len(gaussians.means), 3 * (gaussians.sh.shape[1] - 1)
     values = _chunked_values(gaussians)
     limits = _limits(values)
@@ -114,7 +104,7 @@ def read_compressed_ply(path: str | os.PathLike) -> Gaussians:
         means=_between(_fractions(position), limits[:, 0], chunks).astype(np.float32),
         quats=_quats(rotation),
         log_scales=_between(_fractions(scale), limits[:, 1], chunks).astype(np.float32),
-        logit_opacities=logits_of_bytes(_bytes_of(color)[:, 3]),
+        logit_opacities=packing.logits_of_bytes(_bytes_of(color)[:, 3]),
         sh=np.concatenate([rgb_to_sh0(colors)[:, None].astype(np.float32), _harmonics(rest)], 1),
     )
 
@@ -157,8 +147,8 @@ def _packed(
     fractions = (values - low) / np.where(size > 0, size, 1)
     count = len(gaussians.means)
     position, scale, color = fractions.reshape(-1, 3, 3)[:count].transpose(1, 0, 2)
-    alpha = to_byte(255 * opacities(gaussians.logit_opacities)).clip(max=MAX_STORED_OPACITY)
-    rgba = np.concatenate([to_byte(255 * color), alpha[:, None]], axis=1)
+    alpha = packing.opacity_bytes(gaussians.logit_opacities)
+    rgba = np.concatenate([packing.to_byte(255 * color), alpha[:, None]], axis=1)
     words = [
         _word(position, BITS),
         _rotation_word(gaussians.quats),
@@ -178,13 +168,13 @@ def _word(fractions: Float[np.ndarray, "N F"], bits: Sequence[int]) -> Int[np.nd
 
 
 def _rotation_word(quats: Float[np.ndarray, "N 4"]) -> Int[np.ndarray, " N"]:
-    largest, others = without_largest(unit_quats(quats))
+    largest, others = packing.without_largest(packing.unit_quats(quats))
     return largest.astype(np.uint32) << 30 | _word(others / sqrt(2) + 0.5, (10, 10, 10))
 
 
 def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Int[np.ndarray, "N C"]:
     by_channel = rest.transpose(0, 2, 1).reshape(len(rest), 3 * rest.shape[1])
-    return to_byte(np.floor(256 * (by_channel / (2 * SH_REACH) + 0.5)))
+    return packing.to_byte(np.floor(256 * (by_channel / (2 * SH_REACH) + 0.5)))
 
 
 # ---- reading -------------------------------------------------------------------------------------
@@ -265,7 +255,7 @@ def _fractions(words: Int[np.ndarray, " N"], bits: Sequence[int] = BITS) -> np.n
 
 def _quats(words: Int[np.ndarray, " N"]) -> Float[np.ndarray, "N 4"]:
     others = (_fractions(words, (10, 10, 10)) - 0.5) * sqrt(2)
-    return with_largest(words.astype(np.int64) >> 30, others)
+    return packing.with_largest(words.astype(np.int64) >> 30, others)
 
 
 def _bytes_of(words: Int[np.ndarray, " N"]) -> Int[np.ndarray, "N 4"]:

@@ -91,8 +91,8 @@ def _read_sog(path: Path) -> Content:
 def _write_spz(
     path: str, gaussians: Gaussians, notes: Sequence[str], version: int = spz.VERSION
 ) -> None:
-    comment = "; ".join(note for note in notes if note != ANTIALIASED)
-    write_spz(path, gaussians, comment=comment, version=version, antialiased=ANTIALIASED in notes)
+    antialiased, comment = ANTIALIASED in notes, _without_mode(notes)
+    write_spz(path, gaussians, comment=comment, version=version, antialiased=antialiased)
 
 
 def _write_sog(path: str, gaussians: Gaussians, notes: Sequence[str]) -> None:
@@ -239,13 +239,26 @@ def _notes(cloud: StoredCloud, known: CloudFormat) -> list[str]:
     return [*up, *pruned, *([ANTIALIASED] if cloud.antialiased else [])]
 
 
+def ply_notes(cloud: StoredCloud) -> list[str]:
+    """Return the comments about a cloud in the header of its PLY."""
+    return _notes(cloud, FORMATS[".ply"])
+
+
+def spz_note(cloud: StoredCloud) -> str:
+    """Return the comment about a cloud in its SPZ file: the PSNR of pruning, or nothing."""
+    return _without_mode(_notes(cloud, FORMATS[".spz"]))
+
+
+def _without_mode(notes: Sequence[str]) -> str:
+    """Join notes for an SPZ, which has a flag for antialiasing."""
+    return "; ".join(note for note in notes if note != ANTIALIASED)
+
+
 def file_size(cloud: StoredCloud, suffix: str) -> int:
     """Return the size in bytes of the PLY or SPZ file that :func:`write_cloud` would write."""
-    notes = _notes(cloud, FORMATS[suffix])
     if suffix == ".spz":
-        comment = "; ".join(note for note in notes if note != ANTIALIASED)
-        return len(spz_bytes(cloud.in_axes(SPZ_UP).gaussians, comment=comment))
-    return gaussians_size(*cloud.gaussians.sh.shape[:2], notes)
+        return len(spz_bytes(cloud.in_axes(SPZ_UP).gaussians, comment=spz_note(cloud)))
+    return gaussians_size(*cloud.gaussians.sh.shape[:2], ply_notes(cloud))
 
 
 def as_stored(cloud: StoredCloud, suffix: str) -> StoredCloud:

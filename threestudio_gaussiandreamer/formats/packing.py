@@ -7,6 +7,8 @@ OPACITY_MARGIN = 1 / 2040
 """Opacities that are read from bytes are clamped to this distance from 0 and 1, an eighth of a
 step, since their logits are infinite there.
 """
+MAX_OPACITY_BYTE = 254
+"""Other readers take the logit of the byte over 255, which is infinite at 255."""
 
 
 def morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
@@ -57,6 +59,13 @@ def opacities(logits: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
     from scipy.special import expit
 
     return expit(logits.astype(np.float64))
+
+
+def opacity_bytes(
+    logits: Float[np.ndarray, " N"], most: int = MAX_OPACITY_BYTE
+) -> Int[np.ndarray, " N"]:
+    """Return opacities in steps of 1 / 255, at most ``most``."""
+    return to_byte(255 * opacities(logits)).clip(max=most)
 
 
 def logits_of_bytes(alphas: Int[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:

@@ -35,16 +35,8 @@ from ..core.files import atomic_file
 from ..gaussians.axes import VIEWER_UP
 from ..gaussians.gaussians import Gaussians, finite
 from ..gaussians.sh import COEFFICIENTS
+from . import packing
 from .codebook import scalar_codebook, vector_codebook
-from .packing import (
-    logits_of_bytes,
-    morton_order,
-    opacities,
-    to_byte,
-    unit_quats,
-    with_largest,
-    without_largest,
-)
 from .sog_archive import CODEBOOK, FIRST_TAG, PALETTE_COLUMNS, SogArchive
 
 SOG_UP = VIEWER_UP
@@ -74,7 +66,7 @@ def write_sog(
         UserError: harmonics above degree 3, or the file can't be written.
     """
     gaussians = finite(gaussians, str(path))
-    gaussians = gaussians.rows(morton_order(gaussians.means))
+    gaussians = gaussians.rows(packing.morton_order(gaussians.means))
     images, meta = _encoded(gaussians)
     meta |= {"model": ANTIALIASED} if antialiased else {}
     meta |= {"notes": list(notes)} if notes else {}
@@ -106,7 +98,7 @@ def load_sog(path: str | os.PathLike) -> tuple[Gaussians, bool, list[str]]:
             means=_positions((low | high << 8)[:, :3], *archive.bounds()),
             quats=_quats(quats, archive),
             log_scales=archive.codebook("scales")[archive.rows("scales")[:, :3]],
-            logit_opacities=logits_of_bytes(sh0[:, 3]),
+            logit_opacities=packing.logits_of_bytes(sh0[:, 3]),
             sh=_harmonics(archive.codebook("sh0")[sh0[:, :3]], archive),
         )
         return gaussians, archive.meta.get("model") == ANTIALIASED, archive.notes()
@@ -120,7 +112,7 @@ def _encoded(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], dict[str, Any
     positions, bounds = _position_steps(gaussians.means)
     scale_book, scale_rows = scalar_codebook(gaussians.log_scales, CODEBOOK)
     color_book, color_rows = scalar_codebook(gaussians.sh[:, 0], CODEBOOK)
-    alphas = to_byte(255 * opacities(gaussians.logit_opacities))[:, None]
+    alphas = packing.opacity_bytes(gaussians.logit_opacities, 255)[:, None]
     images = {
         "means_l.webp": _image(positions & 255),
         "means_u.webp": _image(positions >> 8),
@@ -159,9 +151,9 @@ def _position_steps(
 
 
 def _quat_bytes(quats: Float[np.ndarray, "N 4"]) -> Int[np.ndarray, "N 4"]:
-    largest, others = without_largest(unit_quats(quats))
+    largest, others = packing.without_largest(packing.unit_quats(quats))
     tags = (FIRST_TAG + largest).astype(np.uint8)
-    return np.concatenate([to_byte(255 * (others / sqrt(2) + 0.5)), tags[:, None]], axis=1)
+    return np.concatenate([packing.to_byte(255 * (others / sqrt(2) + 0.5)), tags[:, None]], axis=1)
 
 
 def _palette(rest: Float[np.ndarray, "N K 3"]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -229,7 +221,7 @@ def _quats(rows: Int[np.ndarray, "N 4"], archive: SogArchive) -> Float[np.ndarra
     largest = rows[:, 3].astype(np.int64) - FIRST_TAG
     if (largest < 0).any():
         archive.fail("a quaternion's largest component has no number of 0 to 3: it is damaged")
-    return with_largest(largest, (rows[:, :3] / 255 - 0.5) * sqrt(2))
+    return packing.with_largest(largest, (rows[:, :3] / 255 - 0.5) * sqrt(2))
 
 
 def _harmonics(

@@ -32,15 +32,7 @@ from jaxtyping import Bool, Float, Int
 from ..core.errors import UserError
 from ..core.files import atomic_file, existing_file
 from ..gaussians.gaussians import Gaussians, finite, usable
-from .packing import (
-    logits_of_bytes,
-    morton_order,
-    opacities,
-    to_byte,
-    unit_quats,
-    with_largest,
-    without_largest,
-)
+from . import packing
 from .spz_container import ANTIALIASED, MAGIC, SpzHeader, pack, unpack
 
 logger = logging.getLogger(__name__)
@@ -56,7 +48,6 @@ INLIERS, OUTLIER = 0.99, 256
 """If the range of the farthest position would leave fewer than ``MIN_STEPS_PER_SIZE`` steps per
 median size, positions beyond ``OUTLIER`` times the ``INLIERS`` quantile of distances are clipped.
 """
-MAX_OPACITY_BYTE = 254
 COLOR_SCALE = 0.15
 MAX_FIXED = 2**23 - 1
 COLOR_REACH = 0.5 / COLOR_SCALE
@@ -123,13 +114,13 @@ def spz_bytes(
         raise UserError("an SPZ file can't hold Gaussians with NaN or infinite values")
     if gaussians.sh_degree > 3:
         raise UserError(f"an SPZ file holds harmonics up to degree 3, not {gaussians.sh_degree}")
-    gaussians = gaussians.rows(morton_order(gaussians.means))
+    gaussians = gaussians.rows(packing.morton_order(gaussians.means))
     fractional = _fractional_bits(gaussians)
     blocks = [
         _fixed_point(gaussians.means, fractional),
-        to_byte(255 * opacities(gaussians.logit_opacities)).clip(max=MAX_OPACITY_BYTE),
-        to_byte(255 * (COLOR_SCALE * gaussians.sh[:, 0] + 0.5)),
-        to_byte(16 * (gaussians.log_scales - MIN_LOG_SCALE)),
+        packing.opacity_bytes(gaussians.logit_opacities),
+        packing.to_byte(255 * (COLOR_SCALE * gaussians.sh[:, 0] + 0.5)),
+        packing.to_byte(16 * (gaussians.log_scales - MIN_LOG_SCALE)),
         _smallest_three(gaussians.quats),
         _harmonic_bytes(gaussians.sh[:, 1:]),
     ]
@@ -176,7 +167,7 @@ def _decoded(header: SpzHeader, blocks: list[Int[np.ndarray, "N B"]]) -> Gaussia
         means=_positions(positions, header.fractional_bits),
         quats=read_quats(rotations),
         log_scales=scales / np.float32(16) + np.float32(MIN_LOG_SCALE),
-        logit_opacities=logits_of_bytes(alphas[:, 0]),
+        logit_opacities=packing.logits_of_bytes(alphas[:, 0]),
         sh=_harmonics(colors, harmonics),
     )
 
@@ -226,7 +217,7 @@ def _positions(block: Int[np.ndarray, "N 9"], fractional_bits: int) -> Float[np.
 
 
 def _smallest_three(quats: Float[np.ndarray, "N 4"]) -> Int[np.ndarray, " N"]:
-    largest, others = without_largest(unit_quats(quats)[:, [1, 2, 3, 0]])
+    largest, others = packing.without_largest(packing.unit_quats(quats)[:, [1, 2, 3, 0]])
     fields = (
         np.rint(np.abs(others) * (511 * sqrt(2))).astype(np.int64).clip(0, 511) | (others < 0) << 9
     )
@@ -237,7 +228,7 @@ def _from_smallest_three(block: Int[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 
     word = np.ascontiguousarray(block).view("<u4").astype(np.int64)
     fields = word >> np.array([20, 10, 0]) & 1023
     others = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / (511 * sqrt(2))
-    return with_largest(word[:, 0] >> 30, others)[:, [3, 0, 1, 2]]
+    return packing.with_largest(word[:, 0] >> 30, others)[:, [3, 0, 1, 2]]
 
 
 def _from_first_three(block: Int[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4"]:
@@ -264,4 +255,4 @@ def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Int[np.ndarray, "N K 3"
     """
     degrees = np.sqrt(np.arange(1, rest.shape[1] + 1)).astype(int) - 1
     steps = 2 ** (8 - np.array(SH_BITS))[degrees][:, None]
-    return to_byte(np.floor((np.rint(128 * rest) + 128 + steps // 2) / steps) * steps)
+    return packing.to_byte(np.floor((np.rint(128 * rest) + 128 + steps // 2) / steps) * steps)

@@ -12,7 +12,7 @@ from typing import Any, Optional
 from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.files import existing_file, require_writable
-from ..formats.gaussian_files import StoredCloud, read_cloud, require_format
+from ..formats.gaussian_files import READ, StoredCloud, read_cloud, require_format
 from ..gaussians.axes import AXES, WORLD_UP
 from ..gaussians.gaussians import drawable
 from ..gaussians.views import EPS2D, NEAR, bounds
@@ -58,7 +58,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         prog="python -m threestudio_gaussiandreamer.view",
         description="Write a cloud of Gaussians as one HTML file that shows it in a browser.",
     )
-    parser.add_argument("path", metavar="PATH", help="a PLY or SPZ file, or a checkpoint")
+    parser.add_argument("path", metavar="PATH", help="a file of Gaussians, or a checkpoint")
     parser.add_argument(
         "--html",
         metavar="OUT",
@@ -114,7 +114,7 @@ def read_any(source: Path, up: Optional[str] = None) -> StoredCloud:
     """
     if source.suffix in CHECKPOINT_ENDINGS:
         return StoredCloud(drawable(from_checkpoint(source), str(source)), up or WORLD_UP)
-    require_format(source.name, "PATH")
+    require_format(source.name, "PATH", READ)
     return read_cloud(str(source), up=up)
 
 
@@ -127,7 +127,8 @@ def _settings(
     if run_files is not None:
         settings = run_files.settings
     else:
-        settings = RenderSettings(near=NEAR * bounds(stored.gaussians.tensors())[1])
+        near = NEAR * bounds(stored.gaussians.tensors())[1]
+        settings = RenderSettings(near=near, antialias=stored.antialiased)
     given = {name: getattr(args, name) for name in ("eps2d", "antialias", "bound_colors")}
     if args.preset is not None:
         given["alpha_min"] = PRESETS[args.preset]

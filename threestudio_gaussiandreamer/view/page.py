@@ -165,7 +165,11 @@ def _facts(shown: Shown) -> dict[str, Any]:
 def _data_blocks(clouds: Sequence[Shown]) -> str:
     blocks = {f"cloud-{i}": packed(shown.cloud.gaussians) for i, shown in enumerate(clouds)}
     stored = clouds[0].cloud
-    blocks["spz"] = spz_bytes(stored.in_axes(SPZ_UP).gaussians, comment=spz_note(stored))
+    blocks["spz"] = spz_bytes(
+        stored.in_axes(SPZ_UP).gaussians,
+        comment=spz_note(stored),
+        antialiased=stored.antialiased,
+    )
     return "\n".join(
         f'<script type="text/plain" id="{name}">{base64.b64encode(data).decode()}</script>'
         for name, data in blocks.items()
