@@ -9,7 +9,6 @@ A cloud of 10,000, trained as the demo is at 128^2 on one thread (`runs.py`), go
 shot; in one shot and as many steps of recovery as the rounds have together; and in rounds, as the
 prune command does it, ranked as it does and otherwise. Results go to docs/charts/after_run.csv."""
 
-import argparse
 import statistics
 import sys
 import tempfile
@@ -46,16 +45,9 @@ COLUMNS = "variant,x,object,seed,psnr,machine,commit".split(",")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--objects", nargs="+", default=["toy.glb"])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    arguments = parser.parse_args()
+    arguments = runs.argument_parser(__doc__).parse_args()
     register_parts()
-    done = runs.measured_in("after_run", "object", "seed")
-    for seed in arguments.seeds:
-        for mesh in arguments.objects:
-            if (runs.object_name(mesh), str(seed)) not in done:
-                runs.append_rows("after_run", COLUMNS, measured(mesh, seed))
+    runs.measure_missing("after_run", COLUMNS, arguments, measured)
     print(table())
 
 

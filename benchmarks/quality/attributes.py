@@ -19,7 +19,6 @@ Trained clouds are kept in outputs/attributes; what the CSV has is not run again
 
 import argparse
 import json
-import os
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -50,7 +49,9 @@ from benchmarks.quality.runs import (
     ROOT,
     SIZE,
     STEPS,
+    add_jobs,
     append_rows,
+    argument_parser,
     measured_in,
     object_name,
     rows_of,
@@ -124,17 +125,8 @@ def main() -> None:
 
 
 def parse_arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--objects",
-        nargs="*",
-        default=["toy.glb"],
-        help="meshes; a bare name is a bundled one (default: toy.glb)",
-    )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count(), help="runs side by side, one thread each"
-    )
+    parser = argument_parser(__doc__)
+    add_jobs(parser)
     return parser.parse_args()
 
 

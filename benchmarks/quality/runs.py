@@ -22,6 +22,7 @@ import platform
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -78,19 +79,43 @@ def main() -> None:
     sys.exit(f"{failed} of {len(todo)} runs failed" if failed else 0)
 
 
-def parse_arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--charts", nargs="+", choices=JOBS, default=list(JOBS))
+def argument_parser(doc: str, seeds: Sequence[int] = (0,)) -> argparse.ArgumentParser:
+    """Return a parser with ``--objects`` and ``--seeds``; ``doc``'s first line describes it."""
+    parser = argparse.ArgumentParser(description=doc.splitlines()[0])
     parser.add_argument(
         "--objects",
-        nargs="+",
+        nargs="*",
         default=["toy.glb"],
         help="meshes; a bare name is a bundled one (default: toy.glb)",
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(5)))
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(seeds))
+    return parser
+
+
+def add_jobs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--jobs", type=int, default=os.cpu_count(), help="runs side by side, one thread each"
     )
+
+
+def measure_missing(
+    chart: str,
+    columns: list[str],
+    arguments: argparse.Namespace,
+    measure: Callable[[str, int], Iterable[dict[str, Any]]],
+) -> None:
+    """Append the rows of every mesh and seed that the chart's CSV doesn't have."""
+    done = measured_in(chart, "object", "seed")
+    for seed in arguments.seeds:
+        for mesh in arguments.objects:
+            if (object_name(mesh), str(seed)) not in done:
+                append_rows(chart, columns, list(measure(mesh, seed)))
+
+
+def parse_arguments() -> argparse.Namespace:
+    parser = argument_parser(__doc__, seeds=range(5))
+    parser.add_argument("--charts", nargs="+", choices=JOBS, default=list(JOBS))
+    add_jobs(parser)
     parser.add_argument("--list", action="store_true", help="only print what would run")
     return parser.parse_args()
 

@@ -9,14 +9,13 @@ The demo at its own 256^2 with dilations of 0.1 and of 0.3 square pixels; each r
 both at 256^2 and at 512^2, in dB to the ray-cast truth on 24 held-out views. Results go to
 docs/charts/viewers.csv; what that has is not run again."""
 
-import argparse
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from benchmarks.quality.attributes import score
-from benchmarks.quality.runs import append_rows, measured_in, object_name, train
+from benchmarks.quality.runs import argument_parser, measure_missing, object_name, train
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.gaussians.axes import WORLD_UP
@@ -27,21 +26,9 @@ COLUMNS = "variant,x,size,object,seed,psnr,machine,commit".split(",")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--objects",
-        nargs="+",
-        default=["toy.glb"],
-        help="meshes; a bare name is a bundled one (default: toy.glb)",
-    )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    arguments = parser.parse_args()
+    arguments = argument_parser(__doc__).parse_args()
     register_parts()
-    measured = measured_in("viewers", "object", "seed")
-    for seed in arguments.seeds:
-        for mesh in arguments.objects:
-            if (object_name(mesh), str(seed)) not in measured:
-                append_rows("viewers", COLUMNS, list(rows(mesh, seed)))
+    measure_missing("viewers", COLUMNS, arguments, rows)
 
 
 def rows(mesh: str, seed: int) -> Iterator[dict[str, Any]]:

@@ -115,3 +115,13 @@ def test_ddim_with_the_true_noise_of_a_point_lands_on_it():
     for steps in (1, 7, 50):
         out = sds.ddim_sample(predict, z, torch.tensor([3, 500, 980]), ABAR, steps=steps)
         torch.testing.assert_close(out, point.expand(3, 5), rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("batch", [1, 7, 32])
+def test_stratified_timesteps_lie_one_in_each_range(batch):
+    rng = torch.Generator().manual_seed(3)
+    draws = torch.stack([sds.stratified_timesteps(batch, 1000, rng) for _ in range(200)])
+    low, high = torch.arange(batch) * 1000 // batch, (torch.arange(batch) + 1) * 1000 / batch
+    ordered = draws.sort(1).values
+    assert (ordered >= low).all() and (ordered <= high).all()
+    assert draws.min() < 20 and draws.max() > 980 and (draws[:, 0] != draws[0, 0]).any()

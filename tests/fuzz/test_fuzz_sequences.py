@@ -27,8 +27,11 @@ def run_sequences(count: int, **options) -> None:
     )
 
 
-def test_no_sequence_breaks_a_cloud():
+def test_no_sequence_breaks_a_cloud(monkeypatch):
+    """Invariants hold after every rule: finite parameters, moments of the right rows, the cap."""
+    monkeypatch.setattr(CloudSequence, "steps", 0)
     run_sequences(30)
+    assert CloudSequence.steps > 200
 
 
 def test_a_split_beyond_floats_is_detected(monkeypatch):

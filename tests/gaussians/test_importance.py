@@ -322,14 +322,15 @@ def test_auto_by_contribution_never_drops_the_top_gaussian_of_a_pixel():
     assert rounds(geometry, 1, lambda kept: True) == [95]
 
 
+def one_view():
+    """View matrix and intrinsics of 24^2 pixels."""
+    c2w = orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0]))
+    return to_opencv(c2w, torch.tensor([0.8]), 24, 24)
+
+
 def test_a_weight_above_one_half_is_the_largest_of_its_pixel():
     geometry = cloud(60)
-    viewmats, Ks = to_opencv(
-        orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])),
-        torch.tensor([0.8]),
-        24,
-        24,
-    )
+    viewmats, Ks = one_view()
     inputs = geometry.means, geometry.quats, geometry.scales(), geometry.opacities()
     # a colour of its own for each Gaussian shows every weight of every pixel
     weights = rasterize(*inputs, torch.eye(60), viewmats, Ks, 24, 24, backend="torch")
@@ -348,12 +349,7 @@ def test_auto_in_the_loop_ends_where_the_quality_ends():
 
 def test_hidden_gaussians_are_as_if_they_were_not_there_and_come_back():
     geometry = cloud(50)
-    viewmats, Ks = to_opencv(
-        orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0])),
-        torch.tensor([0.8]),
-        24,
-        24,
-    )
+    viewmats, Ks = one_view()
 
     def image(rows=slice(None)):
         inputs = (

@@ -118,25 +118,15 @@ def test_ctrl_c_during_the_test_ends_with_130(launch, monkeypatch):
     assert load_file(only_run() / "ckpts/last.ckpt")["global_step"] == 6
 
 
-def test_a_second_ctrl_c_stops_at_once(launch, monkeypatch):
+@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_second_signal_stops_at_once_with_its_own_code(launch, monkeypatch, signum, code):
     def endless_step(self, batch, batch_idx):
-        os.kill(os.getpid(), signal.SIGINT)
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signum)
+        os.kill(os.getpid(), signum)
         time.sleep(60)
 
     monkeypatch.setattr(tiny_parts.TinySystem, "training_step", endless_step)
-    code, _, _ = launch("--train")
-    assert code == 130 and not Path("outputs").exists()
-
-
-def test_a_second_sigterm_stops_at_once_with_its_own_code(launch, monkeypatch):
-    def endless_step(self, batch, batch_idx):
-        os.kill(os.getpid(), signal.SIGTERM)
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(60)
-
-    monkeypatch.setattr(tiny_parts.TinySystem, "training_step", endless_step)
-    assert launch("--train")[0] == 143
+    assert launch("--train")[0] == code and not Path("outputs").exists()
 
 
 def test_under_nohup_a_hang_up_changes_nothing(launch):

@@ -2,11 +2,11 @@
 
 import math
 import sys
-import types
 
 import pytest
 import torch
 
+from benchmarks.splatting import gsplat_reference
 from tests.helpers import splatting_scenes as scenes
 from tests.splatting.reference_cases import ROUNDING, SPECIFICATION
 from threestudio_gaussiandreamer.splatting.projection import quats_to_rotations
@@ -175,23 +175,7 @@ def gsplat(monkeypatch):
     """
     torch_impl = pytest.importorskip("gsplat.cuda._torch_impl", reason="pip install gsplat")
 
-    def render_weight_from_alpha(alphas, ray_indices, n_rays):
-        same_ray = (ray_indices[:, None] == ray_indices) & torch.ones(
-            len(alphas), len(alphas), dtype=torch.bool
-        ).tril(-1)
-        T = torch.where(same_ray, 1 - alphas, 1).prod(1)
-        return alphas * T, T
-
-    def accumulate_along_rays(weights, values, ray_indices, n_rays):
-        values = weights[:, None] if values is None else weights[:, None] * values
-        return values.new_zeros(n_rays, values.shape[1]).index_add(0, ray_indices, values)
-
-    stand_in = types.ModuleType("nerfacc")
-    stand_in.render_weight_from_alpha, stand_in.accumulate_along_rays = (
-        render_weight_from_alpha,
-        accumulate_along_rays,
-    )
-    monkeypatch.setitem(sys.modules, "nerfacc", stand_in)
+    monkeypatch.setitem(sys.modules, "nerfacc", gsplat_reference.nerfacc())
     return torch_impl
 
 

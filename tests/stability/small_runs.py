@@ -103,6 +103,12 @@ def training_state(checkpoint: dict[str, Any]) -> dict[str, Tensor]:
     return {**checkpoint["state_dict"], **found, "step": torch.tensor(checkpoint["global_step"])}
 
 
+def require_equal_ends(measured: Any, one: Ended, other: Ended, what: str) -> None:
+    """Measure how many tensors of two runs' last training states differ; fail if any does."""
+    differing = differences(one.checkpoint(), other.checkpoint())
+    measured(differing, "tensors", what=what, at_most=0)
+
+
 def differences(a: dict[str, Any], b: dict[str, Any]) -> int:
     """Count the tensors of two checkpoints' training states that differ in any bit."""
     one, other = training_state(a), training_state(b)

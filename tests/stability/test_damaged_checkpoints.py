@@ -8,7 +8,7 @@ import torch
 
 from tests.stability.rows import row
 from tests.stability.run_failures_cases import EVERY_STEP, content
-from tests.stability.small_runs import Ended, differences, launch
+from tests.stability.small_runs import Ended, launch, require_equal_ends
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.checkpoint_file import (
     load_file,
@@ -81,12 +81,7 @@ def test_resume_auto_takes_the_one_before_and_says_so(stopped, whole, tmp_path, 
         or "last-prev.ckpt" in ended.err
     )
     assert ended.err.count("is damaged") == 2  # what was passed over is named
-    measured(
-        differences(whole.checkpoint(), ended.checkpoint()),
-        "tensors",
-        what="that differ after resume=auto",
-        at_most=0,
-    )
+    require_equal_ends(measured, whole, ended, "that differ after resume=auto")
 
 
 @row("A5", "Corrupted checkpoint")

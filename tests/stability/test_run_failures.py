@@ -17,7 +17,7 @@ import torch
 
 from tests.stability.rows import row
 from tests.stability.run_failures_cases import EVERY_STEP, content
-from tests.stability.small_runs import Ended, differences, launch
+from tests.stability.small_runs import Ended, launch, require_equal_ends
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core import images as pictures
 from threestudio_gaussiandreamer.core.checkpoint_file import (
@@ -274,8 +274,7 @@ def require_resumed_equal(tmp_path, ended, whole, measured) -> None:
     """Resume a stopped run to its end; fail unless it ends as the undisturbed run ``whole``."""
     finished = launch(tmp_path, *EVERY_STEP, f"resume={ended.last}")
     assert finished.code == 0, finished.err
-    differing = differences(whole.checkpoint(), finished.checkpoint())
-    measured(differing, "tensors", what="that differ after resuming", at_most=0)
+    require_equal_ends(measured, whole, finished, "that differ after resuming")
 
 
 @row("A5", "Ctrl-C / SIGTERM")

@@ -10,7 +10,7 @@ from lightning.pytorch.plugins import MixedPrecision
 
 from tests.helpers.pixel_guidance import TowardsGrey
 from tests.stability.rows import row
-from tests.stability.small_runs import Ended, differences, launch
+from tests.stability.small_runs import Ended, launch, require_equal_ends
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion import sds
@@ -127,12 +127,7 @@ def test_any_loss_scale_trains_the_same_bits_as_float32(
     """
     ended = scaled_run(tmp_path, monkeypatch, scale, "trainer.max_steps=3")
     assert ended.code == 0, ended.err
-    measured(
-        differences(three_steps.checkpoint(), ended.checkpoint()),
-        "tensors",
-        what="that differ from float32",
-        at_most=0,
-    )
+    require_equal_ends(measured, three_steps, ended, "that differ from float32")
 
 
 @row("A4", "GradScaler")
@@ -310,12 +305,7 @@ def test_resumed_at_the_edge_of_every_schedule(step, over_the_edge, tmp_path, me
     the paper's from 500 to 501.
     """
     ended = resumed(tmp_path, over_the_edge, step, *EDGE, *EVERY_STEP)
-    measured(
-        differences(over_the_edge.checkpoint(), ended.checkpoint()),
-        "tensors",
-        what="that differ",
-        at_most=0,
-    )
+    require_equal_ends(measured, over_the_edge, ended, "that differ")
 
 
 @pytest.fixture(scope="module")
@@ -333,12 +323,7 @@ def random_streams(tmp_path_factory) -> Ended:
 @pytest.mark.parametrize("step", [1, 4, 8])
 def test_stopped_and_resumed_anywhere(step, random_streams, tmp_path, measured):
     ended = resumed(tmp_path, random_streams, step, *DENSIFYING, *EVERY_STEP)
-    measured(
-        differences(random_streams.checkpoint(), ended.checkpoint()),
-        "tensors",
-        what="that differ",
-        at_most=0,
-    )
+    require_equal_ends(measured, random_streams, ended, "that differ")
 
 
 @row("A4", "RNG")
@@ -363,9 +348,4 @@ def test_validation_changes_nothing(views, every, random_streams, tmp_path, monk
     ended = launch(tmp_path, *DENSIFYING, *EVERY_STEP, *validated, "system.guidance.eval_steps=2")
     assert ended.code == 0, ended.err
     assert len(seen) == views * (9 // every)
-    measured(
-        differences(random_streams.checkpoint(), ended.checkpoint()),
-        "tensors",
-        what="that differ",
-        at_most=0,
-    )
+    require_equal_ends(measured, random_streams, ended, "that differ")

@@ -78,10 +78,7 @@ class PointsStage(Stage):
         self, model: nn.Module, batch: PointsBatch, step: int
     ) -> tuple[Tensor, dict[str, Tensor]]:
         rng, x = generator(self.options.seed, "points-noise", step), batch.points
-        places = (torch.randperm(len(x), generator=rng) + torch.rand(len(x), generator=rng)) / len(
-            x
-        )
-        t = (places * len(self.alphas_cumprod)).long().clamp(max=len(self.alphas_cumprod) - 1)
+        t = sds.stratified_timesteps(len(x), len(self.alphas_cumprod), rng)
         noise = torch.randn(x.shape, generator=rng).to(self.device)
         z = sds.add_noise(x, noise, self.alphas_cumprod[t].to(self.device))
         predicted = mean_of(lambda z, t: model(z, t, batch.condition))(z, t.to(self.device)).float()

@@ -80,11 +80,7 @@ class UNetStage(Stage):
         self, model: nn.Module, batch: UNetBatch, step: int
     ) -> tuple[Tensor, dict[str, Tensor]]:
         rng, x = generator(self.options.seed, "unet-noise", step), batch.latents
-        # one timestep in each of B equal ranges: the loss of a batch varies less
-        places = (torch.randperm(len(x), generator=rng) + torch.rand(len(x), generator=rng)) / len(
-            x
-        )
-        t = (places * len(self.alphas_cumprod)).long().clamp(max=len(self.alphas_cumprod) - 1)
+        t = sds.stratified_timesteps(len(x), len(self.alphas_cumprod), rng)
         abar = self.alphas_cumprod[t].to(self.device)
         noise = torch.randn(x.shape, generator=rng).to(self.device)
         z = sds.add_noise(x, noise, abar)
