@@ -163,6 +163,22 @@ def test_a_lock_file_whose_process_may_run_is_kept(folder, no_flock, owner):
     assert (folder / ".lock").read_text() == owner
 
 
+def test_a_lock_file_that_cannot_be_read_or_written_is_one_message(folder, no_flock, monkeypatch):
+    (folder / ".lock").mkdir(parents=True)
+    with pytest.raises(FolderInUse, match="remove outputs/tiny/run/.lock"):
+        claim(folder)
+    (folder / ".lock").rmdir()
+
+    def disk_full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("builtins.open", disk_full)
+        with pytest.raises(UserError, match="can't be written: No space left on device"):
+            claim(folder)
+    assert os.listdir(folder) == []
+
+
 def test_a_lock_taken_while_a_stale_one_is_removed_is_put_back(folder, no_flock, monkeypatch):
     """Another run replaces the stale file between reading and renaming it."""
     folder.mkdir(parents=True)

@@ -260,24 +260,28 @@ def _lock_by_file(path: Path) -> Lock:
         FileNotFoundError: the folder was removed.
         UserError: the file can't be created.
     """
-    file, owner = path / LOCK_FILE, _owner(os.getpid())
+    file = path / LOCK_FILE
     while True:
         try:
-            descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+            _create(file, f"{socket.gethostname()} {os.getpid()}")
+            return Lock(file=file)
         except FileExistsError:
             _remove_stale(file)
         except FileNotFoundError:
             raise
         except OSError as error:
             raise unwritable(path, error) from error
-        else:
-            with open(descriptor, "w") as opened:
-                opened.write(owner)
-            return Lock(file=file)
 
 
-def _owner(process: int) -> str:
-    return f"{socket.gethostname()} {process}"
+def _create(file: Path, content: str) -> None:
+    """Create a file that must not exist; it is removed if the content can't be written."""
+    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+    try:
+        with open(descriptor, "w") as opened:
+            opened.write(content)
+    except OSError:  # the disk is full
+        file.unlink(missing_ok=True)
+        raise
 
 
 def _remove_stale(file: Path) -> None:
@@ -289,17 +293,19 @@ def _remove_stale(file: Path) -> None:
     Raises:
         FolderInUse: its process may still run.
     """
-    advice = f". If none does, on this machine or another, remove {file}"
     mine = file.with_name(f"{LOCK_FILE}-{os.getpid()}")
     try:
-        found = file.read_text()
-        if not _has_ended(found):
-            raise in_use(file.parent, advice)
-        file.rename(mine)
-        taken = mine.read_text()
+        found = file.read_bytes()
+        ended = _has_ended(found.decode(errors="replace"))
+        if ended:
+            file.rename(mine)
     except FileNotFoundError:  # released, or removed by another process
         return
-    if taken != found:
+    except OSError:  # unreadable, or a folder
+        ended = False
+    if not ended:
+        raise in_use(file.parent, f". If none is, here or on another machine, remove {file}")
+    if mine.read_bytes() != found:
         with contextlib.suppress(OSError):
             os.link(mine, file)
     mine.unlink()
@@ -314,6 +320,6 @@ def _has_ended(owner: str) -> bool:
         os.kill(int(process), 0)
     except ProcessLookupError:
         return True
-    except (OSError, OverflowError):  # another user's
-        return False
+    except (OSError, OverflowError):  # it is another user's, or no process number
+        pass
     return False
