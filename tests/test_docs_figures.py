@@ -43,7 +43,8 @@ CONSTANTS = {
         f"at most {MOST_DEPTH} levels and {MOST_NODES:,} values",
         f"checked against {file_memory.FIXED_BYTES >> 20} MiB plus "
         f"{file_memory.BYTES_PER_FILE_BYTE} times the file",
-        f"may take {budget.FIXED_BYTES >> 20} MiB plus {budget.BYTES_PER_BYTE} times the files",
+        f"may take {budget.FIXED_BYTES >> 20} MiB plus "
+        f"{budget.BYTES_PER_FILE_BYTE} times the files",
     ],
 }
 PUBLISHED = {

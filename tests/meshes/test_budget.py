@@ -27,7 +27,7 @@ def refused(made, saved):
 def test_textures_count_together(saved, monkeypatch):
     """Two images of half a megabyte in a small file: one fits, two do not."""
     monkeypatch.setattr(budget, "FIXED_BYTES", 700_000)
-    monkeypatch.setattr(budget, "BYTES_PER_BYTE", 0)
+    monkeypatch.setattr(budget, "BYTES_PER_FILE_BYTE", 0)
     flat = np.zeros((256, 256, 3), np.uint8)
     made = textured_quad(flat)
     assert load_mesh(saved(made)).texture.shape == (256, 256, 3)
@@ -44,7 +44,7 @@ def test_instances_count(saved, monkeypatch):
     once.
     """
     monkeypatch.setattr(budget, "FIXED_BYTES", 1 << 20)
-    monkeypatch.setattr(budget, "BYTES_PER_BYTE", 0)
+    monkeypatch.setattr(budget, "BYTES_PER_FILE_BYTE", 0)
     made = textured_quad(np.zeros((64, 64, 3), np.uint8))
     made.document["nodes"] = [{"mesh": 0, "translation": [i, 0, 0]} for i in range(500)]
     made.document["scenes"][0]["nodes"] = list(range(500))

@@ -14,6 +14,7 @@ give field of view, size and background either; 70 degrees, 1024 pixels and the 
 (black) are those of the released code. The azimuths are -180, -177, ..., 177 degrees."""
 
 import argparse
+import functools
 import math
 import sys
 from collections.abc import Sequence
@@ -343,9 +344,7 @@ def evaluate(
     return content
 
 
-def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line; return the exit code of :func:`core.command.run_command`."""
-    return run_command(parse, run, argv)
+main = functools.partial(run_command, parse, run)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ metrics.
 
 import argparse
 import csv
+import functools
 import io
 import os
 import sys
@@ -185,9 +186,7 @@ def table(content: dict[str, Any]) -> list[str]:
     return lines
 
 
-def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line; return the exit code of :func:`core.command.run_command`."""
-    return run_command(parse, run, argv)
+main = functools.partial(run_command, parse, run)
 
 
 if __name__ == "__main__":

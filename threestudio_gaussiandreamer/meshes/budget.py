@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import NoReturn
 
 from ..core.errors import UserError
+from ..core.file_memory import BYTES_PER_FILE_BYTE
 
 FIXED_BYTES = 640 << 20
-"""Budget of every file: one texture of 8192 x 8192, or three million triangles."""
-BYTES_PER_BYTE = 64
-"""Additional budget per byte of the file."""
+"""Budget of every file: one texture of 8192 x 8192, or three million triangles. There are
+``BYTES_PER_FILE_BYTE`` per byte of the file in addition.
+"""
 BYTES_PER_TEXEL = 8
 BYTES_PER_VERTEX = 200
 BYTES_PER_FACE = 150
@@ -37,8 +38,8 @@ class Budget:
 
     def add_file(self, size: int) -> None:
         """Increase the budget for a file of ``size`` bytes."""
-        self.left += BYTES_PER_BYTE * size
-        self.total += BYTES_PER_BYTE * size
+        self.left += BYTES_PER_FILE_BYTE * size
+        self.total += BYTES_PER_FILE_BYTE * size
 
     def spend(self, size: int, what: str) -> None:
         """Deduct ``size`` bytes; ``what`` names the content in the message.

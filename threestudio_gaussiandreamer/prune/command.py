@@ -11,6 +11,7 @@ pruning it again counts from the original: with the same budget or a stricter on
 removed."""
 
 import argparse
+import functools
 import os
 from collections.abc import Sequence
 from dataclasses import fields
@@ -66,11 +67,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line; return the exit code of :func:`core.command.run_command`."""
-    return run_command(parse, run, argv)
-
-
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     """Parse a command line; exits for ``--help`` and for invalid arguments."""
     parser = argparse.ArgumentParser(
@@ -111,6 +107,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     result = prune_to_budget(stored, options, suffix, "--")
     write_cloud(args.output, result.after)
     return write_report(args.output, result, suffix, options)
+
+
+main = functools.partial(run_command, parse, run)
 
 
 def _same_file(source: str, output: str) -> bool:

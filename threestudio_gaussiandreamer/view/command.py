@@ -5,6 +5,7 @@ A cloud in the folder of a run is drawn as the run has drawn it, with its prompt
 that. Other clouds are drawn with the defaults below."""
 
 import argparse
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Optional
@@ -98,9 +99,7 @@ def run(args: argparse.Namespace) -> None:
     print(f"{out}: {len(stored.gaussians.means):,} Gaussians, {out.stat().st_size / 1e6:.2f} MB")
 
 
-def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run the command; return the exit code of :func:`core.command.run_command`."""
-    return run_command(parse, run, argv)
+main = functools.partial(run_command, parse, run)
 
 
 def read_any(source: Path, up: Optional[str] = None) -> StoredCloud:
