@@ -35,7 +35,7 @@ RINGS = (
     ),
     Ring("1 host", "#dcfce7", ("host", "models")),
     Ring("2 parts", "#fef9c3", ("prompts", "priors", "guidance", "exporters")),
-    Ring("3 training", "#ffedd5", ("training", "prune", "view")),
+    Ring("3 training", "#ffedd5", ("training", "prune", "view", "convert")),
     Ring("4 programs", "#fee2e2", ("launch", "evaluation", "evaluate", "toybox")),
 )
 

@@ -159,7 +159,7 @@ def _quat_bytes(quats: Float[np.ndarray, "N 4"]) -> Int[np.ndarray, "N 4"]:
 def _palette(rest: Float[np.ndarray, "N K 3"]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return the images of the harmonics above the constant one, and their entry in the JSON."""
     count, coefficients = rest.shape[:2]
-    entries, labels = vector_codebook(rest.reshape(count, -1), _palette_size(count))
+    entries, labels = vector_codebook(rest.reshape(count, -1), palette_size(count))
     book, rows = scalar_codebook(entries.reshape(-1, coefficients, 3), CODEBOOK)
     missing = -len(rows) % PALETTE_COLUMNS
     pixels = np.pad(rows, ((0, missing), (0, 0), (0, 0)))
@@ -178,7 +178,7 @@ def _palette(rest: Float[np.ndarray, "N K 3"]) -> tuple[dict[str, np.ndarray], d
     return images, meta
 
 
-def _palette_size(count: int) -> int:
+def palette_size(count: int) -> int:
     """Return the palette's size for ``count`` Gaussians: a half of them to all, within bounds of
     the format and of the time for k-means.
     """

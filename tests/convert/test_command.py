@@ -1,0 +1,114 @@
+"""The converter: what it writes, what it says, and what it refuses."""
+
+import numpy as np
+import pytest
+
+from tests.helpers.object_clouds import assert_close, ball
+from tests.helpers.ply_files import write_raw_gaussians
+from threestudio_gaussiandreamer.convert.command import main
+from threestudio_gaussiandreamer.formats.gaussian_files import (
+    READ,
+    WRITTEN,
+    StoredCloud,
+    read_cloud,
+    write_cloud,
+)
+
+
+@pytest.fixture
+def source(tmp_path):
+    write_cloud(str(tmp_path / "in.ply"), StoredCloud(ball(60, 1), "z", 40.0))
+    return tmp_path / "in.ply"
+
+
+@pytest.mark.parametrize("suffix", WRITTEN)
+def test_every_format_is_written(source, tmp_path, capsys, suffix):
+    out = tmp_path / f"out{suffix}"
+    assert main([str(source), str(out)]) == 0
+    size = out.stat().st_size
+    assert f"60 Gaussians of degree 1, {size / 1000:.3g} kB" in capsys.readouterr().out
+    if suffix in READ:
+        read, before = read_cloud(str(out)), ball(60, 1)
+        means = read.in_axes("z").gaussians.means
+        nearest = [np.abs(before.means - mean).sum(axis=1).min() for mean in means]
+        assert max(nearest) < 5e-3 and read.pruned_to == 40
+
+
+def test_the_way_there_and_back_is_exact_where_the_format_is(source, tmp_path):
+    for name in ("a.glb", "b.ply"):
+        assert main([str(source), str(tmp_path / name)]) == 0
+        source = tmp_path / name
+    read = read_cloud(str(source))
+    assert read.up == "-y"
+    assert_close(ball(60, 1), read.in_axes("z").gaussians, sh=1e-6, means=1e-6)
+
+
+def test_what_is_lost_and_the_decibels_are_printed(source, tmp_path, capsys):
+    assert main([str(source), str(tmp_path / "a.spz"), "--check", "--size", "64"]) == 0
+    said = capsys.readouterr().out
+    assert "lost: positions are rounded" in said and "lost: harmonics above degree 0" in said
+    assert "dB in 8 views of 64 x 64 pixels" in said
+    assert main([str(source), str(tmp_path / "a.glb"), "--check", "--size", "64"]) == 0
+    said = capsys.readouterr().out
+    assert "lost:" not in said and "check: 100.0 dB" in said
+
+
+def test_options_change_what_is_written(source, tmp_path):
+    out = str(tmp_path / "a.ply")
+    assert main([str(source), out, "--harmonics", "0", "--antialiased", "--up-out", "y"]) == 0
+    read = read_cloud(out)
+    assert (read.up, read.antialiased, read.gaussians.sh_degree) == ("y", True, 0)
+    assert main([out, str(tmp_path / "b.spz"), "--no-antialiased", "--up=-y"]) == 0
+    again = read_cloud(str(tmp_path / "b.spz"))
+    assert not again.antialiased
+    assert abs(again.gaussians.means[:, 1].mean() + read.gaussians.means[:, 1].mean()) < 1e-2
+
+
+def test_version_4_of_spz(source, tmp_path):
+    pytest.importorskip("zstandard")
+    assert main([str(source), str(tmp_path / "a.spz"), "--spz-version", "4"]) == 0
+    assert (tmp_path / "a.spz").read_bytes()[:5] == b"NGSP\4"
+
+
+def test_rows_that_cant_be_drawn_are_left_out(tmp_path, caplog):
+    cloud = ball(9)
+    cloud.means[3, 0] = np.nan
+    write_raw_gaussians(tmp_path / "in.ply", cloud)
+    assert main([str(tmp_path / "in.ply"), str(tmp_path / "a.sog")]) == 0
+    assert len(read_cloud(str(tmp_path / "a.sog")).gaussians.means) == 8
+    assert "1 of 9 Gaussians hold NaN or infinity" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["in.ply", "a.obj"], "OUT: expected the name of a .ply,"),
+        (["in.ply", "a.splat"], "OUT: expected the name of a .ply,"),
+        (["none.ply", "a.glb"], "'none.ply' does not exist; near names"),
+        (["in.ply", "nowhere/a.glb"], "OUT: there is no folder 'nowhere'"),
+        (["in.ply", "in.ply"], "OUT is IN"),
+        (["in.ply", "a.glb", "--spz-version", "4"], "--spz-version: OUT is a .glb file"),
+        (["in.ply", "a.glb", "--from", "lgm", "--up", "z"], "--from and --up both say"),
+        (["in.ply", "a.usda", "--check"], "--check: .usda files are written here, but not read"),
+        (["in.ply", "a.glb", "--harmonics", "4"], "--harmonics: expected"),
+        (["in.ply", "a.glb", "--check", "--size", "2"], "--size: expected"),
+        (["empty.ply", "a.glb"], "empty.ply holds no Gaussians that can be drawn"),
+        (["text.ply", "a.glb"], "isn't a PLY file|this is not a PLY file"),
+        (["in.ply", "a.glb", "--from", "blender"], None),
+    ],
+)
+def test_mistakes_are_found_before_anything_is_written(
+    source, tmp_path, capsys, monkeypatch, arguments, said
+):
+    monkeypatch.chdir(tmp_path)
+    write_cloud("empty.ply", StoredCloud(ball(0)))
+    (tmp_path / "text.ply").write_text("hello")
+    before = sorted(tmp_path.iterdir())
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert "invalid choice" in error if said is None else _matches(said, error)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def _matches(pattern, text):
+    return any(part in text for part in pattern.split("|"))

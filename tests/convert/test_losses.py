@@ -1,0 +1,51 @@
+"""What a format can't hold is said, with how many Gaussians it concerns."""
+
+import pytest
+
+from tests.helpers.object_clouds import ball
+from threestudio_gaussiandreamer.convert.losses import losses
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud
+
+
+def said(cloud, suffix, version=3, **more):
+    return "; ".join(losses(StoredCloud(cloud, "-y", **more), suffix, version))
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb", ".usda"])
+def test_exact_formats_lose_nothing(suffix):
+    assert said(ball(9, 3), suffix, pruned_to=40.0) == ""
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".compressed.ply", ".sog"])
+def test_rounding_is_said(suffix):
+    assert "rounded" in said(ball(9), suffix) and "harmonics" not in said(ball(9), suffix)
+    assert "of 9 Gaussians" not in said(ball(9, 1), suffix)
+
+
+def test_values_beyond_the_range_of_spz_are_counted():
+    cloud = ball(500, 1)
+    cloud.means[0] = 1e9
+    cloud.log_scales[1:3] = -15
+    cloud.sh[4, 0], cloud.sh[5:9, 1] = 5, -2
+    text = said(cloud, ".spz")
+    assert "1 of 500 Gaussians are farther away or larger" in text
+    assert "2 of 500 Gaussians are smaller than e^-10" in text
+    assert "1 of 500 Gaussians have colours beyond" in text
+    assert "4 of 500 Gaussians have harmonics beyond 1" in text
+
+
+def test_values_beyond_the_range_of_a_compressed_ply_are_counted():
+    cloud = ball(50, 1)
+    cloud.sh[:3, 1], cloud.log_scales[5] = 4.5, -30
+    text = said(cloud, ".compressed.ply")
+    assert "3 of 50 Gaussians have harmonics beyond 4" in text and "1 of 50 Gaussians are" in text
+
+
+def test_a_palette_smaller_than_the_cloud_is_said():
+    assert "a palette of 1,024 for 2,000 Gaussians" in said(ball(2000, 1), ".sog")
+    assert "palette" not in said(ball(1000, 1), ".sog")
+
+
+def test_the_note_of_pruning_that_version_4_loses():
+    assert "note about pruning" in said(ball(9), ".spz", 4, pruned_to=40.0)
+    assert "note" not in said(ball(9), ".spz", 3, pruned_to=40.0) + said(ball(9), ".spz", 4)

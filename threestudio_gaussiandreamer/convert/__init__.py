@@ -1,0 +1,1 @@
+"""Convert files of Gaussians between formats and the axes of their producers."""

@@ -1,0 +1,166 @@
+"""Convert a file of Gaussians: ``python -m threestudio_gaussiandreamer.convert IN OUT``.
+
+The formats are those of the extensions: .ply, .compressed.ply, .spz, .sog and .glb are read and
+written, .splat and .gltf are read, .usda is written; IN may also be a checkpoint. The command says
+what OUT can't hold of IN, and with ``--check`` how many dB that costs."""
+
+import argparse
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Optional
+
+from ..core.command import run_command
+from ..core.errors import UserError
+from ..core.files import existing_file, require_writable
+from ..core.memory import size_text
+from ..core.options import check_options, in_range
+from ..formats.gaussian_files import (
+    FORMATS,
+    StoredCloud,
+    read_cloud,
+    require_format,
+    write_cloud,
+)
+from ..formats.spz import VERSION
+from ..formats.spz_container import VERSIONS, require_version
+from ..gaussians.axes import AXES, VIEWER_UP
+from ..gaussians.gaussians import finite
+from ..gaussians.sh import COEFFICIENTS, MAX_DEGREE
+from ..view.command import read_any
+from .check import VIEWS, round_trip
+from .losses import losses
+from .producers import PRODUCERS, from_producer
+
+
+@dataclass
+class ConvertOptions:
+    """The options that are numbers, with their ranges."""
+
+    harmonics: Optional[int] = field(default=None, metadata=in_range(0, MAX_DEGREE))
+    size: int = field(default=256, metadata=in_range(16, 4096, "pixels"))
+
+
+OPTIONS: dict[str, dict[str, Any]] = {
+    "--from": {
+        "dest": "producer",
+        "choices": PRODUCERS,
+        "help": "the program that has written IN, whose axes are known",
+    },
+    "--up": {
+        "choices": AXES,
+        "help": "which axis of IN is up (default: what the file says, else its format's custom)",
+    },
+    "--up-out": {
+        "choices": AXES,
+        "default": VIEWER_UP,
+        "help": "which axis of OUT is up, for PLYs (default: %(default)s, as viewers expect)",
+    },
+    "--spz-version": {
+        "type": int,
+        "choices": VERSIONS,
+        "default": VERSION,
+        "help": "of an SPZ (default: %(default)s)",
+    },
+    "--harmonics": {
+        "type": int,
+        "metavar": "DEGREE",
+        "help": "drop the harmonics above this degree, 0 to 3",
+    },
+    "--antialiased": {
+        "action": argparse.BooleanOptionalAction,
+        "help": "whether the Gaussians were trained so (default: what the file says)",
+    },
+    "--check": {"action": "store_true", "help": f"measure the dB of OUT to IN in {VIEWS} views"},
+    "--size": {
+        "type": int,
+        "default": ConvertOptions.size,
+        "help": "pixels each way of these views (default: %(default)d)",
+    },
+}
+
+
+def main(argv: Optional[Sequence[str]] = None) -> int:
+    """Run one command line; return the exit code of :func:`core.command.run_command`."""
+    return run_command(parse, run, argv)
+
+
+def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
+    """Parse a command line; exits for ``--help`` and for invalid arguments."""
+    parser = argparse.ArgumentParser(
+        prog="python -m threestudio_gaussiandreamer.convert",
+        description="Convert a file of Gaussians to another format, by the extensions of IN and "
+        "OUT.",
+    )
+    parser.add_argument("source", metavar="IN", help="a file of Gaussians, or a checkpoint")
+    parser.add_argument("output", metavar="OUT", help="the file to write")
+    for name, settings in OPTIONS.items():
+        parser.add_argument(name, **settings)
+    return parser.parse_args(argv)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Check options and files, convert, and print what was written and what is lost.
+
+    Raises:
+        UserError: an option is invalid, a file can't be read or written, or it holds no Gaussians.
+    """
+    suffix = require_format(args.output, "OUT")
+    _check_options(args, suffix)
+    source = existing_file(args.source, "file of Gaussians or checkpoint")
+    stored = _read(source, args)
+    write_cloud(args.output, stored, suffix, spz_version=args.spz_version)
+    count, size = len(stored.gaussians.means), os.path.getsize(args.output)
+    print(
+        f"{args.output}: {count:,} Gaussians of degree {stored.gaussians.sh_degree}, "
+        f"{size_text(size)}, {size / count:.1f} bytes each"
+    )
+    for loss in losses(stored, suffix, args.spz_version):
+        print(f"lost: {loss}")
+    if args.check:
+        print(_checked(args, stored, suffix))
+
+
+def _check_options(args: argparse.Namespace, suffix: str) -> None:
+    require_writable(args.output, "OUT")
+    if args.producer and args.up:
+        raise UserError("--from and --up both say which axis of IN is up: give one")
+    if suffix == ".spz":
+        require_version(args.spz_version)
+    elif args.spz_version != VERSION:
+        raise UserError(f"--spz-version: OUT is a {suffix} file")
+    check_options(ConvertOptions, ConvertOptions(args.harmonics, args.size), "--")
+    if args.check and FORMATS[suffix].read is None:
+        raise UserError(f"--check: {suffix} files are written here, but not read")
+    if os.path.exists(args.output) and os.path.exists(args.source):
+        if os.path.samefile(args.source, args.output):
+            raise UserError("OUT is IN: give it another name, so that IN is kept")
+
+
+def _read(source: Path, args: argparse.Namespace) -> StoredCloud:
+    """Read IN as it shall be written.
+
+    Raises:
+        UserError: it can't be read, or holds no Gaussians that can be drawn.
+    """
+    stored = read_any(source, args.up)
+    if not len(stored.gaussians.means):
+        raise UserError(f"{args.source} holds no Gaussians that can be drawn: nothing is written")
+    if args.antialiased is not None:
+        stored = stored._replace(antialiased=args.antialiased)
+    if args.harmonics is not None:
+        sh = stored.gaussians.sh[:, : COEFFICIENTS[args.harmonics]]
+        stored = stored._replace(gaussians=stored.gaussians._replace(sh=sh))
+    if args.producer:
+        stored = from_producer(stored, args.producer)
+    stored = stored.in_axes(args.up_out)
+    return stored._replace(gaussians=finite(stored.gaussians, args.source))
+
+
+def _checked(args: argparse.Namespace, stored: StoredCloud, suffix: str) -> str:
+    found = round_trip(stored, read_cloud(args.output), args.size)
+    return (
+        f"check: {found.mean:.1f} dB in {VIEWS} views of {args.size} x {args.size} pixels, "
+        f"{found.worst:.1f} dB in the worst one"
+    )

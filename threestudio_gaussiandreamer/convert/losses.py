@@ -1,0 +1,72 @@
+"""What a file of a format can't hold of a cloud, as sentences."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ..formats.compressed_ply import MAX_STORED_LOG, SH_REACH
+from ..formats.gaussian_files import StoredCloud
+from ..formats.sog import palette_size
+from ..formats.spz import COLOR_REACH, MIN_LOG_SCALE, SPZ_UP, out_of_range
+from ..formats.spz_container import ZSTD_VERSION
+
+ROUNDING = {
+    ".spz": "positions are rounded to 1/32 of the median size, scales to 6 %, opacities and "
+    "colours to 8 bits, rotations to 10",
+    ".compressed.ply": "positions and scales are rounded to 10 or 11 bits in chunks of 256, "
+    "opacities and colours to 8 bits, rotations to 10",
+    ".sog": "positions are rounded to 16 bits, scales and colours to 256 values each, opacities "
+    "and rotations to 8 bits",
+}
+HARMONICS = {
+    ".spz": "harmonics above degree 0 are rounded to 5 bits (degree 1) and 4",
+    ".compressed.ply": "harmonics above degree 0 are rounded to 8 bits",
+}
+
+
+def losses(cloud: StoredCloud, suffix: str, spz_version: int) -> Iterator[str]:
+    """Yield what is lost when a cloud is written, nothing for exact formats.
+
+    Args:
+        suffix: the format, a key of ``formats.gaussian_files.FORMATS``.
+    """
+    if suffix in ROUNDING:
+        yield ROUNDING[suffix]
+    if cloud.gaussians.sh_degree and suffix in HARMONICS:
+        yield HARMONICS[suffix]
+    yield from {".spz": _of_spz, ".compressed.ply": _of_compressed_ply, ".sog": _of_sog}.get(
+        suffix, lambda cloud: ()
+    )(cloud)
+    if suffix == ".spz" and spz_version == ZSTD_VERSION and cloud.pruned_to is not None:
+        yield "the note about pruning: SPZ of version 4 has no place for it"
+
+
+def _counted(rows: np.ndarray, what: str) -> Iterator[str]:
+    """Yield "n of N Gaussians ``what``" where ``rows``, of any number of columns, hold any."""
+    count = int(rows.reshape(len(rows), -1).any(axis=1).sum())
+    if count:
+        yield f"{count:,} of {len(rows):,} Gaussians {what}"
+
+
+def _of_spz(cloud: StoredCloud) -> Iterator[str]:
+    gaussians = cloud.in_axes(SPZ_UP).gaussians
+    yield from _counted(out_of_range(gaussians), "are farther away or larger than it holds")
+    small = gaussians.log_scales < MIN_LOG_SCALE - 1 / 32
+    yield from _counted(small, "are smaller than e^-10 along an axis, and become that large")
+    beyond = np.abs(gaussians.sh[:, 0]) > COLOR_REACH
+    yield from _counted(beyond, "have colours beyond -0.44 to 1.44, which are clipped")
+    yield from _counted(np.abs(gaussians.sh[:, 1:]) > 1, "have harmonics beyond 1, clipped")
+
+
+def _of_compressed_ply(cloud: StoredCloud) -> Iterator[str]:
+    gaussians = cloud.gaussians
+    beyond = np.abs(gaussians.sh[:, 1:]) > SH_REACH
+    yield from _counted(beyond, f"have harmonics beyond {SH_REACH:g}, clipped")
+    large = np.abs(gaussians.log_scales) > MAX_STORED_LOG
+    yield from _counted(large, "are smaller or larger than e^20, and clipped")
+
+
+def _of_sog(cloud: StoredCloud) -> Iterator[str]:
+    count = len(cloud.gaussians.means)
+    if cloud.gaussians.sh_degree and (entries := palette_size(count)) < count:
+        yield f"harmonics above degree 0 come from a palette of {entries:,} for {count:,} Gaussians"
