@@ -93,10 +93,10 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         description="Convert a file of Gaussians to another format, by the extensions of IN and "
         "OUT.",
     )
-    parser.add_argument("source", metavar="IN", help="a file of Gaussians, or a checkpoint")
-    parser.add_argument("output", metavar="OUT", help="the file to write")
     for name, settings in OPTIONS.items():
         parser.add_argument(name, **settings)
+    parser.add_argument("source", metavar="IN", help="a file of Gaussians, or a checkpoint")
+    parser.add_argument("output", metavar="OUT", help="the file to write")
     return parser.parse_args(argv)
 
 
