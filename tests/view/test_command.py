@@ -26,23 +26,6 @@ def source(tmp_path) -> Path:
     return path
 
 
-@pytest.fixture
-def run_folder(tmp_path) -> Path:
-    """A run of 7 steps with an export."""
-    folder = tmp_path / "run"
-    (folder / "save" / "it7-export").mkdir(parents=True)
-    (folder / "configs").mkdir()
-    (folder / "configs" / "parsed.yaml").write_text(
-        "system:\n  renderer: {preset: fast, eps2d: 0.4, antialias: true, downsample: 2}\n"
-        "  prompt_processor: {prompt: a box}\n  background: {color: [0.0, 1.0, 0.0]}\n"
-        "  geometry: {bound_colors: false}\n"
-    )
-    scores = {"prior": {"step": 0, "psnr": 12.0}, "result": {"step": 7, "psnr": 31.25}}
-    (folder / "save" / "metrics.json").write_text(json.dumps(scores))
-    write_cloud(str(folder / "save" / "it7-export" / "gaussians.spz"), cloud(30))
-    return folder
-
-
 def meta(path: Path) -> dict:
     return json.loads(re.search(r'id="meta">(.*?)</script>', path.read_text())[1])
 
@@ -140,6 +123,25 @@ def test_an_empty_cloud_and_one_of_nan(tmp_path, capsys):
     write_raw_gaussians(tmp_path / "nan.ply", broken)
     assert "no Gaussians" in message(capsys, tmp_path / "nan.ply", "--html")
     assert not list(tmp_path.glob("*.html"))
+
+
+def test_a_run_gets_an_index_and_a_page(run_folder, capsys):
+    assert main([str(run_folder), "--html"]) == 0
+    assert meta(run_folder / "save" / "it7-export" / "view.html")["title"] == "a box"
+    assert capsys.readouterr().out.strip().endswith(str(run_folder / "index.html"))
+    assert "it7-export/view.html" in (run_folder / "index.html").read_text()
+
+
+def test_a_folder_of_runs_gets_a_gallery(run_folder, capsys):
+    assert main([str(run_folder.parent), "--html"]) == 0
+    assert "run/index.html" in (run_folder.parent / "index.html").read_text()
+
+
+def test_a_folder_without_runs_and_options_of_clouds(tmp_path, run_folder, capsys):
+    (tmp_path / "empty").mkdir()
+    assert "holds no run" in message(capsys, tmp_path / "empty", "--html")
+    assert "is a folder" in message(capsys, run_folder, "--html", "out.html")
+    assert "--eps2d" in message(capsys, run_folder, "--html", "--eps2d", "1")
 
 
 def test_too_many_gaussians(source, monkeypatch, capsys):

@@ -8,8 +8,10 @@ import contextlib
 import errno
 import shlex
 import threading
+import time
 import traceback
 from collections.abc import Iterator, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Optional
 
@@ -17,6 +19,7 @@ from ..core.checkpoint_file import load_checkpoint
 from ..core.errors import UserError
 from ..core.logs import get_rank
 from ..host import find, info, pl, warn
+from ..view.run_index import note_time, write_index
 from .callbacks import LastCheckpoint, ProgressBar, RunRecord, Stopped
 from .checkpoints import AtomicCheckpointIO
 from .config_check import MisconfigurationException, build, plain
@@ -81,7 +84,9 @@ class Run:
         try:
             self.start()
             with lightning_errors(self.cfg.resume), write_errors(self.folder):
+                began, start = datetime.now(), time.perf_counter()
                 getattr(self, self.args.stage)()
+                self.write_index(began, time.perf_counter() - start)
             self.summarize()
         except Stopped as stop:
             print(f"stopped at step {stop.step}; to go on: {self.resume_command()}", flush=True)
@@ -176,6 +181,12 @@ class Run:
 
     def export(self) -> None:
         self.trainer.predict(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
+
+    def write_index(self, began: datetime, seconds: float) -> None:
+        """Note how long the stage has taken, and write ``index.html``."""
+        if self.trainer.is_global_zero and self.cfg.system.get("pages", True):
+            note_time(self.folder, self.args.stage, began, seconds)
+            info(f"the run at a glance: {write_index(self.folder)}")
 
     def summarize(self) -> None:
         """Print the system's summary, which lists its results."""

@@ -1,6 +1,7 @@
-"""Look at a cloud or a run: ``python -m threestudio_gaussiandreamer.view cloud.ply --html``.
+"""Look at clouds and runs: ``python -m threestudio_gaussiandreamer.view cloud.ply --html``.
 
-PATH is a PLY or SPZ file of Gaussians of any program, or a checkpoint of this package or of gsplat.
+PATH is a PLY or SPZ file of Gaussians of any program, or a checkpoint of this package or of gsplat;
+or the folder of a run, which gets an ``index.html``, or a folder of runs, which gets a gallery.
 A cloud in the folder of a run is drawn as the run has drawn it, with its prompt; options override
 that. Other clouds are drawn with the defaults below."""
 
@@ -19,9 +20,11 @@ from ..gaussians.gaussians import drawable
 from ..gaussians.views import EPS2D, NEAR, bounds
 from ..prune.pipeline import from_checkpoint
 from ..splatting import PRESETS
+from .gallery import write_gallery
 from .page import WHITE, PageOptions, Shown, decibels, require_page_size, write_page
 from .render import RenderSettings
-from .run_files import RunFiles
+from .run_files import RunFiles, is_run
+from .run_index import write_index
 
 CHECKPOINT_ENDINGS = (".ckpt", ".pt", ".pth")
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -57,16 +60,19 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     """Parse the arguments of the command; exits as :mod:`argparse` does."""
     parser = argparse.ArgumentParser(
         prog="python -m threestudio_gaussiandreamer.view",
-        description="Write a cloud of Gaussians as one HTML file that shows it in a browser.",
+        description="Write a cloud of Gaussians as one HTML file that shows it in a browser, or "
+        "the index of a run or of a folder of runs.",
     )
-    parser.add_argument("path", metavar="PATH", help="a file of Gaussians, or a checkpoint")
+    parser.add_argument(
+        "path", metavar="PATH", help="a file of Gaussians, a checkpoint, a run or runs"
+    )
     parser.add_argument(
         "--html",
         metavar="OUT",
         nargs="?",
         const="",
         required=True,
-        help="the file to write (default: PATH with the ending .html)",
+        help="the file to write (default: PATH with the ending .html, or index.html in a folder)",
     )
     for name, settings in OPTIONS.items():
         parser.add_argument(name, **settings)
@@ -74,19 +80,28 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Write the page of a cloud.
+    """Write the page of a cloud, the index of a run, or the gallery of a folder of runs.
 
     Raises:
         UserError: an option is invalid, the file can't be read, has too many Gaussians or none, or
             the page can't be written.
     """
+    folder = Path(args.path).expanduser()
+    if folder.is_dir():
+        run_folder(folder, args)
+        return
     source = existing_file(args.path, "file of Gaussians or checkpoint")
     out = Path(args.html) if args.html else source.with_suffix(".html")
     require_writable(out, "--html")
+    write_cloud_page(source, out, args)
+
+
+def write_cloud_page(source: Path, out: Path, args: argparse.Namespace) -> None:
+    """Write the page of a file or checkpoint, as its run has drawn it or as the options say."""
     background = _color(args.background)
     _require_dilation(args.eps2d)
     stored = read_any(source, args.up)
-    require_page_size(len(stored.gaussians.means), args.path)
+    require_page_size(len(stored.gaussians.means), str(source))
     run_files = RunFiles.around(source)
     options = PageOptions(
         title=args.title or (run_files.prompt if run_files else source.name),
@@ -100,6 +115,26 @@ def run(args: argparse.Namespace) -> None:
 
 
 main = functools.partial(run_command, parse, run)
+
+
+def run_folder(folder: Path, args: argparse.Namespace) -> None:
+    """Write the index of a run, and the page of its cloud if there is none, or the gallery of a
+    folder of runs.
+    """
+    given = [name for name in OPTIONS if getattr(args, name[2:].replace("-", "_")) is not None]
+    if args.html or given:
+        raise UserError(
+            f"{' '.join(given) or '--html OUT'}: is for a cloud, and {args.path!r} is a folder, "
+            "whose index.html is written into it"
+        )
+    if not is_run(folder):
+        print(write_gallery(folder))
+        return
+    found = RunFiles(folder)
+    page = found.export and found.export / "view.html"
+    if found.cloud and not page.exists():
+        write_cloud_page(found.cloud, page, args)
+    print(write_index(folder))
 
 
 def read_any(source: Path, up: Optional[str] = None) -> StoredCloud:

@@ -16,7 +16,7 @@ from ..splatting import PRESETS, rasterize
 
 ELEVATION, AZIMUTH = 15.0, 30.0
 """The first view, degrees: the front, from slightly above and to the right."""
-MARGIN = 1.05
+MARGIN = 1.15
 """Of the first view around the cloud."""
 
 

@@ -3,20 +3,23 @@
 Nothing here trusts a file: what is missing or damaged is left out."""
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Optional
+from typing import Any, Optional, TypeVar
 
 import yaml
 
 from ..core.errors import UserError
+from ..formats.ply import is_gaussian_ply
 from ..host import warn
 from ..host.typed_config import parse_structured
 from ..training.renderer import SplattingRenderer
 from .render import RenderSettings
 
+T = TypeVar("T", dict, list)
 MAX_BYTES = 4 << 20
 """Largest configuration or file of scores that is read."""
 
@@ -56,11 +59,7 @@ class RunFiles:
     @cached_property
     def scores(self) -> dict[str, Any]:
         """The content of ``metrics.json``; empty if there is none."""
-        try:
-            content = json.loads(_text(self.save / "metrics.json"))
-        except (OSError, ValueError):
-            return {}
-        return content if isinstance(content, dict) else {}
+        return read_json(self.save / "metrics.json", dict)
 
     @property
     def prompt(self) -> str:
@@ -87,6 +86,18 @@ class RunFiles:
         color = section(self.config, "system", "background").get("color")
         return as_color(color)
 
+    @property
+    def export(self) -> Optional[Path]:
+        """The folder of the exports of the latest step; None if there are none."""
+        found = [(step_of(path), path) for path in self.save.glob("it*-export") if path.is_dir()]
+        return max(found)[1] if found else None
+
+    @property
+    def cloud(self) -> Optional[Path]:
+        """The file of the exported Gaussians; None if there is none."""
+        files = sorted(self.export.glob("*.*")) if self.export else []
+        return next(filter(is_cloud, files), None)
+
     def psnr(self, key: str, step: Optional[int] = None) -> Optional[float]:
         """Return dB on held-out views; None if they aren't known.
 
@@ -98,6 +109,17 @@ class RunFiles:
         psnr = found.get("psnr")
         known = isinstance(psnr, (int, float)) and step in (None, found.get("step"))
         return float(psnr) if known else None
+
+
+def step_of(path: Path) -> int:
+    """Return the step in the name of a result, ``it<step>-...``; -1 if there is none."""
+    found = re.match(r"it(\d+)", path.name)
+    return int(found[1]) if found else -1
+
+
+def is_cloud(path: Path) -> bool:
+    """Return whether a file is a PLY of Gaussians or an SPZ."""
+    return path.suffix == ".spz" or path.suffix == ".ply" and is_gaussian_ply(path)
 
 
 def is_run(folder: Path) -> bool:
@@ -117,6 +139,15 @@ def as_color(value: Any) -> Optional[tuple[float, float, float]]:
     numbers = value if isinstance(value, (list, tuple)) and len(value) == 3 else ()
     valid = all(isinstance(x, (int, float)) and 0 <= x <= 1 for x in numbers)
     return (float(numbers[0]), float(numbers[1]), float(numbers[2])) if numbers and valid else None
+
+
+def read_json(path: Path, kind: type[T]) -> T:
+    """Read a JSON file that holds a ``kind``; an empty one if there is none or it is damaged."""
+    try:
+        content = json.loads(_text(path))
+    except (OSError, ValueError, RecursionError):
+        return kind()
+    return content if isinstance(content, kind) else kind()
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -1,0 +1,124 @@
+"""The index of a run and the gallery: what they show of what is there, and that no file of a run
+can add markup or break them.
+"""
+
+import re
+from datetime import datetime
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+import pytest
+
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.images import write
+from threestudio_gaussiandreamer.view.gallery import write_gallery
+from threestudio_gaussiandreamer.view.run_index import note_time, write_index
+
+PROMPT = 'a <img src=x onerror="alert(1)"> & </title><script>alert(1)</script>'
+LOG = "dB,loss,gaussians,step\n10.0,5.0,200,1\n,,,2\n20.0,0.01,150,3\nnan,x,,4\n"
+
+
+class Tags(HTMLParser):
+    """Collects tags, and the files that they name."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.files: list[str] = []
+        self.feed(page.read_text())
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        assert not [name for name, _ in attributes if name.startswith("on")]
+        self.files += [unquote(value) for name, value in attributes if name in ("src", "href")]
+
+
+@pytest.fixture
+def full_run(run_folder):
+    """The run with a log, pictures, a base configuration and a name that needs escaping."""
+    save = run_folder / "save"
+    config = (run_folder / "configs" / "parsed.yaml").read_text()
+    (run_folder / "configs" / "raw.yaml").write_text(
+        config.replace("eps2d: 0.4", "eps2d: 0.3") + "seed: 0\ntag: ${name}\n"
+    )
+    extra = "seed: 0\ntag: t\nexp_dir: x\ntrainer: {max_steps: 7}\n"
+    quoted = config.replace("prompt: a box", f"prompt: {PROMPT!r}")
+    (run_folder / "configs" / "parsed.yaml").write_text(quoted + extra)
+    log = run_folder / "csv_logs" / "version_0" / "metrics.csv"
+    log.parent.mkdir(parents=True)
+    log.write_text(LOG)
+    for name in ("it7-0.png", "held_out/compare.png", "it7-export/poster.png", "it7-test/0.png"):
+        (save / name).parent.mkdir(exist_ok=True)
+        write(save / name, np.zeros((4, 4, 3), np.uint8))
+    (save / "it7-test.mp4").write_bytes(b"")
+    (save / "it7-export" / "view.html").write_text("")
+    (save / "a 'quoted' #&?<b>.txt").write_text("")
+    return run_folder
+
+
+def test_the_index_shows_what_the_run_has(full_run):
+    note_time(full_run, "train", datetime(2026, 1, 2, 3, 4, 5), 61.25)
+    text = write_index(full_run).read_text()
+    for expected in ("dB to the truth", "loss, logarithmic", "31.25", "61.2 s", "2026-01-02 03:04"):
+        assert expected in text
+    found = Tags(full_run / "index.html")
+    assert found.tags.count("svg") == 3 and "iframe" in found.tags and "video" in found.tags
+    assert found.tags.count("img") == 3  # poster, comparison, validation
+
+
+def test_every_file_is_linked_and_every_link_leads_to_a_file(full_run):
+    linked = {name for name in Tags(write_index(full_run)).files if name != "data:,"}
+    files = {str(path.relative_to(full_run)) for path in full_run.rglob("*") if path.is_file()}
+    assert linked == files - {"index.html"}
+
+
+def test_a_prompt_adds_no_markup(full_run):
+    found = Tags(write_index(full_run))
+    assert "script" not in found.tags and "b" not in found.tags and "x" not in found.files
+    write_gallery(full_run.parent)
+    assert "script" not in Tags(full_run.parent / "index.html").tags
+
+
+def test_the_changes_of_the_configuration_are_listed(full_run):
+    text = write_index(full_run).read_text()
+    rows = re.findall(r"<tr><td>([\w.]+)</td><td>([^<]*)</td><td>([^<]*)</td></tr>", text)
+    changed = {key: (base, run) for key, base, run in rows}
+    assert changed["system.renderer.eps2d"] == ("0.3", "0.4")
+    assert changed["trainer.max_steps"] == ("–", "7")
+    # neither what is equal, nor what is computed, nor what the base file refers to elsewhere
+    assert not changed.keys() & {"seed", "exp_dir", "tag", "system.renderer.preset"}
+
+
+def test_times_of_several_stages_are_kept(full_run):
+    for stage in ("train", "export"):
+        note_time(full_run, stage, datetime.now(), 1.0)
+    text = write_index(full_run).read_text()
+    assert "<td>train</td>" in text and "<td>export</td>" in text
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b"[1]", b"\xff\xfe", b'{"result": {"psnr": "x"}}'])
+@pytest.mark.parametrize(
+    "name",
+    ["save/metrics.json", "times.json", "configs/raw.yaml", "csv_logs/version_0/metrics.csv"],
+)
+def test_a_damaged_file_only_loses_its_part(full_run, name, damage):
+    (full_run / name).write_bytes(damage)
+    assert "held_out/compare.png" in write_index(full_run).read_text()
+
+
+def test_an_empty_folder_has_an_index(tmp_path):
+    assert Tags(write_index(tmp_path)).tags.count("h1") == 1
+
+
+def test_the_gallery_shows_prompt_poster_and_scores(full_run):
+    page = write_gallery(full_run.parent)
+    assert "31.2 dB" in page.read_text()
+    assert {"run/index.html", "run/save/it7-export/poster.png"} <= set(Tags(page).files)
+    assert (full_run / "index.html").is_file()
+
+
+def test_a_gallery_needs_runs(tmp_path):
+    with pytest.raises(UserError, match="holds no run.*configs/parsed.yaml"):
+        write_gallery(tmp_path)
