@@ -22,7 +22,11 @@ def meta(path) -> dict:
 def save(tmp_path_factory, painted_box):
     """The results of a run of two steps, and of ``--export`` after it."""
     folder = tmp_path_factory.mktemp("pages")
-    options = ["system.prompt_processor.prompt=a <painted> box", "system.renderer.eps2d=0.2"]
+    options = [
+        "system.prompt_processor.prompt=a <painted> box",
+        "system.renderer.eps2d=0.2",
+        "system.renderer.antialias=true",
+    ]
     assert launch(folder, painted_box, *options, *SHORT) == 0
     return trial(folder) / "save"
 
@@ -35,6 +39,11 @@ def test_a_run_ends_with_a_page_of_its_cloud(save):
     for shown, label in zip(found["clouds"], ("result", "prior"), strict=True):
         assert shown["label"] == label and shown["count"] == 200
         assert shown["quality"] == f"{scores[label]['psnr']:.1f} dB on held-out views"
+
+
+def test_the_page_saves_the_ply_file_of_the_export(save):
+    header = meta(save / "it2-export" / "view.html")["plyHeader"].encode()
+    assert (save / "it2-export" / "gaussians.ply").read_bytes().startswith(header)
 
 
 def test_the_first_cloud_is_kept(save):

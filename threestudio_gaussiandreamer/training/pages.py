@@ -65,6 +65,7 @@ def write_pages(system: Any, folder: str) -> None:
         return
     run = RunFiles(Path(system.get_save_dir()).parent)
     options = _page_options(system, run)
+    cloud = cloud._replace(antialiased=options.settings.antialias)
     result = Shown(cloud, "result", decibels(run.psnr("result", system.true_global_step)))
     write_page(
         Path(system.get_save_path(f"{folder}/{PAGE}")), result, options, _first_cloud(system, run)

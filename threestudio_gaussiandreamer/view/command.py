@@ -1,9 +1,9 @@
 """Look at clouds and runs: ``python -m threestudio_gaussiandreamer.view cloud.ply --html``.
 
-PATH is a PLY or SPZ file of Gaussians of any program, or a checkpoint of this package or of gsplat;
-or the folder of a run, which gets an ``index.html``, or a folder of runs, which gets a gallery.
-A cloud in the folder of a run is drawn as the run has drawn it, with its prompt; options override
-that. Other clouds are drawn with the defaults below."""
+PATH is a file of Gaussians of any program, or a checkpoint of this package or of gsplat; or the
+folder of a run, which gets an ``index.html``, or a folder of runs, which gets a gallery. A cloud in
+the folder of a run is drawn as the run has drawn it, with its prompt; options override that. Other
+clouds are drawn with the defaults below."""
 
 import argparse
 import functools
