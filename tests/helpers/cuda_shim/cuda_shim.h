@@ -1,7 +1,7 @@
-// Runs CUDA source on the host: every thread of a block is a fibre, barriers and warp functions are meeting points.
+// Runs CUDA source on the host: every thread of a block is a fibre, barriers and warp functions are synchronisation points.
 //
-// Blocks run one after the other. Between meeting points a fibre runs alone, in an order that the test chooses: results that
-// depend on it betray a missing barrier. Stricter than a GPU: a fibre that waits for one that has ended, or that meets another
+// Blocks run one after the other. Between them a fibre runs alone, in an order that the test chooses: results that
+// depend on it reveal a missing barrier. Stricter than a GPU: a fibre that waits for one that has ended, or that reaches another
 // kind of function, stops the launch with a message.
 #pragma once
 
@@ -22,7 +22,7 @@
 #define __noinline__ __attribute__((noinline))
 #define __forceinline__ inline
 #define __launch_bounds__(...)
-// In a section of its own, so that what an earlier block left there can be spoilt.
+// In a section of its own, so that the values of an earlier block can be overwritten.
 #define __shared__ static __attribute__((section("cuda_shared")))
 extern "C" char __start_cuda_shared[], __stop_cuda_shared[];
 
@@ -45,8 +45,8 @@ struct Fibre {
   jmp_buf at;
   bool started, done;
   Kind waits_for;
-  unsigned given;      // what it brings to the meeting
-  unsigned received;   // what it takes away
+  unsigned given;      // its contribution to the synchronisation
+  unsigned received;   // the value that it receives
 };
 
 struct Block {
@@ -79,7 +79,7 @@ inline void resume(unsigned i) {
   swapcontext(&block.scheduler_context, &fibre.context);
 }
 
-// Waits until all of the warp, or of the block, have come here; returns what the meeting gives this thread.
+// Waits until all of the warp, or of the block, are here; returns the value for this thread.
 inline unsigned meet(Kind kind, unsigned given) {
   Fibre& fibre = block.fibres[block.current];
   fibre.waits_for = kind, fibre.given = given;
@@ -87,7 +87,7 @@ inline unsigned meet(Kind kind, unsigned given) {
   return fibre.received;
 }
 
-// What fibres [begin, end) get from a meeting they have all come to; of a shuffle, what they gave, for others to look up.
+// The values that fibres [begin, end) receive when all have arrived; for a shuffle, their contributions.
 inline void give(Kind kind, unsigned begin, unsigned end) {
   unsigned all = 0;
   for (unsigned i = begin; i < end; i++) {
@@ -108,7 +108,7 @@ inline void fail(unsigned begin, const char* why, const Fibre& a, const Fibre& b
   block.error = std::string(why) + " in " + place + std::to_string(begin) + ": " + state(a) + " and " + state(b);
 }
 
-// Lets the fibres [begin, end) go on if they have all met; false when nobody is waiting.
+// Resumes the fibres [begin, end) if all have arrived; false if none is waiting.
 inline bool settle(unsigned begin, unsigned end) {
   const Fibre& first = block.fibres[begin];
   for (unsigned i = begin; i < end; i++) {
@@ -133,7 +133,7 @@ inline std::vector<unsigned> order_of(unsigned count, Order order, unsigned seed
 inline bool ended(const Fibre& fibre) { return fibre.done; }
 inline bool at_barrier(const Fibre& fibre) { return !fibre.done && waits_for_block(fibre); }
 
-// Runs a warp as far as it gets without the others: to a barrier of the block, or to its end.
+// Runs a warp until it needs the others: to a barrier of the block, or to its end.
 inline bool run_warp(unsigned begin, unsigned end, Order order, unsigned round) {
   const auto stuck = [](const Fibre& fibre) { return ended(fibre) || at_barrier(fibre); };
   while (!std::all_of(&block.fibres[begin], &block.fibres[begin] + (end - begin), stuck)) {
@@ -144,10 +144,10 @@ inline bool run_warp(unsigned begin, unsigned end, Order order, unsigned round) 
   return true;
 }
 
-// One warp after the other hurries from barrier to barrier: the worst neighbours for whoever forgot one.
+// Warps run one after the other from barrier to barrier, which exposes missing barriers best.
 inline bool run_block(Order order) {
   const unsigned threads = unsigned(block.fibres.size());
-  std::memset(__start_cuda_shared, 0xff, __stop_cuda_shared - __start_cuda_shared);  // NaN; a GPU promises nothing
+  std::memset(__start_cuda_shared, 0xff, __stop_cuda_shared - __start_cuda_shared);  // NaN; a GPU leaves it undefined
   for (Fibre& fibre : block.fibres) fibre.started = fibre.done = false, fibre.waits_for = NOTHING;
   for (unsigned round = 7 * blockIdx.x;; round++) {
     for (unsigned warp : order_of((threads + WARP - 1) / WARP, order, round))

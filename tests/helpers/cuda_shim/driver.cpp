@@ -1,4 +1,4 @@
-// NVIDIA's driver interface, as far as the product uses it, on top of the stand-in. Refuses what a driver would refuse.
+// The part of NVIDIA's driver interface that the package uses, on top of the emulation. Rejects what a driver rejects.
 #include <cstring>
 #include <string>
 

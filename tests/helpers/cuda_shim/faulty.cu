@@ -1,4 +1,4 @@
-// Kernels with the two mistakes that the stand-in must not hide.
+// Kernels with the two errors that the emulation must detect.
 #include "launch.h"
 
 // Every second thread ends before a barrier that the others wait at.

@@ -1,4 +1,4 @@
-// The product's CUDA text, compiled for the host.
+// The package's CUDA source, compiled for the host.
 #include "cuda_shim.h"
 
 #include "project.cu"

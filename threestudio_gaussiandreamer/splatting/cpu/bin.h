@@ -1,4 +1,4 @@
-// Stages 2 and 3: sort the visible Gaussians by depth, then deal them to the tiles in that order.
+// Stages 2 and 3: sort the visible Gaussians by depth, then assign them to the tiles in that order.
 #pragma once
 
 #include "parallel.h"
@@ -92,7 +92,7 @@ inline void count_tiles(View& view, const DepthOrder& order, int64_t part) {
                    [&](uint32_t gaussian) { for_each_tile(view, gaussian, [&](int tile) { counts[tile]++; }); });
 }
 
-// From the counts per (part, tile) to where each part writes its first intersection of each tile.
+// Converts the counts per (part, tile) to the position of each part's first intersection of each tile.
 inline void scan_histogram(View& view, int parts) {
   int32_t sum = 0;
   for (int tile = 0; tile < view.tiles(); tile++) {
@@ -114,7 +114,7 @@ inline void fill_tiles(View& view, const DepthOrder& order, int64_t part) {
   });
 }
 
-// Deals the Gaussians to the tiles; each part takes an equal run of them, so the order survives.
+// Assigns the Gaussians to the tiles; each part processes a contiguous range, which keeps the order.
 inline void deal_to_tiles(View& view, const uint64_t* keys, int64_t visible, int threads) {
   const DepthOrder order = {keys, visible, int(std::min<int64_t>(threads, visible / SLICE + 1))};
   view.histogram.reserve(size_t(order.parts) * view.tiles());

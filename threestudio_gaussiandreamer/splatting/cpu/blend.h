@@ -30,7 +30,7 @@ SPLAT_FN bool blend_strip(BlendScratch& scratch, Planes& p, const StripPixels& p
       sum += weight, red += weight * s.red, green += weight * s.green, blue += weight * s.blue, depth += weight * s.depth;
       store(peak, maximum(weight, load(peak)));
     }
-    transmittance = select(transmittance >= limits.stop, transmittance, Floats{});  // keeps it out of the denormals
+    transmittance = select(transmittance >= limits.stop, transmittance, Floats{});  // avoids denormals
     live = any_at_least(transmittance, limits.stop);
   }
   store(scratch.transmittance + at, transmittance), store(p.alpha + at, sum);
@@ -58,7 +58,7 @@ inline void raise_contributions(const View& view, int first, int count, const fl
   }
 }
 
-// Blends all intersections of a tile into `planes`; notes in the view which blocks each of them touches.
+// Blends all intersections of a tile into `planes`; stores in the view which blocks each of them overlaps.
 inline void blend_list(const ForwardCall& call, View& view, const TileFrame& frame, Planes& planes) {
   const BlendLimits limits = limits_of(call.settings);
   uint64_t* masks = call.keep ? view.block_masks.data() : nullptr;

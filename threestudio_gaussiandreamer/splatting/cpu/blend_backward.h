@@ -1,6 +1,6 @@
 // Stage 4, backward: from the gradients of the pixels to one row of sums per (splat, tile).
 //
-// The splats are blended front to back once more. What lies behind splat i is then the pixel's total minus what came so far,
+// The splats are blended front to back once more. The sum behind splat i is then the pixel's total minus the sum so far,
 // so neither lists per pixel nor a division by T are needed. Per pair of splat and pixel only u = d loss / d ln(alpha) and the
 // weight are kept; transposed, LANES splats become lanes, and since y is linear in the pixel's coordinates, six moments of u
 // give the gradients of mean, covariance and opacity.
@@ -86,7 +86,7 @@ SPLAT_FN void add_pairs(BackwardScratch& scratch, PairRows& rows, const StripPix
 
 SPLAT_FN Floats absolute(Floats x) { return maximum(x, -x); }
 
-// A strip on its way from front to back.
+// The state of a strip in the pass front to back.
 struct StripState {
   Floats red, green, blue, depth, alpha;  // upstream
   Floats transmittance, behind;
@@ -98,7 +98,7 @@ SPLAT_FN StripState load_strip(const BackwardScratch& s, int at) {
           load(up.alpha + at), load(s.transmittance + at), load(s.behind + at)};
 }
 
-// Blends one splat into a strip once more and notes what its gradient needs in row `j`.
+// Blends one splat into a strip again and stores what its gradient needs in row `j`.
 template <bool ABSOLUTE>
 SPLAT_FN void blend_backward(const LocalSplat& s, const StripPixels& pixels, const BlendLimits& limits, StripState& strip,
                              PairRows& rows, int j) {
@@ -114,7 +114,7 @@ SPLAT_FN void blend_backward(const LocalSplat& s, const StripPixels& pixels, con
   if constexpr (ABSOLUTE) rows.abs_x[j] = absolute(u * s.a * y1), rows.abs_y[j] = absolute(u * (s.b * y1 + s.c * y2));
 }
 
-// Goes once more over the splats of `list` in a strip; false when all its pixels have stopped.
+// Visits the splats of `list` in a strip again; false when all its pixels have stopped.
 template <bool ABSOLUTE>
 SPLAT_FN bool blend_strip_backward(BackwardScratch& scratch, const StripPixels& pixels, const uint16_t* list, int length,
                                    const BlendLimits& limits) {
@@ -133,7 +133,7 @@ SPLAT_FN bool blend_strip_backward(BackwardScratch& scratch, const StripPixels& 
   return live;
 }
 
-// What lies behind the first splat: the sum of weight * value over all of them, and the background's share.
+// The sum behind the first splat: weight * value over all splats, and the background's share.
 inline void start_behind(const Planes& planes, const Vec3<float>& background, BackwardScratch& scratch) {
   const UpstreamPlanes& up = scratch.upstream;
   for (int p = 0; p < TILE_PIXELS; p++) {
@@ -159,7 +159,7 @@ inline void store_sums(const View& view, const float* sums, int first, int count
     std::memcpy(slots + int64_t(view.intersections[first + i].slot) * ROW, sums + i * ROW, sizeof(float) * ROW);
 }
 
-// The rows of sums of all intersections of one tile, each into its slot; those behind the last chunk that counted are zero.
+// The rows of sums of all intersections of one tile, each into its slot; those behind the last chunk that contributes are zero.
 template <bool ABSOLUTE>
 inline void blend_list_backward(const BackwardCall& call, View& view, const TileFrame& frame, BackwardScratch& scratch) {
   const BlendLimits limits = limits_of(call.settings);

@@ -1,4 +1,4 @@
-// Memory that only grows, and objects made of it that are used again instead of being freed.
+// Buffers that only grow, and pools of objects that own such buffers.
 #pragma once
 
 #include <cstddef>
@@ -16,7 +16,7 @@
 
 namespace splat {
 
-// What a call would have needed; becomes its return value.
+// The memory that a call needs and can't get; becomes its return value.
 struct OutOfMemory {
   int64_t bytes;
 };
@@ -29,7 +29,7 @@ inline int64_t memory_of_machine() {
 #endif
 }
 
-// Linux grants memory that it doesn't have, and then kills: better to refuse.
+// Linux overcommits memory and later kills the process, so larger requests are refused here.
 inline void check_memory(int64_t bytes) {
   if (bytes > memory_of_machine() / 4 * 3) throw OutOfMemory{bytes};
 }
@@ -78,7 +78,7 @@ template <class T> T& of_process() {
   return *instance;
 }
 
-// Hands out objects whose buffers have already grown; keeps at most two idle ones.
+// A pool of objects whose buffers have already grown; keeps at most two idle ones.
 template <class T> class Pool {
  public:
   std::unique_ptr<T> take() {

@@ -1,4 +1,4 @@
-// What the stages of one call share.
+// Data shared by the stages of one call.
 #pragma once
 
 #include <cmath>
@@ -11,10 +11,10 @@ struct ForwardCall {
   const Scene& scene;
   const SplatSettings& settings;
   const SplatPictures& out;
-  bool keep;  // what a backward pass needs
+  bool keep;  // whether to keep what a backward pass needs
 };
 
-// What only lives during a backward pass.
+// Buffers of a backward pass.
 struct Workspace {
   Buffer<float> slots;       // (intersections of all views, ROW): gradient sums of a splat in a tile
   Buffer<float> background;  // (views, tiles, 3)

@@ -70,8 +70,8 @@ SPLAT_FN bool any_at_least(Floats x, float bound) {
   return (any[0] | any[1]) != 0;
 }
 
-// 2^x for -126 <= x < 128, relative error 3e-7; garbage below. Adding 1.5 * 2^23 rounds to an integer n, which is then both
-// the number to take off and, in the low bits, the exponent to add; a minimax polynomial does the rest in [-1/2, 1/2].
+// 2^x for -126 <= x < 128, relative error 3e-7; undefined below. Adding 1.5 * 2^23 rounds to an integer n, which is then both
+// subtracted and, in the low bits, added to the exponent; a minimax polynomial approximates the rest in [-1/2, 1/2].
 SPLAT_FN Floats exp2(Floats x) {
   const float rounder = 12582912.0f;
   const Floats rounded = x + rounder, r = x - (rounded - rounder);

@@ -24,7 +24,7 @@ inline Vec3<float> background_of(const Scene& scene, int view) {
   return {background[0], background[1], background[2]};
 }
 
-// Four pixels in a row: where they are in a block-ordered plane.
+// The positions of four adjacent pixels in a block-ordered plane.
 SPLAT_FN int quad_at(int row, int column) {
   return ((row / BLOCK) * BLOCKS_PER_ROW + column) * BLOCK_PIXELS + row % BLOCK * BLOCK;
 }
@@ -39,7 +39,7 @@ template <int DOWNSAMPLE> SPLAT_FN Quad fetch(const float* plane, int row, int c
   return 0.25f * (even + odd);
 }
 
-// The adjoint of `fetch`, onto a plane that nothing else writes.
+// The adjoint of `fetch`, onto a plane that only this function writes.
 template <int DOWNSAMPLE> SPLAT_FN void spread(float* plane, int row, int column, Quad value) {
   if constexpr (DOWNSAMPLE == 1) return store(plane + quad_at(row, column), value);
   const Quad quarter = 0.25f * value;

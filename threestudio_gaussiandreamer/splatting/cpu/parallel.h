@@ -1,5 +1,5 @@
-// A parallel loop on a team of threads that never holds its caller up: the caller works too, and waits at the end only for
-// helpers in the middle of a task, not for those that the system hasn't woken yet. (An OpenMP barrier waits for every thread;
+// A parallel loop on a team of threads: the caller works too, and at the end waits only for helpers that are executing a
+// task, not for those that the system hasn't woken yet. (An OpenMP barrier waits for every thread;
 // when other programs, or torch's own threads, hold the cores, that costs milliseconds where the work takes microseconds.)
 #pragma once
 
@@ -53,9 +53,9 @@ class Team {
     std::exception_ptr error = nullptr;
   };
 
-  static constexpr int SPINS = 4000;  // some tens of microseconds: the pause between two stages
+  static constexpr int SPINS = 4000;  // tens of microseconds, the pause between two stages
 
-  // Where the system grants no more threads, those that there are do the work.
+  // If the system grants no more threads, the existing ones do the work.
   void hire(int helpers) try {
     for (; workers_ < helpers; workers_++) std::thread([this] { help(); }).detach();
   } catch (const std::system_error&) {

@@ -1,4 +1,4 @@
-// Stage 1: Gaussians to splats, and which tiles each splat touches.
+// Stage 1: project Gaussians to splats, and find the tiles that each splat overlaps.
 #pragma once
 
 #include "calls.h"
@@ -38,7 +38,7 @@ inline Ellipse<float> ellipse_of(const Splat& s) {
   return {s.x, s.y, s.extent_y, s.c * s.c, s.level, s.inverse_a, s.tilt, s.slant};
 }
 
-// Columns [first, last] of tiles cut down to those that the ellipse meets in one row of tiles, a little more to be safe.
+// Columns [first, last] of tiles cut down to those that the ellipse meets in one row of tiles, with a safety margin.
 inline TileSpan cut_span(const Ellipse<float>& ellipse, int row, int first, int last) {
   const float top = row * TILE + 0.5f;
   const Span<float> x = row_span(ellipse, top, top + (TILE - 1));
@@ -91,7 +91,7 @@ SPLAT_FN void store_screen(const ForwardCall& call, int view, Group group, const
   store_items<1>(call.out.contribution + at, group.count, [&](float* q) { store(q, zero); });
 }
 
-// Notes the tiles and the depth of the visible lanes.
+// Stores the tiles and the depth of the visible lanes.
 inline void list_lanes(View& view, Slice& slice, Group group, const Projection<Floats>& p, const Reach<Floats>& reach, Ints visible) {
   const TileRange x = tile_range(p.screen.mean.x, reach.extent.x, view.camera.size.x);
   const TileRange y = tile_range(p.screen.mean.y, reach.extent.y, view.camera.size.y);

@@ -13,7 +13,7 @@ struct ViewmatSums {
   Vec3<Floats> translation;
 };
 
-// Adds up each Gaussian's slots in their order, as LANES rows; says which of the Gaussians have any.
+// Sums each Gaussian's slots in their order, as LANES rows; returns which of the Gaussians have any.
 inline Ints gather_slots(const View& view, const float* slots, Group group, float* rows) {
   Ints drawn = {};
   for (int l = 0; l < LANES; l++) {
@@ -32,7 +32,7 @@ SPLAT_FN Floats keep(Ints mask, Floats x) { return select(mask, x, Floats{}); }
 SPLAT_FN Vec3<Floats> keep(Ints mask, const Vec3<Floats>& v) { return {keep(mask, v.x), keep(mask, v.y), keep(mask, v.z)}; }
 SPLAT_FN Mat3<Floats> keep(Ints mask, const Mat3<Floats>& m) { return {keep(mask, m.x), keep(mask, m.y), keep(mask, m.z)}; }
 
-// LANES Gaussians and what follows from them alone.
+// LANES Gaussians and their view-independent quantities.
 struct Shapes {
   Gaussian<Floats> gaussians;
   Rotation<Floats> rotation;
@@ -78,7 +78,7 @@ SPLAT_FN void store_view(const BackwardCall& call, int view, Group group, const 
   if (call.scene.colors_per_view) store_vec3(out.colors + 3 * at, group.count, d.color);
 }
 
-// Through rotation and scale; nothing flows to a Gaussian that isn't drawn, finite or not.
+// Through rotation and scale; a Gaussian that isn't rendered has zero gradients, finite or not.
 SPLAT_FN void store_world(const BackwardCall& call, Group group, const Shapes& shapes, const WorldGradient<Floats>& d, Ints drawn) {
   const auto [first, count] = group;
   const SplatGradients& out = call.out;

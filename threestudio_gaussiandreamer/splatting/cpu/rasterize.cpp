@@ -13,7 +13,7 @@ struct SplatState {
 
 namespace splat {
 
-constexpr int TILE_GRAIN = 4;        // neighbours share splats, and so cache lines
+constexpr int TILE_GRAIN = 4;        // adjacent tiles share splats, hence cache lines
 constexpr int BACKWARD_SLICE = 512;  // Gaussians per task, and per partial sum of d loss / d viewmats
 
 static Pool<SplatState>& states() { return of_process<Pool<SplatState>>(); }
@@ -34,7 +34,7 @@ static void forward(const ForwardCall& call, Views& views) {
 
 static int64_t slices_of(const Scene& scene) { return (scene.gaussians + BACKWARD_SLICE - 1) / BACKWARD_SLICE; }
 
-// Numbers the slots of all views and makes room for whatever the backward pass writes on its way.
+// Numbers the slots of all views and allocates the buffers of the backward pass.
 static void prepare(BackwardCall& call) {
   int64_t slots = 0;
   for (int v = 0; v < call.scene.views; v++) call.first_slots.push_back(slots), slots += call.views[v].intersection_count;
@@ -86,7 +86,7 @@ static void backward(BackwardCall call) {
   sum_over_views(call);
 }
 
-// 0, or the bytes that couldn't be had; -1 when even that isn't known.
+// 0, or the bytes that couldn't be allocated; -1 if their number is unknown.
 template <class Body> static int64_t guarded(const Body& body) {
   try {
     body();

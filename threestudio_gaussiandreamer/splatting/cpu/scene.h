@@ -10,7 +10,7 @@ struct SplatSettings {
   int32_t antialias, downsample, threads;
 };
 
-// What a forward pass fills; pixels after the downsampling.
+// Outputs of a forward pass; pixels after downsampling.
 struct SplatPictures {
   float* image;         // (B, H, W, 3)
   float* alpha;         // (B, H, W)
@@ -24,7 +24,7 @@ struct SplatUpstream {
   const float *image, *alpha, *depth;  // d loss / d pictures; null is zero
 };
 
-// What a backward pass fills; those that may be null aren't computed then.
+// Outputs of a backward pass; optional ones are null if they aren't needed.
 struct SplatGradients {
   float *means, *quats, *scales, *opacities;  // as in splat::Scene
   float* viewmats;                            // may be null
@@ -33,13 +33,13 @@ struct SplatGradients {
   float* absgrad;  // (B, N, 2), sums over the pixels of absolute values; may be null
 };
 
-// What a backward pass needs from its forward pass.
+// State of a forward pass that its backward pass needs.
 struct SplatState;
 
 #pragma GCC visibility push(default)
 extern "C" {
-// 0, or the bytes of memory that would have been needed. With `state` not null it receives what a backward pass needs, to be
-// given back by `splat_release`.
+// 0, or the bytes of memory that would have been needed. If `state` is not null, it receives what a backward pass needs, to be
+// freed by `splat_release`.
 int64_t splat_forward(const splat::Scene*, const SplatSettings*, const SplatPictures*, SplatState** state);
 int64_t splat_backward(SplatState*, const splat::Scene*, const SplatSettings*, const SplatUpstream*, const SplatGradients*);
 void splat_release(SplatState*);  // null is ignored

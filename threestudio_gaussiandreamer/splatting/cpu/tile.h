@@ -1,4 +1,4 @@
-// What the forward and the backward blend share: the splats of a tile in its own coordinates, and which blocks they touch.
+// Shared by the forward and the backward blend: the splats of a tile in its own coordinates, and which blocks they touch.
 #pragma once
 
 #include "calls.h"
@@ -7,7 +7,7 @@ namespace splat {
 
 constexpr int CHUNK = 256;      // splats staged at a time
 constexpr int PREFETCH = 32;    // splats ahead
-constexpr int CHECK_EVERY = 4;  // splats between two looks at whether all pixels of a strip have stopped
+constexpr int CHECK_EVERY = 4;  // splats between two tests whether all pixels of a strip have stopped
 
 struct TileFrame {
   int left, top;
@@ -65,7 +65,7 @@ SPLAT_FN void block_masks(const SplatLanes& s, uint64_t* masks) {
   for (int l = 0; l < LANES; l++) masks[l] = uint64_t(uint32_t(halves[1][l])) << 32 | uint32_t(halves[0][l]);
 }
 
-// Turns 64 x 64 bits over: bit i of word j becomes bit j of word i (Warren, Hacker's Delight, 7-3).
+// Transposes 64 x 64 bits: bit i of word j becomes bit j of word i (Warren, Hacker's Delight, 7-3).
 inline void transpose_bits(uint64_t* words) {
   uint64_t mask = 0x00000000ffffffff;
   for (int step = 32; step; step >>= 1, mask ^= mask << step)
@@ -111,7 +111,7 @@ SPLAT_FN int list_block(const Staged& staged, int block, uint16_t* list) {
   return count;
 }
 
-// Brings `count` splats into the coordinates of a tile; the masks of the blocks that they touch are found, or read back.
+// Transforms `count` splats to the coordinates of a tile; the masks of the blocks that they overlap are computed, or read.
 template <bool FIND>
 SPLAT_FN void stage(const View& view, const TileFrame& frame, int first, int count, uint64_t* masks, Staged& staged) {
   for (int i = 0; i < count; i += LANES) {
@@ -171,7 +171,7 @@ struct LiveStrips {
   }
 };
 
-// Calls blend(pixels, list, length), which says whether the strip lives on, for each live strip and the splats that touch it.
+// Calls blend(pixels, list, length), which returns whether the strip continues, for each unfinished strip and the splats that overlap it.
 template <class Blend> SPLAT_FN void for_each_live_strip(const Staged& staged, LiveStrips& live, Blend blend) {
   uint16_t list[CHUNK + 8];
   for (int block = 0; block < BLOCKS; block++) {

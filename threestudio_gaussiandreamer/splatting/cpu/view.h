@@ -1,4 +1,4 @@
-// What is known of one view between the stages and between a forward pass and its backward pass.
+// Data of one view between the stages, and between a forward pass and its backward pass.
 #pragma once
 
 #include <deque>
@@ -43,7 +43,7 @@ struct Intersection {
   int32_t gaussian, slot;
 };
 
-// Sums of weight * (colour, depth, 1) per pixel of a tile, block after block. 1 - alpha is what the background still gets.
+// Sums of weight * (colour, depth, 1) per pixel of a tile, block after block. 1 - alpha is the weight of the background.
 struct Planes {
   alignas(64) float red[TILE_PIXELS], green[TILE_PIXELS], blue[TILE_PIXELS], depth[TILE_PIXELS], alpha[TILE_PIXELS];
 };
@@ -62,7 +62,7 @@ struct View {
   Buffer<uint64_t> block_masks;  // per intersection, the blocks of the tile that it touches
   Buffer<Planes> planes;         // (tiles) before the background; those of empty tiles aren't set
 
-  // Room for everything whose size doesn't depend on where the Gaussians are.
+  // Allocates everything whose size doesn't depend on the positions of the Gaussians.
   void prepare(const Scene& scene, int view) {
     index = view, tiles_x = (scene.width + TILE - 1) / TILE, tiles_y = (scene.height + TILE - 1) / TILE;
     slices.resize((scene.gaussians + SLICE - 1) / SLICE);
@@ -78,7 +78,7 @@ struct View {
   int64_t slot_end(int64_t gaussian) const { return slice_of(gaussian).first_slot + (&coverage(gaussian))[1].slot; }
 };
 
-// Never shrinks, so that the views' buffers are used again; the scene says how many there are.
+// Never shrinks, so that the views' buffers are reused; the scene has their number.
 using Views = std::deque<View>;
 
 }  // namespace splat

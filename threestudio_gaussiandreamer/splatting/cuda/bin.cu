@@ -1,10 +1,10 @@
-// Stages 3 to 5: deal the splats, sorted by depth, to the tiles that they reach. An intersection is a pair of a splat and a tile; they are
-// numbered front to back, so a stable sort by tile leaves the list of each tile front to back.
+// Stages 3 to 5: assign the splats, sorted by depth, to the tiles that they overlap. An intersection is a pair of a splat and a tile;
+// they are numbered front to back, so a stable sort by tile keeps the list of each tile front to back.
 #include "reach.h"
 
 namespace splat {
 
-// Not inlined: whoever counts and whoever lists must get the same tiles to the bit.
+// Not inlined, so that counting and listing use the same machine code and get the same tiles to the bit.
 static __device__ __noinline__ Range tile_rows(const Splat& splat, int count) { return rows_of(splat, 0.0f, TILE, count); }
 
 static __device__ __noinline__ Range tile_columns(const Splat& splat, int row, int count) {
@@ -38,7 +38,7 @@ count_tiles(splat::Scene scene, const splat::Splat* splats, const splat::Index* 
 }
 
 // Stage 4: tile and owner (view * N + Gaussian) of each intersection. `ends` is the running sum of the counts. What doesn't fit into
-// the capacity is left out; the blend notices and does without the lists.
+// the capacity is skipped; the blend detects this and does not use the lists.
 extern "C" __global__ void __launch_bounds__(128)
 list_tiles(splat::Scene scene, const splat::Splat* splats, const splat::Index* order, const int* counts,
            const splat::Index* ends, splat::Index capacity, int* tiles, int* owners) {

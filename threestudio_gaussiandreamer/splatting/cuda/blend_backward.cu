@@ -1,6 +1,6 @@
 // The adjoint of stage 6: from the gradients of the pixels to one row of sums per intersection (splat in a tile).
 //
-// The splats are blended front to back once more. What lies behind splat i is then the pixel's total minus what came so far,
+// The splats are blended front to back once more. The sum behind splat i is then the pixel's total minus the sum so far,
 // so neither lists per pixel nor a division by T are needed. Per pair of splat and pixel only u = d loss / d ln(alpha) and the
 // weight are kept, in shared memory; read the other way round, lanes are splats, and since y is linear in the pixel's
 // coordinates, six moments of u give the gradients of mean, covariance and opacity. No atomics: every row has one writer, and
@@ -15,7 +15,7 @@ struct Upstream {
   const float* transmittance;
 };
 
-// Splats are turned into lanes so many at a time: each then has one lane per row of the patch. Four more columns than pixels
+// Number of splats that are transposed into lanes at a time: each then has one lane per row of the patch. Four more columns than pixels
 // spread both directions over all banks: a float per pixel is written, four at once are read.
 constexpr int PAIRS = WARP / PATCH_HEIGHT, PITCH = WARP + 4;
 
@@ -31,7 +31,7 @@ struct BackwardShared {
   unsigned summed[PATCHES];                             // which of the parts exist
 };
 
-// One pixel's gradients, and what it knows while going front to back.
+// One pixel's gradients, and its state in the pass front to back.
 struct PixelBackward {
   Quad d_color_depth;
   float d_alpha, transmittance, behind;
@@ -115,7 +115,7 @@ SPLAT_FN Row sum_pairs(const BackwardShared& shared, const LocalSplat& s, const 
   return r;
 }
 
-// Goes once more over the hits of a group in this warp's patch, PAIRS at a time; returns which hits were summed.
+// Visits the hits of a group again in this warp's patch, PAIRS at a time; returns which hits were summed.
 template <bool ABSOLUTE>
 SPLAT_FN unsigned blend_hits_backward(BackwardShared& shared, int group, const Pixel& pixel, const Settings& settings,
                                       PixelBackward& p) {
@@ -132,7 +132,7 @@ SPLAT_FN unsigned blend_hits_backward(BackwardShared& shared, int group, const P
       blend_pair(splat, pixel, settings, p, pairs.u[pair][pixel.lane], pairs.weight[pair][pixel.lane]);
     }
     __syncwarp();
-    // Lanes without a splat sum up what an earlier round left behind, and nobody reads it.
+    // Lanes without a splat sum values of an earlier round; the result is not used.
     const LocalSplat splat = load_staged(shared.stage, group * WARP + maximum(mine, 0));
     const Row part = sum_pairs<ABSOLUTE>(shared, splat, pixel, k, row);
     if (mine >= 0 && row == 0) copy_quads(part, shared.parts[pixel.patch][mine]);
@@ -151,7 +151,7 @@ SPLAT_FN void write_rows(const BackwardShared& shared, const Lists& lists, Index
   reinterpret_cast<Quad*>(rows + lists.sorted[first + slot])[quad] = sum;
 }
 
-// Intersections behind the last splat that any pixel of the tile saw.
+// Intersections behind the last splat that contributes to a pixel of the tile.
 SPLAT_FN void clear_rows(const Lists& lists, Index first, Index end, Row* rows) {
   for (Index i = first * ROW_QUADS + threadIdx.x; i < end * ROW_QUADS; i += TILE_PIXELS)
     reinterpret_cast<Quad*>(rows + lists.sorted[i / ROW_QUADS])[i % ROW_QUADS] = {};

@@ -1,4 +1,4 @@
-// What every kernel is told, and the words that differ between NVRTC and a host compiler that runs these files in tests.
+// Parameters of all kernels, and the keywords that differ between NVRTC and a host compiler that runs these files in tests.
 #pragma once
 
 #define SPLAT_FN static __device__ __forceinline__

@@ -38,7 +38,7 @@ SPLAT_FN void sum_block(const float* columns, float* out) {
   __syncthreads();
 }
 
-// Through rotation and scale; nothing flows to a Gaussian that no view draws, finite or not.
+// Through rotation and scale; a Gaussian that no view renders has zero gradients, finite or not.
 SPLAT_FN void store_world(const Gradients& out, Index i, const Gaussian<float>& g, const Rotation<float>& rotation,
                           const WorldGradient<float>& d, bool drawn) {
   Mat3<float> d_rotation;

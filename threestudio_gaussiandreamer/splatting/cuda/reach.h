@@ -1,5 +1,5 @@
-// Which tiles, and which patches of a tile, an ellipse reaches. All tests are exact but for a margin that covers rounding:
-// the blend decides each pixel, so a patch too many costs time only.
+// Which tiles, and which patches of a tile, an ellipse overlaps. All tests are exact but for a margin that covers rounding:
+// the blend tests each pixel, so an additional patch only costs time.
 #pragma once
 
 #include "launch.h"

@@ -1,4 +1,4 @@
-// What the forward and the backward blend share: the list of a tile, its splats staged in shared memory, and a warp's pixels.
+// Shared by the forward and the backward blend: the list of a tile, its splats staged in shared memory, and a warp's pixels.
 #pragma once
 
 #include "reach.h"
@@ -7,7 +7,7 @@ namespace splat {
 
 constexpr int CHUNK = 128, GROUPS = CHUNK / WARP;  // splats staged at a time
 
-// All tile intersections of all views, as stages 1 to 5 left them.
+// All tile intersections of all views, the result of stages 1 to 5.
 struct Lists {
   const Splat* splats;    // (B, N)
   const Index* order;     // (B, N) Gaussians front to back
@@ -46,8 +46,8 @@ struct alignas(16) LocalSplat {
   float red, green, blue, depth, spare_1, spare_2;
 };
 
-// a b + c, rounded once wherever it stands. What decides over a pixel is built from it, so that the backward pass takes the
-// forward pass's decisions to the bit: left to itself a compiler may fuse the same expression differently in two kernels.
+// a b + c, always rounded once. Values that are compared with thresholds use it, so that the backward pass makes the forward
+// pass's decisions to the bit: a compiler may fuse the same expression differently in two kernels.
 SPLAT_FN float multiply_add(float a, float b, float c) { return __fmaf_rn(a, b, c); }
 
 SPLAT_FN LocalSplat to_tile(const Splat& s, const TileFrame& frame) {
@@ -81,7 +81,7 @@ SPLAT_FN LocalSplat load_staged(const Stage& stage, int slot) {
 }
 
 // Fills the stage with items [first, first + count) of the list; returns the owner of this thread's one, or -1. The caller
-// separates it with barriers from whatever reads the stage.
+// puts barriers between this and the reads of the stage.
 SPLAT_FN Index fill_stage(Stage& stage, const Scene& scene, const Lists& lists, const TileFrame& frame, Index first, int count) {
   const int slot = threadIdx.x;
   Index owner = -1;
@@ -121,7 +121,7 @@ SPLAT_FN Pixel pixel_of(const Scene& scene, const TileFrame& frame) {
   return p;
 }
 
-// A pixel's colour and depth in front of the background, and what is left of the light.
+// A pixel's colour and depth in front of the background, and its transmittance.
 struct Sums {
   Quad color_depth;
   float transmittance;

@@ -280,7 +280,7 @@ template <class F> SPLAT_FN F weight_of(F alpha, F transmittance, float stop) {
 }
 
 // d loss / d ln(alpha), zero where the cap holds or the pixel has stopped. `value` is d loss / d weight, `behind` is
-// the sum of weight * value over what lies behind, background included.
+// the sum of weight * value over everything behind, background included.
 template <class F> SPLAT_FN F blend_vjp(F alpha, F transmittance, F weight, F value, F behind, float alpha_max, float stop) {
   const F zero = {}, u = weight * value - behind * alpha / (1.0f - alpha);
   return select((alpha < zero + alpha_max) & (transmittance >= zero + stop), u, zero);
