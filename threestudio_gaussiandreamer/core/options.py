@@ -21,7 +21,7 @@ RULE = "option"
 FLOAT32_MAX = 3.4028234663852886e38
 FLOAT32_TINY = 1.1754943508222875e-38
 """Smallest normal float32: smaller positive options could be rounded to zero."""
-NAME = string.ascii_letters + string.digits + "_"
+NAME_CHARACTERS = string.ascii_letters + string.digits + "_"
 INT64_MAX = 2**63 - 1
 SHOWN = 80
 """Maximum length of a value in a message, characters."""
@@ -49,25 +49,26 @@ def satisfies(expected: str, holds: Callable[[Any], bool]) -> Rule:
 
 def positive(unit: str = "") -> Rule:
     """Accept numbers that are above 0, also after conversion to float32."""
-    return satisfies(f"a number above 0{_of(unit)}", is_positive)
+    return satisfies(f"a number above 0{_with_unit(unit)}", is_positive)
 
 
 def at_least(low: float, unit: str = "") -> Rule:
     """Accept numbers of ``low`` or more."""
-    return satisfies(f"{low:g} or more{_of(unit)}", lambda v: is_number(v) and v >= low)
+    return satisfies(f"{low:g} or more{_with_unit(unit)}", lambda v: is_number(v) and v >= low)
 
 
 def in_range(low: float, high: float, unit: str = "") -> Rule:
     """Accept numbers from ``low`` to ``high``, both included."""
     return satisfies(
-        f"a number from {low:g} to {high:g}{_of(unit)}", lambda v: is_number(v) and low <= v <= high
+        f"a number from {low:g} to {high:g}{_with_unit(unit)}",
+        lambda v: is_number(v) and low <= v <= high,
     )
 
 
 def between(low: float, high: float, unit: str = "") -> Rule:
     """Accept numbers between ``low`` and ``high``, both excluded."""
     return satisfies(
-        f"a number between {low:g} and {high:g}{_of(unit)}",
+        f"a number between {low:g} and {high:g}{_with_unit(unit)}",
         lambda v: is_number(v) and low < v < high,
     )
 
@@ -127,7 +128,7 @@ def required(purpose: str) -> Rule:
     return rule(check)
 
 
-def _of(unit: str) -> str:
+def _with_unit(unit: str) -> str:
     return f" ({unit})" if unit else ""
 
 
@@ -227,5 +228,5 @@ def _located(message: str, prefix: str, names: Collection[str]) -> str:
     """Prepend the option's path to ``message``, unless the message begins with it already."""
     if message.startswith(prefix):
         return message
-    begins_with_option = message[: len(message) - len(message.lstrip(NAME))] in names
+    begins_with_option = message[: len(message) - len(message.lstrip(NAME_CHARACTERS))] in names
     return prefix + message if begins_with_option else f"{prefix.rstrip('.')}: {message}"

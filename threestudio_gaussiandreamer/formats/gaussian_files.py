@@ -25,6 +25,7 @@ from .spz import SPZ_UP, load_spz, read_spz_comment, spz_arrays, spz_bytes, writ
 from .usda import USDA_UP, write_usda
 
 UP, PRUNED = "up:", "pruned to the likeness, dB:"
+"""Keys of the comments in files; the second is the PSNR to the original cloud."""
 ANTIALIASED = "SplatRenderMode: mip"
 """The comment by which Brush, SuperSplat and splat-transform tag clouds trained with antialiasing.
 """

@@ -9,14 +9,14 @@ back:
 ==========  ========================================================================================
 header      ``NGSP``, version u32, N u32, degree of the harmonics u8, fractional bits u8, flags u8
             (1: antialiased), number of packed blocks u8 (version 4)
-positions   N x 3 fixed point of 24 bit, signed
+positions   N x 3 fixed point of 24 bits, signed
 alphas      N u8: 255 opacity, written up to 254: Niantic's reader takes the logit of the byte over
             255, which is infinite at 255
 colors      N x 3 u8: 255 (0.15 sh + 0.5)
 scales      N x 3 u8: 16 (log scale + 10), so sizes from e^-10 to e^5.9 world units
-rotations   N u32: the number of the largest component, and sign and 9 bit of each other (version 2:
+rotations   N u32: the index of the largest component, and sign and 9 bits of each other (version 2:
             x y z u8)
-harmonics   N x (K - 1) x 3 u8: 128 sh + 128, of which 5 bit are used at degree 1, 4 above
+harmonics   N x (K - 1) x 3 u8: 128 sh + 128, of which 5 bits are used at degree 1, 4 above
 ==========  ========================================================================================
 
 The size in the header is checked against the file's size before anything is unpacked. The loss by
@@ -44,9 +44,10 @@ STEPS_PER_SIZE = 32
 PSNR (docs/results.md).
 """
 MIN_STEPS_PER_SIZE = 2
-INLIERS, OUTLIER = 0.99, 256
+INLIER_QUANTILE, OUTLIER_FACTOR = 0.99, 256
 """If the range of the farthest position would leave fewer than ``MIN_STEPS_PER_SIZE`` steps per
-median size, positions beyond ``OUTLIER`` times the ``INLIERS`` quantile of distances are clipped.
+median size, positions beyond ``OUTLIER_FACTOR`` times the ``INLIER_QUANTILE`` quantile of distances
+are clipped.
 """
 COLOR_SCALE = 0.15
 MAX_FIXED = 2**23 - 1
@@ -190,12 +191,12 @@ def _fractional_bits(gaussians: Gaussians) -> int:
     if not len(gaussians.means):
         return 1  # some readers refuse 0
     distances = np.abs(gaussians.means).max(axis=1)
-    inliers = float(np.quantile(distances, INLIERS, method="lower"))
+    inliers = float(np.quantile(distances, INLIER_QUANTILE, method="lower"))
     log2_size = float(np.median(gaussians.log_scales.clip(-50, 50).mean(axis=1))) / log(2)
     fewest, wanted = (ceil(log2(n) - log2_size) for n in (MIN_STEPS_PER_SIZE, STEPS_PER_SIZE))
     room = _room(float(distances.max()))
     if room < fewest:
-        room = max(room, _room(OUTLIER * inliers))
+        room = max(room, _room(OUTLIER_FACTOR * inliers))
     return max(0, min(room, max(1, wanted), 30))
 
 

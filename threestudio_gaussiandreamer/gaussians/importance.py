@@ -15,8 +15,8 @@ alone ranks some redundant Gaussians high; their product does not.
 The score ``contribution`` protects the Gaussian with the largest weight in a pixel: it is pruned
 last, and with the budget ``auto`` never (SafeguardGS, Lee et al. 2024). Since the weights of a
 pixel sum to at most 1, a weight above 1/2 is the largest. The score ``removal`` doesn't protect
-these Gaussians: their neighbours can often render that pixel as well, and to keep all of them costs
-half a dB (docs/results.md)."""
+these Gaussians: their neighbours can often render that pixel as well, and keeping
+all of them lowers the PSNR."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple

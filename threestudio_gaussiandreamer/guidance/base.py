@@ -83,7 +83,7 @@ class ScoreDistillation(BaseObject, ABC):
     alphas_cumprod: Float[Tensor, " T"]
     """The noise schedule; a subclass sets it in ``configure``."""
 
-    # What a guidance says
+    # Defined by subclasses
     # ----------------------------------------------------------------------------------------------
 
     @abstractmethod

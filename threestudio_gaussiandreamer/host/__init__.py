@@ -25,13 +25,12 @@ def _threestudio_is_importable() -> bool:
         if error.name == "threestudio":
             return False
         raise UserError(
-            f"threestudio is on the Python path but can't be imported: {error}; mend it or "
-            "take it off"
+            f"threestudio is on the Python path but can't be imported: {error}; fix it or remove it"
         ) from error
     except Exception as error:
         raise UserError(
-            f"threestudio is on the Python path but can't be imported: {error!r}; mend it or "
-            "take it off"
+            f"threestudio is on the Python path but can't be imported: {error!r}; fix it or "
+            "remove it"
         ) from error
     return hasattr(threestudio, "register")
 

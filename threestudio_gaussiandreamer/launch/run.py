@@ -127,7 +127,7 @@ class Run:
                 if "resume=auto" in self.args.overrides:
                     raise UserError(
                         f"resume=auto: there is no checkpoint to --{self.args.stage}; train "
-                        "first, or look at name and tag"
+                        "first, or check name and tag"
                     )
                 warn(
                     f"no checkpoint given (resume=...): --{self.args.stage} shows what "
@@ -153,7 +153,7 @@ class Run:
         """Check the content that the system and Lightning will restore.
 
         Raises:
-            UserError: the content is none that a run writes, such as a cloud without Gaussians.
+            UserError: a run can't have written the content, such as a cloud without Gaussians.
         """
         check_checkpoint = getattr(find(self.cfg.system_type), "check_checkpoint", None)
         if check_checkpoint is not None:

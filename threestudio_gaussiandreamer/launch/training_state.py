@@ -45,7 +45,7 @@ def check_training_state(checkpoint: Mapping[str, Any], optimizer: Mapping, what
         what: the file, for messages.
 
     Raises:
-        UserError: a type, count or shape is none that a run writes.
+        UserError: a run can't have written a type, count or shape.
     """
     for key in TYPES.keys() & checkpoint.keys():
         if not isinstance(checkpoint[key], TYPES[key]):

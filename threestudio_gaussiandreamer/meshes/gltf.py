@@ -104,7 +104,7 @@ class _Scene:
             if not np.array_equal(world, np.eye(4)):
                 vertices = vertices @ world[:3, :3].T + world[:3, 3]
             if np.linalg.det(world[:3, :3]) < 0:
-                faces = faces[:, ::-1]  # glTF: a mirrored node turns its faces round
+                faces = faces[:, ::-1]  # glTF: a mirrored node reverses the winding of its faces
         part = Mesh(vertices, faces, vertex_colors=self._colors(primitive, count, weights))
         return self._with_material(part, primitive, weights)
 
@@ -128,7 +128,7 @@ class _Scene:
             if len(corners) % 3:
                 self.document.fail(f"{len(corners)} corners don't make triangles")
             return corners.reshape(-1, 3)
-        if mode == STRIP:  # every second triangle is turned round
+        if mode == STRIP:  # every second triangle has the opposite winding
             odd = first % 2
             return np.stack([corners[first + i] for i in (0, 1 + odd, 2 - odd)], axis=1)
         if mode == FAN:
@@ -187,7 +187,7 @@ class _Scene:
             return part
         name = f"TEXCOORD_{surface.coordinates}"
         if name not in primitive["attributes"]:
-            log.warning("%s has a texture for %s, which isn't there", self.document.path, name)
+            log.warning("%s has a texture for %s, which is missing", self.document.path, name)
             return part
         uv = self._attribute(primitive, name, ("VEC2",), len(part.vertices), weights)
         return part._replace(

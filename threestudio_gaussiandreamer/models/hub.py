@@ -2,7 +2,7 @@
 
 No network request is made if the disk has the needed files, so ``HF_HUB_OFFLINE=1`` works once they
 are downloaded. Only needed files are downloaded; ``model_files.py`` selects them. A model that
-can't be had fails within seconds, with a message that says what to do."""
+isn't available fails within seconds, with a message that says what to do."""
 
 import errno
 import os
@@ -313,7 +313,7 @@ def _how_to_get(source: Source) -> str:
         return f" The folder {str(folder.parent)!r} has no {folder.name!r}{_near_folders(folder)}."
     name = MOVED.get(source.name, source.name)
     moved = (
-        f" Its maker took it off the hub; {name!r} is the copy that people use."
+        f" Its publisher removed it from the hub; {name!r} is a copy."
         if source.name in MOVED
         else ""
     )
@@ -323,6 +323,6 @@ def _how_to_get(source: Source) -> str:
         filter(None, ["hf download", name, revision, source.download_options, "--local-dir", local])
     )
     return (
-        f"{moved} Where there is a network: `{command}`; then set {source.option} to that folder."
+        f"{moved} With a network connection: `{command}`; then set {source.option} to that folder."
         " To run without any weights: --config demo.yaml."
     )

@@ -69,7 +69,7 @@ from .shap_e_checkpoint import load_original_prior
 COMPONENTS = ("tokenizer", "text_encoder", "prior", "scheduler", "shap_e_renderer")
 COLORS = ("display", "linear")
 GRID_BYTES = 32
-"""Of a point of the grid: its place, its distance, and what marching cubes makes of it."""
+"""Memory per grid point, bytes: position, distance, and the temporaries of marching cubes."""
 
 
 @register("shap-e-prior")
@@ -108,7 +108,7 @@ class ShapEPrior(Prior):
     cfg: Config
 
     def preflight(self) -> None:
-        """Check in seconds that all files can be had, before any long work.
+        """Check within seconds that all files are available, before any long work.
 
         Raises:
             UserError: what is missing, and what to do.
@@ -220,8 +220,8 @@ def read_schedule(folder: Path) -> tuple[Float[np.ndarray, "T"], str]:
 def prior_network(
     prior: Any, condition: Float[Tensor, "1 D"], scale: float, *, half: bool
 ) -> Network:
-    """diffusers' network with its condition, first the prompt's and then, where there is guidance,
-    that of no prompt.
+    """Wrap diffusers' network with its condition: first the prompt's and then, with guidance, the
+    empty prompt's.
     """
     conditions = condition if scale == 1 else torch.cat([condition, torch.zeros_like(condition)])
 

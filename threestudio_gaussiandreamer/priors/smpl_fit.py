@@ -198,8 +198,8 @@ def posed_joints(
     shape: Float[Tensor, "F B"],
     translation: Float[Tensor, "F 3"],
 ) -> Float[Tensor, "F J 3"]:
-    """Return where the joints are; cheaper than the whole body, since vertices are needed for the
-    shape only.
+    """Return the joint positions; cheaper than the whole body, whose vertices are needed for the
+    surface only.
     """
     from smplx.lbs import batch_rigid_transform, batch_rodrigues
 

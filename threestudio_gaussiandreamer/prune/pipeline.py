@@ -118,8 +118,8 @@ def from_checkpoint(file: Path) -> Gaussians:
             harmonics = torch.cat([values.pop("sh0"), values.pop("sh_rest")], 1)
             return Gaussians(sh=harmonics, **values).arrays()
     raise UserError(
-        f"{file} holds no cloud of Gaussians: neither our {CHECKPOINTS['state_dict']['means']} "
-        "nor gsplat's splats are there"
+        f"{file} holds no cloud of Gaussians: it has neither {CHECKPOINTS['state_dict']['means']} "
+        "nor gsplat's splats"
     )
 
 
@@ -152,8 +152,8 @@ def prune_to_budget(
     met = asked.psnr is None or error_of(spent) <= error_of(asked.psnr) + 2 * LEAST_ERROR
     if not met:
         logger.warning(
-            "the budget isn't met: as a %s file no cloud of these Gaussians is more than %.2f "
-            "dB like the first",
+            "the budget isn't met: as a %s file these Gaussians reach a PSNR to the original of "
+            "at most %.2f dB",
             suffix,
             spent,
         )
@@ -183,8 +183,8 @@ def _remaining_budget(asked: Budget, stored: StoredCloud) -> Budget:
     if left is not None:
         return Budget(psnr=left)
     print(
-        f"no Gaussian goes: this cloud has been pruned to {stored.pruned_to:g} dB already, as "
-        "it was judged then"
+        f"no Gaussian is removed: this cloud has been pruned to {stored.pruned_to:g} dB before, as "
+        "measured then"
     )
     return Budget(count=len(stored.gaussians.means))
 

@@ -69,8 +69,8 @@ def _print_report(
             f"{cost.ms_per_frame:8.2f} ms a frame"
         )
     print(
-        f"{report['psnr_on_unseen_views']:.2f} dB to what it was before, on views that nothing was "
-        f"fitted to; {path}.json, {path}.png"
+        f"{report['psnr_on_unseen_views']:.2f} dB to the original, on the test views; "
+        f"{path}.json, {path}.png"
     )
 
 

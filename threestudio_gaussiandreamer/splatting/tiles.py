@@ -14,8 +14,8 @@ from torch import Tensor
 TILE = 8
 CANDIDATES_PER_SLICE = 2**22
 CANDIDATES_PER_TEST = 2**17
-# Margin for the rounding of the float32 tests. The blend evaluates each pixel exactly, so a splat
-# that is listed in vain only costs time.
+# Margin for the rounding of the float32 tests. The blend evaluates each pixel exactly, so an
+# unnecessarily listed splat only costs time.
 SLACK = 1e-3
 
 

@@ -142,7 +142,7 @@ def _for(network: Any, weights: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line; returns the exit code: 0 done, 2 something the user can mend."""
+    """Run one command line; returns the exit code: 0 done, 2 an error that the user can correct."""
     parser = argparse.ArgumentParser(
         prog=f"python -m {__package__}.export", description="Write the toybox's models."
     )

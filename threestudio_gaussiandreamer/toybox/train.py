@@ -55,7 +55,12 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     )
     add("--threads", type=int, help="of torch")
     add("--batch", type=int, help="pictures of one step; default: the stage's own")
-    add("--pool", type=int, default=40, help="shards of 1024 pictures that a stage goes round in")
+    add(
+        "--pool",
+        type=int,
+        default=40,
+        help="shards of 1024 pictures that a stage visits cyclically",
+    )
     add("--workers", type=int, default=0, help="processes that render all shards first")
     add("--save-minutes", type=float, default=5.0)
     add("--sheet-minutes", type=float, default=20.0)
@@ -114,7 +119,7 @@ def train(options: Options, stages: Sequence[str], images: Optional[int] = None)
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line; returns the exit code: 0 done, 2 something the user can mend."""
+    """Run one command line; returns the exit code: 0 done, 2 an error that the user can correct."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
         args = parse(argv)

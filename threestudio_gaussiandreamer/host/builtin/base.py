@@ -40,7 +40,7 @@ class Updateable:
         """
 
     def update_step_end(self, epoch: int, global_step: int) -> None:
-        """Do what is due after a batch."""
+        """Hook that is called after a batch."""
 
     def _updateables(self) -> list["Updateable"]:
         attributes = {**vars(self), **getattr(self, "_modules", {})}

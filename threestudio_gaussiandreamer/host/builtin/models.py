@@ -1,4 +1,4 @@
-"""Base classes of the parts that a system is made of, and the host's own smallest ones."""
+"""Base classes of the parts of a system, and the host's own minimal parts."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from .registry import register
 
 
 class BaseGeometry(BaseModule):
-    """What is optimised: the Gaussians."""
+    """Base class of geometries: the optimised parameters."""
 
     @dataclass
     class Config(BaseModule.Config):
@@ -23,7 +23,7 @@ class BaseGeometry(BaseModule):
 
     @staticmethod
     def create_from(other: "BaseGeometry", cfg: Any = None, **kwargs: Any) -> "BaseGeometry":
-        """Make a geometry from another one; raises TypeError if that isn't possible."""
+        """Make a geometry from another one; raise TypeError if that isn't possible."""
         raise TypeError(f"a {type(other).__name__} can't be converted to this geometry")
 
     def export(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
@@ -31,7 +31,9 @@ class BaseGeometry(BaseModule):
 
 
 class BaseMaterial(BaseModule):
-    """Turns features into colours; Gaussians carry their colours themselves."""
+    """Base class of materials, which turn features into colours; Gaussians have their own
+    colours.
+    """
 
     @dataclass
     class Config(BaseModule.Config):
@@ -51,9 +53,7 @@ COLOR_ACTIVATIONS = {"sigmoid": torch.sigmoid, "none": lambda x: x}
 
 @register("no-material")
 class NoMaterial(BaseMaterial):
-    """Passes colours through a sigmoid; without ``input_feature_dims`` there is nothing to
-    learn.
-    """
+    """Pass colours through a sigmoid; without ``input_feature_dims`` there are no parameters."""
 
     @dataclass
     class Config(BaseMaterial.Config):
@@ -70,7 +70,7 @@ class NoMaterial(BaseMaterial):
 
 
 class BaseBackground(BaseModule):
-    """Colour of the background: ray directions (B,H,W,3) to colours (B,H,W,C) in [0,1]."""
+    """Base class of backgrounds: ray directions (B,H,W,3) to colours (B,H,W,C) in [0,1]."""
 
     @dataclass
     class Config(BaseModule.Config):
@@ -141,7 +141,7 @@ class HasSubModules:
 
 
 class Renderer(HasSubModules, BaseModule):
-    """Cameras to pictures: ``renderer(**batch)`` gives a dict with ``comp_rgb`` (B,H,W,3),
+    """Base class of renderers: ``renderer(**batch)`` returns a dict with ``comp_rgb`` (B,H,W,3),
     ``opacity`` (B,H,W,1), ...
     """
 
@@ -177,7 +177,7 @@ class ExporterOutput:
 
 
 class Exporter(HasSubModules, BaseObject):
-    """The trained parts to a list of files."""
+    """Base class of exporters, which turn the trained parts into a list of files."""
 
     @dataclass
     class Config(BaseObject.Config):
@@ -196,7 +196,7 @@ class Exporter(HasSubModules, BaseObject):
 
 @register("dummy-exporter")
 class DummyExporter(Exporter):
-    """Writes nothing."""
+    """Write nothing."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> list[ExporterOutput]:
         return []

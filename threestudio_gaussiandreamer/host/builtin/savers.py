@@ -35,8 +35,7 @@ class SaverMixin:
         path = os.path.join(self.get_save_dir(), filename)
         if os.path.relpath(path, self.get_save_dir()).startswith(os.pardir):
             raise UserError(
-                f"the file name {filename!r} leads out of the folder of results "
-                f"{self.get_save_dir()}"
+                f"the file name {filename!r} is outside the folder of results {self.get_save_dir()}"
             )
         os.makedirs(os.path.dirname(path), exist_ok=True)
         return path
@@ -74,7 +73,7 @@ class SaverMixin:
         step: Optional[int] = None,
     ) -> str:
         """Save (H,W,C) or (C,H,W) values in ``data_range``; more than three channels are laid side
-        by side, three by three.
+        by side in groups of three.
         """
         picture = pictures.rgb(
             self.convert_data(img), data_format=data_format, data_range=data_range

@@ -1,6 +1,4 @@
-"""The LightningModule that holds the parts, and when it makes, updates, renders and exports
-them.
-"""
+"""The base systems: LightningModules that build, update, render and export the parts."""
 
 from dataclasses import dataclass, field
 from typing import Any, List, Optional
@@ -54,7 +52,7 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         """Build the parts."""
 
     def post_configure(self) -> None:
-        """Do what is due after ``weights`` are loaded."""
+        """Hook that is called after ``weights`` are loaded."""
 
     def load_weights(self, weights: str, ignore_modules: Optional[List[str]] = None) -> None:
         """Load the parameters of a checkpoint, except those of ``ignore_modules``; names that don't

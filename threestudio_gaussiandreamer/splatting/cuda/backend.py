@@ -143,7 +143,7 @@ def _draw(
             lists = list_intersections(*part, capacity, context)
         except torch.cuda.OutOfMemoryError:
             if last - first > 1:
-                estimate.refuse(gaussians)
+                estimate.record_failure(gaussians)
                 raise
             _report_short_memory()
             lists = no_lists(*part)

@@ -14,8 +14,10 @@ from ...core.errors import UserError
 
 HEADROOM = 1.5
 STEP = 4096  # intersections; rounding up makes torch's caching allocator reuse blocks
-MOST = 2**31 - 1 - STEP  # intersections; torch's sort and the kernels use 32-bit indices
-FORGET = 0.99  # decay of the estimate per call
+MAX_INTERSECTIONS = (
+    2**31 - 1 - STEP
+)  # intersections; torch's sort and the kernels use 32-bit indices
+DECAY = 0.99  # of the estimate, per call
 LIST_BYTES = (
     4 + 4 + 4 + 8 + 20
 )  # per intersection: tile, owner, sorted tile, position, and the temporaries of the sort
@@ -29,7 +31,7 @@ def round_up_capacity(intersections: int) -> int:
     Raises:
         torch.cuda.OutOfMemoryError: the number exceeds 32-bit indices.
     """
-    if intersections > MOST:
+    if intersections > MAX_INTERSECTIONS:
         raise torch.cuda.OutOfMemoryError(f"{intersections} intersections")
     return (intersections // STEP + 1) * STEP
 
@@ -43,7 +45,7 @@ class CapacityEstimate:
     def __init__(self, views: int):
         self.views = views
         self.per_gaussian: Optional[float] = None
-        self.too_much = math.inf  # the smallest capacity for which there was no memory
+        self.failed_capacity = math.inf  # smallest capacity that didn't fit into memory
         self.pending: deque = deque()
         self.lock = threading.Lock()
 
@@ -64,24 +66,26 @@ class CapacityEstimate:
             while self.pending and (self.per_gaussian is None or self.pending[0][0].ready()):
                 self._learn(*self.pending.popleft())
             capacity = self._capacity(gaussians)
-        if self.views > 1 and capacity >= self.too_much:
+        if self.views > 1 and capacity >= self.failed_capacity:
             raise torch.cuda.OutOfMemoryError(f"{capacity} intersections")
         return capacity
 
-    def refuse(self, gaussians: int) -> None:
-        """Record that there was no memory for the capacity of this many Gaussians."""
+    def record_failure(self, gaussians: int) -> None:
+        """Record that the capacity for this many Gaussians didn't fit into memory."""
         with self.lock:
-            self.too_much = min(self.too_much, self._capacity(gaussians))
+            self.failed_capacity = min(self.failed_capacity, self._capacity(gaussians))
 
     def _learn(self, totals, gaussians: int) -> None:
         """Update the estimate: at once to a larger number, slowly to a smaller one."""
         self.per_gaussian = max(
-            FORGET * (self.per_gaussian or 0.0), sum(totals.values()) / gaussians
+            DECAY * (self.per_gaussian or 0.0), sum(totals.values()) / gaussians
         )
 
     def _capacity(self, gaussians: int) -> int:
         expected = math.ceil(self.per_gaussian * gaussians)
-        return round_up_capacity(max(expected, min(math.ceil(HEADROOM * expected), MOST)))
+        return round_up_capacity(
+            max(expected, min(math.ceil(HEADROOM * expected), MAX_INTERSECTIONS))
+        )
 
 
 def halve_on_oom(work: Callable[[int, int], Result], first: int, last: int) -> list[Result]:
@@ -96,9 +100,8 @@ def halve_on_oom(work: Callable[[int, int], Result], first: int, last: int) -> l
     except torch.cuda.OutOfMemoryError:
         if last - first == 1:
             raise
-    middle = (
-        first + last
-    ) // 2  # outside the except block, where the traceback would keep the attempt's tensors alive
+    # Outside the except block, where the traceback would keep the attempt's tensors alive.
+    middle = (first + last) // 2
     return halve_on_oom(work, first, middle) + halve_on_oom(work, middle, last)
 
 
@@ -109,9 +112,8 @@ def too_large(intersections: int) -> UserError:
         torch.cuda.mem_get_info()[0] / 2**30 if torch.cuda.is_available() else 0.0,
     )
     return UserError(
-        f"one view's Gaussians reach {intersections} tiles of the picture; their gradients need "
+        f"one view's Gaussians overlap {intersections} tiles of the image; their gradients need "
         f"about {needed:.1f} GiB on the GPU, "
-        f"of which {free:.1f} GiB are free, though views are drawn one by one already: use "
-        "fewer or smaller Gaussians, a smaller picture "
-        "or preset='fast', or free memory that something else holds."
+        f"of which {free:.1f} GiB are free. Views are already rendered one at a time: use fewer or "
+        "smaller Gaussians, a smaller image or preset='fast', or free memory of other programs."
     )
