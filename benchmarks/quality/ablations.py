@@ -1,5 +1,4 @@
-"""The paper's ablations and claims as tables, measured in dB against a known truth; one command,
-minutes on a CPU.
+"""The paper's ablations and claims as tables, in dB against a known ground truth, on a CPU.
 
     python -m benchmarks.quality.ablations                          # the paper's ablations
     python -m benchmarks.quality.ablations --table faces            # prior against random start
@@ -34,8 +33,8 @@ RANDOM_START = {
     "system.geometry.prior": {"num_points": 10000, "shape": "sphere"},
     "system.geometry.grow.enabled": False,
 }
-# One distance for cameras and bank: otherwise a nearer view is one more mode to drift to, and zoom
-# hides what the faces do.
+# One distance for cameras and bank: otherwise nearer views are further modes of the mixture, and
+# their zoom hides the effect of the faces.
 VIEW_BLIND = {
     "system.guidance.mode": "view-agnostic",
     "system.guidance.space": "latent",
@@ -61,7 +60,7 @@ PAPER_RATES = {
     )
 }
 
-# Options replace what the demo's YAML has under their key, whole sections included.
+# Options replace the demo's values under their keys, whole sections included.
 TABLES = {
     "ablations": {
         "default": {},
@@ -120,7 +119,7 @@ def parse_arguments() -> argparse.Namespace:
 
 
 def run(arguments: argparse.Namespace, seed: int, options: dict[str, Any]) -> dict:
-    """One training run in a process of its own; its metrics."""
+    """Run one training in a process of its own; return its metrics."""
     size, steps = arguments.size, arguments.steps
     common = {
         "name": "run", "tag": "run", "use_timestamp": False, "seed": seed, "data.width": size,
@@ -149,7 +148,7 @@ def run(arguments: argparse.Namespace, seed: int, options: dict[str, Any]) -> di
 
 
 def changed_demo(options: dict[str, Any]) -> dict:
-    """configs/demo.yaml with each dotted key replaced."""
+    """Return configs/demo.yaml with each dotted key replaced."""
     cfg = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())
     for dotted, value in options.items():
         *sections, key = dotted.split(".")

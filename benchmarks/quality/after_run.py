@@ -1,8 +1,8 @@
-"""After the run: what ranks best, and what rounds and recovery buy, in dB to the unpruned cloud on
-views that nothing was fitted to.
+"""Pruning after the run: rankings, and the effect of rounds and recovery, in dB to the unpruned
+cloud on test views.
 
     python -m benchmarks.quality.after_run                                       # the toy, one
-                                                                         seed: three minutes
+                                                                         seed
     python -m benchmarks.quality.after_run --objects toy.glb spot.glb duck.glb --seeds 0 1 2
 
 A cloud of 10,000, trained as the demo is at 128^2 on one thread (`runs.py`), goes to a count in one
@@ -40,7 +40,7 @@ from threestudio_gaussiandreamer.prune.pipeline import views_of
 
 COUNTS = (2500, 1500)
 DRAWN = PruneOptions(size=runs.SIZE, eps2d=runs.RENDERER["eps2d"])
-"""As the cloud was in training."""
+"""Options of the renderer that the cloud was trained with."""
 COLUMNS = "variant,x,object,seed,psnr,machine,commit".split(",")
 
 
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def measured(mesh: str, seed: int) -> list[dict[str, Any]]:
-    """Rows of the CSV: what was done, to how many, and the dB that it led to."""
+    """Return the rows of the CSV: method, number of Gaussians and dB."""
     with tempfile.TemporaryDirectory() as folder:
         stored = read_cloud(
             str(
@@ -79,7 +79,7 @@ def measured(mesh: str, seed: int) -> list[dict[str, Any]]:
 def variants(
     cloud: Gaussians, count: int, train_views: Views, val_views: Views
 ) -> Iterator[tuple[str, Gaussians]]:
-    """The ways from a cloud to ``count`` Gaussians, and where they lead."""
+    """Yield each way from a cloud to ``count`` Gaussians, and its result."""
     for name in importance.SCORES:
         yield f"one shot, by {name}", keep_best(cloud, RANKS[name](cloud, train_views, 0), count)
     steps = STEPS_A_ROUND * rounds_to(count, len(cloud.means))
@@ -107,7 +107,7 @@ def variants(
 
 @torch.no_grad()
 def contribution(cloud: Gaussians, views: Views, seed: int) -> Tensor:
-    """The largest weight in any pixel."""
+    """Return the largest weight in any pixel."""
     return draw(cloud, views, torch.arange(len(views.viewmats)))[1].amax(0)
 
 
@@ -122,7 +122,7 @@ RANKS = {
 
 
 def table() -> str:
-    """Medians over the seeds, as Markdown."""
+    """Return the medians over the seeds as Markdown."""
     rows = runs.rows_of("after_run")
     objects = list(dict.fromkeys(row["object"] for row in rows))
     lines = [f"| to | {' | '.join(objects)} |", f"| --- |{' ---: |' * len(objects)}"]

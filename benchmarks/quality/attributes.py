@@ -1,4 +1,4 @@
-"""Which attributes a scene needs: dB per byte of harmonics, anisotropy and precision, into
+"""Measure dB per byte of spherical harmonics, anisotropy and precision:
 docs/charts/attributes.csv and .png.
 
     python -m benchmarks.quality.attributes                                                  # what
@@ -78,7 +78,7 @@ the longest side.
 
 
 class Kind(NamedTuple):
-    """A cloud of certain attributes."""
+    """A cloud with certain attributes."""
 
     floats: int
     counts: tuple[int, ...]
@@ -134,7 +134,7 @@ def parse_arguments() -> argparse.Namespace:
 
 
 def folder_of(kind: str, count: int, mesh: str, seed: int) -> Path:
-    """The results of one training run, which is made unless it is there."""
+    """Return the results of one training run, which is made unless it exists."""
     folder = (
         CLOUDS / f"{kind.replace(', ', '-').replace(' ', '')}-{count}-{object_name(mesh)}-{seed}"
     )
@@ -151,7 +151,7 @@ def folder_of(kind: str, count: int, mesh: str, seed: int) -> Path:
 
 
 def rows(kind: str, count: int, mesh: str, seed: int, results: Path) -> Iterator[dict[str, Any]]:
-    """The row of a training run, and those of its cloud rounded."""
+    """Yield the row of a training run, and those of its cloud with rounded attributes."""
     scores = json.loads((results / "metrics.json").read_text())["result"]
     yield {
         "experiment": "trained",
@@ -187,7 +187,7 @@ def rows(kind: str, count: int, mesh: str, seed: int, results: Path) -> Iterator
 
 
 def written(arrays: Gaussians) -> Iterator[tuple[str, int, Gaussians]]:
-    """The cloud as it comes back from files of each kind, with their sizes."""
+    """Return the cloud as read back from files of each kind, with their sizes."""
     with tempfile.TemporaryDirectory() as folder:
         for name in ("a.ply", "a.spz"):
             path = Path(folder) / name
@@ -200,8 +200,8 @@ def written(arrays: Gaussians) -> Iterator[tuple[str, int, Gaussians]]:
 
 
 def score(mesh: str, arrays: Gaussians, size: int = SIZE, **drawn: Any) -> float:
-    """Compute the PSNR on the held-out views, as a run ends with it; drawn as the demo draws, but
-    for ``drawn``.
+    """Compute the PSNR on the held-out views as a run does; rendered with the options of the demo,
+    except ``drawn``.
     """
     images, truth = held_out_pictures(mesh, arrays, size, **drawn)
     return round(float(psnr(images, truth)), 4)
@@ -210,7 +210,7 @@ def score(mesh: str, arrays: Gaussians, size: int = SIZE, **drawn: Any) -> float
 def held_out_pictures(
     mesh: str, arrays: Gaussians, size: int, *, bound_colors: bool = True, **drawn: Any
 ) -> tuple[Float[Tensor, "V H W 3"], Float[Tensor, "V H W 3"]]:
-    """Draw the held-out views of a cloud, in [0, 1], and cast their truth, both on white.
+    """Render the held-out views of a cloud, in [0, 1], and cast their ground truth, both on white.
 
     Args:
         bound_colors: clamp the colour of each Gaussian to [0, 1], as viewers do.
@@ -247,8 +247,8 @@ def append(job: tuple[str, int, str, int], measurements: list[dict[str, Any]]) -
 
 
 def draw(measurements: list[dict[str, str]]) -> Path:
-    """One column per object: what attributes buy per byte above, what rounding costs below; returns
-    the path.
+    """Draw one column per object: the effect of attributes per byte above, of rounding below;
+    return the path.
     """
     import matplotlib
 
@@ -285,7 +285,7 @@ def draw(measurements: list[dict[str, str]]) -> Path:
 
 
 def draw_bytes(panel: Any, measurements: list[dict[str, str]]) -> None:
-    """dB against bytes: float32 of each kind of cloud, and the compact file as a star."""
+    """Draw dB against bytes: float32 of each kind of cloud, and the compact file as a star."""
     trained = [row for row in measurements if row["experiment"] == "trained"]
     lines = grouped(trained, lambda row: row["variant"])
     for index, label in enumerate(kind for kind in KINDS if kind in lines):
@@ -323,7 +323,7 @@ def draw_bytes(panel: Any, measurements: list[dict[str, str]]) -> None:
 
 
 def draw_bits(panel: Any, measurements: list[dict[str, str]]) -> None:
-    """dB lost against bits, attribute by attribute; a ring where SPZ is."""
+    """Draw dB lost against bits, attribute by attribute, with a ring at the bits of SPZ."""
     exact = {
         row["seed"]: float(row["psnr"])
         for row in measurements

@@ -1,13 +1,13 @@
-"""How long the prune command takes: clouds of 100,000 to a count and to a quality, into
+"""Time the prune command: clouds of 100,000 Gaussians to a count and to a quality, into
 docs/charts/prune.csv.
 
-    python -m benchmarks.quality.bench_prune                    # some minutes on 4 cores
+    python -m benchmarks.quality.bench_prune
     python -m benchmarks.quality.bench_prune --count 10000
 
 *torus*: `known_answer.py`'s, of random colours, every Gaussian to be seen. *torus and sphere*:
 `bench_splatting.py`'s shells of 2 % thickness, whose inside is hidden. Seconds are the pruning's,
-on all cores, reading and the report's pictures left out; dB are to the unpruned cloud, on views
-that nothing was fitted to."""
+on all cores, reading and the report's pictures left out; dB are to the unpruned cloud, on test
+views."""
 
 import argparse
 import os
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def rows(count: int, measured: set[tuple[str, ...]]) -> Iterator[dict[str, Any]]:
-    """The CSV's that aren't among those ``measured``, one by one."""
+    """Yield the CSV's rows that aren't among those ``measured``."""
     with tempfile.TemporaryDirectory() as folder:
         for scene, make in SCENES.items():
             source = Path(folder) / "source.ply"

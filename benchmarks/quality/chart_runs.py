@@ -1,11 +1,10 @@
-"""Draws the run charts: docs/charts/<name>.csv, as `runs.py` measured it, becomes
-docs/charts/<name>.png.
+"""Draw the run charts: docs/charts/<name>.png from docs/charts/<name>.csv, which `runs.py` writes.
 
     python -m benchmarks.quality.chart_runs                # all that have been measured
     python -m benchmarks.quality.chart_runs time count
 
-Lines are medians over the seeds, bands and bars the whole range; every panel is one object, and the
-first is the one that settings were tuned on."""
+Lines are medians over the seeds, bands and bars the whole range. Each panel is one object; settings
+were tuned on the first."""
 
 import argparse
 import statistics
@@ -28,20 +27,20 @@ class Chart(NamedTuple):
     """The column on the horizontal axis."""
     x_label: str
     curves: bool
-    """Whether each run is a curve over its steps, or the one point where it ended."""
+    """Whether each run is a curve over its steps, or a point at its end."""
     per_variant: str = "variant"
-    """The column that tells one line from the next."""
+    """The column by which rows are grouped into lines."""
     log_x: bool = True
     marks_paper: bool = False
     """Whether the end of the paper's recipe is drawn from the chart ``count``."""
     size: int = SIZE
-    """Pixels of the renders each way."""
+    """Width and height of the renders, pixels."""
     chosen_on: tuple[str, ...] = (TUNED_ON,)
     """The objects that settings were chosen on."""
     labels_x: bool = False
     """Whether the points are labelled with the column ``x``."""
     common: str = ""
-    """The variant that is a point of every line that has none at its place."""
+    """The variant that is also a point of every line without one at its position."""
 
 
 DECIBEL = "held-out PSNR, dB"
@@ -121,8 +120,8 @@ def main() -> None:
 
 
 def papers_own(chart: Chart) -> list[Row]:
-    """Where the paper's recipe ends, for charts that have no runs of it; at 1 where the axis counts
-    times something of the demo's.
+    """Return the end of the paper's recipe, for charts without runs of it; at 1 if the axis is a
+    multiple of the demo's value.
     """
     return [row | {"x": "1"} for row in papers_ends()] if chart.marks_paper else []
 
@@ -132,7 +131,7 @@ def papers_ends() -> list[Row]:
 
 
 def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
-    """One figure, a panel for each object; returns the path."""
+    """Draw one figure, a panel per object; return the path."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -161,17 +160,17 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
 
 
 def objects_of(rows: list[Row]) -> list[str]:
-    """Their order in charts and tables: the one that settings were chosen on is the first."""
+    """Return the objects in the order of charts and tables; settings were chosen on the first."""
     return sorted({row["object"] for row in rows}, key=lambda name: (name != TUNED_ON, name))
 
 
 def title_of(name: str, chosen_on: tuple[str, ...] = (TUNED_ON,)) -> str:
-    """An object, and whether settings were chosen on it."""
+    """Return an object's title, and whether settings were chosen on it."""
     return name if name in chosen_on else f"{name} (held back from tuning)"
 
 
 def draw_panel(panel: Any, chart: Chart, labels: list[str], rows: list[Row]) -> None:
-    """All lines of one object, in the order and the colours of their labels."""
+    """Draw all lines of one object, in the order and colours of their labels."""
     from matplotlib import ticker
 
     lines = grouped(rows, lambda row: label_of(chart, row))
@@ -205,7 +204,7 @@ def label_of(chart: Chart, row: Row) -> str:
 def draw_curve(
     panel: Any, chart: Chart, rows: Iterable[Row], style: dict[str, Any], marker: str
 ) -> None:
-    """Median over the seeds at each step, the range as a band, a marker at the end."""
+    """Draw the median over the seeds at each step, the range as a band, and a marker at the end."""
     steps = grouped(
         (row for row in rows if float(row["cpu_seconds"]) > 0), lambda row: int(row["step"])
     )
@@ -221,7 +220,7 @@ def draw_curve(
 def draw_points(
     panel: Any, chart: Chart, rows: Iterable[Row], style: dict[str, Any], marker: str
 ) -> None:
-    """One point for each place: median, and the range over the seeds as a bar."""
+    """Draw the median over the seeds at each position, and the range as a bar."""
     places = [ends(at) for at in grouped(rows, lambda row: float(row["x"])).values()]
     points = sorted((median(at, chart.x), *spread(at)) for at in places)
     x, low, middle, high = (list(column) for column in zip(*points, strict=True))
@@ -247,7 +246,7 @@ def draw_points(
 
 
 def ends(rows: Iterable[Row]) -> list[Row]:
-    """The last row of each run."""
+    """Return the last row of each run."""
     return [
         max(run, key=lambda row: int(row["step"]))
         for run in grouped(rows, lambda row: row["seed"]).values()
@@ -266,13 +265,13 @@ def median(rows: list[Row], column: str) -> float:
 
 
 def spread(rows: list[Row]) -> tuple[float, float, float]:
-    """Least, median and greatest dB."""
+    """Return smallest, median and largest dB."""
     values = [float(row["psnr"]) for row in rows]
     return min(values), statistics.median(values), max(values)
 
 
 def caption(rows: list[Row], size: int = SIZE) -> str:
-    """What a chart was made on."""
+    """Return a chart's caption: objects, seeds and configuration."""
     counts = sorted(
         {
             len({row["seed"] for row in same})

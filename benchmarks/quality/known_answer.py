@@ -1,7 +1,7 @@
-"""A scene with a known answer: pictures of exactly M Gaussians; from 4 M, with duplicates and
-floaters, M have to be found again.
+"""A scene with a known answer: images of exactly M Gaussians. Starting from 4 M, with duplicates
+and floaters, training and pruning should return to M.
 
-    python -m benchmarks.quality.known_answer                   # M = 200, five seeds: minutes
+    python -m benchmarks.quality.known_answer                   # M = 200, five seeds
     python -m benchmarks.quality.known_answer --count 1000 --seeds 0
 
 *auto*: a training run of configs/demo.yaml at 128^2 with `budget: auto`, at a quarter of its rates
@@ -9,7 +9,7 @@ and with a shorter memory, from the M true Gaussians, two copies of each a littl
 floaters anywhere, against pictures of the truth. *prune*: the prune command with `--psnr 40`, which
 knows nothing but its input: three copies of each in one place, which share its opacity, and M
 floaters too faint to be seen. dB are to the truth, or to the prune command's input, on views that
-nothing was fitted to. Results go to docs/charts/known_answer.csv; what that has is not run again.
+were not fitted. Results go to docs/charts/known_answer.csv; runs that it contains are skipped.
 """
 
 import argparse
@@ -69,7 +69,9 @@ def main() -> None:
 
 
 def torus(count: int, seed: int) -> Gaussians:
-    """Flat Gaussians of random colours on a torus, each to be seen from somewhere."""
+    """Return flat Gaussians of random colours on a torus, each of which is visible from
+    somewhere.
+    """
     rng = torch.Generator().manual_seed(seed)
     u, v = 2 * math.pi * torch.rand(2, count, generator=rng)
     normals = torch.stack([u.cos() * v.cos(), u.sin() * v.cos(), v.sin()], 1)
@@ -97,7 +99,7 @@ def colored(count: int, rng: torch.Generator) -> Float[Tensor, "N 1 3"]:
 
 
 def floaters(count: int, seed: int) -> Gaussians:
-    """Gaussians as on the torus, anywhere in a box that no camera is in."""
+    """Return Gaussians like those of the torus, uniformly in a box without cameras."""
     rng = torch.Generator().manual_seed(1000 + seed)
     return torus(count, seed + 1)._replace(
         means=1.6 * torch.rand(count, 3, generator=rng) - 0.8, sh=colored(count, rng)
@@ -105,14 +107,16 @@ def floaters(count: int, seed: int) -> Gaussians:
 
 
 def mixed(clouds: list[Gaussians], seed: int) -> Gaussians:
-    """All in one, in random order."""
+    """Join clouds in random order."""
     together = Gaussians(*(torch.cat(values) for values in zip(*clouds, strict=True)))
     order = torch.randperm(len(together.means), generator=torch.Generator().manual_seed(seed))
     return together.rows(order)
 
 
 def with_copies_and_floaters(true: Gaussians, seed: int) -> Gaussians:
-    """Copies moved by about a third of the thinnest axis, and floaters as opaque as the rest."""
+    """Add copies, moved by about a third of the thinnest axis, and floaters as opaque as
+    the rest.
+    """
     rng = torch.Generator().manual_seed(seed)
     thinnest = true.log_scales.exp().amin(1, keepdim=True)
     moved = [
@@ -125,7 +129,9 @@ def with_copies_and_floaters(true: Gaussians, seed: int) -> Gaussians:
 
 
 def with_shares_and_faint_floaters(true: Gaussians, seed: int) -> Gaussians:
-    """Three in the place of each that let through what it did, and floaters of opacity 0.01."""
+    """Replace each Gaussian by three with the same total transmittance, and add floaters of opacity
+    0.01.
+    """
     shared = 1 - (1 - true.logit_opacities.sigmoid()) ** (1 / 3)
     faint = floaters(len(true.means), seed)._replace(
         logit_opacities=torch.full((len(true.means),), 0.01).logit()
@@ -134,7 +140,7 @@ def with_shares_and_faint_floaters(true: Gaussians, seed: int) -> Gaussians:
 
 
 def held_out(size: int = SIZE) -> Views:
-    """The views that runs are scored on."""
+    """Return the views that runs are scored on."""
     orbit = held_out_orbit(24)
     return Views(*to_opencv(orbit.c2w, orbit.fovy, size, size), orbit.c2w[:, :3, 3], size)
 
@@ -143,7 +149,7 @@ def held_out(size: int = SIZE) -> Views:
 
 
 class CloudTruth:
-    """Pictures of a cloud of degree 0 as the truth; see ``guidance/known_truth.py``."""
+    """Renders of a cloud of degree 0 as the ground truth; see ``guidance/known_truth.py``."""
 
     mesh = None
 
@@ -166,8 +172,8 @@ class CloudTruth:
 
 @register("known-cloud-guidance")
 class KnownCloud(BaseObject):
-    """Score distillation with one picture for each camera, that of a cloud, and no noise: the mean
-    squared error to it.
+    """Score distillation with one image per camera, that of a cloud, and no noise: the mean squared
+    error to it.
     """
 
     @dataclass
@@ -193,13 +199,15 @@ class KnownCloud(BaseObject):
 
 
 def auto_config(folder: Path, steps: int) -> dict[str, Any]:
-    """Return the demo's configuration with a known cloud as its truth and ``budget: auto``."""
+    """Return the demo's configuration with a known cloud as its ground truth and
+    ``budget: auto``.
+    """
     cfg = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())
     cfg["system"] |= {
         "guidance_type": "known-cloud-guidance",
         "guidance": {"path": str(folder / "true.ply")},
     }
-    cfg["system"]["renderer"] = {}  # the truth is drawn with the default preset, too
+    cfg["system"]["renderer"] = {}  # the ground truth is rendered with the default preset too
     # a start that is nearly right: at the demo's rates and with its long memory even one at the
     # truth wanders off to 38.8 dB
     cfg["system"]["optimizer"]["args"]["betas"] = [0.7, 0.9]
@@ -214,7 +222,7 @@ def auto_config(folder: Path, steps: int) -> dict[str, Any]:
 
 
 def found_by_auto(true: Gaussians, seed: int, steps: int, folder: Path) -> tuple[int, int, float]:
-    """Gaussians before and after, and dB to the truth."""
+    """Return Gaussians before and after, and dB to the ground truth."""
     start = with_copies_and_floaters(true, seed)
     write_cloud(str(folder / "true.ply"), StoredCloud(true.arrays()))
     write_cloud(str(folder / "start.ply"), StoredCloud(start.arrays()))
@@ -238,7 +246,7 @@ def found_by_auto(true: Gaussians, seed: int, steps: int, folder: Path) -> tuple
 
 
 def found_by_prune(true: Gaussians, seed: int, folder: Path) -> tuple[int, int, float]:
-    """Gaussians before and after, and dB to what they were before."""
+    """Return Gaussians before and after, and dB to the original."""
     start = with_shares_and_faint_floaters(true, seed)
     write_cloud(str(folder / "shared.ply"), StoredCloud(start.arrays()))
     report = prune.run(

@@ -1,7 +1,7 @@
 """`launch.py` with one more geometry, ``round-cloud``: Gaussians with one size for all three axes,
 for `attributes.py` alone.
 
-It is no part of the package since it doesn't pay: see docs/results.md.
+It isn't part of the package, because anisotropic Gaussians are better: see docs/results.md.
 """
 
 import sys
@@ -19,7 +19,9 @@ register_parts()
 
 @register("round-cloud")
 class RoundCloud(GaussianCloud):
-    """The three stored sizes start equal and get equal gradients, so that they stay equal."""
+    """A cloud whose three stored scales start equal and get equal gradients, so that they stay
+    equal.
+    """
 
     def scales(self) -> Float[Tensor, "N 3"]:
         return self.log_scales.mean(1, keepdim=True).clamp(*LOG_SCALE_RANGE).exp().expand(-1, 3)

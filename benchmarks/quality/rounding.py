@@ -9,7 +9,7 @@ from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 
 
 def steps_of(values: np.ndarray, low: float, high: float, levels: float) -> np.ndarray:
-    """``values`` rounded to ``levels`` equal steps from ``low`` to ``high``."""
+    """Round ``values`` to ``levels`` equal steps from ``low`` to ``high``."""
     scaled = (values.astype(np.float64).clip(low, high) - low) / (high - low)
     return (low + (high - low) * np.rint(scaled * levels) / levels).astype(np.float32)
 
@@ -28,7 +28,7 @@ def with_scales(arrays: Gaussians, bits: int) -> Gaussians:
 
 
 def with_rotation(arrays: Gaussians, bits: int) -> Gaussians:
-    """The three smallest components, sign and magnitude; the largest follows."""
+    """Round the three smallest components to sign and magnitude; the largest follows."""
     quats = arrays.quats / np.linalg.norm(arrays.quats, axis=1, keepdims=True)
     largest = np.arange(4) == np.abs(quats).argmax(1)[:, None]
     quats *= np.sign(quats[largest])[:, None]

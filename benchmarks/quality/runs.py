@@ -1,18 +1,16 @@
-"""Training runs for the charts: every run that a chart needs, side by side on the CPU, into one CSV
+"""Training runs for the charts: all runs that a chart needs, in parallel on the CPU, into one CSV
 per chart.
 
-    python -m benchmarks.quality.runs                               # all that isn't measured yet:
-                                                            about two hours on 4 cores
+    python -m benchmarks.quality.runs                               # all missing runs
     python -m benchmarks.quality.runs --charts count --seeds 0 1 2  # one chart, fewer seeds
-    python -m benchmarks.quality.runs --list                        # what would run
+    python -m benchmarks.quality.runs --list                        # print what would run
 
-Each run is `launch.py` with configs/demo.yaml at 128^2 and a few options changed, on one thread,
-several side by side, and is scored on 24 held-out views that neither a bank nor a training camera
-holds, ray-cast from the mesh. Seconds are the processor's while training, targets included and
-evaluation excluded: what else the machine does counts little. Rows are appended as runs end, seeds
-in turn, and what a CSV has is not run again: stop and go on at will. Settings were tuned on the
-bundled toy alone (the draft's steps and views on the duck too); other objects are given by path and
-held back."""
+Each run is `launch.py` with configs/demo.yaml at 128^2 and a few options changed, on one thread. It
+is scored on 24 held-out views, ray-cast from the mesh, that are neither in a bank nor training
+views. Seconds are CPU seconds of training, with targets and without evaluation, so other programs
+hardly affect them. Rows are appended as runs end, seed by seed, and runs in the CSV are skipped, so
+the command can be interrupted. Settings were tuned on the bundled toy only (the draft's steps and
+views on the duck too); other objects are given by path and held back."""
 
 import argparse
 import csv
@@ -35,7 +33,7 @@ from benchmarks.quality.jobs import JOBS, OWN_OBJECTS, STEPS, Job
 ROOT = Path(__file__).resolve().parents[2]
 CHARTS = ROOT / "docs/charts"
 RENDERER = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())["system"]["renderer"]
-"""How the demo draws."""
+"""The demo's options of the renderer."""
 SIZE, EVERY = 128, 100
 WITH_CURVES = ("time", "batch", "preset")
 MEASURED = ("psnr", "ssim", "multi_face", "floater_mass", "out_of_gamut")
@@ -121,8 +119,8 @@ def parse_arguments() -> argparse.Namespace:
 
 
 def run(mesh: str, seed: int, options: dict[str, Any], overlay: str = "") -> dict[str, Any]:
-    """One training run in a process of its own; its metrics, at the end those of the pruned cloud
-    where ``system.prune`` asks for one.
+    """Run one training in a process of its own; return its metrics, with those of the pruned cloud
+    if ``system.prune`` is given.
     """
     with tempfile.TemporaryDirectory() as folder:
         save = train(Path(folder), mesh, seed, options, overlay=overlay)
@@ -144,7 +142,7 @@ def run(mesh: str, seed: int, options: dict[str, Any], overlay: str = "") -> dic
                 same | start | {"system.geometry.budget": "null", "trainer.max_steps": 1},
             )
             scores = json.loads((again / "metrics.json").read_text())["prior"]
-            # the seconds of pruning aren't among those of training
+            # seconds of pruning are not part of training
             metrics["result"] |= {
                 name: value
                 for name, value in scores.items()
@@ -162,10 +160,10 @@ def train(
     program: str = "launch.py",
     overlay: str = "",
 ) -> Path:
-    """One training run in a process of its own below ``folder``; where its results lie.
+    """Run one training in a process of its own below ``folder``; return the folder of its results.
 
     Args:
-        overlay: the name of a file of configs/ that is laid over demo.yaml.
+        overlay: name of a file of configs/ that is laid over demo.yaml.
     """
     common = {
         "use_timestamp": "false", "tag": "run", "seed": seed, "data.width": SIZE,
@@ -190,7 +188,7 @@ def train(
 
 
 def curve(job: Job) -> dict[str, Any]:
-    """How often a run is scored on its way, where its chart shows it."""
+    """Return how often a run is scored, for charts with curves."""
     return {"system.evaluation.every": EVERY if job.chart in WITH_CURVES else 0}
 
 
@@ -199,12 +197,12 @@ def object_name(mesh: str) -> str:
 
 
 def measured_in(chart: str, *columns: str) -> set[tuple[str, ...]]:
-    """What a chart's CSV has, by these columns."""
+    """Return the runs in a chart's CSV, by these columns."""
     return {tuple(row[column] for column in columns) for row in rows_of(chart)}
 
 
 def rows_of(chart: str) -> list[dict[str, str]]:
-    """The rows of a chart's CSV; none where it doesn't exist yet."""
+    """Return the rows of a chart's CSV; an empty list if it doesn't exist."""
     path = CHARTS / f"{chart}.csv"
     if not path.is_file():
         return []
@@ -213,7 +211,7 @@ def rows_of(chart: str) -> list[dict[str, str]]:
 
 
 def append(job: Job, mesh: str, seed: int, metrics: dict[str, Any]) -> None:
-    """The curve and the result of one run; a result's ``step`` is the last."""
+    """Append the curve and the result of one run; a result's ``step`` is the last."""
     start = metrics["prior"] | {"step": 0}
     points = {
         scores["step"]: scores for scores in (start, *metrics.get("curve", ()), metrics["result"])
@@ -223,9 +221,7 @@ def append(job: Job, mesh: str, seed: int, metrics: dict[str, Any]) -> None:
 
 
 def append_rows(chart: str, columns: list[str], rows: list[dict[str, Any]]) -> None:
-    """Rows at the end of a chart's CSV, with the machine and the commit that they were measured
-    on.
-    """
+    """Append rows to a chart's CSV, with processor and commit."""
     path, here = CHARTS / f"{chart}.csv", {"machine": machine(), "commit": commit()}
     path.parent.mkdir(parents=True, exist_ok=True)
     new = not path.is_file()
@@ -239,7 +235,7 @@ def append_rows(chart: str, columns: list[str], rows: list[dict[str, Any]]) -> N
 
 
 def machine() -> str:
-    """The processor's name, where the system tells it."""
+    """Return the processor's name, if the system reports it."""
     try:
         names = [
             line.partition(":")[2].strip()

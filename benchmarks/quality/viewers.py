@@ -1,8 +1,7 @@
-"""What viewers make of a cloud: trained with one screen-space dilation, drawn with another, at the
-size of training and larger.
+"""The effect of a viewer's dilation: clouds trained with one screen-space dilation and rendered
+with another, at the training size and larger.
 
-    python -m benchmarks.quality.viewers                                       # the toy: two
-                                                                               minutes
+    python -m benchmarks.quality.viewers                                       # the toy
     python -m benchmarks.quality.viewers --objects toy.glb spot.glb duck.glb
 
 The demo at its own 256^2 with dilations of 0.1 and of 0.3 square pixels; each result drawn with

@@ -1,5 +1,5 @@
-"""What the guards cost: each one's time next to that of the training step, and the finite check's
-next to the forward pass.
+"""The overhead of the checks: the time of each one relative to a training step, and of the finite
+check relative to a forward pass.
 
     python -m benchmarks.robustness.bench_guards [--gaussians 10000 --size 256 --views 4 --threads
     4]
@@ -32,18 +32,18 @@ from threestudio_gaussiandreamer.training.finite import (
 from threestudio_gaussiandreamer.training.geometry import LOG_SCALE_RANGE, GaussianCloud
 
 RESULTS = Path(__file__).parents[1] / "results/guards.csv"
-LOG_EVERY = 10  # steps between two looks at the cloud's sizes, as in configs/demo.yaml
+LOG_EVERY = 10  # steps between two checks of the cloud's scales, as in configs/demo.yaml
 
 
 class Pixels(PixelGuidance):
-    """The shared path of score distillation: the prediction is the noised picture itself."""
+    """The shared path of score distillation, predicting the noisy image itself."""
 
     def predict(self, z, t, condition):
         return z, None
 
 
 class Bench:
-    """A cloud, its cameras, and everything that a step and its guards work on."""
+    """A cloud, its cameras, and the inputs of a step and its checks."""
 
     def __init__(self, gaussians: int, size: int, views: int):
         self.size, self.scene = size, make_scene(gaussians)
@@ -106,7 +106,7 @@ class Bench:
 
     @torch.no_grad()
     def log_scales_are_clamped(self) -> None:
-        """Forward, and the mask of its backward."""
+        """Run the clamp forward, and the mask of its backward pass."""
         x = self.geometry.log_scales
         x.clamp(*LOG_SCALE_RANGE)
         torch.where((x >= LOG_SCALE_RANGE[0]) & (x <= LOG_SCALE_RANGE[1]), x, 0)
@@ -128,7 +128,7 @@ class Bench:
 
 
 def milliseconds(function: Callable[[], None], seconds: float) -> float:
-    """The median time of a call, of as many as fit into ``seconds``, at least 5."""
+    """Return the median time of a call, over as many as fit into ``seconds``, at least 5."""
     function()
     times: list[float] = []
     while len(times) < 5 or sum(times) < seconds:
@@ -163,7 +163,7 @@ def main() -> None:
         (f.__name__.replace("_", " "), milliseconds(f, options.seconds / 10) / every, step)
         for f, every in guards.items()
     ]
-    rows.append(("all guards of a training step", sum(time for _, time, _ in rows), step))
+    rows.append(("all checks of a training step", sum(time for _, time, _ in rows), step))
     rows.append(
         (
             'non_finite="error" in a forward pass',

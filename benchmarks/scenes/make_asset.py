@@ -4,7 +4,7 @@ Deterministic; no input.
     python -m benchmarks.scenes.make_asset [threestudio_gaussiandreamer/assets/toy.glb]
 
 It is a test object as well as a picture: a face, a bib and a scarf's end in front, stripes and a
-wind-up key behind (so that a front can't be taken for a back), a tail on its left only, thin parts
+wind-up key behind (so that front and back differ), a tail on its left only, thin parts
 (ears, key, tail's tip), paint with edges and fine grain.
 
 Every part is a grid over (u, v), u once around and v along, in world coordinates (z up, front =
@@ -32,7 +32,7 @@ DEFAULT = Path(__file__).resolve().parents[2] / "threestudio_gaussiandreamer/ass
 
 
 class Part(NamedTuple):
-    """A closed surface, where it is solid, and how it is painted."""
+    """A closed surface, its parameters and its paint."""
 
     place: Callable[[np.ndarray, np.ndarray], np.ndarray]
     """(u, v) in [0, 1] to points (..., 3)."""
@@ -49,12 +49,12 @@ class Part(NamedTuple):
 
 
 def fox() -> list[Part]:
-    """All parts, the largest first."""
+    """Return all parts, the largest first."""
     return [*trunk(), *limbs(-1), *limbs(1)]
 
 
 def trunk() -> list[Part]:
-    """Head, body, tail, scarf and its end, snout, nose, and the key's shaft."""
+    """Return head, body, tail, scarf and its end, snout, nose, and the key's shaft."""
     end = [(0.30, -0.15, 0.02), (0.385, -0.19, -0.14), (0.40, -0.21, -0.40)]
     head = ellipsoid((0.06, 0, 0.40), (0.37, 0.43, 0.34))
     body = ellipsoid((0, 0, -0.40), (0.36, 0.37, 0.50), taper=0.22)
@@ -77,7 +77,7 @@ def trunk() -> list[Part]:
 
 
 def limbs(sign: int) -> list[Part]:
-    """Ear, arm, thigh, foot and the key's loop of one side, +1 for y > 0."""
+    """Return ear, arm, thigh, foot and the key's loop of one side, +1 for y > 0."""
     hand = np.array([0.40, 0.19 * sign, -0.50])
     ear = [(0.02, 0.25 * sign, 0.60), (0.0, 0.30 * sign, 0.78), (-0.03, 0.37 * sign, 1.0)]
     arm = [(0.12, 0.27 * sign, -0.12), (0.30, 0.33 * sign, -0.34), hand]
@@ -117,8 +117,8 @@ NECK = [
 
 
 def build(parts: list[Part]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (V, 3), texture coordinates (V, 2) with v downwards, faces (F, 3) and the texture
-    (512, 512, 3) in [0, 1].
+    """Return vertices (V, 3), texture coordinates (V, 2) with v downwards, faces (F, 3) and the
+    texture (512, 512, 3) in [0, 1].
     """
     texture = np.full((TEXTURE, TEXTURE, 3), 0.5)
     vertices, uvs, faces, count = [], [], [], 0
@@ -140,7 +140,7 @@ def build(parts: list[Part]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def surface(part: Part, corner: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A part's grid: points, texture coordinates and faces that turn outwards."""
+    """Return a part's grid: points, texture coordinates and faces oriented outwards."""
     around, along = part.grid
     v, u = np.meshgrid(np.arange(along + 1) / along, np.arange(around + 1) / around, indexing="ij")
     points = part.place(u, v).reshape(-1, 3)
@@ -159,7 +159,7 @@ def surface(part: Part, corner: tuple[int, int]) -> tuple[np.ndarray, np.ndarray
 
 
 def paint_part(part: Part, corner: tuple[int, int], texture: np.ndarray) -> None:
-    """Fill a part's rectangle: each texel by the place in space that it covers."""
+    """Fill a part's rectangle: each texel by the position that it covers."""
     (width, height), (left, top) = part.texels, corner
     rows, columns = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
     u = (columns - MARGIN) / (width - 2 * MARGIN)
@@ -169,7 +169,7 @@ def paint_part(part: Part, corner: tuple[int, int], texture: np.ndarray) -> None
 
 
 def pack(sizes: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Corners (left, top) of rectangles on shelves, the highest first."""
+    """Return corners (left, top) of rectangles placed on shelves, the highest first."""
     corners: list[Optional[tuple[int, int]]] = [None] * len(sizes)
     left = top = shelf = 0
     for index in sorted(range(len(sizes)), key=lambda i: -sizes[i][1]):
@@ -228,7 +228,9 @@ def png(texture: np.ndarray) -> bytes:
 
 
 def scene_description() -> dict[str, Any]:
-    """Return what the file says apart from its numbers: one node, its material and its image."""
+    """Return the description of the file without its numbers: one node, its material and
+    its image.
+    """
     attributes = {"POSITION": 0, "TEXCOORD_0": 1}
     roughness = {
         "baseColorTexture": {"index": 0},
@@ -260,7 +262,7 @@ def accessors(positions: np.ndarray, uv_count: int, corner_count: int) -> list[d
 
 
 def buffers(chunks: list[bytes]) -> dict[str, Any]:
-    """Describe where the chunks lie in the one buffer of the file."""
+    """Describe the positions of the chunks in the one buffer of the file."""
     offsets = np.cumsum([0] + [len(padded(chunk)) for chunk in chunks])
     views = [
         {"buffer": 0, "byteOffset": int(offset), "byteLength": len(chunk)}
@@ -270,7 +272,7 @@ def buffers(chunks: list[bytes]) -> dict[str, Any]:
 
 
 def padded(chunk: bytes, fill: bytes = b"\0") -> bytes:
-    """Filled up to a multiple of four bytes, as glTF aligns its parts."""
+    """Pad to a multiple of four bytes, as glTF aligns its parts."""
     return chunk + fill * (-len(chunk) % 4)
 
 

@@ -1,5 +1,5 @@
-"""Make benchmarks/scenes/ball.ply: a ball with a face in front and stripes behind, so that shape
-alone tells no side from another.
+"""Make benchmarks/scenes/ball.ply: a sphere with a face in front and stripes behind, whose shape
+alone does not distinguish its sides.
 
     python -m benchmarks.scenes.make_ball
 
@@ -30,7 +30,7 @@ def main() -> None:
 
 
 def paint(points: np.ndarray) -> np.ndarray:
-    """RGB of points (N, 3) on the unit sphere as bytes."""
+    """Return RGB of points (N, 3) on the unit sphere as bytes."""
     x, y, z = points.T
     colors = np.tile(np.array(SKIN, np.uint8), (len(points), 1))
     colors[(x < 0) & (np.floor(y * 5) % 2 == 0)] = STRIPE

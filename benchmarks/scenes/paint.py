@@ -18,7 +18,7 @@ LATTICE = np.random.default_rng(7).random((16, 16, 16))
 
 
 def grain(points: np.ndarray, frequency: float) -> np.ndarray:
-    """Smooth noise in [0, 1] with features of about 1 / frequency."""
+    """Return smooth noise in [0, 1] with features of about 1 / frequency."""
     scaled = points * frequency + 100
     cell = np.floor(scaled).astype(int)
     weight = scaled - cell
@@ -31,25 +31,25 @@ def grain(points: np.ndarray, frequency: float) -> np.ndarray:
 
 
 def blend(base: np.ndarray, color, amount: np.ndarray) -> np.ndarray:
-    """``color`` laid over ``base`` where ``amount`` is 1."""
+    """Blend ``color`` over ``base`` where ``amount`` is 1."""
     amount = np.clip(amount, 0, 1)[:, None]
     return base * (1 - amount) + np.asarray(color) * amount
 
 
 def within(signed: np.ndarray, softness: float = 0.02) -> np.ndarray:
-    """1 where ``signed`` is negative, 0 where positive, with a soft edge of that width."""
+    """Return 1 where ``signed`` is negative, 0 where positive, with a soft edge of that width."""
     return np.clip(0.5 - signed / softness, 0, 1)
 
 
 def fur(points: np.ndarray, color) -> np.ndarray:
-    """``color`` with strands that run down and a broad mottle."""
+    """Return ``color`` with strands that run down and a broad mottle."""
     strands = grain(points * [1, 1, 0.25], 26) - 0.5
     mottle = grain(points + 3, 5) - 0.5
     return np.clip(np.asarray(color) * (1 + 0.12 * strands + 0.16 * mottle)[:, None], 0, 1)
 
 
 def disc(points: np.ndarray, center, radius: float, squash: float = 1.0) -> np.ndarray:
-    """Signed distance of (y, z) from a disc ``squash`` times as high as wide."""
+    """Return the signed distance of (y, z) from a disc ``squash`` times as high as wide."""
     offset = (points[:, 1:] - center) / [1, squash]
     return np.linalg.norm(offset, axis=1) - radius
 
@@ -72,7 +72,7 @@ def body(points: np.ndarray) -> np.ndarray:
 
 
 def heart(x: np.ndarray, y: np.ndarray, size: float) -> np.ndarray:
-    """About the signed distance from a heart."""
+    """Return approximately the signed distance from a heart."""
     x, y = np.abs(x) / size, y / size + 0.2
     return (np.hypot(x, y - 0.75 * np.sqrt(x + 1e-9)) - 1) * size
 
@@ -144,7 +144,7 @@ def ear(points: np.ndarray) -> np.ndarray:
 
 
 def limb(points: np.ndarray, end: np.ndarray, reach: float) -> np.ndarray:
-    """Orange with a dark, gloved end."""
+    """Paint orange with a dark, gloved end."""
     distance = np.linalg.norm(points - end, axis=1)
     return blend(
         fur(points, ORANGE),
@@ -197,13 +197,13 @@ def tail(points: np.ndarray) -> np.ndarray:
 
 
 def scarf(points: np.ndarray) -> np.ndarray:
-    """Knitted, in stripes around the neck."""
+    """Paint knitted stripes around the neck."""
     x, y, z = points.T
     return knit(points, np.arctan2(y, x - 0.05) * 8 / np.pi)
 
 
 def scarf_end(points: np.ndarray) -> np.ndarray:
-    """Stripes and a fringe."""
+    """Paint stripes and a fringe."""
     color = knit(points, -10 * points[:, 2])
     return blend(
         color, CREAM, within(-np.sin(90 * points[:, 1]), 0.6) * within(points[:, 2] + 0.37)
@@ -211,7 +211,7 @@ def scarf_end(points: np.ndarray) -> np.ndarray:
 
 
 def knit(points: np.ndarray, stripe: np.ndarray) -> np.ndarray:
-    """Two colours in turn, each as wide as 1 of ``stripe``, with the rows of a coarse yarn."""
+    """Alternate two colours, each as wide as 1 of ``stripe``, with the rows of a coarse yarn."""
     color = blend(np.tile(TEAL, (len(points), 1)), YELLOW, within(np.sin(np.pi * stripe), 0.35))
     rows = np.sin(70 * points[:, 2] + 6 * grain(points, 8))
     return np.clip(color * (1 + 0.06 * rows)[:, None], 0, 1)

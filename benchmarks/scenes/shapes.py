@@ -6,8 +6,8 @@ import numpy as np
 
 
 def ellipsoid(center, radii, *, tilt: float = 0.0, taper: float = 0.0) -> tuple[Callable, Callable]:
-    """An ellipsoid with vertical poles, tilted forward by ``tilt`` degrees and narrower towards the
-    top by ``taper``.
+    """Return an ellipsoid with vertical poles, tilted forward by ``tilt`` degrees and narrower
+    towards the top by ``taper``.
     """
     center, radii, angle = np.array(center), np.array(radii), np.radians(tilt)
     turn = np.array(
@@ -33,10 +33,10 @@ def ellipsoid(center, radii, *, tilt: float = 0.0, taper: float = 0.0) -> tuple[
 def tube(
     path, radii, *, flat: float = 1.0, side=(0.0, 1.0, 0.0), closed: bool = False
 ) -> tuple[Callable, Callable]:
-    """A round tube along a smooth path through points, with a radius at each; ``flat`` scales it
-    across ``side``.
+    """Return a round tube along a smooth path through points, with a radius at each; ``flat``
+    scales it across ``side``.
 
-    Open tubes are rounded off at both ends; their radii are those of the body between.
+    Open tubes have rounded ends; their radii are those of the body between.
     """
     curve, width = (
         smooth(np.array(path, float), closed),
@@ -67,8 +67,8 @@ def tube(
 
 
 def rounded_ends(v: np.ndarray, share: float = 0.12) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where along the path v lies, how far out of its end (in radii), and the ring's relative
-    radius.
+    """Return the position along the path of v, the distance beyond its end (in radii), and the
+    ring's relative radius.
     """
     start, end = np.clip(1 - v / share, 0, 1), np.clip(1 - (1 - v) / share, 0, 1)
     t = np.clip((v - share) / (1 - 2 * share), 0, 1)
@@ -77,8 +77,8 @@ def rounded_ends(v: np.ndarray, share: float = 0.12) -> tuple[np.ndarray, np.nda
 
 
 def smooth(knots: np.ndarray, closed: bool) -> Callable[[np.ndarray], np.ndarray]:
-    """A Catmull-Rom curve through the knots, t in [0, 1] (periodic when closed, else held at its
-    ends).
+    """Evaluate a Catmull-Rom curve through the knots, t in [0, 1] (periodic if closed, else clamped
+    at its ends).
     """
     padded = (
         np.concatenate([knots[-1:], knots, knots[:2]])

@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 class Scene(NamedTuple):
-    """The arguments of `rasterize`, one view."""
+    """Arguments of `rasterize`, one view."""
 
     means: Tensor
     quats: Tensor
@@ -20,8 +20,8 @@ class Scene(NamedTuple):
 
 
 def make_scene(n: int, seed: int = 0) -> Scene:
-    """85 % torus (radii 0.7 and 0.3), 15 % sphere (0.28), both 2 % thick; scales from 3-NN
-    distances with lognormal(0.35) stretch.
+    """Return 85 % torus (radii 0.7 and 0.3) and 15 % sphere (0.28), both 2 % thick; scales from
+    3-NN distances with lognormal(0.35) stretch.
     """
     rng = np.random.default_rng(seed)
     torus = _torus(rng, int(n * 0.85))
@@ -48,7 +48,7 @@ def make_scene(n: int, seed: int = 0) -> Scene:
 
 
 def _torus(rng: np.random.Generator, n: int, large: float = 0.7, small: float = 0.3) -> np.ndarray:
-    """Uniform by area: draws are kept in proportion to their distance from the axis."""
+    """Sample uniformly by area: draws are kept in proportion to their distance from the axis."""
     kept = []
     while sum(map(len, kept)) < n:
         angles = rng.random((n, 2)) * 2 * math.pi
@@ -68,7 +68,7 @@ def make_camera(
     distance: float = 3.0,
     fov: float = 50.0,
 ) -> tuple[Tensor, Tensor]:
-    """viewmat (4, 4) and K (3, 3) of a square picture, looking at the origin; degrees."""
+    """Return viewmat (4, 4) and K (3, 3) of a square image, looking at the origin; degrees."""
     a, e = math.radians(azimuth), math.radians(elevation)
     position = distance * np.array(
         [math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)]
@@ -85,6 +85,6 @@ def make_camera(
 
 
 def make_cotangents(size: int) -> list[Tensor]:
-    """Fixed gradients of image (1, H, W, 3), depth and alpha (1, H, W, 1)."""
+    """Return fixed gradients of image (1, H, W, 3), depth and alpha (1, H, W, 1)."""
     noise = torch.randn(size, size, 5, generator=torch.Generator().manual_seed(1)) / size
     return [x.contiguous()[None] for x in noise.split([3, 1, 1], -1)]

@@ -2,7 +2,7 @@
 
 A torus shell with a sphere in its hole, seen once, at several sizes; forward, and forward with
 backward (gradients of all five attributes from image, depth and alpha). Every cell is a process of
-its own, so that its memory can be read; contenders take turns, so that all meet the same load.
+its own, so that its memory can be measured; contenders alternate, so that all have the same load.
 Prints a table and writes ``benchmarks/results/splatting.csv``.
 
 Contenders: ``cpu`` (the best build for this processor), ``cpu-v3`` and ``cpu-base`` (builds for
@@ -54,7 +54,7 @@ COLUMNS = (
 def contender(
     name: str, size: int, preset: str, threads: int
 ) -> Callable[[Scene], tuple[Tensor, ...]]:
-    """A function that draws a scene: image, depth, alpha."""
+    """Return a function that renders a scene: image, depth, alpha."""
     viewmat, K = make_camera(size)
     if name == "prototype":
         return _prototype(viewmat, K, size, threads)
@@ -95,8 +95,8 @@ def _prototype(
 def measure(
     draw: Callable, leaves: Scene, cotangents: list[Tensor], seconds: float
 ) -> dict[str, float]:
-    """Medians of forward and of forward with backward in milliseconds, and the peak memory above
-    inputs and libraries in MB.
+    """Return the medians of forward and of forward with backward in milliseconds, and the peak
+    memory above inputs and libraries in MB.
     """
     _reset_peak()
     before, rows, start = _memory("VmRSS"), [], time.perf_counter()
@@ -117,7 +117,7 @@ def _step(draw: Callable, leaves: Scene, cotangents: list[Tensor]) -> tuple[floa
 
 
 def _memory(field: str) -> float:
-    """MB from /proc/self/status; NaN where there is none."""
+    """Return MB from /proc/self/status; NaN if it does not exist."""
     status = pathlib.Path("/proc/self/status")
     if not status.exists():
         return math.nan
@@ -182,7 +182,7 @@ def run_in_process(
 
 
 def run_row(gaussians: int, size: int, threads: int, args: argparse.Namespace) -> list[dict]:
-    """All contenders, in turns; of each the faster turn."""
+    """Run all contenders alternately; return the faster turn of each."""
     names = [name for name in args.contenders if name != "gsplat" or size <= args.gsplat_size]
     turns = [
         {name: run_in_process(name, gaussians, size, threads, args) for name in names}
@@ -215,7 +215,7 @@ def print_row(rows: list[dict]) -> None:
 
 
 def describe_machine() -> str:
-    """Processor, versions and commit, for the head of the table."""
+    """Return processor, versions and commit, for the head of the table."""
     info = pathlib.Path("/proc/cpuinfo")
     names = (
         [
@@ -234,7 +234,7 @@ def describe_machine() -> str:
 
 
 def _commit() -> str:
-    """Nothing where there is no git, or this isn't a checkout."""
+    """Return the commit; empty without git or outside a checkout."""
     git = shutil.which("git")
     if git is None:
         return ""
@@ -244,7 +244,7 @@ def _commit() -> str:
 
 
 def available(names: list[str]) -> list[str]:
-    """Those that can run here; says why not of the others."""
+    """Return the contenders that can run here, and log why others cannot."""
     from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 
     builds = cpu.usable_builds()

@@ -1,15 +1,14 @@
 """Error against milliseconds of the rasteriser, forward and gradients: docs/charts/rasteriser.csv
 and two pictures.
 
-    python -m benchmarks.splatting.chart_splatting              # measure (some ten minutes) and
-                                                                draw
+    python -m benchmarks.splatting.chart_splatting              # measure and draw
     python -m benchmarks.splatting.chart_splatting --from-csv   # draw what was measured
 
-Truth is the specification in float64 with every cut-off off (no smallest alpha, no early stop, no
-tiles: every pixel against every Gaussian), at random pixels of the picture; gradients are those of
-a random cotangent on the same pixels. The cap of alpha belongs to the image model and stays on.
-Knobs are turned one at a time; peers' cut-offs are drawn as settings of our kernel, which says
-nothing about the peers' speed. Times are medians over 20 pictures, with the quartiles in the CSV.
+The reference is the specification in float64 without cutoffs (no smallest alpha, no early
+termination, no tiles: every pixel against every Gaussian), at random pixels; gradients are those of
+a random cotangent on the same pixels. The cap of alpha is part of the image model and stays on.
+Settings are varied one at a time; other libraries' cutoffs are settings of our kernel, which says
+nothing about their speed. Times are medians over 20 renders, with the quartiles in the CSV.
 """
 
 import argparse
@@ -74,7 +73,7 @@ def settings() -> Iterator[Setting]:
 
 
 class Truth(NamedTuple):
-    """What the specification says at some pixels."""
+    """Values of the specification at some pixels."""
 
     pixels: Tensor
     """(P,) flat indices."""
@@ -86,8 +85,8 @@ class Truth(NamedTuple):
 
 
 def truth(scene: Scene, size: int) -> Truth:
-    """Colours and gradients at ``PIXELS`` random pixels, in float64, without any cut-off but the
-    cap.
+    """Compute colours and gradients at ``PIXELS`` random pixels, in float64, without any cutoff
+    except the cap.
     """
     rng = torch.Generator().manual_seed(size)
     pixels = torch.randperm(size * size, generator=rng)[:PIXELS].sort().values
@@ -111,7 +110,7 @@ def truth(scene: Scene, size: int) -> Truth:
 
 
 def measured(scene: Scene, size: int, setting: Setting, true: Truth) -> dict[str, float]:
-    """Errors and times of one setting."""
+    """Measure errors and times of one setting."""
     leaves = [x.clone().requires_grad_() for x in scene]
     viewmat, K = (x[None] for x in make_camera(size))
     cotangent = (
@@ -141,7 +140,7 @@ def measured(scene: Scene, size: int, setting: Setting, true: Truth) -> dict[str
 
 
 def forward_errors(image: Tensor, true: Tensor) -> dict[str, float]:
-    """PSNR, and the largest and 99.9 % error in grey levels."""
+    """Return PSNR, and the largest and 99.9 % error in grey levels."""
     error = (image - true).abs()
     mse = float((error**2).mean())
     return {
@@ -152,7 +151,7 @@ def forward_errors(image: Tensor, true: Tensor) -> dict[str, float]:
 
 
 def gradient_errors(leaves: list[Tensor], true: Truth) -> dict[str, float]:
-    """Relative L2 error and cosine per attribute, and the worst of both."""
+    """Return relative L2 error and cosine per attribute, and the worst of both."""
     errors, cosines = {}, {}
     for name, leaf, exact in zip(ATTRIBUTES, leaves, true.gradients, strict=True):
         if name == "quats" and bool((leaves[2] == leaves[2][:, :1]).all()):
@@ -191,7 +190,7 @@ def measure() -> list[dict[str, Any]]:
 
 
 class Axes(NamedTuple):
-    """What one picture shows."""
+    """The content of one picture."""
 
     file: str
     title: str
@@ -271,8 +270,8 @@ def draw_marks(
 
 
 def draw_panel(panel: Any, axes: Axes, rows: list[dict[str, str]]) -> None:
-    """For each size the smallest alpha as a line, the presets and other knobs as marks, and the
-    front of all as a dashed line.
+    """Draw, for each size, the smallest alpha as a line, presets and other settings as marks, and
+    the Pareto front of all as a dashed line.
     """
     for index, size in enumerate(SIZES):
         here, color = [row for row in rows if int(row["size"]) == size], f"C{index}"
@@ -293,13 +292,13 @@ def draw_panel(panel: Any, axes: Axes, rows: list[dict[str, str]]) -> None:
 
 
 def smallest_alpha(setting: str) -> float:
-    """The number behind "1/255" or "0"."""
+    """Parse "1/255" or "0"."""
     numerator, _, denominator = setting.partition("/")
     return float(numerator) / float(denominator or 1)
 
 
 def place(axes: Axes, row: dict[str, str]) -> tuple[float, float]:
-    """(milliseconds, error) of one setting."""
+    """Return (milliseconds, error) of one setting."""
     backward = float(row["backward_ms"]) if axes.x == "both_ms" else 0.0
     return float(row["forward_ms"]) + backward, float(row[axes.y])
 
@@ -310,7 +309,7 @@ def columns(axes: Axes, rows: list[dict[str, str]]) -> tuple[list[float], list[f
 
 
 def front(axes: Axes, rows: list[dict[str, str]]) -> tuple[list[float], list[float]]:
-    """The settings that no other one beats in both time and error."""
+    """Return the settings that no other one beats in both time and error (the Pareto front)."""
     better = (lambda a, b: a < b) if axes.log else (lambda a, b: a > b)
     best: list[dict[str, str]] = []
     for row in sorted(rows, key=lambda row: place(axes, row)[0]):

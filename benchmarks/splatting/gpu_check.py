@@ -1,4 +1,4 @@
-"""Everything that waits for an NVIDIA GPU, in one command of under ten minutes: `make gpu-check`.
+"""All checks and measurements that need an NVIDIA GPU, in one command: `make gpu-check`.
 
     python -m benchmarks.splatting.gpu_check                          # exit 0: all well; 1:
                                                             something failed; 2: no GPU
@@ -88,7 +88,7 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
         "--minutes",
         type=float,
         default=9.0,
-        help="for everything; what comes too late is recorded as such",
+        help="limit for everything; later parts are recorded as skipped",
     )
     parser.add_argument("--out", type=Path, help="default: benchmarks/results/gpu-<device>.json")
     parser.add_argument("--only", choices=PARTS, help=argparse.SUPPRESS)
@@ -110,9 +110,7 @@ def about(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def describe_device(args: argparse.Namespace) -> dict[str, Any]:
-    """The GPU, the releases that have to fit one another, and why our kernels can't run, or
-    None.
-    """
+    """Return the GPU, the releases that must match, and why the kernels can't run, or None."""
     from threestudio_gaussiandreamer.splatting import available_backends
     from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver
     from threestudio_gaussiandreamer.splatting.cuda import nvrtc

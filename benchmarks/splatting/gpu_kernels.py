@@ -1,5 +1,5 @@
 """The kernels' sections of ``gpu_check``: correctness against plain torch in float64, time of the
-first picture, compute-sanitizer, and speed beside gsplat.
+first render, compute-sanitizer, and speed beside gsplat.
 """
 
 import argparse
@@ -40,7 +40,7 @@ SANITIZER_FOUND = 99
 
 
 def on(device: str, scene: Scene, dtype: torch.dtype = torch.float32) -> Scene:
-    """The scene as leaves of a graph."""
+    """Return the scene as leaves of a graph."""
     return Scene(*(x.detach().to(device, dtype).requires_grad_() for x in scene))
 
 
@@ -53,7 +53,7 @@ def cameras(size: int, views: int, scene: Scene) -> tuple[Tensor, Tensor]:
 
 
 def cotangents(size: int, views: int, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
-    """Fixed gradients of image, depth and alpha."""
+    """Return fixed gradients of image, depth and alpha."""
     noise = torch.randn(views, size, size, 5, generator=torch.Generator().manual_seed(size)) / size
     return tuple(x.contiguous() for x in noise.to(scene.means).split([3, 1, 1], -1))
 
@@ -61,8 +61,8 @@ def cotangents(size: int, views: int, scene: Scene) -> tuple[Tensor, Tensor, Ten
 def drawer(
     scene: Scene, size: int, views: int, backend: str, **options: Any
 ) -> Callable[[], tuple[Tensor, ...]]:
-    """A function that gives image, depth, alpha and the gradients of all attributes, for a fixed
-    cotangent.
+    """Return a function that computes image, depth, alpha and the gradients of all attributes, for
+    a fixed cotangent.
     """
     from threestudio_gaussiandreamer.splatting import rasterize
 
@@ -81,14 +81,14 @@ def drawer(
 
 
 def correct(args: argparse.Namespace) -> dict[str, Any]:
-    """Each case against plain torch in float64, and against itself."""
+    """Compare each case with plain torch in float64, and with itself."""
     cases = in_process("errors", args)
     wrong = [f"{name}: {words}" for name, case in cases.items() for words in complaints(case)]
     return {"relative_errors": cases} | ({"failed": wrong} if wrong else {})
 
 
 def complaints(case: dict[str, Any]) -> Iterator[str]:
-    """What rounding doesn't explain."""
+    """Return differences that rounding does not explain."""
     if "failed" in case:
         yield case["failed"]
         return
@@ -141,7 +141,7 @@ def relative(value: Tensor, exact: Tensor) -> float:
 
 
 def trimmed(value: Tensor, exact: Tensor) -> float:
-    """The relative error without the worst Gaussians."""
+    """Return the relative error without the worst Gaussians."""
     errors = (
         (value.double() - exact).flatten(1).norm(dim=1)
         if value.ndim > 1
@@ -152,8 +152,8 @@ def trimmed(value: Tensor, exact: Tensor) -> float:
 
 
 def compile_kernels(args: argparse.Namespace) -> dict[str, Any]:
-    """Seconds from the first call to its picture, in new processes: with an empty cache, and with
-    what that left.
+    """Return the seconds from the first call to its image, in new processes: with an empty cache,
+    and with a filled one.
     """
     with tempfile.TemporaryDirectory() as cache:
         return {
@@ -184,8 +184,8 @@ def sanitize(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def sanitize_with(tool: str, kind: str, args: argparse.Namespace) -> dict[str, Any]:
-    """What one of its tools says of a first picture; a machine where the tool can't run is no
-    failure of ours.
+    """Run one tool of compute-sanitizer on a first render; a tool that cannot run here is not a
+    failure.
     """
     uncached = {
         "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"
@@ -207,9 +207,7 @@ def synchronize(args: argparse.Namespace) -> None:
 
 
 def timed(args: argparse.Namespace, call: Callable[[], Any], repetitions: int) -> dict[str, float]:
-    """Milliseconds of a call, its quartiles, and the most memory that it took beyond what was
-    there.
-    """
+    """Return milliseconds of a call, its quartiles, and its peak additional memory."""
     for _ in range(3):
         call()
     synchronize(args)
@@ -232,12 +230,14 @@ def timed(args: argparse.Namespace, call: Callable[[], Any], repetitions: int) -
 
 
 def bench(args: argparse.Namespace) -> dict[str, Any]:
-    """Ours at every preset, and gsplat, forward with backward."""
+    """Time this package at every preset, and gsplat, forward with backward."""
     found = in_process("speed", args)
     if args.device != "cuda" or args.small:
         return found | {"gsplat": {"skipped": "needs a GPU"}}
     found["gsplat"] = guarded(gsplat, args)
-    if "failed" in found["gsplat"]:  # a peer that doesn't build here is no failure of ours
+    if (
+        "failed" in found["gsplat"]
+    ):  # gsplat may not build here, which isn't a failure of this package
         found["gsplat"] = {"unavailable": found["gsplat"]["failed"]}
     else:
         found["times_faster_than_gsplat"] = round(found["gsplat"]["ms"] / found["fast"]["ms"], 2)
@@ -257,8 +257,8 @@ def speed(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def gsplat(args: argparse.Namespace) -> dict[str, Any]:
-    """gsplat as it is installed, else of PyPI in a folder of its own; its kernels are built at
-    first use, for this GPU alone.
+    """Import the installed gsplat, or install it from PyPI into a folder; its kernels are compiled
+    on first use, for this GPU only.
     """
     with tempfile.TemporaryDirectory() as folder:
         if importlib.util.find_spec("gsplat") is None:

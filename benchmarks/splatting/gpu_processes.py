@@ -25,13 +25,13 @@ SECONDS = {
     "make_model": 100,
     "train_steps": 150,
 }
-"""The most that each part may take."""
+"""Time limit of each part."""
 
 
 def guarded(
     section: Callable[[argparse.Namespace], dict[str, Any]], args: argparse.Namespace
 ) -> dict[str, Any]:
-    """What a section found, or why it failed."""
+    """Return a section's result, or why it failed."""
     try:
         return section(args)
     except Exception as error:
@@ -40,7 +40,7 @@ def guarded(
 
 
 def failures(found: Any) -> Iterator[str]:
-    """All that is called "failed", at any depth."""
+    """Return all entries called "failed", at any depth."""
     for key, value in found.items() if isinstance(found, dict) else ():
         yield from [str(value)] if key == "failed" else failures(value)
 
@@ -48,7 +48,7 @@ def failures(found: Any) -> Iterator[str]:
 def run(
     command: list[str], args: argparse.Namespace, limit: float, environment: dict[str, str]
 ) -> tuple[int, str]:
-    """Exit status and output of a command. Neither it nor whatever it started outlives the limit.
+    """Return exit status and output of a command. Neither it nor its children outlive the limit.
 
     Raises:
         RuntimeError: it took too long, or there was no time for it.
@@ -88,10 +88,10 @@ def end_group(process: subprocess.Popen) -> None:
 def in_process(
     name: str, args: argparse.Namespace, environment: dict[str, str] | None = None
 ) -> dict[str, Any]:
-    """What a part found.
+    """Return a part's result.
 
     Raises:
-        RuntimeError: it didn't end well.
+        RuntimeError: it failed.
     """
     with tempfile.TemporaryDirectory() as folder:
         found = Path(folder) / "found.json"

@@ -55,7 +55,9 @@ def prune_twice(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def train(args: argparse.Namespace) -> dict[str, Any]:
-    """Seconds per step and memory of the paper's configuration, whole and for little memory."""
+    """Return seconds per step and memory of the paper's configuration, and of its low-memory
+    variant.
+    """
     with tempfile.TemporaryDirectory() as folder:
         environment = {"GPU_CHECK_MODEL": str(Path(folder) / "model"), "HF_HUB_OFFLINE": "1"}
         in_process("make_model", args, environment)
@@ -83,7 +85,7 @@ def make_model(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def train_steps(args: argparse.Namespace) -> dict[str, Any]:
-    """A short run of the launcher itself; the first steps, which warm up, aren't counted."""
+    """Run the launcher for a few steps; the first ones, which warm up, aren't counted."""
     from threestudio_gaussiandreamer.launch import experiment
     from threestudio_gaussiandreamer.training import system
 
@@ -115,7 +117,9 @@ def train_steps(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def training_arguments(args: argparse.Namespace, folder: str) -> list[str]:
-    """The paper's configuration from a mesh in the place of Shap-E, which has no part in a step."""
+    """Return the paper's configuration with a mesh instead of Shap-E, which plays no part in a
+    step.
+    """
     overlays = [
         part
         for name in ("gaussiandreamer.yaml", os.environ["GPU_CHECK_OVERLAY"])

@@ -1,8 +1,9 @@
-"""gsplat's plain-torch twins (`gsplat.cuda._torch_impl`) as a contender: pip install gsplat.
+"""gsplat's plain-torch functions (`gsplat.cuda._torch_impl`) as a contender: pip install gsplat.
 
-As shipped they need CUDA for three things: which pixels a Gaussian touches, and two functions of
-nerfacc. These three stand here in vectorised torch; projection, compositing and everything that has
-a gradient is gsplat's."""
+They need CUDA for three helpers: the pixels that a Gaussian covers, and two functions of nerfacc.
+This module replaces these three by vectorised torch; projection, compositing and everything with a
+gradient is gsplat's.
+"""
 
 import sys
 import types
@@ -17,8 +18,8 @@ ALPHA_MIN, STOP, SIGMAS = 1 / 255, 1e-4, 3.33
 
 
 def drawer(viewmat: Tensor, K: Tensor, size: int) -> Callable[[Any], tuple[Tensor, ...]]:
-    """A function that draws a scene (means, quats, scales, opacities, colors) from one camera:
-    image, depth, alpha.
+    """Return a function that renders a scene (means, quats, scales, opacities, colors) from one
+    camera: image, depth, alpha.
     """
     sys.modules.setdefault("nerfacc", nerfacc())
     from gsplat.cuda import _torch_impl as gsplat
@@ -47,7 +48,8 @@ def drawer(viewmat: Tensor, K: Tensor, size: int) -> Callable[[Any], tuple[Tenso
 def pairs(
     means2d: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, size: int
 ) -> tuple[Tensor, Tensor]:
-    """(Gaussian, pixel) of every alpha >= 1/255 in front of what stops a ray, by pixel and depth.
+    """Return (Gaussian, pixel) of every alpha >= 1/255 before early termination, by pixel and
+    depth.
 
     The candidates are the pixels of each Gaussian's box of 3.33 standard deviations.
     """
@@ -76,14 +78,14 @@ def pairs(
 
 
 def expanded(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """For counts [2, 0, 3] the rows [0, 0, 2, 2, 2] and the places [0, 1, 0, 1, 2]."""
+    """For counts [2, 0, 3] return the rows [0, 0, 2, 2, 2] and the positions [0, 1, 0, 1, 2]."""
     rows = torch.repeat_interleave(counts)
     return rows, torch.arange(len(rows)) - (counts.cumsum(0) - counts)[rows]
 
 
 def transmittance(alphas: Tensor, rays: Tensor) -> Tensor:
-    """The product of 1 - alpha over what lies in front on the same ray; rays in order, float64
-    inside for the long sums.
+    """Return the product of 1 - alpha over everything in front on the same ray; rays in order, in
+    float64 for the long sums.
     """
     logs = torch.log1p(-alphas.double())
     before = logs.cumsum(0) - logs
@@ -93,7 +95,7 @@ def transmittance(alphas: Tensor, rays: Tensor) -> Tensor:
 
 
 def nerfacc() -> types.ModuleType:
-    """The two functions of nerfacc that gsplat's compositing calls."""
+    """Provide the two functions of nerfacc that gsplat's compositing calls."""
 
     def render_weight_from_alpha(
         alphas: Tensor, ray_indices: Tensor, n_rays: int

@@ -24,7 +24,7 @@ def scenes() -> dict[str, Scene]:
 
 
 def initial(count: int = 4000) -> Scene:
-    """A cloud as a prior leaves it: points on a surface, opacity 0.1, isotropic, as large as the
+    """A cloud as a prior gives it: points on a surface, opacity 0.1, isotropic, as large as the
     distance to the next.
     """
     scene = make_scene(count)
@@ -68,7 +68,7 @@ def blob(count: int, spread: float, size: float, opacity: float, seed: int) -> S
 
 
 def fog() -> Scene:
-    """2,000 that are each too faint to be seen."""
+    """2,000 Gaussians, each of them below the usual alpha threshold."""
     return blob(2000, 0.3, 0.2, 0.0038, 1)
 
 
@@ -80,7 +80,7 @@ def needles() -> Scene:
 
 
 def deep() -> Scene:
-    """10,000 behind each other, opacities from 0.01 to 0.9."""
+    """10,000 Gaussians along one ray, opacities from 0.01 to 0.9."""
     scene = blob(10_000, 0.05, 0.05, 0.5, 3)
     scene.means[:, 0] = torch.linspace(-1, 1, 10_000)
     return scene._replace(
@@ -91,5 +91,7 @@ def deep() -> Scene:
 
 
 def near() -> Scene:
-    """Around the camera too: some are behind it, some straddle its near plane."""
+    """A cloud that surrounds the camera: some Gaussians are behind it, some intersect its near
+    plane.
+    """
     return blob(3000, 1.5, 0.03, 0.5, 4)

@@ -1,5 +1,5 @@
-"""Pictures of clouds from viewers in headless Chromium, which gets pages from a local web server
-and posts the pixels back.
+"""Images of clouds from viewers in headless Chromium, which gets pages from a local web server and
+posts the pixels back.
 
 Install outside the repository:
 
@@ -47,7 +47,7 @@ TIMEOUT = 300
 
 
 class Camera(NamedTuple):
-    """A pinhole camera with square pictures in the axes of the drawn scene."""
+    """A pinhole camera with square images in the axes of the rendered scene."""
 
     c2w: Float[np.ndarray, "4 4"]
     """OpenGL: the columns are right, up, back, position."""
@@ -59,12 +59,12 @@ class Camera(NamedTuple):
 
 
 def chromium() -> Optional[str]:
-    """Find the browser's program."""
+    """Return the path of the browser."""
     return next(filter(None, map(shutil.which, CHROMIUM_NAMES)), None)
 
 
 def missing(modules: Path) -> Optional[str]:
-    """Name what is missing here for pictures from viewers, or return None.
+    """Return what is missing for images from viewers, or None.
 
     Args:
         modules: the folder ``node_modules`` with the npm packages.
@@ -136,7 +136,7 @@ def draw_with_splat_transform(cloud: Path, size: int, modules: Path) -> UInt8[np
 
 @dataclass
 class Exchange:
-    """What a page is given, and what it has posted: ``count`` pictures or a failure."""
+    """The input of a page, and its result: ``count`` images or a failure."""
 
     files: dict[str, bytes]
     modules: Path
@@ -146,7 +146,7 @@ class Exchange:
     finished: threading.Event = field(default_factory=threading.Event)
 
     def receive(self, path: str, body: bytes) -> None:
-        """Take what was posted to ``/picture/<number>`` or ``/failed``."""
+        """Store what was posted to ``/picture/<number>`` or ``/failed``."""
         if path == "/failed":
             self.failure = body.decode(errors="replace")
         else:
@@ -156,10 +156,10 @@ class Exchange:
 
 
 def pictures_of(exchange: Exchange, size: int) -> list[bytes]:
-    """Show the page in a window of about ``size`` pixels and wait for its pictures.
+    """Show the page in a window of about ``size`` pixels and wait for its images.
 
     Raises:
-        RuntimeError: the page failed, or wasn't done in time.
+        RuntimeError: the page failed, or took too long.
     """
     with served(exchange) as address, browser(f"{address}/", size):
         exchange.finished.wait(TIMEOUT)
@@ -172,7 +172,7 @@ def pictures_of(exchange: Exchange, size: int) -> list[bytes]:
 
 
 class Handler(SimpleHTTPRequestHandler):
-    """Serves the files of an exchange and the npm packages, and hands over what is posted."""
+    """Serves the files of an exchange and the npm packages, and stores what is posted."""
 
     extensions_map = SimpleHTTPRequestHandler.extensions_map | {".wasm": "application/wasm"}
 
@@ -205,7 +205,7 @@ class Handler(SimpleHTTPRequestHandler):
 
 @contextmanager
 def served(exchange: Exchange) -> Iterator[str]:
-    """Serve on a free port of this machine while the block runs; gives the address."""
+    """Serve on a free local port in this context; yield the address."""
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, exchange))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
@@ -217,9 +217,10 @@ def served(exchange: Exchange) -> Iterator[str]:
 
 @contextmanager
 def browser(address: str, size: int) -> Iterator[None]:
-    """Keep a headless Chromium open on ``address`` while the block runs.
+    """Keep a headless Chromium open on ``address`` in this context.
 
-    Its window, toolbars included, has at least 640 pixels each way: it makes none much smaller."""
+    Its window, toolbars included, has at least 640 pixels each way, the smallest that it supports.
+    """
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         options = [f"--user-data-dir={profile}", f"--window-size={max(size, 640)},{max(size, 640)}"]
         process = subprocess.Popen(
