@@ -5,9 +5,9 @@ cloud on test views.
                                                                          seed
     python -m benchmarks.quality.after_run --objects toy.glb spot.glb duck.glb --seeds 0 1 2
 
-A cloud of 10,000, trained as the demo is at 128^2 on one thread (`runs.py`), goes to a count in one
-shot; in one shot and as many steps of recovery as the rounds have together; and in rounds, as the
-prune command does it, ranked as it does and otherwise. Results go to docs/charts/after_run.csv."""
+A cloud of 10,000, trained as the demo is at 128^2 on one thread (`runs.py`), is pruned to a count
+in one shot; in one shot with as many recovery steps as all rounds together; and in rounds, like the
+prune command, with its ranking and others. Results go to docs/charts/after_run.csv."""
 
 import statistics
 import sys

@@ -208,8 +208,7 @@ def auto_config(folder: Path, steps: int) -> dict[str, Any]:
         "guidance": {"path": str(folder / "true.ply")},
     }
     cfg["system"]["renderer"] = {}  # the ground truth is rendered with the default preset too
-    # a start that is nearly right: at the demo's rates and with its long memory even one at the
-    # truth wanders off to 38.8 dB
+    # the start is nearly right; the demo's rates and long averages would move it away again
     cfg["system"]["optimizer"]["args"]["betas"] = [0.7, 0.9]
     for name, (first, last) in RATES.items():
         cfg["system"]["geometry"][name] = [0, first / 4, last / 4, steps]

@@ -4,9 +4,9 @@ with another, at the training size and larger.
     python -m benchmarks.quality.viewers                                       # the toy
     python -m benchmarks.quality.viewers --objects toy.glb spot.glb duck.glb
 
-The demo at its own 256^2 with dilations of 0.1 and of 0.3 square pixels; each result drawn with
-both at 256^2 and at 512^2, in dB to the ray-cast truth on 24 held-out views. Results go to
-docs/charts/viewers.csv; what that has is not run again."""
+The demo at its own 256^2 with dilations of 0.1 and of 0.3 square pixels; each result is rendered
+with both at 256^2 and at 512^2; dB to the ray-cast ground truth on 24 held-out views. Results go to
+docs/charts/viewers.csv; runs that it contains are skipped."""
 
 import tempfile
 from collections.abc import Iterator

@@ -189,15 +189,15 @@ def test_a_folder_that_is_a_file_is_named(tmp_path):
 
 
 def test_lightnings_door(tmp_path):
-    door = AtomicCheckpointIO()
+    io = AtomicCheckpointIO()
     path = tmp_path / "ckpts" / "last.ckpt"
-    assert door.saved_step(path) == -1
-    door.save_checkpoint(content(9), path)
-    assert door.saved_step(path) == 9 and same(
-        door.load_checkpoint(path, map_location=lambda storage, place: storage), content(9)
+    assert io.saved_step(path) == -1
+    io.save_checkpoint(content(9), path)
+    assert io.saved_step(path) == 9 and same(
+        io.load_checkpoint(path, map_location=lambda storage, place: storage), content(9)
     )
-    door.remove_checkpoint(path)
-    door.remove_checkpoint(path)
+    io.remove_checkpoint(path)
+    io.remove_checkpoint(path)
     assert not path.exists()
 
 

@@ -312,9 +312,9 @@ def test_a_gradient_that_overflows_in_the_encoder_is_left_out_and_counted(models
         return encode(images)
 
     guide.vae.encode = overflowing
-    spoilt, _ = gradient(guide, prompts[False], rgb)
-    assert not spoilt[1].any() and guide.bad_items == 1
-    assert torch.equal(spoilt[[0, 2, 3]], clean[[0, 2, 3]])
+    corrupted, _ = gradient(guide, prompts[False], rgb)
+    assert not corrupted[1].any() and guide.bad_items == 1
+    assert torch.equal(corrupted[[0, 2, 3]], clean[[0, 2, 3]])
     with pytest.raises(NonFiniteScore, match="VAE.*half_precision_weights=false"):
         for _ in range(2):
             gradient(guide, prompts[False], rgb)

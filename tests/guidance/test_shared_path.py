@@ -19,11 +19,11 @@ pytest.importorskip("embreex")
 
 
 class Stub(ScoreDistillation):
-    """Predict the noise plus the latent (so that the gradient is w x), or what ``spoil`` returns
+    """Predict the noise plus the latent (so that the gradient is w x), or what ``corrupt`` returns
     for it.
     """
 
-    spoil = staticmethod(lambda eps, step: eps)
+    corrupt = staticmethod(lambda eps, step: eps)
     unconditional = None
 
     def encode(self, rgb, **batch):
@@ -40,7 +40,7 @@ class Stub(ScoreDistillation):
         noise = streams.normal_per_item(tuple(z.shape), 0, "noise", self.step)
         abar = self.alphas_cumprod[t]
         x = sds.predict_x0(z, noise, abar)
-        return self.spoil(
+        return self.corrupt(
             noise + x, self.step
         ), None if self.unconditional is None else noise + self.unconditional * x
 
@@ -111,12 +111,12 @@ def test_bad_items_are_masked_and_the_others_keep_their_gradient_bit_for_bit(val
     guidance = Stub({"grad_clip": 10.0})
     _, expected = step(guidance, rgb)
 
-    def spoil(eps, step):
+    def corrupt(eps, step):
         eps = eps.clone()
         eps[1, 0, 2, 3] = value
         return eps
 
-    guidance.spoil = spoil
+    guidance.corrupt = corrupt
     out, grad = step(guidance, rgb)
     assert out["bad_items"] == 1 and guidance.bad_items == 1
     assert torch.equal(grad[[0, 2, 3]], expected[[0, 2, 3]])
@@ -143,10 +143,10 @@ def test_an_encoder_that_overflows_spoils_only_its_item():
 def test_ten_bad_steps_in_a_row_end_the_run_with_a_named_error():
     guidance, rgb = Stub({}), uniform(2, 4, 4, 3)
 
-    def spoil(eps, step):
+    def corrupt(eps, step):
         return eps * math.nan if step != 5 else eps
 
-    guidance.spoil = spoil
+    guidance.corrupt = corrupt
     for at in range(15):  # five bad, one good, nine bad
         guidance.update_step(0, at)
         step(guidance, rgb)

@@ -217,10 +217,10 @@ def test_a_bad_item_is_left_out_and_the_others_are_untouched(models, prompts):
     guide, rgb = tiny.guidance(models), tiny.renders()
     clean, _ = tiny.gradient(guide, prompts[False], rgb)
     guide.unet = Spoiling(guide.unet, [1])
-    spoilt, out = tiny.gradient(guide, prompts[False], rgb)
+    corrupted, out = tiny.gradient(guide, prompts[False], rgb)
     assert out["bad_items"] == 1
-    assert torch.equal(spoilt[[0, 2, 3]], clean[[0, 2, 3]])
-    assert not spoilt[1].any()
+    assert torch.equal(corrupted[[0, 2, 3]], clean[[0, 2, 3]])
+    assert not corrupted[1].any()
     with pytest.raises(NonFiniteScore, match="10 steps in a row"):
         for _ in range(9):
             tiny.gradient(guide, prompts[False], rgb)

@@ -36,11 +36,11 @@ class LimitsContract:
         self, backend, attribute, value
     ):
         cloud, camera = random_cloud(300, seed=6), cameras(2, 40, 24)
-        poisoned = Cloud(*(x.clone() for x in cloud))
-        getattr(poisoned, attribute)[7] = value
+        corrupted = Cloud(*(x.clone() for x in cloud))
+        getattr(corrupted, attribute)[7] = value
         rest = torch.arange(300) != 7
         with_it, without = (
-            draw(backend, poisoned, camera, 40, 24),
+            draw(backend, corrupted, camera, 40, 24),
             draw(backend, cloud.pick(rest), camera, 40, 24),
         )
         assert torch.equal(with_it.out.image, without.out.image) and torch.equal(

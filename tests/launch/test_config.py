@@ -260,8 +260,8 @@ def test_the_home_folder_is_expanded_once(folder, monkeypatch):
     cfg = load("exp_root_dir=~/runs", "use_timestamp=false")
     assert cfg.exp_root_dir == "/home/someone/runs"
     assert cfg.trial_dir == "/home/someone/runs/tiny/a_red_ball"
-    with pytest.raises(UserError, match="exp_root_dir is '~nobody-here/x', and there is no such"):
-        load("exp_root_dir=~nobody-here/x")
+    with pytest.raises(UserError, match="exp_root_dir is '~missing-user/x', and there is no such"):
+        load("exp_root_dir=~missing-user/x")
     assert load("exp_root_dir=./~odd").exp_root_dir == "./~odd"
     assert load("resume=~/last.ckpt").resume == "/home/someone/last.ckpt"
 

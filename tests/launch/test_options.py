@@ -75,7 +75,7 @@ def test_a_configuration_is_found_by_path_or_name(tmp_path, monkeypatch):
     (tmp_path / "other.yaml").touch()
     assert find_config("other.yaml") == Path("other.yaml")
     assert find_config("mine.yaml") == find_config("mine") == Path("configs/mine.yaml")
-    # from anywhere, those that come along
+    # the shipped ones, from any folder
     assert find_config("demo.yaml").resolve() == REPOSITORY / "configs" / "demo.yaml"
     with pytest.raises(
         UserError, match="unknown configuration 'mien.yaml': did you mean 'mine.yaml'"

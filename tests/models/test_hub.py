@@ -277,8 +277,8 @@ def test_a_gated_model_says_where_to_accept(online):
 
 
 def test_a_missing_model(online):
-    with pytest.raises(UserError, match="not on the hub, or is private.*hf download nobody/none"):
-        hub.find_model("nobody/none", IMAGE)
+    with pytest.raises(UserError, match="not on the hub, or is private.*hf download missing/model"):
+        hub.find_model("missing/model", IMAGE)
 
 
 def test_a_removed_model_names_its_copy(online):

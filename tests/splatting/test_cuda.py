@@ -89,10 +89,10 @@ def test_nothing_is_read_before_it_is_written(device, monkeypatch, cloud):
     torch.use_deterministic_algorithms(True)
     try:
         assert torch.empty(1).isnan()
-        spoilt = scene(device, cloud)
+        corrupted = scene(device, cloud)
     finally:
         torch.use_deterministic_algorithms(False)
-    assert same(plain, spoilt)
+    assert same(plain, corrupted)
     assert cloud is None or plain.out.alpha.min() > 1 - 1e-4
 
 

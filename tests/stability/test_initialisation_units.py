@@ -151,13 +151,13 @@ def uniformity(points: np.ndarray) -> float:
 
 
 @row("A2", "Non-manifold, duplicate faces, degenerate triangles")
-@pytest.mark.parametrize("repeated", ["not", "same", "turned round", "with copied vertices"])
+@pytest.mark.parametrize("repeated", ["not", "same", "reversed", "with copied vertices"])
 def test_a_surface_is_sampled_uniformly_for_any_triangulation(repeated, tmp_path, measured):
     """Repeated faces, whose edges are non-manifold, are on one side: counted twice, that side would
     be denser.
     """
     points, faces = uneven_square()
-    again = faces[:40] if repeated != "turned round" else faces[:40, ::-1]
+    again = faces[:40] if repeated != "reversed" else faces[:40, ::-1]
     if repeated == "with copied vertices":
         again, points = again + len(points), np.concatenate([points, points])
     faces = faces if repeated == "not" else np.concatenate([faces, again])

@@ -25,22 +25,22 @@ register_parts()
 # ---- scores that aren't finite -------------------------------------------------------------------
 
 
-@register("stability-spoilt-guidance")
-class Spoilt(TowardsGrey):
-    """Replace the score of some items, at the steps in ``spoilt``, by a value."""
+@register("stability-corrupted-guidance")
+class CorruptedScore(TowardsGrey):
+    """Replace the score of some items, at the steps in ``corrupted``, by a value."""
 
-    spoilt: dict[int, dict[int, float]] = {}
+    corrupted: dict[int, dict[int, float]] = {}
 
     def predict(self, z, t, condition):
         eps, _ = super().predict(z, t, condition)
-        for item, value in self.spoilt.get(self.step, {}).items():
+        for item, value in self.corrupted.get(self.step, {}).items():
             eps[item] = value
         return eps, None
 
 
-def gradient(spoilt):
-    guidance = Spoilt({"guidance_scale": 1.0})
-    guidance.spoilt = {0: spoilt}
+def gradient(corrupted):
+    guidance = CorruptedScore({"guidance_scale": 1.0})
+    guidance.corrupted = {0: corrupted}
     rgb = torch.rand(4, 8, 8, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
     out = guidance(rgb)
     out["loss_sds"].backward()
@@ -72,9 +72,9 @@ def test_bad_steps_are_counted_and_the_tenth_in_a_row_ends_the_run(tmp_path, mon
         3: {1: math.inf},
         **{step: {0: math.nan, 1: math.nan} for step in range(5, 50)},
     }
-    monkeypatch.setattr(Spoilt, "spoilt", bad)
+    monkeypatch.setattr(CorruptedScore, "corrupted", bad)
     guided = [
-        "system.guidance_type=stability-spoilt-guidance",
+        "system.guidance_type=stability-corrupted-guidance",
         "system.geometry.prior.path=toy.glb",
     ]
     ended = launch(tmp_path, *guided, "trainer.max_steps=50", "checkpoint.every_n_train_steps=14")
@@ -175,7 +175,7 @@ def test_the_clip_at_its_knots(measured):
         abs(C([0, 1.5, 2.0, 10.0], epoch, 99_999) - value)
         for epoch, value in {0: 1.5, 5: 1.75, 10: 2.0}.items()
     ]
-    guidance = Spoilt({"grad_clip": [0, 1.5, 2.0, 1000]})
+    guidance = CorruptedScore({"grad_clip": [0, 1.5, 2.0, 1000]})
     for step, value in schedules[0, 1.5, 2.0, 1000].items():
         guidance.update_step(0, step)
         wrong.append(abs(guidance.grad_clip - value))
@@ -205,7 +205,7 @@ def test_the_clip_at_its_knots(measured):
 )
 def test_an_invalid_clip_schedule_is_refused_when_it_is_read(knots, measured):
     with pytest.raises(UserError, match="system.guidance.grad_clip"):
-        check_part("system.guidance", "stability-spoilt-guidance", {"grad_clip": knots})
+        check_part("system.guidance", "stability-corrupted-guidance", {"grad_clip": knots})
     measured("bad lists refused by name")
 
 
@@ -223,7 +223,7 @@ def test_a_range_that_is_empty_after_annealing_is_named(measured):
     """Before any work, not at the step at which the two schedules cross."""
     crossing = {"min_step_percent": 0.6, "max_step_percent": [500, 0.98, 0.55, 501]}
     with pytest.raises(UserError, match="min_step_percent: 0.6 is above max_step_percent, 0.55"):
-        check_part("system.guidance", "stability-spoilt-guidance", crossing)
+        check_part("system.guidance", "stability-corrupted-guidance", crossing)
     with pytest.raises(UserError, match="min_step_percent"):
         sds.step_range(0.98, 0.5)
     measured("named error")

@@ -62,12 +62,12 @@ def test_a_non_finite_state_never_replaces_a_good_checkpoint(tmp_path, painted_b
     """The checkpoint of the previous step is kept; a run resumed from it completes."""
     step = GaussianDreamerSystem.training_step
 
-    def poisoned(self, batch, batch_idx):
+    def with_nan(self, batch, batch_idx):
         step(self, batch, batch_idx)
         if self.global_step == 3:
             self.geometry.means.data[5, 1] = torch.nan
 
-    monkeypatch.setattr(GaussianDreamerSystem, "training_step", poisoned)
+    monkeypatch.setattr(GaussianDreamerSystem, "training_step", with_nan)
     every = [
         "checkpoint.every_n_train_steps=1",
         "trainer.max_steps=4",
@@ -87,11 +87,11 @@ def test_a_cloud_that_is_not_finite_is_neither_shown_nor_exported(
 ):
     ensure_cloud = GaussianDreamerSystem.ensure_cloud
 
-    def poisoned(self):
+    def with_nan(self):
         ensure_cloud(self)
         self.geometry.sh0.data[7] = torch.inf
 
-    monkeypatch.setattr(GaussianDreamerSystem, "ensure_cloud", poisoned)
+    monkeypatch.setattr(GaussianDreamerSystem, "ensure_cloud", with_nan)
     assert launch(tmp_path, painted_box, stage=stage) == 2
     assert "3 of the 600 numbers of geometry.sh0 are NaN or infinite" in capsys.readouterr().err
     assert not list(tmp_path.rglob("it*"))
