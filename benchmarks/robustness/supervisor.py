@@ -113,7 +113,7 @@ class Supervisor:
         """Return the step from which the process resumed, from its output; ``before`` if it was
         killed before it printed one.
         """
-        chosen = re.search(r"resume=auto: going on from (.*) \(step (\d+)\)", self.output())
+        chosen = re.search(r"resume=auto: resuming from (.*) \(step (\d+)\)", self.output())
         if chosen:
             return int(chosen[2])
         return 0 if "starting from the prior" in self.output() else before

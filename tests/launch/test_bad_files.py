@@ -201,7 +201,7 @@ def test_a_signal_while_the_test_views_are_rendered_leaves_a_checkpoint_and_says
         code = experiment.main(["--config", str(DEMO), "--train", "--gpu", "cpu", *SMALL])
     out = capsys.readouterr().out
     last = TRIAL / "ckpts" / "last.ckpt"
-    assert code == 130 and "to go on: " in out and f"resume={last}" in out
+    assert code == 130 and "to resume: " in out and f"resume={last}" in out
     shutil.rmtree(TRIAL / "save")
     assert launch_demo(f"resume={last}")[0] == 0
     assert (TRIAL / "save" / "it2-export" / "gaussians.ply").is_file()

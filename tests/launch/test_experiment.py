@@ -212,7 +212,7 @@ def test_launch_py_with_parts_in_custom(tmp_path):
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130 and "Traceback" not in err
-    resume = shlex.split(re.search("to go on: (.*)", out)[1])
+    resume = shlex.split(re.search("to resume: (.*)", out)[1])
     step = int(re.search(r"stopped at step (\d+)", out)[1])
     resumed = subprocess.run(
         [sys.executable, *resume[1:], f"trainer.max_steps={step + 3}"],

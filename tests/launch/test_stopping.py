@@ -32,7 +32,7 @@ def test_stopped_and_resumed_equals_never_stopped(launch, name, code, step):
     assert f"stopped at step {step + 1}" in out and "it6-test" not in str(files(only_run()))
     assert load_file(only_run() / "ckpts/last.ckpt")["global_step"] == step + 1
 
-    command = shlex.split(re.search("to go on: (.*)", out)[1])
+    command = shlex.split(re.search("to resume: (.*)", out)[1])
     options = command[command.index("--config") :]
     assert options[1] == f"{only_run()}/configs/parsed.yaml"
     assert main([*options, "system.signal_at=-1"]) == 0

@@ -76,8 +76,8 @@ def test_resume_auto_takes_the_one_before_and_says_so(stopped, whole, tmp_path, 
     ended = launch(tmp_path, *EVERY_STEP, "resume=auto")
     assert ended.code == 0, ended.err
     assert (
-        "going on from" in ended.err
-        and "step=2.ckpt" in ended.err.split("going on from")[1]
+        "resuming from" in ended.err
+        and "step=2.ckpt" in ended.err.split("resuming from")[1]
         or "last-prev.ckpt" in ended.err
     )
     assert ended.err.count("is damaged") == 2  # what was passed over is named

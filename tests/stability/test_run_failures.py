@@ -286,7 +286,7 @@ def test_a_signal_at_a_random_step(name, code, step, whole, tmp_path, monkeypatc
         ended = launch(tmp_path, "trainer.max_steps=5")
     assert (
         ended.code == code
-        and f"stopped at step {step}; to go on: " in ended.out
+        and f"stopped at step {step}; to resume: " in ended.out
         and f"resume={ended.last}" in ended.out
     ), ended.err
     assert load_checkpoint(ended.last)["global_step"] == step
@@ -309,7 +309,7 @@ def test_a_signal_while_views_are_validated(whole, tmp_path, monkeypatch, measur
             "trainer.limit_val_batches=1",
             "trainer.val_check_interval=3",
         )
-    assert ended.code == 143 and "stopped at step 3; to go on: " in ended.out, ended.err
+    assert ended.code == 143 and "stopped at step 3; to resume: " in ended.out, ended.err
     require_resumed_equal(tmp_path, ended, whole, measured)
 
 

@@ -23,7 +23,7 @@ def test_a_budget_without_remaining_rounds_gives_a_warning(tmp_path, painted_box
         "trainer.val_check_interval=9",
     ]
     assert launch(tmp_path, painted_box, *options, resume) == 0
-    assert "no round of pruning is to come, so that 130 Gaussians stay, not 100" in "".join(
+    assert "no round of pruning remains, so 130 Gaussians are kept instead of 100" in "".join(
         capsys.readouterr()
     )
 
@@ -78,7 +78,7 @@ def test_a_budget_that_needs_larger_rounds_is_met_and_says_so(tmp_path, painted_
     ]
     assert launch(tmp_path, painted_box, *options) == 0
     told = (
-        r"2 rounds of pruning have to lead from \d+ Gaussians to 70: each keeps 0.[56]\d "
+        r"2 rounds of pruning must reduce \d+ Gaussians to 70: each keeps 0.[56]\d "
         r"instead of 0.8"
     )
     assert re.search(told, "".join(capsys.readouterr()))

@@ -10,7 +10,7 @@ from threestudio_gaussiandreamer.training.density import (
     DensityOutcome,
     QualityResult,
     RenderedQuality,
-    fewest_that_hold,
+    smallest_passing_count,
 )
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
@@ -59,7 +59,7 @@ def test_a_round_of_auto_says_what_the_accepted_count_cost():
 @pytest.mark.parametrize("margin", [-1.0, float("nan")])
 def test_quality_that_is_lost_or_unknown_never_holds(margin):
     result = QualityResult(torch.tensor(margin), {"prune/lost": 1.0})
-    assert fewest_that_hold(torch.arange(10.0), 5, lambda kept: result) == (10, {})
+    assert smallest_passing_count(torch.arange(10.0), 5, lambda kept: result) == (10, {})
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -93,9 +93,14 @@ def test_quality_is_measured_against_the_truth_or_between_renders(known):
         ({"budget": None}, 0, 5, None),
         ({"budget": 5}, 0, 5, "4 of the 10 rounds of pruning would come after step 5"),
         ({"budget": 5}, 0, -1, None),
-        ({"budget": 5}, 9, 10, "no round of pruning is to come, so that 10 Gaussians stay, not 5"),
+        (
+            {"budget": 5},
+            9,
+            10,
+            "no round of pruning remains, so 10 Gaussians are kept instead of 5",
+        ),
         ({"budget": 2}, 0, 10, None),
-        ({"budget": 1}, 7, 10, "2 rounds of pruning have to lead from 10 Gaussians to 1"),
+        ({"budget": 1}, 7, 10, "2 rounds of pruning must reduce 10 Gaussians to 1"),
         ({"budget": 20}, 9, 10, None),
     ],
 )

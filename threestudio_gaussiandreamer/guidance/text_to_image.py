@@ -125,8 +125,8 @@ class TextToImageDistillation(ScoreDistillation):
             & DDPMScheduler.load_config(folder, subfolder="scheduler").keys()
         ):
             raise UserError(
-                f"{self.cfg.pretrained_model_name_or_path} is no diffusion model of betas: its "
-                "scheduler has no beta_schedule"
+                f"{self.cfg.pretrained_model_name_or_path} has no known noise schedule: "
+                "its scheduler has no beta_schedule"
             )
         self.prediction_type = scheduler.config.prediction_type
         if self.prediction_type not in PREDICTIONS:
@@ -189,10 +189,10 @@ class TextToImageDistillation(ScoreDistillation):
             if config[name] not in values
         ]:
             raise UserError(
-                f"{self.cfg.pretrained_model_name_or_path} isn't text to image alone "
-                f"({', '.join(other)}), as Stable Diffusion XL and"
-                " models for inpainting, depth or upscaling aren't: take Stable Diffusion 1.x "
-                "or 2.x, or the first stage of DeepFloyd IF"
+                f"{self.cfg.pretrained_model_name_or_path} needs other inputs than text "
+                f"({', '.join(other)}), like Stable Diffusion XL and"
+                " models for inpainting, depth or upscaling: use Stable Diffusion 1.x or 2.x, or "
+                "the first stage of DeepFloyd IF"
             )
 
     def network(

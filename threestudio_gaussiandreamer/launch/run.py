@@ -89,14 +89,14 @@ class Run:
                 self.write_index(began, time.perf_counter() - start)
             self.summarize()
         except Stopped as stop:
-            print(f"stopped at step {stop.step}; to go on: {self.resume_command()}", flush=True)
+            print(f"stopped at step {stop.step}; to resume: {self.resume_command()}", flush=True)
             return 128 + stop.signum
         except BaseException as stop:
             self.discard_if_unused()
             interrupted = isinstance(stop, (KeyboardInterrupt, SystemExit))
             # interrupted after training, while the test views are rendered
             if interrupted and self.args.stage == "train" and self.last.is_file():
-                print(f"to go on: {self.resume_command()}", flush=True)
+                print(f"to resume: {self.resume_command()}", flush=True)
             raise
         finally:
             self.claimed.release()
@@ -206,7 +206,7 @@ class Run:
         checkpoint_io = AtomicCheckpointIO()
         training = self.args.stage == "train"
         callbacks = [ProgressBar()] if options["enable_progress_bar"] else []
-        ours = {
+        required = {
             "accelerator": "gpu" if self.n_gpus else "cpu",
             "devices": self.n_gpus or 1,
             "logger": self.build_loggers() if training else False,
@@ -217,7 +217,7 @@ class Run:
         }
         if self.n_gpus > 1 and options.get("strategy", "auto") in ("auto", "ddp"):
             options["strategy"] = ReplicatedStrategy()
-        return build("trainer", pl.Trainer, options | ours)
+        return build("trainer", pl.Trainer, options | required)
 
     def build_loggers(self) -> list:
         folder = str(self.folder)

@@ -117,9 +117,9 @@ def _resume_newest(cfg: Any, tag: str) -> None:
             _set_trial(cfg, run.name)
             path, step = found
             cfg.resume = escape(str(path))
-            info(f"resume=auto: going on from {path} (step {step})")
+            info(f"resume=auto: resuming from {path} (step {step})")
             return
     info(
-        f"resume=auto: no checkpoint of {os.path.join(cfg.exp_dir, tag)} to go on from; "
+        f"resume=auto: no checkpoint of {os.path.join(cfg.exp_dir, tag)} to resume; "
         "starting from the prior"
     )

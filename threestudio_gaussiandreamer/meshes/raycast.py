@@ -218,9 +218,8 @@ def _embree_hits(
     origins = np.ascontiguousarray(np.broadcast_to(c2w[:3, 3].astype(np.float32), directions.shape))
     hits = scene.run(origins, directions, output=True)
     u, v = hits["u"], hits["v"]
-    barycentric = np.stack(
-        [1 - u - v, u, v], axis=1
-    )  # embree's u and v are the weights of the second and the third corner
+    # embree's u and v are the weights of the second and the third corner
+    barycentric = np.stack([1 - u - v, u, v], axis=1)
     shape = len(rows), len(columns)
     return hits["primID"].reshape(shape), barycentric.reshape(*shape, 3)
 

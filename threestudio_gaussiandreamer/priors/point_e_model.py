@@ -152,7 +152,9 @@ class Upsampler(PointTransformer):
 
 
 def timestep_embedding(timesteps: Real[Tensor, " B"], width: int) -> Float[Tensor, "B W"]:
-    """Cosines, then sines, of frequencies that fall from 1 to 1/10000 (Vaswani et al. 2017)."""
+    """Return cosines, then sines, of frequencies that fall from 1 to 1/10000 (Vaswani et
+    al. 2017).
+    """
     frequencies = torch.exp(
         -math.log(10000) * torch.arange(width // 2, device=timesteps.device) / (width // 2)
     )

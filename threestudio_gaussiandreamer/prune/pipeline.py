@@ -157,11 +157,11 @@ def prune_to_budget(
             suffix,
             spent,
         )
-    after = after._replace(pruned_to=_note(stored, after, asked, spent, met))
+    after = after._replace(pruned_to=_psnr_note(stored, after, asked, spent, met))
     return PruneResult(stored, after, time.perf_counter() - started, met)
 
 
-def _note(
+def _psnr_note(
     stored: StoredCloud, after: StoredCloud, asked: Budget, spent: float, met: bool
 ) -> Optional[float]:
     """Return the PSNR to the original that is stored in the file; None if there is no guarantee for
@@ -241,7 +241,7 @@ def _simplify(
     cloud = stored.gaussians.tensors(get_device())
     train_views, val_views, _ = views_of(stored, options)
 
-    def after_file(fewer: Gaussians) -> Gaussians:
+    def as_read_back(fewer: Gaussians) -> Gaussians:
         file = as_stored(stored._replace(gaussians=fewer.arrays()), suffix)
         return file.gaussians.tensors(get_device())
 
@@ -250,7 +250,7 @@ def _simplify(
         train_views,
         val_views,
         steps=options.steps,
-        as_stored=after_file,
+        as_stored=as_read_back,
         sh_reach=constant_sh_limit(cloud, suffix),
     )
     rounds = None if budget.count is None else rounds_to(budget.count, len(cloud.means))

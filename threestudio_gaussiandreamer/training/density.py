@@ -114,26 +114,26 @@ class DensityControl:
         if late:
             return (
                 f"{late} of the {len(rounds)} rounds of pruning would come after step {end}, the "
-                "last: give system.geometry.prune.start, stop and every to match"
+                "last: set system.geometry.prune.start, stop and every accordingly"
             )
         if budget == AUTO or count <= budget:
             return None
         return self._shortage([round_ for round_ in rounds if step < round_ <= end])
 
-    def _shortage(self, to_come: list[int]) -> Optional[str]:
+    def _shortage(self, remaining: list[int]) -> Optional[str]:
         """Describe why these rounds are too few for the budget; return None if they suffice."""
         budget, keep, count = self.cfg.budget, self.cfg.prune.keep, len(self.cloud)
-        if not to_come:
+        if not remaining:
             return (
-                f"no round of pruning is to come, so that {count} Gaussians stay, not {budget}: "
-                "give system.geometry.prune.start, stop and every to match"
+                f"no round of pruning remains, so {count} Gaussians are kept instead of {budget}: "
+                "set system.geometry.prune.start, stop and every accordingly"
             )
-        share = self.kept_share(count, to_come[0])
+        share = self.kept_share(count, remaining[0])
         if share >= keep - 0.005:
             return None
         return (
-            f"{len(to_come)} rounds of pruning have to lead from {count} Gaussians to {budget}: "
-            f"each keeps {share:.2f} instead of {keep:g}, which costs more; give more rounds "
+            f"{len(remaining)} rounds of pruning must reduce {count} Gaussians to {budget}: "
+            f"each keeps {share:.2f} instead of {keep:g}, which costs more; use more rounds "
             "(system.geometry.prune.every) or start with fewer"
         )
 
@@ -273,11 +273,11 @@ class DensityControl:
             count = len(scores)  # new Gaussians haven't been rendered, so have no statistics
         elif self.cfg.budget == AUTO:
             top = importance.top_count(stats.contribution) if cfg.score == "contribution" else 0
-            count, measured = fewest_that_hold(scores, max(count, top), check)
+            count, measured = smallest_passing_count(scores, max(count, top), check)
         return importance.keep_highest(values, scores, count, first), measured
 
 
-def fewest_that_hold(
+def smallest_passing_count(
     scores: Float[Tensor, " N"], least: int, check: QualityCheck
 ) -> tuple[int, dict[str, float]]:
     """Find the smallest number of Gaussians, at least ``least``, that passes ``check``.
@@ -287,7 +287,7 @@ def fewest_that_hold(
     """
     measured: dict[int, dict[str, float]] = {}
 
-    def holds(kept: Bool[Tensor, " N"]) -> bool:
+    def passes(kept: Bool[Tensor, " N"]) -> bool:
         result = check(kept)
         # processes render different views, but must make the same decision
         if not all_sum(result.margin) >= 0:
@@ -295,7 +295,7 @@ def fewest_that_hold(
         measured[int(kept.sum())] = result.measured
         return True
 
-    count = importance.smallest_count(scores, least, holds)
+    count = importance.smallest_count(scores, least, passes)
     return count, measured.get(count, {})
 
 
