@@ -6,9 +6,9 @@ its own, so that its memory can be measured; contenders alternate, so that all h
 Prints a table and writes ``benchmarks/results/splatting.csv``.
 
 Contenders: ``cpu`` (the best build for this processor), ``cpu-v3`` and ``cpu-base`` (builds for
-older ones), ``torch``, ``gsplat`` (its plain-torch twins, see gsplat_reference.py), and
+older ones), ``torch``, ``gsplat`` (its plain-torch functions, see gsplat_reference.py), and
 ``prototype``, the AVX-512 program that shows what a CPU can reach (where $GAUSSIANDREAMER_SHARED or
-``../shared`` has it). gsplat's twins keep every pair of Gaussian and pixel (3 GB at 100,000 and
+``../shared`` has it). gsplat's functions keep every pair of Gaussian and pixel (3 GB at 100,000 and
 512^2), so that pictures larger than --gsplat-size are left to the others."""
 
 import argparse
@@ -296,10 +296,10 @@ def parse(argv: list[str]) -> argparse.Namespace:
         help="the first one is the unit of the ratios",
     )
     parser.add_argument(
-        "--preset", default="fast", help="fast is what the prototype and every peer do"
+        "--preset", default="fast", help="fast: the threshold of the prototype and other libraries"
     )
     parser.add_argument(
-        "--gsplat-size", type=int, default=512, help="the largest picture that gsplat's twins draw"
+        "--gsplat-size", type=int, default=512, help="largest image for gsplat's functions"
     )
     parser.add_argument("--turns", type=int, default=2)
     parser.add_argument(

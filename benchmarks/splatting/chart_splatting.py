@@ -59,10 +59,12 @@ def settings() -> Iterator[Setting]:
     for preset in ("fast", "balanced", "accurate"):
         yield Setting("preset", preset, {"preset": preset})
     yield Setting(
-        "peers' cut-offs", "alpha 1/255 to 0.99", {"alpha_min": 1 / 255, "alpha_max": 0.99}
+        "other libraries' cutoffs", "alpha 1/255 to 0.99", {"alpha_min": 1 / 255, "alpha_max": 0.99}
     )
     yield Setting(
-        "peers' cut-offs", "alpha 1/255 to 0.999", {"alpha_min": 1 / 255, "alpha_max": 0.999}
+        "other libraries' cutoffs",
+        "alpha 1/255 to 0.999",
+        {"alpha_min": 1 / 255, "alpha_max": 0.999},
     )
 
 
@@ -259,8 +261,8 @@ def draw(rows: list[dict[str, str]]) -> None:
 def draw_marks(
     panel: Any, axes: Axes, rows: list[dict[str, str]], color: str, labelled: bool
 ) -> None:
-    """Mark presets, stops and the peers' cut-offs; presets with their initial."""
-    for group, marker in (("preset", "D"), ("stop", "x"), ("peers' cut-offs", "^")):
+    """Mark presets, stops and the other libraries' cutoffs; presets with their initial."""
+    for group, marker in (("preset", "D"), ("stop", "x"), ("other libraries' cutoffs", "^")):
         marks = [row for row in rows if row["group"] == group]
         label = group if labelled else None
         panel.plot(*columns(axes, marks), marker, color=color, markersize=6, label=label)

@@ -194,7 +194,7 @@ def test_logits_in_float32_at_512_are_stable():
     bank = torch.rand(2, size, generator=torch.Generator().manual_seed(0)) * 2 - 1
     bank[1] = bank[0] + 1e-3 * randn(
         size, seed=1, dtype=torch.float32
-    )  # near twins: the logits nearly cancel
+    )  # nearly equal images: the logits nearly cancel
     abar = ABAR[20:21]
     z = sds.add_noise(bank[:1], randn(1, size, seed=2, dtype=torch.float32), abar)
     variance = 2 * mode_variance(abar, 0.0)

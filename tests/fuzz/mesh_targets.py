@@ -56,7 +56,7 @@ def exercise_gltf_features(path: Path) -> None:
 
 
 def require_same_surface(mesh: Any, corners: np.ndarray) -> None:
-    """The triangles that a file says, in the product's pose: y up and z in front become z up and x
+    """The triangles that a file says, in the package's pose: y up and z in front become z up and x
     in front, the box is [-1, 1].
     """
     corners = corners[np.isfinite(corners).all(axis=(1, 2))]

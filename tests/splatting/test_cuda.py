@@ -215,7 +215,7 @@ def test_without_memory_for_one_view_there_is_a_picture_but_no_gradient(device, 
     assert torch.equal(known.image, short.image) and torch.equal(
         known.contribution, short.contribution
     )
-    with pytest.raises(UserError, match=r"reach \d+ tiles .* GiB .* fewer or smaller Gaussians"):
+    with pytest.raises(UserError, match=r"overlap \d+ tiles .* GiB .* fewer or smaller Gaussians"):
         short.image.sum().backward()
 
 

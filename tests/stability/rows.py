@@ -33,7 +33,7 @@ def row(group: str, name: str, *, bar: Optional[str] = None) -> pytest.MarkDecor
 
 
 GROUPS = {
-    "A0": "Faults in the peers' own code",
+    "A0": "Defects in other projects' code",
     "A1": "Rasteriser numerics",
     "A2": "Geometry and the first cloud",
     "A3": "Densification",

@@ -60,7 +60,7 @@ class Ledger:
     def ids(self) -> torch.Tensor:
         return self.geometry.sh0[:, 0, 0].detach().clone()
 
-    def fresh(self) -> torch.Tensor:
+    def is_new(self) -> torch.Tensor:
         """Return which Gaussians have no moments; the moments of all others must be their own, bit
         for bit.
         """
@@ -71,20 +71,20 @@ class Ledger:
             id(parameter) for parameter in self.geometry.parameters() if parameter.numel()
         }
         assert {id(parameter) for parameter in self.optimizer.state} <= held
-        fresh = torch.zeros(len(self.geometry), dtype=torch.bool)
+        is_new = torch.zeros(len(self.geometry), dtype=torch.bool)
         for i, parameter in enumerate(self.parameters()):
             state = self.optimizer.state[parameter]
-            zero = (state["exp_avg"].reshape(len(fresh), -1) == 0).all(1)
-            fresh = zero if i == 0 else fresh
+            zero = (state["exp_avg"].reshape(len(is_new), -1) == 0).all(1)
+            is_new = zero if i == 0 else is_new
             past = torch.where(
                 zero.reshape(-1, *[1] * (parameter.dim() - 1)), 0.0, spelt(self.ids(), parameter)
             )
             assert (
-                torch.equal(zero, fresh)
+                torch.equal(zero, is_new)
                 and torch.equal(state["exp_avg"], past)
                 and torch.equal(state["exp_avg_sq"], 2 * past)
             )
-        return fresh
+        return is_new
 
 
 def spelt(ids: torch.Tensor, parameter: torch.Tensor) -> torch.Tensor:
@@ -126,12 +126,12 @@ def test_moments_follow_their_gaussian(seed, measured):
             optimizer.state[parameter]["step"].item() for parameter in ledger.parameters()
         ]
         if steps:
-            fresh = ledger.fresh()
-            assert len(left[~fresh].unique()) == int((~fresh).sum())  # no history is duplicated
+            is_new = ledger.is_new()
+            assert len(left[~is_new].unique()) == int((~is_new).sum())  # no history is duplicated
             assert torch.isin(
-                left[fresh], ids[gradient > 0.6]
+                left[is_new], ids[gradient > 0.6]
             ).all()  # new Gaussians derive from selected ones
-            new += int(fresh.sum())
+            new += int(is_new.sum())
         gone += n - len(left.unique())
     assert new > 5 and gone > 5
     measured("to the bit")

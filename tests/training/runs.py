@@ -75,7 +75,7 @@ def launch(folder, mesh, *options, stage="--train"):
     return main(["--config", str(CONFIGS / "demo.yaml"), stage, "--gpu", "cpu", *overrides])
 
 
-def trial(folder):
+def run_folder(folder):
     return Path(folder) / "demo" / "t"
 
 

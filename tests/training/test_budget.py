@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from tests.training.runs import CONFIGS, PRUNE, SMALL, cloud_of, launch, mocked_config, trial
+from tests.training.runs import CONFIGS, PRUNE, SMALL, cloud_of, launch, mocked_config, run_folder
 from threestudio_gaussiandreamer.launch.experiment import main
 
 
@@ -15,7 +15,7 @@ def test_a_budget_without_remaining_rounds_gives_a_warning(tmp_path, painted_box
     steps = ["trainer.max_steps=7", "trainer.val_check_interval=7"]
     assert launch(tmp_path, painted_box, *PRUNE, *steps) == 0
     assert "no round of pruning" not in "".join(capsys.readouterr())
-    resume = f"resume={trial(tmp_path) / 'ckpts' / 'last.ckpt'}"
+    resume = f"resume={run_folder(tmp_path) / 'ckpts' / 'last.ckpt'}"
     options = [
         *PRUNE,
         "system.geometry.budget=100",
@@ -65,7 +65,9 @@ def test_auto_says_what_it_measured(tmp_path, painted_box, capsys, known):
     pattern = r"step (2|4): (\d+) -> (\d+) Gaussians; dB on the views of this step: " + measured
     rounds = [re.search(pattern, line) for line in said]
     assert len(rounds) == 2 and all(int(found[3]) == int(0.8 * int(found[2])) for found in rounds)
-    rows = list(csv.DictReader(open(trial(tmp_path) / "csv_logs" / "version_0" / "metrics.csv")))
+    rows = list(
+        csv.DictReader(open(run_folder(tmp_path) / "csv_logs" / "version_0" / "metrics.csv"))
+    )
     assert any(row.get("prune/lost" if known else "prune/likeness") for row in rows)
 
 
@@ -82,4 +84,4 @@ def test_a_budget_that_needs_larger_rounds_is_met_and_says_so(tmp_path, painted_
         r"instead of 0.8"
     )
     assert re.search(told, "".join(capsys.readouterr()))
-    assert len(cloud_of(trial(tmp_path) / "ckpts" / "last.ckpt")["geometry.means"]) == 70
+    assert len(cloud_of(run_folder(tmp_path) / "ckpts" / "last.ckpt")["geometry.means"]) == 70

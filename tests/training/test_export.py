@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from tests.training.runs import cloud_of, launch, trial
+from tests.training.runs import cloud_of, launch, run_folder
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.formats.spz import read_spz
@@ -25,7 +25,7 @@ def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted
         )
         == 0
     )
-    export = trial(tmp_path) / "save" / "it4-export"
+    export = run_folder(tmp_path) / "save" / "it4-export"
     assert len(read_gaussians(export / "gaussians.ply").means) == 200
     first = read_gaussians(export / "pruned" / "gaussians.ply")
     assert len(first.means) == len(read_spz(export / "pruned" / "gaussians.spz").means) == 90
@@ -38,11 +38,11 @@ def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted
     )
     shutil.rmtree(export)
     resume = [
-        f"resume={trial(tmp_path) / 'ckpts' / 'last.ckpt'}",
+        f"resume={run_folder(tmp_path) / 'ckpts' / 'last.ckpt'}",
         "system.exporter.save_video=false",
     ]
     assert launch(tmp_path, painted_box, *options, *resume, stage="--export") == 0
-    (again,) = trial(tmp_path).parent.glob("*/save/it4-export/pruned/gaussians.ply")
+    (again,) = run_folder(tmp_path).parent.glob("*/save/it4-export/pruned/gaussians.ply")
     assert all(
         a.tobytes() == b.tobytes() for a, b in zip(read_gaussians(again), first, strict=True)
     )
@@ -61,7 +61,7 @@ def test_pruned_exports_note_what_they_have_spent(tmp_path, painted_box, capsys)
         )
         == 0
     )
-    files = trial(tmp_path) / "save" / "it2-export" / "pruned"
+    files = run_folder(tmp_path) / "save" / "it2-export" / "pruned"
     said = capsys.readouterr().out
     for name in ("gaussians.ply", "gaussians.spz"):
         assert str(files / name) in said  # where everything is
@@ -72,7 +72,7 @@ def test_test_validate_and_export_use_the_checkpoint_and_no_prior(tmp_path, pain
     mesh = tmp_path / "box.glb"
     mesh.write_bytes(painted_box.read_bytes())
     assert launch(tmp_path, mesh, "trainer.max_steps=3", "trainer.val_check_interval=3") == 0
-    save, last = trial(tmp_path) / "save", trial(tmp_path) / "ckpts" / "last.ckpt"
+    save, last = run_folder(tmp_path) / "save", run_folder(tmp_path) / "ckpts" / "last.ckpt"
     trained = (save / "it3-test" / "1.png").read_bytes()
     for path in (
         *save.glob("it3-test/*"),

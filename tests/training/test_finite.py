@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.training.runs import launch, trial
+from tests.training.runs import launch, run_folder
 from threestudio_gaussiandreamer.training import system
 from threestudio_gaussiandreamer.training.finite import (
     NonFiniteParameters,
@@ -74,7 +74,7 @@ def test_a_non_finite_state_never_replaces_a_good_checkpoint(tmp_path, painted_b
         "trainer.val_check_interval=4",
     ]
     assert launch(tmp_path, painted_box, *every) == 2
-    last = trial(tmp_path) / "ckpts" / "last.ckpt"
+    last = run_folder(tmp_path) / "ckpts" / "last.ckpt"
     found = torch.load(last, weights_only=True)
     assert found["global_step"] == 2 and found["state_dict"]["geometry.means"].isfinite().all()
     monkeypatch.undo()

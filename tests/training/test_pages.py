@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.training.runs import launch, trial
+from tests.training.runs import launch, run_folder
 from threestudio_gaussiandreamer.core.images import read
 from threestudio_gaussiandreamer.formats.spz import read_spz
 
@@ -28,7 +28,7 @@ def save(tmp_path_factory, painted_box):
         "system.renderer.antialias=true",
     ]
     assert launch(folder, painted_box, *options, *SHORT) == 0
-    return trial(folder) / "save"
+    return run_folder(folder) / "save"
 
 
 def test_a_run_ends_with_a_page_of_its_cloud(save):
@@ -72,7 +72,7 @@ def test_export_writes_the_page_again(save, painted_box, tmp_path):
 
 def test_pages_can_be_switched_off(painted_box, tmp_path):
     assert launch(tmp_path, painted_box, "system.pages=false", *SHORT) == 0
-    save = trial(tmp_path) / "save"
+    save = run_folder(tmp_path) / "save"
     assert not [*save.rglob("*.html"), *save.rglob("poster.png"), *save.rglob("prior/*.spz")]
 
 

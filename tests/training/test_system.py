@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from tests.training.runs import DENSIFY, PRUNE, SMALL, cloud_of, launch, mocked_config, same, trial
+from tests.training.runs import (
+    DENSIFY,
+    PRUNE,
+    SMALL,
+    cloud_of,
+    launch,
+    mocked_config,
+    run_folder,
+    same,
+)
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh0_to_rgb
 from threestudio_gaussiandreamer.guidance.known_truth import MeshTruth
@@ -38,12 +47,12 @@ def test_a_run_with_a_mocked_guidance_goes_from_prior_to_files(tmp_path, painted
         )
         == 0
     )
-    save = trial(tmp_path) / "save"
+    save = run_folder(tmp_path) / "save"
     assert (save / "it3-0.png").is_file() and (save / "it6-0.png").is_file()
     assert (save / "it6-test.mp4").stat().st_size > 0 and (save / "it6-test" / "2.png").is_file()
     assert len(read_gaussians(save / "it6-export" / "gaussians.ply").means) == 200
-    assert (trial(tmp_path) / "ckpts" / "last.ckpt").is_file() and (
-        trial(tmp_path) / "cmd.txt"
+    assert (run_folder(tmp_path) / "ckpts" / "last.ckpt").is_file() and (
+        run_folder(tmp_path) / "cmd.txt"
     ).is_file()
 
 
@@ -51,12 +60,12 @@ def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, pai
     assert (
         launch(tmp_path, painted_box, "trainer.max_steps=60", "trainer.val_check_interval=60") == 0
     )
-    metrics = json.loads((trial(tmp_path) / "save" / "metrics.json").read_text())
+    metrics = json.loads((run_folder(tmp_path) / "save" / "metrics.json").read_text())
     assert (
         metrics["result"]["psnr"] > metrics["prior"]["psnr"] + 1.5
     )  # 60 steps at 24 pixels give about 4 dB
     assert metrics["result"]["step"] == 60 and metrics["result"]["gaussians"] == 200
-    (exported,) = (trial(tmp_path) / "save").glob("it60-export/gaussians.ply")
+    (exported,) = (run_folder(tmp_path) / "save").glob("it60-export/gaussians.ply")
     colors = sh0_to_rgb(read_gaussians(exported).sh[:, 0])
     assert (
         colors.min() > -1e-6 and colors.max() < 1 + 1e-6 and metrics["result"]["out_of_gamut"] == 0
@@ -68,9 +77,11 @@ def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, pai
         and ".ply" in printed
         and "multi-face" in printed
     )
-    rows = list(csv.DictReader(open(trial(tmp_path) / "csv_logs" / "version_0" / "metrics.csv")))
+    rows = list(
+        csv.DictReader(open(run_folder(tmp_path) / "csv_logs" / "version_0" / "metrics.csv"))
+    )
     assert {"loss", "gaussians", "dB", "train/loss_sds", "train/grad_norm"} <= set(rows[0])
-    events = tensorboard_events(trial(tmp_path))
+    events = tensorboard_events(run_folder(tmp_path))
     logged = [(event.step, round(event.value, 3)) for event in events.Scalars("held_out/psnr")]
     assert logged == [(0, metrics["prior"]["psnr"]), (60, metrics["result"]["psnr"])]
     assert [event.step for event in events.Images("validation/0")] == [60]
@@ -128,7 +139,7 @@ def test_looking_at_pictures_is_no_training_time(tmp_path, painted_box, monkeypa
         )
         == 0
     )
-    assert json.loads((trial(tmp_path) / "save" / "metrics.json").read_text())["seconds"] == 2
+    assert json.loads((run_folder(tmp_path) / "save" / "metrics.json").read_text())["seconds"] == 2
 
 
 @pytest.mark.slow
@@ -149,11 +160,11 @@ def test_a_stopped_and_resumed_run_equals_the_run_that_never_stopped(
 
     train("whole", 9, 9)
     train("parts", stop, 1)
-    last = trial(tmp_path / "parts") / "ckpts" / "last.ckpt"
+    last = run_folder(tmp_path / "parts") / "ckpts" / "last.ckpt"
     assert changes is DENSIFY or cloud_of(last)["geometry.removal"].any()  # stopped between samples
     train("parts", 9, 2, f"resume={last}")
     whole, parts = (
-        torch.load(trial(tmp_path / name) / "ckpts" / "last.ckpt", weights_only=True)
+        torch.load(run_folder(tmp_path / name) / "ckpts" / "last.ckpt", weights_only=True)
         for name in ("whole", "parts")
     )
     assert whole["global_step"] == parts["global_step"] == 9
@@ -179,7 +190,7 @@ def test_regularisers_have_real_gradients_on_the_real_alpha(tmp_path, painted_bo
     weights = ["system.loss.lambda_sds=0", f"system.loss.lambda_{name}=100"]
     assert launch(tmp_path, painted_box, *base, *weights) == 0
     opacity = torch.sigmoid(
-        cloud_of(trial(tmp_path) / "ckpts" / "last.ckpt")["geometry.logit_opacities"]
+        cloud_of(run_folder(tmp_path) / "ckpts" / "last.ckpt")["geometry.logit_opacities"]
     ).mean()
     assert sign * (opacity - 0.7) > 0.02
 
@@ -195,7 +206,9 @@ def test_a_learned_background_learns_and_is_in_the_checkpoint(tmp_path, painted_
         "trainer.val_check_interval=20",
     ]
     assert main(["--config", str(config), "--train", "--gpu", "cpu", *overrides]) == 0
-    color = torch.sigmoid(cloud_of(trial(tmp_path) / "ckpts" / "last.ckpt")["background.logit"])
+    color = torch.sigmoid(
+        cloud_of(run_folder(tmp_path) / "ckpts" / "last.ckpt")["background.logit"]
+    )
     assert (
         color[0] > 0.7 and color[1] < 0.35 and color[2] < 0.3
     )  # on its way from grey to the mock's (0.9, 0.2, 0.1)
