@@ -116,7 +116,7 @@ def test_every_format_is_exported_and_says_that_it_was_trained_antialiased(tmp_p
     ]
     steps = ["trainer.max_steps=1", "trainer.val_check_interval=1"]
     assert launch(tmp_path, painted_box, *options, *steps) == 0
-    export = trial(tmp_path) / "save" / "it1-export"
+    export = run_folder(tmp_path) / "save" / "it1-export"
     suffixes = ["ply", "compressed.ply", "spz", "sog", "glb"]
     stored = [read_cloud(str(export / f"gaussians.{suffix}")) for suffix in suffixes]
     assert [cloud.antialiased for cloud in stored] == [True] * 5
