@@ -34,7 +34,7 @@ RINGS = (
         ("core", "gaussians", "formats", "splatting", "diffusion", "meshes", "cameras", "metrics"),
     ),
     Ring("1 host", "#dcfce7", ("host", "models")),
-    Ring("2 parts", "#fef9c3", ("prompts", "priors", "guidance", "exporters")),
+    Ring("2 parts", "#fef9c3", ("prompts", "priors", "guidance", "surface", "exporters")),
     Ring("3 training", "#ffedd5", ("training", "prune", "view", "convert")),
     Ring("4 programs", "#fee2e2", ("launch", "evaluation", "evaluate", "toybox")),
 )

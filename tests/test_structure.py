@@ -46,6 +46,7 @@ HEAVY = HOST | {
     "smplx",
     "zstandard",
 }
+HEAVY |= {"skimage", "fast_simplification", "xatlas"}
 LONGEST_FUNCTION, LONGEST_FILE, LONGEST_LINE, MODULES_AT_THE_TOP = 40, 400, 100, 5
 MOST_EQUAL_LINES = 5
 KERNEL_SOURCES = {".cpp", ".cu", ".cuh", ".h"}

@@ -6,13 +6,14 @@ and the system writes each with its method ``save_<save_type>(name, **params)``.
 
 import os
 from dataclasses import dataclass, field
-from typing import List, Optional
+from typing import List, NamedTuple, Optional
 
 from ..core.errors import UserError
 from ..core.options import check_options, one_of, rule
 from ..formats.gaussian_files import FORMATS, StoredCloud
 from ..gaussians.axes import AXES
 from ..gaussians.gaussians import Gaussians, finite
+from ..gaussians.views import EPS2D
 from ..host import BaseGeometry, Exporter, ExporterOutput
 
 NAME_BYTES = 255
@@ -44,6 +45,14 @@ UP = one_of(AXES)
 """The rule for the option ``up``, the axis of the file that points up."""
 
 
+class Drawing(NamedTuple):
+    """How a run draws its cloud."""
+
+    eps2d: float = EPS2D
+    """Screen-space dilation in square pixels of the final image."""
+    antialias: bool = False
+
+
 class FileExporter(Exporter):
     """Base class of exporters that write one file."""
 
@@ -54,6 +63,8 @@ class FileExporter(Exporter):
     cfg: Config
     shared: Optional[Gaussians] = None
     """Set by the bundle exporter, which reads the Gaussians once for all formats."""
+    drawing: Drawing = Drawing()
+    """Set by the system before the call."""
 
     def configure(self, geometry: BaseGeometry, *args: object, **kwargs: object) -> None:
         check_options(self.Config, self.cfg)

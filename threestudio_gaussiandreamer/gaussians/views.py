@@ -15,6 +15,7 @@ from ..core.errors import UserError
 from ..core.streams import generator
 from ..metrics import MAX_PSNR, psnr
 from ..splatting import rasterize
+from ..splatting.output import Rasterized
 from .gaussians import Gaussians
 from .sh import sh_to_colors
 
@@ -30,6 +31,8 @@ plane.
 MAX_RADIUS = 1e15
 """Largest radius of a cloud, in its units: squares of distances stay within float32's range."""
 VIEWS_PER_CALL = 4
+SINES, DISTANCES = (-0.5, 0.9), (1.0, 1.4)
+"""Of the views by default: the range of the sine of the elevation, and relative distances."""
 
 
 class Views(NamedTuple):
@@ -75,8 +78,10 @@ def views_around(
     *,
     turn: float = 0.0,
     to_z_up: Optional[Float[Tensor, "3 3"]] = None,
+    sines: tuple[float, float] = SINES,
+    distances: tuple[float, ...] = DISTANCES,
 ) -> Views:
-    """Place views around Gaussians on a golden-angle spiral, at two alternating distances.
+    """Place views around Gaussians on a golden-angle spiral, at alternating distances.
 
     Each view has its own random background, so that Gaussians of the background's colour still
     have a removal error and opacities are observed.
@@ -87,13 +92,15 @@ def views_around(
         size: width and height of their images, pixels.
         turn: azimuth of the first view, degrees.
         to_z_up: rotation from the cloud's axes to axes with z up.
+        sines: of the elevations of the first and the last view.
+        distances: relative to that at which the ball of :func:`bounds` fills the view.
 
     Raises:
         UserError: the radius of the cloud exceeds ``MAX_RADIUS``.
     """
     centre, radius = bounds(cloud)
     _require_renderable(cloud, radius)
-    c2w = _spiral(count, radius, turn).to(centre)
+    c2w = _spiral(count, radius, turn, sines, distances).to(centre)
     if to_z_up is not None:
         c2w[:, :3] = to_z_up.T.to(c2w) @ c2w[:, :3]
     c2w[:, :3, 3] += centre
@@ -114,11 +121,17 @@ def _require_renderable(cloud: Gaussians, radius: float) -> None:
         )
 
 
-def _spiral(count: int, radius: float, turn: float) -> Float[Tensor, "V 3 4"]:
+def _spiral(
+    count: int,
+    radius: float,
+    turn: float,
+    sines: tuple[float, float],
+    distances: tuple[float, ...],
+) -> Float[Tensor, "V 4 4"]:
     """Return camera-to-world matrices of views that show a ball around the origin."""
     index = torch.arange(count)
-    elevation = torch.rad2deg(torch.asin(torch.linspace(-0.5, 0.9, count)))
-    distance = radius / math.sin(FOVY / 2) * torch.tensor([1.0, 1.4])[index % 2]
+    elevation = torch.rad2deg(torch.asin(torch.linspace(*sines, count)))
+    distance = radius / math.sin(FOVY / 2) * torch.tensor(distances)[index % len(distances)]
     azimuth = (turn + index * 137.50776) % 360.0
     return Orbit(elevation, azimuth, distance, torch.full((count,), FOVY)).c2w
 
@@ -132,26 +145,40 @@ def draw(
         rows: (B,) indices of the views.
         opacities: used instead of the cloud's own, for gradients with respect to them.
     """
-    opacities = cloud.logit_opacities.sigmoid() if opacities is None else opacities
-    dirs = torch.nn.functional.normalize(cloud.means.detach() - views.positions[rows, None], dim=-1)
     grey = torch.full((3,), 0.5, device=cloud.means.device)
-    out = rasterize(
+    background = grey if views.backgrounds is None else views.backgrounds[rows]
+    out = rasterize_views(cloud, views, rows, background, opacities=opacities)
+    return out.image, out.contribution
+
+
+def rasterize_views(
+    cloud: Gaussians,
+    views: Views,
+    rows: Tensor,
+    background: Float[Tensor, "... C"],
+    *,
+    opacities: Optional[Float[Tensor, " N"]] = None,
+    channels: Optional[Float[Tensor, "B N K"]] = None,
+) -> Rasterized:
+    """Rasterize some of the views; ``channels`` are composited after the three colours."""
+    dirs = torch.nn.functional.normalize(cloud.means.detach() - views.positions[rows, None], dim=-1)
+    colors = sh_to_colors(cloud.sh, dirs)
+    return rasterize(
         cloud.means,
         cloud.quats,
         cloud.log_scales.exp(),
-        opacities,
-        sh_to_colors(cloud.sh, dirs),
+        cloud.logit_opacities.sigmoid() if opacities is None else opacities,
+        colors if channels is None else torch.cat([colors, channels], dim=-1),
         views.viewmats[rows],
         views.Ks[rows],
         views.size,
         views.size,
-        background=grey if views.backgrounds is None else views.backgrounds[rows],
+        background=background,
         near=views.near,
         far=math.inf,
         eps2d=views.eps2d,
         antialias=views.antialias,
     )
-    return out.image, out.contribution
 
 
 @torch.no_grad()

@@ -28,6 +28,7 @@ MODULES = (
     "exporters.usda",
     "exporters.points",
     "exporters.surface",
+    "exporters.mesh",
     "exporters.bundle",
     "training.system",
 )

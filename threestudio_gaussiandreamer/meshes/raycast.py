@@ -96,6 +96,23 @@ class MeshCaster:
                 )
         return images
 
+    def visible(
+        self, c2w: Float[np.ndarray, "4 4"], fovy: float, height: int, width: int
+    ) -> tuple[tuple[int, int], Int[np.ndarray, "h w"], Float[np.ndarray, "h w 3"]]:
+        """Return what is seen at the centres of the pixels that the mesh may cover.
+
+        Args:
+            c2w, fovy: as in :meth:`render`.
+
+        Returns:
+            the row and the column of the first of these pixels, and for each the index of the
+            nearest face, -1 for none, with its barycentric weights.
+        """
+        focal = height / (2 * math.tan(fovy / 2))
+        top, bottom, left, right = self._bounds(c2w, focal, height, width)
+        rows, columns = _samples(top, bottom, 1) - height / 2, _samples(left, right, 1) - width / 2
+        return (top, left), *self._hits(c2w, focal, rows, columns)
+
     def _bands(
         self, image: Float[np.ndarray, "H W 4"], c2w: np.ndarray, fovy: float, supersample: int
     ) -> list[Callable[[], None]]:

@@ -5,16 +5,18 @@ to ``system.prune``.
 from pathlib import Path
 from typing import Any, Optional
 
-from ..exporters.base import read_gaussians
+from ..exporters.base import Drawing, FileExporter, read_gaussians
 from ..formats.gaussian_files import StoredCloud, write_cloud
 from ..formats.obj import write_obj
 from ..formats.ply import write_points
 from ..formats.spz import VERSION
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.surface import Surface
-from ..gaussians.views import EPS2D
 from ..host import find
+from ..meshes.mesh import Mesh
+from ..meshes.write import write_textured_mesh
 from ..prune import PruneOptions, prune_to_budget, write_report
+from ..view.render import RenderSettings
 from .pages import write_pages
 from .renderer import SplattingRenderer
 
@@ -54,7 +56,7 @@ class GaussianSavers:
         **options: Any,
     ) -> str:
         path = self.get_save_path(filename)
-        stored = stored._replace(pruned_to=pruned_to, antialiased=is_antialiased(self))
+        stored = stored._replace(pruned_to=pruned_to, antialiased=drawing(self).antialias)
         write_cloud(path, stored, suffix, **options)
         return path
 
@@ -63,16 +65,15 @@ class GaussianSavers:
         write_points(path, cloud)
         return path
 
+    def save_textured_mesh(self, filename: str, mesh: Mesh, unlit: bool) -> str:
+        path = self.get_save_path(filename)
+        write_textured_mesh(path, mesh, unlit=unlit)
+        return path
+
     def save_surface(self, filename: str, surface: Surface) -> str:
         path = self.get_save_path(filename)
         write_obj(path, surface)
         return path
-
-
-def is_antialiased(system: Any) -> bool:
-    """Return whether a system trains with antialiasing, which only our renderer has."""
-    renderer = getattr(system, "renderer", None)
-    return isinstance(renderer, SplattingRenderer) and bool(renderer.cfg.antialias)
 
 
 def export(system: Any) -> None:
@@ -103,6 +104,9 @@ def export_cloud(
     """
     parts = {"geometry": geometry, "material": system.material, "background": system.background}
     exporter = find(system.cfg.exporter_type)(system.cfg.exporter, **parts)
+    for part in (exporter, *getattr(exporter, "exporters", ())):
+        if isinstance(part, FileExporter):
+            part.drawing = drawing(system)
     for out in exporter():
         noted = {"pruned_to": pruned_to} if out.save_type in CLOUDS else {}
         save = getattr(system, f"save_{out.save_type}")
@@ -128,14 +132,21 @@ def export_pruned(system: Any) -> None:
 
 def prune_options(system: Any) -> PruneOptions:
     """Return ``system.prune``, with the dilation and antialiasing of our renderer unless given."""
-    options, renderer = PruneOptions(**dict(system.cfg.prune)), system.renderer
-    ours = renderer.cfg if isinstance(renderer, SplattingRenderer) else None
+    options, drawn = PruneOptions(**dict(system.cfg.prune)), drawing(system)
     if options.eps2d is None:
-        # in square pixels of what is exported, which downsampling has made smaller
-        options.eps2d = ours.eps2d / ours.downsample**2 if ours else EPS2D
+        options.eps2d = drawn.eps2d
     if options.antialias is None:
-        options.antialias = is_antialiased(system)
+        options.antialias = drawn.antialias
     return options
+
+
+def drawing(system: Any) -> Drawing:
+    """Return how a system draws; with another renderer than ours, as most viewers do."""
+    renderer = getattr(system, "renderer", None)
+    if not isinstance(renderer, SplattingRenderer):
+        return Drawing()
+    settings = RenderSettings.of(renderer.cfg, bound_colors=True)
+    return Drawing(settings.eps2d, settings.antialias)
 
 
 def _suffix(cfg: Any) -> str:

@@ -1,0 +1,101 @@
+"""Textured meshes are written so that other programs read them: upright, closed, in sRGB."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.meshes.load import load_mesh
+from threestudio_gaussiandreamer.meshes.mesh import Mesh, surface_colors
+from threestudio_gaussiandreamer.meshes.write import welded, write_textured_mesh
+from threestudio_gaussiandreamer.surface.unwrap import in_grid
+
+
+def textured_box():
+    """Return a closed box, y up, taller than wide, whose top is red and whose rest is grey."""
+    box = trimesh.creation.box((1, 2, 1.5))
+    atlas = in_grid(box.vertices, box.faces, 64)
+    mesh = Mesh(box.vertices[atlas.rows], atlas.faces, uv=atlas.uv)
+    texture = np.full((64, 64, 3), 128, np.uint8)
+    for corners in mesh.faces[(mesh.vertices[mesh.faces][..., 1] > 0.99).all(axis=1)]:
+        columns, rows = (mesh.uv[corners] * [64, -64] + [0, 64]).T
+        box_of = [slice(int(x.min()) - 1, int(np.ceil(x.max())) + 1) for x in (rows, columns)]
+        texture[tuple(slice(max(s.start, 0), s.stop) for s in box_of)] = [200, 30, 20]
+    return mesh._replace(texture=texture)
+
+
+MESH = textured_box()
+
+
+def document(path):
+    data = path.read_bytes()
+    magic, version, size, length, kind = struct.unpack("<4sIII4s", data[:20])
+    assert (magic, version, size, kind) == (b"glTF", 2, len(data), b"JSON") and size % 4 == 0
+    return json.loads(data[20 : 20 + length])
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+class TestBothFormats:
+    def test_trimesh_reads_a_closed_upright_mesh(self, suffix, tmp_path):
+        path = tmp_path / f"box{suffix}"
+        write_textured_mesh(path, MESH)
+        read = trimesh.load(path, force="mesh")
+        np.testing.assert_allclose(read.extents, [1, 2, 1.5], atol=1e-6)
+        material = read.visual.material
+        picture = getattr(material, "image", None) or material.baseColorTexture
+        np.testing.assert_array_equal(np.asarray(picture), MESH.texture)
+        read.merge_vertices(merge_tex=True, merge_norm=True)
+        assert read.is_watertight and read.volume == pytest.approx(3)
+
+    def test_our_own_reader_gives_the_same_colours(self, suffix, tmp_path):
+        path = tmp_path / f"box{suffix}"
+        write_textured_mesh(path, MESH)
+        read = load_mesh(path)
+        face = np.arange(len(read.faces))
+        middle = np.full((len(face), 3), 1 / 3)
+        up = read.vertices[read.faces].mean(axis=1)[:, 2] > 0.99  # y of the file is our z
+        colors = surface_colors(read, face, middle) * 255
+        np.testing.assert_allclose(colors[up], [[200, 30, 20]] * up.sum(), atol=1)
+        assert up.sum() == 2
+
+    def test_a_folder_that_is_missing_is_named(self, suffix, tmp_path):
+        with pytest.raises(UserError, match="cannot write .*nowhere"):
+            write_textured_mesh(tmp_path / "nowhere" / f"box{suffix}", MESH)
+
+    def test_nan_is_refused(self, suffix, tmp_path):
+        broken = MESH._replace(vertices=np.where(MESH.vertices > 0.9, np.nan, MESH.vertices))
+        with pytest.raises(UserError, match="NaN or infinity"):
+            write_textured_mesh(tmp_path / f"box{suffix}", broken)
+        assert not list(tmp_path.iterdir())
+
+
+def test_another_format_is_refused(tmp_path):
+    with pytest.raises(UserError, match=r"\.glb or \.obj"):
+        write_textured_mesh(tmp_path / "box.fbx", MESH)
+
+
+@pytest.mark.parametrize("unlit", [False, True])
+def test_the_material_is_rough_and_not_metallic(unlit, tmp_path):
+    write_textured_mesh(tmp_path / "box.glb", MESH, unlit=unlit)
+    found = document(tmp_path / "box.glb")
+    material = found["materials"][0]["pbrMetallicRoughness"]
+    assert (material["metallicFactor"], material["roughnessFactor"]) == (0, 1)
+    assert ("KHR_materials_unlit" in found.get("extensionsUsed", ())) == unlit
+    assert ("extensions" in found["materials"][0]) == unlit
+
+
+def test_an_obj_names_its_files_and_every_position_once(tmp_path):
+    write_textured_mesh(tmp_path / "box.obj", MESH)
+    lines = (tmp_path / "box.obj").read_text().splitlines()
+    assert lines[0] == "mtllib box.mtl" and sum(line.startswith("v ") for line in lines) == 8
+    assert "map_Kd box.png" in (tmp_path / "box.mtl").read_text().splitlines()
+
+
+def test_normals_point_outwards_and_are_unit():
+    joined = welded(MESH)
+    assert len(joined.positions) == 8
+    np.testing.assert_allclose(np.linalg.norm(joined.normals, axis=1), 1)
+    assert ((joined.normals * joined.positions).sum(axis=1) > 0).all()

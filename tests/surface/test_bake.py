@@ -1,0 +1,68 @@
+"""Textures hold the colours of the renders, and no gaps."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from threestudio_gaussiandreamer.cameras import Orbit
+from threestudio_gaussiandreamer.meshes.mesh import Mesh
+from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
+from threestudio_gaussiandreamer.surface.bake import bake, filled
+from threestudio_gaussiandreamer.surface.renders import Renders
+from threestudio_gaussiandreamer.surface.unwrap import in_charts, in_grid
+
+FOVY = math.radians(50)
+
+
+def cameras(count, turn=0.0):
+    index = torch.arange(count)
+    elevation = torch.rad2deg(torch.asin(torch.linspace(-0.9, 0.9, count)))
+    angle = torch.full((count,), FOVY)
+    orbit = Orbit(elevation, turn + 137.5 * index, torch.full((count,), 3.0), angle)
+    return orbit.c2w.double().numpy()
+
+
+@pytest.mark.parametrize("unwrapped", [in_charts, in_grid])
+def test_renders_of_the_baked_mesh_are_those_it_was_baked_from(unwrapped):
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    painted = Mesh(ball.vertices, ball.faces, vertex_colors=(0.5 + 0.4 * ball.vertices))
+    caster, size = MeshCaster(painted), 160
+    images = caster.render_views([(c2w, FOVY) for c2w in cameras(16)], size, size, supersample=1)
+    renders = Renders(cameras(16), np.round(255 * images).astype(np.uint8), FOVY)
+    atlas = unwrapped(ball.vertices, ball.faces, 160)
+    mesh = Mesh(ball.vertices[atlas.rows], atlas.faces, uv=atlas.uv)
+    baked = MeshCaster(mesh._replace(texture=bake(mesh, renders, 160)))
+    unseen = [(c2w, FOVY) for c2w in cameras(5, turn=60)]
+    ours, truth = (each.render_views(unseen, 96, 96) for each in (baked, caster))
+    error = np.square(ours - truth).mean()
+    assert -10 * np.log10(error) > 40
+
+
+def test_what_is_hidden_takes_nothing():
+    """A wall behind another one: only the one in front is seen, so only it gets its colour."""
+    wall = np.array([[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]], float)
+    vertices = np.concatenate([wall + [0.5, 0, 0], wall - [0.5, 0, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [0.4, 0.9] + 0.05
+    mesh = Mesh(vertices, faces, uv=np.concatenate([square, square + [0.5, 0]]))
+    orbit = Orbit(*(torch.tensor([value]) for value in (0.0, 0.0, 3.0, FOVY)))
+    rgba = np.zeros((1, 64, 64, 4), np.uint8)
+    rgba[...] = [200, 40, 10, 255]
+    texture = bake(mesh, Renders(orbit.c2w.double().numpy(), rgba, FOVY), 32)
+    assert (texture[4:-4, 4:12] == [200, 40, 10]).all()
+    caster = MeshCaster(mesh)
+    _, face, _ = caster.visible(orbit.c2w[0].double().numpy(), FOVY, 64, 64)
+    assert set(np.unique(face)) <= {-1, 0, 1}
+
+
+def test_gaps_take_the_mean_of_their_surroundings():
+    colors, known = np.zeros((7, 9, 3)), np.zeros((7, 9), bool)
+    colors[0, 0], colors[6, 8] = 10, 30
+    known[0, 0] = known[6, 8] = True
+    found = filled(colors, known)
+    assert (found[0, 0] == 10).all() and (found[6, 8] == 30).all()
+    assert (found[1, 1] == 10).all() and 10 <= found.min() and found.max() <= 30
+    np.testing.assert_array_equal(filled(colors, np.zeros((7, 9), bool)), colors)

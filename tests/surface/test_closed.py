@@ -1,0 +1,92 @@
+"""Parts, simplification and touching parts of closed meshes."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.surface.closed import (
+    is_closed,
+    separated,
+    simplified,
+    without_folds,
+    without_small_parts,
+)
+
+
+def ball(radius=1.0, subdivisions=3, place=(0, 0, 0)):
+    found = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return found.vertices + place, found.faces
+
+
+def joined(*parts):
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    faces = [part[1] + start for part, start in zip(parts, starts, strict=False)]
+    return np.concatenate([part[0] for part in parts]), np.concatenate(faces)
+
+
+def welded(vertices, faces):
+    positions, rows = np.unique(vertices, axis=0, return_inverse=True)
+    return positions, rows.reshape(-1)[faces]
+
+
+def boxes_with_a_common_edge():
+    box = trimesh.creation.box()
+    return welded(*joined((box.vertices, box.faces), (box.vertices + [1, 1, 0], box.faces)))
+
+
+def test_small_parts_and_cavities_are_dropped():
+    vertices, faces = ball(subdivisions=2)
+    cavity = ball(0.5, 2)[0], ball(0.5, 2)[1][:, ::-1]
+    kept = without_small_parts(*joined(ball(0.05, 1, (2, 0, 0)), cavity, (vertices, faces)), 0.01)
+    np.testing.assert_array_equal(kept[0], vertices)
+    np.testing.assert_array_equal(kept[1], faces)
+
+
+def test_parts_above_the_share_stay():
+    two = joined(ball(), ball(0.5, 2, (2, 0, 0)))
+    assert len(without_small_parts(*two, 0.1)[1]) == len(two[1])
+
+
+@pytest.mark.parametrize("count", [100, 300])
+def test_simplified_meshes_stay_closed_and_keep_their_size(count):
+    vertices, faces = simplified(*ball(), count)
+    assert len(faces) <= count and is_closed(faces)
+    assert trimesh.Trimesh(vertices, faces, process=False).volume == pytest.approx(4.12, rel=0.08)
+
+
+def test_a_mesh_of_few_faces_is_left_as_it_is():
+    vertices, faces = ball(subdivisions=1)
+    again = simplified(vertices, faces, 5000)
+    assert len(again[1]) == len(faces) and is_closed(again[1])
+    np.testing.assert_allclose(np.sort(again[0], axis=0), np.sort(vertices, axis=0))
+
+
+def test_a_surface_with_a_hole_is_refused():
+    vertices, faces = ball(subdivisions=1)
+    with pytest.raises(UserError, match="closed with 5000 faces"):
+        simplified(vertices, faces[1:], 5000)
+
+
+def test_boxes_that_share_an_edge_are_separated():
+    vertices, faces = boxes_with_a_common_edge()
+    assert not is_closed(faces)
+    moved, apart = separated(vertices, faces)
+    assert is_closed(apart) and is_closed(welded(moved, apart)[1])
+    parts = trimesh.Trimesh(moved, apart, process=False).split()
+    assert len(parts) == 2
+    assert all(part.volume == pytest.approx(1, abs=0.1) for part in parts)
+
+
+def test_boxes_that_share_a_corner_are_separated():
+    box = trimesh.creation.box()
+    touching = welded(*joined((box.vertices, box.faces), (box.vertices + 1, box.faces)))
+    moved, apart = separated(*touching)
+    assert len(moved) == 16 and len(np.unique(moved, axis=0)) == 16 and is_closed(apart)
+
+
+def test_a_fold_is_dropped():
+    _, faces = ball(subdivisions=1)
+    fold = [[0, 1, 2], [2, 1, 0], [3, 3, 4]]
+    kept = without_folds(np.concatenate([faces, [[90, 91, 92], [92, 91, 90], fold[2]]]))
+    np.testing.assert_array_equal(kept, faces)

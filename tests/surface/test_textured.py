@@ -1,0 +1,119 @@
+"""Clouds become closed textured meshes that look like them; what can't be converted is refused."""
+
+import dataclasses
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers.painted_ball import painted_ball
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.gaussians.views import FOVY, rasterize_views, views_around
+from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
+from threestudio_gaussiandreamer.meshes.write import welded
+from threestudio_gaussiandreamer.surface import textured
+from threestudio_gaussiandreamer.surface.closed import is_closed
+from threestudio_gaussiandreamer.surface.options import MeshOptions
+from threestudio_gaussiandreamer.surface.renders import opengl
+from threestudio_gaussiandreamer.surface.textured import mesh_from_gaussians
+
+SMALL = MeshOptions(faces=600, texture=128, views=16, view_size=128, resolution=32)
+
+
+def closed(mesh):
+    return is_closed(welded(mesh).rows[mesh.faces])
+
+
+def psnr_to_cloud(mesh, gaussians, size=128):
+    """Return the PSNR of the mesh's views to the cloud's, over white, dB."""
+    cloud = gaussians.tensors()
+    views = views_around(cloud, 12, size, turn=33, distances=(1.2,))
+    rows, white = torch.arange(12), torch.ones(3)
+    truth = rasterize_views(cloud, views, rows, white).image.numpy()
+    cameras = [(c2w, FOVY) for c2w in opengl(views)]
+    ours = MeshCaster(mesh).render_views(cameras, size, size)
+    error = np.square(ours[..., :3] + 1 - ours[..., 3:] - truth).mean()
+    return -10 * np.log10(error)
+
+
+@pytest.mark.parametrize("method", ["fusion", "density"])
+def test_a_ball_becomes_a_closed_mesh_that_looks_like_it(method):
+    gaussians = painted_ball()
+    mesh = mesh_from_gaussians(gaussians, dataclasses.replace(SMALL, method=method))
+    assert closed(mesh) and len(mesh.faces) <= 600 and mesh.texture.shape == (128, 128, 3)
+    radius = np.linalg.norm(mesh.vertices, axis=1)
+    assert 0.75 < radius.min() and radius.max() < 0.95
+    assert psnr_to_cloud(mesh, gaussians) > 24
+
+
+def test_small_parts_are_dropped():
+    ball, speck = painted_ball(300), painted_ball(30, radius=0.03)
+    speck = speck._replace(means=speck.means + np.float32([1.2, 0, 0]))
+    both = type(ball)(*(np.concatenate(pair) for pair in zip(ball, speck, strict=True)))
+    assert mesh_from_gaussians(both, SMALL).vertices[:, 0].max() < 1
+
+
+def test_the_same_cloud_gives_the_same_mesh():
+    first, second = (mesh_from_gaussians(painted_ball(200), SMALL) for _ in range(2))
+    np.testing.assert_array_equal(first.vertices, second.vertices)
+    np.testing.assert_array_equal(first.texture, second.texture)
+
+
+def test_rows_with_nan_are_left_out(caplog):
+    gaussians = painted_ball(300)
+    gaussians.means[:5] = np.nan
+    assert closed(mesh_from_gaussians(gaussians, SMALL))
+    assert "5 of 300 Gaussians hold NaN or infinity" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "gaussians", [painted_ball(300).rows(slice(0)), painted_ball(300, opacity=0.01)]
+)
+def test_a_cloud_without_visible_gaussians_is_refused_before_rendering(gaussians, monkeypatch):
+    monkeypatch.setattr(textured, "render_around", None)
+    with pytest.raises(UserError, match="form no surface"):
+        mesh_from_gaussians(gaussians, SMALL)
+
+
+def test_a_cloud_of_fog_is_refused():
+    with pytest.raises(UserError, match="no view is covered to more than half"):
+        mesh_from_gaussians(painted_ball(30, opacity=0.05), SMALL)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"faces": 10}, "--faces: expected a whole number from 100 to 100000"),
+        ({"faces": 10**6}, "--faces: expected a whole number from 100 to 100000"),
+        ({"faces": 50_000, "texture": 512}, "--faces: a texture of 512 x 512 texels has room for"),
+        ({"texture": 0}, "--texture: expected a whole number from 64 to 8192"),
+        ({"texture": 10**6}, "--texture: expected a whole number from 64 to 8192"),
+        ({"texture": 512.5}, "--texture: expected a whole number"),
+        ({"views": 1}, "--views: expected a whole number from 8"),
+        ({"method": "fuson"}, "did you mean 'fusion'"),
+        ({"min_component": 2}, "--min_component: expected a number from 0 to 0.5"),
+        ({"eps2d": -1}, "--eps2d: expected 0 or more"),
+    ],
+)
+def test_wrong_options_are_refused_before_any_work(options, message, monkeypatch):
+    monkeypatch.setattr(textured, "finite", None)
+    with pytest.raises(UserError, match=message):
+        mesh_from_gaussians(painted_ball(20), MeshOptions(**options), "--")
+
+
+@pytest.mark.parametrize("library", ["skimage", "fast_simplification", "xatlas"])
+def test_a_missing_library_is_named_with_its_extra(library, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.setattr(textured, "finite", None)
+    with pytest.raises(UserError, match=rf"needs {library} .*threestudio-gaussiandreamer\[mesh\]"):
+        mesh_from_gaussians(painted_ball(20))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("faces", [5000, 20000])
+def test_the_whole_conversion_at_its_defaults(faces):
+    gaussians = painted_ball(5000)
+    mesh = mesh_from_gaussians(gaussians, MeshOptions(faces=faces))
+    assert closed(mesh) and faces * 0.9 < len(mesh.faces) <= faces
+    assert psnr_to_cloud(mesh, gaussians, 256) > 30

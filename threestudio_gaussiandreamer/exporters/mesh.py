@@ -1,0 +1,84 @@
+"""``mesh-exporter``: a closed mesh with a texture, as GLB and as OBJ with its MTL and PNG.
+
+=============  ===================================================================================
+option         meaning
+=============  ===================================================================================
+save_name      name of the GLB in the export folder; OBJ, MTL and PNG have the same stem
+up             the files' up axis: ``y`` (the front faces +z), as glTF and most programs that read
+               OBJ expect, or ``z`` for this package's world
+obj            also write the OBJ with its MTL and PNG
+unlit          ask viewers to show the texture without lighting
+faces          triangles at most
+texture        texels of the texture each way
+method         ``fusion`` of rendered depths, or a level set of the summed ``density``
+resolution     cells along the longest side, from which the surface is extracted
+views          renders that the surface and the texture are made from
+view_size      pixels of a render each way
+min_component  connected parts with a smaller share of the surface's area are dropped
+eps2d          screen-space dilation of the renders, square pixels; by default the run's
+antialias      whether the renders are antialiased; by default as in the run
+save_video     also render the turntable
+=============  ===================================================================================
+
+Needs the extra ``mesh``. docs/mesh.md has the PSNR to the cloud for each size."""
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import List
+
+from ..core.errors import UserError
+from ..gaussians.axes import WORLD_UP, rotation_between
+from ..host import ExporterOutput, register
+from ..surface.options import MeshOptions
+from ..surface.textured import mesh_from_gaussians, require_mesh_libraries
+from .base import SAVE_NAME, UP, FileExporter
+
+
+@register("mesh-exporter")
+class MeshExporter(FileExporter):
+    """Files of save_type "textured_mesh"; their params are ``{"mesh": Mesh, "unlit": bool}``."""
+
+    @dataclass
+    class Config(FileExporter.Config, MeshOptions):
+        save_name: str = field(default="mesh.glb", metadata=SAVE_NAME)
+        up: str = field(default="y", metadata=UP)
+        obj: bool = True
+        unlit: bool = False
+
+        @staticmethod
+        def check(cfg: "MeshExporter.Config") -> None:
+            """Check the name and the options, and that the libraries are installed.
+
+            Raises:
+                UserError: one of them is wrong or missing.
+            """
+            if Path(cfg.save_name).suffix.lower() != ".glb":
+                raise UserError(
+                    f"save_name: expected the name of a .glb file, got {cfg.save_name!r}"
+                )
+            MeshOptions.check(cfg)
+            require_mesh_libraries()
+
+    cfg: Config
+
+    def __call__(self) -> List[ExporterOutput]:
+        mesh = mesh_from_gaussians(self.gaussians(), self._options())
+        rotation = rotation_between(WORLD_UP, self.cfg.up)
+        params = {
+            "mesh": mesh._replace(vertices=mesh.vertices @ rotation.T),
+            "unlit": self.cfg.unlit,
+        }
+        names = [self.cfg.save_name]
+        names += [str(Path(self.cfg.save_name).with_suffix(".obj"))] if self.cfg.obj else []
+        return [
+            ExporterOutput(save_name=name, save_type="textured_mesh", params=params)
+            for name in names
+        ]
+
+    def _options(self) -> MeshOptions:
+        """Return the options, with the dilation and antialiasing of the run unless given."""
+        options = {option.name: getattr(self.cfg, option.name) for option in fields(MeshOptions)}
+        drawn = {
+            name: value for name, value in self.drawing._asdict().items() if options[name] is None
+        }
+        return MeshOptions(**options | drawn)

@@ -1,0 +1,217 @@
+"""Write a textured mesh as GLB, or as OBJ with its MTL and PNG.
+
+Textures hold display values, and both formats define the texture of the base colour as sRGB, so the
+bytes are stored as they are. Both are y up with the front at +z where the mesh is. An OBJ names a
+position once however often a seam repeats it, so the file is as closed as the mesh; a GLB repeats
+it, as glTF requires."""
+
+import io
+import json
+import os
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from ..core.errors import UserError
+from ..core.files import atomic_file
+from .mesh import Mesh
+
+UNLIT = "KHR_materials_unlit"
+FLOAT, UNSIGNED_INT, LINEAR, CLAMP_TO_EDGE = 5126, 5125, 9729, 33071
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+MTL = """# threestudio-gaussiandreamer
+newmtl baked
+Ka 0 0 0
+Kd 1 1 1
+Ks 0 0 0
+Ns 0
+Pr 1
+Pm 0
+illum {illum}
+map_Kd {texture}
+"""
+
+
+class Welded(NamedTuple):
+    """The positions of a mesh, each once, with smooth normals."""
+
+    positions: Float[np.ndarray, "W 3"]
+    normals: Float[np.ndarray, "W 3"]
+    rows: Int[np.ndarray, " V"]
+    """The position of each vertex."""
+
+
+def welded(mesh: Mesh) -> Welded:
+    """Join the vertices of equal position; normals are weighted by the faces' areas."""
+    positions, rows = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    rows = rows.reshape(-1)
+    faces = rows[mesh.faces]
+    a, b, c = np.moveaxis(positions[faces], 1, 0)
+    across = np.cross(b - a, c - a)
+    sums = [np.bincount(faces.ravel(), np.repeat(x, 3), len(positions)) for x in across.T]
+    normals = np.stack(sums, axis=1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(length > 0, normals / np.maximum(length, 1e-300), [0, 1, 0])
+    return Welded(positions, normals, rows)
+
+
+def write_textured_mesh(path: str | os.PathLike, mesh: Mesh, *, unlit: bool = False) -> None:
+    """Write a mesh with ``uv`` and ``texture`` as GLB or OBJ, by the extension.
+
+    Raises:
+        UserError: the extension is another one, a value isn't finite, or the file can't be written.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in WRITERS:
+        raise UserError(f"expected the name of a {' or '.join(WRITERS)} file, got {str(path)!r}")
+    WRITERS[suffix](path, mesh, unlit=unlit)
+
+
+# ---- GLB -----------------------------------------------------------------------------------------
+
+
+def write_textured_glb(path: str | os.PathLike, mesh: Mesh, *, unlit: bool = False) -> None:
+    """Write a mesh with ``uv`` and ``texture`` as GLB: its texture as base colour, metallic 0,
+    roughness 1.
+
+    Args:
+        unlit: also ask viewers to show the texture without lighting (KHR_materials_unlit).
+
+    Raises:
+        UserError: a value isn't finite, or the file can't be written.
+    """
+    require_finite(path, mesh)
+    joined = welded(mesh)
+    arrays = {
+        "indices": mesh.faces.reshape(-1, 1).astype("<u4"),
+        "POSITION": mesh.vertices.astype("<f4"),
+        "NORMAL": joined.normals[joined.rows].astype("<f4"),
+        "TEXCOORD_0": (mesh.uv * [1, -1] + [0, 1]).astype("<f4"),
+    }
+    blocks = [values.tobytes() for values in arrays.values()]
+    write_glb_file(path, _document(arrays, unlit), [*blocks, png_bytes(mesh.texture)])
+
+
+def write_glb_file(
+    path: str | os.PathLike, document: Mapping[str, Any], blocks: Sequence[bytes]
+) -> None:
+    """Write the JSON of a GLB and its binary blocks, which become the buffer views, in order.
+
+    Args:
+        document: without ``buffers``, and with ``bufferViews`` that lack place and size.
+    """
+    padded = [block + b"\0" * (-len(block) % 4) for block in blocks]
+    starts = np.cumsum([0, *map(len, padded)]).tolist()
+    views = [
+        {"buffer": 0, "byteOffset": start, "byteLength": len(block), **view}
+        for start, block, view in zip(starts, blocks, document["bufferViews"], strict=False)
+    ]
+    whole = {**document, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
+    text = json.dumps(whole, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    with atomic_file(path) as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + starts[-1]))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
+        file.writelines(padded)
+
+
+def _document(arrays: Mapping[str, np.ndarray], unlit: bool) -> dict[str, Any]:
+    """Return the JSON of a GLB with one mesh; the arrays and the picture are its buffer views."""
+    targets = [ELEMENT_ARRAY_BUFFER] + [ARRAY_BUFFER] * (len(arrays) - 1)
+    accessors = [_accessor(view, values) for view, values in enumerate(arrays.values())]
+    accessors[1] |= {
+        "min": arrays["POSITION"].min(axis=0).tolist(),
+        "max": arrays["POSITION"].max(axis=0).tolist(),
+    }
+    material: dict[str, Any] = {
+        "pbrMetallicRoughness": {
+            "baseColorTexture": {"index": 0},
+            "metallicFactor": 0.0,
+            "roughnessFactor": 1.0,
+        },
+    }
+    attributes = {name: view for view, name in enumerate(arrays) if name != "indices"}
+    primitive = {"attributes": attributes, "indices": 0, "material": 0}
+    # without mipmaps, which would mix parts of the texture that are far apart on the surface
+    sampler = {"magFilter": LINEAR, "minFilter": LINEAR}
+    sampler |= {"wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
+    return {
+        "asset": {"version": "2.0", "generator": "threestudio-gaussiandreamer"},
+        **({"extensionsUsed": [UNLIT]} if unlit else {}),
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [material | ({"extensions": {UNLIT: {}}} if unlit else {})],
+        "textures": [{"sampler": 0, "source": 0}],
+        "samplers": [sampler],
+        "images": [{"bufferView": len(arrays), "mimeType": "image/png"}],
+        "accessors": accessors,
+        "bufferViews": [*({"target": target} for target in targets), {}],
+    }
+
+
+def _accessor(view: int, values: np.ndarray) -> dict[str, Any]:
+    kinds = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
+    component = UNSIGNED_INT if values.dtype.kind == "u" else FLOAT
+    return {
+        "bufferView": view,
+        "componentType": component,
+        "count": len(values),
+        "type": kinds[values.shape[1]],
+    }
+
+
+# ---- OBJ -----------------------------------------------------------------------------------------
+
+
+def write_textured_obj(path: str | os.PathLike, mesh: Mesh, *, unlit: bool = False) -> None:
+    """Write a mesh with ``uv`` and ``texture`` as OBJ, and its MTL and PNG of the same name beside
+    it.
+
+    Raises:
+        UserError: a value isn't finite, or a file can't be written.
+    """
+    require_finite(path, mesh)
+    path = Path(path)
+    texture, material = path.with_suffix(".png"), path.with_suffix(".mtl")
+    with atomic_file(texture) as file:
+        file.write(png_bytes(mesh.texture))
+    with atomic_file(material) as file:
+        file.write(MTL.format(illum=0 if unlit else 1, texture=texture.name).encode())
+    joined = welded(mesh)
+    position, coordinate = joined.rows[mesh.faces] + 1, mesh.faces + 1
+    corners = np.stack([position, coordinate, position], axis=2).reshape(-1, 9)
+    with atomic_file(path) as file:
+        file.write(f"mtllib {material.name}\nusemtl baked\n".encode())
+        np.savetxt(file, joined.positions, fmt="v %.7g %.7g %.7g")
+        np.savetxt(file, mesh.uv, fmt="vt %.6f %.6f")
+        np.savetxt(file, joined.normals, fmt="vn %.4f %.4f %.4f")
+        np.savetxt(file, corners, fmt="f %d/%d/%d %d/%d/%d %d/%d/%d")
+
+
+# ---- both ----------------------------------------------------------------------------------------
+
+
+def require_finite(path: str | os.PathLike, mesh: Mesh) -> None:
+    """Raise UserError unless positions and texture coordinates are finite."""
+    if not (np.isfinite(mesh.vertices).all() and np.isfinite(mesh.uv).all()):
+        raise UserError(f"{str(path)!r} isn't written: some of its vertices hold NaN or infinity")
+
+
+def png_bytes(picture: UInt8[np.ndarray, "H W 3"]) -> bytes:
+    """Encode an RGB picture."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "PNG")
+    return file.getvalue()
+
+
+WRITERS = {".glb": write_textured_glb, ".obj": write_textured_obj}
+"""By extension."""

@@ -1,0 +1,1 @@
+"""Convert Gaussians to a textured triangle mesh."""

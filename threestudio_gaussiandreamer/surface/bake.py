@@ -1,0 +1,107 @@
+"""Bake renders to a texture.
+
+Rays through the pixels' centres find the faces that each render shows, so nothing that is hidden is
+baked. A pixel is added to the four texels around its place in the texture, weighted by the opacity
+and by the square of the cosine between the surface's normal and the ray. Texels that no pixel
+reaches, between the charts and on hidden faces, take the mean of their surroundings."""
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from tqdm import tqdm
+
+from ..meshes.mesh import Mesh
+from ..meshes.raycast import MeshCaster
+from .renders import Renders
+
+MIN_ALPHA = 128
+"""Pixels of a lower opacity, as a byte, show too much of what is behind the surface."""
+MIN_COSINE = 0.1
+KNOWN = 1e-3
+"""Texels of a smaller weight are filled from their surroundings."""
+
+Added = tuple[Int[np.ndarray, " A"], Float[np.ndarray, "A 4"]]
+
+
+def bake(mesh: Mesh, renders: Renders, size: int) -> UInt8[np.ndarray, "S S 3"]:
+    """Return the texture, row 0 at the top, of a mesh with ``uv``."""
+    caster, sums = MeshCaster(mesh), np.zeros((4, size * size))
+    count = len(renders.c2w)
+    workers = min(os.cpu_count() or 1, 4)
+    with ThreadPoolExecutor(workers) as pool:
+        views = pool.map(lambda view: _observed(caster, renders, view, size), range(count))
+        for texels, values in tqdm(views, "texture", count, unit="view", disable=None, leave=False):
+            for channel in range(4):
+                sums[channel] += np.bincount(texels, values[:, channel], size * size)
+    known = sums[3] > KNOWN
+    colors = (sums[:3] / np.maximum(sums[3], KNOWN)).T.reshape(size, size, 3)
+    colors = filled(colors, known.reshape(size, size))
+    return np.round(colors.clip(0, 255)).astype(np.uint8)
+
+
+def _observed(caster: MeshCaster, renders: Renders, view: int, size: int) -> Added:
+    """Return the texels that a render adds to, and colour times weight and weight of each."""
+    c2w, rgba = renders.c2w[view], renders.rgba[view]
+    (top, left), face, weights = caster.visible(c2w, renders.fovy, *rgba.shape[:2])
+    pixels = rgba[top : top + face.shape[0], left : left + face.shape[1]]
+    seen = (face >= 0) & (pixels[..., 3] >= MIN_ALPHA)
+    face, weights, pixels = face[seen], weights[seen], pixels[seen].astype(np.float64)
+    cosine = _cosines(caster.mesh, face, weights, c2w[:3, 3])
+    weight = (pixels[:, 3] / 255) ** 2 * np.where(cosine > MIN_COSINE, cosine, 0) ** 2
+    values = np.concatenate([pixels[:, :3], np.ones((len(pixels), 1))], axis=1) * weight[:, None]
+    uv = np.einsum("mk,mkc->mc", weights, caster.mesh.uv[caster.mesh.faces[face]])
+    parts = [(texel, values * share[:, None]) for texel, share in _around(uv, size)]
+    texels, added = zip(*parts, strict=True)
+    return np.concatenate(texels), np.concatenate(added)
+
+
+def _cosines(
+    mesh: Mesh,
+    face: Int[np.ndarray, " M"],
+    weights: Float[np.ndarray, "M 3"],
+    eye: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, " M"]:
+    """Return the cosine between the outward normal and the direction to the eye."""
+    corners = mesh.vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    toward = eye - np.einsum("mk,mkc->mc", weights, corners[face])
+    toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-30)
+    return np.einsum("mc,mc->m", normals[face], toward)
+
+
+def _around(
+    uv: Float[np.ndarray, "M 2"], size: int
+) -> Iterator[tuple[Int[np.ndarray, " M"], Float[np.ndarray, " M"]]]:
+    """Yield the four texels around each place and their shares, as bilinear lookup has them."""
+    x, y = uv[:, 0] * size - 0.5, (1 - uv[:, 1]) * size - 0.5
+    column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    right, down = x - column, y - row
+    for step_down, share_down in ((0, 1 - down), (1, down)):
+        for step_right, share_right in ((0, 1 - right), (1, right)):
+            rows, columns = (
+                (row + step_down).clip(0, size - 1),
+                (column + step_right).clip(0, size - 1),
+            )
+            yield rows * size + columns, share_down * share_right
+
+
+def filled(
+    colors: Float[np.ndarray, "H W 3"], known: Bool[np.ndarray, "H W"]
+) -> Float[np.ndarray, "H W 3"]:
+    """Fill unknown texels from the means of ever larger blocks that hold known ones."""
+    if known.all() or not known.any():
+        return colors
+    height, width = known.shape
+    pad = ((0, height % 2), (0, width % 2))
+    weight = np.pad(known, pad).astype(np.float64)[..., None]
+    padded = np.pad(colors, (*pad, (0, 0))) * weight
+    blocks = (weight.shape[0] // 2, 2, weight.shape[1] // 2, 2)
+    counts = weight.reshape(*blocks, 1).sum(axis=(1, 3))
+    means = padded.reshape(*blocks, 3).sum(axis=(1, 3)) / np.maximum(counts, 1)
+    coarse = filled(means, counts[..., 0] > 0)
+    around = coarse.repeat(2, axis=0).repeat(2, axis=1)[:height, :width]
+    return np.where(known[..., None], colors, around)

@@ -1,0 +1,193 @@
+"""Closed triangle meshes: which parts to keep, fewer faces, and edges of exactly two faces."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..core.errors import UserError
+
+Vertices = Float[np.ndarray, "V 3"]
+Faces = Int[np.ndarray, "F 3"]
+AGGRESSIVENESS = (7, 5, 3, 1)
+"""Of the simplification, in the order in which they are tried; lower ones keep more of the shape.
+"""
+APART = 0.05
+"""Share of the way to their neighbours by which vertices are moved that had the same position."""
+
+
+def without_small_parts(vertices: Vertices, faces: Faces, share: float) -> tuple[Vertices, Faces]:
+    """Drop connected parts with less than ``share`` of the area, and surfaces of inner cavities."""
+    label = _parts(len(vertices), faces)[faces[:, 0]]
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    area = np.bincount(label, np.linalg.norm(normals, axis=1))
+    volume = np.bincount(label, np.einsum("fk,fk->f", a, normals))
+    keep = (area >= share * area.sum()) & (volume > 0)
+    return used(vertices, faces[keep[label]])
+
+
+def used(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
+    """Drop the vertices that no face uses."""
+    rows, index = np.unique(faces, return_inverse=True)
+    return vertices[rows], index.reshape(-1, 3)
+
+
+def simplified(vertices: Vertices, faces: Faces, count: int) -> tuple[Vertices, Faces]:
+    """Reduce a closed mesh to at most ``count`` faces by quadric errors; it stays closed.
+
+    Raises:
+        UserError: the shape can't be closed with so few faces.
+    """
+    import fast_simplification
+
+    for aggressiveness in AGGRESSIVENESS:
+        fewer = vertices, faces
+        if len(faces) > count:
+            fewer = fast_simplification.simplify(
+                vertices.astype(np.float32),
+                faces.astype(np.int32),
+                target_count=count,
+                agg=aggressiveness,
+            )
+        positions, index = joined(*fewer)
+        found = separated(positions, without_folds(index))
+        if found is not None and len(found[1]) and is_closed(joined(*found)[1]):
+            return found
+    raise UserError(
+        f"faces: the surface can't be closed with {count} faces; allow more, or extract it with "
+        "a lower resolution"
+    )
+
+
+def joined(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
+    """Join the vertices that files, which hold float32, have at the same position."""
+    positions, rows = np.unique(vertices.astype(np.float32), axis=0, return_inverse=True)
+    return positions.astype(np.float64), rows.reshape(-1)[faces]
+
+
+def without_folds(faces: Faces) -> Faces:
+    """Drop faces with equal corners, and pairs of faces that are each other's back."""
+    proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    faces = faces[proper]
+    _, index, count = np.unique(
+        np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    return faces[count[index.reshape(-1)] == 1]
+
+
+def is_closed(faces: Faces) -> bool:
+    """Return whether each edge has exactly two faces, which run along it in opposite directions."""
+    edges = half_edges(faces)
+    there, back = np.unique(edges, axis=0), np.unique(edges[:, ::-1], axis=0)
+    return len(there) == len(edges) and np.array_equal(there, back)
+
+
+def half_edges(faces: Faces) -> Int[np.ndarray, "E 2"]:
+    """Return the directed edges: from corner 0 to 1 of all faces, from 1 to 2, from 2 to 0."""
+    return np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)])
+
+
+def separated(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces] | None:
+    """Split the edges and vertices at which a closed mesh touches itself; None if it has holes.
+
+    At an edge of more than two faces those are paired that bound a sector of the inside; the parts
+    are then moved apart a little.
+    """
+    pairs = _paired(vertices, faces)
+    if pairs is None:
+        return None
+    (start, end), (other_start, other_end) = (_corners(edges, len(faces)) for edges in pairs)
+    links = np.concatenate(
+        [np.stack([start, other_end], axis=1), np.stack([end, other_start], axis=1)]
+    )
+    label = _labels(links, faces.size)
+    old = np.zeros(label.max() + 1, np.int64)
+    old[label] = faces.ravel()
+    fans = label.reshape(-1, 3)
+    return _moved_apart(vertices[old], fans, np.bincount(old)[old] > 1), fans
+
+
+def _corners(
+    edges: Int[np.ndarray, " P"], count: int
+) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]:
+    """Return the corners of ``count`` faces, three each, at which half-edges start and end."""
+    first, face = np.divmod(edges, count)
+    return 3 * face + first, 3 * face + (first + 1) % 3
+
+
+def _paired(
+    vertices: Vertices, faces: Faces
+) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]] | None:
+    """Pair half-edges in opposite directions, by index; None if some have no partner."""
+    edges = half_edges(faces)
+    ahead = edges[:, 0] < edges[:, 1]
+    key = edges.min(axis=1) * len(vertices) + edges.max(axis=1)
+    angle = _angles(vertices, faces, edges, np.unique(key, return_inverse=True)[1])
+    # from the front face of a sector of the inside, its back face is the next one downwards
+    first, second = (np.flatnonzero(side) for side in (ahead, ~ahead))
+    first, second = (side[np.lexsort((angle[side], key[side]))] for side in (first, second))
+    if len(first) != len(second) or (key[first] != key[second]).any():
+        return None
+    return first, _next_below(key, angle, first, second)
+
+
+def _next_below(
+    key: Int[np.ndarray, " E"],
+    angle: Float[np.ndarray, " E"],
+    first: Int[np.ndarray, " P"],
+    second: Int[np.ndarray, " P"],
+) -> Int[np.ndarray, " P"]:
+    """Return ``second`` rotated within each edge so that angles fall from ``first`` to it."""
+    second = second.copy()
+    _, start, count = np.unique(key[first], return_index=True, return_counts=True)
+    for begin, size in zip(start[count > 1], count[count > 1], strict=True):
+        rows = slice(begin, begin + size)
+        below = np.searchsorted(angle[second[rows]], angle[first[begin]]) - 1
+        second[rows] = np.roll(second[rows], -below)
+    return second
+
+
+def _angles(
+    vertices: Vertices, faces: Faces, edges: Int[np.ndarray, "E 2"], group: Int[np.ndarray, " E"]
+) -> Float[np.ndarray, " E"]:
+    """Return the angle of each half-edge's face around its edge, from the lower vertex's side,
+    in radians from a common direction; only for edges of more than two faces, else 0.
+    """
+    angles = np.zeros(len(edges))
+    crowded = np.flatnonzero(np.bincount(group)[group] > 2)
+    if not len(crowded):
+        return angles
+    low, high = vertices[edges[crowded].min(axis=1)], vertices[edges[crowded].max(axis=1)]
+    axis = _unit(high - low)
+    other = faces[crowded % len(faces), (crowded // len(faces) + 2) % 3]
+    across = vertices[other] - low
+    side = _unit(np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)]))
+    up = np.cross(axis, side)
+    angles[crowded] = np.arctan2((across * up).sum(1), (across * side).sum(1))
+    return angles
+
+
+def _moved_apart(vertices: Vertices, faces: Faces, touching: Bool[np.ndarray, " V"]) -> Vertices:
+    """Move vertices towards the mean of their faces' other corners."""
+    edges = half_edges(faces)
+    count = np.maximum(np.bincount(edges[:, 0], minlength=len(vertices)), 1)
+    sums = [np.bincount(edges[:, 0], x[edges[:, 1]], len(vertices)) for x in vertices.T]
+    toward = np.stack(sums, axis=1) / count[:, None] - vertices
+    return vertices + APART * touching[:, None] * toward
+
+
+def _parts(count: int, faces: Faces) -> Int[np.ndarray, " V"]:
+    """Return the connected part of each of ``count`` vertices."""
+    return _labels(half_edges(faces), count)
+
+
+def _labels(links: Int[np.ndarray, "L 2"], count: int) -> Int[np.ndarray, " N"]:
+    """Return the connected component of each of ``count`` nodes."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_matrix((np.ones(len(links), bool), links.T), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
+
+
+def _unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
