@@ -1,10 +1,12 @@
 """Exit codes and messages of the package's commands."""
 
+import contextlib
 import os
+import sys
 
 import pytest
 
-from threestudio_gaussiandreamer.core.command import run_command
+from threestudio_gaussiandreamer.core.command import exit_code, run_command
 from threestudio_gaussiandreamer.core.errors import UserError
 
 
@@ -45,3 +47,21 @@ def test_usage_has_argparses_code(asked, code):
         raise SystemExit(asked)
 
     assert run_command(parse, len) == code
+
+
+def test_nobody_reads_the_message_about_a_closed_pipe_either(monkeypatch):
+    """As after ``command 2>&1 | head``."""
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    broken = open(write_end, "w", buffering=1)
+    monkeypatch.setattr(sys, "stderr", broken)
+    monkeypatch.setattr(os, "dup2", lambda *descriptors: None)
+    error = BrokenPipeError(32, "Broken pipe")
+    assert exit_code(error) == 141
+    with contextlib.suppress(BrokenPipeError):
+        broken.close()
+
+
+def test_the_exit_code_is_that_of_the_work_without_a_standard_output(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    assert run_command(len, lambda args: print("nobody reads this"), []) == 0

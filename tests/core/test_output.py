@@ -72,3 +72,14 @@ def test_the_streams_are_put_back(monkeypatch):
     with tolerant_output():
         pass
     assert (sys.stdout, sys.stderr) == earlier
+
+
+@pytest.mark.parametrize("name", ["stdout", "stderr"])
+def test_a_stream_that_was_closed_before_the_start_takes_any_text(monkeypatch, name):
+    """Python sets it to None, as after ``command >&-``."""
+    monkeypatch.setattr(sys, name, None)
+    with tolerant_output():
+        stream = getattr(sys, name)
+        print("nobody reads this", file=stream, flush=True)
+        assert not stream.isatty()
+    assert getattr(sys, name) is None and stream.closed

@@ -13,6 +13,8 @@ from threestudio_gaussiandreamer.core import images as pictures
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host.builtin.savers import SaverMixin
 
+TRIANGLE = SimpleNamespace(v_pos=torch.eye(3), t_pos_idx=torch.tensor([[0, 1, 2]]))
+
 
 @pytest.fixture
 def saver(tmp_path):
@@ -113,6 +115,27 @@ def test_data_json_files_and_meshes_come_back(saver, tmp_path):
     assert (
         Path(saver.save_mesh("m.ply", torch.eye(3), torch.tensor([[0, 1, 2]]))).stat().st_size > 0
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "save"),
+    [
+        ("a.json", lambda saver, name: saver.save_json(name, {"psnr": 30.5})),
+        ("a.npy", lambda saver, name: saver.save_data(name, np.ones(2))),
+        ("a.npz", lambda saver, name: saver.save_data(name, {"x": np.ones(2)})),
+        ("a.bin", lambda saver, name: saver.save_file(name, __file__)),
+        ("a.ply", lambda saver, name: saver.save_mesh(name, torch.eye(3), torch.zeros(1, 3).int())),
+        ("a.off", lambda saver, name: saver.save_mesh(name, torch.eye(3), torch.zeros(1, 3).int())),
+        ("a.obj", lambda saver, name: saver.save_obj(name, TRIANGLE)[0]),
+    ],
+)
+def test_files_are_replaced_whole_and_links_are_not_followed(saver, tmp_path, name, save):
+    """So that neither a full disk nor a link in the folder of results costs an earlier file."""
+    (tmp_path / "mine").write_text("mine")
+    Path(saver.get_save_path(name)).symlink_to(tmp_path / "mine")
+    path = Path(save(saver, name))
+    assert (tmp_path / "mine").read_text() == "mine"
+    assert path.stat().st_size > 0 and not path.is_symlink()
 
 
 def test_only_arrays_can_be_converted(saver):

@@ -13,6 +13,7 @@ from tests.helpers.checkpoints import whole_checkpoint
 from tests.launch.bad_input_cases import DEMO, SMALL, assert_refused
 from threestudio_gaussiandreamer import host, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.images import read as read_image
 from threestudio_gaussiandreamer.launch import experiment, folder_lock
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.training import held_out as evaluate
@@ -111,6 +112,48 @@ def test_a_damaged_score_file_is_measured_again(tmp_path):
         assert evaluate.Measurements(None, tmp_path).values == {}
 
 
+GOOD = {"psnr": 30.0, "ssim": 0.9, "multi_face": 0.0, "gaussians": 3, "seconds": 1.0}
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"seconds": "x"},
+        {"seconds": [1]},
+        {"cpu_seconds": None},
+        {"seconds": -1},
+        {"curve": 5},
+        {"prior": 5},
+        {"result": {}},
+        {"prior": GOOD | {"psnr": None}},
+        {"prior": GOOD | {"gaussians": 0.5}},
+    ],
+)
+def test_an_entry_of_the_score_file_that_no_run_writes_is_left_out(tmp_path, entry):
+    (tmp_path / "metrics.json").write_text(json.dumps({"result": GOOD, "seconds": 2.5} | entry))
+    found = evaluate.Measurements(None, tmp_path)
+    assert not found.values.keys() & entry.keys()
+    assert found.seconds.tolist() == [0.0 if "seconds" in entry else 2.5, 0.0]
+    assert ("30.00" in found.table()) == ("result" not in entry)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\nxx"])
+def test_a_damaged_picture_of_an_earlier_run_is_left_out(tmp_path, content):
+    (tmp_path / "held_out").mkdir()
+    (tmp_path / "held_out/prior.png").write_bytes(content)
+    images = torch.rand(6, 4, 4, 3)
+    evaluate.Measurements(None, tmp_path)._save_pictures("result", images, images)
+    assert read_image(tmp_path / "held_out/compare.png").shape == (8, 24, 3)
+
+
+def test_a_fifo_in_the_place_of_a_file_is_named(launch_demo):
+    """Writing to it would wait for a reader."""
+    TRIAL.mkdir(parents=True)
+    os.mkfifo(TRIAL / "cmd.txt")
+    code, err = launch_demo()
+    assert code == 2 and f"{TRIAL}/cmd.txt is no file" in err and "Traceback" not in err
+
+
 def test_a_file_in_the_place_of_a_folder_is_named(launch_demo):
     TRIAL.mkdir(parents=True)
     (TRIAL / "save").touch()
@@ -122,7 +165,7 @@ def test_a_full_disk_is_named(launch_demo, monkeypatch):
     def full(*args: object, **kwargs: object) -> None:
         raise OSError(28, "No space left on device", "picture.png")
 
-    monkeypatch.setattr(evaluate, "_write_png", full)
+    monkeypatch.setattr(evaluate, "write_image", full)
     code, err = launch_demo()
     assert (
         code == 2

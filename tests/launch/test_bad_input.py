@@ -193,6 +193,12 @@ register_parts()
             "trainer.enable_checkpointing is set by the launcher",
         ),
         ("checkpoint.filename=../../x", "checkpoint.filename is '../../x'"),
+        ("checkpoint.filename='{step}/../../../x'", "expected a name below the folder"),
+        ('checkpoint.filename="a\\0b"', "of at most 200 bytes without NUL"),
+        (f"checkpoint.filename={300 * 'x'}", "of at most 200 bytes without NUL"),
+        ("checkpoint.filename='{step'", "which isn't a format: expected '}'"),
+        ("checkpoint.filename='{epoch:z}'", "which isn't a format: "),
+        ("checkpoint.filename='{step[0]}'", "which isn't a format: "),
         # folders and texts
         ("exp_root_dir=a\0b", "no folder's name has a NUL"),
         ("exp_root_dir=" + 300 * "x", "can't be written: File name too long"),

@@ -59,6 +59,22 @@ def test_a_deleted_configuration_is_stored_as_it_was_read(launch, monkeypatch):
     assert Path(only_run(), "configs/raw.yaml").read_text() == tiny_parts.CONFIG
 
 
+def test_the_record_of_the_command_holds_names_that_are_no_utf8(launch):
+    name = os.fsdecode(b"caf\xe9.yaml")
+    Path(name).write_text(tiny_parts.CONFIG)
+    assert launch("--train", config=name)[0] == 0
+    assert b"--config 'caf\xe9.yaml' --train" in (only_run() / "cmd.txt").read_bytes()
+
+
+def test_a_fifo_in_the_place_of_a_copy_is_replaced(launch):
+    """Writing to it would wait for a reader."""
+    copy = Path("outputs/tiny/t/configs/raw.yaml")
+    copy.parent.mkdir(parents=True)
+    os.mkfifo(copy)
+    assert launch("--train", "use_timestamp=false", "tag=t")[0] == 0
+    assert copy.read_text() == tiny_parts.CONFIG
+
+
 def test_a_configuration_that_can_not_be_read_is_named(launch, monkeypatch):
     def vanished(path):
         raise FileNotFoundError(2, "No such file or directory", str(path))

@@ -1,5 +1,7 @@
 """The plain prompt processor: the prompt is text, verbatim."""
 
+import tracemalloc
+
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -55,6 +57,16 @@ def test_view_dependent_prompts_are_in_the_order_of_the_host():
 def test_there_are_no_embeddings():
     with pytest.raises(UserError, match="no text encoder.*stable-diffusion-prompt-processor"):
         processed(prompt="a fox").get_text_embeddings(None, None, None, True)
+
+
+def test_of_a_huge_prompt_file_only_the_beginning_is_read(tmp_path):
+    with open(tmp_path / "prompt.txt", "wb") as file:
+        file.truncate(1 << 30)  # sparse
+    tracemalloc.start()
+    with pytest.raises(UserError, match="more than"):
+        processed(prompt_file=str(tmp_path / "prompt.txt"))
+    assert tracemalloc.get_traced_memory()[1] < 16 << 20
+    tracemalloc.stop()
 
 
 def test_bad_prompt_files_are_named(tmp_path):

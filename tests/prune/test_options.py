@@ -1,9 +1,15 @@
-"""Budgets in dB."""
+"""Budgets as users write them, and in dB."""
+
+import re
+import time
 
 import pytest
 
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.prune.options import (
     combined_psnr,
+    parse_bytes,
+    parse_number,
     psnr_for_loss,
     remaining_psnr_budget,
 )
@@ -28,3 +34,39 @@ def test_the_psnr_that_loses_a_tenth_of_a_decibel():
     # two independent errors: their squares add
     psnr = psnr_for_loss(0.1, 35.0)
     assert 10 ** (-3.5) + 10 ** (-psnr / 10) == pytest.approx(10 ** (-3.49))
+
+
+@pytest.mark.parametrize(
+    ("text", "size"), [("500kB", 500_000), (" 2 MB ", 2_000_000), ("1.5g", 1_500_000_000), (7, 7)]
+)
+def test_sizes(text, size):
+    assert parse_bytes(text, "bytes") == size
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("9" * 300 + "G", "below 2^63 bytes"),
+        ("9" * 400, "expected a number"),
+        ("1e3", "expected a size such as"),
+        ("2 M B", "expected a size such as"),
+    ],
+)
+def test_a_size_that_is_none_is_named_in_a_short_message(text, message):
+    with pytest.raises(UserError, match=re.escape(message)) as caught:
+        parse_bytes(text, "bytes")
+    assert len(str(caught.value)) < 200
+
+
+@pytest.mark.parametrize("text", ["40", " 40dB ", "40 db", 40.0])
+def test_decibels_with_and_without_their_unit(text):
+    assert parse_number(text, "psnr", "dB") == 40.0
+
+
+def test_numbers_are_read_in_linear_time():
+    text = "4" + 100_000 * " " + "x"
+    started = time.process_time()
+    for parse in (parse_bytes, lambda text, name: parse_number(text, name, "dB")):
+        with pytest.raises(UserError):
+            parse(text, "x")
+    assert time.process_time() - started < 0.5

@@ -1,6 +1,7 @@
 """Run a command-line program: exit codes, and errors in the user's input as one message without a
 traceback."""
 
+import contextlib
 import os
 import signal
 import sys
@@ -57,5 +58,8 @@ def exit_code(error: Exception, verbose: bool = False) -> int:
         return 2
     # The reader has closed the pipe, as `| head` does; without this, Python's flush at exit fails.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    print(f"stopped: the reader of the output has closed it ({error.strerror})", file=sys.stderr)
+    with contextlib.suppress(BrokenPipeError):  # after `2>&1 |` nobody reads this either
+        print(
+            f"stopped: the reader of the output has closed it ({error.strerror})", file=sys.stderr
+        )
     return 128 + signal.SIGPIPE

@@ -9,7 +9,7 @@ from typing import Any, Optional
 import numpy as np
 
 from .errors import UserError
-from .files import atomic_file
+from .files import atomic_file, existing_file
 
 _COLOR_MAPS = {
     "jet": "000080 0000ff 0080ff 00ffff 80ff80 ffff00 ff8000 ff0000 800000",
@@ -115,10 +115,18 @@ def with_texts(image: np.ndarray, texts: list) -> np.ndarray:
 
 
 def read(path: str | os.PathLike) -> np.ndarray:
-    """Read an image as uint8 (H,W,3)."""
+    """Read an image as uint8 (H,W,3).
+
+    Raises:
+        UserError: there is no such file, or it is damaged.
+    """
     from PIL import Image
 
-    return np.asarray(Image.open(path).convert("RGB"))
+    path = existing_file(path, "image")
+    try:
+        return np.asarray(Image.open(path).convert("RGB"))
+    except Exception as error:  # Pillow raises many kinds for damaged files
+        raise UserError(f"image {str(path)!r} can't be read: {error}") from error
 
 
 def write(path: str | os.PathLike, image: np.ndarray) -> None:

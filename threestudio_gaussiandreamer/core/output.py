@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import io
+import os
 import sys
 from collections.abc import Iterator
 from typing import Any, Optional
@@ -39,15 +40,22 @@ class TolerantFile(io.FileIO):
 def tolerant_output() -> Iterator[None]:
     """Replace ``sys.stdout`` and ``sys.stderr`` by streams that ignore write errors, and that
     escape characters which their encoding doesn't have.
+
+    Streams that Python couldn't open, since their descriptors were closed (``>&-``), are replaced
+    by the null device.
     """
     earlier = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = map(_tolerant, earlier)
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError, ValueError):
-            sys.stdout.flush()
-        sys.stdout, sys.stderr = earlier
+    with contextlib.ExitStack() as opened:
+        sys.stdout, sys.stderr = (
+            opened.enter_context(open(os.devnull, "w")) if stream is None else _tolerant(stream)
+            for stream in earlier
+        )
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError, ValueError):
+                sys.stdout.flush()
+            sys.stdout, sys.stderr = earlier
 
 
 def _tolerant(stream: Any) -> Any:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ..core.files import atomic_file
 from ..host import pl, warn
 from .checkpoints import AtomicCheckpointIO
 from .config import dump_config
@@ -54,7 +55,9 @@ class RunRecord(pl.Callback):
             self.save_configs()
             self.save_code()
             # append, since a resumed run has several command lines
-            with open(self.folder / "cmd.txt", "a") as file:
+            # surrogateescape: paths on the command line may be no UTF-8
+            log = self.folder / "cmd.txt"
+            with open(log, "a", encoding="utf-8", errors="surrogateescape") as file:
                 file.write(self.command + "\n")
 
     def save_configs(self) -> None:
@@ -64,7 +67,7 @@ class RunRecord(pl.Callback):
         for i, (path, content) in enumerate(self.sources):
             # not if the run is resumed from its own parsed.yaml: keep the original raw.yaml
             if path.resolve().parent != configs.resolve():
-                (configs / (f"raw-{i}.yaml" if i else "raw.yaml")).write_bytes(content)
+                write_copy(configs / (f"raw-{i}.yaml" if i else "raw.yaml"), content)
         dump_config(configs / "parsed.yaml", self.cfg)
 
     def save_code(self) -> None:
@@ -92,7 +95,13 @@ def copy_sources(source: Path, destination: Path) -> None:
                 continue
             copy = destination / path.relative_to(source)
             copy.parent.mkdir(parents=True, exist_ok=True)
-            copy.write_bytes(content)
+            write_copy(copy, content)
+
+
+def write_copy(path: Path, content: bytes) -> None:
+    """Write a file atomically: whatever has its name, such as a link or a FIFO, is replaced."""
+    with atomic_file(path, durable=False) as file:
+        file.write(content)
 
 
 class ProgressBar(pl.callbacks.TQDMProgressBar):

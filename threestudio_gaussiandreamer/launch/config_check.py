@@ -13,11 +13,12 @@ import typing
 from collections.abc import Collection, Mapping
 from typing import Any, Optional
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError, unknown
-from ..core.options import check_options, require_representable
+from ..core.options import check_options, require_representable, shown
 from ..guidance.base import ScoreDistillation
 from ..host import (
     BaseBackground,
@@ -78,6 +79,10 @@ KINDS: dict[str, type] = {
 Parts of other packages may have other base classes; a part is refused only if it derives from the
 base class of a different kind.
 """
+LONGEST_NAME = 200
+"""Longest name of a checkpoint, bytes; file systems allow 255, of which numbers and suffixes need
+some.
+"""
 LOGGER_KEYS = ("enable", "project", "name")
 
 
@@ -102,9 +107,8 @@ def check_config(cfg: Any) -> None:
     _check_loss(cfg.system.get("loss"), getattr(find(cfg.system_type), "LOSSES", None))
     _check_loggers(cfg.system.get("loggers"))
     _check_arguments("checkpoint", cfg.checkpoint, pl.callbacks.ModelCheckpoint)
-    _check_file_name("checkpoint.filename", cfg.checkpoint.get("filename"))
     _check_monitor(cfg)
-    build("checkpoint", pl.callbacks.ModelCheckpoint, plain(cfg.checkpoint))
+    _check_file_name(build("checkpoint", pl.callbacks.ModelCheckpoint, plain(cfg.checkpoint)))
     options = {
         key: value for key, value in plain(cfg.trainer).items() if key not in NEEDS_PROCESSES
     }
@@ -312,9 +316,28 @@ def _check_strategy(name: Any) -> None:
     build("trainer.strategy", registry.get, {"name": name})
 
 
-def _check_file_name(path: str, name: Any) -> None:
-    if name is not None and (os.path.isabs(name) or os.path.normpath(name).startswith(os.pardir)):
-        raise UserError(f"{path} is {name!r}; expected a name below the folder of the checkpoints")
+def _check_file_name(checkpointing: Any) -> None:
+    """Raise UserError unless Lightning can make names of files from ``checkpoint.filename``."""
+    name = checkpointing.filename
+    if name is None:
+        return
+    start = {"epoch": torch.tensor(0), "step": torch.tensor(0)}
+    try:
+        made = checkpointing.format_checkpoint_name(start)
+    except Exception as error:  # of str.format, for instance ValueError, KeyError, AttributeError
+        raise UserError(
+            f"checkpoint.filename is {name!r}, which isn't a format: {error}"
+        ) from error
+    if os.path.isabs(made) or os.path.normpath(made).startswith(os.pardir):
+        raise UserError(
+            f"checkpoint.filename is {name!r}; expected a name below the folder of the checkpoints"
+        )
+    longest = max(len(os.fsencode(part)) for part in made.split(os.sep))
+    if "\0" in made or longest > LONGEST_NAME:
+        raise UserError(
+            f"checkpoint.filename is {shown(name)}; expected names of at most {LONGEST_NAME} bytes "
+            "without NUL"
+        )
 
 
 def _check_monitor(cfg: Any) -> None:

@@ -181,7 +181,8 @@ def require_writable(folder: Path) -> None:
 def _require_replaceable(folder: Path) -> None:
     """Raise OSError if a path that a run writes exists, but can't be replaced.
 
-    A path for a folder must be a writable folder, and a path for a file not a folder.
+    A path for a folder must be a writable folder, and a path for a file a regular file: writing to
+    a FIFO waits for a reader.
     """
     for name in SUBFOLDERS:
         path = folder / name
@@ -190,8 +191,8 @@ def _require_replaceable(folder: Path) -> None:
         if (path.exists() or path.is_symlink()) and not path.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, f"{path} is no folder")
     for name in FILES:
-        if (folder / name).is_dir():
-            raise IsADirectoryError(errno.EISDIR, f"{folder / name} is a folder")
+        if (folder / name).exists() and not (folder / name).is_file():
+            raise IsADirectoryError(errno.EISDIR, f"{folder / name} is no file")
 
 
 def _require_short(folder: Path, existing: Path) -> None:

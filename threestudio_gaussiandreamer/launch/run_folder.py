@@ -15,6 +15,10 @@ from ..core.interpolation import escape
 from ..host import info
 
 SLUG_BYTES = 64
+SLUG_SOURCE = 1024
+"""Characters of a text that its slug is made of: normalising takes quadratic time in the length of
+a run of combining characters.
+"""
 SLUG_CHARACTERS = "-_.,+=()'! "
 WINDOWS_DEVICES = {
     "con",
@@ -89,7 +93,7 @@ def safe_name(text: str) -> str:
     a dot or hyphen or end with a dot, or be that of a Windows device."""
     slug = "".join(
         c if c.isalnum() or c in SLUG_CHARACTERS else "_"
-        for c in unicodedata.normalize("NFC", text)
+        for c in unicodedata.normalize("NFC", text[:SLUG_SOURCE])
     )
     slug = slug.encode()[:SLUG_BYTES].decode(errors="ignore").lstrip("-. ").rstrip(". ")
     if slug and slug == text and slug.split(".")[0].lower() not in WINDOWS_DEVICES:

@@ -76,7 +76,8 @@ def read_prompt(path: str) -> str:
     """
     file = existing_file(path, "prompt file")
     try:
-        content = file.read_bytes()[: MAX_PROMPT_BYTES + 1]
+        with open(file, "rb") as opened:
+            content = opened.read(MAX_PROMPT_BYTES + 1)
         text = content.decode("utf-8-sig")
     except OSError as error:
         raise UserError(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Optional
 
 from ..core.errors import UserError
-from ..core.options import at_least, in_range
+from ..core.options import INT64_MAX, at_least, in_range, shown
 from ..gaussians.simplify import Budget
 from ..gaussians.views import LEAST_ERROR
 
@@ -93,12 +93,13 @@ def parse_number(value: Any, option: str, unit: str = "") -> float:
         UserError: ``value`` is no finite number.
     """
     text = str(value).strip()
+    number = text[: -len(unit)] if unit and text.lower().endswith(unit.lower()) else text
     try:
-        found = float(re.sub(rf"\s*{unit}$", "", text, flags=re.IGNORECASE))
+        found = float(number)
     except ValueError:
         found = math.nan
     if not math.isfinite(found):
-        raise UserError(f"{option}: expected a number, got {text!r}")
+        raise UserError(f"{option}: expected a number, got {shown(text)}")
     return found
 
 
@@ -120,11 +121,15 @@ def parse_bytes(value: Any, option: str) -> int:
     Raises:
         UserError: ``value`` is no size.
     """
-    found = re.fullmatch(r"\s*([\d.]+)\s*(k|m|g)?b?\s*", str(value).lower())
+    # no two neighbouring parts of the pattern match the same character, so it takes linear time
+    found = re.fullmatch(r"([\d.]+)\s*(k|m|g)?b?", str(value).strip().lower())
     if not found:
-        raise UserError(f"{option}: expected a size such as 500kB or 2MB, got {str(value)!r}")
+        raise UserError(f"{option}: expected a size such as 500kB or 2MB, got {shown(str(value))}")
     factor = 1000 ** ("kmg".index(found[2]) + 1 if found[2] else 0)
-    return int(parse_number(found[1], option) * factor)
+    size = parse_number(found[1], option) * factor
+    if size > INT64_MAX:
+        raise UserError(f"{option}: expected a size below 2^63 bytes, got {shown(str(value))}")
+    return int(size)
 
 
 def parse_loss(value: Any, where: str) -> float:

@@ -8,7 +8,7 @@ mass); fraction of pixels with a colour outside [0, 1] (out of gamut)."""
 import json
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -20,10 +20,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..cameras import Orbit, held_out_orbit
+from ..core.errors import UserError
 from ..core.files import atomic_file, json_text
 from ..core.images import read as read_image
+from ..core.images import write as write_image
 from ..core.memory import require_memory
-from ..core.options import at_least, in_range
+from ..core.options import at_least, in_range, is_number, is_whole
 from ..meshes.mesh import SurfaceDistance
 from ..meshes.raycast import over_background
 from ..metrics import floater_mass, multi_face_rate, out_of_gamut, psnr, ssim
@@ -147,6 +149,8 @@ class HeldOut:
 
 
 CLOCKS = ("seconds", "cpu_seconds")
+TABLE = ("psnr", "ssim", "multi_face", "gaussians", "seconds")
+"""The scores that the last message of a run shows."""
 
 
 class Measurements:
@@ -158,7 +162,7 @@ class Measurements:
     def __init__(self, held_out: HeldOut, folder: Path) -> None:
         self.held_out, self.folder = held_out, folder
         self.path = folder / "metrics.json"
-        self.values: dict[str, Any] = _read_json(self.path)
+        self.values: dict[str, Any] = _read_scores(self.path)
         self.seconds = np.array([self.values.get(name, 0.0) for name in CLOCKS], np.float64)
         self._started: Optional[np.ndarray] = None
 
@@ -233,11 +237,13 @@ class Measurements:
         folder.mkdir(parents=True, exist_ok=True)
         rows = {key: _row(renders), "truth": _row(truth)}
         for name, row in rows.items():
-            _write_png(folder / f"{name}.png", row)
-        shown = [folder / f"{name}.png" for name in ("prior", "result", "truth")]
-        pictures = [read_image(path) for path in shown if path.is_file()]
+            write_image(folder / f"{name}.png", row)
+        pictures = []
+        for path in (folder / f"{name}.png" for name in ("prior", "result", "truth")):
+            with suppress(UserError):  # an earlier run's picture is missing or damaged
+                pictures.append(read_image(path))
         if len({picture.shape for picture in pictures}) == 1:
-            _write_png(folder / "compare.png", np.concatenate(pictures, 0))
+            write_image(folder / "compare.png", np.concatenate(pictures, 0))
 
     def table(self) -> str:
         """Format a table of the main scores of prior and result."""
@@ -257,22 +263,28 @@ def _now() -> np.ndarray:
     return np.array([time.perf_counter(), time.process_time()])
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    """Read a mapping from a JSON file; return an empty one if the file is missing or damaged."""
+def _read_scores(path: Path) -> dict[str, Any]:
+    """Read what an earlier run has stored, without entries that no run writes; empty if the file is
+    missing or damaged.
+    """
     try:
-        values = json.loads(path.read_text())
-    except (OSError, ValueError):
+        values = json.loads(path.read_text()) if path.is_file() else {}
+    except (OSError, ValueError, RecursionError):
         return {}
-    return values if isinstance(values, dict) else {}
+    stored = values if isinstance(values, dict) else {}
+    return {name: value for name, value in stored.items() if _is_stored(name, value)}
+
+
+def _is_stored(name: str, value: Any) -> bool:
+    if name in CLOCKS:
+        return is_number(value) and value >= 0
+    if name == "curve":
+        return isinstance(value, list)
+    shown = {} if not isinstance(value, dict) else value
+    return all(is_number(shown.get(column)) for column in TABLE) and is_whole(shown["gaussians"])
 
 
 def _row(images: Float[Tensor, "V H W 3"], count: int = 6) -> np.ndarray:
     """Join ``count`` views spread around the object side by side, as bytes."""
     chosen = images[:: max(1, len(images) // count)][:count]
     return (torch.cat(list(chosen), 1).clamp(0, 1) * 255).round().byte().numpy()
-
-
-def _write_png(path: Path, pixels: np.ndarray) -> None:
-    from PIL import Image
-
-    Image.fromarray(pixels).save(path)

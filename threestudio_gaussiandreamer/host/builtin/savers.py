@@ -12,7 +12,7 @@ from torch import Tensor
 from ...core import images as pictures
 from ...core.checkpoint_file import save_file as save_checked
 from ...core.errors import UserError
-from ...core.files import json_text
+from ...core.files import atomic_file, json_text
 
 
 class SaverMixin:
@@ -146,7 +146,8 @@ class SaverMixin:
         path = self.get_save_path(
             filename if filename.endswith(extension) else filename + extension
         )
-        np.savez(path, **data) if isinstance(data, dict) else np.save(path, data)
+        with atomic_file(path) as file:
+            np.savez(file, **data) if isinstance(data, dict) else np.save(file, data)
         return path
 
     def save_state_dict(self, filename: str, data: Any) -> str:
@@ -161,9 +162,11 @@ class SaverMixin:
         import trimesh
 
         path = self.get_save_path(filename)
-        trimesh.Trimesh(
-            vertices=self.convert_data(v_pos), faces=self.convert_data(t_pos_idx), process=False
-        ).export(path)
+        vertices, faces = self.convert_data(v_pos), self.convert_data(t_pos_idx)
+        mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+        with atomic_file(path) as file:
+            content = mesh.export(file_type=Path(path).suffix.removeprefix("."))
+            file.write(content.encode() if isinstance(content, str) else content)
         return path
 
     def save_obj(
@@ -176,19 +179,21 @@ class SaverMixin:
         vertices, faces = self.convert_data(mesh.v_pos), self.convert_data(mesh.t_pos_idx)
         if save_vertex_color:
             vertices = np.concatenate([vertices, self.convert_data(mesh.v_rgb)], axis=1)
-        with open(path, "w") as file:
+        with atomic_file(path) as file:
             np.savetxt(file, vertices, fmt="v" + " %.9g" * vertices.shape[1])
             np.savetxt(file, faces + 1, fmt="f %d %d %d")
         return [path]
 
     def save_file(self, filename: str, src_path: str) -> str:
         path = self.get_save_path(filename)
-        shutil.copyfile(src_path, path)
+        with open(src_path, "rb") as source, atomic_file(path) as file:
+            shutil.copyfileobj(source, file)
         return path
 
     def save_json(self, filename: str, payload: Any) -> str:
         path = self.get_save_path(filename)
-        Path(path).write_text(json_text(payload))
+        with atomic_file(path) as file:
+            file.write(json_text(payload).encode())
         return path
 
     def _converted(self, imgs: list) -> list:
