@@ -1,5 +1,7 @@
 """The converter: what it writes, what it says, and what it refuses."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,9 @@ from threestudio_gaussiandreamer.formats.gaussian_files import (
     write_cloud,
 )
 
+GAUSSIANS = {".glb": ["--gaussians"]}
+"""Without it a .glb is a mesh."""
+
 
 @pytest.fixture
 def source(tmp_path):
@@ -24,7 +29,7 @@ def source(tmp_path):
 @pytest.mark.parametrize("suffix", WRITTEN)
 def test_every_format_is_written(source, tmp_path, capsys, suffix):
     out = tmp_path / f"out{suffix}"
-    assert main([str(source), str(out)]) == 0
+    assert main([str(source), str(out), *GAUSSIANS.get(suffix, ())]) == 0
     size = out.stat().st_size
     assert f"60 Gaussians of degree 1, {size / 1000:.3g} kB" in capsys.readouterr().out
     if suffix in READ:
@@ -36,7 +41,8 @@ def test_every_format_is_written(source, tmp_path, capsys, suffix):
 
 def test_the_way_there_and_back_is_exact_where_the_format_is(source, tmp_path):
     for name in ("a.glb", "b.ply"):
-        assert main([str(source), str(tmp_path / name)]) == 0
+        options = GAUSSIANS.get(Path(name).suffix, ())
+        assert main([str(source), str(tmp_path / name), *options]) == 0
         source = tmp_path / name
     read = read_cloud(str(source))
     assert read.up == "-y"
@@ -48,7 +54,8 @@ def test_what_is_lost_and_the_decibels_are_printed(source, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "lost: positions are rounded" in said and "lost: harmonics above degree 0" in said
     assert "dB in 8 views of 64 x 64 pixels" in said
-    assert main([str(source), str(tmp_path / "a.glb"), "--check", "--size", "64"]) == 0
+    options = ["--gaussians", "--check", "--size", "64"]
+    assert main([str(source), str(tmp_path / "a.glb"), *options]) == 0
     said = capsys.readouterr().out
     assert "lost:" not in said and "check: 100.0 dB" in said
 
@@ -82,7 +89,7 @@ def test_rows_that_cant_be_drawn_are_left_out(tmp_path, caplog):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["in.ply", "a.obj"], "OUT: expected the name of a .ply,"),
+        (["in.ply", "a.obj", "--gaussians"], "OUT: expected the name of a .ply,"),
         (["in.ply", "a.splat"], "OUT: expected the name of a .ply,"),
         (["none.ply", "a.glb"], "'none.ply' does not exist; near names"),
         (["in.ply", "nowhere/a.glb"], "OUT: there is no folder 'nowhere'"),
@@ -92,6 +99,12 @@ def test_rows_that_cant_be_drawn_are_left_out(tmp_path, caplog):
         (["in.ply", "a.usda", "--check"], "--check: .usda files are written here, but not read"),
         (["in.ply", "a.glb", "--harmonics", "4"], "--harmonics: expected"),
         (["in.ply", "a.glb", "--check", "--size", "2"], "--size: expected"),
+        (["in.ply", "a.glb", "--check"], "--check: OUT is a mesh"),
+        (["in.ply", "a.glb", "--faces", "5"], "--faces: expected a whole number from 100"),
+        (["in.ply", "a.glb", "--texture", "0"], "--texture: expected a whole number from 64"),
+        (["in.ply", "a.spz", "--faces", "500"], "--faces: OUT is a file of Gaussians"),
+        (["in.ply", "a.glb", "--gaussians", "--unlit"], "--unlit: OUT is a file of Gaussians"),
+        (["in.ply", "nowhere/a.obj"], "OUT: there is no folder 'nowhere'"),
         (["empty.ply", "a.glb"], "empty.ply holds no Gaussians that can be drawn"),
         (["text.ply", "a.glb"], "isn't a PLY file|this is not a PLY file"),
         (["in.ply", "a.glb", "--from", "blender"], None),

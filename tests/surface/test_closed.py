@@ -90,3 +90,41 @@ def test_a_fold_is_dropped():
     fold = [[0, 1, 2], [2, 1, 0], [3, 3, 4]]
     kept = without_folds(np.concatenate([faces, [[90, 91, 92], [92, 91, 90], fold[2]]]))
     np.testing.assert_array_equal(kept, faces)
+
+
+def cells_to_mesh(cells):
+    """Return the faces between filled and empty cells of a grid, two triangles each."""
+    padded = np.pad(cells, 1)
+    faces, corners = [], []
+    for axis in range(3):
+        for sign in (-1, 1):
+            open_side = padded & ~np.roll(padded, -sign, axis)
+            for cell in np.argwhere(open_side):
+                u, v = np.eye(3, dtype=int)[(axis + 1) % 3], np.eye(3, dtype=int)[(axis + 2) % 3]
+                first = cell + (sign > 0) * np.eye(3, dtype=int)[axis]
+                ring = [first, first + u, first + u + v, first + v][::sign]
+                start = len(corners)
+                corners += ring
+                faces += [[start, start + 1, start + 2], [start, start + 2, start + 3]]
+    return welded(np.array(corners, float), np.array(faces))
+
+
+def test_a_surface_that_passes_an_edge_twice_gets_another_vertex():
+    """A ring of cells whose ends touch at one edge only, so that its ends have one fan each."""
+    cells = np.zeros((3, 3, 1), bool)
+    cells[[0, 0, 0, 1, 2, 2], [0, 1, 2, 2, 2, 1]] = True
+    cells[1, 0] = True  # touches (2, 1) at an edge
+    vertices, faces = cells_to_mesh(cells)
+    assert not is_closed(faces)
+    moved, apart = separated(vertices, faces)
+    assert is_closed(welded(moved, apart)[1])
+    volume = trimesh.Trimesh(moved, apart, process=False).volume
+    assert volume == pytest.approx(cells.sum(), rel=0.05)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_random_cells_are_closed(seed):
+    cells = np.random.default_rng(seed).random((5, 5, 5)) < 0.4
+    vertices, faces = cells_to_mesh(cells)
+    moved, apart = separated(vertices, faces)
+    assert is_closed(welded(moved.astype(np.float32), apart)[1])

@@ -2,7 +2,10 @@
 
 The formats are those of the extensions: .ply, .compressed.ply, .spz, .sog and .glb are read and
 written, .splat and .gltf are read, .usda is written; IN may also be a checkpoint. The command says
-what OUT can't hold of IN, and with ``--check`` how many dB that costs."""
+what OUT can't hold of IN, and with ``--check`` how many dB that costs.
+
+A .glb or .obj is a textured mesh of the cloud's surface; ``--gaussians`` writes the Gaussians
+themselves into a .glb."""
 
 import argparse
 import os
@@ -21,6 +24,7 @@ from ..formats.gaussian_files import (
     StoredCloud,
     read_cloud,
     require_format,
+    suffix_of,
     write_cloud,
 )
 from ..formats.spz import VERSION
@@ -29,6 +33,7 @@ from ..gaussians.axes import AXES, VIEWER_UP
 from ..gaussians.gaussians import finite
 from ..gaussians.sh import COEFFICIENTS, MAX_DEGREE
 from ..view.command import read_any
+from . import to_mesh
 from .check import VIEWS, round_trip
 from .losses import losses
 from .producers import PRODUCERS, from_producer
@@ -56,6 +61,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "choices": AXES,
         "default": VIEWER_UP,
         "help": "which axis of OUT is up, for PLYs (default: %(default)s, as viewers expect)",
+    },
+    "--gaussians": {
+        "action": "store_true",
+        "help": "write the Gaussians themselves into a .glb (KHR_gaussian_splatting), not a mesh",
     },
     "--spz-version": {
         "type": int,
@@ -90,11 +99,14 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     """Parse a command line; exits for ``--help`` and for invalid arguments."""
     parser = argparse.ArgumentParser(
         prog="python -m threestudio_gaussiandreamer.convert",
-        description="Convert a file of Gaussians to another format, by the extensions of IN and "
-        "OUT.",
+        description="Convert a file of Gaussians to another format, or to a textured mesh, by "
+        "the extensions of IN and OUT.",
     )
     for name, settings in OPTIONS.items():
         parser.add_argument(name, **settings)
+    meshes = parser.add_argument_group("for meshes, .glb and .obj")
+    for name, settings in to_mesh.OPTIONS.items():
+        meshes.add_argument(name, **settings)
     parser.add_argument("source", metavar="IN", help="a file of Gaussians, or a checkpoint")
     parser.add_argument("output", metavar="OUT", help="the file to write")
     return parser.parse_args(argv)
@@ -106,10 +118,14 @@ def run(args: argparse.Namespace) -> None:
     Raises:
         UserError: an option is invalid, a file can't be read or written, or it holds no Gaussians.
     """
-    suffix = require_format(args.output, "OUT")
+    mesh = to_mesh.writes_mesh(args)
+    suffix = suffix_of(args.output) if mesh else require_format(args.output, "OUT")
     _check_options(args, suffix)
     source = existing_file(args.source, "file of Gaussians or checkpoint")
     stored = _read(source, args)
+    if mesh:
+        to_mesh.write_mesh(args, stored)
+        return
     write_cloud(args.output, stored, suffix, spz_version=args.spz_version)
     count, size = len(stored.gaussians.means), os.path.getsize(args.output)
     print(
@@ -131,6 +147,7 @@ def _check_options(args: argparse.Namespace, suffix: str) -> None:
     elif args.spz_version != VERSION:
         raise UserError(f"--spz-version: OUT is a {suffix} file")
     check_options(ConvertOptions, ConvertOptions(args.harmonics, args.size), "--")
+    to_mesh.check_mesh_options(args)
     if args.check and FORMATS[suffix].read is None:
         raise UserError(f"--check: {suffix} files are written here, but not read")
     if os.path.exists(args.output) and os.path.exists(args.source):

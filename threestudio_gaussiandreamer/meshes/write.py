@@ -178,8 +178,7 @@ def write_textured_obj(path: str | os.PathLike, mesh: Mesh, *, unlit: bool = Fal
         UserError: a value isn't finite, or a file can't be written.
     """
     require_finite(path, mesh)
-    path = Path(path)
-    texture, material = path.with_suffix(".png"), path.with_suffix(".mtl")
+    texture, material = companions(path)
     with atomic_file(texture) as file:
         file.write(png_bytes(mesh.texture))
     with atomic_file(material) as file:
@@ -196,6 +195,13 @@ def write_textured_obj(path: str | os.PathLike, mesh: Mesh, *, unlit: bool = Fal
 
 
 # ---- both ----------------------------------------------------------------------------------------
+
+
+def companions(path: str | os.PathLike) -> tuple[Path, ...]:
+    """Return the files that are written beside a mesh: the PNG and the MTL of an OBJ."""
+    path = Path(path)
+    beside = path.suffix.lower() == ".obj"
+    return (path.with_suffix(".png"), path.with_suffix(".mtl")) if beside else ()
 
 
 def require_finite(path: str | os.PathLike, mesh: Mesh) -> None:

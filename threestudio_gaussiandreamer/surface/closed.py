@@ -10,6 +10,7 @@ Faces = Int[np.ndarray, "F 3"]
 AGGRESSIVENESS = (7, 5, 3, 1)
 """Of the simplification, in the order in which they are tried; lower ones keep more of the shape.
 """
+ATTEMPTS = 4
 APART = 0.05
 """Share of the way to their neighbours by which vertices are moved that had the same position."""
 
@@ -37,25 +38,38 @@ def simplified(vertices: Vertices, faces: Faces, count: int) -> tuple[Vertices, 
     Raises:
         UserError: the shape can't be closed with so few faces.
     """
-    import fast_simplification
-
     for aggressiveness in AGGRESSIVENESS:
-        fewer = vertices, faces
-        if len(faces) > count:
-            fewer = fast_simplification.simplify(
-                vertices.astype(np.float32),
-                faces.astype(np.int32),
-                target_count=count,
-                agg=aggressiveness,
-            )
-        positions, index = joined(*fewer)
-        found = separated(positions, without_folds(index))
-        if found is not None and len(found[1]) and is_closed(joined(*found)[1]):
+        target = count
+        for _ in range(ATTEMPTS):
+            found = _closed_again(*_fewer(vertices, faces, target, aggressiveness))
+            if found is None or len(found[1]) <= count:
+                break
+            target -= len(found[1]) - count  # splitting edges has added faces
+        if found is not None and 0 < len(found[1]) <= count:
             return found
     raise UserError(
         f"faces: the surface can't be closed with {count} faces; allow more, or extract it with "
         "a lower resolution"
     )
+
+
+def _fewer(
+    vertices: Vertices, faces: Faces, count: int, aggressiveness: int
+) -> tuple[Vertices, Faces]:
+    import fast_simplification
+
+    if len(faces) <= count:
+        return vertices, faces
+    return fast_simplification.simplify(
+        vertices.astype(np.float32), faces.astype(np.int32), target_count=count, agg=aggressiveness
+    )
+
+
+def _closed_again(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces] | None:
+    """Mend what simplification has left touching; None if the mesh can't be closed."""
+    positions, index = joined(vertices, faces)
+    found = separated(positions, without_folds(index))
+    return found if found is not None and is_closed(joined(*found)[1]) else None
 
 
 def joined(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
@@ -66,12 +80,17 @@ def joined(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
 
 def without_folds(faces: Faces) -> Faces:
     """Drop faces with equal corners, and pairs of faces that are each other's back."""
-    proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    faces = faces[proper]
-    _, index, count = np.unique(
-        np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    return faces[count[index.reshape(-1)] == 1]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    ordered = np.sort(faces, axis=1)
+    lowest = faces.argmin(axis=1)
+    following = faces[np.arange(len(faces)), (lowest + 1) % 3]
+    turn = np.where(following == ordered[:, 1], 1, -1)
+    _, index = np.unique(ordered, axis=0, return_inverse=True)
+    index = index.reshape(-1)
+    surplus = np.bincount(index, turn, minlength=1)[index]
+    kept = faces[surplus * turn > 0]
+    first = np.unique(np.sort(kept, axis=1), axis=0, return_index=True)[1]
+    return kept[np.sort(first)]
 
 
 def is_closed(faces: Faces) -> bool:
@@ -90,20 +109,58 @@ def separated(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces] | None
     """Split the edges and vertices at which a closed mesh touches itself; None if it has holes.
 
     At an edge of more than two faces those are paired that bound a sector of the inside; the parts
-    are then moved apart a little.
+    are then moved apart a little. Where the same surface passes an edge twice, so that its ends
+    can't be split, one passage gets a vertex of its own in the middle of the edge.
     """
-    pairs = _paired(vertices, faces)
-    if pairs is None:
-        return None
+    for _ in range(ATTEMPTS):
+        pairs = _paired(vertices, faces)
+        if pairs is None:
+            return None
+        old, fans = _split(faces, pairs)
+        vertices = _moved_apart(vertices[old], fans, np.bincount(old)[old] > 1)
+        if is_closed(fans):
+            return vertices, fans
+        vertices, faces = _with_middles(vertices, fans, pairs)
+    return None
+
+
+def _split(
+    faces: Faces, pairs: tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]
+) -> tuple[Int[np.ndarray, " U"], Faces]:
+    """Give every fan of paired faces a vertex of its own; return the old vertex of each, and the
+    faces.
+    """
     (start, end), (other_start, other_end) = (_corners(edges, len(faces)) for edges in pairs)
-    links = np.concatenate(
-        [np.stack([start, other_end], axis=1), np.stack([end, other_start], axis=1)]
-    )
-    label = _labels(links, faces.size)
+    links = [np.stack([start, other_end], axis=1), np.stack([end, other_start], axis=1)]
+    label = _labels(np.concatenate(links), faces.size)
     old = np.zeros(label.max() + 1, np.int64)
     old[label] = faces.ravel()
-    fans = label.reshape(-1, 3)
-    return _moved_apart(vertices[old], fans, np.bincount(old)[old] > 1), fans
+    return old, label.reshape(-1, 3)
+
+
+def _with_middles(
+    vertices: Vertices, faces: Faces, pairs: tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]
+) -> tuple[Vertices, Faces]:
+    """Split the faces of the second pair at each edge that has two, at a new vertex between its
+    ends; faces that are split already wait for the next attempt.
+    """
+    edges, count = half_edges(faces), len(faces)
+    key = np.sort(edges[pairs[0]], axis=1)
+    _, first = np.unique(key, axis=0, return_index=True)
+    changed, added, places = set(), [], []
+    for pair in np.setdiff1d(np.arange(len(key)), first):
+        halves = [int(side[pair]) for side in pairs]
+        if changed & {half % count for half in halves}:
+            continue
+        changed |= {half % count for half in halves}
+        corners = [np.roll(faces[half % count], -(half // count)) for half in halves]
+        opposite = vertices[[corner[2] for corner in corners]].mean(axis=0)
+        middle = vertices[corners[0][:2]].mean(axis=0)
+        places.append(middle + APART * (opposite - middle))
+        new = len(vertices) + len(places) - 1
+        added += [[row for a, b, c in corners for row in ([a, new, c], [new, b, c])]]
+    kept = np.delete(faces, sorted(changed), axis=0)
+    return np.concatenate([vertices, places]), np.concatenate([kept, *added])
 
 
 def _corners(
