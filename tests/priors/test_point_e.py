@@ -318,7 +318,7 @@ def test_a_clip_of_another_size_is_named(tmp_path, files):
         BaseModel(width=64, layers=1, features=tiny.FEATURES + 8).state_dict(),
         tmp_path / "other.pt",
     )
-    with pytest.raises(UserError, match="clip: .* 24 features, .* 32: take ViT-L/14"):
+    with pytest.raises(UserError, match="clip: .* 24 features, .* 32: use ViT-L/14"):
         make(files, checkpoint=str(tmp_path / "other.pt"))("a fox")
 
 

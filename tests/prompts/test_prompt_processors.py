@@ -237,7 +237,7 @@ def test_the_prompt_library(models, tmp_path, layout):
     content = texts if layout == "list" else {"dreamfusion": texts[:2], "mine": texts[1:]}
     (tmp_path / "load" / "prompt_library.json").write_text(json.dumps(content))
     assert processor(models, prompt="lib:snow_corgi")().prompt == "a Corgi in the snow"
-    with pytest.raises(UserError, match="fits 2 texts.*add a word"):
+    with pytest.raises(UserError, match="matches 2 texts.*add a word"):
         processor(models, prompt="lib:corgi")
     with pytest.raises(UserError, match="near: a bald eagle"):
         processor(models, prompt="lib:bald_eagel")

@@ -97,7 +97,7 @@ def test_test_validate_and_export_use_the_checkpoint_and_no_prior(tmp_path, pain
         (["system.prune.count=0"], "system.prune.count: expected a whole number from 1 on"),
         (
             ["system.prune.count=9", "system.prune.psnr=40"],
-            "system.prune.psnr: give one budget; count is one too",
+            "system.prune.psnr: give one budget only; count is set too",
         ),
         (["system.prune.bytes=lots"], "system.prune.bytes: expected a size such as 500kB"),
     ],

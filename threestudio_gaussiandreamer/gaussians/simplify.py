@@ -95,8 +95,8 @@ class _Search:
         self._take(cloud)
         if not self.scores.any():
             raise UserError(
-                f"none of the {len(cloud.means)} Gaussians is to be seen from around: nothing says "
-                "which ones to keep"
+                f"none of the {len(cloud.means)} Gaussians is visible in any view, so they "
+                "can't be ranked"
             )
         self._fit_within_reach()
         self._merge()

@@ -194,7 +194,7 @@ def _rehearse(optimizer: Mapping, state: Mapping, parameters: Mapping, what: str
         rehearsed.step()
     except Exception as error:  # torch doesn't check keys and types
         raise UserError(
-            f"{what}: {kind.__name__} can't go on from its optimizer_states: "
+            f"{what}: {kind.__name__} can't resume from its optimizer_states: "
             f"{type(error).__name__} {error}"
         ) from error
     for name, value in optimizer_tensors(rehearsed):

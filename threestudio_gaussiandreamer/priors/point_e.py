@@ -233,5 +233,5 @@ def require_features(model: BaseModel, condition: Float[Tensor, "1 D"], clip: st
     if condition.shape[-1] != expected:
         raise UserError(
             f"clip: {clip!r} has {condition.shape[-1]} features, but the checkpoint was "
-            f"trained with {expected}: take ViT-L/14"
+            f"trained with {expected}: use ViT-L/14"
         )

@@ -232,7 +232,7 @@ def from_library(words: str, path: str) -> str:
         return matches[0]
     if matches:
         raise UserError(
-            f"lib:{words} fits {len(matches)} texts of {path}, for instance {matches[0]!r} and "
+            f"lib:{words} matches {len(matches)} texts of {path}, for instance {matches[0]!r} and "
             f"{matches[1]!r}: add a word"
         )
     near = get_close_matches(" ".join(keywords), texts, n=3, cutoff=0.3)

@@ -52,7 +52,7 @@ class PruneOptions:
         """
         given = [name for name in BUDGETS if getattr(cfg, name) is not None]
         if len(given) > 1:
-            raise UserError(f"{given[1]}: give one budget; {given[0]} is one too")
+            raise UserError(f"{given[1]}: give one budget only; {given[0]} is set too")
         budget_of(cfg, "")
 
 

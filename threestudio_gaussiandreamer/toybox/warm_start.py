@@ -51,7 +51,7 @@ def _load(model: nn.Module, state: dict[str, Tensor], weights: Path, name: str) 
     if differing or (name != "clip" and state.keys() != known.keys()):
         raise UserError(
             f"the weights of {name!r} in {str(weights)!r} are of another model"
-            f" ({', '.join(differing[:3]) or 'some are missing'}): take those of this version"
+            f" ({', '.join(differing[:3]) or 'some are missing'}): use those of this version"
         )
     model.load_state_dict(state, strict=False)
 

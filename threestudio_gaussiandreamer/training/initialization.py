@@ -100,7 +100,7 @@ def most_visible(cloud: Gaussians, max_gaussians: int, device: torch.device) -> 
     if len(cloud.means) <= max_gaussians:
         return cloud
     logger.warning(
-        "the prior has %d Gaussians; keeping the %d that show most (max_gaussians)",
+        "the prior has %d Gaussians; keeping the %d that contribute most (max_gaussians)",
         len(cloud.means),
         max_gaussians,
     )

@@ -27,7 +27,7 @@ class LossScale:
         self.skipped_steps += 1
         warn(
             f"step {trainer.global_step}: gradients overflowed at the loss scale {before:g}, "
-            "so nothing was learnt in it; schedules go on "
+            "so its update was skipped; schedules continue "
             f"({self.skipped_steps} such steps so far)"
         )
         return True
