@@ -114,7 +114,7 @@ def test_the_pool_covers_all_azimuths():
     assert not torch.equal(pool.distance, cameras.camera_pool(200, OrbitRanges(), 4).distance)
 
 
-def test_the_inverse_of_a_camera_is_exact_and_of_a_broken_one_its_own_trouble():
+def test_the_inverse_of_a_camera_is_exact_and_an_invalid_one_affects_only_itself():
     c2w = cameras.orbit_c2w(
         torch.tensor([10.0, 90.0, 0.0]),
         torch.tensor([20.0, 0.0, 0.0]),

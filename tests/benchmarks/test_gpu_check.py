@@ -35,7 +35,7 @@ def test_every_section_runs_and_reports(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_fails_is_recorded_and_the_rest_goes_on(monkeypatch, tmp_path):
+def test_a_failed_section_is_recorded_and_the_rest_continues(monkeypatch, tmp_path):
     monkeypatch.setattr(gpu_kernels, "GRADIENT_ERROR", 0.0)
     monkeypatch.setattr(
         gpu_check, "SECTIONS", {name: gpu_check.SECTIONS[name] for name in ("correct", "bench")}
@@ -52,7 +52,7 @@ def test_what_fails_is_recorded_and_the_rest_goes_on(monkeypatch, tmp_path):
     )
 
 
-def test_each_section_leaves_its_numbers_whatever_the_next_one_does(monkeypatch, tmp_path):
+def test_each_section_is_written_before_the_next_one_runs(monkeypatch, tmp_path):
     def crash(args):
         raise SystemExit("as if somebody had ended the process")
 

@@ -110,7 +110,7 @@ def test_rows_that_cant_be_drawn_are_left_out(tmp_path, caplog):
         (["in.ply", "a.glb", "--from", "blender"], None),
     ],
 )
-def test_mistakes_are_found_before_anything_is_written(
+def test_errors_are_found_before_anything_is_written(
     source, tmp_path, capsys, monkeypatch, arguments, said
 ):
     monkeypatch.chdir(tmp_path)

@@ -17,7 +17,7 @@ def test_exact_formats_lose_nothing(suffix):
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".compressed.ply", ".sog"])
-def test_rounding_is_said(suffix):
+def test_rounding_is_reported(suffix):
     assert "rounded" in said(ball(9), suffix) and "harmonics" not in said(ball(9), suffix)
     assert "of 9 Gaussians" not in said(ball(9, 1), suffix)
 
@@ -41,7 +41,7 @@ def test_values_beyond_the_range_of_a_compressed_ply_are_counted():
     assert "3 of 50 Gaussians have harmonics beyond 4" in text and "1 of 50 Gaussians are" in text
 
 
-def test_a_palette_smaller_than_the_cloud_is_said():
+def test_a_palette_smaller_than_the_cloud_is_reported():
     assert "a palette of 1,024 for 2,000 Gaussians" in said(ball(2000, 1), ".sog")
     assert "palette" not in said(ball(1000, 1), ".sog")
 

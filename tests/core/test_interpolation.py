@@ -10,7 +10,7 @@ from threestudio_gaussiandreamer.launch.config_source import _protect_escaped
 
 
 @pytest.mark.parametrize("text", ["${a}", "\\${a}", "x\\\\${", "\\\\", "${${", "a\\b ${c} \\\\${d"])
-def test_escaped_text_comes_back(text):
+def test_escaped_text_is_read_back(text):
     assert OmegaConf.create({"text": escape(text)}).text == text
 
 

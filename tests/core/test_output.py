@@ -29,7 +29,7 @@ def unbuffered(descriptor):
 
 
 @pytest.mark.parametrize("opened", [buffered, unbuffered])
-def test_a_full_device_is_said_once_on_the_other_stream(capfd, monkeypatch, opened):
+def test_a_full_device_is_reported_once_on_the_other_stream(capfd, monkeypatch, opened):
     descriptor = os.dup(1)
     full = os.open("/dev/full", os.O_WRONLY)
     os.dup2(full, 1)

@@ -7,7 +7,7 @@ import torch
 from threestudio_gaussiandreamer.core import streams
 
 
-def test_the_same_key_gives_the_same_draw_whatever_happened_before():
+def test_the_same_key_gives_the_same_draw_after_any_other_draws():
     first = torch.rand(4, generator=streams.generator(1, "camera", 7))
     torch.rand(100)
     torch.manual_seed(5)

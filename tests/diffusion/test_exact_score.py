@@ -164,7 +164,7 @@ def test_classifier_free_guidance_acts_on_the_means():
     )
 
 
-def test_a_batch_is_its_items_with_shared_and_with_own_banks():
+def test_items_are_independent_with_shared_and_with_separate_banks():
     z, abar, own = randn(3, 12), ABAR[torch.tensor([5, 400, 950])], randn(3, 4, 12, seed=1)
     log_prior = randn(3, 4, seed=2)
     for bank in (own, own[0]):

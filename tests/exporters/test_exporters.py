@@ -164,7 +164,7 @@ def test_axes_of_the_world_can_be_asked_for(tmp_path):
             build(f"{name}-exporter", up="x")
 
 
-def test_the_surface_lies_in_our_own_mesh_reader_as_the_gaussians_do(tmp_path):
+def test_the_exported_surface_is_read_back_in_the_pose_of_the_gaussians(tmp_path):
     """A tall object with a nose in front: z is its longest side, the nose points to +x."""
     source, rng = geometry(400, 0), torch.Generator().manual_seed(1)
     source.means.data = torch.rand(400, 3, generator=rng) * torch.tensor([0.3, 0.5, 2.0])
@@ -212,7 +212,7 @@ def test_harmonics_can_be_padded():
         build("ply-exporter", pad_sh_degree=4)
 
 
-def test_nothing_that_is_not_finite_is_exported_and_that_is_said_once(tmp_path, caplog):
+def test_nothing_that_is_not_finite_is_exported_and_that_is_reported_once(tmp_path, caplog):
     source = geometry(degree=1)
     with torch.no_grad():
         source.means[3], source.log_scales[5, 1] = float("nan"), float("inf")

@@ -112,6 +112,6 @@ def test_damaged_files_are_refused(tmp_path, data, said):
         read_compressed_ply(stored(tmp_path, data))
 
 
-def test_what_follows_is_said(tmp_path, caplog):
+def test_what_follows_is_reported(tmp_path, caplog):
     read_compressed_ply(stored(tmp_path, BY_HAND + b"more"))
     assert "4 bytes follow its elements" in caplog.text

@@ -112,7 +112,7 @@ def test_an_empty_cloud(tmp_path):
     assert read_glb(tmp_path / "a.glb").means.shape == (0, 3)
 
 
-def test_another_colour_space_is_said(path, caplog):
+def test_another_colour_space_is_reported(path, caplog):
     read_glb(changed(path, ((*SPLATTING, "colorSpace"), "lin_rec709_display")))
     assert "colours of 'lin_rec709_display' are read as sRGB" in caplog.text
 

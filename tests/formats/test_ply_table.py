@@ -17,7 +17,7 @@ class TestDamage:
         [("char", struct.pack("<b", -1)), ("float", struct.pack("<f", float("nan")))]
         + [("double", struct.pack("<d", float("inf"))), ("uint", struct.pack("<I", 2**32 - 1))],
     )
-    def test_lengths_of_lists_that_are_none(self, tmp_path, kind, length):
+    def test_invalid_lengths_of_lists(self, tmp_path, kind, length):
         before = f"element face 1\nproperty list {kind} int vertex_indices"
         head = header("binary_little_endian", 2, before=before)
         with pytest.raises(UserError, match="a list in 'face' is longer than the file"):
@@ -32,7 +32,7 @@ class TestDamage:
         assert time.process_time() - started < 1.5
 
     @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
-    def test_more_than_was_announced_is_said(self, tmp_path, encoding, caplog):
+    def test_more_than_was_announced_is_reported(self, tmp_path, encoding, caplog):
         data = b"1 2 3\n4 5 6\n7 8 9\n" if encoding == "ascii" else bytes(range(36))
         assert (
             len(ply.read_points(saved(tmp_path, header(encoding, 2).encode() + data)).points) == 2

@@ -98,7 +98,7 @@ def test_the_floor_holds_when_everything_is_faint_and_keeps_the_best():
     assert change.parents.tolist() == list(range(30, 50))
 
 
-def test_faint_and_huge_gaussians_go():
+def test_faint_and_huge_gaussians_are_dropped():
     params = cloud(6)
     params["logit_opacities"].data[0] = -5.0
     params["log_scales"].data[1, 2] = 0.0
@@ -182,7 +182,7 @@ def test_the_room_of_faint_gaussians_is_used_in_the_same_round():
     assert sorted(change.parents.tolist()) == [3, 4, 5, 6, 7, 7, 8, 8, 9, 9]
 
 
-def test_the_floor_is_said_only_where_it_holds_something_back(caplog, monkeypatch):
+def test_the_floor_is_reported_only_if_it_keeps_gaussians(caplog, monkeypatch):
     monkeypatch.setattr(densify.logger.parent, "propagate", True)  # the launcher stops it
     params = cloud(50)
     densify.densify_and_prune(params, statistics(50), Rules(), generator(0, "s"))

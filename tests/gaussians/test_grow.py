@@ -84,7 +84,7 @@ class TestGrow:
         assert 4000 < len(grown) < 4700
         np.testing.assert_array_equal(grown, candidates[distances < 0.01].astype(np.float32))
 
-    def test_originals_come_first_and_untouched(self):
+    def test_originals_come_first_and_unchanged(self):
         cloud = sphere()._replace(faces=np.array([[0, 1, 2]]))
         grown = grow(cloud, num_candidates=5000, radius=0.05, generator=rng())
         np.testing.assert_array_equal(grown.points[:2000], cloud.points)
@@ -157,7 +157,7 @@ class TestGrow:
         )
         assert len(grow(sphere(), **options, max_points=0, generator=rng()).points) == 2000
 
-    def test_same_generator_same_cloud_and_the_global_one_is_untouched(self):
+    def test_same_generator_same_cloud_and_the_global_one_is_unchanged(self):
         before = np.random.get_state()[1].copy()
         first, again, other = (
             grow(sphere(), num_candidates=5000, radius=0.05, generator=rng(seed))

@@ -98,7 +98,7 @@ def test_a_budget_above_the_count_changes_nothing():
 
 
 @pytest.mark.parametrize("sampled", [False, True])
-def test_those_with_the_lowest_scores_go_first(sampled):
+def test_the_lowest_scores_are_pruned_first(sampled):
     geometry = cloud(100, budget=80, prune=EVERY_STEP)
     if sampled:
         geometry.removal += torch.rand(100, generator=torch.Generator().manual_seed(1))
@@ -347,7 +347,7 @@ def test_auto_in_the_loop_ends_where_the_quality_ends():
     assert 70 <= counts[0] <= 74
 
 
-def test_hidden_gaussians_are_as_if_they_were_not_there_and_come_back():
+def test_hidden_gaussians_render_as_if_absent_and_are_restored():
     geometry = cloud(50)
     viewmats, Ks = one_view()
 

@@ -84,7 +84,7 @@ def test_copies_in_one_place_become_one(times):
     assert psnr(picture(change.values), picture(copies(params, times))) > 40
 
 
-def test_copies_a_little_apart_become_one_that_looks_like_both():
+def test_nearby_copies_are_merged_into_one_that_renders_like_both():
     params = shell()
     both = copies(params, 2)
     away = torch.randn(120, 3, generator=torch.Generator().manual_seed(1)).clamp(-1.5, 1.5)

@@ -24,7 +24,7 @@ def test_how_many_rounds_it_takes(here, count, rounds):
     assert rounds_to(count, here) == rounds
 
 
-def test_hidden_gaussians_go_first():
+def test_hidden_gaussians_are_removed_first():
     cloud = ball()
     views = views_around(cloud, 16, 48)
     kept = keep_best(cloud, view_importance(cloud, views), 400)

@@ -154,7 +154,7 @@ def test_the_default_is_gated_which_is_reported_at_once(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(NAME != "builtin", reason="inside threestudio its own part has this name")
-def test_threestudios_name_finds_ours():
+def test_threestudios_name_finds_this_packages_part():
     assert find("deep-floyd-guidance") is deep_floyd.DeepFloydGuidance
 
 

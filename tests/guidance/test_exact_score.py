@@ -86,7 +86,7 @@ def test_view_exact_without_width_is_a_weighted_squared_error(mesh_path):
     assert none.abs().max() < 1e-5  # float32 rounding of z against noise of size 1
 
 
-def test_a_batch_is_its_items(mesh_path):
+def test_items_of_a_batch_are_independent(mesh_path):
     """Noise is drawn per item, so the first item's gradient doesn't depend on the others."""
     rgb = uniform(3, 16, 16, 3)
     options = {"mode": "view-agnostic", "space": "latent", "latent_size": 4, "guidance_scale": 3.0}
@@ -100,7 +100,7 @@ def test_a_batch_is_its_items(mesh_path):
 @pytest.mark.parametrize("mode", ["view-exact", "direction-bins", "view-agnostic"])
 @pytest.mark.parametrize("space", ["pixel", "latent"])
 @pytest.mark.parametrize("scale", [1.0, 7.5])
-def test_every_mode_runs_on_constant_and_on_pixel_backgrounds_alike(mesh_path, mode, space, scale):
+def test_every_mode_runs_on_constant_and_on_pixel_backgrounds(mesh_path, mode, space, scale):
     exact = guidance(
         mesh_path, mode=mode, space=space, guidance_scale=scale, latent_size=4, std=0.1
     )
@@ -199,7 +199,7 @@ def test_a_direction_without_bank_views_takes_all(mesh_path):
 
 
 @pytest.mark.parametrize(("mode", "modes"), [("view-exact", 1), ("view-agnostic", 25)])
-def test_the_cameras_own_view_is_one_of_the_modes_unless_it_is_left_out(mesh_path, mode, modes):
+def test_the_cameras_own_view_is_one_of_the_modes_unless_excluded(mesh_path, mode, modes):
     for include in (True, False):
         exact = guidance(mesh_path, mode=mode, bank_includes_view=include)
         exact.encode(uniform(1, 3, 16, 16))

@@ -127,7 +127,7 @@ def test_bad_items_are_masked_and_the_others_keep_their_gradient_bit_for_bit(val
     )
 
 
-def test_an_encoder_that_overflows_spoils_only_its_item():
+def test_an_encoder_that_overflows_affects_only_its_item():
     class Overflowing(Stub):
         def encode(self, rgb, **batch):
             scale = torch.tensor([1.0, math.inf, 1.0]).reshape(3, 1, 1, 1)

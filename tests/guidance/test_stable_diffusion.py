@@ -127,7 +127,7 @@ def test_rescaling_restores_the_contrast_of_the_conditional_picture():
     )
 
 
-def test_prompts_that_do_not_fit_are_said(models, prompts):
+def test_prompts_that_do_not_fit_are_reported(models, prompts):
     guide = tiny.guidance(models)
     with pytest.raises(UserError, match="stable-diffusion-prompt-processor"):
         guide(tiny.renders(), PlainPrompt("a fox"), **tiny.BATCH)
@@ -213,7 +213,7 @@ class Spoiling(nn.Module):
         return out
 
 
-def test_a_bad_item_is_left_out_and_the_others_are_untouched(models, prompts):
+def test_a_bad_item_is_left_out_and_the_others_are_unchanged(models, prompts):
     guide, rgb = tiny.guidance(models), tiny.renders()
     clean, _ = tiny.gradient(guide, prompts[False], rgb)
     guide.unet = Spoiling(guide.unet, [1])

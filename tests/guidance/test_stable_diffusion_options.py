@@ -166,5 +166,5 @@ def test_an_unknown_prediction_type(models, tmp_path):
 
 
 @pytest.mark.skipif(NAME != "builtin", reason="inside threestudio its own part has this name")
-def test_threestudios_name_finds_ours():
+def test_threestudios_name_finds_this_packages_part():
     assert find("stable-diffusion-guidance") is stable_diffusion.StableDiffusionGuidance

@@ -23,12 +23,12 @@ def saver(tmp_path):
     return saver
 
 
-def test_saving_without_a_folder_is_our_own_mistake():
+def test_saving_without_a_folder_is_an_internal_error():
     with pytest.raises(ValueError, match="set_save_dir"):
         SaverMixin().get_save_path("a.png")
 
 
-def test_colours_come_back_from_the_file(saver):
+def test_colours_are_read_back_from_the_file(saver):
     image = torch.tensor([[[1.0, 0.0, 0.0], [0.0, 0.5, 2.0]]])
     path = saver.save_rgb_image("it3-0.png", image)
     assert iio.imread(path).tolist() == [[[255, 0, 0], [0, 128, 255]]]
@@ -97,7 +97,7 @@ def test_a_video_of_nothing_and_an_unknown_format_are_errors(saver):
         saver.save_img_sequence("a", "empty", r"(\d+)\.png", save_format="avi")
 
 
-def test_data_json_files_and_meshes_come_back(saver, tmp_path):
+def test_data_json_files_and_meshes_are_read_back(saver, tmp_path):
     assert np.load(saver.save_data("a", {"x": torch.arange(3)}))["x"].tolist() == [0, 1, 2]
     assert np.load(saver.save_data("b.npy", np.ones(2))).tolist() == [1, 1]
     assert json.loads(Path(saver.save_json("c.json", {"psnr": 30.5})).read_text()) == {"psnr": 30.5}

@@ -44,7 +44,7 @@ def test_a_mistake_in_a_configuration_is_named(values, message):
 
 
 @given(st.text(alphabet="ab\\${} :#[]", max_size=12))
-def test_strings_are_text_whatever_they_look_like(text):
+def test_strings_stay_text_even_if_they_look_like_numbers(text):
     assert OmegaConf.create({"x": escape(text)}).x == text
     cfg = parse_structured(Options, {"text": text, "inner": {"prompt": text}})
     assert cfg.text == text and cfg.inner.prompt == text

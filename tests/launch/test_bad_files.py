@@ -234,7 +234,7 @@ def test_an_extension_that_fails_is_named(launch_demo, source, message):
     assert "custom/part.py" in err
 
 
-def test_a_signal_while_the_test_views_are_rendered_leaves_a_checkpoint_and_says_how_to_go_on(
+def test_a_signal_while_the_test_views_are_rendered_leaves_a_checkpoint_and_prints_the_command(
     launch_demo, monkeypatch, capsys
 ):
     with monkeypatch.context() as patch:

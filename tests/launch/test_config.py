@@ -163,7 +163,7 @@ def test_a_bad_file_is_named(folder, content, message):
 
 
 @pytest.mark.parametrize("prompt", PROMPTS)
-def test_a_prompt_is_text_and_comes_back_from_the_parsed_file(folder, prompt):
+def test_a_prompt_is_text_and_is_read_back_from_the_parsed_file(folder, prompt):
     # a second reference to the prompt must be text too
     cfg = load(
         f"{PROMPT}={prompt}",

@@ -85,7 +85,7 @@ def test_export_with_video_renders_the_test_views(launch, trained):
     assert code == 0 and {"save/it6-export/means.npz", "save/it6-test.mp4"} <= files(trained)
 
 
-def test_evaluating_without_a_checkpoint_says_so(launch):
+def test_evaluating_without_a_checkpoint_gives_a_message(launch):
     code, _, err = launch("--test")
     assert code == 0 and "no checkpoint given" in err
     assert (only_run() / "save/it0-test.mp4").is_file()

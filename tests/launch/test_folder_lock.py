@@ -259,7 +259,7 @@ def test_a_deleted_working_folder_is_one_message(folder, tmp_path):
     ("name", "is_folder"),
     [("ckpts", False), ("save", False), ("ckpts/last.ckpt", True), ("cmd.txt", True)],
 )
-def test_what_lies_in_the_way_of_a_result_is_found_before_the_work(folder, name, is_folder):
+def test_a_path_that_blocks_a_result_is_found_before_the_work(folder, name, is_folder):
     (folder / name).parent.mkdir(parents=True)
     (folder / name).mkdir() if is_folder else (folder / name).touch()
     with pytest.raises(UserError, match=f"{name} is "):

@@ -109,7 +109,9 @@ def test_overlays_can_be_combined(tmp_path):
 
 @pytest.mark.parametrize("other", ["if", "pointe", "avatar", "ground"])
 @pytest.mark.parametrize("lowmem_first", [True, False])
-def test_little_memory_goes_with_every_other_overlay_in_either_order(other, lowmem_first, tmp_path):
+def test_the_lowmem_overlay_combines_with_every_other_in_either_order(
+    other, lowmem_first, tmp_path
+):
     names = ["gaussiandreamer-lowmem.yaml", f"gaussiandreamer-{other}.yaml"]
     overrides = ["system.prompt_processor.prompt=a fox", *MANDATORY.get(names[1], [])]
     paths = [

@@ -84,7 +84,7 @@ def test_a_resumed_run_keeps_its_first_configuration_and_adds_its_command(launch
     )
 
 
-def test_resume_auto_goes_on_where_the_last_run_stopped(launch):
+def test_resume_auto_resumes_the_last_run(launch):
     assert launch("--train", "resume=auto", "system.signal_at=2")[0] == 130
     code, _, _ = launch("--train", "resume=auto")
     assert code == 0 and load_file(only_run() / "ckpts/last.ckpt")["global_step"] == 6
@@ -158,7 +158,7 @@ def test_a_closed_terminal_leaves_a_checkpoint(launch, monkeypatch):
 
 
 @pytest.mark.parametrize("translated", [RecursionError, UserError, None])
-def test_a_signal_during_imports_ends_it_whatever_becomes_of_its_exception(
+def test_a_signal_during_imports_ends_them_even_if_its_exception_is_caught(
     launch, monkeypatch, translated
 ):
     def importing(*arguments):

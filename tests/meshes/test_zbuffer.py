@@ -172,7 +172,7 @@ VIEWS = [
 
 
 @pytest.mark.parametrize("view", range(len(VIEWS)))
-def test_the_toy_looks_as_embree_draws_it(toy, view, monkeypatch):
+def test_the_toy_equals_embrees_render(toy, view, monkeypatch):
     c2w, degrees = VIEWS[view]
     caster = raycast.MeshCaster(toy)
     expected = caster.render(c2w, math.radians(degrees), 96, 96, supersample=2)

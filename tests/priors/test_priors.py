@@ -185,7 +185,7 @@ class TestMesh:
         turned = build("mesh-prior", assets, up="+x", front="+y")("").points
         np.testing.assert_allclose(np.ptp(turned, axis=0), [1, 0.5, 2], atol=1e-6)
 
-    def test_no_colours_are_said(self, assets, caplog):
+    def test_no_colours_are_reported(self, assets, caplog):
         with caplog.at_level(logging.WARNING):
             cloud = build("mesh-prior", assets, path="body.obj")("")
         assert "no colours" in caplog.text and (cloud.colors == 0.5).all()

@@ -127,7 +127,7 @@ def test_latents_that_are_not_finite_are_a_message(folder):
 # sampling
 
 
-def test_text_condition_is_the_pipelines_own(folder):
+def test_text_condition_equals_the_pipelines(folder):
     """Without padding, and with our loading; diffusers pads to 77 tokens."""
     from diffusers import ShapEPipeline
 

@@ -52,7 +52,7 @@ def test_long_and_foreign_texts_give_a_short_warning(folder, caplog, prompt):
     assert 0 < len(caplog.records[0].getMessage()) < 600
 
 
-def test_the_prompt_processor_warns_and_goes_on(models, caplog, tmp_path, monkeypatch):
+def test_the_prompt_processor_warns_and_continues(models, caplog, tmp_path, monkeypatch):
     pytest.importorskip("diffusers")
     monkeypatch.chdir(tmp_path)
     copy = Path(shutil.copytree(models["stable-diffusion"], tmp_path / "model"))

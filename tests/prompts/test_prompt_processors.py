@@ -79,7 +79,7 @@ def test_stable_diffusion_2_is_padded_as_it_was_trained(models):
     assert text_encoders._tokenize(tokenizer, ["a fox"], 77).input_ids[0, -1] == 0
 
 
-def test_a_prompt_that_is_too_long_is_cut_and_said(models, caplog):
+def test_a_prompt_that_is_too_long_is_cut_and_reported(models, caplog):
     long = "a fox " * 60
     out = processor(models, prompt=long + "one")()
     assert "has no effect" in caplog.text
@@ -281,7 +281,7 @@ def test_thresholds_are_angles(models, name, value):
 
 @pytest.mark.skipif(NAME != "builtin", reason="inside threestudio its own parts have these names")
 @pytest.mark.parametrize("kind", KINDS)
-def test_threestudios_names_find_ours(kind):
+def test_threestudios_names_find_this_packages_parts(kind):
     assert find(f"{kind}-prompt-processor") is find(f"gaussiandreamer-{kind}-prompt-processor")
 
 

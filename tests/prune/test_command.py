@@ -83,7 +83,7 @@ def test_the_input_is_not_overwritten(source, tmp_path, capsys):
     assert "OUT is IN" in capsys.readouterr().err and source.read_bytes() == before
 
 
-def test_a_looser_budget_goes_on(source, tmp_path):
+def test_a_looser_budget_prunes_further(source, tmp_path):
     run(source, tmp_path / "once.ply", "--psnr", "55")
     assert run(tmp_path / "once.ply", tmp_path / "twice.ply", "--psnr", "40")["after"][
         "gaussians"

@@ -41,7 +41,7 @@ def usable():
     return [name for name, reason in available_backends().items() if reason is None]
 
 
-def test_shapes_of_what_comes_back():
+def test_shapes_of_the_outputs():
     out = call(downsample=2)
     shapes = {name: tuple(getattr(out, name).shape) for name in out._fields}
     images = {"image": (2, 4, 5, 3), "alpha": (2, 4, 5, 1), "depth": (2, 4, 5, 1)}
@@ -207,7 +207,7 @@ def test_background_of_each_view_or_of_all():
 
 @pytest.mark.parametrize("only", ["colors", "opacities", "background"])
 @pytest.mark.parametrize("backend", list(backends.BACKENDS))
-def test_means2d_reports_its_gradient_whenever_anything_is_differentiated(only, backend):
+def test_means2d_has_a_gradient_if_any_input_has(only, backend):
     if backend not in usable():
         pytest.skip(available_backends()[backend])
     changes = arguments() | {"background": torch.zeros(3)}

@@ -337,12 +337,12 @@ def test_a_gpu_that_is_too_old_is_named(driver, monkeypatch):
 
 
 @needs_nvrtc
-def test_without_a_driver_it_says_so(driver, monkeypatch):
+def test_without_a_driver_it_gives_a_message(driver, monkeypatch):
     monkeypatch.setattr(cuda_driver, "LIBRARY", "libcuda-that-is-not-there.so")
     assert "libcuda-that-is-not-there.so" in cuda_driver.unavailable()
 
 
-def test_a_torch_without_cuda_says_so(monkeypatch):
+def test_a_torch_without_cuda_gives_a_message(monkeypatch):
     monkeypatch.setattr(torch.version, "cuda", None)
     cuda_driver.unavailable.cache_clear()
     try:

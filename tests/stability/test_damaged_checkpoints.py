@@ -72,7 +72,9 @@ def test_a_damaged_checkpoint_that_was_asked_for_is_refused(stopped, tmp_path, m
 
 
 @row("A5", "Corrupted checkpoint")
-def test_resume_auto_takes_the_one_before_and_says_so(stopped, whole, tmp_path, measured):
+def test_resume_auto_falls_back_to_the_previous_checkpoint_with_a_message(
+    stopped, whole, tmp_path, measured
+):
     ended = launch(tmp_path, *EVERY_STEP, "resume=auto")
     assert ended.code == 0, ended.err
     assert (
@@ -85,7 +87,7 @@ def test_resume_auto_takes_the_one_before_and_says_so(stopped, whole, tmp_path, 
 
 
 @row("A5", "Corrupted checkpoint")
-def test_resume_auto_without_a_checkpoint_starts_from_the_prior_and_says_so(tmp_path, measured):
+def test_resume_auto_without_a_checkpoint_starts_from_the_prior_with_a_message(tmp_path, measured):
     ended = launch(tmp_path, "trainer.max_steps=1", "resume=auto")
     assert ended.code == 0
     assert "no checkpoint of" in ended.err and "starting from the prior" in ended.err

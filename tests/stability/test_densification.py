@@ -51,7 +51,7 @@ def test_threshold_zero_fills_the_cap_and_no_more(limit, absgrad, measured):
 
 @row("A3", "Explosion")
 @pytest.mark.parametrize("cap", [64, 123, 199])
-def test_above_the_cap_what_contributes_least_goes_first(cap, measured):
+def test_above_the_cap_the_smallest_contributions_are_removed_first(cap, measured):
     """A cloud larger than the cap, ranked by the contributions of one step; no Gaussian is
     selected.
     """

@@ -74,7 +74,7 @@ def test_f20_every_learning_rate_in_the_config_reaches_the_optimiser(fault):
 
 
 @row("A0", "F25")
-def test_f25_each_preset_holds_its_own_numbers(fault):
+def test_f25_each_preset_has_its_own_values(fault):
     """Paper: scales 1e-3, rotations 1e-2, positions 5e-5. Released code: 5e-3, 1e-3, 5e-5 times the
     extent 4 = 2e-4.
     """

@@ -84,7 +84,7 @@ def test_f17_a_sphere_is_round_on_a_wide_image(backend, fault):
 
 @row("A0", "F26")
 @each_backend
-def test_f26_behind_the_camera_is_nothing_and_equal_depths_go_by_index(backend, fault):
+def test_f26_nothing_behind_the_camera_and_equal_depths_by_index(backend, fault):
     behind = one_gaussian((0.0, 0.0, -2.0), 0.3, 0.9)
     red, green = (
         one_gaussian((0.0, 0.0, 2.0), 0.3, 0.9, color) for color in ((1.0, 0, 0), (0, 1.0, 0))

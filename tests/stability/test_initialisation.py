@@ -232,7 +232,7 @@ def test_a_few_bad_rows_are_counted_and_many_refused(source, what, tmp_path, mea
 
 @row("A2", "No colours")
 @pytest.mark.parametrize("source", ["mesh", "points"])
-def test_without_colours_the_cloud_is_grey_and_says_so(source, tmp_path, measured, said):
+def test_without_colours_the_cloud_is_grey_with_a_message(source, tmp_path, measured, said):
     points, faces = ball_mesh()
     if source == "mesh":
         prior = {

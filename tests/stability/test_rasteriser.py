@@ -238,7 +238,7 @@ def test_log_scales_are_clamped_in_the_parameterisation(measured, caplog):
 
 @row("A1", "Coincident depths")
 @each_backend
-def test_equal_depths_go_by_index(backend, measured):
+def test_equal_depths_are_ordered_by_index(backend, measured):
     """64 Gaussians in one plane: the image is that of the permuted indices, computed in float64;
     equal bits over 10 runs.
     """

@@ -131,7 +131,7 @@ def test_any_loss_scale_trains_the_same_bits_as_float32(
 
 
 @row("A4", "GradScaler")
-def test_steps_that_are_skipped_are_counted_and_said(tmp_path, monkeypatch, measured):
+def test_steps_that_are_skipped_are_counted_and_reported(tmp_path, monkeypatch, measured):
     """At a loss scale of 2^127 gradients overflow until it was halved twice; the log reports the
     steps that Adam skipped.
     """

@@ -147,7 +147,7 @@ def test_weights_of_another_size_are_refused(exported, tmp_path, monkeypatch):
         warm_start.start_from(exported, options(tmp_path), STAGES)
 
 
-def test_no_weights_are_said(tmp_path):
+def test_no_weights_are_reported(tmp_path):
     with pytest.raises(UserError, match="training.json"):
         warm_start.start_from(tmp_path, options(tmp_path), STAGES)
 

@@ -77,7 +77,7 @@ def test_sigterm_saves_and_stops(folder, tmp_path):
     assert signal.getsignal(signal.SIGTERM) == earlier
 
 
-def test_a_full_disk_is_said_and_leaves_the_earlier_checkpoint(folder, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_and_leaves_the_earlier_checkpoint(folder, tmp_path, monkeypatch):
     run = training(copied(folder, tmp_path / "run"), "judge")
     run.run(4)
     before = run.path.read_bytes()
@@ -168,7 +168,7 @@ def test_bad_options_are_one_message(tmp_path, capsys, arguments, message):
 
 
 @pytest.mark.slow  # starts processes
-def test_workers_render_the_shards_that_a_training_makes_by_itself(tmp_path):
+def test_workers_render_the_same_shards_as_a_training(tmp_path):
     there = loop.Options(folder=tmp_path, pool=2, shard_objects=1)
     render_shards(there, [0, 1000], workers=1)
     names = sorted(path.name for path in there.shards_folder().iterdir())

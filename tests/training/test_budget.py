@@ -71,7 +71,7 @@ def test_auto_says_what_it_measured(tmp_path, painted_box, capsys, known):
     assert any(row.get("prune/lost" if known else "prune/likeness") for row in rows)
 
 
-def test_a_budget_that_needs_larger_rounds_is_met_and_says_so(tmp_path, painted_box, capsys):
+def test_a_budget_that_needs_larger_rounds_is_met_with_a_message(tmp_path, painted_box, capsys):
     options = [
         *PRUNE,
         "system.geometry.budget=70",

@@ -21,7 +21,7 @@ def test_one_number_that_is_not_finite_is_named(value):
         require_finite([("quats", torch.ones(5, 4)), ("means", bad)], step=7)
 
 
-def test_infinities_of_both_signs_and_numbers_whose_sum_overflows_are_told_apart():
+def test_infinities_are_distinguished_from_sums_that_overflow():
     with pytest.raises(NonFiniteParameters, match="2 of the 2"):
         require_finite([("means", torch.tensor([float("inf"), -float("inf")]))], step=0)
     require_finite([("means", torch.full((1000,), 3e38)), ("empty", torch.zeros(0))], step=0)

@@ -149,7 +149,7 @@ def test_dragging_turns_and_the_wheel_zooms(tmp_path):
     assert after.distance < 0.95 * before.distance
 
 
-def test_without_webgl2_the_page_says_so_and_shows_the_poster(tmp_path):
+def test_without_webgl2_the_page_gives_a_message_and_shows_the_poster(tmp_path):
     with shown(tmp_path, cloud(50), flags=NO_WEBGL) as (page, _):
         assert page.evaluate("viewer") is None
         assert "WebGL2" in page.evaluate("document.getElementById('message').textContent")
