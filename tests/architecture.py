@@ -201,7 +201,7 @@ def _number(x: float, y: float, number: str) -> str:
 
 def _legend(height: int) -> Iterator[str]:
     top = height - 22 * ((len(STEPS) + 1) // 2) - 14
-    yield _text(MARGIN, top - 8, "The way of a training step", 13, 'font-weight="bold"')
+    yield _text(MARGIN, top - 8, "The path of a training step", 13, 'font-weight="bold"')
     half = (len(STEPS) + 1) // 2
     for i, step in enumerate(STEPS):
         x, y = MARGIN + 10 + (i // half) * (WIDTH // 2), top + 14 + 22 * (i % half)
