@@ -92,9 +92,9 @@ IMPOSSIBLE = [
     (at(*ADAM, "state", value={}), "has no moments"),
     (at(*ADAM, "state", value=3), "isn't a mapping of mappings"),
     (at(*ADAM, "param_groups", value=[3]), "isn't a list of groups"),
-    (at(*ADAM, "param_groups", value=[]), "Adam can't go on"),
+    (at(*ADAM, "param_groups", value=[]), "Adam can't resume"),
     (at(*ADAM, "param_groups", 0, "lr", value=math.nan), "lr of the group means is nan"),
-    (at(*ADAM, "param_groups", 0, "betas", value="x"), "Adam can't go on"),
+    (at(*ADAM, "param_groups", 0, "betas", value="x"), "Adam can't resume"),
     (at(*ADAM, "state", 0, "exp_avg", value=lambda t: t[:3]), "has the shape .3, 3.; expected"),
     (at(*ADAM, "state", 0, "exp_avg_sq", value=NAN), "means.exp_avg_sq holds NaN"),
     (
