@@ -3,7 +3,6 @@ code stands twice.
 """
 
 import ast
-import re
 import statistics
 import subprocess
 import sys
@@ -49,6 +48,7 @@ HEAVY = HOST | {
 HEAVY |= {"skimage", "fast_simplification", "xatlas"}
 LONGEST_FUNCTION, LONGEST_FILE, LONGEST_LINE, MODULES_AT_THE_TOP = 40, 400, 100, 5
 MOST_EQUAL_LINES = 5
+PUNCTUATION = "()[]{}<>*,;:'\" "
 KERNEL_SOURCES = {".cpp", ".cu", ".cuh", ".h"}
 CODE = [
     path for top in (NAME, "tests", "benchmarks") for path in sorted((ROOT / top).rglob("*.py"))
@@ -168,7 +168,7 @@ def code_lines(path: Path) -> list[tuple[int, str]]:
     return [
         (number, line)
         for number, line in enumerate(lines, 1)
-        if re.search(r"\w", line) and not line.startswith(("#", "//", "import ", "from "))
+        if line.strip(PUNCTUATION) and not line.startswith(("#", "//", "import ", "from "))
     ]
 
 

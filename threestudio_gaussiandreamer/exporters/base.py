@@ -2,7 +2,15 @@
 
 Each exporter has its own module: a subclass of the host's ``Exporter``, registered as
 ``<format>-exporter``. A call returns a list of ``ExporterOutput(save_name, save_type, params)``,
-and the system writes each with its method ``save_<save_type>(name, **params)``."""
+and the system writes each with its method ``save_<save_type>(name, **params)``.
+
+===========  ==================================================================================
+option       meaning (all exporters of one file have these)
+===========  ==================================================================================
+save_name    name of the file in the export folder
+save_video   also render the turntable
+===========  ==================================================================================
+"""
 
 import os
 from dataclasses import dataclass, field

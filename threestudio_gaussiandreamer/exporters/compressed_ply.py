@@ -1,12 +1,7 @@
 """``compressed-ply-exporter``: the Gaussians as PlayCanvas' compressed PLY, a quarter of the PLY's
 size, for SuperSplat and other web viewers.
 
-===========  ==================================================================================
-option       meaning
-===========  ==================================================================================
-save_name    name of the file in the export folder
-save_video   also render the turntable
-===========  ==================================================================================
+The options are those of every exporter: see ``exporters/base.py``.
 
 A Gaussian of degree 0 takes 16.3 bytes; docs/formats.md has the PSNR that is lost by rounding. The
 axes are those of the PLY, -y up."""

@@ -1,12 +1,7 @@
 """``glb-exporter``: the Gaussians as a GLB with KHR_gaussian_splatting, for Cesium, Babylon.js
 and PlayCanvas.
 
-===========  ==================================================================================
-option       meaning
-===========  ==================================================================================
-save_name    name of the file in the export folder
-save_video   also render the turntable
-===========  ==================================================================================
+The options are those of every exporter: see ``exporters/base.py``.
 
 Nothing is rounded; y is up, as glTF requires. Programs without the extension show points."""
 

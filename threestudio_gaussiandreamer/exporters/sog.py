@@ -1,11 +1,6 @@
 """``sog-exporter``: the Gaussians as an SOG file, the smallest format of PlayCanvas and SuperSplat.
 
-===========  ==================================================================================
-option       meaning
-===========  ==================================================================================
-save_name    name of the file in the export folder
-save_video   also render the turntable
-===========  ==================================================================================
+The options are those of every exporter: see ``exporters/base.py``.
 
 A Gaussian of degree 0 takes about 12 bytes; docs/formats.md has the PSNR that is lost by rounding.
 The axes are those of the PLY, -y up."""

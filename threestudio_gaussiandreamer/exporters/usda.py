@@ -1,12 +1,7 @@
 """``usda-exporter``: the Gaussians as USD text, for Omniverse, Houdini and other programs that read
 OpenUSD 26.03.
 
-===========  ==================================================================================
-option       meaning
-===========  ==================================================================================
-save_name    name of the file in the export folder
-save_video   also render the turntable
-===========  ==================================================================================
+The options are those of every exporter: see ``exporters/base.py``.
 
 Nothing is rounded; y is up. The file is about three times as large as the PLY."""
 
