@@ -12,8 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
+
+# a busy machine exceeds any deadline; the same inputs every time
+settings.register_profile("repeatable", deadline=None, derandomize=True)
+settings.load_profile("repeatable")
 
 
 @pytest.fixture(autouse=True, scope="session")
