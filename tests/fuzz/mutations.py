@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Optional
 
 import numpy as np
+import zstandard
 
 NUMBERS = (
     b"0 -0 1 -1 2 3 255 256 65535 65536 -2147483648 2147483647 4294967295 "
@@ -282,7 +283,7 @@ def _unglb(data: bytes) -> list[tuple[str, bytes]]:
 def _glb(pieces: list[tuple[str, bytes]]) -> bytes:
     chunks = b""
     for name, content in pieces:
-        content += (b" " if name == "JSON" else b"\0") * (-len(content) % 4)
+        content += (b" " if name in JSON else b"\0") * (-len(content) % 4)
         chunks += (
             struct.pack("<I4s", len(content), name.encode("latin-1").ljust(4, b"\0")) + content
         )
@@ -307,6 +308,8 @@ def _joined(pieces: list[tuple[str, bytes]]) -> bytes:
     return b"".join(content for _, content in pieces)
 
 
+JSON = ("JSON", "meta.json")
+"""Names of pieces whose values are replaced one by one."""
 ZIP = Packing(_unzip, _zip)
 GZIP = Packing(_gunzip, _gzip)
 GLB = Packing(_unglb, _glb, text=("JSON",))
@@ -347,6 +350,12 @@ def _places(document: Any) -> Iterator[tuple[Any, Any]]:
             yield from _places(document[key])
 
 
+UNPACKABLE = (
+    *(ValueError, IndexError, OSError, zipfile.BadZipFile, zlib.error, struct.error),
+    zstandard.ZstdError,
+)
+
+
 def mutant(
     seeds: list[bytes],
     rng: np.random.Generator,
@@ -362,7 +371,7 @@ def mutant(
         return damaged(data, rng, mutators)
     try:
         pieces = packing.unpack(data)
-    except (ValueError, zipfile.BadZipFile, zlib.error, struct.error):  # a splice
+    except UNPACKABLE:  # a splice
         return damaged(data, rng, mutators)
     at = int(rng.integers(len(pieces)))
     name, content = pieces[at]

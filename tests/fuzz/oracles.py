@@ -141,6 +141,14 @@ def ply_vertices(data: bytes) -> PlyVertices:
     return PlyVertices(*vertices, leftover=rows.rest())
 
 
+def ply_vertex_count(data: bytes) -> int:
+    """The number of vertices that a PLY announces, in any element order."""
+    elements = {name: count for name, count, _ in _ply_header(data)[1]}
+    if "vertex" not in elements:
+        raise Illegal("no vertices")
+    return elements["vertex"]
+
+
 def _ply_header(data: bytes) -> tuple[str, list, bytes]:
     lines, rest, elements, encodings = [], data, [], []
     while lines[-1:] != [["end_header"]]:
@@ -308,6 +316,11 @@ def glb_triangles(data: bytes) -> Optional[np.ndarray]:
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError):
         return None  # the result for an incomplete document isn't specified
     return np.concatenate(triangles) if triangles else None
+
+
+def glb_document(data: bytes) -> dict:
+    """The JSON of a GLB."""
+    return _glb_chunks(data)[0]
 
 
 def _glb_chunks(data: bytes) -> tuple[dict, bytes]:

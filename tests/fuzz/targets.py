@@ -6,7 +6,7 @@ content. Any other exception is a crash."""
 
 import numpy as np
 
-from tests.fuzz import checkpoint_content, config_values, gltf_features, mutations
+from tests.fuzz import checkpoint_content, config_values, gltf_features, mutations, oracles
 from tests.fuzz.array_targets import (
     ROWS,
     _saved,
@@ -24,6 +24,17 @@ from tests.fuzz.cloud_targets import (
     exercise_points_ply,
     gaussian_plys,
     point_plys,
+)
+from tests.fuzz.format_targets import (
+    SOG,
+    SPZ_4,
+    exercise_counted,
+    exercise_splat,
+    files,
+    glb_count,
+    sog_count,
+    splats,
+    spz_count,
 )
 from tests.fuzz.mesh_targets import (
     exercise_glb,
@@ -101,4 +112,29 @@ TARGETS: dict[str, Target] = {
     ),
     "points-text": Target(".xyz", texts, exercise_points, TEXT),
     "spz": Target(".spz", spz_files, exercise_spz, packing=mutations.GZIP),
+    "spz-4": Target(
+        ".spz",
+        lambda: files(".spz", [(12, 0), (9, 1)], spz_version=4),
+        exercise_counted(spz_count),
+        packing=SPZ_4,
+    ),
+    "sog": Target(
+        ".sog",
+        lambda: files(".sog", [(12, 0), (9, 1)]),
+        exercise_counted(sog_count),
+        packing=SOG,
+    ),
+    "glb-gaussians": Target(
+        ".glb",
+        lambda: files(".glb", [(12, 0), (9, 1)]),
+        exercise_counted(glb_count),
+        packing=mutations.GLB,
+    ),
+    "compressed-ply": Target(
+        ".compressed.ply",
+        lambda: files(".compressed.ply", [(12, 0), (260, 1)]),
+        exercise_counted(oracles.ply_vertex_count),
+        packing=mutations.PLY,
+    ),
+    "splat": Target(".splat", splats, exercise_splat),
 }

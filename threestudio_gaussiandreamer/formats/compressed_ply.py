@@ -95,6 +95,11 @@ def read_compressed_ply(path: str | os.PathLike) -> Gaussians:
             elements = _read_elements(file, path)
     except OSError as error:
         raise UserError(f"cannot read {str(path)!r}: {error.strerror or error}.") from error
+    with np.errstate(invalid="ignore", over="ignore"):  # limits of damaged files
+        return _decoded(elements)
+
+
+def _decoded(elements: dict[str, np.ndarray]) -> Gaussians:
     packed, limits = elements["vertex"], _chunk_limits(elements["chunk"])
     chunks = np.arange(len(packed)) // CHUNK
     position, rotation, scale, color = packed.T
@@ -241,9 +246,8 @@ def _between(
     limits: Float[np.ndarray, "C 2 3"],
     chunks: Int[np.ndarray, " N"],
 ) -> Float[np.ndarray, "N 3"]:
-    with np.errstate(invalid="ignore", over="ignore"):  # limits of damaged files
-        low, high = limits[chunks, 0], limits[chunks, 1]
-        return low * (1 - fractions) + high * fractions
+    low, high = limits[chunks, 0], limits[chunks, 1]
+    return low * (1 - fractions) + high * fractions
 
 
 def _fractions(words: Int[np.ndarray, " N"], bits: Sequence[int] = BITS) -> np.ndarray:
