@@ -4,32 +4,10 @@ import numpy as np
 import pytest
 
 from tests.helpers.object_clouds import assert_close, ball
+from tests.helpers.usd_reader import read_with_pxr
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.usda import write_usda
-from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
-
-
-def read_with_pxr(path):
-    """The stage and the Gaussians that OpenUSD finds in a file."""
-    pxr = pytest.importorskip("pxr", reason="usd-core isn't installed")
-    assert pxr
-    from pxr import Usd, UsdVol
-
-    stage = Usd.Stage.Open(str(path))
-    field = UsdVol.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
-    quats = field.GetOrientationsAttr().Get()
-    count = field.GetRadianceSphericalHarmonicsDegreeAttr().Get()
-    sh = np.array(field.GetRadianceSphericalHarmonicsCoefficientsAttr().Get(), np.float32)
-    opacities = np.array(field.GetOpacitiesAttr().Get(), np.float64)
-    gaussians = Gaussians(
-        means=np.array(field.GetPositionsAttr().Get(), np.float32),
-        quats=np.array([[q.GetReal(), *q.GetImaginary()] for q in quats], np.float32),
-        log_scales=np.log(np.array(field.GetScalesAttr().Get(), np.float32)),
-        logit_opacities=np.log(opacities / (1 - opacities)).astype(np.float32),
-        sh=sh.reshape(-1, (count + 1) ** 2, 3),
-    )
-    return stage, field, gaussians
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
