@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.markdown import markdown
-from benchmarks.quality import failure_table
+from benchmarks.quality import failure_table, formats
 from benchmarks.quality import tables as quality
 from benchmarks.quality.runs import ROOT
 from benchmarks.quality.tables import DIFFERENCES, difference_row, last_rows, medians, named
@@ -60,6 +60,7 @@ def readme_table() -> str:
 SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "README.md": {"measured": readme_table},
     "docs/failures.md": {"tables": failure_table.tables},
+    "docs/formats.md": {"formats": formats.table, "producers": formats.producers},
     "docs/rasteriser.md": {
         "presets": splatting.presets,
         "thresholds": splatting.thresholds,

@@ -21,6 +21,7 @@ from benchmarks.quality.runs import CHARTS, append_rows
 from tests.helpers.object_clouds import ball
 from tests.helpers.usd_reader import read_with_pxr
 from threestudio_gaussiandreamer.convert.check import round_trip
+from threestudio_gaussiandreamer.convert.producers import PRODUCERS
 from threestudio_gaussiandreamer.formats.gaussian_files import (
     StoredCloud,
     read_cloud,
@@ -157,15 +158,24 @@ def table() -> str:
     return markdown(head, (table_row(known, list(last.values())) for known in FORMATS))
 
 
+def producers() -> str:
+    """Return the axes of the converter's argument ``--from``."""
+    rows = ((f"`{name}`", *producer) for name, producer in PRODUCERS.items())
+    return markdown(["producer", "up", "front", "why"], rows)
+
+
 def table_row(known: Format, measured: list[dict[str, str]]) -> list[str]:
     ours = [row for row in measured if row["format"] == known.name]
     trained = [row for row in ours if row["object"] != BALL]
     synthetic = [row for row in ours if row["object"] == BALL]
-    cells = [f"{size(trained)}; {size(synthetic)}", f"{decibels(trained)}; {decibels(synthetic)}"]
+    if ours:
+        sizes, quality = ((cell(trained), cell(synthetic)) for cell in (size, decibels))
+    else:
+        sizes, quality = ("32",), ("",)
     yes = {True: "yes", False: "no"}
     name = f"`{known.name}`" if known.name.startswith(".") else known.name
-    measured_cells = cells if ours else ["32", ""]
-    return [name, yes[known.writes], yes[known.reads], known.keeps, *measured_cells, known.readers]
+    figures = ["; ".join(sizes), "; ".join(quality)]
+    return [name, yes[known.writes], yes[known.reads], known.keeps, *figures, known.readers]
 
 
 def size(measured: list[dict[str, str]]) -> str:

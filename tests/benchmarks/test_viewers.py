@@ -52,10 +52,11 @@ def drawn_from_the_front(cloud: Gaussians) -> torch.Tensor:
 
 
 @pytest.mark.slow
-def test_spark_shows_an_exported_file_as_our_renderer_does(tmp_path):
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog"])
+def test_spark_shows_an_exported_file_as_our_renderer_does(tmp_path, suffix):
     if lacking := browser.missing(MODULES):
         pytest.skip(lacking)
-    cloud, path = asymmetric_cloud(), tmp_path / "cloud.ply"
+    cloud, path = asymmetric_cloud(), tmp_path / f"cloud{suffix}"
     write_cloud(str(path), StoredCloud(cloud.arrays()).in_axes(VIEWER_UP))
     c2w = np.eye(4)
     c2w[2, 3] = DISTANCE
@@ -65,7 +66,7 @@ def test_spark_shows_an_exported_file_as_our_renderer_does(tmp_path):
         SIZE,
         MODULES,
         options={"preBlurAmount": DILATION, "blurAmount": 0.0},
-        rotation=browser.HALF_TURN_ABOUT_X,
+        rotation=browser.UNTURNED if suffix == ".spz" else browser.HALF_TURN_ABOUT_X,
     )
     ours = drawn_from_the_front(cloud)
     spark = torch.from_numpy(shown / np.float32(255))

@@ -6,17 +6,24 @@ import numpy as np
 import pytest
 
 from tests.helpers.ply_files import gaussians, write_raw_gaussians
+from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import (
     PRUNED,
+    READ,
+    WRITTEN,
     StoredCloud,
     file_size,
     read_cloud,
+    suffix_of,
     write_cloud,
 )
 from threestudio_gaussiandreamer.formats.ply import read_comments, write_gaussians
 from threestudio_gaussiandreamer.gaussians.axes import AXES
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
+from threestudio_gaussiandreamer.host import find
+
+register_parts()
 
 
 def cloud(count=60, degree=0):
@@ -88,3 +95,38 @@ def test_harmonics_above_degree_3_are_refused_when_read(tmp_path):
     write_raw_gaussians(path, cloud(degree=4))
     with pytest.raises(UserError, match="harmonics of degree 4; expected 0 to 3"):
         read_cloud(path)
+
+
+@pytest.mark.parametrize(
+    ("comments", "antialiased"),
+    [
+        (["SplatRenderMode: mip"], True),
+        (["splatrendermode: MIP"], True),
+        (["antialiased 1"], True),
+        (["SplatRenderMode: mip", "antialiased 0"], False),
+        (["antialiased 1", "SplatRenderMode: default"], False),
+        (["SplatRenderMode: 2dgs"], False),
+        (["not SplatRenderMode: mip"], False),
+        ([], False),
+    ],
+)
+def test_the_comments_of_brush_and_postshot_about_antialiasing_are_read(
+    tmp_path, comments, antialiased
+):
+    write_gaussians(tmp_path / "a.ply", cloud(), comments)
+    assert read_cloud(str(tmp_path / "a.ply")).antialiased is antialiased
+
+
+@pytest.mark.parametrize("suffix", [suffix for suffix in READ if suffix in WRITTEN])
+def test_every_format_that_is_read_starts_a_run(tmp_path, suffix):
+    write_cloud(str(tmp_path / f"a{suffix}"), StoredCloud(cloud(degree=1)))
+    found = find("gaussians-prior")({"path": str(tmp_path / f"a{suffix}")}).gaussians("")
+    means = cloud(degree=1).means
+    nearest = [np.abs(means - mean).sum(axis=1).min() for mean in found.means]
+    assert len(nearest) == 60 and max(nearest) < 0.02
+
+
+def test_extensions_are_found_whatever_their_case():
+    names = ["a.ply", "a.Compressed.PLY", "a.b.SPZ", "x.compressed.spz", "none"]
+    found = [suffix_of(name) for name in names]
+    assert found == [".ply", ".compressed.ply", ".spz", ".spz", ""]

@@ -22,7 +22,7 @@ class Producer(NamedTuple):
     front: str
     """The side of the object that a viewer sees first; a key of ``VECTORS``."""
     note: str
-    """Why, in a phrase for ``docs/formats.md``."""
+    """The reason, for the table of ``docs/formats.md``."""
 
 
 PRODUCERS = {
@@ -33,7 +33,7 @@ PRODUCERS = {
                            "180 about x"),
     "lgm": Producer("+y", "+z", "OpenGL world, the first camera on +z"),
     "diffsplat": Producer("+y", "+z", "OpenGL world, the first camera on +z"),
-    "supersplat": Producer("-y", "-z", "its half turn about z is undone when it saves"),
+    "supersplat": Producer("-y", "-z", "it undoes its half turn about z when it saves"),
 }  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 
 The options are those of every exporter: see ``exporters/base.py``.
 
-A Gaussian of degree 0 takes about 12 bytes; docs/formats.md has the PSNR that is lost by rounding.
+A Gaussian of degree 0 takes about 15 bytes; docs/formats.md has the PSNR that is lost by rounding.
 The axes are those of the PLY, -y up."""
 
 from dataclasses import dataclass, field

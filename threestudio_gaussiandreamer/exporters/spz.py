@@ -5,7 +5,7 @@ phones.
 option       meaning
 ===========  ==================================================================================
 save_name    name of the file in the export folder
-version      3, which all readers know, or 4, which is a tenth smaller and needs zstandard
+version      3, which all readers know, or 4, which is 4 to 9 % smaller and needs zstandard
 save_video   also render the turntable
 ===========  ==================================================================================
 

@@ -5,6 +5,8 @@ from jaxtyping import Float, Int
 
 ROUNDS = 12
 """Iterations; later ones hardly reduce the error."""
+SHORT_WORK = 10**7
+"""Distances that are computed without a progress bar."""
 BLOCK = 2048
 """Vectors whose distances to all entries are computed at once."""
 
@@ -57,9 +59,13 @@ def vector_codebook(
     """
     if len(vectors) <= size:
         return vectors, np.arange(len(vectors))
+    from tqdm import tqdm
+
     start = np.random.default_rng(0).choice(len(vectors), size, replace=False)
     book = vectors[np.sort(start)].astype(np.float32)
-    for _ in range(ROUNDS // 2):
+    rounds = range(ROUNDS // 2)
+    short = len(vectors) * size < SHORT_WORK
+    for _ in tqdm(rounds, "palette of harmonics", leave=False, disable=short or None):
         nearest = _nearest(vectors, book)
         counts = np.bincount(nearest, minlength=size)[:, None]
         columns = (np.bincount(nearest, column, size) for column in vectors.T)

@@ -1,5 +1,5 @@
 """SOG version 2 (Spatially Ordered Gaussians), PlayCanvas' format for the web: lossless WebP images
-in a zip archive, about 12 bytes for a Gaussian of degree 0.
+in a zip archive, about 15 bytes for a Gaussian of degree 0.
 
 Row i of the Gaussians is pixel i of every image, along a Morton curve; ``meta.json`` says the rest:
 

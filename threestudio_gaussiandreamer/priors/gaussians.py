@@ -1,11 +1,11 @@
-"""``gaussians-prior``: trained Gaussians (the PLY of any 3DGS program, or an SPZ) as the start.
+"""``gaussians-prior``: trained Gaussians of any program as the start: PLY, SPZ, SOG, GLB, .splat.
 
 ============  ======================================================================================
 option        meaning
 ============  ======================================================================================
-path          the PLY or SPZ file
+path          the file, in any format that is read (docs/formats.md)
 up            the file's axis that is up: ``z``, ``y``, ``-y``, or ``auto``: what the file says,
-              else -y for a PLY, as other programs write it; SPZ is always y up
+              else -y for a PLY, as other programs write it; SPZ and GLB are y up
 min_opacity   leave out Gaussians fainter than this, in [0, 1]
 ground, ...   see ``priors/base.py``; not with all attributes
 ============  ======================================================================================
