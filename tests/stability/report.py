@@ -73,7 +73,7 @@ def worst_of(tests: list[dict], kind: str) -> str:
     texts = []
     for (what, unit, worst, words), values in groups.items():
         value = words or f"{min(values) if worst == 'min' else max(values):.3g}"
-        texts.append(" ".join(part for part in (what, value, unit) if part))
+        texts.append((f"{what}: " if what else "") + " ".join(filter(None, (value, unit))))
     return "; ".join(dict.fromkeys(texts))
 
 

@@ -83,7 +83,7 @@ def test_resume_auto_falls_back_to_the_previous_checkpoint_with_a_message(
         or "last-prev.ckpt" in ended.err
     )
     assert ended.err.count("is damaged") == 2  # what was passed over is named
-    require_equal_ends(measured, whole, ended, "that differ after resume=auto")
+    require_equal_ends(measured, whole, ended, "different after resume=auto")
 
 
 @row("A5", "Corrupted checkpoint")
@@ -91,7 +91,7 @@ def test_resume_auto_without_a_checkpoint_starts_from_the_prior_with_a_message(t
     ended = launch(tmp_path, "trainer.max_steps=1", "resume=auto")
     assert ended.code == 0
     assert "no checkpoint of" in ended.err and "starting from the prior" in ended.err
-    measured("says what it chose")
+    measured("the chosen file is logged")
 
 
 INCONSISTENT = {

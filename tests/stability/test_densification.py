@@ -96,7 +96,7 @@ def test_a_trained_cloud_that_is_too_large_keeps_what_contributes(tmp_path, meas
     luckiest = max(psnr_to_trained(drawn(trained).rows(rows)) for rows in lots)
     measured(
         psnr_to_trained(drawn(geometry)) - luckiest,
-        "dB better than the best of 5 lotteries",
+        "dB better than the best of 5 random choices",
         at_least=2.0,
     )
 
@@ -232,4 +232,4 @@ def test_a_transparent_cloud_shrinks_to_the_floor(budget, score, measured):
         getattr(geometry, name).isfinite().all() for name in PARAMETERS if name != "logit_opacities"
     )
     assert finite and counts == sorted(counts, reverse=True)
-    measured(counts[-1], "left of 200 dead ones", at_least=64)
+    measured(counts[-1], "left of 200 transparent ones", at_least=64)

@@ -153,5 +153,7 @@ def test_a_reset_by_hand_is_recovered_from(measured):
     training.run(200)
     assert after < before - 5
     measured(
-        training.quality() - before, "dB over what was there, 200 steps after it", at_least=-0.5
+        training.quality() - before,
+        "dB above the quality before the reset, after 200 steps",
+        at_least=-0.5,
     )

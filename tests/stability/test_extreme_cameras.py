@@ -99,7 +99,7 @@ def test_a_degenerate_camera_affects_only_its_own_item(what, measured):
     changed = (alone != beside).sum()
     if what in bad:
         changed += sum((gradients[name] != expected[name]).sum() for name in gradients)
-    measured(changed, "numbers", what="changed by a degenerate one", at_most=0)
+    measured(changed, "numbers", what="changed by a degenerate camera", at_most=0)
 
 
 def with_cameras(monkeypatch, change) -> None:

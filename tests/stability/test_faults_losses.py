@@ -70,7 +70,7 @@ def test_f20_every_learning_rate_in_the_config_reaches_the_optimiser(fault):
         found = optimised(rates)
         return sum(found.get(name) != rate for name, rate in rates.items())
 
-    fault(deviation, ours=ours, emulation=misspelt, unit="dead keys")
+    fault(deviation, ours=ours, emulation=misspelt, unit="keys that are never read")
 
 
 @row("A0", "F25")
@@ -151,7 +151,7 @@ def test_f22_a_non_finite_score_is_reported(fault):
 
     guidance, healthy = Stub({"guidance_scale": 1.0}), Stub({"guidance_scale": 1.0})
     healthy.broken_from = 1000
-    fault(deviation, ours=ours, emulation=nan_to_num, unit="silent steps")
+    fault(deviation, ours=ours, emulation=nan_to_num, unit="steps without a message")
 
 
 @row("A0", "F23")

@@ -282,5 +282,5 @@ def test_f9_first_scales_of_very_few_points(n, fault):
         deviation,
         ours=nearest_distance_scales,
         emulation=three_nearest_or_the_largest_float,
-        unit="useless scales",
+        unit="infinite scales",
     )

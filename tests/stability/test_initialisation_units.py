@@ -65,13 +65,18 @@ def test_neither_unit_nor_place_matters(unit, kind, tmp_path, measured):
     usual, expected = initialized_from(write(tmp_path / f"a.{kind}", points))
     for shift in (0.0, 1e4):
         other, count = initialized_from(write(tmp_path / f"b/a.{kind}", points * unit + shift))
-        measured(abs(count / expected - 1) * 100, "%", what="share accepted: off by", at_most=1.0)
+        measured(
+            abs(count / expected - 1) * 100,
+            "%",
+            what="deviation of the accepted share",
+            at_most=1.0,
+        )
         n = min(len(usual), len(other))
         assert torch.allclose(other.means[:n], usual.means[:n], atol=1e-4)
         measured(
             psnr(cases.picture(other, usual), cases.picture(usual)).min(),
             "dB",
-            what="same picture",
+            what="PSNR after normalisation",
             at_least=50.0,
         )
 
@@ -89,7 +94,7 @@ def test_growing_does_not_depend_on_the_unit(unit, shift, measured):
     measured(
         abs((counts[1] - 1000) / (counts[0] - 1000) - 1) * 100,
         "%",
-        what="share accepted: off by",
+        what="deviation of the accepted share",
         at_most=1.0,
     )
 

@@ -64,7 +64,7 @@ def test_a_missing_model_is_named_within_seconds(what, empty_cache, monkeypatch,
         hub.find_model("missing/model", ("unet", "vae"))
     seconds = time.monotonic() - start
     scale = 1.0 if what in ("sockets blocked", "HF_HUB_OFFLINE") else hub_seconds() / 0.5
-    measured(seconds * scale, "s", what="until the message", at_most=5.0)
+    measured(seconds * scale, "s", what="time to the message", at_most=5.0)
 
 
 def hub_seconds() -> float:

@@ -91,7 +91,7 @@ def test_every_key_misspelt_by_one_letter_is_refused_with_the_right_one(measured
     measured(
         len(failed),
         f"of {len(tried)} keys",
-        what="misspelt and accepted, or without the right word",
+        what="misspelt keys accepted, or without a correct suggestion",
         at_most=0,
     )
 
@@ -115,7 +115,7 @@ def test_every_option_of_every_part_misspelt_is_refused_with_the_right_one(measu
     measured(
         len(failed),
         f"of {tried} misspelt options",
-        what="accepted, or without the right word",
+        what="misspelt options accepted, or without a correct suggestion",
         at_most=0,
     )
 
@@ -256,4 +256,9 @@ def test_different_prompts_have_different_folders(measured):
     ]
     names = {cfg.trial_name.partition("@")[0] for cfg in cfgs}
     # an empty prompt has no tag at all, only a time
-    measured(len(prompts) - len(names), f"of {len(prompts)}", what="that share a folder", at_most=0)
+    measured(
+        len(prompts) - len(names),
+        f"of {len(prompts)}",
+        what="prompts that share a folder",
+        at_most=0,
+    )

@@ -83,5 +83,5 @@ def test_popping_is_one_jump_of_the_analytic_size(backend, measured):
     frames = [frame(0.005 + 0.01 * k) for k in range(-5, 5)]
     jumps = torch.stack([(b - a).abs().max() for a, b in zip(frames, frames[1:], strict=False)])
     measured(jumps.max() / (a1 * a2), "of a1 a2 |c1 - c2|", what="jump", at_most=1 + 1e-3)
-    measured((jumps > 0.01).sum(), "frames", what="that jump", at_most=1)
+    measured((jumps > 0.01).sum(), "frames", what="duration of the jump", at_most=1)
     assert (jumps > 0.01).sum() == 1

@@ -81,7 +81,7 @@ def test_killed_at_random_moments_of_200_saves(tmp_path, measured):
         "last.ckpt",
         "last-prev.ckpt",
     }  # partially written files are gone
-    measured(kills, "kills", what="in 200 saves or more", at_least=20)
+    measured(kills, "kills", what="kills in 200 saves or more", at_least=20)
     measured(read_end_lost, "saves", what="lost", at_most=0)
 
 
@@ -172,7 +172,7 @@ def test_a_full_disk_in_the_middle_of_a_run(tmp_path, monkeypatch, measured):
         at_step(monkeypatch, 3, lambda _: full.enter_context(file_size_limit(2000)))
         ended = launch(tmp_path, *EVERY_STEP)
     assert_stopped_cleanly(ended, "File too large")
-    measured("named error, exit code 2, earlier file whole, no temporary")
+    measured("named error, exit code 2, earlier file intact, no temporary")
 
 
 @row("A5", "Disk full, read-only")
@@ -233,7 +233,7 @@ def test_a_partial_video_is_an_error(kind, limit, tmp_path, measured):
     with file_size_limit(limit), pytest.raises(UserError):
         write()
     assert path.read_bytes() == whole and len(list(tmp_path.iterdir())) == 5
-    measured("named error, earlier file whole")
+    measured("named error, earlier file intact")
 
 
 @row("A5", "Disk full, read-only")
@@ -249,7 +249,7 @@ def test_a_folder_that_becomes_read_only(tmp_path, monkeypatch, measured):
         at_step(monkeypatch, 3, lock)
         ended = launch(tmp_path, *EVERY_STEP)
     assert_stopped_cleanly(ended, "Permission denied")
-    measured("named error, exit code 2, earlier file whole, no temporary")
+    measured("named error, exit code 2, earlier file intact, no temporary")
 
 
 @row("A5", "Disk full, read-only")
@@ -274,7 +274,7 @@ def require_resumed_equal(tmp_path, ended, whole, measured) -> None:
     """Resume a stopped run to its end; fail unless it ends as the undisturbed run ``whole``."""
     finished = launch(tmp_path, *EVERY_STEP, f"resume={ended.last}")
     assert finished.code == 0, finished.err
-    require_equal_ends(measured, whole, finished, "that differ after resuming")
+    require_equal_ends(measured, whole, finished, "different after resuming")
 
 
 @row("A5", "Ctrl-C / SIGTERM")
@@ -331,6 +331,6 @@ def test_a_second_signal_stops_at_once(tmp_path, monkeypatch, measured):
     measured(
         3 - load_checkpoint(ended.last)["global_step"],
         "steps",
-        what="lost to a second signal",
+        what="lost by a second signal",
         at_most=1,
     )

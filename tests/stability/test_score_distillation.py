@@ -127,7 +127,7 @@ def test_any_loss_scale_trains_the_same_bits_as_float32(
     """
     ended = scaled_run(tmp_path, monkeypatch, scale, "trainer.max_steps=3")
     assert ended.code == 0, ended.err
-    require_equal_ends(measured, three_steps, ended, "that differ from float32")
+    require_equal_ends(measured, three_steps, ended, "different from float32")
 
 
 @row("A4", "GradScaler")
@@ -179,7 +179,7 @@ def test_the_clip_at_its_knots(measured):
     for step, value in schedules[0, 1.5, 2.0, 1000].items():
         guidance.update_step(0, step)
         wrong.append(abs(guidance.grad_clip - value))
-    measured(max(wrong + by_epoch), what="off", at_most=0)
+    measured(max(wrong + by_epoch), what="error", at_most=0)
 
 
 @row("A4", "Clip schedule")
@@ -305,7 +305,7 @@ def test_resumed_at_the_edge_of_every_schedule(step, over_the_edge, tmp_path, me
     the paper's from 500 to 501.
     """
     ended = resumed(tmp_path, over_the_edge, step, *EDGE, *EVERY_STEP)
-    require_equal_ends(measured, over_the_edge, ended, "that differ")
+    require_equal_ends(measured, over_the_edge, ended, "different")
 
 
 @pytest.fixture(scope="module")
@@ -323,7 +323,7 @@ def random_streams(tmp_path_factory) -> Ended:
 @pytest.mark.parametrize("step", [1, 4, 8])
 def test_stopped_and_resumed_anywhere(step, random_streams, tmp_path, measured):
     ended = resumed(tmp_path, random_streams, step, *DENSIFYING, *EVERY_STEP)
-    require_equal_ends(measured, random_streams, ended, "that differ")
+    require_equal_ends(measured, random_streams, ended, "different")
 
 
 @row("A4", "RNG")
@@ -348,4 +348,4 @@ def test_validation_changes_nothing(views, every, random_streams, tmp_path, monk
     ended = launch(tmp_path, *DENSIFYING, *EVERY_STEP, *validated, "system.guidance.eval_steps=2")
     assert ended.code == 0, ended.err
     assert len(seen) == views * (9 // every)
-    require_equal_ends(measured, random_streams, ended, "that differ")
+    require_equal_ends(measured, random_streams, ended, "different")

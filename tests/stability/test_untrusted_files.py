@@ -96,7 +96,7 @@ def test_a_ply_of_another_program_is_read_correctly(what, tmp_path, measured):
         + (arrays.quats != expected[:, 10:]).sum()
         + (arrays.sh[:, 0] != expected[:, 3:6]).sum()
     )
-    measured(wrong, "numbers", what="read wrong", at_most=0)
+    measured(wrong, "numbers", what="read incorrectly", at_most=0)
 
 
 @row("A5", "Corrupted/foreign PLY")
@@ -364,4 +364,4 @@ def test_every_load_in_the_package_is_the_safe_one(measured):
             if name in NEVER:
                 unsafe.append(f"{path.name}:{line}: {name}")
     assert found >= 4 and not unsafe, unsafe
-    measured(len(unsafe), f"of {found} loads", what="unsafe", at_most=0)
+    measured(len(unsafe), f"of {found} loads", what="unsafe loads", at_most=0)
