@@ -3,6 +3,7 @@ code stands twice.
 """
 
 import ast
+import re
 import statistics
 import subprocess
 import sys
@@ -46,6 +47,11 @@ HEAVY = HOST | {
     "zstandard",
 }
 HEAVY |= {"skimage", "fast_simplification", "xatlas"}
+PRIVATE_WORDS = re.compile(
+    r"\b(anew|nobody|whoever|strangers?|handmade|aright|parsimony|assured_likeness|unspent"
+    r"|by_views|whole_steps|spin_briefly|spelt_out)\b",
+    re.IGNORECASE,
+)
 LONGEST_FUNCTION, LONGEST_FILE, LONGEST_LINE, MODULES_AT_THE_TOP = 40, 400, 100, 5
 MOST_EQUAL_LINES = 5
 PUNCTUATION = "()[]{}<>*,;:'\" "
@@ -134,6 +140,18 @@ def functions(path: Path) -> Iterator[tuple[str, int]]:
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
             yield f"{named(path)}:{node.name}", length_of(node)
+
+
+def test_texts_use_standard_terms():
+    """Words of an earlier private vocabulary don't return."""
+    texts = [*CODE, ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    found = [
+        f"{named(path)}: {word}"
+        for path in texts
+        if path != Path(__file__)
+        for word in PRIVATE_WORDS.findall(path.read_text())
+    ]
+    assert not found, found
 
 
 def test_functions_are_short():

@@ -80,6 +80,6 @@ def test_a_stream_that_was_closed_before_the_start_takes_any_text(monkeypatch, n
     monkeypatch.setattr(sys, name, None)
     with tolerant_output():
         stream = getattr(sys, name)
-        print("nobody reads this", file=stream, flush=True)
+        print("unread", file=stream, flush=True)
         assert not stream.isatty()
     assert getattr(sys, name) is None and stream.closed

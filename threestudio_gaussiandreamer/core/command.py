@@ -58,7 +58,7 @@ def exit_code(error: Exception, verbose: bool = False) -> int:
         return 2
     # The reader has closed the pipe, as `| head` does; without this, Python's flush at exit fails.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    with contextlib.suppress(BrokenPipeError):  # after `2>&1 |` nobody reads this either
+    with contextlib.suppress(BrokenPipeError):  # after `2>&1 |` it has no reader either
         print(
             f"stopped: the reader of the output has closed it ({error.strerror})", file=sys.stderr
         )

@@ -17,7 +17,8 @@ from .unet_stage import LATENT_SCALE
 def start_from(weights: Path, options: Options, stages: dict[str, type[Stage]]) -> None:
     """Write a checkpoint for every stage of ``weights`` that the training folder has none of.
 
-    Optimisers start anew; CLIP's attribute classifiers, which aren't published, start at random.
+    Optimisers start without state; CLIP's attribute classifiers, which aren't published, start at
+    random.
 
     Args:
         weights: a folder that ``toybox.export`` wrote.
