@@ -35,7 +35,7 @@ QUIET = (
     "--hide-scrollbars",
 )
 NO_WEBGL = ("--disable-3d-apis",)
-TIMEOUT = 120.0
+TIMEOUT = 300.0
 """Seconds that one answer may take."""
 
 

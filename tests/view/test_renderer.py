@@ -59,6 +59,15 @@ def test_the_page_draws_what_our_rasteriser_draws(name, tmp_path):
         assert page.problems == []
 
 
+def test_a_moving_picture_is_nearly_the_same(tmp_path):
+    """It is blended into half floats, which many faint layers need most."""
+    stored, settings = CLOUDS["1,500 faint layers, z up"]
+    with shown(tmp_path, stored, **settings) as (page, how):
+        page.evaluate("viewer.then(v => { v.renderer.targets.still = v.renderer.targets.moving; })")
+        poses = orbit_poses(first_pose(stored), 2)
+        assert min(difference_to_ours(page, stored, how, poses, SIZE)) >= 40.0
+
+
 def test_the_views_differ_and_are_not_empty(tmp_path):
     """What the comparison above would miss if both were blank."""
     stored, settings = CLOUDS["thin, as the demo draws"]

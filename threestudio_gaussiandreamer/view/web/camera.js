@@ -63,7 +63,7 @@ function panned(pose, dx, dy, pixels) {
   return { ...pose, target: pose.target.map((x, i) => x - step * (dx * right[i] + dy * down[i])) };
 }
 
-// ---- the pose in the page's address --------------------------------------------------------------
+// ---- the pose in the page's address -------------------------------------------------------------
 
 function poseToHash(pose) {
   const numbers = [pose.azimuth, pose.elevation, pose.distance, ...pose.target, pose.fovy];

@@ -72,7 +72,7 @@ function harmonicTexels(columns, degree, first, last) {
   return texels;
 }
 
-// ---- files ---------------------------------------------------------------------------------------
+// ---- files --------------------------------------------------------------------------------------
 
 // The PLY file: the header that Python wrote into the page, then the rows with normals of zero.
 function plyParts(header, columns) {

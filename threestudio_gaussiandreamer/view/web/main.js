@@ -61,8 +61,9 @@ class Viewer {
     this.cloud.order.sort(this.camera, near, far);
   }
 
-  draw(scale) {
-    this.renderer.draw(this.cloud.scene, this.camera, this.pose, this.background, scale);
+  draw(target, scale) {
+    const { scene } = this.cloud;
+    this.renderer.draw(scene, this.camera, this.pose, this.background, target, scale);
   }
 
   change(update) {
@@ -92,7 +93,8 @@ class Viewer {
     if (this.turning) this.turnOn(Math.min(elapsed, 200));
     const moving = this.turning || performance.now() - this.lastChange < STILL_AFTER;
     if (moving && elapsed < 1000) this.adapt(elapsed);
-    this.draw(moving ? this.scale : 1);
+    const { targets } = this.renderer;
+    this.draw(moving ? targets.moving : targets.still, moving ? this.scale : 1);
     document.body.classList.add("drawn");
     if (moving) this.invalidate();
   }
@@ -129,12 +131,12 @@ class Viewer {
     Object.assign(this.canvas, { width, height });
     this.sort();
     while (!this.cloud.order.settled) await new Promise((done) => setTimeout(done, 1));
-    this.draw(1);
+    this.draw(this.renderer.targets.still, 1);
     return this.renderer.pixels();
   }
 }
 
-// ---- what surrounds the picture ------------------------------------------------------------------
+// ---- what surrounds the picture -----------------------------------------------------------------
 
 function describe(meta, index) {
   const { count, label, quality } = meta.clouds[index];

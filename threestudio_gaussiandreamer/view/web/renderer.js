@@ -1,5 +1,6 @@
-// Draws Gaussians with WebGL2: instanced quads, blended back to front into a picture of half
-// floats, since 8 bits lose too much under many faint layers, then composited to the canvas.
+// Draws Gaussians with WebGL2: instanced quads, blended back to front into a picture of floats,
+// since 8 bits lose too much under many faint layers, then composited to the canvas. While the
+// picture moves it is one of half floats, which graphics cards blend faster.
 
 const TEXTURE_WIDTH = 4096;
 const UPLOAD_ROWS = 64;
@@ -42,11 +43,12 @@ class Renderer {
     const gl = this.gl;
     this.splats = linked(gl, sources.splatVert, sources.splatFrag, SPLAT_UNIFORMS);
     this.screen = linked(gl, sources.screenVert, sources.screenFrag, ["picture", "background"]);
-    this.format = gl.getExtension("EXT_color_buffer_float")
-      || gl.getExtension("EXT_color_buffer_half_float") ? gl.RGBA16F : gl.RGBA8;
-    this.picture = gl.createTexture();
-    this.framebuffer = gl.createFramebuffer();
-    this.pictureSize = [0, 0];
+    const floats = gl.getExtension("EXT_color_buffer_float");
+    const halves = floats || gl.getExtension("EXT_color_buffer_half_float");
+    const moving = this.target(halves ? gl.RGBA16F : gl.RGBA8, gl.LINEAR);
+    const still = floats && gl.getExtension("EXT_float_blend")
+      ? this.target(gl.RGBA32F, gl.NEAREST) : moving;
+    this.targets = { moving, still };
     this.blank = gl.createVertexArray();
   }
 
@@ -100,12 +102,12 @@ class Renderer {
     scene.visible = visible;
   }
 
-  // Draw to the canvas. With `scale` below 1 the Gaussians are drawn at fewer pixels.
-  draw(scene, camera, pose, background, scale) {
-    const gl = this.gl;
-    const size = [this.canvas.width, this.canvas.height].map((x) => Math.max(1, Math.round(x * scale)));
-    this.resize(size);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+  // Draw to the canvas. With `scale` below 1, for `targets.moving` only, the Gaussians are drawn at
+  // fewer pixels.
+  draw(scene, camera, pose, background, target, scale) {
+    const gl = this.gl, { width, height } = this.canvas;
+    const size = [width, height].map((x) => Math.max(1, Math.round(x * scale)));
+    this.resize(target, size);
     gl.viewport(0, 0, ...size);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
@@ -115,7 +117,7 @@ class Renderer {
     gl.bindVertexArray(scene.vertices);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, scene.visible);
     gl.disable(gl.BLEND);
-    this.composite(background);
+    this.composite(target, background);
   }
 
   useSplats(scene, camera, size, focal, scale) {
@@ -144,32 +146,40 @@ class Renderer {
     gl.uniform1i(at.boundColors, settings.boundColors);
   }
 
-  composite(background) {
+  composite(target, background) {
     const gl = this.gl;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, this.canvas.width, this.canvas.height);
     gl.useProgram(this.screen.program);
     gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.picture);
+    gl.bindTexture(gl.TEXTURE_2D, target.texture);
     gl.uniform1i(this.screen.at.picture, 0);
     gl.uniform3fv(this.screen.at.background, background);
     gl.bindVertexArray(this.blank);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  resize(size) {
-    if (size.every((x, i) => x === this.pictureSize[i])) return;
+  // A picture to blend into; it gets its texture when its size is known.
+  target(format, filter) {
+    const framebuffer = this.gl.createFramebuffer();
+    return { format, filter, texture: null, framebuffer, size: [0, 0] };
+  }
+
+  // Bind a target, with a texture of this size.
+  resize(target, size) {
     const gl = this.gl;
-    gl.deleteTexture(this.picture);
-    this.picture = gl.createTexture();
-    this.pictureSize = size;
-    gl.bindTexture(gl.TEXTURE_2D, this.picture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, this.format, ...size);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
+    if (size.every((x, i) => x === target.size[i])) return;
+    gl.deleteTexture(target.texture);
+    Object.assign(target, { texture: gl.createTexture(), size });
+    gl.bindTexture(gl.TEXTURE_2D, target.texture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, target.format, ...size);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, target.filter);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, target.filter);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture, 0);
+    gl.framebufferTexture2D(
+      gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target.texture, 0);
   }
 
   // The canvas as bytes RGBA, rows from the bottom; to be called in the task that has drawn it.
