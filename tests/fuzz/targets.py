@@ -45,6 +45,7 @@ from tests.fuzz.mesh_targets import (
     meshes,
 )
 from tests.fuzz.mutations import TEXT
+from tests.fuzz.page_targets import exercise_run_folder, run_folders
 from tests.fuzz.run_targets import (
     COMMANDS,
     checkpoints,
@@ -111,6 +112,7 @@ TARGETS: dict[str, Target] = {
         exercise_npy_points,
     ),
     "points-text": Target(".xyz", texts, exercise_points, TEXT),
+    "run-folder": Target(".txt", run_folders, exercise_run_folder, TEXT, traced=False),
     "spz": Target(".spz", spz_files, exercise_spz, packing=mutations.GZIP),
     "spz-4": Target(
         ".spz",

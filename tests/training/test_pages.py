@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.viewers.browser import chromium
+from benchmarks.viewers.devtools import open_page
 from tests.training.runs import launch, run_folder
 from threestudio_gaussiandreamer.core.images import read
 from threestudio_gaussiandreamer.formats.spz import read_spz
@@ -61,6 +63,29 @@ def test_the_turntable_is_an_animated_picture_too(save):
     assert turntable.n_frames == len(list((save / "it2-test").glob("*.png"))) == 3
     expected = read(save / "it2-test" / "0.png").astype(float)
     assert np.abs(np.asarray(turntable.convert("RGB")) - expected).mean() < 8
+
+
+IMAGES = "[...document.images].map(image => image.decode().then(() => image.naturalWidth))"
+VIDEO = (
+    "new Promise((done, fail) => { const video = document.querySelector('video');"
+    " video.onloadeddata = () => done(video.videoWidth); video.onerror = () => fail(video.error);"
+    " video.load(); })"
+)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(chromium() is None, reason="no Chromium is installed")
+def test_a_browser_shows_the_index_of_a_run(save):
+    index = save.parent / "index.html"
+    with open_page(index) as page:
+        page.evaluate("document.querySelectorAll('img').forEach(image => image.loading = 'eager')")
+        widths = page.evaluate(f"Promise.all({IMAGES})")
+        assert len(widths) >= 4 and min(widths) > 0
+        assert page.evaluate(VIDEO) == 32  # H.264 in yuv420p, which every browser plays
+        assert page.problems == []
+        folder = save.parent.resolve().as_uri() + "/"
+        assert all(x.startswith((folder, "data:", "blob:")) for x in page.requests)
+        assert index.as_uri() in page.requests
 
 
 def test_export_writes_the_page_again(save, painted_box, tmp_path):

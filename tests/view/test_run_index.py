@@ -53,6 +53,7 @@ def full_run(run_folder):
         (save / name).parent.mkdir(exist_ok=True)
         write(save / name, np.zeros((4, 4, 3), np.uint8))
     (save / "it7-test.mp4").write_bytes(b"")
+    (run_folder / "cmd.txt").write_text("launch.py --train <x>\n")
     (save / "it7-export" / "view.html").write_text("")
     (save / "a 'quoted' #&?<b>.txt").write_text("")
     return run_folder
@@ -61,7 +62,14 @@ def full_run(run_folder):
 def test_the_index_shows_what_the_run_has(full_run):
     note_time(full_run, "train", datetime(2026, 1, 2, 3, 4, 5), 61.25)
     text = write_index(full_run).read_text()
-    for expected in ("dB to the truth", "loss, logarithmic", "31.25", "61.2 s", "2026-01-02 03:04"):
+    for expected in (
+        "dB to the truth",
+        "loss, logarithmic",
+        "31.25",
+        "61.2 s",
+        "2026-01-02 03:04",
+        "&lt;x&gt;",
+    ):
         assert expected in text
     found = Tags(full_run / "index.html")
     assert found.tags.count("svg") == 3 and "iframe" in found.tags and "video" in found.tags

@@ -44,9 +44,12 @@ def _is_users(key: str) -> bool:
 
 
 def _refers(value: Any) -> bool:
-    return "${" in str(value)
+    return "${" in _shown(value)
 
 
 def _shown(value: Any) -> str:
-    text = str(value)
+    try:
+        text = str(value)
+    except ValueError:  # an integer of more digits than Python converts
+        return "a large number"
     return text if len(text) <= 200 else f"{text[:200]}..."

@@ -107,8 +107,8 @@ class RunFiles:
         """
         found = section(self.scores, key)
         psnr = found.get("psnr")
-        known = isinstance(psnr, (int, float)) and step in (None, found.get("step"))
-        return float(psnr) if known else None
+        known = isinstance(psnr, float) and step in (None, found.get("step"))
+        return psnr if known else None
 
 
 def step_of(path: Path) -> int:
@@ -139,6 +139,14 @@ def as_color(value: Any) -> Optional[tuple[float, float, float]]:
     numbers = value if isinstance(value, (list, tuple)) and len(value) == 3 else ()
     valid = all(isinstance(x, (int, float)) and 0 <= x <= 1 for x in numbers)
     return (float(numbers[0]), float(numbers[1]), float(numbers[2])) if numbers and valid else None
+
+
+def read_text(path: Path) -> str:
+    """Read a text file; an empty text if there is none, it is too large or no UTF-8."""
+    try:
+        return _text(path)
+    except (OSError, ValueError):
+        return ""
 
 
 def read_json(path: Path, kind: type[T]) -> T:

@@ -10,7 +10,7 @@ from typing import Any
 from ..core.files import atomic_file, json_text
 from .config_changes import config_changes
 from .curves import read_curves, svg
-from .run_files import RunFiles, read_json, step_of
+from .run_files import RunFiles, read_json, read_text, step_of
 from .static_page import address, document, element, link, media, section, table
 
 NAME = "index.html"
@@ -22,7 +22,7 @@ CURVES = {
 }
 """Columns of the logs and what they are called."""
 SCORES = {"psnr": "dB", "ssim": "SSIM", "multi_face": "multi-face", "gaussians": "Gaussians"}
-MAX_FILES = 5000
+MAX_FILES, MAX_COMMANDS = 5000, 10
 VALIDATION_PICTURES = 8
 TIMES = "times.json"
 """What the launcher notes of each stage: its name, when it began, and its seconds."""
@@ -44,18 +44,25 @@ def write_index(folder: Path) -> Path:
 
 def _parts(run: RunFiles) -> Iterator[str]:
     yield element("h1", run.prompt)
-    yield element("p", str(run.folder.name))
+    yield element("p", run.folder.name)
     yield section("In 3D", _viewer(run))
     yield section("Turntable", _turntable(run))
     yield section("Scores on held-out views", _scores(run))
     yield section("Curves", *_curves(run))
     yield section("Pictures", *_pictures(run))
+    yield section("Command", *_commands(run))
     changes = config_changes(run.folder / "configs")
     yield section(
         "What differs from the base configuration", table(("key", "base", "run"), changes)
     )
     yield section("Times", _times(run))
     yield section("Files", *_files(run.folder))
+
+
+def _commands(run: RunFiles) -> Iterator[str]:
+    """Yield the command lines of the run and of those that have gone on with it."""
+    lines = read_text(run.folder / "cmd.txt").splitlines()
+    yield from (f"<p>{element('code', line)}</p>" for line in lines[-MAX_COMMANDS:])
 
 
 def _viewer(run: RunFiles) -> str:
