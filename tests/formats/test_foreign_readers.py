@@ -1,8 +1,9 @@
 """Programs of others read what we write, as we read it, and we read what they write.
 
-PlayCanvas' splat-transform (npm, in the folder node_modules that the environment variable
-VIEWER_NODE_MODULES names), and from PyPI gaussforge, pygltflib and Pillow; each is skipped
-where it isn't installed. OpenUSD's parser reads USDA in ``test_usda.py``."""
+PlayCanvas' splat-transform and Babylon.js (npm: @playcanvas/splat-transform, @babylonjs/core and
+@babylonjs/loaders in the folder node_modules that the environment variable VIEWER_NODE_MODULES
+names), and from PyPI gaussforge, pygltflib and Pillow; each is skipped where it isn't installed.
+OpenUSD's parser reads USDA in ``test_usda.py``."""
 
 import io
 import os
@@ -27,6 +28,7 @@ MODULES = Path(os.environ.get("VIEWER_NODE_MODULES", "node_modules"))
 SCRIPT = MODULES / "@playcanvas/splat-transform/bin/cli.mjs"
 OWN_NODE = MODULES / ".bin/node"
 NODE = str(OWN_NODE) if OWN_NODE.is_file() else shutil.which("node")
+BABYLON = Path(__file__).with_name("glb_by_babylon.mjs")
 WRITTEN = ["a.ply", "a.compressed.ply", "3.spz", "4.spz", "a.sog"]
 STEPS = {
     "a.compressed.ply": {"means": 2e-3, "log_scales": 1e-3, "opacities": 5e-3, "sh": 0.017},
@@ -82,6 +84,22 @@ def test_we_read_what_splat_transform_writes(tmp_path, name, degree):
     assert read.antialiased
     palette = {"sh": 0.3} if name == "a.sog" and degree else {}  # 256 entries for 300 Gaussians
     assert_close(in_order_of(cloud, read.gaussians), read.gaussians, **STEPS[name] | palette)
+
+
+@pytest.mark.slow
+def test_babylon_reads_our_glb_and_we_read_what_it_makes_of_it(tmp_path):
+    """Its loader makes .splat records, so colours and rotations come back as bytes."""
+    loaders = MODULES / "@babylonjs/loaders/glTF"
+    if NODE is None or not loaders.is_dir():
+        pytest.skip(f"no node, or no {loaders}")
+    cloud = ball(300, 3)
+    write_cloud(str(tmp_path / "a.glb"), StoredCloud(cloud, "y"))
+    command = [NODE, str(BABYLON), str(MODULES), str(tmp_path / "a.glb"), str(tmp_path / "a.splat")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = read_cloud(str(tmp_path / "a.splat")).gaussians
+    constant = cloud._replace(sh=cloud.sh[:, :1])
+    assert_close(constant, found, means=0, opacities=2.1e-3, sh=7.1e-3, quats=1e-3)
 
 
 # ---- gaussforge ----------------------------------------------------------------------------------
