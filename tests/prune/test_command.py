@@ -9,7 +9,7 @@ import torch
 
 from tests.helpers.ply_files import write_raw_gaussians
 from tests.helpers.pruning import FAST, ball, run
-from threestudio_gaussiandreamer.formats.gaussian_files import PRUNED, read_cloud
+from threestudio_gaussiandreamer.formats.gaussian_files import PRUNED, read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.ply import read_comments, read_gaussians, write_gaussians
 from threestudio_gaussiandreamer.gaussians import recover
 from threestudio_gaussiandreamer.prune import command as prune
@@ -20,6 +20,16 @@ def test_a_count_is_met_exactly(source, tmp_path):
     assert report["after"]["gaussians"] == 250 == len(read_gaussians(tmp_path / "out.ply").means)
     assert json.loads((tmp_path / "out.ply.json").read_text())["after"]["gaussians"] == 250
     assert (tmp_path / "out.ply.png").stat().st_size > 0
+
+
+def test_a_cloud_trained_antialiased_is_measured_and_written_so(source, tmp_path):
+    stored = read_cloud(str(source))._replace(antialiased=True)
+    write_cloud(str(tmp_path / "mip.ply"), stored)
+    run(tmp_path / "mip.ply", tmp_path / "out.spz", "--count", "250")
+    assert json.loads((tmp_path / "out.spz.json").read_text())["options"]["antialias"] is True
+    assert read_cloud(str(tmp_path / "out.spz")).antialiased
+    run(source, tmp_path / "plain.ply", "--count", "250")
+    assert json.loads((tmp_path / "plain.ply.json").read_text())["options"]["antialias"] is False
 
 
 def test_a_size_is_kept(source, tmp_path):
@@ -104,7 +114,7 @@ def test_a_cloud_that_shows_nothing_is_refused(tmp_path, capsys):
         prune.main([str(tmp_path / "in.ply"), str(tmp_path / "out.ply"), "--psnr", "40", *FAST])
         == 2
     )
-    assert "none of the 600 Gaussians is to be seen" in capsys.readouterr().err
+    assert "none of the 600 Gaussians is visible in any view" in capsys.readouterr().err
 
 
 def test_ctrl_c_leaves_nothing_behind(source, tmp_path, monkeypatch, capsys):

@@ -25,7 +25,7 @@ CODEBOOK = 256
 PALETTE_COLUMNS = 64
 FIRST_TAG = 252
 """Alpha of a quaternion whose largest component is number 0."""
-MAX_META_BYTES = 4 << 20
+MAX_META_BYTES = 1 << 19
 DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 200, 24
 """Bytes of memory that reading takes per Gaussian, and per harmonic of it, with a safety margin."""
 BYTES_PER_PIXEL = 24

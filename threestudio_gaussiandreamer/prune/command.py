@@ -58,7 +58,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
     "--antialias": {
         "action": "store_true",
-        "help": "the viewer keeps the energy of small Gaussians",
+        "help": "the viewer keeps the energy of small Gaussians (default: if IN says that it was "
+        "trained so)",
     },
     "--up": {
         "choices": AXES,
@@ -102,6 +103,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     if _same_file(args.source, args.output):
         raise UserError("OUT is IN: give it another name, so that the unpruned cloud is kept")
     stored = read(args.source, args.up)
+    options.antialias = options.antialias or stored.antialiased
     if suffix == ".ply" and Path(args.source).suffix.lower() != ".ply":
         stored = stored.in_axes(VIEWER_UP)  # from a PLY, the axes stay as they are
     result = prune_to_budget(stored, options, suffix, "--")
