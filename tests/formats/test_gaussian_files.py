@@ -18,7 +18,9 @@ from threestudio_gaussiandreamer.formats.gaussian_files import (
     suffix_of,
     write_cloud,
 )
+from threestudio_gaussiandreamer.formats.glb import write_glb
 from threestudio_gaussiandreamer.formats.ply import read_comments, write_gaussians
+from threestudio_gaussiandreamer.formats.spz import write_spz
 from threestudio_gaussiandreamer.gaussians.axes import AXES
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.host import find
@@ -124,6 +126,12 @@ def test_every_format_that_is_read_starts_a_run(tmp_path, suffix):
     means = cloud(degree=1).means
     nearest = [np.abs(means - mean).sum(axis=1).min() for mean in found.means]
     assert len(nearest) == 60 and max(nearest) < 0.02
+
+
+def test_a_note_cant_turn_a_format_with_axes_of_its_own(tmp_path):
+    write_spz(tmp_path / "a.spz", cloud(), comment="up: z")
+    write_glb(tmp_path / "a.glb", cloud(), ["up: z"])
+    assert [read_cloud(str(tmp_path / name)).up for name in ("a.spz", "a.glb")] == ["y", "y"]
 
 
 def test_extensions_are_found_whatever_their_case():

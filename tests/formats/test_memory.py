@@ -8,7 +8,7 @@ from tests.helpers.object_clouds import ball
 from threestudio_gaussiandreamer.formats import glb, sog_archive
 from threestudio_gaussiandreamer.formats.gaussian_files import FORMATS, StoredCloud, write_cloud
 
-COUNT = 20_000
+COUNT = 6000
 
 
 @pytest.mark.parametrize("degree", [0, 3])

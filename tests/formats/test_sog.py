@@ -159,13 +159,13 @@ def peak_of(path, said):
 
 
 def test_a_bomb_in_the_archive_costs_no_memory(path):
-    repacked(path, zipfile.ZIP_DEFLATED, sh0__webp=bytes(300_000_000))
-    assert peak_of(path, "has 300000000 bytes; at most") < 4 << 20
+    repacked(path, zipfile.ZIP_DEFLATED, sh0__webp=bytes(40_000_000))
+    assert peak_of(path, "has 40000000 bytes; at most") < 4 << 20
 
 
 def test_a_bomb_as_json_costs_no_memory(path):
-    repacked(path, zipfile.ZIP_DEFLATED, meta__json=b" " * 300_000_000)
-    assert peak_of(path, "'meta.json' has 300000000 bytes; at most") < 4 << 20
+    repacked(path, zipfile.ZIP_DEFLATED, meta__json=b" " * 40_000_000)
+    assert peak_of(path, "'meta.json' has 40000000 bytes; at most") < 4 << 20
 
 
 def test_a_bomb_as_an_image_costs_no_memory(path):

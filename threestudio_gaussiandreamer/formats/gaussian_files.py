@@ -173,7 +173,7 @@ def read_stored(file: Path, *, up: Optional[str] = None) -> StoredCloud:
     gaussians, notes = known.read(file)
     if up is not None and up not in AXES:
         raise unknown("axis", up, AXES)
-    up = up or stated_up(notes) or known.up
+    up = up or (stated_up(notes) if known.any_up else None) or known.up
     return StoredCloud(gaussians, up, _number(_note(notes, PRUNED)), _stated_mode(notes))
 
 
