@@ -36,7 +36,7 @@ RINGS = (
     Ring("1 host", "#dcfce7", ("host", "models")),
     Ring("2 parts", "#fef9c3", ("prompts", "priors", "guidance", "surface", "exporters")),
     Ring("3 training", "#ffedd5", ("training", "prune", "view", "convert")),
-    Ring("4 programs", "#fee2e2", ("launch", "evaluation", "evaluate", "toybox")),
+    Ring("4 programs", "#fee2e2", ("launch", "farm", "evaluation", "evaluate", "toybox")),
 )
 
 

@@ -1,0 +1,264 @@
+"""Read prompt lists: one prompt per line, or CSV or JSONL with more columns per prompt.
+
+=========  =========================================================================================
+column     meaning
+=========  =========================================================================================
+prompt     the text; required
+name       the asset's folder; by default made from the prompt, and from the seed if one is given
+seed       the run's seed; by default the configuration's
+config     a YAML file, or a list of them, laid over the farm's configuration
+overrides  ``key=value`` arguments of the launcher; in CSV separated by spaces and quoted as in a
+           shell, in JSONL a list, a text or an object
+=========  =========================================================================================
+
+Empty lines and lines that begin with ``#`` are skipped. A list is read as a stream, since it may
+have a million rows."""
+
+import csv
+import hashlib
+import json
+import shlex
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, Optional
+
+from ..core.errors import UserError, unknown
+from ..core.files import existing_file
+from ..launch.run_folder import safe_name
+
+COLUMNS = ("prompt", "name", "seed", "config", "overrides")
+MOST_LINE_BYTES = 32_768
+MOST_SEED = 2**32 - 1
+
+
+class Row(NamedTuple):
+    """One asset that is asked for."""
+
+    name: str
+    prompt: str
+    seed: Optional[int] = None
+    config: tuple[str, ...] = ()
+    overrides: tuple[str, ...] = ()
+    line: int = 0
+    """Where it stands in its file, from 1."""
+
+    @property
+    def key(self) -> str:
+        """A digest of what the asset depends on beside the farm's configuration."""
+        content = [self.prompt, self.seed, self.config, self.overrides]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
+
+
+def read_rows(path: Path) -> Iterator[Row]:
+    """Yield the rows of a prompt list; the format follows from the extension.
+
+    Raises:
+        UserError: the file is missing, isn't UTF-8 text, or has a line that is too long, an unknown
+            column, or an invalid value; the message names the line.
+    """
+    existing_file(path, "prompt list")
+    read = FORMATS.get(path.suffix.lower(), _from_text)
+    for line, values in read(path):
+        try:
+            yield make_row(values, line)
+        except UserError as error:
+            raise UserError(f"{path}, line {line}: {error}") from error
+
+
+def check_rows(path: Path) -> int:
+    """Read a whole prompt list and return its number of rows.
+
+    Raises:
+        UserError: as :func:`read_rows`, the list has no prompt, or two rows have the same name.
+    """
+    lines: dict[int, int] = {}
+    for row in read_rows(path):
+        earlier = lines.setdefault(name_number(row.name), row.line)
+        if earlier != row.line:
+            raise UserError(
+                f"{path}: lines {earlier} and {row.line} have the same name {row.name!r}; remove "
+                "one, or give names in a CSV or JSONL list (columns prompt, name, seed)"
+            )
+    if not lines:
+        raise UserError(f"{path} has no prompts: expected one per line, such as 'a fox'")
+    return len(lines)
+
+
+def name_number(name: str) -> int:
+    """Return a 64-bit digest of a name: a set of a million names takes less memory so."""
+    return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little")
+
+
+# Values
+# --------------------------------------------------------------------------------------------------
+
+
+def make_row(values: Mapping[str, Any], line: int = 0) -> Row:
+    """Check the values of one row, and fill in its name.
+
+    Raises:
+        UserError: a column is unknown, the prompt is empty, or a value is invalid.
+    """
+    for column in values:
+        if column not in COLUMNS:
+            raise unknown("column", column, COLUMNS)
+    prompt, seed = _prompt(values.get("prompt")), _seed(values.get("seed"))
+    return Row(
+        name=_name(values.get("name"), prompt, seed),
+        prompt=prompt,
+        seed=seed,
+        config=tuple(_texts("config", values.get("config"))),
+        overrides=tuple(_overrides(values.get("overrides"))),
+        line=line,
+    )
+
+
+def _prompt(value: Any) -> str:
+    if not isinstance(value, str) or not value.strip():
+        raise UserError(f"the prompt is {value!r}; expected a text, such as 'a fox'")
+    if not value.isprintable():
+        raise UserError(f"the prompt {value[:80]!r} has a line break or a control character")
+    return value.strip()
+
+
+def _seed(value: Any) -> Optional[int]:
+    if value is None or value == "":
+        return None
+    text = str(value)
+    if isinstance(value, bool) or not text.isascii() or not text.isdigit() or len(text) > 10:
+        raise UserError(f"the seed is {value!r}; expected a whole number from 0 to {MOST_SEED}")
+    if int(text) > MOST_SEED:
+        raise UserError(f"the seed is {value}; expected at most {MOST_SEED}")
+    return int(text)
+
+
+def _name(value: Any, prompt: str, seed: Optional[int]) -> str:
+    if value is None or value == "":
+        words = "_".join(prompt.split())
+        return safe_name(words if seed is None else f"{words}-seed{seed}")
+    if not isinstance(value, str) or safe_name(value) != value:
+        raise UserError(
+            f"the name {str(value)[:80]!r} can't be a folder's: expected for instance "
+            f"{safe_name(str(value))!r}"
+        )
+    return value
+
+
+def _texts(column: str, value: Any) -> list[str]:
+    values = [value] if isinstance(value, str) else value or []
+    if not isinstance(values, list) or not all(isinstance(text, str) for text in values):
+        raise UserError(f"{column} is {value!r}; expected a text or a list of texts")
+    return [text for text in values if text]
+
+
+def _overrides(value: Any) -> list[str]:
+    if isinstance(value, Mapping):
+        value = [f"{key}={_yaml(item)}" for key, item in value.items()]
+    if isinstance(value, str):
+        try:
+            value = shlex.split(value)
+        except ValueError as error:
+            raise UserError(f"the overrides {value[:80]!r} have an open quote: {error}") from error
+    texts = _texts("overrides", value)
+    for text in texts:
+        if "=" not in text:
+            raise UserError(f"the override {text!r} isn't key=value, such as trainer.max_steps=600")
+    return texts
+
+
+def _yaml(value: Any) -> str:
+    # JSON is YAML, but a text stands without its quotes, as on a command line
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+# Formats
+# --------------------------------------------------------------------------------------------------
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield number and text of each line that is neither empty nor a comment."""
+    with open(path, "rb") as file:
+        number = 0
+        while content := file.readline(MOST_LINE_BYTES + 1):
+            number += 1
+            if len(content) > MOST_LINE_BYTES:
+                raise UserError(
+                    f"{path}, line {number} is longer than {MOST_LINE_BYTES} bytes: is this a "
+                    "list of prompts, one per line?"
+                )
+            text = _decoded(content, path, number)
+            if text.strip() and not text.lstrip().startswith("#"):
+                yield number, text
+
+
+def _decoded(content: bytes, path: Path, number: int) -> str:
+    try:
+        text = content.decode("utf-8-sig" if number == 1 else "utf-8")
+    except UnicodeDecodeError as error:
+        raise _not_text(path, number) from error
+    if "\0" in text:
+        raise _not_text(path, number)
+    return text
+
+
+def _not_text(path: Path, number: int) -> UserError:
+    return UserError(
+        f"{path}, line {number} isn't UTF-8 text; expected a list of prompts (.txt, .csv, .jsonl)"
+    )
+
+
+def _from_text(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+    for number, text in _lines(path):
+        yield number, {"prompt": text.strip()}
+
+
+def _from_csv(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+    numbers = [0]
+    reader = csv.reader(_noted(path, numbers), skipinitialspace=True, strict=True)
+    try:
+        header = [column.strip() for column in next(reader, [])]
+        _check_header(path, header)
+        for cells in reader:
+            if len(cells) > len(header):
+                raise UserError(
+                    f"{path}, line {numbers[0]}: {len(cells)} cells for {len(header)} columns; "
+                    "put a text with commas in double quotes"
+                )
+            yield numbers[0], dict(zip(header, cells, strict=False))
+    except csv.Error as error:
+        raise UserError(f"{path}, line {numbers[0]}: {error}") from error
+
+
+def _noted(path: Path, numbers: list[int]) -> Iterator[str]:
+    """Yield the lines, and keep the number of the last one in ``numbers``."""
+    for numbers[0], text in _lines(path):
+        yield text
+
+
+def _check_header(path: Path, header: list[str]) -> None:
+    for column in header:
+        if column not in COLUMNS:
+            raise UserError(f"{path}: {unknown('column', column, COLUMNS)}")
+    if header and "prompt" not in header or len(set(header)) != len(header):
+        raise UserError(
+            f"{path}: its first line must name each column once, with a column prompt; "
+            f"it is {','.join(header)!r}"
+        )
+
+
+def _from_jsonl(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+    for number, text in _lines(path):
+        try:
+            values = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise UserError(f"{path}, line {number} isn't JSON: {error}") from error
+        if not isinstance(values, dict):
+            raise UserError(f'{path}, line {number}: expected an object {{"prompt": "a fox"}}')
+        yield number, values
+
+
+FORMATS: dict[str, Callable[[Path], Iterator[tuple[int, dict[str, Any]]]]] = {
+    ".csv": _from_csv,
+    ".jsonl": _from_jsonl,
+    ".ndjson": _from_jsonl,
+}
