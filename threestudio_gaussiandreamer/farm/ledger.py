@@ -108,6 +108,7 @@ class Ledger:
                 offset = self._file.tell()
                 self._file.write(content)
                 self._note(line, offset)
+                self.copy(content)
             self._file.flush()
             os.fsync(self._file.fileno())
         except OSError as error:
@@ -115,6 +116,9 @@ class Ledger:
                 f"the ledger {self.path} can't be written: {error.strerror or error}; make room "
                 "and give the same command again"
             ) from error
+
+    def copy(self, content: bytes) -> None:
+        """Take note of a line that was appended, for a subclass that copies it elsewhere."""
 
     def close(self) -> None:
         for file in (self._file, self._reader):

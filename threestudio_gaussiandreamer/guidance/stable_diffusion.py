@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from ..core.errors import UserError
@@ -47,9 +47,7 @@ class StableDiffusionGuidance(TextToImageDistillation):
         from diffusers import AutoencoderKL
 
         super().load(folder)
-        self.vae = self.network(AutoencoderKL, folder, "vae")
-        if self.cfg.enable_vae_tiling:
-            self.vae.enable_tiling()
+        self.vae = self.network(AutoencoderKL, folder, "vae", self._prepare_vae)
         self.require_text_to_image(self.vae.config.latent_channels)
         factor = 2 ** (len(self.vae.config.block_out_channels) - 1)
         self.image_size = self.size_of_images(factor)
@@ -59,6 +57,11 @@ class StableDiffusionGuidance(TextToImageDistillation):
                 f"{self.image_size}"
             )
         self._bad_backwards = 0
+
+    def _prepare_vae(self, vae: nn.Module) -> nn.Module:
+        if self.cfg.enable_vae_tiling:
+            vae.enable_tiling()
+        return vae.to(self.device)
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B 4 h w"]:
         """Draw latents from the VAE's posterior, scaled to unit variance, float32. The draw is a

@@ -27,6 +27,7 @@ enable_memory_efficient_attention   torch's own attention is so already; accepte
 ==================================  ================================================================
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Optional
@@ -42,6 +43,7 @@ from ..diffusion import sds
 from ..host import debug, info, parse_structured
 from ..models.extras import require_extra
 from ..models.hub import find_model
+from ..models.loaded import loaded
 from ..models.model_files import load_network, load_settings
 from .base import ScoreDistillation
 from .half_precision import weights_type
@@ -143,20 +145,12 @@ class TextToImageDistillation(ScoreDistillation):
         from diffusers import UNet2DConditionModel
 
         cfg = self.cfg
-        self.unet = self.network(
-            UNet2DConditionModel, folder, "unet", on_device=not cfg.enable_sequential_cpu_offload
-        )
+        self.unet = self.network(UNet2DConditionModel, folder, "unet", self._prepare_unet)
         self.text_width = self.unet.config.encoder_hid_dim or self.unet.config.cross_attention_dim
         if cfg.enable_memory_efficient_attention:
             debug(
                 "enable_memory_efficient_attention: torch's attention is memory efficient already"
             )
-        if cfg.enable_attention_slicing:
-            self.unet.set_attention_slice(1)
-        if cfg.enable_sequential_cpu_offload:
-            self._offload()
-        if cfg.enable_torch_compile:
-            self.unet = torch.compile(self.unet)
 
     def size_of_images(self, factor: int = 1) -> int:
         """Return height and width of the images for the model, pixels: ``image_size``, or
@@ -196,25 +190,42 @@ class TextToImageDistillation(ScoreDistillation):
             )
 
     def network(
-        self, network_class: Any, folder: Path, component: str, *, on_device: bool = True
+        self,
+        network_class: Any,
+        folder: Path,
+        component: str,
+        prepare: Callable[[nn.Module], nn.Module],
     ) -> nn.Module:
-        """Load one frozen network of the model."""
-        half = self.dtype == torch.float16
-        network = load_network(
-            network_class, folder, component, half=half, torch_dtype=self.dtype
-        ).requires_grad_(False)
-        if self.cfg.enable_channels_last_format:
-            network.to(memory_format=torch.channels_last)
-        return network.to(self.device) if on_device else network
+        """Load one frozen network of the model, unless this process has kept it (``loaded.py``).
 
-    def _offload(self) -> None:
-        try:
-            from accelerate import cpu_offload
-        except ImportError as error:
-            raise UserError(
-                "enable_sequential_cpu_offload needs accelerate: pip install accelerate"
-            ) from error
-        cpu_offload(self.unet, execution_device=self.device)
+        Args:
+            prepare: moves it to its device and applies options of this part.
+        """
+
+        def load() -> nn.Module:
+            network = load_network(
+                network_class,
+                folder,
+                component,
+                half=self.dtype == torch.float16,
+                torch_dtype=self.dtype,
+            ).requires_grad_(False)
+            if self.cfg.enable_channels_last_format:
+                network.to(memory_format=torch.channels_last)
+            return prepare(network)
+
+        options = tuple(name for name in sorted(self.cfg) if name.startswith("enable_"))
+        chosen = tuple(bool(self.cfg[name]) for name in options)
+        return loaded((component, str(folder), self.dtype, self.device, options, chosen), load)
+
+    def _prepare_unet(self, unet: nn.Module) -> nn.Module:
+        if self.cfg.enable_attention_slicing:
+            unet.set_attention_slice(1)
+        if self.cfg.enable_sequential_cpu_offload:
+            _offload(unet, self.device)
+        else:
+            unet.to(self.device)
+        return torch.compile(unet) if self.cfg.enable_torch_compile else unet
 
     # Score distillation
     # ---------------------------------------------------------------------------------------
@@ -303,6 +314,16 @@ class TextToImageDistillation(ScoreDistillation):
         return F.interpolate(
             images, (size, size), mode="bilinear", align_corners=False, antialias=antialias
         )
+
+
+def _offload(network: nn.Module, device: torch.device) -> None:
+    try:
+        from accelerate import cpu_offload
+    except ImportError as error:
+        raise UserError(
+            "enable_sequential_cpu_offload needs accelerate: pip install accelerate"
+        ) from error
+    cpu_offload(network, execution_device=device)
 
 
 # Formulas

@@ -43,17 +43,25 @@ class RunRecord(pl.Callback):
         cfg: the merged and resolved configuration.
         sources: the YAML files that were merged, and their content.
         command: the command line.
+        records_code: write ``code/`` too.
     """
 
     def __init__(
-        self, folder: Path, cfg: Any, sources: Sequence[tuple[Path, bytes]], command: str
+        self,
+        folder: Path,
+        cfg: Any,
+        sources: Sequence[tuple[Path, bytes]],
+        command: str,
+        records_code: bool = True,
     ) -> None:
         self.folder, self.cfg, self.sources, self.command = folder, cfg, sources, command
+        self.records_code = records_code
 
     def on_fit_start(self, trainer: Any, pl_module: Any) -> None:
         if trainer.is_global_zero:
             self.save_configs()
-            self.save_code()
+            if self.records_code:
+                self.save_code()
             # append, since a resumed run has several command lines
             # surrogateescape: paths on the command line may be no UTF-8
             log = self.folder / "cmd.txt"

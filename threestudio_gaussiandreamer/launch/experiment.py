@@ -16,13 +16,16 @@ import traceback
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Optional
+from typing import TYPE_CHECKING, Any, Optional
 
 from ..core.command import exit_code
 from ..core.errors import Terminated, UserError
 from ..core.output import tolerant_output
 from .options import PROGRAM, announce_device, choose_gpu, find_config, parse_arguments
 from .signals import raised_signals
+
+if TYPE_CHECKING:
+    from .run import Run
 
 NOISE = (
     # warnings of Lightning that don't apply to an infinite dataset of computed cameras, or to a run
@@ -93,6 +96,15 @@ def foreign_exit(stop: SystemExit) -> UserError:
 
 def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
     """Run the stages that the module's docstring lists; return the exit code."""
+    return prepare(args, argv).run()
+
+
+def prepare(args: argparse.Namespace, argv: Sequence[str], **options: Any) -> "Run":
+    """Run the stages up to the checked configuration, and return the run that is left to do.
+
+    Args:
+        options: further arguments of :class:`.run.Run`.
+    """
     config_paths = [find_config(name) for name in args.config]
     choose_gpu(args.gpu)
     if args.typecheck:
@@ -117,7 +129,7 @@ def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
 
     from .run import Run
 
-    return Run(cfg, args, sources, shlex.join([*PROGRAM, *argv]), n_gpus).run()
+    return Run(cfg, args, sources, shlex.join([*PROGRAM, *argv]), n_gpus, **options)
 
 
 def read_source(path: Path) -> bytes:

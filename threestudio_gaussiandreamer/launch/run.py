@@ -49,6 +49,8 @@ class Run:
         sources: the YAML files and their content, stored beside the results.
         command: the command line, stored beside the results.
         n_gpus: GPUs to use; 0 for the CPU.
+        callbacks: further Lightning callbacks, called before those that write checkpoints.
+        records_code: copy the package's sources into the folder when training starts.
     """
 
     def __init__(
@@ -58,8 +60,12 @@ class Run:
         sources: Sequence[tuple[Path, bytes]],
         command: str,
         n_gpus: int,
+        *,
+        callbacks: Sequence[Any] = (),
+        records_code: bool = True,
     ) -> None:
         self.cfg, self.args, self.n_gpus = cfg, args, n_gpus
+        self.callbacks, self.records_code = list(callbacks), records_code
         self.sources, self.command = sources, command
         self.claimed = RunFolder(Path(cfg.trial_dir))
         self.resumed_step = -1
@@ -205,7 +211,7 @@ class Run:
         }
         checkpoint_io = AtomicCheckpointIO()
         training = self.args.stage == "train"
-        callbacks = [ProgressBar()] if options["enable_progress_bar"] else []
+        callbacks = self.callbacks + ([ProgressBar()] if options["enable_progress_bar"] else [])
         required = {
             "accelerator": "gpu" if self.n_gpus else "cpu",
             "devices": self.n_gpus or 1,
@@ -234,7 +240,7 @@ class Run:
         return [
             pl.callbacks.ModelCheckpoint(dirpath=str(self.last.parent), **checkpointing),
             pl.callbacks.LearningRateMonitor(logging_interval="step"),
-            RunRecord(self.folder, self.cfg, self.sources, self.command),
+            RunRecord(self.folder, self.cfg, self.sources, self.command, self.records_code),
             LastCheckpoint(self.last, checkpoint_io),
         ]
 

@@ -1,5 +1,6 @@
 """Encode texts with a model's text encoder: CLIP for Stable Diffusion, T5 for DeepFloyd IF. The
-encoder is loaded for one call and freed.
+encoder is loaded for one call and freed; CLIP's, which is small, is kept where ``loaded.py`` keeps
+networks.
 
 As in diffusers' pipelines, texts are padded to the model's length, and longer ones truncated with a
 warning. The result is float32, without gradients."""
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from ..host import get_device, warn
 from .extras import require_extra
+from .loaded import loaded
 from .model_files import free_memory, load_network, load_settings
 
 LENGTH = 77
@@ -26,21 +28,19 @@ def encode_clip(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
     """
     from transformers import CLIPTextModel
 
-    tokenizer = _tokenizer(folder)
+    tokenizer = loaded(("tokenizer", str(folder)), lambda: _tokenizer(folder))
     tokens = _tokenize(tokenizer, texts, min(tokenizer.model_max_length, LENGTH))
 
     def run(device: torch.device) -> Tensor:
-        encoder = load_network(CLIPTextModel, folder, "text_encoder", dtype=torch.float32).to(
-            device
-        )
+        def load() -> Any:
+            network = load_network(CLIPTextModel, folder, "text_encoder", dtype=torch.float32)
+            return network.to(device)
+
+        encoder = loaded(("text_encoder", str(folder), device), load)
         # Some models were trained with a mask that hides the padding; most, including all of Stable
         # Diffusion's, were trained without.
-        mask = (
-            tokens.attention_mask.to(device)
-            if getattr(encoder.config, "use_attention_mask", False)
-            else None
-        )
-        return encoder(tokens.input_ids.to(device), attention_mask=mask)[0].float().cpu()
+        uses_mask = getattr(encoder.config, "use_attention_mask", False)
+        return _one_by_one(encoder, tokens, device, uses_mask=uses_mask)
 
     return list(_freed(run))
 
@@ -66,13 +66,22 @@ def encode_t5(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
         encoder = load_network(T5EncoderModel, folder, "text_encoder", half=half, dtype=dtype).to(
             device
         )
-        return (
-            encoder(tokens.input_ids.to(device), attention_mask=tokens.attention_mask.to(device))[0]
-            .float()
-            .cpu()
-        )
+        return _one_by_one(encoder, tokens, device, uses_mask=True)
 
     return list(_freed(run))
+
+
+def _one_by_one(
+    encoder: Any, tokens: Any, device: torch.device, *, uses_mask: bool
+) -> Float[Tensor, "T N F"]:
+    """Encode each text by itself: in a batch its last bits would depend on the other texts, so on
+    which ones are in the cache already.
+    """
+    found = []
+    for ids, mask in zip(tokens.input_ids.split(1), tokens.attention_mask.split(1), strict=True):
+        attention = mask.to(device) if uses_mask else None
+        found.append(encoder(ids.to(device), attention_mask=attention)[0].float().cpu())
+    return torch.cat(found)
 
 
 def _tokenizer(folder: Path) -> Any:

@@ -47,6 +47,7 @@ from ..host import info, register
 from ..models.clip import clip_source, load_text_encoder, load_tokenizer, text_condition
 from ..models.extras import require_extra
 from ..models.hub import Source, locate
+from ..models.loaded import loaded
 from ..models.model_files import free_memory
 from .base import SCALE, Prior, points
 from .karras import (
@@ -157,12 +158,17 @@ class PointEPrior(Prior):
 
     def _condition(self, prompt: str, device: torch.device) -> Float[Tensor, "1 D"]:
         folder = locate(self._clip())
-        return text_condition(load_tokenizer(folder), load_text_encoder(folder).to(device), prompt)
+        encoder = loaded(
+            ("Point-E text_encoder", str(folder), device),
+            lambda: load_text_encoder(folder).to(device),
+        )
+        tokenizer = loaded(("Point-E tokenizer", str(folder)), lambda: load_tokenizer(folder))
+        return text_condition(tokenizer, encoder, prompt)
 
     def _coarse_points(
         self, condition: Float[Tensor, "1 D"], rng: torch.Generator
     ) -> Float[Tensor, "1 6 N"]:
-        model = load_network(BASE, self.cfg.checkpoint).to(condition.device)
+        model = kept_network(BASE, self.cfg.checkpoint, condition.device)
         require_features(model, condition, self.cfg.clip)
         scale = self.cfg.guidance_scale
         conditions = (
@@ -176,7 +182,7 @@ class PointEPrior(Prior):
     def _further_points(
         self, coarse: Float[Tensor, "1 6 M"], rng: torch.Generator
     ) -> Float[Tensor, "1 6 N"]:
-        model = load_network(UPSAMPLER, self.cfg.upsampler).to(coarse.device)
+        model = kept_network(UPSAMPLER, self.cfg.upsampler, coarse.device)
         denoise = guided_denoiser(
             mean_of(lambda z, t: model(z, t, coarse)), linear_alphas_cumprod()
         )
@@ -202,6 +208,11 @@ def mean_of(network: Network) -> Network:
     half is the variance.
     """
     return lambda z, timesteps: network(z, timesteps)[:, :CHANNELS]
+
+
+def kept_network(kind: Kind, path: str, device: torch.device) -> Any:
+    """Return :func:`load_network`'s result on a device, or the one that this process has kept."""
+    return loaded((kind.title, path, device), lambda: load_network(kind, path).to(device))
 
 
 def load_network(kind: Kind, path: str) -> Any:

@@ -60,6 +60,7 @@ from ..meshes.colors import linear_to_srgb
 from ..models.clip import load_text_encoder, load_tokenizer, text_condition
 from ..models.extras import require_extra
 from ..models.hub import Source, locate
+from ..models.loaded import loaded
 from ..models.model_files import free_memory, load_network, load_settings, needed_files
 from .base import SCALE, Prior
 from .karras import Network, guided_denoiser, karras_sigmas, sample_heun
@@ -155,8 +156,6 @@ class ShapEPrior(Prior):
         """
         condition = self._condition(folder, prompt, device)
         prior = self._part(folder, "prior", device)
-        if self.cfg.checkpoint:
-            load_original_prior(prior, self.cfg.checkpoint)
         alphas_cumprod, prediction = read_schedule(folder)
         noise = torch.randn(
             1, prior.config.num_embeddings, prior.config.embedding_dim, generator=rng
@@ -174,8 +173,15 @@ class ShapEPrior(Prior):
         return sample_heun(denoise, noise, sigmas, generator=rng, progress="Shap-E")
 
     def _condition(self, folder: Path, prompt: str, device: torch.device) -> Float[Tensor, "1 D"]:
-        encoder = load_text_encoder(folder, "text_encoder", allow_bin=self.cfg.allow_bin).to(device)
-        return text_condition(load_tokenizer(folder, "tokenizer"), encoder, prompt)
+        def load() -> Any:
+            network = load_text_encoder(folder, "text_encoder", allow_bin=self.cfg.allow_bin)
+            return network.to(device)
+
+        encoder = loaded(("Shap-E text_encoder", str(folder), device, self.cfg.allow_bin), load)
+        tokenizer = loaded(
+            ("Shap-E tokenizer", str(folder)), lambda: load_tokenizer(folder, "tokenizer")
+        )
+        return text_condition(tokenizer, encoder, prompt)
 
     def _decode(
         self, folder: Path, latents: Float[Tensor, "1 N D"], device: torch.device
@@ -192,13 +198,22 @@ class ShapEPrior(Prior):
 
     def _part(self, folder: Path, part: str, device: torch.device) -> Any:
         """Return one network, always in float32: in half precision the renderer's encoding of
-        positions loses all detail.
+        positions loses all detail. ``checkpoint`` replaces the weights of the prior.
         """
         from diffusers import PriorTransformer
         from diffusers.pipelines.shap_e.renderer import ShapERenderer
 
         kind = {"prior": PriorTransformer, "shap_e_renderer": ShapERenderer}[part]
-        return load_network(kind, folder, part, allow_bin=self.cfg.allow_bin).float().to(device)
+        checkpoint = self.cfg.checkpoint if part == "prior" else None
+
+        def load() -> Any:
+            network = load_network(kind, folder, part, allow_bin=self.cfg.allow_bin).float()
+            if checkpoint:
+                load_original_prior(network, checkpoint)
+            return network.to(device)
+
+        key = (f"Shap-E {part}", str(folder), device, self.cfg.allow_bin, checkpoint)
+        return loaded(key, load)
 
 
 def read_schedule(folder: Path) -> tuple[Float[np.ndarray, "T"], str]:
@@ -254,7 +269,7 @@ def decoded(
         raise UserError(
             "Shap-E's latents are not finite: set half_precision: false, or check its weights"
         )
-    renderer.mesh_decoder.register_forward_hook(_refuse_empty)
+    hook = renderer.mesh_decoder.register_forward_hook(_refuse_empty)
     try:
         mesh = renderer.decode_to_mesh(
             latents, latents.device, grid_size=grid_size, query_batch_size=query_batch_size
@@ -264,6 +279,8 @@ def decoded(
             f"Shap-E's grid of {grid_size}^3 does not fit the memory: set grid_size or "
             "query_batch_size lower"
         ) from error
+    finally:
+        hook.remove()  # the renderer may be kept for the next prompt
     linear = (
         torch.stack([mesh.vertex_channels[name] for name in "RGB"], dim=-1).float().cpu().numpy()
     )

@@ -1,0 +1,150 @@
+"""The command: what is refused before any work, and the lock of the farm's folder."""
+
+import fcntl
+import os
+import sys
+
+import pytest
+
+from tests.launch.bad_input_cases import DEMO
+from threestudio_gaussiandreamer.farm import command
+from threestudio_gaussiandreamer.farm.assets import Recipe, Source
+from threestudio_gaussiandreamer.farm.command import main
+from threestudio_gaussiandreamer.farm.identity import require_same_farm
+from threestudio_gaussiandreamer.farm.recipe import check_recipe, make_recipe
+from threestudio_gaussiandreamer.farm.rows import Row, read_rows
+from threestudio_gaussiandreamer.farm.storage import Place
+
+RECIPE = Recipe((Source("a.yaml", b"x: 1"),), ("y=2",), cpu=True, cores=1)
+
+
+@pytest.fixture
+def farm(tmp_path, monkeypatch, capsys):
+    """``farm(text, arguments...)`` runs the command; returns (exit code, stderr)."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(text, *arguments, name="prompts.txt"):
+        (tmp_path / name).write_text(text)
+        code = main([name, "--config", str(DEMO), *arguments])
+        return code, capsys.readouterr().err
+
+    return run
+
+
+def no_ray(monkeypatch):
+    def refuse(address):
+        raise AssertionError("Ray was started")
+
+    monkeypatch.setattr(command.cluster, "connect", refuse)
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "message"),
+    [
+        ("", [], "prompts.txt has no prompts"),
+        ("a fox\na fox", [], "lines 1 and 2 have the same name 'a_fox'"),
+        ("a fox", ["trainer.max_stepz=2"], "did you mean 'trainer.max_steps'"),
+        ("a fox", ["name=mine"], "name is set by --out: remove 'name=mine'"),
+        ("a fox", ["resume=auto"], "resume is set by the farm"),
+        ("a fox", ["system.prompt_processor.prompt=x"], "set by the prompt list"),
+        ("a fox", ["--config", "demoo.yaml"], "unknown configuration 'demoo.yaml'"),
+        ("a fox", ["--out", "prompts.txt"], "can't be written"),
+    ],
+)
+def test_bad_input_is_refused_before_ray_starts(farm, monkeypatch, text, arguments, message):
+    no_ray(monkeypatch)
+    code, err = farm(text, *arguments)
+    assert code == 2 and message in err and "Traceback" not in err
+    assert os.listdir() == ["prompts.txt"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--workers", "0"], "--workers: expected a whole number from 1, got '0'"),
+        (["--gpus", "-1"], "--gpus"),
+        (["--time-limit", "nan"], "expected a number above 0, got 'nan'"),
+        (["--price", "-2"], "--price"),
+        (["--nothing"], "unrecognized option --nothing"),
+    ],
+)
+def test_invalid_options_are_named(farm, arguments, message):
+    code, err = farm("a fox", *arguments)
+    assert code == 2 and message in err
+
+
+def test_a_cluster_that_is_out_of_reach_is_named(farm):
+    pytest.importorskip("ray")
+    code, err = farm("a fox", "--address", "127.0.0.1:1")
+    assert code == 2 and "--address 127.0.0.1:1: no Ray cluster answers there" in err
+
+
+def test_without_ray_the_extra_is_named(farm, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    code, err = farm("a fox")
+    assert code == 2 and "pip install 'threestudio-gaussiandreamer[cluster]'" in err
+
+
+def test_a_folder_in_which_another_command_works_is_refused(farm, monkeypatch, tmp_path):
+    no_ray(monkeypatch)
+    (tmp_path / "out").mkdir()
+    descriptor = os.open(tmp_path / "out", os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    code, err = farm("a fox", "--out", "out")
+    os.close(descriptor)
+    assert code == 2 and "another farm command is at work in" in err
+
+
+def test_the_report_needs_neither_ray_nor_a_finished_asset(farm, monkeypatch, tmp_path):
+    no_ray(monkeypatch)
+    code, _ = farm("a fox", "--report", f"exp_root_dir={tmp_path}/runs")
+    assert code == 0
+    assert "waiting" in (tmp_path / "runs/farm-prompts/report/table.csv").read_text()
+
+
+# -- configurations --------------------------------------------------------------------------------
+
+
+def test_an_error_in_a_rows_configuration_names_its_line(tmp_path):
+    path = tmp_path / "prompts.csv"
+    path.write_text("prompt,overrides\na fox,\na cat,trainer.max_steps=-3\n")
+    recipe = make_recipe([str(DEMO)], [], cpu=True, cores=1)
+    with pytest.raises(ValueError, match="line 3 of the prompt list: trainer.max_steps"):
+        check_recipe(recipe, read_rows(path))
+
+
+def test_a_missing_configuration_of_a_row_names_its_line(tmp_path):
+    row = Row("fox", "a fox", config=("nothing.yaml",), line=4)
+    recipe = make_recipe([str(DEMO)], [], cpu=True, cores=1)
+    with pytest.raises(ValueError, match="line 4 .*unknown configuration 'nothing.yaml'"):
+        check_recipe(recipe, [row])
+
+
+def test_the_low_memory_configuration_is_used_where_it_is_valid():
+    row = [Row("fox", "a fox")]
+    demo = make_recipe([str(DEMO)], [], cpu=True, cores=1)
+    assert check_recipe(demo, row).low_memory is None  # its guidance has no such options
+    paper = make_recipe(["gaussiandreamer.yaml"], [], cpu=True, cores=1)
+    assert check_recipe(paper, row).low_memory.name.endswith("gaussiandreamer-lowmem.yaml")
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (RECIPE._replace(sources=(Source("a.yaml", b"x: 2"),)), "its configurations is"),
+        (RECIPE._replace(overrides=("y=3",)), 'its overrides is \\["y=2"\\], here \\["y=3"\\]'),
+        (RECIPE._replace(cores=2), "its cores is 1, here 2"),
+        (RECIPE._replace(cpu=False), 'its device is "cpu", here "gpu"'),
+    ],
+)
+def test_a_folder_of_another_farm_is_refused(tmp_path, other, message):
+    require_same_farm(Place(tmp_path), RECIPE)
+    require_same_farm(Place(tmp_path), RECIPE)
+    with pytest.raises(ValueError, match=f"belongs to another farm: {message}"):
+        require_same_farm(Place(tmp_path), other)
+
+
+def test_a_damaged_farm_file_is_named(tmp_path):
+    (tmp_path / "farm.json").write_text("{")
+    with pytest.raises(ValueError, match="farm.json is damaged"):
+        require_same_farm(Place(tmp_path), RECIPE)

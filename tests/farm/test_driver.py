@@ -1,0 +1,203 @@
+"""The driver's decisions, with workers that return at once and a stand-in for Ray."""
+
+import io
+from types import SimpleNamespace
+
+import pytest
+
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.farm.assets import Job, Recipe, Source
+from threestudio_gaussiandreamer.farm.board import Beat
+from threestudio_gaussiandreamer.farm.display import Display
+from threestudio_gaussiandreamer.farm.driver import Driver
+from threestudio_gaussiandreamer.farm.ledger import FAILED, FINISHED, RUNNING, Ledger
+from threestudio_gaussiandreamer.farm.rows import Row
+from threestudio_gaussiandreamer.farm.worker import BLOCKED, NO_MEMORY, STOPPED, Setting
+
+ROWS = [Row(f"toy{i}", f"toy {i}", i) for i in range(6)]
+LOW = Source("low.yaml", b"")
+
+
+class FakeRay:
+    """Ray's calls that the driver makes. A handle is the outcome itself, or an exception."""
+
+    class exceptions:
+        class RayError(Exception):
+            pass
+
+        class RayActorError(RayError):
+            pass
+
+    def __init__(self):
+        self.restarted = []
+
+    def wait(self, handles, timeout):
+        return handles[:1], handles[1:]
+
+    def get(self, handle, timeout=None):
+        if isinstance(handle.outcome, Exception):
+            raise handle.outcome
+        return handle.outcome
+
+    def kill(self, worker, no_restart):
+        assert not no_restart
+        self.restarted.append(worker)
+
+
+class FakeWorker:
+    def __init__(self, answers):
+        self.made = []
+        self.make = SimpleNamespace(remote=self._make)
+        self.answers = answers
+
+    def _make(self, job, setting):
+        self.made.append(job)
+        return SimpleNamespace(outcome=self.answers(job))
+
+
+def finished(job):
+    return {"state": FINISHED, "key": job.row.key, "seconds": 1.0}
+
+
+class Bench:
+    """A driver with one worker, and what it has done."""
+
+    def __init__(self, path, answers, rows=ROWS, low_memory=LOW):
+        recipe = Recipe((Source("a.yaml", b""),), (), True, 1, low_memory)
+        self.ray, self.worker = FakeRay(), FakeWorker(answers)
+        self.beats, self.stops = {}, 0
+        board = SimpleNamespace(
+            read=SimpleNamespace(remote=lambda: SimpleNamespace(outcome=self.beats)),
+            stop=SimpleNamespace(remote=self._stop),
+        )
+        self.ledger, self.stream = Ledger(path), io.StringIO()
+        self.driver = Driver(
+            self.ray,
+            [self.worker],
+            [Setting(0, recipe, None, board, "", "now", 3)],
+            iter([Job(row) for row in rows]),
+            self.ledger,
+            10.0,
+            Display(len(rows), 0, self.stream),
+        )
+
+    def _stop(self):
+        self.stops += 1
+        return SimpleNamespace(outcome=None)
+
+    def states(self):
+        return [self.ledger.state(row) for row in ROWS]
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "ledger.jsonl"
+
+
+def test_every_asset_is_made_once(path):
+    bench = Bench(path, finished)
+    bench.driver.run()
+    assert [job.row for job in bench.worker.made] == ROWS
+    assert bench.states() == [FINISHED] * 6
+    assert "6 of 6 finished" in bench.stream.getvalue()
+
+
+def test_a_failed_asset_stops_no_other_and_is_reported_with_its_command(path):
+    def answers(job):
+        failed = {"state": FAILED, "error": "no surface"}
+        return failed if job.row == ROWS[1] else finished(job)
+
+    bench = Bench(path, answers)
+    bench.driver.run()
+    assert bench.states() == [FINISHED, FAILED, *[FINISHED] * 4]
+    line = bench.ledger.last(ROWS[1])
+    assert line["error"] == "no surface" and "prompt=toy 1" in line["command"]
+
+
+def test_an_asset_whose_worker_can_not_be_restarted_is_given_up(path):
+    def answers(job):
+        dead = FakeRay.exceptions.RayActorError("killed")
+        return dead if job.row == ROWS[0] else finished(job)
+
+    bench = Bench(path, answers)
+    bench.driver.run()
+    assert bench.states() == [FAILED, *[FINISHED] * 5]
+    assert bench.ledger.last(ROWS[0])["error"] == "its worker can't be restarted: killed"
+
+
+def test_an_asset_without_memory_is_tried_with_less(path):
+    def answers(job):
+        none = {"state": NO_MEMORY, "error": "out of memory"}
+        return none if job.row == ROWS[0] and not job.saves_memory else finished(job)
+
+    bench = Bench(path, answers)
+    bench.driver.run()
+    assert bench.states() == [FINISHED] * 6 and len(bench.ray.restarted) == 1
+    tries = [job.saves_memory for job in bench.worker.made if job.row == ROWS[0]]
+    assert tries == [False, True]
+
+
+@pytest.mark.parametrize("low_memory", [LOW, None])
+def test_an_asset_without_memory_is_reported_at_last(path, low_memory):
+    def answers(job):
+        none = {"state": NO_MEMORY, "error": "out of memory"}
+        return none if job.row == ROWS[0] else finished(job)
+
+    bench = Bench(path, answers, low_memory=low_memory)
+    bench.driver.run()
+    assert bench.states() == [FAILED, *[FINISHED] * 5]
+    assert ("low.yaml" in bench.ledger.last(ROWS[0])["command"]) == bool(low_memory)
+
+
+def test_a_full_disk_ends_the_farm_and_leaves_the_assets_to_the_next(path):
+    def answers(job):
+        full = {"state": BLOCKED, "error": "No space left"}
+        return full if job.row == ROWS[2] else finished(job)
+
+    bench = Bench(path, answers)
+    with pytest.raises(UserError, match="No space left"):
+        bench.driver.run()
+    assert bench.states() == [FINISHED, FINISHED, RUNNING, None, None, None] and bench.stops
+
+
+def test_assets_that_all_fail_alike_end_the_farm(path):
+    bench = Bench(path, lambda job: {"state": FAILED, "error": "no model"})
+    with pytest.raises(UserError, match="first 3 assets have failed alike.*no model"):
+        bench.driver.run()
+    assert len(bench.worker.made) == 3
+
+
+def test_assets_that_fail_differently_do_not(path):
+    bench = Bench(path, lambda job: {"state": FAILED, "error": job.row.name})
+    bench.driver.run()
+    assert bench.states() == [FAILED] * 6
+
+
+def test_a_worker_that_hangs_is_restarted_once_for_each_standstill(path):
+    bench = Bench(path, finished, rows=ROWS[:1])
+    bench.driver.fill()
+    for beat, seconds, restarts in (
+        (Beat("toy0", 1, "training", 3, 9), 9.0, 0),
+        (Beat("toy0", 1, "training", 3, 9), 11.0, 1),
+        (Beat("toy0", 1, "training", 3, 9), 12.0, 1),
+        (Beat("toy0", 2, "starting", 0, 0), 1.0, 1),
+        (Beat("toy0", 2, "starting", 0, 0), 11.0, 2),
+        (Beat("earlier", 1, "rendering", 1, 0), 99.0, 2),
+    ):
+        bench.driver.restart_hung({0: (beat, seconds)})
+        assert len(bench.ray.restarted) == restarts, beat
+
+
+def test_ctrl_c_lets_the_workers_write_checkpoints(path):
+    def answers(job):
+        if job.row == ROWS[1]:
+            bench.driver.fill = interrupted
+        return finished(job) if job.row == ROWS[0] else {"state": STOPPED, "error": "stopped"}
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    bench = Bench(path, answers)
+    with pytest.raises(KeyboardInterrupt):
+        bench.driver.run()
+    assert bench.stops == 1 and bench.states() == [FINISHED, RUNNING, None, None, None, None]

@@ -1,0 +1,126 @@
+"""Whole farms of tiny guided assets on Ray, against single runs."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.helpers.tiny_farm import ROOT, make_alone, write_farm
+from threestudio_gaussiandreamer.farm import assets
+
+pytest.importorskip("ray", reason="Ray isn't installed: pip install -e .[cluster]")
+pytestmark = pytest.mark.slow
+COUNT, STEPS = 3, 40
+SECONDS = 300
+
+
+class Farm:
+    """The command in a process of its own."""
+
+    def __init__(self, folder, arguments):
+        self.out = folder / "farm"
+        command = [sys.executable, "-m", "threestudio_gaussiandreamer.farm", *arguments]
+        self.command = [*command, "--out", str(self.out), "--gpus", "0", "--workers", "2"]
+
+    def start(self, *more):
+        return subprocess.Popen(
+            [*self.command, *more],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    def run(self, *more):
+        process = self.start(*more)
+        said, _ = process.communicate(timeout=SECONDS)
+        return process.returncode, said
+
+    def lines(self):
+        return [json.loads(line) for line in open(self.out / "ledger.jsonl")]
+
+    def checkpointed(self):
+        """The assets that have a checkpoint and aren't finished."""
+        found = {path.parents[1] for path in self.out.glob("assets/*/ckpts/*.ckpt")}
+        return [folder for folder in found if not (folder / assets.RESULT).exists()]
+
+
+def wait_for(condition, process):
+    deadline = time.monotonic() + SECONDS
+    while not (found := condition()):
+        assert process.poll() is None and time.monotonic() < deadline, process.stdout.read()
+        time.sleep(0.02)
+    return found
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A farm whose worker was killed, whose driver was killed, and which was then left alone."""
+    folder = tmp_path_factory.mktemp("farm")
+    farm = Farm(folder, write_farm(folder, COUNT, STEPS))
+    process = farm.start()
+    asset = wait_for(farm.checkpointed, process)[0]
+    worker = int((asset / "attempts.txt").read_text().split()[-1])
+    os.kill(worker, signal.SIGKILL)
+    wait_for(lambda: len((asset / "attempts.txt").read_text().splitlines()) == 2, process)
+    process.kill()
+    process.communicate()
+    code, said = farm.run()
+    assert code == 0, said
+    return farm
+
+
+def test_a_killed_worker_goes_on_from_the_last_checkpoint(made):
+    logs = [path.read_text() for path in made.out.glob("assets/*/log.txt")]
+    assert any("resume=auto: going on from" in log for log in logs)
+
+
+def test_every_asset_is_finished_once(made):
+    names = [line["name"] for line in made.lines() if line["state"] == "finished"]
+    assert sorted(names) == [f"toy{i}" for i in range(COUNT)]
+
+
+def test_the_assets_are_those_of_single_runs_to_the_bit(made):
+    last = [line for line in made.lines() if line["state"] == "finished"][-1]
+    number = int(last["name"].removeprefix("toy"))
+    alone = make_alone(made.out.parent, number, STEPS)
+    assert last["hash"] == assets.digest(alone) == assets.digest(made.out / "assets" / last["name"])
+
+
+def test_a_worker_loads_each_network_at_most_once(made):
+    for line in made.lines():
+        if line["state"] == "finished":
+            assert set(line["loads"].values()) == {1} and "unet" in line["loads"]
+
+
+def test_the_same_command_finds_nothing_left(made):
+    code, said = made.run()
+    assert code == 0 and f"{COUNT} finished, 0 failed" in said
+    attempts = [path.read_text() for path in made.out.glob("assets/*/attempts.txt")]
+    assert made.run("--report")[0] == 0
+    assert attempts == [path.read_text() for path in made.out.glob("assets/*/attempts.txt")]
+
+
+def test_another_configuration_is_refused_in_its_folder(made):
+    code, said = made.run("system.geometry.init_opacity=0.2")
+    assert code == 2 and "belongs to another farm: its overrides is" in said
+
+
+def test_ctrl_c_leaves_checkpoints_and_a_failed_asset_is_reported(tmp_path):
+    farm = Farm(tmp_path, write_farm(tmp_path, 1, 100_000))
+    rows = [{"prompt": "a toy", "name": "long", "seed": 1}]
+    rows.append({"prompt": "b", "name": "fails", "overrides": "system.geometry.prior.path=no.glb"})
+    (tmp_path / "prompts.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    process = farm.start()
+    wait_for(lambda: any(folder.name == "long" for folder in farm.checkpointed()), process)
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=SECONDS)
+    assert process.returncode == 130, said
+    assert "stopped at step" in (farm.out / "assets/long/log.txt").read_text()
+    failed = [line for line in farm.lines() if line["state"] == "failed"]
+    assert [line["name"] for line in failed] == ["fails"] and "no.glb" in failed[0]["error"]
+    assert "system.geometry.prior.path=no.glb" in failed[0]["command"]

@@ -1,0 +1,68 @@
+"""The report: tables, gallery and failures, for any number of assets."""
+
+import csv
+
+import pytest
+
+from threestudio_gaussiandreamer.farm import report
+from threestudio_gaussiandreamer.farm.ledger import FAILED, FINISHED, RUNNING, Ledger
+from threestudio_gaussiandreamer.farm.rows import Row
+from threestudio_gaussiandreamer.farm.storage import Place
+
+ROWS = [Row(f"toy{i}", f"a <b>toy</b> {i}", i) for i in range(5)]
+
+
+def line(row, state, **more):
+    return {"name": row.name, "key": row.key, "state": state, **more}
+
+
+@pytest.fixture
+def ledger(tmp_path):
+    ledger = Ledger(tmp_path / "ledger.jsonl")
+    done = {"seconds": 36.0, "steps": 5, "gaussians": 10, "attempts": 2, "saves_memory": False}
+    scores = {"scores": {"psnr": 30.0}, "picture": "save/it5-test/0.png"}
+    ledger.append([line(ROWS[0], FINISHED, **done, **scores), line(ROWS[1], RUNNING)])
+    ledger.append([line(ROWS[2], FAILED, error="no <space>", command="launch 'a b'")])
+    ledger.append([line(ROWS[3], FINISHED, **done)])
+    return ledger
+
+
+def read(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_table_has_a_row_per_asset_and_its_cost(tmp_path, ledger):
+    report.write_report(Place(tmp_path), ROWS, ledger, price=2.0)
+    rows = read(tmp_path / "report/table.csv")
+    states = [row["state"] for row in rows]
+    assert states == [FINISHED, RUNNING, FAILED, FINISHED, report.WAITING]
+    assert (rows[0]["cost"], rows[0]["psnr"], rows[0]["seed"]) == ("0.02", "30.0", "0")
+    assert rows[1]["cost"] == "" and rows[2]["command"] == "launch 'a b'"
+
+
+def test_parquet_has_the_same_rows(tmp_path, ledger, monkeypatch):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    monkeypatch.setattr(report, "BATCH", 2)
+    report.write_report(Place(tmp_path), ROWS, ledger)
+    rows = parquet.read_table(tmp_path / "report/table.parquet").to_pylist()
+    assert [row["name"] for row in rows] == [row.name for row in ROWS]
+    assert rows[0]["seconds"] == 36.0 and rows[4]["seconds"] is None
+    assert list(rows[0]) == list(report.COLUMNS)
+
+
+def test_the_pages_show_pictures_and_failures_escaped(tmp_path, ledger, monkeypatch):
+    monkeypatch.setattr(report, "PER_PAGE", 1)
+    first = report.write_report(Place(tmp_path), ROWS, ledger, price=2.0).read_text()
+    assert "no &lt;space&gt;" in first and "launch &#x27;a b&#x27;" in first
+    assert "page-2.html" in first and "page-3.html" not in first
+    assert "0.04, 0.02 per finished asset" in first
+    page = (tmp_path / "report/page-1.html").read_text()
+    assert 'src="../assets/toy0/save/it5-test/0.png"' in page and "a &lt;b&gt;toy" in page
+    assert (tmp_path / "report/page-2.html").exists()
+
+
+def test_an_empty_farm_has_a_report(tmp_path):
+    ledger = Ledger(tmp_path / "ledger.jsonl")
+    report.write_report(Place(tmp_path), ROWS, ledger)
+    assert {row["state"] for row in read(tmp_path / "report/table.csv")} == {report.WAITING}

@@ -1,0 +1,105 @@
+"""What a worker makes of errors, and how often it tries."""
+
+import errno
+
+import pytest
+import torch
+
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.farm import worker
+from threestudio_gaussiandreamer.farm.assets import Job, Recipe, Source
+from threestudio_gaussiandreamer.farm.ledger import FAILED
+from threestudio_gaussiandreamer.farm.rows import Row
+from threestudio_gaussiandreamer.farm.storage import Place, Unreachable
+from threestudio_gaussiandreamer.farm.worker import (
+    BLOCKED,
+    NO_MEMORY,
+    Setting,
+    Worker,
+    count_attempts,
+    outcome_of,
+)
+
+JOB = Job(Row("fox", "a fox"))
+
+
+def caused(error, cause):
+    error.__cause__ = cause
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "state"),
+    [
+        (UserError("no surface"), FAILED),
+        (KeyError("x"), FAILED),
+        (MemoryError(), NO_MEMORY),
+        (torch.OutOfMemoryError("CUDA out of memory"), NO_MEMORY),
+        (caused(UserError("the grid doesn't fit"), torch.OutOfMemoryError()), NO_MEMORY),
+        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory"), NO_MEMORY),
+        (OSError(errno.ENOSPC, "No space left on device"), BLOCKED),
+        (caused(UserError("can't write"), OSError(errno.ENOSPC, "full")), BLOCKED),
+        (Unreachable("s3://a can't be reached"), BLOCKED),
+        (OSError(errno.ENOENT, "no such file"), FAILED),
+    ],
+)
+def test_errors_have_states(error, state):
+    outcome = outcome_of(error)
+    assert outcome["state"] == state and outcome["error"]
+
+
+def test_attempts_are_counted_in_the_session_and_in_all(tmp_path):
+    assert [count_attempts(tmp_path, "one") for _ in range(2)] == [(1, 1), (2, 2)]
+    assert count_attempts(tmp_path, "two") == (3, 1)
+
+
+def setting(place, **options):
+    recipe = Recipe((Source("a.yaml", b""),), (), True, 1, Source("low.yaml", b""))
+    return Setting(0, recipe, place, None, options.pop("start", "."), "now", retries=1)
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(worker, "keep_loaded", lambda: None)
+    return Place(tmp_path)
+
+
+def test_an_asset_is_given_up_after_its_retries(place, monkeypatch):
+    monkeypatch.setattr(Worker, "_run", dies)
+    with pytest.raises(KeyboardInterrupt):
+        Worker().make(JOB, setting(place))
+    with pytest.raises(KeyboardInterrupt):
+        Worker().make(JOB, setting(place))
+    outcome = Worker().make(JOB, setting(place))
+    assert outcome["state"] == NO_MEMORY and "died or hung 2 times" in outcome["error"]
+
+
+def dies(*args):
+    raise KeyboardInterrupt  # nothing of the worker goes on after it, as after a kill
+
+
+def test_what_was_made_with_much_memory_is_not_gone_on_with(place, monkeypatch):
+    monkeypatch.setattr(Worker, "_run", dies)
+    saving = JOB._replace(saves_memory=True)
+    folder = place.work_folder(JOB.row)
+    (folder / "ckpts").mkdir(parents=True)
+    for expected in (False, True):
+        with pytest.raises(KeyboardInterrupt):
+            Worker().make(saving, setting(place))
+        assert (folder / "ckpts").exists() == expected
+        (folder / "ckpts").mkdir(exist_ok=True)
+
+
+def test_a_machine_without_the_folder_is_named(place):
+    outcome = Worker().make(JOB, setting(place, start="/nowhere"))
+    assert outcome["state"] == FAILED and "has no folder /nowhere" in outcome["error"]
+
+
+def test_an_error_is_in_the_log_of_its_asset(place, monkeypatch):
+    def fails(*args):
+        raise ValueError("no such thing")
+
+    monkeypatch.setattr(Worker, "_run", fails)
+    assert Worker().make(JOB, setting(place))["error"] == "ValueError: no such thing"
+    assert "Traceback" in (place.work_folder(JOB.row) / "log.txt").read_text()

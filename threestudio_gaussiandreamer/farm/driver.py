@@ -1,0 +1,201 @@
+"""The driver hands assets to the workers, notes their outcomes in the ledger, and watches for
+workers that hang."""
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from typing import Any, Optional
+
+from ..core.errors import UserError
+from .assets import Job, repeat_command
+from .board import Beat
+from .display import Display
+from .ledger import FAILED, FINISHED, RUNNING, Ledger
+from .worker import BLOCKED, NO_MEMORY, STOPPED, Setting
+
+POLL = 0.5
+"""Seconds between two looks at the board."""
+SECONDS_TO_STOP = 60
+"""How long workers may take to write their checkpoints when the farm is stopped."""
+SAME_ERRORS = 3
+"""The farm ends when so many assets have failed with one message, and none has been finished."""
+
+
+class Driver:
+    """Makes all assets that are left.
+
+    Args:
+        ray: the connected module.
+        workers: handles of :class:`.worker.Worker`.
+        settings: of the workers.
+        jobs: the assets that aren't finished; read as they are needed.
+        ledger: of the farm.
+        hang: seconds without a finished step after which a worker is restarted.
+    """
+
+    def __init__(
+        self,
+        ray: Any,
+        workers: list[Any],
+        settings: list[Setting],
+        jobs: Iterator[Job],
+        ledger: Ledger,
+        hang: float,
+        display: Display,
+    ) -> None:
+        self.ray, self.workers, self.settings = ray, workers, settings
+        self.board, self.recipe = settings[0].board, settings[0].recipe
+        self.jobs, self.ledger = jobs, ledger
+        self.hang, self.display = hang, display
+        self.idle = deque(range(len(workers)))
+        self.running: dict[Any, tuple[int, Job]] = {}
+        self.again: deque[Job] = deque()
+        self.killed: dict[int, Beat] = {}
+        self.errors: list[str] = []
+        self.obstacle: Optional[str] = None
+
+    def run(self) -> None:
+        """Make the assets.
+
+        Raises:
+            UserError: the results can't be written, or the first assets all fail alike.
+            KeyboardInterrupt: Ctrl-C; the workers have written checkpoints.
+        """
+        try:
+            self.display.start_clock()
+            self.fill()
+            while self.running:
+                self.step()
+        except (KeyboardInterrupt, SystemExit):
+            print("\nstopping: the workers write checkpoints; once more to stop at once")
+            self.stop()
+            raise
+        if self.obstacle:
+            raise UserError(self.obstacle)
+
+    def step(self) -> None:
+        """Wait for outcomes for at most :data:`POLL` seconds, and look at the workers."""
+        ready, _ = self.ray.wait(list(self.running), timeout=POLL)
+        for handle in ready:
+            self.collect(handle)
+        if not self.obstacle:
+            self.fill()
+        beats = self.read_board()
+        self.restart_hung(beats)
+        names = {worker: job.row.name for worker, job in self.running.values()}
+        self.display.draw(beats, names)
+
+    def fill(self) -> None:
+        """Give an asset to each worker that has none."""
+        while self.idle:
+            job = self.again.popleft() if self.again else next(self.jobs, None)
+            if job is None:
+                return
+            self.ledger.append([self.line(job, RUNNING)])
+            number = self.idle.popleft()
+            handle = self.workers[number].make.remote(job, self.settings[number])
+            self.running[handle] = number, job
+
+    def stop(self) -> None:
+        """Let all workers write a checkpoint and end."""
+        self.tell_board_to_stop()
+        deadline = time.monotonic() + SECONDS_TO_STOP
+        while self.running and time.monotonic() < deadline:
+            ready, _ = self.ray.wait(list(self.running), timeout=POLL)
+            for handle in ready:
+                self.collect(handle)
+
+    # Outcomes
+    # ----------------------------------------------------------------------------------------------
+
+    def collect(self, handle: Any) -> None:
+        """Note the outcome of an asset."""
+        number, job = self.running.pop(handle)
+        self.idle.append(number)
+        outcome = self.outcome(handle)
+        state = outcome["state"]
+        if state == FINISHED:
+            self.finish(job, outcome)
+        elif state == NO_MEMORY and self.recipe.low_memory and not job.saves_memory:
+            self.display.note(job.row.name, "again with less memory", outcome["error"])
+            self.again.append(job._replace(saves_memory=True))
+            self.restart(number)
+        elif state == BLOCKED:
+            self.block(outcome["error"])
+        elif state != STOPPED:
+            self.fail(job, outcome["error"])
+
+    def outcome(self, handle: Any) -> dict[str, Any]:
+        """Return what the worker returned, or what Ray says about its death."""
+        errors = self.ray.exceptions
+        try:
+            return self.ray.get(handle)
+        except errors.RayActorError as error:
+            return {"state": FAILED, "error": f"its worker can't be restarted: {error}"}
+        except errors.RayError as error:
+            return {"state": FAILED, "error": first_line(error)}
+
+    def finish(self, job: Job, outcome: dict[str, Any]) -> None:
+        outcome.pop("key")
+        self.ledger.append([self.line(job, **outcome)])
+        self.display.note(job.row.name, FINISHED, f"{outcome.get('seconds', 0):.1f} s")
+
+    def fail(self, job: Job, error: str) -> None:
+        """Note a failed asset.
+
+        Raises:
+            UserError: the first assets all fail alike.
+        """
+        command = repeat_command(self.recipe, job)
+        self.ledger.append([self.line(job, FAILED, error=error, command=command)])
+        self.display.note(job.row.name, FAILED, error)
+        self.errors.append(error)
+        finished = self.display.done + self.display.counts[FINISHED]
+        if not finished and self.errors == [error] * SAME_ERRORS:
+            self.block(
+                f"the first {SAME_ERRORS} assets have failed alike, so the farm ends: {error}"
+            )
+
+    def block(self, error: str) -> None:
+        """Hand out no more assets, and let the workers write checkpoints."""
+        self.obstacle = self.obstacle or error
+        self.tell_board_to_stop()
+
+    def line(self, job: Job, state: str, **more: Any) -> dict[str, Any]:
+        row = job.row
+        return {"name": row.name, "key": row.key, "state": state, **more}
+
+    # Workers
+    # ----------------------------------------------------------------------------------------------
+
+    def read_board(self) -> dict[int, tuple[Beat, float]]:
+        """Return the board's content; nothing while its process is restarted."""
+        try:
+            return self.ray.get(self.board.read.remote(), timeout=2)
+        except self.ray.exceptions.RayError:
+            return {}
+
+    def tell_board_to_stop(self) -> None:
+        try:
+            self.ray.get(self.board.stop.remote(), timeout=5)
+        except self.ray.exceptions.RayError:
+            pass  # it is being restarted; the workers are stopped without checkpoints
+
+    def restart_hung(self, beats: dict[int, tuple[Beat, float]]) -> None:
+        """Restart workers that have finished no step for long; Ray hands them their asset again."""
+        for number, job in self.running.values():
+            beat, seconds = beats.get(number, (None, 0.0))
+            hangs = beat is not None and beat.name == job.row.name and seconds > self.hang
+            if hangs and self.killed.get(number) != beat:
+                self.killed[number] = beat
+                said = f"no step for {seconds:.0f} s ({beat.stage} {beat.step})"
+                self.display.note(job.row.name, "restarted", said)
+                self.restart(number)
+
+    def restart(self, number: int) -> None:
+        self.ray.kill(self.workers[number], no_restart=False)
+
+
+def first_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[0][:500]

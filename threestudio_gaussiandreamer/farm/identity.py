@@ -1,0 +1,55 @@
+"""What tells one farm from another: a folder's ``farm.json`` names the configuration that all its
+assets are made with."""
+
+import hashlib
+import json
+from typing import Any
+
+from .. import __version__
+from ..core.errors import UserError
+from ..core.files import json_text
+from .assets import Recipe
+from .storage import Place
+
+FILE = "farm.json"
+
+
+def identity(recipe: Recipe) -> dict[str, Any]:
+    """Return what the assets of a farm depend on beside their rows."""
+    return {
+        "version": __version__,
+        "configurations": {
+            source.name: hashlib.sha256(source.content).hexdigest() for source in recipe.sources
+        },
+        "overrides": list(recipe.overrides),
+        "device": "cpu" if recipe.cpu else "gpu",
+        "cores": recipe.cores if recipe.cpu else None,
+    }
+
+
+def require_same_farm(place: Place, recipe: Recipe) -> None:
+    """Check that a folder is new or of the same farm, and note the farm in a new one.
+
+    Raises:
+        UserError: the folder belongs to another farm; the message names what differs.
+    """
+    ours, content = identity(recipe), place.read(FILE)
+    if content is None:
+        place.write(FILE, json_text(ours, indent=1).encode())
+        return
+    try:
+        theirs = json.loads(content)
+        differs = [name for name in ours if theirs.get(name) != ours[name]]
+    except (ValueError, AttributeError) as error:
+        raise UserError(f"{place}/{FILE} is damaged: {error}; choose another --out") from error
+    if differs:
+        name = differs[0]
+        raise UserError(
+            f"{place} belongs to another farm: its {name} is {shown(theirs.get(name))}, here "
+            f"{shown(ours[name])}; choose another --out"
+        )
+
+
+def shown(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 300 else f"{text[:300]}..."

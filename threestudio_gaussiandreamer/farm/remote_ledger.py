@@ -1,0 +1,71 @@
+"""The ledger of a farm below a URL: object stores can't append to a file, so lines are uploaded as
+a series of small files, which are joined again when the farm is started.
+
+Lines of the last seconds may be missing after a kill. Nothing is made twice then: before it makes
+an asset, a worker looks for its ``result.json``."""
+
+import time
+
+from .ledger import FILE, Ledger
+from .storage import Place, RemotePlace
+
+FOLDER = "ledger"
+SECONDS_BETWEEN = 5.0
+MOST_PARTS = 100
+"""Above this number, the parts are joined into one at the start."""
+
+
+def open_ledger(place: Place) -> Ledger:
+    """Return the ledger of a farm."""
+    return RemoteLedger(place) if isinstance(place, RemotePlace) else Ledger(place.folder / FILE)
+
+
+class RemoteLedger(Ledger):
+    """A local copy of the ledger, and its parts below the URL."""
+
+    def __init__(self, place: RemotePlace) -> None:
+        self.place = place
+        self.waiting: list[bytes] = []
+        self.uploaded = time.monotonic()
+        self.count = 0
+        path = place.folder / FILE
+        path.parent.mkdir(parents=True, exist_ok=True)
+        parts = place.names(FOLDER)
+        with open(path, "wb") as file:
+            for part in parts:
+                file.write(place.read(part) or b"")
+        super().__init__(path)
+        if len(parts) > MOST_PARTS:
+            self._join(parts)
+
+    def copy(self, content: bytes) -> None:
+        self.waiting.append(content)
+        if time.monotonic() >= self.uploaded + SECONDS_BETWEEN:
+            self.upload()
+
+    def upload(self) -> None:
+        """Upload the lines that are waiting, as one part."""
+        if self.waiting:
+            self._write_part(b"".join(self.waiting))
+            self.waiting = []
+        self.uploaded = time.monotonic()
+
+    def close(self) -> None:
+        self.upload()
+        super().close()
+
+    def _write_part(self, content: bytes) -> None:
+        self.count += 1
+        # sorted by time, also between drivers
+        self.place.write(f"{FOLDER}/{time.time_ns():020d}-{self.count:06d}.jsonl", content)
+
+    def _join(self, parts: list[str]) -> None:
+        """Replace the parts by one with the last line of each asset."""
+        with open(self.path, "rb") as file:
+            last = []
+            for entry in sorted(self.index.values()):
+                file.seek(entry.offset)
+                last.append(file.readline())
+        # a reader between the two steps sees these lines twice, which changes nothing
+        self._write_part(b"".join(last))
+        self.place.remove(parts)
