@@ -8,7 +8,7 @@ PYTEST  = $(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --d
 # without the CPU kernel (no C++ compiler) plain torch renders, and the demo is smaller
 SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import available_backends as b; print("--config configs/demo-small.yaml" if b()["cpu"] else "")')
 
-.PHONY: demo test test-slow test-all docs stability fuzz long-run ablations bench gpu-check train-toybox toybox-sheet charts measure-charts clean
+.PHONY: demo test test-slow test-all test-farm docs stability fuzz long-run ablations bench gpu-check train-toybox toybox-sheet charts measure-charts clean
 
 demo: $(VENV)/ready                ## train the bundled toy from a coarse prior, offline, on the CPU
 	$(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
@@ -20,6 +20,9 @@ test-slow: $(VENV)/ready-for-tests ## kills, fuzzing, emulated kernels and runs 
 	$(PYTEST) -m slow
 
 test-all: test test-slow           ## both, as CI runs them
+
+test-farm: $(VENV)/ready-for-farm  ## the farm's tests on Ray and on an S3 server, which test and test-slow skip where Ray isn't installed
+	$(PYTEST) tests/farm
 
 stability: $(VENV)/ready-for-tests          ## every known failure, provoked and measured: docs/stability.md
 	$(ENVIRON) $(BIN)/python -m pytest tests/stability --stability-report stability.json; status=$$?; \
@@ -88,6 +91,10 @@ $(VENV)/ready-for-tests: requirements-dev.txt $(PACKAGE) | $(BIN)/python
 
 $(VENV)/ready-for-charts: $(VENV)/ready
 	$(PIP) -c constraints.txt -e .[charts]
+	touch $@
+
+$(VENV)/ready-for-farm: $(VENV)/ready-for-tests
+	$(PIP) -c constraints.txt -e .[cluster,farm-test]
 	touch $@
 
 $(VENV)/ready-for-models: $(VENV)/ready

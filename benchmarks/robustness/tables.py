@@ -1,4 +1,6 @@
-"""The measured parts of docs/robustness.md, from benchmarks/results/fuzz.csv and long_run.json."""
+"""The measured parts of docs/robustness.md, from benchmarks/results/fuzz.csv and long_run.json,
+and of docs/farm.md, from farm.csv and farm_chaos.csv.
+"""
 
 import json
 from pathlib import Path
@@ -41,3 +43,24 @@ def long_run() -> str:
         ("duration on one thread", f"{run['minutes']:.0f} minutes"),
     )  # fmt: skip
     return markdown(("the interrupted run", ""), rows)
+
+
+KILLED = {"worker": "workers", "driver": "the driver", "node": "machines"}
+
+
+def farm() -> str:
+    """Return the costs of a farm beside its assets, and what a farm with killed processes made."""
+    table = []
+    for row in read(RESULTS / "farm.csv"):
+        places = [f"{int(row['rows']):,} {'assets' if row['workers'] else 'rows'}"]
+        places += [f"{row['workers']} workers"] if row["workers"] else []
+        value = f"{float(row['value']):.3g} {row['unit']}".strip()
+        table.append((f"{row['measured']}, {', '.join(places)}", value))
+    (chaos,) = read(RESULTS / "farm_chaos.csv")
+    kills = ", ".join(f"{chaos[f'{kind}_kills']} of {name}" for kind, name in KILLED.items())
+    table += [
+        (f"SIGKILLs: {kills}; assets finished", f"{chaos['finished']} of {chaos['assets']}"),
+        ("of these equal to the bit to single runs", chaos["equal_to_single_runs"]),
+        ("of these finished twice", chaos["finished_twice"]),
+    ]
+    return markdown(("measured", "value"), table)

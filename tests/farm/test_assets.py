@@ -49,4 +49,5 @@ def test_the_digest_is_of_names_and_contents(tmp_path):
         (folder / name).write_bytes(content)
         digests.add(assets.digest(tmp_path))
     (folder / "report.json").write_text("seconds")
+    (folder / "pruned").mkdir()
     assert len(digests) == 3 and assets.digest(tmp_path) in digests

@@ -19,7 +19,7 @@ LOW = Source("low.yaml", b"")
 
 
 class FakeRay:
-    """Ray's calls that the driver makes. A handle is the outcome itself, or an exception."""
+    """Ray's calls that the driver makes; an outcome may be an exception."""
 
     class exceptions:
         class RayError(Exception):
@@ -44,6 +44,13 @@ class FakeRay:
         self.restarted.append(worker)
 
 
+class Handle:
+    """Of a call: its outcome, which is there at once."""
+
+    def __init__(self, outcome):
+        self.outcome = outcome
+
+
 class FakeWorker:
     def __init__(self, answers):
         self.made = []
@@ -52,7 +59,7 @@ class FakeWorker:
 
     def _make(self, job, setting):
         self.made.append(job)
-        return SimpleNamespace(outcome=self.answers(job))
+        return Handle(self.answers(job))
 
 
 def finished(job):
@@ -67,7 +74,7 @@ class Bench:
         self.ray, self.worker = FakeRay(), FakeWorker(answers)
         self.beats, self.stops = {}, 0
         board = SimpleNamespace(
-            read=SimpleNamespace(remote=lambda: SimpleNamespace(outcome=self.beats)),
+            read=SimpleNamespace(remote=lambda: Handle(self.beats)),
             stop=SimpleNamespace(remote=self._stop),
         )
         self.ledger, self.stream = Ledger(path), io.StringIO()
@@ -83,7 +90,7 @@ class Bench:
 
     def _stop(self):
         self.stops += 1
-        return SimpleNamespace(outcome=None)
+        return Handle(None)
 
     def states(self):
         return [self.ledger.state(row) for row in ROWS]

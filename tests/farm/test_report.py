@@ -20,7 +20,7 @@ def line(row, state, **more):
 def ledger(tmp_path):
     ledger = Ledger(tmp_path / "ledger.jsonl")
     done = {"seconds": 36.0, "steps": 5, "gaussians": 10, "attempts": 2, "saves_memory": False}
-    scores = {"scores": {"psnr": 30.0}, "picture": "save/it5-test/0.png"}
+    scores = {"scores": {"psnr": 30.0}, "picture": "save/it5-test/0.png", "page": "a.html"}
     ledger.append([line(ROWS[0], FINISHED, **done, **scores), line(ROWS[1], RUNNING)])
     ledger.append([line(ROWS[2], FAILED, error="no <space>", command="launch 'a b'")])
     ledger.append([line(ROWS[3], FINISHED, **done)])
@@ -59,6 +59,7 @@ def test_the_pages_show_pictures_and_failures_escaped(tmp_path, ledger, monkeypa
     assert "0.04, 0.02 per finished asset" in first
     page = (tmp_path / "report/page-1.html").read_text()
     assert 'src="../assets/toy0/save/it5-test/0.png"' in page and "a &lt;b&gt;toy" in page
+    assert 'href="../assets/toy0/a.html"' in page
     assert (tmp_path / "report/page-2.html").exists()
 
 

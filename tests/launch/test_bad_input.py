@@ -201,6 +201,7 @@ register_parts()
         ("checkpoint.filename='{step[0]}'", "which isn't a format: "),
         # folders and texts
         ("exp_root_dir=a\0b", "no folder's name has a NUL"),
+        ("exp_root_dir=s3://a/b", "a single run writes to a folder, and only the farm to a URL"),
         ("exp_root_dir=" + 300 * "x", "can't be written: File name too long"),
         ("system.prompt_processor.prompt=???", "'???' can't be a text"),
         ("system.geometry.weights=last.ckpt", "expected <checkpoint>:<module>"),

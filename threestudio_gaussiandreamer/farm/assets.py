@@ -17,7 +17,9 @@ from .rows import Row
 RESULT = "result.json"
 ASSETS = "assets"
 """The ``name`` of the assets' runs, and so the folder that holds one folder per asset."""
-EXPORTED = (".ply", ".spz", ".obj", ".glb")
+NOT_EXPORTED = (".json", ".html", ".png")
+"""Reports and pages beside the exported files, which may hold times."""
+PICTURES = ("it*-export/poster.png", "it*-test/0.png", "it*.png")
 MANAGED = {
     "exp_root_dir": "--out",
     "name": "--out",
@@ -136,7 +138,7 @@ def read_result(folder: Path, row: Row) -> Optional[dict[str, Any]]:
 def exported(folder: Path) -> Iterator[Path]:
     """Yield the exported files of an asset, sorted."""
     found = folder.glob("save/it*-export/**/*")
-    yield from sorted(path for path in found if path.suffix in EXPORTED)
+    yield from sorted(p for p in found if p.is_file() and p.suffix not in NOT_EXPORTED)
 
 
 def digest(folder: Path) -> str:
@@ -150,7 +152,12 @@ def digest(folder: Path) -> str:
 
 def picture(folder: Path) -> Optional[str]:
     """Return the path, relative to ``folder``, of the picture that a gallery shows."""
-    found = sorted(folder.glob("save/it*-test/0.png")) or sorted(folder.glob("save/it*.png"))
+    return next(filter(None, (newest(folder, pattern) for pattern in PICTURES)), None)
+
+
+def newest(folder: Path, pattern: str) -> Optional[str]:
+    """Return the last of the files below ``save`` with this pattern, relative to ``folder``."""
+    found = sorted(folder.glob(f"save/{pattern}"))
     return found[-1].relative_to(folder).as_posix() if found else None
 
 

@@ -177,6 +177,8 @@ def start_workers(ray: Any, settings: list[Setting], device: Device) -> list[Any
         UserError: a worker can't start, or has another version of the package.
     """
     environment = {"OMP_NUM_THREADS": str(device.cores), "OMP_WAIT_POLICY": "passive"}
+    if not device.gpus:
+        environment["CUDA_VISIBLE_DEVICES"] = ""
     actor = ray.remote(
         num_cpus=device.cores,
         num_gpus=device.gpus,

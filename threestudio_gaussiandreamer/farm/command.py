@@ -23,7 +23,7 @@ from .display import Display
 from .driver import Driver
 from .identity import require_same_farm
 from .ledger import FAILED, FINISHED, Ledger
-from .recipe import check_recipe, jobs_left, make_recipe
+from .recipe import check_recipe, jobs_left, make_recipe, root_of
 from .remote_ledger import open_ledger
 from .report import write_report
 from .rows import check_rows, read_rows
@@ -139,7 +139,7 @@ def run_farm(args: argparse.Namespace) -> int:
     configure_logging(verbose=False)
     total = check_rows(args.prompts)
     root, overrides = split_root(args.overrides)
-    place = place_of(args.out or f"{root}/farm-{args.prompts.stem}")
+    place = place_of(args.out or f"{root or root_of(args.config)}/farm-{args.prompts.stem}")
     if args.report:
         return report(args, place, open_ledger(place))
     if not is_url(str(place)):
@@ -164,11 +164,11 @@ def run_farm(args: argparse.Namespace) -> int:
     return report(args, place, ledger)
 
 
-def split_root(overrides: Sequence[str]) -> tuple[str, list[str]]:
-    """Return the value of ``exp_root_dir``, which the farm's folder lies in, and the others."""
+def split_root(overrides: Sequence[str]) -> tuple[Optional[str], list[str]]:
+    """Return the value of ``exp_root_dir``, in which the farm's folder lies, and the others."""
     roots = [text for text in overrides if text.startswith("exp_root_dir=")]
     others = [text for text in overrides if text not in roots]
-    return roots[-1].partition("=")[2] if roots else "outputs", others
+    return roots[-1].partition("=")[2] if roots else None, others
 
 
 def make_assets(

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Optional
 
 from ..core.errors import UserError
+from ..launch.config_source import read_yaml
 from ..launch.experiment import read_source
 from ..launch.options import find_config
 from .assets import MANAGED, Job, Recipe, Source, run_overrides
@@ -37,6 +38,12 @@ def make_recipe(
     for override in overrides:
         require_free(override)
     return Recipe(tuple(map(read_config, configs)), overrides, cpu, cores)
+
+
+def root_of(configs: Iterable[str]) -> str:
+    """Return ``exp_root_dir`` of the configuration: the folder or URL for the farm's folder."""
+    roots = [read_yaml(read_config(name).name).get("exp_root_dir") for name in configs]
+    return str([root for root in ["outputs", *roots] if root][-1])
 
 
 def require_free(override: str) -> None:
@@ -105,7 +112,8 @@ def check_job(recipe: Recipe, job: Job) -> Any:
 
     extra = [recipe.low_memory] if job.saves_memory and recipe.low_memory else []
     paths = [Path(source.name) for source in (*recipe.sources, *job.sources, *extra)]
-    cfg = load_config(*paths, cli_args=run_overrides(recipe, job))
+    # the farm's own exp_root_dir may be a URL, which a single run refuses
+    cfg = load_config(*paths, cli_args=[*run_overrides(recipe, job), "exp_root_dir=outputs"])
     check_config(cfg)
     return cfg
 

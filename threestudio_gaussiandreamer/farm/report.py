@@ -46,6 +46,7 @@ COLUMNS = {
     "host": TEXT,
     "hash": TEXT,
     "picture": TEXT,
+    "page": TEXT,
     "error": TEXT,
     "command": TEXT,
 }
@@ -224,7 +225,7 @@ def figure(line: dict[str, Any]) -> str:
     score = f", {line['psnr']:.1f} dB" if line["psnr"] is not None else ""
     numbers = f"{line['gaussians'] or 0} Gaussians, {duration(line['seconds'] or 0)}{score}"
     caption = f"{html.escape(line['prompt'])}<br><small>{numbers}</small>"
-    linked = f'<a href="{folder}/">{image}</a>'
+    linked = f'<a href="{folder}/{quote(line["page"] or "")}">{image}</a>'
     return f"<figure>{linked}<figcaption>{caption}</figcaption></figure>"
 
 

@@ -126,6 +126,7 @@ class Worker:
             "hash": assets.digest(folder),
             "files": [path.relative_to(folder).as_posix() for path in assets.exported(folder)],
             "picture": assets.picture(folder),
+            "page": assets.newest(folder, "it*-export/view.html"),
             "scores": assets.scores(folder),
             "steps": run.trainer.global_step,
             "gaussians": len(run.system.geometry) if hasattr(run.system.geometry, "__len__") else 0,

@@ -66,6 +66,11 @@ def _home_expanded(path: str) -> str:
             f"exp_root_dir is {path!r}, and there is no such user; for a folder of this name write "
             f"{'./' + path!r}"
         )
+    if "://" in expanded:
+        raise UserError(
+            f"exp_root_dir is {path!r}; a single run writes to a folder, and only the farm to a "
+            "URL (docs/farm.md)"
+        )
     if "\0" in expanded:
         raise UserError(f"exp_root_dir is {path!r}; no folder's name has a NUL")
     return expanded
