@@ -86,18 +86,32 @@ def busy_workers() -> list[int]:
     return found
 
 
+def training_workers(out: Path) -> list[int]:
+    """Processes of the workers whose asset has a checkpoint and isn't finished."""
+    folders = {path.parents[1] for path in out.glob("assets/*/ckpts/*.ckpt")}
+    left = [folder for folder in folders if not (folder / assets.RESULT).exists()]
+    last = {int((folder / "attempts.txt").read_text().split()[-1]) for folder in left}
+    return sorted(last & set(busy_workers()))
+
+
 class Chaos:
     """One farm and its disturbances.
 
     Args:
         command: of the farm.
+        out: its folder.
         events: kinds of kills, in their order.
     """
 
     def __init__(
-        self, command: list[str], events: list[str], cluster: Cluster, options: argparse.Namespace
+        self,
+        command: list[str],
+        out: Path,
+        events: list[str],
+        cluster: Cluster,
+        options: argparse.Namespace,
     ) -> None:
-        self.command, self.events, self.cluster = command, events, cluster
+        self.command, self.out, self.events, self.cluster = command, out, events, cluster
         self.rng = random.Random(options.seed)
         self.longest = options.longest
         self.done: Counter = Counter()
@@ -123,7 +137,8 @@ class Chaos:
 
     def disturb(self, event: str) -> bool:
         """Kill; return False if there is nothing to kill yet."""
-        workers = busy_workers()
+        # every second event at least falls into training, from which an asset can go on
+        workers = training_workers(self.out) if self.rng.random() < 0.5 else busy_workers()
         if not workers:
             return False
         if event == WORKER:
@@ -213,7 +228,7 @@ def main(arguments: Optional[list[str]] = None) -> int:
                 *("--out", str(out), "--address", cluster.ray.address),
                 *("--retries", str(RETRIES)),
             ]
-            chaos = Chaos(command, events, cluster, options)
+            chaos = Chaos(command, out, events, cluster, options)
             code = chaos.run(began + 60 * options.minutes)
             seconds = time.monotonic() - began
         finally:
