@@ -2,6 +2,7 @@
 
 import json
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -138,6 +139,18 @@ def test_another_colour_space_is_reported(path, caplog):
 def test_damaged_and_foreign_files_are_refused(path, places, said):
     with pytest.raises(UserError, match=said):
         read_glb(changed(path, *places))
+
+
+def test_many_nodes_of_one_mesh_cost_no_memory(path):
+    """Ten thousand nodes in a file of 200 kB would be half a million Gaussians."""
+    nodes = [{"mesh": 0}] * 10_000
+    bomb = changed(path, (("nodes",), nodes), (("scenes", 0, "nodes"), list(range(10_000))))
+    tracemalloc.start()
+    with pytest.raises(UserError, match="500000 Gaussians would take .* of memory"):
+        read_glb(bomb)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 24 << 20
 
 
 def test_drafts_with_logarithms_are_refused_by_name(tmp_path):

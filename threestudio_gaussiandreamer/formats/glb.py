@@ -13,7 +13,7 @@ import json
 import logging
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -89,8 +89,12 @@ def load_glb(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
     path = existing_file(path, "GLB file")
     with parse_errors(path):
         document = Document(path)
-        worlds = world_matrices(document).items()
-        parts = [part for item in worlds for part in _parts(document, *item)]
+        placed = list(_primitives(document))
+        _require_memory(document, [primitive for primitive, _ in placed])
+        parts = [
+            _moved(_read_primitive(document, primitive), world, document)
+            for primitive, world in placed
+        ]
         if not parts and EXTENSION not in document.json.get("extensionsUsed", []):
             document.fail(f"no primitive has the extension {EXTENSION}: it holds no Gaussians")
         extras = document.json["asset"].get("extras")
@@ -171,25 +175,41 @@ def _accessor(view: int, values: np.ndarray) -> dict[str, Any]:
 # ---- reading -------------------------------------------------------------------------------------
 
 
-def _parts(document: Document, node: int, world: Float[np.ndarray, "4 4"]) -> list[Gaussians]:
-    """Return the Gaussians of a node's primitives, in the world."""
-    entry = document.entry("nodes", node)
-    if "mesh" not in entry:
-        return []
-    primitives = document.entry("meshes", entry["mesh"])["primitives"]
-    ours = [item for item in primitives if EXTENSION in item.get("extensions", {})]
-    return [_placed(_read_primitive(document, item), world, document) for item in ours]
+Primitive = dict[str, Any]
+World = Float[np.ndarray, "4 4"]
 
 
-def _read_primitive(document: Document, primitive: dict[str, Any]) -> Gaussians:
+def _primitives(document: Document) -> Iterator[tuple[Primitive, World]]:
+    """Yield the primitives of Gaussians with the matrices of their nodes to the world."""
+    for node, world in world_matrices(document).items():
+        entry = document.entry("nodes", node)
+        if "mesh" in entry:
+            for primitive in document.entry("meshes", entry["mesh"])["primitives"]:
+                if EXTENSION in primitive.get("extensions", {}):
+                    yield primitive, world
+
+
+def _require_memory(document: Document, primitives: list[Primitive]) -> None:
+    """Check what all primitives announce together; nodes may share one."""
+    counts = [document.count(item["attributes"]["POSITION"]) for item in primitives]
+    needed = sum(
+        count * (DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * _harmonics(item))
+        for count, item in zip(counts, primitives, strict=True)
+    )
+    size, name = document.path.stat().st_size, f"GLB file {str(document.path)!r}"
+    require_file_memory(needed, size, name, f"{sum(counts)} Gaussians")
+
+
+def _harmonics(primitive: Primitive) -> int:
+    """Return (degree + 1)^2 of the highest degree whose last coefficient is there."""
+    found = [k for k in COEFFICIENTS if _semantics(k)[-1] in primitive["attributes"]]
+    return max(found, default=COEFFICIENTS[0])
+
+
+def _read_primitive(document: Document, primitive: Primitive) -> Gaussians:
     _check_extension(document, primitive)
     attributes = primitive["attributes"]
     count = document.count(attributes["POSITION"])
-    degrees = [d for d in range(1, len(COEFFICIENTS)) if _semantics((d + 1) ** 2)[-1] in attributes]
-    harmonics = COEFFICIENTS[max(degrees, default=0)]
-    needed = count * (DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * harmonics)
-    size, name = document.path.stat().st_size, f"GLB file {str(document.path)!r}"
-    require_file_memory(needed, size, name, f"{count} Gaussians")
 
     def rows(semantic: str, kind: str) -> np.ndarray:
         if semantic not in attributes:
@@ -209,11 +229,13 @@ def _read_primitive(document: Document, primitive: dict[str, Any]) -> Gaussians:
         quats=rows(f"{EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]],
         log_scales=log_scales,
         logit_opacities=logits(rows(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0], MARGIN),
-        sh=np.stack([rows(semantic, "VEC3") for semantic in _semantics(harmonics)], axis=1),
+        sh=np.stack(
+            [rows(semantic, "VEC3") for semantic in _semantics(_harmonics(primitive))], axis=1
+        ),
     )
 
 
-def _check_extension(document: Document, primitive: dict[str, Any]) -> None:
+def _check_extension(document: Document, primitive: Primitive) -> None:
     extension = primitive["extensions"][EXTENSION]
     if compressed := list(extension.get("extensions", {})):
         document.fail(
@@ -226,7 +248,7 @@ def _check_extension(document: Document, primitive: dict[str, Any]) -> None:
         logger.warning("%s: colours of %r are read as sRGB", document.path, str(space)[:40])
 
 
-def _placed(gaussians: Gaussians, world: Float[np.ndarray, "4 4"], document: Document) -> Gaussians:
+def _moved(gaussians: Gaussians, world: Float[np.ndarray, "4 4"], document: Document) -> Gaussians:
     """Move Gaussians by a matrix that is a rotation, a translation and one scale."""
     if np.array_equal(world, np.eye(4)):
         return gaussians
