@@ -122,11 +122,12 @@ class Page:
 
 @contextmanager
 def open_page(
-    path: Path, *, size: tuple[int, int] = (800, 600), flags: tuple[str, ...] = ()
+    place: Path | str, *, size: tuple[int, int] = (800, 600), flags: tuple[str, ...] = ()
 ) -> Iterator[Page]:
     """Open a file in a browser of its own while the block runs.
 
     Args:
+        place: the file, or an address.
         size: width and height of the window, pixels.
         flags: more of Chromium's flags.
     """
@@ -147,7 +148,7 @@ def open_page(
         os.close(to_write)
         try:
             page = Page(to_browser, from_browser)
-            page.load(path.resolve().as_uri())
+            page.load(place if isinstance(place, str) else place.resolve().as_uri())
             yield page
         finally:
             process.terminate()

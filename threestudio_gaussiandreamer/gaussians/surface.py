@@ -61,7 +61,7 @@ def gaussian_surface(gaussians: Gaussians, *, resolution: int = 128, level: floa
     if not visible.any():
         return Surface(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)))
     gaussians = gaussians.rows(visible)
-    covariances = _covariances(gaussians)
+    covariances = covariance_matrices(gaussians)
     size = HALF_HEIGHT * np.sqrt(covariances[:, range(3), range(3)])
     low, high = (gaussians.means - size).min(axis=0), (gaussians.means + size).max(axis=0)
     cell = max(float((high - low).max()) / resolution, 1e-6)
@@ -187,7 +187,7 @@ def _falloff(away: Sequence[np.ndarray], precision: Float[np.ndarray, "3 3 *k"])
     )
 
 
-def _covariances(gaussians: Gaussians) -> Float[np.ndarray, "N 3 3"]:
+def covariance_matrices(gaussians: Gaussians) -> Float[np.ndarray, "N 3 3"]:
     w, x, y, z = (
         gaussians.quats / np.maximum(np.linalg.norm(gaussians.quats, axis=1, keepdims=True), 1e-12)
     ).T.astype(np.float64)

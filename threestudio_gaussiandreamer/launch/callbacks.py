@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from ..core.files import atomic_file
+from ..core.signals import interrupt, restore_handlers, set_handlers
 from ..host import pl, warn
 from .checkpoints import AtomicCheckpointIO
 from .config import dump_config
-from .signals import interrupt, restore_handlers, set_handlers
 
 SECONDS_BETWEEN = 60.0
 """Shortest time between two checkpoints, seconds: a crash loses about as much training."""

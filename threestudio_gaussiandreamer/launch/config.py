@@ -51,6 +51,8 @@ class ExperimentConfig:
     # arguments of Lightning's Trainer and ModelCheckpoint
     trainer: dict = field(default_factory=dict)
     checkpoint: dict = field(default_factory=dict)
+    viewer: dict = field(default_factory=dict)
+    """See ``live_viewer.py``."""
 
 
 def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus: int = 1) -> Any:
@@ -85,6 +87,8 @@ def dump_config(path: str | os.PathLike, cfg: Any) -> None:
     if "resume" in plain:
         plain.resume = None
     plain.pop("new_folder", None)
+    if not plain.get("viewer"):
+        plain.pop("viewer", None)  # threestudio doesn't know the key
     with atomic_file(path) as file:
         file.write(OmegaConf.to_yaml(plain).encode())
 
@@ -119,7 +123,7 @@ def _merge(sources: list[DictConfig]) -> DictConfig:
         raise UserError(
             f"the configurations can't be merged: {clash} is a list in one and a section in another"
         ) from error
-    for section in ("data", "system", "trainer", "checkpoint"):
+    for section in ("data", "system", "trainer", "checkpoint", "viewer"):
         # YAML reads "trainer:" without content as null
         if section in merged and merged._get_node(section)._is_none():
             merged[section] = {}

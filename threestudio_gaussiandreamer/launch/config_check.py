@@ -34,6 +34,7 @@ from ..host import (
 from ..host.typed_config import parse_structured
 from ..priors.base import Prior
 from ..prompts.prompt_processors import TextEncoderPromptProcessor
+from .live_viewer import ViewerConfig
 
 MisconfigurationException = pl.utilities.exceptions.MisconfigurationException
 
@@ -102,6 +103,8 @@ def check_config(cfg: Any) -> None:
     _check_arguments("trainer", cfg.trainer, pl.Trainer)
     _check_trainer_ranges(cfg.trainer)
     _check_strategy(cfg.trainer.get("strategy"))
+    _check_keys("viewer", cfg.viewer, ViewerConfig)
+    _typed("viewer", cfg.viewer, ViewerConfig)
     check_part("data", cfg.data_type, cfg.data)
     check_part("system", cfg.system_type, cfg.system)
     _check_loss(cfg.system.get("loss"), getattr(find(cfg.system_type), "LOSSES", None))

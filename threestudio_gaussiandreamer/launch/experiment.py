@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any, Optional
 from ..core.command import exit_code
 from ..core.errors import Terminated, UserError
 from ..core.output import tolerant_output
+from ..core.signals import raised_signals
 from .options import PROGRAM, announce_device, choose_gpu, find_config, parse_arguments
-from .signals import raised_signals
 
 if TYPE_CHECKING:
     from .run import Run

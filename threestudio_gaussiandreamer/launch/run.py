@@ -19,12 +19,15 @@ from ..core.checkpoint_file import load_checkpoint
 from ..core.errors import UserError
 from ..core.logs import get_rank
 from ..host import find, info, pl, warn
+from ..host.typed_config import parse_structured
+from ..view.live import LiveView, serve_until_stopped
 from ..view.run_index import note_time, write_index
 from .callbacks import LastCheckpoint, ProgressBar, RunRecord, Stopped
 from .checkpoints import AtomicCheckpointIO
 from .config_check import MisconfigurationException, build, plain
 from .ddp import ReplicatedStrategy
 from .folder_lock import RunFolder, claim, claim_new, require_writable
+from .live_viewer import LiveViewer, ViewerConfig
 from .options import PROGRAM
 from .run_folder import renumber
 from .training_state import check_training_state
@@ -70,6 +73,8 @@ class Run:
         self.claimed = RunFolder(Path(cfg.trial_dir))
         self.resumed_step = -1
         self.trainer: Any = None
+        self.viewer = parse_structured(ViewerConfig, cfg.viewer)
+        self.view: Optional[LiveView] = None
 
     @property
     def folder(self) -> Path:
@@ -94,6 +99,8 @@ class Run:
                 getattr(self, self.args.stage)()
                 self.write_index(began, time.perf_counter() - start)
             self.summarize()
+            if self.view is not None and self.viewer.keep_serving:
+                serve_until_stopped(self.view)
         except Stopped as stop:
             print(f"stopped at step {stop.step}; to resume: {self.resume_command()}", flush=True)
             return 128 + stop.signum
@@ -106,12 +113,16 @@ class Run:
             raise
         finally:
             self.claimed.release()
+            if self.view is not None:
+                self.view.close()
         return 0
 
     def start(self) -> None:
         """Check the checkpoint and the folder, create the folder, build the parts and trainer."""
         checkpoint = self.read_resume()
         require_writable(self.folder)
+        if self.viewer.enabled and self.args.stage == "train" and not get_rank():
+            self.view = LiveView(self.viewer.host, self.viewer.port, self.cfg.tag or self.cfg.name)
         self.claim_folder()
         # the same seed in all processes; streams that must differ also depend on the rank
         pl.seed_everything(self.cfg.seed, workers=True)
@@ -237,12 +248,16 @@ class Run:
         # without the version counter a resumed run overwrites last.ckpt instead of adding
         # last-v1.ckpt
         checkpointing = {"enable_version_counter": False, **plain(self.cfg.checkpoint)}
-        return [
+        last = LastCheckpoint(self.last, checkpoint_io)
+        callbacks = [
             pl.callbacks.ModelCheckpoint(dirpath=str(self.last.parent), **checkpointing),
             pl.callbacks.LearningRateMonitor(logging_interval="step"),
             RunRecord(self.folder, self.cfg, self.sources, self.command, self.records_code),
-            LastCheckpoint(self.last, checkpoint_io),
+            last,
         ]
+        if self.view is not None:
+            callbacks.append(LiveViewer(self.view, self.viewer, lambda: bool(last.signum)))
+        return callbacks
 
     # -- the folder --------------------------------------------------------------------------------
 

@@ -1,4 +1,7 @@
-"""Look at clouds and runs: ``python -m threestudio_gaussiandreamer.view cloud.ply --html``.
+"""Look at clouds and runs: ``python -m threestudio_gaussiandreamer.view cloud.ply [--html]``.
+
+Without ``--html`` the cloud is served to browsers until Ctrl-C (``live.py``); with it, it is
+written as one HTML file.
 
 PATH is a file of Gaussians of any program, or a checkpoint of this package or of gsplat; or the
 folder of a run, which gets an ``index.html``, or a folder of runs, which gets a gallery. A cloud in
@@ -21,6 +24,7 @@ from ..gaussians.views import EPS2D, NEAR, bounds
 from ..prune.pipeline import from_checkpoint
 from ..splatting import PRESETS
 from .gallery import write_gallery
+from .live import LiveView, require_server, serve, serve_until_stopped
 from .page import WHITE, PageOptions, Shown, decibels, require_page_size, write_page
 from .render import RenderSettings
 from .run_files import RunFiles, is_run
@@ -55,13 +59,15 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
 }
 
+PAGE_OPTIONS = [name for name in OPTIONS if name not in ("--title", "--up")]
+
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     """Parse the arguments of the command; exits as :mod:`argparse` does."""
     parser = argparse.ArgumentParser(
         prog="python -m threestudio_gaussiandreamer.view",
-        description="Write a cloud of Gaussians as one HTML file that shows it in a browser, or "
-        "the index of a run or of a folder of runs.",
+        description="Serve a cloud of Gaussians to browsers, or write it as one HTML file, or the "
+        "index of a run or of a folder of runs.",
     )
     parser.add_argument(
         "path", metavar="PATH", help="a file of Gaussians, a checkpoint, a run or runs"
@@ -71,9 +77,11 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         metavar="OUT",
         nargs="?",
         const="",
-        required=True,
-        help="the file to write (default: PATH with the ending .html, or index.html in a folder)",
+        help="write a file instead of serving (default: PATH with the ending .html, or "
+        "index.html in a folder)",
     )
+    parser.add_argument("--host", default="127.0.0.1", help="address to serve on (this machine)")
+    parser.add_argument("--port", type=int, default=8080, help="port to serve on (8080)")
     for name, settings in OPTIONS.items():
         parser.add_argument(name, **settings)
     return parser.parse_args(argv)
@@ -87,6 +95,9 @@ def run(args: argparse.Namespace) -> None:
             the page can't be written.
     """
     folder = Path(args.path).expanduser()
+    if args.html is None:
+        serve_until_stopped(served(args))
+        return
     if folder.is_dir():
         run_folder(folder, args)
         return
@@ -114,6 +125,28 @@ def write_cloud_page(source: Path, out: Path, args: argparse.Namespace) -> None:
     print(f"{out}: {len(stored.gaussians.means):,} Gaussians, {out.stat().st_size / 1e6:.2f} MB")
 
 
+def served(args: argparse.Namespace) -> LiveView:
+    """Serve a cloud, or the last exported cloud of a run.
+
+    Raises:
+        UserError: the options are for a page, or there is no cloud, viser or free port.
+    """
+    if given := [name for name in PAGE_OPTIONS if _value(args, name) is not None]:
+        raise UserError(f"{' '.join(given)}: is for the page that --html writes")
+    require_server(args.host, args.port)
+    source = Path(args.path).expanduser()
+    if source.is_dir():
+        found = RunFiles(source).cloud if is_run(source) else None
+        if found is None:
+            raise UserError(
+                f"{args.path!r} is no run with an exported cloud: name a file or a run, or give "
+                "--html for the gallery of a folder of runs"
+            )
+        source = found
+    source = existing_file(str(source), "file of Gaussians or checkpoint")
+    return serve(read_any(source, args.up), args.host, args.port, args.title or source.name)
+
+
 main = functools.partial(run_command, parse, run)
 
 
@@ -121,7 +154,7 @@ def run_folder(folder: Path, args: argparse.Namespace) -> None:
     """Write the index of a run, and the page of its cloud if there is none, or the gallery of a
     folder of runs.
     """
-    given = [name for name in OPTIONS if getattr(args, name[2:].replace("-", "_")) is not None]
+    given = [name for name in OPTIONS if _value(args, name) is not None]
     if args.html or given:
         raise UserError(
             f"{' '.join(given) or '--html OUT'}: is for a cloud, and {args.path!r} is a folder, "
@@ -150,6 +183,10 @@ def read_any(source: Path, up: Optional[str] = None) -> StoredCloud:
         return StoredCloud(drawable(from_checkpoint(source), str(source)), up or WORLD_UP)
     require_format(source.name, "PATH", READ)
     return read_cloud(str(source), up=up)
+
+
+def _value(args: argparse.Namespace, option: str) -> Any:
+    return getattr(args, option[2:].replace("-", "_"))
 
 
 def _settings(

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
-from ..core.errors import Terminated
+from .errors import Terminated
 
 Handler = Callable[[int, Any], Any]
 

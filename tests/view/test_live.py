@@ -1,0 +1,109 @@
+"""The server of a cloud: what viser gets, what a browser shows, and messages for wrong input."""
+
+import io
+import socket
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from benchmarks.viewers.browser import chromium
+from benchmarks.viewers.devtools import open_page
+from tests.view.clouds import cloud
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats.gaussian_files import write_cloud
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
+from threestudio_gaussiandreamer.view import live
+from threestudio_gaussiandreamer.view.command import main
+
+
+@pytest.fixture
+def port():
+    """A port that is free."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture
+def taken():
+    """A port on which another server listens."""
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        yield server.getsockname()[1]
+
+
+def test_viser_gets_covariances_colours_and_opacities():
+    quarter_turn = np.float32([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]])  # about z: x becomes y
+    one = Gaussians(
+        means=np.float32([[1, 2, 3]]),
+        sh=np.float32([[[0, 10, -10]]]),
+        logit_opacities=np.float32([0]),
+        log_scales=np.log(np.float32([[1, 2, 3]])),
+        quats=quarter_turn,
+    )
+    got = live.splats(one)
+    np.testing.assert_allclose(got["covariances"][0], np.diag([4, 1, 9]), atol=1e-6)
+    np.testing.assert_allclose(got["rgbs"], [[0.5, 1, 0]])
+    assert got["opacities"].shape == (1, 1) and got["opacities"][0, 0] == 0.5
+
+
+def test_a_port_in_use_is_named(taken, tmp_path, capsys):
+    pytest.importorskip("viser")
+    write_cloud(str(tmp_path / "a.ply"), cloud(5))
+    assert main([str(tmp_path / "a.ply"), "--port", str(taken)]) == 2
+    assert f"127.0.0.1:{taken} can't be served" in capsys.readouterr().err
+
+
+def test_without_viser_the_extra_is_named(monkeypatch, port):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(UserError, match=r"\[viewer\]"):
+        live.require_server("127.0.0.1", port)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{}/runs"], "no run with an exported cloud"),
+        (["{}/none.ply"], "none.ply"),
+        (["{}/text.ply"], "text.ply"),
+        (["{}/a.ply", "--eps2d", "0.3"], "--eps2d: is for the page"),
+        (["{}/a.ply", "--host", "999.1.1.1"], "999.1.1.1"),
+    ],
+)
+def test_wrong_input_is_named_before_serving(tmp_path, capsys, port, arguments, message):
+    pytest.importorskip("viser")
+    write_cloud(str(tmp_path / "a.ply"), cloud(5))
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "text.ply").write_text("hello")
+    arguments = [argument.replace("{}", str(tmp_path)) for argument in arguments]
+    assert main([*arguments, "--port", str(port)]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(chromium() is None, reason="no Chromium is installed")
+def test_a_browser_shows_the_cloud(port):
+    pytest.importorskip("viser")
+    from PIL import Image
+
+    view = live.serve(cloud(300, size=0.05), "127.0.0.1", port, "a box")
+    try:
+        assert not view.watched
+        with open_page(view.address) as page:
+            end = time.monotonic() + 90
+            colored = 0.0
+            while colored < 0.02 and time.monotonic() < end:
+                time.sleep(0.5)
+                picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("HSV"))
+                middle = picture[150:450, 100:500]
+                colored = float((middle[..., 1] > 60).mean())
+            assert view.watched
+            assert colored >= 0.02
+            assert {x.split("/")[2] for x in page.requests if x.startswith("http")} == {
+                f"127.0.0.1:{port}"
+            }
+    finally:
+        view.close()

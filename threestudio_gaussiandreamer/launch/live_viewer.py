@@ -1,0 +1,121 @@
+"""Show the cloud in a browser while it trains: ``viewer.enabled=true viewer.port=8080``.
+
+==================  ================================================================================
+option              meaning
+==================  ================================================================================
+enabled             serve the cloud with viser (extra ``[viewer]``)
+host                address to listen on; 127.0.0.1 admits this machine alone, and what SSH forwards
+port                of the web page and its connection
+updates_per_second  at most; fewer where an update takes longer than ``SHARE_OF_TIME``
+keep_serving        go on after the run until Ctrl-C
+==================  ================================================================================
+
+The training is the same bit for bit with and without the viewer: it only reads the cloud, and does
+so only while a browser is connected.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Optional
+
+import torch
+
+from ..core import images
+from ..core.options import in_range
+from ..formats.gaussian_files import StoredCloud
+from ..gaussians.gaussians import Gaussians, drawable
+from ..host import info, pl
+from ..training.pictures import score_panels
+from ..view.live import Controls, LiveView
+
+SHARE_OF_TIME = 0.02
+"""Largest share of the training's time that is spent on updates."""
+POLL = 0.05
+"""Seconds between two looks at the buttons while the training is paused."""
+
+
+@dataclass
+class ViewerConfig:
+    enabled: bool = False
+    host: str = "127.0.0.1"
+    port: int = field(default=8080, metadata=in_range(1, 65535))
+    updates_per_second: float = field(default=1.0, metadata=in_range(0.01, 30))
+    keep_serving: bool = True
+
+
+class LiveViewer(pl.Callback):
+    """Update a :class:`LiveView` from the training, and obey its buttons.
+
+    Args:
+        stopping: whether a signal has asked the training to stop, which also ends a pause.
+    """
+
+    def __init__(self, view: LiveView, cfg: ViewerConfig, stopping: Callable[[], bool]) -> None:
+        self.view, self.cfg, self.stopping = view, cfg, stopping
+        self.controls: Optional[Controls] = None
+        self._due = 0.0
+
+    def on_train_start(self, trainer: Any, pl_module: Any) -> None:
+        cloud = current_cloud(pl_module)
+        self.view.look_from_front(StoredCloud(cloud))
+        self.view.show(cloud, status(trainer, cloud))
+        self.controls = Controls(self.view)
+        info(f"the viewer is at {self.view.address}")
+
+    def on_train_batch_start(
+        self, trainer: Any, pl_module: Any, batch: Any, batch_idx: int
+    ) -> None:
+        while not (self.controls.may_go_on() or self.stopping()):
+            self._show_if_due(trainer, pl_module)
+            time.sleep(POLL)
+
+    def on_train_batch_end(
+        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if self.controls.picture.is_set():
+            self.controls.picture.clear()
+            self.controls.show_picture(score_picture(pl_module, batch))
+        if self._show_if_due(trainer, pl_module):
+            pose, fovy = batch["c2w"].detach().cpu().numpy(), batch["fovy"].detach().cpu().numpy()
+            self.view.show_cameras(pose, fovy, batch["width"] / batch["height"])
+
+    def on_train_end(self, trainer: Any, pl_module: Any) -> None:
+        cloud = current_cloud(pl_module)
+        self.view.show(cloud, status(trainer, cloud))
+        self.controls.remove()
+
+    def _show_if_due(self, trainer: Any, pl_module: Any) -> bool:
+        """Show the cloud if an update is due and a browser looks; return whether it was shown."""
+        start = time.monotonic()
+        if start < self._due or not self.view.watched:
+            return False
+        cloud = current_cloud(pl_module)
+        self.view.show(cloud, status(trainer, cloud))
+        spent = time.monotonic() - start
+        self._due = start + max(1 / self.cfg.updates_per_second, spent / SHARE_OF_TIME)
+        return True
+
+
+def current_cloud(system: Any) -> Gaussians:
+    """Return the finite Gaussians of a system as arrays."""
+    return drawable(Gaussians.of(system.geometry).arrays(), "viewer")
+
+
+def status(trainer: Any, cloud: Gaussians) -> str:
+    """Return the line below the title: step, number of Gaussians and the logged dB."""
+    decibels = trainer.callback_metrics.get("dB")
+    quality = "" if decibels is None else f", {float(decibels):.1f} dB"
+    return f"step {trainer.global_step}, {len(cloud.means):,} Gaussians{quality}"
+
+
+@torch.no_grad()
+def score_picture(system: Any, batch: dict[str, Any]) -> Any:
+    """Draw what the score model makes of the first training view, uint8 (H, W, 3)."""
+    system.eval()
+    try:
+        out = system(batch)
+        evaluated = system.guide(out, batch, guidance_eval=True)["eval"]
+    finally:
+        system.train()
+    return images.grid(score_panels(evaluated, out["comp_rgb"].shape[1:3]))

@@ -1,0 +1,211 @@
+"""Serve a cloud of Gaussians to browsers with viser (extra ``[viewer]``).
+
+viser draws Gaussians with a dilation of its own, 0.3 square pixels, and with colours of degree 0;
+the page that ``--html`` writes draws them as the run does.
+"""
+
+import math
+import socket
+import threading
+from typing import Any, Optional
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from ..core.errors import UserError
+from ..core.signals import restore_handlers, set_handlers
+from ..formats.gaussian_files import StoredCloud
+from ..gaussians.axes import WORLD_UP
+from ..gaussians.gaussians import Gaussians
+from ..gaussians.sh import sh0_colors
+from ..gaussians.surface import covariance_matrices
+from ..models.extras import require_extra
+from .render import AZIMUTH, ELEVATION, first_pose
+
+LARGEST_HALF = 6e4
+"""viser stores covariances in half precision."""
+FLIP_YZ = np.diag([1.0, -1.0, -1.0])
+"""From OpenGL's camera axes (y up, looks along -z) to OpenCV's (y down, looks along z)."""
+
+
+def require_server(host: str, port: int) -> None:
+    """Check that a server can be started.
+
+    Raises:
+        UserError: viser isn't installed, or the port can't be listened on.
+    """
+    require_extra("viewer", "viser")
+    try:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host, port))
+    except OSError as error:
+        raise UserError(
+            f"viewer: {host}:{port} can't be served ({error.strerror or error}): choose another "
+            "port, such as viewer.port=8081 of a run or --port 8081"
+        ) from error
+
+
+class LiveView:
+    """A server that shows one cloud, which may change.
+
+    Args:
+        host: the address to listen on; 127.0.0.1 admits this machine alone.
+        title: the heading of the panel.
+
+    Raises:
+        UserError: see :func:`require_server`.
+    """
+
+    def __init__(self, host: str, port: int, title: str) -> None:
+        require_server(host, port)
+        import viser
+
+        self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        self.server.scene.set_up_direction("+z")
+        self.address = f"http://{'localhost' if host == '0.0.0.0' else host}:{port}"
+        self._status = self.server.gui.add_markdown(title)
+        self._title, self._splats, self._frustums = title, None, []
+
+    @property
+    def watched(self) -> bool:
+        """Whether a browser is connected."""
+        return bool(self.server.get_clients())
+
+    def look_from_front(self, cloud: StoredCloud) -> None:
+        """Set the first view of browsers that connect from now on: the page's first view."""
+        pose = first_pose(cloud)
+        elevation, azimuth = math.radians(ELEVATION), math.radians(AZIMUTH)
+        away = np.array(
+            [
+                math.cos(elevation) * math.cos(azimuth),
+                math.cos(elevation) * math.sin(azimuth),
+                math.sin(elevation),
+            ]
+        )
+        camera = self.server.initial_camera
+        camera.position = tuple(np.array(pose.target) + pose.distance * away)
+        camera.look_at = pose.target
+
+    def show(self, gaussians: Gaussians, status: str = "") -> None:
+        """Replace the cloud.
+
+        Args:
+            gaussians: finite arrays, in the world's axes.
+            status: a line below the title.
+        """
+        with self.server.atomic():
+            if self._splats is not None:
+                self._splats.remove()
+            self._splats = self.server.scene.add_gaussian_splats("/cloud", **splats(gaussians))
+            self._status.content = f"**{self._title}**\n\n{status}"
+        self.server.flush()
+
+    def show_cameras(
+        self, c2w: Float[np.ndarray, "B 4 4"], fovy: Float[np.ndarray, " B"], aspect: float
+    ) -> None:
+        """Replace the frustums of the training cameras.
+
+        Args:
+            c2w: OpenGL cameras in the world's axes.
+            fovy: radians.
+            aspect: width over height.
+        """
+        import viser.transforms
+
+        for frustum in self._frustums:
+            frustum.remove()
+        self._frustums = [
+            self.server.scene.add_camera_frustum(
+                f"/cameras/{number}",
+                fov=float(angle),
+                aspect=aspect,
+                scale=0.15,
+                wxyz=viser.transforms.SO3.from_matrix(pose[:3, :3] @ FLIP_YZ).wxyz,
+                position=pose[:3, 3],
+            )
+            for number, (pose, angle) in enumerate(zip(c2w, fovy, strict=True))
+        ]
+
+    def close(self) -> None:
+        """Stop serving."""
+        self.server.stop()
+
+
+class Controls:
+    """The buttons of a training run in a view's panel: pause, step and the score model's picture.
+
+    Browsers set the flags from the server's threads; the training reads them.
+    """
+
+    def __init__(self, view: LiveView) -> None:
+        gui = view.server.gui
+        self.paused, self.step, self.picture = (threading.Event() for _ in range(3))
+        self._pause = gui.add_button("Pause")
+        self._pause.on_click(lambda _: self._toggle())
+        step = gui.add_button("One step")
+        step.on_click(lambda _: self.step.set())
+        picture = gui.add_button("Picture of the score model")
+        picture.on_click(lambda _: self.picture.set())
+        self._buttons, self._gui = [self._pause, step, picture], gui
+        self._image: Optional[Any] = None
+
+    def may_go_on(self) -> bool:
+        """Return whether the next step may begin; a single step is allowed once."""
+        if not self.paused.is_set():
+            return True
+        allowed = self.step.is_set()
+        self.step.clear()
+        return allowed
+
+    def show_picture(self, image: UInt8[np.ndarray, "H W 3"]) -> None:
+        """Show a picture in the panel."""
+        if self._image is None:
+            self._image = self._gui.add_image(image, label="noisy, one step, many steps")
+        else:
+            self._image.image = image
+
+    def remove(self) -> None:
+        """Remove the buttons, after the training."""
+        self.paused.clear()
+        for button in self._buttons:
+            button.remove()
+
+    def _toggle(self) -> None:
+        if self.paused.is_set():
+            self.paused.clear()
+        else:
+            self.paused.set()
+        self._pause.label = "Go on" if self.paused.is_set() else "Pause"
+
+
+def splats(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Return the arguments of viser's ``add_gaussian_splats``."""
+    opacities = 1 / (1 + np.exp(-gaussians.logit_opacities.astype(np.float64)))
+    return {
+        "centers": gaussians.means,
+        "covariances": covariance_matrices(gaussians).clip(-LARGEST_HALF, LARGEST_HALF),
+        "rgbs": sh0_colors(gaussians.sh[:, 0]),
+        "opacities": opacities.reshape(-1, 1),
+    }
+
+
+def serve(cloud: StoredCloud, host: str, port: int, title: str) -> LiveView:
+    """Serve a finished cloud until the returned view is closed."""
+    view, upright = LiveView(host, port, title), cloud.in_axes(WORLD_UP)
+    view.look_from_front(upright)
+    view.show(upright.gaussians, f"{len(upright.gaussians.means):,} Gaussians")
+    return view
+
+
+def serve_until_stopped(view: LiveView) -> None:
+    """Wait for a stop signal, such as Ctrl-C, and close the view; that is no error."""
+    stopped = threading.Event()
+    earlier = set_handlers(lambda signum, frame: stopped.set())
+    try:
+        print(f"the viewer is at {view.address}; Ctrl-C ends it", flush=True)
+        while not stopped.wait(0.1):
+            pass
+    finally:
+        restore_handlers(earlier)
+        view.close()
