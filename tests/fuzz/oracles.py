@@ -113,7 +113,7 @@ def _text_number(words: list[str], kind: str) -> float:
 
 def ply_vertices(data: bytes) -> PlyVertices:
     """The vertices of a PLY file (Turk 1994)."""
-    encoding, elements, body = _ply_header(data)
+    encoding, elements, body = ply_header(data)
     rows, vertices = _Rows(encoding, body), None
     for name, count, properties in elements:
         if not properties:
@@ -141,15 +141,7 @@ def ply_vertices(data: bytes) -> PlyVertices:
     return PlyVertices(*vertices, leftover=rows.rest())
 
 
-def ply_vertex_count(data: bytes) -> int:
-    """The number of vertices that a PLY announces, in any element order."""
-    elements = {name: count for name, count, _ in _ply_header(data)[1]}
-    if "vertex" not in elements:
-        raise Illegal("no vertices")
-    return elements["vertex"]
-
-
-def _ply_header(data: bytes) -> tuple[str, list, bytes]:
+def ply_header(data: bytes) -> tuple[str, list, bytes]:
     lines, rest, elements, encodings = [], data, [], []
     while lines[-1:] != [["end_header"]]:
         line, newline, rest = rest.partition(b"\n")

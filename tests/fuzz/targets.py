@@ -6,7 +6,7 @@ content. Any other exception is a crash."""
 
 import numpy as np
 
-from tests.fuzz import checkpoint_content, config_values, gltf_features, mutations, oracles
+from tests.fuzz import checkpoint_content, config_values, gltf_features, mutations
 from tests.fuzz.array_targets import (
     ROWS,
     _saved,
@@ -25,14 +25,15 @@ from tests.fuzz.cloud_targets import (
     gaussian_plys,
     point_plys,
 )
+from tests.fuzz.format_oracles import compressed_means, sog_means
 from tests.fuzz.format_targets import (
     SOG,
     SPZ_4,
     exercise_counted,
+    exercise_means,
     exercise_splat,
     files,
     glb_count,
-    sog_count,
     splats,
     spz_count,
 )
@@ -55,6 +56,8 @@ from tests.fuzz.run_targets import (
     exercise_configuration,
 )
 from tests.fuzz.target import Target, require_picture
+from threestudio_gaussiandreamer.formats.compressed_ply import read_compressed_ply
+from threestudio_gaussiandreamer.formats.sog import read_sog
 
 
 def mutant(name: str, seed: int, index: int) -> bytes:
@@ -123,7 +126,7 @@ TARGETS: dict[str, Target] = {
     "sog": Target(
         ".sog",
         lambda: files(".sog", [(12, 0), (9, 1)]),
-        exercise_counted(sog_count),
+        exercise_means(read_sog, sog_means),
         packing=SOG,
     ),
     "glb-gaussians": Target(
@@ -135,7 +138,7 @@ TARGETS: dict[str, Target] = {
     "compressed-ply": Target(
         ".compressed.ply",
         lambda: files(".compressed.ply", [(12, 0), (260, 1)]),
-        exercise_counted(oracles.ply_vertex_count),
+        exercise_means(read_compressed_ply, compressed_means),
         packing=mutations.PLY,
     ),
     "splat": Target(".splat", splats, exercise_splat),

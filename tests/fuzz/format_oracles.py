@@ -1,0 +1,53 @@
+"""Second readers of the compact formats of Gaussians, as ``oracles.py`` has them of the others."""
+
+import io
+import json
+import struct
+import zipfile
+
+import numpy as np
+from PIL import Image
+
+from tests.fuzz.oracles import Illegal, ply_header
+
+
+def compressed_means(data: bytes) -> np.ndarray:
+    """The positions (N, 3) in a compressed PLY: 11, 10 and 11 bits between the limits of 256."""
+    encoding, elements, body = ply_header(data)
+    if encoding == "ascii":
+        raise Illegal("text")
+    order, at, tables = "<" if "little" in encoding else ">", 0, {}
+    for name, count, properties in elements:
+        row = struct.Struct(order + "".join(kind for _, kind, _ in properties))
+        if at + count * row.size > len(body):
+            raise Illegal("truncated")
+        names = [entry[0] for entry in properties]
+        rows = (row.unpack_from(body, at + i * row.size) for i in range(count))
+        tables[name] = [dict(zip(names, values, strict=True)) for values in rows]
+        at += count * row.size
+    return np.array(
+        [
+            _between_limits(vertex["packed_position"], tables["chunk"][index // 256])
+            for index, vertex in enumerate(tables["vertex"])
+        ]
+    ).reshape(-1, 3)
+
+
+def _between_limits(word: int, chunk: dict[str, float]) -> list[float]:
+    fractions = [(word >> 21) / 2047, (word >> 11 & 1023) / 1023, (word & 2047) / 2047]
+    return [
+        chunk[f"min_{axis}"] * (1 - fraction) + chunk[f"max_{axis}"] * fraction
+        for axis, fraction in zip("xyz", fractions, strict=True)
+    ]
+
+
+def sog_means(data: bytes) -> np.ndarray:
+    """The positions (N, 3) in a SOG archive whose images Pillow decodes."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        meta = json.loads(archive.read("meta.json"))
+        means, count = meta["means"], meta["count"]
+        images = [Image.open(io.BytesIO(archive.read(name))) for name in means["files"][:2]]
+    low, high = (np.array(image.convert("RGB"), int).reshape(-1, 3)[:count] for image in images)
+    start, end = (np.array(means[key], float) for key in ("mins", "maxs"))
+    logs = start + (end - start) * ((high * 256 + low) / 65535)
+    return np.sign(logs) * (np.exp(np.abs(logs)) - 1)
