@@ -16,6 +16,7 @@ from benchmarks.quality.runs import ROOT
 from benchmarks.quality.tables import DIFFERENCES, difference_row, last_rows, medians, named
 from benchmarks.robustness import tables as robustness
 from benchmarks.splatting import tables as splatting
+from benchmarks.start import tables as start
 from tests.stability import report as stability
 
 # ---- README.md -----------------------------------------------------------------------------------
@@ -66,6 +67,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "thresholds": splatting.thresholds,
         "contenders": splatting.contenders,
     },
+    "docs/step_time.md": {"start": start.first_step},
     "docs/robustness.md": {"fuzz": robustness.fuzz, "long run": robustness.long_run},
 }
 

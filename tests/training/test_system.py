@@ -22,6 +22,7 @@ from tests.training.runs import (
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh0_to_rgb
 from threestudio_gaussiandreamer.guidance.known_truth import MeshTruth
+from threestudio_gaussiandreamer.launch.checkpoints import AtomicCheckpointIO
 from threestudio_gaussiandreamer.launch.experiment import main
 from threestudio_gaussiandreamer.training import held_out as evaluate
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
@@ -86,6 +87,26 @@ def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, pai
     assert logged == [(0, metrics["prior"]["psnr"]), (60, metrics["result"]["psnr"])]
     assert [event.step for event in events.Images("validation/0")] == [60]
     assert events.Images("validation/0")[0].width > events.Images("validation/0")[0].height
+
+
+def test_the_prior_is_scored_after_the_first_step_and_before_a_checkpoint(
+    tmp_path, painted_box, monkeypatch
+):
+    happened = []
+
+    def record(owner, name, what):
+        body = getattr(owner, name)
+        monkeypatch.setattr(
+            owner, name, lambda *args, **options: (happened.append(what), body(*args, **options))[1]
+        )
+
+    record(GaussianDreamerSystem, "training_step", "step")
+    record(evaluate.Measurements, "_score", "score")
+    record(AtomicCheckpointIO, "save_checkpoint", "checkpoint")
+    options = ["trainer.max_steps=2", "checkpoint.every_n_train_steps=1"]
+    assert launch(tmp_path, painted_box, *options, "system.exporter.save_video=false") == 0
+    assert happened[:3] == ["step", "score", "checkpoint"]
+    assert happened.count("score") == 2  # prior and result
 
 
 def tensorboard_events(folder):

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from ..meshes.raycast import MeshCaster, TargetCache
 
-PIXELS_PER_CAST = 2**20
 Batch = dict[str, Any]
 Size = tuple[int, int]
 """Height and width, pixels."""
@@ -43,8 +42,8 @@ class KnownTruth(Protocol):
     def prefetch(
         self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int
     ) -> None:
-        """Render these views in advance, if that saves time. Called if training will need most of
-        them, at this size.
+        """Prepare for these views, such as to render many at once. Called if training will need
+        most of them, at this size.
         """
 
 
@@ -88,15 +87,10 @@ class MeshTruth:
     def prefetch(
         self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int
     ) -> None:
-        """Cast these views in large batches, which takes a third of the time, if all fit into the
-        cache.
-        """
+        """Plan to cast these views in large batches, if all fit into the cache."""
         if self._prefetch_size is None or len(c2w) > self.pictures.capacity:
             return
-        height, width = self._prefetch_size(height, width)
-        views = max(1, PIXELS_PER_CAST // (height * width))
-        for group in zip(c2w.split(views), fovy.split(views), strict=True):
-            self.pictures(*group, height, width)
+        self.pictures.plan(c2w, fovy, *self._prefetch_size(height, width))
 
 
 def background_of(

@@ -7,6 +7,8 @@ Errors that the user can correct end it with one message and exit code 2; those 
 before training leave no files."""
 
 import argparse
+import contextlib
+import gc
 import logging
 import os
 import shlex
@@ -14,7 +16,7 @@ import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Optional
 
@@ -113,23 +115,40 @@ def prepare(args: argparse.Namespace, argv: Sequence[str], **options: Any) -> "R
         typecheck.install()
     # torch and Lightning are imported only here, so that --help and invalid arguments are answered
     # immediately
-    from .. import register_parts
-    from .config import load_config
-    from .config_check import check_config
-    from .extensions import load_extensions
+    with without_garbage_collection():
+        from .. import register_parts
+        from .config import load_config
+        from .config_check import check_config
+        from .extensions import load_extensions
+        from .run import Run
 
+        register_parts()
     configure_logging(args.verbose)
     # read only once, since the file may change while the parts are built
     sources = [(path, read_source(path)) for path in config_paths]
     n_gpus = announce_device(args.gpu)
-    register_parts()
     load_extensions()
     cfg = load_config(*config_paths, cli_args=args.overrides, n_gpus=max(n_gpus, 1))
     check_config(cfg)
-
-    from .run import Run
-
     return Run(cfg, args, sources, shlex.join([*PROGRAM, *argv]), n_gpus, **options)
+
+
+@contextlib.contextmanager
+def without_garbage_collection() -> Iterator[None]:
+    """Import torch, Lightning and the parts without garbage collection, which takes a fifth of the
+    imports' time, and exclude them from later collections.
+
+    Nothing is changed if torch is imported already, as in a notebook: what is garbage by then would
+    never be freed."""
+    if "torch" in sys.modules or not gc.isenabled():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def read_source(path: Path) -> bytes:

@@ -99,7 +99,8 @@ def mesh_formats() -> set[str]:
 
 def _extension(path: Path) -> str:
     extension = path.suffix.lower().lstrip(".")
-    if extension not in mesh_formats():
+    # trimesh takes a second of processor time to import
+    if extension not in GLTF_FORMATS and extension not in mesh_formats():
         raise unknown(f"mesh format of {str(path)!r}:", extension, mesh_formats())
     return extension
 

@@ -4,17 +4,24 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ..core.images import read as read_image
+from ..host import info
 
 LOGGED_SCORES = ("psnr", "ssim", "multi_face", "floater_mass")
 
 
-def log_scores(loggers: Iterable[Any], scores: Mapping[str, Any]) -> None:
-    """Log ``held_out/psnr`` (dB) and the other held-out scores at ``scores["step"]``.
+def log_scores(
+    loggers: Iterable[Any], scores_by_key: Mapping[str, Mapping[str, Any]], views: int
+) -> None:
+    """Print the scores on so many held-out views, and log ``held_out/psnr`` (dB) and the others at
+    their ``step``.
 
     ``LightningModule.log`` isn't allowed where the last score is made, in ``on_fit_end``."""
-    values = {f"held_out/{name}": float(scores[name]) for name in LOGGED_SCORES}
-    for logger in loggers:
-        logger.log_metrics(values, step=scores["step"])
+    loggers = list(loggers)
+    for key, scores in scores_by_key.items():
+        values = {f"held_out/{name}": float(scores[name]) for name in LOGGED_SCORES}
+        for logger in loggers:
+            logger.log_metrics(values, step=scores["step"])
+        info(f"{key}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f} on {views} held-out views")
 
 
 def log_picture(loggers: Iterable[Any], tag: str, path: str, step: int) -> None:

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Optional
+from typing import Any, NamedTuple, Optional
 
 import numpy as np
 import torch
@@ -153,6 +153,18 @@ TABLE = ("psnr", "ssim", "multi_face", "gaussians", "seconds")
 """The scores that the last message of a run shows."""
 
 
+class Snapshot(NamedTuple):
+    """The held-out views of a cloud at one step, and what else its scores need."""
+
+    step: int
+    elapsed: dict[str, float]
+    images: Float[Tensor, "V H W 3"]
+    """Unclamped."""
+    backgrounds: Float[Tensor, "V 3"]
+    means: Float[Tensor, "N 3"]
+    opacities: Float[Tensor, " N"]
+
+
 class Measurements:
     """The scores and training time of a run, stored in ``metrics.json`` and continued on resume.
 
@@ -165,6 +177,7 @@ class Measurements:
         self.values: dict[str, Any] = _read_scores(self.path)
         self.seconds = np.array([self.values.get(name, 0.0) for name in CLOCKS], np.float64)
         self._started: Optional[np.ndarray] = None
+        self._postponed: dict[str, Snapshot] = {}
 
     def start_clock(self) -> None:
         self._started = _now()
@@ -187,29 +200,51 @@ class Measurements:
                 self.start_clock()
 
     @torch.no_grad()
-    def score(self, key: str, renderer: Any, step: int) -> dict[str, Any]:
-        """Score the renderer's cloud, and store the scores in ``metrics.json``.
+    def score(self, key: str, renderer: Any, step: int) -> dict[str, dict[str, Any]]:
+        """Score the renderer's cloud, after the postponed ones, and store the scores in
+        ``metrics.json``.
 
         Args:
             key: "prior" or "result", or "curve", a list to which the scores are appended.
             step: number of finished optimiser steps.
-        """
-        with self.paused_clock():
-            return self._score(key, renderer, step)
 
-    def _score(self, key: str, renderer: Any, step: int) -> dict[str, Any]:
-        rendered, backgrounds = self.held_out.render(renderer)
-        images = rendered.clamp(0, 1)
-        truth = self.held_out.truth_on(backgrounds)
-        scores = {"step": step, **self._elapsed(), "gaussians": len(renderer.geometry)}
+        Returns:
+            the scores by key.
+        """
+        scores = self.score_postponed()
+        with self.paused_clock():
+            return scores | {key: self._score(key, self._snapshot(renderer, step))}
+
+    @torch.no_grad()
+    def postpone(self, key: str, renderer: Any, step: int) -> None:
+        """Render the cloud now and score it with the next one, or in :meth:`score_postponed`."""
+        with self.paused_clock():
+            self._postponed[key] = self._snapshot(renderer, step)
+
+    @torch.no_grad()
+    def score_postponed(self) -> dict[str, dict[str, Any]]:
+        """Score what was postponed; return the scores by key."""
+        postponed, self._postponed = self._postponed, {}
+        with self.paused_clock():
+            return {key: self._score(key, cloud) for key, cloud in postponed.items()}
+
+    def _snapshot(self, renderer: Any, step: int) -> Snapshot:
+        cloud = renderer.geometry
+        images, backgrounds = self.held_out.render(renderer)
+        means, opacities = cloud.means.detach().clone(), cloud.opacities().detach().clone()
+        return Snapshot(step, self._elapsed(), images, backgrounds, means, opacities)
+
+    def _score(self, key: str, cloud: Snapshot) -> dict[str, Any]:
+        images = cloud.images.clamp(0, 1)
+        truth = self.held_out.truth_on(cloud.backgrounds)
+        scores = {"step": cloud.step, **cloud.elapsed, "gaussians": len(cloud.means)}
         scores |= {
             "psnr": round(float(psnr(images, truth).mean()), 3),
             "ssim": round(float(ssim(images, truth).mean()), 4),
         }
-        scores["multi_face"] = round(self.held_out.multi_face(images, backgrounds), 4)
-        cloud = renderer.geometry
-        scores["floater_mass"] = round(self.held_out.floaters(cloud.means, cloud.opacities()), 5)
-        scores["out_of_gamut"] = round(out_of_gamut(rendered), 5)
+        scores["multi_face"] = round(self.held_out.multi_face(images, cloud.backgrounds), 4)
+        scores["floater_mass"] = round(self.held_out.floaters(cloud.means, cloud.opacities), 5)
+        scores["out_of_gamut"] = round(out_of_gamut(cloud.images), 5)
         if key == "curve":
             self.values.setdefault("curve", []).append(scores)
         else:

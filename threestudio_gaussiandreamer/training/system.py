@@ -169,6 +169,9 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.require_finite()  # before the file of an earlier, good state is replaced
+        if self.measurements:  # a run that resumes from this file has no prior to score
+            scores = self.measurements.score_postponed()
+            log_scores(self.loggers, scores, self.cfg.evaluation.views)
         super().on_save_checkpoint(checkpoint)
         checkpoint["guidance"] = learnt_weights(self.guidance)
 
@@ -210,8 +213,9 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             warn(problem)
         if self.global_step == 0:
             save_first_cloud(self)
-            self.score("prior")
         if self.measurements:
+            if self.global_step == 0:  # scored later, since the truth takes seconds to render
+                self.measurements.postpone("prior", self.renderer, 0)
             self.measurements.start_clock()
         prefetch_truth(self)
 
@@ -314,11 +318,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         """Score the cloud on the held-out views, if the ground truth is a mesh."""
         if self.measurements:
             scores = self.measurements.score(key, self.renderer, self.global_step)
-            log_scores(self.loggers, scores)
-            info(
-                f"{key}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f} on "
-                f"{self.cfg.evaluation.views} held-out views"
-            )
+            log_scores(self.loggers, scores, self.cfg.evaluation.views)
 
     def on_train_end(self) -> None:
         if self.measurements:

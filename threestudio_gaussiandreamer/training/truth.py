@@ -24,8 +24,8 @@ def true_views(
 
 
 def prefetch_truth(system: Any) -> None:
-    """Render the ground truth for all cameras of a fixed pool in advance, if the run of ``system``
-    will use most of them.
+    """Announce all cameras of a fixed pool to the ground truth, if the run of ``system`` will use
+    most of them.
     """
     truth, trainer = truth_of(system.guidance), system.trainer
     if truth is None or not isinstance(trainer.datamodule, GaussianDreamerDataModule):

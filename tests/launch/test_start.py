@@ -1,0 +1,25 @@
+"""What a run imports and does before its first step."""
+
+import subprocess
+import sys
+
+import pytest
+
+from benchmarks.start.first_step import ROOT, start_run
+from tests.training.runs import SMALL
+
+UNUSED = {
+    "trimesh", "networkx", "diffusers", "transformers", "viser", "imageio", "smplx", "matplotlib",
+    "tensorboard.backend", "accelerate", "scipy.stats", "scipy.signal",
+}  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_demo_run_imports_nothing_heavy_that_it_does_not_use():
+    # Lightning imports what of these its own dependencies find installed
+    modules = set(start_run(ROOT, *SMALL)["modules"])
+    code = "import lightning.pytorch, torch.utils.tensorboard, sys; print(*sys.modules)"
+    lightnings = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    added = modules - set(lightnings.stdout.split())
+    assert "torch" in modules and "threestudio_gaussiandreamer.training.system" in added
+    assert not UNUSED & added
