@@ -19,14 +19,18 @@ log = logging.getLogger(__name__)
 class Backend:
     """A module of this package with ``rasterize(scene, options)`` and ``unavailable()``, and the
     devices and types of tensors that it supports.
+
+    ``proof`` is a module with ``failure(device)``, which compares the backend with plain torch on
+    a device before it is first used there.
     """
 
     module: str
     devices: Optional[tuple[str, ...]] = None  # None: any
     dtypes: tuple[torch.dtype, ...] = (torch.float32, torch.float64)
+    proof: Optional[str] = None
 
     def load(self) -> ModuleType:
-        return importlib.import_module(f".{self.module}", __package__)
+        return _import(self.module)
 
     def refuses(self, tensor: Tensor) -> Optional[str]:
         """Return why the backend can't be used with tensors like this one, or None if it can."""
@@ -34,13 +38,21 @@ class Backend:
             return f"it takes tensors on {' or '.join(self.devices)}, these are on {tensor.device}"
         if tensor.dtype not in self.dtypes:
             return f"it takes {' or '.join(map(str, self.dtypes))}, these are {tensor.dtype}"
-        return self.load().unavailable()
+        unavailable = self.load().unavailable()
+        if unavailable is not None or self.proof is None:
+            return unavailable
+        return _import(self.proof).failure(tensor.device)
+
+
+@functools.cache
+def _import(module: str) -> ModuleType:
+    return importlib.import_module(f".{module}", __package__)
 
 
 # In order of preference for "auto", which never gets to "reference", since "torch" always runs.
 BACKENDS = {
     "cpu": Backend("cpu.backend", devices=("cpu",), dtypes=(torch.float32,)),
-    "cuda": Backend("cuda.backend", devices=("cuda",), dtypes=(torch.float32,)),
+    "cuda": Backend("cuda.backend", devices=("cuda",), dtypes=(torch.float32,), proof="cuda.proof"),
     "torch": Backend("torch_backend"),
     "reference": Backend("reference"),
 }
@@ -56,20 +68,22 @@ def choose_backend(name: str, tensor: Tensor) -> Backend:
 
     Raises:
         UserError: there is no backend with this name, or it can't run or doesn't support the
-            tensor's device or type.
+            tensor's device or type, or differs from plain torch on this device.
     """
     if name not in ("auto", *BACKENDS):
         raise unknown("backend", name, ["auto", *BACKENDS])
-    refusals = {name: backend.refuses(tensor) for name, backend in BACKENDS.items()}
-    usable = [name for name, reason in refusals.items() if reason is None]
+    usable = (known for known, backend in BACKENDS.items() if backend.refuses(tensor) is None)
     if name == "auto":
-        _report_slow_path(usable[0], tensor)
-    elif refusals[name] is not None:
+        name = next(usable)
+        _report_slow_path(name, tensor)
+        return BACKENDS[name]
+    refusal = BACKENDS[name].refuses(tensor)
+    if refusal is not None:
         raise UserError(
-            f"the backend {name!r} can't run: {refusals[name]}. Use backend='auto', or one of "
+            f"the backend {name!r} can't run: {refusal}. Use backend='auto', or one of "
             f"{', '.join(usable)}."
         )
-    return BACKENDS[usable[0] if name == "auto" else name]
+    return BACKENDS[name]
 
 
 def _report_slow_path(chosen: str, tensor: Tensor) -> None:

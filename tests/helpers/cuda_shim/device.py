@@ -90,6 +90,9 @@ class HostDevice:
         )
         self.launched: list[str] = []
 
+    def describe(self) -> str:
+        return "the stand-in"
+
     def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments) -> None:
         self.launched.append(name)
         if (

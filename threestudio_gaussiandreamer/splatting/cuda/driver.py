@@ -59,6 +59,13 @@ class Gpu:
         self.modules: dict[str, ctypes.c_void_p] = {}
         self.functions: dict[str, ctypes.c_void_p] = {}
 
+    def describe(self) -> str:
+        """Return the names and releases that the kernels' results may depend on."""
+        return (
+            f"{torch.cuda.get_device_name(self.index)}, {self.target}, driver of CUDA "
+            f"{_release(driver_version())}, NVRTC of CUDA {_release(nvrtc.version())}"
+        )
+
     def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Argument) -> None:
         """Queue a kernel on torch's current stream of the device; ``arguments`` are tensors,
         structures and C numbers.

@@ -95,11 +95,11 @@ def target_for(capability: tuple[int, int]) -> str:
 def machine_code(unit: str, target: str) -> bytes:
     """Return ``<unit>.cu`` compiled for a target of `target_for`, from the cache if it is there."""
     name = f"{unit}-{target}-{_key(unit, target)}"
-    found = _read(name)
+    found = read_cached(name)
     if found is None:
         log.info("compiling the CUDA kernels of %s.cu for %s", unit, target)
         found = compile_unit(unit, target).code
-        _write(name, found)
+        write_cached(name, found)
     return found
 
 
@@ -190,20 +190,25 @@ def _key(unit: str, target: str) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 
 
-def _read(name: str) -> Optional[bytes]:
+def cached_path(name: str) -> Path:
+    """Return the path of a file in the cache; see :func:`cache_folder`."""
+    return cache_folder() / name
+
+
+def read_cached(name: str) -> Optional[bytes]:
     """Return the content if it is whole: the file ends with a digest of what comes before."""
     try:
-        data = (cache_folder() / name).read_bytes()
+        data = cached_path(name).read_bytes()
     except (OSError, RuntimeError):
         return None
     content, digest = data[:-DIGEST], data[-DIGEST:]
     return content if hashlib.sha256(content).digest() == digest else None
 
 
-def _write(name: str, content: bytes) -> None:
+def write_cached(name: str, content: bytes) -> None:
     """Write to the cache; log a failure and go on, since kernels can be compiled again."""
     try:
-        path = cache_folder() / name
+        path = cached_path(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(path) as file:
             file.write(content + hashlib.sha256(content).digest())

@@ -1,0 +1,131 @@
+"""Compare the kernels with plain torch on a GPU, once, before they are used there.
+
+A small fixed scene is drawn and differentiated by the kernels in float32 and by plain torch in
+float64, on the same device. The verdict depends on the GPU, the driver, the compiler and the text
+of this folder, and is kept beside the compiled kernels."""
+
+import functools
+import hashlib
+import math
+from types import ModuleType
+from typing import Optional
+
+import torch
+from torch import Tensor
+
+from ...core.errors import UserError
+from .. import torch_backend
+from ..options import RasterizeOptions
+from ..scene import Scene
+from . import backend as kernels
+from . import driver, nvrtc
+
+TOLERANCE = 1e-3
+"""Largest error of an output or a gradient, relative to its largest entry. Rounding gives 1e-5; a
+Gaussian that falls on the other side of a threshold in float64 gives 1e-4."""
+GAUSSIANS, WIDTH, HEIGHT = 200, 40, 24  # more than a batch of ``blend``, and 3 x 2 tiles
+ANGLES = (0.0, 0.7)
+"""Of the two cameras around the scene, radians."""
+
+
+def failure(device: torch.device) -> Optional[str]:
+    """Return why the kernels must not be used on this GPU, or None if they are right.
+
+    Raises:
+        torch.cuda.OutOfMemoryError: the GPU has no memory left; there is no verdict.
+    """
+    return _failure(device)
+
+
+@functools.cache
+def _failure(device: torch.device) -> Optional[str]:
+    try:
+        gpu = driver.device(device).describe()
+    except UserError as error:
+        return str(error)
+    name = f"proof-{_key(gpu)}"
+    stored = nvrtc.read_cached(name)
+    if stored is None:
+        stored = _compare(device).encode()
+        nvrtc.write_cached(name, stored)
+    if not stored:
+        return None
+    return (
+        f"{stored.decode()} [{gpu}, torch {torch.__version__}]. Please report this line; delete "
+        f"{nvrtc.cached_path(name)} to try again"
+    )
+
+
+def _key(gpu: str) -> str:
+    """Return a hash of everything that the verdict depends on."""
+    texts = [path.read_bytes() for path in sorted(nvrtc.KERNELS.glob("*.*"))]
+    texts += [text.encode() for text in nvrtc.headers().values()]
+    parts = [gpu.encode(), torch.__version__.encode(), *texts]
+    return hashlib.sha256(b"\0".join(parts)).hexdigest()[:24]
+
+
+def _compare(device: torch.device) -> str:
+    """Return how the kernels fail on the scene; empty if they are right."""
+    try:
+        errors = errors_on(device)
+    except torch.cuda.OutOfMemoryError:
+        raise
+    except (UserError, RuntimeError) as error:
+        return f"its kernels fail on a small scene: {error}"
+    # not "> TOLERANCE", so that NaN is wrong
+    wrong = [f"{name} by {size:.1e}" for name, size in errors.items() if not size <= TOLERANCE]
+    if not wrong:
+        return ""
+    return (
+        f"on a small scene its kernels differ from plain torch: {', '.join(wrong)} (rounding is "
+        f"at most {TOLERANCE:.0e})"
+    )
+
+
+def errors_on(device: torch.device) -> dict[str, float]:
+    """Return the relative error of each output and gradient of the kernels."""
+    with torch.inference_mode(False), torch.enable_grad():
+        found = _draw(kernels, _scene(device, torch.float32))
+        expected = _draw(torch_backend, _scene(device, torch.float64))
+    errors = [
+        (found[name].double() - true).abs().max() / true.abs().max()
+        for name, true in expected.items()
+    ]
+    return dict(zip(expected, torch.stack(errors).tolist(), strict=True))
+
+
+def _draw(backend: ModuleType, scene: Scene) -> dict[str, Tensor]:
+    """Return the images and, for fixed cotangents, the gradients."""
+    leaves = {name: getattr(scene, name).requires_grad_() for name in Scene._fields[:7]}
+    out = backend.rasterize(scene, RasterizeOptions())
+    images = {name: getattr(out, name) for name in ("image", "alpha", "depth")}
+    weights = [torch.linspace(-1, 1, x.numel(), device=x.device).to(x) for x in images.values()]
+    torch.autograd.backward(
+        list(images.values()), [w.view_as(x) for w, x in zip(weights, images.values(), strict=True)]
+    )
+    leaves["means2d"] = out.means2d
+    gradients = {f"gradient of {name}": leaf.grad for name, leaf in leaves.items()}
+    detached = {name: image.detach() for name, image in images.items()}
+    return detached | {"contribution": out.contribution.detach()} | gradients
+
+
+def _scene(device: torch.device, dtype: torch.dtype) -> Scene:
+    """Return the scene: Gaussians of all sizes and opacities in front of two cameras."""
+    generator = torch.Generator("cpu").manual_seed(0)
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        u = torch.rand(*shape, generator=generator, dtype=torch.float32, device="cpu")
+        return (low + (high - low) * u).to(device, dtype)
+
+    means, quats = uniform(-0.7, 0.7, GAUSSIANS, 3), uniform(-1, 1, GAUSSIANS, 4)
+    scales, opacities = uniform(0.01, 0.2, GAUSSIANS, 3), uniform(0.05, 0.99, GAUSSIANS)
+    colors, background = uniform(0, 1, GAUSSIANS, 3), uniform(0, 1, len(ANGLES), 3)
+    viewmats = torch.tensor([_viewmat(angle) for angle in ANGLES], device=device, dtype=dtype)
+    focal = [[WIDTH, 0.0, WIDTH / 2], [0.0, WIDTH, HEIGHT / 2], [0.0, 0.0, 1.0]]
+    Ks = torch.tensor([focal] * len(ANGLES), device=device, dtype=dtype)
+    return Scene(means, quats, scales, opacities, viewmats, colors, background, Ks, WIDTH, HEIGHT)
+
+
+def _viewmat(angle: float) -> list[list[float]]:
+    cos, sin = math.cos(angle), math.sin(angle)
+    return [[cos, 0.0, sin, 0.0], [0.0, 1.0, 0.0, 0.0], [-sin, 0.0, cos, 3.0], [0.0, 0.0, 0.0, 1.0]]
