@@ -1,11 +1,12 @@
-// Draws Gaussians with WebGL2: instanced quads, blended back to front into a picture of floats,
+// Draws Gaussians with WebGL2: quads, many to an instance, blended back to front into a picture of floats,
 // since 8 bits lose too much under many faint layers, then composited to the canvas. While the
 // picture moves it is one of half floats, which graphics cards blend faster.
 
 const TEXTURE_WIDTH = 4096;
 const UPLOAD_ROWS = 64;
+const PER_INSTANCE = 128;  // quads; an instance of one quad costs as much as one of many
 const SPLAT_UNIFORMS = [
-  "cloud", "harmonics", "cloudColumns", "harmonicColumns", "degree", "rotation", "translation",
+  "order", "visible", "perInstance", "cloud", "harmonics", "cloudColumns", "harmonicColumns", "degree", "rotation", "translation",
   "cameraPosition", "size", "focal", "near", "far", "eps2d", "alphaMin", "alphaMax", "antialias",
   "boundColors",
 ];
@@ -24,13 +25,18 @@ function linked(gl, vertex, fragment, uniforms) {
   const program = gl.createProgram();
   gl.attachShader(program, compiled(gl, gl.VERTEX_SHADER, vertex));
   gl.attachShader(program, compiled(gl, gl.FRAGMENT_SHADER, fragment));
-  gl.bindAttribLocation(program, 0, "index");
   gl.linkProgram(program);
   if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
     throw new Error(gl.getProgramInfoLog(program));
   }
   const places = uniforms.map((name) => [name, gl.getUniformLocation(program, name)]);
   return { program, at: Object.fromEntries(places) };
+}
+
+// Vertex numbers of the two triangles of each of `count` quads; a quad has four vertices.
+function quadCorners(count) {
+  const corners = [0, 1, 2, 2, 1, 3];
+  return Uint16Array.from({ length: 6 * count }, (_, i) => 4 * Math.floor(i / 6) + corners[i % 6]);
 }
 
 class Renderer {
@@ -50,13 +56,17 @@ class Renderer {
       ? this.target(gl.RGBA32F, gl.NEAREST) : moving;
     this.targets = { moving, still };
     this.blank = gl.createVertexArray();
+    this.quads = gl.createVertexArray();
+    gl.bindVertexArray(this.quads);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, quadCorners(PER_INSTANCE), gl.STATIC_DRAW);
   }
 
   // Upload a cloud; returns what `draw` takes.
   upload(columns, degree) {
-    const gl = this.gl, count = columns[0].length, each = (degree + 1) ** 2 - 1;
+    const { gl } = this, count = columns[0].length, each = (degree + 1) ** 2 - 1;
     const width = Math.min(TEXTURE_WIDTH, gl.getParameter(gl.MAX_TEXTURE_SIZE));
-    const scene = { count, visible: 0, degree, order: gl.createBuffer() };
+    const scene = { visible: 0, degree, order: this.orderTexture(count) };
     scene.cloudColumns = Math.floor(width / 4);
     scene.cloud = this.texture(gl.RGBA32F, 4, scene.cloudColumns, count,
       (first, last) => cloudTexels(columns, degree, first, last));
@@ -65,13 +75,6 @@ class Renderer {
       ? this.texture(gl.RGBA16F, each, scene.harmonicColumns, count,
         (first, last) => harmonicTexels(columns, degree, first, last))
       : scene.cloud;
-    scene.vertices = gl.createVertexArray();
-    gl.bindVertexArray(scene.vertices);
-    gl.bindBuffer(gl.ARRAY_BUFFER, scene.order);
-    gl.bufferData(gl.ARRAY_BUFFER, 4 * count, gl.DYNAMIC_DRAW);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
     return scene;
   }
 
@@ -84,8 +87,7 @@ class Renderer {
     const texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.texStorage2D(gl.TEXTURE_2D, 1, format, each * columns, rows);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    this.unfiltered(texture);
     for (let row = 0; row < rows; row += UPLOAD_ROWS) {
       const height = Math.min(UPLOAD_ROWS, rows - row), first = row * columns;
       const part = new Float32Array(4 * each * columns * height);
@@ -95,10 +97,29 @@ class Renderer {
     return texture;
   }
 
-  setOrder(scene, sorted, visible) {
+  // Turn off the interpolation of the bound texture, which formats of floats and integers lack.
+  unfiltered(texture) {
     const gl = this.gl;
-    gl.bindBuffer(gl.ARRAY_BUFFER, scene.order);
-    gl.bufferSubData(gl.ARRAY_BUFFER, 0, sorted, 0, visible);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    return texture;
+  }
+
+  orderTexture(count) {
+    const gl = this.gl, texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R32UI, ORDER_WIDTH, Math.ceil(count / ORDER_WIDTH));
+    return this.unfiltered(texture);
+  }
+
+  // `sorted` holds whole rows of the texture.
+  setOrder(scene, sorted, visible) {
+    const gl = this.gl, rows = Math.ceil(visible / ORDER_WIDTH);
+    gl.bindTexture(gl.TEXTURE_2D, scene.order);
+    if (rows) {
+      gl.texSubImage2D(
+        gl.TEXTURE_2D, 0, 0, 0, ORDER_WIDTH, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, sorted);
+    }
     scene.visible = visible;
   }
 
@@ -114,8 +135,9 @@ class Renderer {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     this.useSplats(scene, camera, size, focalLength(pose, ...size), scale);
-    gl.bindVertexArray(scene.vertices);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, scene.visible);
+    gl.bindVertexArray(this.quads);
+    const instances = Math.ceil(scene.visible / PER_INSTANCE);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * PER_INSTANCE, gl.UNSIGNED_SHORT, 0, instances);
     gl.disable(gl.BLEND);
     this.composite(target, background);
   }
@@ -123,12 +145,13 @@ class Renderer {
   useSplats(scene, camera, size, focal, scale) {
     const gl = this.gl, { program, at } = this.splats, settings = this.settings;
     gl.useProgram(program);
-    [scene.cloud, scene.harmonics].forEach((texture, unit) => {
+    ["cloud", "harmonics", "order"].forEach((name, unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
-      gl.bindTexture(gl.TEXTURE_2D, texture);
+      gl.bindTexture(gl.TEXTURE_2D, scene[name]);
+      gl.uniform1i(at[name], unit);
     });
-    gl.uniform1i(at.cloud, 0);
-    gl.uniform1i(at.harmonics, 1);
+    gl.uniform1i(at.visible, scene.visible);
+    gl.uniform1i(at.perInstance, PER_INSTANCE);
     gl.uniform1i(at.cloudColumns, scene.cloudColumns);
     gl.uniform1i(at.harmonicColumns, scene.harmonicColumns);
     gl.uniform1i(at.degree, scene.degree);

@@ -49,6 +49,8 @@ function sorter() {
   };
 }
 
+const ORDER_WIDTH = 2048;  // of the texture that takes the sorted numbers, in whole rows
+
 // Sorts the Gaussians of one cloud back to front, ties by number, one request at a time.
 class DepthOrder {
   constructor(columns, toSorted) {
@@ -57,7 +59,7 @@ class DepthOrder {
     this.worker = new Worker(address);
     URL.revokeObjectURL(address);
     this.worker.postMessage({ means: columns.slice(0, 3) });
-    this.buffer = new Uint32Array(columns[0].length);
+    this.buffer = new Uint32Array(Math.ceil(columns[0].length / ORDER_WIDTH) * ORDER_WIDTH);
     this.toSorted = toSorted;
     this.waiting = null;  // the newest camera that came while the worker was busy
     this.requested = this.finished = 0;

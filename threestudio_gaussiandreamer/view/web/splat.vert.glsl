@@ -4,7 +4,11 @@
 precision highp float;
 precision highp int;
 precision highp sampler2D;
+precision highp usampler2D;
 
+uniform usampler2D order;     // numbers of the Gaussians, back to front
+uniform int visible;          // how many of them are drawn
+uniform int perInstance;
 uniform sampler2D cloud;      // four texels a Gaussian: mean opacity, quat wxyz, scales, colour
 uniform sampler2D harmonics;  // a texel for each coefficient above degree 0
 uniform int cloudColumns;     // Gaussians in a row of each texture
@@ -22,7 +26,6 @@ uniform float alphaMin;
 uniform bool antialias;
 uniform bool boundColors;
 
-in uint index;
 flat out vec2 mean2d;         // pixels, y down, centres at +0.5
 flat out vec3 conic;          // a, k, c of a (dx - k dy)^2 + c dy^2
 flat out vec4 colorOpacity;
@@ -30,13 +33,12 @@ flat out vec4 colorOpacity;
 const float FRUSTUM_MARGIN = 0.3;
 const float SMALLEST_QUATERNION = 1e-12;
 
-vec4 cloudTexel(int field) {
-  int i = int(index);
+vec4 cloudTexel(int i, int field) {
   return texelFetch(cloud, ivec2(4 * (i % cloudColumns) + field, i / cloudColumns), 0);
 }
 
-vec3 coefficient(int k) {
-  int i = int(index), perGaussian = (degree + 1) * (degree + 1) - 1;
+vec3 coefficient(int i, int k) {
+  int perGaussian = (degree + 1) * (degree + 1) - 1;
   int column = perGaussian * (i % harmonicColumns) + k - 1;
   return texelFetch(harmonics, ivec2(column, i / harmonicColumns), 0).rgb;
 }
@@ -51,31 +53,31 @@ mat3 rotationOf(vec4 quat) {
     2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
-vec3 degreeOne(vec3 d) {
-  return 0.48860251190 * (-d.y * coefficient(1) + d.z * coefficient(2) - d.x * coefficient(3));
+vec3 degreeOne(int i, vec3 d) {
+  return 0.48860251190 * (-d.y * coefficient(i, 1) + d.z * coefficient(i, 2) - d.x * coefficient(i, 3));
 }
 
-vec3 degreeTwo(vec3 d) {
-  return 1.09254843059 * (d.x * d.y * coefficient(4) - d.y * d.z * coefficient(5)
-      - d.x * d.z * coefficient(7) + 0.5 * (d.x * d.x - d.y * d.y) * coefficient(8))
-    + 0.31539156525 * (3.0 * d.z * d.z - 1.0) * coefficient(6);
+vec3 degreeTwo(int i, vec3 d) {
+  return 1.09254843059 * (d.x * d.y * coefficient(i, 4) - d.y * d.z * coefficient(i, 5)
+      - d.x * d.z * coefficient(i, 7) + 0.5 * (d.x * d.x - d.y * d.y) * coefficient(i, 8))
+    + 0.31539156525 * (3.0 * d.z * d.z - 1.0) * coefficient(i, 6);
 }
 
-vec3 degreeThree(vec3 d) {
+vec3 degreeThree(int i, vec3 d) {
   float xx = d.x * d.x, yy = d.y * d.y, zz = d.z * d.z;
-  return 0.59004358993 * (-d.y * (3.0 * xx - yy) * coefficient(9)
-      - d.x * (xx - 3.0 * yy) * coefficient(15))
-    + 2.89061144264 * (d.x * d.y * d.z * coefficient(10)
-      + 0.5 * d.z * (xx - yy) * coefficient(14))
-    - 0.45704579946 * (5.0 * zz - 1.0) * (d.y * coefficient(11) + d.x * coefficient(13))
-    + 0.37317633259 * d.z * (5.0 * zz - 3.0) * coefficient(12);
+  return 0.59004358993 * (-d.y * (3.0 * xx - yy) * coefficient(i, 9)
+      - d.x * (xx - 3.0 * yy) * coefficient(i, 15))
+    + 2.89061144264 * (d.x * d.y * d.z * coefficient(i, 10)
+      + 0.5 * d.z * (xx - yy) * coefficient(i, 14))
+    - 0.45704579946 * (5.0 * zz - 1.0) * (d.y * coefficient(i, 11) + d.x * coefficient(i, 13))
+    + 0.37317633259 * d.z * (5.0 * zz - 3.0) * coefficient(i, 12);
 }
 
-vec3 colorSeen(vec3 mean) {
-  vec3 color = cloudTexel(3).rgb, d = normalize(mean - cameraPosition);
-  if (degree >= 1) color += degreeOne(d);
-  if (degree >= 2) color += degreeTwo(d);
-  if (degree >= 3) color += degreeThree(d);
+vec3 colorSeen(int i, vec3 mean) {
+  vec3 color = cloudTexel(i, 3).rgb, d = normalize(mean - cameraPosition);
+  if (degree >= 1) color += degreeOne(i, d);
+  if (degree >= 2) color += degreeTwo(i, d);
+  if (degree >= 3) color += degreeThree(i, d);
   return boundColors ? clamp(color, 0.0, 1.0) : max(color, 0.0);
 }
 
@@ -84,12 +86,15 @@ void hide() {
 }
 
 void main() {
-  vec4 meanOpacity = cloudTexel(0);
+  int place = gl_InstanceID * perInstance + (gl_VertexID >> 2), width = textureSize(order, 0).x;
+  if (place >= visible) { hide(); return; }
+  int i = int(texelFetch(order, ivec2(place % width, place / width), 0).r);
+  vec4 meanOpacity = cloudTexel(i, 0);
   vec3 t = rotation * meanOpacity.xyz + translation;
   if (!(t.z > near && t.z < far)) { hide(); return; }
 
-  mat3 axes = rotation * rotationOf(cloudTexel(1));
-  vec3 scales = cloudTexel(2).xyz;
+  mat3 axes = rotation * rotationOf(cloudTexel(i, 1));
+  vec3 scales = cloudTexel(i, 2).xyz;
   for (int j = 0; j < 3; j++) axes[j] *= scales[j];
   mat3 rows = transpose(axes);
   vec2 limit = (0.5 + 0.5 * FRUSTUM_MARGIN) * size / focal;
@@ -106,8 +111,8 @@ void main() {
 
   mean2d = 0.5 * size + focal * t.xy / t.z;
   conic = vec3(1.0 / variance, xy / yy, 1.0 / yy);
-  colorOpacity = vec4(colorSeen(meanOpacity.xyz), opacity);
-  vec2 sign = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+  colorOpacity = vec4(colorSeen(i, meanOpacity.xyz), opacity);
+  vec2 sign = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
   // beyond this distance, in standard deviations, alpha is below alphaMin
   vec2 v = sign * sqrt(2.0 * log(opacity / alphaMin));
   float dy = v.y * sqrt(yy), dx = v.x * sqrt(variance) + conic.y * dy;
