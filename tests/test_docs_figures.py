@@ -15,6 +15,7 @@ from tests.test_docs import TEXTS
 from threestudio_gaussiandreamer import metrics
 from threestudio_gaussiandreamer.core import file_memory
 from threestudio_gaussiandreamer.launch.config_source import MOST_DEPTH, MOST_NODES
+from threestudio_gaussiandreamer.launch.live_viewer import SHARE_OF_TIME
 from threestudio_gaussiandreamer.meshes import budget
 from threestudio_gaussiandreamer.priors.motion import MotionPrior
 from threestudio_gaussiandreamer.prune import PruneOptions
@@ -31,6 +32,7 @@ CONSTANTS = {
         f"take {LIST_BYTES} bytes per intersection, the backward pass {ROW_BYTES} more",
     ],
     "docs/failures.md": [f"farther than {FLOATERS:.0%}".replace("%", " %")],
+    "docs/viewing.md": [f"at most {SHARE_OF_TIME:.0%}".replace("%", " %")],
     "docs/models.md": [f"`max_residual_mm` ({MotionPrior.Config.max_residual_mm:g})"],
     "docs/pruning.md": [
         f"for {PruneOptions.steps} steps",
