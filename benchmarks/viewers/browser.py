@@ -26,10 +26,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 SPARK_PAGE = Path(__file__).with_name("spark.html")
+THREE_PAGE = Path(__file__).with_name("three.html")
 SCREENSHOT_SCRIPT = Path(__file__).with_name("screenshot.html")
 CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
 SPLAT_TRANSFORM = "@playcanvas/splat-transform/bin/cli.mjs"
-MODULES = ("@sparkjsdev/spark/dist/spark.module.js", "three/build/three.module.js", SPLAT_TRANSFORM)
+THREE = "three/build/three.module.js"
+MODULES = ("@sparkjsdev/spark/dist/spark.module.js", THREE, SPLAT_TRANSFORM)
 FLAGS = (
     "--headless=new",
     "--no-sandbox",
@@ -63,15 +65,16 @@ def chromium() -> Optional[str]:
     return next(filter(None, map(shutil.which, CHROMIUM_NAMES)), None)
 
 
-def missing(modules: Path) -> Optional[str]:
+def missing(modules: Path, names: Sequence[str] = MODULES) -> Optional[str]:
     """Return what is missing for images from viewers, or None.
 
     Args:
         modules: the folder ``node_modules`` with the npm packages.
+        names: the files of packages that are needed.
     """
     if chromium() is None:
         return f"none of {', '.join(CHROMIUM_NAMES)} is installed"
-    lacking = [name for name in MODULES if not (modules / name).is_file()]
+    lacking = [name for name in names if not (modules / name).is_file()]
     return f"{modules} has no {lacking[0]}" if lacking else None
 
 
@@ -105,9 +108,34 @@ def draw_with_spark(
         "/job.json": json.dumps(job).encode(),
         job["cloud"]: cloud.read_bytes(),
     }
-    posted = pictures_of(Exchange(files, modules, len(cameras)), size)
-    pixels = [np.frombuffer(rows, np.uint8).reshape(size, size, 4) for rows in posted]
-    return np.stack(pixels)[:, ::-1, :, :3]
+    return _canvases(Exchange(files, modules, len(cameras)), size)
+
+
+def draw_with_three(
+    mesh: Path, cameras: Sequence[Camera], size: int, modules: Path
+) -> UInt8[np.ndarray, "V S S 3"]:
+    """Draw a GLB with three.js on white from every camera, without lights.
+
+    Raises:
+        RuntimeError: as :func:`draw_with_spark`.
+    """
+    job = {
+        "size": size,
+        "mesh": "/mesh.glb",
+        "cameras": [camera.as_json() for camera in cameras],
+    }
+    files = {
+        "/": THREE_PAGE.read_bytes(),
+        "/job.json": json.dumps(job).encode(),
+        job["mesh"]: mesh.read_bytes(),
+    }
+    return _canvases(Exchange(files, modules, len(cameras)), size)
+
+
+def _canvases(exchange: "Exchange", size: int) -> UInt8[np.ndarray, "V S S 3"]:
+    """Return the pictures of a page that posts the rows of its canvas from the bottom up."""
+    rows = [np.frombuffer(posted, np.uint8) for posted in pictures_of(exchange, size)]
+    return np.stack([values.reshape(size, size, 4) for values in rows])[:, ::-1, :, :3]
 
 
 def draw_with_splat_transform(cloud: Path, size: int, modules: Path) -> UInt8[np.ndarray, "S S 3"]:

@@ -9,7 +9,7 @@ from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, writ
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.mesh import vertex_surface_colors
 
-SMALL = "--faces 300 --texture 96 --views 8 --view-size 96 --resolution 24".split()
+SMALL = "--faces 300 --texture 96 --views 24 --view-size 96 --resolution 24".split()
 
 
 @pytest.mark.parametrize("name", ["ball.glb", "ball.obj"])
@@ -21,7 +21,7 @@ def test_the_mesh_stands_upright_with_its_front_forward(name, tmp_path, capsys):
     colors = vertex_surface_colors(mesh)
     directions = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
     # red in front, green on the left, blue on top, as the ball is painted
-    np.testing.assert_allclose(colors, 0.5 + 0.4 * directions, atol=0.12)
+    assert np.abs(colors - (0.5 + 0.4 * directions)).mean() < 0.05
 
 
 def test_an_obj_that_cannot_have_its_texture_beside_it_is_refused(tmp_path, capsys):

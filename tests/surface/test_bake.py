@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from threestudio_gaussiandreamer.cameras import Orbit
-from threestudio_gaussiandreamer.meshes.mesh import Mesh
+from threestudio_gaussiandreamer.meshes.mesh import Mesh, surface_colors
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
 from threestudio_gaussiandreamer.surface.bake import bake, filled
 from threestudio_gaussiandreamer.surface.renders import Renders
@@ -66,3 +66,18 @@ def test_gaps_take_the_mean_of_their_surroundings():
     assert (found[0, 0] == 10).all() and (found[6, 8] == 30).all()
     assert (found[1, 1] == 10).all() and 10 <= found.min() and found.max() <= 30
     np.testing.assert_array_equal(filled(colors, np.zeros((7, 9), bool)), colors)
+
+
+def test_a_hidden_face_takes_the_colour_of_the_nearest_one():
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    atlas = in_grid(ball.vertices, ball.faces, 120)
+    mesh = Mesh(ball.vertices[atlas.rows], atlas.faces, uv=atlas.uv)
+    painted = mesh._replace(vertex_colors=np.where(mesh.vertices[:, :1] > 0, [1, 0, 0], [0, 0, 1]))
+    orbit = Orbit(*(torch.tensor([value]) for value in (0.0, 0.0, 3.0, FOVY)))
+    c2w = orbit.c2w.double().numpy()
+    images = MeshCaster(painted).render_views([(c2w[0], FOVY)], 96, 96, supersample=1)
+    seen_from_the_front = Renders(c2w, np.round(255 * images).astype(np.uint8), FOVY)
+    baked = mesh._replace(texture=bake(mesh, seen_from_the_front, 120))
+    behind = np.flatnonzero(mesh.vertices[mesh.faces].mean(axis=1)[:, 0] < 0)
+    colors = surface_colors(baked, behind, np.full((len(behind), 3), 1 / 3))
+    assert (colors[:, 0] > 0.9).all() and (colors[:, 2] < 0.1).all()

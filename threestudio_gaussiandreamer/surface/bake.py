@@ -2,12 +2,14 @@
 
 Rays through the pixels' centres find the faces that each render shows, so nothing that is hidden is
 baked. A pixel is added to the four texels around its place in the texture, weighted by the opacity
-and by the square of the cosine between the surface's normal and the ray. Texels that no pixel
-reaches, between the charts and on hidden faces, take the mean of their surroundings."""
+and by the square of the cosine between the surface's normal and the ray. Faces that no view shows
+take the colour of the nearest face that one does; texels between the faces take the mean of their
+surroundings."""
 
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -23,39 +25,84 @@ MIN_COSINE = 0.1
 KNOWN = 1e-3
 """Texels of a smaller weight are filled from their surroundings."""
 
-Added = tuple[Int[np.ndarray, " A"], Float[np.ndarray, "A 4"]]
+LATTICE = 8
+"""Intervals along the edges of a hidden face at whose ends its colour is put."""
+
+
+class Seen(NamedTuple):
+    """What a render shows of a mesh, one row per pixel."""
+
+    face: Int[np.ndarray, " M"]
+    uv: Float[np.ndarray, "M 2"]
+    values: Float[np.ndarray, "M 4"]
+    """Colour times weight, 0 to 255, and weight."""
 
 
 def bake(mesh: Mesh, renders: Renders, size: int) -> UInt8[np.ndarray, "S S 3"]:
     """Return the texture, row 0 at the top, of a mesh with ``uv``."""
-    caster, sums = MeshCaster(mesh), np.zeros((4, size * size))
-    count = len(renders.c2w)
-    workers = min(os.cpu_count() or 1, 4)
-    with ThreadPoolExecutor(workers) as pool:
-        views = pool.map(lambda view: _observed(caster, renders, view, size), range(count))
-        for texels, values in tqdm(views, "texture", count, unit="view", disable=None, leave=False):
-            for channel in range(4):
-                sums[channel] += np.bincount(texels, values[:, channel], size * size)
-    known = sums[3] > KNOWN
-    colors = (sums[:3] / np.maximum(sums[3], KNOWN)).T.reshape(size, size, 3)
+    caster, count = MeshCaster(mesh), len(renders.c2w)
+    texels, faces = np.zeros((4, size * size)), np.zeros((4, len(mesh.faces)))
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
+        views = pool.map(lambda view: _seen(caster, renders, view), range(count))
+        for seen in tqdm(views, "texture", count, unit="view", disable=None, leave=False):
+            _add(faces, seen.face, seen.values)
+            _splat(texels, seen.uv, seen.values, size)
+    _paint_hidden(texels, mesh, faces, size)
+    known = texels[3] > KNOWN
+    colors = (texels[:3] / np.maximum(texels[3], KNOWN)).T.reshape(size, size, 3)
     colors = filled(colors, known.reshape(size, size))
     return np.round(colors.clip(0, 255)).astype(np.uint8)
 
 
-def _observed(caster: MeshCaster, renders: Renders, view: int, size: int) -> Added:
-    """Return the texels that a render adds to, and colour times weight and weight of each."""
+def _seen(caster: MeshCaster, renders: Renders, view: int) -> Seen:
     c2w, rgba = renders.c2w[view], renders.rgba[view]
     (top, left), face, weights = caster.visible(c2w, renders.fovy, *rgba.shape[:2])
     pixels = rgba[top : top + face.shape[0], left : left + face.shape[1]]
-    seen = (face >= 0) & (pixels[..., 3] >= MIN_ALPHA)
-    face, weights, pixels = face[seen], weights[seen], pixels[seen].astype(np.float64)
+    covered = (face >= 0) & (pixels[..., 3] >= MIN_ALPHA)
+    face, weights, pixels = face[covered], weights[covered], pixels[covered].astype(np.float64)
     cosine = _cosines(caster.mesh, face, weights, c2w[:3, 3])
     weight = (pixels[:, 3] / 255) ** 2 * np.where(cosine > MIN_COSINE, cosine, 0) ** 2
     values = np.concatenate([pixels[:, :3], np.ones((len(pixels), 1))], axis=1) * weight[:, None]
     uv = np.einsum("mk,mkc->mc", weights, caster.mesh.uv[caster.mesh.faces[face]])
-    parts = [(texel, values * share[:, None]) for texel, share in _around(uv, size)]
-    texels, added = zip(*parts, strict=True)
-    return np.concatenate(texels), np.concatenate(added)
+    return Seen(face, uv, values)
+
+
+def _paint_hidden(
+    texels: Float[np.ndarray, "4 T"], mesh: Mesh, faces: Float[np.ndarray, "4 F"], size: int
+) -> None:
+    """Give faces without weight the mean colour of the nearest face that has one."""
+    from scipy.spatial import cKDTree
+
+    shown = faces[3] > KNOWN
+    if shown.all() or not shown.any():
+        return
+    corners = mesh.faces[~shown]
+    centres = mesh.vertices[mesh.faces].mean(axis=1)
+    nearest = cKDTree(centres[shown]).query(centres[~shown])[1]
+    means = np.append(faces[:3] / np.maximum(faces[3], KNOWN), shown[None], axis=0).T
+    steps = [(i, j) for i in range(LATTICE + 1) for j in range(LATTICE + 1 - i)]
+    for i, j in steps:
+        weights = np.array([i, j, LATTICE - i - j]) / LATTICE
+        uv = np.einsum("k,fkc->fc", weights, mesh.uv[corners])
+        _splat(texels, uv, 2 * KNOWN * means[shown][nearest], size)
+
+
+def _splat(
+    sums: Float[np.ndarray, "4 T"],
+    uv: Float[np.ndarray, "M 2"],
+    values: Float[np.ndarray, "M 4"],
+    size: int,
+) -> None:
+    """Add values to the four texels around each place."""
+    texels, shares = zip(*_around(uv, size), strict=True)
+    _add(sums, np.concatenate(texels), np.concatenate([values * s[:, None] for s in shares]))
+
+
+def _add(
+    sums: Float[np.ndarray, "4 T"], rows: Int[np.ndarray, " M"], values: Float[np.ndarray, "M 4"]
+) -> None:
+    for channel in range(4):
+        sums[channel] += np.bincount(rows, values[:, channel], sums.shape[1])
 
 
 def _cosines(

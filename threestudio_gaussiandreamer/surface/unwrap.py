@@ -35,7 +35,7 @@ class Unwrapped(NamedTuple):
 
 def faces_that_fit(size: int) -> int:
     """Return the number of faces for which a texture of size x size texels has room."""
-    return 2 * (size // SMALLEST_CELL) ** 2
+    return max(XATLAS_FACES, 2 * (size // SMALLEST_CELL) ** 2)
 
 
 def unwrap(
