@@ -52,11 +52,10 @@ COLUMNS = "variant,x,object,seed,psnr,cpu_seconds,faces,closed,machine,commit".s
 VARIANTS = {
     "faces": (1000, 2000, 5000, 10_000, 20_000),
     "texture": (256, 512, 2048),
-    "resolution": (48, 144, 192),
-    "views": (16, 32, 128),
+    "resolution": (144,),
 }
 """Options, and values beside the default; with faces the default is measured."""
-DENSITY = (64, 96, 144)
+DENSITY = (96,)
 """Resolutions of the summed density."""
 
 
@@ -131,7 +130,7 @@ def mesh_views(mesh: Mesh) -> Float[Tensor, "V H W 3"]:
 
 # ---- the chart -----------------------------------------------------------------------------------
 
-MARKERS = {"faces": "o", "texture": "s", "resolution": "^", "views": "D", "density": "x"}
+MARKERS = {"faces": "o", "texture": "s", "resolution": "^", "density": "x"}
 """Of the variants, where all are in one panel."""
 
 
