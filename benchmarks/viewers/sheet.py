@@ -23,7 +23,7 @@ from benchmarks.viewers.browser import (
 from threestudio_gaussiandreamer.core.images import write
 
 SIZE = 240
-DISTANCE = 2.6
+DISTANCE = 3.0
 """Of the camera from the middle of an object whose longest side is about 2."""
 
 

@@ -263,6 +263,19 @@ raise SystemExit(main({arguments!r}))
     assert (tmp_path / "evaluation" / "clip.json").is_file()
 
 
+def test_the_report_replaces_a_link_and_holds_paths_that_are_no_utf8(clip, plys, tmp_path):
+    output, mine = tmp_path / "evaluation", tmp_path / "mine"
+    output.mkdir()
+    mine.write_text("mine")
+    (output / "clip.json").symlink_to(mine)
+    ply = os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.ply")
+    shutil.copy(plys[0], ply)
+    arguments = [ply, "--clip", clip, "--prompt", PROMPT, "--output", str(output), *FAST]
+    assert main(arguments) == 0
+    assert mine.read_text() == "mine"
+    assert b"caf\xe9.ply" in (output / "clip.json").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -276,7 +289,23 @@ raise SystemExit(main({arguments!r}))
         (["{ply}", "--clip", "x", "--prompt", "a", "--drawn", "121"], "--drawn 121"),
         (["{ply}", "--clip", "x", "--prompt", "a", "--size", "0"], "--size"),
         (["{ply}", "--clip", "x", "--prompt", "a", "--fovy", "180"], "--fovy"),
+        (
+            ["{ply}", "--clip", "x", "--prompt", "a", "--size", "100000"],
+            "--size 100000: expected 1",
+        ),
+        (["{ply}", "--clip", "x", "--prompt", "a", "--views", "9" * 12], "--views 999"),
+        (["{ply}", "--clip", "x", "--prompt", "a\udcff"], "isn't valid UTF-8 text"),
+        (["{ply}", "--clip", "x", "--prompt", "a", "--output", "{ply}/o"], "can't be made"),
+        (["{ply}", "--prompt", "a", "--t3bench", "{ply}/o"], "can't be made"),
         (["{ply}", "--prompt", "a/b", "--t3bench", "{folder}"], "slash"),
+        (["{ply}", "--prompt", "..", "--t3bench", "{folder}"], "dots"),
+        (["{ply}", "--prompt", "", "--t3bench", "{folder}"], "empty"),
+        (["{ply}", "--prompt", 300 * "x", "--t3bench", "{folder}"], "more than 240 bytes"),
+        (["{ply}", "{ply}", "--prompt", "a", "--t3bench", "{folder}"], "would replace each other"),
+        (
+            ["{ply}", "--prompt", "a", "--t3bench", "{folder}", "--t3bench-method", "../x"],
+            "--t3bench-method",
+        ),
     ],
 )
 def test_mistakes_are_one_message(arguments, said, plys, tmp_path, capsys):

@@ -3,6 +3,7 @@ any model.
 """
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -155,3 +156,18 @@ def test_no_weights_are_reported(tmp_path):
 def test_an_untrained_folder_is_reported(tmp_path, capsys):
     assert main([str(tmp_path / "nothing"), str(tmp_path / "models")]) == 2
     assert "train the stage 'clip' first" in capsys.readouterr().err
+
+
+def test_a_target_that_can_not_be_made_is_one_message(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert main([str(tmp_path), str(tmp_path / "file" / "models")]) == 2
+    assert "TARGET: the folder" in capsys.readouterr().err
+
+
+def test_an_error_of_the_file_system_is_one_message(trained, tmp_path, capsys, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(shutil, "copytree", full)
+    assert main([str(trained), str(tmp_path / "models")]) == 2
+    assert "No space left on device" in capsys.readouterr().err

@@ -1,6 +1,8 @@
 """Every stage of the toybox's training learns, resumes exactly, and reports errors."""
 
+import contextlib
 import signal
+import sys
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import torch
 from tests.toybox.helpers import copied, options, training
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.toybox import loop, points_stage, unet_stage, views
+from threestudio_gaussiandreamer.toybox import loop, points_stage, train, unet_stage, views
 from threestudio_gaussiandreamer.toybox.clip_stage import IGNORED, LABELS, text_labels
 from threestudio_gaussiandreamer.toybox.train import STAGES, main, render_shards
 
@@ -62,19 +64,53 @@ def test_a_stage_is_measured_on_withheld_objects(folder, name):
     assert numbers and all(np.isfinite(value) for value in numbers.values())
 
 
-def test_sigterm_saves_and_stops(folder, tmp_path):
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_stop_signal_saves_and_stops(folder, tmp_path, name):
+    number = getattr(signal, name)
     run = training(copied(folder, tmp_path / "run"), "judge")
-    step, earlier = run.train_step, signal.getsignal(signal.SIGTERM)
+    step, earlier = run.train_step, signal.getsignal(number)
 
     def interrupted(batch):
-        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(number)
         return step(batch)
 
     run.train_step = interrupted
     run.run(1000)
-    assert run.progress.images == 4
+    assert run.progress.images == 4 and run.signum == number
     assert load_file(run.path)["images"] == 4
-    assert signal.getsignal(signal.SIGTERM) == earlier
+    assert signal.getsignal(number) == earlier
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+def test_after_a_stop_signal_no_other_stage_begins(tmp_path, monkeypatch, capsys, name, code):
+    begun = []
+
+    class Stopped:
+        progress, signum = loop.Progress(), getattr(signal, name)
+
+        def __init__(self, stage):
+            begun.append(stage)
+
+        def run(self, images):
+            return self.progress
+
+    monkeypatch.setattr(train, "Training", Stopped)
+    monkeypatch.setattr(train, "STAGES", {"clip": lambda options: "a", "unet": lambda options: "b"})
+    assert main([str(tmp_path), "--stages", "clip", "unet"]) == code
+    assert begun == ["a"] and capsys.readouterr().err == "stopped\n"
+
+
+def test_a_full_device_as_standard_output_stops_no_training(folder, tmp_path, monkeypatch, capfd):
+    place = copied(folder, tmp_path / "run")
+    monkeypatch.setattr(train, "options_of", lambda args: options(place))
+    monkeypatch.setattr(loop.Training, "_show", lambda self: None)
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert main([str(place), "--stages", "judge", "--images", "4"]) == 0
+        monkeypatch.undo()
+        with contextlib.suppress(OSError):
+            full.flush()
+    assert load_file(place / "judge.pt")["images"] == 4
 
 
 def test_a_full_disk_is_reported_and_leaves_the_earlier_checkpoint(folder, tmp_path, monkeypatch):
@@ -158,6 +194,10 @@ def test_curves_are_written(folder):
         (["--images", "0"], "--images 0: expected at least 1"),
         (["--pool", "-3"], "--pool -3: expected at least 1"),
         (["--device", "cuda"], "sees no GPU"),
+        (["--device", "cpuu"], "unknown device 'cpuu': did you mean 'cpu'"),
+        (["--workers", "-1"], "--workers -1: expected 0 or more"),
+        (["--save-minutes", "nan"], "--save-minutes nan: expected minutes"),
+        (["--sheet-minutes", "-1"], "--sheet-minutes -1.0: expected minutes"),
     ],
 )
 def test_bad_options_are_one_message(tmp_path, capsys, arguments, message):
@@ -165,6 +205,12 @@ def test_bad_options_are_one_message(tmp_path, capsys, arguments, message):
         pytest.skip("there is a GPU")
     assert main([str(tmp_path), *arguments]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_folder_that_can_not_be_made_is_one_message(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert main([str(tmp_path / "file" / "run")]) == 2
+    assert "FOLDER: the folder" in capsys.readouterr().err
 
 
 @pytest.mark.slow  # starts processes

@@ -267,3 +267,17 @@ def test_the_sheet_shows_every_object_with_its_prompt(tmp_path):
     texts = sheet[views.SIZE : cell, : 10 * views.SIZE]
     assert all((part < 128).any() for part in np.split(texts, 10, axis=1))
     assert (sheet[cell:, 2 * views.SIZE :] == 255).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["sheet.png", "--count", "0"], "--count 0: expected 1 to"),
+        (["sheet.png", "--count", "1000000000"], "--count 1000000000: expected 1 to"),
+        (["sheet.txt"], "expected the name of a PNG"),
+        (["none/sheet.png"], "there is no folder"),
+    ],
+)
+def test_bad_options_of_the_sheet_are_one_message(tmp_path, capsys, arguments, message):
+    assert main([str(tmp_path / arguments[0]), *arguments[1:]]) == 2
+    assert message in capsys.readouterr().err

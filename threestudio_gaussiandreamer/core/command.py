@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from typing import Any, Optional
 
-from .errors import UserError
+from .errors import Terminated, UserError
 from .output import tolerant_output
 
 
@@ -25,7 +25,8 @@ def run_command(
         run: does the work; its argument is what ``parse`` returned.
 
     Returns:
-        the exit code: 0 for success, 2 for wrong input, 130 for Ctrl-C, 141 for a closed pipe.
+        the exit code: 0 for success, 2 for wrong input, 130 for Ctrl-C, 141 for a closed pipe, that
+        of the signal if ``run`` raises ``Terminated``.
     """
     try:
         args = parse(argv)
@@ -35,9 +36,9 @@ def run_command(
         try:
             run(args)
             sys.stdout.flush()
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, Terminated) as stop:
             print("stopped", file=sys.stderr)
-            return 128 + signal.SIGINT
+            return stop.code if isinstance(stop, Terminated) else 128 + signal.SIGINT
         except Exception as error:
             return exit_code(error)
     return 0

@@ -138,6 +138,31 @@ def require_writable(path: str | os.PathLike, what: str) -> None:
         raise UserError(f"{what}: {_quoted(path)} can't be written: its folder is read-only")
 
 
+def output_folder(path: str | os.PathLike, option: str, files: Collection[str] = ()) -> Path:
+    """Make a folder for results, before the work that makes them.
+
+    Args:
+        option: names the folder in messages.
+        files: names of what will be written into it.
+
+    Raises:
+        UserError: it can't be made or written into.
+    """
+    try:
+        folder = Path(path).expanduser()
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError, RuntimeError) as error:  # NUL; "~user" of an unknown user
+        why = getattr(error, "strerror", None) or error
+        raise UserError(
+            f"{option}: the folder {_quoted(Path(path))} can't be made: {why}"
+        ) from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise UserError(f"{option}: the folder {_quoted(folder)} is read-only")
+    for name in files:
+        require_writable(folder / name, option)
+    return folder
+
+
 def _quoted(path: Path) -> str:
     """Quote a path for a message, at most 100 characters of it."""
     text = str(path)

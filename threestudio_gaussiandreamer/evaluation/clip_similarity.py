@@ -30,12 +30,17 @@ from ..cameras import Orbit
 from ..core import images as files_of_pictures
 from ..core.command import run_command
 from ..core.errors import UserError
-from ..core.files import existing_file, json_text
+from ..core.files import atomic_file, existing_file, json_text, output_folder
+from ..core.options import shown
 from ..core.streams import numpy_generator
 from ..host import get_device
 from ..models.clip import PictureText, clip_source
+from ..training.camera_options import MAX_SIDE
 from .results import Pictures, Result, find_result, read_result
+from .t3bench import require_folder_names, write_t3bench
 
+FILES = ("clip.json", "clip.png")
+MAX_VIEWS = 100_000
 PERCENT = 100.0
 THUMBNAIL = 160
 
@@ -185,8 +190,8 @@ def prompts_for(
     or the prompts of their runs.
 
     Raises:
-        UserError: both are given, the prompt of a result is unknown, or the numbers of lines and
-            results differ.
+        UserError: both are given, the prompt of a result is unknown, isn't valid Unicode, or the
+            numbers of lines and results differ.
     """
     if prompt is not None and prompts_file is not None:
         raise UserError("both --prompt and --prompts-file: give one of them")
@@ -198,6 +203,10 @@ def prompts_for(
                 "results: one line for each is needed"
             )
         return lines
+    try:
+        (prompt or "").encode()
+    except UnicodeEncodeError as error:
+        raise UserError(f"--prompt {shown(prompt)} isn't valid UTF-8 text: {error}") from error
     prompts = [prompt if prompt is not None else result.prompt for result in results]
     if None in prompts:
         raise UserError(
@@ -274,8 +283,11 @@ def protocol_of(args: argparse.Namespace) -> Protocol:
     """
     if not 1 <= args.drawn <= args.views:
         raise UserError(f"--drawn {args.drawn}: expected 1 to {args.views}, the number of views")
-    if args.size < 1 or args.t3bench_size < 1:
-        raise UserError("--size and --t3bench-size: expected a positive number of pixels")
+    for option, size in (("--size", args.size), ("--t3bench-size", args.t3bench_size)):
+        if not 1 <= size <= MAX_SIDE:
+            raise UserError(f"{option} {shown(size)}: expected 1 to {MAX_SIDE} pixels")
+    if args.views > MAX_VIEWS:
+        raise UserError(f"--views {shown(args.views)}: expected at most {MAX_VIEWS}")
     if not 0 < args.fovy < 180:
         raise UserError(f"--fovy {args.fovy}: expected degrees between 0 and 180")
     return Protocol(
@@ -295,13 +307,15 @@ def run(args: argparse.Namespace) -> None:
     prompts = prompts_for(results, args.prompt, args.prompts_file)
     if not (args.clip or args.t3bench):
         raise UserError("nothing to do: give --clip FOLDER, --t3bench FOLDER, or both")
-    if args.clip:
-        evaluate(results, prompts, args.clip, protocol, Path(args.output))
     if args.t3bench:
-        from .t3bench import write_t3bench
-
+        require_folder_names(args.t3bench_method, prompts)
+        output_folder(args.t3bench, "--t3bench")
+    if args.clip:
+        output = output_folder(args.output, "--output", FILES)
+        evaluate(results, prompts, args.clip, protocol, output)
+    if args.t3bench:
         write_t3bench(
-            Path(args.t3bench),
+            Path(args.t3bench).expanduser(),
             results,
             prompts,
             method=args.t3bench_method,
@@ -327,13 +341,9 @@ def evaluate(
         scores.append(score(result, prompt, item, clip, protocol))
         print(f"{scores[-1].per_seed.mean():6.2f}  {prompt}  {result.ply}", flush=True)
     content = report(results, prompts, scores, clip_folder, protocol)
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        (output / "clip.json").write_text(
-            json_text(content, indent=2, ensure_ascii=False), encoding="utf-8"
-        )
-    except OSError as error:
-        raise UserError(f"--output {output} can't be written: {error.strerror or error}") from error
+    text = json_text(content, indent=2, ensure_ascii=False)
+    with atomic_file(output / "clip.json") as file:
+        file.write(text.encode(errors="surrogateescape"))  # paths may be no UTF-8
     files_of_pictures.write(output / "clip.png", contact_sheet(prompts, scores))
     spread = (
         ""

@@ -25,8 +25,10 @@ from tqdm import tqdm
 from .. import register_parts
 from ..core.command import run_command
 from ..core.errors import UserError, unknown
-from ..core.files import atomic_file, json_text, require_writable
+from ..core.files import atomic_file, json_text, output_folder
+from ..core.options import shown
 from ..toybox.recognition import BUNDLED
+from ..training.camera_options import MAX_SIDE
 from .asset_metrics import METRICS, Asset, Metric
 from .intervals import Estimate, bootstrap, paired, per_prompt
 from .results import Result, find_result, read_result
@@ -57,7 +59,7 @@ def run(args: argparse.Namespace) -> None:
     metrics = open_metrics(args)
     first = find_results(args.folders)
     second = find_results([args.against]) if args.against else []
-    output = output_folder(args.output)
+    output = output_folder(args.output, "--output", FILES)
     rows = [list(scored(results, metrics)) for results in (first, second)]
     content = summary(metrics, *rows)
     write(output, rows[0] + rows[1], content)
@@ -76,8 +78,8 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
             raise unknown("metric", name, METRICS)
     if not names:
         raise UserError(f"--metrics is empty: expected some of {', '.join(METRICS)}")
-    if args.size < 1:
-        raise UserError(f"--size {args.size}: expected a positive number of pixels")
+    if not 1 <= args.size <= MAX_SIDE:
+        raise UserError(f"--size {shown(args.size)}: expected 1 to {MAX_SIDE} pixels")
     if not args.clip and (needing := [name for name in names if name in ("clip", "directions")]):
         raise UserError(
             f"--metrics {needing[0]} needs --clip FOLDER, for instance after `hf download "
@@ -115,22 +117,6 @@ def run_folders(folder: Path) -> Iterator[Path]:
         if any(Path(place).glob("save/it*-export/*.ply")):
             names.clear()
             yield Path(place)
-
-
-def output_folder(path: str) -> Path:
-    """Make the folder of the reports.
-
-    Raises:
-        UserError: it can't be made or written into.
-    """
-    folder = Path(path).expanduser()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"--output {path} can't be made: {error.strerror or error}") from error
-    for name in FILES:
-        require_writable(folder / name, "--output")
-    return folder
 
 
 def scored(results: Sequence[Result], metrics: Sequence[Metric]) -> Iterator[dict[str, Any]]:
@@ -172,7 +158,7 @@ def write(output: Path, rows: Rows, content: dict[str, Any]) -> None:
     writer.writerows(rows)
     for name, body in zip(FILES, (text.getvalue(), json_text(content, indent=2)), strict=True):
         with atomic_file(output / name) as file:
-            file.write(body.encode())
+            file.write(body.encode(errors="surrogateescape"))  # paths may be no UTF-8
 
 
 def table(content: dict[str, Any]) -> list[str]:

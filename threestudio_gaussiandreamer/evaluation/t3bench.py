@@ -18,6 +18,8 @@ of a mesh, or the centres of Gaussians with an opacity of at least ``MIN_OPACITY
 """
 
 import math
+import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -28,6 +30,8 @@ from jaxtyping import Float
 from ..cameras import look_at
 from ..core import images as files_of_pictures
 from ..core.errors import UserError
+from ..core.files import atomic_file
+from ..core.options import shown
 from ..formats.obj import write_obj
 from ..gaussians.gaussians import Gaussians, opaque
 from ..gaussians.surface import gaussian_surface
@@ -38,6 +42,8 @@ QUALITY_FOVY = tuple(math.pi / part for part in (3.0, 4.0, 5.0, 6.0, 7.5))
 CAPTION_FOVY = math.pi / 3
 MIN_OPACITY = 0.1
 NEAR_POLE = 0.99
+LONGEST_NAME = 240
+"""Bytes of a folder's name; file systems allow 255, of which the group's name needs some."""
 STAND_IN = '''"""Copy pictures rendered beforehand, black ones where there are none."""
 
 import argparse
@@ -76,19 +82,13 @@ def write_t3bench(
         size: height and width of the pictures, pixels.
 
     Raises:
-        UserError: a prompt has a slash, so that it can't name a folder, or a file can't be written.
+        UserError: a prompt can't name a folder, or a file can't be written.
     """
-    if bad := [prompt for prompt in prompts if "/" in prompt]:
-        raise UserError(
-            f"T3Bench names folders after prompts, and {bad[0]!r} has a slash: leave it out, "
-            "or reword it"
-        )
+    require_folder_names(method, prompts)
     try:
         _write_stand_ins(folder / "render_gaussians", size)
         for result, prompt in zip(results, prompts, strict=True):
-            save = (
-                folder / "outputs_mesh_t3" / f"{method}_{group}" / prompt.replace(" ", "_") / "save"
-            )
+            save = folder / "outputs_mesh_t3" / f"{method}_{group}" / folder_name(prompt) / "save"
             _write_result(save, normalized(read_result(result)), size)
             print(f"T3Bench: {save}", flush=True)
     except OSError as error:
@@ -97,15 +97,39 @@ def write_t3bench(
         ) from error
 
 
+def require_folder_names(method: str, prompts: Sequence[str]) -> None:
+    """Raise UserError unless each prompt, and the method, names a folder of its own."""
+    for text in (method, *prompts):
+        if set(text) & set("/\0") or text in ("", os.curdir, os.pardir):
+            raise UserError(
+                f"T3Bench names folders after prompts and --t3bench-method, and {shown(text)} is "
+                "empty, dots, or has a slash or NUL: reword it"
+            )
+        if len(os.fsencode(text)) > LONGEST_NAME:
+            raise UserError(
+                f"T3Bench names folders after prompts and --t3bench-method: {shown(text)} has more "
+                f"than {LONGEST_NAME} bytes"
+            )
+    twice = [prompt for prompt, count in Counter(map(folder_name, prompts)).items() if count > 1]
+    if twice:
+        raise UserError(
+            f"T3Bench names folders after prompts: the results of {shown(twice[0])} would replace "
+            "each other; give one of them"
+        )
+
+
+def folder_name(prompt: str) -> str:
+    return prompt.replace(" ", "_")
+
+
 def _write_stand_ins(folder: Path, size: int) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for script, kind, names in (
         ("meshrender.py", "quality", quality_names()),
         ("meshrender_cap.py", "caption", caption_names()),
     ):
-        (folder / script).write_text(
-            STAND_IN.format(kind=kind, names=names, size=size), encoding="utf-8"
-        )
+        with atomic_file(folder / script, durable=False) as file:
+            file.write(STAND_IN.format(kind=kind, names=names, size=size).encode())
 
 
 def _write_result(save: Path, arrays: Gaussians, size: int) -> None:

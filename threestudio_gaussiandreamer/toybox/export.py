@@ -12,6 +12,7 @@ training.json         what each network has seen: images, hours, numbers on with
 """
 
 import argparse
+import functools
 import json
 import shutil
 import sys
@@ -23,8 +24,9 @@ import torch
 from torch import Tensor
 
 from ..core.checkpoint_file import load_file
+from ..core.command import run_command
 from ..core.errors import UserError
-from ..core.files import atomic_file
+from ..core.files import atomic_file, output_folder
 from . import models
 from .loop import averaged_weights, checkpoint_path
 from .text_batches import open_tokenizer
@@ -141,25 +143,28 @@ def _for(network: Any, weights: dict[str, Tensor]) -> dict[str, Tensor]:
     return {(prefix if prefixed else "") + name: value for name, value in weights.items()}
 
 
-def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line; returns the exit code: 0 done, 2 an error that the user can correct."""
+def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
+    """Parse the command line."""
     parser = argparse.ArgumentParser(
         prog=f"python -m {__package__}.export", description="Write the toybox's models."
     )
     parser.add_argument("training", type=Path, help="folder of toybox.train")
     parser.add_argument("target", type=Path, help="folder for the models")
+    return parser.parse_args(argv)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Write the models, and print their size."""
+    target = output_folder(args.target, "TARGET")
     try:
-        args = parser.parse_args(argv)
-        args.target.mkdir(parents=True, exist_ok=True)
-        record = export(args.training, args.target)
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    size = sum(path.stat().st_size for path in args.target.rglob("*") if path.is_file())
-    print(f"{args.target}: {', '.join(record)}, {size / 1e6:.1f} MB")
-    return 0
+        record = export(args.training, target)
+    except OSError as error:
+        raise UserError(f"cannot write {str(target)!r}: {error.strerror or error}") from error
+    size = sum(path.stat().st_size for path in target.rglob("*") if path.is_file())
+    print(f"{target}: {', '.join(record)}, {size / 1e6:.1f} MB")
+
+
+main = functools.partial(run_command, parse, run)
 
 
 if __name__ == "__main__":

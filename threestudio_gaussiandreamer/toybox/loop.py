@@ -8,7 +8,6 @@ as an uninterrupted one.
 """
 
 import logging
-import signal
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -25,6 +24,7 @@ from ..core.checkpoint_file import load_file, save_file
 from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..core.images import write as write_picture
+from ..launch.signals import restore_handlers, set_handlers
 
 EMA_DECAY = 0.999
 WARMUP, DECAY_START = 200, 10_000
@@ -130,7 +130,7 @@ class Training:
         )
         self.progress = Progress()
         self.measured: dict[str, float] = {}
-        self._stop = False
+        self.signum = 0
         if self.path.exists():
             self._resume()
         self._freeze()
@@ -140,24 +140,22 @@ class Training:
         return checkpoint_path(self.stage.options.folder, self.stage.name)
 
     def run(self, images: Optional[int] = None) -> Progress:
-        """Train until ``images`` have been seen; SIGTERM and SIGINT save a checkpoint and stop."""
+        """Train until ``images`` have been seen. The signals that stop a run save a checkpoint and
+        stop, with the signal's number in ``signum``.
+        """
         target = images or self.stage.images
-        earlier = {
-            number: signal.signal(number, self._on_signal)
-            for number in (signal.SIGTERM, signal.SIGINT)
-        }
+        earlier = set_handlers(self._on_signal)
         try:
             self._loop(target)
         finally:
-            for number, handler in earlier.items():
-                signal.signal(number, handler)
+            restore_handlers(earlier)
         return self.progress
 
     def _loop(self, target: int) -> None:
         progress, sums = self.progress, _Sums()
         saved = shown = started = time.monotonic()
         for batch in self.stage.batches(progress.step):
-            if progress.images >= target or self._stop:
+            if progress.images >= target or self.signum:
                 break
             metrics = self.train_step(batch)
             now = time.monotonic()
@@ -274,7 +272,7 @@ class Training:
             write_picture(folder / f"{self.stage.name}-{self.progress.images:08d}.png", image)
 
     def _on_signal(self, number: int, frame: Any) -> None:
-        self._stop = True
+        self.signum = number
 
 
 class _Sums:

@@ -6,6 +6,7 @@ command continues a training that was stopped anywhere. It runs unchanged on a G
 """
 
 import argparse
+import functools
 import logging
 import os
 import sys
@@ -17,7 +18,11 @@ from typing import Optional
 
 import torch
 
+from ..core.command import run_command
 from ..core.errors import UserError, unknown
+from ..core.files import output_folder
+from ..core.options import is_number, shown
+from ..launch.signals import interrupt
 from .autoencoder_stage import AutoencoderStage
 from .clip_stage import ClipStage
 from .judge_stage import SEED_OFFSET, JudgeStage
@@ -79,9 +84,18 @@ def options_of(args: argparse.Namespace) -> Options:
     for name in ("images", "threads", "batch", "pool"):
         value = getattr(args, name)
         if value is not None and value < 1:
-            raise UserError(f"--{name} {value}: expected at least 1")
+            raise UserError(f"--{name} {shown(value)}: expected at least 1")
+    if args.workers < 0:
+        raise UserError(f"--workers {shown(args.workers)}: expected 0 or more")
+    for name in ("save_minutes", "sheet_minutes"):
+        if not is_number(getattr(args, name)) or getattr(args, name) < 0:
+            option = f"--{name.replace('_', '-')}"
+            raise UserError(f"{option} {getattr(args, name)}: expected minutes, 0 or more")
     if args.device.startswith("cuda") and not torch.cuda.is_available():
         raise UserError(f"--device {args.device}: PyTorch sees no GPU here; give cpu")
+    devices = ["cpu", "cuda", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    if args.device not in devices:
+        raise unknown("device", args.device, devices)
     return Options(
         folder=args.folder,
         seed=args.seed,
@@ -108,36 +122,41 @@ def _render(job: tuple[Options, int, int]) -> None:
 
 
 def train(options: Options, stages: Sequence[str], images: Optional[int] = None) -> None:
-    """Train the stages in order."""
-    for name in STAGES:
-        if name in stages:
-            progress = Training(STAGES[name](options)).run(images)
-            print(
-                f"{name}: {progress.images} images in {progress.seconds / 3600:.2f} hours",
-                flush=True,
-            )
+    """Train the stages in order.
+
+    Raises:
+        Terminated, KeyboardInterrupt: a signal stopped one, after it wrote its checkpoint.
+    """
+    for name in (name for name in STAGES if name in stages):
+        training = Training(STAGES[name](options))
+        progress = training.run(images)
+        hours = progress.seconds / 3600
+        print(f"{name}: {progress.images} images in {hours:.2f} hours", flush=True)
+        if training.signum:
+            interrupt(training.signum)
 
 
-def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line; returns the exit code: 0 done, 2 an error that the user can correct."""
+def run(args: argparse.Namespace) -> None:
+    """Check the options, and train.
+
+    Raises:
+        UserError: an option is invalid, or a file can't be written or doesn't fit.
+        Terminated, KeyboardInterrupt: a signal stopped the training; a checkpoint is written.
+    """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    try:
-        args = parse(argv)
-        options = options_of(args)
-        if args.threads:
-            torch.set_num_threads(args.threads)
-        if args.workers:
-            seeds = [options.seed] + [options.seed + SEED_OFFSET] * ("judge" in args.stages)
-            render_shards(options, seeds, min(args.workers, os.cpu_count() or 1))
-        if args.from_weights:
-            start_from(args.from_weights, options, STAGES)
-        train(options, args.stages, args.images)
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    options = options_of(args)
+    output_folder(options.folder, "FOLDER")
+    if args.threads:
+        torch.set_num_threads(args.threads)
+    if args.workers:
+        seeds = [options.seed] + [options.seed + SEED_OFFSET] * ("judge" in args.stages)
+        render_shards(options, seeds, min(args.workers, os.cpu_count() or 1))
+    if args.from_weights:
+        start_from(args.from_weights, options, STAGES)
+    train(options, args.stages, args.images)
+
+
+main = functools.partial(run_command, parse, run)
 
 
 if __name__ == "__main__":
