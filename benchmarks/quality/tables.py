@@ -42,7 +42,7 @@ NOTES = {
     "Gaussians with a channel above 1. Only the first and the chosen one are in the code.",
     "spark": "Held-out PSNR of this package's render and of Spark 2.2 in Chromium, and between the "
     "two, by `benchmarks/viewers/spark.py`. `up`: the file's axis; unbounded clouds are from "
-    "before `bound_colors`, in z-up files.",
+    "before `bound_colors`, in z-up files. Seed 0 unless another is named.",
 }
 
 
