@@ -69,6 +69,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     },
     "docs/step_time.md": {"start": start.first_step},
     "docs/robustness.md": {"fuzz": robustness.fuzz, "long run": robustness.long_run},
+    "docs/farm.md": {"farm": robustness.farm},
 }
 
 

@@ -50,12 +50,13 @@ KILLED = {"worker": "workers", "driver": "the driver", "node": "machines"}
 
 def farm() -> str:
     """Return the costs of a farm beside its assets, and what a farm with killed processes made."""
-    table = []
+    measured: dict[str, list[str]] = {}
     for row in read(RESULTS / "farm.csv"):
-        places = [f"{int(row['rows']):,} {'assets' if row['workers'] else 'rows'}"]
-        places += [f"{row['workers']} workers"] if row["workers"] else []
+        where = f"{int(row['rows']):,} {'assets' if row['workers'] else 'rows of the ledger'}"
+        where += f", {row['workers']} workers" if row["workers"] else ""
         value = f"{float(row['value']):.3g} {row['unit']}".strip()
-        table.append((f"{row['measured']}, {', '.join(places)}", value))
+        measured.setdefault(f"{row['measured']}, {where}", []).append(value)
+    table = [(name, ", ".join(values)) for name, values in measured.items()]
     (chaos,) = read(RESULTS / "farm_chaos.csv")
     kills = ", ".join(f"{chaos[f'{kind}_kills']} of {name}" for kind, name in KILLED.items())
     table += [

@@ -10,7 +10,8 @@ import time
 import pytest
 
 from tests.helpers.tiny_farm import ROOT, make_alone, write_farm
-from threestudio_gaussiandreamer.farm import assets
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.farm import assets, cluster
 
 pytest.importorskip("ray", reason="Ray isn't installed: pip install -e .[cluster]")
 pytestmark = pytest.mark.slow
@@ -18,18 +19,35 @@ COUNT, STEPS = 3, 40
 SECONDS = 300
 
 
-class Farm:
-    """The command in a process of its own."""
+HANGS_ONCE = """
+import time
+from pathlib import Path
+from threestudio_gaussiandreamer.host import register
+from threestudio_gaussiandreamer.priors.mesh import MeshPrior
 
-    def __init__(self, folder, arguments):
-        self.out = folder / "farm"
+@register("hanging-prior")
+class HangingPrior(MeshPrior):
+    def generate(self, prompt, generator):
+        if not Path("has_hung").exists():
+            Path("has_hung").touch()
+            time.sleep(1000)
+        return super().generate(prompt, generator)
+"""
+
+
+class Farm:
+    """The command in a process of its own, in the folder ``start``."""
+
+    def __init__(self, folder, arguments, start=ROOT):
+        self.out, self.place = folder / "farm", start
         command = [sys.executable, "-m", "threestudio_gaussiandreamer.farm", *arguments]
         self.command = [*command, "--out", str(self.out), "--gpus", "0", "--workers", "2"]
 
     def start(self, *more):
         return subprocess.Popen(
             [*self.command, *more],
-            cwd=ROOT,
+            cwd=self.place,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -124,3 +142,30 @@ def test_ctrl_c_leaves_checkpoints_and_a_failed_asset_is_reported(tmp_path):
     failed = [line for line in farm.lines() if line["state"] == "failed"]
     assert [line["name"] for line in failed] == ["fails"] and "no.glb" in failed[0]["error"]
     assert "system.geometry.prior.path=no.glb" in failed[0]["command"]
+
+
+def test_an_asset_that_hangs_is_made_again(tmp_path):
+    (tmp_path / "custom").mkdir()
+    (tmp_path / "custom/hanging.py").write_text(HANGS_ONCE)
+    arguments = [*write_farm(tmp_path, 1), "system.geometry.prior_type=hanging-prior"]
+    farm = Farm(tmp_path, arguments, start=tmp_path)
+    code, said = farm.run("--time-limit", "20", "--retries", "9")
+    assert code == 0 and "toy0: restarted: no step for" in said, said
+    assert farm.lines()[-1]["state"] == "finished" and farm.lines()[-1]["attempts"] >= 2
+
+
+def test_a_machine_with_another_version_is_refused(tmp_path):
+    import ray
+
+    package = tmp_path / "threestudio_gaussiandreamer"
+    package.mkdir()
+    (package / "__init__.py").write_text("__version__ = '9.9'")
+    cluster.connect(None)
+    try:
+        cluster.require_same_version(ray)
+        elsewhere = {"env_vars": {"PYTHONPATH": str(tmp_path)}, "working_dir": str(tmp_path)}
+        probe = ray.remote(runtime_env=elsewhere)(cluster.installed_version)
+        with pytest.raises(UserError, match="has threestudio-gaussiandreamer 9.9"):
+            cluster.check_versions([ray.get(probe.remote())])
+    finally:
+        ray.shutdown()
