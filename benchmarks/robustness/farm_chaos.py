@@ -170,7 +170,7 @@ def finished_lines(out: Path) -> Counter:
 def resumed(out: Path) -> int:
     """How often an asset went on from a checkpoint."""
     logs = [path.read_text(errors="replace") for path in out.glob("assets/*/log.txt")]
-    return sum(len(re.findall("resume=auto: going on from", log)) for log in logs)
+    return sum(len(re.findall("resume=auto: resuming from", log)) for log in logs)
 
 
 def equal_to_single_runs(folder: Path, out: Path, count: int, steps: int) -> int:
