@@ -126,7 +126,7 @@ def exercise_gaussians_ply(path: Path) -> None:
     with messages() as said:
         arrays = ply.read_gaussians(path, allow_non_finite=True)
     truth = strictly(oracles.ply_vertices, path)
-    require(not truth.leftover or bool(said), "more follows than the header announces, in silence")
+    require(not truth.leftover or bool(said), "data after the announced end without a message")
     columns = truth.columns
     rest = [
         columns[f"f_rest_{i}"] for i in range(sum(name.startswith("f_rest_") for name in columns))
@@ -153,7 +153,7 @@ def exercise_points_ply(path: Path) -> None:
     with messages() as said:
         cloud = ply.read_points(path, allow_non_finite=True)
     truth = strictly(oracles.ply_vertices, path)
-    require(not truth.leftover or bool(said), "more follows than the header announces, in silence")
+    require(not truth.leftover or bool(said), "data after the announced end without a message")
     same(cloud.points, np.stack([truth.columns[name] for name in "xyz"], 1), "points")
     if (
         truth.types.get("red") == "B"

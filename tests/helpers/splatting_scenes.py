@@ -59,7 +59,7 @@ def random_cloud(
     )
 
 
-HOSTILE = {
+EXTREMES = {
     "means": [0.0, 0.3, -0.7, 3.0, -3.0, 1e4, 1e30, math.nan, math.inf],
     "quats": [0.0, 1.0, -1.0, 1e-20, 1e-40, 1e20, math.nan],
     "scales": [1e-8, 1e-4, 1e-2, 0.3, 1.0, 100.0, 1e4, 0.0, math.inf],
@@ -68,14 +68,14 @@ HOSTILE = {
 }
 
 
-def hostile_cloud(seed: int, n: int, hostile: dict[str, list[float]] = HOSTILE) -> Cloud:
-    """Half of the entries are picked from ``hostile``, the others are ordinary; the second half's
+def extreme_cloud(seed: int, n: int, extremes: dict[str, list[float]] = EXTREMES) -> Cloud:
+    """Half of the entries are picked from ``extremes``, the others are ordinary; the second half's
     means coincide with the first's.
     """
     g = torch.Generator().manual_seed(seed)
     cloud = random_cloud(n, seed)
     for name, x in zip(NAMES, cloud, strict=True):
-        values = torch.tensor(hostile[name], dtype=torch.float64)
+        values = torch.tensor(extremes[name], dtype=torch.float64)
         picked = values[torch.randint(len(values), x.shape, generator=g)]
         # A value that isn't finite removes the whole Gaussian; rarely enough that most stay.
         rare = picked.isfinite() | (torch.rand(x.shape, generator=g) < 0.1)

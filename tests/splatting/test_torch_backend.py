@@ -110,16 +110,16 @@ def test_random_clouds(seed, n, size, stretch, shape):
     )
 
 
-WITH_BRIGHT_COLORS = scenes.HOSTILE | {"colors": [*scenes.HOSTILE["colors"], 1e3]}
+WITH_BRIGHT_COLORS = scenes.EXTREMES | {"colors": [*scenes.EXTREMES["colors"], 1e3]}
 
 
 @repeatable
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 60), antialias=st.booleans())
-def test_hostile_clouds(seed, n, antialias):
+def test_extreme_clouds(seed, n, antialias):
     """Needles, discs, points, behind the camera, NaN, coincident, transparent, opaque: equal in
     float64, finite in float32.
     """
-    cloud, camera = scenes.hostile_cloud(seed, n, WITH_BRIGHT_COLORS), scenes.cameras(2, 19, 13)
+    cloud, camera = scenes.extreme_cloud(seed, n, WITH_BRIGHT_COLORS), scenes.cameras(2, 19, 13)
     both = [
         scenes.run(cloud, *camera, 19, 13, backend=b, antialias=antialias)
         for b in ("torch", "reference")

@@ -12,8 +12,8 @@ from tests.helpers.splatting_scenes import (
     Cloud,
     cameras,
     equal,
+    extreme_cloud,
     front_camera,
-    hostile_cloud,
     one_gaussian,
     random_cloud,
 )
@@ -197,7 +197,7 @@ def test_more_tile_intersections_than_32_bits_count(measured):
 def test_extreme_clouds_give_finite_images_and_gradients(backend, measured):
     drawn = 0
     for seed in range(20):
-        cloud = hostile_cloud(seed, 50)
+        cloud = extreme_cloud(seed, 50)
         assert finite(
             draw(
                 backend,
