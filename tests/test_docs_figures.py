@@ -38,6 +38,7 @@ CONSTANTS = {
         f"for {PruneOptions.steps} steps",
         f"the best {PruneConfig.keep:g} are kept",
     ],
+    "docs/viewing.md": [f"take at most {100 * SHARE_OF_TIME:g} % of the time"],
     "docs/robustness.md": [
         f"more than {runner.SECONDS:g} seconds of CPU time",
         f"at most {runner.FIXED_BYTES >> 20} MiB plus {runner.PER_BYTE} times the file size",
