@@ -257,8 +257,9 @@ class TargetCache:
     def plan(
         self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int
     ) -> None:
-        """Announce pictures that will be asked for. They are cast beside missing ones, many at
-        once, which takes a third of the time; not in advance, so that nobody waits for all of them.
+        """Announce images that will be requested. They are cast together with missing ones, many at
+        once, which is faster; not in advance, so that the first request does not wait for all of
+        them.
         """
         keyed = {_key(camera, height, width): camera for camera in _cameras(c2w, fovy)}
         self._planned |= {key: keyed[key] for key in keyed if key not in self._pictures}
