@@ -100,6 +100,19 @@ def test_after_a_stop_signal_no_other_stage_begins(tmp_path, monkeypatch, capsys
     assert begun == ["a"] and capsys.readouterr().err == "stopped\n"
 
 
+def test_a_stage_is_trained_by_one_process_at_a_time(folder, tmp_path, capsys, monkeypatch):
+    place = copied(folder, tmp_path / "run")
+    monkeypatch.setattr(train, "options_of", lambda args: options(place))
+    monkeypatch.setattr(loop.Training, "_show", lambda self: None)
+    arguments = [str(place), "--stages", "judge", "--images", "4"]
+    with train.locked(place, "judge"):
+        assert main(arguments) == 2 and not (place / "judge.pt").exists()
+        assert "another process trains the stage 'judge'" in capsys.readouterr().err
+        with train.locked(place, "unet"):  # other stages may be trained
+            pass
+    assert main(arguments) == 0
+
+
 def test_a_full_device_as_standard_output_stops_no_training(folder, tmp_path, monkeypatch, capfd):
     place = copied(folder, tmp_path / "run")
     monkeypatch.setattr(train, "options_of", lambda args: options(place))

@@ -6,11 +6,12 @@ command continues a training that was stopped anywhere. It runs unchanged on a G
 """
 
 import argparse
+import contextlib
 import functools
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -22,6 +23,7 @@ from ..core.command import run_command
 from ..core.errors import UserError, unknown
 from ..core.files import output_folder
 from ..core.options import is_number, shown
+from ..launch.folder_lock import FolderInUse, claim
 from ..launch.signals import interrupt
 from .autoencoder_stage import AutoencoderStage
 from .clip_stage import ClipStage
@@ -125,15 +127,38 @@ def train(options: Options, stages: Sequence[str], images: Optional[int] = None)
     """Train the stages in order.
 
     Raises:
+        UserError: another process trains one of them in this folder.
         Terminated, KeyboardInterrupt: a signal stopped one, after it wrote its checkpoint.
     """
     for name in (name for name in STAGES if name in stages):
-        training = Training(STAGES[name](options))
-        progress = training.run(images)
+        with locked(options.folder, name):
+            training = Training(STAGES[name](options))
+            progress = training.run(images)
         hours = progress.seconds / 3600
         print(f"{name}: {progress.images} images in {hours:.2f} hours", flush=True)
         if training.signum:
             interrupt(training.signum)
+
+
+@contextlib.contextmanager
+def locked(folder: Path, name: str) -> Iterator[None]:
+    """Let no other process train this stage in this folder meanwhile: their checkpoints would
+    replace each other's.
+
+    Raises:
+        UserError: another process trains it.
+    """
+    try:
+        claimed = claim(folder / "locks" / name)
+    except FolderInUse as error:
+        raise UserError(
+            f"another process trains the stage {name!r} in {folder}: wait until it ends, or give "
+            "another folder"
+        ) from error
+    try:
+        yield
+    finally:
+        claimed.release()
 
 
 def run(args: argparse.Namespace) -> None:
