@@ -14,9 +14,9 @@ from typing import Any, Optional
 
 from ..core.command import run_command
 from ..core.errors import UserError
+from ..core.signals import raised_signals
 from ..launch.experiment import configure_logging
 from ..launch.folder_lock import FolderInUse, claim, require_writable
-from ..launch.signals import raised_signals
 from . import cluster
 from .assets import Recipe
 from .display import Display

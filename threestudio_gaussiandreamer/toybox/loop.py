@@ -24,7 +24,7 @@ from ..core.checkpoint_file import load_file, save_file
 from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..core.images import write as write_picture
-from ..launch.signals import restore_handlers, set_handlers
+from ..core.signals import restore_handlers, set_handlers
 
 EMA_DECAY = 0.999
 WARMUP, DECAY_START = 200, 10_000

@@ -23,8 +23,8 @@ from ..core.command import run_command
 from ..core.errors import UserError, unknown
 from ..core.files import output_folder
 from ..core.options import is_number, shown
+from ..core.signals import interrupt
 from ..launch.folder_lock import FolderInUse, claim
-from ..launch.signals import interrupt
 from .autoencoder_stage import AutoencoderStage
 from .clip_stage import ClipStage
 from .judge_stage import SEED_OFFSET, JudgeStage
