@@ -139,7 +139,8 @@ def test_the_low_memory_configuration_is_used_where_it_is_valid():
 )
 def test_a_folder_of_another_farm_is_refused(tmp_path, other, message):
     require_same_farm(Place(tmp_path), RECIPE)
-    require_same_farm(Place(tmp_path), RECIPE)
+    moved = (Source("elsewhere/a.yaml", b"x: 1"),)
+    require_same_farm(Place(tmp_path), RECIPE._replace(sources=moved))
     with pytest.raises(ValueError, match=f"belongs to another farm: {message}"):
         require_same_farm(Place(tmp_path), other)
 

@@ -178,6 +178,8 @@ def test_many_parts_of_a_ledger_are_joined(memory, monkeypatch, tmp_path):
         ledger.append([{"name": "fox", "key": FOX.key, "state": RUNNING}])
     ledger.append([{"name": "fox", "key": FOX.key, "state": FINISHED}])
     assert len(place.names("ledger")) == 7
+    read = open_ledger(RemotePlace(memory, scratch=tmp_path / "a"), only_read=True)
+    assert read.state(FOX) == FINISHED and len(place.names("ledger")) == 7
     joined = open_ledger(RemotePlace(memory, scratch=tmp_path / "b"))
     assert joined.state(FOX) == FINISHED and len(place.names("ledger")) == 1
     assert open_ledger(RemotePlace(memory, scratch=tmp_path / "c")).state(FOX) == FINISHED

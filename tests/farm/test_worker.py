@@ -19,6 +19,7 @@ from threestudio_gaussiandreamer.farm.worker import (
     count_attempts,
     outcome_of,
 )
+from threestudio_gaussiandreamer.launch.folder_lock import FolderInUse
 
 JOB = Job(Row("fox", "a fox"))
 
@@ -89,6 +90,35 @@ def test_what_was_made_with_much_memory_is_not_gone_on_with(place, monkeypatch):
             Worker().make(saving, setting(place))
         assert (folder / "ckpts").exists() == expected
         (folder / "ckpts").mkdir(exist_ok=True)
+
+
+def test_a_later_session_goes_on_with_the_low_memory_configuration(place, monkeypatch):
+    tries = []
+
+    def fails(self, job, folder, attempt):
+        tries.append(job.saves_memory)
+        raise ValueError("killed")
+
+    monkeypatch.setattr(Worker, "_run", fails)
+    Worker().make(JOB._replace(saves_memory=True), setting(place))
+    Worker().make(JOB, setting(place))
+    assert tries == [True, True]
+
+
+def test_a_folder_that_a_dying_process_still_holds_is_waited_for(monkeypatch):
+    monkeypatch.setattr(worker.time, "sleep", lambda seconds: None)
+    codes = [FolderInUse("held"), FolderInUse("held"), 0]
+
+    class Run:
+        def run(self):
+            code = codes.pop(0)
+            if code:
+                raise code
+            return code
+
+    made = []
+    run, code = worker.run_when_unlocked(lambda: made.append(Run()) or made[-1])
+    assert code == 0 and run is made[2] and not codes
 
 
 def test_a_machine_without_the_folder_is_named(place):

@@ -141,7 +141,7 @@ def run_farm(args: argparse.Namespace) -> int:
     root, overrides = split_root(args.overrides)
     place = place_of(args.out or f"{root or root_of(args.config)}/farm-{args.prompts.stem}")
     if args.report:
-        return report(args, place, open_ledger(place))
+        return report(args, place, open_ledger(place, only_read=True))
     if not is_url(str(place)):
         require_writable(place.folder)
     # before Ray starts: this takes a second

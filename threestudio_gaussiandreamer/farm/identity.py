@@ -3,6 +3,7 @@ assets are made with."""
 
 import hashlib
 import json
+from pathlib import Path
 from typing import Any
 
 from .. import __version__
@@ -18,9 +19,10 @@ def identity(recipe: Recipe) -> dict[str, Any]:
     """Return what the assets of a farm depend on beside their rows."""
     return {
         "version": __version__,
-        "configurations": {
-            source.name: hashlib.sha256(source.content).hexdigest() for source in recipe.sources
-        },
+        "configurations": [
+            f"{Path(source.name).name} {hashlib.sha256(source.content).hexdigest()[:16]}"
+            for source in recipe.sources
+        ],
         "overrides": list(recipe.overrides),
         "device": "cpu" if recipe.cpu else "gpu",
         "cores": recipe.cores if recipe.cpu else None,

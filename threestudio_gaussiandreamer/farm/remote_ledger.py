@@ -15,27 +15,33 @@ MOST_PARTS = 100
 """Above this number, the parts are joined into one at the start."""
 
 
-def open_ledger(place: Place) -> Ledger:
-    """Return the ledger of a farm."""
-    return RemoteLedger(place) if isinstance(place, RemotePlace) else Ledger(place.folder / FILE)
+def open_ledger(place: Place, *, only_read: bool = False) -> Ledger:
+    """Return the ledger of a farm.
+
+    Args:
+        only_read: nothing will be appended, and another command may append at the same time.
+    """
+    if isinstance(place, RemotePlace):
+        return RemoteLedger(place, only_read)
+    return Ledger(place.folder / FILE)
 
 
 class RemoteLedger(Ledger):
     """A local copy of the ledger, and its parts below the URL."""
 
-    def __init__(self, place: RemotePlace) -> None:
+    def __init__(self, place: RemotePlace, only_read: bool = False) -> None:
         self.place = place
         self.waiting: list[bytes] = []
         self.uploaded = time.monotonic()
         self.count = 0
-        path = place.folder / FILE
+        path = place.folder / (f"read-{FILE}" if only_read else FILE)
         path.parent.mkdir(parents=True, exist_ok=True)
         parts = place.names(FOLDER)
         with open(path, "wb") as file:
             for part in parts:
                 file.write(place.read(part) or b"")
         super().__init__(path)
-        if len(parts) > MOST_PARTS:
+        if len(parts) > MOST_PARTS and not only_read:
             self._join(parts)
 
     def copy(self, content: bytes) -> None:
@@ -46,18 +52,16 @@ class RemoteLedger(Ledger):
     def upload(self) -> None:
         """Upload the lines that are waiting, as one part."""
         if self.waiting:
-            self._write_part(b"".join(self.waiting))
+            self.count += 1
+            # sorted by time, also between drivers
+            name = f"{FOLDER}/{time.time_ns():020d}-{self.count:06d}.jsonl"
+            self.place.write(name, b"".join(self.waiting))
             self.waiting = []
         self.uploaded = time.monotonic()
 
     def close(self) -> None:
         self.upload()
         super().close()
-
-    def _write_part(self, content: bytes) -> None:
-        self.count += 1
-        # sorted by time, also between drivers
-        self.place.write(f"{FOLDER}/{time.time_ns():020d}-{self.count:06d}.jsonl", content)
 
     def _join(self, parts: list[str]) -> None:
         """Replace the parts by one with the last line of each asset."""
@@ -67,5 +71,6 @@ class RemoteLedger(Ledger):
                 file.seek(entry.offset)
                 last.append(file.readline())
         # a reader between the two steps sees these lines twice, which changes nothing
-        self._write_part(b"".join(last))
+        joined = parts[-1].removesuffix(".jsonl") + "-joined.jsonl"
+        self.place.write(joined, b"".join(last))
         self.place.remove(parts)

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
@@ -104,7 +104,9 @@ class Worker:
 
     def _make(self, job: Job) -> dict[str, Any]:
         folder = self.setting.place.work_folder(job.row)
-        if job.saves_memory and not marked(folder):
+        if marked(folder):  # by an earlier session, whose checkpoint this one goes on from
+            job = job._replace(saves_memory=True)
+        elif job.saves_memory:
             self.setting.place.discard(job.row)  # what was made with the other configuration
         folder.mkdir(parents=True, exist_ok=True)
         if job.saves_memory:
@@ -159,8 +161,10 @@ class Worker:
         with written_sources(assets.all_sources(self.setting.recipe, job)) as configs:
             root = folder.parents[1]
             argv = assets.launch_arguments(self.setting.recipe, job, configs, root)
-            run = prepare(parse_arguments(argv), argv, callbacks=[heartbeat], records_code=False)
-            return run, run_when_unlocked(run)
+            args = parse_arguments(argv)
+            return run_when_unlocked(
+                lambda: prepare(args, argv, callbacks=[heartbeat], records_code=False)
+            )
 
     def _send(self, beat: Beat) -> Any:
         return self.setting.board.report.remote(self.setting.number, beat)
@@ -177,14 +181,21 @@ def answer_of(handle: Any) -> Optional[bool]:
         return None
 
 
-def run_when_unlocked(run: Any) -> int:
-    """Run, waiting for a process of a killed driver that may not have ended yet."""
+def run_when_unlocked(prepared: Callable[[], Any]) -> tuple[Any, int]:
+    """Run, waiting for a process of a killed driver that may not have ended yet; return the run and
+    its exit code.
+
+    Args:
+        prepared: makes the run; called again after a wait, since that process may have written
+            newer checkpoints.
+    """
     from ..launch.folder_lock import FolderInUse
 
     deadline = time.monotonic() + SECONDS_FOR_LOCK
     while True:
+        run = prepared()
         try:
-            return run.run()
+            return run, run.run()
         except FolderInUse:
             if time.monotonic() > deadline:
                 raise
