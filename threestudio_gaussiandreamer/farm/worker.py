@@ -123,23 +123,8 @@ class Worker:
             run, code = self._run(job, folder, attempt)
         if code:
             return {"state": STOPPED, "error": f"stopped by signal {code - 128}"}
-        result = {
-            "key": job.row.key,
-            "hash": assets.digest(folder),
-            "files": [path.relative_to(folder).as_posix() for path in assets.exported(folder)],
-            "picture": assets.picture(folder),
-            "page": assets.newest(folder, "it*-export/view.html"),
-            "scores": assets.scores(folder),
-            "steps": run.trainer.global_step,
-            "gaussians": len(run.system.geometry) if hasattr(run.system.geometry, "__len__") else 0,
-            "seconds": round(time.monotonic() - began, 3),
-            "megabytes": peak_megabytes(),
-            "attempts": attempt,
-            "saves_memory": job.saves_memory,
-            "host": socket.gethostname(),
-            "process": os.getpid(),
-            "loads": load_counts(),
-        }
+        seconds = round(time.monotonic() - began, 3)
+        result = {**result_of(job, folder, run), "seconds": seconds, "attempts": attempt}
         assets.write_result(folder, result)
         self.setting.place.publish(job.row)
         return {"state": FINISHED, **result}
@@ -168,6 +153,26 @@ class Worker:
 
     def _send(self, beat: Beat) -> Any:
         return self.setting.board.report.remote(self.setting.number, beat)
+
+
+def result_of(job: Job, folder: Path, run: Any) -> dict[str, Any]:
+    """Return what a finished run has made, and where."""
+    geometry = run.system.geometry
+    return {
+        "key": job.row.key,
+        "hash": assets.digest(folder),
+        "files": [path.relative_to(folder).as_posix() for path in assets.exported(folder)],
+        "picture": assets.picture(folder),
+        "page": assets.newest(folder, "it*-export/view.html"),
+        "scores": assets.scores(folder),
+        "steps": run.trainer.global_step,
+        "gaussians": len(geometry) if hasattr(geometry, "__len__") else 0,
+        "megabytes": peak_megabytes(),
+        "saves_memory": job.saves_memory,
+        "host": socket.gethostname(),
+        "process": os.getpid(),
+        "loads": load_counts(),
+    }
 
 
 def answer_of(handle: Any) -> Optional[bool]:
