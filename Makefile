@@ -58,6 +58,7 @@ charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbe
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting --from-csv
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.chart_runs
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.attributes --objects
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.mesh --objects
 
 # the meshes to measure on: make measure-charts OBJECTS="toy.glb path/to/spot.glb path/to/duck.glb"
 OBJECTS = toy.glb
@@ -69,6 +70,7 @@ measure-charts: $(VENV)/ready-for-charts     ## repeat the measurements, about t
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.attributes --objects $(OBJECTS) --seeds 0 1 2 3 4
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.after_run --objects $(OBJECTS) --seeds 0 1 2 3 4
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.viewers --objects $(OBJECTS)
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.mesh --objects $(OBJECTS)
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.known_answer
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.known_answer --count 1000
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.bench_prune

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from benchmarks.markdown import markdown
 from benchmarks.quality import failure_table, formats
+from benchmarks.quality import mesh as mesh_quality
 from benchmarks.quality import tables as quality
 from benchmarks.quality.runs import ROOT
 from benchmarks.quality.tables import DIFFERENCES, difference_row, last_rows, medians, named
@@ -62,6 +63,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "README.md": {"measured": readme_table},
     "docs/failures.md": {"tables": failure_table.tables},
     "docs/formats.md": {"formats": formats.table, "producers": formats.producers},
+    "docs/mesh.md": {"front": mesh_quality.front},
     "docs/rasteriser.md": {
         "presets": splatting.presets,
         "thresholds": splatting.thresholds,

@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks.markdown import markdown
 from benchmarks.quality.chart_runs import COLOURS, Row, caption, objects_of
 from benchmarks.quality.runs import (
     CHARTS,
@@ -32,6 +33,7 @@ from benchmarks.quality.runs import (
     rows_of,
     train,
 )
+from benchmarks.quality.tables import medians
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.cameras import held_out_orbit, to_opencv
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
@@ -126,6 +128,32 @@ def mesh_views(mesh: Mesh) -> Float[Tensor, "V H W 3"]:
     cameras = zip(orbit.c2w.double().numpy(), orbit.fovy.tolist(), strict=True)
     images = MeshCaster(mesh).render_views(cameras, SIZE, SIZE)
     return torch.from_numpy(over_background(images, np.ones(3, np.float32)))
+
+
+# ---- the table -----------------------------------------------------------------------------------
+
+NAMES = {
+    "faces": "{} faces",
+    "texture": "texture of {}²",
+    "resolution": "{} cells",
+    "density": "density instead of fusion, {} cells",
+}
+"""How the table calls a variant."""
+
+
+def front() -> str:
+    """Return the table of docs/mesh.md."""
+    found = rows_of("mesh")
+    names = list(dict.fromkeys((row["variant"], row["x"]) for row in found))
+    lines = []
+    for variant, x in names:
+        same = [row for row in found if (row["variant"], row["x"]) == (variant, x)]
+        closed = "yes" if all(row["closed"] == "True" for row in same) else "no"
+        name = NAMES[variant].format(f"{int(x):,}")
+        lines.append(
+            (name, medians(same, "psnr", 1, 1), medians(same, "cpu_seconds", 1, 1), closed)
+        )
+    return markdown(("option", "PSNR, dB", "CPU seconds", "closed"), lines)
 
 
 # ---- the chart -----------------------------------------------------------------------------------

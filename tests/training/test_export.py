@@ -6,7 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
+from tests.helpers.painted_ball import painted_ball
 from tests.training.runs import cloud_of, launch, run_folder
+from threestudio_gaussiandreamer.exporters import mesh as mesh_exporter
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.formats.spz import read_spz
@@ -122,3 +124,41 @@ def test_every_format_is_exported_and_says_that_it_was_trained_antialiased(tmp_p
     assert [cloud.antialiased for cloud in stored] == [True] * 5
     assert [len(cloud.gaussians.means) for cloud in stored] == [200] * 5
     assert "SplatRenderMode: mip" in (export / "gaussians.usda").read_text()
+
+
+def test_a_mesh_is_exported_beside_the_cloud_as_the_run_draws(tmp_path, painted_box, monkeypatch):
+    seen = []
+    convert = mesh_exporter.mesh_from_gaussians
+    monkeypatch.setattr(
+        mesh_exporter,
+        "mesh_from_gaussians",
+        lambda gaussians, options: seen.append(options) or convert(painted_ball(200), options),
+    )
+    small = "{faces: 200, texture: 64, views: 8, view_size: 64, resolution: 16}"
+    options = ["system.exporter.formats=[ply,mesh]", f"system.exporter.options={{mesh: {small}}}"]
+    steps = ["trainer.max_steps=1", "trainer.val_check_interval=1"]
+    drawn = ["system.renderer.antialias=true", "system.renderer.eps2d=0.2"]
+    assert launch(tmp_path, painted_box, *options, *steps, *drawn) == 0
+    export = run_folder(tmp_path) / "save" / "it1-export"
+    files = {"gaussians.ply", "mesh.glb", "mesh.obj", "mesh.mtl", "mesh.png"}
+    assert files <= {path.name for path in export.iterdir()}
+    assert (seen[0].eps2d, seen[0].antialias, seen[0].faces) == (0.2, True, 200)
+
+
+@pytest.mark.parametrize(
+    "option, said",
+    [
+        ("faces=7", "system.exporter.faces: expected a whole number from 100"),
+        ("texture=9999999", "system.exporter.texture: expected a whole number from 64"),
+        ("save_name=a.fbx", "system.exporter.save_name: expected the name of a .glb"),
+    ],
+)
+def test_wrong_options_of_the_mesh_are_refused_before_training(
+    tmp_path, painted_box, capsys, option, said
+):
+    options = [
+        "system.exporter_type=mesh-exporter",
+        f"system.exporter={{{option.replace('=', ': ')}}}",
+    ]
+    assert launch(tmp_path, painted_box, *options) == 2
+    assert said in capsys.readouterr().err
