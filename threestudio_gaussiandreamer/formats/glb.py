@@ -9,10 +9,8 @@ The extension has no place for antialiasing and notes, so they are in ``extras``
 Compressions of the extension, kernels other than "ellipse", and nodes that scale by different
 factors along the axes aren't read."""
 
-import json
 import logging
 import os
-import struct
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -20,11 +18,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.file_memory import require_file_memory
-from ..core.files import atomic_file, existing_file
+from ..core.files import existing_file
 from ..gaussians.axes import rotate
 from ..gaussians.gaussians import Gaussians, finite
 from ..gaussians.sh import COEFFICIENTS, sh0_colors
 from ..meshes.colors import srgb_to_linear
+from ..meshes.glb_file import write_glb_file
 from ..meshes.gltf import parse_errors
 from ..meshes.gltf_document import Document
 from ..meshes.gltf_poses import world_matrices
@@ -62,16 +61,8 @@ def write_glb(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence[str
     """
     gaussians = finite(gaussians, str(path))
     attributes = _attributes(gaussians)
-    document = _document(attributes, gaussians.means, notes)
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
     blocks = [values.tobytes() for values in attributes.values()]
-    binary = sum(map(len, blocks))
-    with atomic_file(path) as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + binary))
-        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        file.write(struct.pack("<I4s", binary, b"BIN\0"))
-        file.writelines(blocks)
+    write_glb_file(path, _document(attributes, gaussians.means, notes), blocks)
 
 
 def read_glb(path: str | os.PathLike) -> Gaussians:
@@ -144,19 +135,13 @@ def _document(
         "mode": POINTS,
         "extensions": {EXTENSION: SPLATTING},
     }
-    views, accessors, at = [], [], 0
-    for index, values in enumerate(attributes.values()):
-        place = {"buffer": 0, "byteOffset": at, "byteLength": values.nbytes}
-        views.append(place | {"target": ARRAY_BUFFER})
-        accessors.append(_accessor(index, values))
-        at += values.nbytes
+    accessors = [_accessor(index, values) for index, values in enumerate(attributes.values())]
     accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
     return head | {
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [primitive]}],
-        "buffers": [{"byteLength": at}],
-        "bufferViews": views,
+        "bufferViews": [{"target": ARRAY_BUFFER} for _ in attributes],
         "accessors": accessors,
     }
 

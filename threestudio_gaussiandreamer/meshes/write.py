@@ -6,10 +6,8 @@ position once however often a seam repeats it, so the file is as closed as the m
 it, as glTF requires."""
 
 import io
-import json
 import os
-import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +16,7 @@ from jaxtyping import Float, Int, UInt8
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
+from .glb_file import write_glb_file
 from .mesh import Mesh
 
 UNLIT = "KHR_materials_unlit"
@@ -94,30 +93,6 @@ def write_textured_glb(path: str | os.PathLike, mesh: Mesh, *, unlit: bool = Fal
     }
     blocks = [values.tobytes() for values in arrays.values()]
     write_glb_file(path, _document(arrays, unlit), [*blocks, png_bytes(mesh.texture)])
-
-
-def write_glb_file(
-    path: str | os.PathLike, document: Mapping[str, Any], blocks: Sequence[bytes]
-) -> None:
-    """Write the JSON of a GLB and its binary blocks, which become the buffer views, in order.
-
-    Args:
-        document: without ``buffers``, and with ``bufferViews`` that lack place and size.
-    """
-    padded = [block + b"\0" * (-len(block) % 4) for block in blocks]
-    starts = np.cumsum([0, *map(len, padded)]).tolist()
-    views = [
-        {"buffer": 0, "byteOffset": start, "byteLength": len(block), **view}
-        for start, block, view in zip(starts, blocks, document["bufferViews"], strict=False)
-    ]
-    whole = {**document, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
-    text = json.dumps(whole, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    with atomic_file(path) as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + starts[-1]))
-        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
-        file.writelines(padded)
 
 
 def _document(arrays: Mapping[str, np.ndarray], unlit: bool) -> dict[str, Any]:
