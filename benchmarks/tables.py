@@ -18,6 +18,7 @@ from benchmarks.quality.tables import DIFFERENCES, difference_row, last_rows, me
 from benchmarks.robustness import tables as robustness
 from benchmarks.splatting import tables as splatting
 from benchmarks.start import tables as start
+from benchmarks.viewers import tables as viewers
 from tests.stability import report as stability
 
 # ---- README.md -----------------------------------------------------------------------------------
@@ -72,6 +73,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "docs/step_time.md": {"start": start.first_step},
     "docs/robustness.md": {"fuzz": robustness.fuzz, "long run": robustness.long_run},
     "docs/farm.md": {"farm": robustness.farm},
+    "docs/viewing.md": {"quality": viewers.page_quality, "speed": viewers.page_speed},
 }
 
 

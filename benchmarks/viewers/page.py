@@ -1,10 +1,10 @@
 """The page that ``view --html`` writes, in headless Chromium: dB to our own render, size, seconds.
 
-    python -m benchmarks.viewers.page toy:toy.ply spot:spot.ply duck:duck.ply
+    python -m benchmarks.viewers.page toy:toy.ply spot:spot.ply duck:duck.ply fog
 
 Each cloud is given as name:file and drawn at 256^2 from 8 views, blended into floats as the page
-does where it can, into half floats as it does while the picture moves, and into 8 bits; a fog of
-faint Gaussians is drawn too. Then clouds of many Gaussians are timed in a window of 800 x 600.
+does where it can, into half floats as it does while the picture moves, and into 8 bits; ``fog`` is
+made of 2,000 faint Gaussians. Then clouds of many Gaussians are timed in a window of 800 x 600.
 Chromium draws in software here (SwiftShader), so the times of a frame are those of the processor
 and no graphics card's. Rows go to docs/charts/page.csv.
 """
@@ -57,17 +57,14 @@ TIME_FRAME = """viewer.then(async v => {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("clouds", nargs="*", metavar="NAME:FILE")
+    parser.add_argument("clouds", nargs="*", metavar="NAME:FILE|fog")
     parser.add_argument("--counts", type=int, nargs="*", default=[100_000, 1_000_000])
     arguments = parser.parse_args()
     if chromium() is None:
         parser.error("no Chromium is installed")
     for given in arguments.clouds:
         name, _, file = given.partition(":")
-        run = RunFiles.around(Path(file))
-        settings = run.settings if run else RenderSettings()
-        record(quality_rows(name, read_cloud(file), settings))
-    record(quality_rows("fog", fog(), RenderSettings(alpha_min=PRESETS["accurate"])))
+        record(quality_rows(name, *(cloud_and_settings(file) if file else fog())))
     for count in arguments.counts:
         record(speed_rows(ball(count)))
 
@@ -78,10 +75,17 @@ def record(rows: Iterator[dict[str, Any]]) -> None:
         append_rows("page", COLUMNS.split(","), [row])
 
 
-def fog(count: int = 2000) -> StoredCloud:
+def cloud_and_settings(file: str) -> tuple[StoredCloud, RenderSettings]:
+    """Read a cloud and how its run has drawn it."""
+    run = RunFiles.around(Path(file))
+    return read_cloud(file), run.settings if run else RenderSettings()
+
+
+def fog(count: int = 2000) -> tuple[StoredCloud, RenderSettings]:
     """Make Gaussians of opacity 0.0038 that lie in front of each other."""
     rng = np.random.default_rng(0)
-    return cloud_of(rng.normal(size=(count, 3)) * 0.3, 0.3, np.log(0.0038), rng)
+    faint = cloud_of(rng.normal(size=(count, 3)) * 0.3, 0.3, np.log(0.0038), rng)
+    return faint, RenderSettings(alpha_min=PRESETS["accurate"])
 
 
 def ball(count: int) -> StoredCloud:
@@ -133,10 +137,10 @@ def speed_rows(cloud: StoredCloud) -> Iterator[dict[str, Any]]:
             page.evaluate(
                 "new Promise(done => { const wait = () => "
                 "document.body.classList.contains('drawn') ? done() : setTimeout(wait, 20); "
-                "wait(); })"
+                "wait(); }).then(() => viewer).then(v => v.renderer.pixels().length)"
             )
             first = {"first_picture_s": time.perf_counter() - start}
-            frames = rounded(frame_times(page), 0)
+            frames = frame_times(page)
         yield {"cloud": "ball", "target": "half floats", **facts, **rounded(first, 1), **frames}
 
 
@@ -144,7 +148,7 @@ def frame_times(page: Page) -> dict[str, float]:
     """Return the median milliseconds of sorting and drawing."""
     times: Sequence[Sequence[float]] = [page.evaluate(TIME_FRAME) for _ in range(FRAMES)]
     sorting, drawing = map(statistics.median, zip(*times, strict=True))
-    return {"sort_ms": sorting, "frame_ms": drawing}
+    return {"sort_ms": round(sorting), "frame_ms": round(drawing)}
 
 
 def written(path: Path, cloud: StoredCloud, options: PageOptions) -> dict[str, Any]:

@@ -62,6 +62,13 @@ def test_an_empty_cloud_is_refused():
         page(Shown(cloud(0), "result"), options())
 
 
+def test_gaussians_beyond_float32_are_refused():
+    large = cloud(5)
+    large.gaussians.log_scales[:] = 80.0
+    with pytest.raises(UserError, match="float32 can't render"):
+        page(Shown(large, "result"), options())
+
+
 def test_too_many_gaussians_are_refused_with_the_way_out(monkeypatch):
     monkeypatch.setattr(page_module, "MAX_GAUSSIANS", 100)
     with pytest.raises(UserError, match="prune it first.*threestudio_gaussiandreamer.prune"):

@@ -99,7 +99,7 @@ def views_around(
         UserError: the radius of the cloud exceeds ``MAX_RADIUS``.
     """
     centre, radius = bounds(cloud)
-    _require_renderable(cloud, radius)
+    require_renderable(cloud, radius)
     c2w = _spiral(count, radius, turn, sines, distances).to(centre)
     if to_z_up is not None:
         c2w[:, :3] = to_z_up.T.to(c2w) @ c2w[:, :3]
@@ -112,7 +112,8 @@ def views_around(
     return Views(viewmats, Ks, c2w[:, :3, 3], size, NEAR * radius, backgrounds)
 
 
-def _require_renderable(cloud: Gaussians, radius: float) -> None:
+def require_renderable(cloud: Gaussians, radius: float) -> None:
+    """Raise UserError if the radius of a cloud exceeds ``MAX_RADIUS``."""
     if not radius <= MAX_RADIUS:
         raise UserError(
             f"the Gaussians reach {radius:g} units from their centre, further than "

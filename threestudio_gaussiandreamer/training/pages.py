@@ -14,6 +14,7 @@ prior/gaussians.spz         the cloud that training has started with
 from pathlib import Path
 from typing import Any, Optional
 
+from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..core.images import write_animation
 from ..exporters.base import read_gaussians
@@ -27,7 +28,7 @@ from ..view.page import (
     PageOptions,
     Shown,
     decibels,
-    write_page,
+    page,
 )
 from ..view.poster import picture
 from ..view.render import RenderSettings, first_pose
@@ -45,13 +46,15 @@ TURNTABLE_FRAMES, TURNTABLE_SIZE, TURNTABLE_SECONDS = 40, 256, 4.0
 
 def save_first_cloud(system: Any) -> None:
     """Keep the cloud that training starts with, so that pages can show it beside the result."""
-    if system.cfg.pages and system._save_dir is not None and system.trainer.is_global_zero:
+    kept = system._save_dir is not None and _is_cloud(system.geometry)
+    if kept and system.cfg.pages and system.trainer.is_global_zero:
         first = StoredCloud(read_gaussians(system.geometry))
         write_cloud(system.get_save_path(FIRST_CLOUD), first, ".spz")
 
 
 def write_pages(system: Any, folder: str) -> None:
-    """Write the page and the poster of the cloud of ``system``, unless ``system.pages`` is off.
+    """Write the page and the poster of the cloud of ``system``, unless ``system.pages`` is off or a
+    page can't show it.
 
     Args:
         folder: of the exports, below the system's folder of results.
@@ -59,17 +62,17 @@ def write_pages(system: Any, folder: str) -> None:
     if not system.cfg.pages or not _is_cloud(system.geometry):
         return
     cloud = StoredCloud(read_gaussians(system.geometry)).in_axes(VIEWER_UP)
-    count = len(cloud.gaussians.means)
-    if not 0 < count <= MAX_GAUSSIANS:
-        warn(f"no {PAGE} is written for {count:,} Gaussians: it shows 1 to {MAX_GAUSSIANS:,}")
-        return
     run = RunFiles(Path(system.get_save_dir()).parent)
     options = _page_options(system, run)
     cloud = cloud._replace(antialiased=options.settings.antialias)
     result = Shown(cloud, "result", decibels(run.psnr("result", system.true_global_step)))
-    write_page(
-        Path(system.get_save_path(f"{folder}/{PAGE}")), result, options, _first_cloud(system, run)
-    )
+    try:
+        content = page(result, options, _first_cloud(run))
+    except UserError as error:
+        warn(f"no {PAGE} is written: {error}")
+        return
+    with atomic_file(system.get_save_path(f"{folder}/{PAGE}")) as file:
+        file.write(content.encode())
     with atomic_file(system.get_save_path(f"{folder}/{POSTER}"), durable=False) as file:
         picture(cloud, options.settings, first_pose(cloud), POSTER_SIZE).save(file, "png")
 
@@ -120,7 +123,7 @@ def _background(background: Any) -> tuple[float, float, float]:
     return (red, green, blue)
 
 
-def _first_cloud(system: Any, run: RunFiles) -> Optional[Shown]:
+def _first_cloud(run: RunFiles) -> Optional[Shown]:
     """Return the cloud that training has started with, if it is there and a page can show it."""
     path = run.save / FIRST_CLOUD
     if not path.is_file():

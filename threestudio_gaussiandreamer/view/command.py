@@ -10,6 +10,7 @@ clouds are drawn with the defaults below."""
 
 import argparse
 import functools
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Optional
@@ -30,6 +31,8 @@ from .render import RenderSettings
 from .run_files import RunFiles, is_run
 from .run_index import write_index
 
+LONG_WORK = 200_000
+"""Gaussians from which writing a page takes seconds, so that it is announced."""
 CHECKPOINT_ENDINGS = (".ckpt", ".pt", ".pth")
 OPTIONS: dict[str, dict[str, Any]] = {
     "--title": {"help": "what the page is called (default: the run's prompt, or the file's name)"},
@@ -112,7 +115,10 @@ def write_cloud_page(source: Path, out: Path, args: argparse.Namespace) -> None:
     background = _color(args.background)
     _require_dilation(args.eps2d)
     stored = read_any(source, args.up)
-    require_page_size(len(stored.gaussians.means), str(source))
+    count = len(stored.gaussians.means)
+    require_page_size(count, str(source))
+    if count > LONG_WORK:
+        print(f"{out}: packing {count:,} Gaussians", file=sys.stderr, flush=True)
     run_files = RunFiles.around(source)
     options = PageOptions(
         title=args.title or (run_files.prompt if run_files else source.name),
@@ -122,7 +128,7 @@ def write_cloud_page(source: Path, out: Path, args: argparse.Namespace) -> None:
     )
     quality = decibels(run_files.psnr("result")) if _is_result(source, run_files) else ""
     write_page(out, Shown(stored, "result", quality), options)
-    print(f"{out}: {len(stored.gaussians.means):,} Gaussians, {out.stat().st_size / 1e6:.2f} MB")
+    print(f"{out}: {count:,} Gaussians, {out.stat().st_size / 1e6:.2f} MB")
 
 
 def served(args: argparse.Namespace) -> LiveView:

@@ -72,7 +72,8 @@ def write_page(
         before: a second cloud to compare with, such as the prior; it is stored in lower precision.
 
     Raises:
-        UserError: there are too many Gaussians or none, or the file can't be written.
+        UserError: there are too many Gaussians or none, they reach too far for float32, or the file
+            can't be written.
     """
     content = page(shown, options, before)
     with atomic_file(path) as file:

@@ -11,7 +11,7 @@ from ..cameras import orbit_c2w, to_opencv
 from ..formats.gaussian_files import StoredCloud
 from ..gaussians.axes import WORLD_UP, rotation_between
 from ..gaussians.sh import bounded_colors, sh_to_unclamped_colors
-from ..gaussians.views import EPS2D, FOVY, NEAR, bounds
+from ..gaussians.views import EPS2D, FOVY, NEAR, bounds, require_renderable
 from ..splatting import PRESETS, rasterize
 
 ELEVATION, AZIMUTH = 15.0, 30.0
@@ -61,8 +61,14 @@ class Pose(NamedTuple):
 
 
 def first_pose(cloud: StoredCloud) -> Pose:
-    """Return the pose that shows the whole cloud from the front."""
-    centre, radius = bounds(cloud.gaussians.tensors())
+    """Return the pose that shows the whole cloud from the front.
+
+    Raises:
+        UserError: the cloud is too large for float32.
+    """
+    gaussians = cloud.gaussians.tensors()
+    centre, radius = bounds(gaussians)
+    require_renderable(gaussians, radius)
     to_world = torch.from_numpy(rotation_between(cloud.up, WORLD_UP)).float()
     target = (to_world @ centre).tolist()
     return Pose(tuple(target), MARGIN * radius / math.sin(FOVY / 2))

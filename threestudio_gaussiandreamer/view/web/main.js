@@ -29,7 +29,7 @@ class Viewer {
     this.clouds = [];
     this.shown = 0;
     this.background = colorOf(meta.background);
-    this.turning = this.pending = this.sorted = false;
+    this.turning = this.moving = this.pending = this.sorted = false;
     this.scale = 1;
     this.lastFrame = this.lastChange = 0;
   }
@@ -42,6 +42,7 @@ class Viewer {
     const scene = this.renderer.upload(columns, facts.degree);
     const order = new DepthOrder(columns, (sorted, visible) => {
       this.renderer.setOrder(scene, sorted, visible);
+      if (this.cloud?.scene !== scene) return;  // another cloud is shown by now
       this.sorted = true;
       this.invalidate();
     });
@@ -92,7 +93,8 @@ class Viewer {
     this.lastFrame = now;
     if (this.turning) this.turnOn(Math.min(elapsed, 200));
     const moving = this.turning || performance.now() - this.lastChange < STILL_AFTER;
-    if (moving && elapsed < 1000) this.adapt(elapsed);
+    if (moving && this.moving) this.adapt(elapsed);
+    this.moving = moving;
     const { targets } = this.renderer;
     this.draw(moving ? targets.moving : targets.still, moving ? this.scale : 1);
     document.body.classList.add("drawn");

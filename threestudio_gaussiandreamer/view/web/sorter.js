@@ -55,9 +55,7 @@ const ORDER_WIDTH = 2048;  // of the texture that takes the sorted numbers, in w
 class DepthOrder {
   constructor(columns, toSorted) {
     const source = new Blob([`(${sorter})()`], { type: "text/javascript" });
-    const address = URL.createObjectURL(source);
-    this.worker = new Worker(address);
-    URL.revokeObjectURL(address);
+    this.worker = new Worker(URL.createObjectURL(source));
     this.worker.postMessage({ means: columns.slice(0, 3) });
     this.buffer = new Uint32Array(Math.ceil(columns[0].length / ORDER_WIDTH) * ORDER_WIDTH);
     this.toSorted = toSorted;
