@@ -32,7 +32,6 @@ CONSTANTS = {
         f"take {LIST_BYTES} bytes per intersection, the backward pass {ROW_BYTES} more",
     ],
     "docs/failures.md": [f"farther than {FLOATERS:.0%}".replace("%", " %")],
-    "docs/viewing.md": [f"at most {SHARE_OF_TIME:.0%}".replace("%", " %")],
     "docs/models.md": [f"`max_residual_mm` ({MotionPrior.Config.max_residual_mm:g})"],
     "docs/pruning.md": [
         f"for {PruneOptions.steps} steps",
