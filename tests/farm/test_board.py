@@ -24,13 +24,17 @@ def test_the_board_knows_since_when_nothing_has_changed(monkeypatch):
     assert found.report(0, BEAT) is True
 
 
-def test_reports_are_rare_and_their_answers_are_not_waited_for():
-    sent, answers = [], iter([None, None, True])
+def test_reports_are_rare_and_their_answers_are_not_waited_for(monkeypatch):
+    now = SimpleNamespace(seconds=0.0)
+    monkeypatch.setattr(board.time, "monotonic", lambda: now.seconds)
+    sent, answers = [], iter([None, True, False])
     reporter = Reporter(lambda beat: sent.append(beat) or len(sent), lambda handle: next(answers))
-    assert [reporter(BEAT) for _ in range(4)] == [False, False, False, True]
-    assert len(sent) == 1
-    reporter.answer = lambda handle: None
-    assert reporter(BEAT, now=True) and len(sent) == 2
+    assert [reporter(BEAT) for _ in range(9)] == [False] * 9 and len(sent) == 1
+    now.seconds = 1.0
+    assert not reporter(BEAT) and len(sent) == 2  # the first answer hasn't come
+    assert reporter(BEAT, now=True) and len(sent) == 3
+    now.seconds = 2.0
+    assert reporter(BEAT) and reporter(BEAT)
 
 
 def test_a_run_is_stopped_once():

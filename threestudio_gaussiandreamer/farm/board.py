@@ -67,9 +67,10 @@ class Reporter:
         Args:
             now: also if the last report was less than :data:`SECONDS_BETWEEN` ago.
         """
+        if not now and time.monotonic() < self.due:
+            return self.stopping
         if self.sent is not None:
             self.stopping = bool(self.answer(self.sent)) or self.stopping
-        if now or time.monotonic() >= self.due:
-            self.sent = self.send(beat)
-            self.due = time.monotonic() + SECONDS_BETWEEN
+        self.sent = self.send(beat)
+        self.due = time.monotonic() + SECONDS_BETWEEN
         return self.stopping
