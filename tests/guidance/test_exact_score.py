@@ -9,7 +9,7 @@ import torch
 from tests.guidance.exact_score_cases import batch, guidance, step, uniform
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion import sds
-from threestudio_gaussiandreamer.guidance.exact_score import direction_indices
+from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance, direction_indices
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.meshes import raycast
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
@@ -91,6 +91,32 @@ def test_view_exact_without_width_is_a_weighted_squared_error(mesh_path):
         comp_rgb_bg=BACKGROUNDS,
     )
     assert none.abs().max() < 1e-5  # float32 rounding of z against noise of size 1
+
+
+def test_the_noise_of_one_picture_cancels_and_is_not_drawn(mesh_path, monkeypatch):
+    rgb, views = uniform(3, 16, 16, 3), batch(*VIEWS)
+    out, grad = step(guidance(mesh_path), rgb, **views)
+    monkeypatch.setattr(ExactScoreGuidance, "known_error", lambda *_: None)
+    by_noise, expected = step(guidance(mesh_path), rgb, **views)
+    assert torch.allclose(grad, expected, rtol=1e-4, atol=1e-5 * expected.abs().max())
+    assert torch.isclose(out["loss_sds"], by_noise["loss_sds"], rtol=1e-4)
+    assert out.keys() == by_noise.keys() and out["perplexity"] == by_noise["perplexity"] == 1
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"std": 0.1}, {"mode": "view-agnostic"}, {"guidance_scale": 3.0}],
+    ids=lambda options: next(iter(options)),
+)
+def test_the_noise_of_other_mixtures_is_drawn(mesh_path, monkeypatch, options):
+    drawn, draw = [], ExactScoreGuidance.add_noise
+    monkeypatch.setattr(
+        ExactScoreGuidance, "add_noise", lambda *args: drawn.append(1) or draw(*args)
+    )
+    step(guidance(mesh_path), uniform(3, 16, 16, 3), **batch(*VIEWS))
+    assert not drawn
+    step(guidance(mesh_path, **options), uniform(3, 16, 16, 3), **batch(*VIEWS))
+    assert drawn == [1]
 
 
 def test_items_of_a_batch_are_independent(mesh_path):

@@ -184,9 +184,8 @@ class ScoreDistillation(BaseObject, ABC):
             images = rgb.float().movedim(-1, 1).contiguous()
             latents = (images if rgb_as_latents else self.encode(images, **batch)).float()
             with torch.no_grad():
-                noised = self.add_noise(latents)
                 condition = self.condition(prompt_utils, **batch)
-                grad, bad = self._gradient(noised, condition)
+                grad, bad = self._gradient(*self._error(latents, condition))
             if not guidance_eval:  # an evaluation isn't a training step
                 self._count_bad(bad)
             loss = _masked_loss(images, latents, grad, bad)
@@ -200,12 +199,13 @@ class ScoreDistillation(BaseObject, ABC):
             out |= {f"grad_norm_{i}": norm for i, norm in enumerate(norms)}
             out |= {"bad_items": float(bad.sum()), **self.report()}
             if guidance_eval:
-                out["eval"] = self.evaluate(noised, prompt_utils, **batch)
+                out["eval"] = self.evaluate(self.add_noise(latents), prompt_utils, **batch)
         return out
 
-    def add_noise(self, latents: Float[Tensor, "B c h w"]) -> Noised:
-        """Draw this step's timesteps and noise, and add the noise to ``latents``."""
-        device = latents.device
+    def draw_timesteps(
+        self, latents: Float[Tensor, "B c h w"]
+    ) -> tuple[Int[Tensor, " B"], Float[Tensor, " B"]]:
+        """Draw this step's timesteps t; also return their abar, float64."""
         t = sds.timesteps(
             len(latents),
             self.min_step,
@@ -214,11 +214,17 @@ class ScoreDistillation(BaseObject, ABC):
             step=self.step,
             num_train=len(self.alphas_cumprod),
         )
-        abar = self.alphas_cumprod.double().cpu()[t].to(device)
+        abar = self.alphas_cumprod.double().cpu()[t]
+        return t.to(latents.device), abar.to(latents.device)
+
+    @torch.no_grad()
+    def add_noise(self, latents: Float[Tensor, "B c h w"]) -> Noised:
+        """Draw this step's timesteps and noise, and add the noise to ``latents``."""
+        t, abar = self.draw_timesteps(latents)
         noise = streams.normal_per_item(
-            tuple(latents.shape), item_seed(), "noise", self.step, device
+            tuple(latents.shape), item_seed(), "noise", self.step, latents.device
         )
-        return Noised(t.to(device), abar, noise, sds.add_noise(latents, noise, abar))
+        return Noised(t, abar, noise, sds.add_noise(latents, noise, abar))
 
     def predict_noise(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Any
@@ -231,15 +237,33 @@ class ScoreDistillation(BaseObject, ABC):
             else sds.classifier_free(cond.float(), uncond.float(), self.cfg.guidance_scale)
         )
 
-    def _gradient(self, noised: Noised, condition: Any) -> tuple[Tensor, Tensor]:
+    def known_error(
+        self, latents: Float[Tensor, "B c h w"], condition: Any
+    ) -> Optional[tuple[Float[Tensor, "B c h w"], Float[Tensor, " B"]]]:
+        """Return eps_hat - eps and abar if they don't depend on the noise, which isn't drawn then;
+        None if they do.
+        """
+        return None
+
+    def _error(
+        self, latents: Float[Tensor, "B c h w"], condition: Any
+    ) -> tuple[Float[Tensor, "B c h w"], Float[Tensor, " B"]]:
+        """Return eps_hat - eps and abar."""
+        known = self.known_error(latents, condition)
+        if known is not None:
+            return known
+        noised = self.add_noise(latents)
+        return self.predict_noise(noised.z, noised.t, condition) - noised.noise, noised.abar
+
+    def _gradient(
+        self, error: Float[Tensor, "B c h w"], abar: Float[Tensor, " B"]
+    ) -> tuple[Tensor, Tensor]:
         """Compute w(t) (eps_hat - eps), clipped to ``grad_clip``.
 
         Returns:
             the gradient, zero for items in which it isn't finite, and a mask of those, (B,) bool.
         """
-        eps = self.predict_noise(noised.z, noised.t, condition)
-        weight = sds.weight(self.cfg.weighting_strategy, noised.abar)
-        grad = sds.per_item(weight, eps) * (eps - noised.noise)
+        grad = sds.per_item(sds.weight(self.cfg.weighting_strategy, abar), error) * error
         bad = _bad_items(grad)
         if bad.any():
             grad[bad] = 0

@@ -50,6 +50,7 @@ from ..cameras import OrbitRanges, camera_pool
 from ..core.errors import UserError
 from ..core.memory import count_of, require_memory
 from ..core.options import at_least, in_range, interval, one_of, positive, required
+from ..diffusion import sds
 from ..diffusion.exact_score import LinearLatent, color_matrix, denoise, squared_distances
 from ..host import register
 from ..meshes.load import AXES, load_mesh
@@ -191,6 +192,20 @@ class ExactScoreGuidance(ScoreDistillation):
         if items[0][1] is None:
             return cond, None
         return cond, torch.cat([item[1].eps for item in items]).view_as(z)
+
+    def known_error(
+        self, latents: Float[Tensor, "B c h w"], condition: list[Mixture]
+    ) -> Optional[tuple[Float[Tensor, "B c h w"], Float[Tensor, " B"]]]:
+        """Return sqrt(abar / (1 - abar)) (x - x_1) for mixtures of one picture without width, in
+        whose score the noise cancels.
+        """
+        one = all(len(mixture.modes) == 1 and mixture.log_prior is None for mixture in condition)
+        if self.cfg.std or not one:
+            return None
+        _, abar = self.draw_timesteps(latents)
+        self._perplexity = 1.0
+        difference = latents - torch.cat([mixture.modes for mixture in condition])
+        return difference.mul_(sds.per_item((abar / (1 - abar)).sqrt(), difference)), abar
 
     def report(self) -> dict[str, float]:
         """Return the perplexity of the responsibilities, the effective number of modes per noisy
