@@ -48,6 +48,7 @@ def test_the_digest_is_of_names_and_contents(tmp_path):
     for name, content in (("a.ply", b"1"), ("a.ply", b"2"), ("b.spz", b"2")):
         (folder / name).write_bytes(content)
         digests.add(assets.digest(tmp_path))
+    assert assets.stored_bytes(tmp_path) == 2
     (folder / "report.json").write_text("seconds")
     (folder / "pruned").mkdir()
     assert len(digests) == 3 and assets.digest(tmp_path) in digests

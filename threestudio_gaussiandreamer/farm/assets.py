@@ -161,6 +161,11 @@ def newest(folder: Path, pattern: str) -> Optional[str]:
     return found[-1].relative_to(folder).as_posix() if found else None
 
 
+def stored_bytes(folder: Path) -> int:
+    """Return the size of all files of an asset, checkpoints included."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
 def scores(folder: Path) -> dict[str, float]:
     """Return the numbers that a run has measured on its result."""
     try:

@@ -37,6 +37,7 @@ COLUMNS = {
     "steps": WHOLE,
     "gaussians": WHOLE,
     "megabytes": NUMBER,
+    "bytes": WHOLE,
     "attempts": WHOLE,
     "saves_memory": TEXT,
     "psnr": NUMBER,

@@ -168,6 +168,7 @@ def result_of(job: Job, folder: Path, run: Any) -> dict[str, Any]:
         "steps": run.trainer.global_step,
         "gaussians": len(geometry) if hasattr(geometry, "__len__") else 0,
         "megabytes": peak_megabytes(),
+        "bytes": assets.stored_bytes(folder),
         "saves_memory": job.saves_memory,
         "host": socket.gethostname(),
         "process": os.getpid(),
