@@ -14,6 +14,7 @@ from tests.fuzz import runner
 from tests.test_docs import TEXTS
 from threestudio_gaussiandreamer import metrics
 from threestudio_gaussiandreamer.core import file_memory
+from threestudio_gaussiandreamer.evaluation import intervals
 from threestudio_gaussiandreamer.launch.config_source import MOST_DEPTH, MOST_NODES
 from threestudio_gaussiandreamer.launch.live_viewer import SHARE_OF_TIME
 from threestudio_gaussiandreamer.meshes import budget
@@ -32,6 +33,7 @@ CONSTANTS = {
         f"take {LIST_BYTES} bytes per intersection, the backward pass {ROW_BYTES} more",
     ],
     "docs/failures.md": [f"farther than {FLOATERS:.0%}".replace("%", " %")],
+    "docs/evaluation.md": [f"its {intervals.LEVEL:.0%} bootstrap".replace("%", " %")],
     "docs/models.md": [f"`max_residual_mm` ({MotionPrior.Config.max_residual_mm:g})"],
     "docs/pruning.md": [
         f"for {PruneOptions.steps} steps",
