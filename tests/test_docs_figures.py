@@ -34,12 +34,12 @@ CONSTANTS = {
     ],
     "docs/failures.md": [f"farther than {FLOATERS:.0%}".replace("%", " %")],
     "docs/evaluation.md": [f"its {intervals.LEVEL:.0%} bootstrap".replace("%", " %")],
+    "docs/viewing.md": [f"at most {SHARE_OF_TIME:.0%}".replace("%", " %")],
     "docs/models.md": [f"`max_residual_mm` ({MotionPrior.Config.max_residual_mm:g})"],
     "docs/pruning.md": [
         f"for {PruneOptions.steps} steps",
         f"the best {PruneConfig.keep:g} are kept",
     ],
-    "docs/viewing.md": [f"take at most {100 * SHARE_OF_TIME:g} % of the time"],
     "docs/robustness.md": [
         f"more than {runner.SECONDS:g} seconds of CPU time",
         f"at most {runner.FIXED_BYTES >> 20} MiB plus {runner.PER_BYTE} times the file size",
