@@ -44,8 +44,8 @@ FLAGS = (
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
 HALF_TURN_ABOUT_X = (1.0, 0.0, 0.0, 0.0)
 """Quaternion xyzw by which Spark's examples bring files that are -y up into three's y-up scene."""
-TIMEOUT = 300
-"""Seconds that a page has for all of its pictures."""
+TIMEOUT = 1200
+"""Seconds that a page has for all of its pictures; a busy machine takes 20 s for one."""
 
 
 class Camera(NamedTuple):
