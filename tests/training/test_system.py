@@ -22,6 +22,7 @@ from tests.training.runs import (
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh0_to_rgb
 from threestudio_gaussiandreamer.guidance.known_truth import MeshTruth
+from threestudio_gaussiandreamer.launch.callbacks import SECONDS_BETWEEN, LastCheckpoint
 from threestudio_gaussiandreamer.launch.checkpoints import AtomicCheckpointIO
 from threestudio_gaussiandreamer.launch.experiment import main
 from threestudio_gaussiandreamer.training import held_out as evaluate
@@ -107,6 +108,23 @@ def test_the_prior_is_scored_after_the_first_step_and_before_a_checkpoint(
     assert launch(tmp_path, painted_box, *options, "system.exporter.save_video=false") == 0
     assert happened[:3] == ["step", "score", "checkpoint"]
     assert happened.count("score") == 2  # prior and result
+
+
+def test_scoring_the_prior_does_not_delay_the_next_checkpoint(tmp_path, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
+
+    class Trainer:
+        global_step = 1
+
+        def save_checkpoint(self, path):
+            clock[0] += 8.0  # as scoring takes on a slow machine
+            io.save_checkpoint({"global_step": 1}, path)
+
+    io = AtomicCheckpointIO()
+    callback = LastCheckpoint(tmp_path / "last.ckpt", io)
+    callback._save(Trainer())
+    assert callback._due == clock[0] + SECONDS_BETWEEN
 
 
 def tensorboard_events(folder):

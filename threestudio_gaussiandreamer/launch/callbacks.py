@@ -190,11 +190,11 @@ class LastCheckpoint(pl.callbacks.Checkpoint):
         """Write the checkpoint, and schedule the next one so that saving takes at most
         :data:`SHARE_OF_TIME` of the running time.
         """
-        started = time.monotonic()
         if self.checkpoint_io.saved_step(self.last) != trainer.global_step:
             trainer.save_checkpoint(self.last)
-        ended = time.monotonic()
-        self._due = ended + max(SECONDS_BETWEEN, (ended - started) / SHARE_OF_TIME)
+        # not the time of save_checkpoint(), in which the system scores the prior once
+        pause = max(SECONDS_BETWEEN, self.checkpoint_io.seconds / SHARE_OF_TIME)
+        self._due = time.monotonic() + pause
 
     def _restore_handlers(self) -> None:
         restore_handlers(self._earlier)

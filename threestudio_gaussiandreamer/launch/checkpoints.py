@@ -3,6 +3,7 @@ that they can't run code.
 """
 
 import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ class AtomicCheckpointIO(pl.plugins.CheckpointIO):
 
     def __init__(self) -> None:
         self.saved_steps: dict[str, int] = {}
+        self.seconds = 0.0
+        """Duration of the last write."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike, storage_options: Any = None
@@ -27,7 +30,9 @@ class AtomicCheckpointIO(pl.plugins.CheckpointIO):
             UserError: the disk is full or the folder can't be written; an existing file is left
                 unchanged.
         """
+        started = time.monotonic()
         save_file(path, checkpoint)
+        self.seconds = time.monotonic() - started
         self.saved_steps[os.path.abspath(path)] = checkpoint.get("global_step", -1)
 
     def load_checkpoint(
