@@ -24,7 +24,8 @@ MIN_ALPHA = 128
 MIN_COSINE = 0.1
 KNOWN = 1e-3
 """Texels of a smaller weight are filled from their surroundings."""
-
+VIEWS_AT_ONCE = 4
+"""Views whose pixels are kept at a time, to bound the memory."""
 LATTICE = 8
 """Intervals along the edges of a hidden face at whose ends its colour is put."""
 
@@ -42,11 +43,14 @@ def bake(mesh: Mesh, renders: Renders, size: int) -> UInt8[np.ndarray, "S S 3"]:
     """Return the texture, row 0 at the top, of a mesh with ``uv``."""
     caster, count = MeshCaster(mesh), len(renders.c2w)
     texels, faces = np.zeros((4, size * size)), np.zeros((4, len(mesh.faces)))
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
-        views = pool.map(lambda view: _seen(caster, renders, view), range(count))
-        for seen in tqdm(views, "texture", count, unit="view", disable=None, leave=False):
-            _add(faces, seen.face, seen.values)
-            _splat(texels, seen.uv, seen.values, size)
+    bar = tqdm(desc="texture", unit="view", total=count, disable=None, leave=False)
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, VIEWS_AT_ONCE)) as pool, bar:
+        for first in range(0, count, VIEWS_AT_ONCE):
+            views = range(first, min(first + VIEWS_AT_ONCE, count))
+            for seen in pool.map(lambda view: _seen(caster, renders, view), views):
+                _add(faces, seen.face, seen.values)
+                _splat(texels, seen.uv, seen.values, size)
+                bar.update()
     _paint_hidden(texels, mesh, faces, size)
     known = texels[3] > KNOWN
     colors = (texels[:3] / np.maximum(texels[3], KNOWN)).T.reshape(size, size, 3)
@@ -55,6 +59,7 @@ def bake(mesh: Mesh, renders: Renders, size: int) -> UInt8[np.ndarray, "S S 3"]:
 
 
 def _seen(caster: MeshCaster, renders: Renders, view: int) -> Seen:
+    """Return what a render shows of the mesh."""
     c2w, rgba = renders.c2w[view], renders.rgba[view]
     (top, left), face, weights = caster.visible(c2w, renders.fovy, *rgba.shape[:2])
     pixels = rgba[top : top + face.shape[0], left : left + face.shape[1]]

@@ -54,6 +54,7 @@ def render_around(cloud: Gaussians, options: MeshOptions, fusion: Optional[Depth
 def _render(
     cloud: Gaussians, views: Views, rows: Tensor, fusion: Optional[DepthFusion]
 ) -> UInt8[np.ndarray, "B S S 4"]:
+    """Return the pictures of some of the views, after adding their depths to ``fusion``."""
     viewmats = views.viewmats[rows]
     # relative to the views' centre, since squares of large depths lose the digits of the deviation
     depths = torch.einsum("bj,nj->bn", viewmats[:, 2, :3], cloud.means - cloud.means.mean(0))
