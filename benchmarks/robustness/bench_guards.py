@@ -1,13 +1,13 @@
 """The overhead of the checks: the time of each one relative to a training step, and of the finite
 check relative to a forward pass.
 
-    python -m benchmarks.robustness.bench_guards [--gaussians 10000 --size 256 --views 4 --threads
-    4]
+    python -m benchmarks.robustness.bench_guards [--gaussians 10000 --size 256 --views 4]
 
 A step is what the demo's is: four views drawn and differentiated, the shared path of score
 distillation on their pixels, Adam. Guards are timed on their own, since a difference of two steps
-drowns in their noise. Prints a table and writes ``benchmarks/results/guards.csv``. The bars: all
-guards of a step <= 2 % of it, ``non_finite="error"`` <= 2 % of a forward pass."""
+drowns in their noise. Times are CPU times of one thread, which other programs change little. Prints
+a table and writes ``benchmarks/results/guards.csv``. The bars: all guards of a step <= 2 % of it,
+``non_finite="error"`` <= 2 % of a forward pass."""
 
 import argparse
 import csv
@@ -128,13 +128,13 @@ class Bench:
 
 
 def milliseconds(function: Callable[[], None], seconds: float) -> float:
-    """Return the median time of a call, over as many as fit into ``seconds``, at least 5."""
+    """Return the median CPU time of a call, over as many as fit into ``seconds``, at least 5."""
     function()
     times: list[float] = []
     while len(times) < 5 or sum(times) < seconds:
-        start = time.perf_counter()
+        start = time.process_time()
         function()
-        times.append(time.perf_counter() - start)
+        times.append(time.process_time() - start)
     return 1e3 * statistics.median(times)
 
 
@@ -142,7 +142,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    for name, default in (("gaussians", 10_000), ("size", 256), ("views", 4), ("threads", 4)):
+    for name, default in (("gaussians", 10_000), ("size", 256), ("views", 4), ("threads", 1)):
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument(
         "--seconds",
@@ -177,7 +177,7 @@ def main() -> None:
 def report(rows: list[tuple[str, float, float]], options: argparse.Namespace) -> None:
     print(
         f"{options.gaussians:,} Gaussians, {options.views} views of {options.size}^2, "
-        f"{options.threads} threads"
+        f"{options.threads} thread{'s' * (options.threads > 1)}"
     )
     for name, time_of_guard, whole in rows:
         print(
