@@ -115,6 +115,7 @@ class Chaos:
         self.rng = random.Random(options.seed)
         self.longest = options.longest
         self.done: Counter = Counter()
+        self.in_training = False
         self.log = options.log
         self.driver = self.start()
 
@@ -124,21 +125,25 @@ class Chaos:
 
     def run(self, deadline: float) -> int:
         """Disturb the farm until all events have happened, and let it end; return its code."""
-        due = time.monotonic() + self.rng.uniform(0, self.longest)
+        due = self.next_due()
         while self.driver.poll() is None:
             if time.monotonic() > deadline:
                 self.driver.kill()
                 raise RuntimeError("not done in the given time")
             if self.events and time.monotonic() > due and self.disturb(self.events[0]):
                 self.done[self.events.pop(0)] += 1
-                due = time.monotonic() + self.rng.uniform(0, self.longest)
+                due = self.next_due()
             time.sleep(0.05)
         return self.driver.returncode
 
+    def next_due(self) -> float:
+        """Draw the time of the next event, and whether it waits for an asset with a checkpoint."""
+        self.in_training = self.rng.random() < 0.5
+        return time.monotonic() + self.rng.uniform(0, self.longest)
+
     def disturb(self, event: str) -> bool:
         """Kill; return False if there is nothing to kill yet."""
-        # every second event at least falls into training, from which an asset can go on
-        workers = training_workers(self.out) if self.rng.random() < 0.5 else busy_workers()
+        workers = training_workers(self.out) if self.in_training else busy_workers()
         if not workers:
             return False
         if event == WORKER:
