@@ -161,7 +161,7 @@ def read_json(path: Path, kind: type[T]) -> T:
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a mapping from a YAML file; an empty one if there is none or it is damaged."""
     try:
-        content = yaml.load(_text(path), PlainLoader)
+        content = PlainLoader(_text(path)).get_single_data()
     except (OSError, ValueError, RecursionError, yaml.YAMLError):
         return {}
     return content if isinstance(content, dict) else {}
