@@ -27,6 +27,8 @@ from jaxtyping import Float, UInt8
 
 SPARK_PAGE = Path(__file__).with_name("spark.html")
 THREE_PAGE = Path(__file__).with_name("three.html")
+DRAWING = Path(__file__).with_name("page.js")
+"""What both pages import."""
 SCREENSHOT_SCRIPT = Path(__file__).with_name("screenshot.html")
 CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
 SPLAT_TRANSFORM = "@playcanvas/splat-transform/bin/cli.mjs"
@@ -105,6 +107,7 @@ def draw_with_spark(
     }
     files = {
         "/": SPARK_PAGE.read_bytes(),
+        "/page.js": DRAWING.read_bytes(),
         "/job.json": json.dumps(job).encode(),
         job["cloud"]: cloud.read_bytes(),
     }
@@ -126,6 +129,7 @@ def draw_with_three(
     }
     files = {
         "/": THREE_PAGE.read_bytes(),
+        "/page.js": DRAWING.read_bytes(),
         "/job.json": json.dumps(job).encode(),
         job["mesh"]: mesh.read_bytes(),
     }
@@ -212,7 +216,7 @@ class Handler(SimpleHTTPRequestHandler):
         if self.path not in self.exchange.files:
             super().do_GET()
             return
-        kind = "text/html" if self.path == "/" else "application/octet-stream"
+        kind = "text/html" if self.path == "/" else self.guess_type(self.path)
         self.reply(self.exchange.files[self.path], kind)
 
     def do_POST(self) -> None:
