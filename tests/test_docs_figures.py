@@ -21,6 +21,7 @@ from threestudio_gaussiandreamer.meshes import budget
 from threestudio_gaussiandreamer.priors.motion import MotionPrior
 from threestudio_gaussiandreamer.prune import PruneOptions
 from threestudio_gaussiandreamer.splatting.cuda.memory import LIST_BYTES, ROW_BYTES
+from threestudio_gaussiandreamer.surface.options import MeshOptions
 from threestudio_gaussiandreamer.training.density_options import PruneConfig
 
 GENERATED = {"docs/results.md", "docs/stability.md"}
@@ -35,6 +36,7 @@ CONSTANTS = {
     "docs/failures.md": [f"farther than {FLOATERS:.0%}".replace("%", " %")],
     "docs/evaluation.md": [f"its {intervals.LEVEL:.0%} bootstrap".replace("%", " %")],
     "docs/viewing.md": [f"at most {SHARE_OF_TIME:.0%}".replace("%", " %")],
+    "docs/mesh.md": [f"Parts below {MeshOptions.min_component:.0%}".replace("%", " %")],
     "docs/models.md": [f"`max_residual_mm` ({MotionPrior.Config.max_residual_mm:g})"],
     "docs/pruning.md": [
         f"for {PruneOptions.steps} steps",
