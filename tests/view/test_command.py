@@ -115,6 +115,25 @@ def test_mistakes_in_options(source, capsys):
     assert "--background" in message(capsys, source, "--html", "--background", "red")
 
 
+@pytest.mark.parametrize("name", ["~nosuchuser/a.ply", "a" * 5000])
+def test_a_path_that_can_be_no_file(name, capsys):
+    assert "not a usable file name" in message(capsys, name, "--html")
+
+
+def test_the_page_does_not_replace_its_cloud(source, tmp_path, capsys):
+    before, alias = source.read_bytes(), tmp_path / "alias.html"
+    alias.symlink_to(source)
+    for out in (source, alias):
+        assert "OUT is PATH" in message(capsys, source, "--html", out)
+    assert source.read_bytes() == before and alias.is_symlink()
+
+
+def test_a_title_whose_bytes_are_not_utf_8(source):
+    assert main([str(source), "--html", "--title", "box \udcff"]) == 0
+    page_file = source.with_suffix(".html")
+    assert "<title>box ?</title>" in page_file.read_text(encoding="utf-8")
+
+
 def test_an_empty_cloud_and_one_of_nan(tmp_path, capsys):
     write_cloud(str(tmp_path / "empty.ply"), cloud(0))
     assert "no Gaussians" in message(capsys, tmp_path / "empty.ply", "--html")

@@ -57,6 +57,13 @@ def test_a_port_in_use_is_named(taken, tmp_path, capsys):
     assert f"127.0.0.1:{taken} can't be served" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("number", [-1, 65536])
+def test_a_number_that_is_no_port(number):
+    pytest.importorskip("viser")
+    with pytest.raises(UserError, match=f"127.0.0.1:{number} can't be served"):
+        live.require_server("127.0.0.1", number)
+
+
 def test_without_viser_the_extra_is_named(monkeypatch, port):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(UserError, match=r"\[viewer\]"):
@@ -71,6 +78,10 @@ def test_without_viser_the_extra_is_named(monkeypatch, port):
         (["{}/text.ply"], "text.ply"),
         (["{}/a.ply", "--eps2d", "0.3"], "--eps2d: is for the page"),
         (["{}/a.ply", "--host", "999.1.1.1"], "999.1.1.1"),
+        (["{}/a.ply", "--host", "é" * 70], "choose another port"),
+        (["{}/a.ply", "--host", "\0"], "choose another port"),
+        (["~nosuchuser/a.ply"], "not a usable file name"),
+        (["a" * 5000], "not a usable file name"),
     ],
 )
 def test_wrong_input_is_named_before_serving(tmp_path, capsys, port, arguments, message):

@@ -16,7 +16,7 @@ from typing import Any, Optional
 
 from ..core.command import run_command
 from ..core.errors import UserError
-from ..core.files import existing_file, require_writable
+from ..core.files import existing_file, require_other_file, require_writable
 from ..core.memory import size_text
 from ..core.options import check_options, in_range
 from ..formats.gaussian_files import (
@@ -122,6 +122,7 @@ def run(args: argparse.Namespace) -> None:
     suffix = suffix_of(args.output) if mesh else require_format(args.output, "OUT")
     _check_options(args, suffix)
     source = existing_file(args.source, "file of Gaussians or checkpoint")
+    require_other_file(args.output, source)
     stored = _read(source, args)
     if mesh:
         to_mesh.write_mesh(args, stored)
@@ -150,9 +151,6 @@ def _check_options(args: argparse.Namespace, suffix: str) -> None:
     to_mesh.check_mesh_options(args)
     if args.check and FORMATS[suffix].read is None:
         raise UserError(f"--check: {suffix} files are written here, but not read")
-    if os.path.exists(args.output) and os.path.exists(args.source):
-        if os.path.samefile(args.source, args.output):
-            raise UserError("OUT is IN: give it another name, so that IN is kept")
 
 
 def _read(source: Path, args: argparse.Namespace) -> StoredCloud:

@@ -138,6 +138,30 @@ def require_writable(path: str | os.PathLike, what: str) -> None:
         raise UserError(f"{what}: {_quoted(path)} can't be written: its folder is read-only")
 
 
+def require_other_file(
+    path: str | os.PathLike, source: str | os.PathLike, what: str = "OUT is IN"
+) -> None:
+    """Check that a file to be written isn't the one that it is made from.
+
+    Args:
+        what: the beginning of the message.
+
+    Raises:
+        UserError: both are the same existing file.
+    """
+    both_exist = os.path.exists(source) and os.path.exists(path)
+    if both_exist and os.path.samefile(source, path):
+        raise UserError(f"{what}: give it another name, so that {_quoted(Path(source))} is kept")
+
+
+def is_folder(path: str | os.PathLike) -> bool:
+    """Return whether ``path`` is an existing folder; False for what can't be a file's name."""
+    try:
+        return Path(path).expanduser().is_dir()
+    except (OSError, ValueError, RuntimeError):  # too long; NUL; "~user" of an unknown user
+        return False
+
+
 def output_folder(path: str | os.PathLike, option: str, files: Collection[str] = ()) -> Path:
     """Make a folder for results, before the work that makes them.
 

@@ -12,15 +12,13 @@ removed."""
 
 import argparse
 import functools
-import os
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, Optional
 
 from ..core.command import run_command
-from ..core.errors import UserError
-from ..core.files import require_writable
+from ..core.files import require_other_file, require_writable
 from ..core.options import check_options
 from ..formats.gaussian_files import PRUNED_FORMATS, require_format, write_cloud
 from ..gaussians.axes import AXES, VIEWER_UP
@@ -100,8 +98,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     suffix = require_format(args.output, "OUT", PRUNED_FORMATS)
     for ending in ("", *REPORTS):
         require_writable(args.output + ending, f"OUT{ending}")
-    if _same_file(args.source, args.output):
-        raise UserError("OUT is IN: give it another name, so that the unpruned cloud is kept")
+    require_other_file(args.output, args.source)
     stored = read(args.source, args.up)
     options.antialias = options.antialias or stored.antialiased
     if suffix == ".ply" and Path(args.source).suffix.lower() != ".ply":
@@ -112,8 +109,3 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 
 main = functools.partial(run_command, parse, run)
-
-
-def _same_file(source: str, output: str) -> bool:
-    both_exist = os.path.exists(source) and os.path.exists(output)
-    return both_exist and os.path.samefile(source, output)

@@ -17,7 +17,7 @@ from typing import Any, Optional
 
 from ..core.command import run_command
 from ..core.errors import UserError
-from ..core.files import existing_file, require_writable
+from ..core.files import existing_file, is_folder, require_other_file, require_writable
 from ..formats.gaussian_files import READ, StoredCloud, read_cloud, require_format
 from ..gaussians.axes import AXES, WORLD_UP
 from ..gaussians.gaussians import drawable
@@ -97,16 +97,16 @@ def run(args: argparse.Namespace) -> None:
         UserError: an option is invalid, the file can't be read, has too many Gaussians or none, or
             the page can't be written.
     """
-    folder = Path(args.path).expanduser()
     if args.html is None:
         serve_until_stopped(served(args))
         return
-    if folder.is_dir():
-        run_folder(folder, args)
+    if is_folder(args.path):
+        run_folder(Path(args.path).expanduser(), args)
         return
     source = existing_file(args.path, "file of Gaussians or checkpoint")
     out = Path(args.html) if args.html else source.with_suffix(".html")
     require_writable(out, "--html")
+    require_other_file(out, source, "--html OUT is PATH")
     write_cloud_page(source, out, args)
 
 
@@ -140,16 +140,17 @@ def served(args: argparse.Namespace) -> LiveView:
     if given := [name for name in PAGE_OPTIONS if _value(args, name) is not None]:
         raise UserError(f"{' '.join(given)}: is for the page that --html writes")
     require_server(args.host, args.port)
-    source = Path(args.path).expanduser()
-    if source.is_dir():
-        found = RunFiles(source).cloud if is_run(source) else None
+    name = args.path
+    if is_folder(name):
+        folder = Path(name).expanduser()
+        found = RunFiles(folder).cloud if is_run(folder) else None
         if found is None:
             raise UserError(
                 f"{args.path!r} is no run with an exported cloud: name a file or a run, or give "
                 "--html for the gallery of a folder of runs"
             )
-        source = found
-    source = existing_file(str(source), "file of Gaussians or checkpoint")
+        name = str(found)
+    source = existing_file(name, "file of Gaussians or checkpoint")
     return serve(read_any(source, args.up), args.host, args.port, args.title or source.name)
 
 

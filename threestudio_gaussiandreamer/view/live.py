@@ -39,10 +39,12 @@ def require_server(host: str, port: int) -> None:
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
-    except OSError as error:
+    except (OSError, OverflowError, TypeError, ValueError) as error:
+        # OverflowError: no 16-bit port; TypeError, ValueError: a text that can't be a host's name
+        reason = getattr(error, "strerror", None) or error
         raise UserError(
-            f"viewer: {host}:{port} can't be served ({error.strerror or error}): choose another "
-            "port, such as viewer.port=8081 of a run or --port 8081"
+            f"viewer: {host}:{port} can't be served ({reason}): choose another port, such as "
+            "viewer.port=8081 of a run or --port 8081, or the host 127.0.0.1"
         ) from error
 
 

@@ -77,7 +77,8 @@ def write_page(
     """
     content = page(shown, options, before)
     with atomic_file(path) as file:
-        file.write(content.encode())
+        # a title may be a file's name, whose bytes needn't be UTF-8
+        file.write(content.encode(errors="replace"))
 
 
 def page(shown: Shown, options: PageOptions, before: Optional[Shown] = None) -> str:
