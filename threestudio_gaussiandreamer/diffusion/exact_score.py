@@ -1,7 +1,8 @@
 """The optimal denoiser of a known image distribution, in closed form.
 
-The data are narrow Gaussians around K known images, p(x0) = sum_k pi_k N(x_k, s^2 I). With z = a x
-+ sigma eps, a = sqrt(abar), sigma = sqrt(1 - abar) and v = a^2 s^2 + sigma^2:
+The data are narrow Gaussians around K known images of d values, p(x0) = sum_k pi_k N(x_k, s^2 I).
+With z = a x0 + sigma eps, where a = sqrt(abar) and sigma = sqrt(1 - abar) as in ``sds.py``, and
+v = a^2 s^2 + sigma^2:
 
     p_t(z)  = sum_k pi_k N(z; a x_k, v I)
     gamma_k = softmax_k(log pi_k - |z - a x_k|^2 / 2v)          responsibilities
@@ -10,10 +11,12 @@ The data are narrow Gaussians around K known images, p(x0) = sum_k pi_k N(x_k, s
     eps_hat = (z - a D) / sigma = sigma (z - a m) / v = -sigma grad log p_t(z)
 
 Distances are sums of squared differences in float64: expanding them to |z|^2 - 2 z x + |x|^2 in
-float32 gives errors of about one nat in the logits at 512 x 512 pixels. The rest has the type of z.
-The closed-form denoiser memorises: unless d is at most a few hundred, it returns the nearest image
+float32 gives errors of about one nat in the logits at 512 x 512 pixels. Everything else is computed
+in the type of z.
+
+The closed-form denoiser memorises: for d above a few hundred it returns the nearest known image
 (Scarvelis et al. 2023, "Closed-Form Diffusion Models"). The perplexity of the responsibilities
-measures this."""
+measures this: it is then 1."""
 
 import math
 from typing import NamedTuple, Optional
@@ -90,10 +93,10 @@ def denoise(
     temperature: float = 1.0,
     distances: Optional[Float[Tensor, "B K"]] = None,
 ) -> Denoised:
-    """Compute the exact score at z.
+    """Compute the exact score at z, in the form of the optimal noise prediction.
 
     Args:
-        abar: per item, in (0, 1).
+        abar: cumulative product of 1 - beta, per item, in (0, 1).
         bank: the images x_k, shared (K, d) or per item (B, K, d).
         std: s, the standard deviation of each mode, >= 0.
         log_prior: log pi_k, not necessarily normalised; by default uniform.
@@ -103,10 +106,10 @@ def denoise(
     """
     variance = mode_variance(abar, std)
     if distances is None:
-        alone = bank.shape[-2] == 1  # then its responsibility is 1 wherever z is
+        single = bank.shape[-2] == 1  # its responsibility is 1 at any distance
         distances = (
             z.new_zeros((len(z), 1), dtype=torch.float64)
-            if alone
+            if single
             else squared_distances(z, bank, abar)
         )
     gamma = responsibilities(distances, variance, log_prior=log_prior, temperature=temperature)

@@ -49,8 +49,8 @@ def step_range(min_percent: float, max_percent: float, num_train: int = 1000) ->
             raise UserError(f"{name} must lie in [0, 1], not {percent}")
     if min_percent > max_percent:
         raise UserError(
-            f"min_step_percent: {min_percent} is above max_step_percent, {max_percent}: check "
-            "where their schedules cross"
+            f"min_step_percent: {min_percent} is above max_step_percent, {max_percent}: if they "
+            "are schedules, the minimum must not exceed the maximum at any step"
         )
     low, high = (
         min(max(int(num_train * percent), 1), num_train - 1)
@@ -95,8 +95,8 @@ def stratified_timesteps(batch: int, num_train: int, rng: torch.Generator) -> In
     """Draw one timestep in each of ``batch`` equal ranges of [0, num_train - 1], in random order:
     the loss of a batch varies less than with independent timesteps.
     """
-    places = (torch.randperm(batch, generator=rng) + torch.rand(batch, generator=rng)) / batch
-    return (places * num_train).long().clamp(max=num_train - 1)
+    fractions = (torch.randperm(batch, generator=rng) + torch.rand(batch, generator=rng)) / batch
+    return (fractions * num_train).long().clamp(max=num_train - 1)
 
 
 def add_noise(
@@ -177,7 +177,8 @@ def ddim_sample(
     """Denoise z from each item's timestep ``t`` to x0 in ``steps`` equal steps of DDIM.
 
     Args:
-        predict: returns eps for (z, t).
+        predict: returns eps for (z, t); t is (B,).
+        alphas_cumprod: abar by timestep; a step to timestep 0 ends at abar = 1 instead.
     """
     for index in range(steps):
         now, later = (

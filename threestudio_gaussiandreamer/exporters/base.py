@@ -5,7 +5,7 @@ Each exporter has its own module: a subclass of the host's ``Exporter``, registe
 and the system writes each with its method ``save_<save_type>(name, **params)``.
 
 ===========  ==================================================================================
-option       meaning (all exporters of one file have these)
+option       meaning (all exporters that write one file have these)
 ===========  ==================================================================================
 save_name    name of the file in the export folder
 save_video   also render the turntable
@@ -29,7 +29,7 @@ NAME_BYTES = 255
 
 
 RESERVED = ("pruned", "report.json", "report.png", "view.html", "poster.png")
-"""Names that a run itself uses in the export folder."""
+"""Names of other files that a run writes into the export folder."""
 
 
 def require_file_name(option: str, name: str) -> None:
@@ -54,7 +54,7 @@ UP = one_of(AXES)
 
 
 class Drawing(NamedTuple):
-    """How a run draws its cloud."""
+    """The options of a run's renderer that its exports need."""
 
     eps2d: float = EPS2D
     """Screen-space dilation in square pixels of the final image."""
@@ -72,7 +72,7 @@ class FileExporter(Exporter):
     shared: Optional[Gaussians] = None
     """Set by the bundle exporter, which reads the Gaussians once for all formats."""
     drawing: Drawing = Drawing()
-    """Set by the system before the call."""
+    """Set by the system before it calls the exporter."""
 
     def configure(self, geometry: BaseGeometry, *args: object, **kwargs: object) -> None:
         check_options(self.Config, self.cfg)

@@ -5,7 +5,7 @@ option        meaning
 ============  ======================================================================================
 formats       names of registered exporters without their ``-exporter``: ``ply``, ``spz``,
               ``compressed-ply``, ``sog``, ``glb``, ``usda``, ``points``, ``surface``
-options       options of some of them: ``{ply: {pad_sh_degree: 3}}``
+options       options of single formats, such as ``{ply: {pad_sh_degree: 3}}``
 up            the up axis in all formats that have this option (``ply``, ``surface``): ``z`` for
               this package's world; by default the axis that viewers of each format expect
 save_video    also render the turntable
@@ -65,8 +65,8 @@ class BundleExporter(Exporter):
             for name in cfg.options:
                 if name not in cfg.formats:
                     raise UserError(
-                        f"options.{name}: the formats are {', '.join(cfg.formats)}; options of "
-                        "another one have no effect"
+                        f"options.{name}: {name} isn't in formats ({', '.join(cfg.formats)}), so "
+                        "its options have no effect"
                     )
             _require_own_files(
                 (name, _checked(name, options_of(name, cfg))) for name in cfg.formats
@@ -88,15 +88,17 @@ class BundleExporter(Exporter):
         ]
 
     def __call__(self) -> List[ExporterOutput]:
-        ours = [exporter for exporter in self.exporters if isinstance(exporter, FileExporter)]
-        shared = read_gaussians(self.geometry) if ours else None
-        for exporter in ours:
+        readers = [exporter for exporter in self.exporters if isinstance(exporter, FileExporter)]
+        shared = read_gaussians(self.geometry) if readers else None
+        for exporter in readers:
             exporter.shared = shared
         return [output for exporter in self.exporters for output in exporter()]
 
 
 def options_of(name: str, cfg: Any) -> Any:
-    """Return the options of one format, with the bundle's ``up`` if the format has that option."""
+    """Return the options of one format, with the bundle's ``up`` as default if the format has that
+    option.
+    """
     options, known = cfg.options.get(name, {}), find(name + SUFFIX).Config.__dataclass_fields__
     if cfg.up is None or "up" not in known or not isinstance(options, Mapping):
         return options

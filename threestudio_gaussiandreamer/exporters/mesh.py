@@ -8,19 +8,19 @@ up             the files' up axis: ``y`` (the front faces +z), as glTF and most 
                OBJ expect, or ``z`` for this package's world
 obj            also write the OBJ with its MTL and PNG
 unlit          ask viewers to show the texture without lighting
-faces          triangles at most
-texture        texels of the texture each way
+faces          largest number of triangles
+texture        width and height of the texture, texels
 method         ``fusion`` of rendered depths, or a level set of the summed ``density``
-resolution     cells along the longest side, from which the surface is extracted
-views          renders that the surface and the texture are made from
-view_size      pixels of a render each way
-min_component  connected parts with a smaller share of the surface's area are dropped
+resolution     cells along the longest side of the grid that the surface is extracted from
+views          number of renders that the surface and the texture are made from
+view_size      width and height of a render, pixels
+min_component  connected parts with a smaller share of the surface's area than this are dropped
 eps2d          screen-space dilation of the renders, square pixels; by default the run's
 antialias      whether the renders are antialiased; by default as in the run
 save_video     also render the turntable
 =============  ===================================================================================
 
-Needs the extra ``mesh``. docs/mesh.md has the PSNR to the cloud for each size."""
+Needs the extra ``mesh``. ``docs/mesh.md`` lists the PSNR between mesh and cloud by size."""
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -76,9 +76,9 @@ class MeshExporter(FileExporter):
         ]
 
     def _options(self) -> MeshOptions:
-        """Return the options, with the dilation and antialiasing of the run unless given."""
+        """Return the options, with ``eps2d`` and ``antialias`` of the run if they aren't given."""
         options = {option.name: getattr(self.cfg, option.name) for option in fields(MeshOptions)}
-        drawn = {
+        of_run = {
             name: value for name, value in self.drawing._asdict().items() if options[name] is None
         }
-        return MeshOptions(**options | drawn)
+        return MeshOptions(**options | of_run)

@@ -1,8 +1,8 @@
 """The ground truth of guidances that have one, such as a mesh.
 
-If a guidance has an attribute ``truth`` (a :class:`KnownTruth`), its runs are compared with it: the
-progress bar shows PSNR, validation pictures show the ground truth, ``budget: auto`` measures the
-loss of PSNR against it, and, if it is a mesh, held-out views are scored.
+If a guidance has an attribute ``truth`` (a :class:`KnownTruth`), renders of the run are compared
+with that ground truth: the progress bar shows the PSNR, validation pictures include the ground
+truth, ``budget: auto`` measures the loss of PSNR, and, if it is a mesh, held-out views are scored.
 """
 
 from collections.abc import Callable
@@ -20,6 +20,7 @@ Size = tuple[int, int]
 """Height and width, pixels."""
 
 PictureSize = Callable[[int, int], Size]
+"""Maps (height, width) of a render to the size of a picture."""
 
 
 class KnownTruth(Protocol):
@@ -42,13 +43,13 @@ class KnownTruth(Protocol):
     def prefetch(
         self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int
     ) -> None:
-        """Prepare for these views, such as to render many at once. Called if training will need
-        most of them, at this size.
+        """Prepare to render these views, for instance many at once. Called if training will need
+        most of them at this size.
         """
 
 
 def truth_of(guidance: Any) -> Optional[KnownTruth]:
-    """Return the ground truth of a guidance, also of other packages'; None if it has none."""
+    """Return the ground truth of a guidance of this or another package; None if it has none."""
     return getattr(guidance, "truth", None)
 
 
@@ -114,7 +115,7 @@ def composite(
 
 
 def resized(images: Float[Tensor, "B c H W"], size: tuple[int, int]) -> Float[Tensor, "B c h w"]:
-    """Resize images: box averages for whole factors, else bilinear with antialiasing."""
+    """Resize images: average blocks if the sizes divide evenly, else bilinear with antialiasing."""
     height, width = images.shape[-2:]
     if (height, width) == size:
         return images

@@ -2,13 +2,13 @@
 Stable Diffusion.
 
 Takes any model in diffusers' Stable Diffusion format (1.x, 2.x; predicting noise, v or x0). Options
-beside those of ``guidance/text_to_image.py``:
+in addition to those of ``guidance/text_to_image.py``:
 
 ===================  ===============================================================================
 option               meaning
 ===================  ===============================================================================
-enable_vae_slicing   encode one image at a time and again in the backward pass: the memory of one
-                     image, one more encoding
+enable_vae_slicing   encode one image at a time, and once more in the backward pass: needs the
+                     memory of a single image, and the time of a second encoding
 enable_vae_tiling    encode and decode in overlapping tiles: for images much larger than the model's
 ===================  ===============================================================================
 """
@@ -34,6 +34,8 @@ from .text_to_image import TextToImageDistillation
 @register_builtin("stable-diffusion-guidance")
 @register("gaussiandreamer-stable-diffusion-guidance")
 class StableDiffusionGuidance(TextToImageDistillation):
+    """Score distillation of renders that the VAE has encoded."""
+
     @dataclass
     class Config(TextToImageDistillation.Config):
         pretrained_model_name_or_path: str = STABLE_DIFFUSION
@@ -86,6 +88,7 @@ class StableDiffusionGuidance(TextToImageDistillation):
         return (mean.float() + std.float() * noise) * self.vae.config.scaling_factor
 
     def _moments(self, images: Float[Tensor, "B 3 s s"]) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation of the VAE's posterior, (B, 4, h, w) each."""
         posterior = self.vae.encode(images).latent_dist
         return posterior.mean, posterior.std
 

@@ -6,9 +6,10 @@ option                              meaning
 ==================================  ================================================================
 pretrained_model_name_or_path       the model, the prompt processor's: a folder or a hub id;
                                     ``revision`` of a hub id
-guidance_scale, ..._step_percent,   see ``guidance/base.py``; classifier-free guidance in the usual
-                                    convention, where 1 is
-grad_clip, weighting_strategy, ...  none (threestudio's 100 is 101 here)
+guidance_scale                      of classifier-free guidance; 1 is none (threestudio's 100 is 101
+                                    here)
+..._step_percent, grad_clip,        see ``guidance/base.py``
+weighting_strategy, ...
 recon_std_rescale                   0 to 1: bring the contrast of the guided x0 back to that of the
                                     conditional one (Lin et al. 2023, as in MVDream), which undoes
                                     the over-exposure of large scales

@@ -1,5 +1,5 @@
-"""Typed configurations of parts: the launcher checks them in both hosts, and the built-in host
-builds its parts from them."""
+"""Typed configurations of registered classes. The launcher checks them in both hosts (threestudio
+and the built-in one), and the built-in host passes them to the classes."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -17,7 +17,8 @@ def parse_structured(config_class: Any, values: Any = None) -> DictConfig:
     """Fill the dataclass ``config_class`` with ``values`` and check their types; ranges are
     checked by ``core/options.py``.
 
-    A ``${`` in a string is literal text, since interpolations have been resolved before.
+    Interpolations have been resolved before, so a remaining ``${`` in a string is escaped:
+    OmegaConf must not resolve it.
 
     Raises:
         UserError: an unknown key, a value of the wrong type or a missing one; the message begins

@@ -1,8 +1,8 @@
 """Locate a model in a local folder, in the hub's cache on this disk, or on the Hugging Face hub.
 
 No network request is made if the disk has the needed files, so ``HF_HUB_OFFLINE=1`` works once they
-are downloaded. Only needed files are downloaded; ``model_files.py`` selects them. A model that
-isn't available fails within seconds, with a message that says what to do."""
+are downloaded. Only needed files are downloaded; ``model_files.py`` selects them. If a model isn't
+available, UserError is raised within seconds; its message says what to do."""
 
 import errno
 import os
@@ -68,15 +68,16 @@ def find_model(
     Args:
         half: prefer half-precision files if there are files of both precisions.
     """
-    # '*/*' leaves out files beside the components' folders: all weights again, in a single file
-    only_safe = "--include '*/*' --exclude '*.bin'"
+    # '*/*' skips files outside of the components' folders: some models have a copy of all weights
+    # there, in a single file
+    download_options = "--include '*/*' --exclude '*.bin'"
     return locate(
         Source(
             name,
             lambda names: needed_files(names, components, half=half),
             OPTION,
             revision,
-            only_safe,
+            download_options,
         ),
         download=download,
     )
@@ -96,14 +97,14 @@ def locate(source: Source, *, download: bool = True) -> Optional[Path]:
         return _checked(folder, source)
     if not is_hub_id(source.name):
         raise UserError(
-            f"{source}: there is no such folder{_near_folders(folder)}, and a hub id reads "
-            "owner/model."
+            f"{source}: there is no such folder{_near_folders(folder)}, and a hub id has "
+            "the form owner/model."
         )
     require_extra("diffusion", "huggingface_hub")
     cached = cached_snapshot(source)
     if cached is not None and _is_complete(cached, source):
         return cached
-    sizes = _offered(source)
+    sizes = _files_on_hub(source)
     return _downloaded(source, sizes) if download else None
 
 
@@ -120,6 +121,7 @@ def is_hub_id(name: str) -> bool:
 
 
 def _checked(folder: Path, source: Source) -> Path:
+    """Return ``folder``; raise UserError if needed files are missing from it."""
     names = files_below(folder)
     try:
         source.picks(names)
@@ -149,7 +151,7 @@ def _is_complete(folder: Path, source: Source) -> bool:
 def _is_folder(path: Path) -> bool:
     try:
         return path.is_dir()
-    except (OSError, ValueError):  # a name too long, a NUL inside
+    except (OSError, ValueError):  # the name is too long, or contains a NUL
         return False
 
 
@@ -191,7 +193,7 @@ def cached_snapshot(source: Source) -> Optional[Path]:
         return None
 
 
-def _offered(source: Source) -> dict[str, int]:
+def _files_on_hub(source: Source) -> dict[str, int]:
     """Return the needed files of a model on the hub and their sizes in bytes."""
     from huggingface_hub import HfApi
 
@@ -202,7 +204,7 @@ def _offered(source: Source) -> dict[str, int]:
         )
     try:
         api = HfApi(endpoint=_endpoint())
-        model = _in_time(
+        model = _with_timeout(
             lambda: api.model_info(
                 source.name, revision=source.revision, timeout=TIMEOUT, files_metadata=True
             )
@@ -216,20 +218,21 @@ def _offered(source: Source) -> dict[str, int]:
         raise UserError(f"{source} can't be used: {error}.") from error
 
 
-def _in_time(ask: Callable[[], Any]) -> Any:
-    """Call ``ask()`` in a daemon thread and return its result, if it comes within ``TIMEOUT``.
+def _with_timeout(ask: Callable[[], Any]) -> Any:
+    """Call ``ask()`` in a daemon thread and return its result, or raise after ``TIMEOUT``.
 
     The library's own timeout doesn't cover the DNS lookup, which can take a minute.
 
     Raises:
-        TimeoutError: ``ask`` hasn't returned; its thread goes on, and its result is ignored.
+        TimeoutError: ``ask`` hasn't returned in time; its thread continues, and its result is
+            ignored.
     """
     answers: SimpleQueue = SimpleQueue()
 
     def work() -> None:
         try:
             answers.put((ask(), None))
-        except Exception as error:  # raised again in the waiting thread
+        except Exception as error:  # raised in the thread that waits for the answer
             answers.put((None, error))
 
     threading.Thread(target=work, daemon=True).start()
@@ -306,10 +309,10 @@ def explain(source: Source, error: Exception) -> str:
 
 
 def _how_to_get(source: Source) -> str:
+    """Return sentences for a message that say how to get the model, beginning with a space."""
     folder = Path(source.name)
-    if _is_folder(
-        folder.parent
-    ):  # so the name is more likely a local path ("models/mine") than a hub id
+    # if the part before the slash is a local folder, a path such as "models/mine" was meant
+    if _is_folder(folder.parent):
         return f" The folder {str(folder.parent)!r} has no {folder.name!r}{_near_folders(folder)}."
     name = MOVED.get(source.name, source.name)
     moved = (

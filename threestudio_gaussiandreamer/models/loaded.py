@@ -1,9 +1,9 @@
-"""Networks that stay in memory for the next run of this process.
+"""A cache of networks for processes with several runs.
 
-One run loads each network, uses it and drops it. A process that makes many assets calls
-:func:`keep_loaded` first: then each network is loaded once. What a caller changes in a network
-must be part of ``load``, and everything that it depends on part of the key, so that the next run
-gets what it would have loaded itself."""
+By default each run loads its networks and drops them at its end. After :func:`keep_loaded` each
+network is loaded only once per process. The next run must get the same network as if it had loaded
+it: the key must contain everything that the result of ``load`` depends on, and changes of a network
+(its device, compilation) must happen inside ``load``."""
 
 from collections import Counter
 from collections.abc import Callable, Hashable

@@ -1,9 +1,9 @@
 """Select the needed files of a model in diffusers' or transformers' format, and load them.
 
-A model of several components has a sub-folder for each (``unet``, ``vae``, ``text_encoder``, ...);
-one of a single network has its files in the folder itself, and that component is called "". Weights
-are read from safetensors, since a pickle could run code; where a caller allows a ``.bin``, it is
-read with ``weights_only``."""
+A model of several components has a sub-folder for each (``unet``, ``vae``, ``text_encoder``, ...).
+The files of a single network lie in the model's folder itself; its component is named "". Weights
+are read from safetensors, since a pickle could run code; if a caller allows ``.bin`` files, they
+are read with ``weights_only``."""
 
 import gc
 import hashlib
@@ -18,11 +18,12 @@ from ..core.errors import UserError
 WITHOUT_WEIGHTS = {"tokenizer": "tokenizer_config.json", "scheduler": "scheduler_config.json"}
 """Components without weights, and the file that each must have."""
 VOCABULARIES = ({"tokenizer.json"}, {"vocab.json", "merges.txt"}, {"spiece.model"})
-"""Sets of files, of which any one holds a tokenizer's vocabulary."""
+"""Alternative sets of files that hold a tokenizer's vocabulary; one complete set is enough."""
 WEIGHTS = re.compile(
     r"(?:diffusion_pytorch_model|model)(?P<early>\.fp16)?(?:-\d{5}-of-(?P<shards>\d{5}))?"
     r"(?P<late>\.fp16)?\.safetensors"
 )
+"""Name of a weight file; ".fp16" may precede or follow the number of the shard."""
 PICKLED = ("diffusion_pytorch_model.bin", "pytorch_model.bin")
 SAMPLE = 1 << 16
 """Bytes of each of the sixteen samples of a weight file that enter its fingerprint."""
@@ -108,8 +109,8 @@ def component_weights(
 
     Args:
         half: prefer half precision.
-        allow_bin: accept ``.bin`` files if there is no safetensors. None is as False, for callers
-            whose users have no such option.
+        allow_bin: accept ``.bin`` files if there is no safetensors. None is False for callers
+            without such an option: messages don't suggest to set it.
 
     Raises:
         UserError: there is no complete set of files that may be read.
@@ -125,7 +126,7 @@ def component_weights(
     pickled = [prefix + name for name in own if name in PICKLED]
     if allow_bin and pickled:
         return Weights(pickled[:1], None, False)
-    raise UserError(_without_weights(prefix, own, allow_bin))
+    raise UserError(_missing_weights(prefix, own, allow_bin))
 
 
 def _own(names: Collection[str], component: str) -> tuple[str, list[str]]:
@@ -145,14 +146,15 @@ def _complete_set(own: list[str], variant: Optional[str]) -> list[str]:
         for name, match in matches.items()
         if match and bool(match["early"] or match["late"]) == (variant == "fp16")
     }
-    whole = [name for name, match in found.items() if match["shards"] is None]
-    if whole:
-        return whole[:1]
+    single = [name for name, match in found.items() if match["shards"] is None]
+    if single:
+        return single[:1]
     shards = sorted(found)
     return shards if shards and len(shards) == int(found[shards[0]]["shards"]) else []
 
 
-def _without_weights(prefix: str, own: list[str], allow_bin: Optional[bool]) -> str:
+def _missing_weights(prefix: str, own: list[str], allow_bin: Optional[bool]) -> str:
+    """Describe what is missing, given that no set of weight files can be used."""
     if any(name.endswith(".safetensors") for name in own):
         return f"some of {prefix}*.safetensors are missing"
     if any(name.endswith((".bin", ".pt", ".pth", ".ckpt")) for name in own):
@@ -221,7 +223,7 @@ def load_network(
     }
     with _quiet_transformers():
         network, report = _from_pretrained(loader, folder, component, options)
-    # both libraries only warn, and initialise missing weights at random
+    # if weights are missing, both libraries only warn and initialise them at random
     if missing := sorted(report["missing_keys"]):
         raise UserError(
             f"{_name(loader, folder, component)} lacks weights: "
@@ -258,8 +260,8 @@ def _name(loader: Any, folder: Path, component: str) -> str:
 
 @contextmanager
 def _quiet_transformers() -> Iterator[None]:
-    """Suppress transformers' table of weights that a file has in excess of the loaded network, as
-    when only the text encoder of a CLIP is loaded.
+    """Suppress transformers' report of weights in the file that the loaded network doesn't have,
+    such as those of CLIP's image encoder when only its text encoder is loaded.
     """
     from transformers.utils import logging
 
@@ -272,7 +274,7 @@ def _quiet_transformers() -> Iterator[None]:
 
 
 def free_memory() -> None:
-    """Collect garbage, and return the GPU memory that PyTorch caches to the device."""
+    """Collect garbage, and release the GPU memory that PyTorch's allocator has cached."""
     import torch
 
     gc.collect()

@@ -8,7 +8,7 @@ ground           add the paper's layer of randomly coloured points below the obj
                  grows first (Algorithm 1), as if there were no ground
 ground_points    how many
 ground_size      side of the square they fill, in units of the longest side of the object's box
-ground_height    its z in world units, or ``auto``: the bottom of the object
+ground_height    z of the square in world units, or ``auto``: the bottom of the object
 ===============  ===================================================================================
 
 Each prior has its own module: a registered subclass of :class:`Prior` that implements
@@ -44,7 +44,7 @@ def is_color(value: Any) -> bool:
 
 
 def points(low: int) -> Rule:
-    """Return the rule for numbers of points, from ``low`` to what fits into memory."""
+    """Return the rule for a number of points: at least ``low``, and few enough for the memory."""
     return count_of("points", low, POINT_BYTES)
 
 
@@ -57,8 +57,10 @@ PATH = required("this prior reads a file; set path to it")
 
 
 def require_axes(cfg: Any, kind: str) -> None:
-    """Raise UserError unless the options ``up`` and ``front`` name two axes that aren't parallel,
-    for a ``kind`` of file ("glb").
+    """Raise UserError unless the options ``up`` and ``front`` name two axes that aren't parallel.
+
+    Args:
+        kind: extension of the file ("glb"), which determines the default axes.
     """
     pose_rotation(kind, cfg.up, cfg.front)
 
@@ -91,8 +93,8 @@ class Prior(BaseObject):
         """Return the points for ``prompt``: float32, finite, colours in [0, 1], z up, +x the front.
 
         Raises:
-            UserError: the source is missing, unreadable, empty, or more than 5 % of it is not
-                finite.
+            UserError: the source is missing, unreadable or empty, or more than 5 % of its points
+                aren't finite.
         """
         cloud = validated(
             self.generate(prompt, numpy_generator(run_seed(), "prior")), type(self).__name__
@@ -122,7 +124,9 @@ class Prior(BaseObject):
 def chosen_colors(
     color: Any, count: int, generator: np.random.Generator
 ) -> Float[np.ndarray, "P 3"]:
-    """Return ``count`` colours: uniformly random in [0, 1], grey, or all the same."""
+    """Return ``count`` colours: uniformly random in [0, 1] if ``color`` is "random",
+    else all equal to it: "grey" or three numbers in [0, 1].
+    """
     if color == "random":
         return generator.random((count, 3), np.float32)
     return np.tile(np.float32([GREY] * 3 if color == "grey" else list(color)), (count, 1))
@@ -133,14 +137,14 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
     1].
 
     Raises:
-        UserError: no points, arrays that don't fit each other, or more than 5 % of rows that are
-            not finite.
+        UserError: there are no points, points and colours aren't both (P, 3), or more than 5 % of
+            the rows are not finite.
     """
     points, colors = (np.asarray(values, np.float32) for values in (cloud.points, cloud.colors))
     if points.ndim != 2 or points.shape[1:] != (3,) or colors.shape != points.shape:
         raise UserError(
-            f"{name} gave points {points.shape} and colours {colors.shape}: (P, 3) of both "
-            "were expected"
+            f"{name} gave points {points.shape} and colours {colors.shape}; expected "
+            "(P, 3) for both"
         )
     if not len(points):
         raise UserError(f"{name} gave no points: its source is empty")

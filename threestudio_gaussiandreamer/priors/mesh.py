@@ -1,5 +1,5 @@
-"""``mesh-prior``: any triangle mesh as the coarse shape, in place of what a text-to-3D model would
-give.
+"""``mesh-prior``: any triangle mesh as the coarse shape, in place of the output of a text-to-3D
+model.
 
 ================  ==================================================================================
 option            meaning
@@ -9,14 +9,14 @@ path              GLB, glTF, OBJ, PLY, STL, OFF, ... with texture, vertex colour
 scale             half the longest side of the result, world units
 up, front         the file's axes, ``+x`` to ``-z``; ``auto`` and null: by the kind of file (see
                   ``meshes/load.py``)
-num_points        0: the mesh's vertices, as the paper takes them from Shap-E; else points uniform
-                  over the surface
-color_smoothing   average each colour over this many nearest points: the coarse colours of a
-                  text-to-3D model
-color             null: the mesh's colours; ``grey``, ``random`` or [r, g, b] in [0, 1] in their
-                  place
-jitter            standard deviation of noise on the positions, in units of ``scale``: a wrong,
-                  coarse shape
+num_points        0: the mesh's vertices, as the paper uses those of Shap-E's mesh; else this many
+                  points, uniform over the surface
+color_smoothing   average each colour over this many nearest points, which imitates the coarse
+                  colours of a text-to-3D model
+color             null: the mesh's colours; ``grey``, ``random`` or [r, g, b] in [0, 1] replace
+                  them
+jitter            standard deviation of noise on the positions, in units of ``scale``, which
+                  imitates a coarse, inaccurate shape
 ground, ...       see ``priors/base.py``
 ================  ==================================================================================
 
@@ -41,8 +41,8 @@ from .base import COLOR, PATH, SCALE, Prior, chosen_colors, points, require_axes
 logger = logging.getLogger(__name__)
 
 SMOOTHING_ROWS, SMOOTHING_ENTRIES = 8192, 2**22
-"""Rows that are averaged at a time, and their neighbours in all, so that memory doesn't grow with
-points times neighbours.
+"""Largest number of points whose colours are averaged at a time, and of all their neighbours
+together. They bound the memory.
 """
 
 
@@ -72,7 +72,7 @@ class MeshFilePrior(Prior):
 
 @register("mesh-prior")
 class MeshPrior(MeshFilePrior):
-    """The vertices of a mesh, or points on its surface."""
+    """Start from the vertices of a mesh, or from points on its surface."""
 
     @dataclass
     class Config(MeshFilePrior.Config):
@@ -117,7 +117,9 @@ def vertex_cloud(mesh: Mesh) -> PointCloud:
 
 
 def face_normals(mesh: Mesh) -> Float[np.ndarray, "F 3"]:
-    """Unit normals, by the order of the corners; zero for a face without area."""
+    """Return unit normals, towards the side on which the corners are counter-clockwise; zero for a
+    face without area.
+    """
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -132,6 +134,7 @@ def smoothed_colors(cloud: PointCloud, neighbours: int) -> Float[np.ndarray, "P 
     neighbours = min(neighbours, len(cloud.points))
 
     def average(points: Float[np.ndarray, "Q 3"]) -> Float[np.ndarray, "Q 3"]:
+        # a range, since the result for k=1 would lack the second dimension
         nearest: Int[np.ndarray, "Q K"] = tree.query(
             points, k=range(1, neighbours + 1), workers=-1
         )[1]

@@ -5,7 +5,7 @@ option              meaning
 ==================  ================================================================================
 checkpoint          ``base_40m_textvec.pt`` as OpenAI publishes it, or Cap3D's
                     ``pointE_finetuned_with_330kdata.pth``
-upsampler           ``upsample_40m.pt``; null: stop at the coarse points
+upsampler           ``upsample_40m.pt``; null: only the coarse points, without upsampling
 clip                OpenAI's CLIP ViT-L/14 in transformers' format, a folder or an id of the hub
 prompt              replaces the run's prompt for Point-E
 guidance_scale      of the coarse points; 1 = none, 3 in the published sampler. The upsampler isn't
@@ -18,7 +18,7 @@ sigma_max           highest noise levels of the base model and of the upsampler;
 churn               S_churn of Karras et al. for the base model and the upsampler; 3 and 0
 scale               world units per unit of Point-E, whose points lie in [-0.5, 0.5]; with
                     ``normalize``: half the longest side
-normalize           centre the box and make its longest half side ``scale``
+normalize           centre the bounding box, and make half its longest side ``scale``
 front               the axis of Point-E's space that faces azimuth 0
 device              ``auto``: the run's GPU, or the CPU, where it takes minutes
 ground, ...         see ``priors/base.py``
@@ -64,7 +64,9 @@ from .weights import load_exactly, read_state_dict
 
 SCALES = torch.tensor([2.0] * 3 + [2 / 255] * 3)[:, None]
 BIASES = torch.tensor([0.0] * 3 + [-1.0] * 3)[:, None]
-"""The inputs of the networks are ``points * SCALES + BIASES``, which is in [-1, 1]."""
+"""Per channel (x, y, z, red, green, blue): the inputs of the networks are ``points * SCALES +
+BIASES``, in [-1, 1], of positions in [-0.5, 0.5] and colours in [0, 255].
+"""
 
 
 class Kind(NamedTuple):
@@ -74,7 +76,9 @@ class Kind(NamedTuple):
     title: str
     file: str
     projection: str
-    """Name of a weight that identifies this network; its columns are the condition's features."""
+    """Name of a weight that only this network has. It projects CLIP's features, so its number of
+    columns is their number.
+    """
 
 
 BASE = Kind(BaseModel, "Point-E base checkpoint", "base_40m_textvec.pt", "clip_embed.weight")
@@ -87,7 +91,7 @@ CHECKPOINT = required(
     "Point-E's weights are a file that you download; set checkpoint to base_40m_textvec.pt"
 )
 PAIR = satisfies(
-    "two numbers of 0 or more, of the coarse and of the further points",
+    "two numbers of 0 or more, for the base model and for the upsampler",
     lambda value: is_numbers(value, 2) and min(value) >= 0,
 )
 
@@ -143,7 +147,7 @@ class PointEPrior(Prior):
         info(f"Point-E: {self.cfg.prompt or prompt!r} on {device}")
         points = self._coarse_points(self._condition(self.cfg.prompt or prompt, device), rng)
         if self.cfg.upsampler:
-            points = torch.cat([points, self._further_points(points, rng)], dim=-1)
+            points = torch.cat([points, self._upsampled_points(points, rng)], dim=-1)
         free_memory()
         rows = points[0].T.cpu().numpy()
         cloud = PointCloud(
@@ -171,6 +175,7 @@ class PointEPrior(Prior):
         model = kept_network(BASE, self.cfg.checkpoint, condition.device)
         require_features(model, condition, self.cfg.clip)
         scale = self.cfg.guidance_scale
+        # with guidance a second row, the unconditional one
         conditions = (
             condition if scale == 1 else torch.cat([condition, torch.zeros_like(condition)])
         )
@@ -179,7 +184,7 @@ class PointEPrior(Prior):
         )
         return self._sampled(denoise, self.cfg.num_points, 0, rng, condition.device)
 
-    def _further_points(
+    def _upsampled_points(
         self, coarse: Float[Tensor, "1 6 M"], rng: torch.Generator
     ) -> Float[Tensor, "1 6 N"]:
         model = kept_network(UPSAMPLER, self.cfg.upsampler, coarse.device)
@@ -191,7 +196,11 @@ class PointEPrior(Prior):
     def _sampled(
         self, denoise: Any, count: int, stage: int, rng: torch.Generator, device: torch.device
     ) -> Float[Tensor, "1 6 N"]:
-        """Return ``count`` points in Point-E's units: positions, and colours up to 255."""
+        """Return ``count`` points in Point-E's units: positions, and colours in [0, 255].
+
+        Args:
+            stage: 0 for the base model, 1 for the upsampler.
+        """
         noise = torch.randn(1, CHANNELS, count, generator=rng).to(device)
         sigmas = karras_sigmas(
             self.cfg.num_steps, self.cfg.sigma_min, float(self.cfg.sigma_max[stage])
@@ -211,12 +220,14 @@ def mean_of(network: Network) -> Network:
 
 
 def kept_network(kind: Kind, path: str, device: torch.device) -> Any:
-    """Return :func:`load_network`'s result on a device, or the one that this process has kept."""
+    """Return the network of :func:`load_network` on ``device``, loaded once if the process keeps
+    its networks (``models/loaded.py``).
+    """
     return loaded((kind.title, path, device), lambda: load_network(kind, path).to(device))
 
 
 def load_network(kind: Kind, path: str) -> Any:
-    """Load a network of this kind in evaluation mode. Its sizes are those of the weights' shapes.
+    """Load a network of this kind in evaluation mode. Its sizes are read from the weights' shapes.
 
     Raises:
         UserError: the file can't be read, or is of another model.

@@ -1,7 +1,7 @@
 """Warn about words of a prompt that a model with a small vocabulary wasn't trained on.
 
 A model may list the words that it was trained on in ``tokenizer/words.txt``; published models have
-no such file, and any prompt is taken without a warning.
+no such file, so that no prompt causes a warning.
 """
 
 import re
@@ -13,6 +13,7 @@ from ..host import warn
 
 WORDS_FILE = "tokenizer/words.txt"
 SHOWN = 8
+"""Largest number of words that the warning names."""
 
 
 def warn_of_unknown_words(folder: Path, prompt: str) -> None:

@@ -6,21 +6,23 @@ In the built-in host they are also registered under threestudio's names, with th
 =============================  =====================================================================
 option                         meaning
 =============================  =====================================================================
-pretrained_model_name_or_path  the model: a folder or a hub id; ``revision`` of a hub id
-prompt                         the text; ``lib:corgi_ukulele`` is the one text of ``prompt_library``
-                               with both words
+pretrained_model_name_or_path  the model: a folder or a hub id
+revision                       branch, tag or commit of a hub id
+prompt                         the text; ``lib:corgi_ukulele`` stands for the only text of
+                               ``prompt_library`` that contains both words
 prompt_file                    a UTF-8 file whose content is the prompt; overrides ``prompt``
 prompt_library                 a JSON list of texts, or an object of such lists (threestudio's
                                load/prompt_library.json)
 prompt_front, _side, _back,    the whole prompt of a direction, in place of "<prompt>, front view"
 _overhead
-view_dependent_prompt_front    "front view of <prompt>" instead
+view_dependent_prompt_front    write "front view of <prompt>" in place of "<prompt>, front view"
 front_threshold, back_...      half the width of front and back, degrees of azimuth
 overhead_threshold             elevation above which a view is overhead, degrees
 negative_prompt                what the pictures should not be; default: that of the released
                                GaussianDreamer
-use_perp_neg, perp_neg_f_*     Perp-Neg: the other directions as negative prompts, with weights -(a
-                               exp(-b r) + c)
+use_perp_neg                   Perp-Neg: the other directions as negative prompts
+perp_neg_f_*                   (a, b, c) of their weights -(a exp(-b r) + c), see
+                               ``view_prompts.py``
 use_cache, cache_dir           keep the embeddings on the disk, by model and text
 spawn                          run the text encoder in a separate process
 =============================  =====================================================================
@@ -104,7 +106,9 @@ class TextEncoderPromptProcessor(BaseObject):
     @staticmethod
     @abstractmethod
     def encode(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
-        """Return an embedding (N, F) per text; ``spawn`` needs a function that can be pickled."""
+        """Return an embedding (N, F) per text: N tokens of F features. With ``spawn`` this function
+        is pickled.
+        """
 
     def configure(self) -> None:
         check_options(self.Config, self.cfg, "system.prompt_processor.")
@@ -220,7 +224,7 @@ def from_library(words: str, path: str) -> str:
 
     Args:
         words: words joined by underscores, such as "corgi_ukulele"; case is ignored.
-        path: of the library, see :func:`read_library`.
+        path: the library's file, see :func:`read_library`.
 
     Raises:
         UserError: no text matches, several do, or there is no library at ``path``.
@@ -284,5 +288,6 @@ def in_a_child(encode: Any, folder: Path, texts: list[str]) -> list[Float[Tensor
 
 
 def _as_arrays(encode: Any, folder: Path, texts: list[str]) -> list[Any]:
-    # as arrays, since tensors are passed as handles of shared memory that ends with the process
+    # Arrays are copied to the parent. Tensors would be passed as handles of shared memory, which is
+    # freed when this process ends.
     return [embedding.numpy() for embedding in encode(folder, texts)]

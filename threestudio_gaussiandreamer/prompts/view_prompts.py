@@ -21,13 +21,17 @@ Coefficients = Tuple[float, float, float]
 
 
 class Direction(NamedTuple):
-    """One view direction. If a view satisfies the conditions of several, the last one applies."""
+    """One view direction. If a view satisfies the conditions of several directions, the last one in
+    :func:`view_directions` applies.
+    """
 
     name: str
     prompt: Callable[[str], str]
     negative_prompt: Callable[[str], str]
     condition: Condition
-    """Maps (elevation, azimuth, camera_distances), each (B,), to bool (B,): which views have it."""
+    """Maps (elevation, azimuth, camera_distances), each (B,), to bool (B,): which views have this
+    direction.
+    """
 
 
 def view_directions(
@@ -73,8 +77,16 @@ def shifted(azimuth: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
 class PromptEmbeddings:
     """The embeddings of one prompt; the names are those of threestudio's ``PromptProcessorOutput``.
 
-    ``*_vd`` hold one row per direction; ``perp_neg_f_*`` are (a, b, c) of the weight a exp(-b r) +
-    c."""
+    Each embedding has N tokens of F features; ``*_vd`` hold one per direction.
+
+    ``perp_neg_f_*`` are the coefficients (a, b, c) of the weights -(a exp(-b r) + c) of the
+    negative prompts:
+
+    - for a view between front and side: ``fs`` for "front", with r the share of "front" in the
+      interpolated prompt, and ``sf`` for "side", with r the share of "side";
+    - for a view between side and back: ``sb`` for "side" and ``fsb`` for "front", both with r the
+      share of "side".
+    """
 
     text_embeddings: Float[Tensor, "1 N F"]
     uncond_text_embeddings: Float[Tensor, "1 N F"]
@@ -123,9 +135,9 @@ class PromptEmbeddings:
                 self.text_embeddings_vd.device
             )
             return torch.cat([self.text_embeddings_vd[rows], self.uncond_text_embeddings_vd[rows]])
-        every = (len(elevation), -1, -1)
+        shape = (len(elevation), -1, -1)
         return torch.cat(
-            [self.text_embeddings.expand(every), self.uncond_text_embeddings.expand(every)]
+            [self.text_embeddings.expand(shape), self.uncond_text_embeddings.expand(shape)]
         )
 
     def get_text_embeddings_perp_neg(
@@ -155,22 +167,23 @@ class PromptEmbeddings:
         rows = self.direction_indices(elevation, azimuth, camera_distances).to(device)
         overhead = rows == self.direction2idx["overhead"]
         angle = shifted(azimuth).abs().to(device)
-        pair, closeness = self._interpolation(angle)
+        pair, share = self._interpolation(angle)
         embeddings, uncond = self.text_embeddings_vd, self.uncond_text_embeddings_vd[rows]
-        share = closeness.to(embeddings)[:, None, None]
-        positive = share * embeddings[pair[:, 0]] + (1 - share) * embeddings[pair[:, 1]]
+        first = share.to(embeddings)[:, None, None]
+        positive = first * embeddings[pair[:, 0]] + (1 - first) * embeddings[pair[:, 1]]
+        # overhead views aren't interpolated, and have no other directions as negative prompts
         positive = torch.where(overhead[:, None, None], embeddings[rows], positive)
         negative = torch.where(
             overhead[:, None, None, None], uncond[:, None], embeddings[self._negative_rows(angle)]
         )
-        weights = torch.where(overhead[:, None], 0.0, self._negative_weights(angle, closeness))
+        weights = torch.where(overhead[:, None], 0.0, self._negative_weights(angle, share))
         return torch.cat([positive, uncond, negative.flatten(0, 1)]), weights.to(elevation.device)
 
     def _interpolation(
         self, angle: Float[Tensor, " B"]
     ) -> Tuple[Int[Tensor, "B 2"], Float[Tensor, " B"]]:
-        """Return the two directions that each view lies between, and the weight of the first one in
-        the interpolation, in [0, 1].
+        """Return the two directions that each view lies between, and the share of the first one in
+        the interpolated prompt, in [0, 1].
         """
         side, front, back = (self.direction2idx[name] for name in ("side", "front", "back"))
         in_front = angle < 90
@@ -186,13 +199,13 @@ class PromptEmbeddings:
         ).long()
 
     def _negative_weights(
-        self, angle: Float[Tensor, " B"], closeness: Float[Tensor, " B"]
+        self, angle: Float[Tensor, " B"], share: Float[Tensor, " B"]
     ) -> Float[Tensor, "B 2"]:
         front_half = torch.stack(
-            [decay(self.perp_neg_f_fs, closeness), decay(self.perp_neg_f_sf, 1 - closeness)], dim=1
+            [decay(self.perp_neg_f_fs, share), decay(self.perp_neg_f_sf, 1 - share)], dim=1
         )
         back_half = torch.stack(
-            [decay(self.perp_neg_f_sb, closeness), decay(self.perp_neg_f_fsb, closeness)], dim=1
+            [decay(self.perp_neg_f_sb, share), decay(self.perp_neg_f_fsb, share)], dim=1
         )
         return -torch.where((angle < 90)[:, None], front_half, back_half)
 

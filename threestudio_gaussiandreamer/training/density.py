@@ -1,4 +1,4 @@
-"""Density control: clone, split and drop Gaussians while the cloud is trained.
+"""Density control: clone, split and prune Gaussians during training.
 
 As gsplat's ``Strategy``, one object is called around every optimiser step:
 
@@ -54,7 +54,7 @@ class DensityOutcome(NamedTuple):
     after: int
     """Number of Gaussians after the changes."""
     replaced: bool
-    """Whether the cloud has new parameters."""
+    """Whether the parameters of the cloud were replaced."""
     measured: dict[str, float]
     """dB that a round of ``budget: auto`` cost, by their name in the logs; empty for any other."""
 
@@ -104,7 +104,8 @@ class DensityControl:
 
     def schedule_problem(self, step: int, max_steps: int) -> Optional[str]:
         """Describe why the rounds between ``step`` and ``max_steps`` (-1: unlimited) can't meet the
-        budget, or only if they keep less than ``prune.keep``; return None if they meet it.
+        budget, or can meet it only by keeping less than ``prune.keep``. Return None if there is no
+        such problem.
         """
         end = max_steps if max_steps > 0 else math.inf
         budget, rounds, count = self.cfg.budget, self.prune_rounds, len(self.cloud)
@@ -129,12 +130,12 @@ class DensityControl:
                 "set system.geometry.prune.start, stop and every accordingly"
             )
         share = self.kept_share(count, remaining[0])
-        if share >= keep - 0.005:
+        if share >= keep - 0.005:  # equal in the two decimals of the message
             return None
         return (
             f"{len(remaining)} rounds of pruning must reduce {count} Gaussians to {budget}: "
-            f"each keeps {share:.2f} instead of {keep:g}, which costs more; use more rounds "
-            "(system.geometry.prune.every) or start with fewer"
+            f"each keeps {share:.2f} instead of {keep:g}, which loses more quality; use more "
+            "rounds (system.geometry.prune.every) or start with fewer"
         )
 
     # -- statistics --------------------------------------------------------------------------------
@@ -159,7 +160,7 @@ class DensityControl:
             importance.removal_error(image, pictures["gaussian_opacities"], rng)
         )
         if self.cloud.wants_absgrad:
-            # the sample's backward pass has added to absgrad, but the statistics are of the loss
+            # removal_error has added its gradients to absgrad, which is for those of the loss only
             pictures["rasterized"].means2d.absgrad.zero_()
 
     def samples_removal(self, step: int) -> bool:
@@ -270,8 +271,9 @@ class DensityControl:
         share = self.kept_share(len(scores), step)
         count, measured = importance.next_count(len(scores), share, min_count(self.cfg)), {}
         if self.cfg.budget == AUTO and (first is not None or check is None):
-            count = len(scores)  # new Gaussians haven't been rendered, so have no statistics
+            count = len(scores)  # new Gaussians haven't been rendered: their loss is unknown
         elif self.cfg.budget == AUTO:
+            # never prune the Gaussians that this score protects, see importance.py
             top = importance.top_count(stats.contribution) if cfg.score == "contribution" else 0
             count, measured = smallest_passing_count(scores, max(count, top), check)
         return importance.keep_highest(values, scores, count, first), measured

@@ -1,13 +1,13 @@
-"""What a run leaves to look at: the page of its cloud, its poster, and the turntable.
+"""Write the files that show a run's result: a page with the cloud, a poster and the turntable.
 
 ==========================  =======================================================================
 file in ``save/``           content
 ==========================  =======================================================================
-it<step>-export/view.html   the cloud, and the first one to compare with, in a browser
+it<step>-export/view.html   page for browsers: the cloud, and the initial cloud for comparison
 it<step>-export/poster.png  one view with a transparent background
 it<step>-test.mp4           the turntable of the test views
-it<step>-test.webp          fewer of them, for pages that play no video
-prior/gaussians.spz         the cloud that training has started with
+it<step>-test.webp          fewer frames as an animated picture, for pages that play no video
+prior/gaussians.spz         the initial cloud, before training
 ==========================  =======================================================================
 """
 
@@ -41,13 +41,13 @@ PAGE, POSTER = "view.html", "poster.png"
 POSTER_SIZE = 512
 """Pixels each way."""
 TURNTABLE_FRAMES, TURNTABLE_SIZE, TURNTABLE_SECONDS = 40, 256, 4.0
-"""Largest number of frames of the animated picture and its largest size in pixels."""
+"""Of the animated picture: largest number of frames, longest side in pixels, seconds."""
 
 
 def save_first_cloud(system: Any) -> None:
     """Keep the cloud that training starts with, so that pages can show it beside the result."""
-    kept = system._save_dir is not None and _is_cloud(system.geometry)
-    if kept and system.cfg.pages and system.trainer.is_global_zero:
+    can_save = system._save_dir is not None and _is_cloud(system.geometry)
+    if can_save and system.cfg.pages and system.trainer.is_global_zero:
         first = StoredCloud(read_gaussians(system.geometry))
         write_cloud(system.get_save_path(FIRST_CLOUD), first, ".spz")
 
@@ -86,6 +86,7 @@ def write_turntable(system: Any) -> None:
     folder = Path(system.get_save_dir(), name)
     if not system.cfg.pages:
         return
+    # every n-th frame, with n rounded up, so that at most TURNTABLE_FRAMES are left
     frames = sorted(folder.glob("*.png"), key=lambda path: int(path.stem))
     chosen = frames[:: -(-len(frames) // TURNTABLE_FRAMES) or 1]
     if chosen:

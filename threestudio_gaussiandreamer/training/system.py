@@ -5,7 +5,7 @@ In the host's order: ``configure_optimizers`` builds prompt processor and guidan
 prior; ``training_step`` renders, gets the losses from the guidance, steps the optimiser, then
 densifies and prunes (after the step, so that no update is lost and a checkpoint written after it
 holds the cloud that the next step starts from); validation saves a grid of pictures, test a
-turntable. Where the guidance knows the truth, the cloud is scored on held-out views.
+turntable. If the guidance knows a mesh as ground truth, held-out views are scored.
 
 =============  =====================================================================================
 option         meaning
@@ -17,11 +17,11 @@ optimizer      name (a torch optimiser) and args; the learning rates belong to t
                background
 evaluation     views, size (pixels), supersample, every (steps; 0: only at start and end): PSNR and
                SSIM on held-out views
-prune          a budget for a second, pruned export: count, bytes (of the SPZ file where that is
-               exported, else of the PLY), psnr (dB to the cloud before) or within (dB lost of
-               quality); quality, size, steps: as the prune command; eps2d, antialias: the
-               renderer's, unless given
-pages          write what shows the cloud in a browser, see ``pages.py``
+prune          options of a second, pruned export. Its budget is one of count; bytes (of the SPZ
+               file if it is exported, else of the PLY); psnr (dB, to the unpruned cloud); within
+               (dB that may be lost against the ground truth). quality, size and steps are as in
+               the prune command; eps2d and antialias by default the renderer's
+pages          write a page that shows the cloud in a browser, and more: see ``pages.py``
 =============  =====================================================================================
 """
 
@@ -107,13 +107,13 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     @staticmethod
     def check_checkpoint(checkpoint: dict[str, Any], what: str) -> None:
-        """Check a cloud before anything is built for it; called by the launcher.
+        """Check a checkpoint before any object is built from it; called by the launcher.
 
         Args:
             what: the file, for messages.
 
         Raises:
-            UserError: no Gaussians, or what can't be one.
+            UserError: the cloud is empty, or tensors of the cloud or the guidance are malformed.
         """
         if "geometry.means" in checkpoint["state_dict"]:
             names = {name: f"geometry.{name}" for name in SHAPES}
@@ -157,8 +157,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             guidance.preflight(self.cfg.guidance)
 
     def prepare_guidance(self) -> None:
-        """Build prompt processor and guidance; before the prior runs, since weights may be missing
-        here too.
+        """Build prompt processor and guidance. Called before the prior runs, so that missing
+        weights are reported first.
         """
         self.prompt_processor = find(self.cfg.prompt_processor_type)(self.cfg.prompt_processor)
         self.prompt_utils = self.prompt_processor()
@@ -169,7 +169,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.require_finite()  # before the file of an earlier, good state is replaced
-        if self.measurements:  # a run that resumes from this file has no prior to score
+        if self.measurements:  # the prior's cloud isn't in this file, so score it now
             scores = self.measurements.score_postponed()
             log_scores(self.loggers, scores, self.cfg.evaluation.views)
         super().on_save_checkpoint(checkpoint)
@@ -214,7 +214,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         if self.global_step == 0:
             save_first_cloud(self)
         if self.measurements:
-            if self.global_step == 0:  # scored later, since the truth takes seconds to render
+            if self.global_step == 0:  # scored later, since rendering the truth takes seconds
                 self.measurements.postpone("prior", self.renderer, 0)
             self.measurements.start_clock()
         prefetch_truth(self)
@@ -252,7 +252,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         check = RenderedQuality(
             self.density, lambda: self(batch), lambda out: true_views(self.guidance, batch, out)
         )
-        # self.optimizers() wraps the torch optimiser, whose rows have to follow the Gaussians
+        # The rows of the optimiser's state are changed with the Gaussians, so pass the torch
+        # optimiser in Lightning's wrapper.
         outcome = self.density.after_step(optimizer.optimizer, self.global_step, check)
         if outcome.measured:
             self.log_dict(outcome.measured)
@@ -334,15 +335,15 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         lines = exported_files(Path(self._save_dir or "."))
         return "\n".join([*lines, *(["", self.measurements.table()] if self.measurements else [])])
 
-    # -- looking -----------------------------------------------------------------------------------
+    # -- pictures ----------------------------------------------------------------------------------
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         with self.measurements.paused_clock() if self.measurements else contextlib.nullcontext():
             self.show(batch)
 
     def show(self, batch: dict[str, Any]) -> None:
-        """Save a row of pictures: the render, its depth and normals, the truth where it is known,
-        and what the score model sees.
+        """Save a row of pictures: the render, its depth and normals, the ground truth if there is
+        one, and the score model's noisy and denoised images.
         """
         out = self(batch)
         images = render_panels(out)

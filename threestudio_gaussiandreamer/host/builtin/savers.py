@@ -1,4 +1,4 @@
-"""Writing results into the ``save`` folder of a run, by the host's method names."""
+"""Write results into the ``save`` folder of a run, by methods with threestudio's names."""
 
 import os
 import re
@@ -16,8 +16,8 @@ from ...core.files import atomic_file, json_text
 
 
 class SaverMixin:
-    """``save_*`` methods; each takes a file name below the save folder, makes its folder, and
-    returns the full path.
+    """``save_*`` methods: each takes a file name relative to the save folder, and returns the full
+    path of the file that it has written.
     """
 
     _save_dir: Optional[str] = None
@@ -32,6 +32,11 @@ class SaverMixin:
         return self._save_dir
 
     def get_save_path(self, filename: str) -> str:
+        """Return the full path of a file below the save folder, and create its folder.
+
+        Raises:
+            UserError: the path is outside the save folder.
+        """
         path = os.path.join(self.get_save_dir(), filename)
         if os.path.relpath(path, self.get_save_dir()).startswith(os.pardir):
             raise UserError(
@@ -72,8 +77,9 @@ class SaverMixin:
         name: Optional[str] = None,
         step: Optional[int] = None,
     ) -> str:
-        """Save (H,W,C) or (C,H,W) values in ``data_range``; more than three channels are laid side
-        by side in groups of three.
+        """Save an image (H,W,C) or (C,H,W) whose values span ``data_range``.
+
+        With more than three channels, each three of them become one RGB image, side by side.
         """
         picture = pictures.rgb(
             self.convert_data(img), data_format=data_format, data_range=data_range
@@ -89,8 +95,12 @@ class SaverMixin:
         name: Optional[str] = None,
         step: Optional[int] = None,
     ) -> str:
-        """Save (H,W) values; without ``data_range`` from their smallest to their largest. ``cmap``:
-        None, "jet", "magma".
+        """Save values (H,W) with a colour map.
+
+        Args:
+            data_range: the values at the ends of the colour map; by default the smallest and the
+                largest value.
+            cmap: "jet", "magma", or None for grey.
         """
         picture = pictures.grayscale(self.convert_data(img), data_range=data_range, cmap=cmap)
         return self._save_picture(filename, picture, name, step)
@@ -104,8 +114,13 @@ class SaverMixin:
         step: Optional[int] = None,
         texts: Optional[list] = None,
     ) -> str:
-        """Save a row of ``{"type": "rgb"|"grayscale", "img": ..., "kwargs": {...}}``, or a list of
-        rows; resized to ``align``.
+        """Save a grid of images.
+
+        Args:
+            imgs: a row of ``{"type": "rgb"|"grayscale", "img": ..., "kwargs": {...}}``, or a list
+                of rows; ``kwargs`` as for :meth:`save_rgb_image` and :meth:`save_grayscale_image`.
+            align: the size of every cell, see ``core.images.grid``.
+            texts: one line of text per row.
         """
         picture = pictures.grid(self._converted(imgs), align=align)
         if texts:
@@ -126,8 +141,11 @@ class SaverMixin:
         name: Optional[str] = None,
         step: Optional[int] = None,
     ) -> str:
-        """Save the pictures in ``img_dir`` (below the save folder) whose name matches as a video,
-        in the order of the number in the first group.
+        """Save a video of the pictures in ``img_dir``, a folder below the save folder.
+
+        Args:
+            matcher: regular expression for the file names to include; its first group is the
+                number by which they are sorted.
         """
         if save_format not in ("mp4", "gif"):
             raise UserError(f"unknown video format {save_format!r}: expected 'mp4' or 'gif'")
@@ -181,6 +199,7 @@ class SaverMixin:
             vertices = np.concatenate([vertices, self.convert_data(mesh.v_rgb)], axis=1)
         with atomic_file(path) as file:
             np.savetxt(file, vertices, fmt="v" + " %.9g" * vertices.shape[1])
+            # OBJ counts vertices from 1
             np.savetxt(file, faces + 1, fmt="f %d %d %d")
         return [path]
 

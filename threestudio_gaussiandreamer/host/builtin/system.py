@@ -1,4 +1,6 @@
-"""The base systems: LightningModules that build, update, render and export the parts."""
+"""The base systems: LightningModules that build the registered parts of a run (geometry, renderer,
+...), update them at every step, and export the result.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any, List, Optional
@@ -20,7 +22,7 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
     """Parses its configuration, calls ``configure``, and updates dataset and parts before and after
     every batch.
 
-    Its data loaders must have a ``dataset``.
+    Every data loader must have an attribute ``dataset``.
     """
 
     @dataclass
@@ -63,8 +65,8 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         self.do_update_step(epoch, global_step, on_load_weights=True)
 
     def set_resume_status(self, current_epoch: int, global_step: int) -> None:
-        """Set the epoch and step of the checkpoint that is validated, tested or exported:
-        Lightning's own stay 0 there.
+        """Set the epoch and step of the checkpoint that is validated, tested or exported;
+        Lightning's own counters are 0 outside of training.
         """
         self._resumed_eval = current_epoch, global_step
 
@@ -75,20 +77,20 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
 
     @property
     def true_current_epoch(self) -> int:
+        """The epoch of training, or of the checkpoint that is evaluated."""
         return self._resumed_eval[0] if self._resumed_eval else self.current_epoch
 
     @property
     def true_global_step(self) -> int:
+        """The finished steps of training, or of the checkpoint that is evaluated."""
         return self._resumed_eval[1] if self._resumed_eval else self.global_step
 
     def C(self, value: Any) -> float:
-        """Return the value of a schedule now."""
+        """Return the value of a schedule at the current epoch and step."""
         return C(value, self.true_current_epoch, self.true_global_step)
 
     def configure_optimizers(self) -> Any:
-        """Build ``optimizer: {name, args, params}`` from ``torch.optim``; ``params`` names
-        attributes, each with its own options.
-        """
+        """Build the optimiser of the option ``optimizer``; see :func:`optimizer_from`."""
         return optimizer_from(self.cfg.optimizer, self)
 
     def training_step(self, batch: dict, batch_idx: int) -> Any:
@@ -165,8 +167,8 @@ class BaseLift3DSystem(BaseSystem):
     """Builds geometry, material, background and renderer by their names in the registry; exports
     through an exporter.
 
-    Guidance and prompt processor are left to the subclass, best in ``on_fit_start``: testing and
-    exporting need neither."""
+    Subclasses build the guidance and the prompt processor, preferably in ``on_fit_start``, since
+    testing and exporting need neither."""
 
     @dataclass
     class Config(BaseSystem.Config):
@@ -200,7 +202,7 @@ class BaseLift3DSystem(BaseSystem):
 
     def on_fit_start(self) -> None:
         if self._save_dir is None:
-            warn("the save folder isn't set: no picture will be saved")
+            warn("the save folder isn't set: no pictures will be saved")
         else:
             info(f"Validation results will be saved to {self._save_dir}")
 
@@ -238,8 +240,12 @@ class BaseLift3DSystem(BaseSystem):
 
 
 def optimizer_from(config: Any, module: torch.nn.Module) -> torch.optim.Optimizer:
-    """Build the optimiser ``{name, args, params}`` of ``torch.optim`` over all parameters, or over
-    the named attributes with their own options.
+    """Build an optimiser of ``torch.optim``.
+
+    Args:
+        config: ``name``, the class; ``args``, its keyword arguments; and optionally ``params``, a
+            mapping from attributes of ``module`` ("geometry.means") to the options of their
+            parameter groups. Without ``params`` all parameters are optimised.
 
     Raises:
         UserError: no such optimiser, or no such attribute.
