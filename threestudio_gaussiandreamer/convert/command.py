@@ -2,7 +2,7 @@
 
 The formats are those of the extensions: .ply, .compressed.ply, .spz, .sog and .glb are read and
 written, .splat and .gltf are read, .usda is written; IN may also be a checkpoint. The command says
-what OUT can't hold of IN, and with ``--check`` how many dB that costs.
+what OUT can't hold of IN, and ``--check`` measures the PSNR between them.
 
 A .glb or .obj is a textured mesh of the cloud's surface; ``--gaussians`` writes the Gaussians
 themselves into a .glb."""
@@ -41,7 +41,7 @@ from .producers import PRODUCERS, from_producer
 
 @dataclass
 class ConvertOptions:
-    """The options that are numbers, with their ranges."""
+    """The numeric options, with their ranges."""
 
     harmonics: Optional[int] = field(default=None, metadata=in_range(0, MAX_DEGREE))
     size: int = field(default=256, metadata=in_range(16, 4096, "pixels"))
@@ -51,11 +51,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--from": {
         "dest": "producer",
         "choices": PRODUCERS,
-        "help": "the program that has written IN, whose axes are known",
+        "help": "the program that wrote IN, which determines the axes",
     },
     "--up": {
         "choices": AXES,
-        "help": "which axis of IN is up (default: what the file says, else its format's custom)",
+        "help": "which axis of IN is up (default: from the file, else its format's convention)",
     },
     "--up-out": {
         "choices": AXES,
@@ -70,7 +70,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "type": int,
         "choices": VERSIONS,
         "default": VERSION,
-        "help": "of an SPZ (default: %(default)s)",
+        "help": "version of an SPZ file (default: %(default)s)",
     },
     "--harmonics": {
         "type": int,
@@ -79,13 +79,13 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
     "--antialiased": {
         "action": argparse.BooleanOptionalAction,
-        "help": "whether the Gaussians were trained so (default: what the file says)",
+        "help": "whether the Gaussians were trained with antialiasing (default: what IN says)",
     },
-    "--check": {"action": "store_true", "help": f"measure the dB of OUT to IN in {VIEWS} views"},
+    "--check": {"action": "store_true", "help": f"measure the PSNR of OUT to IN in {VIEWS} views"},
     "--size": {
         "type": int,
         "default": ConvertOptions.size,
-        "help": "pixels each way of these views (default: %(default)d)",
+        "help": "width and height of the views of --check, pixels (default: %(default)d)",
     },
 }
 
@@ -154,7 +154,7 @@ def _check_options(args: argparse.Namespace, suffix: str) -> None:
 
 
 def _read(source: Path, args: argparse.Namespace) -> StoredCloud:
-    """Read IN as it shall be written.
+    """Read IN and apply the options, so that the result is what OUT shall hold.
 
     Raises:
         UserError: it can't be read, or holds no Gaussians that can be drawn.

@@ -1,4 +1,4 @@
-"""What a file of a format can't hold of a cloud, as sentences."""
+"""Describe in sentences what a cloud loses when it is written in a format."""
 
 from collections.abc import Iterator
 
@@ -25,7 +25,7 @@ HARMONICS = {
 
 
 def losses(cloud: StoredCloud, suffix: str, spz_version: int) -> Iterator[str]:
-    """Yield what is lost when a cloud is written, nothing for exact formats.
+    """Yield a sentence for each loss of a format; none for formats that store float32.
 
     Args:
         suffix: the format, a key of ``formats.gaussian_files.FORMATS``.
@@ -42,7 +42,11 @@ def losses(cloud: StoredCloud, suffix: str, spz_version: int) -> Iterator[str]:
 
 
 def _counted(rows: np.ndarray, what: str) -> Iterator[str]:
-    """Yield "n of N Gaussians ``what``" where ``rows``, of any number of columns, hold any."""
+    """Yield "n of N Gaussians ``what``" if n > 0.
+
+    Args:
+        rows: Booleans, N rows of any shape; a Gaussian counts if any of its row is true.
+    """
     count = int(rows.reshape(len(rows), -1).any(axis=1).sum())
     if count:
         yield f"{count:,} of {len(rows):,} Gaussians {what}"
@@ -63,7 +67,7 @@ def _of_compressed_ply(cloud: StoredCloud) -> Iterator[str]:
     beyond = np.abs(gaussians.sh[:, 1:]) > SH_REACH
     yield from _counted(beyond, f"have harmonics beyond {SH_REACH:g}, clipped")
     large = np.abs(gaussians.log_scales) > MAX_STORED_LOG
-    yield from _counted(large, "are smaller or larger than e^20, and clipped")
+    yield from _counted(large, "are smaller than e^-20 or larger than e^20, and clipped")
 
 
 def _of_sog(cloud: StoredCloud) -> Iterator[str]:

@@ -18,12 +18,15 @@ from ..surface.textured import mesh_from_gaussians, require_mesh_libraries
 
 MESH_UP = "y"
 OPTIONS: dict[str, dict[str, Any]] = {
-    "--faces": {"type": int, "help": f"triangles at most (default: {MeshOptions.faces})"},
-    "--texture": {"type": int, "help": f"texels each way (default: {MeshOptions.texture})"},
-    "--views": {"type": int, "help": f"renders to bake (default: {MeshOptions.views})"},
+    "--faces": {"type": int, "help": f"largest number of triangles (default: {MeshOptions.faces})"},
+    "--texture": {
+        "type": int,
+        "help": f"texture width and height, texels (default: {MeshOptions.texture})",
+    },
+    "--views": {"type": int, "help": f"number of renders to bake (default: {MeshOptions.views})"},
     "--view-size": {
         "type": int,
-        "help": f"pixels of a render each way (default: {MeshOptions.view_size})",
+        "help": f"width and height of a render, pixels (default: {MeshOptions.view_size})",
     },
     "--method": {
         "choices": METHODS,
@@ -31,7 +34,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
     "--resolution": {
         "type": int,
-        "help": f"cells along the longest side (default: {MeshOptions.resolution})",
+        "help": f"grid cells along the longest side (default: {MeshOptions.resolution})",
     },
     "--eps2d": {
         "type": float,
@@ -43,7 +46,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "help": "ask viewers to show the texture without lighting",
     },
 }
-"""All are None where they aren't given."""
+"""Each is None unless it is given."""
 
 
 def writes_mesh(args: argparse.Namespace) -> bool:
@@ -52,10 +55,10 @@ def writes_mesh(args: argparse.Namespace) -> bool:
 
 
 def check_mesh_options(args: argparse.Namespace) -> None:
-    """Check what can be wrong before IN is read.
+    """Check options, libraries and output files, before IN is read.
 
     Raises:
-        UserError: an option has another range or has no effect, a library is missing, or a file
+        UserError: an option is out of range or has no effect, a library is missing, or a file
             can't be written.
     """
     if not writes_mesh(args):
@@ -72,7 +75,7 @@ def check_mesh_options(args: argparse.Namespace) -> None:
 
 
 def mesh_options(args: argparse.Namespace, antialias: bool) -> MeshOptions:
-    """Return the options that are given, and the defaults of the others."""
+    """Collect the mesh options; those that aren't given have their defaults."""
     names = [_attribute(name) for name in OPTIONS if name != "--unlit"]
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     return MeshOptions(**given, antialias=antialias)
@@ -97,4 +100,5 @@ def write_mesh(args: argparse.Namespace, stored: StoredCloud) -> None:
 
 
 def _attribute(option: str) -> str:
+    """Return the name that argparse gives an option's value."""
     return option.removeprefix("--").replace("-", "_")

@@ -50,13 +50,14 @@ class Asset(NamedTuple):
     prompt: str
     gaussians: Gaussians
     item: int
-    """Its number, from which random views are drawn."""
+    """Index of the asset; it seeds the asset's random views."""
 
 
 class Metric(ABC):
-    """One family of columns; constructed once, before the first render."""
+    """A metric of finished assets; constructed once, before the first render."""
 
     columns: ClassVar[tuple[str, ...]]
+    """Keys of the dictionary that :meth:`score` returns."""
 
     @abstractmethod
     def __init__(self, args: Namespace) -> None:
@@ -92,7 +93,7 @@ class Clip(Metric):
 
 
 class Directions(Metric):
-    """CLIP's share of views that look like another direction."""
+    """The share of views that CLIP assigns to the prompt of another direction."""
 
     columns = ("wrong_direction",)
     AZIMUTHS = {"front": (-15, 15), "side": (75, 105, -75, -105), "back": (165, -165)}
@@ -102,12 +103,12 @@ class Directions(Metric):
 
     def score(self, asset: Asset) -> dict[str, float]:
         azimuth = torch.tensor([float(a) for group in self.AZIMUTHS.values() for a in group])
-        same, protocol = torch.ones_like(azimuth), Protocol()
+        ones, protocol = torch.ones_like(azimuth), Protocol()
         orbit = Orbit(
-            protocol.elevation_deg * same,
+            protocol.elevation_deg * ones,
             azimuth,
-            protocol.radius * same,
-            math.radians(protocol.fovy_deg) * same,
+            protocol.radius * ones,
+            math.radians(protocol.fovy_deg) * ones,
         )
         pictures = rendered(asset, orbit, self.size)
         texts = {d.name: d.prompt(asset.prompt) for d in view_directions(45, 45, 60)}
@@ -119,7 +120,7 @@ class Directions(Metric):
 
 
 class Recognized(Metric):
-    """The attributes of the prompt that the toybox's judge recognises."""
+    """Which attributes of the prompt the toybox's judge recognises."""
 
     columns = ("kind", "colors", "pattern", "accessory")
 
@@ -135,7 +136,7 @@ class Recognized(Metric):
 
 
 class Janus(Metric):
-    """The judge's share of views that look like another quadrant."""
+    """The share of views that the judge takes for views from another quadrant."""
 
     columns = ("multi_face",)
 

@@ -343,7 +343,7 @@ def evaluate(
     content = report(results, prompts, scores, clip_folder, protocol)
     text = json_text(content, indent=2, ensure_ascii=False)
     with atomic_file(output / "clip.json") as file:
-        file.write(text.encode(errors="surrogateescape"))  # paths may be no UTF-8
+        file.write(text.encode(errors="surrogateescape"))  # paths may hold invalid UTF-8
     files_of_pictures.write(output / "clip.png", contact_sheet(prompts, scores))
     spread = (
         ""

@@ -36,7 +36,7 @@ class Result(NamedTuple):
 
 
 def find_result(place: str) -> Result:
-    """Find the last exported result in a run's folder, or take a PLY file.
+    """Find the result of the last export in a run's folder; a PLY file is a result itself.
 
     Raises:
         UserError: there is no such file or folder, or it has no Gaussians.
@@ -55,7 +55,7 @@ def find_result(place: str) -> Result:
             f"{place!r} is no run's folder with Gaussians in save/it*-export: export it first "
             "(--export), or name a PLY file"
         )
-    return Result(gaussians[-1], *_asked_for(folder / "configs" / "parsed.yaml"))
+    return Result(gaussians[-1], *_prompt_and_background(folder / "configs" / "parsed.yaml"))
 
 
 def _step(path: Path) -> tuple[int, str]:
@@ -72,7 +72,7 @@ def _checked(result: Result) -> Result:
     return result
 
 
-def _asked_for(parsed: Path) -> tuple[Optional[str], tuple[float, float, float]]:
+def _prompt_and_background(parsed: Path) -> tuple[Optional[str], tuple[float, float, float]]:
     """Return prompt and background colour of the run with this configuration; None and black if
     they aren't given.
     """
@@ -91,9 +91,7 @@ def _prompt_of(processor: Mapping[str, Any]) -> Optional[str]:
             )
             or None
         )
-    except (
-        UserError
-    ):  # the prompt library no longer exists; the user can give the prompt as an option
+    except UserError:  # the prompt library was removed; the prompt can be given as an option
         return None
 
 
@@ -110,13 +108,13 @@ class Pictures:
     def __init__(self, arrays: Gaussians, background: tuple[float, float, float] = BLACK) -> None:
         geometry = find("gaussiandreamer-cloud")({"sh_degree": math.isqrt(arrays.sh.shape[1]) - 1})
         geometry.set_arrays(**arrays._asdict())
-        behind = find("gaussiandreamer-background")({"color": list(background)})
+        backdrop = find("gaussiandreamer-background")({"color": list(background)})
         renderer = find("gaussiandreamer-splatting")(
-            {}, geometry=geometry, material=None, background=behind
+            {}, geometry=geometry, material=None, background=backdrop
         )
         self._renderer = renderer.to(get_device()).eval()
         geometry.to(get_device())
-        behind.to(get_device()).eval()
+        backdrop.to(get_device()).eval()
 
     def render(
         self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], size: int, *, chunk: int = 4

@@ -3,10 +3,10 @@
 ``python -m threestudio_gaussiandreamer.evaluate FOLDER [FOLDER ...] --metrics clip,judge,janus
 [--clip FOLDER] [--against FOLDER]``
 
-A folder is a run's, or holds runs at any depth. ``scorecard.csv`` has a row for each asset,
-``scorecard.json`` the means over the prompts with their bootstrap intervals, and with ``--against``
-the paired differences over the prompts that both folders have. ``asset_metrics.py`` lists the
-metrics.
+A folder is that of one run, or holds the folders of runs at any depth. ``scorecard.csv`` has a row
+for each asset. ``scorecard.json`` has the means over the prompts with their bootstrap intervals;
+with ``--against`` it also has the paired differences over the prompts that both sides have.
+``asset_metrics.py`` lists the metrics.
 """
 
 import argparse
@@ -48,13 +48,13 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     add("--against", metavar="FOLDER", help="also score these runs, and print paired differences")
     add("--clip", help="folder of a CLIP in transformers' format, for clip and directions")
     add("--judge", default=str(BUNDLED), help="file of a judge, for judge and janus")
-    add("--size", type=int, default=1024, help="of the pictures for CLIP, pixels")
+    add("--size", type=int, default=1024, help="width and height of the pictures for CLIP, pixels")
     add("--output", default="evaluation", help="folder for scorecard.csv and scorecard.json")
     return parser.parse_args(argv)
 
 
 def run(args: argparse.Namespace) -> None:
-    """Score all assets; files, prompts and output are checked before the first render."""
+    """Check files, prompts and output, then score all assets and write the scorecard."""
     register_parts()
     metrics = open_metrics(args)
     first = find_results(args.folders)
@@ -102,16 +102,16 @@ def find_results(folders: Sequence[str]) -> list[Result]:
         if not runs:
             raise UserError(f"{folder!r} holds no finished run, which has a save/it*-export folder")
         found += [find_result(str(place)) for place in runs]
-    if unasked := [result for result in found if not result.prompt]:
+    if without_prompt := [result for result in found if not result.prompt]:
         raise UserError(
-            f"{str(unasked[0].ply)!r} has no prompt in its run's configs/parsed.yaml: metrics of "
-            "the scorecard compare renders with prompts"
+            f"{str(without_prompt[0].ply)!r} has no prompt in its run's configs/parsed.yaml: "
+            "metrics of the scorecard compare renders with prompts"
         )
     return found
 
 
 def run_folders(folder: Path) -> Iterator[Path]:
-    """Yield the folders of finished runs, without descending into them."""
+    """Yield the folders of finished runs below a folder; runs inside runs aren't searched."""
     for place, names, _ in os.walk(folder):
         names.sort()
         if any(Path(place).glob("save/it*-export/*.ply")):
@@ -142,11 +142,13 @@ def summary(metrics: Sequence[Metric], first: Rows, second: Rows) -> dict[str, A
 
 
 def prompt_means(rows: Rows, column: str) -> dict[str, float]:
+    """Return the mean of a column for each prompt."""
     values = np.array([row[column] for row in rows], float)
     return per_prompt([row["prompt"] for row in rows], values)
 
 
 def estimate(means: dict[str, float]) -> Estimate:
+    """Return the mean over the prompts with its bootstrap interval."""
     return bootstrap(np.array(list(means.values()), float))
 
 
@@ -158,7 +160,7 @@ def write(output: Path, rows: Rows, content: dict[str, Any]) -> None:
     writer.writerows(rows)
     for name, body in zip(FILES, (text.getvalue(), json_text(content, indent=2)), strict=True):
         with atomic_file(output / name) as file:
-            file.write(body.encode(errors="surrogateescape"))  # paths may be no UTF-8
+            file.write(body.encode(errors="surrogateescape"))  # paths may hold invalid UTF-8
 
 
 def table(content: dict[str, Any]) -> list[str]:

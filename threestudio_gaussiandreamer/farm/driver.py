@@ -14,22 +14,22 @@ from .ledger import FAILED, FINISHED, RUNNING, Ledger
 from .worker import BLOCKED, NO_MEMORY, STOPPED, Setting
 
 POLL = 0.5
-"""Seconds between two looks at the board."""
+"""Seconds between two reads of the board."""
 SECONDS_TO_STOP = 60
 """How long workers may take to write their checkpoints when the farm is stopped."""
 SAME_ERRORS = 3
-"""The farm ends when so many assets have failed with one message, and none has been finished."""
+"""The farm ends if its first assets, this many, all fail with the same message."""
 
 
 class Driver:
-    """Makes all assets that are left.
+    """Gives all remaining assets to the workers.
 
     Args:
-        ray: the connected module.
+        ray: the module ``ray``, connected to a cluster.
         workers: handles of :class:`.worker.Worker`.
-        settings: of the workers.
-        jobs: the assets that aren't finished; read as they are needed.
-        ledger: of the farm.
+        settings: of the workers, in the same order.
+        jobs: the assets that aren't finished; the iterator is advanced when a worker is idle.
+        ledger: the farm's ledger.
         hang: seconds without a finished step after which a worker is restarted.
     """
 
@@ -58,7 +58,7 @@ class Driver:
         """Make the assets.
 
         Raises:
-            UserError: the results can't be written, or the first assets all fail alike.
+            UserError: the results can't be written, or the first assets all fail with one message.
             KeyboardInterrupt: Ctrl-C; the workers have written checkpoints.
         """
         try:
@@ -74,7 +74,7 @@ class Driver:
             raise UserError(self.obstacle)
 
     def step(self) -> None:
-        """Wait for outcomes for at most :data:`POLL` seconds, and look at the workers."""
+        """Wait up to :data:`POLL` seconds for outcomes, restart hung workers, draw the display."""
         ready, _ = self.ray.wait(list(self.running), timeout=POLL)
         for handle in ready:
             self.collect(handle)
@@ -141,11 +141,7 @@ class Driver:
         self.display.note(job.row.name, FINISHED, f"{outcome.get('seconds', 0):.1f} s")
 
     def fail(self, job: Job, error: str) -> None:
-        """Note a failed asset.
-
-        Raises:
-            UserError: the first assets all fail alike.
-        """
+        """Note a failed asset; end the farm if the first assets all failed with one message."""
         command = repeat_command(self.recipe, job)
         self.ledger.append([self.line(job, FAILED, error=error, command=command)])
         self.display.note(job.row.name, FAILED, error)
@@ -157,7 +153,9 @@ class Driver:
             )
 
     def block(self, error: str) -> None:
-        """Hand out no more assets, and let the workers write checkpoints."""
+        """Hand out no more assets, and let the workers write checkpoints; :meth:`run` then raises
+        the first of these errors.
+        """
         self.obstacle = self.obstacle or error
         self.tell_board_to_stop()
 
@@ -182,14 +180,16 @@ class Driver:
             pass  # it is being restarted; the workers are stopped without checkpoints
 
     def restart_hung(self, beats: dict[int, tuple[Beat, float]]) -> None:
-        """Restart workers that have finished no step for long; Ray hands them their asset again."""
+        """Restart workers that have finished no step for ``hang`` seconds; Ray calls
+        :meth:`.worker.Worker.make` again with the same asset.
+        """
         for number, job in self.running.values():
             beat, seconds = beats.get(number, (None, 0.0))
             hangs = beat is not None and beat.name == job.row.name and seconds > self.hang
             if hangs and self.killed.get(number) != beat:
                 self.killed[number] = beat
-                said = f"no step for {seconds:.0f} s ({beat.stage} {beat.step})"
-                self.display.note(job.row.name, "restarted", said)
+                reason = f"no step for {seconds:.0f} s ({beat.stage} {beat.step})"
+                self.display.note(job.row.name, "restarted", reason)
                 self.restart(number)
 
     def restart(self, number: int) -> None:

@@ -21,9 +21,10 @@ STATES = (RUNNING, FINISHED, FAILED)
 
 
 class Entry(NamedTuple):
-    """Where the last line of an asset stands in the file, and what it says."""
+    """The last line of an asset."""
 
     offset: int
+    """Of the line in the file, bytes."""
     state: int
     """Index in :data:`STATES`."""
     key: str
@@ -48,7 +49,7 @@ class Ledger:
             self._note(line, offset)
 
     def _read(self) -> Iterator[tuple[int, dict[str, Any]]]:
-        """Yield offset and content of each line; count those that aren't whole."""
+        """Yield offset and content of each line; count damaged lines."""
         if not self.path.exists():
             return
         with open(self.path, "rb") as file:
@@ -97,8 +98,8 @@ class Ledger:
         """Append lines, each with name, key and state, and flush them to the disk.
 
         Raises:
-            UserError: the disk is full or the file can't be written; the ledger can be read
-                nevertheless.
+            UserError: the disk is full or the file can't be written; what was written before can
+                still be read.
         """
         try:
             if self._file is None:
@@ -118,7 +119,7 @@ class Ledger:
             ) from error
 
     def copy(self, content: bytes) -> None:
-        """Take note of a line that was appended, for a subclass that copies it elsewhere."""
+        """Do nothing; a subclass copies each appended line to another place here."""
 
     def close(self) -> None:
         for file in (self._file, self._reader):
@@ -128,7 +129,7 @@ class Ledger:
 
 
 def _opened(path: Path) -> Any:
-    """Open the ledger to append to it, below a last line that is whole."""
+    """Open the ledger for appending; end its last line if a killed process left it incomplete."""
     file = open(path, "ab")
     if file.tell():
         with open(path, "rb") as reader:
@@ -139,7 +140,7 @@ def _opened(path: Path) -> Any:
 
 
 def parse_line(content: bytes) -> Optional[dict[str, Any]]:
-    """Return the content of a line; None if it isn't a whole line of a ledger."""
+    """Return the content of a line; None if it is incomplete or no line of a ledger."""
     if not content.endswith(b"\n"):
         return None
     try:

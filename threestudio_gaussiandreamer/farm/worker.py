@@ -28,8 +28,8 @@ from .ledger import FAILED, FINISHED
 from .storage import Place, Unreachable
 
 STOPPED, BLOCKED, NO_MEMORY = "stopped", "blocked", "no memory"
-"""Outcomes beside ``ledger.STATES``: stopped with a checkpoint; the results can't be written; the
-memory doesn't suffice.
+"""Outcomes beside ``ledger.STATES``: stopped with a checkpoint; the results can't be written; out
+of memory.
 """
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 SECONDS_FOR_LOCK = 60
@@ -37,20 +37,20 @@ SECONDS_FOR_LOCK = 60
 
 
 class Setting(NamedTuple):
-    """What a worker needs beside the job. It comes with each job, since Ray restarts a killed
-    worker without asking.
+    """What a worker needs besides the job. It is passed with each job, since Ray restarts a killed
+    worker without calling :meth:`Worker.hello`.
     """
 
     number: int
-    """Of the worker, from 0."""
+    """Index of the worker, from 0."""
     recipe: Recipe
     place: Place
     board: Any
     """The handle of a :class:`.board.Board`."""
     start: str
-    """The folder that the farm was started in, for relative paths and ``custom/``."""
+    """The folder that the farm was started in: relative paths and ``custom/`` are found there."""
     session: str
-    """Names one start of the driver."""
+    """Identifier of one start of the driver."""
     retries: int
     """How often an asset is tried again in a session after its worker has died."""
 
@@ -85,7 +85,7 @@ class Worker:
         return __version__
 
     def make(self, job: Job, setting: Setting) -> dict[str, Any]:
-        """Make an asset, or go on with it, and return its outcome.
+        """Make an asset, or resume it from its checkpoint, and return its outcome.
 
         Returns:
             ``state``, one of ``ledger.STATES``, :data:`STOPPED`, :data:`BLOCKED` or
@@ -104,21 +104,21 @@ class Worker:
 
     def _make(self, job: Job) -> dict[str, Any]:
         folder = self.setting.place.work_folder(job.row)
-        if marked(folder):  # by an earlier session, whose checkpoint this one goes on from
+        if marked(folder):  # an earlier session chose it, and this one resumes its checkpoint
             job = job._replace(saves_memory=True)
         elif job.saves_memory:
             self.setting.place.discard(job.row)  # what was made with the other configuration
         folder.mkdir(parents=True, exist_ok=True)
         if job.saves_memory:
             mark(folder)
-        attempt, of_session = count_attempts(folder, self.setting.session)
-        if of_session > self.setting.retries + 1:
-            said = (
-                f"its worker died or hung {of_session - 1} times, as if the memory didn't suffice"
-            )
-            return {"state": NO_MEMORY, "error": said}
+        attempt, session_attempt = count_attempts(folder, self.setting.session)
+        if session_attempt > self.setting.retries + 1:
+            times = session_attempt - 1
+            error = f"its worker died or hung {times} times, as if the memory didn't suffice"
+            return {"state": NO_MEMORY, "error": error}
         self.setting.place.fetch_checkpoint(job.row)
-        began, _ = time.monotonic(), reset_peak_memory()
+        began = time.monotonic()
+        reset_peak_memory()
         with written_log(folder / "log.txt"):
             run, code = self._run(job, folder, attempt)
         if code:
@@ -188,12 +188,13 @@ def answer_of(handle: Any) -> Optional[bool]:
 
 
 def run_when_unlocked(prepared: Callable[[], Any]) -> tuple[Any, int]:
-    """Run, waiting for a process of a killed driver that may not have ended yet; return the run and
-    its exit code.
+    """Run as soon as the folder's lock is free; return the run and its exit code.
 
-    Args:
-        prepared: makes the run; called again after a wait, since that process may have written
-            newer checkpoints.
+    A process of a killed driver may hold the lock for a while. ``prepared`` makes the run, and is
+    called again after each wait, since that process may have written newer checkpoints.
+
+    Raises:
+        FolderInUse: the folder is still locked after :data:`SECONDS_FOR_LOCK`.
     """
     from ..launch.folder_lock import FolderInUse
 
@@ -248,11 +249,12 @@ def count_attempts(folder: Path, session: str) -> tuple[int, int]:
 
 
 def mark(folder: Path) -> None:
-    """Note that an asset's folder is of the low-memory configuration."""
+    """Record that an asset's folder is made with the low-memory configuration."""
     (folder / "saves_memory.txt").touch()
 
 
 def marked(folder: Path) -> bool:
+    """Return whether :func:`mark` was called for the folder."""
     return (folder / "saves_memory.txt").is_file()
 
 

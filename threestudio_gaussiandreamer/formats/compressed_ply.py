@@ -1,13 +1,13 @@
-"""Compressed PLY, PlayCanvas' chunked layout: 16 bytes and 0.3 for a Gaussian of degree 0, and one
-byte for each further coefficient. Binary little-endian elements, in this order:
+"""Compressed PLY, PlayCanvas' chunked layout: 16.3 bytes for a Gaussian of degree 0, and one byte
+for each further coefficient. Binary little-endian elements, in this order:
 
 ==========  ========================================================================================
 chunk       18 float32 for 256 Gaussians each: minimum and maximum of positions, logarithms of
-            scales and colours (0.5 + C0 sh); files without the colours' six are read too
+            scales and colours (0.5 + C0 sh); files without the limits of colours are read too
 vertex      4 u32: position and logarithm of the scale as 11, 10, 11 bits between the chunk's
-            limits; quaternion wxyz as the number of its largest component and 10 bits for each
+            limits; quaternion wxyz as the index of its largest component and 10 bits for each
             other one, (q / sqrt(2) + 0.5); colour between the limits and opacity as 8 bits each
-sh          f_rest as bytes, where there are any: 256 (f_rest / 8 + 0.5)
+sh          f_rest as bytes; absent at degree 0: 256 (f_rest / 8 + 0.5)
 ==========  ========================================================================================
 
 Described in PlayCanvas' manual, "The Compressed PLY Format"; axes as those of a PLY."""
@@ -43,9 +43,9 @@ WITHOUT_COLORS = 12
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 BITS = (11, 10, 11)
 SH_REACH = 4.0
-"""Stored coefficients lie between plus and minus this."""
+"""Harmonics above degree 0 are clipped to [-SH_REACH, SH_REACH]."""
 MAX_STORED_LOG = 20.0
-"""Other readers expect logarithms of scales within plus and minus this."""
+"""Logarithms of scales are clipped to plus and minus this, as other readers expect."""
 
 
 def write_compressed_ply(
@@ -128,8 +128,8 @@ def _header(count: int, chunks: int, coefficients: int, comments: Sequence[str])
 
 
 def _chunked_values(gaussians: Gaussians) -> Float[np.ndarray, "C 256 3 3"]:
-    """Return positions, logarithms of scales and colours in whole chunks; the last Gaussian fills
-    up the last one.
+    """Return positions, logarithms of scales and colours by chunk; the last chunk is padded with
+    copies of the last Gaussian.
     """
     scales = gaussians.log_scales.clip(-MAX_STORED_LOG, MAX_STORED_LOG)
     values = np.stack([gaussians.means, scales, sh0_to_rgb(gaussians.sh[:, 0])], axis=1)
@@ -139,7 +139,7 @@ def _chunked_values(gaussians: Gaussians) -> Float[np.ndarray, "C 256 3 3"]:
 
 
 def _limits(values: Float[np.ndarray, "C 256 3 3"]) -> Float[np.ndarray, "C 3 2 3"]:
-    """Return minimum and maximum of each kind of value, chunk by chunk."""
+    """Return minimum and maximum of positions, scales and colours for each chunk."""
     return np.stack([values.min(axis=1), values.max(axis=1)], axis=2)
 
 
@@ -164,7 +164,7 @@ def _packed(
 
 
 def _word(fractions: Float[np.ndarray, "N F"], bits: Sequence[int]) -> Int[np.ndarray, " N"]:
-    """Pack fractions in [0, 1] from the highest bits downwards."""
+    """Pack fractions in [0, 1] into one integer each, the first in the highest bits."""
     word = np.zeros(len(fractions), np.uint32)
     for fraction, width in zip(fractions.T, bits, strict=True):
         most = (1 << width) - 1
@@ -194,7 +194,7 @@ def _names(element: Element) -> tuple[str, ...]:
 
 
 def _read_elements(file: BinaryIO, path: Path) -> dict[str, np.ndarray]:
-    """Read the elements as (rows, columns) after checking that they fit each other."""
+    """Read each element as an array (rows, columns), after checking the header."""
     header = read_header(file, str(path))
     order = BYTE_ORDERS[header.encoding]
     if not order:
@@ -268,7 +268,7 @@ def _bytes_of(words: Int[np.ndarray, " N"]) -> Int[np.ndarray, "N 4"]:
 
 
 def _harmonics(rest: Int[np.ndarray, "N C"]) -> Float[np.ndarray, "N K 3"]:
-    """Decode f_rest at the middle of each step; the ends are the limits themselves."""
+    """Decode f_rest to the middle of each step; 0 and 255 decode to the limits themselves."""
     fractions = (rest.astype(np.float32) + np.float32(0.5)) / 256
     fractions[rest == 0], fractions[rest == 255] = 0, 1
     values = (fractions - np.float32(0.5)) * np.float32(2 * SH_REACH)

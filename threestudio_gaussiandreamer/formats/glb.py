@@ -41,10 +41,10 @@ SPLATTING = {
 FLOAT, BYTE, POINTS, ARRAY_BUFFER = 5126, 5121, 0, 34962
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 MARGIN = 2.0**-25
-"""Opacities that are read are clamped to this distance from 0 and 1; float32 below 1 has no less.
-"""
+"""Opacities that are read are clamped to this distance from 0 and 1, to make their logits finite:
+half the distance from 1 to the next lower float32."""
 DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 300, 72
-"""Bytes of memory that reading takes per Gaussian, and per harmonic of it, with a safety margin."""
+"""Upper bounds of the memory that reading takes, per Gaussian and per harmonic of a Gaussian."""
 SAME_SCALE = 1e-4
 """Largest relative difference of a node's scales that counts as rounding."""
 
@@ -74,8 +74,8 @@ def load_glb(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
     """Read the Gaussians of all nodes of the default scene, with y up, and the notes of our writer.
 
     Raises:
-        UserError: there is no such file, it is damaged, holds no Gaussians, or some that aren't
-            supported.
+        UserError: there is no such file, it is damaged, holds no Gaussians, or
+            Gaussians that aren't supported.
     """
     path = existing_file(path, "GLB file")
     with parse_errors(path):
@@ -97,7 +97,7 @@ def load_glb(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """Return the attributes by semantic; rows are multiples of 4 bytes, as glTF asks for."""
+    """Return the attributes by semantic; their rows have multiples of 4 bytes, as glTF requires."""
     opacity = opacities(gaussians.logit_opacities)[:, None]
     fallback = np.concatenate([srgb_to_linear(sh0_colors(gaussians.sh[:, 0])), opacity], axis=1)
     named = {
@@ -165,7 +165,7 @@ World = Float[np.ndarray, "4 4"]
 
 
 def _primitives(document: Document) -> Iterator[tuple[Primitive, World]]:
-    """Yield the primitives of Gaussians with the matrices of their nodes to the world."""
+    """Yield each primitive that holds Gaussians, and its node's matrix to world coordinates."""
     for node, world in world_matrices(document).items():
         entry = document.entry("nodes", node)
         if "mesh" in entry:
@@ -175,7 +175,9 @@ def _primitives(document: Document) -> Iterator[tuple[Primitive, World]]:
 
 
 def _require_memory(document: Document, primitives: list[Primitive]) -> None:
-    """Check what all primitives announce together; nodes may share one."""
+    """Check the memory for the Gaussians of all primitives; one that several nodes use counts for
+    each of them.
+    """
     counts = [document.count(item["attributes"]["POSITION"]) for item in primitives]
     needed = sum(
         count * (DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * _harmonics(item))
@@ -186,7 +188,7 @@ def _require_memory(document: Document, primitives: list[Primitive]) -> None:
 
 
 def _harmonics(primitive: Primitive) -> int:
-    """Return (degree + 1)^2 of the highest degree whose last coefficient is there."""
+    """Return the number of harmonics, by the highest degree whose last coefficient is present."""
     found = [k for k in COEFFICIENTS if _semantics(k)[-1] in primitive["attributes"]]
     return max(found, default=COEFFICIENTS[0])
 
@@ -234,7 +236,11 @@ def _check_extension(document: Document, primitive: Primitive) -> None:
 
 
 def _moved(gaussians: Gaussians, world: Float[np.ndarray, "4 4"], document: Document) -> Gaussians:
-    """Move Gaussians by a matrix that is a rotation, a translation and one scale."""
+    """Transform Gaussians to world coordinates.
+
+    Raises:
+        UserError: the matrix isn't a rotation, a translation and one scale.
+    """
     if np.array_equal(world, np.eye(4)):
         return gaussians
     scales = np.linalg.norm(world[:3, :3], axis=0)

@@ -1,13 +1,14 @@
 """SOG version 2 (Spatially Ordered Gaussians), PlayCanvas' format for the web: lossless WebP images
 in a zip archive, about 15 bytes for a Gaussian of degree 0.
 
-Row i of the Gaussians is pixel i of every image, along a Morton curve; ``meta.json`` says the rest:
+Gaussians are sorted along a Morton curve. Gaussian i is pixel i of each image but the palette's.
+The images, with the entries of ``meta.json`` that they use:
 
 =================  =================================================================================
 means_l, means_u   low and high byte of positions: 65535 steps between ``mins`` and ``maxs`` of
                    sign(x) log(1 + abs(x))
 quats              wxyz without its largest component: 255 (q / sqrt(2) + 0.5); alpha is 252 + the
-                   number of that component
+                   index of that component
 scales             index into ``scales.codebook`` of the logarithm of each axis' scale
 sh0                indices into ``sh0.codebook`` of the constant harmonics; alpha is 255 opacity
 shN_labels         number of an entry of the palette, low byte and high byte
@@ -15,8 +16,8 @@ shN_centroids      the palette, 64 entries a row, a pixel for each coefficient: 
                    ``shN.codebook``
 =================  =================================================================================
 
-``model`` is "antialiased" where the Gaussians were trained so. The axes are those of the PLY, as
-splat-transform writes and reads them (-y up), though the specification says y up
+``model`` is "antialiased" where the Gaussians were trained with antialiasing. The axes are those of
+the PLY, as splat-transform writes and reads them (-y up), though the specification says y up
 (developer.playcanvas.com, "The SOG Format"). Other tools write the same files without an archive,
 or version 1; those aren't read."""
 
@@ -43,9 +44,10 @@ SOG_UP = VIEWER_UP
 ANTIALIASED = "antialiased"
 MAX_PALETTE = 65536
 MAX_DISTANCES = 3e8
-"""Distances that a round of k-means computes at most: half a minute a core for the palette."""
-WRITTEN = (1980, 1, 1, 0, 0, 0)
-"""Date of the archive's members, to make files reproducible."""
+"""Limit of the distances that an iteration of k-means computes, entries times Gaussians; at the
+limit the palette takes one core about half a minute."""
+MEMBER_DATE = (1980, 1, 1, 0, 0, 0)
+"""Constant, so that equal clouds give equal files."""
 
 
 def write_sog(
@@ -72,8 +74,8 @@ def write_sog(
     meta |= {"notes": list(notes)} if notes else {}
     with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
         for name, pixels in images.items():
-            archive.writestr(zipfile.ZipInfo(name, WRITTEN), _webp(pixels))
-        archive.writestr(zipfile.ZipInfo("meta.json", WRITTEN), json.dumps(meta))
+            archive.writestr(zipfile.ZipInfo(name, MEMBER_DATE), _webp(pixels))
+        archive.writestr(zipfile.ZipInfo("meta.json", MEMBER_DATE), json.dumps(meta))
 
 
 def read_sog(path: str | os.PathLike) -> Gaussians:
@@ -136,7 +138,7 @@ def _encoded(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], dict[str, Any
 
 
 def _numbers(book: Float[np.ndarray, " B"]) -> list[float]:
-    """Return a codebook for the JSON, with as many digits as float32 has."""
+    """Round a codebook to 7 digits for the JSON, about the precision of float32."""
     return [float(f"{value:.7g}") for value in book]
 
 
@@ -179,8 +181,8 @@ def _palette(rest: Float[np.ndarray, "N K 3"]) -> tuple[dict[str, np.ndarray], d
 
 
 def palette_size(count: int) -> int:
-    """Return the palette's size for ``count`` Gaussians: a half of them to all, within bounds of
-    the format and of the time for k-means.
+    """Return the number of palette entries for ``count`` Gaussians: as many up to 1024, else the
+    largest power of two that ``count``, MAX_DISTANCES and MAX_PALETTE allow, at least 1024.
     """
     size = 2 ** (count.bit_length() - 1) if count > 1024 else count
     while size > 1024 and size * count > MAX_DISTANCES:
@@ -202,7 +204,7 @@ def _webp(pixels: Int[np.ndarray, "H W 4"]) -> bytes:
     from PIL import Image
 
     buffer = io.BytesIO()
-    # exact: colours below alpha 0 are numbers here
+    # exact: keep the RGB of pixels with alpha 0, which hold data here
     Image.fromarray(pixels, "RGBA").save(buffer, "WEBP", lossless=True, exact=True, method=4)
     return buffer.getvalue()
 
@@ -220,7 +222,7 @@ def _positions(
 def _quats(rows: Int[np.ndarray, "N 4"], archive: SogArchive) -> Float[np.ndarray, "N 4"]:
     largest = rows[:, 3].astype(np.int64) - FIRST_TAG
     if (largest < 0).any():
-        archive.fail("a quaternion's largest component has no number of 0 to 3: it is damaged")
+        archive.fail("a quaternion's index of its largest component isn't 0 to 3: it is damaged")
     return packing.with_largest(largest, (rows[:, :3] / 255 - 0.5) * sqrt(2))
 
 

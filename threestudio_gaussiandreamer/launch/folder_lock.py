@@ -1,8 +1,8 @@
-"""The folder of a run on disk: made by one process only, locked while it is in use, and removed
-only by the process that made it and still holds the lock.
+"""Create, lock and remove the folder of a run: exactly one process creates it, one uses it at a
+time, and only the process that created it and still holds the lock removes it.
 
 The lock is the operating system's lock of the folder, which ends with the process. File systems
-without such locks get a file with the name of the machine and the number of the process."""
+without such locks get a lock file with the host name and the process ID."""
 
 import contextlib
 import errno
@@ -25,14 +25,12 @@ SUBFOLDERS = ("ckpts", "configs", "code", "save", "tb_logs", "csv_logs")
 FILES = ("ckpts/last.ckpt", "configs/parsed.yaml", "cmd.txt")
 LONGEST_RESULT = 200
 """Upper bound of the length of paths that a run writes below its folder, bytes."""
-
-
 LOCK_FILE = ".lock"
-"""Created in the folder where the file system has no locks; holds the owner."""
+"""Name of the lock file."""
 
 
 class Lock(NamedTuple):
-    """A lock of a folder: its open descriptor, or a file in it."""
+    """A lock on a folder: the folder's open descriptor, or a lock file in it."""
 
     descriptor: Optional[int] = None
     file: Optional[Path] = None
@@ -75,8 +73,8 @@ class RunFolder:
                     folder.rmdir()
 
     def _remove(self) -> None:
-        """Remove the folder. One with a lock file is renamed before, so that no other run takes it
-        while it is being removed.
+        """Remove the folder. If it has a lock file it is renamed first, since other runs could lock
+        it as soon as that file is removed.
         """
         doomed = self.path
         if self.lock.file is not None:
@@ -86,7 +84,7 @@ class RunFolder:
         shutil.rmtree(doomed, ignore_errors=True)
 
     def release(self) -> None:
-        """Release the lock. The operating system releases its own also when the process ends."""
+        """Release the lock. The operating system's lock also ends with the process."""
         if self.lock is not None:
             self.lock.release()
             self.lock = None
@@ -105,9 +103,7 @@ def claim_new(path: Path) -> tuple[RunFolder, int]:
         candidate = path if number == 1 else path.with_name(f"{path.name}-{number}")
         first_made = make_folder(candidate)
         if first_made is not None:
-            with contextlib.suppress(
-                FolderInUse
-            ):  # another run has claimed this name in the meantime
+            with contextlib.suppress(FolderInUse):  # another run has locked it in the meantime
                 return RunFolder(candidate, first_made, _lock(candidate)), number
     raise AssertionError("unreachable")
 
@@ -253,8 +249,8 @@ def in_use(path: Path, advice: str = "") -> FolderInUse:
 
 
 def _lock_by_file(path: Path) -> Lock:
-    """Create the lock file, of which ``O_EXCL`` lets exactly one process succeed. The file of a
-    process of this machine that has ended is replaced.
+    """Create the lock file, with ``O_EXCL``, so that exactly one process succeeds. A lock file is
+    replaced if its process ran on this machine and has ended.
 
     Raises:
         FolderInUse: another process has created it, and may still run.
@@ -288,32 +284,32 @@ def _create(file: Path, content: str) -> None:
 def _remove_stale(file: Path) -> None:
     """Remove the lock file of a process of this machine that has ended.
 
-    It is renamed first: of two processes that find it, one succeeds, and a lock that a third one
-    has taken in the meantime is put back.
+    The file is renamed first, in which only one of several processes succeeds. If it isn't the file
+    that was read, since another process has taken the lock in between, it is put back.
 
     Raises:
         FolderInUse: its process may still run.
     """
-    mine = file.with_name(f"{LOCK_FILE}-{os.getpid()}")
+    renamed = file.with_name(f"{LOCK_FILE}-{os.getpid()}")
     try:
         found = file.read_bytes()
         ended = _has_ended(found.decode(errors="replace"))
         if ended:
-            file.rename(mine)
+            file.rename(renamed)
     except FileNotFoundError:  # released, or removed by another process
         return
     except OSError:  # unreadable, or a folder
         ended = False
     if not ended:
         raise in_use(file.parent, f". If none is, here or on another machine, remove {file}")
-    if mine.read_bytes() != found:
+    if renamed.read_bytes() != found:
         with contextlib.suppress(OSError):
-            os.link(mine, file)
-    mine.unlink()
+            os.link(renamed, file)
+    renamed.unlink()
 
 
 def _has_ended(owner: str) -> bool:
-    """Return whether the process is one of this machine, and doesn't run any more."""
+    """Return whether the owner in a lock file is a process of this machine that has ended."""
     host, _, process = owner.rpartition(" ")
     if host != socket.gethostname() or not process.isdecimal() or os.name != "posix":
         return False

@@ -4,10 +4,10 @@
 option              meaning
 ==================  ================================================================================
 enabled             serve the cloud with viser (extra ``[viewer]``)
-host                address to listen on; 127.0.0.1 admits this machine alone, and what SSH forwards
-port                of the web page and its connection
-updates_per_second  at most; fewer where an update takes longer than ``SHARE_OF_TIME``
-keep_serving        go on after the run until Ctrl-C
+host                address to listen on; 127.0.0.1 accepts this machine and SSH tunnels only
+port                port of the web page and its WebSocket
+updates_per_second  upper limit; fewer if updates would take more than ``SHARE_OF_TIME``
+keep_serving        keep the server running after the training, until Ctrl-C
 ==================  ================================================================================
 
 The training is the same bit for bit with and without the viewer: it only reads the cloud, and does
@@ -32,7 +32,7 @@ from ..view.live import Controls, LiveView
 SHARE_OF_TIME = 0.02
 """Largest share of the training's time that is spent on updates."""
 POLL = 0.05
-"""Seconds between two looks at the buttons while the training is paused."""
+"""Seconds between two checks of the buttons while the training is paused."""
 
 
 @dataclass
@@ -45,7 +45,7 @@ class ViewerConfig:
 
 
 class LiveViewer(pl.Callback):
-    """Update a :class:`LiveView` from the training, and obey its buttons.
+    """Update a :class:`LiveView` from the training, and act on its buttons.
 
     Args:
         stopping: whether a signal has asked the training to stop, which also ends a pause.
@@ -86,7 +86,7 @@ class LiveViewer(pl.Callback):
         self.controls.remove()
 
     def _show_if_due(self, trainer: Any, pl_module: Any) -> bool:
-        """Show the cloud if an update is due and a browser looks; return whether it was shown."""
+        """Show the cloud if that is due and a browser is connected; return whether it was shown."""
         start = time.monotonic()
         if start < self._due or not self.view.watched:
             return False

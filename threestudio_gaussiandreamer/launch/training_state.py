@@ -1,5 +1,5 @@
-"""Check the training state in a checkpoint before any work: Lightning restores invalid content
-without an error, or fails halfway."""
+"""Check the training state in a checkpoint before it is restored, since Lightning restores some
+invalid content without an error, and fails on other content after it has restored a part."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -22,8 +22,9 @@ TYPES = {
     "lr_schedulers": (list, tuple),
     "hyper_parameters": Mapping,
 }
-"""Types of further entries that Lightning reads if a checkpoint has them."""
+"""Types of optional entries that Lightning reads."""
 OLDEST = "2.0"
+"""Oldest version of Lightning whose checkpoints can be resumed."""
 CHECKPOINT_STATE = {
     **dict.fromkeys(
         ("best_model_path", "kth_best_model_path", "last_model_path"), (str, type(None))
@@ -45,7 +46,7 @@ def check_training_state(checkpoint: Mapping[str, Any], optimizer: Mapping, what
         what: the file, for messages.
 
     Raises:
-        UserError: a run can't have written a type, count or shape.
+        UserError: an entry is missing, or its type, value or shape is one that no run writes.
     """
     for key in TYPES.keys() & checkpoint.keys():
         if not isinstance(checkpoint[key], TYPES[key]):
@@ -56,7 +57,7 @@ def check_training_state(checkpoint: Mapping[str, Any], optimizer: Mapping, what
     _check_loops(checkpoint, what)
     _check_optimizers(checkpoint, what)
     for state in checkpoint["optimizer_states"]:
-        _rehearse(optimizer, state, checkpoint["state_dict"], what)
+        _try_step(optimizer, state, checkpoint["state_dict"], what)
 
 
 def _check_version(version: str, what: str) -> None:
@@ -107,8 +108,8 @@ def _check_loops(checkpoint: Mapping[str, Any], what: str) -> None:
 
 
 def _leaves(node: Mapping, path: str) -> Iterator[tuple[str, Any]]:
-    """Yield every value below a mapping with its path, except what a loop stores itself under
-    ``state_dict``.
+    """Yield the path and value of each leaf of a nested mapping, except below keys that end in
+    ``state_dict``, whose content is the loop's own.
     """
     for key, value in node.items():
         if str(key).endswith("state_dict"):
@@ -174,7 +175,7 @@ def _check_moment(value: Any, parameter: Any, name: str) -> None:
         raise UserError(f"{name} holds NaN or infinity")
 
 
-def _rehearse(optimizer: Mapping, state: Mapping, parameters: Mapping, what: str) -> None:
+def _try_step(optimizer: Mapping, state: Mapping, parameters: Mapping, what: str) -> None:
     """Restore the state into an optimiser of zeros and make a step with zero gradients, so that
     missing or invalid entries fail here.
 
@@ -189,15 +190,15 @@ def _rehearse(optimizer: Mapping, state: Mapping, parameters: Mapping, what: str
         for group in state["param_groups"]
     ]
     try:
-        rehearsed = kind(groups, lr=0.0)
-        rehearsed.load_state_dict(dict(state))
-        rehearsed.step()
+        restored = kind(groups, lr=0.0)
+        restored.load_state_dict(dict(state))
+        restored.step()
     except Exception as error:  # torch doesn't check keys and types
         raise UserError(
             f"{what}: {kind.__name__} can't resume from its optimizer_states: "
             f"{type(error).__name__} {error}"
         ) from error
-    for name, value in optimizer_tensors(rehearsed):
+    for name, value in optimizer_tensors(restored):
         if not value.isfinite().all():
             raise UserError(
                 f"{what}: a step of {kind.__name__} from its optimizer_states makes {name} NaN or "

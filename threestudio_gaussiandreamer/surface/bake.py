@@ -1,10 +1,10 @@
 """Bake renders to a texture.
 
-Rays through the pixels' centres find the faces that each render shows, so nothing that is hidden is
-baked. A pixel is added to the four texels around its place in the texture, weighted by the opacity
-and by the square of the cosine between the surface's normal and the ray. Faces that no view shows
-take the colour of the nearest face that one does; texels between the faces take the mean of their
-surroundings."""
+Rays through the pixels' centres find the faces that are visible in each render, so hidden faces get
+no colour from it. A pixel is added to the four texels around its uv coordinates, with weights
+proportional to the squares of its opacity and of the cosine between the surface's normal and the
+ray. Faces that no render shows take the colour of the nearest face that is shown; texels outside of
+all faces take the mean of their surroundings."""
 
 import os
 from collections.abc import Iterator
@@ -20,36 +20,37 @@ from ..meshes.raycast import MeshCaster
 from .renders import Renders
 
 MIN_ALPHA = 128
-"""Pixels of a lower opacity, as a byte, show too much of what is behind the surface."""
+"""Pixels of a lower opacity (0 to 255) aren't baked: they show what is behind the surface."""
 MIN_COSINE = 0.1
+"""Pixels with a smaller cosine between normal and ray have no weight."""
 KNOWN = 1e-3
 """Texels of a smaller weight are filled from their surroundings."""
 VIEWS_AT_ONCE = 4
-"""Views whose pixels are kept at a time, to bound the memory."""
+"""Largest number of views whose pixels are in memory at once."""
 LATTICE = 8
-"""Intervals along the edges of a hidden face at whose ends its colour is put."""
+"""A hidden face is coloured at the points of a triangular grid, with this many intervals a side."""
 
 
-class Seen(NamedTuple):
-    """What a render shows of a mesh, one row per pixel."""
+class PixelSamples(NamedTuple):
+    """The pixels of a render that show the mesh: where on it, and their weighted colours."""
 
     face: Int[np.ndarray, " M"]
     uv: Float[np.ndarray, "M 2"]
     values: Float[np.ndarray, "M 4"]
-    """Colour times weight, 0 to 255, and weight."""
+    """RGB (0 to 255) times weight, and weight."""
 
 
 def bake(mesh: Mesh, renders: Renders, size: int) -> UInt8[np.ndarray, "S S 3"]:
-    """Return the texture, row 0 at the top, of a mesh with ``uv``."""
+    """Return the texture, row 0 at the top, for the ``uv`` of a mesh."""
     caster, count = MeshCaster(mesh), len(renders.c2w)
     texels, faces = np.zeros((4, size * size)), np.zeros((4, len(mesh.faces)))
     bar = tqdm(desc="texture", unit="view", total=count, disable=None, leave=False)
     with ThreadPoolExecutor(min(os.cpu_count() or 1, VIEWS_AT_ONCE)) as pool, bar:
         for first in range(0, count, VIEWS_AT_ONCE):
             views = range(first, min(first + VIEWS_AT_ONCE, count))
-            for seen in pool.map(lambda view: _seen(caster, renders, view), views):
-                _add(faces, seen.face, seen.values)
-                _splat(texels, seen.uv, seen.values, size)
+            for samples in pool.map(lambda view: _samples(caster, renders, view), views):
+                _add(faces, samples.face, samples.values)
+                _splat(texels, samples.uv, samples.values, size)
                 bar.update()
     _paint_hidden(texels, mesh, faces, size)
     known = texels[3] > KNOWN
@@ -58,8 +59,8 @@ def bake(mesh: Mesh, renders: Renders, size: int) -> UInt8[np.ndarray, "S S 3"]:
     return np.round(colors.clip(0, 255)).astype(np.uint8)
 
 
-def _seen(caster: MeshCaster, renders: Renders, view: int) -> Seen:
-    """Return what a render shows of the mesh."""
+def _samples(caster: MeshCaster, renders: Renders, view: int) -> PixelSamples:
+    """Find the place on the mesh and the weight of each pixel of a view."""
     c2w, rgba = renders.c2w[view], renders.rgba[view]
     (top, left), face, weights = caster.visible(c2w, renders.fovy, *rgba.shape[:2])
     pixels = rgba[top : top + face.shape[0], left : left + face.shape[1]]
@@ -69,13 +70,13 @@ def _seen(caster: MeshCaster, renders: Renders, view: int) -> Seen:
     weight = (pixels[:, 3] / 255) ** 2 * np.where(cosine > MIN_COSINE, cosine, 0) ** 2
     values = np.concatenate([pixels[:, :3], np.ones((len(pixels), 1))], axis=1) * weight[:, None]
     uv = np.einsum("mk,mkc->mc", weights, caster.mesh.uv[caster.mesh.faces[face]])
-    return Seen(face, uv, values)
+    return PixelSamples(face, uv, values)
 
 
 def _paint_hidden(
     texels: Float[np.ndarray, "4 T"], mesh: Mesh, faces: Float[np.ndarray, "4 F"], size: int
 ) -> None:
-    """Give faces without weight the mean colour of the nearest face that has one."""
+    """Give faces that no render shows the mean colour of the nearest shown face."""
     from scipy.spatial import cKDTree
 
     shown = faces[3] > KNOWN
@@ -85,8 +86,8 @@ def _paint_hidden(
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     nearest = cKDTree(centres[shown]).query(centres[~shown])[1]
     means = np.append(faces[:3] / np.maximum(faces[3], KNOWN), shown[None], axis=0).T
-    steps = [(i, j) for i in range(LATTICE + 1) for j in range(LATTICE + 1 - i)]
-    for i, j in steps:
+    grid = [(i, j) for i in range(LATTICE + 1) for j in range(LATTICE + 1 - i)]
+    for i, j in grid:
         weights = np.array([i, j, LATTICE - i - j]) / LATTICE
         uv = np.einsum("k,fkc->fc", weights, mesh.uv[corners])
         _splat(texels, uv, 2 * KNOWN * means[shown][nearest], size)
@@ -98,7 +99,7 @@ def _splat(
     values: Float[np.ndarray, "M 4"],
     size: int,
 ) -> None:
-    """Add values to the four texels around each place."""
+    """Add values to the four texels around each uv, in bilinear shares."""
     texels, shares = zip(*_around(uv, size), strict=True)
     _add(sums, np.concatenate(texels), np.concatenate([values * s[:, None] for s in shares]))
 
@@ -128,7 +129,7 @@ def _cosines(
 def _around(
     uv: Float[np.ndarray, "M 2"], size: int
 ) -> Iterator[tuple[Int[np.ndarray, " M"], Float[np.ndarray, " M"]]]:
-    """Yield the four texels around each place and their shares, as bilinear lookup has them."""
+    """Yield the four texels around each uv, and their weights in bilinear interpolation."""
     x, y = uv[:, 0] * size - 0.5, (1 - uv[:, 1]) * size - 0.5
     column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     right, down = x - column, y - row
@@ -144,7 +145,9 @@ def _around(
 def filled(
     colors: Float[np.ndarray, "H W 3"], known: Bool[np.ndarray, "H W"]
 ) -> Float[np.ndarray, "H W 3"]:
-    """Fill unknown texels from the means of ever larger blocks that hold known ones."""
+    """Fill unknown texels with the mean of the known ones in the smallest block of 2^n x 2^n texels
+    around them that has any.
+    """
     if known.all() or not known.any():
         return colors
     height, width = known.shape

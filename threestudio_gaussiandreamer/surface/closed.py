@@ -1,4 +1,7 @@
-"""Closed triangle meshes: which parts to keep, fewer faces, and edges of exactly two faces."""
+"""Drop small parts of closed triangle meshes, simplify them, and keep them closed.
+
+A mesh is closed if each edge has exactly two faces. Half-edge ``h`` of F faces is the directed edge
+of face ``h % F`` from its corner ``h // F`` to the next one."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -8,11 +11,11 @@ from ..core.errors import UserError
 Vertices = Float[np.ndarray, "V 3"]
 Faces = Int[np.ndarray, "F 3"]
 AGGRESSIVENESS = (7, 5, 3, 1)
-"""Of the simplification, in the order in which they are tried; lower ones keep more of the shape.
+"""Values of fast_simplification's ``agg`` in the order of trial; lower ones keep more of the shape.
 """
 ATTEMPTS = 4
 APART = 0.05
-"""Share of the way to their neighbours by which vertices are moved that had the same position."""
+"""Fraction of the way to their neighbours by which vertices at one position are moved apart."""
 
 
 def without_small_parts(vertices: Vertices, faces: Faces, share: float) -> tuple[Vertices, Faces]:
@@ -66,20 +69,22 @@ def _fewer(
 
 
 def _closed_again(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces] | None:
-    """Mend what simplification has left touching; None if the mesh can't be closed."""
+    """Separate surfaces that simplification made touch; None if the mesh can't be closed."""
     positions, index = joined(vertices, faces)
     found = separated(positions, without_folds(index))
     return found if found is not None and is_closed(joined(*found)[1]) else None
 
 
 def joined(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
-    """Join the vertices that files, which hold float32, have at the same position."""
+    """Join vertices whose positions are equal in float32, the precision of mesh files."""
     positions, rows = np.unique(vertices.astype(np.float32), axis=0, return_inverse=True)
     return positions.astype(np.float64), rows.reshape(-1)[faces]
 
 
 def without_folds(faces: Faces) -> Faces:
-    """Drop faces with equal corners, and pairs of faces that are each other's back."""
+    """Drop faces with a repeated corner, pairs of faces with the same corners in opposite
+    orientation, and repeated faces.
+    """
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     ordered = np.sort(faces, axis=1)
     lowest = faces.argmin(axis=1)
@@ -101,34 +106,36 @@ def is_closed(faces: Faces) -> bool:
 
 
 def half_edges(faces: Faces) -> Int[np.ndarray, "E 2"]:
-    """Return the directed edges: from corner 0 to 1 of all faces, from 1 to 2, from 2 to 0."""
+    """Return the start and end of each half-edge: corners 0 to 1 of all faces, 1 to 2, 2 to 0."""
     return np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)])
 
 
 def separated(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces] | None:
     """Split the edges and vertices at which a closed mesh touches itself; None if it has holes.
 
-    At an edge of more than two faces those are paired that bound a sector of the inside; the parts
-    are then moved apart a little. Where the same surface passes an edge twice, so that its ends
-    can't be split, one passage gets a vertex of its own in the middle of the edge.
+    Around an edge of more than two faces, two faces make a pair if only inside lies between them.
+    Each pair gets vertices of its own, which are then moved apart by ``APART``. Where that leaves
+    two pairs with the same two vertices, one of them gets a new vertex in the middle of the edge.
     """
     for _ in range(ATTEMPTS):
         pairs = _paired(vertices, faces)
         if pairs is None:
             return None
-        old, fans = _split(faces, pairs)
-        vertices = _moved_apart(vertices[old], fans, np.bincount(old)[old] > 1)
-        if is_closed(fans):
-            return vertices, fans
-        vertices, faces = _with_middles(vertices, fans, pairs)
+        old, faces = _split(faces, pairs)
+        vertices = _moved_apart(vertices[old], faces, np.bincount(old)[old] > 1)
+        if is_closed(faces):
+            return vertices, faces
+        vertices, faces = _with_middles(vertices, faces, pairs)
     return None
 
 
 def _split(
     faces: Faces, pairs: tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]
 ) -> tuple[Int[np.ndarray, " U"], Faces]:
-    """Give every fan of paired faces a vertex of its own; return the old vertex of each, and the
-    faces.
+    """Give each fan, the faces around a vertex that pairs connect, a vertex of its own.
+
+    Returns:
+        for each new vertex the old one that it replaces, and the faces of new vertices.
     """
     (start, end), (other_start, other_end) = (_corners(edges, len(faces)) for edges in pairs)
     links = [np.stack([start, other_end], axis=1), np.stack([end, other_start], axis=1)]
@@ -141,8 +148,8 @@ def _split(
 def _with_middles(
     vertices: Vertices, faces: Faces, pairs: tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]
 ) -> tuple[Vertices, Faces]:
-    """Split the faces of the second pair at each edge that has two, at a new vertex between its
-    ends; faces that are split already wait for the next attempt.
+    """Where an edge has several pairs of faces, split all pairs but the first at a new vertex near
+    the middle of the edge. A pair with a face that is split already waits for the next attempt.
     """
     edges, count = half_edges(faces), len(faces)
     key = np.sort(edges[pairs[0]], axis=1)
@@ -166,7 +173,7 @@ def _with_middles(
 def _corners(
     edges: Int[np.ndarray, " P"], count: int
 ) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]:
-    """Return the corners of ``count`` faces, three each, at which half-edges start and end."""
+    """Return the corners, as indices into ``faces.ravel()``, at which half-edges start and end."""
     first, face = np.divmod(edges, count)
     return 3 * face + first, 3 * face + (first + 1) % 3
 
@@ -174,12 +181,16 @@ def _corners(
 def _paired(
     vertices: Vertices, faces: Faces
 ) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]] | None:
-    """Pair half-edges in opposite directions, by index; None if some have no partner."""
+    """Pair each half-edge with one in the opposite direction; None if some have no partner.
+
+    Returns:
+        the half-edges that run from the lower vertex index to the higher, and their partners.
+    """
     edges = half_edges(faces)
     ahead = edges[:, 0] < edges[:, 1]
     key = edges.min(axis=1) * len(vertices) + edges.max(axis=1)
     angle = _angles(vertices, faces, edges, np.unique(key, return_inverse=True)[1])
-    # from the front face of a sector of the inside, its back face is the next one downwards
+    # the inside lies from the face of an ascending half-edge down to the next face around the edge
     first, second = (np.flatnonzero(side) for side in (ahead, ~ahead))
     first, second = (side[np.lexsort((angle[side], key[side]))] for side in (first, second))
     if len(first) != len(second) or (key[first] != key[second]).any():
@@ -193,7 +204,9 @@ def _next_below(
     first: Int[np.ndarray, " P"],
     second: Int[np.ndarray, " P"],
 ) -> Int[np.ndarray, " P"]:
-    """Return ``second`` rotated within each edge so that angles fall from ``first`` to it."""
+    """Rotate ``second`` within each edge, so that the face of each entry is the next one below that
+    of ``first`` by angle. Both are sorted by edge and angle.
+    """
     second = second.copy()
     _, start, count = np.unique(key[first], return_index=True, return_counts=True)
     for begin, size in zip(start[count > 1], count[count > 1], strict=True):
@@ -206,8 +219,14 @@ def _next_below(
 def _angles(
     vertices: Vertices, faces: Faces, edges: Int[np.ndarray, "E 2"], group: Int[np.ndarray, " E"]
 ) -> Float[np.ndarray, " E"]:
-    """Return the angle of each half-edge's face around its edge, from the lower vertex's side,
-    in radians from a common direction; only for edges of more than two faces, else 0.
+    """Return the angle of each half-edge's face around its edge, in radians; 0 at edges of at most
+    two faces, which need none.
+
+    Angles turn counterclockwise about the axis from the edge's lower vertex index to the higher,
+    from a direction that all faces of the edge share.
+
+    Args:
+        group: the edge of each half-edge, without its direction.
     """
     angles = np.zeros(len(edges))
     crowded = np.flatnonzero(np.bincount(group)[group] > 2)
@@ -224,7 +243,7 @@ def _angles(
 
 
 def _moved_apart(vertices: Vertices, faces: Faces, touching: Bool[np.ndarray, " V"]) -> Vertices:
-    """Move vertices towards the mean of their faces' other corners."""
+    """Move the ``touching`` vertices by ``APART`` towards the mean of their neighbours."""
     edges = half_edges(faces)
     count = np.maximum(np.bincount(edges[:, 0], minlength=len(vertices)), 1)
     sums = [np.bincount(edges[:, 0], x[edges[:, 1]], len(vertices)) for x in vertices.T]

@@ -44,7 +44,7 @@ class Options:
     seed: int = 0
     device: str = "cpu"
     pool: int = 40
-    """Number of shards that a stage visits cyclically."""
+    """Number of shards of training data; a stage visits them in a cycle."""
     shard_objects: int = 256
     precision: str = "float32"
     """Either "float32", or "bfloat16" for autocast on GPUs."""
@@ -58,7 +58,7 @@ class Options:
 
 
 class Stage(ABC):
-    """The training of one network; ``model`` is optimised, and its weights are averaged."""
+    """The training of one network, ``model``; :class:`Training` also averages its weights."""
 
     name: ClassVar[str]
     batch_size: ClassVar[int]
@@ -88,7 +88,9 @@ class Stage(ABC):
         """Return the loss of one batch, and further scalars to log."""
 
     def frozen(self) -> tuple[str, ...]:
-        """Return name prefixes of parameters that are frozen, since trained networks use them."""
+        """Return name prefixes of the parameters that stay fixed, since other networks were trained
+        with them.
+        """
         return ()
 
     def evaluate(self, model: nn.Module) -> dict[str, float]:
@@ -112,7 +114,7 @@ class Progress:
     images: int = 0
     seconds: float = 0.0
     history: list[dict[str, float]] = field(default_factory=list)
-    """Means of the metrics over LOG_EVERY steps each."""
+    """One entry for each :data:`LOG_EVERY` steps: the means of the metrics."""
 
 
 LOG_EVERY = 50
@@ -140,8 +142,8 @@ class Training:
         return checkpoint_path(self.stage.options.folder, self.stage.name)
 
     def run(self, images: Optional[int] = None) -> Progress:
-        """Train until ``images`` have been seen. The signals that stop a run save a checkpoint and
-        stop, with the signal's number in ``signum``.
+        """Train until ``images`` (default: the stage's number) have been seen. A stop signal, such
+        as Ctrl-C, ends it earlier: a checkpoint is saved, and ``signum`` is the signal's number.
         """
         target = images or self.stage.images
         earlier = set_handlers(self._on_signal)
@@ -301,9 +303,8 @@ def _average(averages: list[Tensor], current: list[Tensor], count: Any) -> None:
 
 
 def rate_factor(step: int) -> float:
-    """Return the factor on the stage's learning rate at a step.
-
-    It increases linearly to 1, is constant, and then decreases with the step's inverse square root.
+    """Return the multiplier of the learning rate: linear warm-up to 1, constant, then proportional
+    to the inverse square root of the step.
     """
     return min(1.0, (step + 1) / WARMUP) * min(1.0, (DECAY_START / (step + 1)) ** 0.5)
 

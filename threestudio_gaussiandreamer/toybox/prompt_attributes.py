@@ -16,7 +16,7 @@ PATTERN_WORDS: dict[str, tuple[str, ...]] = {
 
 
 class Word(NamedTuple):
-    """A word, or several that belong together, with one meaning."""
+    """The meaning of a word, or of a phrase such as "light green"."""
 
     role: str
     """kind, color, pattern, part or accessory."""
@@ -26,15 +26,15 @@ class Word(NamedTuple):
 def attributes_in(prompt: str) -> Optional[Attributes]:
     """Return the attributes that a prompt names; None if it names no kind of object or no colour.
 
-    A part or an accessory has the colour in front of it; of the other colours the first is the
-    body's and the second the pattern's; a pattern without a second colour is left out, as are
-    words that aren't known.
+    The colour directly in front of a part or an accessory belongs to that. Of the other colours the
+    first is the body's and the second the pattern's. A pattern without a second colour is ignored,
+    as are unknown words.
     """
     words = _meanings(prompt)
     kind = next((word.meaning for word in words if word.role == "kind"), None)
     part = _colored(words, "part", PARTS[kind] if kind else "")
-    extra = _colored(words, "accessory")
-    taken = {place for place, _, _ in (part, extra) if place is not None}
+    accessory = _colored(words, "accessory")
+    taken = {place for place, _, _ in (part, accessory) if place is not None}
     colors = [w.meaning for i, w in enumerate(words) if w.role == "color" and i not in taken]
     if kind is None or not colors:
         return None
@@ -46,8 +46,8 @@ def attributes_in(prompt: str) -> Optional[Attributes]:
         pattern=pattern,
         second=colors[1] if pattern != "plain" else None,
         part=part[2],
-        accessory=extra[1],
-        accessory_color=extra[2],
+        accessory=accessory[1],
+        accessory_color=accessory[2],
     )
 
 
@@ -56,7 +56,7 @@ def _words(prompt: str) -> list[str]:
 
 
 def _meanings(prompt: str) -> list[Word]:
-    """Return the known words in order; where several begin at a place, the longest."""
+    """Return the known words in order; of those that begin at one place, the longest."""
     text, found, at = " ".join(_words(prompt)), [], 0
     while at < len(text):
         phrase = next((p for p in PHRASES if _stands_at(text, p, at)), None)
@@ -76,7 +76,12 @@ def _stands_at(text: str, phrase: str, at: int) -> bool:
 def _colored(
     words: list[Word], role: str, meaning: str = ""
 ) -> tuple[Optional[int], Optional[str], Optional[str]]:
-    """Return the colour's place, the thing and its colour; None for each without a colour."""
+    """Find the first word of a role, and of this meaning if one is given, with a colour before it.
+
+    Returns:
+        the colour's index in ``words``, the word's meaning and its colour; three None if none is
+        found.
+    """
     for place, (color, word) in enumerate(zip(words, words[1:], strict=False)):
         if word.role == role and color.role == "color" and meaning in ("", word.meaning):
             return place, word.meaning, color.meaning
@@ -84,7 +89,7 @@ def _colored(
 
 
 def _synonyms(role: str, words: Mapping[str, Iterable[str]]) -> dict[str, Word]:
-    return {word: Word(role, meaning) for meaning, all_ in words.items() for word in all_}
+    return {word: Word(role, meaning) for meaning, same in words.items() for word in same}
 
 
 MEANINGS: dict[str, Word] = (

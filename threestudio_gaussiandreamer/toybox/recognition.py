@@ -1,10 +1,10 @@
 """Recognise the toybox's attributes in pictures of a result with the judge.
 
 ===========  ===================================================================================
-kind         whether the most probable kind is the prompt's, by the mean of the views' probabilities
-colors       the same for the body's and the pattern's colour, both
+kind         whether the kind with the highest probability, averaged over the views, is the prompt's
+colors       the same for the body's colour and the pattern's: both must be right
 pattern      the same for the pattern
-accessory    the same for the coloured part, the accessory and its colour, all three
+accessory    the same for the coloured part, the accessory and its colour: all three must be right
 multi_face   share of the views that the judge takes for views from another quadrant; NaN for
              objects that look alike from all sides
 ===========  ===================================================================================
@@ -26,8 +26,8 @@ from .world import Attributes
 BUNDLED = Path(__file__).parents[1] / "assets" / "toybox" / "judge.safetensors"
 ELEVATION_DEG = 15.0
 OFFSETS_DEG = (-22.5, 22.5)
-"""Azimuths of the views from each quadrant, from its middle; the quadrants' borders, at 45 degrees,
-are ambiguous.
+"""Azimuths of a quadrant's two views, relative to its middle. They keep away from its borders, at
++-45 degrees, where the right answer is ambiguous.
 """
 ALIKE_FROM_ALL_SIDES = ("mug", "mushroom")
 
@@ -58,12 +58,12 @@ def load_judge(path: Path) -> Judge:
 def views() -> Orbit:
     """Return the eight views that the judge sees, two of each quadrant in the order of LABELS."""
     azimuth = torch.tensor([90.0 * side + offset for side in range(4) for offset in OFFSETS_DEG])
-    same = torch.ones_like(azimuth)
+    ones = torch.ones_like(azimuth)
     return Orbit(
-        ELEVATION_DEG * same,
+        ELEVATION_DEG * ones,
         (azimuth + 180) % 360 - 180,
-        sum(DISTANCE) / 2 * same,
-        math.radians(FOVY_DEG) * same,
+        sum(DISTANCE) / 2 * ones,
+        math.radians(FOVY_DEG) * ones,
     )
 
 
@@ -76,7 +76,7 @@ def probabilities(judge: Judge, pictures: Float[Tensor, "V 3 s s"]) -> dict[str,
 def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, bool]:
     """Return for each attribute of the prompt whether the pictures show it.
 
-    Attributes that the prompt leaves out count too: the judge has to find none.
+    For an attribute that the prompt doesn't name, the judge's most probable class must be "none".
     """
     right = {}
     for name, value in wanted._asdict().items():

@@ -58,7 +58,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
     "--up": {
         "choices": AXES,
-        "help": "which axis of PATH is up (default: what the file says, else its format's custom)",
+        "help": "which axis of PATH is up (default: from the file, else its format's convention)",
     },
 }
 

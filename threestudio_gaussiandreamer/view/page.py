@@ -36,9 +36,9 @@ WEB = Path(__file__).with_name("web")
 SCRIPTS = ("camera.js", "sorter.js", "cloud.js", "renderer.js", "controls.js", "main.js")
 SHADERS = ("splat.vert.glsl", "splat.frag.glsl", "screen.vert.glsl", "screen.frag.glsl")
 MAX_GAUSSIANS = 2_000_000
-"""More take a browser minutes and more memory than it has."""
+"""A browser takes minutes to open a page with more, or runs out of memory."""
 POSTER_SIZE = 320
-"""Pixels each way of the picture that is shown without WebGL2."""
+"""Width and height in pixels of the picture that a browser without WebGL2 shows."""
 WHITE = (1.0, 1.0, 1.0)
 
 
@@ -47,9 +47,9 @@ class Shown(NamedTuple):
 
     cloud: StoredCloud
     label: str
-    """What the choice of clouds calls it."""
+    """Its name in the page's list of clouds."""
     quality: str = ""
-    """The dB of the cloud and what they were measured on, if known."""
+    """Its PSNR and the views on which that was measured; empty if unknown."""
 
 
 class PageOptions(NamedTuple):
@@ -57,7 +57,7 @@ class PageOptions(NamedTuple):
 
     title: str
     name: str
-    """Of the files that the page saves, without extension."""
+    """Name, without extension, of the files that the page saves."""
     settings: RenderSettings
     background: tuple[float, float, float] = WHITE
     """RGB in [0, 1]."""
@@ -190,13 +190,13 @@ def _poster(cloud: StoredCloud, settings: RenderSettings, pose: Pose) -> str:
 
 @cache
 def _source(name: str) -> str:
-    """Read a source without indentation, blank lines and lines that are comments."""
+    """Read a file of ``web/``; drop indentation, blank lines and comment lines."""
     lines = (line.strip() for line in (WEB / name).read_text().splitlines())
     return "\n".join(line for line in lines if line and not line.startswith("//"))
 
 
 def sources(names: Sequence[str]) -> str:
-    """Join the sources of ``web/`` with these names; scripts can't see others' variables."""
+    """Join files of ``web/``; scripts become one script in strict mode, with one global scope."""
     joined = "\n".join(map(_source, names))
     return f'"use strict";\n{joined}' if names[0].endswith(".js") else joined
 
@@ -213,7 +213,7 @@ def policy(script: str, style: str) -> str:
 
 
 def _script_json(content: Any) -> str:
-    """Encode as JSON for a script element, in which no value can end the element."""
+    """Encode as JSON for a script element; escape what could end the element, such as "<"."""
     text = json.dumps(content, allow_nan=False)
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")
@@ -221,6 +221,6 @@ def _script_json(content: Any) -> str:
 
 
 def decibels(psnr: Optional[float]) -> str:
-    """Format the dB of a cloud on held-out views; empty if they aren't known."""
+    """Format the PSNR of a cloud on held-out views; empty if it isn't known."""
     known = psnr is not None and math.isfinite(psnr)
     return f"{psnr:.1f} dB on held-out views" if known else ""

@@ -1,4 +1,4 @@
-"""Pictures of a cloud by our own rasteriser, with the settings and cameras of the page."""
+"""Render a cloud with this package's rasteriser, and the settings and cameras of the page."""
 
 import math
 from typing import Any, NamedTuple
@@ -17,11 +17,11 @@ from ..splatting import PRESETS, rasterize
 ELEVATION, AZIMUTH = 15.0, 30.0
 """The first view, degrees: the front, from slightly above and to the right."""
 MARGIN = 1.15
-"""Of the first view around the cloud."""
+"""Distance of the first view, relative to the one at which the bounding sphere just fits."""
 
 
 class RenderSettings(NamedTuple):
-    """What decides how Gaussians look, as the renderer that trained them has it."""
+    """Renderer options that change how Gaussians look; set them as in the training."""
 
     eps2d: float = EPS2D
     """Screen-space dilation, square pixels."""
@@ -34,8 +34,8 @@ class RenderSettings(NamedTuple):
 
     @classmethod
     def of(cls, renderer: Any, bound_colors: bool) -> "RenderSettings":
-        """Collect the options of our renderer; the dilation is in square pixels of what it
-        returns, which downsampling has made smaller.
+        """Collect the options of our renderer. Its ``eps2d`` is in pixels before ``downsample``;
+        ours is in pixels of the returned image.
         """
         return cls(
             eps2d=renderer.eps2d / renderer.downsample**2,
@@ -112,7 +112,7 @@ def _render_view(
 
 
 def _camera(pose: Pose, up: str) -> Float[Tensor, "1 4 4"]:
-    """Return the OpenGL camera of a pose in the axes of a cloud with the axis ``up`` up."""
+    """Return the OpenGL camera of a pose in the axes of a cloud whose up axis is ``up``."""
     target = torch.tensor([pose.target])
     angles = [torch.tensor([x]) for x in (pose.elevation, pose.azimuth, pose.distance)]
     c2w = orbit_c2w(*angles, center=torch.zeros(1, 3))

@@ -1,8 +1,8 @@
-"""Compare the kernels with plain torch on a GPU, once, before they are used there.
+"""Compare the CUDA kernels with plain torch on a GPU, once, before they are used there.
 
-A small fixed scene is drawn and differentiated by the kernels in float32 and by plain torch in
-float64, on the same device. The verdict depends on the GPU, the driver, the compiler and the text
-of this folder, and is kept beside the compiled kernels."""
+A small fixed scene is rendered and differentiated by the kernels in float32 and by plain torch in
+float64, on the same device. The result is cached beside the compiled kernels; it is computed again
+for another GPU, driver, compiler, torch version or source of the kernels."""
 
 import functools
 import hashlib
@@ -23,16 +23,16 @@ from . import driver, nvrtc
 TOLERANCE = 1e-3
 """Largest error of an output or a gradient, relative to its largest entry. Rounding gives 1e-5; a
 Gaussian that falls on the other side of a threshold in float64 gives 1e-4."""
-GAUSSIANS, WIDTH, HEIGHT = 200, 40, 24  # more than a batch of ``blend``, and 3 x 2 tiles
+GAUSSIANS, WIDTH, HEIGHT = 200, 40, 24  # more than a batch of ``blend``; 3 x 2 tiles
 ANGLES = (0.0, 0.7)
-"""Of the two cameras around the scene, radians."""
+"""Azimuths of the two cameras, radians."""
 
 
 def failure(device: torch.device) -> Optional[str]:
     """Return why the kernels must not be used on this GPU, or None if they are right.
 
     Raises:
-        torch.cuda.OutOfMemoryError: the GPU has no memory left; there is no verdict.
+        torch.cuda.OutOfMemoryError: the GPU has no memory left; nothing is cached.
     """
     return _failure(device)
 
@@ -57,7 +57,7 @@ def _failure(device: torch.device) -> Optional[str]:
 
 
 def _key(gpu: str) -> str:
-    """Return a hash of everything that the verdict depends on."""
+    """Return a hash of everything that the result depends on."""
     texts = [path.read_bytes() for path in sorted(nvrtc.KERNELS.glob("*.*"))]
     texts += [text.encode() for text in nvrtc.headers().values()]
     parts = [gpu.encode(), torch.__version__.encode(), *texts]
@@ -72,7 +72,7 @@ def _compare(device: torch.device) -> str:
         raise
     except (UserError, RuntimeError) as error:
         return f"its kernels fail on a small scene: {error}"
-    # not "> TOLERANCE", so that NaN is wrong
+    # ``not <=`` instead of ``>``, so that NaN counts as wrong
     wrong = [f"{name} by {size:.1e}" for name, size in errors.items() if not size <= TOLERANCE]
     if not wrong:
         return ""
@@ -95,7 +95,7 @@ def errors_on(device: torch.device) -> dict[str, float]:
 
 
 def _draw(backend: ModuleType, scene: Scene) -> dict[str, Tensor]:
-    """Return the images and, for fixed cotangents, the gradients."""
+    """Render a scene; return the images and the gradients of a fixed weighted sum of them."""
     leaves = {name: getattr(scene, name).requires_grad_() for name in Scene._fields[:7]}
     out = backend.rasterize(scene, RasterizeOptions())
     images = {name: getattr(out, name) for name in ("image", "alpha", "depth")}
