@@ -4,6 +4,7 @@ import io
 import socket
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -48,6 +49,34 @@ def test_viser_gets_covariances_colours_and_opacities():
     np.testing.assert_allclose(got["covariances"][0], np.diag([4, 1, 9]), atol=1e-6)
     np.testing.assert_allclose(got["rgbs"], [[0.5, 1, 0]])
     assert got["opacities"].shape == (1, 1) and got["opacities"][0, 0] == 0.5
+
+
+class Button:
+    """A button of viser's panel without a browser."""
+
+    def on_click(self, pressed):
+        self.press = lambda: pressed(None)
+
+
+@pytest.fixture
+def panel():
+    """A view whose panel makes :class:`Button`, and its buttons by label."""
+    buttons = {}
+    gui = SimpleNamespace(add_button=lambda label: buttons.setdefault(label, Button()))
+    return SimpleNamespace(server=SimpleNamespace(gui=gui)), buttons
+
+
+def test_one_step_is_made_for_a_press_during_a_pause_only(panel):
+    view, buttons = panel
+    controls = live.Controls(view)
+    buttons["One step"].press()
+    assert controls.may_go_on()
+    buttons["Pause"].press()
+    assert not controls.may_go_on()
+    buttons["One step"].press()
+    assert controls.may_go_on() and not controls.may_go_on()
+    buttons["Pause"].press()
+    assert controls.may_go_on()
 
 
 def test_a_port_in_use_is_named(taken, tmp_path, capsys):

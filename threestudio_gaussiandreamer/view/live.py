@@ -1,7 +1,7 @@
 """Serve a cloud of Gaussians to browsers with viser (extra ``[viewer]``).
 
-viser draws Gaussians with a dilation of its own, 0.3 square pixels, and with colours of degree 0;
-the page that ``--html`` writes draws them as the run does.
+viser always draws Gaussians with a dilation of 0.3 square pixels and colours of degree 0; the page
+that ``--html`` writes draws them with the options of the run.
 """
 
 import math
@@ -23,7 +23,7 @@ from ..models.extras import require_extra
 from .render import AZIMUTH, ELEVATION, first_pose
 
 LARGEST_HALF = 6e4
-"""viser stores covariances in half precision."""
+"""Covariances are clipped to this, since viser stores them in half precision (65504 at most)."""
 FLIP_YZ = np.diag([1.0, -1.0, -1.0])
 """From OpenGL's camera axes (y up, looks along -z) to OpenCV's (y down, looks along z)."""
 
@@ -52,7 +52,7 @@ class LiveView:
     """A server that shows one cloud, which may change.
 
     Args:
-        host: the address to listen on; 127.0.0.1 admits this machine alone.
+        host: the address to listen on; 127.0.0.1 accepts connections from this machine only.
         title: the heading of the panel.
 
     Raises:
@@ -153,7 +153,7 @@ class Controls:
         self._image: Optional[Any] = None
 
     def may_go_on(self) -> bool:
-        """Return whether the next step may begin; a single step is allowed once."""
+        """Return whether the next step may begin; in a pause, a press of "One step" allows one."""
         if not self.paused.is_set():
             return True
         allowed = self.step.is_set()
@@ -177,6 +177,7 @@ class Controls:
         if self.paused.is_set():
             self.paused.clear()
         else:
+            self.step.clear()  # pressed before the pause
             self.paused.set()
         self._pause.label = "Go on" if self.paused.is_set() else "Pause"
 
@@ -201,7 +202,7 @@ def serve(cloud: StoredCloud, host: str, port: int, title: str) -> LiveView:
 
 
 def serve_until_stopped(view: LiveView) -> None:
-    """Wait for a stop signal, such as Ctrl-C, and close the view; that is no error."""
+    """Wait for a stop signal, such as Ctrl-C, then close the view and return normally."""
     stopped = threading.Event()
     earlier = set_handlers(lambda signum, frame: stopped.set())
     try:
