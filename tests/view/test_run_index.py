@@ -2,6 +2,7 @@
 can add markup or break them.
 """
 
+import os
 import re
 from datetime import datetime
 from html.parser import HTMLParser
@@ -82,6 +83,15 @@ def test_every_file_is_linked_and_every_link_leads_to_a_file(full_run):
     assert linked == files - {"index.html"}
 
 
+def test_names_that_are_not_utf_8_are_linked(full_run):
+    name = b"save/it7-\xff.png"
+    try:
+        os.close(os.open(os.fsencode(full_run) + b"/" + name, os.O_CREAT))
+    except OSError:
+        pytest.skip("this file system has no such names")
+    assert "save/it7-%FF.png" in write_index(full_run).read_text()
+
+
 def test_a_prompt_adds_no_markup(full_run):
     found = Tags(write_index(full_run))
     assert "script" not in found.tags and "b" not in found.tags and "x" not in found.files
@@ -130,3 +140,8 @@ def test_the_gallery_shows_prompt_poster_and_scores(full_run):
 def test_a_gallery_needs_runs(tmp_path):
     with pytest.raises(UserError, match="holds no run.*configs/parsed.yaml"):
         write_gallery(tmp_path)
+
+
+def test_a_run_whose_index_cannot_be_written_stays_in_the_gallery(full_run):
+    (full_run / "index.html").mkdir()
+    assert "run" in Tags(write_gallery(full_run.parent)).files

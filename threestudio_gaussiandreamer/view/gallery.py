@@ -5,6 +5,7 @@ from pathlib import Path
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
+from ..core.logs import warn
 from .page import decibels
 from .run_files import RunFiles, is_run, step_of
 from .run_index import NAME, write_index
@@ -24,8 +25,10 @@ def runs_below(folder: Path) -> list[RunFiles]:
 def write_gallery(folder: Path) -> Path:
     """Write the gallery of the runs in a folder, and their own indices; returns its path.
 
+    Where a run's index can't be written, a warning is given, and its card leads to its folder.
+
     Raises:
-        UserError: there is no run in the folder, or a file can't be written.
+        UserError: there is no run in the folder, or the gallery can't be written.
     """
     runs = runs_below(folder)
     if not runs:
@@ -34,7 +37,10 @@ def write_gallery(folder: Path) -> Path:
             f"configs/parsed.yaml, or one above such folders, up to {MAX_DEPTH} levels"
         )
     for run in runs:
-        write_index(run.folder)
+        try:
+            write_index(run.folder)
+        except UserError as error:
+            warn(str(error))
     path = folder / NAME
     cards = "".join(_card(run, folder) for run in runs)
     title = f"{len(runs)} runs in {folder.resolve().name}"
@@ -47,7 +53,8 @@ def write_gallery(folder: Path) -> Path:
 def _card(run: RunFiles, folder: Path) -> str:
     texts = [run.prompt, decibels(run.psnr("result")), str(run.folder.relative_to(folder))]
     lines = "".join(element("div", text) for text in texts if text)
-    where = address(run.folder / NAME, folder)
+    index = run.folder / NAME
+    where = address(index if index.is_file() else run.folder, folder)
     return f'<a href="{where}">{_picture(run, folder)}{lines}</a>'
 
 

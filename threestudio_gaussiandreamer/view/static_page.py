@@ -57,7 +57,8 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def address(path: Path, page_folder: Path) -> str:
     """Return the relative address of a file from a page in ``page_folder``."""
-    return quote(os.path.relpath(path, page_folder).replace(os.sep, "/"))
+    # as bytes, since a name needn't be UTF-8
+    return quote(os.fsencode(os.path.relpath(path, page_folder).replace(os.sep, "/")))
 
 
 def link(path: Path, page_folder: Path, text: str) -> str:
