@@ -93,6 +93,16 @@ def test_a_number_that_is_no_port(number):
         live.require_server("127.0.0.1", number)
 
 
+def test_the_address_of_any_free_port():
+    pytest.importorskip("viser")
+    view = live.LiveView("127.0.0.1", 0, "cloud")
+    try:
+        port = int(view.address.rpartition(":")[2])
+        socket.create_connection(("127.0.0.1", port), timeout=5).close()
+    finally:
+        view.close()
+
+
 def test_without_viser_the_extra_is_named(monkeypatch, port):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(UserError, match=r"\[viewer\]"):

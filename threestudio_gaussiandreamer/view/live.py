@@ -65,7 +65,8 @@ class LiveView:
 
         self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.server.scene.set_up_direction("+z")
-        self.address = f"http://{'localhost' if host == '0.0.0.0' else host}:{port}"
+        name = "localhost" if host == "0.0.0.0" else host
+        self.address = f"http://{name}:{self.server.get_port()}"
         self._status = self.server.gui.add_markdown(title)
         self._title, self._splats, self._frustums = title, None, []
 
