@@ -107,6 +107,8 @@ def test_rows_that_cant_be_drawn_are_left_out(tmp_path, caplog):
         (["in.ply", "nowhere/a.obj"], "OUT: there is no folder 'nowhere'"),
         (["empty.ply", "a.glb"], "empty.ply holds no Gaussians that can be drawn"),
         (["text.ply", "a.glb"], "isn't a PLY file|this is not a PLY file"),
+        (["in.ply", "a.glb", "--up-out", "z"], "--up-out: OUT is a .glb file"),
+        (["in.ply", "a.spz", "--up-out", "z"], "--up-out: OUT is a .spz file"),
         (["in.ply", "a.glb", "--from", "blender"], None),
     ],
 )

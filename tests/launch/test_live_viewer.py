@@ -27,7 +27,7 @@ class Watched:
     def show(self, gaussians, status=""):
         self.shown.append((len(gaussians.means), status))
 
-    def look_from_front(self, cloud):
+    def look_from_front(self, pose):
         pass
 
     def show_cameras(self, c2w, fovy, aspect):

@@ -115,6 +115,8 @@ def test_without_viser_the_extra_is_named(monkeypatch, port):
         (["{}/runs"], "no run with an exported cloud"),
         (["{}/none.ply"], "none.ply"),
         (["{}/text.ply"], "text.ply"),
+        (["{}/empty.ply"], "empty.ply has no Gaussians that can be drawn"),
+        (["{}/far.ply"], "further than"),
         (["{}/a.ply", "--eps2d", "0.3"], "--eps2d: is for the page"),
         (["{}/a.ply", "--host", "999.1.1.1"], "999.1.1.1"),
         (["{}/a.ply", "--host", "é" * 70], "choose another port"),
@@ -126,6 +128,10 @@ def test_without_viser_the_extra_is_named(monkeypatch, port):
 def test_wrong_input_is_named_before_serving(tmp_path, capsys, port, arguments, message):
     pytest.importorskip("viser")
     write_cloud(str(tmp_path / "a.ply"), cloud(5))
+    write_cloud(str(tmp_path / "empty.ply"), cloud(0))
+    far = cloud(5)
+    far.gaussians.means[:] *= 1e20
+    write_cloud(str(tmp_path / "far.ply"), far)
     (tmp_path / "runs").mkdir()
     (tmp_path / "text.ply").write_text("hello")
     arguments = [argument.replace("{}", str(tmp_path)) for argument in arguments]

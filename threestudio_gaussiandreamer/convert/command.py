@@ -59,8 +59,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
     "--up-out": {
         "choices": AXES,
-        "default": VIEWER_UP,
-        "help": "which axis of OUT is up, for PLYs (default: %(default)s, as viewers expect)",
+        "help": f"which axis of OUT is up, for PLYs (default: {VIEWER_UP}, as viewers expect)",
     },
     "--gaussians": {
         "action": "store_true",
@@ -120,7 +119,7 @@ def run(args: argparse.Namespace) -> None:
     """
     mesh = to_mesh.writes_mesh(args)
     suffix = suffix_of(args.output) if mesh else require_format(args.output, "OUT")
-    _check_options(args, suffix)
+    _check_options(args, suffix, mesh)
     source = existing_file(args.source, "file of Gaussians or checkpoint")
     require_other_file(args.output, source)
     stored = _read(source, args)
@@ -139,7 +138,7 @@ def run(args: argparse.Namespace) -> None:
         print(_checked(args, stored, suffix))
 
 
-def _check_options(args: argparse.Namespace, suffix: str) -> None:
+def _check_options(args: argparse.Namespace, suffix: str, mesh: bool) -> None:
     require_writable(args.output, "OUT")
     if args.producer and args.up:
         raise UserError("--from and --up both say which axis of IN is up: give one")
@@ -147,6 +146,8 @@ def _check_options(args: argparse.Namespace, suffix: str) -> None:
         require_version(args.spz_version)
     elif args.spz_version != VERSION:
         raise UserError(f"--spz-version: OUT is a {suffix} file")
+    if args.up_out and (mesh or not FORMATS[suffix].any_up):
+        raise UserError(f"--up-out: OUT is a {suffix} file, whose axes are fixed; it is for PLYs")
     check_options(ConvertOptions, ConvertOptions(args.harmonics, args.size), "--")
     to_mesh.check_mesh_options(args)
     if args.check and FORMATS[suffix].read is None:
@@ -169,7 +170,7 @@ def _read(source: Path, args: argparse.Namespace) -> StoredCloud:
         stored = stored._replace(gaussians=stored.gaussians._replace(sh=sh))
     if args.producer:
         stored = from_producer(stored, args.producer)
-    stored = stored.in_axes(args.up_out)
+    stored = stored.in_axes(args.up_out or VIEWER_UP)
     return stored._replace(gaussians=finite(stored.gaussians, args.source))
 
 

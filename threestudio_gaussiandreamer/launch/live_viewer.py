@@ -28,6 +28,7 @@ from ..gaussians.gaussians import Gaussians, drawable
 from ..host import info, pl
 from ..training.pictures import score_panels
 from ..view.live import Controls, LiveView
+from ..view.render import first_pose
 
 SHARE_OF_TIME = 0.02
 """Largest share of the training's time that is spent on updates."""
@@ -58,7 +59,7 @@ class LiveViewer(pl.Callback):
 
     def on_train_start(self, trainer: Any, pl_module: Any) -> None:
         cloud = current_cloud(pl_module)
-        self.view.look_from_front(StoredCloud(cloud))
+        self.view.look_from_front(first_pose(StoredCloud(cloud)))
         self.view.show(cloud, status(trainer, cloud))
         self.controls = Controls(self.view)
         info(f"the viewer is at {self.view.address}")

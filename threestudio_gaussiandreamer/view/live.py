@@ -20,7 +20,7 @@ from ..gaussians.gaussians import Gaussians
 from ..gaussians.sh import sh0_colors
 from ..gaussians.surface import covariance_matrices
 from ..models.extras import require_extra
-from .render import AZIMUTH, ELEVATION, first_pose
+from .render import AZIMUTH, ELEVATION, Pose, first_pose, require_gaussians
 
 LARGEST_HALF = 6e4
 """Covariances are clipped to this, since viser stores them in half precision (65504 at most)."""
@@ -75,9 +75,8 @@ class LiveView:
         """Whether a browser is connected."""
         return bool(self.server.get_clients())
 
-    def look_from_front(self, cloud: StoredCloud) -> None:
-        """Set the first view of browsers that connect from now on: the page's first view."""
-        pose = first_pose(cloud)
+    def look_from_front(self, pose: Pose) -> None:
+        """Set the first view of browsers that connect from now on, as the page's is set."""
         elevation, azimuth = math.radians(ELEVATION), math.radians(AZIMUTH)
         away = np.array(
             [
@@ -195,9 +194,16 @@ def splats(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 
 def serve(cloud: StoredCloud, host: str, port: int, title: str) -> LiveView:
-    """Serve a finished cloud until the returned view is closed."""
-    view, upright = LiveView(host, port, title), cloud.in_axes(WORLD_UP)
-    view.look_from_front(upright)
+    """Serve a finished cloud until the returned view is closed.
+
+    Raises:
+        UserError: see :func:`require_server`; or there are no Gaussians, or they reach too far.
+    """
+    require_gaussians(len(cloud.gaussians.means), title)
+    upright = cloud.in_axes(WORLD_UP)
+    pose = first_pose(upright)  # its errors come before the server
+    view = LiveView(host, port, title)
+    view.look_from_front(pose)
     view.show(upright.gaussians, f"{len(upright.gaussians.means):,} Gaussians")
     return view
 

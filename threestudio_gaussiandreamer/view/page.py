@@ -30,7 +30,7 @@ from ..gaussians.gaussians import finite
 from ..splatting.options import RasterizeOptions
 from .page_data import coarse, packed
 from .poster import picture
-from .render import Pose, RenderSettings, first_pose
+from .render import Pose, RenderSettings, first_pose, require_gaussians
 
 WEB = Path(__file__).with_name("web")
 SCRIPTS = ("camera.js", "sorter.js", "cloud.js", "renderer.js", "controls.js", "main.js")
@@ -108,8 +108,7 @@ def page(shown: Shown, options: PageOptions, before: Optional[Shown] = None) -> 
 
 def require_page_size(count: int, name: str) -> None:
     """Raise UserError if a page can't show this number of Gaussians."""
-    if not count:
-        raise UserError(f"{name} has no Gaussians that can be drawn: there is nothing to show")
+    require_gaussians(count, name)
     if count > MAX_GAUSSIANS:
         raise UserError(
             f"{name} has {count:,} Gaussians, and a page shows at most {MAX_GAUSSIANS:,}: prune it "

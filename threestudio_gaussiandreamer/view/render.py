@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..cameras import orbit_c2w, to_opencv
+from ..core.errors import UserError
 from ..formats.gaussian_files import StoredCloud
 from ..gaussians.axes import WORLD_UP, rotation_between
 from ..gaussians.sh import bounded_colors, sh_to_unclamped_colors
@@ -58,6 +59,12 @@ class Pose(NamedTuple):
     """Degrees from +x towards +y."""
     fovy: float = math.degrees(FOVY)
     """Degrees."""
+
+
+def require_gaussians(count: int, name: str) -> None:
+    """Raise UserError if a cloud has no Gaussians to show."""
+    if not count:
+        raise UserError(f"{name} has no Gaussians that can be drawn: there is nothing to show")
 
 
 def first_pose(cloud: StoredCloud) -> Pose:
