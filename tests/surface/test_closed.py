@@ -62,6 +62,12 @@ def test_a_mesh_of_few_faces_is_left_as_it_is():
     np.testing.assert_allclose(np.sort(again[0], axis=0), np.sort(vertices, axis=0))
 
 
+def test_more_parts_than_so_few_faces_can_close_are_refused():
+    parts = joined(*(ball(subdivisions=1, place=(3 * k, 0, 0)) for k in range(60)))
+    with pytest.raises(UserError, match="can't be closed with 100 faces"):
+        simplified(*parts, 100)
+
+
 def test_a_surface_with_a_hole_is_refused():
     vertices, faces = ball(subdivisions=1)
     with pytest.raises(UserError, match="closed with 5000 faces"):

@@ -14,6 +14,8 @@ AGGRESSIVENESS = (7, 5, 3, 1)
 """Values of fast_simplification's ``agg`` in the order of trial; lower ones keep more of the shape.
 """
 ATTEMPTS = 4
+MIN_FACES = 4
+"""Of the smallest closed mesh, a tetrahedron."""
 APART = 0.05
 """Fraction of the way to their neighbours by which vertices at one position are moved apart."""
 
@@ -48,6 +50,8 @@ def simplified(vertices: Vertices, faces: Faces, count: int) -> tuple[Vertices, 
             if found is None or len(found[1]) <= count:
                 break
             target -= len(found[1]) - count  # splitting edges has added faces
+            if target < MIN_FACES:
+                break
         if found is not None and 0 < len(found[1]) <= count:
             return found
     raise UserError(
@@ -71,7 +75,8 @@ def _fewer(
 def _closed_again(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces] | None:
     """Separate surfaces that simplification made touch; None if the mesh can't be closed."""
     positions, index = joined(vertices, faces)
-    found = separated(positions, without_folds(index))
+    kept = without_folds(index)
+    found = separated(positions, kept) if len(kept) else None
     return found if found is not None and is_closed(joined(*found)[1]) else None
 
 
