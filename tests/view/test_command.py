@@ -128,6 +128,16 @@ def test_the_page_does_not_replace_its_cloud(source, tmp_path, capsys):
     assert source.read_bytes() == before and alias.is_symlink()
 
 
+def test_a_cloud_of_any_unit_has_no_far_plane(tmp_path):
+    large = cloud(30)
+    large.gaussians.means[:] *= 1e13
+    large.gaussians.log_scales[:] += 30
+    write_cloud(str(tmp_path / "large.ply"), large)
+    assert main([str(tmp_path / "large.ply"), "--html"]) == 0
+    settings = meta(tmp_path / "large.html")["settings"]
+    assert settings["far"] > 1e30 and settings["near"] > 1e10
+
+
 def test_a_title_whose_bytes_are_not_utf_8(source):
     assert main([str(source), "--html", "--title", "box \udcff"]) == 0
     page_file = source.with_suffix(".html")

@@ -10,6 +10,7 @@ clouds are drawn with the defaults below."""
 
 import argparse
 import functools
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -206,7 +207,7 @@ def _settings(
         settings = run_files.settings
     else:
         near = NEAR * bounds(stored.gaussians.tensors())[1]
-        settings = RenderSettings(near=near, antialias=stored.antialiased)
+        settings = RenderSettings(near=near, far=math.inf, antialias=stored.antialiased)
     given = {name: getattr(args, name) for name in ("eps2d", "antialias", "bound_colors")}
     if args.preset is not None:
         given["alpha_min"] = PRESETS[args.preset]
