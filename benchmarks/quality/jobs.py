@@ -24,7 +24,11 @@ COUNTS = (5000, 2500, 1500, 1000)
 STEPS_A_ROUND = PruneOptions.steps
 """Recovery steps of the prune command per round."""
 NO_BUDGET = {"system.geometry.budget": "null"}
-PAPER_START = {"system.geometry.init_opacity": 0.1, "system.geometry.grow.radius": 0.01}
+PAPER_START = {
+    "system.geometry.init_opacity": 0.1,
+    "system.geometry.grow.radius": 0.01,
+    "system.geometry.bound_colors": "false",
+}
 SHARP_PAPER = PAPER_RATES | NO_BUDGET | PAPER_START
 PAPER = SHARP_PAPER | {"system.renderer.eps2d": 0.3}
 """The recipe of the paper: its learning rates, start and screen-space dilation, and no pruning.
