@@ -121,7 +121,7 @@ def test_names_of_members_lead_nowhere(path, tmp_path):
         ({"meta": {"means": None}}, "no section 'means'"),
         ({"meta": {"sh0": {"codebook": [0.0] * 255, "files": ["sh0.webp"]}}}, "256 numbers"),
         ({"meta": {"quats": {"files": []}}}, "names no image 0 of 'quats'"),
-        ({"meta": {"quats": {"files": ["sh0.webp"]}}}, "largest component has no number"),
+        ({"meta": {"quats": {"files": ["sh0.webp"]}}}, "its largest component isn.t 0 to 3"),
         ({"meta": {"means": {"mins": [0, 0, np.nan], "maxs": [1] * 3, "files": FILES}}}, "mins"),
         ({"meta": {"shN": {"bands": 4}}}, "degree 4 are announced"),
         ({"quats__webp": None}, "it has no 'quats.webp'"),
