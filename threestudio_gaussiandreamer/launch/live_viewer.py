@@ -77,22 +77,27 @@ class LiveViewer(pl.Callback):
         if self.controls.picture.is_set():
             self.controls.picture.clear()
             self.controls.show_picture(score_picture(pl_module, batch))
-        if self._show_if_due(trainer, pl_module):
-            pose, fovy = batch["c2w"].detach().cpu().numpy(), batch["fovy"].detach().cpu().numpy()
-            self.view.show_cameras(pose, fovy, batch["width"] / batch["height"])
+        self._show_if_due(trainer, pl_module, batch)
 
     def on_train_end(self, trainer: Any, pl_module: Any) -> None:
         cloud = current_cloud(pl_module)
         self.view.show(cloud, status(trainer, cloud))
         self.controls.remove()
 
-    def _show_if_due(self, trainer: Any, pl_module: Any) -> bool:
-        """Show the cloud if that is due and a browser is connected; return whether it was shown."""
+    def _show_if_due(
+        self, trainer: Any, pl_module: Any, batch: Optional[dict[str, Any]] = None
+    ) -> bool:
+        """Show the cloud, and the cameras of ``batch``, if that is due and a browser is connected;
+        return whether they were shown.
+        """
         start = time.monotonic()
         if start < self._due or not self.view.watched:
             return False
         cloud = current_cloud(pl_module)
         self.view.show(cloud, status(trainer, cloud))
+        if batch is not None:
+            pose, fovy = batch["c2w"].detach().cpu().numpy(), batch["fovy"].detach().cpu().numpy()
+            self.view.show_cameras(pose, fovy, batch["width"] / batch["height"])
         spent = time.monotonic() - start
         self._due = start + max(1 / self.cfg.updates_per_second, spent / SHARE_OF_TIME)
         return True
