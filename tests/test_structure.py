@@ -44,6 +44,7 @@ HEAVY = HOST | {
     "imageio",
     "PIL",
     "smplx",
+    "anny",
     "zstandard",
 }
 HEAVY |= {"skimage", "fast_simplification", "xatlas"}

@@ -18,7 +18,7 @@ PACKAGE = ROOT / "threestudio_gaussiandreamer"
 CONFIGS = sorted(path.name for path in (ROOT / "configs").glob("*.yaml"))
 OVERLAYS = {f"demo-{name}.yaml": "demo.yaml" for name in ("small", "draft", "best")} | {
     f"gaussiandreamer-{name}.yaml": "gaussiandreamer.yaml"
-    for name in ("if", "pointe", "avatar", "ground", "lowmem")
+    for name in ("if", "pointe", "avatar", "avatar-smpl", "ground", "lowmem")
 }
 """What each is laid over."""
 MANDATORY = {
@@ -26,7 +26,7 @@ MANDATORY = {
         "system.geometry.prior.checkpoint=base.pt",
         "system.geometry.prior.upsampler=upsample.pt",
     ],
-    "gaussiandreamer-avatar.yaml": [
+    "gaussiandreamer-avatar-smpl.yaml": [
         "system.geometry.prior.motion=results.npz",
         "system.geometry.prior.body_model=body.npz",
     ],
@@ -74,7 +74,8 @@ def test_a_missing_value_is_requested(name, tmp_path):
 def test_a_body_may_be_chosen_among_meshes_instead(tmp_path):
     prior = ["motion=''", "body_model=''", "candidates=[a.obj,b.obj]"]
     paths = [
-        ROOT / "configs" / name for name in ("gaussiandreamer.yaml", "gaussiandreamer-avatar.yaml")
+        ROOT / "configs" / name
+        for name in ("gaussiandreamer.yaml", "gaussiandreamer-avatar-smpl.yaml")
     ]
     cfg = load_config(
         *paths,
@@ -98,16 +99,19 @@ def test_overlays_can_be_combined(tmp_path):
         "gaussiandreamer.yaml",
         "gaussiandreamer-lowmem.yaml",
         "gaussiandreamer-ground.yaml",
-        "gaussiandreamer-avatar.yaml",
+        "gaussiandreamer-avatar-smpl.yaml",
     ]
-    overrides = ["system.prompt_processor.prompt=a fox", *MANDATORY["gaussiandreamer-avatar.yaml"]]
+    overrides = [
+        "system.prompt_processor.prompt=a fox",
+        *MANDATORY["gaussiandreamer-avatar-smpl.yaml"],
+    ]
     cfg = load_config(*(ROOT / "configs" / name for name in names), cli_args=overrides)
     check_config(cfg)
     prior = host.find(cfg.system.geometry.prior_type)(cfg.system.geometry.prior).cfg
     assert prior.ground and prior.motion == "results.npz" and cfg.system.guidance.enable_vae_slicing
 
 
-@pytest.mark.parametrize("other", ["if", "pointe", "avatar", "ground"])
+@pytest.mark.parametrize("other", ["if", "pointe", "avatar", "avatar-smpl", "ground"])
 @pytest.mark.parametrize("lowmem_first", [True, False])
 def test_the_lowmem_overlay_combines_with_every_other_in_either_order(
     other, lowmem_first, tmp_path

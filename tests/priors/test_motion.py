@@ -22,12 +22,11 @@ from threestudio_gaussiandreamer.priors import motion as module
 from threestudio_gaussiandreamer.priors.motion import (
     MotionPrior,
     body_pictures,
-    facing,
     offered_frames,
-    z_up,
 )
 from threestudio_gaussiandreamer.priors.motion_files import Motions
 from threestudio_gaussiandreamer.priors.motion_text import reduced_prompt
+from threestudio_gaussiandreamer.priors.skeleton import facing, z_up
 
 FAST = {"num_points": 500}
 
@@ -336,7 +335,7 @@ def test_preflight_checks_all_files(options, tmp_path, clip):
 
 def test_without_smplx_the_extra_is_named(options, monkeypatch):
     monkeypatch.setitem(sys.modules, "smplx", None)
-    with pytest.raises(UserError, match=r"pip install 'threestudio-gaussiandreamer\[body\]'"):
+    with pytest.raises(UserError, match=r"pip install 'threestudio-gaussiandreamer\[smpl\]'"):
         MotionPrior(options | {"frame": 0})("a fox kicks")
 
 

@@ -22,7 +22,7 @@ for module in pkgutil.iter_modules(priors.__path__):
 
 
 # Their own test files build tiny weights and run the same contract.
-TESTED_WITH_THEIR_WEIGHTS = {"shap-e-prior", "point-e-prior", "motion-prior"}
+TESTED_WITH_THEIR_WEIGHTS = {"shap-e-prior", "point-e-prior", "motion-prior", "anny-prior"}
 
 
 PRIORS = sorted(name for name in names() if name.endswith("-prior"))

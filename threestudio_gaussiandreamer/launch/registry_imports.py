@@ -15,6 +15,7 @@ MODULES = (
     "priors.shap_e",
     "priors.point_e",
     "priors.motion",
+    "priors.anny",
     "guidance.exact_score",
     "guidance.stable_diffusion",
     "guidance.deep_floyd",

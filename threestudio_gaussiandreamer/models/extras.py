@@ -13,7 +13,11 @@ def require_extra(extra: str, *modules: str) -> None:
         try:
             import_module(module)
         except ImportError as error:
-            raise UserError(
-                f"this part needs {module} ({error}): pip install "
-                f"'threestudio-gaussiandreamer[{extra}]'"
-            ) from error
+            raise missing_extra(extra, module, str(error)) from error
+
+
+def missing_extra(extra: str, module: str, problem: str) -> UserError:
+    """Make the error for a missing module, with the command that installs ``extra``."""
+    return UserError(
+        f"this part needs {module} ({problem}): pip install 'threestudio-gaussiandreamer[{extra}]'"
+    )

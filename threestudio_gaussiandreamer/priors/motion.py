@@ -58,17 +58,9 @@ from .mesh import colored_cloud, face_normals
 from .motion_files import Motions, read_motions
 from .motion_text import reduced_prompt
 from .placing import chosen_device
+from .skeleton import JOINTS, world_mesh
 from .smpl_fit import BodyFit, BodyModel, fit_bodies, load_body_model, posed_vertices
 
-JOINTS = (
-    "pelvis, left hip, right hip, lower spine, left knee, right knee, middle spine, left "
-    "ankle, right ankle, upper spine, left foot,"
-    " right foot, neck, left collar, right collar, head, left shoulder, right shoulder, left "
-    "elbow, right elbow, left wrist, right wrist,"
-    " left hand, right hand"
-).split(", ")
-LEFT, RIGHT = (1, 16), (2, 17)
-"""Hip and shoulder of each side."""
 VIEW_AZIMUTHS = (-40.0, 0.0, 40.0)
 VIEW_ELEVATION, VIEW_DISTANCE, VIEW_FOVY = 10.0, 3.2, math.radians(40)
 PICTURE_SIZE = 224
@@ -132,7 +124,7 @@ class MotionPrior(Prior):
         else:
             read_motions(self.cfg.motion)
             load_body_model(self.cfg.body_model)
-            require_extra("body", "smplx")
+            require_extra("smpl", "smplx")
         if self._needs_clip():
             require_extra("diffusion", "transformers")
             chosen_device(self.cfg.device, self.device)
@@ -283,36 +275,10 @@ def world_meshes(
     Args:
         face_front: rotate each body about the z axis, so that it faces +x.
     """
-    meshes = []
-    for vertices, joints in zip(posed_vertices(model, fit), targets, strict=True):
-        turn = facing(joints) if face_front else np.eye(3)
-        vertices = z_up(vertices) @ turn.T
-        low, high = vertices.min(axis=0), vertices.max(axis=0)
-        meshes.append(
-            Mesh(scale * (vertices - (low + high) / 2) / ((high - low).max() / 2), model.faces)
-        )
-    return meshes
-
-
-def z_up(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """Rotate points from y up, front +z, to z up, front +x."""
-    return points[:, [2, 0, 1]]
-
-
-def facing(joints: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation about the world's z axis after which a body with these joints (y up)
-    faces +x.
-
-    The front is horizontal and perpendicular to the sum of the vectors from the left to the right
-    hip and shoulder. If that sum is vertical or zero, the body isn't rotated."""
-    joints = z_up(joints)
-    across = (joints[list(RIGHT)] - joints[list(LEFT)]).sum(axis=0)
-    forward = np.cross([0.0, 0.0, 1.0], across)[:2]
-    length = np.linalg.norm(forward)
-    if length < 1e-6:
-        return np.eye(3)
-    x, y = forward / length
-    return np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]])
+    return [
+        world_mesh(Mesh(vertices, model.faces), joints, scale=scale, face_front=face_front)
+        for vertices, joints in zip(posed_vertices(model, fit), targets, strict=True)
+    ]
 
 
 def body_pictures(mesh: Mesh) -> Float[np.ndarray, "V H W 3"]:

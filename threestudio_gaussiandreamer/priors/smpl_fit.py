@@ -29,6 +29,7 @@ from ..core.errors import UserError
 from ..core.files import existing_file
 from ..formats.array_files import read_arrays
 from ..models.extras import require_extra
+from .skeleton import BODY_JOINTS
 
 FIELDS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 """Arrays of a body model's file that are used."""
@@ -39,8 +40,6 @@ CONVERT = (
     "else d[k]) for k in "
     "('v_template', 'shapedirs', 'posedirs', 'J_regressor', 'weights', 'kintree_table', 'f')})\""
 )
-BODY_JOINTS = 22
-"""The first joints of SMPL, SMPL-H and SMPL-X, and all of HumanML3D."""
 SMPL_JOINTS = 24
 TRUNK = (0, 1, 2, 3, 6, 9, 13, 14, 16, 17)
 """Pelvis, hips, spine, collars and shoulders, which move almost as one."""
@@ -139,7 +138,7 @@ def fit_bodies(
         fit_shape: the shape coefficients too; else the model's mean shape.
         iterations: the most of the last stage.
     """
-    require_extra("body", "smplx")
+    require_extra("smpl", "smplx")
     wanted = _tensor(targets)[
         :, : SMPL_JOINTS if len(model.parents) == SMPL_JOINTS else BODY_JOINTS
     ]

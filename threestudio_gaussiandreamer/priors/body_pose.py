@@ -1,0 +1,196 @@
+"""Pose a body: by rotations of SMPL's joints relative to a T-pose, or so that its limbs point as
+those of given joint positions.
+
+A pose is the rotation of every joint's part of the body from the rest pose, (22, 3, 3), in the
+body's axes. Skinning is linear (linear blend skinning)."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from .makehuman import Body
+from .skeleton import BODY_JOINTS, JOINTS, PARENTS
+
+ARMS = {
+    f"{side} {joint}": (f"{side} {end}", sign)
+    for side, sign in (("left", 1.0), ("right", -1.0))
+    for joint, end in (("shoulder", "elbow"), ("elbow", "wrist"))
+}
+"""Joints whose bones point sideways in a T-pose: the end of the bone, and the sign of its x."""
+INDEX = {name: number for number, name in enumerate(JOINTS[:BODY_JOINTS])}
+LIMBS = {
+    "neck": "head",
+    **{
+        f"{side} {joint}": f"{side} {end}"
+        for side in ("left", "right")
+        for joint, end in (
+            ("hip", "knee"),
+            ("knee", "ankle"),
+            ("ankle", "foot"),
+            ("shoulder", "elbow"),
+            ("elbow", "wrist"),
+        )
+    },
+}
+"""The end of the bone that begins at a joint, for bones that positions give a direction."""
+SPINE = {"lower spine": 1 / 3, "middle spine": 2 / 3, "upper spine": 1.0}
+"""How far each joint of the spine turns from the pelvis' orientation to the chest's."""
+NEEDED = [
+    f"{side} {joint}"
+    for side in ("left", "right")
+    for joint in ("hip", "knee", "shoulder", "elbow")
+]
+"""Joints without whose positions there is no pose."""
+Degrees = tuple[float, float, float]
+
+WALKING: dict[str, Degrees] = {
+    "left hip": (-28, 0, 0),
+    "left knee": (6, 0, 0),
+    "right hip": (16, 0, 0),
+    "right knee": (28, 0, 0),
+    "right ankle": (18, 0, 0),
+    "left shoulder": (24, 0, -72),
+    "right shoulder": (-24, 0, 72),
+    "left elbow": (0, -18, 0),
+    "right elbow": (0, 24, 0),
+}
+SITTING: dict[str, Degrees] = {
+    **{f"{side} hip": (-88, 0, 0) for side in ("left", "right")},
+    **{f"{side} knee": (86, 0, 0) for side in ("left", "right")},
+    "left shoulder": (-24, 0, -70),
+    "right shoulder": (-24, 0, 70),
+    "left elbow": (0, -40, 0),
+    "right elbow": (0, 40, 0),
+}
+POSES: dict[str, dict[str, Degrees]] = {
+    "A": {"left shoulder": (0, 0, -45), "right shoulder": (0, 0, 45)},
+    "T": {},
+    "walking": WALKING,
+    "sitting": SITTING,
+}
+"""Rotations of joints from a T-pose, degrees: about z first, then y, then x, the parent's axes."""
+
+
+class Posed(NamedTuple):
+    """A body in a pose; the axes and the unit are those of the body at rest."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    joints: Float[np.ndarray, "22 3"]
+
+
+def posed(body: Body, pose: Float[np.ndarray, "22 3 3"]) -> Posed:
+    """Return the body in a pose, with its pelvis where it is at rest."""
+    joints = body.joints.copy()
+    for joint, parent in enumerate(PARENTS):
+        if parent >= 0:
+            offset = body.joints[joint] - body.joints[parent]
+            joints[joint] = joints[parent] + pose[parent] @ offset
+    moved = np.einsum("vj,jab,vb->va", body.weights, pose, body.vertices, optimize=True)
+    shifts = joints - np.einsum("jab,jb->ja", pose, body.joints)
+    return Posed(moved + body.weights @ shifts, joints)
+
+
+def named_pose(body: Body, name: str) -> Float[np.ndarray, "22 3 3"]:
+    """Return a pose of ``POSES``."""
+    from scipy.spatial.transform import Rotation
+
+    local = np.tile(np.eye(3), (BODY_JOINTS, 1, 1))
+    for joint, angles in POSES[name].items():
+        local[INDEX[joint]] = Rotation.from_euler("zyx", angles[::-1], degrees=True).as_matrix()
+    return pose_of_rotations(body, local)
+
+
+def pose_of_rotations(
+    body: Body, local: Float[np.ndarray, "22 3 3"]
+) -> Float[np.ndarray, "22 3 3"]:
+    """Return the pose in which the joints are rotated as SMPL's.
+
+    Args:
+        local: rotation of each joint relative to its parent, from a T-pose; the first one that of
+            the whole body.
+    """
+    turned, to_t_pose = local.copy(), _to_t_pose(body)
+    for joint, parent in enumerate(PARENTS):
+        if parent >= 0:
+            turned[joint] = turned[parent] @ local[joint]
+    return turned @ to_t_pose
+
+
+def _to_t_pose(body: Body) -> Float[np.ndarray, "22 3 3"]:
+    """Return the pose in which the arms point sideways; hands move with the lower arms."""
+    pose = np.tile(np.eye(3), (BODY_JOINTS, 1, 1))
+    for joint, (end, sign) in ARMS.items():
+        bone = body.joints[INDEX[end]] - body.joints[INDEX[joint]]
+        pose[INDEX[joint]] = swing(bone, np.array([sign, 0.0, 0.0]))
+    for side in ("left", "right"):
+        pose[INDEX[f"{side} wrist"]] = pose[INDEX[f"{side} elbow"]]
+    return pose
+
+
+def pose_of_positions(
+    body: Body, positions: dict[str, Float[np.ndarray, "3"]]
+) -> Float[np.ndarray, "22 3 3"]:
+    """Return the pose in which hips, chest and limbs point as those of a skeleton of any size.
+
+    Args:
+        positions: of joints, by their names in ``JOINTS``; those in ``NEEDED`` must be there, and
+            "pelvis", "lower spine", "neck", "head" and the ends of the limbs may be.
+    """
+    from scipy.spatial.transform import Rotation, Slerp
+
+    rest = {name: body.joints[number] for name, number in INDEX.items()}
+    pelvis, chest = (
+        part_frame(positions, part)
+        @ part_frame({k: rest[k] for k in rest if k in positions}, part).T
+        for part in ("hip", "shoulder")
+    )
+    between = Slerp([0, 1], Rotation.from_matrix(np.stack([pelvis, chest])))
+    pose = np.tile(pelvis, (BODY_JOINTS, 1, 1))
+    for joint, parent in list(enumerate(PARENTS))[1:]:
+        name = JOINTS[joint]
+        pose[joint] = between(SPINE[name]).as_matrix() if name in SPINE else pose[parent]
+        end = LIMBS.get(name)
+        if name in positions and end in positions:
+            bone = pose[joint] @ (rest[end] - rest[name])
+            pose[joint] = swing(bone, positions[end] - positions[name]) @ pose[joint]
+    return pose
+
+
+def part_frame(positions: dict[str, Float[np.ndarray, "3"]], part: str) -> Float[np.ndarray, "3 3"]:
+    """Return the orientation of the hips ("hip") or of the chest ("shoulder"): its columns are the
+    directions to the left, up and to the front.
+    """
+    left, right = positions[f"left {part}"], positions[f"right {part}"]
+    middles = {
+        name: (positions[f"left {name}"] + positions[f"right {name}"]) / 2
+        for name in ("hip", "shoulder")
+    }
+    low, high = middles["hip"], positions.get("neck", middles["shoulder"])
+    if part == "hip":
+        high = positions.get("lower spine", high)
+    across = _unit(left - right)
+    up = _unit((high - low) - ((high - low) @ across) * across)
+    return np.stack([across, up, np.cross(across, up)], axis=1)
+
+
+def swing(
+    source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Return the smallest rotation of the direction of ``source`` to that of ``target``; the
+    identity where one of them has no length.
+    """
+    from scipy.spatial.transform import Rotation
+
+    if not (np.linalg.norm(source) > 1e-9 and np.linalg.norm(target) > 1e-9):
+        return np.eye(3)
+    a, b = _unit(source), _unit(target)
+    axis = np.cross(a, b)
+    angle = np.arctan2(np.linalg.norm(axis), a @ b)
+    if np.linalg.norm(axis) < 1e-9:  # parallel, or opposite: any perpendicular axis
+        axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
+    return Rotation.from_rotvec(angle * _unit(axis)).as_matrix()
+
+
+def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)
