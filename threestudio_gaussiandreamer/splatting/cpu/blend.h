@@ -6,23 +6,30 @@
 
 namespace splat {
 
+// The largest weight of a splat, per lane of a strip.
+struct alignas(64) PeakRow {
+  float lanes[ROW];
+};
+
 struct BlendScratch {
   Staged staged;
-  alignas(64) float peaks[CHUNK * LANES];  // largest weight of each splat, per lane
+  alignas(64) PeakRow peaks[CHUNK];
   alignas(64) float transmittance[TILE_PIXELS];
+  Planes planes;
 };
 
 // Blends the splats of `list` into a strip of `p`; false when all its pixels have stopped.
-SPLAT_FN bool blend_strip(BlendScratch& scratch, Planes& p, const StripPixels& pixels, const uint16_t* list, int count,
+SPLAT_FN bool blend_strip(BlendScratch& scratch, const StripPixels& pixels, const BlockList& list, int count,
                           const BlendLimits& limits) {
+  Planes& p = scratch.planes;
   const int at = pixels.first;
   Floats transmittance = load(scratch.transmittance + at), sum = load(p.alpha + at);
   Floats red = load(p.red + at), green = load(p.green + at), blue = load(p.blue + at), depth = load(p.depth + at);
   bool live = true;
   for (int i = 0; i < count && live;) {
     for (const int stop = std::min(i + CHECK_EVERY, count); i < stop; i++) {
-      const LocalSplat& s = scratch.staged.splats[list[i]];
-      float* peak = scratch.peaks + list[i] * LANES;
+      const LocalSplat& s = row_at(scratch.staged.splats, list[i]);
+      float* peak = row_at(scratch.peaks, list[i]).lanes;
       Floats y1, y2;
       const Floats alpha = alpha_of(power_at(s, pixels, y1, y2), limits.log2_alpha_min, limits.alpha_max);
       const Floats weight = weight_of(alpha, transmittance, limits.stop);
@@ -38,55 +45,60 @@ SPLAT_FN bool blend_strip(BlendScratch& scratch, Planes& p, const StripPixels& p
   return live;
 }
 
-// A maximum is exact, so the order of the tiles doesn't matter; positive floats compare like their bits.
-inline void raise_to(float* target, float value) {
-  uint32_t bits, *word = reinterpret_cast<uint32_t*>(target);
-  std::memcpy(&bits, &value, sizeof bits);
-  uint32_t old = __atomic_load_n(word, __ATOMIC_RELAXED);
-  while (old < bits && !__atomic_compare_exchange_n(word, &old, bits, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
-  }
-}
-
-inline void raise_contributions(const View& view, int first, int count, const float* peaks, float* contribution) {
+// The largest weight of each of `count` splats, to their slots.
+inline void store_peaks(const Intersection* intersections, int count, const PeakRow* rows, float* peaks) {
   for (int i = 0; i < count; i += LANES) {
-    Floats rows[LANES];
-    for (int l = 0; l < LANES; l++) rows[l] = load(peaks + (i + l) * LANES);
-    transpose(rows);
-    for (int l = 1; l < LANES; l++) rows[0] = maximum(rows[0], rows[l]);
-    const Intersection* intersections = view.intersections.data() + first + i;
-    for (int l = 0; l < std::min(LANES, count - i); l++) raise_to(contribution + intersections[l].gaussian, rows[0][l]);
+    Floats columns[LANES];
+    for (int l = 0; l < LANES; l++) columns[l] = load(rows[i + l].lanes);
+    transpose(columns);
+    for (int l = 1; l < LANES; l++) columns[0] = maximum(columns[0], columns[l]);
+    for (int l = 0; l < std::min(LANES, count - i); l++) peaks[intersections[i + l].slot] = columns[0][l];
   }
 }
 
-// Blends all intersections of a tile into `planes`; stores in the view which blocks each of them overlaps.
-inline void blend_list(const ForwardCall& call, View& view, const TileFrame& frame, Planes& planes) {
+// Intersections behind the last chunk that contributes touch no block and have no weight.
+inline void skip_rest(View& view, int first, int end, bool keep) {
+  if (keep && first < end) std::fill(view.block_masks.data() + 2 * int64_t(first), view.block_masks.data() + 2 * int64_t(end), 0);
+  for (int i = first; i < end; i++) view.peaks[view.intersections[i].slot] = 0.0f;
+}
+
+// Blends all intersections of a tile into the planes; stores in the view which blocks each of them overlaps.
+inline void blend_list(const ForwardCall& call, View& view, const TileFrame& frame, BlendScratch& scratch) {
   const BlendLimits limits = limits_of(call.settings);
-  uint64_t* masks = call.keep ? view.block_masks.data() : nullptr;
-  BlendScratch scratch;
   LiveStrips live;
   start_transmittance(view, frame, scratch.transmittance);
   int first = frame.begin;
   for (; first < frame.end && live.any(); first += CHUNK) {
     const int count = std::min(CHUNK, frame.end - first);
-    stage<true>(view, frame, first, count, masks, scratch.staged);
-    std::memset(scratch.peaks, 0, sizeof(float) * LANES * count);
-    for_each_live_strip(scratch.staged, live, [&](const StripPixels& pixels, const uint16_t* list, int length) {
-      return blend_strip(scratch, planes, pixels, list, length, limits);
+    stage<true>(view, frame, first, count, call.keep ? view.block_masks.data() + 2 * int64_t(first) : nullptr, scratch.staged);
+    std::memset(scratch.peaks, 0, sizeof(PeakRow) * count);
+    for_each_live_strip(scratch.staged, live, [&](const StripPixels& pixels, const BlockList& list, int length) {
+      return blend_strip(scratch, pixels, list, length, limits);
     });
-    raise_contributions(view, first, count, scratch.peaks, call.out.contribution + view.index * call.scene.gaussians);
+    store_peaks(view.intersections.data() + first, count, scratch.peaks, view.peaks.data());
   }
-  if (masks && first < frame.end) std::fill(masks + first, masks + frame.end, 0);
+  skip_rest(view, std::min(first, frame.end), frame.end, call.keep);
 }
 
 // One tile of one view into the pictures and, for a backward pass, into the view.
 inline void blend_tile(const ForwardCall& call, View& view, int tile) {
   const TileFrame frame = frame_of(view, tile);
-  const bool empty = frame.begin == frame.end;
-  Planes local;
-  Planes& planes = call.keep && !empty ? view.planes[tile] : local;
-  std::memset(&planes, 0, sizeof planes);
-  if (!empty) blend_list(call, view, frame, planes);
-  write_tile(call, view.index, frame, planes);
+  BlendScratch scratch;
+  std::memset(&scratch.planes, 0, sizeof scratch.planes);
+  if (frame.begin < frame.end) blend_list(call, view, frame, scratch);
+  write_tile(call, view.index, frame, scratch.planes);
+  if (call.keep && frame.begin < frame.end) stream(&view.planes[tile].red[0], &scratch.planes.red[0], sizeof(Planes) / sizeof(float));
+}
+
+// The contribution of the Gaussians of a slice: the largest weight in any tile.
+inline void store_contributions(const ForwardCall& call, const View& view, int64_t slice) {
+  float* contribution = call.out.contribution + view.index * call.scene.gaussians;
+  const int64_t end = std::min<int64_t>(call.scene.gaussians, (slice + 1) * SLICE);
+  for (int64_t gaussian = slice * SLICE; gaussian < end; gaussian++) {
+    float peak = 0.0f;
+    for (int64_t slot = view.slot_begin(gaussian); slot < view.slot_end(gaussian); slot++) peak = std::max(peak, view.peaks[slot]);
+    contribution[gaussian] = peak;
+  }
 }
 
 }  // namespace splat

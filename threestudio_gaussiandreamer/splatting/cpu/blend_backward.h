@@ -22,6 +22,7 @@ struct BackwardScratch {
 // Per splat (rows) and pixel of a strip (lanes): LANES splats at a time.
 struct PairRows {
   Floats u[LANES], weight[LANES], abs_x[LANES], abs_y[LANES];
+  alignas(64) float y1[LANES], y2[LANES];  // at the strip's first pixel
 };
 
 // Over a strip, one splat per lane, counted from the strip's first pixel.
@@ -36,11 +37,6 @@ SPLAT_FN Moments<Floats> moments_of(const Floats* u) {
   }
   return {(s0[0] + s0[1]) + (s0[2] + s0[3]), (s1[0] + s1[1]) + (s1[2] + s1[3]),   s0[1] + 2.0f * s0[2] + 3.0f * s0[3],
           (s2[0] + s2[1]) + (s2[2] + s2[3]), s1[1] + 2.0f * s1[2] + 3.0f * s1[3], s0[1] + 4.0f * s0[2] + 9.0f * s0[3]};
-}
-
-SPLAT_FN void whiten_moments(const Moments<Floats>& m, const Floats* splat, const StripPixels& pixels, Floats* sums) {
-  const Floats a = splat[0], b = splat[1], c = splat[2];
-  whiten_moments(m, a, b, c, a * pixels.left + (b * pixels.top + splat[3]), c * pixels.top + splat[4], sums);
 }
 
 SPLAT_FN Floats sum_rows(const Floats* rows) {
@@ -59,7 +55,7 @@ SPLAT_FN Floats weighted_sum(const Floats* rows, const float* weights) {
 template <bool ABSOLUTE>
 SPLAT_FN void sum_pairs(PairRows& rows, const Floats* splats, const UpstreamPlanes& up, const StripPixels& pixels, Floats* sums) {
   transpose(rows.u), transpose(rows.weight);
-  whiten_moments(moments_of(rows.u), splats, pixels, sums);
+  whiten_moments(moments_of(rows.u), splats[0], splats[1], splats[2], load(rows.y1), load(rows.y2), sums);
   sums[RED] = weighted_sum(rows.weight, up.red + pixels.first), sums[GREEN] = weighted_sum(rows.weight, up.green + pixels.first);
   sums[BLUE] = weighted_sum(rows.weight, up.blue + pixels.first),
   sums[DEPTH] = weighted_sum(rows.weight, up.depth + pixels.first);
@@ -71,14 +67,14 @@ SPLAT_FN void sum_pairs(PairRows& rows, const Floats* splats, const UpstreamPlan
 
 // Adds the sums of `count` <= LANES splats over a strip to those over the tile.
 template <bool ABSOLUTE>
-SPLAT_FN void add_pairs(BackwardScratch& scratch, PairRows& rows, const StripPixels& pixels, const uint16_t* list, int count) {
-  Floats splats[ROW], sums[ROW] = {};
-  load_columns<5>([&](int l) { return &scratch.staged.splats[list[std::min(l, count - 1)]].a; }, splats);
+SPLAT_FN void add_pairs(BackwardScratch& scratch, PairRows& rows, const StripPixels& pixels, const uint32_t* list, int count) {
+  Floats splats[4], sums[ROW] = {};
+  load_quad_columns([&](int l) { return &row_at(scratch.staged.splats, list[std::min(l, count - 1)]).a; }, splats);
   sum_pairs<ABSOLUTE>(rows, splats, scratch.upstream, pixels, sums);
   for (int first = 0; first < SUMS; first += LANES) {
     transpose(sums + first);
     for (int l = 0; l < count; l++) {
-      float* row = scratch.sums + list[l] * ROW + first;
+      float* row = scratch.sums + list[l] + first;
       store(row, load(row) + sums[first + l]);
     }
   }
@@ -110,21 +106,29 @@ SPLAT_FN void blend_backward(const LocalSplat& s, const StripPixels& pixels, con
   strip.behind -= weight * value;
   const Floats u = blend_vjp(alpha, strip.transmittance, weight, value, strip.behind, limits.alpha_max, limits.stop);
   strip.transmittance -= alpha * strip.transmittance;
-  rows.u[j] = u, rows.weight[j] = weight;
+  rows.u[j] = u, rows.weight[j] = weight, rows.y1[j] = y1[0], rows.y2[j] = y2[0];
   if constexpr (ABSOLUTE) rows.abs_x[j] = absolute(u * s.a * y1), rows.abs_y[j] = absolute(u * (s.b * y1 + s.c * y2));
+}
+
+// Zeros for the rows from `first` on.
+template <bool ABSOLUTE> SPLAT_FN void clear_rows(PairRows& rows, int first) {
+  for (int j = first; j < LANES; j++) {
+    rows.u[j] = rows.weight[j] = Floats{}, rows.y1[j] = rows.y2[j] = 0.0f;
+    if constexpr (ABSOLUTE) rows.abs_x[j] = rows.abs_y[j] = Floats{};
+  }
 }
 
 // Visits the splats of `list` in a strip again; false when all its pixels have stopped.
 template <bool ABSOLUTE>
-SPLAT_FN bool blend_strip_backward(BackwardScratch& scratch, const StripPixels& pixels, const uint16_t* list, int length,
+SPLAT_FN bool blend_strip_backward(BackwardScratch& scratch, const StripPixels& pixels, const BlockList& list, int length,
                                    const BlendLimits& limits) {
   StripState strip = load_strip(scratch, pixels.first);
   bool live = true;
   for (int i = 0; i < length && live; i += LANES) {
     PairRows rows;
     const int count = std::min(LANES, length - i);
-    for (int j = 0; j < count; j++) blend_backward<ABSOLUTE>(scratch.staged.splats[list[i + j]], pixels, limits, strip, rows, j);
-    for (int j = count; j < LANES; j++) rows.u[j] = rows.weight[j] = rows.abs_x[j] = rows.abs_y[j] = Floats{};
+    for (int j = 0; j < count; j++) blend_backward<ABSOLUTE>(row_at(scratch.staged.splats, list[i + j]), pixels, limits, strip, rows, j);
+    clear_rows<ABSOLUTE>(rows, count);
     add_pairs<ABSOLUTE>(scratch, rows, pixels, list + i, count);
     strip.transmittance = select(strip.transmittance >= limits.stop, strip.transmittance, Floats{});
     live = any_at_least(strip.transmittance, limits.stop);
@@ -169,8 +173,8 @@ inline void blend_list_backward(const BackwardCall& call, View& view, const Tile
     const int count = std::min(CHUNK, frame.end - first);
     std::memset(scratch.sums, 0, sizeof(float) * ROW * count);
     if (live.any()) {
-      stage<false>(view, frame, first, count, view.block_masks.data(), scratch.staged);
-      for_each_live_strip(scratch.staged, live, [&](const StripPixels& pixels, const uint16_t* list, int length) {
+      stage<false>(view, frame, first, count, view.block_masks.data() + 2 * int64_t(first), scratch.staged);
+      for_each_live_strip(scratch.staged, live, [&](const StripPixels& pixels, const BlockList& list, int length) {
         return blend_strip_backward<ABSOLUTE>(scratch, pixels, list, length, limits);
       });
     }

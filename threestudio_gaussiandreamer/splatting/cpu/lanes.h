@@ -5,7 +5,7 @@
 #include <cstring>
 #include <utility>
 
-#if defined(__AVX512F__)
+#if defined(__AVX2__)
 #include <immintrin.h>
 #endif
 
@@ -27,7 +27,6 @@ template <int N> struct Vector {
 };
 using Floats = Vector<LANES>::Float;
 using Ints = Vector<LANES>::Int;
-using Quad = Vector<4>::Float;  // four pixels of a row
 
 template <class V> constexpr int lanes_of() { return sizeof(V) / 4; }
 
@@ -37,6 +36,22 @@ template <class V = Floats> SPLAT_FN V load(const float* p) {
   return v;
 }
 template <class V> SPLAT_FN void store(float* p, V v) { std::memcpy(p, &v, sizeof v); }
+
+// Copies whole vectors past the caches, for memory that is read much later; `to` and `from` are aligned to vectors.
+SPLAT_FN void stream(float* to, const float* from, int64_t count) {
+  for (int64_t i = 0; i < count; i += LANES) {
+#if defined(__AVX512F__)
+    _mm512_stream_ps(to + i, (__m512)load(from + i));
+#elif defined(__AVX2__)
+    _mm256_stream_ps(to + i, (__m256)load(from + i));
+#else
+    store(to + i, load(from + i));
+#endif
+  }
+#if defined(__AVX2__)
+  _mm_sfence();
+#endif
+}
 
 // Lane l of the result is lane `pattern(l)` of a and b laid end to end; `pattern` is a captureless lambda.
 template <class V, class Pattern, int... L> SPLAT_FN V shuffle(V a, V b, Pattern pattern, std::integer_sequence<int, L...>) {
@@ -63,11 +78,15 @@ SPLAT_FN Floats maximum(Floats a, Floats b) { return (Floats)_mm512_maskz_max_ps
 
 // Whether x >= bound in any lane.
 SPLAT_FN bool any_at_least(Floats x, float bound) {
+#if defined(__AVX512F__)
+  return _mm512_cmp_ps_mask((__m512)x, _mm512_set1_ps(bound), _CMP_GE_OQ) != 0;
+#elif defined(__AVX2__)
+  return _mm256_movemask_ps((__m256)(x >= bound)) != 0;
+#else
   Ints any = x >= bound;
-  if constexpr (LANES >= 16) any |= shuffle(any, any, [](int l) { return (l + 8) % LANES; });
-  if constexpr (LANES >= 8) any |= shuffle(any, any, [](int l) { return (l + 4) % LANES; });
   any |= shuffle(any, any, [](int l) { return (l + 2) % LANES; });
   return (any[0] | any[1]) != 0;
+#endif
 }
 
 // 2^x for -126 <= x < 128, relative error 3e-7; undefined below. Adding 1.5 * 2^23 rounds to an integer n, which is then both
@@ -132,6 +151,24 @@ SPLAT_FN void transpose(Floats r[LANES]) {
   }
 }
 
+// LANES / 4 groups of four floats, where group g starts at `group(g)`.
+template <class Group> SPLAT_FN Floats load_quads(Group group) {
+#if defined(__AVX512F__)
+  __m512 v = _mm512_castps128_ps512(_mm_loadu_ps(group(0)));
+  v = _mm512_insertf32x4(v, _mm_loadu_ps(group(1)), 1);
+  v = _mm512_insertf32x4(v, _mm_loadu_ps(group(2)), 2);
+  return (Floats)_mm512_insertf32x4(v, _mm_loadu_ps(group(3)), 3);
+#elif defined(__AVX2__)
+  return (Floats)_mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(group(0))), _mm_loadu_ps(group(1)), 1);
+#else
+  return load(group(0));
+#endif
+}
+
+template <class Group> SPLAT_FN void store_quads(Group group, Floats v) {
+  for (int g = 0; g < LANES / 4; g++) std::memcpy(group(g), reinterpret_cast<const float*>(&v) + 4 * g, 4 * sizeof(float));
+}
+
 constexpr int ROW = 16;  // floats in a cache line; the rows below
 
 // Columns 0 .. COUNT - 1 of LANES rows, where row l starts at `row(l)`; COUNT is rounded up to whole vectors.
@@ -140,6 +177,12 @@ template <int COUNT, class Row> SPLAT_FN void load_columns(Row row, Floats* colu
     for (int l = 0; l < LANES; l++) columns[first + l] = load(row(l) + first);
     transpose(columns + first);
   }
+}
+
+// Columns 0 to 3 of LANES rows.
+template <class Row> SPLAT_FN void load_quad_columns(Row row, Floats columns[4]) {
+  for (int i = 0; i < 4; i++) columns[i] = load_quads([&](int group) { return row(4 * group + i); });
+  transpose_quads(columns[0], columns[1], columns[2], columns[3]);
 }
 
 // The 16 columns as LANES rows one after the other.

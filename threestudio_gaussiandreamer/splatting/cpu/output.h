@@ -24,85 +24,73 @@ inline Vec3<float> background_of(const Scene& scene, int view) {
   return {background[0], background[1], background[2]};
 }
 
-// The positions of four adjacent pixels in a block-ordered plane.
-SPLAT_FN int quad_at(int row, int column) {
-  return ((row / BLOCK) * BLOCKS_PER_ROW + column) * BLOCK_PIXELS + row % BLOCK * BLOCK;
+// LANES adjacent pixels of a row of a block-ordered plane; `run` counts them from the left.
+SPLAT_FN int run_at(int row, int run) {
+  return ((row / BLOCK) * BLOCKS_PER_ROW + run * (LANES / BLOCK)) * BLOCK_PIXELS + row % BLOCK * BLOCK;
 }
 
-// Quad `column` of output row `row`: as rendered, or the mean of 2x2 pixels.
-template <int DOWNSAMPLE> SPLAT_FN Quad fetch(const float* plane, int row, int column) {
-  if constexpr (DOWNSAMPLE == 1) return load<Quad>(plane + quad_at(row, column));
-  const auto pair = [&](int x) { return load<Quad>(plane + quad_at(2 * row, x)) + load<Quad>(plane + quad_at(2 * row + 1, x)); };
-  const Quad left = pair(2 * column), right = pair(2 * column + 1);
-  const Quad even = shuffle(left, right, [](int l) { return 2 * l; });
-  const Quad odd = shuffle(left, right, [](int l) { return 2 * l + 1; });
+// Run `run` of output row `row`: as rendered, or the mean of 2x2 pixels.
+template <int DOWNSAMPLE> SPLAT_FN Floats fetch(const float* plane, int row, int run) {
+  const auto at = [&](int y, int x) { return load_quads([&](int block) { return plane + run_at(y, x) + block * BLOCK_PIXELS; }); };
+  if constexpr (DOWNSAMPLE == 1) return at(row, run);
+  const Floats left = at(2 * row, 2 * run) + at(2 * row + 1, 2 * run);
+  const Floats right = at(2 * row, 2 * run + 1) + at(2 * row + 1, 2 * run + 1);
+  const Floats even = shuffle(left, right, [](int l) { return 2 * l; });
+  const Floats odd = shuffle(left, right, [](int l) { return 2 * l + 1; });
   return 0.25f * (even + odd);
 }
 
 // The adjoint of `fetch`, onto a plane that only this function writes.
-template <int DOWNSAMPLE> SPLAT_FN void spread(float* plane, int row, int column, Quad value) {
-  if constexpr (DOWNSAMPLE == 1) return store(plane + quad_at(row, column), value);
-  const Quad quarter = 0.25f * value;
-  const Quad left = shuffle(quarter, quarter, [](int l) { return l / 2; });
-  const Quad right = shuffle(quarter, quarter, [](int l) { return 2 + l / 2; });
-  for (int y = 2 * row; y < 2 * row + 2; y++)
-    store(plane + quad_at(y, 2 * column), left), store(plane + quad_at(y, 2 * column + 1), right);
+template <int DOWNSAMPLE> SPLAT_FN void spread(float* plane, int row, int run, Floats value) {
+  const auto put = [&](int y, int x, Floats v) {
+    store_quads([&](int block) { return plane + run_at(y, x) + block * BLOCK_PIXELS; }, v);
+  };
+  if constexpr (DOWNSAMPLE == 1) return put(row, run, value);
+  const Floats quarter = 0.25f * value;
+  const Floats left = shuffle(quarter, quarter, [](int l) { return l / 2; });
+  const Floats right = shuffle(quarter, quarter, [](int l) { return (LANES + l) / 2; });
+  for (int y = 2 * row; y < 2 * row + 2; y++) put(y, 2 * run, left), put(y, 2 * run + 1, right);
 }
 
-struct QuadPixels {
-  Vec3<Quad> color;
-  Quad alpha, depth;
+struct RunPixels {
+  Vec3<Floats> color;
+  Floats alpha, depth;
 };
 
-SPLAT_FN void write_quad(const Layers<float>& out, int64_t at, int pixels, const QuadPixels& q) {
-  if (pixels == 4) {
-    store3(out.image + 3 * at, q.color), store(out.alpha + at, q.alpha), store(out.depth + at, q.depth);
-    return;
-  }
-  float image[12];
-  store3(image, q.color);
-  std::memcpy(out.image + 3 * at, image, sizeof(float) * 3 * pixels);
-  std::memcpy(out.alpha + at, &q.alpha, sizeof(float) * pixels);
-  std::memcpy(out.depth + at, &q.depth, sizeof(float) * pixels);
+// `pixels` <= LANES of them.
+SPLAT_FN void write_run(const Layers<float>& out, int64_t at, int pixels, const RunPixels& p) {
+  store_items<3>(out.image + 3 * at, pixels, [&](float* to) { store3(to, p.color); });
+  store_items<1>(out.alpha + at, pixels, [&](float* to) { store(to, p.alpha); });
+  store_items<1>(out.depth + at, pixels, [&](float* to) { store(to, p.depth); });
 }
 
-// `pixels` <= 4 floats of an array that may be missing, then zeros.
-SPLAT_FN Quad read_clipped(const float* p, int64_t at, int pixels) {
-  if (p && pixels == 4) return load<Quad>(p + at);
-  Quad q = {};
-  if (p) std::memcpy(&q, p + at, sizeof(float) * pixels);
-  return q;
+// `pixels` <= LANES, then zeros, of arrays that may be missing.
+SPLAT_FN RunPixels read_run(const Layers<const float>& in, int64_t at, int pixels) {
+  RunPixels p = {};
+  if (in.image) p.color = load_items<3>(in.image + 3 * at, pixels, load3<Floats>);
+  if (in.alpha) p.alpha = load_items<1>(in.alpha + at, pixels, load<Floats>);
+  if (in.depth) p.depth = load_items<1>(in.depth + at, pixels, load<Floats>);
+  return p;
 }
 
-SPLAT_FN Vec3<Quad> read_clipped3(const float* p, int64_t at, int pixels) {
-  if (p && pixels == 4) return load3<Quad>(p + 3 * at);
-  float items[12] = {};
-  if (p) std::memcpy(items, p + 3 * at, sizeof(float) * 3 * pixels);
-  return load3<Quad>(items);
-}
-
-SPLAT_FN QuadPixels read_quad(const Layers<const float>& in, int64_t at, int pixels) {
-  return {read_clipped3(in.image, at, pixels), read_clipped(in.alpha, at, pixels), read_clipped(in.depth, at, pixels)};
-}
-
-// Calls visit(row, column, at, pixels) for the quads of a tile's output: `at` is the first pixel, `pixels` <= 4 lie inside.
+// Calls visit(row, run, at, pixels) for the runs of a tile's output: `at` is the first pixel, `pixels` <= LANES lie inside.
 template <int DOWNSAMPLE, class T, class Visit>
-SPLAT_FN void for_each_quad(const Layers<T>& layers, const TileFrame& frame, Visit visit) {
+SPLAT_FN void for_each_run(const Layers<T>& layers, const TileFrame& frame, Visit visit) {
   const int left = frame.left / DOWNSAMPLE, top = frame.top / DOWNSAMPLE, side = TILE / DOWNSAMPLE;
   const int rows = std::min(side, layers.height - top), columns = std::min(side, layers.width - left);
   for (int row = 0; row < rows; row++)
-    for (int x = 0; x < columns; x += 4)
-      visit(row, x / 4, int64_t(top + row) * layers.width + left + x, std::min(4, columns - x));
+    for (int x = 0; x < columns; x += LANES)
+      visit(row, x / LANES, int64_t(top + row) * layers.width + left + x, std::min(LANES, columns - x));
 }
 
 template <int DOWNSAMPLE>
 inline void write_tile_as(const Layers<float>& out, Vec3<float> background, const TileFrame& frame, const Planes& planes) {
-  for_each_quad<DOWNSAMPLE>(out, frame, [&](int row, int column, int64_t at, int pixels) {
-    const Quad alpha = fetch<DOWNSAMPLE>(planes.alpha, row, column), rest = 1.0f - alpha;
-    const Vec3<Quad> color = {fetch<DOWNSAMPLE>(planes.red, row, column) + rest * background.x,
-                              fetch<DOWNSAMPLE>(planes.green, row, column) + rest * background.y,
-                              fetch<DOWNSAMPLE>(planes.blue, row, column) + rest * background.z};
-    write_quad(out, at, pixels, {color, alpha, fetch<DOWNSAMPLE>(planes.depth, row, column)});
+  for_each_run<DOWNSAMPLE>(out, frame, [&](int row, int run, int64_t at, int pixels) {
+    const Floats alpha = fetch<DOWNSAMPLE>(planes.alpha, row, run), rest = 1.0f - alpha;
+    const Vec3<Floats> color = {fetch<DOWNSAMPLE>(planes.red, row, run) + rest * background.x,
+                                fetch<DOWNSAMPLE>(planes.green, row, run) + rest * background.y,
+                                fetch<DOWNSAMPLE>(planes.blue, row, run) + rest * background.z};
+    write_run(out, at, pixels, {color, alpha, fetch<DOWNSAMPLE>(planes.depth, row, run)});
   });
 }
 
@@ -121,11 +109,11 @@ struct UpstreamPlanes {
 
 template <int DOWNSAMPLE>
 inline void read_tile_as(const Layers<const float>& in, const TileFrame& frame, UpstreamPlanes& planes) {
-  for_each_quad<DOWNSAMPLE>(in, frame, [&](int row, int column, int64_t at, int pixels) {
-    const QuadPixels q = read_quad(in, at, pixels);
-    spread<DOWNSAMPLE>(planes.red, row, column, q.color.x), spread<DOWNSAMPLE>(planes.green, row, column, q.color.y);
-    spread<DOWNSAMPLE>(planes.blue, row, column, q.color.z), spread<DOWNSAMPLE>(planes.depth, row, column, q.depth);
-    spread<DOWNSAMPLE>(planes.alpha, row, column, q.alpha);
+  for_each_run<DOWNSAMPLE>(in, frame, [&](int row, int run, int64_t at, int pixels) {
+    const RunPixels p = read_run(in, at, pixels);
+    spread<DOWNSAMPLE>(planes.red, row, run, p.color.x), spread<DOWNSAMPLE>(planes.green, row, run, p.color.y);
+    spread<DOWNSAMPLE>(planes.blue, row, run, p.color.z), spread<DOWNSAMPLE>(planes.depth, row, run, p.depth);
+    spread<DOWNSAMPLE>(planes.alpha, row, run, p.alpha);
   });
 }
 

@@ -80,7 +80,7 @@ SPLAT_FN void store_splats(const Projection<Floats>& p, const Reach<Floats>& rea
   store_columns(columns, &splats->x);
 }
 
-// Means and radii of the visible lanes, zeros elsewhere; the contributions start at zero.
+// Means and radii of the visible lanes, zeros elsewhere.
 SPLAT_FN void store_screen(const ForwardCall& call, int view, Group group, const Projection<Floats>& p, const Reach<Floats>& reach,
                            Ints visible) {
   const int64_t at = view * call.scene.gaussians + group.first;
@@ -88,7 +88,6 @@ SPLAT_FN void store_screen(const ForwardCall& call, int view, Group group, const
   const Vec2<Floats> mean = {select(visible, p.screen.mean.x, zero), select(visible, p.screen.mean.y, zero)};
   store_items<2>(call.out.means2d + 2 * at, group.count, [&](float* q) { store2(q, mean); });
   store_items<1>(call.out.radii + at, group.count, [&](float* q) { store(q, radius); });
-  store_items<1>(call.out.contribution + at, group.count, [&](float* q) { store(q, zero); });
 }
 
 // Stores the tiles and the depth of the visible lanes.

@@ -21,10 +21,15 @@ static Pool<Workspace>& workspaces() { return of_process<Pool<Workspace>>(); }
 
 static void blend_views(const ForwardCall& call, Views& views) {
   const int tiles = views[0].tiles();
-  for (int v = 0; call.keep && v < call.scene.views; v++)
-    views[v].block_masks.reserve(views[v].intersection_count), views[v].planes.reserve(tiles);
+  for (int v = 0; v < call.scene.views; v++) {
+    views[v].peaks.reserve(views[v].intersection_count);
+    if (call.keep) views[v].block_masks.reserve(2 * views[v].intersection_count), views[v].planes.reserve(tiles);
+  }
   parallel_for(int64_t(tiles) * call.scene.views, call.settings.threads, TILE_GRAIN,
                [&](int64_t i) { blend_tile(call, views[i / tiles], int(i % tiles)); });
+  const int64_t slices = views[0].slices.size();
+  parallel_for(slices * call.scene.views, call.settings.threads, 1,
+               [&](int64_t i) { store_contributions(call, views[i / slices], i % slices); });
 }
 
 static void forward(const ForwardCall& call, Views& views) {

@@ -57,14 +57,48 @@ SPLAT_FN Ints blocks_in_row(const Ellipse<Floats>& ellipse, int row) {
   return meets_rows(ellipse, top - 1e-3f, bottom + 1e-3f) & ((one << end) - 1) & ~((one << first) - 1);
 }
 
-// Bit 8 r + c of each mask is set when the splat touches block (r, c) of the tile.
-SPLAT_FN void block_masks(const SplatLanes& s, uint64_t* masks) {
+// Bit 8 r + c is set when the splat touches block (r, c) of the tile; rows 0 to 3 are the first half.
+SPLAT_FN void block_masks(const SplatLanes& s, Ints halves[2]) {
   const Ellipse<Floats> ellipse = {s.x, s.y, s.extent_y, s.c * s.c, s.level, s.inverse_a, s.tilt, s.slant};
-  Ints halves[2] = {};
+  halves[0] = halves[1] = Ints{};
   for (int row = 0; row < BLOCKS_PER_ROW; row++) halves[row / 4] |= blocks_in_row(ellipse, row) << (8 * (row % 4));
-  for (int l = 0; l < LANES; l++) masks[l] = uint64_t(uint32_t(halves[1][l])) << 32 | uint32_t(halves[0][l]);
 }
 
+// The staged splats of a chunk and which blocks each of them touches.
+struct Staged {
+  alignas(64) LocalSplat splats[CHUNK];
+  alignas(64) uint32_t touching[2][CHUNK];  // halves of the masks; zero behind the last splat, up to a whole group
+  int groups;                               // of 64 splats
+#if !defined(__AVX512F__)
+  uint64_t splats_of[CHUNK];  // [64 splats][block], one bit per splat
+#endif
+};
+
+// Where the splats of a block are among the staged ones, front to back: the first float of each row of ROW floats.
+using BlockList = uint32_t[CHUNK + 16];
+
+template <class Row> SPLAT_FN Row& row_at(Row* rows, uint32_t position) {
+  static_assert(sizeof(Row) == sizeof(float) * ROW, "a row");
+  return *reinterpret_cast<Row*>(reinterpret_cast<uintptr_t>(rows) + sizeof(float) * position);
+}
+
+#if defined(__AVX512F__)
+SPLAT_FN void list_splats(Staged&) {}
+
+// Writes the splats that touch a block; returns how many.
+SPLAT_FN int list_block(const Staged& staged, int block, BlockList& list) {
+  const __m512i bit = _mm512_set1_epi32(1 << block % 32), step = _mm512_set1_epi32(16 * ROW);
+  __m512i positions = _mm512_mullo_epi32(_mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15), _mm512_set1_epi32(ROW));
+  int count = 0;
+  for (int i = 0; i < staged.groups * 64; i += 16) {
+    const __mmask16 touching = _mm512_test_epi32_mask(_mm512_load_si512(staged.touching[block / 32] + i), bit);
+    _mm512_storeu_si512(list + count, _mm512_maskz_compress_epi32(touching, positions));
+    count += __builtin_popcount(touching);
+    positions = _mm512_add_epi32(positions, step);
+  }
+  return count;
+}
+#else
 // Transposes 64 x 64 bits: bit i of word j becomes bit j of word i (Warren, Hacker's Delight, 7-3).
 inline void transpose_bits(uint64_t* words) {
   uint64_t mask = 0x00000000ffffffff;
@@ -74,6 +108,13 @@ inline void transpose_bits(uint64_t* words) {
         const uint64_t swap = (words[j] >> step ^ words[j + step]) & mask;
         words[j] ^= swap << step, words[j + step] ^= swap;
       }
+}
+
+// From the blocks of each splat to the splats of each block.
+inline void list_splats(Staged& staged) {
+  for (int i = 0; i < staged.groups * 64; i++)
+    staged.splats_of[i] = uint64_t(staged.touching[1][i]) << 32 | staged.touching[0][i];
+  for (int group = 0; group < staged.groups; group++) transpose_bits(staged.splats_of + group * 64);
 }
 
 // The positions of the bits of each byte, low to high.
@@ -88,44 +129,44 @@ struct BitPositions {
 };
 constexpr BitPositions BIT_POSITIONS;
 
-// The staged splats of a chunk and, for each block, which of them touch it.
-struct Staged {
-  alignas(64) LocalSplat splats[CHUNK];
-  alignas(64) uint64_t touching[CHUNK];  // by splat while they are staged; then [64 splats][block], one bit per splat
-  int groups;                            // of 64 splats
-};
-
-// Writes the splats that touch a block, front to back; returns how many. Up to 7 more elements are overwritten.
-SPLAT_FN int list_block(const Staged& staged, int block, uint16_t* list) {
+// Writes the splats that touch a block; returns how many.
+SPLAT_FN int list_block(const Staged& staged, int block, BlockList& list) {
   typedef uint8_t Bytes __attribute__((vector_size(8)));
-  typedef uint16_t Shorts __attribute__((vector_size(16)));
+  typedef uint32_t Words __attribute__((vector_size(32)));
   int count = 0;
   for (int group = 0; group < staged.groups; group++)
-    for (uint64_t word = staged.touching[group * 64 + block], first = group * 64; word; word >>= 8, first += 8) {
+    for (uint64_t word = staged.splats_of[group * 64 + block], first = group * 64; word; word >>= 8, first += 8) {
       Bytes positions;
       std::memcpy(&positions, BIT_POSITIONS.of[word & 255], sizeof positions);
-      const Shorts splats = __builtin_convertvector(positions, Shorts) + uint16_t(first);
+      const Words splats = (__builtin_convertvector(positions, Words) + uint32_t(first)) * ROW;
       std::memcpy(list + count, &splats, sizeof splats);
       count += BIT_POSITIONS.count[word & 255];
     }
   return count;
 }
+#endif
 
-// Transforms `count` splats to the coordinates of a tile; the masks of the blocks that they overlap are computed, or read.
+// Transforms `count` splats to the coordinates of a tile; the masks of the blocks that they overlap are computed, or read from
+// `masks` (2, count), which may be null when they are computed.
 template <bool FIND>
-SPLAT_FN void stage(const View& view, const TileFrame& frame, int first, int count, uint64_t* masks, Staged& staged) {
+SPLAT_FN void stage(const View& view, const TileFrame& frame, int first, int count, uint32_t* masks, Staged& staged) {
   for (int i = 0; i < count; i += LANES) {
     for (int l = 0; l < LANES; l++)
       __builtin_prefetch(&view.splats[view.intersections[std::min(first + i + l + PREFETCH, frame.end - 1)].gaussian]);
     const SplatLanes splats = load_splats(view, frame, first + i, count - i);
     store_local(splats, staged.splats + i);
-    if (FIND) block_masks(splats, staged.touching + i);
+    if (!FIND) continue;
+    Ints halves[2];
+    block_masks(splats, halves);
+    for (int half = 0; half < 2; half++) std::memcpy(staged.touching[half] + i, &halves[half], sizeof halves[half]);
   }
   staged.groups = (count + 63) / 64;
-  if (FIND && masks) std::memcpy(masks + first, staged.touching, sizeof(uint64_t) * count);
-  if (!FIND) std::memcpy(staged.touching, masks + first, sizeof(uint64_t) * count);
-  std::fill(staged.touching + count, staged.touching + staged.groups * 64, 0);
-  for (int group = 0; group < staged.groups; group++) transpose_bits(staged.touching + group * 64);
+  for (int half = 0; half < 2; half++) {
+    if (FIND && masks) std::memcpy(masks + half * count, staged.touching[half], sizeof(uint32_t) * count);
+    if (!FIND) std::memcpy(staged.touching[half], masks + half * count, sizeof(uint32_t) * count);
+    std::fill(staged.touching[half] + count, staged.touching[half] + staged.groups * 64, 0);
+  }
+  list_splats(staged);
 }
 
 // The pixel centres of a strip in tile coordinates.
@@ -173,7 +214,7 @@ struct LiveStrips {
 
 // Calls blend(pixels, list, length), which returns whether the strip continues, for each unfinished strip and the splats that overlap it.
 template <class Blend> SPLAT_FN void for_each_live_strip(const Staged& staged, LiveStrips& live, Blend blend) {
-  uint16_t list[CHUNK + 8];
+  BlockList list;
   for (int block = 0; block < BLOCKS; block++) {
     uint64_t alive = 0;
     for (int strip = 0; strip < STRIPS; strip++) alive |= live.blocks[strip] >> block & 1;

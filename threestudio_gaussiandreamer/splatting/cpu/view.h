@@ -59,7 +59,8 @@ struct View {
   Buffer<int32_t> histogram;
   Buffer<int32_t> tile_begin;    // (tiles + 1) into intersections
   Buffer<Intersection> intersections;         // by tile, then by depth
-  Buffer<uint64_t> block_masks;  // per intersection, the blocks of the tile that it touches
+  Buffer<uint32_t> block_masks;  // the blocks that each intersection touches: two halves per chunk, see tile.h
+  Buffer<float> peaks;           // per slot, the largest weight of the Gaussian in the tile
   Buffer<Planes> planes;         // (tiles) before the background; those of empty tiles aren't set
 
   // Allocates everything whose size doesn't depend on the positions of the Gaussians.
