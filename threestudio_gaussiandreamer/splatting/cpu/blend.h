@@ -87,7 +87,9 @@ inline void blend_tile(const ForwardCall& call, View& view, int tile) {
   std::memset(&scratch.planes, 0, sizeof scratch.planes);
   if (frame.begin < frame.end) blend_list(call, view, frame, scratch);
   write_tile(call, view.index, frame, scratch.planes);
-  if (call.keep && frame.begin < frame.end) stream(&view.planes[tile].red[0], &scratch.planes.red[0], sizeof(Planes) / sizeof(float));
+  if (!call.keep || frame.begin == frame.end) return;
+  stream(view.planes[tile].red, scratch.planes.red, sizeof(Planes) / sizeof(float));
+  end_streams();
 }
 
 // The contribution of the Gaussians of a slice: the largest weight in any tile.

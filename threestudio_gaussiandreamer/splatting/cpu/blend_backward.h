@@ -159,8 +159,7 @@ inline Vec3<float> background_sum(const float* alpha, const UpstreamPlanes& up) 
 }
 
 inline void store_sums(const View& view, const float* sums, int first, int count, float* slots) {
-  for (int i = 0; i < count; i++)
-    std::memcpy(slots + int64_t(view.intersections[first + i].slot) * ROW, sums + i * ROW, sizeof(float) * ROW);
+  for (int i = 0; i < count; i++) stream(slots + int64_t(view.intersections[first + i].slot) * ROW, sums + i * ROW, ROW);
 }
 
 // The rows of sums of all intersections of one tile, each into its slot; those behind the last chunk that contributes are zero.
@@ -180,6 +179,7 @@ inline void blend_list_backward(const BackwardCall& call, View& view, const Tile
     }
     store_sums(view, scratch.sums, first, count, call.slots(view));
   }
+  end_streams();
 }
 
 // One tile of one view: fills the slots of its intersections, returns d loss / d background.

@@ -37,9 +37,10 @@ template <class V = Floats> SPLAT_FN V load(const float* p) {
 }
 template <class V> SPLAT_FN void store(float* p, V v) { std::memcpy(p, &v, sizeof v); }
 
-// Copies whole vectors past the caches, for memory that is read much later; `to` and `from` are aligned to vectors.
-SPLAT_FN void stream(float* to, const float* from, int64_t count) {
-  for (int64_t i = 0; i < count; i += LANES) {
+// Copies whole vectors past the caches, for memory that is read much later; `to` and `from` are aligned to vectors. Other threads
+// see it after `end_streams`.
+SPLAT_FN void stream(float* to, const float* from, int count) {
+  for (int i = 0; i < count; i += LANES) {
 #if defined(__AVX512F__)
     _mm512_stream_ps(to + i, (__m512)load(from + i));
 #elif defined(__AVX2__)
@@ -48,6 +49,9 @@ SPLAT_FN void stream(float* to, const float* from, int64_t count) {
     store(to + i, load(from + i));
 #endif
   }
+}
+
+SPLAT_FN void end_streams() {
 #if defined(__AVX2__)
   _mm_sfence();
 #endif

@@ -5,7 +5,7 @@
 
 namespace splat {
 
-constexpr int CHUNK = 256;      // splats staged at a time
+constexpr int CHUNK = 512;      // splats staged at a time
 constexpr int PREFETCH = 32;    // splats ahead
 constexpr int CHECK_EVERY = 4;  // splats between two tests whether all pixels of a strip have stopped
 
