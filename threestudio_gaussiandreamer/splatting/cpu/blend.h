@@ -84,6 +84,7 @@ inline void blend_list(const ForwardCall& call, View& view, const TileFrame& fra
 inline void blend_tile(const ForwardCall& call, View& view, int tile) {
   const TileFrame frame = frame_of(view, tile);
   BlendScratch scratch;
+  prefetch_tile<true>(pictures_of(call, view.index), frame, call.settings.downsample);
   std::memset(&scratch.planes, 0, sizeof scratch.planes);
   if (frame.begin < frame.end) blend_list(call, view, frame, scratch);
   write_tile(call, view.index, frame, scratch.planes);

@@ -187,6 +187,7 @@ inline Vec3<float> blend_tile_backward(const BackwardCall& call, View& view, int
   const TileFrame frame = frame_of(view, tile);
   BackwardScratch scratch;
   read_tile(call, view.index, frame, scratch.upstream);
+  if (tile + 1 < view.tiles()) prefetch_tile<false>(upstream_of(call, view.index), frame_of(view, tile + 1), call.settings.downsample);
   if (frame.begin == frame.end) {
     std::fill(scratch.behind, scratch.behind + TILE_PIXELS, 0.0f);
     return background_sum(scratch.behind, scratch.upstream);

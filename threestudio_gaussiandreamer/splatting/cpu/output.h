@@ -94,9 +94,33 @@ inline void write_tile_as(const Layers<float>& out, Vec3<float> background, cons
   });
 }
 
-inline void write_tile(const ForwardCall& call, int view, const TileFrame& frame, const Planes& planes) {
+// Asks for the cache lines of a tile's part of an array with `width` pixels of CHANNELS floats per row.
+template <int CHANNELS, bool WRITE, class T>
+SPLAT_FN void prefetch_rows(T* p, const TileFrame& frame, int downsample, int width, int height) {
+  const int left = frame.left / downsample, top = frame.top / downsample, side = TILE / downsample;
+  const int rows = std::min(side, height - top), floats = CHANNELS * std::min(side, width - left);
+  for (int row = 0; p && row < rows; row++)
+    for (int x = 0; x < floats; x += 16) __builtin_prefetch(p + (int64_t(top + row) * width + left) * CHANNELS + x, WRITE);
+}
+
+template <bool WRITE, class T> SPLAT_FN void prefetch_tile(const Layers<T>& layers, const TileFrame& frame, int downsample) {
+  prefetch_rows<3, WRITE>(layers.image, frame, downsample, layers.width, layers.height);
+  prefetch_rows<1, WRITE>(layers.alpha, frame, downsample, layers.width, layers.height);
+  prefetch_rows<1, WRITE>(layers.depth, frame, downsample, layers.width, layers.height);
+}
+
+inline Layers<float> pictures_of(const ForwardCall& call, int view) {
   const SplatPictures& p = call.out;
-  const Layers<float> out = layers_of(p.image, p.alpha, p.depth, call.scene, call.settings, view);
+  return layers_of(p.image, p.alpha, p.depth, call.scene, call.settings, view);
+}
+
+inline Layers<const float> upstream_of(const BackwardCall& call, int view) {
+  const SplatUpstream& u = call.upstream;
+  return layers_of(u.image, u.alpha, u.depth, call.scene, call.settings, view);
+}
+
+inline void write_tile(const ForwardCall& call, int view, const TileFrame& frame, const Planes& planes) {
+  const Layers<float> out = pictures_of(call, view);
   const Vec3<float> background = background_of(call.scene, view);
   call.settings.downsample == 2 ? write_tile_as<2>(out, background, frame, planes)
                                 : write_tile_as<1>(out, background, frame, planes);
@@ -118,8 +142,7 @@ inline void read_tile_as(const Layers<const float>& in, const TileFrame& frame, 
 }
 
 inline void read_tile(const BackwardCall& call, int view, const TileFrame& frame, UpstreamPlanes& planes) {
-  const SplatUpstream& u = call.upstream;
-  const Layers<const float> in = layers_of(u.image, u.alpha, u.depth, call.scene, call.settings, view);
+  const Layers<const float> in = upstream_of(call, view);
   if (!frame.inside) std::memset(&planes, 0, sizeof planes);
   call.settings.downsample == 2 ? read_tile_as<2>(in, frame, planes) : read_tile_as<1>(in, frame, planes);
 }
