@@ -50,17 +50,6 @@ inline const uint64_t* sort_by_depth(View& view, int64_t visible) {
   return visible ? radix_sort(view.keys.data(), view.spare_keys.data(), visible, lowest, highest) : view.keys.data();
 }
 
-// Calls visit(tile) for the tiles of a Gaussian, in the order of its slots.
-template <class Visit> SPLAT_FN void for_each_tile(const View& view, uint32_t gaussian, Visit visit) {
-  const Coverage& c = view.coverage(gaussian);
-  const bool cut = c.all.begin == c.all.end;
-  const TileSpan* spans = cut ? view.slice_of(gaussian).spans.data() + c.span : &c.all;
-  for (int r = 0; r < c.rows; r++) {
-    const TileSpan span = spans[cut ? r : 0];
-    for (int x = span.begin; x < span.end; x++) visit((c.row + r) * view.tiles_x + x);
-  }
-}
-
 // The visible Gaussians in the order of their depth, in parts of equal size.
 struct DepthOrder {
   const uint64_t* keys;  // the lower halves are the Gaussians
@@ -117,9 +106,11 @@ inline void fill_tiles(View& view, const DepthOrder& order, int64_t part) {
 // Assigns the Gaussians to the tiles; each part processes a contiguous range, which keeps the order.
 inline void deal_to_tiles(View& view, const uint64_t* keys, int64_t visible, int threads) {
   const DepthOrder order = {keys, visible, int(std::min<int64_t>(threads, visible / SLICE + 1))};
-  view.histogram.reserve(size_t(order.parts) * view.tiles());
   view.intersections.reserve(view.intersection_count), view.tile_begin.reserve(view.tiles() + 1);
-  parallel_for(order.parts, threads, 1, [&](int64_t part) { count_tiles(view, order, part); });
+  if (!view.counted) {
+    view.histogram.reserve(size_t(order.parts) * view.tiles());
+    parallel_for(order.parts, threads, 1, [&](int64_t part) { count_tiles(view, order, part); });
+  }
   scan_histogram(view, order.parts);
   parallel_for(order.parts, threads, 1, [&](int64_t part) { fill_tiles(view, order, part); });
 }
@@ -127,6 +118,8 @@ inline void deal_to_tiles(View& view, const uint64_t* keys, int64_t visible, int
 // Stages 1 to 3 of one view.
 inline void build_view(const ForwardCall& call, View& view, int index, int threads) {
   view.prepare(call.scene, index);
+  view.counted = threads == 1;
+  if (view.counted) std::fill_n(view.histogram.reserve(view.tiles()), view.tiles(), 0);
   view.camera = make_camera(call.scene, index);
   parallel_for(view.slices.size(), threads, 1, [&](int64_t i) { project_slice(call, view, i); });
   number_slots(view);

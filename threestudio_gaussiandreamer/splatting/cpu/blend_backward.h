@@ -127,7 +127,8 @@ SPLAT_FN bool blend_strip_backward(BackwardScratch& scratch, const StripPixels& 
   for (int i = 0; i < length && live; i += LANES) {
     PairRows rows;
     const int count = std::min(LANES, length - i);
-    for (int j = 0; j < count; j++) blend_backward<ABSOLUTE>(row_at(scratch.staged.splats, list[i + j]), pixels, limits, strip, rows, j);
+    for (int j = 0; j < count; j++)
+      blend_backward<ABSOLUTE>(row_at(scratch.staged.splats, list[i + j]), pixels, limits, strip, rows, j);
     clear_rows<ABSOLUTE>(rows, count);
     add_pairs<ABSOLUTE>(scratch, rows, pixels, list + i, count);
     strip.transmittance = select(strip.transmittance >= limits.stop, strip.transmittance, Floats{});
@@ -187,7 +188,8 @@ inline Vec3<float> blend_tile_backward(const BackwardCall& call, View& view, int
   const TileFrame frame = frame_of(view, tile);
   BackwardScratch scratch;
   read_tile(call, view.index, frame, scratch.upstream);
-  if (tile + 1 < view.tiles()) prefetch_tile<false>(upstream_of(call, view.index), frame_of(view, tile + 1), call.settings.downsample);
+  if (tile + 1 < view.tiles())
+    prefetch_tile<false>(upstream_of(call, view.index), frame_of(view, tile + 1), call.settings.downsample);
   if (frame.begin == frame.end) {
     std::fill(scratch.behind, scratch.behind + TILE_PIXELS, 0.0f);
     return background_sum(scratch.behind, scratch.upstream);

@@ -90,7 +90,7 @@ SPLAT_FN void store_screen(const ForwardCall& call, int view, Group group, const
   store_items<1>(call.out.radii + at, group.count, [&](float* q) { store(q, radius); });
 }
 
-// Stores the tiles and the depth of the visible lanes.
+// Stores the tiles and the depth of the visible lanes, and counts them by tile where one thread sees all of them.
 inline void list_lanes(View& view, Slice& slice, Group group, const Projection<Floats>& p, const Reach<Floats>& reach, Ints visible) {
   const TileRange x = tile_range(p.screen.mean.x, reach.extent.x, view.camera.size.x);
   const TileRange y = tile_range(p.screen.mean.y, reach.extent.y, view.camera.size.y);
@@ -99,7 +99,9 @@ inline void list_lanes(View& view, Slice& slice, Group group, const Projection<F
     const int64_t gaussian = group.first + l;
     const Splat& splat = view.splats[gaussian];
     view.coverage(gaussian) = visible[l] ? cover(splat, x.first[l], x.last[l], y.first[l], y.last[l], slice) : no_coverage(slice);
-    if (visible[l]) keys[slice.visible++] = depth_key(splat.depth, gaussian);
+    if (!visible[l]) continue;
+    keys[slice.visible++] = depth_key(splat.depth, gaussian);
+    if (view.counted) for_each_tile(view, gaussian, [&](int tile) { view.histogram[tile]++; });
   }
 }
 

@@ -87,8 +87,9 @@ SPLAT_FN void list_splats(Staged&) {}
 
 // Writes the splats that touch a block; returns how many.
 SPLAT_FN int list_block(const Staged& staged, int block, BlockList& list) {
-  const __m512i bit = _mm512_set1_epi32(1 << block % 32), step = _mm512_set1_epi32(16 * ROW);
-  __m512i positions = _mm512_mullo_epi32(_mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15), _mm512_set1_epi32(ROW));
+  const __m512i bit = _mm512_set1_epi32(int(1u << block % 32)), step = _mm512_set1_epi32(16 * ROW);
+  __m512i positions = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+  positions = _mm512_mullo_epi32(positions, _mm512_set1_epi32(ROW));
   int count = 0;
   for (int i = 0; i < staged.groups * 64; i += 16) {
     const __mmask16 touching = _mm512_test_epi32_mask(_mm512_load_si512(staged.touching[block / 32] + i), bit);
@@ -212,7 +213,8 @@ struct LiveStrips {
   }
 };
 
-// Calls blend(pixels, list, length), which returns whether the strip continues, for each unfinished strip and the splats that overlap it.
+// Calls blend(pixels, list, length), which returns whether the strip continues, for each unfinished strip and the splats that
+// overlap it.
 template <class Blend> SPLAT_FN void for_each_live_strip(const Staged& staged, LiveStrips& live, Blend blend) {
   BlockList list;
   for (int block = 0; block < BLOCKS; block++) {

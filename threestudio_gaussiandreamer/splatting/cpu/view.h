@@ -56,7 +56,8 @@ struct View {
   Buffer<Coverage> coverages;  // (N), and one more behind each slice
   std::vector<Slice> slices;
   Buffer<uint64_t> keys, spare_keys;  // depth << 32 | Gaussian
-  Buffer<int32_t> histogram;
+  Buffer<int32_t> histogram;  // of the intersections by (part of the Gaussians, tile)
+  bool counted;               // by the projection, as one part
   Buffer<int32_t> tile_begin;    // (tiles + 1) into intersections
   Buffer<Intersection> intersections;         // by tile, then by depth
   Buffer<uint32_t> block_masks;  // the blocks that each intersection touches: two halves per chunk, see tile.h
@@ -78,6 +79,17 @@ struct View {
   int64_t slot_begin(int64_t gaussian) const { return slice_of(gaussian).first_slot + coverage(gaussian).slot; }
   int64_t slot_end(int64_t gaussian) const { return slice_of(gaussian).first_slot + (&coverage(gaussian))[1].slot; }
 };
+
+// Calls visit(tile) for the tiles of a Gaussian, in the order of its slots.
+template <class Visit> SPLAT_FN void for_each_tile(const View& view, int64_t gaussian, Visit visit) {
+  const Coverage& c = view.coverage(gaussian);
+  const bool cut = c.all.begin == c.all.end;
+  const TileSpan* spans = cut ? view.slice_of(gaussian).spans.data() + c.span : &c.all;
+  for (int r = 0; r < c.rows; r++) {
+    const TileSpan span = spans[cut ? r : 0];
+    for (int x = span.begin; x < span.end; x++) visit((c.row + r) * view.tiles_x + x);
+  }
+}
 
 // Never shrinks, so that the views' buffers are reused; the scene has their number.
 using Views = std::deque<View>;
