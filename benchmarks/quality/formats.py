@@ -4,8 +4,7 @@ its source.
     python -m benchmarks.quality.formats toy:toy.ply spot:spot.ply duck:duck.ply
 
 Each cloud is given as object:file; a ball with random harmonics of degree 3 is added. Rows go to
-docs/charts/formats.csv; ``python -m benchmarks.tables`` makes the table of docs/formats.md. USDA is
-read by OpenUSD (``pip install usd-core``).
+docs/charts/formats.csv; ``python -m benchmarks.tables`` makes the table of docs/formats.md.
 """
 
 import argparse
@@ -19,7 +18,6 @@ from typing import Any, NamedTuple
 from benchmarks.markdown import markdown, read
 from benchmarks.quality.runs import CHARTS, append_rows
 from tests.helpers.object_clouds import ball
-from tests.helpers.usd_reader import read_with_pxr
 from threestudio_gaussiandreamer.convert.check import round_trip
 from threestudio_gaussiandreamer.convert.producers import PRODUCERS
 from threestudio_gaussiandreamer.formats.gaussian_files import (
@@ -97,7 +95,7 @@ FORMATS = (
         "a.usda",
         3,
         True,
-        False,
+        True,
         "all attributes with 9 digits; the notes as layer data",
         "OpenUSD 26.03 on: Omniverse, Houdini",
     ),
@@ -127,7 +125,7 @@ def rows(name: str, cloud: StoredCloud) -> Iterator[dict[str, Any]]:
             started = time.process_time()
             write_cloud(str(path), cloud, spz_version=known.version)
             written = time.process_time()
-            after = read_cloud(str(path)) if known.reads else from_usda(path)
+            after = read_cloud(str(path))
             done = time.process_time()
             found = round_trip(cloud, after, SIZE)
             yield {
@@ -141,11 +139,6 @@ def rows(name: str, cloud: StoredCloud) -> Iterator[dict[str, Any]]:
                 "write_s": round(written - started, 3),
                 "read_s": round(done - written, 3),
             }
-
-
-def from_usda(path: Path) -> StoredCloud:
-    """Read a USDA file by OpenUSD."""
-    return StoredCloud(read_with_pxr(path)[2], "y")
 
 
 # ---- the table of docs/formats.md ----------------------------------------------------------------

@@ -10,7 +10,6 @@ from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import (
     PRUNED,
-    READ,
     WRITTEN,
     StoredCloud,
     file_size,
@@ -119,7 +118,7 @@ def test_the_comments_of_brush_and_postshot_about_antialiasing_are_read(
     assert read_cloud(str(tmp_path / "a.ply")).antialiased is antialiased
 
 
-@pytest.mark.parametrize("suffix", [suffix for suffix in READ if suffix in WRITTEN])
+@pytest.mark.parametrize("suffix", WRITTEN)
 def test_every_format_that_is_read_starts_a_run(tmp_path, suffix):
     write_cloud(str(tmp_path / f"a{suffix}"), StoredCloud(cloud(degree=1)))
     found = find("gaussians-prior")({"path": str(tmp_path / f"a{suffix}")}).gaussians("")

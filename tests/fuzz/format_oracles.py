@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import struct
 import zipfile
 
@@ -51,3 +52,12 @@ def sog_means(data: bytes) -> np.ndarray:
     start, end = (np.array(means[key], float) for key in ("mins", "maxs"))
     logs = start + (end - start) * ((high * 256 + low) / 65535)
     return np.sign(logs) * (np.exp(np.abs(logs)) - 1)
+
+
+def usda_means(data: bytes) -> np.ndarray:
+    """The positions (N, 3) in the one line of a USDA layer that gives them."""
+    declared = rb"^\s*(?:custom )?(?:uniform )?point3f\[\] positions = \[(.*)\]"
+    found = re.findall(declared, data, re.MULTILINE)
+    if len(found) != 1:
+        raise Illegal(f"{len(found)} lines with positions")
+    return np.array([float(number) for number in re.findall(rb"[^(), ]+", found[0])]).reshape(-1, 3)

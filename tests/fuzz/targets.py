@@ -25,7 +25,7 @@ from tests.fuzz.cloud_targets import (
     gaussian_plys,
     point_plys,
 )
-from tests.fuzz.format_oracles import compressed_means, sog_means
+from tests.fuzz.format_oracles import compressed_means, sog_means, usda_means
 from tests.fuzz.format_targets import (
     SOG,
     SPZ_4,
@@ -58,6 +58,7 @@ from tests.fuzz.run_targets import (
 from tests.fuzz.target import Target, require_picture
 from threestudio_gaussiandreamer.formats.compressed_ply import read_compressed_ply
 from threestudio_gaussiandreamer.formats.sog import read_sog
+from threestudio_gaussiandreamer.formats.usda_reader import read_usda
 
 
 def mutant(name: str, seed: int, index: int) -> bytes:
@@ -142,4 +143,10 @@ TARGETS: dict[str, Target] = {
         packing=mutations.PLY,
     ),
     "splat": Target(".splat", splats, exercise_splat),
+    "usda": Target(
+        ".usda",
+        lambda: files(".usda", [(12, 0), (9, 1)]),
+        exercise_means(lambda path: read_usda(path)[0], usda_means),
+        TEXT,
+    ),
 }

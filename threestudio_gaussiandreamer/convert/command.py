@@ -150,8 +150,6 @@ def _check_options(args: argparse.Namespace, suffix: str, mesh: bool) -> None:
         raise UserError(f"--up-out: OUT is a {suffix} file, whose axes are fixed; it is for PLYs")
     check_options(ConvertOptions, ConvertOptions(args.harmonics, args.size), "--")
     to_mesh.check_mesh_options(args)
-    if args.check and FORMATS[suffix].read is None:
-        raise UserError(f"--check: {suffix} files are written here, but not read")
 
 
 def _read(source: Path, args: argparse.Namespace) -> StoredCloud:

@@ -23,6 +23,7 @@ from .sog import SOG_UP, load_sog, write_sog
 from .splat import read_splat
 from .spz import SPZ_UP, load_spz, read_spz_comment, spz_arrays, spz_bytes, write_spz
 from .usda import USDA_UP, write_usda
+from .usda_reader import read_usda
 
 UP, PRUNED = "up:", "pruned to the likeness, dB:"
 """Keys of the comments in files; the second is the PSNR to the original cloud."""
@@ -64,7 +65,7 @@ class CloudFormat(NamedTuple):
 
     up: str
     """The axis that is up, in formats with ``any_up`` where no note says another one."""
-    read: Optional[Callable[[Path], Content]]
+    read: Callable[[Path], Content]
     write: Optional[Callable[..., None]]
     """Called with the path, the Gaussians and the notes; None where a format is only read."""
     any_up: bool = False
@@ -108,11 +109,11 @@ FORMATS = {
     ".sog": CloudFormat(SOG_UP, _read_sog, _write_sog),
     ".glb": CloudFormat(GLB_UP, load_glb, write_glb),
     ".gltf": CloudFormat(GLB_UP, load_glb, None),
-    ".usda": CloudFormat(USDA_UP, None, write_usda),
+    ".usda": CloudFormat(USDA_UP, read_usda, write_usda),
     ".splat": CloudFormat(VIEWER_UP, lambda path: (read_splat(path), []), None),
 }
 """By extension."""
-READ = tuple(suffix for suffix, known in FORMATS.items() if known.read)
+READ = tuple(FORMATS)
 WRITTEN = tuple(suffix for suffix, known in FORMATS.items() if known.write)
 PRUNED_FORMATS = (".ply", ".spz")
 """Formats whose size and rounding :func:`file_size` and :func:`as_stored` know."""
@@ -168,8 +169,6 @@ def read_stored(file: Path, *, up: Optional[str] = None) -> StoredCloud:
     The format is that of the extension, or PLY where the extension is unknown.
     """
     known = FORMATS.get(suffix_of(file.name), FORMATS[".ply"])
-    if known.read is None:
-        raise UserError(f"{str(file)!r}: files of this format are written here, but not read")
     gaussians, notes = known.read(file)
     if up is not None and up not in AXES:
         raise unknown("axis", up, AXES)

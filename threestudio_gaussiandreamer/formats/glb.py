@@ -27,7 +27,7 @@ from ..meshes.glb_file import write_glb_file
 from ..meshes.gltf import parse_errors
 from ..meshes.gltf_document import Document
 from ..meshes.gltf_poses import world_matrices
-from .packing import logits, opacities, to_byte, unit_quats
+from .packing import FLOAT_OPACITY_MARGIN, logits, opacities, to_byte, unit_quats
 
 logger = logging.getLogger(__name__)
 GLB_UP = "y"
@@ -40,9 +40,6 @@ SPLATTING = {
 }
 FLOAT, BYTE, POINTS, ARRAY_BUFFER = 5126, 5121, 0, 34962
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-MARGIN = 2.0**-25
-"""Opacities that are read are clamped to this distance from 0 and 1, to make their logits finite:
-half the distance from 1 to the next lower float32."""
 DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 300, 72
 """Upper bounds of the memory that reading takes, per Gaussian and per harmonic of a Gaussian."""
 SAME_SCALE = 1e-4
@@ -215,7 +212,7 @@ def _read_primitive(document: Document, primitive: Primitive) -> Gaussians:
         means=rows("POSITION", "VEC3"),
         quats=rows(f"{EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]],
         log_scales=log_scales,
-        logit_opacities=logits(rows(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0], MARGIN),
+        logit_opacities=logits(rows(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0], FLOAT_OPACITY_MARGIN),
         sh=np.stack(
             [rows(semantic, "VEC3") for semantic in _semantics(_harmonics(primitive))], axis=1
         ),

@@ -7,6 +7,9 @@ OPACITY_MARGIN = 1 / 2040
 """Opacities that are read from bytes are clamped to this distance from 0 and 1, an eighth of a
 step, since their logits are infinite there.
 """
+FLOAT_OPACITY_MARGIN = 2.0**-25
+"""The same for opacities that are read as float32: half the distance from 1 to the next lower one.
+"""
 MAX_OPACITY_BYTE = 254
 """Other readers take the logit of the byte over 255, which is infinite at 255."""
 

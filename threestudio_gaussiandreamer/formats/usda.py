@@ -1,5 +1,6 @@
 """USDA text of one ParticleField3DGaussianSplat prim, the Gaussians of OpenUSD from 26.03 on, for
-Omniverse, Houdini and other programs of film and simulation. Write only; needs no USD library.
+Omniverse, Houdini and other programs of film and simulation. Needs no USD library; the reader is
+``usda_reader.py``.
 
 Scales and opacities are linear, quaternions (w, x, y, z), coefficients of a Gaussian one after the
 other, all float32 with 9 digits. Axes: y up, front +z; one unit is one metre. USD has no attribute
@@ -16,7 +17,18 @@ from ..gaussians.gaussians import Gaussians, finite
 from .packing import opacities, unit_quats
 
 USDA_UP = "y"
-PRIM = "Gaussians"
+MAGIC, PRIM, SCHEMA = "#usda 1.0", "Gaussians", "ParticleField3DGaussianSplat"
+DEGREE = "radiance:sphericalHarmonicsDegree"
+HARMONICS = "radiance:sphericalHarmonicsCoefficients"
+TYPES = {
+    "positions": "point3f[]",
+    "orientations": "quatf[]",
+    "scales": "float3[]",
+    "opacities": "float[]",
+    DEGREE: "int",
+    HARMONICS: "float3[]",
+}
+"""Of the prim's attributes."""
 REACH = 3.0
 """Standard deviations of a Gaussian that the prim's extent contains."""
 ROWS = 4096
@@ -45,28 +57,28 @@ def _head(gaussians: Gaussians, notes: Sequence[str]) -> str:
     said = ", ".join(f'"{note}"' for note in notes)
     custom = f"    customLayerData = {{\n        string[] notes = [{said}]\n    }}\n"
     return (
-        f'#usda 1.0\n(\n{custom if notes else ""}    defaultPrim = "{PRIM}"\n'
+        f'{MAGIC}\n(\n{custom if notes else ""}    defaultPrim = "{PRIM}"\n'
         f'    metersPerUnit = 1\n    upAxis = "{USDA_UP.upper()}"\n)\n\n'
-        f'def ParticleField3DGaussianSplat "{PRIM}"\n{{\n'
+        f'def {SCHEMA} "{PRIM}"\n{{\n'
         f"    float3[] extent = [{', '.join(map(_tuple, _extent(gaussians)))}]\n"
-        f"    uniform int radiance:sphericalHarmonicsDegree = {gaussians.sh_degree}\n"
+        f"    uniform {TYPES[DEGREE]} {DEGREE} = {gaussians.sh_degree}\n"
     )
 
 
 def _arrays(gaussians: Gaussians) -> Iterator[tuple[str, np.ndarray, str]]:
-    """Yield declaration, values and metadata of each array; scalars as (N,)."""
+    """Yield name, values and metadata of each array; scalars as (N,)."""
     harmonics = gaussians.sh.shape[1]
     sh = gaussians.sh.reshape(len(gaussians.sh) * harmonics, 3)
-    yield "point3f[] positions", gaussians.means, ""
-    yield "quatf[] orientations", unit_quats(gaussians.quats).astype(np.float32), ""
-    yield "float3[] scales", np.exp(gaussians.log_scales), ""
-    yield "float[] opacities", opacities(gaussians.logit_opacities).astype(np.float32), ""
+    yield "positions", gaussians.means, ""
+    yield "orientations", unit_quats(gaussians.quats).astype(np.float32), ""
+    yield "scales", np.exp(gaussians.log_scales), ""
+    yield "opacities", opacities(gaussians.logit_opacities).astype(np.float32), ""
     layout = f'elementSize = {harmonics}\n        interpolation = "vertex"'
-    yield "float3[] radiance:sphericalHarmonicsCoefficients", sh, layout
+    yield HARMONICS, sh, layout
 
 
-def _write_array(file: BinaryIO, declaration: str, values: np.ndarray, metadata: str) -> None:
-    file.write(f"    {declaration} = [".encode())
+def _write_array(file: BinaryIO, name: str, values: np.ndarray, metadata: str) -> None:
+    file.write(f"    {TYPES[name]} {name} = [".encode())
     for at in range(0, len(values), ROWS):
         rows = map(_tuple, values[at : at + ROWS])
         file.write((", " if at else "").encode() + ", ".join(rows).encode())
