@@ -117,6 +117,7 @@ def test_what_openusd_writes_is_read(tmp_path):
         ("\n}\n", "\n}\ndef Xform", "expected one prim, but after it there is 'def Xform'"),
         ('interpolation = "vertex"\n    )', 'interpolation = "vertex"', "ends before the ')'"),
         ("\n{\n", "\n", "expected the '{' of the prim"),
+        ("elementSize", "point3f[] positions = [(1, 1, 1)]\n x", "an attribute of the prim"),
         ("(\n    default", '(\n    doc = """a\n    default', "texts of several lines"),
     ],
 )

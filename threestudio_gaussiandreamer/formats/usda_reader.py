@@ -92,13 +92,13 @@ def _read_head(lines: _Lines) -> list[str]:
         lines.fail(f"this is not a USDA file, which begins with {MAGIC!r}")
     line, notes = lines.take(), []
     if line == b"(":
-        notes = _notes(lines.take_until(b")"), lines)
+        notes = _notes(_metadata(lines), lines)
         line = lines.take()
     prim = PRIM.fullmatch(line)
     if prim is None:
         lines.fail(f"expected one prim 'def {SCHEMA} \"name\"', got {_shown(line)}")
     if prim[1]:
-        lines.take_until(b")")
+        _metadata(lines)
     if lines.take() != b"{":
         lines.fail("expected the '{' of the prim")
     return notes
@@ -129,10 +129,20 @@ def _read_attributes(lines: _Lines) -> dict[str, _Attribute]:
         if value:
             found[name] = _Attribute(head[1], value.removesuffix(b" ("))
         if line.endswith(b" ("):
-            lines.take_until(b")")
+            _metadata(lines)
     if rest := lines.take():
         lines.fail(f"expected one prim, but after it there is {_shown(rest)}")
     return found
+
+
+def _metadata(lines: _Lines) -> list[bytes]:
+    """Return the lines up to the closing parenthesis, none of which may be an attribute."""
+    taken = lines.take_until(b")")
+    for line in taken:
+        head = HEAD.fullmatch(line.partition(b" = ")[0])
+        if head and head[2].decode() in TYPES:
+            lines.fail(f"the metadata before has {_shown(line)}, an attribute of the prim")
+    return taken
 
 
 def _shown(line: bytes) -> str:
