@@ -3,6 +3,7 @@
 import io
 import socket
 import sys
+import threading
 import time
 from types import SimpleNamespace
 
@@ -101,6 +102,30 @@ def test_the_address_of_any_free_port():
         socket.create_connection(("127.0.0.1", port), timeout=5).close()
     finally:
         view.close()
+
+
+def test_updates_replace_the_cloud_and_the_cameras_and_are_counted():
+    pytest.importorskip("viser")
+    view = live.LiveView("127.0.0.1", 0, "cloud")
+    try:
+        for count in (5, 5, 7):
+            view.show(cloud(count).gaussians, f"{count} Gaussians")
+            assert len(view._splats.centers) == count
+        for views in (2, 2, 3):
+            poses = np.tile(np.eye(4, dtype=np.float32), (views, 1, 1))
+            poses[:, 0, 3] = views
+            view.show_cameras(poses, np.full(views, 0.5, np.float32), 1.5)
+            assert [frustum.position[0] for frustum in view._frustums] == [views] * views
+            assert view._frustums[0].fov == 0.5 and view._frustums[0].aspect == 1.5
+        assert view.server_seconds() > 0
+    finally:
+        view.close()
+    assert view.server_seconds() >= 0
+
+
+def test_clocks_are_optional(monkeypatch):
+    monkeypatch.delattr(live.time, "pthread_getcpuclockid", raising=False)
+    assert live.cpu_clocks([threading.current_thread()]) == []
 
 
 def test_without_viser_the_extra_is_named(monkeypatch, port):

@@ -4,9 +4,12 @@ viser always draws Gaussians with a dilation of 0.3 square pixels and colours of
 that ``--html`` writes draws them with the options of the run.
 """
 
+import contextlib
 import math
 import socket
 import threading
+import time
+from collections.abc import Iterable
 from typing import Any, Optional
 
 import numpy as np
@@ -63,7 +66,9 @@ class LiveView:
         require_server(host, port)
         import viser
 
+        before = set(threading.enumerate())
         self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        self._clocks = cpu_clocks(set(threading.enumerate()) - before)
         self.server.scene.set_up_direction("+z")
         name = "localhost" if host == "0.0.0.0" else host
         self.address = f"http://{name}:{self.server.get_port()}"
@@ -74,6 +79,16 @@ class LiveView:
     def watched(self) -> bool:
         """Whether a browser is connected."""
         return bool(self.server.get_clients())
+
+    def server_seconds(self) -> float:
+        """Return the CPU seconds of the server's threads so far; 0 on systems that don't count them
+        by thread.
+        """
+        seconds = 0.0
+        for clock in self._clocks:
+            with contextlib.suppress(OSError):  # the thread has ended
+                seconds += time.clock_gettime(clock)
+        return seconds
 
     def look_from_front(self, pose: Pose) -> None:
         """Set the first view of browsers that connect from now on, as the page's is set."""
@@ -97,16 +112,17 @@ class LiveView:
             status: a line below the title.
         """
         with self.server.atomic():
-            if self._splats is not None:
-                self._splats.remove()
-            self._splats = self.server.scene.add_gaussian_splats("/cloud", **splats(gaussians))
+            if self._splats is None:
+                self._splats = self.server.scene.add_gaussian_splats("/cloud", **splats(gaussians))
+            else:
+                self._splats.set_gaussians(**splats(gaussians))
             self._status.content = f"**{self._title}**\n\n{status}"
         self.server.flush()
 
     def show_cameras(
         self, c2w: Float[np.ndarray, "B 4 4"], fovy: Float[np.ndarray, " B"], aspect: float
     ) -> None:
-        """Replace the frustums of the training cameras.
+        """Show the frustums of the training cameras.
 
         Args:
             c2w: OpenGL cameras in the world's axes.
@@ -115,18 +131,20 @@ class LiveView:
         """
         import viser.transforms
 
+        turns = [viser.transforms.SO3.from_matrix(pose[:3, :3] @ FLIP_YZ).wxyz for pose in c2w]
+        if len(self._frustums) != len(c2w):
+            self._add_frustums(len(c2w))
+        for frustum, turn, pose, angle in zip(self._frustums, turns, c2w, fovy, strict=True):
+            frustum.wxyz, frustum.position = turn, pose[:3, 3]
+            frustum.fov, frustum.aspect = float(angle), aspect
+
+    def _add_frustums(self, count: int) -> None:
+        """Replace the frustums by new ones, whose poses are set later."""
         for frustum in self._frustums:
             frustum.remove()
         self._frustums = [
-            self.server.scene.add_camera_frustum(
-                f"/cameras/{number}",
-                fov=float(angle),
-                aspect=aspect,
-                scale=0.15,
-                wxyz=viser.transforms.SO3.from_matrix(pose[:3, :3] @ FLIP_YZ).wxyz,
-                position=pose[:3, 3],
-            )
-            for number, (pose, angle) in enumerate(zip(c2w, fovy, strict=True))
+            self.server.scene.add_camera_frustum(f"/cameras/{i}", fov=1, aspect=1, scale=0.15)
+            for i in range(count)
         ]
 
     def close(self) -> None:
@@ -180,6 +198,15 @@ class Controls:
             self.step.clear()  # pressed before the pause
             self.paused.set()
         self._pause.label = "Go on" if self.paused.is_set() else "Pause"
+
+
+def cpu_clocks(threads: Iterable[threading.Thread]) -> list[int]:
+    """Return the CPU clocks of running threads, for ``time.clock_gettime``; none where the system
+    has no such clocks.
+    """
+    if not hasattr(time, "pthread_getcpuclockid"):
+        return []
+    return [time.pthread_getcpuclockid(thread.ident) for thread in threads]
 
 
 def splats(gaussians: Gaussians) -> dict[str, np.ndarray]:
