@@ -31,8 +31,8 @@ class FakeRay:
     def __init__(self):
         self.restarted = []
 
-    def wait(self, handles, timeout):
-        return handles[:1], handles[1:]
+    def wait(self, handles, num_returns=1, timeout=None):
+        return handles[:num_returns], handles[num_returns:]
 
     def get(self, handle, timeout=None):
         if isinstance(handle.outcome, Exception):
@@ -69,24 +69,28 @@ def finished(job):
 class Bench:
     """A driver with one worker, and what it has done."""
 
-    def __init__(self, path, answers, rows=ROWS, low_memory=LOW):
+    def __init__(self, path, answers, rows=ROWS, low_memory=LOW, workers=1):
         recipe = Recipe((Source("a.yaml", b""),), (), True, 1, low_memory)
         self.ray, self.worker = FakeRay(), FakeWorker(answers)
-        self.beats, self.stops = {}, 0
+        self.beats, self.stops, self.reads = {}, 0, 0
         board = SimpleNamespace(
-            read=SimpleNamespace(remote=lambda: Handle(self.beats)),
+            read=SimpleNamespace(remote=self._read),
             stop=SimpleNamespace(remote=self._stop),
         )
         self.ledger, self.stream = Ledger(path), io.StringIO()
         self.driver = Driver(
             self.ray,
-            [self.worker],
-            [Setting(0, recipe, None, board, "", "now", 3)],
+            [self.worker] * workers,
+            [Setting(number, recipe, None, board, "", "now", 3) for number in range(workers)],
             iter([Job(row) for row in rows]),
             self.ledger,
             10.0,
             Display(len(rows), 0, self.stream),
         )
+
+    def _read(self):
+        self.reads += 1
+        return Handle(self.beats)
 
     def _stop(self):
         self.stops += 1
@@ -99,6 +103,18 @@ class Bench:
 @pytest.fixture
 def path(tmp_path):
     return tmp_path / "ledger.jsonl"
+
+
+def test_a_step_collects_all_outcomes_and_looks_after_workers_now_and_then(path):
+    bench = Bench(path, finished, workers=3)
+    bench.driver.fill()
+    bench.driver.step()
+    assert bench.states() == [FINISHED] * 3 + [RUNNING] * 3
+    bench.driver.step()
+    assert bench.states() == [FINISHED] * 6 and bench.reads == 1
+    bench.driver.look_due = 0.0
+    bench.driver.look_after_workers()
+    assert bench.reads == 2
 
 
 def test_every_asset_is_made_once(path):

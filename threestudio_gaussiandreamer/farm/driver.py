@@ -14,7 +14,7 @@ from .ledger import FAILED, FINISHED, RUNNING, Ledger
 from .worker import BLOCKED, NO_MEMORY, STOPPED, Setting
 
 POLL = 0.5
-"""Seconds between two reads of the board."""
+"""Seconds between two reads of the board, and longest wait for an outcome."""
 SECONDS_TO_STOP = 60
 """How long workers may take to write their checkpoints when the farm is stopped."""
 SAME_ERRORS = 3
@@ -53,6 +53,7 @@ class Driver:
         self.killed: dict[int, Beat] = {}
         self.errors: list[str] = []
         self.obstacle: Optional[str] = None
+        self.look_due = 0.0
 
     def run(self) -> None:
         """Make the assets.
@@ -74,12 +75,23 @@ class Driver:
             raise UserError(self.obstacle)
 
     def step(self) -> None:
-        """Wait up to :data:`POLL` seconds for outcomes, restart hung workers, draw the display."""
+        """Wait up to :data:`POLL` seconds for outcomes and hand out new assets; each :data:`POLL`
+        seconds restart hung workers and draw the display.
+        """
         ready, _ = self.ray.wait(list(self.running), timeout=POLL)
+        if ready:  # all that are there: each wait takes longer the more workers there are
+            handles = list(self.running)
+            ready, _ = self.ray.wait(handles, num_returns=len(handles), timeout=0)
         for handle in ready:
             self.collect(handle)
         if not self.obstacle:
             self.fill()
+        if time.monotonic() >= self.look_due:
+            self.look_after_workers()
+            self.look_due = time.monotonic() + POLL
+
+    def look_after_workers(self) -> None:
+        """Restart hung workers, and draw the display."""
         beats = self.read_board()
         self.restart_hung(beats)
         names = {worker: job.row.name for worker, job in self.running.values()}
