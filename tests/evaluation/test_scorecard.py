@@ -8,6 +8,8 @@ import torch
 
 from tests.evaluation.clip_similarity_cases import blob, save
 from tests.helpers import tiny_3d_models as tiny
+from tests.helpers import tiny_image_reward
+from threestudio_gaussiandreamer.evaluation import t3bench
 from threestudio_gaussiandreamer.evaluation.scorecard import main
 from threestudio_gaussiandreamer.toybox import export, models
 
@@ -60,12 +62,26 @@ def test_clip_of_two_folders_is_compared_by_prompt(tmp_path):
     assert 0 <= content["wrong_direction"]["against"]["mean"] <= 1
 
 
+def test_rewards_of_views(tmp_path, monkeypatch):
+    pytest.importorskip("transformers")
+    monkeypatch.setattr(t3bench, "SIZE", 16)
+    folder = str(tiny_image_reward.write(tmp_path / "ir"))
+    runs = finished(tmp_path / "runs", PROMPTS[:1])
+    arguments = ["--metrics", "imagereward,quality", "--imagereward", folder, "--size", "16"]
+    assert main([str(runs), *arguments, "--output", str(tmp_path / "out")]) == 0
+    content = json.loads((tmp_path / "out/scorecard.json").read_text())
+    reward, quality = (content[name]["mean"]["mean"] for name in ("imagereward", "quality"))
+    assert abs(quality - (20 * reward + 50)) < 40  # of the same cloud, on another scale
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["{}", "--metrics", "clop"], "clip"),
         (["{}", "--metrics", ","], "--metrics is empty"),
         (["{}", "--metrics", "clip"], "--clip FOLDER"),
+        (["{}", "--metrics", "quality"], "--imagereward FOLDER, after `hf download"),
+        (["{}", "--metrics", "imagereward", "--imagereward", "no"], "ImageReward.pt is missing"),
         (["{}", "--metrics", "judge", "--judge", "none.safetensors"], "none.safetensors"),
         (["{}", "--metrics", "judge", "--size", "0", "--judge", "{judge}"], "--size 0"),
         (["{}/no", "--metrics", "judge", "--judge", "{judge}"], "no folder"),

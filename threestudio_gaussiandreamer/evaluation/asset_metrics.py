@@ -7,6 +7,10 @@ clip           clip: 100 times the cosine of CLIP's features of picture and     
                prompt, by the paper's protocol; 3 seeds of 10 of 120 views
 directions     wrong_direction: share of views from front, side and back that   ``--clip`` FOLDER
                CLIP assigns to the prompt of another direction
+imagereward    imagereward: mean of ImageReward over ten of the paper's views   ``--imagereward``
+                                                                                FOLDER
+quality        quality: T3Bench's, from ImageReward on its 162 x 5 views of     ``--imagereward``
+               the cloud itself                                                 FOLDER
 judge          kind, colors, pattern, accessory: 1 where the toybox's judge     ``--judge`` FILE
                recognises what the prompt names
 janus          multi_face: share of views that the judge takes for views from   ``--judge`` FILE
@@ -31,13 +35,16 @@ from torch import Tensor
 
 from ..cameras import Orbit
 from ..gaussians.gaussians import Gaussians
+from ..host import get_device
 from ..models.clip import PictureText
 from ..prompts.view_prompts import view_directions
 from ..toybox import recognition
 from ..toybox.models import Judge
 from ..toybox.prompt_attributes import attributes_in
 from ..toybox.views import BACKGROUND, SIZE
+from . import t3bench
 from .clip_similarity import Protocol, open_clip, score
+from .image_reward import ImageReward
 from .results import Pictures, Result
 
 Color = tuple[float, float, float]
@@ -119,6 +126,36 @@ class Directions(Metric):
         return {"wrong_direction": float(np.mean(found != wanted))}
 
 
+class Reward(Metric):
+    """ImageReward of the views of the paper's CLIP similarity, of its first seed."""
+
+    columns = ("imagereward",)
+
+    def __init__(self, args: Namespace) -> None:
+        self.model, self.size = shared_image_reward(args.imagereward), args.size
+
+    def score(self, asset: Asset) -> dict[str, float]:
+        protocol = Protocol()
+        orbit = protocol.orbit.rows(torch.from_numpy(protocol.draw(0, asset.item)))
+        found = self.model.rewards(rendered(asset, orbit, self.size), asset.prompt)
+        return {"imagereward": float(found.mean())}
+
+
+class Quality(Metric):
+    """T3Bench's quality, of the Gaussians in place of a mesh."""
+
+    columns = ("quality",)
+
+    def __init__(self, args: Namespace) -> None:
+        self.model = shared_image_reward(args.imagereward)
+
+    def score(self, asset: Asset) -> dict[str, float]:
+        chunks = t3bench.quality_pictures(t3bench.normalized(asset.gaussians), t3bench.SIZE)
+        found = [self.model.rewards(pictures, asset.prompt) for pictures in chunks]
+        rewards = np.concatenate(found).reshape(-1, len(t3bench.QUALITY_FOVY))
+        return {"quality": t3bench.quality(rewards)}
+
+
 class Recognized(Metric):
     """Which attributes of the prompt the toybox's judge recognises."""
 
@@ -153,9 +190,17 @@ class Janus(Metric):
 METRICS: dict[str, type[Metric]] = {
     "clip": Clip,
     "directions": Directions,
+    "imagereward": Reward,
+    "quality": Quality,
     "judge": Recognized,
     "janus": Janus,
 }
+
+
+@lru_cache(maxsize=1)
+def shared_image_reward(folder: str) -> ImageReward:
+    """Load an ImageReward once for all metrics that use it."""
+    return ImageReward(folder, get_device())
 
 
 @lru_cache(maxsize=1)

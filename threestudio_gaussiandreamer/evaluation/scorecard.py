@@ -30,6 +30,7 @@ from ..core.options import shown
 from ..toybox.recognition import BUNDLED
 from ..training.camera_options import MAX_SIDE
 from .asset_metrics import METRICS, Asset, Metric
+from .image_reward import SOURCES
 from .intervals import Estimate, bootstrap, paired, per_prompt
 from .results import Result, find_result, read_result
 
@@ -47,6 +48,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     add("--metrics", default="clip", help=f"comma-separated, of {', '.join(METRICS)}")
     add("--against", metavar="FOLDER", help="also score these runs, and print paired differences")
     add("--clip", help="folder of a CLIP in transformers' format, for clip and directions")
+    add("--imagereward", help="folder with ImageReward.pt and vocab.txt, for imagereward, quality")
     add("--judge", default=str(BUNDLED), help="file of a judge, for judge and janus")
     add("--size", type=int, default=1024, help="width and height of the pictures for CLIP, pixels")
     add("--output", default="evaluation", help="folder for scorecard.csv and scorecard.json")
@@ -80,12 +82,21 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
         raise UserError(f"--metrics is empty: expected some of {', '.join(METRICS)}")
     if not 1 <= args.size <= MAX_SIDE:
         raise UserError(f"--size {shown(args.size)}: expected 1 to {MAX_SIDE} pixels")
-    if not args.clip and (needing := [name for name in names if name in ("clip", "directions")]):
+    for name in names:
+        require_models(name, args)
+    return [METRICS[name](args) for name in names]
+
+
+def require_models(name: str, args: argparse.Namespace) -> None:
+    """Raise UserError unless the folder of models that a metric needs is given."""
+    if name in ("clip", "directions") and not args.clip:
         raise UserError(
-            f"--metrics {needing[0]} needs --clip FOLDER, for instance after `hf download "
+            f"--metrics {name} needs --clip FOLDER, for instance after `hf download "
             "openai/clip-vit-large-patch14 --local-dir clip`"
         )
-    return [METRICS[name](args) for name in names]
+    if name in ("imagereward", "quality") and not args.imagereward:
+        commands = " and ".join(f"`{line} --local-dir ir`" for line in SOURCES.values())
+        raise UserError(f"--metrics {name} needs --imagereward FOLDER, after {commands}")
 
 
 def find_results(folders: Sequence[str]) -> list[Result]:

@@ -20,7 +20,7 @@ of a mesh, or the centres of Gaussians with an opacity of at least ``MIN_OPACITY
 import math
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,7 @@ QUALITY_FOVY = tuple(math.pi / part for part in (3.0, 4.0, 5.0, 6.0, 7.5))
 CAPTION_FOVY = math.pi / 3
 MIN_OPACITY = 0.1
 NEAR_POLE = 0.99
+SIZE, SMOOTHINGS = 512, 3
 LONGEST_NAME = 240
 """Bytes of a folder's name; file systems allow 255, of which the group's name needs some."""
 STAND_IN = '''"""Copy pictures rendered beforehand, black ones where there are none."""
@@ -72,7 +73,7 @@ def write_t3bench(
     *,
     method: str,
     group: str,
-    size: int = 512,
+    size: int = SIZE,
 ) -> None:
     """Write meshes, pictures and scripts into ``folder``, a checkout of T3Bench, without changing
     its own files.
@@ -133,49 +134,57 @@ def _write_stand_ins(folder: Path, size: int) -> None:
 
 
 def _write_result(save: Path, arrays: Gaussians, size: int) -> None:
-    pictures = Pictures(arrays)
-    quality = icosphere(2, RADIUS)
-    _write_views(
-        save / "t3bench" / "quality",
-        pictures,
-        quality_names(),
-        np.repeat(quality, len(QUALITY_FOVY), 0),
-        QUALITY_FOVY,
-        size,
-    )
-    _write_views(
-        save / "t3bench" / "caption",
-        pictures,
-        caption_names(),
-        icosphere(0, RADIUS) * RADIUS,
-        (CAPTION_FOVY,),
-        size,
-    )
+    _write_views(save / "t3bench" / "quality", quality_names(), quality_pictures(arrays, size))
+    _write_views(save / "t3bench" / "caption", caption_names(), caption_pictures(arrays, size))
     export = save / "it0-export"
     export.mkdir(parents=True, exist_ok=True)
     write_obj(export / "model.obj", gaussian_surface(arrays))
 
 
 def _write_views(
-    folder: Path,
-    pictures: Pictures,
-    names: list[str],
-    positions: Float[np.ndarray, "V 3"],
-    fovy: Sequence[float],
-    size: int,
+    folder: Path, names: list[str], chunks: Iterable[Float[np.ndarray, "B s s 3"]]
 ) -> None:
-    """Write the pictures ``names`` of views from ``positions`` towards the origin.
-
-    Args:
-        fovy: fields of view in radians, repeated cyclically over the positions.
-    """
+    """Write pictures under their names."""
     folder.mkdir(parents=True, exist_ok=True)
-    angles, remaining = torch.tensor(fovy).repeat(len(positions) // len(fovy)), iter(names)
-    for images in pictures.render(towards_origin(positions), angles, size, chunk=8):
+    remaining = iter(names)
+    for images in chunks:
         for image in images:
             files_of_pictures.write(
                 folder / next(remaining), (image * 255).round().astype(np.uint8)
             )
+
+
+def quality_pictures(
+    arrays: Gaussians, size: int = SIZE
+) -> Iterator[Float[np.ndarray, "B size size 3"]]:
+    """Render the 162 x 5 views for quality of a normalised cloud, in the order of
+    :func:`quality_names`.
+    """
+    positions = np.repeat(icosphere(2, RADIUS), len(QUALITY_FOVY), 0)
+    angles = torch.tensor(QUALITY_FOVY).repeat(len(positions) // len(QUALITY_FOVY))
+    return Pictures(arrays).render(towards_origin(positions), angles, size, chunk=8)
+
+
+def caption_pictures(
+    arrays: Gaussians, size: int = SIZE
+) -> Iterator[Float[np.ndarray, "B size size 3"]]:
+    """Render the 12 views for captions of a normalised cloud."""
+    positions = icosphere(0, RADIUS) * RADIUS
+    angles = torch.full((len(positions),), CAPTION_FOVY)
+    return Pictures(arrays).render(towards_origin(positions), angles, size, chunk=8)
+
+
+def quality(rewards: Float[np.ndarray, "162 5"]) -> float:
+    """Compute T3Bench's quality from the rewards of its views: the best camera of each vertex,
+    averaged three times with the vertex's neighbours, then the best vertex, as 20 x + 50.
+    """
+    import trimesh
+
+    near = trimesh.creation.icosphere(subdivisions=2).vertex_neighbors
+    scores = rewards.max(axis=1)
+    for _ in range(SMOOTHINGS):
+        scores = np.array([scores[[i, *near[i]]].mean() for i in range(len(scores))])
+    return float(20 * scores.max() + 50)
 
 
 def quality_names() -> list[str]:

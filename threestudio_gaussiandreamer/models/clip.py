@@ -111,7 +111,7 @@ class PictureText:
         )
         size = self._model.config.vision_config.image_size
         chunks = [
-            _preprocessed(pictures[start : start + batch], size).to(self._device)
+            preprocessed(pictures[start : start + batch], size).to(self._device)
             for start in range(0, len(pictures), batch)
         ]
         return (
@@ -151,7 +151,10 @@ def _unit(features: Tensor) -> Tensor:
     return features / features.norm(dim=-1, keepdim=True)
 
 
-def _preprocessed(pictures: Float[np.ndarray, "N H W 3"], size: int) -> Float[Tensor, "N 3 S S"]:
+def preprocessed(pictures: Float[np.ndarray, "N H W 3"], size: int) -> Float[Tensor, "N 3 S S"]:
+    """Resize pictures (values in [0, 1]) bicubically, and normalise them as CLIP's training
+    pictures.
+    """
     pixels = torch.from_numpy(np.ascontiguousarray(pictures, np.float32)).permute(0, 3, 1, 2)
     if pixels.shape[-2:] != (size, size):
         pixels = torch.nn.functional.interpolate(

@@ -1,0 +1,219 @@
+"""ImageReward (Xu et al. 2023): how well people like a picture for a prompt, by the published file
+``ImageReward.pt``, run by transformers' BLIP.
+
+The file holds a BLIP (a ViT, and a BERT that attends to it) under Salesforce's names, and five
+linear layers that map the first token's features to the reward. Sizes are taken from the tensors.
+A reward is standardised over the pictures that ImageReward was trained on: mean 0, deviation 1.
+"""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ..core.errors import UserError
+from ..models.clip import preprocessed
+from ..models.extras import require_extra
+from ..priors.weights import load_exactly, read_state_dict
+
+WEIGHTS, VOCABULARY = "ImageReward.pt", "vocab.txt"
+SOURCES = {
+    WEIGHTS: "hf download zai-org/ImageReward ImageReward.pt",
+    VOCABULARY: "hf download google-bert/bert-base-uncased vocab.txt",
+}
+"""Commands that download the files, without the option for the folder."""
+MEAN, DEVIATION = 0.16717362830052426, 1.0333394966054072
+"""Of the head's output; published in ImageReward's code, not in its file."""
+TOKENS, HEAD_WIDTH = 35, 64
+"""Length of a prompt, padded and cut; features of one attention head."""
+VISION_NAMES = (
+    (r"^cls_token$", "embeddings.class_embedding"),
+    (r"^pos_embed$", "embeddings.position_embedding"),
+    (r"^patch_embed\.proj\.", "embeddings.patch_embedding."),
+    (r"^norm\.", "post_layernorm."),
+    (r"^blocks\.(\d+)\.norm(\d)\.", r"encoder.layers.\1.layer_norm\2."),
+    (r"^blocks\.(\d+)\.attn\.proj\.", r"encoder.layers.\1.self_attn.projection."),
+    (r"^blocks\.(\d+)\.attn\.", r"encoder.layers.\1.self_attn."),
+    (r"^blocks\.", "encoder.layers."),
+)
+"""Salesforce's names in the ViT, and those of transformers; the first that matches holds."""
+PARTS = {"blip.visual_encoder.": "vision.", "blip.text_encoder.": "text.", "mlp.layers.": "head."}
+NOT_LOADED = "text.embeddings.position_ids"
+
+
+class RewardNetwork(nn.Module):
+    """ViT, BERT with cross-attention, and head.
+
+    Args:
+        vision, text: configurations of transformers' BLIP.
+    """
+
+    def __init__(self, vision: Any, text: Any) -> None:
+        super().__init__()
+        from transformers import BlipTextModel, BlipVisionModel
+
+        self.vision = BlipVisionModel(vision)
+        self.text = BlipTextModel(text, add_pooling_layer=False)
+        # dropout keeps the numbers of the layers in the file
+        self.head = nn.Sequential(
+            nn.Linear(text.hidden_size, 1024),
+            nn.Dropout(0.2),
+            nn.Linear(1024, 128),
+            nn.Dropout(0.2),
+            nn.Linear(128, 64),
+            nn.Dropout(0.1),
+            nn.Linear(64, 16),
+            nn.Linear(16, 1),
+        )
+
+    def forward(
+        self, pixels: Float[Tensor, "B 3 S S"], ids: Tensor, mask: Tensor
+    ) -> Float[Tensor, " B"]:
+        """Return the rewards of pictures for one prompt.
+
+        Args:
+            pixels: normalised as for CLIP.
+            ids, mask: (1, L) tokens, and which of them aren't padding.
+        """
+        features = self.vision(pixels).last_hidden_state
+        count = len(features)
+        found = self.text(
+            input_ids=ids.expand(count, -1),
+            attention_mask=mask.expand(count, -1),
+            encoder_hidden_states=features,
+            encoder_attention_mask=torch.ones(features.shape[:2], dtype=torch.long).to(mask),
+        ).last_hidden_state
+        return (self.head(found[:, 0])[:, 0] - MEAN) / DEVIATION
+
+
+class ImageReward:
+    """ImageReward from a folder with ``ImageReward.pt`` and BERT's ``vocab.txt``.
+
+    Raises:
+        UserError: transformers isn't installed, or a file is missing, damaged or another one.
+    """
+
+    def __init__(self, folder: str, device: torch.device) -> None:
+        require_extra("diffusion", "transformers")
+        place = Path(folder).expanduser()
+        for name, command in SOURCES.items():
+            if not (place / name).is_file():
+                raise UserError(
+                    f"--imagereward {folder}: {name} is missing: `{command} --local-dir {folder}`"
+                )
+        self.network = load_network(place / WEIGHTS).to(device)
+        self.tokenizer, self.device = open_tokenizer(place / VOCABULARY), device
+        self.size = self.network.vision.config.image_size
+
+    @torch.no_grad()
+    def rewards(
+        self, pictures: Float[np.ndarray, "N H W 3"], prompt: str, *, batch: int = 32
+    ) -> Float[np.ndarray, " N"]:
+        """Return the reward of each picture (values in [0, 1]) for a prompt."""
+        tokens = self.tokenizer.encode(prompt)
+        ids, mask = (
+            torch.tensor([values], device=self.device)
+            for values in (tokens.ids, tokens.attention_mask)
+        )
+        found = [
+            self.network(
+                preprocessed(pictures[start : start + batch], self.size).to(self.device), ids, mask
+            )
+            for start in range(0, len(pictures), batch)
+        ]
+        return torch.cat(found).cpu().numpy()
+
+
+def open_tokenizer(vocabulary: Path) -> Any:
+    """Open BERT's tokenizer for lower-case text, which pads and cuts to ``TOKENS``.
+
+    Raises:
+        UserError: the file is no vocabulary of BERT.
+    """
+    from tokenizers import BertWordPieceTokenizer
+
+    try:
+        words = set(vocabulary.read_text(encoding="utf-8").splitlines())
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"the vocabulary {str(vocabulary)!r} can't be read: {error}") from error
+    if missing := {"[PAD]", "[UNK]", "[CLS]", "[SEP]"} - words:
+        raise UserError(f"{str(vocabulary)!r} is no vocabulary of BERT: no {min(missing)} in it")
+    tokenizer = BertWordPieceTokenizer(str(vocabulary), lowercase=True)
+    tokenizer.enable_truncation(TOKENS)
+    tokenizer.enable_padding(length=TOKENS, pad_id=tokenizer.token_to_id("[PAD]"))
+    return tokenizer
+
+
+def load_network(path: Path) -> RewardNetwork:
+    """Load the published file in float32 and evaluation mode.
+
+    Raises:
+        UserError: it is damaged, or isn't a file of ImageReward.
+    """
+    kind = "ImageReward file"
+    state = {}
+    for name, value in read_state_dict(str(path), kind).items():
+        for old, new in PARTS.items():
+            if name.startswith(old):
+                state[new + renamed(name.removeprefix(old), new)] = value
+    state.pop(NOT_LOADED, None)
+    try:
+        network = RewardNetwork(*configurations(state))
+    except (KeyError, IndexError, ValueError, RuntimeError, ZeroDivisionError) as error:
+        raise UserError(
+            f"{kind} {str(path)!r}: it has no tensors, or misshapen ones, of a BLIP with a reward "
+            f"head ({error})"
+        ) from error
+    load_exactly(network, state, f"{kind} {str(path)!r}")
+    return network.float().eval()
+
+
+def renamed(name: str, part: str) -> str:
+    """Return transformers' name of a tensor; BERT's are the same in the file."""
+    if part == "vision.":
+        for pattern, replacement in VISION_NAMES:
+            if re.search(pattern, name):
+                return re.sub(pattern, replacement, name)
+    return name
+
+
+def configurations(state: Mapping[str, Tensor]) -> tuple[Any, Any]:
+    """Return the configurations of ViT and BERT that the shapes of the tensors imply."""
+    from transformers import BlipTextConfig, BlipVisionConfig
+
+    patch = state["vision.embeddings.patch_embedding.weight"]
+    places = state["vision.embeddings.position_embedding"].shape[1] - 1
+    words = state["text.embeddings.word_embeddings.weight"]
+    vision = BlipVisionConfig(
+        hidden_size=len(patch),
+        intermediate_size=len(state["vision.encoder.layers.0.mlp.fc1.weight"]),
+        num_hidden_layers=layers(state, "vision.encoder.layers."),
+        num_attention_heads=len(patch) // HEAD_WIDTH,
+        image_size=round(places**0.5) * patch.shape[-1],
+        patch_size=patch.shape[-1],
+        hidden_act="gelu",
+        layer_norm_eps=1e-6,
+    )
+    text = BlipTextConfig(
+        vocab_size=len(words),
+        hidden_size=words.shape[1],
+        encoder_hidden_size=len(patch),
+        intermediate_size=len(state["text.encoder.layer.0.intermediate.dense.weight"]),
+        num_hidden_layers=layers(state, "text.encoder.layer."),
+        num_attention_heads=words.shape[1] // HEAD_WIDTH,
+        max_position_embeddings=len(state["text.embeddings.position_embeddings.weight"]),
+        hidden_act="gelu",
+        layer_norm_eps=1e-12,
+        is_decoder=True,  # with cross-attention
+    )
+    return vision, text
+
+
+def layers(state: Mapping[str, Tensor], prefix: str) -> int:
+    """Return the number of layers whose names begin with ``prefix`` and a number."""
+    return len({name[len(prefix) :].split(".")[0] for name in state if name.startswith(prefix)})
