@@ -117,6 +117,25 @@ def test_what_cuda_reports(monkeypatch, environment, gpu, visible):
     assert os.environ["CUDA_VISIBLE_DEVICES"] == visible
 
 
+@pytest.mark.parametrize(
+    ("variables", "overrides", "visible"),
+    [
+        ({"LOCAL_WORLD_SIZE": "2"}, [], "0,1"),
+        ({"SLURM_NTASKS_PER_NODE": "4(x2)"}, [], "0"),
+        ({"SLURM_NTASKS_PER_NODE": "2"}, [], "0,1"),
+        ({}, ["trainer.devices=3", "seed=1"], "0,1,2"),
+        ({}, ["trainer.devices=x"], "0"),
+    ],
+)
+def test_as_many_gpus_as_processes_are_visible(monkeypatch, variables, overrides, visible):
+    for name in ("CUDA_VISIBLE_DEVICES", "LOCAL_WORLD_SIZE", "SLURM_NTASKS_PER_NODE"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    choose_gpu(None, overrides)
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == visible
+
+
 @pytest.mark.parametrize("gpu", ["", "gpu", "0,", "-1", "0 1"])
 def test_an_invalid_gpu_is_named(gpu):
     with pytest.raises(UserError, match="expected cpu, or numbers of GPUs"):

@@ -1,14 +1,19 @@
-"""Data-parallel training: each process renders its own views; gradients and statistics are reduced
-over all processes.
+"""Data-parallel training: the views of a step are shared equally by the processes; gradients and
+statistics are reduced over all of them.
 
-In a single-process run these functions return their input unchanged.
+Random numbers belong to a view, not to the process that renders it, so a step with several
+processes is the same as with one but for the order of floating-point sums. In a single-process run
+these functions return their input unchanged.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
+
+from .errors import UserError
 
 
 def is_active() -> bool:
@@ -18,6 +23,60 @@ def is_active() -> bool:
 def rank() -> int:
     """Return the rank of this process; 0 in a single-process run."""
     return dist.get_rank() if is_active() else 0
+
+
+def world_size() -> int:
+    """Return the number of processes; 1 in a single-process run."""
+    return dist.get_world_size() if is_active() else 1
+
+
+def first_item(count: int) -> int:
+    """Return the index, among the views of all processes, of the first of this one's ``count``."""
+    return rank() * count
+
+
+def own_rows(total: int) -> slice:
+    """Return which of a step's ``total`` views this process renders."""
+    count = total // world_size()
+    return slice(first_item(count), first_item(count) + count)
+
+
+def draw_shared(count: int, draw: Callable[[int], Tensor]) -> Tensor:
+    """Draw numbers for the views of all processes, and return the rows of this one's.
+
+    Args:
+        count: views of this process.
+        draw: returns a tensor with as many rows as asked for, the same in all processes.
+    """
+    total = count * world_size()
+    return draw(total)[own_rows(total)]
+
+
+def require_shareable(views: int, option: str) -> None:
+    """Check that the processes can share the views of a step equally.
+
+    Args:
+        option: names the option in the message.
+
+    Raises:
+        UserError: there are fewer views than processes, or their number is no multiple.
+    """
+    size = world_size()
+    if views % size:
+        too_few = "fewer than" if views < size else "no multiple of"
+        raise UserError(
+            f"{option} is {views}, {too_few} the {size} processes that share the views of a step: "
+            f"set {option} to {size} or a multiple, or use as many processes as divide {views}"
+        )
+
+
+def from_first(make: Callable[[], Any]) -> Any:
+    """Call ``make`` in the first process, and return its result in all of them."""
+    if not is_active():
+        return make()
+    shared = [make() if rank() == 0 else None]
+    dist.broadcast_object_list(shared)
+    return shared[0]
 
 
 def all_sum(tensor: Tensor) -> Tensor:

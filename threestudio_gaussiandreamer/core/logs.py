@@ -24,8 +24,10 @@ def _log(level: int, *args: object, **kwargs: object) -> None:
 
 
 def get_rank() -> int:
-    """Return the rank of this process from its environment variables; 0 if none is set."""
-    ranks = (
-        os.environ.get(key) for key in ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
-    )
-    return int(next((rank for rank in ranks if rank is not None), 0))
+    """Return a number from the environment variables of the process's launcher that is 0 in the
+    first process only: its rank where that is known, before torch.distributed is initialised.
+    """
+    for key in ("RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK"):
+        if key in os.environ:
+            return int(os.environ[key])
+    return int(os.environ.get("NODE_RANK", 0)) + int(os.environ.get("LOCAL_RANK", 0))

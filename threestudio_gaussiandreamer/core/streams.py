@@ -30,13 +30,19 @@ def numpy_generator(seed: int, stream: str, step: int = 0, item: int = 0) -> np.
 
 
 def normal_per_item(
-    shape: tuple[int, ...], seed: int, stream: str, step: int, device: torch.device | str = "cpu"
+    shape: tuple[int, ...],
+    seed: int,
+    stream: str,
+    step: int,
+    device: torch.device | str = "cpu",
+    first: int = 0,
 ) -> Tensor:
     """Draw standard normal numbers (float32) of ``shape`` (B, ...).
 
-    Each of the B items has its own stream, so its numbers don't depend on B.
+    Each of the B items, which are numbered from ``first``, has its own stream, so its numbers don't
+    depend on B.
     """
     items = torch.empty(shape)
-    for b, item in enumerate(items):
+    for b, item in enumerate(items, first):
         item.normal_(generator=generator(seed, stream, step, b))
     return items.to(device)

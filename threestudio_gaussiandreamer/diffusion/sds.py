@@ -68,10 +68,12 @@ def timesteps(
     step: int,
     num_train: int = 1000,
     stream: str = "timestep",
+    first: int = 0,
 ) -> Int[Tensor, " B"]:
     """Draw one timestep per item, uniform on [min_step, max_step] clamped to [1, num_train - 1].
 
-    Each item has its own random stream, so its timestep doesn't depend on ``batch``.
+    Each item, numbered from ``first``, has its own random stream, so its timestep doesn't depend on
+    ``batch``.
 
     Raises:
         UserError: ``min_step`` is above ``max_step``.
@@ -81,7 +83,7 @@ def timesteps(
     low, high = (min(max(value, 1), num_train - 1) for value in (min_step, max_step))
     draws = [
         torch.randint(low, high + 1, (), generator=streams.generator(seed, stream, step, item))
-        for item in range(batch)
+        for item in range(first, first + batch)
     ]
     return torch.stack(draws) if draws else torch.empty(0, dtype=torch.long)
 

@@ -78,6 +78,9 @@ class Worker:
         os.chdir(setting.start)
         import torch
 
+        from ..launch.ddp import train_alone
+
+        train_alone()
         torch.set_num_threads(setting.recipe.cores)
         keep_loaded()
         register_parts()

@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..core.distributed import all_sum, draw_shared
 from .densify import Change, prune_to
 
 SCORES = ("removal", "contribution", "opacity", "random")
@@ -66,14 +67,21 @@ def removal_error(
     A pixel I_p is linear in the opacity o of each Gaussian, so d_p = o dI_p/do is exactly the
     change if that Gaussian alone is removed (except in pixels where its alpha is capped, which have
     no gradient). For random signs z_p, the expectation of (sum_p z_p d_p)^2 is sum_p d_p^2
-    (Hutchinson 1989), so one backward pass serves all Gaussians.
+    (Hutchinson 1989), so one backward pass serves all Gaussians. Several processes sum over
+    the views of all of them.
 
     Args:
         images: rendered views, whose graph is kept.
         opacities: the tensor that they were rendered with.
     """
-    signs = torch.randint(0, 2, images.shape, generator=rng).to(images) * 2 - 1
-    (gradients,) = torch.autograd.grad(images, opacities, signs, retain_graph=True)
+    signs = draw_shared(
+        len(images),
+        lambda count: torch.randint(0, 2, (count, *images.shape[1:]), generator=rng),
+    )
+    (gradients,) = torch.autograd.grad(
+        images, opacities, signs.to(images) * 2 - 1, retain_graph=True
+    )
+    gradients = all_sum(gradients)
     return (opacities.detach() * gradients).square().nan_to_num(nan=0.0)
 
 

@@ -36,10 +36,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..core import streams
+from ..core.distributed import first_item
 from ..core.errors import UserError
 from ..core.options import at_least, check_options, in_range, one_of, schedule
 from ..diffusion import sds
-from ..host import BaseObject, C, item_seed, warn
+from ..host import BaseObject, C, run_seed, warn
 
 GUIDANCE_SCALE = in_range(-1e6, 1e6)
 
@@ -210,9 +211,10 @@ class ScoreDistillation(BaseObject, ABC):
             len(latents),
             self.min_step,
             self.max_step,
-            seed=item_seed(),
+            seed=run_seed(),
             step=self.step,
             num_train=len(self.alphas_cumprod),
+            first=first_item(len(latents)),
         )
         abar = self.alphas_cumprod.double().cpu()[t]
         return t.to(latents.device), abar.to(latents.device)
@@ -221,10 +223,13 @@ class ScoreDistillation(BaseObject, ABC):
     def add_noise(self, latents: Float[Tensor, "B c h w"]) -> Noised:
         """Draw this step's timesteps and noise, and add the noise to ``latents``."""
         t, abar = self.draw_timesteps(latents)
-        noise = streams.normal_per_item(
-            tuple(latents.shape), item_seed(), "noise", self.step, latents.device
-        )
+        noise = self.normal(latents, "noise")
         return Noised(t, abar, noise, sds.add_noise(latents, noise, abar))
+
+    def normal(self, like: Float[Tensor, "B *d"], stream: str) -> Float[Tensor, "B *d"]:
+        """Draw this step's standard normal numbers, of the shape and on the device of ``like``."""
+        place = (run_seed(), stream, self.step, like.device, first_item(len(like)))
+        return streams.normal_per_item(tuple(like.shape), *place)
 
     def predict_noise(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Any

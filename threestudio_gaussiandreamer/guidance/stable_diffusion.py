@@ -23,8 +23,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from ..core.errors import UserError
-from ..core.streams import normal_per_item
-from ..host import item_seed, register, register_builtin, warn
+from ..host import register, register_builtin, warn
 from ..prompts.prompt_processors import STABLE_DIFFUSION
 from .base import NonFiniteScore
 from .half_precision import PerItemLossScale
@@ -84,8 +83,8 @@ class StableDiffusionGuidance(TextToImageDistillation):
             mean, std = (torch.cat(part) for part in zip(*parts, strict=True))
         else:
             mean, std = self._moments(images)
-        noise = normal_per_item(tuple(mean.shape), item_seed(), "vae", self.step, mean.device)
-        return (mean.float() + std.float() * noise) * self.vae.config.scaling_factor
+        sample = mean.float() + std.float() * self.normal(mean, "vae")
+        return sample * self.vae.config.scaling_factor
 
     def _moments(self, images: Float[Tensor, "B 3 s s"]) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation of the VAE's posterior, (B, 4, h, w) each."""

@@ -118,8 +118,8 @@ else:
 
 
 def item_seed() -> int:
-    """Return the seed for cameras, noise and backgrounds, which differs between the processes that
-    train one cloud together.
+    """Return the seed for what draws from torch's global generators, which differs between the
+    processes that train one cloud together.
     """
     return run_seed() if rank() == 0 else derive_seed(run_seed(), "rank", rank())
 

@@ -190,7 +190,9 @@ class LastCheckpoint(pl.callbacks.Checkpoint):
         """Write the checkpoint, and schedule the next one so that saving takes at most
         :data:`SHARE_OF_TIME` of the running time.
         """
-        if self.checkpoint_io.saved_step(self.last) != trainer.global_step:
+        is_new = self.checkpoint_io.saved_step(self.last) != trainer.global_step
+        # only the first process writes and knows the step, but all take part in saving
+        if _any_process(trainer, trainer.is_global_zero and is_new):
             trainer.save_checkpoint(self.last)
         # not the time of save_checkpoint(), in which the system scores the prior once
         pause = max(SECONDS_BETWEEN, self.checkpoint_io.seconds / SHARE_OF_TIME)

@@ -20,6 +20,7 @@ from ..host import find, info, names
 from ..host.typed_config import parse_structured
 from ..prompts.prompts import read_prompt
 from .config_source import is_text, map_strings, parse_overrides, protect, read_yaml, unprotect
+from .ddp import planned_processes
 from .run_folder import name_folders
 
 
@@ -55,28 +56,41 @@ class ExperimentConfig:
     """See ``live_viewer.py``."""
 
 
-def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus: int = 1) -> Any:
+def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus: int = 0) -> Any:
     """Merge YAML files, of which later ones take precedence, and ``key=value`` overrides into the
     configuration of a run. No folder is created.
+
+    Args:
+        n_gpus: visible GPUs; 0 for the CPU.
 
     Returns:
         an :class:`ExperimentConfig` as a DictConfig without interpolations.
 
     Raises:
         UserError: a file can't be read, an override isn't ``key=value``, a top-level key is
-            unknown, a ``???`` or an interpolation is left open, a value has the wrong type.
+            unknown, a ``???`` or an interpolation is left open, a value has the wrong type; see
+            also :func:`planned_processes`.
     """
     sources = [
         _with_prompt_from_file(source)
         for source in [*map(read_yaml, paths), parse_overrides(cli_args)]
     ]
     merged = _merge(sources)
-    merged.n_gpus = n_gpus
+    trainer = {name: _trainer_option(merged, name) for name in ("devices", "num_nodes")}
+    merged.n_gpus = planned_processes(n_gpus, trainer).total
     _require_mandatory(merged)
     _resolve(merged)
     cfg = parse_structured(ExperimentConfig, merged)
     name_folders(cfg)
     return cfg
+
+
+def _trainer_option(merged: DictConfig, name: str) -> Any:
+    """Return an option before all are resolved; None if it can't be, which is reported later."""
+    try:
+        return OmegaConf.select(merged, f"trainer.{name}")
+    except OmegaConfBaseException:
+        return None
 
 
 def dump_config(path: str | os.PathLike, cfg: Any) -> None:

@@ -40,7 +40,6 @@ MisconfigurationException = pl.utilities.exceptions.MisconfigurationException
 
 LAUNCHER_SETS = {
     "accelerator": "--gpu",
-    "devices": "--gpu",
     "callbacks": "the launcher",
     "logger": "the launcher and system.loggers",
     "plugins": "the launcher",

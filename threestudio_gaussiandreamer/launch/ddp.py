@@ -1,21 +1,138 @@
-"""Lightning's strategy for several GPUs: every process has a copy of the cloud, and gradients are
-averaged without DistributedDataParallel.
+"""Several processes that train one cloud: how many there are, and Lightning's strategy for them.
 
-DistributedDataParallel ties its buckets to the parameters of its first iteration, which
-densification replaces. The cloud is small, so the system averages the gradients itself
-(``distributed.average_gradients``). The statistics for densification are combined over all
-processes, so that they make the same changes."""
+Every process has a copy of the cloud, renders its share of a step's views, and gradients are
+averaged without DistributedDataParallel, which ties its buckets to the parameters of its first
+iteration, which densification replaces. The cloud is small, so the system averages the gradients
+itself (``distributed.average_gradients``). The statistics for densification are combined over all
+processes, so that they make the same changes.
+
+The processes are started by ``torchrun``, by SLURM's ``srun`` with one task each, or by Lightning,
+for ``--gpu 0,1`` or ``trainer.devices=2`` (without a GPU: processes on the CPU)."""
+
+import importlib
+import os
+from collections.abc import Mapping
+from datetime import timedelta
+from typing import Any, NamedTuple, Optional
 
 import torch
 
+from ..core.errors import UserError
 from ..host import pl
+
+LONGEST_WAIT = timedelta(hours=12)
+"""A process waits so long for the others, for instance while the first one renders results."""
+SLURM, TORCHRUN = "SLURM", "torchrun"
+
+
+class Processes(NamedTuple):
+    """The processes that train one cloud."""
+
+    devices: int
+    """On each machine."""
+    nodes: int
+    started_by: Optional[str] = None
+    """The program that has started them; None if Lightning does."""
+
+    @property
+    def total(self) -> int:
+        return self.devices * self.nodes
 
 
 class ReplicatedStrategy(pl.strategies.DDPStrategy):
     """Launch and connect processes as DDP does, without wrapping the module."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**{"timeout": LONGEST_WAIT, **options})
 
     def _setup_model(self, model: torch.nn.Module) -> torch.nn.Module:
         return model
 
     def configure_ddp(self) -> None:
         """Leave the module unwrapped, and register no communication hooks."""
+
+
+def planned_processes(n_gpus: int, trainer: Mapping[str, Any]) -> Processes:
+    """Return the processes that torchrun or SLURM has started, else those that ``trainer.devices``
+    (by default one for each visible GPU) and ``trainer.num_nodes`` ask for.
+
+    Args:
+        n_gpus: visible GPUs; 0 for the CPU.
+        trainer: the section of the configuration.
+
+    Raises:
+        UserError: the options contradict the launcher, or there are too few GPUs.
+    """
+    devices, nodes = trainer.get("devices"), trainer.get("num_nodes")
+    _require_count("trainer.devices", devices)
+    _require_count("trainer.num_nodes", nodes)
+    found = _started_processes() or Processes(devices or max(n_gpus, 1), nodes or 1)
+    for name, asked, there in (
+        ("devices", devices, found.devices),
+        ("num_nodes", nodes, found.nodes),
+    ):
+        if asked not in (None, there):
+            raise UserError(
+                f"trainer.{name} is {asked}, but {found.started_by} has started {found.nodes} x "
+                f"{found.devices} processes (machines x processes): leave the option out"
+            )
+    if n_gpus and found.devices > n_gpus:
+        raise UserError(
+            f"{found.devices} processes on a machine need as many GPUs, and {n_gpus} can be seen: "
+            "list them (--gpu 0,1), and let SLURM show all of a machine's GPUs to each task "
+            "(--gpus-per-node), or run with --gpu cpu"
+        )
+    return found
+
+
+def train_alone() -> None:
+    """Let later runs of this process be single ones, whatever program has started it."""
+    for key in ("TORCHELASTIC_RUN_ID", "SLURM_NTASKS"):
+        os.environ.pop(key, None)
+
+
+def _require_count(option: str, value: Any) -> None:
+    whole = isinstance(value, int) and not isinstance(value, bool) and value > 0
+    if value is not None and not whole:
+        raise UserError(f"{option}: expected a whole number from 1 on, got {value!r}")
+
+
+def _started_processes() -> Optional[Processes]:
+    """Return what torchrun or SLURM says about its processes; None for a single one."""
+    if "TORCHELASTIC_RUN_ID" in os.environ:
+        local = int(os.environ["LOCAL_WORLD_SIZE"])
+        return Processes(local, int(os.environ["WORLD_SIZE"]) // local, TORCHRUN)
+    if not _environments().SLURMEnvironment.detect():
+        return None
+    tasks, nodes = (int(os.environ.get(f"SLURM_{key}", 1)) for key in ("NTASKS", "NNODES"))
+    return Processes(tasks // nodes, nodes, SLURM) if tasks > 1 else None
+
+
+def _environments() -> Any:
+    """Return Lightning's classes of cluster environments."""
+    return importlib.import_module(f"{pl.__name__}.plugins.environments")
+
+
+def environment_plugins(processes: Processes) -> list[Any]:
+    """Return the plugin that lets Lightning start the processes inside of a SLURM job with a single
+    task, where it would wait for SLURM to start them.
+    """
+    in_job = _environments().SLURMEnvironment.detect()
+    alone = processes.started_by is None and processes.total > 1
+    return [_environments().LightningEnvironment()] if in_job and alone else []
+
+
+def trainer_options(processes: Processes, strategy: Any) -> dict[str, Any]:
+    """Return the trainer's options for several processes; none for a single one.
+
+    Args:
+        strategy: the option ``trainer.strategy``, which is kept if it isn't ``auto`` or ``ddp``.
+    """
+    if processes.total == 1:
+        return {"devices": 1, "num_nodes": 1}
+    options: dict[str, Any] = {"devices": processes.devices, "num_nodes": processes.nodes}
+    # the first process renders all views of validation and test, since it alone writes results
+    options["use_distributed_sampler"] = False
+    if strategy in (None, "auto", "ddp"):
+        options["strategy"] = ReplicatedStrategy()
+    return options

@@ -108,7 +108,7 @@ def prepare(args: argparse.Namespace, argv: Sequence[str], **options: Any) -> "R
         options: further arguments of :class:`.run.Run`.
     """
     config_paths = [find_config(name) for name in args.config]
-    choose_gpu(args.gpu)
+    choose_gpu(args.gpu, args.overrides)
     if args.typecheck:
         from ..core import typecheck
 
@@ -128,7 +128,7 @@ def prepare(args: argparse.Namespace, argv: Sequence[str], **options: Any) -> "R
     sources = [(path, read_source(path)) for path in config_paths]
     n_gpus = announce_device(args.gpu)
     load_extensions()
-    cfg = load_config(*config_paths, cli_args=args.overrides, n_gpus=max(n_gpus, 1))
+    cfg = load_config(*config_paths, cli_args=args.overrides, n_gpus=n_gpus)
     check_config(cfg)
     return Run(cfg, args, sources, shlex.join([*PROGRAM, *argv]), n_gpus, **options)
 

@@ -66,8 +66,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         )
     parser.add_argument(
         "--gpu",
-        help="0, or 0,1, or cpu; default: GPU 0 if there is one. Ignored where "
-        "CUDA_VISIBLE_DEVICES is set",
+        help="0, or cpu, or 0,1 for a process on each; default: GPU 0 if there is one. Ignored "
+        "where CUDA_VISIBLE_DEVICES is set",
     )
     parser.add_argument(
         "--verbose", action="store_true", help="more messages, and tracebacks of errors"
@@ -79,8 +79,13 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def choose_gpu(gpu: Optional[str]) -> None:
+def choose_gpu(gpu: Optional[str], overrides: Sequence[str] = ()) -> None:
     """Set which GPUs are visible to this process; must be called before torch is imported.
+
+    Args:
+        gpu: the argument ``--gpu``; without it as many GPUs as processes on this machine, which
+            torchrun or SLURM has started, or which ``trainer.devices`` among the overrides asks
+            for.
 
     Raises:
         UserError: ``gpu`` is neither "cpu" nor a list of numbers.
@@ -91,13 +96,24 @@ def choose_gpu(gpu: Optional[str]) -> None:
     if gpu == "cpu":
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
     elif "CUDA_VISIBLE_DEVICES" not in os.environ:
-        os.environ["CUDA_VISIBLE_DEVICES"] = gpu or "0"
-    elif gpu is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpu or ",".join(map(str, range(_processes(overrides))))
+    elif gpu is not None and "LOCAL_RANK" not in os.environ:  # processes inherit the choice
         print(
             f"CUDA_VISIBLE_DEVICES={os.environ['CUDA_VISIBLE_DEVICES']} is set: --gpu {gpu} is "
             "ignored",
             file=sys.stderr,
         )
+
+
+def _processes(overrides: Sequence[str]) -> int:
+    """Return how many processes this machine will run, as far as is known before the configuration
+    is read.
+    """
+    found = [re.fullmatch(r"trainer\.devices=(\d{1,4})", override) for override in overrides]
+    asked = [match[1] for match in found if match]
+    started = (os.environ.get(key) for key in ("LOCAL_WORLD_SIZE", "SLURM_NTASKS_PER_NODE"))
+    counts = [text for text in (*started, *asked[-1:]) if text and text.isdecimal()]
+    return max(1, *map(int, counts)) if counts else 1
 
 
 def announce_device(gpu: Optional[str]) -> int:

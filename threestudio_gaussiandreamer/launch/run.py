@@ -25,7 +25,7 @@ from ..view.run_index import note_time, write_index
 from .callbacks import LastCheckpoint, ProgressBar, RunRecord, Stopped
 from .checkpoints import AtomicCheckpointIO
 from .config_check import MisconfigurationException, build, plain
-from .ddp import ReplicatedStrategy
+from .ddp import environment_plugins, planned_processes, trainer_options
 from .folder_lock import RunFolder, claim, claim_new, require_writable
 from .live_viewer import LiveViewer, ViewerConfig
 from .options import PROGRAM
@@ -223,17 +223,16 @@ class Run:
         checkpoint_io = AtomicCheckpointIO()
         training = self.args.stage == "train"
         callbacks = self.callbacks + ([ProgressBar()] if options["enable_progress_bar"] else [])
+        processes = planned_processes(self.n_gpus, options)
         required = {
             "accelerator": "gpu" if self.n_gpus else "cpu",
-            "devices": self.n_gpus or 1,
             "logger": self.build_loggers() if training else False,
             "callbacks": callbacks + (self.training_callbacks(checkpoint_io) if training else []),
-            "plugins": [checkpoint_io],
+            "plugins": [checkpoint_io, *environment_plugins(processes)],
             "inference_mode": False,
             "default_root_dir": str(self.folder),
         }
-        if self.n_gpus > 1 and options.get("strategy", "auto") in ("auto", "ddp"):
-            options["strategy"] = ReplicatedStrategy()
+        required |= trainer_options(processes, options.get("strategy"))
         return build("trainer", pl.Trainer, options | required)
 
     def build_loggers(self) -> list:

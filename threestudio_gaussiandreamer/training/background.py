@@ -17,9 +17,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ..core.distributed import first_item
 from ..core.options import check_options, each, in_range, one_of, schedule
 from ..core.streams import generator
-from ..host import BaseBackground, C, item_seed, register
+from ..host import BaseBackground, C, register, run_seed
 
 MODES = ("fixed", "random", "learned")
 
@@ -66,10 +67,11 @@ class FlatBackground(BaseBackground):
         if self.cfg.mode == "learned":
             return torch.sigmoid(self.logit).expand(batch_size, 3)
         if self.cfg.mode == "random" and self.training:
+            first = first_item(batch_size)
             return torch.stack(
                 [
-                    torch.rand(3, generator=generator(item_seed(), "background", self.step, b))
-                    for b in range(batch_size)
+                    torch.rand(3, generator=generator(run_seed(), "background", self.step, item))
+                    for item in range(first, first + batch_size)
                 ]
             ).to(self.fixed)
         return self.fixed.expand(batch_size, 3)

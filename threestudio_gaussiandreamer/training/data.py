@@ -13,7 +13,7 @@ option                    meaning
 ========================  ==========================================================================
 height, width             pixels; a number, or a list with one entry more than
                           ``resolution_milestones``
-batch_size                views per step; a number or such a list
+batch_size                views per step, which several processes share; a number or such a list
 *_range                   elevation and azimuth in degrees, distance in world units, fovy in degrees
                           (vertical)
 batch_uniform_azimuth     each view of a batch in its own azimuth sector
@@ -38,9 +38,10 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from .. import cameras
 from ..cameras import Orbit, OrbitRanges
+from ..core.distributed import own_rows, require_shareable
 from ..core.options import check_options
 from ..core.streams import generator
-from ..host import Updateable, item_seed, parse_structured, pl, register, register_builtin, run_seed
+from ..host import Updateable, parse_structured, pl, register, register_builtin, run_seed
 from .camera_options import CameraConfig, plain
 
 
@@ -86,6 +87,8 @@ class TrainCameras(IterableDataset, Updateable):
             for v in map(plain, (cfg.height, cfg.width, cfg.batch_size))
         ]
         stages = max(map(len, sizes))
+        for batch_size in sizes[2]:
+            require_shareable(batch_size, "data.batch_size")
         self.sizes = list(zip(*[v * stages if len(v) == 1 else v for v in sizes], strict=True))
         self.ranges = OrbitRanges(
             *(
@@ -111,11 +114,11 @@ class TrainCameras(IterableDataset, Updateable):
             step += 1
 
     def collate(self, step: int) -> dict[str, Any]:
-        """Return the batch for ``step``, a function of (seed, step) and the rank of the process."""
+        """Return this process's views of the batch for ``step``, a function of (seed, step)."""
         height, width, batch_size = self.sizes[
             bisect.bisect_right(self.cfg.resolution_milestones, step)
         ]
-        rng = generator(item_seed(), "camera", step)
+        rng = generator(run_seed(), "camera", step)
         orbit = (
             self._pick(batch_size, rng)
             if self.pool
@@ -124,10 +127,12 @@ class TrainCameras(IterableDataset, Updateable):
             )
         )
         c2w = self._perturbed(orbit, rng)
+        lights = self._lights(c2w, rng)
+        rows = own_rows(batch_size)
         return make_batch(
-            orbit,
-            c2w,
-            self._lights(c2w, rng),
+            orbit.rows(rows),
+            c2w[rows],
+            lights[rows],
             height,
             width,
             self.cfg.rays,

@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..core.distributed import all_max, all_sum
+from ..core.distributed import all_max, all_sum, draw_shared
 from ..core.streams import generator
 from ..gaussians import densify, importance
 from ..gaussians.densify import Change, Rules, Statistics
@@ -154,11 +154,11 @@ class DensityControl:
         image, opacity = pictures["comp_rgb"], pictures["opacity"]
         # Composite over a random background per view, so that Gaussians of the background's colour
         # still have a removal error.
-        random = torch.rand(len(image), 1, 1, 3, generator=rng).to(image)
+        random = draw_shared(
+            len(image), lambda count: torch.rand(count, 1, 1, 3, generator=rng)
+        ).to(image)
         image = image + (1 - opacity) * (random - pictures["comp_rgb_bg"].detach())
-        self.cloud.removal += all_sum(
-            importance.removal_error(image, pictures["gaussian_opacities"], rng)
-        )
+        self.cloud.removal += importance.removal_error(image, pictures["gaussian_opacities"], rng)
         if self.cloud.wants_absgrad:
             # removal_error has added its gradients to absgrad, which is for those of the loss only
             pictures["rasterized"].means2d.absgrad.zero_()

@@ -7,8 +7,30 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from ..guidance.base import ScoreDistillation
+from .events import log_picture
+from .truth import true_views
+
 Panel = dict[str, Any]
 SCORE_PICTURES = ("imgs_noisy", "imgs_1step", "imgs_final")
+
+
+def save_pictures(system: Any, batch: dict[str, Any]) -> None:
+    """Save a row of pictures: the render, its depth and normals, the ground truth if there is one,
+    and the score model's noisy and denoised images.
+    """
+    out = system(batch)
+    images = render_panels(out)
+    truth = true_views(system.guidance, batch, out)
+    if truth is not None:
+        images.append(rgb_panel(truth[0]))
+    if isinstance(system.guidance, ScoreDistillation):
+        evaluated = system.guide(out, batch, guidance_eval=True)["eval"]
+        images += score_panels(evaluated, out["comp_rgb"].shape[1:3])
+    view, step = int(batch["index"][0]), system.true_global_step
+    name = f"it{step}-{view}.png"
+    system.save_image_grid(name, images, name="validation_step", step=step)
+    log_picture(system.loggers, f"validation/{view}", system.get_save_path(name), step)
 
 
 def render_panels(out: Mapping[str, Any]) -> list[Panel]:

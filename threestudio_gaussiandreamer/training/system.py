@@ -34,7 +34,7 @@ from typing import Any, Optional
 import torch
 from torch import Tensor
 
-from ..core.distributed import average_gradients
+from ..core.distributed import average_gradients, from_first, rank
 from ..core.errors import UserError
 from ..core.nested import adopt_nested
 from ..core.options import check_options
@@ -54,7 +54,7 @@ from ..priors.cache import cached_cloud
 from ..prune import PruneOptions
 from .background import FlatBackground
 from .density import DensityControl, RenderedQuality
-from .events import log_picture, log_scores
+from .events import log_scores
 from .export import GaussianSavers, export, export_companions, exported_files
 from .finite import CHECK_EVERY, optimizer_tensors, require_finite
 from .held_out import EvaluationConfig, HeldOut, Measurements
@@ -62,7 +62,7 @@ from .loss_scale import LossScale
 from .losses import check_losses, loggable, logged_names, weighted_losses
 from .optimizer import check_optimizer, make_optimizer
 from .pages import save_first_cloud, write_turntable
-from .pictures import render_panels, rgb_panel, score_panels
+from .pictures import rgb_panel, save_pictures
 from .truth import prefetch_truth, true_views
 
 GUIDANCE_LR = 1e-4
@@ -190,6 +190,14 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         """Run the prior, unless the cloud has been loaded from a checkpoint."""
         if len(self.geometry):
             return
+        # one process runs the prior: on a GPU two runs may differ in their last bits
+        state = from_first(self.first_state)
+        if rank():
+            self.geometry.load_state_dict(state)
+        info(f"the cloud starts with {len(self.geometry)} Gaussians")
+
+    def first_state(self) -> dict[str, Tensor]:
+        """Run the prior; return the state of the cloud, on the CPU."""
         prompt = self.prompt_utils or find(self.cfg.prompt_processor_type)(
             self.cfg.prompt_processor
         )
@@ -197,12 +205,18 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             str(getattr(prompt, "prompt", "")),
             lambda prior, text: cached_cloud(prior, text, self._save_dir),
         )
-        info(f"the cloud starts with {len(self.geometry)} Gaussians")
+        return {name: value.cpu() for name, value in self.geometry.state_dict().items()}
+
+    @property
+    def writes_results(self) -> bool:
+        """Whether this process renders, scores and exports results: only the first one does."""
+        return rank() == 0
 
     def on_fit_start(self) -> None:
         super().on_fit_start()
         truth = truth_of(self.guidance)
-        if truth is not None and truth.mesh is not None and self._save_dir is not None:
+        measures = self.writes_results and self._save_dir is not None
+        if measures and truth is not None and truth.mesh is not None:
             held_out = HeldOut(self.cfg.evaluation, truth.mesh)
             self.measurements = Measurements(held_out, Path(self._save_dir))
 
@@ -338,31 +352,17 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     # -- pictures ----------------------------------------------------------------------------------
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
+        if not self.writes_results:
+            return
         with self.measurements.paused_clock() if self.measurements else contextlib.nullcontext():
-            self.show(batch)
-
-    def show(self, batch: dict[str, Any]) -> None:
-        """Save a row of pictures: the render, its depth and normals, the ground truth if there is
-        one, and the score model's noisy and denoised images.
-        """
-        out = self(batch)
-        images = render_panels(out)
-        truth = true_views(self.guidance, batch, out)
-        if truth is not None:
-            images.append(rgb_panel(truth[0]))
-        if isinstance(self.guidance, ScoreDistillation):
-            images += score_panels(
-                self.guide(out, batch, guidance_eval=True)["eval"], out["comp_rgb"].shape[1:3]
-            )
-        view, step = int(batch["index"][0]), self.true_global_step
-        name = f"it{step}-{view}.png"
-        self.save_image_grid(name, images, name="validation_step", step=step)
-        log_picture(self.loggers, f"validation/{view}", self.get_save_path(name), step)
+            save_pictures(self, batch)
 
     def on_validation_epoch_end(self) -> None:
         pass
 
     def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
+        if not self.writes_results:
+            return
         name = f"it{self.true_global_step}-test/{int(batch['index'][0])}.png"
         self.save_image_grid(
             name,
@@ -372,8 +372,9 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         )
 
     def on_test_epoch_end(self) -> None:
-        write_turntable(self)
-        if self.guidance is not None:
+        if self.writes_results:
+            write_turntable(self)
+        if self.writes_results and self.guidance is not None:
             export(self)
 
     def on_validation_start(self) -> None:
@@ -390,5 +391,6 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         super().on_predict_start()
 
     def on_predict_epoch_end(self) -> None:
-        super().on_predict_epoch_end()
-        export_companions(self)
+        if self.writes_results:
+            super().on_predict_epoch_end()
+            export_companions(self)

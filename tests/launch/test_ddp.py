@@ -1,0 +1,221 @@
+"""Several processes that train one cloud: how many there are, and what they make."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.helpers.tiny_runs import files
+from tests.training import runs
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch.ddp import (
+    LONGEST_WAIT,
+    Processes,
+    ReplicatedStrategy,
+    environment_plugins,
+    planned_processes,
+    train_alone,
+    trainer_options,
+)
+
+ROOT = Path(__file__).parents[2]
+TORCHRUN = {"TORCHELASTIC_RUN_ID": "1", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2"}
+SLURM = {"SLURM_NTASKS": "4", "SLURM_NNODES": "2", "SLURM_JOB_NAME": "train"}
+
+
+@pytest.fixture
+def environment(monkeypatch):
+    """Sets the variables of a launcher; without a call there is none."""
+    for name in [*TORCHRUN, *SLURM]:
+        monkeypatch.delenv(name, raising=False)
+
+    def launched_by(variables):
+        for name, value in variables.items():
+            monkeypatch.setenv(name, value)
+
+    return launched_by
+
+
+@pytest.mark.parametrize(
+    ("variables", "n_gpus", "trainer", "expected"),
+    [
+        ({}, 0, {}, (1, 1)),
+        ({}, 2, {}, (2, 1)),
+        ({}, 2, {"devices": 1}, (1, 1)),
+        ({}, 0, {"devices": 3}, (3, 1)),
+        ({}, 2, {"num_nodes": 2}, (2, 2)),
+        (TORCHRUN, 0, {}, (2, 2)),
+        (TORCHRUN, 4, {"devices": 2, "num_nodes": 2}, (2, 2)),
+        (SLURM, 2, {}, (2, 2)),
+        (SLURM | {"SLURM_NTASKS": "1", "SLURM_NNODES": "1"}, 2, {}, (2, 1)),
+        (SLURM | {"SLURM_JOB_NAME": "bash"}, 0, {}, (1, 1)),
+    ],
+)
+def test_how_many_processes_train(environment, variables, n_gpus, trainer, expected):
+    environment(variables)
+    found = planned_processes(n_gpus, trainer)
+    assert (found.devices, found.nodes) == expected
+
+
+@pytest.mark.parametrize(
+    ("variables", "n_gpus", "trainer", "said"),
+    [
+        ({}, 0, {"devices": 0}, "trainer.devices: expected a whole number from 1 on, got 0"),
+        ({}, 0, {"devices": "auto"}, "trainer.devices: expected .* got 'auto'"),
+        ({}, 0, {"devices": True}, "trainer.devices: expected .* got True"),
+        ({}, 0, {"num_nodes": 1.5}, "trainer.num_nodes: expected .* got 1.5"),
+        ({}, 1, {"devices": 2}, "2 processes on a machine need as many GPUs, and 1 can be seen"),
+        (TORCHRUN, 0, {"devices": 3}, "trainer.devices is 3, but torchrun has started 2 x 2"),
+        (SLURM, 0, {"num_nodes": 1}, "trainer.num_nodes is 1, but SLURM has started 2 x 2"),
+    ],
+)
+def test_contradictions_are_named(environment, variables, n_gpus, trainer, said):
+    environment(variables)
+    with pytest.raises(UserError, match=said):
+        planned_processes(n_gpus, trainer)
+
+
+@pytest.mark.parametrize("variables", [TORCHRUN, SLURM])
+def test_a_worker_of_a_farm_trains_alone(environment, variables):
+    environment(variables)
+    train_alone()
+    assert planned_processes(0, {}) == Processes(1, 1)
+
+
+def test_a_single_process_needs_no_strategy():
+    assert trainer_options(Processes(1, 1), None) == {"devices": 1, "num_nodes": 1}
+    strategy = trainer_options(Processes(2, 2), "auto")["strategy"]
+    assert isinstance(strategy, ReplicatedStrategy) and strategy._timeout == LONGEST_WAIT
+    assert "strategy" not in trainer_options(Processes(2, 1), "deepspeed")
+
+
+def test_lightning_starts_the_processes_in_a_job_with_one_task(environment):
+    assert environment_plugins(Processes(2, 1)) == []
+    environment(SLURM | {"SLURM_NTASKS": "1"})
+    (plugin,) = environment_plugins(planned_processes(2, {}))
+    assert not plugin.creates_processes_externally
+    assert (
+        environment_plugins(Processes(2, 1, "SLURM")) == environment_plugins(Processes(1, 1)) == []
+    )
+
+
+# ---- whole runs ----------------------------------------------------------------------------------
+
+CHANGES = [*runs.DENSIFY, *runs.PRUNE, "data.batch_size=4"]
+
+
+@pytest.fixture(scope="module")
+def mesh(tmp_path_factory):
+    import trimesh
+
+    path = tmp_path_factory.mktemp("mesh") / "box.glb"
+    trimesh.creation.box().export(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def alone(mesh, tmp_path_factory):
+    """The folder of a run of six steps in one process."""
+    folder = tmp_path_factory.mktemp("alone")
+    assert runs.launch(folder, mesh, *CHANGES, "trainer.max_steps=6") == 0
+    return runs.run_folder(folder)
+
+
+def command(folder, mesh, *options, launcher=()):
+    """Return the command line of a run on the CPU."""
+    paths = [f"exp_root_dir={folder}", f"system.guidance.mesh={mesh}"]
+    config = ["--config", str(runs.CONFIGS / "demo.yaml"), "--train", "--gpu", "cpu"]
+    program = [sys.executable, *launcher, str(ROOT / "launch.py")]
+    return [*program, *config, *paths, *runs.SMALL, *CHANGES, *options]
+
+
+def started(folder, line, **variables):
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"} | variables
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    return subprocess.Popen(line, cwd=folder, env=environment, **output)
+
+
+def require_success(*processes):
+    said = [process.communicate(timeout=900)[0] for process in processes]
+    for process, text in zip(processes, said, strict=True):
+        assert process.returncode == 0, text[-3000:]
+    return said
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return str(probe.getsockname()[1])
+
+
+def require_same_training(ours, theirs):
+    """Compare the results of runs with different numbers of processes: as many Gaussians, and the
+    same quality but for the order of sums in float32, which Adam's first steps magnify.
+    """
+    one, other = (runs.cloud_of(folder / "ckpts" / "last.ckpt") for folder in (ours, theirs))
+    assert {n: v.shape for n, v in one.items()} == {n: v.shape for n, v in other.items()}
+    scores = (json.loads((folder / "save/metrics.json").read_text()) for folder in (ours, theirs))
+    found, expected = ([s["prior"]["psnr"], s["result"]["psnr"]] for s in scores)
+    assert found == pytest.approx(expected, abs=0.05)
+
+
+@pytest.mark.slow
+def test_two_processes_of_lightning_and_a_resumed_run_with_one(alone, mesh, tmp_path):
+    two = command(tmp_path, mesh, "trainer.devices=2", "trainer.max_steps=3")
+    (said,) = require_success(started(tmp_path, two))
+    assert said.count("the run at a glance") == 1
+    ckpt = runs.run_folder(tmp_path) / "ckpts" / "last.ckpt"
+    assert torch.load(ckpt, weights_only=True)["global_step"] == 3
+    options = [*CHANGES, "trainer.max_steps=6", f"resume={ckpt}"]
+    assert runs.launch(tmp_path, mesh, *options) == 0
+    require_same_training(runs.run_folder(tmp_path), alone)
+
+
+@pytest.mark.slow
+def test_four_processes_of_torchrun_on_two_machines(alone, mesh, tmp_path):
+    port = free_port()
+    module = ["-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=2"]
+    machines = [
+        [*module, f"--node-rank={rank}", "--master-addr=127.0.0.1", f"--master-port={port}"]
+        for rank in (0, 1)
+    ]
+    lines = [
+        command(tmp_path, mesh, "trainer.max_steps=6", launcher=machine) for machine in machines
+    ]
+    require_success(*(started(tmp_path, line) for line in lines))
+    require_same_training(runs.run_folder(tmp_path), alone)
+    assert written(runs.run_folder(tmp_path)) == written(alone)
+
+
+@pytest.mark.slow
+def test_two_tasks_of_slurm_on_two_machines(alone, mesh, tmp_path):
+    line = command(tmp_path, mesh, "trainer.max_steps=6")
+    job = SLURM | {"SLURM_NTASKS": "2", "SLURM_NTASKS_PER_NODE": "1", "SLURM_JOB_ID": "7"}
+    job |= {"MASTER_PORT": free_port(), "MASTER_ADDR": "127.0.0.1"}
+    tasks = [
+        job | {"SLURM_PROCID": str(rank), "SLURM_NODEID": str(rank), "SLURM_LOCALID": "0"}
+        for rank in (0, 1)
+    ]
+    require_success(*(started(tmp_path, line, **task) for task in tasks))
+    require_same_training(runs.run_folder(tmp_path), alone)
+    assert written(runs.run_folder(tmp_path)) == written(alone)
+    assert (runs.run_folder(tmp_path) / "cmd.txt").read_text().count("\n") == 1
+
+
+def written(folder):
+    """The files of a run but for TensorBoard's, whose names have the time."""
+    return {name for name in files(folder) if not name.startswith("tb_logs")}
+
+
+@pytest.mark.slow
+def test_fewer_views_than_processes(mesh, tmp_path):
+    line = command(tmp_path, mesh, "trainer.devices=2", "data.batch_size=1")
+    process = started(tmp_path, line)
+    said = process.communicate(timeout=900)[0]
+    assert process.returncode == 2, said[-3000:]
+    assert "data.batch_size is 1, fewer than the 2 processes" in said
