@@ -15,6 +15,8 @@ from benchmarks.quality import mesh as mesh_quality
 from benchmarks.quality import tables as quality
 from benchmarks.quality.runs import ROOT
 from benchmarks.quality.tables import DIFFERENCES, difference_row, last_rows, medians, named
+from benchmarks.robustness import ddp
+from benchmarks.robustness import scale_tables as scale
 from benchmarks.robustness import tables as robustness
 from benchmarks.splatting import tables as splatting
 from benchmarks.start import tables as start
@@ -73,7 +75,19 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "docs/step_time.md": {"start": start.first_step},
     "docs/robustness.md": {"fuzz": robustness.fuzz, "long run": robustness.long_run},
     "docs/farm.md": {"farm": robustness.farm},
-    "docs/viewing.md": {"quality": viewers.page_quality, "speed": viewers.page_speed},
+    "docs/viewing.md": {
+        "quality": viewers.page_quality,
+        "speed": viewers.page_speed,
+        "live": viewers.live_view,
+    },
+    "docs/several_processes.md": {"ddp": ddp.table},
+    "docs/scale.md": {
+        "units": scale.unit_costs,
+        "stated": scale.stated,
+        "runs": scale.runs,
+        "storage": scale.storage,
+        "limits": scale.limits,
+    },
 }
 
 
