@@ -11,6 +11,7 @@ import pytest
 
 from benchmarks.robustness.fuzz import ROOM
 from tests.fuzz import runner
+from tests.launch.test_ddp import TOLERANCE
 from tests.test_docs import TEXTS
 from threestudio_gaussiandreamer import metrics
 from threestudio_gaussiandreamer.core import file_memory
@@ -30,6 +31,7 @@ FIGURE = re.compile(
 )
 FLOATERS = inspect.signature(metrics.floater_mass).parameters["share"].default
 CONSTANTS = {
+    "docs/several_processes.md": [f"within {TOLERANCE:g} dB"],
     "docs/cuda.md": [
         f"take {LIST_BYTES} bytes per intersection, the backward pass {ROW_BYTES} more",
     ],

@@ -24,6 +24,8 @@ from threestudio_gaussiandreamer.launch.ddp import (
 )
 
 ROOT = Path(__file__).parents[2]
+TOLERANCE = 0.01
+"""Largest difference of the dB of runs with different numbers of processes."""
 TORCHRUN = {"TORCHELASTIC_RUN_ID": "1", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2"}
 SLURM = {"SLURM_NTASKS": "4", "SLURM_NNODES": "2", "SLURM_JOB_NAME": "train"}
 
@@ -107,6 +109,8 @@ def test_lightning_starts_the_processes_in_a_job_with_one_task(environment):
 # ---- whole runs ----------------------------------------------------------------------------------
 
 CHANGES = [*runs.DENSIFY, *runs.PRUNE, "data.batch_size=4"]
+# without it Adam's first steps would magnify the rounding of gradients that are zero
+CHANGES.append("system.optimizer.args.eps=1.0e-3")
 
 
 @pytest.fixture(scope="module")
@@ -155,13 +159,13 @@ def free_port():
 
 def require_same_training(ours, theirs):
     """Compare the results of runs with different numbers of processes: as many Gaussians, and the
-    same quality but for the order of sums in float32, which Adam's first steps magnify.
+    same quality but for the order of sums in float32.
     """
     one, other = (runs.cloud_of(folder / "ckpts" / "last.ckpt") for folder in (ours, theirs))
     assert {n: v.shape for n, v in one.items()} == {n: v.shape for n, v in other.items()}
     scores = (json.loads((folder / "save/metrics.json").read_text()) for folder in (ours, theirs))
     found, expected = ([s["prior"]["psnr"], s["result"]["psnr"]] for s in scores)
-    assert found == pytest.approx(expected, abs=0.05)
+    assert found == pytest.approx(expected, abs=TOLERANCE)
 
 
 @pytest.mark.slow
