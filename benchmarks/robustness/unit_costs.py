@@ -44,7 +44,7 @@ KINDS = {
     "exported clouds and pages": ("save/*-export/**/*",),
     "pictures and video": ("save/*-test*", "save/*-test/*", "save/*.png", "save/held_out/*"),
 }
-OTHER = "logs, sources, prior and others"
+OTHER = "logs, configuration, prior and others"
 WORKERS, ASSETS = (10, 100, 1000, 10_000), 4000
 
 
@@ -80,7 +80,8 @@ def run_asset(seed: int, folder: Path) -> dict[str, Any]:
     argv = [*config, f"exp_root_dir={folder}", f"seed={seed}", "use_timestamp=false", "tag=run"]
     clock = Clock()
     clock.note()
-    experiment.prepare(parse_arguments(argv), argv, callbacks=[clock]).run()
+    arguments = parse_arguments(argv)
+    experiment.prepare(arguments, argv, callbacks=[clock], records_code=False).run()  # as a farm
     clock.note()
     return {"ends": clock.ends, "files": stored(folder / "demo/run")}
 
