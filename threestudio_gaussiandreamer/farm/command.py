@@ -136,6 +136,8 @@ def positive(text: str) -> float:
 
 def run_farm(args: argparse.Namespace) -> int:
     """Make the assets, or only the report, and return the exit code."""
+    from ..launch.ddp import train_alone  # imports Lightning, which --help doesn't need
+
     configure_logging(verbose=False)
     total = check_rows(args.prompts)
     root, overrides = split_root(args.overrides)
@@ -145,6 +147,7 @@ def run_farm(args: argparse.Namespace) -> int:
     if not is_url(str(place)):
         require_writable(place.folder)
     # before Ray starts: this takes a second
+    train_alone()  # whatever has started this process, such as a job of SLURM
     recipe = make_recipe(args.config, overrides, cpu=True, cores=args.cores)
     recipe = check_recipe(recipe, read_rows(args.prompts))
     with claimed(place), connected(args) as ray:

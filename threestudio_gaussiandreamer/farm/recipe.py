@@ -109,9 +109,7 @@ def check_job(recipe: Recipe, job: Job) -> Any:
     """Check the configuration of one asset as the launcher does, and return it."""
     from ..launch.config import load_config
     from ..launch.config_check import check_config
-    from ..launch.ddp import train_alone
 
-    train_alone()  # whatever has started the driver, such as a job of SLURM
     extra = [recipe.low_memory] if job.saves_memory and recipe.low_memory else []
     paths = [Path(source.name) for source in (*recipe.sources, *job.sources, *extra)]
     # the farm's own exp_root_dir may be a URL, which a single run refuses
