@@ -54,7 +54,7 @@ def live_view() -> str:
             (
                 mode,
                 ", ".join(row["updates"] for row in ours),
-                f"{statistics.median(map(milliseconds, ours)):.1f}",
+                cost_of_an_update(ours),
                 f"{max(shares):.2f}",
                 ", ".join(f"{value:+.1f}" for value in more),
                 "yes" if same else "no",
@@ -69,5 +69,7 @@ def updates_seconds(row: dict[str, str]) -> float:
     return float(row["update_s"]) + float(row["server_s"])
 
 
-def milliseconds(row: dict[str, str]) -> float:
-    return 1000 * updates_seconds(row) / max(int(row["updates"]), 1)
+def cost_of_an_update(rows: list[dict[str, str]]) -> str:
+    """Return the median over the rounds, milliseconds; nothing if there was none."""
+    found = [1000 * updates_seconds(r) / int(r["updates"]) for r in rows if int(r["updates"])]
+    return f"{statistics.median(found):.1f}" if found else ""
