@@ -212,8 +212,10 @@ def test_two_tasks_of_slurm_on_two_machines(alone, mesh, tmp_path):
 
 
 def written(folder):
-    """The files of a run but for TensorBoard's, whose names have the time."""
-    return {name for name in files(folder) if not name.startswith("tb_logs")}
+    """The files of a run but for TensorBoard's, whose names have the time, and the sources, which
+    those in the working directory belong to.
+    """
+    return {name for name in files(folder) if not name.startswith(("tb_logs", "code"))}
 
 
 @pytest.mark.slow
