@@ -13,18 +13,18 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Optional
 
 from benchmarks.markdown import markdown, read
 from benchmarks.quality.runs import CHARTS, append_rows
 from tests.helpers.object_clouds import ball
 from threestudio_gaussiandreamer.convert.check import round_trip
-from threestudio_gaussiandreamer.convert.producers import PRODUCERS
 from threestudio_gaussiandreamer.formats.gaussian_files import (
     StoredCloud,
     read_cloud,
     write_cloud,
 )
+from threestudio_gaussiandreamer.formats.producers import PRODUCERS, Axes
 
 SIZE, BALL, BALL_COUNT = 256, "ball", 5000
 COLUMNS = "object,degree,gaussians,format,bytes,psnr,worst,write_s,read_s,machine,commit".split(",")
@@ -152,9 +152,16 @@ def table() -> str:
 
 
 def producers() -> str:
-    """Return the axes of the converter's argument ``--from``."""
-    rows = ((f"`{name}`", *producer) for name, producer in PRODUCERS.items())
-    return markdown(["producer", "up", "front", "why"], rows)
+    """Return the axes of each producer's files."""
+    rows = (
+        (f"`{name}`", axes_cell(known.gaussians), axes_cell(known.mesh), known.note)
+        for name, known in PRODUCERS.items()
+    )
+    return markdown(["producer", "Gaussians: up, front", "mesh: up, front", "why"], rows)
+
+
+def axes_cell(axes: Optional[Axes]) -> str:
+    return ", ".join(axes or ())
 
 
 def table_row(known: Format, measured: list[dict[str, str]]) -> list[str]:

@@ -16,10 +16,14 @@ register_parts()
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "threestudio_gaussiandreamer"
 CONFIGS = sorted(path.name for path in (ROOT / "configs").glob("*.yaml"))
-OVERLAYS = {f"demo-{name}.yaml": "demo.yaml" for name in ("small", "draft", "best")} | {
-    f"gaussiandreamer-{name}.yaml": "gaussiandreamer.yaml"
-    for name in ("if", "pointe", "avatar", "avatar-smpl", "ground", "lowmem")
-}
+OVERLAYS = (
+    {f"demo-{name}.yaml": "demo.yaml" for name in ("small", "draft", "best")}
+    | {
+        f"gaussiandreamer-{name}.yaml": "gaussiandreamer.yaml"
+        for name in ("if", "pointe", "avatar", "avatar-smpl", "ground", "lowmem")
+    }
+    | {"polish.yaml": "gaussiandreamer.yaml"}
+)
 """What each is laid over."""
 MANDATORY = {
     "gaussiandreamer-pointe.yaml": [
@@ -30,6 +34,7 @@ MANDATORY = {
         "system.geometry.prior.motion=results.npz",
         "system.geometry.prior.body_model=body.npz",
     ],
+    "polish.yaml": ["system.geometry.prior.path=fox.ply"],
 }
 """The user's files where a configuration leaves them open."""
 

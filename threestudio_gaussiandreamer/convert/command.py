@@ -27,6 +27,7 @@ from ..formats.gaussian_files import (
     suffix_of,
     write_cloud,
 )
+from ..formats.producers import GAUSSIANS, from_producer, producers_of
 from ..formats.spz import VERSION
 from ..formats.spz_container import VERSIONS, require_version
 from ..gaussians.axes import AXES, VIEWER_UP
@@ -36,7 +37,6 @@ from ..view.command import read_any
 from . import to_mesh
 from .check import VIEWS, round_trip
 from .losses import losses
-from .producers import PRODUCERS, from_producer
 
 
 @dataclass
@@ -50,7 +50,7 @@ class ConvertOptions:
 OPTIONS: dict[str, dict[str, Any]] = {
     "--from": {
         "dest": "producer",
-        "choices": PRODUCERS,
+        "choices": producers_of(GAUSSIANS),
         "help": "the program that wrote IN, which determines the axes",
     },
     "--up": {

@@ -16,15 +16,25 @@ Each prior has its own module: a registered subclass of :class:`Prior` that impl
 
 import logging
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Optional
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from ..core.errors import UserError
 from ..core.memory import count_of
-from ..core.options import Rule, check_options, is_number, is_numbers, positive, required, satisfies
+from ..core.options import (
+    Rule,
+    check_options,
+    is_number,
+    is_numbers,
+    one_of,
+    positive,
+    required,
+    satisfies,
+)
 from ..core.streams import numpy_generator
+from ..formats.producers import PRODUCERS, producer_axes
 from ..gaussians.point_cloud import PointCloud
 from ..host import BaseObject, run_seed
 from ..meshes.load import pose_rotation
@@ -56,13 +66,43 @@ SCALE = positive("world units")
 PATH = required("this prior reads a file; set path to it")
 
 
+PRODUCER = one_of(PRODUCERS)
+
+
 def require_axes(cfg: Any, kind: str) -> None:
-    """Raise UserError unless the options ``up`` and ``front`` name two axes that aren't parallel.
+    """Raise UserError unless the options ``up`` and ``front`` name two axes that aren't parallel,
+    and aren't given beside a producer.
 
     Args:
         kind: extension of the file ("glb"), which determines the default axes.
     """
     pose_rotation(kind, cfg.up, cfg.front)
+    require_no_axes_beside_producer(cfg, cfg.up, cfg.front)
+
+
+def require_no_axes_beside_producer(cfg: Any, up: str, front: Optional[str] = None) -> None:
+    """Raise UserError if both the producer and an axis of the file are given."""
+    if cfg.producer and (up != "auto" or front):
+        raise UserError("producer: it says which axes the file has; give it, or up and front")
+
+
+def file_axes(cfg: Any, kind: str) -> tuple[str, Optional[str]]:
+    """Return the axes of the file that are up and the front: the producer's, or the options.
+
+    Args:
+        kind: ``GAUSSIANS`` or ``MESH`` of ``formats/producers.py``.
+
+    Raises:
+        UserError: the producer doesn't write such files.
+    """
+    return producer_axes(cfg.producer, kind) if cfg.producer else (cfg.up, cfg.front)
+
+
+def is_normalized(cfg: Any) -> bool:
+    """Return whether points are centred and scaled: as ``normalize`` says, by default with a
+    producer.
+    """
+    return bool(cfg.producer) if cfg.normalize is None else cfg.normalize
 
 
 class Prior(BaseObject):

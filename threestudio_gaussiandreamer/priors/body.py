@@ -10,6 +10,7 @@ scale         half the longest side (the height, when it stands), world units; t
               is about 1.7
 up, front     the file's axes, ``+x`` to ``-z``; ``auto`` and null: by the kind of file (see
               ``meshes/load.py``)
+producer      the program that wrote the file (docs/formats.md), instead of ``up`` and ``front``
 num_points    points uniform over the surface (the released code), or 0 for the vertices (the paper)
 color         ``random`` (the paper), ``grey``, [r, g, b] in [0, 1], or null for the mesh's own
               colours

@@ -6,6 +6,10 @@ option        meaning
 path          the file, in any format that is read (docs/formats.md)
 up            the file's axis that is up: ``z``, ``y``, ``-y``, or ``auto``: what the file says,
               else -y for a PLY, as other programs write it; SPZ and GLB are y up
+producer      the program that wrote the file (docs/formats.md), instead of ``up``
+normalize     centre the box of the centres and make its longest half side ``scale``; null: with a
+              ``producer``
+scale         half the longest side, world units, with ``normalize``
 min_opacity   leave out Gaussians fainter than this, in [0, 1]
 ground, ...   see ``priors/base.py``; not with all attributes
 ============  ======================================================================================
@@ -14,10 +18,10 @@ Called as any prior it gives the centres and the colours of the constant harmoni
 are grown; the geometry may instead take every attribute from :meth:`GaussiansPrior.gaussians` and
 continue that training.
 
-Limits: the prompt is not read; the Gaussians are rotated to the world's axes, but not moved or
-scaled."""
+Limits: the prompt is not read."""
 
 from dataclasses import dataclass, field
+from typing import Any, Optional
 
 import numpy as np
 
@@ -25,12 +29,22 @@ from ..core.errors import UserError
 from ..core.files import existing_file
 from ..core.options import in_range, one_of
 from ..formats.gaussian_files import read_stored
+from ..formats.producers import GAUSSIANS, from_producer, producer_axes
 from ..gaussians.axes import AXES, WORLD_UP
 from ..gaussians.gaussians import Gaussians, opaque, usable
+from ..gaussians.grow import longest_side
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.sh import COEFFICIENTS, sh0_colors
 from ..host import register
-from .base import PATH, Prior, report_non_finite
+from .base import (
+    PATH,
+    PRODUCER,
+    SCALE,
+    Prior,
+    is_normalized,
+    report_non_finite,
+    require_no_axes_beside_producer,
+)
 
 
 @register("gaussians-prior")
@@ -41,7 +55,16 @@ class GaussiansPrior(Prior):
     class Config(Prior.Config):
         path: str = field(default="", metadata=PATH)
         up: str = field(default="auto", metadata=one_of(("auto", *AXES)))
+        producer: Optional[str] = field(default=None, metadata=PRODUCER)
+        normalize: Optional[bool] = None
+        scale: float = field(default=1.0, metadata=SCALE)
         min_opacity: float = field(default=0.0, metadata=in_range(0, 1))
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            require_no_axes_beside_producer(cfg, cfg.up)
+            if cfg.producer:
+                producer_axes(cfg.producer, GAUSSIANS)
 
     cfg: Config
 
@@ -72,6 +95,8 @@ class GaussiansPrior(Prior):
         stored = read_stored(path, up=None if self.cfg.up == "auto" else self.cfg.up)
         harmonics = stored.gaussians.sh[:, : COEFFICIENTS[-1]]  # more can't be drawn
         stored = stored._replace(gaussians=stored.gaussians._replace(sh=harmonics))
+        if self.cfg.producer:
+            stored = from_producer(stored, self.cfg.producer)
         arrays = stored.in_axes(WORLD_UP).gaussians
         keep = usable(arrays)
         if bad := int((~keep).sum()):
@@ -82,4 +107,17 @@ class GaussiansPrior(Prior):
                 f"no Gaussians in {str(path)!r} with an opacity of {self.cfg.min_opacity} or "
                 f"more, among {len(keep)}"
             )
-        return arrays.rows(keep)
+        kept = arrays.rows(keep)
+        return normalized(kept, self.cfg.scale) if is_normalized(self.cfg) else kept
+
+
+def normalized(gaussians: Gaussians, scale: float) -> Gaussians:
+    """Translate and scale Gaussians so that the box of their centres is centred at the origin and
+    half its longest side is ``scale``.
+    """
+    low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
+    factor = np.float32(scale / (longest_side(gaussians.means) / 2 or 1.0))
+    return gaussians._replace(
+        means=(gaussians.means - (low + high) / 2) * factor,
+        log_scales=gaussians.log_scales + np.log(factor),
+    )

@@ -9,6 +9,8 @@ path              GLB, glTF, OBJ, PLY, STL, OFF, ... with texture, vertex colour
 scale             half the longest side of the result, world units
 up, front         the file's axes, ``+x`` to ``-z``; ``auto`` and null: by the kind of file (see
                   ``meshes/load.py``)
+producer          the program that wrote the file (docs/formats.md), instead of ``up`` and
+                  ``front``
 num_points        0: the mesh's vertices, as the paper uses those of Shap-E's mesh; else this many
                   points, uniform over the surface
 color_smoothing   average each colour over this many nearest points, which imitates the coarse
@@ -32,11 +34,22 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.options import at_least
+from ..formats.producers import MESH
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.load import load_mesh
 from ..meshes.mesh import Mesh, sample_surface, surface_colors, vertex_surface_colors
-from .base import COLOR, PATH, SCALE, Prior, chosen_colors, points, require_axes
+from .base import (
+    COLOR,
+    PATH,
+    PRODUCER,
+    SCALE,
+    Prior,
+    chosen_colors,
+    file_axes,
+    points,
+    require_axes,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -55,19 +68,21 @@ class MeshFilePrior(Prior):
         scale: float = field(default=1.0, metadata=SCALE)
         up: str = "auto"
         front: Optional[str] = None
+        producer: Optional[str] = field(default=None, metadata=PRODUCER)
         num_points: int = field(default=0, metadata=points(0))
         color: Any = field(default=None, metadata=COLOR)
 
         @staticmethod
         def check(cfg: Any) -> None:
             require_axes(cfg, Path(cfg.path).suffix.lower().lstrip("."))
+            file_axes(cfg, MESH)
 
     cfg: Config
 
     def load(self) -> Mesh:
         """Return the mesh, scaled and turned into the world's axes."""
-        cfg = self.cfg
-        return load_mesh(cfg.path, scale=cfg.scale, up=cfg.up, front=cfg.front)
+        up, front = file_axes(self.cfg, MESH)
+        return load_mesh(self.cfg.path, scale=self.cfg.scale, up=up, front=front)
 
 
 @register("mesh-prior")

@@ -8,11 +8,12 @@ path          PLY; NPZ with ``points`` and ``colors`` (``normals``); NPY, XYZ, T
               columns x y z or x y z r g b; or any format of trimesh, whose vertices are taken (GLB,
               OBJ, ...)
 normalize     centre the box and make its longest half side ``scale``; else the points stay as they
-              are
+              are; null: with a ``producer``
 scale         half the longest side, world units, with ``normalize``
 up, front     the file's axes, ``+x`` to ``-z``; by default z is up and +x the front, but for
               modelling formats (GLB, OBJ, ...), where y is up and +z the front, and for a PLY of
               Gaussians, whose header says so, or -y is up and -z the front
+producer      the program that wrote the file (docs/formats.md), instead of ``up`` and ``front``
 ground, ...   see ``priors/base.py``
 ============  ======================================================================================
 
@@ -33,13 +34,14 @@ from ..core.files import existing_file
 from ..formats.array_files import read_arrays
 from ..formats.gaussian_files import ply_up
 from ..formats.ply import is_gaussian_ply, read_points, unit_colors
+from ..formats.producers import GAUSSIANS, MESH
 from ..gaussians.axes import FRONTS
 from ..gaussians.grow import longest_side
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.load import mesh_formats, pose_rotation, read_parts
 from ..meshes.mesh import GREY, vertex_surface_colors
-from .base import PATH, SCALE, Prior, require_axes
+from .base import PATH, PRODUCER, SCALE, Prior, file_axes, is_normalized, require_axes
 
 logger = logging.getLogger(__name__)
 
@@ -51,10 +53,11 @@ class PointCloudPrior(Prior):
     @dataclass
     class Config(Prior.Config):
         path: str = field(default="", metadata=PATH)
-        normalize: bool = False
+        normalize: Optional[bool] = None
         scale: float = field(default=1.0, metadata=SCALE)
         up: str = "auto"
         front: Optional[str] = None
+        producer: Optional[str] = field(default=None, metadata=PRODUCER)
 
         @staticmethod
         def check(cfg: Any) -> None:
@@ -65,8 +68,9 @@ class PointCloudPrior(Prior):
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         path = existing_file(self.cfg.path, "point cloud")
         cloud = load_points(path)
-        cloud = rotated(cloud, to_world(path, self.cfg.up, self.cfg.front))
-        return normalized(cloud, self.cfg.scale) if self.cfg.normalize else cloud
+        axes = file_axes(self.cfg, GAUSSIANS if is_gaussian_ply(path) else MESH)
+        cloud = rotated(cloud, to_world(path, *axes))
+        return normalized(cloud, self.cfg.scale) if is_normalized(self.cfg) else cloud
 
 
 def to_world(path: Path, up: str, front: Optional[str]) -> Float[np.ndarray, "3 3"]:

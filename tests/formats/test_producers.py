@@ -1,0 +1,106 @@
+"""The axes of other programs: an object's top and front get to where ours are.
+
+``EXPORTS`` repeats what each program does to an object before it writes it, from its published
+source (docs/formats.md names the files), independently of the table that is tested."""
+
+import numpy as np
+import pytest
+
+from tests.helpers.object_clouds import ball
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud
+from threestudio_gaussiandreamer.formats.producers import (
+    GAUSSIANS,
+    MESH,
+    PRODUCERS,
+    VECTORS,
+    from_producer,
+    producer_axes,
+    producers_of,
+    to_y_up,
+)
+from threestudio_gaussiandreamer.gaussians.axes import AXES
+
+
+def about(axis, degrees):
+    """Return the rotation by ``degrees`` about the axis x, y or z."""
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    rotation = np.eye(3)
+    rotation[[i, i, j, j], [i, j, i, j]] = cos, -sin, sin, cos
+    return rotation.round(12)
+
+
+Z_UP_FRONT_MINUS_Y = ((0, 0, 1), (0, -1, 0))
+"""Blender's axes of an imported glTF file: up and front."""
+Z_UP_FRONT_X = ((0, 0, 1), (1, 0, 0))
+OPENGL = ((0, 1, 0), (0, 0, 1))
+SAVE_PLY = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+TO_GLB = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]).T
+RENDERER = np.array([[-1, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""Hunyuan3D's texture stage loads (x, y, z) as (-x, z, -y), a mirrored mesh upside down; its
+pictures are mirrored back.
+"""
+EXPORTS = [
+    ("trellis", GAUSSIANS, Z_UP_FRONT_MINUS_Y, SAVE_PLY),
+    ("trellis", MESH, Z_UP_FRONT_MINUS_Y, TO_GLB),
+    ("trellis2", MESH, Z_UP_FRONT_MINUS_Y, np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])),
+    ("sam3d", GAUSSIANS, Z_UP_FRONT_MINUS_Y, np.eye(3)),
+    ("sam3d", MESH, Z_UP_FRONT_MINUS_Y, TO_GLB),
+    ("lgm", GAUSSIANS, OPENGL, np.eye(3)),
+    ("lgm", MESH, OPENGL, np.eye(3)),
+    ("diffsplat", GAUSSIANS, OPENGL, np.eye(3)),
+    ("triposr", MESH, Z_UP_FRONT_X, np.eye(3)),
+    ("triposr-app", MESH, Z_UP_FRONT_X, about("y", 90) @ about("x", -90)),
+    ("triposg", MESH, OPENGL, np.eye(3)),
+    # its cameras: elevation 90 at (0, 0, -1), azimuth 0 at (0, 1, 0) of the renderer
+    ("hunyuan3d", MESH, ((0, 0, -1), (0, 1, 0)), np.linalg.inv(RENDERER)),
+    # its viewer: y up, the camera on +z, the file turned about y and then about x
+    ("triposplat", GAUSSIANS, OPENGL, np.linalg.inv(about("x", 180) @ about("y", 90))),
+]
+
+
+@pytest.mark.parametrize(("name", "kind", "axes", "export"), EXPORTS)
+def test_a_producers_export_puts_up_and_front_where_the_table_says(name, kind, axes, export):
+    found = producer_axes(name, kind)
+    np.testing.assert_allclose(export @ axes[0], VECTORS[found.up], atol=1e-9)
+    np.testing.assert_allclose(export @ axes[1], VECTORS[found.front], atol=1e-9)
+
+
+def test_every_generator_is_among_the_exports():
+    others = {"3dgs", "nerfstudio", "supersplat"}  # conventions of programs that generate nothing
+    kinds = {(name, kind) for name, kind, *_ in EXPORTS}
+    assert kinds == {
+        (name, kind)
+        for name, known in PRODUCERS.items()
+        for kind in (GAUSSIANS, MESH)
+        if name not in others and getattr(known, kind)
+    }
+
+
+@pytest.mark.parametrize("name", producers_of(GAUSSIANS))
+def test_up_and_front_of_a_producer_become_ours(name):
+    axes = producer_axes(name, GAUSSIANS)
+    rotation = to_y_up(axes)
+    np.testing.assert_allclose(np.linalg.det(rotation), 1)
+    cloud = ball(2)
+    cloud.means[:] = [VECTORS[axes.up], 2 * VECTORS[axes.front]]
+    world = from_producer(StoredCloud(cloud), name).in_axes("z").gaussians
+    np.testing.assert_allclose(world.means, [[0, 0, 1], [2, 0, 0]], atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "up"), [("3dgs", "-y"), ("lgm", "y"), ("nerfstudio", "z")])
+def test_plain_axes_agree_with_the_option_up(name, up):
+    np.testing.assert_allclose(to_y_up(producer_axes(name, GAUSSIANS)), AXES[up], atol=1e-12)
+
+
+def test_an_unknown_producer_is_refused_with_the_nearest():
+    with pytest.raises(UserError, match="unknown producer 'triposplt': did you mean 'triposplat'"):
+        from_producer(StoredCloud(ball(1)), "triposplt")
+
+
+def test_a_producer_of_other_files_is_refused_with_those_that_fit():
+    with pytest.raises(UserError, match="'triposr' stands for files of meshes.* are 3dgs, "):
+        from_producer(StoredCloud(ball(1)), "triposr")
+    with pytest.raises(UserError, match="'diffsplat' stands for files of Gaussians.*hunyuan3d"):
+        producer_axes("diffsplat", MESH)

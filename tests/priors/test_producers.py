@@ -1,0 +1,173 @@
+"""Files in the conventions of other generators become priors that stand upright, face +x, have the
+size of ``scale`` and display colours."""
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from tests.formats.test_producers import EXPORTS
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats import ply
+from threestudio_gaussiandreamer.formats.producers import GAUSSIANS, MESH
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
+from threestudio_gaussiandreamer.gaussians.sh import C0
+from threestudio_gaussiandreamer.host import find
+
+register_parts()
+SIZE, SCALE = 0.37, 1.25
+LARGEST_ERROR = 1.0
+"""Degrees."""
+
+
+def frame(axes):
+    """Return the rotation from (front, left, up), the world's axes, to axes with this up and
+    front.
+    """
+    up, front = np.array(axes, float)
+    return np.stack([front, np.cross(up, front), up], axis=1)
+
+
+def box():
+    """Return a box without symmetry: longest upwards, with a colour for each corner."""
+    mesh = trimesh.creation.box(extents=[0.5, 0.8, 2.0])
+    mesh.vertices[mesh.vertices[:, 2] > 0] *= [0.6, 0.5, 1.0]
+    mesh.vertices[mesh.vertices[:, 0] > 0] += [0.1, 0.05, 0.0]
+    colors = np.random.default_rng(0).integers(0, 256, (len(mesh.vertices), 3), np.uint8)
+    return mesh, colors
+
+
+def in_world(mesh):
+    """Return the vertices as a prior has to give them."""
+    vertices = mesh.vertices - (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+    return SCALE * vertices / (np.ptp(vertices, axis=0).max() / 2)
+
+
+def pose_error(found, wanted):
+    """Return the angle, degrees, of the rotation between two sets of points (Kabsch 1976)."""
+    u, _, vt = np.linalg.svd(found.T @ wanted)
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    return np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
+
+
+def matched(points, colors, wanted_colors):
+    """Order the rows by their colours, which are all different."""
+    order = [np.abs(colors - color).sum(axis=1).argmin() for color in wanted_colors]
+    return points[order], colors[order]
+
+
+def write_mesh(path, vertices, faces, colors):
+    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
+    mesh.export(path)
+
+
+def write_gaussians(path, vertices, colors):
+    count = len(vertices)
+    cloud = Gaussians(
+        means=np.float32(vertices),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.full((count, 3), np.log(0.01), np.float32),
+        logit_opacities=np.full(count, 3, np.float32),
+        sh=np.float32((colors[:, None] / 255 - 0.5) / C0),
+    )
+    ply.write_gaussians(path, cloud, [])
+
+
+CASES = [
+    (name, kind, suffix, axes, export)
+    for name, kind, axes, export in EXPORTS
+    for suffix in ((".ply",) if kind == GAUSSIANS else (".glb", ".obj", ".ply"))
+]
+
+
+@pytest.mark.parametrize(("name", "kind", "suffix", "axes", "export"), CASES)
+@pytest.mark.parametrize("part", ["own", "point-cloud-prior"])
+def test_a_file_comes_in_upright_to_the_front_scaled_and_in_display_colours(
+    name, kind, suffix, axes, export, part, tmp_path
+):
+    mesh, colors = box()
+    turn = export @ frame(axes) @ np.diag([1, np.linalg.det(export), 1])  # one renderer mirrors
+    vertices = SIZE * mesh.vertices @ turn.T + [0.3, -0.2, 0.1]
+    path = tmp_path / f"object{suffix}"
+    if kind == GAUSSIANS:
+        write_gaussians(path, vertices, colors)
+    else:
+        write_mesh(path, vertices, mesh.faces, colors)
+    own = "gaussians-prior" if kind == GAUSSIANS else "mesh-prior"
+    prior = find(own if part == "own" else part)
+    cloud = prior({"path": str(path), "producer": name, "scale": SCALE})("")
+    points, found = matched(cloud.points, cloud.colors, colors / 255)
+    wanted = in_world(mesh)
+    assert pose_error(points, wanted) < LARGEST_ERROR
+    np.testing.assert_allclose(points, wanted, atol=1e-4)
+    np.testing.assert_allclose(found, colors / 255, atol=1 / 254)
+
+
+def test_the_pose_error_is_the_angle():
+    wanted = in_world(box()[0])
+    turn = np.radians(3)
+    rotation = np.array(
+        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
+    )
+    assert pose_error(wanted @ rotation.T, wanted) == pytest.approx(3)
+
+
+def test_a_baked_texture_is_taken_as_display_values(tmp_path):
+    """TRELLIS and Hunyuan3D write textures, of which glTF says that they are sRGB."""
+    mesh, _ = box()
+    picture = Image.new("RGB", (4, 4), (10, 128, 250))
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=picture, baseColorFactor=np.uint8([255] * 4), roughnessFactor=1.0
+    )
+    uv = np.random.default_rng(0).random((len(mesh.vertices), 2))
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    trimesh.Trimesh(mesh.vertices, mesh.faces, visual=visual, process=False).export(
+        tmp_path / "a.glb"
+    )
+    colors = find("mesh-prior")({"path": str(tmp_path / "a.glb"), "producer": "trellis2"})(
+        ""
+    ).colors
+    np.testing.assert_allclose(colors, np.tile([10, 128, 250], (len(colors), 1)) / 255, atol=1e-6)
+
+
+def test_all_attributes_of_gaussians_are_scaled(tmp_path):
+    mesh, colors = box()
+    write_gaussians(tmp_path / "a.ply", SIZE * mesh.vertices, colors)
+    options = {"path": str(tmp_path / "a.ply"), "producer": "lgm", "scale": SCALE}
+    cloud = find("gaussians-prior")(options).gaussians("")
+    np.testing.assert_allclose(np.exp(cloud.log_scales), 0.01 * SCALE / SIZE, rtol=1e-5)
+    still = find("gaussians-prior")(options | {"normalize": False}).gaussians("")
+    np.testing.assert_allclose(np.exp(still.log_scales), 0.01, rtol=1e-6)
+    assert np.ptp(still.means, axis=0).max() == pytest.approx(2 * SIZE, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["mesh-prior", "point-cloud-prior", "gaussians-prior"])
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        ({"producer": "trelis"}, "producer.*did you mean 'trellis'"),
+        ({"producer": "trellis", "up": "y"}, "up|give it, or up and front"),
+    ],
+)
+def test_wrong_producers_are_refused_when_the_prior_is_built(name, options, problem):
+    if "up" in options and name != "gaussians-prior":
+        options = options | {"up": "+y"}
+    with pytest.raises(UserError, match=problem):
+        find(name)({"path": "a.glb"} | options)
+
+
+def test_a_producer_of_other_files_is_refused(tmp_path):
+    with pytest.raises(UserError, match="stands for files of Gaussians.*producers of meshes are"):
+        find("mesh-prior")({"path": "a.glb", "producer": "diffsplat"})
+    with pytest.raises(UserError, match="stands for files of meshes"):
+        find("gaussians-prior")({"path": "a.ply", "producer": "triposr"})
+    mesh, colors = box()
+    write_mesh(tmp_path / "a.glb", mesh.vertices, mesh.faces, colors)
+    prior = find("point-cloud-prior")({"path": str(tmp_path / "a.glb"), "producer": "diffsplat"})
+    with pytest.raises(UserError, match="stands for files of Gaussians"):
+        prior("")
+
+
+def test_every_kind_is_tested():
+    assert {kind for _, kind, *_ in CASES} == {GAUSSIANS, MESH}
