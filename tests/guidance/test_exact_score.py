@@ -288,3 +288,17 @@ def test_sizes_that_do_not_fit_are_named(mesh_path):
         )
     with pytest.raises(UserError, match="rgb_as_latents"):
         guidance(mesh_path)(uniform(1, 16, 16, 3), None, rgb_as_latents=True, **batch(0.0))
+
+
+def test_a_view_without_its_direction_in_the_bank_beside_others_with_guidance(mesh_path):
+    """The bank has no view from above, so the mixtures of such a view are the same, and its guided
+    score is the conditional one.
+    """
+    guide = guidance(mesh_path, mode="direction-bins", guidance_scale=7.5)
+    views = batch(0.0, 0.0)
+    views["elevation"][1] = 80.0
+    z = guide.encode(uniform(2, 3, 16, 16)) + 0.1
+    condition = guide.condition(None, **views)
+    assert [mixture.log_prior is None for mixture in condition] == [False, True]
+    cond, uncond = guide.predict(z, torch.tensor([400, 400]), condition)
+    assert torch.equal(cond[1], uncond[1]) and not torch.equal(cond[0], uncond[0])

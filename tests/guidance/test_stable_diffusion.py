@@ -11,8 +11,9 @@ from torch import nn
 from tests.helpers import tiny_guidance as tiny
 from tests.helpers import tiny_models
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.diffusion.noise_prediction import perp_neg, rescaled
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
-from threestudio_gaussiandreamer.guidance.text_to_image import perp_neg, rescaled, view_of_row
+from threestudio_gaussiandreamer.guidance.text_to_image import view_of_row
 from threestudio_gaussiandreamer.prompts.prompts import PlainPrompt
 
 pytest.importorskip("diffusers")

@@ -21,9 +21,11 @@ WEIGHTS: dict[str, Callable[[Tensor], Tensor]] = {
     "sds": lambda abar: 1 - abar,
     "uniform": torch.ones_like,
     "fantasia3d": lambda abar: abar.sqrt() * (1 - abar),
+    "x0": lambda abar: ((1 - abar) / abar).sqrt(),
 }
-"""The weights w(t): sigma_t^2 of DreamFusion (Poole et al. 2022), 1, and a_t sigma_t^2 of
-Fantasia3D (Chen et al. 2023), with a_t = sqrt(abar) and sigma_t^2 = 1 - abar.
+"""The weights w(t): sigma_t^2 of DreamFusion (Poole et al. 2022), 1, a_t sigma_t^2 of Fantasia3D
+(Chen et al. 2023), and sigma_t / a_t, with which the gradient is x minus the denoised x, with a_t =
+sqrt(abar) and sigma_t^2 = 1 - abar.
 """
 
 
@@ -165,7 +167,9 @@ def ddim_step(
     """Take one deterministic DDIM step to the lower noise ``abar_next`` (Song et al. 2021 eq. 12
     with eta 0).
     """
-    return add_noise(predict_x0(z, eps, abar), eps, abar_next)
+    ratio = (abar_next / abar).sqrt()
+    slope = (1 - abar_next).sqrt() - ratio * (1 - abar).sqrt()
+    return per_item(ratio, z) * z + per_item(slope, z) * eps
 
 
 def ddim_sample(

@@ -4,7 +4,8 @@ its latent.
     x = encode(render),  z = sqrt(abar) x + sqrt(1 - abar) eps,  grad = w(t) (eps_hat(z, t) - eps),
                          dloss/dx = grad / B
 
-A guidance is a subclass that says how to ``encode`` and ``decode``, what to ``condition`` on, and
+A variant (``variants/``) replaces eps_hat - eps by another error, for every guidance alike. A
+guidance is a subclass that says how to ``encode`` and ``decode``, what to ``condition`` on, and
 how to ``predict`` the noise. Its networks may run in half precision; this module computes in
 float32. Timesteps and noise are functions of (seed, step, item), so a resumed run draws the same
 values as an uninterrupted one.
@@ -14,12 +15,22 @@ option              meaning
 ==================  ================================================================================
 guidance_scale      eps = eps_u + scale (eps_c - eps_u); 1 = none. threestudio's scale is one less:
                     its 100 is 101 here
+guidance_interval   [low, high], shares of all timesteps: only between them the unconditional score
+                    is computed and the scale applied (Kynkaanniemi et al. 2024)
+recon_std_rescale   0 to 1: bring the contrast of the guided x0 back to that of the conditional one
+                    (Lin et al. 2023, as in MVDream), which undoes the over-exposure of large scales
+variant_type        how the score becomes a gradient, and the options of it: sds-variant,
+variant             csd-variant, ...; see docs/distillation.md
 min_step_percent    smallest timestep as a share of all, a number or a schedule; timesteps are
                     clamped to [1, T - 1]
 max_step_percent    largest timestep, likewise (the paper: [500, 0.98, 0.55, 501])
+timestep_schedule   uniform: random between the two; linear, sqrt, dreamtime: from the largest to
+                    the smallest within ``timestep_steps`` steps, the same for all items. One fixed
+                    timestep: the same share as the smallest and as the largest
 grad_clip           clamp each element of the latent's gradient to +- this; none, a number or a
                     schedule
-weighting_strategy  w(t): sds (1 - abar), uniform (1), fantasia3d (sqrt(abar) (1 - abar))
+weighting_strategy  w(t): sds (1 - abar), uniform (1), fantasia3d (sqrt(abar) (1 - abar)),
+                    x0 (sqrt((1 - abar) / abar): the gradient is x minus the denoised x)
 max_bad_steps       stop after this many steps in a row in which the score of some item was NaN or
                     infinite
 max_items_eval      how many items ``guidance_eval`` shows; 0 or less = all, as in threestudio
@@ -27,46 +38,37 @@ eval_steps          DDIM steps from the noise to ``imgs_final``
 ==================  ================================================================================
 """
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Optional
+from typing import Any, Optional
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from ..core import streams
-from ..core.distributed import first_item
-from ..core.errors import UserError
+from ..core.errors import UserError, unknown
 from ..core.options import at_least, check_options, in_range, one_of, schedule
 from ..diffusion import sds
-from ..host import BaseObject, C, run_seed, warn
+from ..host import C, find, names, parse_structured, warn
+from .particles import GaussianParticles, ParticleModel
+from .score_model import GUIDANCE_SCALE, ScoreModel
+from .score_pictures import score_pictures
+from .variants import Variant
 
-GUIDANCE_SCALE = in_range(-1e6, 1e6)
+__all__ = ["GUIDANCE_SCALE", "NonFiniteScore", "ScoreDistillation"]
 
 
 class NonFiniteScore(UserError):
     """The score model returned NaN or infinity in ``max_bad_steps`` consecutive steps."""
 
 
-class Noised(NamedTuple):
-    """A batch of noisy latents, the input of the score model."""
-
-    t: Int[Tensor, " B"]
-    abar: Float[Tensor, " B"]
-    """float64."""
-    noise: Float[Tensor, "B c h w"]
-    z: Float[Tensor, "B c h w"]
-
-
-class ScoreDistillation(BaseObject, ABC):
+class ScoreDistillation(ScoreModel):
     """Base class of all guidances; see the module's docstring."""
 
     @dataclass
-    class Config(BaseObject.Config):
-        guidance_scale: float = field(default=100.0, metadata=GUIDANCE_SCALE)
-        min_step_percent: Any = field(default=0.02, metadata=schedule(min=0, max=1))
-        max_step_percent: Any = field(default=0.98, metadata=schedule(min=0, max=1))
+    class Config(ScoreModel.Config):
+        variant_type: str = "sds-variant"
+        variant: dict = field(default_factory=dict)
         grad_clip: Any = field(default=None, metadata=schedule(min=0))
         weighting_strategy: str = field(default="sds", metadata=one_of(sds.WEIGHTS))
         max_bad_steps: int = field(default=10, metadata=at_least(1))
@@ -75,14 +77,10 @@ class ScoreDistillation(BaseObject, ABC):
 
         @staticmethod
         def check(cfg: Any) -> None:
-            for step in _knots(cfg.min_step_percent, cfg.max_step_percent):
-                sds.step_range(
-                    C(cfg.min_step_percent, step, step), C(cfg.max_step_percent, step, step)
-                )
+            ScoreModel.Config.check(cfg)
+            variant_class(cfg)
 
     cfg: Config
-    alphas_cumprod: Float[Tensor, " T"]
-    """The noise schedule; a subclass sets it in ``configure``."""
 
     # Defined by subclasses
     # ----------------------------------------------------------------------------------------------
@@ -99,13 +97,17 @@ class ScoreDistillation(BaseObject, ABC):
     def condition(self, prompt_utils: Any, **batch: Any) -> Any:
         """Return the conditions on prompt and views for ``predict``; called without gradients."""
 
-    @abstractmethod
-    def predict(
-        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Any
-    ) -> tuple[Float[Tensor, "B c h w"], Optional[Float[Tensor, "B c h w"]]]:
-        """Predict the noise in z, conditional and unconditional (None if ``guidance_scale`` is 1);
-        called without gradients.
+    def particle_model(self, options: Any) -> ParticleModel:
+        """Return the model of the renders' own distribution that ``vsd-variant`` trains.
+
+        Args:
+            options: the variant's.
         """
+        return GaussianParticles(options.momentum)
+
+    @classmethod
+    def check_particle_model(cls, cfg: Any) -> None:
+        """Raise UserError if ``vsd-variant`` can't be used with these options of the guidance."""
 
     @classmethod
     def preflight(cls, cfg: Any) -> None:
@@ -116,6 +118,13 @@ class ScoreDistillation(BaseObject, ABC):
             UserError: a requirement, such as a model's file, is missing; the message says what to
                 do.
         """
+        cfg = parse_structured(cls.Config, cfg)
+        variant_class(cfg).preflight(cls, cfg)
+
+    @classmethod
+    def is_text_guided(cls, cfg: Any) -> bool:
+        """Return whether the conditional score differs from the unconditional one."""
+        return True
 
     REPORTS: tuple[str, ...] = ()
     """The keys of :meth:`report`, which ``checkpoint.monitor`` may name."""
@@ -135,23 +144,26 @@ class ScoreDistillation(BaseObject, ABC):
 
     def configure(self) -> None:
         check_options(self.Config, self.cfg, "system.guidance.")
-        self.alphas_cumprod = sds.sd_alphas_cumprod()
+        super().configure()
+        self.variant = variant_class(self.cfg)(self.cfg.variant)
         self.bad_items = self.bad_steps = 0
         self.update_step(0, 0)
 
     @property
+    def renders(self) -> tuple[str, ...]:
+        """Names of the renderer's outputs that the batch must have beside ``comp_rgb_bg``."""
+        return self.variant.RENDERS
+
+    @property
     def guided(self) -> bool:
-        """Whether classifier-free guidance is on, which needs the unconditional score."""
-        return self.cfg.guidance_scale != 1
+        """Whether ``predict`` returns the unconditional score too: for classifier-free guidance, or
+        since the variant needs it.
+        """
+        return self.cfg.guidance_scale != 1 or self.variant.NEEDS_UNCONDITIONAL
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
         """Evaluate the schedules at this step."""
-        self.step = global_step
-        percents = (
-            C(self.cfg[name], epoch, global_step)
-            for name in ("min_step_percent", "max_step_percent")
-        )
-        self.min_step, self.max_step = sds.step_range(*percents, len(self.alphas_cumprod))
+        super().update_step(epoch, global_step)
         self.grad_clip = (
             None if self.cfg.grad_clip is None else C(self.cfg.grad_clip, epoch, global_step)
         )
@@ -169,26 +181,29 @@ class ScoreDistillation(BaseObject, ABC):
 
         Args:
             rgb: renders in [0, 1]; or latents, with ``rgb_as_latents``.
-            guidance_eval: also return ``eval``, the pictures of :meth:`evaluate`.
+            guidance_eval: also return ``eval``, see :mod:`.score_pictures`.
             batch: the host's batch, and ``comp_rgb_bg``.
 
         Returns:
             ``loss_sds``; ``grad_norm`` of the batch, and ``grad_norm_0``, ... of each item;
             ``min_step``, ``max_step``; ``bad_items``, the number of items whose score isn't finite;
-            the entries of :meth:`report`; and ``eval``, if requested.
+            ``evaluations``, those of the score model in this step, one per item and prompt; the
+            entries of :meth:`report`; and ``eval``, if requested.
 
         Raises:
             NonFiniteScore: in each of the last ``max_bad_steps`` steps the score of at least one
                 item wasn't finite.
         """
+        self.evaluations = 0
         with torch.autocast(rgb.device.type, enabled=False):
             images = rgb.float().movedim(-1, 1).contiguous()
             latents = (images if rgb_as_latents else self.encode(images, **batch)).float()
             with torch.no_grad():
                 condition = self.condition(prompt_utils, **batch)
-                grad, bad = self._gradient(*self._error(latents, condition))
+                grad, bad = self._gradient(*self.variant.error(self, latents, condition, batch))
             if not guidance_eval:  # an evaluation isn't a training step
                 self._count_bad(bad)
+                self.variant.learn(self, latents.detach(), condition, batch, ~bad)
             loss = _masked_loss(images, latents, grad, bad)
             norms = grad.flatten(1).norm(dim=1)
             out = {
@@ -198,49 +213,11 @@ class ScoreDistillation(BaseObject, ABC):
                 "max_step": self.max_step,
             }
             out |= {f"grad_norm_{i}": norm for i, norm in enumerate(norms)}
-            out |= {"bad_items": float(bad.sum()), **self.report()}
+            out |= {"bad_items": float(bad.sum()), "evaluations": float(self.evaluations)}
+            out |= self.report() | self.variant.report()
             if guidance_eval:
-                out["eval"] = self.evaluate(self.add_noise(latents), prompt_utils, **batch)
+                out["eval"] = score_pictures(self, self.add_noise(latents), prompt_utils, batch)
         return out
-
-    def draw_timesteps(
-        self, latents: Float[Tensor, "B c h w"]
-    ) -> tuple[Int[Tensor, " B"], Float[Tensor, " B"]]:
-        """Draw this step's timesteps t; also return their abar, float64."""
-        t = sds.timesteps(
-            len(latents),
-            self.min_step,
-            self.max_step,
-            seed=run_seed(),
-            step=self.step,
-            num_train=len(self.alphas_cumprod),
-            first=first_item(len(latents)),
-        )
-        abar = self.alphas_cumprod.double().cpu()[t]
-        return t.to(latents.device), abar.to(latents.device)
-
-    @torch.no_grad()
-    def add_noise(self, latents: Float[Tensor, "B c h w"]) -> Noised:
-        """Draw this step's timesteps and noise, and add the noise to ``latents``."""
-        t, abar = self.draw_timesteps(latents)
-        noise = self.normal(latents, "noise")
-        return Noised(t, abar, noise, sds.add_noise(latents, noise, abar))
-
-    def normal(self, like: Float[Tensor, "B *d"], stream: str) -> Float[Tensor, "B *d"]:
-        """Draw this step's standard normal numbers, of the shape and on the device of ``like``."""
-        place = (run_seed(), stream, self.step, like.device, first_item(len(like)))
-        return streams.normal_per_item(tuple(like.shape), *place)
-
-    def predict_noise(
-        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Any
-    ) -> Float[Tensor, "B c h w"]:
-        """Predict the noise with guidance, float32."""
-        cond, uncond = self.predict(z, t, condition)
-        return (
-            cond.float()
-            if uncond is None
-            else sds.classifier_free(cond.float(), uncond.float(), self.cfg.guidance_scale)
-        )
 
     def known_error(
         self, latents: Float[Tensor, "B c h w"], condition: Any
@@ -249,16 +226,6 @@ class ScoreDistillation(BaseObject, ABC):
         None if they do.
         """
         return None
-
-    def _error(
-        self, latents: Float[Tensor, "B c h w"], condition: Any
-    ) -> tuple[Float[Tensor, "B c h w"], Float[Tensor, " B"]]:
-        """Return eps_hat - eps and abar."""
-        known = self.known_error(latents, condition)
-        if known is not None:
-            return known
-        noised = self.add_noise(latents)
-        return self.predict_noise(noised.z, noised.t, condition) - noised.noise, noised.abar
 
     def _gradient(
         self, error: Float[Tensor, "B c h w"], abar: Float[Tensor, " B"]
@@ -291,45 +258,6 @@ class ScoreDistillation(BaseObject, ABC):
                 "they are left out"
             )
 
-    # Pictures of the score model's inputs and predictions
-    # ---------------------------------------------------------------------------------
-
-    @torch.no_grad()
-    def evaluate(self, noised: Noised, prompt_utils: Any, **batch: Any) -> dict[str, Any]:
-        """Decode pictures for the host's ``guidance_evaluation_save``.
-
-        Returns:
-            pictures (B, H, W, 3) in [0, 1]: ``imgs_noisy``, the noisy latents; ``imgs_1step``,
-            denoised in one step with guidance; ``imgs_1orig``, denoised in one step with the
-            conditional score only; ``imgs_final``, denoised in ``eval_steps`` steps; and ``texts``,
-            ``noise_levels`` and ``bs``, the number of items."""
-        count = (
-            len(noised.t)
-            if self.cfg.max_items_eval < 1
-            else min(self.cfg.max_items_eval, len(noised.t))
-        )
-        batch = _first_items(batch, len(noised.t), count)
-        t, abar, _, z = (values[:count] for values in noised)
-        condition = self.condition(prompt_utils, **batch)
-        alphas_cumprod = self.alphas_cumprod.double().to(z.device)
-        latents = {
-            "imgs_noisy": z,
-            "imgs_1step": sds.predict_x0(z, self.predict_noise(z, t, condition), abar),
-            "imgs_1orig": sds.predict_x0(z, self.predict(z, t, condition)[0].float(), abar),
-            "imgs_final": sds.ddim_sample(
-                lambda z, t: self.predict_noise(z, t, condition),
-                z,
-                t,
-                alphas_cumprod,
-                steps=self.cfg.eval_steps,
-            ),
-        }
-        levels = (t / len(alphas_cumprod)).tolist()
-        images = {
-            name: self.decode(value).float().movedim(1, -1) for name, value in latents.items()
-        }
-        return {"bs": count, "noise_levels": levels, "texts": _captions(levels, batch), **images}
-
 
 def _bad_items(grad: Tensor) -> Tensor:
     """Return which items contain NaN or infinity, (B,) bool. If the sum over all elements is finite
@@ -350,40 +278,21 @@ def _masked_loss(images: Tensor, latents: Tensor, grad: Tensor, bad: Tensor) -> 
     return sds.sds_loss(latents, grad)
 
 
-def _first_items(batch: dict[str, Any], size: int, count: int) -> dict[str, Any]:
-    """Return the batch of the first ``count`` of ``size`` items."""
-    return {
-        k: v[:count] if isinstance(v, Tensor) and v.dim() and len(v) == size else v
-        for k, v in batch.items()
-    }
+def variant_class(cfg: Any) -> type[Variant]:
+    """Return the class that ``variant_type`` names.
 
-
-def _captions(levels: list[float], batch: dict[str, Any]) -> list[str]:
-    """Write threestudio's captions: noise level, elevation, azimuth and distance of each item."""
-    captions = [f"n{level:.02f}" for level in levels]
-    for letter, name, digits in (
-        ("e", "elevation", 1),
-        ("a", "azimuth", 1),
-        ("c", "camera_distances", 2),
-    ):
-        if name in batch:
-            captions = [
-                f"{caption}\n{letter}{float(value):.0{digits}f}"
-                for caption, value in zip(captions, batch[name], strict=True)
-            ]
-    return captions
-
-
-def _knots(*schedules: Any) -> set[int]:
-    """Return a set that contains all steps at which the slope of a schedule changes. It also has
-    the values of the schedules, which does no harm.
+    Raises:
+        UserError: it is unknown, or another kind of part.
     """
-    return {
-        0,
-        *(
-            int(entry)
-            for schedule in schedules
-            if not isinstance(schedule, (int, float))
-            for entry in schedule
-        ),
-    }
+    try:
+        found = find(cfg.variant_type)
+    except UserError:
+        found = None
+    if not _is_variant(found):
+        known = [name for name in names() if _is_variant(find(name))]
+        raise UserError(f"variant_type: {unknown('variant', cfg.variant_type, known)}")
+    return found
+
+
+def _is_variant(part: Any) -> bool:
+    return isinstance(part, type) and issubclass(part, Variant)

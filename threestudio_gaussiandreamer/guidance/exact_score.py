@@ -147,6 +147,10 @@ class ExactScoreGuidance(ScoreDistillation):
         )
         self.bank_orbit = camera_pool(cfg.bank_views, ranges, cfg.bank_seed, "bank")
 
+    @classmethod
+    def is_text_guided(cls, cfg: Any) -> bool:
+        return cfg.mode != "view-agnostic"
+
     # Score distillation
     # ---------------------------------------------------------------------------------------
 
@@ -188,10 +192,11 @@ class ExactScoreGuidance(ScoreDistillation):
             for i, mixture in enumerate(condition)
         ]
         cond = torch.cat([item[0].eps for item in items]).view_as(z)
+        self.evaluations += len(z) * (2 if self.guided else 1)
         self._perplexity = float(torch.cat([item[0].perplexity for item in items]).mean())
-        if items[0][1] is None:
+        if not self.guided:
             return cond, None
-        return cond, torch.cat([item[1].eps for item in items]).view_as(z)
+        return cond, torch.cat([(item[1] or item[0]).eps for item in items]).view_as(z)
 
     def known_error(
         self, latents: Float[Tensor, "B c h w"], condition: list[Mixture]

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from ..core.errors import UserError
 from ..core.streams import derive_seed
 from ..host import item_seed
+from .base import ScoreDistillation
 
 
 def call_guidance(
@@ -111,9 +112,12 @@ def trainable_groups(guidance: Any, lr: float) -> list[dict[str, Any]]:
 
 
 def learnt_weights(guidance: Any) -> dict[str, Tensor]:
-    """Return the trained parameters of a guidance, for a checkpoint. Frozen weights aren't stored,
-    since they are those of the published model.
+    """Return the trained parameters of a guidance, for a checkpoint; of this package's guidances,
+    the state of the variant. Frozen weights aren't stored, since they are those of the published
+    model.
     """
+    if isinstance(guidance, ScoreDistillation):
+        return guidance.variant.state()
     return {name: parameter.detach() for name, parameter in trainable_parameters(guidance).items()}
 
 
@@ -123,6 +127,9 @@ def restore_learnt(guidance: Any, weights: dict[str, Tensor]) -> None:
     Raises:
         UserError: names or shapes differ from the parameters that the guidance trains.
     """
+    if isinstance(guidance, ScoreDistillation):
+        guidance.variant.restore(guidance, weights)
+        return
     own = trainable_parameters(guidance)
     if {name: parameter.shape for name, parameter in own.items()} != {
         name: value.shape for name, value in weights.items()

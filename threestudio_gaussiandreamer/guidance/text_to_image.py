@@ -10,9 +10,6 @@ guidance_scale                      of classifier-free guidance; 1 is none (thre
                                     here)
 ..._step_percent, grad_clip,        see ``guidance/base.py``
 weighting_strategy, ...
-recon_std_rescale                   0 to 1: bring the contrast of the guided x0 back to that of the
-                                    conditional one (Lin et al. 2023, as in MVDream), which undoes
-                                    the over-exposure of large scales
 view_dependent_prompting            use the prompt of each view's direction
 image_size                          height and width that the model sees, pixels; none = what it was
                                     trained with
@@ -40,7 +37,7 @@ from torch import Tensor, nn
 
 from ..core.errors import UserError, unknown
 from ..core.options import in_range
-from ..diffusion import sds
+from ..diffusion.noise_prediction import PREDICTIONS, perp_neg
 from ..host import debug, info, parse_structured
 from ..models.extras import require_extra
 from ..models.hub import find_model
@@ -48,6 +45,8 @@ from ..models.loaded import loaded
 from ..models.model_files import load_network, load_settings
 from .base import ScoreDistillation
 from .half_precision import weights_type
+from .lora import LoRAParticles, check_adaptable
+from .particles import ParticleModel
 
 TERMINAL_ABAR = 2.0**-24
 """Replaces an ``abar`` of exactly 0, which schedules with zero terminal SNR have at the last step,
@@ -64,6 +63,20 @@ class Condition(NamedTuple):
     """
     negative_weights: Optional[Float[Tensor, "B 2"]]
     """The weights of the two Perp-Neg rows, <= 0; None without Perp-Neg."""
+    empty: Optional[Float[Tensor, "1 N F"]] = None
+    """The embedding of an empty prompt, if the variant needs it and the prompts have it."""
+
+    def select(self, rows: Int[Tensor, " R"]) -> "Condition":
+        """Return the conditions of some views."""
+        views = len(self.embeddings) // (2 if self.negative_weights is None else 4)
+        index = torch.cat([rows, views + rows])
+        if self.negative_weights is None:
+            return self._replace(embeddings=self.embeddings[index])
+        pairs = 2 * (views + rows)[:, None] + torch.arange(2, device=rows.device)
+        return self._replace(
+            embeddings=self.embeddings[torch.cat([index, pairs.flatten()])],
+            negative_weights=self.negative_weights[rows],
+        )
 
 
 class TextToImageDistillation(ScoreDistillation):
@@ -75,7 +88,6 @@ class TextToImageDistillation(ScoreDistillation):
     class Config(ScoreDistillation.Config):
         pretrained_model_name_or_path: str = ""
         revision: Optional[str] = None
-        recon_std_rescale: float = field(default=0.0, metadata=in_range(0, 1))
         view_dependent_prompting: bool = True
         image_size: Optional[int] = field(default=None, metadata=in_range(1, 4096, "pixels"))
         half_precision_weights: bool = True
@@ -94,6 +106,7 @@ class TextToImageDistillation(ScoreDistillation):
     @classmethod
     def preflight(cls, cfg: Any) -> None:
         cfg = parse_structured(cls.Config, cfg)
+        super().preflight(cfg)
         require_extra("diffusion", "diffusers", "transformers")
         find_model(
             cfg.pretrained_model_name_or_path, cls.components, revision=cfg.revision, download=False
@@ -261,7 +274,41 @@ class TextToImageDistillation(ScoreDistillation):
                 "give system.prompt_processor and system.guidance the same "
                 "pretrained_model_name_or_path"
             )
-        return Condition(embeddings.to(self.device), weights)
+        return Condition(embeddings.to(self.device), weights, self._empty_embedding(prompt_utils))
+
+    def _empty_embedding(self, prompt_utils: Any) -> Optional[Float[Tensor, "1 N F"]]:
+        """Return the embedding of an empty prompt if the variant needs one and ``prompt_utils`` can
+        make it, as this package's can.
+        """
+        make = getattr(prompt_utils, "empty", None)
+        return make().to(self.device) if self.variant.NEEDS_EMPTY_PROMPT and make else None
+
+    def select(self, condition: Condition, rows: Int[Tensor, " R"]) -> Condition:
+        return condition.select(rows)
+
+    def conditional(
+        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition
+    ) -> Float[Tensor, "B c h w"]:
+        return self.noise(z, t, condition.embeddings[: len(z)])
+
+    def unconditional(
+        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition
+    ) -> Float[Tensor, "B c h w"]:
+        return self.noise(z, t, condition.embeddings[len(z) : 2 * len(z)])
+
+    def empty_prompt(
+        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition
+    ) -> Optional[Float[Tensor, "B c h w"]]:
+        if condition.empty is None:
+            return None
+        return self.noise(z, t, condition.empty.expand(len(z), -1, -1))
+
+    def particle_model(self, options: Any) -> ParticleModel:
+        return LoRAParticles(self, options)
+
+    @classmethod
+    def check_particle_model(cls, cfg: Any) -> None:
+        check_adaptable(cfg)
 
     def predict(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition
@@ -278,25 +325,13 @@ class TextToImageDistillation(ScoreDistillation):
             eps[:batch], eps[batch : 2 * batch], negative, condition.negative_weights
         ), eps[batch : 2 * batch]
 
-    def predict_noise(
-        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition
-    ) -> Float[Tensor, "B c h w"]:
-        cond, uncond = self.predict(z, t, condition)
-        if uncond is None:
-            return cond
-        guided = sds.classifier_free(cond, uncond, self.cfg.guidance_scale)
-        return (
-            rescaled(guided, cond, z, self._abar[t], self.cfg.recon_std_rescale)
-            if self.cfg.recon_std_rescale
-            else guided
-        )
-
     def noise(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], embeddings: Float[Tensor, "kB N F"]
     ) -> Float[Tensor, "kB c h w"]:
         """Predict the noise, float32, for each row of ``embeddings`` and the latent of its view, in
         one forward pass of the UNet.
         """
+        self.evaluations += len(embeddings)
         rows = view_of_row(len(z), len(embeddings)).to(z.device)
         z, t = z[rows], t[rows]
         output = self.unet(
@@ -327,65 +362,7 @@ def _offload(network: nn.Module, device: torch.device) -> None:
     cpu_offload(network, execution_device=device)
 
 
-# Formulas
-# --------------------------------------------------------------------------------------------------
-
-PREDICTIONS = {
-    "epsilon": lambda output, z, abar: output,
-    "v_prediction": lambda output, z, abar: (
-        sds.per_item(abar.sqrt(), z) * output + sds.per_item((1 - abar).sqrt(), z) * z
-    ),
-    "sample": lambda output, z, abar: (
-        (z - sds.per_item(abar.sqrt(), z) * output) / sds.per_item((1 - abar).sqrt(), z)
-    ),
-}
-"""Conversions of the network's output to the noise, by prediction type: the noise itself,
-v = sqrt(abar) eps - sqrt(1 - abar) x0 (Salimans and Ho 2022), or x0.
-"""
-
-
 def view_of_row(views: int, rows: int) -> Int[Tensor, " kB"]:
     """Return the view of each row of a :class:`Condition`: 0..B-1, 0..B-1, then 0, 0, 1, 1, ..."""
     order = torch.arange(views)
     return torch.cat([order, order, order.repeat_interleave(2)])[:rows]
-
-
-def perp_neg(
-    cond: Float[Tensor, "B c h w"],
-    uncond: Float[Tensor, "B c h w"],
-    negative: Float[Tensor, "B 2 c h w"],
-    weights: Float[Tensor, "B 2"],
-) -> Float[Tensor, "B c h w"]:
-    """Compute eps_u + d + sum_i w_i (n_i - proj_d n_i), where d = eps_c - eps_u, n_i = eps_i -
-    eps_u (Armandpour et al. 2023, eq. 9).
-
-    Classifier-free guidance with scale s turns this into eps_u + s (d + ...), the paper's formula.
-    """
-    wanted = (cond - uncond)[:, None]
-    unwanted = negative - uncond[:, None]
-    inner = (unwanted * wanted).sum(dim=(2, 3, 4), keepdim=True)
-    length = wanted.square().sum(dim=(2, 3, 4), keepdim=True).clamp_min(1e-6)
-    perpendicular = unwanted - inner / length * wanted
-    return cond + (weights.to(cond)[:, :, None, None, None] * perpendicular).sum(dim=1)
-
-
-def rescaled(
-    guided: Float[Tensor, "B c h w"],
-    cond: Float[Tensor, "B c h w"],
-    z: Float[Tensor, "B c h w"],
-    abar: Float[Tensor, " B"],
-    share: float,
-) -> Float[Tensor, "B c h w"]:
-    """Rescale the guided noise so that its x0 has the standard deviation of the conditional x0.
-
-    Args:
-        share: 0 for no effect, 1 for the full rescaling; linear between.
-    """
-    x0, reference = sds.predict_x0(z, guided, abar), sds.predict_x0(z, cond, abar)
-    factor = _deviation(reference) / _deviation(x0)
-    x0 = x0 * (share * factor + 1 - share)
-    return PREDICTIONS["sample"](x0, z, abar)
-
-
-def _deviation(x: Float[Tensor, "B c h w"]) -> Float[Tensor, "B 1 1 1"]:
-    return x.std(dim=(1, 2, 3), keepdim=True).clamp_min(1e-8)

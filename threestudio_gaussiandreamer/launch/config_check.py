@@ -20,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 from ..core.errors import UserError, unknown
 from ..core.options import check_options, require_representable, shown
 from ..guidance.base import ScoreDistillation
+from ..guidance.variants import Variant
 from ..host import (
     BaseBackground,
     BaseGeometry,
@@ -72,6 +73,7 @@ KINDS: dict[str, type] = {
     "exporter": Exporter,
     "prior": Prior,
     "guidance": ScoreDistillation,
+    "variant": Variant,
     "prompt_processor": TextEncoderPromptProcessor,
 }
 """The base class of each kind of part, by the name of its section.

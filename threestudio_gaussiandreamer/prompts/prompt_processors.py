@@ -28,6 +28,7 @@ spawn                          run the text encoder in a separate process
 =============================  =====================================================================
 """
 
+import functools
 import json
 import multiprocessing
 from abc import abstractmethod
@@ -152,6 +153,8 @@ class TextEncoderPromptProcessor(BaseObject):
             },
             prompt=self.prompt,
             prompts_vd=prompts_vd,
+            # on first use, since few guidances need it
+            empty=functools.cache(lambda: self._embeddings(folder, [""])),
         )
 
     def _embeddings(self, folder: Path, texts: list[str]) -> Float[Tensor, "T N F"]:

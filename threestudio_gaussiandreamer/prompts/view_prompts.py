@@ -8,7 +8,7 @@ are in degrees; azimuth 0 is the front."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Dict, List, NamedTuple, Tuple
+from typing import Dict, List, NamedTuple, Optional, Tuple
 
 import torch
 from jaxtyping import Float, Int
@@ -101,6 +101,8 @@ class PromptEmbeddings:
     perp_neg_f_sf: Coefficients
     prompt: str
     prompts_vd: List[str]
+    empty: Optional[Callable[[], Float[Tensor, "1 N F"]]] = None
+    """Returns the embedding of an empty prompt; not in threestudio."""
 
     def direction_indices(
         self,

@@ -44,7 +44,15 @@ def logged_names(guidance: type, options: Iterable[str]) -> Optional[set[str]]:
     if not issubclass(guidance, ScoreDistillation):
         return None
     losses = [name.replace("lambda_", "loss_", 1) for name in options]
-    guided = [*losses, "grad_norm", "min_step", "max_step", "bad_items", *guidance.REPORTS]
+    guided = [
+        *losses,
+        "grad_norm",
+        "min_step",
+        "max_step",
+        "bad_items",
+        "evaluations",
+        *guidance.REPORTS,
+    ]
     known = {"loss", "gaussians", *(f"train/{name}" for name in guided)}
     return known | {"dB"} if guidance.KNOWS_TRUTH else known
 

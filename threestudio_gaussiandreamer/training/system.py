@@ -290,7 +290,10 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         return weighted_losses(guided, out["opacity"], weights)
 
     def guide(self, out: dict[str, Any], batch: dict[str, Any], **options: Any) -> dict[str, Any]:
-        """Call the guidance with these renders, the whole batch and the renders' background."""
+        """Call the guidance with these renders, the whole batch, the renders' background, and the
+        further outputs of the renderer that it names.
+        """
+        options |= {name: out[name].detach() for name in getattr(self.guidance, "renders", ())}
         with own_randomness(self.true_global_step):
             return call_guidance(
                 self.guidance,

@@ -1,0 +1,42 @@
+"""DDIM inversion."""
+
+import torch
+
+from threestudio_gaussiandreamer.diffusion import sds
+from threestudio_gaussiandreamer.diffusion.inversion import invert
+
+ABAR = sds.sd_alphas_cumprod()
+
+
+def test_items_end_at_their_own_timesteps_and_take_their_own_steps():
+    asked = []
+
+    def predict(step):
+        asked.append((step.index, step.rows.tolist(), step.t.tolist()))
+        return torch.zeros_like(step.z)
+
+    x, t = torch.ones(3, 1, 1, 2, dtype=torch.float64), torch.tensor([30, 0, 250])
+    z = invert(predict, x, t, ABAR, 100)
+    assert asked == [(0, [0, 2], [0, 0]), (1, [2], [100]), (2, [2], [200])]
+    # without predicted noise only the scale changes
+    torch.testing.assert_close(z[:, 0, 0, 0], (ABAR[t] / ABAR[0]).sqrt())
+
+
+def test_an_inversion_is_undone_by_ddim():
+    """With the exact noise of a known image, sampling back from the end gives the start."""
+    image = torch.tensor([0.3, -0.5], dtype=torch.float64)
+    eps = torch.tensor([1.2, -0.7], dtype=torch.float64)
+    start = ABAR[0].sqrt() * image + (1 - ABAR[0]).sqrt() * eps
+    z = invert(lambda step: eps.expand_as(step.z), start[None], torch.tensor([640]), ABAR, 70)
+    torch.testing.assert_close(z[0], ABAR[640].sqrt() * image + (1 - ABAR[640]).sqrt() * eps)
+
+
+def test_fresh_noise_has_the_deviation_of_ddpms_reverse_step():
+    x, t = torch.zeros(1, 20000, dtype=torch.float64), torch.tensor([400])
+    drawn = torch.randn(1, 20000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    z = invert(
+        lambda step: torch.zeros_like(step.z), x, t, ABAR, 400, eta=0.5, fresh=lambda step: drawn
+    )
+    now, later = ABAR[0], ABAR[400]
+    deviation = 0.5 * ((1 - now) / (1 - later) * (1 - later / now)).sqrt()
+    torch.testing.assert_close(z, deviation * drawn)

@@ -1,0 +1,205 @@
+"""VSD with a diffusion model: the LoRA on its UNet."""
+
+import copy
+
+import pytest
+import torch
+
+from tests.helpers import tiny_guidance as tiny
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.guidance.lora import adapted_layers, particle_noise
+from threestudio_gaussiandreamer.guidance.stable_diffusion import StableDiffusionGuidance
+
+pytest.importorskip("diffusers")
+
+GOOD = torch.ones(4, dtype=torch.bool)
+
+
+def cameras(count=4):
+    generator = torch.Generator().manual_seed(7)
+    return {"c2w": torch.randn(count, 4, 4, generator=generator)}
+
+
+def vsd(models, prediction="epsilon", **variant):
+    """Return a guidance and its particle model."""
+    options = {"variant_type": "vsd-variant", "variant": variant, "guidance_scale": 7.5}
+    guide = tiny.guidance(models, prediction, **options)
+    return guide, guide.variant.particles(guide)
+
+
+def inputs(guide, prompts):
+    """Return latents, noisy latents and conditions of four views."""
+    condition = guide.condition(prompts[False], **tiny.BATCH)
+    latents = torch.randn(4, 4, 8, 8, generator=torch.Generator().manual_seed(1))
+    return latents, guide.add_noise(latents), condition
+
+
+def learn(guide, latents, condition, good=GOOD):
+    """Train on four views; return what is logged."""
+    guide.variant.learn(guide, latents, condition, cameras(), good)
+    return guide.variant.report()
+
+
+def with_values(particles):
+    """Fill the parts of a LoRA that start at zero."""
+    generator = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for value in (*particles.lora.up, particles.lora.camera_out):
+            value.copy_(0.2 * torch.randn(value.shape, generator=generator))
+
+
+def merged(guide, particles):
+    """Return a copy of the UNet with the products of the LoRA added to its weights."""
+    unet, lora = copy.deepcopy(guide.unet), particles.lora
+    layers = dict(adapted_layers(unet))
+    with torch.no_grad():
+        for name, down, up in zip(lora.names, lora.down, lora.up, strict=True):
+            layers[name].weight += up @ down
+    return unet
+
+
+def test_the_lora_is_in_every_attention_and_starts_as_the_unet(models, prompts):
+    guide, particles = vsd(models)
+    names = [name.rpartition("transformer_blocks.0.")[2] for name in particles.lora.names]
+    each = ("to_q", "to_k", "to_v", "to_out.0")
+    assert set(names) == {f"attn{i}.{layer}" for i in (1, 2) for layer in each}
+    latents, noised, condition = inputs(guide, prompts)
+    with torch.no_grad():
+        own = particles.predict(guide, noised, condition, cameras())
+        assert torch.equal(own, guide.conditional(noised.z, noised.t, condition))
+
+
+@pytest.mark.parametrize("prediction", tiny.PREDICTIONS)
+def test_the_error_is_threestudios(models, prompts, prediction):
+    """threestudio's compute_grad_vsd (stable_diffusion_vsd_guidance.py, v0.2.3), written again from
+    its formulas: the UNet with the additions merged into its weights and the camera in the class
+    embedding, v converted to the noise; w(t) is left out, and the prompts are those of the views.
+    """
+    guide, particles = vsd(models, prediction)
+    with_values(particles)
+    latents, noised, condition = inputs(guide, prompts)
+    views, lora, unet = cameras(), particles.lora, merged(guide, particles)
+    embedding = torch.nn.functional.silu(views["c2w"].flatten(1) @ lora.camera_in.T)
+    unet.class_embedding = lambda labels: embedding @ lora.camera_out.T
+
+    def noise(network, text, **options):
+        output = network(noised.z, noised.t, encoder_hidden_states=text, **options).sample
+        a, sigma = (
+            root.sqrt().float().reshape(-1, 1, 1, 1) for root in (noised.abar, 1 - noised.abar)
+        )
+        return a * output + sigma * noised.z if prediction == "v_prediction" else output
+
+    cond, uncond = condition.embeddings.chunk(2)
+    with torch.no_grad():
+        error, _ = guide.variant.error(guide, latents, condition, views)
+        own = noise(unet, cond, class_labels=torch.zeros(4))
+        plain, negative = noise(guide.unet, cond), noise(guide.unet, uncond)
+    expected = negative + 7.5 * (plain - negative) - own
+    assert (own - plain).abs().max() > 0.1
+    torch.testing.assert_close(error, expected, rtol=0, atol=2e-5)
+
+
+def test_the_lora_follows_the_gradient_of_the_mean_squared_error(models, prompts):
+    """Two samples without the camera's dropout: the gradient that Adam gets, against autograd
+    through the merged weights.
+    """
+    guide, particles = vsd(models, samples=2, camera_dropout=1.0)
+    with_values(particles)
+    latents, _, condition = inputs(guide, prompts)
+    particles.optimizer.step = lambda: None
+    numbers = learn(guide, latents, condition)
+    unet = merged(guide, particles).requires_grad_(True)
+    losses = []
+    for sample in range(2):
+        noised = particle_noise(guide, latents, sample)
+        text = condition.embeddings[:4]
+        predicted = unet(noised.z, noised.t, encoder_hidden_states=text).sample
+        losses.append(torch.nn.functional.mse_loss(predicted, noised.noise))
+    loss = (losses[0] + losses[1]) / 2
+    loss.backward()
+    assert numbers["lora_error"] == pytest.approx(loss.item(), rel=1e-5)
+    for (name, layer), down, up in zip(
+        adapted_layers(unet), particles.lora.down, particles.lora.up, strict=True
+    ):
+        whole = layer.weight.grad
+        torch.testing.assert_close(up.grad, whole @ down.T, rtol=1e-3, atol=1e-6, msg=name)
+        torch.testing.assert_close(down.grad, up.T @ whole, rtol=1e-3, atol=1e-6, msg=name)
+
+
+def test_the_lora_learns_the_renders_and_leaves_the_unet_alone(models, prompts):
+    guide, particles = vsd(models, lr=1e-2)
+    before = {name: value.clone() for name, value in guide.unet.state_dict().items()}
+    latents, noised, condition = inputs(guide, prompts)
+
+    def error():
+        predicted = particles.predict(guide, noised, condition, cameras())
+        return float((predicted - noised.noise).square().mean())
+
+    start = error()
+    for at in range(12):
+        guide.update_step(0, at)
+        learn(guide, latents, condition)
+    assert error() < 0.97 * start
+    after = guide.unet.state_dict()
+    assert all(torch.equal(after[name], value) for name, value in before.items())
+    assert not any(layer._forward_hooks for layer in guide.unet.modules())
+
+
+def test_an_evaluation_does_not_train(models, prompts):
+    guide, particles = vsd(models)
+    state = {name: value.clone() for name, value in particles.state().items()}
+    rgb = tiny.renders(2)
+    guide(rgb, prompts[False], guidance_eval=True, **tiny.first(2), **cameras(2))
+    assert all(torch.equal(particles.state()[name], value) for name, value in state.items())
+    guide(rgb, prompts[False], **tiny.first(2), **cameras(2))
+    assert any(not torch.equal(particles.state()[name], value) for name, value in state.items())
+
+
+def test_bad_items_are_not_learnt(models, prompts):
+    guide, particles = vsd(models)
+    latents, _, condition = inputs(guide, prompts)
+    poisoned = latents.clone()
+    poisoned[2] = torch.nan
+    good = torch.tensor([True, True, False, True])
+    assert learn(guide, poisoned, condition, good)["lora_error"] > 0
+    assert all(value.isfinite().all() for value in particles.state().values())
+    assert learn(guide, poisoned, condition, ~GOOD) == {}
+
+
+# State
+# --------------------------------------------------------------------------------------------------
+
+
+def test_a_restored_lora_continues_bit_for_bit(models, prompts):
+    guide, particles = vsd(models, lr=1e-3)
+    latents, _, condition = inputs(guide, prompts)
+    learn(guide, latents, condition)
+    saved = {name: value.clone() for name, value in guide.variant.state().items()}
+    other, restored = vsd(models, lr=1e-3)
+    other.variant.restore(other, saved)
+    for guidance in (guide, other):
+        guidance.update_step(0, 1)
+        learn(guidance, latents, condition)
+    ours, theirs = particles.state(), restored.state()
+    assert ours.keys() == theirs.keys() == saved.keys()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    assert any(not torch.equal(ours[name], saved[name]) for name in ours)
+
+
+def test_a_lora_of_another_rank_is_refused(models):
+    guide, particles = vsd(models)
+    other, _ = vsd(models, rank=2)
+    with pytest.raises(UserError, match="not the LoRA of rank 2 .* resume with the configuration"):
+        other.variant.restore(other, particles.state())
+
+
+@pytest.mark.parametrize("option", ["enable_torch_compile", "enable_sequential_cpu_offload"])
+def test_options_that_replace_the_unets_forward_pass_are_refused(models, option):
+    cfg = {
+        "pretrained_model_name_or_path": str(models["epsilon"]),
+        "variant_type": "vsd-variant",
+        option: True,
+    }
+    with pytest.raises(UserError, match=f"system.guidance.{option}: vsd-variant trains a LoRA"):
+        StableDiffusionGuidance.preflight(cfg)
+    StableDiffusionGuidance.preflight(cfg | {option: False})

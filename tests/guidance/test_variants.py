@@ -1,0 +1,262 @@
+"""Each variant of score distillation against its closed form, in float64, on a mixture of Gaussians
+in three dimensions.
+"""
+
+import pytest
+import torch
+
+from tests.helpers.mixture_guidance import (
+    MODES,
+    STD,
+    MixtureGuidance,
+    draws,
+    latents,
+    mixture_guidance,
+    noise_of,
+)
+from threestudio_gaussiandreamer.core.streams import generator
+from threestudio_gaussiandreamer.diffusion.consistent_noise import attach_noise
+
+EXACT = 1e-10
+"""Largest error: only rounding of float64, and the noise, which is drawn in float32, is given."""
+
+
+def error_of(guidance, x, batch=None):
+    with torch.no_grad():
+        error, abar = guidance.variant.error(guidance, x, None, batch or {})
+    assert error.dtype == torch.float64 and error.shape == x.shape and abar.shape == (len(x),)
+    return error
+
+
+def assert_close(a, b):
+    assert (a - b).abs().max() <= EXACT * b.abs().max()
+
+
+def both_scores(guidance, z, t):
+    abar = guidance.abar_of(t)
+    return noise_of(z, abar, MODES[:1]), noise_of(z, abar, MODES)
+
+
+@pytest.mark.parametrize("scale", [1.0, 7.5])
+def test_sds_is_the_guided_noise_minus_the_noise(scale):
+    guidance, x = mixture_guidance(guidance_scale=scale), latents()
+    t, a, sigma, noise, z = draws(guidance, x)
+    cond, uncond = both_scores(guidance, z, t)
+    assert_close(error_of(guidance, x), uncond + scale * (cond - uncond) - noise)
+
+
+def test_sds_on_one_gaussian_is_the_distance_to_its_mean_on_average():
+    """E_eps[eps_hat - eps] = sigma a (x - m) / (a^2 s^2 + sigma^2)."""
+    guidance, x = mixture_guidance(guidance_scale=1.0), latents(1)
+    t, a, sigma, noise, z = draws(guidance, x)
+    variance = a**2 * STD**2 + sigma**2
+    mean = sigma * a * (x - MODES[0]) / variance
+    assert_close(error_of(guidance, x), mean + (sigma**2 / variance - 1) * noise)
+
+
+def test_csd_is_the_difference_that_the_condition_makes():
+    guidance, x = mixture_guidance("csd-variant", guidance_scale=7.5), latents()
+    t, a, sigma, noise, z = draws(guidance, x)
+    cond, uncond = both_scores(guidance, z, t)
+    assert_close(error_of(guidance, x), 7.5 * (cond - uncond))
+
+
+def test_csd_is_what_guidance_adds_to_sds():
+    x = latents()
+    low, high = (error_of(mixture_guidance(guidance_scale=s), x) for s in (1.0, 8.5))
+    csd = error_of(mixture_guidance("csd-variant", guidance_scale=7.5), x)
+    assert_close(csd, high - low)
+
+
+class Negative(MixtureGuidance):
+    """The unconditional score is that of a negative prompt, two of the modes."""
+
+    def empty_prompt(self, z, t, condition):
+        return noise_of(z, self.abar_of(t), MODES[1:])
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.4, 1.0])
+def test_nfsd_with_a_negative_prompt(threshold):
+    options = {"guidance_scale": 7.5, "variant": {"threshold": threshold}}
+    guidance, x = Negative({"variant_type": "nfsd-variant", **options}), latents(9)
+    t, a, sigma, noise, z = draws(guidance, x)
+    cond, negative = both_scores(guidance, z, t)
+    empty = noise_of(z, guidance.abar_of(t), MODES[1:])
+    small = (t < 1000 * threshold).reshape(-1, 1, 1, 1)
+    assert 0 < threshold < 1 or small.all() or not small.any()
+    expected = torch.where(small, empty, empty - negative) + 7.5 * (cond - empty)
+    assert_close(error_of(guidance, x), expected)
+
+
+def test_nfsd_without_a_negative_prompt_has_no_domain_direction_at_large_noise():
+    guidance, x = mixture_guidance("nfsd-variant", guidance_scale=7.5), latents(9)
+    t, a, sigma, noise, z = draws(guidance, x)
+    cond, uncond = both_scores(guidance, z, t)
+    small = (t < 200).reshape(-1, 1, 1, 1)
+    assert small.any() and not small.all()
+    expected = torch.where(small, uncond, torch.zeros_like(z)) + 7.5 * (cond - uncond)
+    assert_close(error_of(guidance, x), expected)
+
+
+# VSD
+# --------------------------------------------------------------------------------------------------
+
+
+def learn(guidance, x):
+    guidance.variant.learn(guidance, x, None, {}, torch.ones(len(x), dtype=torch.bool))
+
+
+def test_vsd_before_any_render_is_sds():
+    x = latents()
+    sds, vsd = (
+        error_of(mixture_guidance(name, guidance_scale=7.5), x)
+        for name in ("sds-variant", "vsd-variant")
+    )
+    assert torch.equal(sds, vsd)
+
+
+def test_vsd_subtracts_the_optimal_denoiser_of_the_renders_gaussian():
+    """With a momentum of 3/4, the renders of two steps have the shares 3/7 and 4/7."""
+    options = {"guidance_scale": 7.5, "variant": {"momentum": 0.75}}
+    guidance, first, second = mixture_guidance("vsd-variant", **options), latents(4), latents(6, 1)
+    learn(guidance, first)
+    learn(guidance, second)
+    weights = torch.tensor([3 / 28] * 4 + [4 / 42] * 6, dtype=torch.float64)
+    seen = torch.cat([first, second]).reshape(-1, 3)
+    mean = weights @ seen
+    variance = weights @ (seen - mean) ** 2
+    x = latents()
+    t, a, sigma, noise, z = draws(guidance, x)
+    cond, uncond = both_scores(guidance, z, t)
+    own = sigma * (z - a * mean) / (a**2 * variance + sigma**2)
+    assert_close(error_of(guidance, x), uncond + 7.5 * (cond - uncond) - own)
+
+
+def test_vsd_of_one_render_that_stays_the_same_is_sds():
+    """A particle model that knows its only render predicts the noise itself."""
+    guidance, x = mixture_guidance("vsd-variant", guidance_scale=7.5), latents(1)
+    for _ in range(3):
+        learn(guidance, x)
+    expected = error_of(mixture_guidance(guidance_scale=7.5), x)
+    assert (error_of(guidance, x) - expected).abs().max() < 1e-7  # the variance's cancellation
+
+
+# Inversions, on one Gaussian, whose DDIM trajectories are straight lines in z - a m
+# --------------------------------------------------------------------------------------------------
+
+
+def moved(guidance, distance, now, later):
+    """Return z' - a' m after a step of DDIM from timestep ``now`` to ``later``, on one Gaussian."""
+    (a, sigma), (b, tau) = (
+        (guidance.alphas_cumprod[t] ** 0.5, (1 - guidance.alphas_cumprod[t]) ** 0.5)
+        for t in (now, later)
+    )
+    return distance * (a * b * STD**2 + sigma * tau) / (a**2 * STD**2 + sigma**2)
+
+
+def on_one_gaussian(monkeypatch, variant_type, **options):
+    """Let the unconditional score be that of the first mode, as the conditional one."""
+    monkeypatch.setattr("tests.helpers.mixture_guidance.MODES", MODES[:1])
+    return mixture_guidance(variant_type, guidance_scale=7.5, **options)
+
+
+def test_sdi_without_fresh_noise_follows_the_trajectory(monkeypatch):
+    guidance = on_one_gaussian(monkeypatch, "sdi-variant", variant={"eta": 0.0})
+    x = latents()
+    ts, abar = guidance.draw_timesteps(x)
+    expected = []
+    for item, t in zip(x, ts.tolist(), strict=True):
+        distance = item - guidance.alphas_cumprod[0] ** 0.5 * MODES[0]
+        for start in range(0, t, 100):
+            distance = moved(guidance, distance, start, min(start + 100, t))
+        a, sigma = guidance.alphas_cumprod[t] ** 0.5, (1 - guidance.alphas_cumprod[t]) ** 0.5
+        z = distance + a * MODES[0]
+        predicted = sigma * distance / (a**2 * STD**2 + sigma**2)
+        expected.append(predicted - (z - a * item) / sigma)
+    assert_close(error_of(guidance, x), torch.stack(expected))
+
+
+def test_sdi_is_threestudios_step_by_step():
+    """threestudio's inversion of one item (stable_diffusion_sdi_guidance.py, v0.2.3), written again
+    from its formulas: ddim_inversion_step with its variance of DDPM's reverse step, guidance in its
+    convention, and x minus the denoised z_t. Its random overshoot of the last step is left out.
+    """
+    options = {"guidance_scale": 8.5, "weighting_strategy": "x0"}
+    guidance, x = mixture_guidance("sdi-variant", step=11, **options), latents(1)
+    (t,), _ = guidance.draw_timesteps(x)
+    abars = guidance.alphas_cumprod
+
+    def predicted(z, t, scale):
+        cond, uncond = both_scores(guidance, z, torch.tensor([t]))
+        return cond + scale * (cond - uncond)
+
+    z = x
+    times = [*range(0, int(t), 100), int(t)]
+    for index, (now, later) in enumerate(zip(times, times[1:], strict=False)):
+        eps = predicted(z, now, -7.5)
+        original = (z - (1 - abars[now]) ** 0.5 * eps) / abars[now] ** 0.5
+        z = abars[later] ** 0.5 * original + (1 - abars[later]) ** 0.5 * eps
+        variance = (1 - abars[now]) / (1 - abars[later]) * (1 - abars[later] / abars[now])
+        drawn = torch.randn(1, 1, 3, generator=generator(0, f"inversion {index}", 11))
+        z = z + 0.3 * drawn.double() * variance**0.5
+    denoised = (z - (1 - abars[t]) ** 0.5 * predicted(z, int(t), 7.5)) / abars[t] ** 0.5
+    weight = ((1 - abars[t]) / abars[t]) ** 0.5
+    assert_close(weight * error_of(guidance, x), x - denoised)
+
+
+def test_ism_is_the_change_of_the_score_over_the_interval(monkeypatch):
+    guidance, x = on_one_gaussian(monkeypatch, "ism-variant"), latents(7)
+    ts, abar = guidance.draw_timesteps(x)
+    expected = []
+    for item, t in zip(x, ts.tolist(), strict=True):
+        s = max(t - 50, 0)
+        distance = item - guidance.alphas_cumprod[0] ** 0.5 * MODES[0]
+        for start in range(0, s, 200):
+            distance = moved(guidance, distance, start, min(start + 200, s))
+        scores = []
+        for time, at in ((s, distance), (t, moved(guidance, distance, s, t))):
+            alpha = guidance.alphas_cumprod[time]
+            scores.append((1 - alpha) ** 0.5 * at / (alpha * STD**2 + 1 - alpha))
+        expected.append(scores[1] - scores[0])
+    assert_close(error_of(guidance, x), torch.stack(expected))
+
+
+def test_ism_guides_only_at_the_end_of_the_interval(monkeypatch):
+    x, ends = latents(), []
+    predict_noise = MixtureGuidance.predict_noise
+
+    def recorded(self, z, t, condition):
+        ends.append(z)
+        return predict_noise(self, z, t, condition)
+
+    monkeypatch.setattr(MixtureGuidance, "predict_noise", recorded)
+    plain, guided = (mixture_guidance("ism-variant", guidance_scale=s) for s in (1.0, 7.5))
+    difference = error_of(guided, x) - error_of(plain, x)
+    assert len(ends) == 2 and torch.equal(*ends)
+    cond, uncond = both_scores(plain, ends[0], plain.draw_timesteps(x)[0])
+    assert_close(difference, 6.5 * (cond - uncond))
+
+
+# Noise that is consistent across views
+# --------------------------------------------------------------------------------------------------
+
+
+def test_cfd_uses_the_surfaces_noise():
+    guidance, x = mixture_guidance("cfd-variant", guidance_scale=7.5), latents(2)
+    batch = {
+        "depth": torch.full((2, 4, 12, 1), 2.0),
+        "opacity": torch.ones(2, 4, 12, 1),
+        "c2w": torch.eye(4).repeat(2, 1, 1),
+        "fovy": torch.full((2,), 0.8),
+    }
+    noise = attach_noise(
+        guidance.normal(x, "noise"),
+        guidance.variant.table(guidance.step + 1, x),  # the same in another step
+        *(batch[name] for name in ("depth", "opacity", "c2w", "fovy")),
+    )
+    t, a, sigma, *_ = draws(guidance, x)
+    z = a * x + sigma * noise
+    cond, uncond = both_scores(guidance, z, t)
+    assert_close(error_of(guidance, x, batch), uncond + 7.5 * (cond - uncond) - noise)
+    assert torch.equal(noise[0], noise[1])  # two views from the same place
+    assert not torch.equal(noise, guidance.normal(x, "noise"))

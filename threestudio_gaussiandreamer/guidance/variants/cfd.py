@@ -1,0 +1,70 @@
+"""``cfd-variant``: noise that is consistent across views (Yan et al. 2025, Consistent Flow
+Distillation, arXiv:2501.05445): noise attached to the rendered surface, the same in all views and
+steps.
+
+    e = eps_hat(z_t, t) - eps,   z_t = sqrt(abar) x + sqrt(1 - abar) eps,   eps = noise(surface)
+
+How noise is attached: ``diffusion/consistent_noise.py``. The background's noise is drawn in
+each step, as in SDS. The paper's t falls in the course of a run: use
+``timestep_schedule: linear`` with it.
+
+=======  ===========================================================================================
+option   meaning
+=======  ===========================================================================================
+refresh  steps after which the surface gets new noise; 0: never, the paper's deterministic flow
+=======  ===========================================================================================
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, Optional
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...core import streams
+from ...core.errors import UserError
+from ...core.options import at_least
+from ...diffusion.consistent_noise import TABLE, attach_noise
+from ...host import register, run_seed
+from .base import Batch, Error, Variant
+
+
+@register("cfd-variant")
+class CFD(Variant):
+    RENDERS = ("depth", "opacity")
+
+    @dataclass
+    class Config(Variant.Config):
+        refresh: int = field(default=0, metadata=at_least(0, "steps"))
+
+    cfg: Config
+
+    def configure(self) -> None:
+        super().configure()
+        self._table: Optional[tuple[int, Tensor]] = None
+
+    def error(
+        self, guidance: Any, latents: Float[Tensor, "B c h w"], condition: Any, batch: Batch
+    ) -> Error:
+        if missing := [name for name in self.RENDERS if name not in batch]:
+            raise UserError(
+                f"cfd-variant attaches noise to the rendered surface: give the guidance the "
+                f"renderer's {' and '.join(missing)}, as gaussiandreamer-system does"
+            )
+        noise = attach_noise(
+            guidance.normal(latents, "noise"),
+            self.table(guidance.step, latents),
+            *(batch[name] for name in (*self.RENDERS, "c2w", "fovy")),
+        )
+        noised = guidance.noised(latents, noise)
+        return guidance.predict_noise(noised.z, noised.t, condition) - noise, noised.abar
+
+    def table(self, step: int, latents: Float[Tensor, "B c h w"]) -> Float[Tensor, "TABLE c"]:
+        """Return the values of the cells, the same in all processes of a run."""
+        epoch = step // self.cfg.refresh if self.cfg.refresh else 0
+        if self._table is None or self._table[0] != epoch:
+            generator = streams.generator(run_seed(), "surface noise", epoch)
+            values = torch.randn(TABLE, latents.shape[1], generator=generator)
+            self._table = epoch, values.to(latents.device)
+        return self._table[1]

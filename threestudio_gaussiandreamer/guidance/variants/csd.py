@@ -1,0 +1,27 @@
+"""``csd-variant``: classifier score distillation (Yu et al. 2023, arXiv:2310.19415): of the
+classifier-free guidance only the difference that the prompt makes.
+
+    e = guidance_scale (eps_c(z_t, t) - eps_u(z_t, t))
+
+The paper has no scale; Adam isn't sensitive to it, but ``grad_clip`` is, and with it the error is
+what SDS at the same scale adds to eps_u - eps. There are no options."""
+
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from ...host import register
+from .base import Batch, Error, Variant
+
+
+@register("csd-variant")
+class CSD(Variant):
+    NEEDS_UNCONDITIONAL = NEEDS_TEXT = True
+
+    def error(
+        self, guidance: Any, latents: Float[Tensor, "B c h w"], condition: Any, batch: Batch
+    ) -> Error:
+        noised = guidance.add_noise(latents)
+        cond, uncond = guidance.both(noised.z, noised.t, condition)
+        return guidance.cfg.guidance_scale * (cond - uncond), noised.abar

@@ -1,0 +1,51 @@
+"""``nfsd-variant``: noise-free score distillation (Katzir et al. 2023, arXiv:2310.17590): the
+direction of the prompt and that of the data's domain, without the predicted noise.
+
+    e = delta_D + guidance_scale delta_C,   delta_C = eps_c - eps_0
+    delta_D = eps_0                         if t < threshold, where the noise in eps_0 is small
+            = eps_0 - eps_n                 otherwise
+
+eps_0 is the prediction for an empty prompt, eps_n that for the negative prompt. A score model
+without a negative prompt has delta_D = 0 at large t, and eps_0 is its unconditional score.
+
+=========  =========================================================================================
+option     meaning
+=========  =========================================================================================
+threshold  timestep as a share of all below which delta_D is eps_0; the paper: 0.2
+=========  =========================================================================================
+
+The paper's ``guidance_scale`` is 7.5."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...core.options import in_range
+from ...diffusion.sds import per_item
+from ...host import register
+from .base import Batch, Error, Variant
+
+
+@register("nfsd-variant")
+class NFSD(Variant):
+    NEEDS_UNCONDITIONAL = NEEDS_EMPTY_PROMPT = True
+
+    @dataclass
+    class Config(Variant.Config):
+        threshold: float = field(default=0.2, metadata=in_range(0, 1))
+
+    cfg: Config
+
+    def error(
+        self, guidance: Any, latents: Float[Tensor, "B c h w"], condition: Any, batch: Batch
+    ) -> Error:
+        noised = guidance.add_noise(latents)
+        cond, negative = guidance.both(noised.z, noised.t, condition)
+        empty = guidance.empty_prompt(noised.z, noised.t, condition)
+        empty = negative if empty is None else empty
+        small = noised.t < self.cfg.threshold * len(guidance.alphas_cumprod)
+        domain = empty - torch.where(per_item(small, cond) > 0, 0.0, negative)
+        return domain + guidance.cfg.guidance_scale * (cond - empty), noised.abar
