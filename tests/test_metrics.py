@@ -10,6 +10,7 @@ from threestudio_gaussiandreamer.metrics import (
     multi_face_rate,
     out_of_gamut,
     psnr,
+    saturation,
     ssim,
 )
 
@@ -73,6 +74,11 @@ def test_floater_mass_is_weighted_by_opacity():
     distances, opacities = torch.tensor([0.0, 0.03, 0.05, 0.1]), torch.tensor([0.5, 0.5, 0.2, 0.8])
     assert math.isclose(floater_mass(distances, opacities, extent=2.0), 0.5)  # farther than 0.04
     assert floater_mass(distances, torch.zeros(4), extent=2.0) == 0
+
+
+def test_saturation_is_the_range_of_the_channels():
+    images = torch.tensor([[[0.2, 0.9, 0.5], [0.4, 0.4, 0.4]]])
+    assert saturation(images) == pytest.approx(0.35)
 
 
 def test_out_of_gamut_counts_pixels_beyond_what_a_screen_shows():

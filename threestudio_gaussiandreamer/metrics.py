@@ -111,6 +111,11 @@ def out_of_gamut(images: Float[Tensor, "*batch 3"]) -> float:
     return ((images < -beyond) | (images > 1 + beyond)).any(-1).double().mean().item()
 
 
+def saturation(images: Float[Tensor, "*batch 3"]) -> float:
+    """Compute the mean saturation of colours in [0, 1]: the largest channel minus the smallest."""
+    return (images.amax(-1) - images.amin(-1)).double().mean().item()
+
+
 def _window_mean(images: Float[Tensor, "*batch H W C"]) -> Float[Tensor, "*batch H W C"]:
     """Compute the Gaussian-weighted mean of the window around each pixel, one axis at a time."""
     offsets = torch.arange(SSIM_WINDOW, device=images.device, dtype=images.dtype) - SSIM_WINDOW // 2

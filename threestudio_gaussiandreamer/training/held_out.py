@@ -3,7 +3,8 @@
 The ground truth is ray cast, independently of the splatting rasteriser, and composited over the
 background of the render. Scores: PSNR and SSIM, averaged over the views; fraction of views that
 show another side of the object (multi-face); fraction of the opacity far from the surface (floater
-mass); fraction of pixels with a colour outside [0, 1] (out of gamut)."""
+mass); fraction of pixels with a colour outside [0, 1] (out of gamut); mean saturation of the
+colours relative to the ground truth's."""
 
 import json
 import time
@@ -28,7 +29,7 @@ from ..core.memory import require_memory
 from ..core.options import at_least, in_range, is_number, is_whole
 from ..meshes.mesh import SurfaceDistance
 from ..meshes.raycast import over_background
-from ..metrics import floater_mass, multi_face_rate, out_of_gamut, psnr, ssim
+from ..metrics import floater_mass, multi_face_rate, out_of_gamut, psnr, saturation, ssim
 from .camera_options import MAX_SIDE
 from .data import make_batch
 
@@ -245,6 +246,8 @@ class Measurements:
         scores["multi_face"] = round(self.held_out.multi_face(images, cloud.backgrounds), 4)
         scores["floater_mass"] = round(self.held_out.floaters(cloud.means, cloud.opacities), 5)
         scores["out_of_gamut"] = round(out_of_gamut(cloud.images), 5)
+        relative = saturation(images) / max(saturation(truth), 1e-6)
+        scores["saturation"] = round(relative, 4)
         if key == "curve":
             self.values.setdefault("curve", []).append(scores)
         else:
