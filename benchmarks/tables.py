@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.markdown import markdown
-from benchmarks.quality import failure_table, formats
+from benchmarks.quality import failure_table, formats, variant_tables
 from benchmarks.quality import mesh as mesh_quality
 from benchmarks.quality import tables as quality
 from benchmarks.quality.runs import ROOT
@@ -62,6 +62,7 @@ def readme_table() -> str:
 
 SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "README.md": {"measured": readme_table},
+    "docs/distillation.md": {"overhead": variant_tables.overhead},
     "docs/failures.md": {"tables": failure_table.tables},
     "docs/formats.md": {"formats": formats.table, "producers": formats.producers},
     "docs/mesh.md": {"front": mesh_quality.front},

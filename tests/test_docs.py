@@ -90,8 +90,10 @@ def test_a_launch_that_is_shown_is_accepted(arguments, tmp_path, monkeypatch):
     args = parse_arguments([word for word in arguments if word != "..."])
     paths = [find_config(name).resolve() for name in args.config]
     overrides = [
-        override for override in args.overrides if "spiral-prior" not in override
-    ]  # an extension, tried below
+        override
+        for override in args.overrides
+        if not re.search("spiral-prior|front-first|variant.behind", override)
+    ]  # extensions, tried below
     monkeypatch.chdir(tmp_path)
     check_config(load_config(*paths, cli_args=overrides))
 
@@ -112,6 +114,10 @@ PARTS = {
     "custom/one_color.py": [
         "system.guidance_type=one-color-guidance",
         "system.geometry.prior.path=toy.glb",
+    ],
+    "custom/front_first.py": [
+        "system.guidance.variant_type=front-first-variant",
+        "system.guidance.variant.behind=0.2",
     ],
 }
 

@@ -1,0 +1,125 @@
+"""The bookkeeping of each variant of score distillation, in CPU time of one thread.
+
+    python -m benchmarks.quality.variant_overhead [--gaussians 10000 --size 256 --views 4]
+
+A step is the demo's: views drawn and differentiated, the shared path of score distillation on 64^2
+latents, Adam. The score model is empty: it returns its input, so a variant's further calls of it
+cost nothing, and what remains is everything else that the variant does. Steps of SDS and of the
+variant alternate; the overhead is the median of the differences of two neighbouring steps, relative
+to the median step of SDS. ``evaluations``: calls of the score model per view and step, on average.
+Writes ``benchmarks/results/variant_overhead.csv``. The bar: at most 2 %."""
+
+import argparse
+import csv
+import io
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from tqdm import tqdm
+
+from benchmarks.quality.runs import commit, machine
+from benchmarks.robustness.bench_guards import Bench
+from tests.helpers.pixel_guidance import PixelGuidance
+from threestudio_gaussiandreamer.cameras import orbit_c2w
+from threestudio_gaussiandreamer.core.files import atomic_file
+from threestudio_gaussiandreamer.guidance.variants import Variant
+from threestudio_gaussiandreamer.host import find, names
+
+RESULTS = Path(__file__).parents[1] / "results/variant_overhead.csv"
+LATENT = 64
+BASELINE = "sds-variant"
+COLUMNS = ["variant", "gaussians", "size", "views", "sds_ms", "extra_ms", "percent", "evaluations"]
+COLUMNS += ["machine", "commit"]
+
+
+class EmptyScore(PixelGuidance):
+    """A score model without any computation, on pooled pixels."""
+
+    def encode(self, rgb, **batch):
+        return F.adaptive_avg_pool2d(2 * rgb - 1, LATENT)
+
+    def predict(self, z, t, condition):
+        self.evaluations += len(z)
+        return z, z
+
+    def unconditional(self, z, t, condition):
+        self.evaluations += len(z)
+        return z
+
+
+class VariantBench(Bench):
+    """A training step with any variant."""
+
+    def __init__(self, gaussians: int, size: int, views: int) -> None:
+        super().__init__(gaussians, size, views)
+        azimuths = torch.arange(views) * 360.0 / views
+        c2w = orbit_c2w(torch.full((views,), 15.0), azimuths, torch.full((views,), 2.7))
+        self.batch = {"c2w": c2w, "fovy": torch.full((views,), 0.87)}
+
+    def step_with(self, guidance: EmptyScore) -> float:
+        """Make a step; return its CPU seconds."""
+        start = time.process_time()
+        out = self.forward()
+        surface = {"depth": out.depth.detach(), "opacity": out.alpha.detach()}
+        surface["depth"] = surface["depth"] / surface["opacity"].clamp_min(1e-6)
+        guidance(out.image, **self.batch, **surface)["loss_sds"].backward()
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        guidance.update_step(0, guidance.step + 1)
+        return time.process_time() - start
+
+
+def variant_names() -> list[str]:
+    """Return the registered variants."""
+    return [name for name in names() if issubclass(find(name), Variant)]
+
+
+def measure(bench: VariantBench, name: str, pairs: int) -> dict[str, Any]:
+    """Return the row of one variant."""
+    options = {"guidance_scale": 7.5}
+    plain, other = (EmptyScore(options | {"variant_type": variant}) for variant in (BASELINE, name))
+    bench.step_with(plain), bench.step_with(other)
+    calls, times = [], []
+    for _ in range(pairs):
+        times.append((bench.step_with(plain), bench.step_with(other)))
+        calls.append(other.evaluations / len(bench.batch["c2w"]))
+    sds = statistics.median(first for first, _ in times)
+    extra = statistics.median(second - first for first, second in times)
+    return {
+        "variant": name,
+        "sds_ms": f"{1e3 * sds:.2f}",
+        "extra_ms": f"{1e3 * extra:.3f}",
+        "percent": f"{100 * extra / sds:.2f}",
+        "evaluations": f"{statistics.mean(calls):.2f}",
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    for name, default in (("gaussians", 10_000), ("size", 256), ("views", 4), ("pairs", 60)):
+        parser.add_argument(f"--{name}", type=int, default=default)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    bench = VariantBench(options.gaussians, options.size, options.views)
+    setting = {name: getattr(options, name) for name in ("gaussians", "size", "views")}
+    setting |= {"machine": machine(), "commit": commit()}
+    rows = []
+    for name in tqdm(variant_names(), unit="variant", disable=None):
+        rows.append(measure(bench, name, options.pairs) | setting)
+        tqdm.write("{variant:14} +{extra_ms} ms of {sds_ms}: {percent} %".format(**rows[-1]))
+    table = io.StringIO()
+    writer = csv.DictWriter(table, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with atomic_file(RESULTS) as file:
+        file.write(table.getvalue().encode())
+
+
+if __name__ == "__main__":
+    main()
