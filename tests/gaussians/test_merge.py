@@ -168,3 +168,37 @@ def test_few_and_unusable_gaussians():
         torch.tensor([-30.0, -30, 3]),
     )
     assert len(merge_duplicates(same).parents) == 6
+
+
+def near_duplicates(count=400):
+    """Return pairs of Gaussians, from nearly equal ones to some far above the bound."""
+    rng, one = torch.Generator().manual_seed(1), shell(count)
+    apart = {"means": 0.1, "log_scales": 0.3, "quats": 0.2, "sh0": 0.5}
+    share = torch.linspace(0, 1, count) ** 3
+    other = {
+        name: value
+        + apart.get(name, 0.0)
+        * (share * torch.randn(value.shape, generator=rng).movedim(0, -1)).movedim(-1, 0)
+        for name, value in one.items()
+    }
+    return {name: torch.cat([value, other[name]]) for name, value in one.items()}
+
+
+def test_the_bound_without_covariances_is_never_above_the_cost():
+    shapes = merging._shapes(near_duplicates())
+    pairs = torch.arange(400)[:, None] + torch.tensor([0, 400])
+    costs, least = merging._costs(shapes, pairs), merging._least_costs(shapes, pairs)
+    assert (least <= costs).all() and (least > merging.DUPLICATE).any()
+    assert (costs <= merging.DUPLICATE).any()
+
+
+def test_pairs_in_parts_give_the_duplicates_of_all_costs_at_once(monkeypatch):
+    params = near_duplicates()
+    spent = torch.zeros(800, dtype=torch.float64)
+    monkeypatch.setattr(merging, "PAIRS_AT_ONCE", 100)
+    in_parts = merging.duplicates(params, spent)
+    monkeypatch.setattr(merging, "_costs_of_duplicates", merging._costs)
+    monkeypatch.setattr(merging, "PAIRS_AT_ONCE", 10**6)
+    at_once = merging.duplicates(params, spent)
+    assert len(in_parts[0]) > 10
+    assert all(torch.equal(*both) for both in zip(in_parts, at_once, strict=True))

@@ -31,6 +31,8 @@ the original, for untrained clouds too.
 """
 COLOR_TOLERANCE = 0.1
 NEIGHBOURS = 4
+PAIRS_AT_ONCE = 2**18
+"""Pairs whose covariances are in memory at the same time."""
 LOG_THINNEST = -12.0
 """Smallest logarithm of the ratio of an axis to the longest one; shorter axes are clamped to it, so
 that covariances are well conditioned in float64.
@@ -42,6 +44,7 @@ class _Shapes(NamedTuple):
 
     means: Float[Tensor, "N 3"]
     covariances: Float[Tensor, "N 3 3"]
+    traces: Float[Tensor, " N"]
     log_determinants: Float[Tensor, " N"]
     opacities: Float[Tensor, " N"]
     weights: Float[Tensor, " N"]
@@ -87,9 +90,9 @@ def duplicates(
     """
     shapes = _shapes(params)
     pairs = _neighbours(shapes.means)
-    costs = _costs(shapes, pairs) + spent[pairs].amax(
-        1
-    )  # accumulated, so that a sequence of small merges can't change the result by much
+    found = torch.cat([_costs_of_duplicates(shapes, p) for p in pairs.split(PAIRS_AT_ONCE)])
+    # accumulated, so that a sequence of small merges can't change the result by much
+    costs = found + spent[pairs].amax(1)
     order = costs.argsort(stable=True)[
         : int((costs <= DUPLICATE).sum())
     ]  # NaN, the cost of Gaussians that aren't finite, is sorted to the end
@@ -112,9 +115,9 @@ def _shapes(params: Mapping[str, Tensor]) -> _Shapes:
     harmonics = params["sh0"] if "sh0" in params else params["sh"]
     colors = C0 * harmonics[:, 0].detach().cpu().double()
     weights = opacities * (log_scales.sum(1) * (2 / 3)).exp()
-    return _Shapes(
-        means, axes @ axes.transpose(1, 2), 2 * log_scales.sum(1), opacities, weights, colors
-    )
+    traces = (2 * log_scales).exp().sum(1)
+    covariances = axes @ axes.transpose(1, 2)
+    return _Shapes(means, covariances, traces, 2 * log_scales.sum(1), opacities, weights, colors)
 
 
 def _neighbours(means: Float[Tensor, "N 3"]) -> Int[Tensor, "P 2"]:
@@ -124,8 +127,9 @@ def _neighbours(means: Float[Tensor, "N 3"]) -> Int[Tensor, "P 2"]:
     rows = means.isfinite().all(1).nonzero()[:, 0]
     if len(rows) < 2:
         return torch.zeros(0, 2, dtype=torch.long)
-    points = means[rows].numpy()
-    nearest = torch.from_numpy(cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(rows)))[1])
+    points, count = means[rows].numpy(), len(rows)
+    _, found = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, count), workers=-1)
+    nearest = torch.from_numpy(found)
     pairs = torch.stack([torch.arange(len(rows))[:, None].expand_as(nearest), nearest], -1).reshape(
         -1, 2
     )
@@ -133,8 +137,9 @@ def _neighbours(means: Float[Tensor, "N 3"]) -> Int[Tensor, "P 2"]:
     # disjoint pairs; pairs of neighbours in sorted order are added for them.
     order = torch.from_numpy(np.lexsort(points.T))
     pairs = torch.cat([pairs, torch.stack([order[:-1], order[1:]], 1)])
-    pairs = pairs[pairs[:, 0] != pairs[:, 1]].sort(1).values.unique(dim=0)
-    return rows[pairs]
+    low, high = pairs[pairs[:, 0] != pairs[:, 1]].sort(1).values.unbind(1)
+    keys = (low * count + high).unique()
+    return rows[torch.stack([keys // count, keys % count], 1)]
 
 
 def _moments(
@@ -153,6 +158,34 @@ def _moments(
     return f, means, within + (f * (1 - f))[:, None, None] * apart[:, :, None] * apart[:, None]
 
 
+def _costs_of_duplicates(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
+    """Return the cost of each pair; of those that are no duplicates, a lower bound above
+    ``DUPLICATE``, which needs no covariances.
+    """
+    costs = _least_costs(shapes, pairs)
+    near = costs <= 1.001 * DUPLICATE  # the determinants' rounding errors are smaller
+    costs[near] = _costs(shapes, pairs[near])
+    return costs
+
+
+def _least_costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
+    """Bound the cost from below: log |S| is concave in S, and for the mean covariance W of a pair,
+    |W + g d d^T| >= |W| (1 + g |d|^2 / trace W).
+    """
+    i, j = pairs.unbind(1)
+    f = shapes.weights[i] / (shapes.weights[i] + shapes.weights[j])
+    within = f * shapes.traces[i] + (1 - f) * shapes.traces[j]
+    growth = torch.log1p(f * (1 - f) * (shapes.means[i] - shapes.means[j]).square().sum(1) / within)
+    return 0.5 * (growth + _color_cost(shapes, pairs, f))
+
+
+def _color_cost(
+    shapes: _Shapes, pairs: Int[Tensor, "P 2"], f: Float[Tensor, " P"]
+) -> Float[Tensor, " P"]:
+    apart = (shapes.colors[pairs[:, 0]] - shapes.colors[pairs[:, 1]]).square().sum(1)
+    return torch.log1p(f * (1 - f) * apart / COLOR_TOLERANCE**2)
+
+
 def _costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
     i, j = pairs.unbind(1)
     f, _, covariances = _moments(shapes, pairs)
@@ -161,8 +194,7 @@ def _costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
         - f * shapes.log_determinants[i]
         - (1 - f) * shapes.log_determinants[j]
     )
-    apart = (shapes.colors[i] - shapes.colors[j]).square().sum(1)
-    return 0.5 * (growth + torch.log1p(f * (1 - f) * apart / COLOR_TOLERANCE**2))
+    return 0.5 * (growth + _color_cost(shapes, pairs, f))
 
 
 def _merged(
