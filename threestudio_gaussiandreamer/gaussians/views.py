@@ -162,14 +162,15 @@ def rasterize_views(
     channels: Optional[Float[Tensor, "B N K"]] = None,
 ) -> Rasterized:
     """Rasterize some of the views; ``channels`` are composited after the three colours."""
-    dirs = torch.nn.functional.normalize(cloud.means.detach() - views.positions[rows, None], dim=-1)
-    colors = sh_to_colors(cloud.sh, dirs)
+    colors = sh_to_colors(cloud.sh, _directions(cloud, views, rows))
+    if channels is not None:
+        colors = torch.cat([colors.expand(len(rows), -1, -1), channels], dim=-1)
     return rasterize(
         cloud.means,
         cloud.quats,
         cloud.log_scales.exp(),
         cloud.logit_opacities.sigmoid() if opacities is None else opacities,
-        colors if channels is None else torch.cat([colors, channels], dim=-1),
+        colors,
         views.viewmats[rows],
         views.Ks[rows],
         views.size,
@@ -180,6 +181,15 @@ def rasterize_views(
         eps2d=views.eps2d,
         antialias=views.antialias,
     )
+
+
+def _directions(cloud: Gaussians, views: Views, rows: Tensor) -> Float[Tensor, "*B N 3"]:
+    """Return the unit vectors from the views to the Gaussians; a single one, of shape (1, 3), if
+    the colours don't depend on it, which saves most of the time and memory outside the rasteriser.
+    """
+    if cloud.sh.shape[1] == 1:
+        return cloud.means.new_tensor([[0.0, 0.0, 1.0]])
+    return torch.nn.functional.normalize(cloud.means.detach() - views.positions[rows, None], dim=-1)
 
 
 @torch.no_grad()
