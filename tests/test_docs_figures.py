@@ -16,6 +16,7 @@ from tests.test_docs import TEXTS
 from threestudio_gaussiandreamer import metrics
 from threestudio_gaussiandreamer.core import file_memory
 from threestudio_gaussiandreamer.evaluation import intervals
+from threestudio_gaussiandreamer.gaussians import simplify
 from threestudio_gaussiandreamer.launch.config_source import MOST_DEPTH, MOST_NODES
 from threestudio_gaussiandreamer.launch.live_viewer import SHARE_OF_TIME
 from threestudio_gaussiandreamer.meshes import budget
@@ -43,6 +44,8 @@ CONSTANTS = {
     "docs/pruning.md": [
         f"for {PruneOptions.steps} steps",
         f"the best {PruneConfig.keep:g} are kept",
+        f"of more than {simplify.LARGE:,} Gaussians",
+        f"({simplify.LOSSLESS:g} dB to the original, or {simplify.RESERVE:g} dB above",
     ],
     "docs/robustness.md": [
         f"more than {runner.SECONDS:g} seconds of CPU time",

@@ -5,6 +5,7 @@ import torch
 
 from tests.helpers.pruning import ball
 from threestudio_gaussiandreamer.gaussians import recover
+from threestudio_gaussiandreamer.gaussians import simplify as simplifying
 from threestudio_gaussiandreamer.gaussians.recover import LR_SCALES, Recovery
 from threestudio_gaussiandreamer.gaussians.simplify import (
     Budget,
@@ -69,3 +70,30 @@ def test_grey_gaussians_are_not_lost_before_grey():
     outside = kept.means.norm(dim=1) > 0.9
     grey = (kept.sh == 0).all(-1)[:, 0] & outside
     assert 0.3 < grey.double().sum() / outside.double().sum() < 0.7
+
+
+def test_a_large_cloud_loses_its_hidden_gaussians_without_a_recovery(monkeypatch):
+    """Rounds would drop a fifth of all first; here fewer are left before the first recovery."""
+    fitted, original = [], recover.recover
+
+    def counted(cloud, *rest):
+        fitted.append(len(cloud.means))
+        return original(cloud, *rest)
+
+    monkeypatch.setattr(recover, "recover", counted)
+    monkeypatch.setattr(simplifying, "LARGE", 450)
+    monkeypatch.setattr(simplifying, "LOSSLESS", 30.0)
+    cloud = ball()
+    kept = recovery(cloud, 48)
+    assert len(simplify(cloud, Budget(count=200), kept).means) == 200
+    assert fitted and max(fitted) < simplifying.KEEP * len(cloud.means)
+
+
+def test_a_large_cloud_keeps_what_its_images_need(monkeypatch):
+    monkeypatch.setattr(simplifying, "LARGE", 100)
+    monkeypatch.setattr(simplifying, "LOSSLESS", 200.0)  # beyond what any change leaves
+    cloud, tried = ball(), []
+    kept = recovery(cloud, 48)
+    monkeypatch.setattr(kept, "quality", lambda fewer: tried.append(len(fewer.means)) or 0.0)
+    assert len(simplify(cloud, Budget(psnr=99.0), kept).means) == len(cloud.means)
+    assert min(tried) == 1

@@ -1,22 +1,23 @@
 """Reduce the number of Gaussians at the same image quality: prune by importance in rounds, and
 recover after each round by fitting images of the original.
 
-First duplicates are merged (``merge.py``). Then each round computes the importance in the training
-views (the score ``removal`` of ``importance.py``), keeps the best 80 %, and fits them to images of
-the original (``recover.py``). Pruning many more at once gives worse results than training with the
-smaller number from the start."""
+A large cloud is first pruned at once to the fewest Gaussians with the same images. Then duplicates
+are merged (``merge.py``). Then each round computes the importance in the training views (the score
+``removal`` of ``importance.py``), keeps the best 80 %, and fits them to images of the original
+(``recover.py``). Pruning many more at once gives worse results than training with the smaller
+number from the start."""
 
 from collections.abc import Callable
 from typing import NamedTuple, Optional
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..core.errors import UserError
 from ..core.streams import generator
 from .gaussians import Gaussians
-from .importance import VisibilityStats, importance_by, removal_error
+from .importance import VisibilityStats, importance_by, removal_error, smallest_count
 from .merge import merge_duplicates
 from .recover import Recovery, Round
 from .views import Views, draw, row_batches
@@ -25,6 +26,13 @@ KEEP = 0.8
 """Smallest fraction that a round keeps."""
 SMALLEST_DROP = 0.02
 """The search ends when a round would drop less than this fraction, too little for a recovery."""
+
+LARGE = 100_000
+"""Clouds of more Gaussians are first pruned without recovery, whose time is proportional to it."""
+LOSSLESS = 50.0
+"""PSNR to the original that the first pruning of a large cloud keeps, dB."""
+RESERVE = 10.0
+"""How far that is above the PSNR of the budget, dB, so that a tenth of the error is spent."""
 
 Ranking = Callable[[Gaussians, Views, int], Float[Tensor, " N"]]
 
@@ -99,6 +107,7 @@ class _Search:
                 "can't be ranked"
             )
         self._fit_within_reach()
+        self._reduce()
         self._merge()
         self._prune()
         return self.cloud
@@ -111,6 +120,19 @@ class _Search:
         """Run a recovery before the first round if some colours exceed the file's range."""
         if float(self.cloud.sh[:, 0].abs().amax()) > self.recovery.sh_reach:
             self._take(self.recovery(self.cloud, self.rounds).cloud)
+
+    def _reduce(self) -> None:
+        """Prune a large cloud at once, as far as its images stay the same without a recovery."""
+        least = max(LOSSLESS, (self.budget.psnr or 0.0) + RESERVE)
+
+        def same(kept: Bool[Tensor, " N"]) -> bool:
+            return self.recovery.quality(self.cloud.rows(kept.nonzero()[:, 0])) >= least
+
+        while (here := len(self.cloud.means)) > LARGE:
+            count = smallest_count(self.scores, self.budget.count or 1, same)
+            if count > (1 - SMALLEST_DROP) * here:
+                return
+            self._take(keep_best(self.cloud, self.scores, count))
 
     def _merge(self) -> None:
         values = self.cloud._asdict()
