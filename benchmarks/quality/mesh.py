@@ -118,7 +118,8 @@ def cloud_views(cloud: Gaussians) -> Float[Tensor, "V H W 3"]:
     views = Views(*cameras, c2w[:, :3, 3], SIZE, eps2d=RENDERER["eps2d"])
     tensors, white = cloud.tensors(), torch.ones(3)
     with torch.no_grad():
-        parts = [rasterize_views(tensors, views, some, white).image for some in row_batches(views)]
+        batches = row_batches(views, len(tensors.means))
+        parts = [rasterize_views(tensors, views, some, white).image for some in batches]
     return torch.cat(parts)
 
 

@@ -9,6 +9,7 @@ from tests.helpers.pruning import ball
 from threestudio_gaussiandreamer.gaussians.views import (
     rasterize_views,
     render_all,
+    row_batches,
     views_around,
 )
 from threestudio_gaussiandreamer.metrics import psnr
@@ -35,3 +36,13 @@ def test_a_constant_harmonic_gives_the_images_of_zero_higher_ones():
     )
     assert ours.shape[-1] == 5 and torch.equal(ours, theirs)
     assert torch.equal(ours[..., :3], rasterize_views(plain, views, rows, black).image)
+
+
+@pytest.mark.parametrize(
+    ("gaussians", "sizes"),
+    [(0, [4, 2]), (1_000_000, [4, 2]), (2_000_000, [2] * 3), (10**7, [1] * 6)],
+)
+def test_fewer_views_of_a_large_cloud_are_rendered_at_once(gaussians, sizes):
+    batches = row_batches(views_around(ball(), 6, 16), gaussians)
+    assert [len(rows) for rows in batches] == sizes
+    assert torch.cat(batches).tolist() == list(range(6))

@@ -56,7 +56,7 @@ def view_importance(cloud: Gaussians, views: Views, seed: int = 0) -> Float[Tens
     opacities = cloud.logit_opacities.detach().sigmoid().requires_grad_()
     rng = generator(seed, "worth")
     contribution, removal = torch.zeros(2, len(opacities), device=opacities.device)
-    for rows in row_batches(views):
+    for rows in row_batches(views, len(opacities)):
         image, contributed = draw(cloud, views, rows, opacities)
         contribution = torch.maximum(contribution, contributed.amax(0))
         removal = removal + removal_error(image, opacities, rng)

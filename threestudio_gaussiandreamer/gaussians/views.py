@@ -30,7 +30,10 @@ plane.
 """
 MAX_RADIUS = 1e15
 """Largest radius of a cloud, in its units: squares of distances stay within float32's range."""
-VIEWS_PER_CALL = 4
+VIEWS_PER_CALL, GAUSSIANS_PER_CALL = 4, 4_000_000
+"""Most views that are rendered at once, and most of their Gaussians together, for which the
+rasteriser needs about half a kilobyte each. One view of more is rendered all the same.
+"""
 SINES, DISTANCES = (-0.5, 0.9), (1.0, 1.4)
 """Of the views by default: the range of the sine of the elevation, and relative distances."""
 
@@ -195,12 +198,13 @@ def _directions(cloud: Gaussians, views: Views, rows: Tensor) -> Float[Tensor, "
 @torch.no_grad()
 def render_all(cloud: Gaussians, views: Views) -> Float[Tensor, "V H W 3"]:
     """Render the images of all views."""
-    return torch.cat([draw(cloud, views, rows)[0] for rows in row_batches(views)])
+    return torch.cat([draw(cloud, views, rows)[0] for rows in row_batches(views, len(cloud.means))])
 
 
-def row_batches(views: Views) -> tuple[Tensor, ...]:
-    """Return the indices of the views in batches of ``VIEWS_PER_CALL``."""
-    return torch.arange(len(views.viewmats)).split(VIEWS_PER_CALL)
+def row_batches(views: Views, gaussians: int) -> tuple[Tensor, ...]:
+    """Return the indices of the views in batches that are rendered at once."""
+    size = min(VIEWS_PER_CALL, max(1, GAUSSIANS_PER_CALL // max(1, gaussians)))
+    return torch.arange(len(views.viewmats)).split(size)
 
 
 def psnr_to_original(cloud: Gaussians, views: Views, images: Float[Tensor, "V H W 3"]) -> float:

@@ -44,7 +44,7 @@ def render_around(cloud: Gaussians, options: MeshOptions, fusion: Optional[Depth
     views = views._replace(eps2d=eps2d, antialias=bool(options.antialias))
     rgba = np.empty((options.views, views.size, views.size, 4), np.uint8)
     with tqdm(desc="surface", unit="view", total=options.views, disable=None, leave=False) as bar:
-        for rows in row_batches(views):
+        for rows in row_batches(views, len(cloud.means)):
             rgba[rows] = _render(cloud, views, rows, fusion)
             bar.update(len(rows))
     return Renders(opengl(views), rgba)
