@@ -70,6 +70,8 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "presets": splatting.presets,
         "thresholds": splatting.thresholds,
         "contenders": splatting.contenders,
+        "kernel": splatting.kernel,
+        "growth": splatting.growth,
     },
     "docs/step_time.md": {"start": start.first_step},
     "docs/robustness.md": {"fuzz": robustness.fuzz, "long run": robustness.long_run},

@@ -98,12 +98,12 @@ def measure(
     """Return the medians of forward and of forward with backward in milliseconds, and the peak
     memory above inputs and libraries in MB.
     """
-    _reset_peak()
-    before, rows, start = _memory("VmRSS"), [], time.perf_counter()
+    reset_peak()
+    before, rows, start = memory_now("VmRSS"), [], time.perf_counter()
     while len(rows) < 3 or (time.perf_counter() - start < seconds and len(rows) < 60):
         rows.append(_step(draw, leaves, cotangents))
     forward, both = (1e3 * statistics.median(column) for column in zip(*rows[1:], strict=True))
-    return {"forward_ms": forward, "both_ms": both, "memory_mb": _memory("VmHWM") - before}
+    return {"forward_ms": forward, "both_ms": both, "memory_mb": memory_now("VmHWM") - before}
 
 
 def _step(draw: Callable, leaves: Scene, cotangents: list[Tensor]) -> tuple[float, float]:
@@ -116,7 +116,7 @@ def _step(draw: Callable, leaves: Scene, cotangents: list[Tensor]) -> tuple[floa
     return middle - start, time.perf_counter() - start
 
 
-def _memory(field: str) -> float:
+def memory_now(field: str) -> float:
     """Return MB from /proc/self/status; NaN if it does not exist."""
     status = pathlib.Path("/proc/self/status")
     if not status.exists():
@@ -128,7 +128,7 @@ def _memory(field: str) -> float:
     )
 
 
-def _reset_peak() -> None:
+def reset_peak() -> None:
     peak = pathlib.Path("/proc/self/clear_refs")
     if peak.exists():
         peak.write_text("5")

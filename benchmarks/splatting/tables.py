@@ -1,5 +1,5 @@
-"""The tables of docs/rasteriser.md, from docs/charts/rasteriser.csv and
-benchmarks/results/splatting.csv.
+"""The tables of docs/rasteriser.md, from docs/charts/rasteriser.csv, docs/charts/growth.csv,
+benchmarks/results/splatting.csv and benchmarks/results/kernel.csv.
 """
 
 from pathlib import Path
@@ -8,6 +8,7 @@ from benchmarks.markdown import markdown, read
 
 ROOT = Path(__file__).resolve().parents[2]
 ACCURACY, SPEED = ROOT / "docs/charts/rasteriser.csv", ROOT / "benchmarks/results/splatting.csv"
+KERNEL, GROWTH = ROOT / "benchmarks/results/kernel.csv", ROOT / "docs/charts/growth.csv"
 SCENES = ("initial", "trained", "fog", "needles", "deep", "near plane")
 PRESETS = {"fast": "1/255", "balanced": "1/1024", "accurate": "1/65536"}
 THRESHOLDS = ("1/64", "1/255", "1/1024", "1/4096", "1/16384", "1/65536", "0")
@@ -103,3 +104,35 @@ def speedup() -> str:
     threads = sorted({key[0] for key in ms}, key=int)
     times = " / ".join(f"{ms[n, 'gsplat'] / ms[n, 'cpu']:.0f}" for n in threads)
     return f"{times} times faster ({' / '.join(threads)} threads)"
+
+
+def kernel() -> str:
+    """Return times of the CPU kernel before and now, and ratios, also to the prototype."""
+    cells: dict[tuple[str, str], dict[str, dict[str, str]]] = {}
+    for row in read(KERNEL):
+        views = f"{row['views']} × " if row["views"] != "1" else ""
+        where = f"{row['scene']}, {int(row['gaussians']):,} Gaussians, {views}{row['size']}²"
+        cells.setdefault((where, row["build"]), {})[row["contender"]] = row
+    table = []
+    for (where, build), found in cells.items():
+        ms = {name: float(row["both_ms"]) for name, row in found.items()}
+        ratios = (
+            f"{ms['now'] / ms[name]:.2f}" if name in ms else "" for name in ("before", "prototype")
+        )
+        table.append((where, build, f"{ms['before']:.1f}", f"{ms['now']:.1f}", *ratios))
+    first = next(iter(cells.values()))
+    before, now = (f"{name} ({first[name]['commit']}), ms" for name in ("before", "now"))
+    return markdown(("scene", "build", before, now, "now / before", "now / prototype"), table)
+
+
+def growth() -> str:
+    """Return processor seconds and peak memory for each number of Gaussians."""
+    rows = (
+        (
+            f"{int(row['gaussians']):,}",
+            f"{float(row['cpu_seconds']):.2f}",
+            f"{float(row['memory_mb']):.0f}",
+        )
+        for row in read(GROWTH)
+    )
+    return markdown(("Gaussians", "CPU s", "peak memory, MB"), rows)

@@ -178,7 +178,16 @@ def _path(build: str) -> pathlib.Path:
 
 
 def _load(build: str) -> ctypes.CDLL:
-    library = ctypes.CDLL(str(_path(build)))
+    return load_library(_path(build))
+
+
+def load_library(path: pathlib.Path) -> ctypes.CDLL:
+    """Load one build and declare its functions.
+
+    Raises:
+        OSError: there is no such file, or it needs another system library.
+    """
+    library = ctypes.CDLL(str(path))
     library.splat_forward.restype = library.splat_backward.restype = ctypes.c_int64
     library.splat_forward.argtypes = [
         ctypes.POINTER(SceneStruct),
