@@ -8,61 +8,21 @@ change little. Writes ``benchmarks/results/start.csv``."""
 
 import argparse
 import csv
-import json
-import os
-import shutil
 import statistics
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
-from typing import Any
+
+from benchmarks.start.launched import commit_of, run_with_probe
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks/results/start.csv"
+PROBE = Path(__file__).with_name("probe.py")
 COLUMNS = ("checkout", "commit", "round", "stage", "cpu_seconds")
-
-
-def start_run(checkout: Path, *overrides: str, config: str = "configs/demo.yaml") -> dict[str, Any]:
-    """Run a checkout's ``launch.py`` until its first step has ended.
-
-    Args:
-        checkout: the folder of ``launch.py``.
-
-    Returns:
-        ``ends``: processor seconds at the end of each stage, in order; ``modules``: the names of
-        the imported modules.
-
-    Raises:
-        RuntimeError: the run failed before.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        extension = Path(folder, "custom", "first_step")
-        extension.mkdir(parents=True)
-        shutil.copy(Path(__file__).with_name("probe.py"), extension / "__init__.py")
-        command = [sys.executable, checkout / "launch.py", "--config", checkout / config, "--train"]
-        done = subprocess.run(
-            [*map(str, command), "--gpu", "cpu", *overrides],
-            cwd=folder,
-            env=os.environ | {"PYTHONPATH": str(checkout)},
-            capture_output=True,
-            text=True,
-        )
-    for line in done.stdout.splitlines():
-        if line.startswith("FIRST_STEP "):
-            return json.loads(line.removeprefix("FIRST_STEP "))
-    raise RuntimeError(f"{checkout} made no step:\n{done.stdout}\n{done.stderr}")
 
 
 def seconds_by_stage(ends: dict[str, float]) -> dict[str, float]:
     """Return the seconds of each stage instead of those at its end."""
     times = [0.0, *ends.values()]
     return {stage: times[i + 1] - times[i] for i, stage in enumerate(ends)}
-
-
-def commit_of(checkout: Path) -> str:
-    command = ["git", "-C", str(checkout), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def main() -> None:
@@ -77,7 +37,7 @@ def main() -> None:
     rows = []
     for number in range(args.rounds):
         for name, checkout in checkouts.items():
-            ends = start_run(checkout)["ends"]
+            ends = run_with_probe(PROBE, checkout)["ends"]
             print(f"{name}: {ends['first step']:.2f} CPU s", flush=True)
             place = (name, commit_of(checkout), number)
             rows += [(*place, *stage) for stage in seconds_by_stage(ends).items()]

@@ -1,8 +1,9 @@
 """Extension that ends a run after its first training step and prints what the start cost.
 
-``first_step.py`` copies this file to ``custom/first_step/__init__.py`` in the folder where it runs
-``launch.py``, so that the order of the imports is that of any other run. The printed line has JSON
-with the processor seconds of the process at the end of each stage, and the imported modules."""
+``launched.py`` copies this file to ``custom/probe/__init__.py`` in the folder where it runs
+``launch.py``, so that the order of the imports is that of any other run. The printed JSON has the
+processor seconds of the process at the ``ends`` of the stages, in order, and the names of the
+imported ``modules``."""
 
 import functools
 import json
@@ -13,7 +14,7 @@ from typing import Any
 
 from threestudio_gaussiandreamer.host import find
 
-MARK = "FIRST_STEP "
+MARK = "MEASURED "
 SYSTEM = find("gaussiandreamer-system")
 ends: dict[str, float] = {}
 

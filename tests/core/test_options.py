@@ -9,7 +9,8 @@ from omegaconf import OmegaConf
 from threestudio_gaussiandreamer.core import options
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.nested import adopt_nested
-from threestudio_gaussiandreamer.core.options import check_options
+from threestudio_gaussiandreamer.core.options import check_options, checked_options
+from threestudio_gaussiandreamer.core.schedule import C
 
 
 @dataclass
@@ -101,3 +102,17 @@ def test_a_message_that_gives_the_whole_path_keeps_it():
 
     with pytest.raises(UserError, match="^system.guidance.size is too small$"):
         check_options(Foreign, Foreign(), "system.guidance.")
+
+
+def test_checked_options_are_plain_attributes_with_parsed_schedules():
+    given = {"rate": [0, 0.2, 0.6, 4], "pair": [1, 2], "free": {"a": [1, {"b": 2}]}}
+    options = checked_options(Options, OmegaConf.structured(Options(**given)))
+    assert options.pair == [1, 2] and type(options.pair) is list
+    assert options.free == {"a": [1, {"b": 2}]} and type(options.free["a"]) is list
+    assert [C(options.rate, 0, step) for step in (0, 2, 9)] == [0.2, 0.4, 0.6]
+    assert C(checked_options(Options, Options(rate=0.7)).rate, 0, 3) == 0.7
+
+
+def test_checked_options_refuse_what_check_options_refuses():
+    with pytest.raises(UserError, match="^a.size"):
+        checked_options(Options, Options(size=0), "a.")

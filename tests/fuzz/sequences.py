@@ -216,19 +216,18 @@ class CloudSequence(RuleBasedStateMachine):
     ) -> None:
         """Run one round of densification, pruning or both, and check its bounds."""
         CloudSequence.steps += 1
-        cfg, before = self.cloud.cfg, len(self.cloud)
+        rules, before = self.cloud.options, len(self.cloud)
         old = {
             name: value.detach().clone() for name, value in self.cloud.parameters_by_name().items()
         }
-        cfg.budget, cfg.densify.enabled = budget, densify is not None
-        for section, options in ((cfg.densify, densify), (cfg.prune, prune)):
-            for key, value in (options or {}).items():
-                section[key] = value
-        cfg.prune.start, cfg.prune.stop, cfg.prune.every = 0, 10, 1
+        rules.budget, rules.densify.enabled = budget, densify is not None
+        for section, options in ((rules.densify, densify), (rules.prune, prune)):
+            vars(section).update(options or {})
+        rules.prune.start, rules.prune.stop, rules.prune.every = 0, 10, 1
         self.changes.clear()
         DensityControl(self.cloud).after_step(self.optimizer, 5, check)
-        assert min(before, cfg.min_gaussians) <= len(self.cloud), "below the floor"
-        assert len(self.cloud) <= (before if densify is None else cfg.max_gaussians), (
+        assert min(before, rules.min_gaussians) <= len(self.cloud), "below the floor"
+        assert len(self.cloud) <= (before if densify is None else rules.max_gaussians), (
             "above the cap"
         )
         for change in self.changes:

@@ -5,7 +5,8 @@ import sys
 
 import pytest
 
-from benchmarks.start.first_step import ROOT, start_run
+from benchmarks.start.first_step import PROBE, ROOT
+from benchmarks.start.launched import run_with_probe
 from tests.training.runs import SMALL
 
 UNUSED = {
@@ -17,7 +18,7 @@ UNUSED = {
 @pytest.mark.slow
 def test_a_demo_run_imports_nothing_heavy_that_it_does_not_use():
     # Lightning imports what of these its own dependencies find installed
-    modules = set(start_run(ROOT, *SMALL)["modules"])
+    modules = set(run_with_probe(PROBE, ROOT, *SMALL)["modules"])
     code = "import lightning.pytorch, torch.utils.tensorboard, sys; print(*sys.modules)"
     lightnings = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     added = modules - set(lightnings.stdout.split())

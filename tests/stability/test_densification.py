@@ -206,7 +206,7 @@ def test_very_few_keep_their_shapes(n, absgrad, measured):
         )
         training = Training(geometry)
         assert training.run(1) == [expected]
-        geometry.cfg.budget, geometry.cfg.densify.grad_threshold = 1, 1e9
+        geometry.options.budget, geometry.options.densify.grad_threshold = 1, 1e9
         assert training.run(1) == [max(1, int(0.8 * expected))]
         shapes = geometry._shapes(len(geometry)) | {name: (len(geometry),) for name in STATISTICS}
         assert all(tuple(getattr(geometry, name).shape) == shape for name, shape in shapes.items())

@@ -39,7 +39,7 @@ def accumulated(
 
 
 def selected(geometry: GaussianCloud, threshold: float) -> set[int]:
-    geometry.cfg.densify.grad_threshold = threshold
+    geometry.options.densify.grad_threshold = threshold
     change = DensityControl(geometry).densified(1)
     return set(change.parents[change.is_new].tolist())
 

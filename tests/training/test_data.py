@@ -135,3 +135,15 @@ def test_progressive_views_widen_from_the_evaluation_view():
 def test_a_wrong_value_is_named(wrong, named):
     with pytest.raises(UserError, match=named):
         module(**wrong)
+
+
+def test_a_batch_of_a_pool_is_that_of_its_cameras_to_the_bit():
+    """The tensors of all its views are computed once, and each step takes rows of them."""
+    rows, computed = (
+        batches(module(train_views=50, batch_size=3, rays=rays), 5) for rays in (False, True)
+    )
+    for row, batch in zip(rows, computed, strict=True):
+        assert batch.keys() - row.keys() == {"rays_o", "rays_d"}
+        for name, value in row.items():
+            same = torch.equal if isinstance(value, torch.Tensor) else lambda a, b: a == b
+            assert same(value, batch[name]), name

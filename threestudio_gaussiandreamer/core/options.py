@@ -11,6 +11,7 @@ of a field. Every number must be representable in float32 or int64."""
 import dataclasses
 import string
 from collections.abc import Callable, Collection, Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 from .errors import UserError, unknown
@@ -18,6 +19,8 @@ from .schedule import parse_schedule
 
 RULE = "option"
 """The key of a field's rule in its metadata."""
+SCHEDULE = "schedule"
+"""The key in the metadata of fields that are schedules."""
 FLOAT32_MAX = 3.4028234663852886e38
 FLOAT32_TINY = 1.1754943508222875e-38
 """Smallest normal float32: smaller positive options could be rounded to zero."""
@@ -26,7 +29,8 @@ INT64_MAX = 2**63 - 1
 SHOWN = 80
 """Maximum length of a value in a message, characters."""
 
-Rule = dict[str, Callable[[str, Any], None]]
+Rule = dict[str, Any]
+"""Metadata of a field."""
 
 
 # -- rules -----------------------------------------------------------------------------------------
@@ -94,7 +98,7 @@ def schedule(min: float = -FLOAT32_MAX, max: float = FLOAT32_MAX) -> Rule:
                 bound = f"{min:g} or more" if number < min else f"{max:g} or less"
                 raise UserError(f"{path}: expected values of {bound}, got {number:g}")
 
-    return rule(check)
+    return rule(check) | {SCHEDULE: True}
 
 
 def interval(low: float = -FLOAT32_MAX, high: float = FLOAT32_MAX, what: str = "numbers") -> Rule:
@@ -222,6 +226,36 @@ def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
         except UserError as error:
             names = {option.name for option in dataclasses.fields(config_class)}
             raise UserError(_located(str(error), prefix, names)) from error
+
+
+def checked_options(config_class: type, cfg: Any, prefix: str = "") -> SimpleNamespace:
+    """Check the options, see :func:`check_options`, and copy them to plain attributes.
+
+    Parts read these in every step: reading one value from OmegaConf takes up to 0.1 ms.
+    Nested sections are namespaces too, lists are lists, and schedules are parsed, for ``C``.
+    """
+    check_options(config_class, cfg, prefix)
+    return _copied_section(config_class, cfg)
+
+
+def _copied_section(config_class: type, cfg: Any) -> SimpleNamespace:
+    options = dataclasses.fields(config_class)
+    return SimpleNamespace(**{o.name: _copied_option(o, getattr(cfg, o.name)) for o in options})
+
+
+def _copied_option(option: dataclasses.Field, value: Any) -> Any:
+    if dataclasses.is_dataclass(option.type):
+        return _copied_section(option.type, value)
+    if SCHEDULE in option.metadata and value is not None:
+        return parse_schedule(value)
+    return _copied(value)
+
+
+def _copied(value: Any) -> Any:
+    """Copy OmegaConf's containers to lists and dictionaries."""
+    if isinstance(value, Mapping):
+        return {key: _copied(value[key]) for key in value}
+    return [_copied(item) for item in value] if is_list(value) else value
 
 
 def _located(message: str, prefix: str, names: Collection[str]) -> str:

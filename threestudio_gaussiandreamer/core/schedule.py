@@ -35,15 +35,13 @@ def C(value: Any, epoch: int, global_step: int, interpolation: str = "linear") -
     """Evaluate a schedule at a step of training.
 
     Args:
-        value: a number or a schedule in one of the forms above.
+        value: a number, a schedule in one of the forms above, or a parsed one, which is faster.
         interpolation: between two knots, "linear" or "exp" (linear in the logarithm; the values
             must be positive).
 
     Raises:
         UserError: ``value`` is no schedule, or the interpolation is unknown.
     """
-    if _is_number(value):
-        return _finite(value, "the schedule")
     schedule = parse_schedule(value)
     return _interpolate(schedule, epoch if schedule.in_epochs else global_step, interpolation)
 
@@ -66,11 +64,14 @@ def validate_schedule(value: Any, name: str = "the schedule", minimum: float = -
 
 
 def parse_schedule(value: Any, name: str = "the schedule") -> Schedule:
-    """Convert a number, list, tuple or ListConfig to the knots of a schedule.
+    """Convert a number, list, tuple or ListConfig to the knots of a schedule; return a parsed
+    schedule as it is.
 
     Raises:
         UserError: wrong length, something that isn't a finite number, or steps that don't increase.
     """
+    if isinstance(value, Schedule):
+        return value
     if _is_number(value):
         return Schedule([0], [_finite(value, name)], in_epochs=False)
     knots = _as_list(value, name)

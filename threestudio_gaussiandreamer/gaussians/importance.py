@@ -19,7 +19,7 @@ these Gaussians: their neighbours can often render that pixel as well, and keepi
 all of them lowers the PSNR."""
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import NamedTuple, Optional
 
 import torch
 from jaxtyping import Bool, Float
@@ -45,6 +45,15 @@ class VisibilityStats(NamedTuple):
     removal: Float[Tensor, " N"]
 
 
+class AddedBackground(NamedTuple):
+    """A colour C that is added behind rendered images: they become I + (1 - alpha) C."""
+
+    alpha: Float[Tensor, "B H W 1"]
+    """Rendered with the images, so it has a graph."""
+    color: Float[Tensor, "B bh bw C"]
+    """May be negative."""
+
+
 def importance_by(
     name: str, logit_opacities: Float[Tensor, " N"], stats: VisibilityStats, rng: torch.Generator
 ) -> Float[Tensor, " N"]:
@@ -59,7 +68,10 @@ def importance_by(
 
 
 def removal_error(
-    images: Float[Tensor, "B H W C"], opacities: Float[Tensor, " N"], rng: torch.Generator
+    images: Float[Tensor, "B H W C"],
+    opacities: Float[Tensor, " N"],
+    rng: torch.Generator,
+    added: Optional[AddedBackground] = None,
 ) -> Float[Tensor, " N"]:
     """Draw an unbiased estimate of the removal error of each Gaussian: the squared change of the
     views without it, summed over pixels and channels.
@@ -73,14 +85,20 @@ def removal_error(
     Args:
         images: rendered views, whose graph is kept.
         opacities: the tensor that they were rendered with.
+        added: a background that the views had but ``images`` don't show.
     """
     signs = draw_shared(
         len(images),
-        lambda count: torch.randint(0, 2, (count, *images.shape[1:]), generator=rng),
+        lambda count: torch.randint(
+            0, 2, (count, *images.shape[1:]), generator=rng, dtype=torch.float32
+        ),
     )
-    (gradients,) = torch.autograd.grad(
-        images, opacities, signs.to(images) * 2 - 1, retain_graph=True
-    )
+    signs = signs.to(images).mul_(2).sub_(1)
+    outputs, upstream = [images], [signs]
+    if added is not None:
+        outputs.append(added.alpha)
+        upstream.append(-(signs * added.color).sum(-1, keepdim=True))
+    (gradients,) = torch.autograd.grad(outputs, opacities, upstream, retain_graph=True)
     gradients = all_sum(gradients)
     return (opacities.detach() * gradients).square().nan_to_num(nan=0.0)
 

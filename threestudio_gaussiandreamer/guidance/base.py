@@ -47,7 +47,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.errors import UserError, unknown
-from ..core.options import at_least, check_options, in_range, one_of, schedule
+from ..core.options import at_least, checked_options, in_range, one_of, schedule
 from ..diffusion import sds
 from ..host import C, find, names, parse_structured, warn
 from .particles import GaussianParticles, ParticleModel
@@ -143,7 +143,7 @@ class ScoreDistillation(ScoreModel):
     # ----------------------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        check_options(self.Config, self.cfg, "system.guidance.")
+        self.options = checked_options(self.Config, self.cfg, "system.guidance.")
         super().configure()
         self.variant = variant_class(self.cfg)(self.cfg.variant)
         self.bad_items = self.bad_steps = 0
@@ -159,14 +159,13 @@ class ScoreDistillation(ScoreModel):
         """Whether ``predict`` returns the unconditional score too: for classifier-free guidance, or
         since the variant needs it.
         """
-        return self.cfg.guidance_scale != 1 or self.variant.NEEDS_UNCONDITIONAL
+        return self.options.guidance_scale != 1 or self.variant.NEEDS_UNCONDITIONAL
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
         """Evaluate the schedules at this step."""
         super().update_step(epoch, global_step)
-        self.grad_clip = (
-            None if self.cfg.grad_clip is None else C(self.cfg.grad_clip, epoch, global_step)
-        )
+        clip = self.options.grad_clip
+        self.grad_clip = None if clip is None else C(clip, epoch, global_step)
 
     def __call__(
         self,
@@ -235,7 +234,7 @@ class ScoreDistillation(ScoreModel):
         Returns:
             the gradient, zero for items in which it isn't finite, and a mask of those, (B,) bool.
         """
-        grad = sds.per_item(sds.weight(self.cfg.weighting_strategy, abar), error) * error
+        grad = sds.per_item(sds.weight(self.options.weighting_strategy, abar), error) * error
         bad = _bad_items(grad)
         if bad.any():
             grad[bad] = 0
@@ -245,7 +244,7 @@ class ScoreDistillation(ScoreModel):
         count = int(bad.sum())
         self.bad_items += count
         self.bad_steps = self.bad_steps + 1 if count else 0
-        if self.bad_steps >= self.cfg.max_bad_steps:
+        if self.bad_steps >= self.options.max_bad_steps:
             raise NonFiniteScore(
                 f"the score model returned NaN or infinity in {self.bad_steps} steps in a row"
                 f" (step {self.step}, {self.bad_items} items so far):"

@@ -205,7 +205,7 @@ class ExactScoreGuidance(ScoreDistillation):
         whose score the noise cancels.
         """
         one = all(len(mixture.modes) == 1 and mixture.log_prior is None for mixture in condition)
-        if self.cfg.std or not one:
+        if self.options.std or not one:
             return None
         _, abar = self.draw_timesteps(latents)
         self._perplexity = 1.0
@@ -222,7 +222,7 @@ class ExactScoreGuidance(ScoreDistillation):
         self, z: Float[Tensor, "1 d"], abar: Float[Tensor, "1"], mixture: Mixture
     ) -> tuple:
         modes = mixture.modes.flatten(1)
-        options = {"std": self.cfg.std, "temperature": self.cfg.temperature}
+        options = {"std": self.options.std, "temperature": self.options.temperature}
         if mixture.log_prior is None:
             return denoise(z, abar, modes, **options), None
         distances = squared_distances(z, modes, abar)
@@ -234,7 +234,7 @@ class ExactScoreGuidance(ScoreDistillation):
 
     @property
     def _needs_own_view(self) -> bool:
-        return self.cfg.mode == "view-exact" or self.cfg.bank_includes_view
+        return self.options.mode == "view-exact" or self.options.bank_includes_view
 
     def _mixture(
         self,
@@ -263,10 +263,11 @@ class ExactScoreGuidance(ScoreDistillation):
 
     def _members(self, batch: dict[str, Any], count: int) -> Bool[Tensor, "B K"]:
         """Return a mask of the bank's views in the conditional mixture of each item."""
-        if self.cfg.mode == "view-exact":
-            return torch.zeros(count, self.cfg.bank_views, dtype=torch.bool)
-        if self.cfg.mode == "view-agnostic":
-            return torch.ones(count, self.cfg.bank_views, dtype=torch.bool)
+        options = self.options
+        if options.mode == "view-exact":
+            return torch.zeros(count, options.bank_views, dtype=torch.bool)
+        if options.mode == "view-agnostic":
+            return torch.ones(count, options.bank_views, dtype=torch.bool)
         bank = direction_indices(self.bank_orbit.elevation, self.bank_orbit.azimuth)
         members = bank == direction_indices(batch["elevation"], batch["azimuth"]).cpu()[:, None]
         # if no view of the bank has this direction, as overhead below 60 degrees, take all
@@ -299,22 +300,23 @@ class ExactScoreGuidance(ScoreDistillation):
         return Bank((images * 255).round().byte(), pooled, latent)
 
     def _latent(self) -> LinearLatent:
-        return LinearLatent() if self.cfg.space == "pixel" else self.bank(*self._size).latent
+        return LinearLatent() if self.options.space == "pixel" else self.bank(*self._size).latent
 
     def _picture_size(self, height: int, width: int) -> tuple[int, int]:
         """Return the size of the compared pictures for a render of this size: ``image_size`` high,
         with the render's aspect.
         """
-        size = self.cfg.image_size
+        options = self.options
+        size = options.image_size
         height, width = (size, max(1, round(width * size / height))) if size else (height, width)
-        needed = 12 * self.cfg.bank_views * height * width
+        needed = 12 * options.bank_views * height * width
         if (
-            self.cfg.space == "pixel"
-            and (self.cfg.mode != "view-exact" or self.guided)
+            options.space == "pixel"
+            and (options.mode != "view-exact" or self.guided)
             and needed > MAX_MODE_BYTES
         ):
             raise UserError(
-                f"a bank of {self.cfg.bank_views} views of {height}x{width} pixels needs "
+                f"a bank of {options.bank_views} views of {height}x{width} pixels needs "
                 f"{needed / 2**30:.1f} GiB for each item:"
                 " use system.guidance.space=latent, or a smaller system.guidance.image_size"
             )

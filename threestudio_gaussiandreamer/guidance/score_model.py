@@ -55,6 +55,8 @@ class ScoreModel(BaseObject, ABC):
     cfg: Config
     alphas_cumprod: Float[Tensor, " T"]
     """The noise schedule, float64; a subclass sets it in ``configure``."""
+    options: Any
+    """Of ``cfg``, as plain attributes."""
     evaluations: int
     """Of the score model, one per item and prompt, since a step began; ``predict`` counts them."""
 
@@ -65,9 +67,10 @@ class ScoreModel(BaseObject, ABC):
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
         """Evaluate the schedules at this step."""
         self.step = global_step
+        options = self.options
         percents = (
-            C(self.cfg[name], epoch, global_step)
-            for name in ("min_step_percent", "max_step_percent")
+            C(percent, epoch, global_step)
+            for percent in (options.min_step_percent, options.max_step_percent)
         )
         self.min_step, self.max_step = sds.step_range(*percents, len(self.alphas_cumprod))
 
@@ -104,7 +107,7 @@ class ScoreModel(BaseObject, ABC):
         """Predict the noise with guidance: that of ``guidance_scale`` for items inside of
         ``guidance_interval``, none for others.
         """
-        low, high = (share * len(self.alphas_cumprod) for share in self.cfg.guidance_interval)
+        low, high = (share * len(self.alphas_cumprod) for share in self.options.guidance_interval)
         everywhere = low == 0 and high == len(self.alphas_cumprod)
         inside = (t >= low) & (t <= high)
         if everywhere or inside.all():
@@ -118,7 +121,7 @@ class ScoreModel(BaseObject, ABC):
 
     def _with_guidance(self, z: Tensor, t: Tensor, condition: Any) -> Tensor:
         return self.guided_noise(
-            z, t, condition, self.cfg.guidance_scale, rescale=self.cfg.recon_std_rescale
+            z, t, condition, self.options.guidance_scale, rescale=self.options.recon_std_rescale
         )
 
     def guided_noise(
@@ -182,7 +185,7 @@ class ScoreModel(BaseObject, ABC):
         self, latents: Float[Tensor, "B c h w"]
     ) -> tuple[Int[Tensor, " B"], Float[Tensor, " B"]]:
         """Draw this step's timesteps t; also return their abar, float64."""
-        if self.cfg.timestep_schedule == "uniform":
+        if self.options.timestep_schedule == "uniform":
             t = sds.timesteps(
                 len(latents),
                 self.min_step,

@@ -33,13 +33,14 @@ from typing import Any, Optional
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Int
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from .. import cameras
 from ..cameras import Orbit, OrbitRanges
 from ..core.distributed import own_rows, require_shareable
-from ..core.options import check_options
+from ..core.options import checked_options
 from ..core.streams import generator
 from ..host import Updateable, parse_structured, pl, register, register_builtin, run_seed
 from .camera_options import CameraConfig, plain
@@ -82,6 +83,7 @@ class TrainCameras(IterableDataset, Updateable):
 
     def __init__(self, cfg: CameraConfig) -> None:
         self.cfg, self.start_step = cfg, 0
+        self._views_by_size: dict[tuple[int, int], dict[str, Any]] = {}
         sizes = [
             v if isinstance(v, (list, tuple)) else [v]
             for v in map(plain, (cfg.height, cfg.width, cfg.batch_size))
@@ -118,9 +120,16 @@ class TrainCameras(IterableDataset, Updateable):
         height, width, batch_size = self.sizes[
             bisect.bisect_right(self.cfg.resolution_milestones, step)
         ]
-        rng = generator(run_seed(), "camera", step)
+        rng, rows = generator(run_seed(), "camera", step), own_rows(batch_size)
+        index = self._pick(batch_size, rng) if self.pool else None
+        if self.pool and not (self.moves or self.cfg.rays):
+            views = self._views_of_pool(height, width)
+            lights = self._lights(views["c2w"][index], rng)[rows]
+            index = index[rows]
+            batch = {name: v[index] if torch.is_tensor(v) else v for name, v in views.items()}
+            return batch | {"light_positions": lights}
         orbit = (
-            self._pick(batch_size, rng)
+            self.pool.rows(index)
             if self.pool
             else cameras.sample_orbit(
                 batch_size, self._ranges(step), rng, self.cfg.batch_uniform_azimuth
@@ -128,7 +137,6 @@ class TrainCameras(IterableDataset, Updateable):
         )
         c2w = self._perturbed(orbit, rng)
         lights = self._lights(c2w, rng)
-        rows = own_rows(batch_size)
         return make_batch(
             orbit.rows(rows),
             c2w[rows],
@@ -139,7 +147,15 @@ class TrainCameras(IterableDataset, Updateable):
             self.cfg.rays_d_normalize,
         )
 
-    def _pick(self, batch_size: int, rng: torch.Generator) -> Orbit:
+    def _views_of_pool(self, height: int, width: int) -> dict[str, Any]:
+        """Return one batch of all views of the pool, with any lights."""
+        if (height, width) not in self._views_by_size:
+            c2w = self.pool.c2w
+            views = make_batch(self.pool, c2w, c2w[:, :3, 3], height, width)
+            self._views_by_size[height, width] = views
+        return self._views_by_size[height, width]
+
+    def _pick(self, batch_size: int, rng: torch.Generator) -> Int[Tensor, " B"]:
         """Draw ``batch_size`` views of the pool, one from each azimuth sector (the pool is ordered
         by azimuth).
         """
@@ -147,8 +163,7 @@ class TrainCameras(IterableDataset, Updateable):
         sector = (
             (u + torch.arange(batch_size)) / batch_size if self.cfg.batch_uniform_azimuth else u
         )
-        index = (sector * len(self.pool.azimuth)).long().clamp_max(len(self.pool.azimuth) - 1)
-        return self.pool.rows(index)
+        return (sector * len(self.pool.azimuth)).long().clamp_max(len(self.pool.azimuth) - 1)
 
     def _ranges(self, step: int) -> OrbitRanges:
         """Widen elevation and azimuth from the evaluation view to the full range over
@@ -232,14 +247,14 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
     def __init__(self, cfg: Any = None) -> None:
         super().__init__()
         self.cfg = parse_structured(CameraConfig, cfg)
-        check_options(CameraConfig, self.cfg, "data.")
+        self.options = checked_options(CameraConfig, self.cfg, "data.")
 
     def setup(self, stage: str | None = None) -> None:
         if stage in (None, "fit"):
-            self.train_dataset = TrainCameras(self.cfg)
+            self.train_dataset = TrainCameras(self.options)
         self.val_dataset, self.test_dataset = (
-            EvalCameras(self.cfg, "val"),
-            EvalCameras(self.cfg, "test"),
+            EvalCameras(self.options, "val"),
+            EvalCameras(self.options, "test"),
         )
 
     def train_dataloader(self) -> DataLoader:

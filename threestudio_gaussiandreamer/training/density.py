@@ -28,6 +28,7 @@ from ..core.distributed import all_max, all_sum, draw_shared
 from ..core.streams import generator
 from ..gaussians import densify, importance
 from ..gaussians.densify import Change, Rules, Statistics
+from ..gaussians.importance import AddedBackground
 from ..host import run_seed
 from ..metrics import psnr
 from ..splatting import Rasterized
@@ -70,37 +71,37 @@ class DensityControl:
     """Densification and pruning of one cloud.
 
     Args:
-        cloud: a :class:`.geometry.GaussianCloud`, whose ``cfg`` has the options ``densify``,
-            ``prune``, ``budget``, ``min_gaussians`` and ``max_gaussians``, and whose buffers are
-            the statistics.
+        cloud: a :class:`.geometry.GaussianCloud`, whose ``options`` are ``densify``,
+            ``prune``, ``budget``, ``min_gaussians`` and ``max_gaussians`` among others, and whose
+            buffers are the statistics.
     """
 
     def __init__(self, cloud: Any) -> None:
-        self.cloud, self.cfg = cloud, cloud.cfg
+        self.cloud, self.options = cloud, cloud.options
 
     # -- schedules ---------------------------------------------------------------------------------
 
     @property
     def prune_rounds(self) -> range:
         """The steps after which a round of pruning takes place."""
-        rounds = rounds_of(self.cfg.prune)
-        return rounds[len(rounds) // 2 :] if self.cfg.budget == AUTO else rounds
+        rounds = rounds_of(self.options.prune)
+        return rounds[len(rounds) // 2 :] if self.options.budget == AUTO else rounds
 
     def kept_share(self, count: int, step: int) -> float:
         """Return the fraction of ``count`` Gaussians that the round at ``step`` keeps:
         ``prune.keep``, or less if the remaining rounds couldn't meet the budget otherwise.
         """
         left = sum(later >= step for later in self.prune_rounds)
-        if self.cfg.budget in (None, AUTO) or not left:
-            return self.cfg.prune.keep
-        return min(self.cfg.prune.keep, (min_count(self.cfg) / max(count, 1)) ** (1 / left))
+        if self.options.budget in (None, AUTO) or not left:
+            return self.options.prune.keep
+        return min(self.options.prune.keep, (min_count(self.options) / max(count, 1)) ** (1 / left))
 
     @property
     def affordable_loss(self) -> float:
         """The loss that one round of ``auto`` is allowed, dB. All rounds share ``prune.quality``
         equally, since later steps may not recover what a round loses.
         """
-        return self.cfg.prune.quality / max(1, len(self.prune_rounds))
+        return self.options.prune.quality / max(1, len(self.prune_rounds))
 
     def schedule_problem(self, step: int, max_steps: int) -> Optional[str]:
         """Describe why the rounds between ``step`` and ``max_steps`` (-1: unlimited) can't meet the
@@ -108,7 +109,7 @@ class DensityControl:
         such problem.
         """
         end = max_steps if max_steps > 0 else math.inf
-        budget, rounds, count = self.cfg.budget, self.prune_rounds, len(self.cloud)
+        budget, rounds, count = self.options.budget, self.prune_rounds, len(self.cloud)
         if budget is None:
             return None
         late = sum(round_ > end for round_ in rounds)
@@ -123,7 +124,7 @@ class DensityControl:
 
     def _shortage(self, remaining: list[int]) -> Optional[str]:
         """Describe why these rounds are too few for the budget; return None if they suffice."""
-        budget, keep, count = self.cfg.budget, self.cfg.prune.keep, len(self.cloud)
+        budget, keep, count = self.options.budget, self.options.prune.keep, len(self.cloud)
         if not remaining:
             return (
                 f"no round of pruning remains, so {count} Gaussians are kept instead of {budget}: "
@@ -151,24 +152,28 @@ class DensityControl:
         if not self.samples_removal(step):
             return
         rng = generator(run_seed(), "removal", step)
-        image, opacity = pictures["comp_rgb"], pictures["opacity"]
+        image = pictures["comp_rgb"]
         # Composite over a random background per view, so that Gaussians of the background's colour
         # still have a removal error.
         random = draw_shared(
             len(image), lambda count: torch.rand(count, 1, 1, 3, generator=rng)
         ).to(image)
-        image = image + (1 - opacity) * (random - pictures["comp_rgb_bg"].detach())
-        self.cloud.removal += importance.removal_error(image, pictures["gaussian_opacities"], rng)
+        added = AddedBackground(pictures["opacity"], random - pictures["comp_rgb_bg"].detach())
+        self.cloud.removal += importance.removal_error(
+            image, pictures["gaussian_opacities"], rng, added
+        )
         if self.cloud.wants_absgrad:
             # removal_error has added its gradients to absgrad, which is for those of the loss only
             pictures["rasterized"].means2d.absgrad.zero_()
 
     def samples_removal(self, step: int) -> bool:
         """Return whether a sample of the removal error is due after ``step`` finished steps."""
-        cfg, rounds = self.cfg.prune, self.prune_rounds
-        if self.cfg.budget is None or cfg.score != "removal" or not rounds:
+        cfg, rounds = self.options.prune, self.prune_rounds
+        if self.options.budget is None or cfg.score != "removal" or not rounds:
             return False
-        if not rounds[0] - cfg.every <= step < rounds[-1] or len(self.cloud) <= min_count(self.cfg):
+        if not rounds[0] - cfg.every <= step < rounds[-1] or len(self.cloud) <= min_count(
+            self.options
+        ):
             return False
         return step % max(1, round(cfg.every / importance.SAMPLES)) == 0
 
@@ -184,7 +189,7 @@ class DensityControl:
             loss_scale: the factor of automatic mixed precision on the gradients.
         """
         cloud = self.cloud
-        if out.means2d.grad is not None and self.cfg.densify.enabled:
+        if out.means2d.grad is not None and self.options.densify.enabled:
             pixels = out.means2d.absgrad if cloud.wants_absgrad else out.means2d.grad
             cloud.gradient_sum += all_sum(
                 densify.screen_gradients(pixels, width, height, loss_scale).sum(0)
@@ -206,7 +211,7 @@ class DensityControl:
         """
         before, measured = len(self.cloud), {}
         change = self._densify(step)
-        if self.cfg.budget is not None and step in self.prune_rounds:
+        if self.options.budget is not None and step in self.prune_rounds:
             change, measured = self._prune(step, change, check)
         if change is not None:
             self.cloud.apply_change(change, optimizer)
@@ -216,7 +221,7 @@ class DensityControl:
         """Return the change by a round of densification at ``step``; None if there is no round or
         nothing is cloned, split or dropped.
         """
-        if not self.cfg.densify.enabled or step not in rounds_of(self.cfg.densify):
+        if not self.options.densify.enabled or step not in rounds_of(self.options.densify):
             return None
         change = self.densified(step)
         self.cloud.gradient_sum.zero_()
@@ -225,14 +230,14 @@ class DensityControl:
 
     def densified(self, step: int) -> Change:
         """Clone, split and drop Gaussians according to the statistics."""
-        cfg, cloud = self.cfg.densify, self.cloud
+        cfg, cloud = self.options.densify, self.cloud
         rules = Rules(
             cfg.grad_threshold,
             cfg.split_scale,
             cfg.min_opacity,
             cfg.max_scale,
             self._cap(),
-            self.cfg.min_gaussians,
+            self.options.min_gaussians,
         )
         gradient = cloud.gradient_sum / cloud.gradient_count.clamp_min(1)
         return densify.densify_and_prune(
@@ -246,10 +251,10 @@ class DensityControl:
         """Return the largest number of Gaussians after densification: ``max_gaussians``, and with a
         budget at most the larger of the budget and the current number (for ``auto`` the latter).
         """
-        budget, count = self.cfg.budget, len(self.cloud)
+        budget, count = self.options.budget, len(self.cloud)
         if budget is None:
-            return self.cfg.max_gaussians
-        return min(self.cfg.max_gaussians, count if budget == AUTO else max(budget, count))
+            return self.options.max_gaussians
+        return min(self.options.max_gaussians, count if budget == AUTO else max(budget, count))
 
     def _prune(
         self, step: int, first: Optional[Change], check: Optional[QualityCheck]
@@ -262,17 +267,17 @@ class DensityControl:
         Returns:
             the combined change of the current cloud, and the values that ``auto`` has measured.
         """
-        cloud, cfg = self.cloud, self.cfg.prune
+        cloud, cfg = self.cloud, self.options.prune
         values = cloud.parameters_by_name() if first is None else first.values
         rows = slice(None) if first is None else first.parents
         stats = importance.VisibilityStats(cloud.contribution[rows], cloud.removal[rows])
         rng = generator(run_seed(), "prune", step)
         scores = importance.importance_by(cfg.score, values["logit_opacities"], stats, rng)
         share = self.kept_share(len(scores), step)
-        count, measured = importance.next_count(len(scores), share, min_count(self.cfg)), {}
-        if self.cfg.budget == AUTO and (first is not None or check is None):
+        count, measured = importance.next_count(len(scores), share, min_count(self.options)), {}
+        if self.options.budget == AUTO and (first is not None or check is None):
             count = len(scores)  # new Gaussians haven't been rendered: their loss is unknown
-        elif self.cfg.budget == AUTO:
+        elif self.options.budget == AUTO:
             # never prune the Gaussians that this score protects, see importance.py
             top = importance.top_count(stats.contribution) if cfg.score == "contribution" else 0
             count, measured = smallest_passing_count(scores, max(count, top), check)
@@ -335,7 +340,7 @@ class RenderedQuality:
         with self.control.cloud.showing_only(kept):
             fewer = self.render()["comp_rgb"]
         if self.truth is None:
-            similarity, wanted = psnr(fewer, whole).mean(), self.control.cfg.prune.likeness
+            similarity, wanted = psnr(fewer, whole).mean(), self.control.options.prune.likeness
             measured = {"prune/likeness": float(similarity), "prune/asked_for": wanted}
             return QualityResult(similarity - wanted, measured)
         loss = (psnr(whole, self.truth) - psnr(fewer, self.truth)).mean()

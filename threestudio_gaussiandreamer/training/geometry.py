@@ -56,7 +56,7 @@ from ..core.nested import adopt_nested
 from ..core.options import (
     at_least,
     between,
-    check_options,
+    checked_options,
     in_range,
     one_of,
     positive,
@@ -125,7 +125,7 @@ class GaussianCloud(BaseGeometry):
     cfg: Config
 
     def configure(self) -> None:
-        check_options(self.Config, self.cfg, "system.geometry.")
+        self.options = checked_options(self.Config, self.cfg, "system.geometry.")
         self.bands = (self.cfg.sh_degree + 1) ** 2
         self._warned = False
         self._allocate(0)
@@ -197,7 +197,7 @@ class GaussianCloud(BaseGeometry):
                 self.means.detach()[None] - camera_positions[:, None], dim=-1
             )
             colors = sh.sh_to_unclamped_colors(self.sh, dirs)
-        return sh.bounded_colors(colors) if self.cfg.bound_colors else colors.clamp_min(0.0)
+        return sh.bounded_colors(colors) if self.options.bound_colors else colors.clamp_min(0.0)
 
     @torch.no_grad()
     def clamp_colors(self) -> None:
@@ -206,7 +206,7 @@ class GaussianCloud(BaseGeometry):
         Called after each step of the optimiser, so that what is stored and exported is in the
         range too. The bands above it add to this colour by direction and aren't changed.
         """
-        if self.cfg.bound_colors:
+        if self.options.bound_colors:
             self.sh0.clamp_(*(sh.rgb_to_sh0(bound) for bound in (0.0, 1.0)))
 
     # -- start -------------------------------------------------------------------------------------
@@ -302,12 +302,12 @@ class GaussianCloud(BaseGeometry):
     def set_learning_rates(self, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
         for group in optimizer.param_groups:
             if group.get("name") in LEARNING_RATES:
-                group["lr"] = C(self.cfg[LEARNING_RATES[group["name"]]], epoch, step)
+                group["lr"] = C(getattr(self.options, LEARNING_RATES[group["name"]]), epoch, step)
 
     @property
     def wants_absgrad(self) -> bool:
         """Whether densification reads absolute gradients, which the rasteriser then collects."""
-        return self.cfg.densify.enabled and self.cfg.densify.absgrad
+        return self.options.densify.enabled and self.options.densify.absgrad
 
     @contextlib.contextmanager
     def showing_only(self, kept: Bool[Tensor, " N"]) -> Iterator[None]:

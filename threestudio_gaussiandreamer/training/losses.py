@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.errors import UserError, unknown
+from ..core.schedule import Schedule, parse_schedule
 from ..guidance.base import ScoreDistillation
 
 REGULARISERS = ("sparsity", "opaque")
@@ -28,9 +29,18 @@ def weighted_losses(
     return {name: value * weights[name] for name, value in raw.items()}
 
 
-def loggable(guided: Mapping[str, Any]) -> dict[str, Any]:
-    """Select the scalars that aren't losses; guidances also return pictures and latents."""
-    return {k: v for k, v in guided.items() if not k.startswith("loss_") and _is_one_number(v)}
+def weight_schedules(options: Mapping[str, Any]) -> dict[str, Schedule]:
+    """Parse ``lambda_<name>``, the weights of ``system.loss``, to schedules by ``name``."""
+    return {name.removeprefix("lambda_"): parse_schedule(value) for name, value in options.items()}
+
+
+def loggable(guided: Mapping[str, Any], losses: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Return the names and values to log: the scalars of a guidance that aren't losses (guidances
+    also return pictures and latents), and the weighted losses.
+    """
+    scalars = {k: v for k, v in guided.items() if not k.startswith("loss_") and _is_one_number(v)}
+    weighted = {f"loss_{name}": value.detach() for name, value in losses.items()}
+    return {f"train/{name}": value for name, value in (scalars | weighted).items()}
 
 
 def _is_one_number(value: Any) -> bool:

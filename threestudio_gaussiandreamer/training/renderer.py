@@ -26,7 +26,7 @@ from torch import Tensor
 
 from .. import cameras
 from ..core.errors import UserError, unknown
-from ..core.options import at_least, check_options, in_range, one_of, positive, rule
+from ..core.options import at_least, checked_options, in_range, one_of, positive, rule
 from ..host import Rasterizer, register
 from ..splatting import PRESETS, Rasterized, available_backends, rasterize
 from .background import FlatBackground
@@ -73,7 +73,7 @@ class SplattingRenderer(Rasterizer):
 
     def configure(self, geometry: Any, material: Any, background: Any) -> None:
         super().configure(geometry, material, background)
-        check_options(self.Config, self.cfg, "system.renderer.")
+        self.options = checked_options(self.Config, self.cfg, "system.renderer.")
 
     def forward(
         self, c2w: Tensor, fovy: Tensor, height: int, width: int, **batch: Any
@@ -117,7 +117,7 @@ class SplattingRenderer(Rasterizer):
             "rasterized": out,
             "gaussian_opacities": opacities,
         }
-        if self.cfg.train_normals or not self.training:
+        if self.options.train_normals or not self.training:
             pictures["comp_normal"] = normals_from_depth(depth, out.alpha, c2w, fovy)
         return pictures
 
@@ -130,7 +130,7 @@ class SplattingRenderer(Rasterizer):
         background: Optional[Float[Tensor, "B 3"]],
     ) -> Rasterized:
         """Rasterize the cloud at (height, width) = ``size``, before ``downsample``."""
-        cfg, cloud, (height, width) = self.cfg, self.geometry, size
+        options, cloud, (height, width) = self.options, self.geometry, size
         viewmats, Ks = cameras.to_opencv(c2w, fovy, height, width)
         colors = cloud.colors(c2w[:, :3, 3])
         gaussians = cloud.means, cloud.quats, cloud.scales(), opacities, colors
@@ -141,13 +141,13 @@ class SplattingRenderer(Rasterizer):
             width,
             height,
             background=background,
-            near=cfg.near,
-            far=cfg.far,
-            eps2d=cfg.eps2d,
-            antialias=cfg.antialias,
-            preset=cfg.preset,
-            downsample=cfg.downsample,
-            backend=cfg.backend,
+            near=options.near,
+            far=options.far,
+            eps2d=options.eps2d,
+            antialias=options.antialias,
+            preset=options.preset,
+            downsample=options.downsample,
+            backend=options.backend,
             absgrad=self.training and getattr(cloud, "wants_absgrad", False),
         )
 

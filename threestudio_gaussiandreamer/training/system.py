@@ -37,7 +37,7 @@ from torch import Tensor
 from ..core.distributed import average_gradients, from_first, rank
 from ..core.errors import UserError
 from ..core.nested import adopt_nested
-from ..core.options import check_options
+from ..core.options import checked_options
 from ..gaussians.stored_state import SHAPES, require_cloud
 from ..guidance.base import ScoreDistillation
 from ..guidance.foreign import (
@@ -48,18 +48,18 @@ from ..guidance.foreign import (
     trainable_groups,
 )
 from ..guidance.known_truth import truth_of
-from ..host import BaseLift3DSystem, find, info, register, validate_schedule, warn
+from ..host import BaseLift3DSystem, C, find, info, register, validate_schedule, warn
 from ..metrics import psnr
 from ..priors.cache import cached_cloud
 from ..prune import PruneOptions
 from .background import FlatBackground
 from .density import DensityControl, RenderedQuality
-from .events import log_scores
+from .events import log_numbers, log_scores
 from .export import GaussianSavers, export, export_companions, exported_files
 from .finite import CHECK_EVERY, optimizer_tensors, require_finite
 from .held_out import EvaluationConfig, HeldOut, Measurements
 from .loss_scale import LossScale
-from .losses import check_losses, loggable, logged_names, weighted_losses
+from .losses import check_losses, loggable, logged_names, weight_schedules, weighted_losses
 from .optimizer import check_optimizer, make_optimizer
 from .pages import save_first_cloud, write_turntable
 from .pictures import rgb_panel, save_pictures
@@ -128,7 +128,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     # -- start -------------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        check_options(self.Config, self.cfg, "system.")
+        self.options = checked_options(self.Config, self.cfg, "system.")
+        self.loss_weights = weight_schedules(self.options.loss)
         super().configure()
         self.density = DensityControl(self.geometry)
         self.automatic_optimization = False
@@ -243,7 +244,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.set_learning_rates(optimizer)
         out = self(batch)
         self.density.before_backward(out, self.global_step)
-        losses = self.losses(out, batch)
+        guided = self.guide(out, batch)
+        losses = self.losses(guided, out["opacity"])
         loss = torch.stack(list(losses.values())).sum()
         self.manual_backward(loss)
         average_gradients(
@@ -254,12 +256,12 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         optimizer.step()
         self.geometry.clamp_colors()
         if self.loss_scale.has_skipped(self.trainer, loss_scale):
-            self.log("train/skipped_steps", float(self.loss_scale.skipped_steps))
+            log_numbers(self.trainer, {"train/skipped_steps": self.loss_scale.skipped_steps})
         if self.global_step % CHECK_EVERY == 0:
             self.require_finite()
         optimizer.zero_grad(set_to_none=True)
         self.control_density(optimizer, batch)
-        self.report(out, batch, losses, loss)
+        self.report(out, batch, guided, losses)
 
     def control_density(self, optimizer: torch.optim.Optimizer, batch: dict[str, Any]) -> None:
         """Densify and prune on schedule; log the quality that a round of ``budget: auto`` lost."""
@@ -270,7 +272,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         # optimiser in Lightning's wrapper.
         outcome = self.density.after_step(optimizer.optimizer, self.global_step, check)
         if outcome.measured:
-            self.log_dict(outcome.measured)
+            log_numbers(self.trainer, outcome.measured)
             info(f"step {self.global_step}: {outcome}")
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
@@ -278,16 +280,11 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         for part in [self.geometry, *([self.background] if own_background else [])]:
             part.set_learning_rates(optimizer, self.true_current_epoch, self.true_global_step)
 
-    def losses(self, out: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
+    def losses(self, guided: dict[str, Any], alpha: Tensor) -> dict[str, Tensor]:
         """Return the weighted losses of the guidance and the regularisers of alpha, by name."""
-        guided = self.guide(out, batch)
-        if self._log_now():
-            numbers = loggable(guided).items()
-            self.log_dict({f"train/{name}": float(value) for name, value in numbers})
-        weights = {
-            name.removeprefix("lambda_"): self.C(weight) for name, weight in self.cfg.loss.items()
-        }
-        return weighted_losses(guided, out["opacity"], weights)
+        now = self.true_current_epoch, self.true_global_step
+        weights = {name: C(weight, *now) for name, weight in self.loss_weights.items()}
+        return weighted_losses(guided, alpha, weights)
 
     def guide(self, out: dict[str, Any], batch: dict[str, Any], **options: Any) -> dict[str, Any]:
         """Call the guidance with these renders, the whole batch, the renders' background, and the
@@ -305,19 +302,23 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             )
 
     def report(
-        self, out: dict[str, Any], batch: dict[str, Any], losses: dict[str, Tensor], loss: Tensor
+        self,
+        out: dict[str, Any],
+        batch: dict[str, Any],
+        guided: dict[str, Any],
+        losses: dict[str, Tensor],
     ) -> None:
-        """Log losses, number of Gaussians and, if there is a ground truth, PSNR, every
-        ``log_every_n_steps``.
+        """Log what the guidance returned, the weighted losses and their sum, the number of
+        Gaussians and, if there is a ground truth, PSNR, every ``log_every_n_steps``.
         """
         if not self._log_now():
             return
-        self.log_dict({f"train/loss_{name}": value.detach() for name, value in losses.items()})
-        shown = {"loss": loss.detach(), "gaussians": float(len(self.geometry))}
+        numbers, loss = loggable(guided, losses), sum(losses.values()).detach()
+        shown = {"loss": loss, "gaussians": len(self.geometry)}
         truth = true_views(self.guidance, batch, out)
         if truth is not None:
             shown["dB"] = psnr(out["comp_rgb"].detach(), truth).mean()
-        self.log_dict(shown, prog_bar=True)
+        log_numbers(self.trainer, numbers | shown, shown)
         self.geometry.warn_of_clamped_sizes()
 
     def _log_now(self) -> bool:
@@ -326,7 +327,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_end(outputs, batch, batch_idx)
-        every = self.cfg.evaluation.every
+        every = self.options.evaluation.every
         if every and self.global_step % every == 0:
             self.score("curve")
 

@@ -1,0 +1,58 @@
+"""Runs of a checkout's ``launch.py`` in a new process, with an extension that measures them."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+MARK = "MEASURED "
+"""The extension prints one line of this and a JSON object."""
+
+
+def run_with_probe(
+    probe: Path,
+    checkout: Path,
+    *overrides: str,
+    config: str = "configs/demo.yaml",
+    environment: Mapping[str, str] = {},
+) -> dict[str, Any]:
+    """Train with a checkout in an empty folder until its extension ends the run.
+
+    Args:
+        probe: the extension's source.
+        checkout: the folder of ``launch.py``.
+        overrides: further arguments, such as ``trainer.max_steps=300``.
+        environment: further variables, for the extension.
+
+    Returns:
+        the object that the extension printed.
+
+    Raises:
+        RuntimeError: the run ended without it.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        extension = Path(folder, "custom", "probe")
+        extension.mkdir(parents=True)
+        shutil.copy(probe, extension / "__init__.py")
+        command = [sys.executable, checkout / "launch.py", "--config", checkout / config, "--train"]
+        done = subprocess.run(
+            [*map(str, command), "--gpu", "cpu", *overrides],
+            cwd=folder,
+            env=os.environ | {"PYTHONPATH": str(checkout)} | dict(environment),
+            capture_output=True,
+            text=True,
+        )
+    for line in done.stdout.splitlines():
+        if line.startswith(MARK):
+            return json.loads(line.removeprefix(MARK))
+    raise RuntimeError(f"{checkout} measured nothing:\n{done.stdout}\n{done.stderr}")
+
+
+def commit_of(checkout: Path) -> str:
+    command = ["git", "-C", str(checkout), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

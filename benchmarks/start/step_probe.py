@@ -1,0 +1,154 @@
+"""Extension that divides the processor seconds of training steps among their parts, and ends the
+run after the last one.
+
+``launched.py`` copies this file beside a run. ``STEP_WINDOW`` gives the first and the last step.
+The printed JSON has the seconds of each part, without those of the parts that it calls."""
+
+import functools
+import importlib
+import json
+import os
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+
+from threestudio_gaussiandreamer.guidance.base import ScoreDistillation
+from threestudio_gaussiandreamer.host import find, pl, register
+
+PACKAGE = "threestudio_gaussiandreamer."
+MARK = "MEASURED "
+FIRST, LAST = map(int, os.environ["STEP_WINDOW"].split())
+SYSTEM = find("gaussiandreamer-system")
+CALLS = {
+    "rasteriser": (
+        ("training.renderer", "rasterize"),
+        ("splatting.autograd", "_Rasterize.backward"),
+    ),
+    "score": (("training.system", "GaussianDreamerSystem.guide"),),
+    "cameras": (("training.data", "TrainCameras.collate"),),
+    "density control": (
+        ("training.density", "DensityControl.before_backward"),
+        ("training.density", "DensityControl.after_backward"),
+        ("training.density", "DensityControl.after_step"),
+    ),
+    "logs and progress bar": (
+        ("training.system", "GaussianDreamerSystem.report"),
+        ("launch.callbacks", "ProgressBar.on_train_batch_end"),
+    ),
+    "renderer without the rasteriser": (("training.renderer", "SplattingRenderer.forward"),),
+    "autograd without the rasteriser": (
+        ("training.system", "GaussianDreamerSystem.manual_backward"),
+    ),
+}
+OTHER = "loop and the rest"
+OF_LIGHTNING = {
+    "logs and progress bar": (
+        (pl.callbacks.LearningRateMonitor, "on_train_batch_start"),
+        (pl.loggers.CSVLogger, "log_metrics"),
+        (pl.loggers.TensorBoardLogger, "log_metrics"),
+    ),
+}
+seconds: dict[str, float] = dict.fromkeys([*CALLS, "optimiser", OTHER], 0.0)
+running, since = [OTHER], 0.0
+
+
+def switch() -> None:
+    """Add the time since the last switch to the part that is running."""
+    global since
+    now = time.process_time()
+    seconds[running[-1]] += now - since
+    since = now
+
+
+def measured(part: str, call: Any) -> Any:
+    @functools.wraps(call)
+    def within(*args: Any, **options: Any) -> Any:
+        switch()
+        running.append(part)
+        try:
+            return call(*args, **options)
+        finally:
+            switch()
+            running.pop()
+
+    return within
+
+
+def measure(part: str, owner: Any, name: str) -> None:
+    static = isinstance(vars(owner).get(name), staticmethod)
+    call = measured(part, getattr(owner, name))
+    setattr(owner, name, staticmethod(call) if static else call)
+
+
+def measure_calls() -> None:
+    for part, places in CALLS.items():
+        for module, path in places:
+            *owners, name = path.split(".")
+            owner = functools.reduce(getattr, owners, importlib.import_module(PACKAGE + module))
+            measure(part, owner, name)
+    for part, places in OF_LIGHTNING.items():
+        for owner, name in places:
+            measure(part, owner, name)
+
+
+def configured(build: Any) -> Any:
+    """Measure the steps of the optimiser that ``build`` makes."""
+
+    @functools.wraps(build)
+    def configure(system: Any) -> Any:
+        optimizer = build(system)
+        measure("optimiser", type(optimizer), "step")
+        return optimizer
+
+    return configure
+
+
+def before_a_batch(begin: Any) -> Any:
+    @functools.wraps(begin)
+    def on_train_batch_start(system: Any, *args: Any) -> Any:
+        if system.global_step == FIRST:
+            switch()
+            seconds.update(dict.fromkeys(seconds, 0.0))
+        if system.global_step == LAST:
+            switch()
+            print(f"\n{MARK}{json.dumps(seconds)}", flush=True)
+            os._exit(0)
+        return begin(system, *args)
+
+    return on_train_batch_start
+
+
+@register("empty-networks-guidance")
+class EmptyNetworks(ScoreDistillation):
+    """Stable Diffusion's shapes with networks that do nothing: the autoencoder averages blocks of
+    8 x 8 pixels to 4 channels, the U-Net predicts zeros.
+    """
+
+    @dataclass
+    class Config(ScoreDistillation.Config):
+        mesh: str = ""  # as in demo.yaml
+        mode: str = ""
+
+    cfg: Config
+
+    def encode(self, rgb: torch.Tensor, **batch: Any) -> torch.Tensor:
+        pooled = F.avg_pool2d(rgb, 8)
+        return torch.cat([pooled, pooled[:, :1]], 1) * 2 - 1
+
+    def decode(self, latents: torch.Tensor) -> torch.Tensor:
+        return latents[:, :3]
+
+    def condition(self, prompt_utils: Any, **batch: Any) -> None:
+        return None
+
+    def predict(self, z: torch.Tensor, t: torch.Tensor, condition: None) -> tuple:
+        return torch.zeros_like(z), None
+
+
+measure_calls()
+SYSTEM.configure_optimizers = configured(SYSTEM.configure_optimizers)
+SYSTEM.on_train_batch_start = before_a_batch(SYSTEM.on_train_batch_start)
+since = time.process_time()

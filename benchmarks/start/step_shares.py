@@ -1,0 +1,65 @@
+"""Processor seconds of a training step, and the share of each of its parts.
+
+    python -m benchmarks.start.step_shares [--against another/checkout] [--rounds 3]
+
+Runs the demo's step (4 views of 256 x 256 pixels, the exact score), and one of 4 x 512 x 512 with
+empty networks of Stable Diffusion's shapes; both checkouts alternate, each run in a new process
+with one thread. Writes ``benchmarks/results/step.csv``."""
+
+import argparse
+import csv
+from pathlib import Path
+
+from benchmarks.start.launched import commit_of, run_with_probe
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "benchmarks/results/step.csv"
+PROBE = Path(__file__).with_name("step_probe.py")
+COLUMNS = ("workload", "checkout", "commit", "round", "part", "cpu_ms")
+WINDOW = (100, 200)
+"""The first and the last step: the demo then prunes from 7,800 to 5,000 Gaussians."""
+FEW_VIEWS = ("data.train_views=24", "system.evaluation.views=1", "system.evaluation.size=16")
+"""What only matters before and after these steps: target images and evaluation."""
+WORKLOADS = {
+    "demo": FEW_VIEWS,
+    "empty networks, 4 × 512²": (
+        *FEW_VIEWS, "data.width=512", "data.height=512",
+        "system.guidance_type=empty-networks-guidance",
+    ),
+}  # fmt: skip
+THREADS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--against", type=Path, help="another checkout, such as a git worktree")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--workloads", nargs="+", choices=[*WORKLOADS], default=[*WORKLOADS])
+    parser.add_argument("--steps", nargs=2, type=int, default=WINDOW, metavar=("FIRST", "LAST"))
+    args = parser.parse_args()
+    checkouts = {"before": args.against.resolve()} if args.against else {}
+    checkouts["now"] = ROOT
+    rows = []
+    for number in range(args.rounds):
+        for workload in args.workloads:
+            for name, checkout in checkouts.items():
+                parts = milliseconds(checkout, WORKLOADS[workload], args.steps)
+                print(f"{workload}, {name}: {sum(parts.values()):.1f} ms", parts, flush=True)
+                place = (workload, name, commit_of(checkout), number)
+                rows += [(*place, part, f"{ms:.3f}") for part, ms in parts.items()]
+    with open(RESULTS, "w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
+
+
+def milliseconds(checkout: Path, options: tuple[str, ...], window: list[int]) -> dict[str, float]:
+    """Return the processor milliseconds of each part of a step, the mean of a window of steps."""
+    first, last = window
+    environment = {**THREADS, "STEP_WINDOW": f"{first} {last}"}
+    found = run_with_probe(PROBE, checkout, *options, environment=environment)
+    return {part: 1000 * value / (last - first) for part, value in found.items()}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,41 @@
+"""The numbers of a step: in the loggers, on the progress bar, and for callbacks."""
+
+import csv
+from types import SimpleNamespace
+
+import torch
+
+from tests.training.runs import launch, run_folder
+from threestudio_gaussiandreamer.training.events import log_numbers
+
+
+class Logger:
+    def __init__(self):
+        self.logged, self.saved = [], 0
+
+    def log_metrics(self, numbers, step):
+        self.logged.append((step, numbers))
+
+    def save(self):
+        self.saved += 1
+
+
+def test_numbers_reach_loggers_progress_bar_and_callbacks():
+    logger = Logger()
+    trainer = SimpleNamespace(
+        callback_metrics={}, progress_bar_metrics={}, loggers=[logger], global_step=10,
+        current_epoch=0,
+    )  # fmt: skip
+    log_numbers(trainer, {"loss": torch.tensor(2.5), "gaussians": 7}, ["gaussians"])
+    assert logger.logged == [(9, {"loss": 2.5, "gaussians": 7.0, "epoch": 0})] and logger.saved == 1
+    assert trainer.callback_metrics == {"loss": torch.tensor(2.5), "gaussians": torch.tensor(7.0)}
+    assert trainer.progress_bar_metrics == {"gaussians": 7.0}
+
+
+def test_a_run_logs_each_number_once_at_the_steps_of_the_learning_rates(tmp_path, painted_box):
+    steps = ["trainer.max_steps=4", "trainer.log_every_n_steps=2", "trainer.val_check_interval=4"]
+    assert launch(tmp_path, painted_box, *steps) == 0
+    with open(run_folder(tmp_path) / "csv_logs" / "version_0" / "metrics.csv") as file:
+        rows = list(csv.DictReader(file))
+    for name in ("loss", "dB", "gaussians", "train/loss_sds", "train/grad_norm", "lr-Adam/means"):
+        assert [row["step"] for row in rows if row[name]] == ["1", "3"], name
