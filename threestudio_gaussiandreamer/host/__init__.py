@@ -96,8 +96,9 @@ if _threestudio_is_importable():
 else:
     import lightning.pytorch as pl
 
+    from ..core.devices import get_device
     from ..core.logs import debug, info, warn
-    from .builtin.base import BaseModule, BaseObject, Updateable, get_device, parse_structured
+    from .builtin.base import BaseModule, BaseObject, Updateable, parse_structured
     from .builtin.models import (
         BaseBackground,
         BaseGeometry,

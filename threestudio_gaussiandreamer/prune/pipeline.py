@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ..core.checkpoint_file import load_file
+from ..core.devices import get_device
 from ..core.errors import UserError
 from ..core.files import existing_file
 from ..formats.gaussian_files import StoredCloud, as_stored, file_size, read_cloud
@@ -34,7 +35,6 @@ from ..gaussians.views import (
     Views,
     views_around,
 )
-from ..host import get_device
 from .options import (
     PruneOptions,
     budget_of,

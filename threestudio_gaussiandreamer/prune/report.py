@@ -10,12 +10,12 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from ..core.devices import get_device
 from ..core.files import atomic_file, json_text
 from ..core.images import write as write_image
 from ..formats.gaussian_files import as_stored, file_size
 from ..gaussians.gaussians import Gaussians
 from ..gaussians.views import Views, psnr_to_original, render_all
-from ..host import get_device
 from .options import PruneOptions
 from .pipeline import PruneResult, views_of
 

@@ -43,18 +43,19 @@ class PixelSamples(NamedTuple):
 def bake(mesh: Mesh, renders: Renders, size: int) -> UInt8[np.ndarray, "S S 3"]:
     """Return the texture, row 0 at the top, for the ``uv`` of a mesh."""
     caster, count = MeshCaster(mesh), len(renders.c2w)
-    texels, faces = np.zeros((4, size * size)), np.zeros((4, len(mesh.faces)))
+    texels, faces = np.zeros((size * size, 4)), np.zeros((len(mesh.faces), 4))
     bar = tqdm(desc="texture", unit="view", total=count, disable=None, leave=False)
     with ThreadPoolExecutor(min(os.cpu_count() or 1, VIEWS_AT_ONCE)) as pool, bar:
         for first in range(0, count, VIEWS_AT_ONCE):
             views = range(first, min(first + VIEWS_AT_ONCE, count))
-            for samples in pool.map(lambda view: _samples(caster, renders, view), views):
-                _add(faces, samples.face, samples.values)
-                _splat(texels, samples.uv, samples.values, size)
-                bar.update()
+            found = list(pool.map(lambda view: _samples(caster, renders, view), views))
+            samples = PixelSamples(*map(np.concatenate, zip(*found, strict=True)))
+            _add(faces, samples.face[:, None], np.ones((len(samples.face), 1)), samples.values)
+            _splat(texels, samples.uv, samples.values, size)
+            bar.update(len(views))
     _paint_hidden(texels, mesh, faces, size)
-    known = texels[3] > KNOWN
-    colors = (texels[:3] / np.maximum(texels[3], KNOWN)).T.reshape(size, size, 3)
+    known = texels[:, 3] > KNOWN
+    colors = (texels[:, :3] / np.maximum(texels[:, 3:], KNOWN)).reshape(size, size, 3)
     colors = filled(colors, known.reshape(size, size))
     return np.round(colors.clip(0, 255)).astype(np.uint8)
 
@@ -74,41 +75,47 @@ def _samples(caster: MeshCaster, renders: Renders, view: int) -> PixelSamples:
 
 
 def _paint_hidden(
-    texels: Float[np.ndarray, "4 T"], mesh: Mesh, faces: Float[np.ndarray, "4 F"], size: int
+    texels: Float[np.ndarray, "T 4"], mesh: Mesh, faces: Float[np.ndarray, "F 4"], size: int
 ) -> None:
     """Give faces that no render shows the mean colour of the nearest shown face."""
     from scipy.spatial import cKDTree
 
-    shown = faces[3] > KNOWN
+    shown = faces[:, 3] > KNOWN
     if shown.all() or not shown.any():
         return
     corners = mesh.faces[~shown]
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     nearest = cKDTree(centres[shown]).query(centres[~shown])[1]
-    means = np.append(faces[:3] / np.maximum(faces[3], KNOWN), shown[None], axis=0).T
+    means = np.append(faces[shown, :3] / faces[shown, 3:], np.ones((shown.sum(), 1)), axis=1)
     grid = [(i, j) for i in range(LATTICE + 1) for j in range(LATTICE + 1 - i)]
-    for i, j in grid:
-        weights = np.array([i, j, LATTICE - i - j]) / LATTICE
-        uv = np.einsum("k,fkc->fc", weights, mesh.uv[corners])
-        _splat(texels, uv, 2 * KNOWN * means[shown][nearest], size)
+    weights = np.array([(i, j, LATTICE - i - j) for i, j in grid]) / LATTICE
+    uv = np.einsum("gk,fkc->gfc", weights, mesh.uv[corners]).reshape(-1, 2)
+    _splat(texels, uv, np.tile(2 * KNOWN * means[nearest], (len(grid), 1)), size)
 
 
 def _splat(
-    sums: Float[np.ndarray, "4 T"],
+    sums: Float[np.ndarray, "T 4"],
     uv: Float[np.ndarray, "M 2"],
     values: Float[np.ndarray, "M 4"],
     size: int,
 ) -> None:
     """Add values to the four texels around each uv, in bilinear shares."""
     texels, shares = zip(*_around(uv, size), strict=True)
-    _add(sums, np.concatenate(texels), np.concatenate([values * s[:, None] for s in shares]))
+    _add(sums, np.stack(texels, axis=1), np.stack(shares, axis=1), values)
 
 
 def _add(
-    sums: Float[np.ndarray, "4 T"], rows: Int[np.ndarray, " M"], values: Float[np.ndarray, "M 4"]
+    sums: Float[np.ndarray, "T 4"],
+    rows: Int[np.ndarray, "M k"],
+    shares: Float[np.ndarray, "M k"],
+    values: Float[np.ndarray, "M 4"],
 ) -> None:
-    for channel in range(4):
-        sums[channel] += np.bincount(rows, values[:, channel], sums.shape[1])
+    """Add ``shares`` of each of the values to k rows of the sums."""
+    from scipy.sparse import csc_array
+
+    first = np.arange(0, rows.size + 1, rows.shape[1])
+    matrix = csc_array((shares.ravel(), rows.ravel(), first), shape=(len(sums), len(rows)))
+    sums += matrix @ values
 
 
 def _cosines(

@@ -13,10 +13,8 @@ from typing import Any, Optional, TypeVar
 import yaml
 
 from ..core.errors import UserError
+from ..core.logs import warn
 from ..formats.ply import is_gaussian_ply
-from ..host import warn
-from ..host.typed_config import parse_structured
-from ..training.renderer import SplattingRenderer
 from .render import RenderSettings
 
 T = TypeVar("T", dict, list)
@@ -70,6 +68,10 @@ class RunFiles:
     @property
     def settings(self) -> RenderSettings:
         """How the run has drawn its cloud."""
+        # only here, since the commands for files need neither Lightning nor the configuration
+        from ..host.typed_config import parse_structured
+        from ..training.renderer import SplattingRenderer
+
         try:
             cfg = parse_structured(
                 SplattingRenderer.Config, section(self.config, "system", "renderer")

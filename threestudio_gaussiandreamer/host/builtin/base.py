@@ -1,24 +1,14 @@
 """Base classes of parts: a typed ``Config``, a device, and ``update_step`` on everything below."""
 
-import os
 from dataclasses import dataclass
 from typing import Any, Optional
 
-import torch
 from torch import nn
 
 from ...core.checkpoint_file import load_module_weights
+from ...core.devices import get_device
 from ...core.errors import UserError
 from ..typed_config import parse_structured
-
-
-def get_device() -> torch.device:
-    """Return where parts are built: this process's GPU, or the CPU when none is visible."""
-    if not torch.cuda.is_available():
-        return torch.device("cpu")
-    return torch.device(
-        "cuda", int(os.environ.get("LOCAL_RANK", os.environ.get("SLURM_LOCALID", 0)))
-    )
 
 
 class Updateable:
