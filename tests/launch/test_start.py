@@ -24,3 +24,13 @@ def test_a_demo_run_imports_nothing_heavy_that_it_does_not_use():
     added = modules - set(lightnings.stdout.split())
     assert "torch" in modules and "threestudio_gaussiandreamer.training.system" in added
     assert not UNUSED & added
+
+
+def test_the_commands_for_files_import_no_lightning():
+    """It takes three times as long as what they use."""
+    rooms = ("convert", "prune", "view")
+    names = ", ".join(f"threestudio_gaussiandreamer.{room}.command" for room in rooms)
+    code = f"import sys, {names}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    modules = set(done.stdout.split())
+    assert "torch" in modules and not {"lightning", "pytorch_lightning", "omegaconf"} & modules
