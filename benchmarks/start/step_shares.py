@@ -1,6 +1,6 @@
 """Processor seconds of a training step, and the share of each of its parts.
 
-    python -m benchmarks.start.step_shares [--against another/checkout] [--rounds 3]
+    python -m benchmarks.start.step_shares [--against another/checkout] [--rounds 2]
 
 Runs the demo's step (4 views of 256 x 256 pixels, the exact score), and one of 4 x 512 x 512 with
 empty networks of Stable Diffusion's shapes; both checkouts alternate, each run in a new process
@@ -16,8 +16,8 @@ ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks/results/step.csv"
 PROBE = Path(__file__).with_name("step_probe.py")
 COLUMNS = ("workload", "checkout", "commit", "round", "part", "cpu_ms")
-WINDOW = (100, 200)
-"""The first and the last step: the demo then prunes from 7,800 to 5,000 Gaussians."""
+WINDOW = (50, 100)
+"""The first and the last step: the demo samples the removal error of its 10,000 Gaussians."""
 FEW_VIEWS = ("data.train_views=24", "system.evaluation.views=1", "system.evaluation.size=16")
 """What only matters before and after these steps: target images and evaluation."""
 WORKLOADS = {
@@ -35,7 +35,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--against", type=Path, help="another checkout, such as a git worktree")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--workloads", nargs="+", choices=[*WORKLOADS], default=[*WORKLOADS])
     parser.add_argument("--steps", nargs=2, type=int, default=WINDOW, metavar=("FIRST", "LAST"))
     args = parser.parse_args()

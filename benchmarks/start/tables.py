@@ -1,11 +1,17 @@
-"""The measured part of docs/step_time.md about the start, from benchmarks/results/start.csv."""
+"""The measured parts of docs/step_time.md, and the seconds of a conversion in docs/mesh.md."""
 
 import statistics
+from collections.abc import Iterable
 from pathlib import Path
+from typing import TypeVar
 
 from benchmarks.markdown import markdown, read
 
-RESULTS = Path(__file__).resolve().parents[1] / "results/start.csv"
+FOLDER = Path(__file__).resolve().parents[1] / "results"
+RESULTS = FOLDER / "start.csv"
+NOT_THE_REST = ("rasteriser", "score", "optimiser")
+T = TypeVar("T")
+Rows = list[dict[str, str]]
 
 
 def first_step() -> str:
@@ -28,6 +34,70 @@ def first_step() -> str:
     return markdown(head, [*table, ("all", *(f"{total:.2f}" for total in sums))])
 
 
-def _heading(rows: list[dict[str, str]], checkout: str) -> str:
+def _heading(rows: Rows, checkout: str) -> str:
     (commit,) = {row["commit"] for row in rows if row["checkout"] == checkout}
     return f"{checkout} ({commit}), CPU s"
+
+
+def step_parts() -> str:
+    """Return the median milliseconds of a step's parts, and their shares of the step now."""
+    rows = read(FOLDER / "step.csv")
+    pairs = _unique((row["workload"], row["checkout"]) for row in rows)
+    medians = {pair: _medians(rows, pair) for pair in pairs}
+    head = ("processor ms of a step", *(f"{name}, {checkout}" for name, checkout in pairs))
+    parts = list(medians[pairs[0]])
+    cells = {part: [_with_share(medians[pair], [part]) for pair in pairs] for part in parts}
+    rest = [part for part in parts if part not in NOT_THE_REST]
+    cells["**all but rasteriser, score, optimiser**"] = [
+        _with_share(medians[pair], rest) for pair in pairs
+    ]
+    cells["all"] = [f"{sum(medians[pair].values()):.1f}" for pair in pairs]
+    return markdown(head, [(part, *values) for part, values in cells.items()])
+
+
+def _medians(rows: Rows, pair: tuple[str, str]) -> dict[str, float]:
+    """Return the median milliseconds of each part, for a workload and a checkout."""
+    own = [row for row in rows if (row["workload"], row["checkout"]) == pair]
+    return {
+        part: statistics.median(float(row["cpu_ms"]) for row in own if row["part"] == part)
+        for part in _unique(row["part"] for row in own)
+    }
+
+
+def _with_share(medians: dict[str, float], parts: list[str]) -> str:
+    milliseconds = sum(medians[part] for part in parts)
+    return f"{milliseconds:.1f} ({milliseconds / sum(medians.values()):.0%})".replace("%", " %")
+
+
+def demo_stages() -> str:
+    """Return the seconds of each stage of ``make demo``."""
+    rows = read(FOLDER / "demo_stages.csv")
+    lines = [
+        (row["stage"], f"{float(row['seconds']):.1f}", f"{float(row['cpu_seconds']):.1f}")
+        for row in rows
+    ]
+    whole = [row for row in rows if not row["stage"].startswith("of it")]
+    sums = [sum(float(row[name]) for row in whole) for name in ("seconds", "cpu_seconds")]
+    return markdown(
+        ("stage", "seconds", "CPU seconds"), [*lines, ("all", *(f"{s:.0f}" for s in sums))]
+    )
+
+
+def conversion() -> str:
+    """Return the median processor seconds of ``convert cloud.ply object.glb`` per object."""
+    rows = read(FOLDER / "convert.csv")
+    objects, checkouts = (_unique(row[key] for row in rows) for key in ("object", "checkout"))
+    table = [
+        (name, *(f"{_seconds_of(rows, name, checkout):.1f}" for checkout in checkouts))
+        for name in objects
+    ]
+    return markdown(("object", *(_heading(rows, name) for name in checkouts)), table)
+
+
+def _seconds_of(rows: Rows, name: str, checkout: str) -> float:
+    own = (row for row in rows if (row["object"], row["checkout"]) == (name, checkout))
+    return statistics.median(float(row["cpu_seconds"]) for row in own)
+
+
+def _unique(values: Iterable[T]) -> list[T]:
+    return list(dict.fromkeys(values))

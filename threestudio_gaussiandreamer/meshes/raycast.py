@@ -267,7 +267,10 @@ class TargetCache:
     def __call__(
         self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int
     ) -> UInt8[Tensor, "B H W 4"]:
-        """Return premultiplied colour and coverage for each camera, on the cameras' device."""
+        """Return premultiplied colour and coverage for each camera, on the cameras' device.
+
+        In memory each channel is a plane, since compositing moves the channels to the front.
+        """
         cameras = _cameras(c2w, fovy)
         keys = [_key(camera, height, width) for camera in cameras]
         asked = dict(zip(keys, cameras, strict=True))
@@ -279,11 +282,11 @@ class TargetCache:
         )
         found = {key: self._pictures[key] for key in asked if key not in missing}
         found |= {
-            key: torch.from_numpy(np.round(image * 255).astype(np.uint8)).to(c2w.device)
+            key: _planes(np.round(image * 255).astype(np.uint8)).to(c2w.device)
             for key, image in zip(missing, images, strict=True)
         }
         self._remember(found)
-        return torch.stack([found[key] for key in keys])
+        return torch.stack([found[key] for key in keys]).movedim(1, -1)
 
     def __len__(self) -> int:
         return len(self._pictures)
@@ -304,6 +307,10 @@ class TargetCache:
             self._pictures.move_to_end(key)
         while len(self._pictures) > self.capacity:
             self._pictures.popitem(last=False)
+
+
+def _planes(image: UInt8[np.ndarray, "H W 4"]) -> UInt8[Tensor, "4 H W"]:
+    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(image, -1, 0)))
 
 
 def _cameras(

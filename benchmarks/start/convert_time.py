@@ -1,0 +1,70 @@
+"""Processor seconds of ``convert cloud.ply object.glb``, the program's start included.
+
+    python -m benchmarks.start.convert_time toy=cloud.ply [spot=...] [--against another/checkout]
+
+Converts each cloud with both checkouts alternately, each time in a new process with one thread.
+Seconds are of all threads of the process: on a machine with nothing else to do the command takes
+less time than that. Writes ``benchmarks/results/convert.csv``."""
+
+import argparse
+import csv
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from benchmarks.start.launched import commit_of
+from benchmarks.start.step_shares import THREADS
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "benchmarks/results/convert.csv"
+COLUMNS = ("object", "checkout", "commit", "round", "cpu_seconds")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("clouds", nargs="+", metavar="NAME=PATH", help="trained clouds")
+    parser.add_argument("--against", type=Path, help="another checkout, such as a git worktree")
+    parser.add_argument("--rounds", type=int, default=3)
+    args = parser.parse_args()
+    checkouts = {"before": args.against.resolve()} if args.against else {}
+    checkouts["now"] = ROOT
+    rows = []
+    for number in range(args.rounds):
+        for name, _, path in (cloud.partition("=") for cloud in args.clouds):
+            for checkout, folder in checkouts.items():
+                seconds = converted(folder, Path(path).resolve())
+                print(f"{name}, {checkout}: {seconds:.2f} CPU s", flush=True)
+                rows.append((name, checkout, commit_of(folder), number, f"{seconds:.3f}"))
+    with open(RESULTS, "w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
+
+
+def converted(checkout: Path, cloud: Path) -> float:
+    """Return the processor seconds of a checkout's command."""
+    environment = os.environ | THREADS | {"PYTHONPATH": str(checkout)}
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "threestudio_gaussiandreamer.convert"]
+        before = children_seconds()
+        subprocess.run(
+            [*command, str(cloud), "object.glb"],
+            cwd=folder,
+            env=environment,
+            check=True,
+            capture_output=True,
+        )
+        return children_seconds() - before
+
+
+def children_seconds() -> float:
+    """Return the processor seconds of all ended child processes."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
+if __name__ == "__main__":
+    main()
