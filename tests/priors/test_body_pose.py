@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.priors.pose_cases import limb_angles, needs_anny, random_local, walked
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.priors.body_pose import (
     INDEX,
     NEEDED,
@@ -74,6 +75,11 @@ def test_the_needed_positions_alone_give_a_pose(stick_body):
     upright = {name: stick_body.joints[INDEX[name]] for name in NEEDED}
     pose = pose_of_positions(stick_body, upright)
     np.testing.assert_allclose(pose, np.tile(np.eye(3), (BODY_JOINTS, 1, 1)), atol=1e-9)
+
+
+def test_positions_on_one_line_have_no_pose(stick_body):
+    with pytest.raises(UserError, match="hips and spine on one line"):
+        pose_of_positions(stick_body, dict.fromkeys(NEEDED, np.zeros(3)))
 
 
 def test_vertices_move_rigidly_with_the_joint_that_owns_them(stick_body):

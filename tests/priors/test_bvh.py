@@ -151,6 +151,8 @@ def test_a_written_skeleton_is_read_back(seed, stick_body, tmp_path):
         ("OFFSET 10 0 0", "OFFSET 10 0", "3 finite numbers were expected"),
         ("OFFSET 10 0 0", "OFFSET 10 zero 0", "3 finite numbers were expected"),
         ("6 Xposition", "6 Xpositoin", "did you mean 'Xposition'"),
+        ("6 Xposition Yposition", "6 Xposition Xposition", "has a channel twice"),
+        ("OFFSET 10 0 0", "OFFSET 1e300 0 0", "3 finite numbers were expected"),
         ("HIERARCHY\nROOT Hips\n{", "HIERARCHY\nROOT Hips\n{\n{", "is cut off"),
         (CASE, "", "has no joints"),
         (CASE, "\x00\xff binary", "has no joints"),
@@ -161,6 +163,11 @@ def test_damaged_files_are_refused(chain, old, new, problem):
     chain.write_text(CASE.replace(old, new, 1))
     with pytest.raises(UserError, match=problem):
         read_bvh(chain, 0)
+
+
+def test_a_brace_before_the_first_joint_is_ignored(chain):
+    chain.write_text(CASE.replace("ROOT", "{\n}\nROOT", 1))
+    np.testing.assert_allclose(read_bvh(chain, 0)["left hip"], [11, 90, 2], atol=1e-9)
 
 
 def test_a_frame_beyond_the_end_is_refused(chain):

@@ -96,6 +96,7 @@ def test_a_bvh_gives_the_body_its_pose(up, stick_body, tmp_path):
         ({"poses": np.full((1, 72), np.nan)}, "NaN or infinite in frame 0"),
         ({"poses": np.array([["a"] * 72])}, "holds an array"),
         ({"poses": np.zeros((1, 72), complex)}, "holds an array"),
+        ({"poses": np.full((1, 72), 1e300)}, "too large"),
         ({"trans": np.zeros((1, 3))}, "neither an array 'poses' nor 'body_pose'"),
         ({"body_pose": np.zeros((2, 63)), "global_orient": np.zeros((3, 3))}, "global_orient"),
         ({"body_pose": np.zeros((2, 60)), "global_orient": np.zeros((2, 3))}, "holds an array"),

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..core.errors import UserError
 from .makehuman import Body
 from .skeleton import BODY_JOINTS, JOINTS, PARENTS
 
@@ -42,6 +43,8 @@ NEEDED = [
     for joint in ("hip", "knee", "shoulder", "elbow")
 ]
 """Joints without whose positions there is no pose."""
+LEAST_EXTENT = 1e-6
+"""Smallest width and height of hips and chest, relative to their sum."""
 Degrees = tuple[float, float, float]
 
 WALKING: dict[str, Degrees] = {
@@ -160,6 +163,9 @@ def pose_of_positions(
 def part_frame(positions: dict[str, Float[np.ndarray, "3"]], part: str) -> Float[np.ndarray, "3 3"]:
     """Return the orientation of the hips ("hip") or of the chest ("shoulder"): its columns are the
     directions to the left, up and to the front.
+
+    Raises:
+        UserError: the joints are on one line, so that they have no orientation.
     """
     left, right = positions[f"left {part}"], positions[f"right {part}"]
     middles = {
@@ -170,7 +176,14 @@ def part_frame(positions: dict[str, Float[np.ndarray, "3"]], part: str) -> Float
     if part == "hip":
         high = positions.get("lower spine", high)
     across = _unit(left - right)
-    up = _unit((high - low) - ((high - low) @ across) * across)
+    rise = (high - low) - ((high - low) @ across) * across
+    size = np.linalg.norm(high - low) + np.linalg.norm(left - right)
+    if min(np.linalg.norm(left - right), np.linalg.norm(rise)) <= LEAST_EXTENT * size:
+        raise UserError(
+            f"the pose has its {part}s and spine on one line: there is no front; choose another "
+            "frame or file"
+        )
+    up = _unit(rise)
     return np.stack([across, up, np.cross(across, up)], axis=1)
 
 

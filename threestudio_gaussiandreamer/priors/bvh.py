@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import UserError, unknown
-from ..core.file_memory import require_file_memory
 from .body_pose import NEEDED
 
 CHANNELS = ("Xposition", "Yposition", "Zposition", "Xrotation", "Yrotation", "Zrotation")
@@ -39,7 +38,8 @@ PAIRED = {
 }
 """Parts of the names of each joint, the most specific one first: "foot" is the ankle in files
 without an "ankle", and "shoulder" the upper arm in those without an "arm"."""
-VALUE_BYTES = 16
+LARGEST = 1e9
+"""Largest number that is plausible, in any unit; squares of larger ones could overflow."""
 
 
 @dataclass
@@ -59,7 +59,6 @@ def read_bvh(path: Path, frame: int) -> dict[str, Float[np.ndarray, "3"]]:
         UserError: the file is damaged, has no such frame, numbers that aren't finite, or lacks
             joints that a pose needs.
     """
-    require_file_memory(VALUE_BYTES, path.stat().st_size, f"BVH file {str(path)!r}", "a number")
     hierarchy, _, motion = path.read_text("utf-8", errors="replace").partition("MOTION")
     joints = list(_hierarchy(hierarchy, path))
     names = joint_names([joint.name for joint in joints], path)
@@ -129,13 +128,13 @@ def _hierarchy(text: str, path: Path) -> Iterator[Joint]:
             joints.append(Joint("" if ends else " ".join(words), current))
         elif kind == "{":
             above.append(current)
-            current = len(joints) - 1
+            current = len(joints) - 1 if joints else None
         elif kind == "}" and above:
             current = above.pop()
         elif kind == "OFFSET" and joints:
             joints[-1].offset = _numbers(words, 3, path)
         elif kind == "CHANNELS" and joints:
-            joints[-1].channels = [_channel(word, path) for word in words[1:]]
+            joints[-1].channels = _channels(words[1:], path)
     if not joints or above:
         raise UserError(
             f"BVH file {str(path)!r} is damaged: its hierarchy "
@@ -144,10 +143,14 @@ def _hierarchy(text: str, path: Path) -> Iterator[Joint]:
     yield from joints
 
 
-def _channel(word: str, path: Path) -> str:
-    if word not in CHANNELS:
-        raise unknown(f"channel in the BVH file {str(path)!r}", word, CHANNELS)
-    return word
+def _channels(words: list[str], path: Path) -> list[str]:
+    """Check the names of a joint's channels, each of which may occur once."""
+    for word in words:
+        if word not in CHANNELS:
+            raise unknown(f"channel in the BVH file {str(path)!r}", word, CHANNELS)
+    if len(set(words)) < len(words):
+        raise UserError(f"BVH file {str(path)!r} is damaged: a joint has a channel twice")
+    return words
 
 
 def _frame_values(text: str, count: int, frame: int, path: Path) -> Float[np.ndarray, " C"]:
@@ -167,7 +170,7 @@ def _numbers(words: list[str], count: int, path: Path) -> Float[np.ndarray, " N"
         values = np.array(words, np.float64)
     except ValueError:
         values = np.array([np.nan])
-    if len(values) != count or not np.isfinite(values).all():
+    if len(values) != count or not (np.abs(values) < LARGEST).all():
         raise UserError(
             f"BVH file {str(path)!r} is damaged: {count} finite numbers were expected in the line "
             f"{' '.join(words)[:80]!r}"

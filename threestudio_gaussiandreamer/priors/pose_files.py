@@ -60,6 +60,8 @@ def read_pose(
     else:
         local, stated = read_axis_angles(file, frame)
         pose = pose_of_rotations(body, local)
+    if not np.isfinite(pose).all():
+        raise UserError(f"pose file {path!r} has rotations in frame {frame} that are too large")
     return TO_BODY[stated if up == "auto" else up] @ pose
 
 
