@@ -65,7 +65,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "docs/distillation.md": {"overhead": variant_tables.overhead},
     "docs/failures.md": {"tables": failure_table.tables},
     "docs/formats.md": {"formats": formats.table, "producers": formats.producers},
-    "docs/mesh.md": {"front": mesh_quality.front},
+    "docs/mesh.md": {"front": mesh_quality.front, "conversion": start.conversion},
     "docs/rasteriser.md": {
         "presets": splatting.presets,
         "thresholds": splatting.thresholds,
@@ -73,7 +73,10 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "kernel": splatting.kernel,
         "growth": splatting.growth,
     },
-    "docs/step_time.md": {"start": start.first_step},
+    "docs/step_time.md": {
+        "step": start.step_parts,
+        "start": start.first_step,
+    },
     "docs/robustness.md": {"fuzz": robustness.fuzz, "long run": robustness.long_run},
     "docs/farm.md": {"farm": robustness.farm},
     "docs/viewing.md": {
