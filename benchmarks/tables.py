@@ -15,6 +15,8 @@ from benchmarks.quality import mesh as mesh_quality
 from benchmarks.quality import tables as quality
 from benchmarks.quality.runs import ROOT
 from benchmarks.quality.tables import DIFFERENCES, difference_row, last_rows, medians, named
+from benchmarks.robustness import ddp
+from benchmarks.robustness import scale_tables as scale
 from benchmarks.robustness import tables as robustness
 from benchmarks.splatting import tables as splatting
 from benchmarks.start import tables as start
@@ -83,6 +85,14 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "quality": viewers.page_quality,
         "speed": viewers.page_speed,
         "live": viewers.live_view,
+    },
+    "docs/several_processes.md": {"ddp": ddp.table},
+    "docs/scale.md": {
+        "units": scale.unit_costs,
+        "stated": scale.stated,
+        "runs": scale.runs,
+        "storage": scale.storage,
+        "limits": scale.limits,
     },
 }
 

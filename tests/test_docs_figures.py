@@ -59,6 +59,7 @@ CONSTANTS = {
     ],
 }
 PUBLISHED = {
+    "docs/scale.md": ["The 15 minutes of GaussianDreamer"],
     "docs/evaluation.md": ["100 times the cosine", "428 M, 1.7 GB", "2.5 G, 10 GB"],
     "docs/models.md": [
         "(intended for 12 GB, not measured)",
