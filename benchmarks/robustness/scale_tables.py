@@ -38,9 +38,7 @@ def unit_costs() -> str:
         )
         for name, size in sizes.items()
     ]
-    rows.append(
-        ("a line of the ledger's share of an asset", f"{median_of('driver', 'bytes'):.0f} bytes")
-    )
+    rows.append(("lines in the ledger", f"{median_of('driver', 'bytes'):.0f} bytes"))
     return markdown(("stage or files", "CPU seconds, peak memory; or size"), rows)
 
 
@@ -53,7 +51,8 @@ def stated() -> str:
         ("assets that hang; that fail whatever is done", f"{rates.hangs:g}; {rates.failures:g}"),
         ("slow machines, their time over the others'", f"{rates.slow:g}, {rates.slowness:g}"),
         ("until a lost machine is replaced", f"{rates.replacement:.0f} s"),
-        ("a GB for a month; an upload of one file", f"${STORAGE_DOLLARS:g}; ${PUT_DOLLARS:g}"),
+        ("a GB for a month", f"${STORAGE_DOLLARS:g}"),
+        ("a thousand uploads", f"${1000 * PUT_DOLLARS:g}"),
     ]
     for found in scenarios():
         times = f"{found.seconds:.0f} s an asset, {found.load:.0f} s to start"
@@ -70,6 +69,7 @@ def runs() -> str:
             f"{int(row['workers']):,}",
             row["variant"],
             f"{float(row['hours']):.1f}",
+            f"{float(row['last_percent_hours']):.1f}",
             f"{float(row['worker_hours']):,.0f}",
             f"{float(row['wasted_percent']):.1f}",
             f"{int(row['failed']):,}",
@@ -78,8 +78,8 @@ def runs() -> str:
         )
         for row in read(RESULTS)
     ]
-    head = ("assets", "workers", "variant", "hours", "worker-hours", "wasted, %", "failed")
-    return markdown((*head, "begun again", "dollars"), rows)
+    head = ("assets", "workers", "variant", "hours", "of them the last 1 %", "worker-hours")
+    return markdown((*head, "wasted, %", "failed", "begun again", "dollars"), rows)
 
 
 def storage() -> str:
