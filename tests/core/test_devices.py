@@ -1,0 +1,24 @@
+"""Which device a process computes on."""
+
+import pytest
+import torch
+
+from threestudio_gaussiandreamer.core.devices import get_device
+
+
+def test_without_a_gpu_it_is_the_cpu(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert get_device() == torch.device("cpu")
+
+
+@pytest.mark.parametrize(
+    ("ranks", "index"),
+    [({}, 0), ({"LOCAL_RANK": "3"}, 3), ({"SLURM_LOCALID": "2"}, 2)],
+)
+def test_each_process_of_a_machine_has_its_own_gpu(monkeypatch, ranks, index):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    for name in ("LOCAL_RANK", "SLURM_LOCALID"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in ranks.items():
+        monkeypatch.setenv(name, value)
+    assert get_device() == torch.device("cuda", index)
