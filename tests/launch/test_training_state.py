@@ -104,6 +104,7 @@ IMPOSSIBLE = [
     (without(*ADAM, "state", 0, "step"), "Adam can't resume from its optimizer_states: KeyError"),
     (at("pytorch-lightning_version", value=3), "pytorch-lightning_version is of type int"),
     (at("pytorch-lightning_version", value="x"), "is 'x'; expected 2.0 or later"),
+    (at("pytorch-lightning_version", value="1.9.5"), "is '1.9.5'; expected 2.0 or later"),
     (at("callbacks", value=[]), "its callbacks is of type list"),
     (at("callbacks", CALLBACK, value=[]), "is of type list"),
     (at("callbacks", CALLBACK, "best_k_models", value=3), "its best_k_models is of type int"),
@@ -122,3 +123,6 @@ def test_impossible_content_is_refused_in_one_message(tmp_path, change, message)
 def test_a_whole_checkpoint_is_accepted(tmp_path):
     assert read(tmp_path / "a.ckpt", whole_checkpoint())["global_step"] == 3
     read(tmp_path / "b.ckpt", whole_checkpoint(steps=0))
+    later = whole_checkpoint()
+    later["pytorch-lightning_version"] = "10.0.1"
+    read(tmp_path / "c.ckpt", later)

@@ -62,7 +62,7 @@ def check_training_state(checkpoint: Mapping[str, Any], optimizer: Mapping, what
 
 def _check_version(version: str, what: str) -> None:
     """Raise UserError for a checkpoint of Lightning 1, whose conversion isn't supported."""
-    if not re.match(r"[2-9]\d*\.\d+", version):
+    if not re.match(r"([2-9]|[1-9]\d+)\.\d+", version):
         raise UserError(
             f"{what}: its pytorch-lightning_version is {shown(version)}; expected {OLDEST} or later"
         )
