@@ -48,6 +48,16 @@ def test_rows_and_intervals_over_prompts(tmp_path, judge, capsys):
     assert "kind" in capsys.readouterr().out
 
 
+def test_a_run_in_several_folders_is_scored_once(tmp_path, judge, monkeypatch):
+    runs = finished(tmp_path / "runs", PROMPTS[:2])
+    (tmp_path / "link").symlink_to(runs)
+    monkeypatch.chdir(tmp_path)
+    again = ["runs/gaussiandreamer/run1", str(runs), "runs", "link"]
+    assert main([*again, "--metrics", "judge", "--judge", judge, "--output", "out"]) == 0
+    with open("out/scorecard.csv", newline="") as file:
+        assert sorted(row["prompt"] for row in csv.DictReader(file)) == sorted(PROMPTS[:2])
+
+
 def test_clip_of_two_folders_is_compared_by_prompt(tmp_path):
     pytest.importorskip("transformers")
     clip = str(tiny.clip(tmp_path / "clip"))

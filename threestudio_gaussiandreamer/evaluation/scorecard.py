@@ -100,25 +100,26 @@ def require_models(name: str, args: argparse.Namespace) -> None:
 
 
 def find_results(folders: Sequence[str]) -> list[Result]:
-    """Find the finished runs in these folders, sorted by path.
+    """Find the finished runs in these folders, sorted by path; a run in several of them once.
 
     Raises:
         UserError: a folder doesn't exist or holds no finished run, or a run's prompt is unknown.
     """
-    found = []
+    found: dict[Path, Result] = {}
     for folder in folders:
         if not Path(folder).expanduser().is_dir():
             raise UserError(f"{folder!r} is no folder: expected a run's, or one that holds runs")
         runs = list(run_folders(Path(folder).expanduser()))
         if not runs:
             raise UserError(f"{folder!r} holds no finished run, which has a save/it*-export folder")
-        found += [find_result(str(place)) for place in runs]
-    if without_prompt := [result for result in found if not result.prompt]:
+        new = [place for place in runs if place.resolve() not in found]
+        found |= {place.resolve(): find_result(str(place)) for place in new}
+    if without_prompt := [result for result in found.values() if not result.prompt]:
         raise UserError(
             f"{str(without_prompt[0].ply)!r} has no prompt in its run's configs/parsed.yaml: "
             "metrics of the scorecard compare renders with prompts"
         )
-    return found
+    return list(found.values())
 
 
 def run_folders(folder: Path) -> Iterator[Path]:
