@@ -224,3 +224,21 @@ def test_ctrl_c_lets_the_workers_write_checkpoints(path):
     with pytest.raises(KeyboardInterrupt):
         bench.driver.run()
     assert bench.stops == 1 and bench.states() == [FINISHED, RUNNING, None, None, None, None]
+
+
+def test_a_full_disk_does_not_take_the_place_of_ctrl_c(path, capsys):
+    bench = Bench(path, finished)
+    wait = bench.ray.wait
+
+    def full(lines):
+        raise UserError("the ledger can't be written")
+
+    def interrupted(*args, **options):
+        bench.ray.wait, bench.ledger.append = wait, full
+        raise KeyboardInterrupt
+
+    bench.ray.wait = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        bench.driver.run()
+    assert not bench.driver.running and bench.states()[0] == RUNNING
+    assert "error: the ledger can't be written" in capsys.readouterr().out

@@ -115,7 +115,16 @@ class Driver:
         while self.running and time.monotonic() < deadline:
             ready, _ = self.ray.wait(list(self.running), timeout=POLL)
             for handle in ready:
-                self.collect(handle)
+                self._collect_last(handle)
+
+    def _collect_last(self, handle: Any) -> None:
+        """Note the outcome of an asset while the farm is stopped; an error of the ledger, such as a
+        full disk, is printed, so that it doesn't take the place of Ctrl-C.
+        """
+        try:
+            self.collect(handle)
+        except UserError as error:
+            print(f"error: {error}")
 
     # Outcomes
     # ----------------------------------------------------------------------------------------------
