@@ -25,7 +25,7 @@ def whole(low: int, high: int, unit: str) -> Rule:
 
 @dataclass
 class MeshOptions:
-    """What the mesh is like, and how the cloud is looked at."""
+    """Size of the mesh and of its texture, and the renders of the cloud that both are made from."""
 
     faces: int = field(default=5000, metadata=whole(100, 100_000, "triangles"))
     texture: int = field(default=1024, metadata=whole(64, 8192, "texels each way"))
@@ -34,6 +34,7 @@ class MeshOptions:
     resolution: int = field(default=96, metadata=whole(16, 256, "cells"))
     """Cells along the longest side of the cloud, from which the surface is extracted."""
     views: int = field(default=64, metadata=whole(8, 1024, "renders"))
+    """Renders on a sphere around the cloud, for depths and colours."""
     view_size: int = field(default=512, metadata=whole(64, 2048, "pixels each way"))
     min_component: float = field(default=0.01, metadata=in_range(0, 0.5))
     """Connected parts with a smaller share of the surface's area are dropped."""
