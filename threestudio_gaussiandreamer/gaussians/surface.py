@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..core.quaternions import rotation_rows
 from .gaussians import Gaussians, opaque
 from .sh import sh0_colors
 
@@ -191,13 +192,8 @@ def covariance_matrices(gaussians: Gaussians) -> Float[np.ndarray, "N 3 3"]:
     w, x, y, z = (
         gaussians.quats / np.maximum(np.linalg.norm(gaussians.quats, axis=1, keepdims=True), 1e-12)
     ).T.astype(np.float64)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
     scaled = (
-        np.moveaxis(np.array(rows), -1, 0)
+        np.moveaxis(np.array(rotation_rows(w, x, y, z)), -1, 0)
         * np.exp(gaussians.log_scales.astype(np.float64))[:, None]
     )
     return scaled @ scaled.transpose(0, 2, 1)

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..core.quaternions import rotation_rows
 from .options import RasterizeOptions
 from .scene import Scene
 
@@ -90,12 +91,7 @@ def quats_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batc
         usable, quats / torch.where(usable, largest, 1), quats.new_tensor([1.0, 0, 0, 0])
     )
     w, x, y, z = (q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)).unbind(-1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+    return torch.stack([torch.stack(row, -1) for row in rotation_rows(w, x, y, z)], -2)
 
 
 def _to_camera(means, quats, scales, viewmats) -> tuple[Tensor, Tensor]:
