@@ -17,6 +17,7 @@ from ..core.errors import UserError
 from ..core.signals import raised_signals
 from ..launch.experiment import configure_logging
 from ..launch.folder_lock import FolderInUse, claim, require_writable
+from ..launch.options import add_config, parse_with_overrides
 from . import cluster
 from .assets import Recipe
 from .display import Display
@@ -59,12 +60,7 @@ def parse_arguments(argv: Optional[Sequence[str]] = None) -> argparse.Namespace:
         allow_abbrev=False,
     )
     parser.add_argument("prompts", type=Path, help="a list of prompts: .txt, .csv or .jsonl")
-    parser.add_argument(
-        "--config",
-        action="append",
-        required=True,
-        help="a YAML file or its name, as for the launcher; given several times, later ones win",
-    )
+    add_config(parser)
     parser.add_argument(
         "--out",
         help="the farm's folder, or a URL such as s3://bucket/farm (default: "
@@ -75,11 +71,7 @@ def parse_arguments(argv: Optional[Sequence[str]] = None) -> argparse.Namespace:
         "--price", type=positive, help="of an hour of one worker, for the report's cost"
     )
     _add_cluster_options(parser)
-    args, args.overrides = parser.parse_known_args(argv)
-    for override in args.overrides:
-        if override.startswith("-"):
-            parser.error(f"unrecognized option {override}")
-    return args
+    return parse_with_overrides(parser, argv)
 
 
 def _add_cluster_options(parser: argparse.ArgumentParser) -> None:

@@ -43,7 +43,30 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
         "'system.prompt_processor.prompt=a fox'",
         allow_abbrev=False,
     )
+    add_config(parser)
     _add_options(parser)
+    return parse_with_overrides(parser, argv)
+
+
+def add_config(parser: argparse.ArgumentParser) -> None:
+    """Add ``--config``, whose values :func:`find_config` takes."""
+    parser.add_argument(
+        "--config",
+        action="append",
+        required=True,
+        help="a YAML file, or the name of one in the current folder, in configs/ or among the "
+        "packaged ones; given several times, later ones win",
+    )
+
+
+def parse_with_overrides(
+    parser: argparse.ArgumentParser, argv: Optional[Sequence[str]]
+) -> argparse.Namespace:
+    """Parse the arguments; those that ``parser`` doesn't know are ``overrides``, a list of strings.
+
+    Raises:
+        SystemExit: for an invalid argument, with a printed message.
+    """
     args, args.overrides = parser.parse_known_args(argv)
     for override in args.overrides:
         if override.startswith("-"):
@@ -52,13 +75,6 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--config",
-        action="append",
-        required=True,
-        help="a YAML file, or the name of one in the current folder, in configs/ or among the "
-        "packaged ones; given several times, later ones win",
-    )
     stages = parser.add_mutually_exclusive_group(required=True)
     for stage, text in STAGES.items():
         stages.add_argument(
