@@ -222,6 +222,22 @@ def sample_orbit(
     return Orbit(elevation, _lerp(ranges.azimuth, sector), _lerp(ranges.distance, u[2]), fovy)
 
 
+def sample_view_groups(
+    batch: int,
+    n_view: int,
+    ranges: OrbitRanges,
+    rng: torch.Generator,
+    uniform_azimuth: bool = True,
+) -> Orbit:
+    """Draw ``batch`` training views in groups of ``n_view``: those of a group are at one elevation
+    and distance, with one field of view, at azimuths 360 / ``n_view`` degrees apart.
+    """
+    orbit = sample_orbit(batch // n_view, ranges, rng, uniform_azimuth)
+    views = orbit.rows(torch.arange(batch // n_view).repeat_interleave(n_view))
+    turn = 360.0 / n_view * torch.arange(n_view).repeat(batch // n_view)
+    return views._replace(azimuth=(views.azimuth + turn + 180) % 360 - 180)
+
+
 def _draw_by_angle(rng: torch.Generator) -> bool:
     return bool(torch.rand(1, generator=rng) < 0.5)
 

@@ -53,6 +53,26 @@ def test_rays_are_there_when_asked_for():
     )
 
 
+def test_groups_of_views_share_all_but_their_evenly_spaced_azimuths():
+    for batch in batches(module(batch_size=8, n_view=4, azimuth_range=[150, 180]), 5):
+        for name in ("elevation", "camera_distances", "fovy"):
+            groups = batch[name].reshape(2, 4)
+            assert torch.equal(groups, groups[:, :1].expand(2, 4)), name
+        azimuth = batch["azimuth"].reshape(2, 4)
+        assert azimuth.min() >= -180 and azimuth.max() < 180
+        turns = (azimuth - azimuth[:, :1]) % 360
+        torch.testing.assert_close(
+            turns, torch.tensor([[0.0, 90, 180, 270]] * 2), rtol=0, atol=1e-4
+        )
+        assert ((azimuth[:, 0] >= 150) & (azimuth[:, 0] <= 180)).all()
+        assert batch["elevation"][0] != batch["elevation"][4]
+
+
+def test_views_in_groups_of_one_are_those_without_groups():
+    for one, other in zip(batches(module(n_view=1), 3), batches(module(), 3), strict=True):
+        assert torch.equal(one["c2w"], other["c2w"])
+
+
 def test_validation_and_test_batches_hold_one_view_and_its_index():
     data = module(n_val_views=4, n_test_views=5, eval_height=20, eval_width=30)
     val, test = list(data.val_dataloader()), list(data.test_dataloader())
@@ -130,6 +150,9 @@ def test_progressive_views_widen_from_the_evaluation_view():
         ({"eval_batch_size": 2}, "eval_batch_size"),
         ({"n_test_views": 0}, "n_test_views"),
         ({"train_views": -1}, "train_views"),
+        ({"n_view": 0}, "n_view"),
+        ({"n_view": 3}, "batch_size: expected multiples of n_view=3, got 4"),
+        ({"n_view": 2, "train_views": 8}, "train_views: a fixed pool of views has no groups"),
     ],
 )
 def test_a_wrong_value_is_named(wrong, named):

@@ -64,6 +64,7 @@ class CameraConfig:
     rays_d_normalize: bool = True
     train_views: int = field(default=0, metadata=count_of("views", 0, CAMERA_BYTES))
     rays: bool = False
+    n_view: int = field(default=1, metadata=in_range(1, 64, "views"))
 
     @staticmethod
     def check(cfg: Any) -> None:
@@ -81,6 +82,7 @@ class CameraConfig:
                     f"resolution_milestones, got {len(cfg.resolution_milestones)}"
                 )
         _check_milestones(cfg)
+        _check_groups(cfg)
         _check_memory(cfg)
 
 
@@ -97,6 +99,15 @@ def _check_milestones(cfg: Any) -> None:
         raise UserError(
             f"resolution_milestones: give height, width or batch_size {len(milestones) + 1} entries"
         )
+
+
+def _check_groups(cfg: Any) -> None:
+    """Raise UserError where the views of a batch can't be groups of ``n_view``."""
+    for size in _per_stage(cfg.batch_size, range(len(cfg.resolution_milestones) + 1)):
+        if size % cfg.n_view:
+            raise UserError(f"batch_size: expected multiples of n_view={cfg.n_view}, got {size}")
+    if cfg.n_view > 1 and cfg.train_views:
+        raise UserError("train_views: a fixed pool of views has no groups: set n_view=1")
 
 
 def _check_memory(cfg: Any) -> None:

@@ -21,6 +21,9 @@ camera_perturb            uniform shift of the camera, +- world units; center_pe
                           normal, standard deviation
 progressive_until         widen the angles from the evaluation view to the full range over that many
                           steps
+n_view                    how many views of an object a multi-view model sees together: so many
+                          consecutive views have one elevation, distance and field of view, and
+                          evenly spaced azimuths; ``batch_size`` is a multiple
 train_views               0: continuous cameras; n: draw from a fixed pool of n views (so that
                           targets can be reused)
 rays                      add rays_o and rays_d (B, H, W, 3) to every batch
@@ -131,9 +134,7 @@ class TrainCameras(IterableDataset, Updateable):
         orbit = (
             self.pool.rows(index)
             if self.pool
-            else cameras.sample_orbit(
-                batch_size, self._ranges(step), rng, self.cfg.batch_uniform_azimuth
-            )
+            else self._sample(batch_size, self._ranges(step), rng)
         )
         c2w = self._perturbed(orbit, rng)
         lights = self._lights(c2w, rng)
@@ -154,6 +155,12 @@ class TrainCameras(IterableDataset, Updateable):
             views = make_batch(self.pool, c2w, c2w[:, :3, 3], height, width)
             self._views_by_size[height, width] = views
         return self._views_by_size[height, width]
+
+    def _sample(self, batch_size: int, ranges: OrbitRanges, rng: torch.Generator) -> Orbit:
+        uniform = self.cfg.batch_uniform_azimuth
+        if self.cfg.n_view == 1:
+            return cameras.sample_orbit(batch_size, ranges, rng, uniform)
+        return cameras.sample_view_groups(batch_size, self.cfg.n_view, ranges, rng, uniform)
 
     def _pick(self, batch_size: int, rng: torch.Generator) -> Int[Tensor, " B"]:
         """Draw ``batch_size`` views of the pool, one from each azimuth sector (the pool is ordered
