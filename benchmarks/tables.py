@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.markdown import markdown
+from benchmarks.models import memory
 from benchmarks.quality import failure_table, formats, variant_tables
 from benchmarks.quality import mesh as mesh_quality
 from benchmarks.quality import tables as quality
@@ -68,6 +69,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "docs/failures.md": {"tables": failure_table.tables},
     "docs/formats.md": {"formats": formats.table, "producers": formats.producers},
     "docs/mesh.md": {"front": mesh_quality.front, "conversion": start.conversion},
+    "docs/models.md": {"memory of models": memory.table},
     "docs/rasteriser.md": {
         "presets": splatting.presets,
         "thresholds": splatting.thresholds,

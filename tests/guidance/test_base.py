@@ -245,7 +245,7 @@ def test_guidance_between_two_mixtures_is_the_closed_form(models, prediction, sc
 @pytest.fixture
 def half(monkeypatch):
     """Use float16 on the CPU too, where a run would use float32."""
-    monkeypatch.setattr(text_to_image, "weights_type", lambda half, device: torch.float16)
+    monkeypatch.setattr(text_to_image, "weights_type", lambda *options: torch.float16)
 
 
 def test_half_precision_is_for_gpus():

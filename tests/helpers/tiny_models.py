@@ -81,24 +81,20 @@ def stable_diffusion(
     """Write a tiny Stable Diffusion 2.1: UNet on 8x8x4 latents, VAE 64x64 to 8x8; ``prediction``:
     epsilon, v_prediction.
     """
-    from diffusers import AutoencoderKL, UNet2DConditionModel
+    from diffusers import UNet2DConditionModel
 
     torch.manual_seed(seed)
     unet = UNet2DConditionModel(
         **sizes.unet, cross_attention_dim=sizes.text_width, use_linear_projection=True
     )
-    _listen_to_text(unet)
+    listen_to_text(unet)
     unet.save_pretrained(folder / "unet")
-    blocks = {
-        "down_block_types": ("DownEncoderBlock2D",) * 4,
-        "up_block_types": ("UpDecoderBlock2D",) * 4,
-    }
-    AutoencoderKL(**sizes.vae, **blocks, latent_channels=4).save_pretrained(folder / "vae")
+    vae(folder, sizes.vae, latent_channels=4)
     _rename(folder / "vae" / "diffusion_pytorch_model.safetensors", PUBLISHED_VAE_NAMES)
     clip_text_encoder(folder, sizes.text_width)
     scheduler = _stable_diffusion_scheduler(prediction)
     scheduler.save_pretrained(folder / "scheduler")
-    return _index(
+    return write_index(
         folder,
         "StableDiffusionPipeline",
         unet=["diffusers", "UNet2DConditionModel"],
@@ -110,6 +106,17 @@ def stable_diffusion(
         feature_extractor=[None, None],
         requires_safety_checker=False,
     )
+
+
+def vae(folder: Path, sizes: dict[str, Any] = TINY.vae, **options: Any) -> None:
+    """Write ``vae``, 64 x 64 pixels to 8 x 8 latents by default."""
+    from diffusers import AutoencoderKL
+
+    blocks = {
+        "down_block_types": ("DownEncoderBlock2D",) * 4,
+        "up_block_types": ("UpDecoderBlock2D",) * 4,
+    }
+    AutoencoderKL(**sizes, **blocks, **options).save_pretrained(folder / "vae")
 
 
 def _stable_diffusion_scheduler(prediction: str) -> Any:
@@ -140,7 +147,7 @@ def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
 
     torch.manual_seed(seed)
     unet = _deep_floyd_unet()
-    _listen_to_text(unet)
+    listen_to_text(unet)
     unet.save_pretrained(folder / "unet")
     t5_text_encoder(folder)
     DDPMScheduler(
@@ -150,7 +157,7 @@ def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
         thresholding=True,
         sample_max_value=1.5,
     ).save_pretrained(folder / "scheduler")
-    return _index(
+    return write_index(
         folder,
         "IFPipeline",
         unet=["diffusers", "UNet2DConditionModel"],
@@ -188,7 +195,7 @@ def _deep_floyd_unet() -> torch.nn.Module:
     )
 
 
-def _listen_to_text(unet: torch.nn.Module) -> None:
+def listen_to_text(unet: torch.nn.Module) -> None:
     """Scale up the output of the cross-attention: with PyTorch's initial weights two prompts give
     nearly equal images.
     """
@@ -197,11 +204,17 @@ def _listen_to_text(unet: torch.nn.Module) -> None:
             weight.data *= 10
 
 
-def clip_text_encoder(folder: Path, width: int = TEXT_WIDTH) -> None:
+def clip_text_encoder(
+    folder: Path, width: int = TEXT_WIDTH, *, suffix: str = "", projection: int = 0
+) -> None:
     """Write ``text_encoder`` and ``tokenizer`` of Stable Diffusion 2.1: CLIP, padded with "!",
     which one of its two files contradicts.
+
+    Args:
+        suffix: of the names of both components.
+        projection: width of the pooled embedding; 0 for an encoder without.
     """
-    from transformers import CLIPTextConfig, CLIPTextModel
+    from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection
 
     vocabulary = _byte_vocabulary()
     start, end = vocabulary["<|startoftext|>"], vocabulary["<|endoftext|>"]
@@ -215,20 +228,25 @@ def clip_text_encoder(folder: Path, width: int = TEXT_WIDTH) -> None:
         bos_token_id=start,
         eos_token_id=end,
         pad_token_id=0,
+        projection_dim=projection or 512,
     )
-    CLIPTextModel(config).save_pretrained(folder / "text_encoder")
-    _publish_clip(folder / "text_encoder" / "model.safetensors")
-    tokenizer = folder / "tokenizer"
+    encoder = (CLIPTextModelWithProjection if projection else CLIPTextModel)(config)
+    encoder.save_pretrained(folder / f"text_encoder{suffix}")
+    _publish_clip(folder / f"text_encoder{suffix}" / "model.safetensors")
+    _clip_tokenizer(folder / f"tokenizer{suffix}", vocabulary)
+
+
+def _clip_tokenizer(tokenizer: Path, vocabulary: dict[str, int]) -> None:
     tokenizer.mkdir(parents=True)
-    _json(tokenizer / "vocab.json", vocabulary)
+    write_json(tokenizer / "vocab.json", vocabulary)
     (tokenizer / "merges.txt").write_text("#version: 0.2\nf o\nfo x</w>\n", encoding="utf-8")
     special = {
         "bos_token": "<|startoftext|>",
         "eos_token": "<|endoftext|>",
         "unk_token": "<|endoftext|>",
     }
-    _json(tokenizer / "special_tokens_map.json", special | {"pad_token": "!"})
-    _json(
+    write_json(tokenizer / "special_tokens_map.json", special | {"pad_token": "!"})
+    write_json(
         tokenizer / "tokenizer_config.json",
         special
         | {
@@ -240,25 +258,28 @@ def clip_text_encoder(folder: Path, width: int = TEXT_WIDTH) -> None:
     )
 
 
-def t5_text_encoder(folder: Path) -> None:
+def t5_text_encoder(folder: Path, width: int = TEXT_WIDTH, *, suffix: str = "") -> None:
     """Write ``text_encoder`` and ``tokenizer`` of DeepFloyd IF: T5 v1.1 and a
     sentencepiece model.
+
+    Args:
+        suffix: of the names of both components.
     """
     from transformers import T5Config, T5EncoderModel
 
-    tokenizer = folder / "tokenizer"
+    tokenizer = folder / f"tokenizer{suffix}"
     tokenizer.mkdir(parents=True)
     (tokenizer / "spiece.model").write_bytes(_sentencepiece())
     special = {"eos_token": "</s>", "unk_token": "<unk>", "pad_token": "<pad>"}
-    _json(
+    write_json(
         tokenizer / "tokenizer_config.json",
         special | {"tokenizer_class": "T5Tokenizer", "model_max_length": 512, "extra_ids": 100},
     )
-    sizes = {"d_model": TEXT_WIDTH, "d_kv": 8, "d_ff": 48, "num_layers": 2, "num_heads": 4}
+    sizes = {"d_model": width, "d_kv": 8, "d_ff": 48, "num_layers": 2, "num_heads": 4}
     config = T5Config(
         vocab_size=200, **sizes, feed_forward_proj="gated-gelu", tie_word_embeddings=False
     )
-    T5EncoderModel(config).save_pretrained(folder / "text_encoder")
+    T5EncoderModel(config).save_pretrained(folder / f"text_encoder{suffix}")
 
 
 def _publish_clip(path: Path) -> None:
@@ -326,13 +347,13 @@ def _sentencepiece() -> bytes:
     return model.getvalue()
 
 
-def _index(folder: Path, pipeline: str, **components) -> Path:
-    _json(
+def write_index(folder: Path, pipeline: str, **components) -> Path:
+    write_json(
         folder / "model_index.json",
         {"_class_name": pipeline, "_diffusers_version": "0.8.0", **components},
     )
     return folder
 
 
-def _json(path: Path, content: dict) -> None:
+def write_json(path: Path, content: dict) -> None:
     path.write_text(json.dumps(content, ensure_ascii=False), encoding="utf-8")

@@ -197,19 +197,20 @@ def test_all_shards_must_be_there():
         model_files.component_weights(names[:-1], "text_encoder", half=False)
 
 
+@pytest.mark.parametrize("variant", ["fp16", "bf16"])
 @pytest.mark.parametrize(
-    "fp16",
+    "name",
     [
-        "model.fp16.safetensors",
-        "model.fp16-00001-of-00001.safetensors",
-        "model-00001-of-00001.fp16.safetensors",
+        "model.{}.safetensors",
+        "model.{}-00001-of-00001.safetensors",
+        "model-00001-of-00001.{}.safetensors",
     ],
 )
-def test_the_wanted_precision_is_preferred_and_the_other_one_will_do(fp16):
-    half, full = f"unet/{fp16}", "unet/model.safetensors"
-    assert model_files.component_weights([half, full], "unet", half=True) == ([half], "fp16", True)
+def test_the_wanted_precision_is_preferred_and_the_other_one_will_do(name, variant):
+    half, full = f"unet/{name.format(variant)}", "unet/model.safetensors"
+    assert model_files.component_weights([half, full], "unet", half=True) == ([half], variant, True)
     assert model_files.component_weights([half, full], "unet", half=False) == ([full], None, True)
-    assert model_files.component_weights([half], "unet", half=False) == ([half], "fp16", True)
+    assert model_files.component_weights([half], "unet", half=False) == ([half], variant, True)
     assert model_files.component_weights([full], "unet", half=True) == ([full], None, True)
 
 

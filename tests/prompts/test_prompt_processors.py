@@ -104,8 +104,11 @@ def test_the_encoder_is_freed(models, monkeypatch):
     from transformers import CLIPTextModel
 
     monkeypatch.setattr(model_files, "gc", gc)
+    gc.collect()
+    others = [thing for thing in gc.get_objects() if type(thing) is CLIPTextModel]
     processor(models)
-    assert not [thing for thing in gc.get_objects() if type(thing) is CLIPTextModel]
+    left = [thing for thing in gc.get_objects() if type(thing) is CLIPTextModel]
+    assert len(left) <= len(others)
 
 
 def test_too_little_memory_on_the_gpu_means_the_cpu(monkeypatch, caplog):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.helpers import tiny_3d_models, tiny_models
+from tests.helpers import tiny_3d_models, tiny_large_models, tiny_models
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.guidance.text_to_image import TextToImageDistillation
 from threestudio_gaussiandreamer.launch.experiment import main
@@ -46,6 +46,11 @@ def models(tmp_path_factory):
         "epsilon": guided_by(tiny_models.stable_diffusion(folder / "epsilon")),
         "v_prediction": guided_by(velocity),
         "deep_floyd": guided_by(tiny_models.deep_floyd(folder / "if")),
+        # the size that the configuration sets is that of the real model
+        "sd3": guided_by(tiny_large_models.stable_diffusion_3(folder / "sd3"))
+        | {"system.guidance.image_size": 64},
+        "sdxl": guided_by(tiny_large_models.stable_diffusion_xl(folder / "sdxl")),
+        "mvdream": guided_by(tiny_large_models.mvdream(folder / "mvdream")),
         "shap_e": prior(
             model=tiny_3d_models.shap_e(folder / "shap-e"), num_inference_steps=2, grid_size=24
         ),
@@ -183,6 +188,21 @@ RUNS = {
         ["candidates", "epsilon"],
     ),
     "ground": (["gaussiandreamer.yaml", "gaussiandreamer-ground.yaml"], ["shap_e", "epsilon"]),
+    "sdxl": (["gaussiandreamer.yaml", "gaussiandreamer-sdxl.yaml"], ["shap_e", "sdxl"]),
+    "sd3": (["gaussiandreamer.yaml", "gaussiandreamer-sd3.yaml"], ["shap_e", "sd3"]),
+    "mvdream": (["gaussiandreamer.yaml", "gaussiandreamer-mvdream.yaml"], ["shap_e", "mvdream"]),
+    "sdxl, lowmem": (
+        ["gaussiandreamer.yaml", "gaussiandreamer-sdxl.yaml", "gaussiandreamer-lowmem.yaml"],
+        ["shap_e", "sdxl"],
+    ),
+    "sd3, lowmem": (
+        ["gaussiandreamer.yaml", "gaussiandreamer-sd3.yaml", "gaussiandreamer-lowmem.yaml"],
+        ["shap_e", "sd3"],
+    ),
+    "mvdream, lowmem": (
+        ["gaussiandreamer.yaml", "gaussiandreamer-mvdream.yaml", "gaussiandreamer-lowmem.yaml"],
+        ["shap_e", "mvdream"],
+    ),
     "lowmem": (["gaussiandreamer.yaml", "gaussiandreamer-lowmem.yaml"], ["shap_e", "epsilon"]),
 }
 

@@ -5,6 +5,7 @@ Notation of ``sds.py``: z = sqrt(abar) x0 + sqrt(1 - abar) eps."""
 from jaxtyping import Float
 from torch import Tensor
 
+from .rectified_flow import noise_of_velocity
 from .sds import per_item, predict_x0
 
 PREDICTIONS = {
@@ -12,12 +13,14 @@ PREDICTIONS = {
     "v_prediction": lambda output, z, abar: (
         per_item(abar.sqrt(), z) * output + per_item((1 - abar).sqrt(), z) * z
     ),
+    "velocity": lambda output, z, abar: noise_of_velocity(output, z, abar),
     "sample": lambda output, z, abar: (
         (z - per_item(abar.sqrt(), z) * output) / per_item((1 - abar).sqrt(), z)
     ),
 }
 """Conversions of the network's output to the noise, by prediction type: the noise itself,
-v = sqrt(abar) eps - sqrt(1 - abar) x0 (Salimans and Ho 2022), or x0.
+v = sqrt(abar) eps - sqrt(1 - abar) x0 (Salimans and Ho 2022), the velocity eps - x0 of a rectified
+flow, or x0.
 """
 
 

@@ -22,10 +22,12 @@ WEIGHTS: dict[str, Callable[[Tensor], Tensor]] = {
     "uniform": torch.ones_like,
     "fantasia3d": lambda abar: abar.sqrt() * (1 - abar),
     "x0": lambda abar: ((1 - abar) / abar).sqrt(),
+    "rectified_flow": lambda abar: 1 + ((1 - abar) / abar).sqrt(),
 }
 """The weights w(t): sigma_t^2 of DreamFusion (Poole et al. 2022), 1, a_t sigma_t^2 of Fantasia3D
-(Chen et al. 2023), and sigma_t / a_t, with which the gradient is x minus the denoised x, with a_t =
-sqrt(abar) and sigma_t^2 = 1 - abar.
+(Chen et al. 2023), sigma_t / a_t, with which the gradient is x minus the denoised x, and 1 plus
+that, with which it is the error of a rectified flow's velocity; a_t = sqrt(abar) and sigma_t^2 =
+1 - abar.
 """
 
 

@@ -30,7 +30,8 @@ timestep_schedule   uniform: random between the two; linear, sqrt, dreamtime: fr
 grad_clip           clamp each element of the latent's gradient to +- this; none, a number or a
                     schedule
 weighting_strategy  w(t): sds (1 - abar), uniform (1), fantasia3d (sqrt(abar) (1 - abar)),
-                    x0 (sqrt((1 - abar) / abar): the gradient is x minus the denoised x)
+                    x0 (sqrt((1 - abar) / abar): the gradient is x minus the denoised x),
+                    rectified_flow (1 + sqrt((1 - abar) / abar): the error of a flow's velocity)
 max_bad_steps       stop after this many steps in a row in which the score of some item was NaN or
                     infinite
 max_items_eval      how many items ``guidance_eval`` shows; 0 or less = all, as in threestudio

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..host import register, register_builtin
+from ..models.families import DEEP_FLOYD as FAMILY
 from ..prompts.prompt_processors import DEEP_FLOYD
 from .base import GUIDANCE_SCALE
 from .text_to_image import TextToImageDistillation
@@ -29,6 +30,7 @@ class DeepFloydGuidance(TextToImageDistillation):
         enable_vae_slicing: bool = False
 
     cfg: Config
+    family = FAMILY
 
     def load(self, folder: Path) -> None:
         super().load(folder)

@@ -18,11 +18,14 @@ factor of 500, and elements 10^9 times smaller than the largest don't vanish.
 """
 
 
-def weights_type(half: bool, device: torch.device) -> torch.dtype:
-    """Return float16 on a GPU if ``half`` is set, else float32. On the CPU half precision has no
-    advantage.
+HALF_TYPES = {"float16": torch.float16, "bfloat16": torch.bfloat16}
+
+
+def weights_type(half: bool, device: torch.device, half_type: str = "float16") -> torch.dtype:
+    """Return the type named ``half_type`` on a GPU if ``half`` is set, else float32. On the CPU
+    half precision has no advantage.
     """
-    return torch.float16 if half and device.type == "cuda" else torch.float32
+    return HALF_TYPES[half_type] if half and device.type == "cuda" else torch.float32
 
 
 class PerItemLossScale:

@@ -48,16 +48,33 @@ class StableDiffusionGuidance(TextToImageDistillation):
         from diffusers import AutoencoderKL
 
         super().load(folder)
-        self.vae = self.network(AutoencoderKL, folder, "vae", self._prepare_vae)
-        self.require_text_to_image(self.vae.config.latent_channels)
+        self.vae_dtype = self.vae_type(folder)
+        self.vae = self.network(
+            AutoencoderKL, folder, "vae", self._prepare_vae, dtype=self.vae_dtype
+        )
+        self.require_inputs()
         factor = 2 ** (len(self.vae.config.block_out_channels) - 1)
         self.image_size = self.size_of_images(factor)
+        factor *= self.patch_size
         if self.image_size % factor:
             raise UserError(
                 f"system.guidance.image_size: expected a multiple of {factor}, got "
                 f"{self.image_size}"
             )
         self._bad_backwards = 0
+
+    def vae_type(self, folder: Path) -> torch.dtype:
+        """Return the number type of the VAE."""
+        return self.dtype
+
+    def require_inputs(self) -> None:
+        """Raise UserError if the model needs inputs that this guidance doesn't have."""
+        self.require_text_to_image(self.vae.config.latent_channels)
+
+    @property
+    def patch_size(self) -> int:
+        """Height and width of the network's patches, latents."""
+        return 1
 
     def _prepare_vae(self, vae: nn.Module) -> nn.Module:
         if self.cfg.enable_vae_tiling:
@@ -69,13 +86,13 @@ class StableDiffusionGuidance(TextToImageDistillation):
         function of (seed, step, item).
         """
         images = self.resized(rgb, self.image_size) * 2 - 1
-        if self.dtype == torch.float32:
+        if self.vae_dtype == torch.float32:
             return self._encode(images)
         loss_scale = PerItemLossScale(self._count_bad_backwards)
         return loss_scale.leave(self._encode(loss_scale.enter(images)))
 
     def _encode(self, images: Float[Tensor, "B 3 s s"]) -> Float[Tensor, "B 4 h w"]:
-        images = images.to(self.dtype)
+        images = images.to(self.vae_dtype)
         if self.cfg.enable_vae_slicing and torch.is_grad_enabled():
             parts = [
                 checkpoint(self._moments, image, use_reentrant=False) for image in images.split(1)
@@ -83,8 +100,13 @@ class StableDiffusionGuidance(TextToImageDistillation):
             mean, std = (torch.cat(part) for part in zip(*parts, strict=True))
         else:
             mean, std = self._moments(images)
-        sample = mean.float() + std.float() * self.normal(mean, "vae")
-        return sample * self.vae.config.scaling_factor
+        latents = mean.float() + std.float() * self.normal(mean, "vae")
+        return (latents - self._shift) * self.vae.config.scaling_factor
+
+    @property
+    def _shift(self) -> float:
+        """The mean of the latents, which models since Stable Diffusion 3 subtract."""
+        return getattr(self.vae.config, "shift_factor", None) or 0.0
 
     def _moments(self, images: Float[Tensor, "B 3 s s"]) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation of the VAE's posterior, (B, 4, h, w) each."""
@@ -92,7 +114,7 @@ class StableDiffusionGuidance(TextToImageDistillation):
         return posterior.mean, posterior.std
 
     def decode(self, latents: Float[Tensor, "B 4 h w"]) -> Float[Tensor, "B 3 s s"]:
-        latents = (latents / self.vae.config.scaling_factor).to(self.dtype)
+        latents = (latents / self.vae.config.scaling_factor + self._shift).to(self.vae_dtype)
         # one at a time, since memory matters more than the speed of pictures for display
         images = torch.cat([self.vae.decode(latent).sample for latent in latents.split(1)]).float()
         return (images / 2 + 0.5).clamp(0, 1)

@@ -1,4 +1,4 @@
-"""The base class of guidances by text-to-image diffusion models: it loads the UNet and the noise
+"""The base class of guidances by text-to-image diffusion models: it loads the network and the noise
 schedule, and evaluates all prompts in one forward pass.
 
 ==================================  ================================================================
@@ -13,19 +13,20 @@ weighting_strategy, ...
 view_dependent_prompting            use the prompt of each view's direction
 image_size                          height and width that the model sees, pixels; none = what it was
                                     trained with
-half_precision_weights              float16 on a GPU; images, latents, gradients and splatting stay
-                                    float32
+half_precision_weights              half precision on a GPU; images, latents, gradients and
+                                    splatting stay float32
+half_precision_type                 float16 or bfloat16, whose range is that of float32
 enable_channels_last_format         lay the weights out channels last
-enable_torch_compile                compile the UNet on its first use
+enable_torch_compile                compile the network on its first use
 enable_attention_slicing            attention in slices: less memory, slower
-enable_sequential_cpu_offload       keep the UNet's weights in the CPU's memory: least memory, much
-                                    slower
+enable_sequential_cpu_offload       keep the network's weights in the CPU's memory: least memory,
+                                    much slower
 enable_memory_efficient_attention   torch's own attention is so already; accepted for threestudio's
                                     configurations
 ==================================  ================================================================
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Optional
@@ -36,15 +37,16 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ..core.errors import UserError, unknown
-from ..core.options import in_range
+from ..core.options import in_range, one_of
 from ..diffusion.noise_prediction import PREDICTIONS, perp_neg
 from ..host import debug, info, parse_structured
 from ..models.extras import require_extra
+from ..models.families import STABLE_DIFFUSION, Family
 from ..models.hub import find_model
-from ..models.loaded import loaded
+from ..models.loaded import keep_on_cpu, loaded
 from ..models.model_files import load_network, load_settings
 from .base import ScoreDistillation
-from .half_precision import weights_type
+from .half_precision import HALF_TYPES, weights_type
 from .lora import LoRAParticles, check_adaptable
 from .particles import ParticleModel
 
@@ -54,8 +56,16 @@ since ``predict_x0`` divides by its square root.
 """
 
 
+Latents = Float[Tensor, "kB c h w"]
+Timesteps = Int[Tensor, " kB"]
+Embeddings = Float[Tensor, "kB N F"]
+"""Inputs of the network, a row for each row of a :class:`Condition`."""
+
+
 class Condition(NamedTuple):
-    """The text embeddings of B views, k rows per view."""
+    """The text embeddings of B views, k rows per view. What else a model is conditioned on is in
+    further tokens of each row (``models/pooled_embeddings.py``).
+    """
 
     embeddings: Float[Tensor, "kB N F"]
     """Prompts of all views, negative prompts of all views, and with Perp-Neg two further rows for
@@ -80,8 +90,8 @@ class Condition(NamedTuple):
 
 
 class TextToImageDistillation(ScoreDistillation):
-    """Score distillation from a UNet that is conditioned on text embeddings. Subclasses define how
-    images are encoded.
+    """Score distillation from a network that is conditioned on text embeddings. Subclasses define
+    how images are encoded.
     """
 
     @dataclass
@@ -91,6 +101,7 @@ class TextToImageDistillation(ScoreDistillation):
         view_dependent_prompting: bool = True
         image_size: Optional[int] = field(default=None, metadata=in_range(1, 4096, "pixels"))
         half_precision_weights: bool = True
+        half_precision_type: str = field(default="float16", metadata=one_of(HALF_TYPES))
         enable_channels_last_format: bool = False
         enable_torch_compile: bool = False
         enable_attention_slicing: bool = False
@@ -99,6 +110,8 @@ class TextToImageDistillation(ScoreDistillation):
 
     cfg: Config
     components: ClassVar[tuple[str, ...]] = ("unet", "scheduler")
+    family: ClassVar[Family] = STABLE_DIFFUSION
+    """The models that this guidance takes."""
 
     # Loading
     # ----------------------------------------------------------------------------------------------
@@ -107,27 +120,31 @@ class TextToImageDistillation(ScoreDistillation):
     def preflight(cls, cfg: Any) -> None:
         cfg = parse_structured(cls.Config, cfg)
         super().preflight(cfg)
+        cls._find(cfg, download=False)
+
+    @classmethod
+    def _find(cls, cfg: Any, **options: Any) -> Optional[Path]:
         require_extra("diffusion", "diffusers", "transformers")
-        find_model(
-            cfg.pretrained_model_name_or_path, cls.components, revision=cfg.revision, download=False
-        )
+        name, revision = cfg.pretrained_model_name_or_path, cfg.revision
+        return find_model(name, cls.components, family=cls.family, revision=revision, **options)
 
     def configure(self) -> None:
         super().configure()
-        require_extra("diffusion", "diffusers", "transformers")
-        self.dtype = weights_type(self.cfg.half_precision_weights, self.device)
-        folder = find_model(
-            self.cfg.pretrained_model_name_or_path,
-            self.components,
-            half=self.dtype == torch.float16,
-            revision=self.cfg.revision,
+        self.dtype = weights_type(
+            self.cfg.half_precision_weights, self.device, self.cfg.half_precision_type
         )
+        folder = self._find(self.cfg, half=self.half)
         info(
             f"loading {self.cfg.pretrained_model_name_or_path} in "
             f"{str(self.dtype).removeprefix('torch.')}"
         )
         self.set_schedule(folder)
         self.load(folder)
+
+    @property
+    def half(self) -> bool:
+        """Whether the networks are in half precision."""
+        return self.dtype != torch.float32
 
     def set_schedule(self, folder: Path) -> None:
         """Read the noise schedule of the model's training, float64, and the prediction type of its
@@ -149,22 +166,33 @@ class TextToImageDistillation(ScoreDistillation):
             raise unknown(
                 "prediction_type of the model's scheduler", self.prediction_type, PREDICTIONS
             )
-        abar = torch.cumprod(1 - scheduler.betas.double(), dim=0)
+        self.set_alphas_cumprod(torch.cumprod(1 - scheduler.betas.double(), dim=0))
+
+    def set_alphas_cumprod(self, abar: Float[Tensor, " T"]) -> None:
+        """Set abar by timestep, float64."""
         self.alphas_cumprod = torch.where(abar > 0, abar, TERMINAL_ABAR)
         self._abar = self.alphas_cumprod.to(self.device)
         self.update_step(0, 0)
 
+    @property
+    def denoiser(self) -> nn.Module:
+        """The network that predicts the noise."""
+        return self.unet
+
     def load(self, folder: Path) -> None:
         """Load the networks; subclasses extend this with their own."""
-        from diffusers import UNet2DConditionModel
-
-        cfg = self.cfg
-        self.unet = self.network(UNet2DConditionModel, folder, "unet", self._prepare_unet)
-        self.text_width = self.unet.config.encoder_hid_dim or self.unet.config.cross_attention_dim
-        if cfg.enable_memory_efficient_attention:
+        self.load_denoiser(folder)
+        if self.cfg.enable_memory_efficient_attention:
             debug(
                 "enable_memory_efficient_attention: torch's attention is memory efficient already"
             )
+
+    def load_denoiser(self, folder: Path) -> None:
+        """Load the network that predicts the noise, and set ``text_width``."""
+        from diffusers import UNet2DConditionModel
+
+        self.unet = self.network(UNet2DConditionModel, folder, "unet", self.prepare_denoiser)
+        self.text_width = self.unet.config.encoder_hid_dim or self.unet.config.cross_attention_dim
 
     def size_of_images(self, factor: int = 1) -> int:
         """Return height and width of the images for the model, pixels: ``image_size``, or
@@ -173,7 +201,7 @@ class TextToImageDistillation(ScoreDistillation):
         Raises:
             UserError: neither is known.
         """
-        trained = self.unet.config.sample_size
+        trained = self.denoiser.config.sample_size
         if self.cfg.image_size is None and not isinstance(trained, int):
             raise UserError(
                 f"{self.cfg.pretrained_model_name_or_path} has sample_size {trained}: set "
@@ -181,15 +209,17 @@ class TextToImageDistillation(ScoreDistillation):
             )
         return self.cfg.image_size or trained * factor
 
-    def require_text_to_image(self, channels: int) -> None:
+    def require_text_to_image(
+        self, channels: int, embedding_types: tuple[Optional[str], ...] = (None, "text")
+    ) -> None:
         """Raise UserError unless the inputs of the UNet are an image of ``channels`` channels and
-        text embeddings only.
+        embeddings of these types only.
         """
         config = self.unet.config
         wanted = {
             "in_channels": (channels,),
             "class_embed_type": (None,),
-            "addition_embed_type": (None, "text"),
+            "addition_embed_type": embedding_types,
         }
         if other := [
             f"{name} {config[name]}"
@@ -198,9 +228,8 @@ class TextToImageDistillation(ScoreDistillation):
         ]:
             raise UserError(
                 f"{self.cfg.pretrained_model_name_or_path} needs other inputs than text "
-                f"({', '.join(other)}), like Stable Diffusion XL and"
-                " models for inpainting, depth or upscaling: use Stable Diffusion 1.x or 2.x, or "
-                "the first stage of DeepFloyd IF"
+                f"({', '.join(other)}), like models for inpainting, depth or upscaling: use a "
+                "model that makes images from text alone"
             )
 
     def network(
@@ -209,37 +238,42 @@ class TextToImageDistillation(ScoreDistillation):
         folder: Path,
         component: str,
         prepare: Callable[[nn.Module], nn.Module],
+        *,
+        dtype: Optional[torch.dtype] = None,
+        read: Callable[..., nn.Module] = load_network,
+        key: tuple[Hashable, ...] = (),
     ) -> nn.Module:
         """Load one frozen network of the model, unless this process has kept it (``loaded.py``).
 
         Args:
             prepare: moves it to its device and applies options of this part.
+            dtype: number type, in place of this part's.
+            read: reads it from the folder, with the arguments of :func:`.model_files.load_network`.
+            key: what ``prepare`` depends on, beside the options that begin with ``enable_``.
         """
+        dtype = dtype or self.dtype
 
         def load() -> nn.Module:
-            network = load_network(
-                network_class,
-                folder,
-                component,
-                half=self.dtype == torch.float16,
-                torch_dtype=self.dtype,
-            ).requires_grad_(False)
+            network = read(network_class, folder, component, half=self.half, torch_dtype=dtype)
+            network.requires_grad_(False)
             if self.cfg.enable_channels_last_format:
                 network.to(memory_format=torch.channels_last)
             return prepare(network)
 
         options = tuple(name for name in sorted(self.cfg) if name.startswith("enable_"))
         chosen = tuple(bool(self.cfg[name]) for name in options)
-        return loaded((component, str(folder), self.dtype, self.device, options, chosen), load)
+        return loaded((component, str(folder), dtype, self.device, options, chosen, *key), load)
 
-    def _prepare_unet(self, unet: nn.Module) -> nn.Module:
-        if self.cfg.enable_attention_slicing:
-            unet.set_attention_slice(1)
+    def prepare_denoiser(self, network: nn.Module) -> nn.Module:
+        """Move the network that predicts the noise to its device, and apply this part's options."""
+        # transformers have no such method: torch's attention needs little memory without
+        if self.cfg.enable_attention_slicing and hasattr(network, "set_attention_slice"):
+            network.set_attention_slice(1)
         if self.cfg.enable_sequential_cpu_offload:
-            _offload(unet, self.device)
+            keep_on_cpu(network, self.device)
         else:
-            unet.to(self.device)
-        return torch.compile(unet) if self.cfg.enable_torch_compile else unet
+            network.to(self.device)
+        return torch.compile(network) if self.cfg.enable_torch_compile else network
 
     # Score distillation
     # ---------------------------------------------------------------------------------------
@@ -329,16 +363,22 @@ class TextToImageDistillation(ScoreDistillation):
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], embeddings: Float[Tensor, "kB N F"]
     ) -> Float[Tensor, "kB c h w"]:
         """Predict the noise, float32, for each row of ``embeddings`` and the latent of its view, in
-        one forward pass of the UNet.
+        one forward pass of the network.
         """
         self.evaluations += len(embeddings)
         rows = view_of_row(len(z), len(embeddings)).to(z.device)
         z, t = z[rows], t[rows]
-        output = self.unet(
-            z.to(self.dtype), t, encoder_hidden_states=embeddings.to(self.dtype)
-        ).sample.float()
+        output = self.run_network(z, t, embeddings).float()
         # models may also predict the variance of the reverse step, in further channels
         return PREDICTIONS[self.prediction_type](output[:, : z.shape[1]], z, self._abar[t])
+
+    def run_network(self, z: Latents, t: Timesteps, embeddings: Embeddings) -> Latents:
+        """Return the output of the network, of the model's prediction type, for as many rows of
+        ``embeddings`` as of latents; subclasses pass the model's further inputs.
+        """
+        return self.unet(
+            z.to(self.dtype), t, encoder_hidden_states=embeddings.to(self.dtype)
+        ).sample
 
     def resized(self, images: Float[Tensor, "B 3 H W"], size: int) -> Float[Tensor, "B 3 s s"]:
         """Resize images to the model's size, with antialiasing if they shrink by more than a factor
@@ -350,16 +390,6 @@ class TextToImageDistillation(ScoreDistillation):
         return F.interpolate(
             images, (size, size), mode="bilinear", align_corners=False, antialias=antialias
         )
-
-
-def _offload(network: nn.Module, device: torch.device) -> None:
-    try:
-        from accelerate import cpu_offload
-    except ImportError as error:
-        raise UserError(
-            "enable_sequential_cpu_offload needs accelerate: pip install accelerate"
-        ) from error
-    cpu_offload(network, execution_device=device)
 
 
 def view_of_row(views: int, rows: int) -> Int[Tensor, " kB"]:

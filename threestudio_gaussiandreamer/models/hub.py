@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, Optional
 from ..core.errors import UserError
 from ..host import info
 from .extras import require_extra
+from .families import Family, require_family, require_names
 from .model_files import files_below, needed_files
 
 TIMEOUT = 4.0
@@ -59,6 +60,7 @@ def find_model(
     name: str,
     components: Collection[str],
     *,
+    family: Optional[Family] = None,
     half: bool = False,
     revision: Optional[str] = None,
     download: bool = True,
@@ -66,21 +68,27 @@ def find_model(
     """Locate a model in diffusers' format that has all of ``components``; see :func:`locate`.
 
     Args:
+        family: what the model must be; None accepts any.
         half: prefer half-precision files if there are files of both precisions.
+
+    Raises:
+        UserError: see :func:`locate`; or the model is of another family.
     """
+    if family is not None:
+        require_family(family, Path(name).expanduser())
     # '*/*' skips files outside of the components' folders: some models have a copy of all weights
     # there, in a single file
     download_options = "--include '*/*' --exclude '*.bin'"
-    return locate(
-        Source(
-            name,
-            lambda names: needed_files(names, components, half=half),
-            OPTION,
-            revision,
-            download_options,
-        ),
-        download=download,
-    )
+
+    def picks(names: Collection[str]) -> list[str]:
+        if family is not None:
+            require_names(family, names)
+        return needed_files(names, components, half=half)
+
+    folder = locate(Source(name, picks, OPTION, revision, download_options), download=download)
+    if family is not None and folder is not None:
+        require_family(family, folder)
+    return folder
 
 
 def locate(source: Source, *, download: bool = True) -> Optional[Path]:

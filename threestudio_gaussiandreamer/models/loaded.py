@@ -9,6 +9,8 @@ from collections import Counter
 from collections.abc import Callable, Hashable
 from typing import Any
 
+from ..core.errors import UserError
+
 _kept: dict[Hashable, Any] = {}
 _counts: Counter = Counter()
 _keeps = False
@@ -37,6 +39,22 @@ def loaded(key: tuple[Hashable, ...], load: Callable[[], Any]) -> Any:
     if _keeps:
         _kept[key] = network
     return network
+
+
+def keep_on_cpu(network: Any, device: Any) -> None:
+    """Keep the weights in the CPU's memory, and copy those of each layer to ``device`` while it
+    computes.
+
+    Raises:
+        UserError: accelerate isn't installed.
+    """
+    try:
+        from accelerate import cpu_offload
+    except ImportError as error:
+        raise UserError(
+            "enable_sequential_cpu_offload needs accelerate: pip install accelerate"
+        ) from error
+    cpu_offload(network, execution_device=device)
 
 
 def load_counts() -> dict[str, int]:

@@ -7,6 +7,7 @@ are read with ``weights_only``."""
 
 import gc
 import hashlib
+import json
 import re
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
@@ -15,15 +16,19 @@ from typing import Any, NamedTuple, Optional
 
 from ..core.errors import UserError
 
-WITHOUT_WEIGHTS = {"tokenizer": "tokenizer_config.json", "scheduler": "scheduler_config.json"}
+WITHOUT_WEIGHTS = {
+    **dict.fromkeys(("tokenizer", "tokenizer_2", "tokenizer_3"), "tokenizer_config.json"),
+    "scheduler": "scheduler_config.json",
+}
 """Components without weights, and the file that each must have."""
 VOCABULARIES = ({"tokenizer.json"}, {"vocab.json", "merges.txt"}, {"spiece.model"})
 """Alternative sets of files that hold a tokenizer's vocabulary; one complete set is enough."""
 WEIGHTS = re.compile(
-    r"(?:diffusion_pytorch_model|model)(?P<early>\.fp16)?(?:-\d{5}-of-(?P<shards>\d{5}))?"
-    r"(?P<late>\.fp16)?\.safetensors"
+    r"(?:diffusion_pytorch_model|model)(?:\.(?P<early>fp16|bf16))?"
+    r"(?:-\d{5}-of-(?P<shards>\d{5}))?(?:\.(?P<late>fp16|bf16))?\.safetensors"
 )
-"""Name of a weight file; ".fp16" may precede or follow the number of the shard."""
+"""Name of a weight file; the variant may precede or follow the number of the shard."""
+HALF_VARIANTS = ("fp16", "bf16")
 PICKLED = ("diffusion_pytorch_model.bin", "pytorch_model.bin")
 SAMPLE = 1 << 16
 """Bytes of each of the sixteen samples of a weight file that enter its fingerprint."""
@@ -34,7 +39,7 @@ class Weights(NamedTuple):
 
     files: list[str]
     variant: Optional[str]
-    """None, or "fp16" for half precision."""
+    """None, or one of ``HALF_VARIANTS``."""
     safe: bool
     """Whether the files are safetensors."""
 
@@ -82,7 +87,7 @@ def component_files(
     needed = WITHOUT_WEIGHTS.get(component, "config.json")
     if needed not in own:
         raise UserError(f"{prefix}{needed} is missing")
-    if component == "tokenizer":
+    if component.startswith("tokenizer"):
         require_vocabulary(names, component)
     return (
         small
@@ -116,13 +121,10 @@ def component_weights(
         UserError: there is no complete set of files that may be read.
     """
     prefix, own = _own(names, component)
-    complete = {}
-    for variant in (None, "fp16"):
+    for variant in (*HALF_VARIANTS, None) if half else (None, *HALF_VARIANTS):
         files = _complete_set(own, variant)
         if files:
-            complete[variant] = Weights([prefix + name for name in files], variant, True)
-    if complete:
-        return complete.get("fp16" if half else None) or next(iter(complete.values()))
+            return Weights([prefix + name for name in files], variant, True)
     pickled = [prefix + name for name in own if name in PICKLED]
     if allow_bin and pickled:
         return Weights(pickled[:1], None, False)
@@ -144,7 +146,7 @@ def _complete_set(own: list[str], variant: Optional[str]) -> list[str]:
     found = {
         name: match
         for name, match in matches.items()
-        if match and bool(match["early"] or match["late"]) == (variant == "fp16")
+        if match and (match["early"] or match["late"]) == variant
     }
     single = [name for name, match in found.items() if match["shards"] is None]
     if single:
@@ -168,6 +170,12 @@ def _missing_weights(prefix: str, own: list[str], allow_bin: Optional[bool]) -> 
             f"safe_serialization=True{hint}"
         )
     return f"{prefix}*.safetensors, the weights, are missing"
+
+
+def pipeline_settings(folder: Path) -> dict[str, Any]:
+    """Return the content of ``model_index.json``; an empty object if there is none."""
+    index = folder / "model_index.json"
+    return json.loads(index.read_text(encoding="utf-8")) if index.is_file() else {}
 
 
 def fingerprint(folder: Path, components: Iterable[str]) -> str:
@@ -242,14 +250,22 @@ def load_settings(loader: Any, folder: Path, component: str = "", **options: Any
 
 
 def _from_pretrained(loader: Any, folder: Path, component: str, options: dict[str, Any]) -> Any:
-    try:
+    with loading_errors(_name(loader, folder, component)):
         return loader.from_pretrained(
             str(folder), subfolder=component, local_files_only=True, **options
         )
+
+
+@contextmanager
+def loading_errors(name: str) -> Iterator[None]:
+    """Raise UserError for any error while ``name``, a component of a model, is loaded."""
+    try:
+        yield
+    except UserError:
+        raise
     except Exception as error:  # OSError, ValueError, RuntimeError, SafetensorError, ImportError
         raise UserError(
-            f"{_name(loader, folder, component)} can't be loaded: {type(error).__name__}: "
-            f"{str(error).strip()[:500]}. "
+            f"{name} can't be loaded: {type(error).__name__}: {str(error).strip()[:500]}. "
             "If a file is damaged, delete it and download it again."
         ) from error
 

@@ -49,6 +49,7 @@ from ..core.options import check_options, in_range
 from ..host import BaseObject, info, register, register_builtin
 from ..models.embedding_cache import EmbeddingCache, Encode
 from ..models.extras import require_extra
+from ..models.families import Family
 from ..models.hub import find_model
 from ..models.model_files import fingerprint
 from ..models.text_encoders import encode_clip, encode_t5
@@ -69,7 +70,6 @@ NEGATIVE_PROMPT = (
 )
 """The negative prompt of the released GaussianDreamer's configuration."""
 PROMPT_LIBRARY = "load/prompt_library.json"
-COMPONENTS = ("tokenizer", "text_encoder")
 
 
 class TextEncoderPromptProcessor(BaseObject):
@@ -101,6 +101,9 @@ class TextEncoderPromptProcessor(BaseObject):
         spawn: bool = False
 
     cfg: Config
+    components: ClassVar[tuple[str, ...]] = ("tokenizer", "text_encoder")
+    family: ClassVar[Optional[Family]] = None
+    """The models that this processor takes; None for any with these components."""
     half: ClassVar[bool] = False
     """Whether to prefer half-precision files of the text encoder on a GPU."""
 
@@ -118,7 +121,8 @@ class TextEncoderPromptProcessor(BaseObject):
         half = self.half and self.device.type == "cuda"
         folder = find_model(
             self.cfg.pretrained_model_name_or_path,
-            COMPONENTS,
+            self.components,
+            family=self.family,
             half=half,
             revision=self.cfg.revision,
         )
@@ -171,7 +175,7 @@ class TextEncoderPromptProcessor(BaseObject):
         return torch.stack([found[text] for text in texts]).to(self.device)
 
     def _cached(self, folder: Path, encode: Encode) -> Encode:
-        cache = EmbeddingCache(self.cfg.cache_dir, fingerprint(folder, COMPONENTS))
+        cache = EmbeddingCache(self.cfg.cache_dir, fingerprint(folder, self.components))
         return lambda texts: cache.embed(texts, encode)
 
     def __call__(self) -> PromptEmbeddings:

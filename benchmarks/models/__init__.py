@@ -1,0 +1,1 @@
+"""The memory of published models, computed from their sizes."""

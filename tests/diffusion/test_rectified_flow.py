@@ -1,0 +1,111 @@
+"""Rectified flow as a diffusion: conversions, and the expected gradient in closed form."""
+
+import math
+
+import pytest
+import torch
+
+from threestudio_gaussiandreamer.diffusion import rectified_flow, sds
+from threestudio_gaussiandreamer.diffusion.exact_score import denoise
+
+SIGMA = torch.tensor([0.002, 0.3, 0.6, 0.95, 0.999], dtype=torch.float64)
+
+
+def randn(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def column(values):
+    return values[:, None]
+
+
+def test_sigma_and_abar_are_inverse_and_give_the_same_ratio():
+    abar = rectified_flow.abar_of_sigma(SIGMA)
+    torch.testing.assert_close(rectified_flow.sigma_of_abar(abar), SIGMA)
+    torch.testing.assert_close(((1 - abar) / abar).sqrt(), SIGMA / (1 - SIGMA))
+    ends = torch.tensor([0.0, 1.0], dtype=torch.float64)
+    assert rectified_flow.abar_of_sigma(ends).tolist() == [1.0, 0.0]
+    assert rectified_flow.sigma_of_abar(1 - ends).tolist() == [0.0, 1.0]
+
+
+def test_a_noisy_latent_lies_on_the_straight_path():
+    x, eps = randn(2, 5, 7)
+    abar = rectified_flow.abar_of_sigma(SIGMA)
+    on_path = rectified_flow.on_path(sds.add_noise(x, eps, abar), abar)
+    torch.testing.assert_close(on_path, column(1 - SIGMA) * x + column(SIGMA) * eps)
+
+
+def test_velocity_and_noise_are_inverse():
+    x, eps = randn(2, 5, 7)
+    abar = rectified_flow.abar_of_sigma(SIGMA)
+    z, v = sds.add_noise(x, eps, abar), rectified_flow.velocity(x, eps)
+    torch.testing.assert_close(rectified_flow.noise_of_velocity(v, z, abar), eps)
+    # the division by 1 - sigma magnifies rounding a thousandfold
+    torch.testing.assert_close(
+        rectified_flow.velocity_of_noise(eps, z, abar), v, rtol=1e-10, atol=1e-10
+    )
+
+
+def test_the_scheduler_of_diffusers_has_the_same_sigmas():
+    scheduler = pytest.importorskip("diffusers").FlowMatchEulerDiscreteScheduler(shift=3.0)
+    sigmas = rectified_flow.shifted_sigmas(1000, 3.0)
+    # theirs are in decreasing order and end at timestep 1
+    torch.testing.assert_close(
+        scheduler.sigmas.flip(0)[:-1].double(), sigmas[1:], rtol=1e-6, atol=0
+    )
+    assert sigmas[0] == 0 and (sigmas.diff() > 0).all()
+
+
+def mixture_velocity(z, sigma, centers, shares, std):
+    """Compute E[eps - x | z] of a flow from a mixture of Gaussians, from its own posterior."""
+    variance = (1 - sigma) ** 2 * std**2 + sigma**2
+    gap = z[None] - (1 - sigma) * centers
+    weight = torch.softmax(shares.log() - gap.square().sum(1) / (2 * variance), 0)[:, None]
+    x0 = (weight * (centers + (1 - sigma) * std**2 / variance * gap)).sum(0)
+    return (z - x0) / sigma
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.5, 0.95])
+def test_a_mixtures_velocity_is_its_score(sigma):
+    """The velocity's posterior, in the flow's own variables, against the exact score."""
+    centers, shares, std = randn(4, 3), torch.tensor([0.1, 0.2, 0.3, 0.4]).double(), 0.4
+    level = torch.tensor([sigma], dtype=torch.float64)
+    abar = rectified_flow.abar_of_sigma(level)
+    z = randn(1, 3, seed=1)
+    eps = denoise(z, abar, centers, std=std, log_prior=shares.log()[None]).eps
+    on_path = rectified_flow.on_path(z, abar)[0]
+    v = mixture_velocity(on_path, sigma, centers, shares, std)[None]
+    torch.testing.assert_close(
+        rectified_flow.noise_of_velocity(v, z, abar), eps, rtol=1e-9, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.5, 0.95])
+def test_the_expected_gradient_towards_a_gaussian_is_the_closed_form(sigma):
+    """For x0 ~ N(m, s^2) the expectation of v_hat - v over the noise is sigma (x - m) / ((1 -
+    sigma)^2 s^2 + sigma^2); it is linear in the noise, so a pair eps, -eps gives it exactly.
+    """
+    std, center, x, eps = 0.4, *randn(3, 1, 6)
+    abar = rectified_flow.abar_of_sigma(torch.tensor([sigma], dtype=torch.float64))
+    errors = []
+    for noise in (eps, -eps):
+        z = sds.add_noise(x, noise, abar)
+        on_path = rectified_flow.on_path(z, abar)[0]
+        v_hat = mixture_velocity(on_path, sigma, center, torch.ones(1).double(), std)[None]
+        error = rectified_flow.noise_of_velocity(v_hat, z, abar) - noise
+        weighted = sds.per_item(sds.weight("rectified_flow", abar), error) * error
+        torch.testing.assert_close(
+            weighted, v_hat - rectified_flow.velocity(x, noise), rtol=1e-9, atol=1e-9
+        )
+        errors.append(weighted)
+    expected = sigma * (x - center) / ((1 - sigma) ** 2 * std**2 + sigma**2)
+    torch.testing.assert_close(sum(errors) / 2, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_the_weight_of_x0_gives_the_distance_to_the_denoised_picture():
+    x, eps, guess = randn(3, 5, 7)
+    abar = rectified_flow.abar_of_sigma(SIGMA)
+    z = sds.add_noise(x, eps, abar)
+    grad = sds.per_item(sds.weight("x0", abar), eps) * (guess - eps)
+    torch.testing.assert_close(grad, x - sds.predict_x0(z, guess, abar), rtol=1e-9, atol=1e-9)
+    assert math.isclose(float(sds.weight("x0", torch.tensor(0.5))), 1.0, rel_tol=1e-6)

@@ -1,0 +1,169 @@
+"""MVDream's guidance: four views of an object together, their cameras, one timestep for all."""
+
+import pytest
+import torch
+
+from tests.helpers import tiny_large_guidance as tiny
+from tests.helpers import tiny_large_models
+from tests.helpers.tiny_guidance import Recorder, relative, renders
+from threestudio_gaussiandreamer.cameras import orbit_c2w
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.guidance import text_to_image
+from threestudio_gaussiandreamer.guidance.mvdream import camera_matrices
+
+pytest.importorskip("diffusers")
+KIND = "mvdream"
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    return tiny_large_models.mvdream(tmp_path_factory.mktemp("models") / "mvdream")
+
+
+@pytest.fixture(scope="module")
+def prompts(model):
+    return tiny.prompts("stable-diffusion", model)
+
+
+def ring(start=10.0, count=4, **changes):
+    """Return ``count`` views around the object at one elevation."""
+    turn = start + torch.arange(count) * 360.0 / count
+    same = torch.ones(count)
+    angles = {"elevation": 15 * same, "azimuth": turn, "camera_distances": 2.5 * same} | changes
+    return tiny.views(**angles)
+
+
+def first(batch, count):
+    return {name: value[:count] for name, value in batch.items()}
+
+
+def gradient(guide, prompt_utils, rgb, **options):
+    return tiny.gradient(guide, prompt_utils, rgb, **(ring() | options))
+
+
+def test_the_cameras_are_mvdreams():
+    """Its ``get_camera`` turns an orbit with y up, azimuth 0 at +z, to z up by (x, y, z) -> (x, -z,
+    y); the front of its pictures is azimuth 90, at +x.
+    """
+    elevation, azimuth = torch.tensor([0.0, 15.0, -30.0]), torch.tensor([0.0, 70.0, -160.0])
+    mine = camera_matrices(orbit_c2w(elevation, azimuth, torch.tensor([1.0, 2.5, 4.0])))
+    assert mine[0].tolist() == pytest.approx(
+        [0, 0, 1, 1, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1], abs=1e-6
+    )
+    e, a = torch.deg2rad(elevation.double()), torch.deg2rad(azimuth.double() + 90)
+    back = torch.stack([e.cos() * a.sin(), e.sin(), e.cos() * a.cos()], 1)
+    right = torch.nn.functional.normalize(
+        torch.linalg.cross(torch.tensor([[0.0, 1.0, 0.0]]).double().expand(3, 3), back), dim=1
+    )
+    columns = torch.stack([right, torch.linalg.cross(back, right), back, back], 2)
+    turned = torch.stack([columns[:, 0], -columns[:, 2], columns[:, 1]], 1)
+    last = torch.tensor([0.0, 0.0, 0.0, 1.0]).double().expand(3, 1, 4)
+    expected = torch.cat([turned, last], 1).flatten(1)
+    torch.testing.assert_close(mine.double(), expected, rtol=0, atol=1e-6)
+
+
+def test_the_network_gets_the_cameras_of_all_rows_and_one_timestep_per_object(model, prompts):
+    guide = tiny.guidance(KIND, model)
+    guide.unet = recorder = Recorder(guide.unet)
+    rgb = torch.cat([renders(), renders(seed=1)]).detach().requires_grad_()
+    batch = {
+        name: torch.cat([value, other])
+        for (name, value), other in zip(ring().items(), ring(55.0).values(), strict=True)
+    }
+    tiny.gradient(guide, prompts, rgb, **batch)
+    (((_, t), options),) = recorder.calls
+    assert torch.equal(options["class_labels"], camera_matrices(batch["c2w"]).repeat(2, 1))
+    assert options["encoder_hidden_states"].shape == (16, 77, 32)
+    assert [len(set(group)) for group in t.reshape(-1, 4).tolist()] == [1] * 4
+    assert t[0] != t[4] and torch.equal(t[:8], t[8:])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_the_gradient_towards_known_views_is_the_closed_form(model, prompts, share):
+    """One latent per view, of zero width: x0 is exact whatever the noise, and the gradient with the
+    weight "x0" is x - x1. Without guidance there is nothing to rescale.
+    """
+    targets = torch.randn(4, 4, 8, 8, generator=torch.Generator().manual_seed(1))
+    cameras = camera_matrices(ring()["c2w"])
+    guide = tiny.guidance(
+        KIND, model, guidance_scale=1.0, min_step_percent=0.2, recon_std_rescale=share
+    )
+
+    def exact(z, t, class_labels, **conditions):
+        view = torch.cdist(class_labels, cameras).argmin(1)
+        abar = guide.alphas_cumprod[t][:, None, None, None]
+        return ((z - abar.sqrt() * targets[view]) / (1 - abar).sqrt()).float()
+
+    guide.unet = tiny.StandIn(guide.unet, exact)
+    latents = torch.randn(4, 8, 8, 4, generator=torch.Generator().manual_seed(2)).requires_grad_()
+    mine, _ = gradient(guide, prompts, latents, rgb_as_latents=True)
+    expected = (latents.detach().double() - targets.movedim(1, -1)) / 4
+    assert relative(mine, expected) < 1e-5
+    assert relative(mine, expected[[2, 0, 3, 1]]) > 0.1, "views could be exchanged"
+
+
+def test_views_that_are_no_group_are_refused(model, prompts):
+    guide = tiny.guidance(KIND, model)
+    said = "set data.n_view=4 and data.batch_size to a multiple of it"
+    with pytest.raises(UserError, match=f"sees 4 views .*together, and a batch has 3.*{said}"):
+        guide(renders(3), prompts, **first(ring(), 3))
+    for change in (
+        {"elevation": torch.tensor([15.0, 15.0, 20.0, 15.0])},
+        {"azimuth": torch.tensor([0.0, 90.0, 270.0, 180.0])},
+    ):
+        with pytest.raises(UserError, match=f"azimuths 90 degrees apart.*{said}"):
+            guide(renders(), prompts, **ring(**change))
+    gradient(guide, prompts, renders(), **ring(azimuth=torch.tensor([100.0, -170.0, -80.0, 370.0])))
+
+
+def test_perp_neg_and_partial_pictures_are_refused(model):
+    with pytest.raises(UserError, match="use_perp_neg=false"):
+        prompt_utils = tiny.prompts("stable-diffusion", model, use_perp_neg=True)
+        gradient(tiny.guidance(KIND, model, view_dependent_prompting=True), prompt_utils, renders())
+    with pytest.raises(UserError, match="max_items_eval: expected a multiple of n_view=4, or 0"):
+        tiny.guidance(KIND, model, max_items_eval=3)
+
+
+def test_the_pictures_of_the_evaluation(model, prompts):
+    guide = tiny.guidance(KIND, model, eval_steps=2)
+    out = guide(renders(), prompts, **ring(), guidance_eval=True)["eval"]
+    assert out["imgs_final"].shape == (4, 64, 64, 3) and out["imgs_final"].isfinite().all()
+
+
+def test_a_single_view_is_evaluated_alone(model, prompts):
+    """With one view per group the network is that of the view alone."""
+    pictures = [
+        tiny.guidance(KIND, model, eval_steps=2, n_view=count, max_items_eval=0)(
+            renders(1), prompts, **first(ring(), 1), guidance_eval=True
+        )["eval"]["imgs_final"]
+        for count in (4, 1)
+    ]
+    assert pictures[0].shape == (1, 64, 64, 3)
+    torch.testing.assert_close(*pictures, rtol=1e-3, atol=1e-3)
+    with pytest.raises(UserError, match="a batch has 1: set data.n_view=4"):
+        tiny.guidance(KIND, model)(renders(1), prompts, **first(ring(), 1))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"enable_attention_slicing": True}, {"enable_sequential_cpu_offload": True}],
+    ids=lambda options: next(iter(options)),
+)
+def test_memory_savers_keep_the_views_together(model, prompts, options):
+    if "enable_sequential_cpu_offload" in options:
+        pytest.importorskip("accelerate")
+    rgb = renders()
+    plain, _ = gradient(tiny.guidance(KIND, model), prompts, rgb)
+    saving, _ = gradient(tiny.guidance(KIND, model, **options), prompts, rgb)
+    assert relative(saving, plain.double()) < 1e-5
+
+
+def test_half_precision(model, prompts, monkeypatch):
+    rgb = renders()
+    plain, _ = gradient(tiny.guidance(KIND, model), prompts, rgb)
+    monkeypatch.setattr(text_to_image, "weights_type", lambda *options: torch.float16)
+    guide = tiny.guidance(KIND, model)
+    assert guide.unet.dtype == torch.float16
+    half, _ = gradient(guide, prompts, rgb)
+    # float16 rounds to 5e-4, which guidance 50 magnifies
+    assert relative(half, plain.double()) < 0.1

@@ -1,0 +1,179 @@
+"""Stable Diffusion 3's guidance: a rectified flow; its gradient against float64 and in closed
+form.
+"""
+
+import json
+
+import pytest
+import torch
+
+from tests.helpers import tiny_large_guidance as tiny
+from tests.helpers import tiny_large_models
+from tests.helpers.tiny_guidance import Recorder, relative, renders
+from threestudio_gaussiandreamer.core import streams
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.guidance import text_to_image
+from threestudio_gaussiandreamer.models.pooled_embeddings import unpack
+
+pytest.importorskip("diffusers")
+KIND = "stable-diffusion-3"
+POOLED = 2 * tiny_large_models.POOLED
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    return tiny_large_models.stable_diffusion_3(tmp_path_factory.mktemp("models") / "3")
+
+
+@pytest.fixture(scope="module")
+def prompts(model):
+    return tiny.prompts(KIND, model)
+
+
+def sigma_of(t, shift=3.0):
+    u = t / 1000
+    return shift * u / (1 + (shift - 1) * u)
+
+
+def reference_gradient(model, prompt_utils, rgb, *, scale):
+    """Compute the RFDS gradient v_hat - (eps - x) in float64 in the flow's own variables, item by
+    item, one forward pass per prompt.
+    """
+    from diffusers import AutoencoderKL, SD3Transformer2DModel
+
+    network = SD3Transformer2DModel.from_pretrained(model, subfolder="transformer").double().eval()
+    vae = AutoencoderKL.from_pretrained(model, subfolder="vae").double().eval()
+    batch = tiny.views()
+    del batch["c2w"]
+    tokens, pooled = unpack(prompt_utils.get_text_embeddings(**batch).double(), POOLED)
+    total = torch.zeros_like(rgb, dtype=torch.float64)
+    for i, image in enumerate(rgb.detach().double()):
+        draw = lambda stream, i=i: streams.generator(0, stream, 0, i)  # noqa: E731
+        t = int(torch.randint(20, 701, (), generator=draw("timestep")))
+        sigma = sigma_of(t)
+        image = image.permute(2, 0, 1)[None].requires_grad_()
+        posterior = vae.encode(image * 2 - 1).latent_dist
+        noise = torch.randn(16, 8, 8, generator=draw("vae")).double()
+        x = 1.5305 * (posterior.mean + posterior.std * noise - 0.0609)
+        eps = torch.randn(16, 8, 8, generator=draw("noise")).double()
+        z = (1 - sigma) * x + sigma * eps
+        with torch.no_grad():
+            cond, uncond = (
+                network(
+                    z,
+                    tokens[row : row + 1],
+                    pooled[row : row + 1],
+                    torch.tensor([1000 * sigma]).double(),
+                ).sample
+                for row in (i, i + len(rgb))
+            )
+        grad = uncond + scale * (cond - uncond) - (eps - x)
+        (back,) = torch.autograd.grad(x, image, grad.detach() / len(rgb))
+        total[i] = back[0].permute(1, 2, 0)
+    return total
+
+
+def test_the_gradient_is_that_of_rfds_in_float64(model, prompts):
+    rgb = renders()
+    mine, _ = tiny.gradient(tiny.guidance(KIND, model, max_step_percent=0.7), prompts, rgb)
+    # guidance 100 magnifies the rounding of float32 a hundredfold
+    assert relative(mine, reference_gradient(model, prompts, rgb, scale=100.0)) < 1e-5
+
+
+@pytest.mark.parametrize("shift", [None, 1.0])
+def test_the_gradient_towards_one_known_latent_is_the_closed_form(model, prompts, shift):
+    """With one mode of zero width the noise cancels: v_hat - v = (x - x1) / sigma."""
+    target = torch.randn(1, 16, 8, 8, generator=torch.Generator().manual_seed(1))
+    guide = tiny.guidance(KIND, model, guidance_scale=1.0, flow_shift=shift, min_step_percent=0.1)
+
+    def exact(hidden_states, timestep, **conditions):
+        return (hidden_states - target) / (timestep / 1000)[:, None, None, None]
+
+    guide.transformer = tiny.StandIn(guide.transformer, exact)
+    latents = torch.randn(4, 8, 8, 16, generator=torch.Generator().manual_seed(2)).requires_grad_()
+    mine, _ = tiny.gradient(guide, prompts, latents, rgb_as_latents=True)
+    sigma = sigma_of(guide.draw_timesteps(latents)[0].double(), shift or 3.0)
+    expected = (latents.detach().double() - target.movedim(1, -1)) / sigma[:, None, None, None] / 4
+    assert relative(mine, expected) < 1e-5
+
+
+def test_denoising_in_steps_ends_at_the_only_latent_there_is(model, prompts):
+    """The flow towards one latent is straight, so that any number of DDIM steps is exact."""
+    target = torch.randn(1, 16, 8, 8, generator=torch.Generator().manual_seed(1))
+    guide = tiny.guidance(KIND, model, guidance_scale=1.0, eval_steps=3)
+    guide.transformer = tiny.StandIn(
+        guide.transformer,
+        lambda hidden_states, timestep, **conditions: (
+            (hidden_states - target) / (timestep / 1000)[:, None, None, None]
+        ),
+    )
+    guide.decode = lambda latents: latents
+    out = guide(renders(), prompts, **tiny.views(), guidance_eval=True)["eval"]
+    for name in ("imgs_1step", "imgs_final"):
+        torch.testing.assert_close(
+            out[name], target.movedim(1, -1).expand(4, -1, -1, -1), rtol=1e-4, atol=1e-4
+        )
+
+
+def test_the_transformer_gets_its_own_timesteps_and_path(model, prompts):
+    guide = tiny.guidance(KIND, model)
+    guide.transformer = recorder = Recorder(guide.transformer)
+    recorder.config = recorder.network.config
+    tiny.gradient(guide, prompts, renders())
+    ((_, options),) = recorder.calls
+    t = guide.draw_timesteps(torch.zeros(4, 1))[0].double()
+    expected = 1000 * sigma_of(t.repeat(2))
+    torch.testing.assert_close(options["timestep"].double(), expected, rtol=1e-5, atol=0)
+    assert options["encoder_hidden_states"].shape == (8, 77 + 256, tiny_large_models.T5_WIDTH)
+    assert options["pooled_projections"].shape == (8, POOLED)
+
+
+@pytest.mark.parametrize("half_type", ["float16", "bfloat16"])
+def test_half_precision(model, prompts, monkeypatch, half_type):
+    dtype = getattr(torch, half_type)
+    monkeypatch.setattr(text_to_image, "weights_type", lambda *options: dtype)
+    guide, rgb = tiny.guidance(KIND, model, max_step_percent=0.7), renders()
+    assert guide.transformer.dtype == guide.vae.dtype == dtype
+    mine, _ = tiny.gradient(guide, prompts, rgb)
+    assert mine.dtype == torch.float32
+    # bfloat16 rounds to 4e-3, which guidance 100 magnifies
+    assert relative(mine, reference_gradient(model, prompts, rgb, scale=100.0)) < 0.5
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"enable_vae_slicing": True},
+        {"enable_channels_last_format": True},
+        {"enable_attention_slicing": True},
+        {"enable_sequential_cpu_offload": True},
+    ],
+    ids=lambda options: next(iter(options)),
+)
+def test_memory_savers_change_nothing_but_memory(model, prompts, options):
+    if "enable_sequential_cpu_offload" in options:
+        pytest.importorskip("accelerate")
+    rgb = renders()
+    plain, _ = tiny.gradient(tiny.guidance(KIND, model), prompts, rgb)
+    saving, _ = tiny.gradient(tiny.guidance(KIND, model, **options), prompts, rgb)
+    assert relative(saving, plain.double()) < 1e-5
+
+
+def test_the_size_is_the_models_unless_given(model, prompts):
+    assert tiny.guidance(KIND, model).image_size == 64
+    assert tiny.guidance(KIND, model, image_size=96).image_size == 96
+    tiny.gradient(tiny.guidance(KIND, model, image_size=192), prompts, renders())
+    with pytest.raises(UserError, match="image_size: expected a multiple of 16"):
+        tiny.guidance(KIND, model, image_size=72)
+    with pytest.raises(UserError, match="image_size: .* positions up to 192 pixels, got 208"):
+        tiny.guidance(KIND, model, image_size=208)
+
+
+def test_a_shift_that_depends_on_the_picture_is_asked_for(tmp_path):
+    folder = tiny_large_models.stable_diffusion_3(tmp_path / "dynamic")
+    file = folder / "scheduler" / "scheduler_config.json"
+    settings = json.loads(file.read_text()) | {"use_dynamic_shifting": True}
+    file.write_text(json.dumps(settings))
+    with pytest.raises(UserError, match="set system.guidance.flow_shift"):
+        tiny.guidance(KIND, folder)
+    assert tiny.guidance(KIND, folder, flow_shift=3.0).image_size == 64

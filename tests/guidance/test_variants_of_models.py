@@ -1,0 +1,61 @@
+"""Variants of score distillation with Stable Diffusion XL, Stable Diffusion 3 and MVDream."""
+
+import pytest
+import torch
+
+from tests.helpers import tiny_large_guidance as tiny
+from tests.helpers import tiny_large_models
+from tests.helpers.tiny_guidance import renders
+from threestudio_gaussiandreamer.core.errors import UserError
+
+pytest.importorskip("diffusers")
+KINDS = {
+    "stable-diffusion-xl": tiny_large_models.stable_diffusion_xl,
+    "stable-diffusion-3": tiny_large_models.stable_diffusion_3,
+    "mvdream": tiny_large_models.mvdream,
+}
+NO_LORA = {"stable-diffusion-3": "is a transformer", "mvdream": "predicts several together"}
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("models")
+    made = {kind: make(folder / kind) for kind, make in KINDS.items()}
+    text = {kind: "stable-diffusion" if kind == "mvdream" else kind for kind in KINDS}
+    return {kind: (made[kind], tiny.prompts(text[kind], made[kind])) for kind in KINDS}
+
+
+def ring():
+    """Return four views around the object, and what the renderer gives of them."""
+    depth, opacity = torch.full((4, 16, 16, 1), 2.0), torch.ones(4, 16, 16, 1)
+    angles = {
+        "elevation": torch.full((4,), 10.0),
+        "azimuth": torch.tensor([0.0, 90.0, 180.0, 270.0]),
+        "camera_distances": torch.full((4,), 2.0),
+    }
+    return tiny.views(**angles) | {"depth": depth, "opacity": opacity, "fovy": torch.ones(4)}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("variant", ["csd", "nfsd", "sdi", "ism", "cfd"])
+def test_every_variant_gives_a_gradient(models, kind, variant):
+    folder, prompt_utils = models[kind]
+    guide = tiny.guidance(kind, folder, variant_type=f"{variant}-variant")
+    plain, _ = tiny.gradient(tiny.guidance(kind, folder), prompt_utils, renders(), **ring())
+    grad, out = tiny.gradient(guide, prompt_utils, renders(), **ring())
+    assert grad.isfinite().all() and (grad != 0).float().mean() > 0.9 and out["bad_items"] == 0
+    assert not torch.allclose(grad, plain)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_lora_is_trained_in_unets_of_single_views(models, kind):
+    folder, prompt_utils = models[kind]
+    options = {"pretrained_model_name_or_path": str(folder), "variant_type": "vsd-variant"}
+    if kind in NO_LORA:
+        part = type(tiny.guidance(kind, folder))
+        with pytest.raises(UserError, match=f"vsd-variant trains a LoRA .*{NO_LORA[kind]}"):
+            part.preflight(options)
+    else:
+        guide = tiny.guidance(kind, folder, variant_type="vsd-variant")
+        grad, out = tiny.gradient(guide, prompt_utils, renders(), **ring())
+        assert grad.isfinite().all() and grad.any() and out["bad_items"] == 0

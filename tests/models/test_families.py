@@ -1,0 +1,89 @@
+"""Families of models: recognised by the settings of their network or by file names, and refused by
+name.
+"""
+
+import json
+
+import pytest
+
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.models import families
+
+UNET = {"_class_name": "UNet2DConditionModel", "in_channels": 4}
+SETTINGS = {
+    families.STABLE_DIFFUSION: UNET,
+    families.STABLE_DIFFUSION_XL: UNET | {"addition_embed_type": "text_time"},
+    families.STABLE_DIFFUSION_3: {"_class_name": "SD3Transformer2DModel"},
+    families.DEEP_FLOYD: UNET | {"in_channels": 3, "addition_embed_type": "text"},
+    families.MULTI_VIEW: {"_class_name": "MultiViewUNetModel", "camera_dim": 16, "ip_dim": 0},
+}
+NAMES = {
+    families.STABLE_DIFFUSION: ["unet", "vae", "text_encoder"],
+    families.STABLE_DIFFUSION_XL: ["unet", "vae", "text_encoder", "text_encoder_2"],
+    families.STABLE_DIFFUSION_3: ["transformer", "vae", "text_encoder_2", "text_encoder_3"],
+    families.DEEP_FLOYD: ["unet", "text_encoder"],
+    families.MULTI_VIEW: ["unet", "vae", "text_encoder"],
+}
+
+
+def model(folder, settings):
+    component = "transformer" if "Transformer" in settings["_class_name"] else "unet"
+    (folder / component).mkdir(parents=True)
+    (folder / component / "config.json").write_text(json.dumps(settings))
+    return folder
+
+
+def names(components):
+    return ["model_index.json", *(f"{component}/config.json" for component in components)]
+
+
+@pytest.mark.parametrize("family", families.FAMILIES, ids=lambda family: family.title)
+def test_every_family_is_taken_by_its_own_parts_alone(family, tmp_path):
+    folder = model(tmp_path / "model", SETTINGS[family])
+    families.require_family(family, folder)
+    families.require_names(family, names(NAMES[family]))
+    by_names = families.STABLE_DIFFUSION if family == families.MULTI_VIEW else family
+    for other in set(families.FAMILIES) - {family}:
+        said = f"isn't {other.title}, but {family.title}.*gaussiandreamer-{family.parts}-guidance"
+        with pytest.raises(UserError, match=said):
+            families.require_family(other, folder)
+        if not {family, other} <= set(families.SAME_FILES):
+            with pytest.raises(UserError, match=f"isn't {other.title}, but {by_names.title}"):
+                families.require_names(other, names(NAMES[family]))
+
+
+@pytest.mark.parametrize(
+    "settings, said",
+    [
+        ({"_class_name": "FluxTransformer2DModel"}, "FluxTransformer2DModel, which no guidance"),
+        (SETTINGS[families.MULTI_VIEW] | {"ip_dim": 16}, "MultiViewUNetModel, which no guidance"),
+    ],
+)
+def test_models_that_no_guidance_takes(settings, said, tmp_path):
+    folder = model(tmp_path / "model", settings)
+    for family in families.FAMILIES:
+        with pytest.raises(UserError, match=f"{said} takes; those that are taken: Stable.*MVDream"):
+            families.require_family(family, folder)
+
+
+@pytest.mark.parametrize("content", [None, "not json", "[1]"])
+def test_missing_and_damaged_settings_are_left_to_the_loader(content, tmp_path):
+    if content is not None:
+        (tmp_path / "unet").mkdir()
+        (tmp_path / "unet" / "config.json").write_text(content)
+    families.require_family(families.STABLE_DIFFUSION, tmp_path)
+    families.require_names(families.STABLE_DIFFUSION, ["README.md", "vae/config.json"])
+
+
+def test_the_parts_and_configurations_that_messages_name_exist():
+    from pathlib import Path
+
+    from threestudio_gaussiandreamer.host import find
+    from threestudio_gaussiandreamer.launch import registry_imports  # noqa: F401
+
+    configs = Path(__file__).parents[2] / "configs"
+    for family in families.FAMILIES:
+        assert find(f"gaussiandreamer-{family.parts}-guidance").family == family
+        assert find(f"gaussiandreamer-{family.processor or family.parts}-prompt-processor")
+        text = (configs / family.config).read_text()
+        assert f"gaussiandreamer-{family.parts}-guidance" in text

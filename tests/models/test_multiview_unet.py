@@ -1,0 +1,105 @@
+"""MVDream's UNet: loaded from its published layout, with attention over the views of an object."""
+
+import pytest
+import torch
+
+from tests.helpers import tiny_large_models
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.models.multiview_unet import (
+    attend_across_views,
+    joined,
+    load_multiview_unet,
+    parted,
+    unet_options,
+)
+
+diffusers = pytest.importorskip("diffusers")
+VIEWS = 4
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tiny_large_models.mvdream(tmp_path_factory.mktemp("models") / "mvdream")
+
+
+def load(folder, dtype=torch.float32):
+    return load_multiview_unet(
+        diffusers.UNet2DConditionModel, folder, "unet", half=False, torch_dtype=dtype
+    )
+
+
+@torch.no_grad()
+def predict(unet, z, text, cameras, t=500):
+    times = torch.full((len(z),), t)
+    return unet(z, times, encoder_hidden_states=text, class_labels=cameras).sample
+
+
+def inputs(rows, seed=0):
+    draw = torch.Generator().manual_seed(seed)
+    shapes = ((rows, 4, 8, 8), (rows, 5, 32), (rows, 16))
+    return [torch.randn(*shape, generator=draw) for shape in shapes]
+
+
+def test_the_published_names_give_the_same_network(folder):
+    mine = load(folder)
+    original = tiny_large_models.plain_unet(unet_options(tiny_large_models.MULTI_VIEW))
+    for name, value in original.state_dict().items():
+        assert torch.equal(mine.state_dict()[name], value), name
+    z, text, cameras = inputs(3)
+    assert torch.equal(predict(mine, z, text, cameras), predict(original, z, text, cameras))
+    assert load(folder, torch.float16).dtype == torch.float16
+
+
+def test_equal_views_give_what_one_view_gives(folder):
+    """Attention to four copies of each token has the weights of attention to one."""
+    z, text, cameras = (values.repeat_interleave(VIEWS, 0) for values in inputs(2))
+    alone = predict(load(folder), z, text, cameras)
+    together = predict(attend_across_views(load(folder), VIEWS), z, text, cameras)
+    torch.testing.assert_close(together, alone, rtol=1e-5, atol=1e-5)
+
+
+def test_views_see_those_of_their_own_object_alone(folder):
+    unet = attend_across_views(load(folder), VIEWS)
+    z, text, cameras = inputs(2 * VIEWS)
+    before = predict(unet, z, text, cameras)
+    z[1] += 1.0
+    change = (predict(unet, z, text, cameras) - before).abs().amax(dim=(1, 2, 3))
+    assert (change[:VIEWS] > 1e-3).all()
+    assert (change[VIEWS:] < 1e-5).all()
+
+
+def test_the_order_of_the_views_does_not_matter(folder):
+    unet = attend_across_views(load(folder), VIEWS)
+    values, order = inputs(VIEWS), [2, 0, 3, 1]
+    there = predict(unet, *(value[order] for value in values))
+    torch.testing.assert_close(there, predict(unet, *values)[order], rtol=1e-5, atol=1e-5)
+
+
+def test_joining_and_parting_are_inverse():
+    tokens = torch.arange(6 * 2 * 3.0).reshape(6, 2, 3)
+    assert joined(tokens, 3)[0, :, 0].tolist() == tokens[:3, :, 0].flatten().tolist()
+    assert torch.equal(parted(joined(tokens, 3), 3), tokens)
+
+
+def test_another_camera_is_another_prediction(folder):
+    unet, (z, text, cameras) = load(folder), inputs(1)
+    assert not torch.allclose(
+        predict(unet, z, text, cameras), predict(unet, z, text, cameras + 1), atol=1e-3
+    )
+
+
+def test_weights_that_do_not_fit_are_reported(tmp_path):
+    folder = tiny_large_models.mvdream(tmp_path / "other", model_channels=64)
+    with pytest.raises(
+        UserError, match="(?s)unet of the model in .* can't be loaded.*size mismatch"
+    ):
+        load(folder)
+    (folder / "unet" / "diffusion_pytorch_model.safetensors").write_bytes(b"no weights")
+    with pytest.raises(UserError, match="unet of the model in .* can't be loaded"):
+        load(folder)
+
+
+def test_a_model_without_cameras_is_refused(tmp_path):
+    folder = tiny_large_models.mvdream(tmp_path / "plain", camera_dim=None)
+    with pytest.raises(UserError, match="camera_dim is None; 16 is expected"):
+        load(folder)

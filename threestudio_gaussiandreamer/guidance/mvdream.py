@@ -1,0 +1,173 @@
+"""Guidance ``gaussiandreamer-mvdream-guidance``: score distillation from a camera-conditioned model
+that sees several views of an object together, MVDream (Shi et al. 2023), which prevents faces on
+several sides.
+
+Takes conversions of MVDream to diffusers' format (``models/multiview_unet.py``) and the prompt
+processor of Stable Diffusion. Each ``n_view`` consecutive views of a batch are one object: the
+data module makes them with ``data.n_view``, at one elevation and evenly spaced azimuths, and they
+get the same timestep, as in training. A single view, which validation shows, is attended alone.
+
+A camera is its matrix from camera to world, by rows, with its position scaled to length 1.
+MVDream's world and cameras are the host's: z up, the front towards +x, columns right, up, back.
+
+Options in addition to those of ``guidance/stable_diffusion.py``:
+
+======================  ============================================================================
+option                  meaning
+======================  ============================================================================
+n_view                  views of an object that the model sees together, 4 in its training
+guidance_scale          50 unless given, as MVDream's
+recon_std_rescale       0.5 unless given; of each view, where MVDream takes those of an object
+                        together
+weighting_strategy      x0 unless given: the gradient is x minus the denoised x (section 3.3, eq. 3)
+view_dependent_...      false unless given: the model knows the directions from the cameras
+======================  ============================================================================
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from ..core.errors import UserError
+from ..core.options import in_range, one_of
+from ..diffusion import sds
+from ..host import register
+from ..models.families import MULTI_VIEW
+from ..models.multiview_unet import CAMERA, attend_across_views, load_multiview_unet
+from ..models.pooled_embeddings import pack, unpack
+from .base import GUIDANCE_SCALE
+from .stable_diffusion import StableDiffusionGuidance
+from .text_to_image import Condition, Embeddings, Latents, Timesteps, view_of_row
+
+SAME = 1e-2
+"""Largest difference of angles that count as equal, degrees."""
+
+
+@register("gaussiandreamer-mvdream-guidance")
+class MVDreamGuidance(StableDiffusionGuidance):
+    @dataclass
+    class Config(StableDiffusionGuidance.Config):
+        pretrained_model_name_or_path: str = "ashawkey/mvdream-sd2.1-diffusers"
+        n_view: int = field(default=4, metadata=in_range(1, 64, "views"))
+        guidance_scale: float = field(default=50.0, metadata=GUIDANCE_SCALE)
+        recon_std_rescale: float = field(default=0.5, metadata=in_range(0, 1))
+        weighting_strategy: str = field(default="x0", metadata=one_of(sds.WEIGHTS))
+        view_dependent_prompting: bool = False
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            StableDiffusionGuidance.Config.check(cfg)
+            if cfg.max_items_eval > 0 and cfg.max_items_eval % cfg.n_view:
+                raise UserError(
+                    f"max_items_eval: expected a multiple of n_view={cfg.n_view}, or 0, got "
+                    f"{cfg.max_items_eval}"
+                )
+
+    cfg: Config
+    family = MULTI_VIEW
+
+    def load_denoiser(self, folder: Path) -> None:
+        from diffusers import UNet2DConditionModel
+
+        self.unet = self.network(
+            UNet2DConditionModel,
+            folder,
+            "unet",
+            self.prepare_denoiser,
+            read=load_multiview_unet,
+            key=(self.cfg.n_view,),
+        )
+        self.text_width = self.unet.config.cross_attention_dim
+
+    def prepare_denoiser(self, network: nn.Module) -> nn.Module:
+        return super().prepare_denoiser(attend_across_views(network, self.cfg.n_view))
+
+    def require_inputs(self) -> None:
+        """Do nothing: the family and its settings leave no other inputs."""
+
+    @classmethod
+    def check_particle_model(cls, cfg: Any) -> None:
+        raise UserError(
+            "vsd-variant trains a LoRA on single views, and MVDream predicts several together: use "
+            "another system.guidance.variant_type"
+        )
+
+    def __call__(
+        self,
+        rgb: Float[Tensor, "B H W c"],
+        prompt_utils: Any = None,
+        *,
+        guidance_eval: bool = False,
+        **batch: Any,
+    ) -> dict[str, Any]:
+        """See :class:`.base.ScoreDistillation`.
+
+        Raises:
+            UserError: the batch isn't groups of views, nor a single view to evaluate.
+        """
+        if not (guidance_eval and len(rgb) == 1):
+            require_groups(batch["elevation"], batch["azimuth"], self.cfg.n_view)
+        return super().__call__(rgb, prompt_utils, guidance_eval=guidance_eval, **batch)
+
+    def condition(self, prompt_utils: Any, **batch: Any) -> Condition:
+        condition = super().condition(prompt_utils, **batch)
+        if condition.negative_weights is not None:
+            raise UserError(
+                "Perp-Neg interpolates between the prompts of directions, and this model has one "
+                "prompt for all: set system.prompt_processor.use_perp_neg=false"
+            )
+        embeddings = condition.embeddings
+        cameras = camera_matrices(batch["c2w"].to(embeddings))
+        rows = view_of_row(len(cameras), len(embeddings)).to(embeddings.device)
+        # an empty prompt's embedding has no cameras
+        return Condition(pack(embeddings, cameras[rows]), None)
+
+    def draw_timesteps(
+        self, latents: Float[Tensor, "B c h w"]
+    ) -> tuple[Int[Tensor, " B"], Float[Tensor, " B"]]:
+        """Draw one timestep for each object, and repeat it for its views."""
+        t, abar = super().draw_timesteps(latents[:: self.cfg.n_view])
+        return tuple(
+            values.repeat_interleave(self.cfg.n_view)[: len(latents)] for values in (t, abar)
+        )
+
+    def run_network(self, z: Latents, t: Timesteps, embeddings: Embeddings) -> Latents:
+        tokens, cameras = unpack(embeddings.to(self.dtype), CAMERA)
+        inputs = (z.to(self.dtype), t, tokens, cameras)
+        # attention to copies of a view is attention to that view
+        copies = self.cfg.n_view if (cameras == cameras[:1]).all() else 1
+        z, t, tokens, cameras = (value.repeat_interleave(copies, dim=0) for value in inputs)
+        output = self.unet(z, t, encoder_hidden_states=tokens, class_labels=cameras).sample
+        return output[::copies]
+
+
+def camera_matrices(c2w: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 16"]:
+    """Return the matrices by rows, with positions scaled to length 1."""
+    position = torch.nn.functional.normalize(c2w[:, :3, 3:], dim=1)
+    upper = torch.cat([c2w[:, :3, :3], position], dim=2)
+    return torch.cat([upper, c2w[:, 3:]], dim=1).flatten(1)
+
+
+def require_groups(
+    elevation: Float[Tensor, " B"], azimuth: Float[Tensor, " B"], n_view: int
+) -> None:
+    """Raise UserError unless the views are groups of ``n_view`` at one elevation and at azimuths
+    360 / ``n_view`` degrees apart.
+    """
+    wanted = f"set data.n_view={n_view} and data.batch_size to a multiple of it"
+    if len(azimuth) % n_view:
+        raise UserError(
+            f"this model sees {n_view} views of an object together, and a batch has "
+            f"{len(azimuth)}: {wanted}"
+        )
+    tilt, turn = (angle.reshape(-1, n_view) for angle in (elevation, azimuth))
+    steps = (turn - turn[:, :1] - 360 / n_view * torch.arange(n_view).to(turn) + 180) % 360 - 180
+    if max((tilt - tilt[:, :1]).abs().max(), steps.abs().max()) > SAME:
+        raise UserError(
+            f"this model sees {n_view} views of an object together, at one elevation and at "
+            f"azimuths {360 / n_view:g} degrees apart, and this batch's aren't: {wanted}"
+        )

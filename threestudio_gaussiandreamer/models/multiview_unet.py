@@ -1,0 +1,124 @@
+"""Load the UNet of MVDream (Shi et al. 2023) from the folders of its conversions to diffusers'
+format, such as ``ashawkey/mvdream-sd2.1-diffusers``.
+
+Those folders hold a ``MultiViewUNetModel``, whose code lies beside the weights and isn't run here.
+It is Stable Diffusion's UNet in the naming of CompVis's latent-diffusion, with two additions, so
+diffusers' own UNet computes it:
+
+* an embedding of the camera, added to that of the timestep: a "projection" class embedding;
+* self-attention over all views of an object together: the tokens of its views are joined before
+  every self-attention and parted after it.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ..core.errors import UserError
+from .model_files import component_weights, files_below, loading_errors
+
+CAMERA = 16
+"""Numbers of a camera: its matrix from camera to world, by rows."""
+LDM_PREFIX = "model.diffusion_model."
+
+
+def load_multiview_unet(
+    unet_class: Any, folder: Path, component: str, *, half: bool, torch_dtype: torch.dtype
+) -> nn.Module:
+    """Load the network as diffusers' UNet; its cameras are ``class_labels`` (B, 16).
+
+    Args: see :func:`.model_files.load_network`.
+
+    Raises:
+        UserError: the files are damaged, or the weights don't fit the settings.
+    """
+    from diffusers.loaders.single_file_utils import convert_ldm_unet_checkpoint
+    from safetensors.torch import load_file
+
+    weights = component_weights(files_below(folder), component, half=half)
+    with loading_errors(f"{component} of the model in {str(folder)!r}"):
+        settings = json.loads((folder / component / "config.json").read_text(encoding="utf-8"))
+        options = unet_options(settings)
+        with torch.device("meta"):
+            unet = unet_class(**options)
+        named = {
+            _ldm_name(name): value.to(torch_dtype)
+            for file in weights.files
+            for name, value in load_file(folder / file).items()
+        }
+        unet.load_state_dict(convert_ldm_unet_checkpoint(named, options), assign=True)
+    return unet.eval()
+
+
+def unet_options(settings: dict[str, Any]) -> dict[str, Any]:
+    """Convert the settings of a ``MultiViewUNetModel`` to those of diffusers' UNet.
+
+    Raises:
+        UserError: its cameras aren't matrices of 16 numbers.
+    """
+    if settings.get("camera_dim") != CAMERA:
+        raise UserError(
+            f"the model's camera_dim is {settings.get('camera_dim')}; {CAMERA} is expected"
+        )
+    channels = [settings["model_channels"] * factor for factor in settings["channel_mult"]]
+    attends = [2**level in settings["attention_resolutions"] for level in range(len(channels))]
+    return {
+        "sample_size": settings["image_size"],
+        "in_channels": settings["in_channels"],
+        "out_channels": settings["out_channels"],
+        "block_out_channels": channels,
+        "layers_per_block": settings["num_res_blocks"],
+        "down_block_types": [_block("Down", attention) for attention in attends],
+        "up_block_types": [_block("Up", attention) for attention in reversed(attends)],
+        # diffusers' name for the number of heads
+        "attention_head_dim": _heads(settings, channels),
+        "cross_attention_dim": settings["context_dim"],
+        "transformer_layers_per_block": settings.get("transformer_depth", 1),
+        "use_linear_projection": True,
+        "class_embed_type": "projection",
+        "projection_class_embeddings_input_dim": CAMERA,
+    }
+
+
+def _block(direction: str, attention: bool) -> str:
+    return f"{'CrossAttn' if attention else ''}{direction}Block2D"
+
+
+def _heads(settings: dict[str, Any], channels: list[int]) -> list[int]:
+    width = settings.get("num_head_channels", -1)
+    return [settings["num_heads"] if width == -1 else channel // width for channel in channels]
+
+
+def _ldm_name(name: str) -> str:
+    """Rename the camera's embedding to the class embedding, which diffusers converts."""
+    return LDM_PREFIX + name.replace("camera_embed.", "label_emb.0.")
+
+
+def attend_across_views(unet: nn.Module, views: int) -> nn.Module:
+    """Let every self-attention of a UNet see the tokens of ``views`` consecutive rows together."""
+
+    def join(module: nn.Module, args: tuple[Any, ...]) -> tuple[Any, ...]:
+        return joined(args[0], views), *args[1:]
+
+    def part(module: nn.Module, args: tuple[Any, ...], output: Tensor) -> Tensor:
+        return parted(output, views)
+
+    for name, module in unet.named_modules():
+        if name.endswith(".attn1"):
+            module.register_forward_pre_hook(join)
+            module.register_forward_hook(part)
+    return unet
+
+
+def joined(tokens: Float[Tensor, "R L F"], views: int) -> Float[Tensor, "G vL F"]:
+    """Join the tokens of each ``views`` consecutive rows."""
+    return tokens.unflatten(0, (-1, views)).flatten(1, 2)
+
+
+def parted(tokens: Float[Tensor, "G vL F"], views: int) -> Float[Tensor, "R L F"]:
+    """Part the tokens into rows of one view each, the inverse of :func:`joined`."""
+    return tokens.unflatten(1, (views, -1)).flatten(0, 1)
