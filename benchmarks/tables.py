@@ -80,6 +80,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "docs/step_time.md": {
         "step": start.step_parts,
         "start": start.first_step,
+        "stages": start.demo_stages,
     },
     "docs/robustness.md": {"fuzz": robustness.fuzz, "long run": robustness.long_run},
     "docs/farm.md": {"farm": robustness.farm},
