@@ -65,7 +65,10 @@ def readme_table() -> str:
 
 SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "README.md": {"measured": readme_table},
-    "docs/distillation.md": {"overhead": variant_tables.overhead},
+    "docs/distillation.md": {
+        "quality": variant_tables.quality,
+        "overhead": variant_tables.overhead,
+    },
     "docs/failures.md": {"tables": failure_table.tables},
     "docs/formats.md": {"formats": formats.table, "producers": formats.producers},
     "docs/mesh.md": {"front": mesh_quality.front, "conversion": start.conversion},

@@ -6,9 +6,9 @@
 
 Each run trains configs/demo.yaml at 64^2 for 240 steps with one variant and one guidance scale. The
 score knows pictures of the object from the side of the camera (`mode: direction-bins`), in a latent
-of 16^2 pixels; colours aren't bounded, so that saturation shows. ``evaluations`` are those of the
-score model per view, per prompt; ``saturation`` is that of the held-out views relative to the
-truth's. Rows are appended to docs/charts/variants.csv as runs end, and runs in it are skipped. The
+of 16^2 pixels; colours aren't bounded, so that saturation shows. ``evaluations`` of the score model
+are one per view and prompt; ``saturation`` is that of the held-out views relative to the truth's.
+Rows are appended to docs/charts/variants.csv as runs end, and runs in it are skipped. The
 charts show each variant at the scale with the best median, and the paper's recipe, clipped SDS at
 100: docs/charts/variants_seconds.png and variants_evaluations.png."""
 

@@ -302,3 +302,14 @@ def test_a_view_without_its_direction_in_the_bank_beside_others_with_guidance(me
     assert [mixture.log_prior is None for mixture in condition] == [False, True]
     cond, uncond = guide.predict(z, torch.tensor([400, 400]), condition)
     assert torch.equal(cond[1], uncond[1]) and not torch.equal(cond[0], uncond[0])
+
+
+def test_one_of_the_two_predictions_counts_as_one_evaluation(mesh_path):
+    guide = guidance(mesh_path, mode="direction-bins", guidance_scale=7.5)
+    z, t = guide.encode(uniform(2, 3, 16, 16)) + 0.1, torch.tensor([400, 400])
+    condition = guide.condition(None, **batch(0.0, 90.0))
+    both = guide.predict(z, t, condition)
+    assert guide.evaluations == 4
+    assert torch.equal(guide.conditional(z, t, condition), both[0])
+    assert torch.equal(guide.unconditional(z, t, condition), both[1])
+    assert guide.evaluations == 8

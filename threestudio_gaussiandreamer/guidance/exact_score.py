@@ -198,6 +198,25 @@ class ExactScoreGuidance(ScoreDistillation):
             return cond, None
         return cond, torch.cat([(item[1] or item[0]).eps for item in items]).view_as(z)
 
+    def conditional(
+        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: list[Mixture]
+    ) -> Float[Tensor, "B c h w"]:
+        return self._one_of_both(0, z, t, condition)
+
+    def unconditional(
+        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: list[Mixture]
+    ) -> Float[Tensor, "B c h w"]:
+        return self._one_of_both(1, z, t, condition)
+
+    def _one_of_both(self, index: int, z: Tensor, t: Tensor, condition: list[Mixture]) -> Tensor:
+        """Predict one of the two, which share most of their computation, and count one evaluation
+        per item, as of a network.
+        """
+        before = self.evaluations
+        eps = self.both(z, t, condition)[index]
+        self.evaluations = before + len(z)
+        return eps
+
     def known_error(
         self, latents: Float[Tensor, "B c h w"], condition: list[Mixture]
     ) -> Optional[tuple[Float[Tensor, "B c h w"], Float[Tensor, " B"]]]:
