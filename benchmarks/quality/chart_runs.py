@@ -53,6 +53,8 @@ COLOURS = [f"C{index}" for index in range(7)] + [
     "indigo",
     "salmon",
 ]
+NARROWEST = 8.6
+"""Width of a chart of one object, inches: its caption needs that."""
 SECONDS = "CPU seconds of training, one thread"
 RUNS = {
     "time": Chart("Quality over time for each kind of score", "cpu_seconds", SECONDS, curves=True),
@@ -139,7 +141,11 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
 
     objects = objects_of(rows)
     figure, panels = plt.subplots(
-        1, len(objects), figsize=(1.2 + 4.2 * len(objects), 4.6), sharey=True, squeeze=False
+        1,
+        len(objects),
+        figsize=(max(NARROWEST, 1.2 + 4.2 * len(objects)), 4.6),
+        sharey=True,
+        squeeze=False,
     )
     labels = list(dict.fromkeys(label_of(chart, row) for row in rows))
     for panel, name_of_object in zip(panels[0], objects, strict=True):
@@ -147,12 +153,11 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
         panel.set_title(title_of(name_of_object, chart.chosen_on), fontsize=10)
     panels[0, 0].set_ylabel(DECIBEL)
     figure.suptitle(chart.title, x=0.01, ha="left", fontweight="bold")
+    columns = min(4 if len(objects) > 1 else 3, len(labels))
     handles, _ = panels[0, 0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="lower center", ncols=min(4, len(labels)), frameon=False, fontsize=9
-    )
+    figure.legend(handles, labels, loc="lower center", ncols=columns, frameon=False, fontsize=9)
     figure.text(0.01, 0.905, caption(rows, chart.size), fontsize=8, color="0.35")
-    figure.tight_layout(rect=(0, 0.06 + 0.04 * ((len(labels) - 1) // 4), 1, 0.93))
+    figure.tight_layout(rect=(0, 0.06 + 0.04 * ((len(labels) - 1) // columns), 1, 0.93))
     path = CHARTS / f"{name}.png"
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -195,7 +195,7 @@ def at_best(rows: list[Row]) -> list[Row]:
 def draw_charts(rows: list[Row]) -> None:
     if not rows:
         return
-    title = "Variants of score distillation, each at its best guidance scale s"
+    title = "Variants of score distillation at their best guidance scales s"
     axes = {"cpu_seconds": SECONDS, "evaluations": "evaluations of the score model"}
     for column, label in axes.items():
         chart = Chart(title, column, label, curves=True, size=SIZE)
