@@ -196,7 +196,6 @@ def large_jobs() -> Iterator[Job]:
         0,
         many | {"data.width": 1024, "data.height": 1024, "system.renderer.downsample": 2},
     )
-    yield Job("large", "the paper's recipe", 0, own | PAPER)
 
 
 def batch_jobs() -> Iterator[Job]:

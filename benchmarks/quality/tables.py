@@ -26,8 +26,10 @@ except where a chart's title names them. A cell is the median over the seeds (sm
 Seconds are CPU seconds of one thread, target images included. Floaters are the share of opacity
 farther than 2 % of the bounding box from the surface. The CSV names device and commit of each run.
 
-The runs were measured before two changes: colours are now kept in [0, 1] (the effect is under
-"Colours that viewers show"), and the paper's recipe now grows points within its whole radius.
+The runs of the demo's own recipe were measured before colours were kept in [0, 1] (the effect is
+under "Colours that viewers show"). Those of the paper's recipe, which doesn't bound colours, were
+repeated after its growing radius became a share of the longest side; their seconds are those of the
+first measurement, on the same processor as the other rows', with as many Gaussians and steps.
 """
 NOTES = {
     "count": "Pruned in the loop to that count, trained with it from the start, or ranked "
