@@ -20,7 +20,10 @@ OVERLAYS = (
     {f"demo-{name}.yaml": "demo.yaml" for name in ("small", "draft", "best")}
     | {
         f"gaussiandreamer-{name}.yaml": "gaussiandreamer.yaml"
-        for name in ("if", "pointe", "avatar", "avatar-smpl", "ground", "lowmem")
+        for name in (
+            *("if", "sdxl", "sd3", "mvdream", "pointe"),
+            *("avatar", "avatar-smpl", "ground", "lowmem"),
+        )
     }
     | {"polish.yaml": "gaussiandreamer.yaml"}
 )

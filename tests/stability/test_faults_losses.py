@@ -28,7 +28,7 @@ def test_f19_a_negative_loss_is_back_propagated(fault):
 
     def ours(parameter):
         kept = MagicMock(param_groups=[{"params": [parameter]}])  # its zero_grad clears nothing
-        system = MagicMock(global_step=1, return_value={"rasterized": None})
+        system = MagicMock(global_step=1, return_value={"rasterized": None, "opacity": None})
         system.optimizers.return_value = kept
         system.losses.return_value = {"x": -(parameter**2).sum()}
         system.manual_backward.side_effect = lambda loss: loss.backward()

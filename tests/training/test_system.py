@@ -8,6 +8,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from lightning.pytorch.strategies import SingleDeviceStrategy
 
 from tests.training.runs import (
     DENSIFY,
@@ -26,6 +27,7 @@ from threestudio_gaussiandreamer.launch.callbacks import SECONDS_BETWEEN, LastCh
 from threestudio_gaussiandreamer.launch.checkpoints import AtomicCheckpointIO
 from threestudio_gaussiandreamer.launch.experiment import main
 from threestudio_gaussiandreamer.training import held_out as evaluate
+from threestudio_gaussiandreamer.training import system as system_module
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 
@@ -115,7 +117,7 @@ def test_scoring_the_prior_does_not_delay_the_next_checkpoint(tmp_path, monkeypa
     monkeypatch.setattr("time.monotonic", lambda: clock[0])
 
     class Trainer:
-        global_step = 1
+        global_step, is_global_zero, strategy = 1, True, SingleDeviceStrategy()
 
         def save_checkpoint(self, path):
             clock[0] += 8.0  # as scoring takes on a slow machine
@@ -161,10 +163,13 @@ def test_a_run_long_enough_for_its_pool_has_the_pictures_cast_at_once(
 def test_looking_at_pictures_is_no_training_time(tmp_path, painted_box, monkeypatch):
     clock = np.zeros(2)
     monkeypatch.setattr(evaluate, "_now", clock.copy)
-    for name, hours in (("training_step", 1), ("show", 100)):
-        body = getattr(GaussianDreamerSystem, name)
+    for owner, name, hours in (
+        (GaussianDreamerSystem, "training_step", 1),
+        (system_module, "save_pictures", 100),
+    ):
+        body = getattr(owner, name)
         monkeypatch.setattr(
-            GaussianDreamerSystem,
+            owner,
             name,
             lambda *args, body=body, hours=hours: (clock.__iadd__(hours), body(*args))[1],
         )

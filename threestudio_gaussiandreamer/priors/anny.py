@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import unknown
+from ..core.errors import UserError, unknown
 from ..core.files import existing_file
 from ..core.options import Rule, in_range, is_number, is_whole, one_of, satisfies
 from ..gaussians.point_cloud import PointCloud
@@ -155,4 +155,5 @@ def textured(mesh: Mesh, body: Body, path: str) -> Mesh:
 def _check_pose(pose: str) -> None:
     """Raise UserError unless ``pose`` is the name of a pose or of a file of poses."""
     if pose not in POSES and Path(pose).suffix.lower() not in SUFFIXES:
-        raise unknown("pose", pose, [*POSES, *(f"a {suffix} file" for suffix in SUFFIXES)])
+        choices = [*POSES, *(f"a {suffix} file" for suffix in SUFFIXES)]
+        raise UserError(f"pose: {unknown('pose', pose, choices)}")

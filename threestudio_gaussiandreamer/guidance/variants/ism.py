@@ -42,7 +42,8 @@ class ISM(Variant):
         self, guidance: Any, latents: Float[Tensor, "B c h w"], condition: Any, batch: Batch
     ) -> Error:
         t, abar = guidance.draw_timesteps(latents)
-        interval, stride = (self._timesteps(guidance, share) for share in self.cfg.values())
+        interval = self._timesteps(guidance, self.cfg.interval)
+        stride = self._timesteps(guidance, self.cfg.stride)
         s = (t - interval).clamp_min(0)
 
         def predict(step: Step) -> Tensor:
