@@ -42,9 +42,11 @@ SMALL = {
 }
 """Options that make an exporter fast."""
 EXPORTERS = sorted(
-    name
-    for name in names()
-    if name.endswith("-exporter") and find(name).__module__.startswith(exporters.__name__)
+    {
+        find(name): name  # one name of each
+        for name in names()
+        if name.endswith("-exporter") and find(name).__module__.startswith(exporters.__name__)
+    }.values()
 )
 
 

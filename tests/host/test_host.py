@@ -1,6 +1,8 @@
 """The built-in host: registry, updates, parts and system; and the choice of the host."""
 
+import re
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -239,3 +241,30 @@ def test_a_broken_threestudio_is_an_error_with_its_cause(path_with_threestudio):
 def test_every_promised_name_is_there():
     assert [name for name in host.__all__ if not hasattr(host, name)] == []
     assert isinstance(Counter({}), Updateable)
+
+
+THREESTUDIO_NAMES = """
+    control4d-multiview-system custom-mesh deep-floyd-guidance deep-floyd-prompt-processor
+    diffuse-with-point-light-material dreamfusion-system dummy-exporter dummy-prompt-processor
+    efficient-dreamfusion-system fantasia3d-system gan-volume-renderer
+    hybrid-rgb-latent-material image-condition-dreamfusion-system implicit-sdf implicit-volume
+    instructnerf2nerf-system latentnerf-system magic123-system magic3d-system mesh-exporter
+    nerf-volume-renderer neural-environment-map-background neural-radiance-material
+    neus-volume-renderer no-material nvdiff-rasterizer patch-renderer pbr-material
+    perceptual-loss prolificdreamer-system sd-latent-adapter-material sdi-system sjc-system
+    solid-color-background stable-diffusion-controlnet-guidance stable-diffusion-guidance
+    stable-diffusion-instructpix2pix-guidance stable-diffusion-prompt-processor
+    stable-diffusion-sdi-guidance stable-diffusion-unified-guidance
+    stable-diffusion-vsd-guidance stable-zero123-guidance tetrahedra-sdf-grid textmesh-system
+    textured-background volume-grid zero123-guidance zero123-simple-system zero123-system
+    zero123-unified-guidance
+""".split()
+"""Registered by threestudio 0.2.3, which refuses an extension that registers one of them again."""
+
+
+def test_no_part_takes_a_name_of_threestudio():
+    package = Path(host.__file__).parents[1]
+    for path in package.rglob("*.py"):
+        if "builtin" not in path.parts:
+            taken = re.findall(r'@register\("([^"]+)"\)', path.read_text())
+            assert not set(taken) & set(THREESTUDIO_NAMES), path

@@ -1,4 +1,5 @@
-"""``mesh-exporter``: a closed mesh with a texture, as GLB and as OBJ with its MTL and PNG.
+"""``gaussiandreamer-mesh-exporter``: a closed mesh with a texture, as GLB and as OBJ with its MTL
+and PNG. In the built-in host it is ``mesh-exporter`` too.
 
 =============  ===================================================================================
 option         meaning
@@ -28,13 +29,14 @@ from typing import List
 
 from ..core.errors import UserError
 from ..gaussians.axes import WORLD_UP, rotation_between
-from ..host import ExporterOutput, register
+from ..host import ExporterOutput, register, register_builtin
 from ..surface.options import MeshOptions
 from ..surface.textured import mesh_from_gaussians, require_mesh_libraries
 from .base import SAVE_NAME, UP, FileExporter
 
 
-@register("mesh-exporter")
+@register("gaussiandreamer-mesh-exporter")
+@register_builtin("mesh-exporter")  # the name of threestudio's own exporter of meshes
 class MeshExporter(FileExporter):
     """Files of save_type "textured_mesh"; their params are ``{"mesh": Mesh, "unlit": bool}``."""
 
