@@ -21,7 +21,7 @@ import torch
 from benchmarks.splatting.bench_scenes import Scene, make_camera, make_cotangents, make_scene
 from benchmarks.splatting.bench_splatting import PROTOTYPE, contender
 from benchmarks.splatting.scenes import trained
-from benchmarks.start.first_step import commit_of
+from benchmarks.start.launched import commit_of
 from threestudio_gaussiandreamer.splatting import autograd
 from threestudio_gaussiandreamer.splatting.autograd import Upstream, Wanted
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu

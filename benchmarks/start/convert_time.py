@@ -6,7 +6,6 @@ Converts each cloud with both checkouts alternately, each time in a new process 
 Seconds are of all threads of the process: on a machine with nothing else to do the command takes
 less time than that. Writes ``benchmarks/results/convert.csv``."""
 
-import argparse
 import csv
 import os
 import resource
@@ -15,24 +14,18 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.start.launched import commit_of
+from benchmarks.start.launched import ROOT, checkouts_of, commit_of, paired_parser
 from benchmarks.start.step_shares import THREADS
 
-ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks/results/convert.csv"
 COLUMNS = ("object", "checkout", "commit", "round", "cpu_seconds")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = paired_parser(__doc__, rounds=3)
     parser.add_argument("clouds", nargs="+", metavar="NAME=PATH", help="trained clouds")
-    parser.add_argument("--against", type=Path, help="another checkout, such as a git worktree")
-    parser.add_argument("--rounds", type=int, default=3)
     args = parser.parse_args()
-    checkouts = {"before": args.against.resolve()} if args.against else {}
-    checkouts["now"] = ROOT
+    checkouts = checkouts_of(args.against)
     rows = []
     for number in range(args.rounds):
         for name, _, path in (cloud.partition("=") for cloud in args.clouds):

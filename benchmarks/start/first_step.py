@@ -6,14 +6,12 @@ Runs both checkouts alternately, each time in a new process and an empty folder,
 the first step. Seconds are of all threads of the process, which other programs on the machine
 change little. Writes ``benchmarks/results/start.csv``."""
 
-import argparse
 import csv
 import statistics
 from pathlib import Path
 
-from benchmarks.start.launched import commit_of, run_with_probe
+from benchmarks.start.launched import ROOT, checkouts_of, commit_of, paired_parser, run_with_probe
 
-ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks/results/start.csv"
 PROBE = Path(__file__).with_name("probe.py")
 COLUMNS = ("checkout", "commit", "round", "stage", "cpu_seconds")
@@ -26,14 +24,9 @@ def seconds_by_stage(ends: dict[str, float]) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--against", type=Path, help="another checkout, such as a git worktree")
-    parser.add_argument("--rounds", type=int, default=5)
+    parser = paired_parser(__doc__, rounds=5)
     args = parser.parse_args()
-    checkouts = {"before": args.against.resolve()} if args.against else {}
-    checkouts["now"] = ROOT
+    checkouts = checkouts_of(args.against)
     rows = []
     for number in range(args.rounds):
         for name, checkout in checkouts.items():

@@ -1,5 +1,7 @@
-"""Runs of a checkout's ``launch.py`` in a new process, with an extension that measures them."""
+"""Runs of a checkout's ``launch.py`` in a new process, with an extension that measures them,
+and the options of measurements that compare two checkouts."""
 
+import argparse
 import json
 import os
 import shutil
@@ -8,8 +10,9 @@ import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Optional
 
+ROOT = Path(__file__).resolve().parents[2]
 MARK = "MEASURED "
 """The extension prints one line of this and a JSON object."""
 
@@ -56,3 +59,18 @@ def run_with_probe(
 def commit_of(checkout: Path) -> str:
     command = ["git", "-C", str(checkout), "rev-parse", "--short", "HEAD"]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def paired_parser(doc: str, rounds: int) -> argparse.ArgumentParser:
+    """Return a parser with ``--against`` and ``--rounds``, which is ``rounds`` by default."""
+    parser = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--against", type=Path, help="another checkout, such as a git worktree")
+    parser.add_argument("--rounds", type=int, default=rounds)
+    return parser
+
+
+def checkouts_of(against: Optional[Path]) -> dict[str, Path]:
+    """Return the checkouts to compare: that of ``--against``, if given, and this one."""
+    return ({"before": against.resolve()} if against else {}) | {"now": ROOT}

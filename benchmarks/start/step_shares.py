@@ -6,13 +6,11 @@ Runs the demo's step (4 views of 256 x 256 pixels, the exact score), and one of 
 empty networks of Stable Diffusion's shapes; both checkouts alternate, each run in a new process
 with one thread. Writes ``benchmarks/results/step.csv``."""
 
-import argparse
 import csv
 from pathlib import Path
 
-from benchmarks.start.launched import commit_of, run_with_probe
+from benchmarks.start.launched import ROOT, checkouts_of, commit_of, paired_parser, run_with_probe
 
-ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks/results/step.csv"
 PROBE = Path(__file__).with_name("step_probe.py")
 COLUMNS = ("workload", "checkout", "commit", "round", "part", "cpu_ms")
@@ -31,16 +29,11 @@ THREADS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--against", type=Path, help="another checkout, such as a git worktree")
-    parser.add_argument("--rounds", type=int, default=2)
+    parser = paired_parser(__doc__, rounds=2)
     parser.add_argument("--workloads", nargs="+", choices=[*WORKLOADS], default=[*WORKLOADS])
     parser.add_argument("--steps", nargs=2, type=int, default=WINDOW, metavar=("FIRST", "LAST"))
     args = parser.parse_args()
-    checkouts = {"before": args.against.resolve()} if args.against else {}
-    checkouts["now"] = ROOT
+    checkouts = checkouts_of(args.against)
     rows = []
     for number in range(args.rounds):
         for workload in args.workloads:

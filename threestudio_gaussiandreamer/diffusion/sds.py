@@ -166,8 +166,8 @@ def ddim_step(
     abar: Float[Tensor, " B"],
     abar_next: Float[Tensor, " B"],
 ) -> Float[Tensor, "B *d"]:
-    """Take one deterministic DDIM step to the lower noise ``abar_next`` (Song et al. 2021 eq. 12
-    with eta 0).
+    """Take one deterministic DDIM step to the noise level ``abar_next``, lower or higher (Song et
+    al. 2021 eq. 12 with eta 0).
     """
     ratio = (abar_next / abar).sqrt()
     slope = (1 - abar_next).sqrt() - ratio * (1 - abar).sqrt()

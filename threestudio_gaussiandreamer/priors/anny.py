@@ -35,7 +35,7 @@ import numpy as np
 
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file
-from ..core.options import Rule, in_range, is_number, is_whole, one_of, satisfies
+from ..core.options import Rule, in_range, is_number, is_whole, one_of, rule, satisfies
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.budget import Budget
@@ -65,6 +65,13 @@ def _is_share(value: Any) -> bool:
     return is_number(value) and 0 <= value <= 1
 
 
+def check_pose(path: str, pose: str) -> None:
+    """Raise UserError unless ``pose`` is the name of a pose or of a file of poses."""
+    if pose not in POSES and Path(pose).suffix.lower() not in SUFFIXES:
+        choices = [*POSES, *(f"a {suffix} file" for suffix in SUFFIXES)]
+        raise UserError(f"{path}: {unknown('pose', pose, choices)}")
+
+
 FRAME = satisfies("a whole number from 0", lambda value: is_whole(value) and value >= 0)
 
 
@@ -74,7 +81,7 @@ class AnnyPrior(Prior):
 
     @dataclass
     class Config(Prior.Config):
-        pose: str = "A"
+        pose: str = field(default="A", metadata=rule(check_pose))
         frame: int = field(default=0, metadata=FRAME)
         pose_up: str = field(default="auto", metadata=one_of(("auto", *TO_BODY)))
         face_front: bool = True
@@ -88,10 +95,6 @@ class AnnyPrior(Prior):
         scale: float = field(default=1.0, metadata=SCALE)
         num_points: int = field(default=50_000, metadata=points(0))
         color: Any = field(default="random", metadata=COLOR)
-
-        @staticmethod
-        def check(cfg: Any) -> None:
-            _check_pose(cfg.pose)
 
     cfg: Config
 
@@ -150,10 +153,3 @@ def textured(mesh: Mesh, body: Body, path: str) -> Mesh:
         uv=body.uv[pairs[:, 1]],
         texture=texture,
     )
-
-
-def _check_pose(pose: str) -> None:
-    """Raise UserError unless ``pose`` is the name of a pose or of a file of poses."""
-    if pose not in POSES and Path(pose).suffix.lower() not in SUFFIXES:
-        choices = [*POSES, *(f"a {suffix} file" for suffix in SUFFIXES)]
-        raise UserError(f"pose: {unknown('pose', pose, choices)}")
