@@ -1,6 +1,7 @@
 """Every stage of the toybox's training learns, resumes exactly, and reports errors."""
 
 import contextlib
+import itertools
 import signal
 import sys
 
@@ -22,14 +23,27 @@ def weights(run: loop.Training) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in run.ema.state_dict().items()}
 
 
+def stop_after(run: loop.Training, steps: int) -> None:
+    """Stop the training by a signal after ``steps`` steps."""
+    train_step, count = run.train_step, itertools.count(1)
+
+    def counted(batch):
+        metrics = train_step(batch)
+        run.signum = signal.SIGINT if next(count) == steps else 0
+        return metrics
+
+    run.train_step = counted
+
+
 @pytest.mark.parametrize("name", STAGES)
 def test_resuming_gives_what_an_uninterrupted_training_gives(folder, name, tmp_path):
     whole, parts = copied(folder, tmp_path / "whole"), copied(folder, tmp_path / "parts")
     uninterrupted = training(whole, name)
     uninterrupted.run(uninterrupted.progress.images + 8)
-    for _ in range(2):
+    for step in (1, 2):
         run = training(parts, name)
-        run.run(run.progress.images + 4)
+        stop_after(run, step)
+        run.run(uninterrupted.progress.images)
     assert run.progress.images == uninterrupted.progress.images
     for key, value in weights(uninterrupted).items():
         assert torch.equal(value, weights(run)[key]), key
@@ -43,7 +57,7 @@ def test_a_stage_learns_one_batch(folder, name, tmp_path):
     batch = next(run.stage.batches(0))
     losses = []
     for _ in range(12):
-        run.progress.step = 1  # the same noise each time
+        run.progress.step = 1  # the same learning rate each time
         losses.append(float(run.train_step(batch)["loss"]))
     assert losses[-1] < 0.97 * losses[0]
 
@@ -157,8 +171,8 @@ def test_a_gradient_that_is_not_finite_stops_before_it_is_saved(folder, tmp_path
     before = run.path.read_bytes()
     loss = run.stage.loss
 
-    def broken(model, batch, step):
-        value, metrics = loss(model, batch, step)
+    def broken(model, batch):
+        value, metrics = loss(model, batch)
         return value * float("nan"), metrics
 
     run.stage.loss = broken

@@ -7,6 +7,7 @@ the encoder's gradients must be useful.
 import functools
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,9 +16,10 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from ..cameras import Orbit, to_opencv
-from ..core.streams import generator, numpy_generator
+from ..core.streams import numpy_generator
 from ..splatting import rasterize
 from . import models
+from .batches import StepData, batches, normal
 from .loop import Stage, checkpoint_path
 from .sheet import contact_sheet
 from .views import (
@@ -27,7 +29,6 @@ from .views import (
     Shard,
     Shards,
     held_out_shard,
-    row_batches,
     with_backgrounds,
 )
 
@@ -35,12 +36,40 @@ RANDOM_BACKGROUNDS = 0.15
 SPLAT_SHARE = 0.2
 """Fraction of the pictures that are renders of rough Gaussians."""
 FULL_EVERY = 4
-"""Every fourth step trains on pictures of the full size, a quarter as many; the others on pictures
+"""One step in four trains on pictures of the full size, a quarter as many; the others on pictures
 of half the size. Crops would be as cheap, but group normalisation computes other statistics on
 them, and colours were learnt much more slowly.
 """
 KL_WEIGHT = 2e-4
 EDGE_WEIGHT, SQUARE_WEIGHT = 1.0, 2.0
+
+
+class AutoencoderBatch(NamedTuple):
+    images: Float[Tensor, "B 3 s s"]
+    noise: Float[Tensor, "B 4 s/8 s/8"]
+    """Of the latents."""
+
+
+class AutoencoderData(StepData):
+    stream = "autoencoder"
+
+    def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> AutoencoderBatch:
+        full = rng.random() < 1 / FULL_EVERY
+        rows = rows[: max(1, len(rows) // 4)] if full else rows
+        images = self._images(self.shards.get(index), rows, rng)
+        images = images if full else F.avg_pool2d(images, 2)
+        side = images.shape[-1] // 8
+        return AutoencoderBatch(
+            images, normal(rng, (len(rows), models.LATENT_CHANNELS, side, side))
+        )
+
+    def _images(
+        self, shard: Shard, rows: np.ndarray, rng: np.random.Generator
+    ) -> Float[Tensor, "B 3 s s"]:
+        rgba = shard.rgba[rows]
+        for place in np.flatnonzero(rng.uniform(size=len(rows)) < SPLAT_SHARE):
+            rgba[place] = rough_render(shard, int(rows[place]), rng)
+        return with_backgrounds(rgba, rng, random_share=RANDOM_BACKGROUNDS)
 
 
 class AutoencoderStage(Stage):
@@ -62,31 +91,14 @@ class AutoencoderStage(Stage):
         trained = checkpoint_path(self.options.folder, "unet").exists()
         return ("encoder.", "quant_conv.") if trained else ()
 
-    def batches(self, step: int) -> Iterator[Float[Tensor, "B 3 s s"]]:
-        seed = self.options.seed
-        order = row_batches(self.shards, seed, "autoencoder", self.batch, self.options.pool, step)
-        for number, (index, rows) in enumerate(order, step):
-            rng = numpy_generator(seed, "autoencoder-batch", number)
-            full = number % FULL_EVERY == FULL_EVERY - 1
-            rows = rows[: max(1, len(rows) // 4)] if full else rows
-            images = self._images(self.shards.get(index), rows, rng)
-            yield (images if full else F.avg_pool2d(images, 2)).to(self.device)
+    def batches(self, step: int) -> Iterator[AutoencoderBatch]:
+        data = AutoencoderData(self.options, self.shards, self.batch)
+        return batches(data, step, self.device, self.options.workers)
 
-    def _images(
-        self, shard: Shard, rows: np.ndarray, rng: np.random.Generator
-    ) -> Float[Tensor, "B 3 s s"]:
-        rgba = shard.rgba[rows]
-        for place in np.flatnonzero(rng.uniform(size=len(rows)) < SPLAT_SHARE):
-            rgba[place] = rough_render(shard, int(rows[place]), rng)
-        return with_backgrounds(rgba, rng, random_share=RANDOM_BACKGROUNDS)
-
-    def loss(self, model: nn.Module, batch: Tensor, step: int) -> tuple[Tensor, dict[str, Tensor]]:
-        images = batch * 2 - 1
+    def loss(self, model: nn.Module, batch: AutoencoderBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        images = batch.images * 2 - 1
         posterior = model.encode(images).latent_dist
-        noise = torch.randn(
-            posterior.mean.shape, generator=generator(self.options.seed, "autoencoder-noise", step)
-        )
-        decoded = model.decode(posterior.mean + posterior.std * noise.to(self.device)).sample
+        decoded = model.decode(posterior.mean + posterior.std * batch.noise).sample
         error = decoded - images
         pixels, edges = error.abs().mean(), edge_error(decoded, images)
         kl = posterior.kl().mean() / posterior.mean[0].numel()

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,9 +14,10 @@ from torch import Tensor, nn
 from ..core.streams import numpy_generator
 from ..models.clip import MEAN, STD
 from . import models
+from .batches import StepData, batches
 from .loop import Stage, checkpoint_path
 from .text_batches import label_tensor, open_tokenizer, token_ids, training_prompts, view_prompts
-from .views import LABELS, VIEWS, Shards, held_out_shard, row_batches, with_backgrounds
+from .views import LABELS, VIEWS, Shards, held_out_shard, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.3
 LARGEST_SCALE = 100.0
@@ -30,6 +32,24 @@ class ClipBatch(NamedTuple):
     """(B,) bool: false for empty prompts."""
     has_view: Tensor
     """(B,) bool: whether the prompt names the direction."""
+
+
+@dataclass(frozen=True)
+class ClipData(StepData):
+    tokenizer: Any
+    stream = "clip"
+
+    def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> ClipBatch:
+        shard = self.shards.get(index)
+        texts = training_prompts(shard, rows, rng)
+        images = with_backgrounds(shard.rgba[rows], rng, random_share=RANDOM_BACKGROUNDS)
+        return ClipBatch(
+            clip_pixels(images),
+            token_ids(self.tokenizer, texts),
+            label_tensor(shard, rows),
+            torch.tensor([bool(text) for text in texts]),
+            torch.tensor(["view" in text for text in texts]),
+        )
 
 
 class ClipStage(Stage):
@@ -63,32 +83,10 @@ class ClipStage(Stage):
         return ("clip.text_model.", "clip.text_projection.") if trained else ()
 
     def batches(self, step: int) -> Iterator[ClipBatch]:
-        seed = self.options.seed
-        order = row_batches(self.shards, seed, "clip", self.batch, self.options.pool, step)
-        for number, (index, rows) in enumerate(order, step):
-            yield self._batch(index, rows, numpy_generator(seed, "clip-batch", number))
+        data = ClipData(self.options, self.shards, self.batch, self.tokenizer)
+        return batches(data, step, self.device, self.options.workers)
 
-    def _batch(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> ClipBatch:
-        shard = self.shards.get(index)
-        texts = training_prompts(shard, rows, rng)
-        pixels = clip_pixels(
-            with_backgrounds(shard.rgba[rows], rng, random_share=RANDOM_BACKGROUNDS)
-        )
-        labels = label_tensor(shard, rows)
-        flags = [
-            torch.tensor([bool(text) for text in texts]),
-            torch.tensor(["view" in text for text in texts]),
-        ]
-        return ClipBatch(
-            *(
-                value.to(self.device)
-                for value in (pixels, token_ids(self.tokenizer, texts), labels, *flags)
-            )
-        )
-
-    def loss(
-        self, model: nn.Module, batch: ClipBatch, step: int
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, model: nn.Module, batch: ClipBatch) -> tuple[Tensor, dict[str, Tensor]]:
         text, image = clip_features(model["clip"], batch.ids, batch.pixels)
         contrast = contrastive(
             text[batch.has_text], image[batch.has_text], model["clip"].logit_scale

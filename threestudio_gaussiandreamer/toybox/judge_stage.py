@@ -11,11 +11,12 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ..core.streams import numpy_generator
+from .batches import StepData, batches
 from .clip_stage import accuracies, classified
 from .loop import Stage
 from .models import Judge
 from .text_batches import label_tensor
-from .views import Shards, held_out_shard, row_batches, with_backgrounds
+from .views import Shards, held_out_shard, with_backgrounds
 
 SEED_OFFSET = 1000
 """Added to the seed, so that the judge and the other networks have no training pictures in common.
@@ -25,6 +26,15 @@ SEED_OFFSET = 1000
 class JudgeBatch(NamedTuple):
     images: Float[Tensor, "B 3 s s"]
     labels: Int[Tensor, "B L"]
+
+
+class JudgeData(StepData):
+    stream = "judge"
+
+    def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> JudgeBatch:
+        shard = self.shards.get(index)
+        images = with_backgrounds(shard.rgba[rows], rng, random_share=0.5)
+        return JudgeBatch(degraded(images, rng), label_tensor(shard, rows))
 
 
 class JudgeStage(Stage):
@@ -43,20 +53,10 @@ class JudgeStage(Stage):
         return Judge()
 
     def batches(self, step: int) -> Iterator[JudgeBatch]:
-        order = row_batches(self.shards, self.seed, "judge", self.batch, self.options.pool, step)
-        for number, (index, rows) in enumerate(order, step):
-            yield self._batch(index, rows, numpy_generator(self.seed, "judge-batch", number))
+        data = JudgeData(self.options, self.shards, self.batch)
+        return batches(data, step, self.device, self.options.workers)
 
-    def _batch(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> JudgeBatch:
-        shard = self.shards.get(index)
-        images = with_backgrounds(shard.rgba[rows], rng, random_share=0.5)
-        return JudgeBatch(
-            degraded(images, rng).to(self.device), label_tensor(shard, rows).to(self.device)
-        )
-
-    def loss(
-        self, model: nn.Module, batch: JudgeBatch, step: int
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, model: nn.Module, batch: JudgeBatch) -> tuple[Tensor, dict[str, Tensor]]:
         loss, right = classified(model(batch.images), batch.labels)
         return loss, {"right": right}
 

@@ -27,9 +27,9 @@ from ..core.images import write as write_picture
 from ..core.signals import restore_handlers, set_handlers
 
 EMA_DECAY = 0.999
-WARMUP, DECAY_START = 200, 10_000
-"""Steps of the linear warm-up of the learning rate, and the step from which it decreases with the
-inverse square root of the step.
+WARMUP, DECAY_SHARE = 200, 0.3
+"""Steps of the linear warm-up of the learning rate, and the last fraction of a training, over which
+it decreases linearly to zero.
 """
 CLIP_GRADIENT = 1.0
 log = logging.getLogger(__name__)
@@ -52,6 +52,8 @@ class Options:
     sheet_seconds: float = 1200.0
     batch: Optional[int] = None
     """Batch size; None for the default of each stage."""
+    workers: int = 0
+    """Number of processes that make batches in advance."""
 
     def shards_folder(self) -> Path:
         return self.folder / "shards"
@@ -81,10 +83,10 @@ class Stage(ABC):
 
     @abstractmethod
     def batches(self, step: int) -> Iterator[Any]:
-        """Yield the batches from ``step`` on."""
+        """Yield the batches from ``step`` on, on the stage's device."""
 
     @abstractmethod
-    def loss(self, model: nn.Module, batch: Any, step: int) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, model: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of one batch, and further scalars to log."""
 
     def frozen(self) -> tuple[str, ...]:
@@ -132,6 +134,7 @@ class Training:
         )
         self.progress = Progress()
         self.measured: dict[str, float] = {}
+        self.target = stage.images
         self.signum = 0
         if self.path.exists():
             self._resume()
@@ -145,26 +148,26 @@ class Training:
         """Train until ``images`` (default: the stage's number) have been seen. A stop signal, such
         as Ctrl-C, ends it earlier: a checkpoint is saved, and ``signum`` is the signal's number.
         """
-        target = images or self.stage.images
+        self.target = images or self.stage.images
         earlier = set_handlers(self._on_signal)
         try:
-            self._loop(target)
+            self._loop()
         finally:
             restore_handlers(earlier)
         return self.progress
 
-    def _loop(self, target: int) -> None:
+    def _loop(self) -> None:
         progress, sums = self.progress, _Sums()
         saved = shown = started = time.monotonic()
         for batch in self.stage.batches(progress.step):
-            if progress.images >= target or self.signum:
+            if progress.images >= self.target or self.signum:
                 break
             metrics = self.train_step(batch)
             now = time.monotonic()
             progress.seconds += now - started
             started = now
             if sums.add(metrics) == LOG_EVERY:
-                self._log(sums.mean(), target)
+                self._log(sums.mean())
             if now - shown > self.stage.options.sheet_seconds:
                 shown = now
                 self._show()
@@ -181,11 +184,12 @@ class Training:
             UserError: the gradient isn't finite; weights and average aren't changed.
         """
         progress, device = self.progress, self.stage.device.type
+        factor = rate_factor(progress.step, progress.images / self.target)
         for group in self.optimizer.param_groups:
-            group["lr"] = self.stage.learning_rate * rate_factor(progress.step)
+            group["lr"] = self.stage.learning_rate * factor
         mixed = self.stage.options.precision == "bfloat16"
         with torch.autocast(device, dtype=torch.bfloat16, enabled=mixed):
-            loss, metrics = self.stage.loss(self.model, batch, progress.step)
+            loss, metrics = self.stage.loss(self.model, batch)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), CLIP_GRADIENT)
@@ -248,14 +252,17 @@ class Training:
                 parameter.copy_(averages[name])
                 parameter.requires_grad_(False)
 
-    def _log(self, means: dict[str, float], target: int) -> None:
+    def _log(self, means: dict[str, float]) -> None:
         progress = self.progress
         progress.history.append(
             {"images": progress.images, "seconds": round(progress.seconds, 1), **means}
         )
         numbers = "  ".join(f"{name} {value:.4g}" for name, value in means.items())
         rate = progress.images / max(progress.seconds, 1e-9)
-        print(f"{self.stage.name}  {progress.images}/{target}  {rate:.1f}/s  {numbers}", flush=True)
+        print(
+            f"{self.stage.name}  {progress.images}/{self.target}  {rate:.1f}/s  {numbers}",
+            flush=True,
+        )
 
     @torch.no_grad()
     def _show(self) -> None:
@@ -302,11 +309,14 @@ def _average(averages: list[Tensor], current: list[Tensor], count: Any) -> None:
     torch._foreach_lerp_(averages, current, 1 - decay)
 
 
-def rate_factor(step: int) -> float:
-    """Return the multiplier of the learning rate: linear warm-up to 1, constant, then proportional
-    to the inverse square root of the step.
+def rate_factor(step: int, done: float) -> float:
+    """Return the multiplier of the learning rate: linear warm-up to 1, constant, then a linear
+    decrease to zero.
+
+    Args:
+        done: fraction of the training's images that were seen.
     """
-    return min(1.0, (step + 1) / WARMUP) * min(1.0, (DECAY_START / (step + 1)) ** 0.5)
+    return min(1.0, (step + 1) / WARMUP) * min(1.0, max(0.0, 1 - done) / DECAY_SHARE)
 
 
 def checkpoint_path(folder: Path, name: str) -> Path:

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ..cameras import Orbit, to_opencv
@@ -16,15 +17,18 @@ from ..priors.karras import cosine_alphas_cumprod, guided_denoiser, karras_sigma
 from ..priors.point_e import BIASES, SCALES, mean_of
 from ..splatting import rasterize
 from . import models
+from .batches import StepData, batches, normal, torch_generator
 from .loop import Stage
 from .sheet import contact_sheet
 from .text_batches import object_prompts, open_tokenizer, token_ids
 from .unet_stage import digest, frozen_clip
-from .views import BACKGROUND, FOVY_DEG, VIEWS, Shards, held_out_shard, row_batches
+from .views import BACKGROUND, FOVY_DEG, VIEWS, Shards, held_out_shard
 from .world import RADIUS
 
 POINTS = 256
 """Of one training sample; a set transformer takes any number later."""
+TIMESTEPS = 1024
+"""Of Point-E's diffusion."""
 EMPTY_SHARE = 0.1
 SAMPLES, SAMPLE_POINTS, SAMPLE_STEPS, SAMPLE_GUIDANCE = 16, 512, 24, 3.0
 
@@ -32,7 +36,32 @@ SAMPLES, SAMPLE_POINTS, SAMPLE_STEPS, SAMPLE_GUIDANCE = 16, 512, 24, 3.0
 class PointsBatch(NamedTuple):
     points: Float[Tensor, "B 6 N"]
     """In the network's units, about [-1, 1]."""
-    condition: Float[Tensor, "B D"]
+    noise: Float[Tensor, "B 6 N"]
+    t: Int[Tensor, " B"]
+    ids: Int[Tensor, "B 32"]
+    """Tokens of the prompts."""
+    empty: Tensor
+    """(B,) bool: whether the condition is zero, for classifier-free guidance."""
+
+
+@dataclass(frozen=True)
+class PointsData(StepData):
+    tokenizer: Any
+    stream, per_object = "points", True
+
+    def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> PointsBatch:
+        shard = self.shards.get_light(index)
+        texts = object_prompts(shard.labels[rows * self.shards.views], rng)
+        chosen = rng.permuted(np.tile(np.arange(shard.points.shape[1]), (len(rows), 1)), axis=1)
+        places = np.take_along_axis(shard.points[rows], chosen[:, :POINTS, None], axis=1)
+        points = network_units(torch.from_numpy(places).float())
+        return PointsBatch(
+            points,
+            normal(rng, points.shape),
+            sds.stratified_timesteps(len(rows), TIMESTEPS, torch_generator(rng)),
+            token_ids(self.tokenizer, texts),
+            torch.from_numpy(rng.uniform(size=len(rows)) < EMPTY_SHARE),
+        )
 
 
 class PointsStage(Stage):
@@ -48,52 +77,30 @@ class PointsStage(Stage):
         self.clip = frozen_clip(self.options.folder, len(self.tokenizer)).to(self.device)
         objects = self.options.shard_objects
         self.shards = Shards(self.options.shards_folder(), self.options.seed, objects=objects)
-        self.alphas_cumprod = torch.from_numpy(cosine_alphas_cumprod())
+        self.alphas_cumprod = torch.from_numpy(cosine_alphas_cumprod()).to(self.device)
         return models.points_model()
 
     def depends(self) -> dict[str, str]:
         return {"clip": digest(self.clip.text_model)}
 
     def batches(self, step: int) -> Iterator[PointsBatch]:
-        seed = self.options.seed
-        order = row_batches(
-            self.shards, seed, "points", self.batch, self.options.pool, step, per_object=True
-        )
-        for number, (index, rows) in enumerate(order, step):
-            rng, shard = numpy_generator(seed, "points-batch", number), self.shards.get_light(index)
-            texts = object_prompts(shard.labels[rows * self.shards.views], rng)
-            condition = self.condition(texts)
-            condition[
-                torch.from_numpy(rng.uniform(size=len(rows)) < EMPTY_SHARE).to(self.device)
-            ] = 0
-            chosen = rng.permuted(
-                np.tile(np.arange(shard.points.shape[1]), (len(rows), 1)), axis=1
-            )[:, :POINTS]
-            points = np.take_along_axis(shard.points[rows], chosen[..., None], axis=1)
-            yield PointsBatch(
-                network_units(torch.from_numpy(points).float()).to(self.device), condition
-            )
+        data = PointsData(self.options, self.shards, self.batch, self.tokenizer)
+        return batches(data, step, self.device, self.options.workers)
 
-    def loss(
-        self, model: nn.Module, batch: PointsBatch, step: int
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        rng, x = generator(self.options.seed, "points-noise", step), batch.points
-        t = sds.stratified_timesteps(len(x), len(self.alphas_cumprod), rng)
-        noise = torch.randn(x.shape, generator=rng).to(self.device)
-        z = sds.add_noise(x, noise, self.alphas_cumprod[t].to(self.device))
-        predicted = mean_of(lambda z, t: model(z, t, batch.condition))(z, t.to(self.device)).float()
-        errors = (predicted - noise).square()
+    def loss(self, model: nn.Module, batch: PointsBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        condition = self.condition(batch.ids) * ~batch.empty[:, None]
+        z = sds.add_noise(batch.points, batch.noise, self.alphas_cumprod[batch.t])
+        predicted = mean_of(lambda z, t: model(z, t, condition))(z, batch.t).float()
+        errors = (predicted - batch.noise).square()
         return errors.mean(), {
             "mse_points": errors[:, :3].mean(),
             "mse_colors": errors[:, 3:].mean(),
         }
 
     @torch.no_grad()
-    def condition(self, texts: list[str]) -> Float[Tensor, "B D"]:
+    def condition(self, ids: Int[Tensor, "B 32"]) -> Float[Tensor, "B D"]:
         """Return CLIP's text features with unit variance, as the Point-E prior gives them."""
-        output = self.clip.text_model(
-            token_ids(self.tokenizer, texts).to(self.device)
-        ).pooler_output
+        output = self.clip.text_model(ids).pooler_output
         features = self.clip.text_projection(output).float()
         return features / features.norm(dim=-1, keepdim=True) * features.shape[-1] ** 0.5
 
@@ -103,7 +110,7 @@ class PointsStage(Stage):
         texts = object_prompts(
             shard.labels[::VIEWS][:SAMPLES], numpy_generator(self.options.seed, "points-sheet")
         )
-        condition = self.condition(texts)
+        condition = self.condition(token_ids(self.tokenizer, texts).to(self.device))
         conditions = torch.cat([condition, torch.zeros_like(condition)])
         network = mean_of(lambda z, t: model(z, t, conditions))
         denoise = guided_denoiser(network, cosine_alphas_cumprod(), scale=SAMPLE_GUIDANCE)

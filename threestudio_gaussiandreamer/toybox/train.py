@@ -68,7 +68,12 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         default=40,
         help="shards of 1024 pictures that a stage visits cyclically",
     )
-    add("--workers", type=int, default=0, help="processes that render all shards first")
+    add(
+        "--workers",
+        type=int,
+        default=0,
+        help="processes that render all shards first and make the batches afterwards",
+    )
     add("--save-minutes", type=float, default=5.0)
     add("--sheet-minutes", type=float, default=20.0)
     return parser.parse_args(argv)
@@ -105,6 +110,7 @@ def options_of(args: argparse.Namespace) -> Options:
         pool=args.pool,
         precision=args.precision,
         batch=args.batch,
+        workers=args.workers,
         save_seconds=60 * args.save_minutes,
         sheet_seconds=60 * args.sheet_minutes,
     )

@@ -3,21 +3,25 @@
 import functools
 import hashlib
 from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from tqdm import tqdm
 
 from ..core.files import atomic_file
 from ..core.streams import generator, numpy_generator
 from ..diffusion import sds
 from . import models
+from .batches import StepData, batches, normal, torch_generator
 from .loop import Stage, averaged_weights
 from .sheet import contact_sheet
 from .text_batches import open_tokenizer, token_ids, training_prompts, view_prompts
-from .views import Shards, held_out_shard, row_batches, with_backgrounds
+from .views import Shards, held_out_shard, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.05
 """Fraction of pictures with a random background. It is small because with a fraction of 0.5 score
@@ -25,13 +29,45 @@ distillation produced haze around the object.
 """
 SNR_GAMMA = 5.0
 LATENT_SCALE = "latent_scale"
+TIMESTEPS = models.SCHEDULE["num_train_timesteps"]
 SAMPLES, SAMPLE_STEPS, SAMPLE_GUIDANCE = 24, 25, 3.0
+
+
+MOMENTS_IN_MEMORY = 256
+"""Number of shards whose latents a process keeps in memory, 4 MB each."""
 
 
 class UNetBatch(NamedTuple):
     latents: Float[Tensor, "B 4 16 16"]
-    """Of unit variance."""
-    tokens: Float[Tensor, "B 32 W"]
+    """Drawn from the autoencoder's posteriors, not scaled."""
+    noise: Float[Tensor, "B 4 16 16"]
+    t: Int[Tensor, " B"]
+    ids: Int[Tensor, "B 32"]
+    """Tokens of the prompts."""
+
+
+@dataclass(frozen=True)
+class UNetData(StepData):
+    tokenizer: Any
+    moments: tuple[Path, ...]
+    """The files of the shards' posteriors."""
+    stream = "unet"
+
+    def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> UNetBatch:
+        texts = training_prompts(self.shards.get_light(index), rows, rng)
+        mean, std = kept_moments(self.moments[index])[:, torch.from_numpy(rows)].float()
+        return UNetBatch(
+            mean + std * normal(rng, mean.shape),
+            normal(rng, mean.shape),
+            sds.stratified_timesteps(len(rows), TIMESTEPS, torch_generator(rng)),
+            token_ids(self.tokenizer, texts),
+        )
+
+
+@functools.lru_cache(maxsize=MOMENTS_IN_MEMORY)
+def kept_moments(path: Path) -> Float[Tensor, "2 N 4 16 16"]:
+    """Read the means and deviations of a shard's posteriors, float16."""
+    return torch.load(path, weights_only=True)
 
 
 class UNetStage(Stage):
@@ -43,7 +79,7 @@ class UNetStage(Stage):
     name = "unet"
     batch_size = 64
     learning_rate = 6e-4
-    images = 2_000_000
+    images = 8_000_000
 
     def build(self) -> nn.Module:
         folder = self.options.folder
@@ -53,9 +89,11 @@ class UNetStage(Stage):
         )
         self.text_model = frozen_clip(folder, len(self.tokenizer)).text_model.to(self.device)
         self.vae = frozen_autoencoder(folder).to(self.device)
-        self.alphas_cumprod = torch.cumprod(1 - models.scheduler().betas.double(), dim=0)
-        self.latents = functools.lru_cache(maxsize=self.options.pool)(self._latents)
-        self.constants[LATENT_SCALE] = latent_scale(self.latents(0))
+        self.encoder_digest = digest(self.vae.encoder)
+        self.alphas_cumprod = torch.cumprod(1 - models.scheduler().betas.double(), dim=0).to(
+            self.device
+        )
+        self.constants[LATENT_SCALE] = latent_scale(kept_moments(self._moments(0)))
         return models.unet()
 
     @property
@@ -64,28 +102,21 @@ class UNetStage(Stage):
         return self.constants[LATENT_SCALE]
 
     def depends(self) -> dict[str, str]:
-        return {"clip": digest(self.text_model), "autoencoder": digest(self.vae.encoder)}
+        return {"clip": digest(self.text_model), "autoencoder": self.encoder_digest}
 
     def batches(self, step: int) -> Iterator[UNetBatch]:
-        seed = self.options.seed
-        order = row_batches(self.shards, seed, "unet", self.batch, self.options.pool, step)
-        for number, (index, rows) in enumerate(order, step):
-            rng = numpy_generator(seed, "unet-batch", number)
-            texts = training_prompts(self.shards.get_light(index), rows, rng)
-            mean, std = self.latents(index)[:, torch.from_numpy(rows)].float()
-            noise = torch.randn(mean.shape, generator=generator(seed, "unet-posterior", number))
-            yield UNetBatch(((mean + std * noise) * self.scale).to(self.device), self.tokens(texts))
+        pool = tqdm(range(self.options.pool), "latents", unit="shard", disable=None)
+        moments = tuple(self._moments(index) for index in pool)
+        data = UNetData(self.options, self.shards, self.batch, self.tokenizer, moments)
+        return batches(data, step, self.device, self.options.workers)
 
-    def loss(
-        self, model: nn.Module, batch: UNetBatch, step: int
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        rng, x = generator(self.options.seed, "unet-noise", step), batch.latents
-        t = sds.stratified_timesteps(len(x), len(self.alphas_cumprod), rng)
-        abar = self.alphas_cumprod[t].to(self.device)
-        noise = torch.randn(x.shape, generator=rng).to(self.device)
+    def loss(self, model: nn.Module, batch: UNetBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        abar, noise, x = self.alphas_cumprod[batch.t], batch.noise, batch.latents * self.scale
         z = sds.add_noise(x, noise, abar)
         v = sds.per_item(abar.sqrt(), x) * noise - sds.per_item((1 - abar).sqrt(), x) * x
-        predicted = model(z, t.to(self.device), encoder_hidden_states=batch.tokens).sample
+        with torch.no_grad():
+            tokens = self.text_model(batch.ids).last_hidden_state
+        predicted = model(z, batch.t, encoder_hidden_states=tokens).sample
         errors = (predicted.float() - v).square().mean(dim=(1, 2, 3))
         high = abar < 0.1
         metrics = {
@@ -100,13 +131,12 @@ class UNetStage(Stage):
         return self.text_model(token_ids(self.tokenizer, texts).to(self.device)).last_hidden_state
 
     @torch.no_grad()
-    def _latents(self, index: int) -> Float[Tensor, "2 N 4 16 16"]:
-        """Return mean and deviation of a shard's posteriors, float16, kept on the disk."""
-        path = (
-            self.options.folder
-            / "latents"
-            / f"{digest(self.vae.encoder)[:12]}-{self.shards.path(index).stem}.pt"
-        )
+    def _moments(self, index: int) -> Path:
+        """Return the file of a shard's posteriors, which is written on first use: their means and
+        deviations (2, N, 4, 16, 16), float16.
+        """
+        name = f"{self.encoder_digest[:12]}-{self.shards.path(index).stem}.pt"
+        path = self.options.folder / "latents" / name
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
             rgba = self.shards.get(index).rgba
@@ -123,7 +153,7 @@ class UNetStage(Stage):
             )
             with atomic_file(path, durable=False) as file:
                 torch.save(moments.half().cpu(), file)
-        return torch.load(path, weights_only=True)
+        return path
 
     @functools.cached_property
     def sheet_prompts(self) -> list[str]:
@@ -147,10 +177,8 @@ class UNetStage(Stage):
         self, model: nn.Module, noise: Tensor, texts: list[str], *, guidance: float
     ) -> Float[Tensor, "B 4 16 16"]:
         """Sample latents of unit variance for the texts by DDIM."""
-        tokens, abar = (
-            torch.cat([self.tokens(texts), self.tokens([""] * len(texts))]),
-            self.alphas_cumprod.to(self.device),
-        )
+        tokens = torch.cat([self.tokens(texts), self.tokens([""] * len(texts))])
+        abar = self.alphas_cumprod
 
         def eps(z: Tensor, t: Int[Tensor, " B"]) -> Tensor:
             v = model(torch.cat([z, z]), torch.cat([t, t]), encoder_hidden_states=tokens).sample

@@ -7,8 +7,7 @@ shards can be used with different backgrounds.
 
 import math
 import zipfile
-from collections.abc import Iterator
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,7 +38,7 @@ BACKGROUND = (0.5, 0.5, 0.5)
 """Background of nearly all pictures; no object has this colour."""
 OBJECTS, VIEWS, POINTS = 256, 4, 1024
 """Objects per shard, views per object, and points per object."""
-LIGHT_SHARDS = 64
+LIGHT_SHARDS = 128
 """Number of shards that are cached in memory without their pictures, 3 MB each."""
 HELD_OUT_OBJECTS = 64
 """Number of objects for evaluation, which are withheld from training."""
@@ -95,6 +94,11 @@ class Shards:
         self.objects, self.views = objects, views
         self.get = lru_cache(maxsize=2)(self._get)
         self.get_light = lru_cache(maxsize=LIGHT_SHARDS)(self._get_light)
+
+    def __reduce__(self) -> tuple:
+        """Send to other processes without what is cached."""
+        known = {"held_out": self.held_out, "objects": self.objects, "views": self.views}
+        return partial(Shards, self.folder, self.seed, **known), ()
 
     def path(self, index: int) -> Path:
         """Return the file of shard ``index``."""
@@ -231,17 +235,10 @@ def with_backgrounds(
     return torch.from_numpy(images).movedim(-1, 1).contiguous()
 
 
-def row_batches(
-    shards: Shards,
-    seed: int,
-    stream: str,
-    batch: int,
-    pool: int,
-    step: int,
-    *,
-    per_object: bool = False,
-) -> Iterator[tuple[int, Int[np.ndarray, " B"]]]:
-    """Yield (shard, rows) of each batch from ``step`` on, a function of (seed, stream, step).
+def row_batch(
+    shards: Shards, stream: str, batch: int, pool: int, step: int, *, per_object: bool = False
+) -> tuple[int, Int[np.ndarray, " B"]]:
+    """Return (shard, rows) of the batch of ``step``, a function of (seed, stream, step).
 
     Each pass over a shard visits its rows in random order; an incomplete last batch is dropped.
 
@@ -251,9 +248,6 @@ def row_batches(
     """
     rows = shards.objects * (1 if per_object else shards.views)
     batch = min(batch, rows)
-    per_shard = rows // batch
-    while True:
-        visit, place = divmod(step, per_shard)
-        order = numpy_generator(seed, stream, visit).permutation(rows)
-        yield visit % pool, order[place * batch : (place + 1) * batch]
-        step += 1
+    visit, place = divmod(step, rows // batch)
+    order = numpy_generator(shards.seed, stream, visit).permutation(rows)
+    return visit % pool, order[place * batch : (place + 1) * batch]

@@ -1,0 +1,86 @@
+"""Training batches as functions of (seed, step), made by worker processes where there are some."""
+
+import itertools
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, Dataset
+
+from ..core.streams import numpy_generator
+from .loop import Options
+from .views import Shards, row_batch
+
+PREFETCHED = 4
+"""Batches that each worker process makes in advance."""
+
+
+@dataclass(frozen=True)
+class StepData(Dataset, ABC):
+    """The batches of one stage, indexed by step.
+
+    Objects are sent to worker processes, so they hold no networks.
+    """
+
+    options: Options
+    shards: Shards
+    batch: int
+    stream: ClassVar[str]
+    """Name of the streams of random numbers."""
+    per_object: ClassVar[bool] = False
+    """Whether rows are objects instead of pictures."""
+
+    def __getitem__(self, step: int) -> Any:
+        """Return the batch of ``step``: a tensor or a named tuple of tensors, on the CPU."""
+        seed = self.shards.seed
+        index, rows = row_batch(
+            self.shards,
+            f"{self.stream}-rows",
+            self.batch,
+            self.options.pool,
+            step,
+            per_object=self.per_object,
+        )
+        return self.make(index, rows, numpy_generator(seed, f"{self.stream}-batch", step))
+
+    @abstractmethod
+    def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> Any:
+        """Make the batch of these rows of shard ``index``."""
+
+
+def batches(data: StepData, step: int, device: torch.device, workers: int = 0) -> Iterator[Any]:
+    """Yield the batches from ``step`` on, on ``device``.
+
+    Args:
+        workers: processes that make batches in advance; with 0 this process makes them.
+    """
+    loader = DataLoader(
+        data,
+        batch_size=None,
+        sampler=itertools.count(step),  # type: ignore[arg-type]
+        num_workers=workers,
+        prefetch_factor=PREFETCHED if workers else None,
+        pin_memory=device.type == "cuda",
+        multiprocessing_context="spawn" if workers else None,
+    )
+    return (moved(batch, device) for batch in loader)
+
+
+def moved(batch: Any, device: torch.device) -> Any:
+    """Return a tensor or a named tuple of tensors on ``device``."""
+    if isinstance(batch, torch.Tensor):
+        return batch.to(device, non_blocking=True)
+    return type(batch)(*(value.to(device, non_blocking=True) for value in batch))
+
+
+def torch_generator(rng: np.random.Generator) -> torch.Generator:
+    """Return a torch generator that is seeded by the next number of ``rng``."""
+    return torch.Generator().manual_seed(int(rng.integers(2**63)))
+
+
+def normal(rng: np.random.Generator, shape: Sequence[int]) -> torch.Tensor:
+    """Draw standard normal numbers, float32."""
+    return torch.from_numpy(rng.standard_normal(tuple(shape), dtype=np.float32))
