@@ -105,7 +105,7 @@ def test_after_a_stop_signal_no_other_stage_begins(tmp_path, monkeypatch, capsys
         def __init__(self, stage):
             begun.append(stage)
 
-        def run(self, images):
+        def run(self, images, seconds):
             return self.progress
 
     monkeypatch.setattr(train, "Training", Stopped)
@@ -208,6 +208,20 @@ def test_a_unet_of_another_text_encoder_is_refused(folder, tmp_path):
         training(place, "unet")
 
 
+def test_a_time_limit_ends_a_stage_and_lowers_the_rate_before(folder, tmp_path):
+    run = training(copied(folder, tmp_path / "run"), "judge")
+    rates = []
+
+    def step(batch):
+        rates.append(loop.rate_factor(loop.WARMUP, run.done))
+        run.progress.seconds += 10
+        return {"loss": torch.zeros(())}
+
+    run.train_step = step
+    run.run(seconds=100.0)
+    assert len(rates) == 10 and rates[0] == 1 and 0 < rates[9] < rates[8] < 1
+
+
 def test_curves_are_written(folder):
     rows = (folder / "clip.csv").read_text().splitlines()
     assert rows[0].startswith("images,seconds,loss") and len(rows) == 3
@@ -222,6 +236,8 @@ def test_curves_are_written(folder):
         (["--pool", "-3"], "--pool -3: expected at least 1"),
         (["--device", "cuda"], "sees no GPU"),
         (["--device", "cpuu"], "unknown device 'cpuu': did you mean 'cpu'"),
+        (["--minutes", "0"], "--minutes 0.0: expected more than 0"),
+        (["--minutes", "nan"], "--minutes nan: expected more than 0"),
         (["--workers", "-1"], "--workers -1: expected 0 or more"),
         (["--save-minutes", "nan"], "--save-minutes nan: expected minutes"),
         (["--sheet-minutes", "-1"], "--sheet-minutes -1.0: expected minutes"),
@@ -248,6 +264,15 @@ def test_workers_render_the_same_shards_as_a_training(tmp_path):
     assert names == [f"train-{seed}-1x4-0000{i}.npz" for seed in (0, 1000) for i in (0, 1)]
     shards = views.Shards(there.shards_folder(), 0, objects=1)
     assert np.array_equal(shards.get(1).rgba, shards.make(1).rgba)
+
+
+@pytest.mark.slow  # starts processes
+@pytest.mark.parametrize("name", ["unet", "judge"])
+def test_worker_processes_make_the_same_batches(folder, name):
+    here, there = (STAGES[name](options(folder, workers=workers)) for workers in (0, 1))
+    pairs = zip(here.batches(3), there.batches(3), strict=True)
+    for one, other in itertools.islice(pairs, 3):
+        assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 # Formulas -----------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ as an uninterrupted one.
 """
 
 import logging
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -134,21 +135,27 @@ class Training:
         )
         self.progress = Progress()
         self.measured: dict[str, float] = {}
-        self.target = stage.images
+        self.target, self.limit = stage.images, math.inf
         self.signum = 0
         if self.path.exists():
             self._resume()
         self._freeze()
 
     @property
+    def done(self) -> float:
+        """Fraction of the training that is done, by images or by seconds."""
+        return max(self.progress.images / self.target, self.progress.seconds / self.limit)
+
+    @property
     def path(self) -> Path:
         return checkpoint_path(self.stage.options.folder, self.stage.name)
 
-    def run(self, images: Optional[int] = None) -> Progress:
-        """Train until ``images`` (default: the stage's number) have been seen. A stop signal, such
-        as Ctrl-C, ends it earlier: a checkpoint is saved, and ``signum`` is the signal's number.
+    def run(self, images: Optional[int] = None, seconds: float = math.inf) -> Progress:
+        """Train until ``images`` (default: the stage's number) have been seen or ``seconds`` of
+        training have passed, those before a resumption included. A stop signal, such as Ctrl-C,
+        ends it earlier: a checkpoint is saved, and ``signum`` is the signal's number.
         """
-        self.target = images or self.stage.images
+        self.target, self.limit = images or self.stage.images, seconds
         earlier = set_handlers(self._on_signal)
         try:
             self._loop()
@@ -158,9 +165,10 @@ class Training:
 
     def _loop(self) -> None:
         progress, sums = self.progress, _Sums()
+        batches = self.stage.batches(progress.step)
         saved = shown = started = time.monotonic()
-        for batch in self.stage.batches(progress.step):
-            if progress.images >= self.target or self.signum:
+        for batch in batches:
+            if self.done >= 1 or self.signum:
                 break
             metrics = self.train_step(batch)
             now = time.monotonic()
@@ -184,7 +192,7 @@ class Training:
             UserError: the gradient isn't finite; weights and average aren't changed.
         """
         progress, device = self.progress, self.stage.device.type
-        factor = rate_factor(progress.step, progress.images / self.target)
+        factor = rate_factor(progress.step, self.done)
         for group in self.optimizer.param_groups:
             group["lr"] = self.stage.learning_rate * factor
         mixed = self.stage.options.precision == "bfloat16"
@@ -314,7 +322,7 @@ def rate_factor(step: int, done: float) -> float:
     decrease to zero.
 
     Args:
-        done: fraction of the training's images that were seen.
+        done: fraction of the training that is done.
     """
     return min(1.0, (step + 1) / WARMUP) * min(1.0, max(0.0, 1 - done) / DECAY_SHARE)
 

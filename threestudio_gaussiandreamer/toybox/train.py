@@ -9,6 +9,7 @@ import argparse
 import contextlib
 import functools
 import logging
+import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -51,6 +52,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     )
     add("--stages", nargs="+", default=list(STAGES), help=f"of {', '.join(STAGES)}; default: all")
     add("--images", type=int, help="a stage's end; default: its own number of pictures")
+    add("--minutes", type=float, default=math.inf, help="a stage's end, if that comes earlier")
     add("--from-weights", type=Path, help="folder of toybox.export to start from")
     add("--seed", type=int, default=0)
     add("--device", default="cpu", help="cpu or cuda")
@@ -94,6 +96,8 @@ def options_of(args: argparse.Namespace) -> Options:
             raise UserError(f"--{name} {shown(value)}: expected at least 1")
     if args.workers < 0:
         raise UserError(f"--workers {shown(args.workers)}: expected 0 or more")
+    if not args.minutes > 0:
+        raise UserError(f"--minutes {args.minutes}: expected more than 0")
     for name in ("save_minutes", "sheet_minutes"):
         if not is_number(getattr(args, name)) or getattr(args, name) < 0:
             option = f"--{name.replace('_', '-')}"
@@ -129,8 +133,13 @@ def _render(job: tuple[Options, int, int]) -> None:
     Shards(options.shards_folder(), seed, objects=options.shard_objects).ensure(index)
 
 
-def train(options: Options, stages: Sequence[str], images: Optional[int] = None) -> None:
-    """Train the stages in order.
+def train(
+    options: Options,
+    stages: Sequence[str],
+    images: Optional[int] = None,
+    seconds: float = math.inf,
+) -> None:
+    """Train the stages in order, each until ``images`` were seen or ``seconds`` have passed.
 
     Raises:
         UserError: another process trains one of them in this folder.
@@ -139,7 +148,7 @@ def train(options: Options, stages: Sequence[str], images: Optional[int] = None)
     for name in (name for name in STAGES if name in stages):
         with locked(options.folder, name):
             training = Training(STAGES[name](options))
-            progress = training.run(images)
+            progress = training.run(images, seconds)
         hours = progress.seconds / 3600
         print(f"{name}: {progress.images} images in {hours:.2f} hours", flush=True)
         if training.signum:
@@ -184,7 +193,7 @@ def run(args: argparse.Namespace) -> None:
         render_shards(options, seeds, min(args.workers, os.cpu_count() or 1))
     if args.from_weights:
         start_from(args.from_weights, options, STAGES)
-    train(options, args.stages, args.images)
+    train(options, args.stages, args.images, 60 * args.minutes)
 
 
 main = functools.partial(run_command, parse, run)

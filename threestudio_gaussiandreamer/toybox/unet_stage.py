@@ -33,6 +33,7 @@ TIMESTEPS = models.SCHEDULE["num_train_timesteps"]
 SAMPLES, SAMPLE_STEPS, SAMPLE_GUIDANCE = 24, 25, 3.0
 
 
+ENCODED_AT_ONCE = 64
 MOMENTS_IN_MEMORY = 256
 """Number of shards whose latents a process keeps in memory, 4 MB each."""
 
@@ -141,7 +142,7 @@ class UNetStage(Stage):
             path.parent.mkdir(parents=True, exist_ok=True)
             rgba = self.shards.get(index).rgba
             rng = numpy_generator(self.options.seed, "unet-backgrounds", index)
-            parts = np.array_split(rgba, -(-len(rgba) // 32))
+            parts = np.array_split(rgba, -(-len(rgba) // ENCODED_AT_ONCE))
             images = (
                 with_backgrounds(part, rng, random_share=RANDOM_BACKGROUNDS) for part in parts
             )

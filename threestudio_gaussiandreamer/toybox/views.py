@@ -223,16 +223,15 @@ def with_backgrounds(
         Pictures in [0, 1], float32.
     """
     count, height = rgba.shape[:2]
-    top, bottom = (rng.uniform(0, 1, (count, 1, 1, 3)) for _ in range(2))
+    top, bottom = (rng.uniform(0, 1, (count, 3, 1, 1)) for _ in range(2))
     bottom = np.where(rng.uniform(size=(count, 1, 1, 1)) < 0.5, top, bottom)
-    ramp = np.linspace(0, 1, height)[None, :, None, None]
+    ramp = np.linspace(0, 1, height)[:, None]
     fixed = rng.uniform(size=(count, 1, 1, 1)) >= random_share
-    background = np.where(fixed, np.array(BACKGROUND), top + (bottom - top) * ramp).astype(
-        np.float32
-    )
-    images = rgba.astype(np.float32) / 255
-    images = images[..., :3] + (1 - images[..., 3:]) * background
-    return torch.from_numpy(images).movedim(-1, 1).contiguous()
+    fixed_color = np.array(BACKGROUND)[:, None, None]
+    background = np.where(fixed, fixed_color, top + (bottom - top) * ramp).astype(np.float32)
+    # with the channels in front, the arithmetic runs along whole rows of pixels
+    channels = torch.from_numpy(rgba.transpose(0, 3, 1, 2)).float().contiguous().div_(255)
+    return channels[:, :3] + (1 - channels[:, 3:]) * torch.from_numpy(background)
 
 
 def row_batch(
