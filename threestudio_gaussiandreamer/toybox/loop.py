@@ -182,6 +182,7 @@ class Training:
             if now - saved > self.stage.options.save_seconds:
                 saved = now
                 self.save()
+        self.save()  # before the sheet, which may fail
         self._show()
         self.save()
 
