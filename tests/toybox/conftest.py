@@ -25,8 +25,8 @@ def small_world():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, small_world):
-    """A training folder in which CLIP and the autoencoder are trained for two steps."""
+    """A training folder in which text encoder, CLIP and autoencoder are trained for two steps."""
     folder = tmp_path_factory.mktemp("toybox")
-    for name in ("clip", "autoencoder"):
+    for name in ("text", "clip", "autoencoder"):
         training(folder, name).run(8)
     return folder

@@ -19,6 +19,7 @@ from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
 from threestudio_gaussiandreamer.toybox import models, warm_start
 from threestudio_gaussiandreamer.toybox.export import main
 from threestudio_gaussiandreamer.toybox.loop import averaged_weights
+from threestudio_gaussiandreamer.toybox.text_batches import token_ids
 from threestudio_gaussiandreamer.toybox.train import STAGES
 
 PROMPT = "a red fox with a green scarf"
@@ -115,7 +116,9 @@ def test_the_point_e_prior_loads_the_points_model(exported, trained):
     assert cloud.points.shape == (50, 3) and np.isfinite(cloud.points).all()
     stage = STAGES["points"](options(trained))
     assert torch.allclose(
-        prior._condition(PROMPT, torch.device("cpu")), stage.condition([PROMPT]), **HALF
+        prior._condition(PROMPT, torch.device("cpu")),
+        stage.condition(token_ids(stage.tokenizer, [PROMPT])),
+        **HALF,
     )
 
 
@@ -144,7 +147,7 @@ def test_a_training_continues_from_the_weights(exported, trained, tmp_path):
 def test_weights_of_another_size_are_refused(exported, tmp_path, monkeypatch):
     monkeypatch.setattr(models, "VISION_LAYERS", 2)
     monkeypatch.setattr(models, "FEATURES", 64)
-    with pytest.raises(UserError, match="'clip'.*of another model"):
+    with pytest.raises(UserError, match="'text'.*of another model"):
         warm_start.start_from(exported, options(tmp_path), STAGES)
 
 

@@ -13,7 +13,8 @@ from tests.toybox.helpers import copied, options, training
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.toybox import loop, points_stage, train, unet_stage, views
-from threestudio_gaussiandreamer.toybox.clip_stage import IGNORED, LABELS, text_labels
+from threestudio_gaussiandreamer.toybox.classifiers import IGNORED
+from threestudio_gaussiandreamer.toybox.text_stage import told_labels
 from threestudio_gaussiandreamer.toybox.train import STAGES, main, render_shards
 
 pytestmark = pytest.mark.usefixtures("small_world")
@@ -71,7 +72,7 @@ def test_a_sheet_is_drawn(folder, name, monkeypatch):
     assert picture.dtype == np.uint8 and picture.shape[2] == 3 and picture.std() > 0
 
 
-@pytest.mark.parametrize("name", ["clip", "judge", "autoencoder"])
+@pytest.mark.parametrize("name", ["text", "clip", "judge", "autoencoder"])
 def test_a_stage_is_measured_on_withheld_objects(folder, name):
     stage = STAGES[name](options(folder))
     numbers = stage.evaluate(stage.model.eval())
@@ -193,18 +194,18 @@ def test_a_damaged_checkpoint_is_refused(folder, tmp_path):
 
 
 def test_stages_that_need_others_name_them(tmp_path):
-    with pytest.raises(UserError, match="train the stage 'clip' first"):
+    with pytest.raises(UserError, match="train the stage 'text' first"):
         training(tmp_path, "unet")
 
 
 def test_a_unet_of_another_text_encoder_is_refused(folder, tmp_path):
     place = copied(folder, tmp_path / "run")
     training(place, "unet").run(4)
-    (place / "clip.pt").unlink()
-    other = training(place, "clip", seed=1)
+    (place / "text.pt").unlink()
+    other = training(place, "text", seed=1)
     other.train_step(next(other.stage.batches(0)))
     other.save()
-    with pytest.raises(UserError, match="trained with another clip"):
+    with pytest.raises(UserError, match="trained with another text"):
         training(place, "unet")
 
 
@@ -308,20 +309,21 @@ def test_points_go_to_point_es_units_and_back():
     assert torch.allclose(points_stage.network_units(front)[0, :, 0], expected, atol=1e-6)
 
 
-def test_only_attributes_that_prompts_name_are_labels(folder):
-    batch = next(STAGES["clip"](options(folder)).batches(0))
-    labels = text_labels(batch._replace(has_text=torch.ones(4, dtype=torch.bool)))
-    quadrant = list(LABELS).index("quadrant")
-    for row in range(4):
-        side = int(batch.labels[row, quadrant]) % 2 == 1
-        ignored = side or not batch.has_view[row]
-        assert (int(labels[row, quadrant]) == IGNORED) == ignored
+def test_only_directions_that_prompts_tell_are_labels():
+    quadrants = torch.arange(8) % 4  # front, left, back, right
+    labels = quadrants[:, None].repeat(1, len(views.LABELS))
+    told = torch.arange(8) < 4
+    found = told_labels(labels, told)
+    quadrant = list(views.LABELS).index("quadrant")
+    assert found[:, quadrant].tolist() == [0, IGNORED, 2, *[IGNORED] * 5]
+    assert torch.equal(found[:, :quadrant], labels[:, :quadrant])
 
 
 @pytest.mark.parametrize(
     ("name", "user", "prefix", "free"),
     [
-        ("clip", "points", "clip.text_model.", "clip.vision_model."),
+        ("text", "points", "text_model.", "heads."),
+        ("text", "clip", "text_projection.", "heads."),
         ("autoencoder", "unet", "encoder.", "decoder."),
     ],
 )

@@ -51,10 +51,11 @@ class StepData(Dataset, ABC):
         """Make the batch of these rows of shard ``index``."""
 
 
-def batches(data: StepData, step: int, device: torch.device, workers: int = 0) -> Iterator[Any]:
+def batches(data: Dataset, step: int, device: torch.device, workers: int = 0) -> Iterator[Any]:
     """Yield the batches from ``step`` on, on ``device``.
 
     Args:
+        data: batches on the CPU, indexed by step.
         workers: processes that make batches in advance; with 0 this process makes them.
     """
     loader = DataLoader(

@@ -28,15 +28,16 @@ from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.files import atomic_file, output_folder
 from . import models
+from .clip_stage import trained_clip
 from .loop import averaged_weights, checkpoint_path
 from .text_batches import open_tokenizer
-from .unet_stage import LATENT_SCALE, frozen_autoencoder, frozen_clip
+from .unet_stage import LATENT_SCALE, frozen_autoencoder
 
-STAGES = ("clip", "autoencoder", "unet", "points", "judge")
+STAGES = ("text", "clip", "autoencoder", "unet", "points", "judge")
 
 
 def export(training: Path, target: Path) -> dict[str, Any]:
-    """Write the models of a training that has all of clip, autoencoder and unet.
+    """Write the models of a training that has all of text, clip, autoencoder and unet.
 
     Networks that it hasn't are left out; what there is of ``target`` is replaced.
 
@@ -47,7 +48,7 @@ def export(training: Path, target: Path) -> dict[str, Any]:
         UserError: a stage isn't trained yet, or the disk is full.
     """
     tokenizer = open_tokenizer(training)
-    clip = frozen_clip(training, len(tokenizer))
+    clip = trained_clip(training, len(tokenizer))
     write_clip(target / "clip", clip, training / "tokenizer")
     write_stable_diffusion(target / "stable-diffusion", training, clip)
     if checkpoint_path(training, "points").exists():

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ..core.streams import numpy_generator
 from .batches import StepData, batches
-from .clip_stage import accuracies, classified
+from .classifiers import accuracies, classified
 from .loop import Stage
 from .models import Judge
 from .text_batches import label_tensor

@@ -19,9 +19,10 @@ from ..splatting import rasterize
 from . import models
 from .batches import StepData, batches, normal, torch_generator
 from .loop import Stage
+from .module_digest import digest
 from .sheet import contact_sheet
 from .text_batches import object_prompts, open_tokenizer, token_ids
-from .unet_stage import digest, frozen_clip
+from .text_stage import frozen_text
 from .views import BACKGROUND, FOVY_DEG, VIEWS, Shards, held_out_shard
 from .world import RADIUS
 
@@ -74,14 +75,14 @@ class PointsStage(Stage):
 
     def build(self) -> nn.Module:
         self.tokenizer = open_tokenizer(self.options.folder)
-        self.clip = frozen_clip(self.options.folder, len(self.tokenizer)).to(self.device)
+        self.clip = frozen_text(self.options.folder, len(self.tokenizer)).to(self.device)
         objects = self.options.shard_objects
         self.shards = Shards(self.options.shards_folder(), self.options.seed, objects=objects)
         self.alphas_cumprod = torch.from_numpy(cosine_alphas_cumprod()).to(self.device)
         return models.points_model()
 
     def depends(self) -> dict[str, str]:
-        return {"clip": digest(self.clip.text_model)}
+        return {"text": digest(self.clip.text_model)}
 
     def batches(self, step: int) -> Iterator[PointsBatch]:
         data = PointsData(self.options, self.shards, self.batch, self.tokenizer)

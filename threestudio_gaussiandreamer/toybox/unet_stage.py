@@ -1,7 +1,6 @@
 """Training the U-Net on the autoencoder's latents and the text encoder's tokens."""
 
 import functools
-import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +18,10 @@ from ..diffusion import sds
 from . import models
 from .batches import StepData, batches, normal, torch_generator
 from .loop import Stage, averaged_weights
+from .module_digest import digest
 from .sheet import contact_sheet
 from .text_batches import open_tokenizer, token_ids, training_prompts, view_prompts
+from .text_stage import frozen_text
 from .views import Shards, held_out_shard, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.05
@@ -88,7 +89,7 @@ class UNetStage(Stage):
         self.shards = Shards(
             self.options.shards_folder(), self.options.seed, objects=self.options.shard_objects
         )
-        self.text_model = frozen_clip(folder, len(self.tokenizer)).text_model.to(self.device)
+        self.text_model = frozen_text(folder, len(self.tokenizer)).text_model.to(self.device)
         self.vae = frozen_autoencoder(folder).to(self.device)
         self.encoder_digest = digest(self.vae.encoder)
         self.alphas_cumprod = torch.cumprod(1 - models.scheduler().betas.double(), dim=0).to(
@@ -103,7 +104,7 @@ class UNetStage(Stage):
         return self.constants[LATENT_SCALE]
 
     def depends(self) -> dict[str, str]:
-        return {"clip": digest(self.text_model), "autoencoder": self.encoder_digest}
+        return {"text": digest(self.text_model), "autoencoder": self.encoder_digest}
 
     def batches(self, step: int) -> Iterator[UNetBatch]:
         pool = tqdm(range(self.options.pool), "latents", unit="shard", disable=None)
@@ -205,24 +206,6 @@ def latent_scale(moments: Float[Tensor, "2 N 4 h w"]) -> float:
     return float((mean.var() + std.square().mean()) ** -0.5)
 
 
-def frozen_clip(folder: Any, vocabulary_size: int) -> nn.Module:
-    """Load the trained CLIP's averaged weights, without gradients.
-
-    Raises:
-        UserError: it isn't trained.
-    """
-    weights = averaged_weights(folder, "clip")
-    clip = models.clip_model(vocabulary_size)
-    clip.load_state_dict(
-        {
-            name.removeprefix("clip."): value
-            for name, value in weights.items()
-            if name.startswith("clip.")
-        }
-    )
-    return clip.eval().requires_grad_(False)
-
-
 def frozen_autoencoder(folder: Any) -> nn.Module:
     """Load the trained autoencoder's averaged weights, without gradients.
 
@@ -232,11 +215,3 @@ def frozen_autoencoder(folder: Any) -> nn.Module:
     vae = models.autoencoder()
     vae.load_state_dict(averaged_weights(folder, "autoencoder"))
     return vae.eval().requires_grad_(False)
-
-
-def digest(module: nn.Module) -> str:
-    """Return a fingerprint of a network's weights."""
-    found = hashlib.sha256()
-    for name, value in sorted(module.state_dict().items()):
-        found.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
-    return found.hexdigest()

@@ -178,6 +178,12 @@ def draw_orbit(count: int, rng: np.random.Generator) -> Orbit:
     return Orbit(*(torch.from_numpy(np.float32(value)) for value in values))
 
 
+def random_angles(rng: np.random.Generator) -> tuple[float, float]:
+    """Draw the elevation and the azimuth of one view, degrees, as :func:`draw_orbit` does."""
+    orbit = draw_orbit(1, rng)
+    return float(orbit.elevation), float(orbit.azimuth)
+
+
 def render(mesh: Mesh, orbit: Orbit, size: int = SIZE) -> Float[np.ndarray, "N s s 4"]:
     """Ray cast the mesh from these cameras; return premultiplied RGBA in [0, 1]."""
     cameras = zip(orbit_c2w(*orbit[:3]).numpy(), orbit.fovy.tolist(), strict=True)

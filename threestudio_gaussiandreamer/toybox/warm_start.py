@@ -11,13 +11,14 @@ from torch import Tensor, nn
 from ..core.errors import UserError
 from ..core.files import existing_file
 from .loop import Options, Progress, Stage, Training, checkpoint_path
+from .text_stage import TEXT_PARTS
 from .unet_stage import LATENT_SCALE
 
 
 def start_from(weights: Path, options: Options, stages: dict[str, type[Stage]]) -> None:
     """Write a checkpoint for every stage of ``weights`` that the training folder has none of.
 
-    Optimisers start without state; CLIP's attribute classifiers, which aren't published, start at
+    Optimisers start without state; the attribute classifiers, which aren't published, start at
     random.
 
     Args:
@@ -49,7 +50,7 @@ def _load(model: nn.Module, state: dict[str, Tensor], weights: Path, name: str) 
     differing = [
         key for key, value in state.items() if key not in known or known[key].shape != value.shape
     ]
-    if differing or (name != "clip" and state.keys() != known.keys()):
+    if differing or (name not in ("text", "clip") and state.keys() != known.keys()):
         raise UserError(
             f"the weights of {name!r} in {str(weights)!r} are of another model"
             f" ({', '.join(differing[:3]) or 'some are missing'}): use those of this version"
@@ -83,7 +84,16 @@ def _read(path: Path) -> dict[str, Tensor]:
     return {key: value.float() for key, value in load_file(existing_file(path, "weights")).items()}
 
 
+def _read_text(weights: Path) -> dict[str, Tensor]:
+    return {
+        key.removeprefix("clip."): value
+        for key, value in _read_clip(weights).items()
+        if key.startswith(tuple(f"clip.{name}." for name in TEXT_PARTS))
+    }
+
+
 READERS = {
+    "text": _read_text,
     "clip": _read_clip,
     "autoencoder": _read_diffusers("vae"),
     "unet": _read_diffusers("unet"),
