@@ -88,6 +88,7 @@ def test_rewards_of_views(tmp_path, monkeypatch):
     ("arguments", "message"),
     [
         (["{}", "--metrics", "clop"], "clip"),
+        (["{}", "--metrics", "alignment"], "GPT-4"),
         (["{}", "--metrics", ","], "--metrics is empty"),
         (["{}", "--metrics", "clip"], "--clip FOLDER"),
         (["{}", "--metrics", "quality"], "--imagereward FOLDER, after `hf download"),

@@ -3,6 +3,7 @@ a few Gaussians start from the bundled toy.
 """
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -49,8 +50,10 @@ def write_farm(folder: Path, count: int, steps: int = 12) -> list[str]:
 
 
 def make_alone(folder: Path, number: int, steps: int = 12) -> Path:
-    """Make one of the assets with the launcher in a process of its own; return its folder. The
-    embeddings aren't taken from the farm's cache.
+    """Make one of the assets with the launcher in a process of its own; return its folder.
+
+    It uses one thread, as the farm's workers do, since torch's results on a CPU depend on the
+    number of threads. The embeddings aren't taken from the farm's cache.
     """
     command = [
         *(sys.executable, str(ROOT / "launch.py"), "--train", "--gpu", "cpu"),
@@ -60,6 +63,7 @@ def make_alone(folder: Path, number: int, steps: int = 12) -> Path:
         f"system.prompt_processor.prompt=a toy number {number}",
         "system.prompt_processor.use_cache=false",
     ]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment)
     assert done.returncode == 0, done.stderr[-3000:]
     return folder / "alone" / "alone" / f"toy{number}"

@@ -16,7 +16,7 @@ from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.models.clip import PictureText, clip_source
 from threestudio_gaussiandreamer.priors.point_e import PointEPrior
 from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
-from threestudio_gaussiandreamer.toybox import models, warm_start
+from threestudio_gaussiandreamer.toybox import export, models, warm_start
 from threestudio_gaussiandreamer.toybox.export import main
 from threestudio_gaussiandreamer.toybox.loop import averaged_weights
 from threestudio_gaussiandreamer.toybox.text_batches import token_ids
@@ -124,7 +124,7 @@ def test_the_point_e_prior_loads_the_points_model(exported, trained):
 
 def test_the_record_lists_what_was_tested(exported):
     record = json.loads((exported / "training.json").read_text())
-    assert set(record) == set(STAGES)
+    assert set(record) == set(export.STAGES)
     assert record["clip"]["images"] == 8 and record["unet"]["steps"] == 1
 
 
@@ -133,7 +133,7 @@ def test_a_training_continues_from_the_weights(exported, trained, tmp_path):
     tokenizer_before = (trained / "tokenizer" / "vocab.json").read_bytes()
     warm_start.start_from(exported, there, STAGES)
     assert (tmp_path / "tokenizer" / "vocab.json").read_bytes() == tokenizer_before
-    for name in STAGES:
+    for name in export.STAGES:
         expected, found = averaged_weights(trained, name), averaged_weights(tmp_path, name)
         for key, value in expected.items():
             if "heads" not in key or name == "judge":

@@ -63,7 +63,7 @@ def test_a_stage_learns_one_batch(folder, name, tmp_path):
     assert losses[-1] < 0.97 * losses[0]
 
 
-@pytest.mark.parametrize("name", ["autoencoder", "unet", "points"])
+@pytest.mark.parametrize("name", ["autoencoder", "unet-small", "unet", "points"])
 def test_a_sheet_is_drawn(folder, name, monkeypatch):
     monkeypatch.setattr(unet_stage, "SAMPLE_STEPS", 2)
     monkeypatch.setattr(points_stage, "SAMPLE_STEPS", 2)
@@ -221,6 +221,16 @@ def test_a_time_limit_ends_a_stage_and_lowers_the_rate_before(folder, tmp_path):
     run.train_step = step
     run.run(seconds=100.0)
     assert len(rates) == 10 and rates[0] == 1 and 0 < rates[9] < rates[8] < 1
+
+
+def test_the_unet_starts_from_the_one_of_small_pictures(folder, tmp_path):
+    place = copied(folder, tmp_path / "run")
+    small = training(place, "unet-small")
+    assert next(small.stage.batches(0)).latents.shape[-1] == 8
+    small.run(8)
+    weights = training(place, "unet").model.state_dict()
+    for name, value in loop.averaged_weights(place, "unet-small").items():
+        assert torch.equal(weights[name], value), name
 
 
 def test_curves_are_written(folder):

@@ -76,6 +76,8 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
     """
     names = [name.strip() for name in args.metrics.split(",") if name.strip()]
     for name in names:
+        if name in NOT_LOCAL:
+            raise UserError(f"--metrics {name}: {NOT_LOCAL[name]}")
         if name not in METRICS:
             raise unknown("metric", name, METRICS)
     if not names:
@@ -85,6 +87,13 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
     for name in names:
         require_models(name, args)
     return [METRICS[name](args) for name in names]
+
+
+NOT_LOCAL = {
+    "alignment": "T3Bench's alignment is the answer of GPT-4, a service without weights to load; "
+    "clip_similarity --t3bench FOLDER writes what its own scripts read (docs/evaluation.md)"
+}
+"""Metrics that can't be computed here, and why."""
 
 
 def require_models(name: str, args: argparse.Namespace) -> None:

@@ -88,8 +88,8 @@ class AutoencoderStage(Stage):
 
     def frozen(self) -> tuple[str, ...]:
         """Freeze the encoder once the U-Net is trained on its latents; the decoder may improve."""
-        trained = checkpoint_path(self.options.folder, "unet").exists()
-        return ("encoder.", "quant_conv.") if trained else ()
+        users = (checkpoint_path(self.options.folder, name) for name in ("unet-small", "unet"))
+        return ("encoder.", "quant_conv.") if any(path.exists() for path in users) else ()
 
     def batches(self, step: int) -> Iterator[AutoencoderBatch]:
         data = AutoencoderData(self.options, self.shards, self.batch)

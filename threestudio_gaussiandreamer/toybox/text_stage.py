@@ -84,7 +84,7 @@ class TextStage(Stage):
 
     def frozen(self) -> tuple[str, ...]:
         """Freeze the encoder once other networks are trained on it."""
-        users = (checkpoint_path(self.options.folder, name) for name in ("clip", "unet", "points"))
+        users = (checkpoint_path(self.options.folder, name) for name in USERS)
         return TEXT_PARTS if any(path.exists() for path in users) else ()
 
     def batches(self, step: int) -> Iterator[TextBatch]:
@@ -109,6 +109,7 @@ class TextStage(Stage):
         return accuracies(self._logits(model, self.held_out.ids), self.held_out.labels)
 
 
+USERS = ("clip", "unet-small", "unet", "points")
 TEXT_PARTS = ("text_model", "text_projection")
 
 

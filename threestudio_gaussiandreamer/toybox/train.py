@@ -32,13 +32,21 @@ from .judge_stage import SEED_OFFSET, JudgeStage
 from .loop import Options, Stage, Training
 from .points_stage import PointsStage
 from .text_stage import TextStage
-from .unet_stage import UNetStage
+from .unet_stage import SmallUNetStage, UNetStage
 from .views import Shards
 from .warm_start import start_from
 
 STAGES: dict[str, type[Stage]] = {
     stage.name: stage
-    for stage in (TextStage, ClipStage, AutoencoderStage, UNetStage, PointsStage, JudgeStage)
+    for stage in (
+        TextStage,
+        ClipStage,
+        AutoencoderStage,
+        SmallUNetStage,
+        UNetStage,
+        PointsStage,
+        JudgeStage,
+    )
 }
 """In the order of training: later ones need earlier ones."""
 
