@@ -8,6 +8,7 @@ import pickle
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 
 from tests.helpers import tiny_3d_models as tiny
@@ -267,6 +268,17 @@ def test_files_of_the_old_format_are_read(tmp_path, files):
         make(files, checkpoint=str(tmp_path / "old.pt"))("a fox").points,
         make(files)("a fox").points,
     )
+
+
+def test_safetensors_are_read(tmp_path, files):
+    path = tmp_path / "points.safetensors"
+    safetensors.torch.save_file(torch.load(files["checkpoint"]), path)
+    np.testing.assert_array_equal(
+        make(files, checkpoint=str(path))("a fox").points, make(files)("a fox").points
+    )
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(UserError, match=r"points\.safetensors' can't be read"):
+        make(files, checkpoint=str(path))("a fox")
 
 
 def test_swapped_files_are_named(files):

@@ -1,10 +1,12 @@
-"""Read published ``.pt`` and ``.pth`` files of weights: tensors only, whose names must match those
-of the network exactly.
+"""Read published ``.pt`` and ``.pth`` files of weights, and ``.safetensors``: tensors only, whose
+names must match those of the network exactly.
 """
 
 import pickle
 import zipfile
 from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -20,8 +22,8 @@ NAMED = 4
 
 
 def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
-    """Return the tensors of a checkpoint by name; it is unpickled with ``weights_only``, so that it
-    can't run code.
+    """Return the tensors of a checkpoint by name: of a ``.safetensors`` file, or of a pickle, which
+    is read with ``weights_only``, so that it can't run code.
 
     Args:
         kind: what the file is, for messages ("Shap-E checkpoint").
@@ -30,18 +32,16 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
         UserError: the file is missing, unreadable, refused, or holds no tensors by name.
     """
     file = existing_file(path, kind)
-    if zipfile.is_zipfile(file):
-        require_plain_archive(file)
-    try:  # zip files are memory-mapped, so that unused tensors (optimiser state) aren't read
-        content = torch.load(
-            file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file)
-        )
+    try:
+        content = _read_safetensors(file) if file.suffix == ".safetensors" else _unpickled(file)
     except pickle.UnpicklingError as error:
         raise UserError(
             f"{kind} {path!r} holds more than tensors, or is no file of PyTorch, and is not "
             "unpickled, since that could run code:"
             f" {str(error).strip().splitlines()[0][:200]}"
         ) from error
+    except UserError:
+        raise
     except Exception as error:  # torch raises various exceptions for damaged pickles
         raise UserError(
             f"{kind} {path!r} can't be read: {type(error).__name__}: {str(error).strip()[:200]}"
@@ -53,6 +53,22 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
             f"{WRAPPER!r}, was expected"
         )
     return dict(state)
+
+
+def _read_safetensors(file: Path) -> dict[str, Tensor]:
+    from safetensors.torch import load_file
+
+    return load_file(file)
+
+
+def _unpickled(file: Path) -> Any:
+    """Read a pickle. Zip files are memory-mapped, so that unused tensors (optimiser state) aren't
+    read.
+    """
+    is_zip = zipfile.is_zipfile(file)
+    if is_zip:
+        require_plain_archive(file)
+    return torch.load(file, map_location="cpu", weights_only=True, mmap=is_zip)
 
 
 def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> None:
