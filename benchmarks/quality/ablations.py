@@ -7,11 +7,11 @@
                                                             annealed, clipped
     python -m benchmarks.quality.ablations --mesh spot.glb --seeds 0 1 2 --size 128
 
-Each row is an ordinary run of configs/demo.yaml with a few options changed; its score is the PSNR
-on held-out views that no bank holds. `view-exact` knows the picture from every camera (an upper
-bound: reconstruction). `view-blind` knows only pictures from anywhere, in a low-dimensional linear
-latent, as a real diffusion model does: that is where a prior matters. Neither says anything about
-the quality of a real diffusion model."""
+Each row is a run of the base recipe (`recipe.py`) with a few options changed. Its score is the
+PSNR on held-out views that no bank holds. `view-exact` knows the picture from every camera: an
+upper bound, reconstruction. `view-blind` knows only pictures from anywhere, in a low-dimensional
+linear latent, as a real diffusion model does: that is where a prior matters. Neither says anything
+about the quality of a real diffusion model."""
 
 import argparse
 import csv
@@ -26,6 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+
+from benchmarks.quality.recipe import recipe
 
 ROOT = Path(__file__).resolve().parents[2]
 RANDOM_START = {
@@ -60,7 +62,7 @@ PAPER_RATES = {
     )
 }
 
-# Options replace the demo's values under their keys, whole sections included.
+# Options replace the recipe's values under their keys, whole sections included.
 TABLES = {
     "ablations": {
         "default": {},
@@ -130,7 +132,7 @@ def run(arguments: argparse.Namespace, seed: int, options: dict[str, Any]) -> di
     }  # fmt: skip
     mesh = {"system.guidance.mesh": arguments.mesh} if arguments.mesh else {}
     with tempfile.TemporaryDirectory() as folder:
-        cfg = changed_demo({**common, **mesh, **options, "exp_root_dir": folder})
+        cfg = changed_recipe({**common, **mesh, **options, "exp_root_dir": folder})
         path = Path(folder) / "run.yaml"
         path.write_text(yaml.safe_dump(cfg))
         command = [
@@ -147,9 +149,9 @@ def run(arguments: argparse.Namespace, seed: int, options: dict[str, Any]) -> di
         return json.loads((Path(folder) / "run/run/save/metrics.json").read_text())
 
 
-def changed_demo(options: dict[str, Any]) -> dict:
-    """Return configs/demo.yaml with each dotted key replaced."""
-    cfg = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())
+def changed_recipe(options: dict[str, Any]) -> dict:
+    """Return the recipe with each dotted key replaced."""
+    cfg = recipe()
     for dotted, value in options.items():
         *sections, key = dotted.split(".")
         section = cfg

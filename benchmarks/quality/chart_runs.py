@@ -88,10 +88,10 @@ RUNS = {
     "rates": Chart(
         "Effect of the learning rates",
         "x",
-        "times the learning rates of demo.yaml",
+        "times the learning rates of the base recipe",
         curves=False,
         marks_paper=True,
-        common="demo.yaml",
+        common="the base recipe",
     ),
     "dilation": Chart(
         "Effect of a smaller screen-space dilation", "x", "dilation, square pixels", curves=False
@@ -100,7 +100,7 @@ RUNS = {
         "Draft, default and best",
         "cpu_seconds",
         SECONDS,
-        curves=True,
+        curves=False,
         size=256,
         chosen_on=(TUNED_ON, "duck"),
     ),
@@ -288,10 +288,7 @@ def caption(rows: list[Row], size: int = SIZE) -> str:
         ", ".join(sorted({row[column] for row in rows})) for column in ("machine", "commit")
     )
     spread_over = "one seed" if seeds == "1" else f"{seeds} seeds: median and range"
-    return (
-        f"exact score of a known object, configs/demo.yaml at {size}², {spread_over}; "
-        f"{machine}; commit {commits}"
-    )
+    return f"exact score of a known object at {size}², {spread_over}; {machine}; commit {commits}"
 
 
 if __name__ == "__main__":

@@ -87,7 +87,7 @@ FAILURES = [
         "Blur and floaters from a screen-space dilation of 0.3 square pixels",
         "floater_mass",
         "plain 0.3",
-        {"`renderer.eps2d: 0.1` (the demo's)": "plain 0.1"},
+        {"`renderer.eps2d: 0.1`": "plain 0.1"},
         chart="dilation",
     ),
     Failure(

@@ -1,9 +1,9 @@
-"""The runs of each chart and table: variants of configs/demo.yaml as :class:`Job`; `runs.py` runs
-them.
+"""The runs of each chart and table, as :class:`Job`: variants of the base recipe (`recipe.py`),
+which `runs.py` runs.
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Optional
 
 from benchmarks.quality.ablations import (
     CLIPPED,
@@ -19,7 +19,7 @@ from threestudio_gaussiandreamer.prune import PruneOptions
 
 STEPS = 1200
 SECOND_STAGE = 500
-"""The step from which the demo draws smaller timesteps."""
+"""The step from which the recipe draws smaller timesteps."""
 COUNTS = (5000, 2500, 1500, 1000)
 STEPS_A_ROUND = PruneOptions.steps
 """Recovery steps of the prune command per round."""
@@ -32,7 +32,7 @@ PAPER_START = {
 SHARP_PAPER = PAPER_RATES | NO_BUDGET | PAPER_START
 PAPER = SHARP_PAPER | {"system.renderer.eps2d": 0.3}
 """The recipe of the paper: its learning rates, start and screen-space dilation, and no pruning.
-Sharp: with the demo's dilation, 0.1.
+Sharp: with the recipe's dilation, 0.1.
 """
 RATES = {
     "lr_means": (2e-4, 2e-5),
@@ -41,7 +41,7 @@ RATES = {
     "lr_opacities": (1e-1, 5e-3),
     "lr_sh": (1e-1, 2e-3),
 }
-"""Learning rates of demo.yaml, at the start and the end of a run."""
+"""Learning rates of the recipe, at the start and the end of a run."""
 SLOWER_MEANS = {"slower means": 0.5, "means at 0.8": 0.8}
 """Factors of the initial learning rate of positions: the smaller, the more Gaussians stay on the
 surface.
@@ -64,8 +64,10 @@ class Job(NamedTuple):
     x: float
     """The place on the chart's horizontal axis, where that isn't measured; else 0."""
     options: dict[str, Any]
-    overlay: str = ""
-    """The name of a file of configs/ that is laid over demo.yaml."""
+    overlay: Optional[str] = None
+    """The name of a file of configs/ that is laid over demo.yaml; "" for none, None for the base
+    recipe.
+    """
 
 
 def steps(count: int) -> dict[str, Any]:
@@ -84,7 +86,7 @@ def steps(count: int) -> dict[str, Any]:
 
 
 def falling(names: Iterable[str], count: int, factor: float = 1.0) -> dict[str, str]:
-    """Return some of the demo's learning rates, ``factor`` times as high, for ``count`` steps."""
+    """Return some of the recipe's learning rates, ``factor`` times as high, for ``count`` steps."""
     return {
         f"system.geometry.{name}": falling_rate(*(factor * rate for rate in RATES[name]), count)
         for name in names
@@ -97,7 +99,7 @@ def falling_rate(start: float, end: float, count: int) -> str:
 
 
 def scratch(count: int) -> dict[str, Any]:
-    """Return the options that start the demo with ``count`` Gaussians: four fifths from the prior,
+    """Return the options that start a run with ``count`` Gaussians: four fifths from the prior,
     one fifth grown.
     """
     return NO_BUDGET | {
@@ -109,7 +111,7 @@ def scratch(count: int) -> dict[str, Any]:
 
 def time_jobs() -> Iterator[Job]:
     """Each kind of score, with a prior and from a random start, over time."""
-    yield Job("time", "view-exact, demo.yaml", 0, {})
+    yield Job("time", "view-exact, the base recipe", 0, {})
     yield Job("time", "view-exact, the paper's recipe", 0, PAPER)
     yield Job("time", "direction bins", 0, BINS)
     yield Job("time", "view-blind, prior", 0, VIEW_BLIND)
@@ -199,7 +201,7 @@ def large_jobs() -> Iterator[Job]:
 
 
 def batch_jobs() -> Iterator[Job]:
-    """Views per step, with as many steps as fit into the demo's seconds."""
+    """Views per step, with as many steps as fit into the recipe's seconds."""
     for batch, count in ((1, 2200), (2, 1650), (4, STEPS), (8, 750)):
         yield Job(
             "batch",
@@ -211,16 +213,16 @@ def batch_jobs() -> Iterator[Job]:
 
 def iteration_jobs() -> Iterator[Job]:
     """Separate runs: a longer run doesn't continue a shorter one, because schedules differ."""
-    for rates, name in (({}, "demo.yaml"), (PAPER, "the paper's recipe")):
+    for rates, name in (({}, "the base recipe"), (PAPER, "the paper's recipe")):
         for count in (150, 300, 600, 1200):
             yield Job("iterations", name, count, steps(count) | rates)
 
 
 def rate_jobs() -> Iterator[Job]:
-    """Each learning rate of the demo a third and three times as high, all of them, and all held
-    instead of falling.
+    """Each learning rate of the recipe a third and three times as high, all of them, and all
+    held instead of falling.
     """
-    yield Job("rates", "demo.yaml", 1, {})
+    yield Job("rates", "the base recipe", 1, {})
     for names in (*([name] for name in RATES), list(RATES)):
         line = names[0].removeprefix("lr_") if len(names) == 1 else "all"
         for factor in (0.3, 3):
@@ -257,26 +259,29 @@ def dilation_jobs() -> Iterator[Job]:
         )
 
 
-def quality_jobs() -> Iterator[Job]:
-    """The demo, its draft and its best variant, at their own size."""
+DEMOS = {"draft": ("demo-draft", 255), "default": ("", 1000), "best": ("demo-best", 2000)}
+"""The demo's variants: the overlay and the steps of each."""
+
+
+def demo_jobs(chart: str, *variants: str) -> Iterator[Job]:
+    """Variants of the demo and the base recipe, at the demo's own size."""
     own = {"data.width": 256, "data.height": 256, "system.evaluation.size": 256}
-    for name, overlay, count in (
-        ("draft", "demo-draft", 255),
-        ("default", "", STEPS),
-        ("best", "demo-best", 3000),
-    ):
-        yield Job(
-            "quality",
-            name,
-            0,
-            own | {"trainer.max_steps": count, "system.evaluation.every": count // 20},
-            overlay,
-        )
-    beginning = {"trainer.max_steps": 160, "system.evaluation.every": 10}
-    yield Job("quality", "best, its beginning", 0, own | beginning, "demo-best")
-    yield Job(
-        "quality", "the paper's recipe", 0, own | {"system.evaluation.every": STEPS // 20} | PAPER
-    )
+    for name in variants:
+        overlay, count = DEMOS[name]
+        yield Job(chart, name, 0, own | {"trainer.max_steps": count}, overlay)
+    yield Job(chart, "the base recipe", 0, own)
+
+
+def quality_jobs() -> Iterator[Job]:
+    """The demo, its draft and its best variant, and what they are compared with."""
+    *_, base = jobs = tuple(demo_jobs("quality", *DEMOS))
+    yield from jobs
+    yield base._replace(variant="the paper's recipe", options=base.options | PAPER)
+
+
+def unseen_jobs() -> Iterator[Job]:
+    """The demo and its draft on objects that nothing was tuned on."""
+    return demo_jobs("unseen", "draft", "default")
 
 
 def failure_jobs() -> Iterator[Job]:
@@ -335,6 +340,9 @@ JOBS: dict[str, Callable[[], Iterator[Job]]] = {
     "quality": quality_jobs,
     "failures": failure_jobs,
     "front_back": front_back_jobs,
+    "unseen": unseen_jobs,
 }
+WITHOUT_OBJECTS = ("unseen",)
+"""Charts whose objects are always given by path."""
 OWN_OBJECTS = {"front_back": ["benchmarks/scenes/ball.ply"]}
 """What a chart is made on, where it isn't the objects that are asked for."""

@@ -4,12 +4,12 @@ and floaters, training and pruning should return to M.
     python -m benchmarks.quality.known_answer                   # M = 200, five seeds
     python -m benchmarks.quality.known_answer --count 1000 --seeds 0
 
-*auto*: a training run of configs/demo.yaml at 128^2 with `budget: auto`, at a quarter of its rates
-and with a shorter memory, from the M true Gaussians, two copies of each a little beside it, and M
-floaters anywhere, against pictures of the truth. *prune*: the prune command with `--psnr 40`, which
-knows nothing but its input: three copies of each in one place, which share its opacity, and M
-floaters too faint to be seen. dB are to the truth, or to the prune command's input, on views that
-were not fitted. Results go to docs/charts/known_answer.csv; runs that it contains are skipped.
+*auto*: a training run of the base recipe (`recipe.py`) at 128^2 with `budget: auto`, a quarter of
+its rates and a shorter memory, from the M true Gaussians, two copies of each a little beside it,
+and M floaters anywhere, against pictures of the truth. *prune*: the prune command with `--psnr
+40`, which knows nothing but its input: three copies of each in one place, which share its opacity,
+and M floaters too faint to be seen. dB are to the truth, or to the prune command's input, on views
+that were not fitted. Results go to docs/charts/known_answer.csv; runs that it contains are skipped.
 """
 
 import argparse
@@ -27,7 +27,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.quality.jobs import RATES
-from benchmarks.quality.runs import ROOT, append_rows, measured_in
+from benchmarks.quality.recipe import recipe
+from benchmarks.quality.runs import append_rows, measured_in
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.cameras import held_out_orbit, to_opencv
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
@@ -199,16 +200,16 @@ class KnownCloud(BaseObject):
 
 
 def auto_config(folder: Path, steps: int) -> dict[str, Any]:
-    """Return the demo's configuration with a known cloud as its ground truth and
+    """Return the recipe with a known cloud as its ground truth and
     ``budget: auto``.
     """
-    cfg = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())
+    cfg = recipe()
     cfg["system"] |= {
         "guidance_type": "known-cloud-guidance",
         "guidance": {"path": str(folder / "true.ply")},
     }
     cfg["system"]["renderer"] = {}  # the ground truth is rendered with the default preset too
-    # the start is nearly right; the demo's rates and long averages would move it away again
+    # the start is nearly right; the recipe's rates and long averages would move it away again
     cfg["system"]["optimizer"]["args"]["betas"] = [0.7, 0.9]
     for name, (first, last) in RATES.items():
         cfg["system"]["geometry"][name] = [0, first / 4, last / 4, steps]

@@ -5,12 +5,13 @@ per chart.
     python -m benchmarks.quality.runs --charts count --seeds 0 1 2  # one chart, fewer seeds
     python -m benchmarks.quality.runs --list                        # print what would run
 
-Each run is `launch.py` with configs/demo.yaml at 128^2 and a few options changed, on one thread. It
-is scored on 24 held-out views, ray-cast from the mesh, that are neither in a bank nor training
-views. Seconds are CPU seconds of training, with targets and without evaluation, so other programs
-hardly affect them. Rows are appended as runs end, seed by seed, and runs in the CSV are skipped, so
-the command can be interrupted. Settings were tuned on the bundled toy only (the draft's steps and
-views on the duck too); other objects are given by path and held back."""
+Each run is `launch.py` with the base recipe (`recipe.py`) at 128^2 and a few options changed, on
+one thread; the charts `quality` and `unseen` take the demo's configurations. It is scored on 24
+held-out views, ray-cast from the mesh, that are neither in a bank nor training views. Seconds are
+CPU seconds of training, with targets and without evaluation, so other programs hardly affect them.
+Rows are appended as runs end, seed by seed, and runs in the CSV are skipped, so the command can be
+interrupted. Settings were tuned on the bundled toy (the demo's start on spot too, the draft's steps
+and views on the duck too); other objects are given by path and held back."""
 
 import argparse
 import csv
@@ -23,17 +24,17 @@ import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any
+from typing import Any, Optional
 
-import yaml
 from tqdm import tqdm
 
-from benchmarks.quality.jobs import JOBS, OWN_OBJECTS, STEPS, Job
+from benchmarks.quality.jobs import JOBS, OWN_OBJECTS, STEPS, WITHOUT_OBJECTS, Job
+from benchmarks.quality.recipe import CONFIGS, RECIPE, recipe
 
 ROOT = Path(__file__).resolve().parents[2]
 CHARTS = ROOT / "docs/charts"
-RENDERER = yaml.safe_load((ROOT / "configs/demo.yaml").read_text())["system"]["renderer"]
-"""The demo's options of the renderer."""
+RENDERER = recipe()["system"]["renderer"]
+"""The recipe's options of the renderer."""
 SIZE, EVERY = 128, 100
 WITH_CURVES = ("time", "batch", "preset")
 MEASURED = ("psnr", "ssim", "multi_face", "floater_mass", "out_of_gamut")
@@ -51,6 +52,7 @@ def main() -> None:
         for seed in arguments.seeds
         for chart in arguments.charts
         for job in JOBS[chart]()
+        if arguments.variants is None or job.variant in arguments.variants
         for mesh in OWN_OBJECTS.get(chart, arguments.objects)
         if (job.variant, f"{job.x:g}", object_name(mesh), str(seed)) not in measured[chart]
     ]
@@ -112,13 +114,17 @@ def measure_missing(
 
 def parse_arguments() -> argparse.Namespace:
     parser = argument_parser(__doc__, seeds=range(5))
-    parser.add_argument("--charts", nargs="+", choices=JOBS, default=list(JOBS))
+    own = [name for name in JOBS if name not in WITHOUT_OBJECTS]
+    parser.add_argument("--charts", nargs="+", choices=JOBS, default=own)
     add_jobs(parser)
+    parser.add_argument("--variants", nargs="+", help="only these; default: all of the charts")
     parser.add_argument("--list", action="store_true", help="only print what would run")
     return parser.parse_args()
 
 
-def run(mesh: str, seed: int, options: dict[str, Any], overlay: str = "") -> dict[str, Any]:
+def run(
+    mesh: str, seed: int, options: dict[str, Any], overlay: Optional[str] = None
+) -> dict[str, Any]:
     """Run one training in a process of its own; return its metrics, with those of the pruned cloud
     if ``system.prune`` is given.
     """
@@ -158,12 +164,13 @@ def train(
     options: dict[str, Any],
     *,
     program: str = "launch.py",
-    overlay: str = "",
+    overlay: Optional[str] = None,
 ) -> Path:
     """Run one training in a process of its own below ``folder``; return the folder of its results.
 
     Args:
-        overlay: name of a file of configs/ that is laid over demo.yaml.
+        overlay: name of a file of configs/ that is laid over demo.yaml; "" for none, None for the
+            recipe.
     """
     common = {
         "use_timestamp": "false", "tag": "run", "seed": seed, "data.width": SIZE,
@@ -175,7 +182,7 @@ def train(
     overrides = [
         f"{key}={value}" for key, value in (common | options | {"exp_root_dir": folder}).items()
     ]
-    configs = [f"--config={ROOT / 'configs' / name}.yaml" for name in ("demo", overlay) if name]
+    configs = [f"--config={path}" for path in configs_of(overlay)]
     command = [sys.executable, str(ROOT / program), *configs, "--train", *overrides]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
     finished = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment)
@@ -185,6 +192,12 @@ def train(
             f"{' '.join(overrides)}\n{finished.stderr[-3000:]}"
         )
     return folder / "demo/run/save"
+
+
+def configs_of(overlay: Optional[str]) -> list[Path]:
+    """Return the configurations of a run; ``overlay`` as in :func:`train`."""
+    over = RECIPE if overlay is None else CONFIGS / f"{overlay}.yaml"
+    return [CONFIGS / "demo.yaml", *([] if overlay == "" else [over])]
 
 
 def curve(job: Job) -> dict[str, Any]:
