@@ -15,7 +15,7 @@ RESULTS = ROOT / "benchmarks/results/step.csv"
 PROBE = Path(__file__).with_name("step_probe.py")
 COLUMNS = ("workload", "checkout", "commit", "round", "part", "cpu_ms")
 WINDOW = (50, 100)
-"""The first and the last step: the demo samples the removal error of its 10,000 Gaussians."""
+"""The first and the last step: the demo samples the removal error and prunes in them."""
 FEW_VIEWS = ("data.train_views=24", "system.evaluation.views=1", "system.evaluation.size=16")
 """What only matters before and after these steps: target images and evaluation."""
 WORKLOADS = {
