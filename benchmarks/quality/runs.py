@@ -94,7 +94,11 @@ def argument_parser(doc: str, seeds: Sequence[int] = (0,)) -> argparse.ArgumentP
 
 def add_jobs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count(), help="runs side by side, one thread each"
+        "--jobs",
+        "--workers",
+        type=int,
+        default=os.cpu_count(),
+        help="runs side by side, one thread each",
     )
 
 
@@ -214,9 +218,9 @@ def measured_in(chart: str, *columns: str) -> set[tuple[str, ...]]:
     return {tuple(row[column] for column in columns) for row in rows_of(chart)}
 
 
-def rows_of(chart: str) -> list[dict[str, str]]:
+def rows_of(chart: str, folder: Path = CHARTS) -> list[dict[str, str]]:
     """Return the rows of a chart's CSV; an empty list if it doesn't exist."""
-    path = CHARTS / f"{chart}.csv"
+    path = folder / f"{chart}.csv"
     if not path.is_file():
         return []
     with open(path, newline="") as file:
@@ -233,9 +237,11 @@ def append(job: Job, mesh: str, seed: int, metrics: dict[str, Any]) -> None:
     append_rows(job.chart, COLUMNS, [scores | place for scores in points.values()])
 
 
-def append_rows(chart: str, columns: list[str], rows: list[dict[str, Any]]) -> None:
+def append_rows(
+    chart: str, columns: list[str], rows: list[dict[str, Any]], folder: Path = CHARTS
+) -> None:
     """Append rows to a chart's CSV, with processor and commit."""
-    path, here = CHARTS / f"{chart}.csv", {"machine": machine(), "commit": commit()}
+    path, here = folder / f"{chart}.csv", {"machine": machine(), "commit": commit()}
     path.parent.mkdir(parents=True, exist_ok=True)
     new = not path.is_file()
     with open(path, "a", newline="") as file:
@@ -261,9 +267,11 @@ def machine() -> str:
 
 
 def commit() -> str:
-    answer = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT
-    )
+    command = ["git", "rev-parse", "--short", "HEAD"]
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    except OSError:  # there is no git
+        return "unknown"
     return answer.stdout.strip() or "unknown"
 
 

@@ -25,7 +25,6 @@ import math
 from abc import ABC, abstractmethod
 from argparse import Namespace
 from functools import lru_cache
-from pathlib import Path
 from typing import ClassVar, NamedTuple, Optional
 
 import numpy as np
@@ -43,7 +42,7 @@ from ..toybox.models import Judge
 from ..toybox.prompt_attributes import attributes_in
 from ..toybox.views import BACKGROUND, SIZE
 from . import t3bench
-from .clip_similarity import Protocol, open_clip, score
+from .clip_similarity import Protocol, open_clip, protocol_for, score
 from .image_reward import ImageReward
 from .results import Pictures, Result
 
@@ -92,7 +91,7 @@ class Clip(Metric):
 
     def __init__(self, args: Namespace) -> None:
         self.clip = shared_clip(args.clip)
-        self.protocol = Protocol(seeds=(0, 1, 2), size=args.size)
+        self.protocol = protocol_for(args.clip, seeds=(0, 1, 2), size=args.size)
 
     def score(self, asset: Asset) -> dict[str, float]:
         scored = score(asset.result, asset.prompt, asset.item, self.clip, self.protocol)
@@ -106,18 +105,18 @@ class Directions(Metric):
     AZIMUTHS = {"front": (-15, 15), "side": (75, 105, -75, -105), "back": (165, -165)}
 
     def __init__(self, args: Namespace) -> None:
-        self.clip, self.size = shared_clip(args.clip), args.size
+        self.clip, self.protocol = shared_clip(args.clip), protocol_for(args.clip, size=args.size)
 
     def score(self, asset: Asset) -> dict[str, float]:
         azimuth = torch.tensor([float(a) for group in self.AZIMUTHS.values() for a in group])
-        ones, protocol = torch.ones_like(azimuth), Protocol()
+        ones, protocol = torch.ones_like(azimuth), self.protocol
         orbit = Orbit(
             protocol.elevation_deg * ones,
             azimuth,
             protocol.radius * ones,
             math.radians(protocol.fovy_deg) * ones,
         )
-        pictures = rendered(asset, orbit, self.size)
+        pictures = rendered(asset, orbit, protocol.size)
         texts = {d.name: d.prompt(asset.prompt) for d in view_directions(45, 45, 60)}
         found = np.stack(
             [self.clip.similarities(pictures, texts[name]) for name in self.AZIMUTHS], axis=1
@@ -206,7 +205,7 @@ def shared_image_reward(folder: str) -> ImageReward:
 @lru_cache(maxsize=1)
 def shared_judge(path: str) -> Judge:
     """Load a judge once for all metrics that use it."""
-    return recognition.load_judge(Path(path).expanduser())
+    return recognition.load_judge(path)
 
 
 def judged(judge: Judge, asset: Asset) -> dict[str, Tensor]:

@@ -34,7 +34,9 @@ from ..core.files import atomic_file, existing_file, json_text, output_folder
 from ..core.options import shown
 from ..core.streams import numpy_generator
 from ..host import get_device
+from ..models.bundled import CLIP, NAME, model_part
 from ..models.clip import PictureText, clip_source
+from ..toybox.views import DISTANCE, FOVY_DEG, SIZE
 from ..training.camera_options import MAX_SIDE
 from .results import Pictures, Result, find_result, read_result
 from .t3bench import require_folder_names, write_t3bench
@@ -78,6 +80,20 @@ class Protocol(NamedTuple):
         )
 
 
+def protocol_for(clip: str, **options: Any) -> Protocol:
+    """Return the paper's protocol; for the toybox's CLIP with the cameras of its training, since
+    the paper's distance makes objects smaller than it has ever seen them.
+
+    Args:
+        clip: as given to :func:`open_clip`.
+        options: replace any of these.
+    """
+    if model_part(clip, CLIP) != clip:
+        cameras = {"radius": sum(DISTANCE) / 2, "fovy_deg": FOVY_DEG, "size": SIZE}
+        options = {**options, **cameras}
+    return Protocol(**options)
+
+
 class Scored(NamedTuple):
     """The scores of one result."""
 
@@ -87,12 +103,12 @@ class Scored(NamedTuple):
 
 
 def open_clip(folder: str) -> PictureText:
-    """Load the CLIP in a local folder in transformers' format.
+    """Load the CLIP in a local folder in transformers' format, or the bundled one.
 
     Raises:
         UserError: there is no such folder, or files are missing.
     """
-    if not Path(folder).expanduser().is_dir():
+    if folder != NAME and not Path(folder).expanduser().is_dir():
         raise UserError(
             f"--clip {folder}: expected a folder, for instance after `hf download "
             "openai/clip-vit-large-patch14 --local-dir clip`"

@@ -27,7 +27,7 @@ from ..core.command import run_command
 from ..core.errors import UserError, unknown
 from ..core.files import atomic_file, json_text, output_folder
 from ..core.options import shown
-from ..toybox.recognition import BUNDLED
+from ..models.bundled import NAME
 from ..training.camera_options import MAX_SIDE
 from .asset_metrics import METRICS, Asset, Metric
 from .image_reward import SOURCES
@@ -49,7 +49,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     add("--against", metavar="FOLDER", help="also score these runs, and print paired differences")
     add("--clip", help="folder of a CLIP in transformers' format, for clip and directions")
     add("--imagereward", help="folder with ImageReward.pt and vocab.txt, for imagereward, quality")
-    add("--judge", default=str(BUNDLED), help="file of a judge, for judge and janus")
+    add("--judge", default=NAME, help="of judge and janus: a file, or toybox, the bundled one")
     add("--size", type=int, default=1024, help="width and height of the pictures for CLIP, pixels")
     add("--output", default="evaluation", help="folder for scorecard.csv and scorecard.json")
     return parser.parse_args(argv)

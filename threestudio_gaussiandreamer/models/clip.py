@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .bundled import CLIP, model_part
 from .extras import require_extra
 from .hub import Source, locate
 from .model_files import (
@@ -46,7 +47,7 @@ def clip_source(
         require_vocabulary(names, "")
         return needed
 
-    return Source(model, picks, option)
+    return Source(model_part(model, CLIP), picks, option)
 
 
 def load_text_encoder(

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Optional
 
 from ..core.errors import UserError
 from ..host import info
+from .bundled import DIFFUSION, model_part
 from .extras import require_extra
 from .families import Family, require_family, require_names
 from .model_files import files_below, needed_files
@@ -74,6 +75,7 @@ def find_model(
     Raises:
         UserError: see :func:`locate`; or the model is of another family.
     """
+    name = model_part(name, DIFFUSION)
     if family is not None:
         require_family(family, Path(name).expanduser())
     # '*/*' skips files outside of the components' folders: some models have a copy of all weights

@@ -4,9 +4,10 @@
 option              meaning
 ==================  ================================================================================
 checkpoint          ``base_40m_textvec.pt`` as OpenAI publishes it, or Cap3D's
-                    ``pointE_finetuned_with_330kdata.pth``
+                    ``pointE_finetuned_with_330kdata.pth``; or ``toybox``, the bundled one
 upsampler           ``upsample_40m.pt``; null: only the coarse points, without upsampling
-clip                OpenAI's CLIP ViT-L/14 in transformers' format, a folder or an id of the hub
+clip                OpenAI's CLIP ViT-L/14 in transformers' format, a folder or an id of the hub; or
+                    ``toybox``
 prompt              replaces the run's prompt for Point-E
 guidance_scale      of the coarse points; 1 = none, 3 in the published sampler. The upsampler isn't
                     guided
@@ -44,6 +45,7 @@ from ..core.files import existing_file
 from ..core.options import in_range, is_numbers, positive, required, satisfies
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
+from ..models.bundled import POINTS, model_part
 from ..models.clip import clip_source, load_text_encoder, load_tokenizer, text_condition
 from ..models.extras import require_extra
 from ..models.hub import Source, locate
@@ -134,7 +136,7 @@ class PointEPrior(Prior):
         Raises:
             UserError: a file is missing; the message says what to do.
         """
-        existing_file(self.cfg.checkpoint, BASE.title)
+        existing_file(self._checkpoint(), BASE.title)
         if self.cfg.upsampler:
             existing_file(self.cfg.upsampler, UPSAMPLER.title)
         require_extra("diffusion", "transformers")
@@ -157,6 +159,9 @@ class PointEPrior(Prior):
             cloud, front=self.cfg.front, scale=self.cfg.scale, normalize=self.cfg.normalize
         )
 
+    def _checkpoint(self) -> str:
+        return model_part(self.cfg.checkpoint, POINTS)
+
     def _clip(self) -> Source:
         return clip_source(self.cfg.clip)
 
@@ -172,7 +177,7 @@ class PointEPrior(Prior):
     def _coarse_points(
         self, condition: Float[Tensor, "1 D"], rng: torch.Generator
     ) -> Float[Tensor, "1 6 N"]:
-        model = kept_network(BASE, self.cfg.checkpoint, condition.device)
+        model = kept_network(BASE, self._checkpoint(), condition.device)
         require_features(model, condition, self.cfg.clip)
         scale = self.cfg.guidance_scale
         # with guidance a second row, the unconditional one

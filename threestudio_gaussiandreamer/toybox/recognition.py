@@ -19,11 +19,11 @@ from torch import Tensor
 
 from ..cameras import Orbit
 from ..core.errors import UserError
+from ..models.bundled import JUDGE, model_part
 from .models import Judge
 from .views import DISTANCE, FOVY_DEG, LABELS
 from .world import Attributes
 
-BUNDLED = Path(__file__).parents[1] / "assets" / "toybox" / "judge.safetensors"
 ELEVATION_DEG = 15.0
 OFFSETS_DEG = (-22.5, 22.5)
 """Azimuths of a quadrant's two views, relative to its middle. They keep away from its borders, at
@@ -32,8 +32,11 @@ OFFSETS_DEG = (-22.5, 22.5)
 ALIKE_FROM_ALL_SIDES = ("mug", "mushroom")
 
 
-def load_judge(path: Path) -> Judge:
+def load_judge(name: str) -> Judge:
     """Load a judge that ``toybox.export`` wrote.
+
+    Args:
+        name: ``toybox``, the folder of an export, or the file.
 
     Raises:
         UserError: there is no such file, or it doesn't hold a judge.
@@ -41,7 +44,7 @@ def load_judge(path: Path) -> Judge:
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    judge = Judge()
+    path, judge = Path(model_part(name, JUDGE)).expanduser(), Judge()
     try:
         weights = load_file(str(path))
         judge.load_state_dict({name: value.float() for name, value in weights.items()})

@@ -1,0 +1,253 @@
+"""Text to 3D with the toybox's models: what guidance scale, schedule, start and view prompts do
+under a learned score.
+
+    python -m benchmarks.quality.toybox                                     # all missing runs
+    python -m benchmarks.quality.toybox --charts default starts --prompts withheld --count 20
+    python -m benchmarks.quality.toybox --variant "wide 0 system.geometry.scale_factor=2"
+    python -m benchmarks.quality.toybox --models FOLDER --jobs 16 --seconds 340 --out DIR
+
+Each run is configs/toybox.yaml with a few options changed, on one thread. The judge sees eight
+views of its result, of its prior's points, of the 2D model's own samples, and of the object itself;
+CPU seconds are those of a whole run without imports and video, in a process that keeps its networks
+loaded. Rows are appended to toybox.csv as runs end, in the order chart, seed, prompt, variant; rows
+in it are skipped. Settings were chosen on "seen" prompts (of combinations that trainings may have
+had); "withheld" ones are of combinations that no training had.
+"""
+
+import argparse
+import contextlib
+import io
+import multiprocessing
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from pathlib import Path
+from typing import Any, NamedTuple, Optional
+
+from tqdm import tqdm
+
+from benchmarks.quality.runs import CHARTS, add_jobs, append_rows, rows_of
+from benchmarks.quality.toybox_jobs import (
+    CHARTS as VARIANTS,
+)
+from benchmarks.quality.toybox_jobs import SAMPLES, TRUTH, Prompt, Variant, options_of, prompts
+
+CHART = "toybox"
+RECOGNIZED = ("kind", "colors", "pattern", "accessory", "multi_face")
+KEY = ("variant", "x", "withheld", "index", "seed")
+COLUMNS = [*KEY, "prompt", "cpu_seconds", "gaussians"]
+COLUMNS += [*RECOGNIZED, "clip", "haze", "faint", *(f"prior_{name}" for name in RECOGNIZED)]
+COLUMNS += ["options", "machine", "commit"]
+QUICK = {
+    "use_timestamp": "false", "name": "toybox", "tag": "run", "system.pages": "false",
+    "data.n_test_views": 1, "data.eval_width": 64, "data.eval_height": 64,
+    "trainer.val_check_interval": 100000, "trainer.enable_progress_bar": "false",
+    "trainer.log_every_n_steps": 100, "system.exporter": "{formats: [ply], save_video: false}",
+}  # fmt: skip
+"""Options that leave out what isn't measured: pages, video and pictures."""
+
+
+ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OMP_WAIT_POLICY": "passive",
+    "CUDA_VISIBLE_DEVICES": "",
+}
+"""Of the processes: one thread, and no GPU, which so small networks can't use."""
+
+
+class Task(NamedTuple):
+    """One run, or one set of pictures."""
+
+    variant: Variant
+    prompt: Prompt
+    seed: int
+    models: str
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        place = (str(int(self.prompt.withheld)), str(self.prompt.index), str(self.seed))
+        return (*self.variant.key, *place)
+
+
+# ---- in the processes ----------------------------------------------------------------------------
+
+
+def prepare() -> None:
+    """Import the package, limit this process to one thread, and keep its networks loaded."""
+    import torch
+
+    from threestudio_gaussiandreamer import register_parts
+    from threestudio_gaussiandreamer.models.loaded import keep_loaded
+
+    torch.set_num_threads(1)
+    register_parts()
+    keep_loaded()
+
+
+def measure(task: Task) -> dict[str, Any]:
+    """Return the row of a task; its messages are shown only if it fails."""
+    messages = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(messages), contextlib.redirect_stderr(messages):
+            return row_of(task, measured(task))
+    except Exception as error:
+        shown = " | ".join(task.key)
+        raise RuntimeError(f"{shown}: {error}\n{messages.getvalue()[-2000:]}") from error
+
+
+def measured(task: Task) -> dict[str, float]:
+    """Make and score the pictures or the run of a task."""
+    from benchmarks.quality import toybox_scores as scores
+
+    text, models, start = task.prompt.text, scores.Models(task.models), time.process_time()
+    if task.variant.name == TRUTH:
+        return scores.truth(task.prompt, models)
+    if task.variant.name == SAMPLES:
+        return scores.of_samples(text, task.variant.x, task.seed, models)
+    with tempfile.TemporaryDirectory() as folder:
+        run(task, Path(folder))
+        seconds = time.process_time() - start
+        found = scores.scores_of_run(Path(folder) / "toybox/run", text, models)
+    return found | {"cpu_seconds": seconds}
+
+
+def run(task: Task, folder: Path) -> None:
+    """Run the launcher in this process."""
+    from threestudio_gaussiandreamer.launch.experiment import main as launch
+
+    options = QUICK | options_of(task.variant, task.prompt.text)
+    options |= {
+        "exp_root_dir": folder,
+        "seed": task.seed,
+        "system.prompt_processor.prompt": task.prompt.text,
+        "system.prompt_processor.cache_dir": folder / "embeddings",
+        "system.guidance.pretrained_model_name_or_path": task.models,
+    }
+    arguments = [f"{key}={value}" for key, value in options.items()]
+    if code := launch(["--config", "toybox.yaml", "--train", "--gpu", "cpu", *arguments]):
+        raise RuntimeError(f"the launcher returned {code}")
+
+
+def row_of(task: Task, found: dict[str, Any]) -> dict[str, Any]:
+    """Return the row of a task."""
+    numbers = {name: f"{value:.4g}" for name, value in found.items()}
+    options = " ".join(f"{key}={value}" for key, value in task.variant.options.items())
+    place = dict(zip(KEY, task.key, strict=True)) | {"prompt": task.prompt.text}
+    return place | numbers | {"options": options.replace("system.", "")}
+
+
+# ---- in the command ------------------------------------------------------------------------------
+
+
+def main() -> None:
+    arguments = parse_arguments()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    done = {tuple(row[name] for name in KEY) for row in rows_of(CHART, arguments.out)}
+    todo = [task for task in unique(tasks(arguments)) if task.key not in done]
+    if arguments.list:
+        print("\n".join(" | ".join((*task.key, task.prompt.text)) for task in todo))
+        return
+    os.environ |= ENVIRONMENT
+    failed = work(todo, arguments)
+    sys.exit(f"{failed} of {len(todo)} failed" if failed else 0)
+
+
+def parse_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    add = parser.add_argument
+    add("--charts", nargs="*", choices=VARIANTS, help="in order of priority (default: all)")
+    add("--variant", action="append", type=variant, default=[], help='"NAME X KEY=VALUE ..."')
+    add("--prompts", nargs="+", choices=("seen", "withheld"), default=["withheld"])
+    add("--count", type=int, default=20, help="of prompts of each sort (default: 20)")
+    add("--seeds", type=int, nargs="+", default=[0])
+    add("--models", default="toybox", help="toybox, or the folder of an export")
+    add("--seconds", type=float, help="stop after this time; runs under way are given up")
+    add("--out", type=Path, default=CHARTS, help="folder of toybox.csv (default: docs/charts)")
+    add("--list", action="store_true", help="only print what would run")
+    add_jobs(parser)
+    arguments = parser.parse_args()
+    if arguments.charts is None:
+        arguments.charts = [] if arguments.variant else list(VARIANTS)
+    return arguments
+
+
+def variant(text: str) -> Variant:
+    """Parse an ad-hoc variant: a name, a number, and options."""
+    name, x, *options = text.split()
+    return Variant(name, float(x), dict(option.split("=", 1) for option in options))
+
+
+def tasks(arguments: argparse.Namespace) -> Iterator[Task]:
+    """Yield all tasks in order of priority."""
+    charts = [list(VARIANTS[name]()) for name in arguments.charts]
+    for variants in (arguments.variant, *charts):
+        for seed in arguments.seeds:
+            for sort in arguments.prompts:
+                for prompt in prompts(sort, arguments.count):
+                    for one in variants:
+                        yield Task(one, prompt, seed, arguments.models)
+
+
+def unique(items: Iterator[Task]) -> list[Task]:
+    """Drop repeated tasks."""
+    found: dict[tuple[str, ...], Task] = {}
+    for task in items:
+        found.setdefault(task.key, task)
+    return list(found.values())
+
+
+def work(todo: list[Task], arguments: argparse.Namespace) -> int:
+    """Measure the tasks side by side and append their rows; return how many failed.
+
+    With ``--seconds`` no run is begun that would take longer than what is left, and what hasn't
+    ended by then is given up.
+    """
+    end = time.monotonic() + (arguments.seconds or float("inf"))
+    queue, running, durations, failed = iter(todo), {}, [0.0], 0
+    spawn = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(arguments.jobs, mp_context=spawn, initializer=prepare)
+    bar = tqdm(total=len(todo), unit="run", disable=None)
+    try:
+        while True:
+            for task in startable(queue, arguments.jobs - len(running), durations, end):
+                running[pool.submit(measure, task)] = task, time.monotonic()
+            if not running:
+                return failed
+            left = max(end - time.monotonic(), 0.0) if arguments.seconds else None
+            for future in wait(running, left, FIRST_COMPLETED).done:
+                task, began = running.pop(future)
+                durations.append(time.monotonic() - began)
+                failed += not noted(future, arguments.out)
+                bar.update()
+            if time.monotonic() >= end:
+                return failed
+    finally:
+        if running:  # given up, or an error
+            for process in multiprocessing.active_children():
+                process.terminate()
+        pool.shutdown(cancel_futures=True)
+
+
+def startable(queue: Iterator[Task], free: int, durations: list[float], end: float) -> list[Task]:
+    """Take at most ``free`` tasks, unless there isn't the time for a run of median length."""
+    if time.monotonic() + statistics.median(durations) > end:
+        return []
+    return [task for _, task in zip(range(free), queue, strict=False)]
+
+
+def noted(done: Future, out: Path) -> Optional[bool]:
+    """Append the row of a task that has ended; return whether it succeeded."""
+    if error := done.exception():
+        tqdm.write(str(error), file=sys.stderr)
+        return False
+    append_rows(CHART, COLUMNS, [done.result()], out)
+    return True
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,222 @@
+"""The runs that benchmarks/quality/toybox.py measures: variants of configs/toybox.yaml, and the
+prompts for them.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import yaml
+
+from benchmarks.quality.runs import ROOT
+from threestudio_gaussiandreamer.core.streams import numpy_generator
+from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
+from threestudio_gaussiandreamer.toybox.words import describe
+from threestudio_gaussiandreamer.toybox.world import KINDS, draw_attributes
+
+CONFIG = yaml.safe_load((ROOT / "configs/toybox.yaml").read_text())
+STEPS = CONFIG["trainer"]["max_steps"]
+GUIDANCE = CONFIG["system"]["guidance"]["guidance_scale"]
+DEFAULT = "toybox.yaml"
+SAMPLES, TRUTH = "the 2D model's samples", "ground truth"
+"""Variants without a run: what the 2D model draws, and ray-cast views of the object itself."""
+PROMPT_SEED = 5000
+"""Of the attributes and words of prompts; trainings use others."""
+PAPER_SCALE = 101.0
+"""threestudio's 100."""
+PAPER_RATES = {
+    "system.geometry.lr_means": 5e-5,
+    "system.geometry.lr_scales": 1e-3,
+    "system.geometry.lr_quats": 1e-2,
+    "system.geometry.lr_opacities": 1e-2,
+    "system.geometry.lr_sh": 1.25e-2,
+}
+PAPER = PAPER_RATES | {
+    "trainer.max_steps": 1200,
+    "system.guidance.max_step_percent": "[500,0.98,0.55,501]",
+    "system.guidance.guidance_scale": PAPER_SCALE,
+    "system.geometry.init_opacity": 0.1,
+    "system.geometry.grow.radius": 0.01,
+    "system.renderer.eps2d": 0.3,
+    "system.geometry.bound_colors": "false",
+}
+"""The numbers of gaussiandreamer.yaml, at the toybox's size and cameras."""
+BALL = {
+    "system.geometry.prior_type": "random-prior",
+    "system.geometry.prior": "{num_points: 3000, size: 0.8, color: grey}",
+    "system.geometry.grow.enabled": "false",
+}
+WITHOUT_VIEWS = {"system.guidance.view_dependent_prompting": "false"}
+WRONG_PRIOR = "another kind's prior"
+"""A variant whose prior gets the prompt with the next kind of object in place of its own."""
+
+
+class Variant(NamedTuple):
+    """One kind of run."""
+
+    name: str
+    x: float = 0.0
+    """The number that a chart varies; 0 if it varies none."""
+    options: dict[str, Any] = {}
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return self.name, f"{self.x:g}"
+
+
+class Prompt(NamedTuple):
+    text: str
+    index: int
+    withheld: bool
+
+
+def steps(count: int) -> dict[str, Any]:
+    """Return the options of a run of ``count`` steps, with its schedules in proportion."""
+    geometry, guidance = CONFIG["system"]["geometry"], CONFIG["system"]["guidance"]
+    rates = {
+        f"system.geometry.{name}": [*value[:3], count]
+        for name, value in geometry.items()
+        if name.startswith("lr_") and isinstance(value, list)
+    }
+    start, high, low, _ = guidance["max_step_percent"]
+    falls = start * count // STEPS
+    return rates | {
+        "trainer.max_steps": count,
+        "system.guidance.max_step_percent": [falls, high, low, falls + 1],
+    }
+
+
+def references() -> Iterator[Variant]:
+    """The judge's ceiling, and the 2D model's own samples over its guidance scale."""
+    yield Variant(TRUTH)
+    for scale in (1, 2, 4, GUIDANCE):
+        yield Variant(SAMPLES, scale)
+
+
+def default() -> Iterator[Variant]:
+    yield Variant(DEFAULT)
+
+
+def over_steps() -> Iterator[Variant]:
+    for count in (150, 300, 600, 1200):
+        yield Variant("steps", count, steps(count))
+
+
+def over_guidance() -> Iterator[Variant]:
+    """Scales of guidance, 1 without guidance and the last that of the paper."""
+    for scale in (1, 2, 4, 7.5, 15, 30, PAPER_SCALE):
+        yield Variant("guidance scale", scale, {"system.guidance.guidance_scale": scale})
+
+
+def schedules() -> Iterator[Variant]:
+    """Ranges of timesteps, and clipping."""
+    constant = {"system.guidance.max_step_percent": 0.98}
+    yield Variant("timesteps up to 0.98 throughout", 0, constant)
+    low = {"system.guidance.max_step_percent": CONFIG["system"]["guidance"]["max_step_percent"]}
+    yield Variant("timesteps from 0.2", 0, low | {"system.guidance.min_step_percent": 0.2})
+    falling = {
+        "system.guidance.timestep_schedule": "sqrt",
+        "system.guidance.timestep_steps": STEPS,
+        **constant,
+    }
+    yield Variant("timesteps that fall by the root of the step", 0, falling)
+    for clip in (0.1, 0.5):
+        yield Variant("grad_clip", clip, {"system.guidance.grad_clip": clip})
+    rescaled = {"system.guidance.recon_std_rescale": 0.5}
+    yield Variant("recon_std_rescale 0.5", 0, rescaled)
+
+
+def starts() -> Iterator[Variant]:
+    """What the second stage starts from, with and without the views' directions in the prompts."""
+    yield Variant("prior, no view prompts", 0, WITHOUT_VIEWS)
+    yield Variant(WRONG_PRIOR)
+    yield Variant("grey ball", 0, BALL)
+    yield Variant("grey ball, no view prompts", 0, BALL | WITHOUT_VIEWS)
+
+
+def growing() -> Iterator[Variant]:
+    """Algorithm 1 of the paper in parts."""
+    yield Variant("no growing", 0, {"system.geometry.grow.enabled": "false"})
+    yield Variant("no perturbation", 0, {"system.geometry.grow.color_range": "[0.0,0.0]"})
+    for radius in (0.005, 0.04):
+        yield Variant("growing radius", radius, {"system.geometry.grow.radius": radius})
+
+
+def counts() -> Iterator[Variant]:
+    """Numbers of Gaussians, of which a third comes from the prior and the others from growing."""
+    for count in (1000, 2000, 4000, 8000):
+        numbers = {
+            "system.geometry.prior.num_points": count // 3,
+            "system.geometry.grow.max_points": count - count // 3,
+            "system.geometry.grow.num_candidates": 400_000,
+            "system.geometry.max_gaussians": count,
+        }
+        yield Variant("Gaussians", count, numbers)
+
+
+def haze() -> Iterator[Variant]:
+    """Ways against faint Gaussians around the object."""
+    yield Variant("random backgrounds", 0, {"system.background.mode": "random"})
+    for weight in (1, 5, 20):
+        yield Variant("sparsity", weight, {"system.loss.lambda_sparsity": weight})
+    yield Variant("opaque", 1, {"system.loss.lambda_opaque": 1.0})
+
+
+def rates() -> Iterator[Variant]:
+    """All learning rates times a factor."""
+    geometry = CONFIG["system"]["geometry"]
+    for factor in (0.3, 3):
+        changed = {
+            f"system.geometry.{name}": [value[0], factor * value[1], factor * value[2], value[3]]
+            for name, value in geometry.items()
+            if name.startswith("lr_") and isinstance(value, list)
+        }
+        yield Variant("learning rates", factor, changed)
+
+
+def paper() -> Iterator[Variant]:
+    yield Variant("the paper's recipe", 0, PAPER)
+
+
+CHARTS: dict[str, Callable[[], Iterator[Variant]]] = {
+    "references": references,
+    "default": default,
+    "guidance": over_guidance,
+    "haze": haze,
+    "rates": rates,
+    "schedules": schedules,
+    "starts": starts,
+    "steps": over_steps,
+    "growing": growing,
+    "counts": counts,
+    "paper": paper,
+}
+
+
+def prompts(sort: str, count: int) -> list[Prompt]:
+    """Write prompts for objects that no training saw.
+
+    Args:
+        sort: "withheld": combinations of attributes that all trainings leave out; "seen": others,
+            on which settings are chosen.
+    """
+    held_out = sort == "withheld"
+    found: list[Prompt] = []
+    for index in range(count):
+        attributes = draw_attributes(PROMPT_SEED, index, held_out=held_out)
+        rng = numpy_generator(PROMPT_SEED, "benchmark-prompt", int(held_out), index)
+        found.append(Prompt(describe(attributes, rng), index, held_out))
+    return found
+
+
+def options_of(variant: Variant, prompt: str) -> dict[str, Any]:
+    """Return the options of a variant's run for a prompt."""
+    if variant.name != WRONG_PRIOR:
+        return variant.options
+    return variant.options | {"system.geometry.prior.prompt": of_another_kind(prompt)}
+
+
+def of_another_kind(prompt: str) -> str:
+    """Describe a plain object of the same colour and of the kind that follows in KINDS."""
+    wanted, kinds = attributes_in(prompt), list(KINDS)
+    kind = kinds[(kinds.index(wanted.kind) + 1) % len(kinds)]
+    return f"a {wanted.color} {kind}"
