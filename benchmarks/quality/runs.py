@@ -218,9 +218,11 @@ def measured_in(chart: str, *columns: str) -> set[tuple[str, ...]]:
     return {tuple(row[column] for column in columns) for row in rows_of(chart)}
 
 
-def rows_of(chart: str, folder: Path = CHARTS) -> list[dict[str, str]]:
-    """Return the rows of a chart's CSV; an empty list if it doesn't exist."""
-    path = folder / f"{chart}.csv"
+def rows_of(chart: str, folder: Optional[Path] = None) -> list[dict[str, str]]:
+    """Return the rows of a chart's CSV, in docs/charts or another folder; an empty list if it
+    doesn't exist.
+    """
+    path = (folder or CHARTS) / f"{chart}.csv"
     if not path.is_file():
         return []
     with open(path, newline="") as file:
@@ -238,10 +240,10 @@ def append(job: Job, mesh: str, seed: int, metrics: dict[str, Any]) -> None:
 
 
 def append_rows(
-    chart: str, columns: list[str], rows: list[dict[str, Any]], folder: Path = CHARTS
+    chart: str, columns: list[str], rows: list[dict[str, Any]], folder: Optional[Path] = None
 ) -> None:
     """Append rows to a chart's CSV, with processor and commit."""
-    path, here = folder / f"{chart}.csv", {"machine": machine(), "commit": commit()}
+    path, here = (folder or CHARTS) / f"{chart}.csv", {"machine": machine(), "commit": commit()}
     path.parent.mkdir(parents=True, exist_ok=True)
     new = not path.is_file()
     with open(path, "a", newline="") as file:

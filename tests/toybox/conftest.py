@@ -4,6 +4,7 @@ import pytest
 
 from tests.toybox.helpers import training
 from threestudio_gaussiandreamer.toybox import loop, models, views
+from threestudio_gaussiandreamer.toybox.export import main as export
 
 
 @pytest.fixture(scope="module")
@@ -30,3 +31,18 @@ def folder(tmp_path_factory, small_world):
     for name in ("text", "clip", "autoencoder"):
         training(folder, name).run(8)
     return folder
+
+
+@pytest.fixture(scope="module")
+def trained(folder):
+    """A folder in which every stage is trained for a step."""
+    for name in ("unet", "points", "judge"):
+        training(folder, name).run(4)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def exported(trained, tmp_path_factory):
+    target = tmp_path_factory.mktemp("models")
+    assert export([str(trained), str(target)]) == 0
+    return target

@@ -13,6 +13,7 @@ from tests.toybox.helpers import options, training
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.guidance import stable_diffusion  # noqa: F401
 from threestudio_gaussiandreamer.host import find
+from threestudio_gaussiandreamer.models.bundled import digest_of, read_digests
 from threestudio_gaussiandreamer.models.clip import PictureText, clip_source
 from threestudio_gaussiandreamer.priors.point_e import PointEPrior
 from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
@@ -27,21 +28,6 @@ HALF = {"rtol": 2e-3, "atol": 2e-3}
 """Float16 keeps eleven bits."""
 
 pytestmark = pytest.mark.usefixtures("small_world")
-
-
-@pytest.fixture(scope="module")
-def trained(folder):
-    """A folder in which every stage is trained for a step."""
-    for name in ("unet", "points", "judge"):
-        training(folder, name).run(4)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def exported(trained, tmp_path_factory):
-    target = tmp_path_factory.mktemp("models")
-    assert main([str(trained), str(target)]) == 0
-    return target
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +112,12 @@ def test_the_record_lists_what_was_tested(exported):
     record = json.loads((exported / "training.json").read_text())
     assert set(record) == set(export.STAGES)
     assert record["clip"]["images"] == 8 and record["unet"]["steps"] == 1
+
+
+def test_digests_of_all_files_are_written(exported):
+    digests = read_digests(exported)
+    assert {"points.pt", "clip/model.safetensors", "training.json"} < set(digests)
+    assert all(digest_of(exported / name) == digest for name, digest in digests.items())
 
 
 def test_a_training_continues_from_the_weights(exported, trained, tmp_path):

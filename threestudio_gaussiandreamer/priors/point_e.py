@@ -45,6 +45,7 @@ from ..core.files import existing_file
 from ..core.options import in_range, is_numbers, positive, required, satisfies
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
+from ..models.bundled import NAME as BUNDLED
 from ..models.bundled import POINTS, model_part
 from ..models.clip import clip_source, load_text_encoder, load_tokenizer, text_condition
 from ..models.extras import require_extra
@@ -136,7 +137,7 @@ class PointEPrior(Prior):
         Raises:
             UserError: a file is missing; the message says what to do.
         """
-        existing_file(self._checkpoint(), BASE.title)
+        existing_file(self._checkpoint(), BASE.title, (BUNDLED,))
         if self.cfg.upsampler:
             existing_file(self.cfg.upsampler, UPSAMPLER.title)
         require_extra("diffusion", "transformers")

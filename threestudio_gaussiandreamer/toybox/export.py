@@ -8,6 +8,7 @@ clip/                 transformers' CLIPModel and tokenizer: both towers
 points.pt             Point-E's base checkpoint
 judge.safetensors     the judge, which has no published format
 training.json         what each network has seen: images, hours, numbers on withheld objects
+SHA256SUMS            digests of all other files
 ====================  ==========================================================================
 """
 
@@ -27,6 +28,7 @@ from ..core.checkpoint_file import load_file
 from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.files import atomic_file, output_folder
+from ..models.bundled import write_digests
 from . import models
 from .clip_stage import trained_clip
 from .loop import averaged_weights, checkpoint_path
@@ -58,6 +60,7 @@ def export(training: Path, target: Path) -> dict[str, Any]:
     record = training_record(training)
     with atomic_file(target / "training.json") as file:
         file.write(json.dumps(record, indent=2).encode())
+    write_digests(target)
     return record
 
 

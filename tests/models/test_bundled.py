@@ -1,0 +1,54 @@
+"""The name of the bundled models, and messages for files that are missing or damaged."""
+
+import pytest
+
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.models import bundled
+from threestudio_gaussiandreamer.models.bundled import CLIP, DIFFUSION, POINTS, model_part
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The layout of an export, in the place of the bundled one."""
+    for name in ("stable-diffusion/unet/weights", "clip/weights", "points.pt", "training.json"):
+        path = tmp_path / "bundle" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(name)
+    bundled.write_digests(tmp_path / "bundle")
+    monkeypatch.setattr(bundled, "FOLDER", tmp_path / "bundle")
+    return tmp_path / "bundle"
+
+
+@pytest.mark.parametrize("part", [DIFFUSION, CLIP, POINTS])
+def test_the_name_and_the_folder_of_an_export_stand_for_their_parts(folder, part):
+    assert model_part("toybox", part) == model_part(str(folder), part) == str(folder / part)
+
+
+def test_other_names_are_unchanged(folder):
+    others = ("owner/model", "", "x" * 5000, "a\0b", str(folder / "clip"), str(folder.parent))
+    assert all(model_part(name, CLIP) == name for name in others)
+
+
+def test_the_list_of_digests_is_that_of_sha256sum(folder):
+    line = (folder / "SHA256SUMS").read_text().splitlines()[1]
+    assert line.endswith("  points.pt") and len(line.split()[0]) == 64
+    assert "training.json" in (folder / "SHA256SUMS").read_text()
+
+
+def test_a_damaged_file_is_named_with_how_to_install_it_again(folder):
+    (folder / "stable-diffusion/unet/weights").write_text("other")
+    with pytest.raises(UserError, match="unet/weights' is damaged: install.*git checkout"):
+        model_part("toybox", DIFFUSION)
+    assert model_part("toybox", CLIP)  # the other parts can be used
+
+
+def test_a_missing_file_is_named(folder):
+    (folder / "points.pt").unlink()
+    with pytest.raises(UserError, match="points.pt': No such file.*install the package again"):
+        model_part("toybox", POINTS)
+
+
+def test_missing_models_are_named(folder, monkeypatch):
+    monkeypatch.setattr(bundled, "FOLDER", folder / "nowhere")
+    with pytest.raises(UserError, match="nowhere/clip' is missing: install the package again"):
+        model_part("toybox", CLIP)

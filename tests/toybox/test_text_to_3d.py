@@ -1,0 +1,110 @@
+"""From a prompt to a measured cloud with learned models, tiny ones here: configs/toybox.yaml, the
+scorecard of its runs, and wrong input.
+"""
+
+import csv
+import json
+
+import pytest
+import yaml
+
+from tests.training.runs import CONFIGS
+from threestudio_gaussiandreamer.evaluation.scorecard import main as evaluate
+from threestudio_gaussiandreamer.launch.experiment import main as launch
+from threestudio_gaussiandreamer.toybox import views
+
+PROMPT = "a red fox with a green scarf"
+QUICK = [
+    "trainer.max_steps=2", "trainer.enable_progress_bar=false", "system.geometry.prior.num_steps=2",
+    "system.geometry.prior.num_points=40", "data.n_test_views=1", "data.eval_width=32",
+    "data.eval_height=32", "use_timestamp=false", "tag=t",
+]  # fmt: skip
+
+pytestmark = pytest.mark.usefixtures("small_world")
+
+
+def run(exported, folder, prompt, *options):
+    overrides = [
+        f"exp_root_dir={folder}",
+        f"system.prompt_processor.prompt={prompt}",
+        f"system.prompt_processor.cache_dir={folder}/cache",
+        f"system.guidance.pretrained_model_name_or_path={exported}",
+        *QUICK,
+        *options,
+    ]
+    return launch(["--config", str(CONFIGS / "toybox.yaml"), "--train", "--gpu", "cpu", *overrides])
+
+
+@pytest.fixture(scope="module")
+def finished(exported, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    assert run(exported, folder, PROMPT) == 0
+    return folder
+
+
+def test_cameras_and_background_are_those_of_the_training():
+    cfg = yaml.safe_load((CONFIGS / "toybox.yaml").read_text())
+    data, low, high = cfg["data"], *views.DISTANCE
+    assert data["camera_distance_range"] == [low, high]
+    assert data["elevation_range"] == list(views.ELEVATION)
+    assert data["fovy_range"] == [views.FOVY_DEG] * 2 and data["width"] == views.SIZE
+    assert cfg["system"]["background"]["color"] == list(views.BACKGROUND)
+    assert data["eval_camera_distance"] == pytest.approx((low + high) / 2)
+
+
+def test_a_prompt_becomes_a_cloud_and_its_pages(finished):
+    save = finished / "toybox/t/save"
+    names = {path.name for path in save.glob("it2-export/*")}
+    assert {"gaussians.ply", "gaussians.spz", "points.ply", "view.html"} <= names
+    assert (save / "prior/points.npz").is_file()
+
+
+def test_finished_runs_are_scored_with_the_models_of_one_folder(finished, exported, tmp_path):
+    models = ["--judge", str(exported), "--clip", str(exported)]
+    arguments = ["--metrics", "judge,janus,clip,directions", "--output", str(tmp_path)]
+    assert evaluate([str(finished), *arguments, *models]) == 0
+    with open(tmp_path / "scorecard.csv", newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert row["kind"] in ("0.0", "1.0") and 0 <= float(row["multi_face"]) <= 1
+    content = json.loads((tmp_path / "scorecard.json").read_text())
+    assert -100 <= content["clip"]["mean"]["mean"] <= 100
+
+
+@pytest.mark.parametrize(
+    ("prompt", "warned"),
+    [
+        ("a red fox with a skarf", "'skarf' (near: scarf)"),
+        ("zzz qqq", "'zzz', 'qqq'"),
+        ("ein roter Fuchs 狐狸 🦊", "'狐狸'"),
+        ("a red fox " * 400, None),
+    ],
+    ids=["misspelt", "unknown words only", "other scripts", "4 kB"],
+)
+def test_any_text_is_a_prompt(exported, tmp_path, capsys, prompt, warned):
+    assert run(exported, tmp_path, prompt, "trainer.max_steps=1", "system.pages=false") == 0
+    errors = capsys.readouterr().err
+    assert warned in errors if warned else "wasn't trained on" not in errors
+
+
+def test_an_empty_prompt_is_requested(exported, tmp_path, capsys):
+    assert run(exported, tmp_path, "") == 2
+    assert "no prompt: give one" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("system.guidance.guidance_scale=1e9", "guidance_scale"),
+        ("system.guidance.image_size=100", "a multiple of 8"),
+        (
+            "system.guidance.pretrained_model_name_or_path=toy-box",
+            "did you mean the bundled 'toybox'?",
+        ),
+    ],
+)
+def test_what_the_models_can_not_do_is_named_before_any_work(
+    exported, tmp_path, capsys, option, message
+):
+    assert run(exported, tmp_path, PROMPT, option) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "toybox").exists()
