@@ -8,10 +8,14 @@ PYTEST  = $(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --d
 # without the CPU kernel (no C++ compiler) plain torch renders, and the demo is smaller
 SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import available_backends as b; print("--config configs/demo-small.yaml" if b()["cpu"] else "")')
 
-.PHONY: demo test test-slow test-all test-farm docs stability fuzz long-run ablations bench gpu-check train-toybox toybox-sheet charts measure-charts clean
+.PHONY: demo demo-text test test-slow test-all test-farm docs stability fuzz long-run ablations bench gpu-check train-toybox toybox-sheet charts measure-charts measure-toybox clean
 
 demo: $(VENV)/ready                ## train the bundled toy from a coarse prior, offline, on the CPU
 	$(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
+
+PROMPT =
+demo-text: $(VENV)/ready-for-models ## text to 3D with the bundled models, offline, on the CPU; make demo-text PROMPT="a red fox with a green scarf"
+	$(BIN)/python -m threestudio_gaussiandreamer.toybox.demo $(if $(PROMPT),"$(PROMPT)")
 
 test: $(VENV)/ready-for-tests      ## every test that isn't slow, one worker per core
 	$(PYTEST) -m "not slow"
@@ -58,6 +62,7 @@ charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbe
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting --from-csv
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.chart_runs
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.attributes --objects
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.toybox_tables
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.mesh --objects
 
 # the meshes to measure on: make measure-charts OBJECTS="toy.glb path/to/spot.glb path/to/duck.glb"
@@ -74,6 +79,9 @@ measure-charts: $(VENV)/ready-for-charts     ## repeat the measurements, about t
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.known_answer
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.known_answer --count 1000
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.bench_prune
+
+measure-toybox: $(VENV)/ready-for-models     ## text to 3D with the bundled models over their settings; runs that are in the CSV are skipped
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.toybox --seeds 0 1 2 3 4
 
 # installed once; again when what is installed changes
 PACKAGE = pyproject.toml setup.py constraints.txt $(wildcard threestudio_gaussiandreamer/splatting/cpu/*.h threestudio_gaussiandreamer/splatting/cpu/*.cpp threestudio_gaussiandreamer/splatting/shared/*.h)

@@ -14,6 +14,7 @@ from benchmarks.models import memory
 from benchmarks.quality import failure_table, formats, variant_tables
 from benchmarks.quality import mesh as mesh_quality
 from benchmarks.quality import tables as quality
+from benchmarks.quality import toybox_tables as toybox
 from benchmarks.quality.runs import ROOT
 from benchmarks.quality.tables import DIFFERENCES, difference_row, last_rows, medians, named
 from benchmarks.robustness import ddp
@@ -92,6 +93,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "speed": viewers.page_speed,
         "live": viewers.live_view,
     },
+    "docs/toybox.md": {"models": toybox.card, "toybox": toybox.results},
     "docs/several_processes.md": {"ddp": ddp.table},
     "docs/scale.md": {
         "units": scale.unit_costs,

@@ -24,9 +24,9 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from pathlib import Path
-from typing import Any, NamedTuple, Optional
+from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
@@ -104,15 +104,15 @@ def measured(task: Task) -> dict[str, float]:
     """Make and score the pictures or the run of a task."""
     from benchmarks.quality import toybox_scores as scores
 
-    text, models, start = task.prompt.text, scores.Models(task.models), time.process_time()
+    text, start = task.prompt.text, time.process_time()
     if task.variant.name == TRUTH:
-        return scores.truth(task.prompt, models)
+        return scores.of_truth(task.prompt, task.models)
     if task.variant.name == SAMPLES:
-        return scores.of_samples(text, task.variant.x, task.seed, models)
+        return scores.of_samples(text, task.variant.x, task.seed, task.models)
     with tempfile.TemporaryDirectory() as folder:
         run(task, Path(folder))
         seconds = time.process_time() - start
-        found = scores.scores_of_run(Path(folder) / "toybox/run", text, models)
+        found = scores.of_run(Path(folder) / "toybox/run", text, task.models)
     return found | {"cpu_seconds": seconds}
 
 
@@ -153,7 +153,9 @@ def main() -> None:
         print("\n".join(" | ".join((*task.key, task.prompt.text)) for task in todo))
         return
     os.environ |= ENVIRONMENT
-    failed = work(todo, arguments)
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(arguments.jobs, mp_context=spawn, initializer=prepare) as pool:
+        failed = work(todo, arguments, pool)
     sys.exit(f"{failed} of {len(todo)} failed" if failed else 0)
 
 
@@ -201,22 +203,20 @@ def unique(items: Iterator[Task]) -> list[Task]:
     return list(found.values())
 
 
-def work(todo: list[Task], arguments: argparse.Namespace) -> int:
+def work(todo: list[Task], arguments: argparse.Namespace, pool: Executor) -> int:
     """Measure the tasks side by side and append their rows; return how many failed.
 
-    With ``--seconds`` no run is begun that would take longer than what is left, and what hasn't
-    ended by then is given up.
+    With ``--seconds`` no run is begun that would take longer than what is left, and the processes
+    of those that haven't ended by then are ended.
     """
     end = time.monotonic() + (arguments.seconds or float("inf"))
     queue, running, durations, failed = iter(todo), {}, [0.0], 0
-    spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(arguments.jobs, mp_context=spawn, initializer=prepare)
     bar = tqdm(total=len(todo), unit="run", disable=None)
     try:
         while True:
             for task in startable(queue, arguments.jobs - len(running), durations, end):
                 running[pool.submit(measure, task)] = task, time.monotonic()
-            if not running:
+            if not running or time.monotonic() >= end:
                 return failed
             left = max(end - time.monotonic(), 0.0) if arguments.seconds else None
             for future in wait(running, left, FIRST_COMPLETED).done:
@@ -224,13 +224,10 @@ def work(todo: list[Task], arguments: argparse.Namespace) -> int:
                 durations.append(time.monotonic() - began)
                 failed += not noted(future, arguments.out)
                 bar.update()
-            if time.monotonic() >= end:
-                return failed
     finally:
         if running:  # given up, or an error
             for process in multiprocessing.active_children():
                 process.terminate()
-        pool.shutdown(cancel_futures=True)
 
 
 def startable(queue: Iterator[Task], free: int, durations: list[float], end: float) -> list[Task]:
@@ -240,13 +237,13 @@ def startable(queue: Iterator[Task], free: int, durations: list[float], end: flo
     return [task for _, task in zip(range(free), queue, strict=False)]
 
 
-def noted(done: Future, out: Path) -> Optional[bool]:
+def noted(done: Future, out: Path) -> bool:
     """Append the row of a task that has ended; return whether it succeeded."""
     if error := done.exception():
         tqdm.write(str(error), file=sys.stderr)
-        return False
-    append_rows(CHART, COLUMNS, [done.result()], out)
-    return True
+    else:
+        append_rows(CHART, COLUMNS, [done.result()], out)
+    return error is None
 
 
 if __name__ == "__main__":

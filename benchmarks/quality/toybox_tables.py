@@ -1,0 +1,206 @@
+"""The tables of docs/toybox.md and its charts, from docs/charts/toybox.csv and the bundled models'
+record of their training.
+
+    python -m benchmarks.quality.toybox_tables      # draws docs/charts/toybox_*.png
+
+Values are means over prompts with bootstrap intervals; several seeds of a prompt count as one.
+Pattern and accessory are those of prompts that ask for one, since a plain object is easily right.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.markdown import markdown
+from benchmarks.quality.runs import CHARTS, rows_of
+from threestudio_gaussiandreamer.evaluation.intervals import Estimate, bootstrap, per_prompt
+from threestudio_gaussiandreamer.models.bundled import FOLDER, RECORD
+from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
+
+CHART = "toybox"
+DEFAULT, SAMPLES, TRUTH = "toybox.yaml", "the 2D model's samples", "ground truth"
+RECOGNIZED = ("kind", "colors", "pattern", "accessory", "multi_face")
+TITLES = {"colors": "colours", "multi_face": "multi-face"}
+NOT_MEASURED = "*Not measured yet: it needs trained models.*"
+Row = dict[str, str]
+
+
+class Line(NamedTuple):
+    """A chart of results against a number that runs vary."""
+
+    variant: str
+    x_column: str
+    x_label: str
+    star: str = ""
+    """The value of ``x`` that is the paper's."""
+
+
+LINES = {
+    "toybox_guidance": Line("guidance scale", "x", "guidance scale (star: the paper's)", "101"),
+    "toybox_steps": Line("steps", "cpu_seconds", "CPU seconds of a run, one thread"),
+}
+
+
+# ---- numbers -------------------------------------------------------------------------------------
+
+
+def asks_for(prompt: str, name: str) -> bool:
+    """Return whether a prompt has what a column is about."""
+    wanted = attributes_in(prompt)
+    has = {"pattern": wanted.pattern != "plain", "accessory": wanted.part or wanted.accessory}
+    return bool(has.get(name, True))
+
+
+def estimate(rows: Iterable[Row], name: str, prefix: str = "") -> Estimate:
+    """Return the mean over prompts of a column, and its interval."""
+    chosen = [row for row in rows if row[prefix + name] and asks_for(row["prompt"], name)]
+    values = np.array([float(row[prefix + name]) for row in chosen])
+    means = per_prompt([row["prompt"] for row in chosen], values)
+    return bootstrap(np.array(list(means.values()), float))
+
+
+def percent(found: Estimate) -> str:
+    """Return a share with its interval; empty where there are no values."""
+    if math.isnan(found.mean):
+        return ""
+    low, middle, high = (f"{100 * value:.0f}" for value in (found.low, found.mean, found.high))
+    return f"{middle} ({low} – {high})"
+
+
+def median_of(rows: Sequence[Row], name: str, digits: int = 0) -> str:
+    values = [float(row[name]) for row in rows if row[name]]
+    return f"{np.median(values):.{digits}f}" if values else ""
+
+
+def measured() -> list[Row]:
+    """Return the rows of withheld prompts."""
+    return [row for row in rows_of(CHART) if row["withheld"] == "1"]
+
+
+def variants(rows: Iterable[Row]) -> Iterator[tuple[str, list[Row]]]:
+    """Yield name and rows of each variant, in the order of their measurement."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        name = row["variant"] if row["x"] == "0" else f"{row['variant']} {row['x']}"
+        groups.setdefault(name, []).append(row)
+    yield from groups.items()
+
+
+# ---- tables --------------------------------------------------------------------------------------
+
+
+def results() -> str:
+    """Return the table of all variants, with the prior's points below toybox.yaml."""
+    rows = measured()
+    if not rows:
+        return NOT_MEASURED
+    lines = []
+    for name, same in variants(rows):
+        lines.append(line_of(name, same))
+        if name == DEFAULT:
+            lines.append(line_of("its prior's points", same, "prior_"))
+    titles = [f"{TITLES.get(name, name)}, %" for name in RECOGNIZED]
+    return markdown(("variant", "prompts", *titles, "haze, %", "Gaussians", "CPU seconds"), lines)
+
+
+def line_of(name: str, rows: list[Row], prefix: str = "") -> list[str]:
+    prompts = len({row["prompt"] for row in rows})
+    cells = [percent(estimate(rows, column, prefix)) for column in RECOGNIZED]
+    others = ["", "", ""]
+    if not prefix:
+        haze = [f"{100 * float(row['haze']):.1f}" for row in rows if row["haze"]]
+        others[0] = f"{np.median(np.array(haze, float)):.1f}" if haze else ""
+        others[1:] = [median_of(rows, "gaussians"), median_of(rows, "cpu_seconds")]
+    return [name, str(prompts), *cells, *others]
+
+
+def card() -> str:
+    """Return what each bundled network has seen, from the record of its training."""
+    if not (FOLDER / RECORD).is_file():
+        return "*No models are bundled yet.*"
+    record = json.loads((FOLDER / RECORD).read_text(encoding="utf-8"))
+    lines = [
+        (f"`{name}`", f"{seen['images']:,}", f"{seen['hours']:.1f}", withheld(seen["withheld"]))
+        for name, seen in record.items()
+    ]
+    size = sum(path.stat().st_size for path in FOLDER.rglob("*") if path.is_file())
+    head = ("network", "pictures or prompts seen", "hours", "on withheld combinations")
+    return f"{markdown(head, lines)}\n\nAll files together: {size / 1e6:.1f} MB."
+
+
+def withheld(numbers: dict[str, Any]) -> str:
+    return ", ".join(f"{name} {float(value):.3g}" for name, value in numbers.items())
+
+
+# ---- charts --------------------------------------------------------------------------------------
+
+
+def main() -> None:
+    rows = measured()
+    for name, line in LINES.items():
+        own = [row for row in rows if row["variant"] == line.variant]
+        if own:
+            print(draw(name, line, own, references(rows)))
+
+
+def references(rows: list[Row]) -> dict[str, Callable[[str], float]]:
+    """Return what is drawn as a horizontal line in the panel of a column."""
+    chosen = [row for row in rows if row["variant"] == DEFAULT]
+    best = [row for row in rows if row["variant"] == SAMPLES and row["x"] == "4"]
+    truth = [row for row in rows if row["variant"] == TRUTH]
+    return {
+        "prior": lambda name: estimate(chosen, name, "prior_").mean,
+        "2D model": lambda name: estimate(best, name).mean,
+        "truth": lambda name: estimate(truth, name).mean,
+    }
+
+
+def draw(name: str, line: Line, rows: list[Row], levels: dict[str, Callable[[str], float]]) -> Path:
+    """Draw one figure, a panel per column of RECOGNIZED; return the path."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(1, len(RECOGNIZED), figsize=(15, 3.6), sharey=True)
+    for panel, column in zip(panels, RECOGNIZED, strict=True):
+        draw_panel(panel, line, column, rows)
+        for (label, level), style in zip(levels.items(), ("--", ":", "-."), strict=True):
+            if not math.isnan(value := level(column)):
+                panel.axhline(100 * value, linestyle=style, color="0.5", label=label)
+        panel.set_title(TITLES.get(column, column), fontsize=10)
+    panels[0].set_ylabel("% of withheld prompts")
+    panels[-1].legend(fontsize=8)
+    figure.supxlabel(line.x_label, fontsize=10)
+    figure.tight_layout()
+    path = CHARTS / f"{name}.png"
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return path
+
+
+def draw_panel(panel: Any, line: Line, column: str, rows: list[Row]) -> None:
+    """Draw mean and interval of one column at each value of ``x``."""
+    places = sorted({row["x"] for row in rows}, key=float)
+    groups = [[row for row in rows if row["x"] == place] for place in places]
+    found = [estimate(group, column) for group in groups]
+    x = [np.median([float(row[line.x_column]) for row in group]) for group in groups]
+    middle = [100 * value.mean for value in found]
+    panel.fill_between(
+        x, [100 * v.low for v in found], [100 * v.high for v in found], alpha=0.2, linewidth=0
+    )
+    panel.plot(x, middle, marker="o")
+    for place, across, value in zip(places, x, middle, strict=True):
+        if place == line.star:
+            panel.plot([across], [value], marker="*", markersize=14, color="0.15")
+    panel.set_xscale("log")
+    panel.grid(alpha=0.25)
+    panel.spines[["top", "right"]].set_visible(False)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+"""The benchmark of text to 3D with learned models: prompts, variants, order, rows and tables."""
+
+import argparse
+import itertools
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from benchmarks.quality import runs, toybox, toybox_jobs, toybox_tables
+from benchmarks.quality.toybox_jobs import CONFIG, DEFAULT, SAMPLES, STEPS, TRUTH, Variant, prompts
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.config_check import check_config
+from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
+from threestudio_gaussiandreamer.toybox.world import withheld
+
+register_parts()
+RUNS = [
+    variant
+    for variant in itertools.chain.from_iterable(make() for make in toybox_jobs.CHARTS.values())
+    if variant.name not in (SAMPLES, TRUTH)
+]
+
+
+def test_prompts_are_of_withheld_combinations_or_of_others():
+    for sort in ("withheld", "seen"):
+        found = prompts(sort, 20)
+        assert len({prompt.text for prompt in found}) == 20
+        for prompt in found:
+            assert withheld(attributes_in(prompt.text)) == prompt.withheld == (sort == "withheld")
+
+
+@pytest.mark.parametrize("variant", RUNS, ids=lambda variant: "-".join(variant.key))
+def test_the_options_of_every_variant_are_accepted(variant, tmp_path):
+    options = toybox.QUICK | toybox_jobs.options_of(variant, "a red fox with a green scarf")
+    words = [f"{key}={value}" for key, value in options.items()]
+    prompt = "system.prompt_processor.prompt=a red fox"
+    cfg = load_config(runs.ROOT / "configs/toybox.yaml", cli_args=[*words, prompt])
+    check_config(cfg)
+
+
+def test_schedules_are_scaled_to_the_steps():
+    options, guidance = toybox_jobs.steps(STEPS // 2), CONFIG["system"]["guidance"]
+    start, high, low, end = guidance["max_step_percent"]
+    assert options["system.guidance.max_step_percent"] == [start // 2, high, low, start // 2 + 1]
+    rates = [value for name, value in options.items() if ".lr_" in name]
+    assert len(rates) == 5 and all(rate[-1] == STEPS // 2 for rate in rates)
+    own = {"system.guidance.max_step_percent": [start, high, low, end]}
+    assert own.items() <= toybox_jobs.steps(STEPS).items()
+
+
+def test_another_kind_of_the_same_colour_misleads_the_prior():
+    variant = Variant(toybox_jobs.WRONG_PRIOR)
+    options = toybox_jobs.options_of(variant, "a red fox with a green scarf")
+    assert options["system.geometry.prior.prompt"] == "a red rabbit"
+
+
+def parsed(monkeypatch, *words) -> argparse.Namespace:
+    monkeypatch.setattr("sys.argv", ["", *map(str, words)])
+    return toybox.parse_arguments()
+
+
+def test_tasks_come_in_order_of_priority_and_once(monkeypatch):
+    words = ["--charts", "default", "default", "--count", 2, "--seeds", 0, 1]
+    arguments = parsed(monkeypatch, "--variant", "mine 2 a.b=[0,1] c=x", *words)
+    found = toybox.unique(toybox.tasks(arguments))
+    assert [(t.variant.name, t.seed, t.prompt.index) for t in found] == [
+        (name, seed, index) for name in ("mine", DEFAULT) for seed in (0, 1) for index in (0, 1)
+    ]
+    assert found[0].variant == Variant("mine", 2, {"a.b": "[0,1]", "c": "x"})
+
+
+@pytest.fixture
+def fake(monkeypatch, tmp_path):
+    """Tasks that take 0.05 seconds, of which those of seed 1 fail."""
+    done = []
+
+    def measure(task):
+        time.sleep(0.05)
+        done.append(task.key)
+        if task.seed == 1:
+            raise RuntimeError("failed")
+        scores = {name: 1.0 for name in toybox_tables.RECOGNIZED} | {"cpu_seconds": 2.0}
+        prior = {f"prior_{name}": 0.5 for name in toybox_tables.RECOGNIZED}
+        return toybox.row_of(task, scores | prior | {"haze": 0.01, "gaussians": 3000})
+
+    monkeypatch.setattr(toybox, "measure", measure)
+    return done
+
+
+def work(monkeypatch, out, *words) -> int:
+    arguments = parsed(monkeypatch, "--out", out, "--jobs", 2, *words)
+    todo = toybox.unique(toybox.tasks(arguments))
+    with ThreadPoolExecutor(2) as pool:
+        return toybox.work(todo, arguments, pool)
+
+
+def test_rows_are_appended_and_failures_counted(monkeypatch, tmp_path, fake):
+    words = ["--charts", "default", "--count", 3, "--seeds", 0, 1]
+    assert work(monkeypatch, tmp_path, *words) == 3
+    rows = runs.rows_of(toybox.CHART, tmp_path)
+    assert sorted(row["index"] for row in rows) == ["0", "1", "2"] and len(fake) == 6
+    assert {row["variant"] for row in rows} == {DEFAULT} and rows[0]["kind"] == "1"
+
+
+def test_no_run_is_begun_that_would_end_too_late(monkeypatch, tmp_path, fake):
+    words = ["--charts", "default", "--count", 40, "--seconds", 0.2]
+    assert work(monkeypatch, tmp_path, *words) == 0
+    assert 2 <= len(runs.rows_of(toybox.CHART, tmp_path)) <= 10
+
+
+def test_rows_become_tables_and_charts(monkeypatch, tmp_path, fake):
+    monkeypatch.setattr(toybox_tables, "rows_of", lambda chart: runs.rows_of(chart, tmp_path))
+    monkeypatch.setattr(toybox_tables, "CHARTS", tmp_path)
+    assert toybox_tables.results() == toybox_tables.NOT_MEASURED
+    work(monkeypatch, tmp_path, "--charts", "default", "guidance", "--count", 3)
+    lines = toybox_tables.results().splitlines()
+    assert len(lines) == 2 + 2 + 7 and lines[2].startswith(f"| {DEFAULT} | 3 | 100 (100 – 100) |")
+    assert lines[3].startswith("| its prior's points | 3 | 50 (50 – 50) |")
+    pytest.importorskip("matplotlib")
+    toybox_tables.main()
+    assert (tmp_path / "toybox_guidance.png").is_file()
+    assert not (tmp_path / "toybox_steps.png").exists()
+
+
+def test_columns_of_prompts_that_ask_for_nothing_are_left_out():
+    asks = toybox_tables.asks_for
+    assert asks("a red fox with a scarf", "kind") and not asks("a red fox", "pattern")
+    assert asks("a red fox with white dots", "pattern")
+    assert asks("a red fox with a blue hat", "accessory") and not asks("a red fox", "accessory")

@@ -1,0 +1,73 @@
+"""The models in the package: complete, small, and able to do what docs/toybox.md says."""
+
+import time
+
+import pytest
+import yaml
+
+from tests.toybox.test_text_to_3d import PROMPT, run
+from tests.training.runs import CONFIGS
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.evaluation.text_to_3d import Scores, result_of
+from threestudio_gaussiandreamer.host import find
+from threestudio_gaussiandreamer.models.bundled import (
+    FOLDER,
+    NAME,
+    RECORD,
+    digest_of,
+    read_digests,
+)
+from threestudio_gaussiandreamer.toybox.recognition import load_judge
+
+register_parts()
+pytestmark = pytest.mark.skipif(
+    not (FOLDER / RECORD).is_file(), reason="the package has no trained models yet"
+)
+LARGEST = 20e6
+"""Bytes of all files together."""
+SECONDS = 2.0
+"""CPU seconds in which the models are loaded, after the libraries are imported."""
+
+
+def test_the_files_are_complete_and_small():
+    digests = read_digests(FOLDER)
+    assert RECORD in digests
+    assert all(digest_of(FOLDER / name) == digest for name, digest in digests.items())
+    files = [path for path in FOLDER.rglob("*") if path.is_file()]
+    assert len(files) == len(digests) + 1
+    assert sum(path.stat().st_size for path in files) <= LARGEST
+
+
+def test_the_models_load_quickly():
+    pytest.importorskip("diffusers")
+    named = {"pretrained_model_name_or_path": NAME}
+
+    def load():
+        start = time.process_time()
+        options = {**named, "prompt": PROMPT, "negative_prompt": "", "use_cache": False}
+        find("gaussiandreamer-stable-diffusion-prompt-processor")(options)
+        find("gaussiandreamer-stable-diffusion-guidance")(named)
+        files = {"checkpoint": NAME, "clip": NAME, "upsampler": None}
+        find("point-e-prior")({**files, "num_steps": 1, "num_points": 10})(PROMPT)
+        load_judge(NAME)
+        return time.process_time() - start
+
+    load()  # imports the libraries
+    assert load() < SECONDS
+
+
+def test_a_few_steps_with_them(tmp_path):
+    pytest.importorskip("diffusers")
+    assert run(NAME, tmp_path, PROMPT) == 0
+
+
+@pytest.mark.slow
+def test_a_whole_run_is_recognised_by_the_judge(tmp_path):
+    pytest.importorskip("diffusers")
+    cfg = yaml.safe_load((CONFIGS / "toybox.yaml").read_text())
+    prior = cfg["system"]["geometry"]["prior"]
+    whole = [f"trainer.max_steps={cfg['trainer']['max_steps']}"]
+    whole += [f"system.geometry.prior.{key}={prior[key]}" for key in ("num_steps", "num_points")]
+    assert run(NAME, tmp_path, PROMPT, *whole) == 0
+    scores = Scores(NAME).of_asset(result_of(tmp_path / "toybox/t", PROMPT))
+    assert scores["kind"] and scores["colors"]

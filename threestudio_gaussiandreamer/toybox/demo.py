@@ -1,0 +1,252 @@
+"""From prompts to clouds with the bundled models, as a demonstration.
+
+``demo [PROMPT ...] [key=value ...]`` trains configs/toybox.yaml on each prompt. It writes a contact
+sheet (the prior, the result, what the 2D model itself draws) and a table of what the judge
+recognises into a new folder of ``outputs/demo``. After Ctrl-C the same command continues.
+"""
+
+import argparse
+import functools
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NamedTuple, Optional
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .. import register_parts
+from ..core import images
+from ..core.command import run_command
+from ..core.errors import Terminated, UserError
+from ..core.files import atomic_file, json_text, output_folder
+from ..core.signals import raised_signals
+from ..evaluation.asset_metrics import Asset, rendered
+from ..evaluation.text_to_3d import ATTRIBUTES, Scores, prior_of, result_of
+from ..launch.folder_lock import FolderInUse, RunFolder, claim
+from ..launch.run_folder import safe_name
+from ..models.bundled import NAME
+from ..view.run_files import read_json
+from . import recognition
+from .samples import samples
+from .sheet import contact_sheet
+from .views import BACKGROUND, SIZE
+
+PROMPTS = (
+    "a red fox with a green scarf",
+    "a blue mug with white dots",
+    "a white and blue striped robot with a red scarf",
+)
+"""The last is of a combination that the models were not trained on."""
+SHOWN = [1, 3, 5]
+"""Which of the judge's views the sheet has: from the front, the left and the back."""
+GUIDANCE = 3.0
+"""Guidance scale of the 2D model's own pictures."""
+RECORD, SECONDS, SHEET, TABLE = "demo.json", "seconds.json", "sheet.png", "table.md"
+STAGES = ("prior", "result", "2D model")
+Row = dict[str, Any]
+
+
+class Stages(NamedTuple):
+    """Pictures and scores of one prompt, by stage."""
+
+    pictures: dict[str, Float[Tensor, "V 3 s s"]]
+    scores: dict[str, dict[str, float]]
+
+
+def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
+    """Parse the command line; arguments of the form key=value are options of the runs."""
+    parser = argparse.ArgumentParser(
+        prog="python -m threestudio_gaussiandreamer.toybox.demo",
+        description="From prompts to clouds with the bundled models.",
+    )
+    add = parser.add_argument
+    add("prompts", nargs="*", metavar="PROMPT|KEY=VALUE", help="default: three prompts")
+    add("--models", default=NAME, help="toybox, or a folder of toybox.export")
+    add("--output", default="outputs/demo", help="folder for a new folder of results")
+    args = parser.parse_args(argv)
+    args.options = [word for word in args.prompts if is_option(word)]
+    args.prompts = [word for word in args.prompts if not is_option(word)] or list(PROMPTS)
+    return args
+
+
+def is_option(word: str) -> bool:
+    """Return whether an argument is key=value; a prompt has a space before its first =, if any."""
+    return "=" in word and " " not in word.partition("=")[0]
+
+
+def run(args: argparse.Namespace) -> None:
+    """Train the prompts that aren't finished, then write sheet and table.
+
+    Raises:
+        UserError: a prompt is empty, or another demo uses the folder.
+        SystemExit: the launcher has failed, and said why.
+    """
+    if not all(prompt.strip() for prompt in args.prompts):
+        raise UserError('a prompt is empty: give one such as "a red fox with a green scarf"')
+    root = output_folder(args.output, "--output")
+    folder = open_folder(root, {"prompts": args.prompts, "options": args.options})
+    claimed = locked(folder)
+    try:
+        runs = [train(folder, index, args) for index in range(len(args.prompts))]
+        register_parts()
+        write_results(folder, args, runs)
+    finally:
+        claimed.release()
+
+
+def open_folder(root: Path, record: dict[str, Any]) -> Path:
+    """Return the newest unfinished folder of the same prompts and options, or else a new one."""
+    for path in sorted(root.glob(f"*/{RECORD}"), reverse=True):
+        if read_json(path, dict) == record and not (path.parent / SHEET).exists():
+            print(f"continuing {path.parent}", flush=True)
+            return path.parent
+    folder = root / datetime.now().strftime("%Y%m%d-%H%M%S")
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_file(folder / RECORD) as file:
+        file.write(json_text(record, indent=1).encode())
+    return folder
+
+
+def locked(folder: Path) -> RunFolder:
+    """Keep other demos out of a folder.
+
+    Raises:
+        UserError: one works there.
+    """
+    try:
+        return claim(folder / "lock")
+    except FolderInUse as error:
+        raise UserError(f"another demo is working in {folder}: wait until it ends") from error
+
+
+# ---- training ------------------------------------------------------------------------------------
+
+
+def train(folder: Path, index: int, args: argparse.Namespace) -> Path:
+    """Train one prompt unless that is done; return the folder of its run."""
+    prompt, text = args.prompts[index], folder / f"prompt{index + 1}.txt"
+    tag = f"{index + 1}-{safe_name(prompt.replace(' ', '_'))}"
+    place = folder / "runs" / tag
+    if (place / SECONDS).is_file():
+        return place
+    with atomic_file(text, durable=False) as file:
+        file.write(prompt.encode())
+    print(f"\n{index + 1}/{len(args.prompts)}: {prompt}", flush=True)
+    start = time.monotonic()
+    launch([
+        f"exp_root_dir={folder}",
+        "name=runs",
+        f"tag={tag}",
+        "use_timestamp=false",
+        "resume=auto",
+        f"system.prompt_processor.prompt_file={text}",
+        f"system.guidance.pretrained_model_name_or_path={args.models}",
+        *args.options,
+    ])  # fmt: skip
+    with atomic_file(place / SECONDS) as file:
+        file.write(json_text({"seconds": round(time.monotonic() - start, 1)}).encode())
+    return place
+
+
+def launch(options: list[str]) -> None:
+    """Run the launcher in a process of its own, and wait for it even after Ctrl-C: it has received
+    the signal too, and writes a checkpoint.
+
+    Raises:
+        SystemExit: it has failed or was stopped.
+    """
+    program = [sys.executable, "-m", "threestudio_gaussiandreamer.launch.experiment"]
+    with raised_signals() as received:
+        process = subprocess.Popen([*program, "--config", "toybox.yaml", "--train", *options])
+        try:
+            code = process.wait()
+        except KeyboardInterrupt:
+            code = process.wait()
+        except Terminated:
+            process.terminate()
+            code = process.wait()
+    if received:
+        print("the same command continues", flush=True)
+    if code:
+        raise SystemExit(code)
+
+
+# ---- results -------------------------------------------------------------------------------------
+
+
+def write_results(folder: Path, args: argparse.Namespace, runs: list[Path]) -> None:
+    """Write the table and the contact sheet, and print where everything is."""
+    scores = Scores(args.models)
+    stages = [
+        stages_of(prompt, place, args.models, scores)
+        for prompt, place in zip(args.prompts, runs, strict=True)
+    ]
+    text = table(args.prompts, runs, stages)
+    with atomic_file(folder / TABLE) as file:
+        file.write(f"{text}\n".encode())
+    images.write(folder / SHEET, sheet(args.prompts, stages))
+    print(f"\n{text}\n\n{folder / SHEET}\n{folder / TABLE}")
+    for place in runs:
+        print(*(str(path) for path in sorted(place.glob("save/it*-export/view.html"))))
+
+
+def stages_of(prompt: str, place: Path, models: str, scores: Scores) -> Stages:
+    """Draw and score the prior, the result and the 2D model's own samples."""
+    result = result_of(place, prompt)
+    assets = {"prior": prior_of(place, result), "result": result}
+    pictures = {name: shown(asset) for name, asset in assets.items()}
+    found = {name: scores.of_asset(asset) for name, asset in assets.items()}
+    own = samples(models, prompt, recognition.views(), guidance_scale=GUIDANCE)
+    found["2D model"] = scores.of_samples(own, prompt)
+    pictures["2D model"] = own[SHOWN]
+    return Stages(pictures, found)
+
+
+def shown(asset: Asset) -> Float[Tensor, "V 3 s s"]:
+    """Render an asset from SHOWN."""
+    pictures = rendered(asset, recognition.views().rows(SHOWN), SIZE, background=BACKGROUND)
+    return torch.from_numpy(pictures).movedim(-1, 1)
+
+
+def sheet(prompts: Sequence[str], stages: Sequence[Stages]) -> Any:
+    """Arrange a row of pictures for each prompt: three of each stage."""
+    pictures = [each.pictures[name] for each in stages for name in STAGES]
+    texts = [
+        f"{name}: {prompt}" if view == 0 else ""
+        for prompt in prompts
+        for name in STAGES
+        for view in range(len(SHOWN))
+    ]
+    return contact_sheet(torch.cat(pictures), texts, columns=len(STAGES) * len(SHOWN))
+
+
+def table(prompts: Sequence[str], runs: Sequence[Path], stages: Sequence[Stages]) -> str:
+    """Return a Markdown table with a line for each prompt and stage."""
+    head = ("prompt", "", *ATTRIBUTES, "multi-face", "seconds")
+    lines = [head, ("---",) * len(head)]
+    for prompt, place, each in zip(prompts, runs, stages, strict=True):
+        seconds = read_json(place / SECONDS, dict).get("seconds", math.nan)
+        for name in STAGES:
+            cells = [answer(each.scores[name].get(key, math.nan)) for key in ATTRIBUTES]
+            rate = each.scores[name].get("multi_face", math.nan)
+            took = f"{seconds:.0f}" if name == "result" else ""
+            lines.append((prompt, name, *cells, "" if math.isnan(rate) else f"{rate:.0%}", took))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def answer(value: float) -> str:
+    """Return yes or no; empty for an attribute that isn't defined for the prompt."""
+    return "" if math.isnan(value) else "yes" if value else "no"
+
+
+main = functools.partial(run_command, parse, run)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
