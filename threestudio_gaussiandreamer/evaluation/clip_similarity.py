@@ -80,15 +80,15 @@ class Protocol(NamedTuple):
         )
 
 
-def protocol_for(clip: str, **options: Any) -> Protocol:
+def protocol_for(clip: Optional[str], **options: Any) -> Protocol:
     """Return the paper's protocol; for the toybox's CLIP with the cameras of its training, since
     the paper's distance makes objects smaller than it has ever seen them.
 
     Args:
-        clip: as given to :func:`open_clip`.
-        options: replace any of these.
+        clip: as given to :func:`open_clip`; None for the paper's.
+        options: replace the paper's.
     """
-    if model_part(clip, CLIP) != clip:
+    if clip and model_part(clip, CLIP) != clip:
         cameras = {"radius": sum(DISTANCE) / 2, "fovy_deg": FOVY_DEG, "size": SIZE}
         options = {**options, **cameras}
     return Protocol(**options)
@@ -306,7 +306,8 @@ def protocol_of(args: argparse.Namespace) -> Protocol:
         raise UserError(f"--views {shown(args.views)}: expected at most {MAX_VIEWS}")
     if not 0 < args.fovy < 180:
         raise UserError(f"--fovy {args.fovy}: expected degrees between 0 and 180")
-    return Protocol(
+    return protocol_for(
+        args.clip,
         seeds=tuple(args.seeds),
         views=args.views,
         drawn=args.drawn,
