@@ -8,8 +8,10 @@ recognises into a new folder of ``outputs/demo``. After Ctrl-C the same command 
 import argparse
 import functools
 import math
+import re
 import subprocess
 import sys
+import textwrap
 import time
 from collections.abc import Sequence
 from datetime import datetime
@@ -25,11 +27,10 @@ from ..core import images
 from ..core.command import run_command
 from ..core.errors import Terminated, UserError
 from ..core.files import atomic_file, json_text, output_folder
-from ..core.signals import raised_signals
+from ..core.signals import interrupt, raised_signals
 from ..evaluation.asset_metrics import Asset, rendered
 from ..evaluation.text_to_3d import ATTRIBUTES, Scores, prior_of, result_of
-from ..launch.folder_lock import FolderInUse, RunFolder, claim
-from ..launch.run_folder import safe_name
+from ..launch.folder_lock import FolderInUse, RunFolder, claim, claim_new
 from ..models.bundled import NAME
 from ..view.run_files import read_json
 from . import recognition
@@ -49,7 +50,10 @@ GUIDANCE = 3.0
 """Guidance scale of the 2D model's own pictures."""
 RECORD, SECONDS, SHEET, TABLE = "demo.json", "seconds.json", "sheet.png", "table.md"
 STAGES = ("prior", "result", "2D model")
-Row = dict[str, Any]
+NAME_LENGTH = 40
+"""Of a prompt in the name of its folder, characters."""
+TABLE_LENGTH = 60
+"""Of a prompt in the table, characters."""
 
 
 class Stages(NamedTuple):
@@ -90,27 +94,30 @@ def run(args: argparse.Namespace) -> None:
     if not all(prompt.strip() for prompt in args.prompts):
         raise UserError('a prompt is empty: give one such as "a red fox with a green scarf"')
     root = output_folder(args.output, "--output")
-    folder = open_folder(root, {"prompts": args.prompts, "options": args.options})
-    claimed = locked(folder)
+    recognition.load_judge(args.models)  # a missing file is reported before the training
+    claimed = open_folder(root, {key: vars(args)[key] for key in ("prompts", "options", "models")})
     try:
-        runs = [train(folder, index, args) for index in range(len(args.prompts))]
+        runs = [train(claimed.path, index, args) for index in range(len(args.prompts))]
         register_parts()
-        write_results(folder, args, runs)
+        write_results(claimed.path, args, runs)
     finally:
         claimed.release()
 
 
-def open_folder(root: Path, record: dict[str, Any]) -> Path:
-    """Return the newest unfinished folder of the same prompts and options, or else a new one."""
+def open_folder(root: Path, record: dict[str, Any]) -> RunFolder:
+    """Lock the newest unfinished folder of the same prompts and options, or else a new one.
+
+    Raises:
+        UserError: another demo works in it.
+    """
     for path in sorted(root.glob(f"*/{RECORD}"), reverse=True):
         if read_json(path, dict) == record and not (path.parent / SHEET).exists():
             print(f"continuing {path.parent}", flush=True)
-            return path.parent
-    folder = root / datetime.now().strftime("%Y%m%d-%H%M%S")
-    folder.mkdir(parents=True, exist_ok=True)
-    with atomic_file(folder / RECORD) as file:
+            return locked(path.parent)
+    claimed, _ = claim_new(root / datetime.now().strftime("%Y%m%d-%H%M%S"))
+    with atomic_file(claimed.path / RECORD) as file:
         file.write(json_text(record, indent=1).encode())
-    return folder
+    return claimed
 
 
 def locked(folder: Path) -> RunFolder:
@@ -120,7 +127,7 @@ def locked(folder: Path) -> RunFolder:
         UserError: one works there.
     """
     try:
-        return claim(folder / "lock")
+        return claim(folder)
     except FolderInUse as error:
         raise UserError(f"another demo is working in {folder}: wait until it ends") from error
 
@@ -131,8 +138,7 @@ def locked(folder: Path) -> RunFolder:
 def train(folder: Path, index: int, args: argparse.Namespace) -> Path:
     """Train one prompt unless that is done; return the folder of its run."""
     prompt, text = args.prompts[index], folder / f"prompt{index + 1}.txt"
-    tag = f"{index + 1}-{safe_name(prompt.replace(' ', '_'))}"
-    place = folder / "runs" / tag
+    place = folder / "runs" / name_of(index, prompt)
     if (place / SECONDS).is_file():
         return place
     with atomic_file(text, durable=False) as file:
@@ -142,7 +148,7 @@ def train(folder: Path, index: int, args: argparse.Namespace) -> Path:
     launch([
         f"exp_root_dir={folder}",
         "name=runs",
-        f"tag={tag}",
+        f"tag={place.name}",
         "use_timestamp=false",
         "resume=auto",
         f"system.prompt_processor.prompt_file={text}",
@@ -154,12 +160,18 @@ def train(folder: Path, index: int, args: argparse.Namespace) -> Path:
     return place
 
 
+def name_of(index: int, prompt: str) -> str:
+    """Return the name of a prompt's folder: its number and its first words."""
+    return f"prompt{index + 1}_" + re.sub(r"[^a-z0-9]+", "_", prompt.lower())[:NAME_LENGTH]
+
+
 def launch(options: list[str]) -> None:
     """Run the launcher in a process of its own, and wait for it even after Ctrl-C: it has received
     the signal too, and writes a checkpoint.
 
     Raises:
-        SystemExit: it has failed or was stopped.
+        SystemExit: it has failed.
+        KeyboardInterrupt, Terminated: a signal has stopped it.
     """
     program = [sys.executable, "-m", "threestudio_gaussiandreamer.launch.experiment"]
     with raised_signals() as received:
@@ -173,6 +185,7 @@ def launch(options: list[str]) -> None:
             code = process.wait()
     if received:
         print("the same command continues", flush=True)
+        interrupt(received[0])
     if code:
         raise SystemExit(code)
 
@@ -236,7 +249,8 @@ def table(prompts: Sequence[str], runs: Sequence[Path], stages: Sequence[Stages]
             cells = [answer(each.scores[name].get(key, math.nan)) for key in ATTRIBUTES]
             rate = each.scores[name].get("multi_face", math.nan)
             took = f"{seconds:.0f}" if name == "result" else ""
-            lines.append((prompt, name, *cells, "" if math.isnan(rate) else f"{rate:.0%}", took))
+            text = textwrap.shorten(prompt, TABLE_LENGTH, placeholder=" ...").replace("|", "\\|")
+            lines.append((text, name, *cells, "" if math.isnan(rate) else f"{rate:.0%}", took))
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
