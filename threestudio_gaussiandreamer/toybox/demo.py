@@ -73,7 +73,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     add("prompts", nargs="*", metavar="PROMPT|KEY=VALUE", help="default: three prompts")
     add("--models", default=NAME, help="toybox, or a folder of toybox.export")
     add("--output", default="outputs/demo", help="folder for a new folder of results")
-    args = parser.parse_args(argv)
+    args = parser.parse_intermixed_args(argv)
     args.options = [word for word in args.prompts if is_option(word)]
     args.prompts = [word for word in args.prompts if not is_option(word)] or list(PROMPTS)
     return args
