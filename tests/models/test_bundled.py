@@ -10,7 +10,12 @@ from threestudio_gaussiandreamer.models.bundled import CLIP, DIFFUSION, POINTS, 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """The layout of an export, in the place of the bundled one."""
-    for name in ("stable-diffusion/unet/weights", "clip/weights", "points.pt", "training.json"):
+    for name in (
+        "stable-diffusion/unet/weights",
+        "clip/weights",
+        "points.safetensors",
+        "training.json",
+    ):
         path = tmp_path / "bundle" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(name)
@@ -31,7 +36,7 @@ def test_other_names_are_unchanged(folder):
 
 def test_the_list_of_digests_is_that_of_sha256sum(folder):
     line = (folder / "SHA256SUMS").read_text().splitlines()[1]
-    assert line.endswith("  points.pt") and len(line.split()[0]) == 64
+    assert line.endswith("  points.safetensors") and len(line.split()[0]) == 64
     assert "training.json" in (folder / "SHA256SUMS").read_text()
 
 
@@ -43,8 +48,10 @@ def test_a_damaged_file_is_named_with_how_to_install_it_again(folder):
 
 
 def test_a_missing_file_is_named(folder):
-    (folder / "points.pt").unlink()
-    with pytest.raises(UserError, match="points.pt': No such file.*install the package again"):
+    (folder / "points.safetensors").unlink()
+    with pytest.raises(
+        UserError, match="points.safetensors': No such file.*install the package again"
+    ):
         model_part("toybox", POINTS)
 
 

@@ -95,7 +95,7 @@ def test_clip_compares_pictures_with_texts(exported):
 
 
 def test_the_point_e_prior_loads_the_points_model(exported, trained):
-    files = {"checkpoint": str(exported / "points.pt"), "clip": str(exported / "clip")}
+    files = {"checkpoint": str(exported / "points.safetensors"), "clip": str(exported / "clip")}
     prior = PointEPrior({**files, "upsampler": None, "num_steps": 3, "num_points": 50})
     prior.preflight()
     cloud = prior(PROMPT)
@@ -116,7 +116,7 @@ def test_the_record_lists_what_was_tested(exported):
 
 def test_digests_of_all_files_are_written(exported):
     digests = read_digests(exported)
-    assert {"points.pt", "clip/model.safetensors", "training.json"} < set(digests)
+    assert {"points.safetensors", "clip/model.safetensors", "training.json"} < set(digests)
     assert all(digest_of(exported / name) == digest for name, digest in digests.items())
 
 

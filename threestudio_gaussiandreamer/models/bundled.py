@@ -2,8 +2,8 @@
 
 The folder of any training's export (``toybox/export.py``) can be named in its place. Of either, the
 option for a diffusion model takes the sub-folder ``stable-diffusion``, that for a CLIP takes
-``clip``, and that for Point-E's weights takes ``points.pt``. Digests of the bundled files detect
-damage before anything is loaded.
+``clip``, and that for Point-E's weights takes ``points.safetensors``. Digests of the bundled files
+detect damage before anything is loaded.
 """
 
 import functools
@@ -19,7 +19,12 @@ RECORD, DIGESTS = "training.json", "SHA256SUMS"
 """The export's record of its training, which marks such a folder, and the digests of its other
 files in the format of ``sha256sum``.
 """
-DIFFUSION, CLIP, POINTS, JUDGE = "stable-diffusion", "clip", "points.pt", "judge.safetensors"
+DIFFUSION, CLIP, POINTS, JUDGE = (
+    "stable-diffusion",
+    "clip",
+    "points.safetensors",
+    "judge.safetensors",
+)
 REINSTALL = (
     "install the package again (pip install --force-reinstall --no-deps "
     "threestudio-gaussiandreamer; in a clone: git checkout -- "

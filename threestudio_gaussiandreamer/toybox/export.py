@@ -5,7 +5,7 @@
 ====================  ==========================================================================
 stable-diffusion/     diffusers' pipeline: tokenizer, text_encoder, vae, unet, scheduler
 clip/                 transformers' CLIPModel and tokenizer: both towers
-points.pt             Point-E's base checkpoint
+points.safetensors    Point-E's base checkpoint
 judge.safetensors     the judge, which has no published format
 training.json         what each network has seen: images, hours, numbers on withheld objects
 SHA256SUMS            digests of all other files
@@ -21,7 +21,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Optional
 
-import torch
 from torch import Tensor
 
 from ..core.checkpoint_file import load_file
@@ -54,9 +53,9 @@ def export(training: Path, target: Path) -> dict[str, Any]:
     write_clip(target / "clip", clip, training / "tokenizer")
     write_stable_diffusion(target / "stable-diffusion", training, clip)
     if checkpoint_path(training, "points").exists():
-        write_points(target / "points.pt", averaged_weights(training, "points"))
+        write_weights(target / "points.safetensors", averaged_weights(training, "points"))
     if checkpoint_path(training, "judge").exists():
-        write_judge(target / "judge.safetensors", averaged_weights(training, "judge"))
+        write_weights(target / "judge.safetensors", averaged_weights(training, "judge"))
     record = training_record(training)
     with atomic_file(target / "training.json") as file:
         file.write(json.dumps(record, indent=2).encode())
@@ -101,14 +100,8 @@ MODEL_INDEX = {
 }
 
 
-def write_points(path: Path, weights: dict[str, Tensor]) -> None:
-    """Write Point-E's base checkpoint: a pickle of tensors alone, as the published file is."""
-    with atomic_file(path) as file:
-        torch.save({name: value.half() for name, value in weights.items()}, file)
-
-
-def write_judge(path: Path, weights: dict[str, Tensor]) -> None:
-    """Write the judge's weights."""
+def write_weights(path: Path, weights: dict[str, Tensor]) -> None:
+    """Write weights by name as safetensors: Point-E's base checkpoint, or the judge's."""
     from safetensors.torch import save
 
     with atomic_file(path) as file:

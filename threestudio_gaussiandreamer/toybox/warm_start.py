@@ -5,7 +5,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from ..core.errors import UserError
@@ -73,11 +72,6 @@ def _read_clip(weights: Path) -> dict[str, Tensor]:
     }
 
 
-def _read_points(weights: Path) -> dict[str, Tensor]:
-    path = existing_file(weights / "points.pt", "weights of the points model")
-    return {key: value.float() for key, value in torch.load(path, weights_only=True).items()}
-
-
 def _read(path: Path) -> dict[str, Tensor]:
     from safetensors.torch import load_file
 
@@ -97,7 +91,7 @@ READERS = {
     "clip": _read_clip,
     "autoencoder": _read_diffusers("vae"),
     "unet": _read_diffusers("unet"),
-    "points": _read_points,
+    "points": lambda weights: _read(weights / "points.safetensors"),
     "judge": lambda weights: _read(weights / "judge.safetensors"),
 }
 
