@@ -33,7 +33,7 @@ def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted
     assert len(first.means) == len(read_spz(export / "pruned" / "gaussians.spz").means) == 90
     report = json.loads((export / "pruned" / "report.json").read_text())
     assert (
-        report["options"]["eps2d"] == 0.1 and not report["options"]["antialias"]
+        report["options"]["eps2d"] == 0.03 and report["options"]["antialias"]
     )  # as the demo draws
     assert (
         report["after"]["gaussians"] == 90 and (export / "pruned" / "report.png").stat().st_size > 0
