@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..core.errors import UserError, unknown
+from .neighbours import NeighbourSearch
 from .point_cloud import PointCloud
 
 logger = logging.getLogger(__name__)
@@ -61,11 +62,14 @@ def grow(
     """
     _check_options(num_candidates, radius, color_range, max_points)
     points = _checked(cloud.points)
+    first, group, _ = distinct(points)  # trees are slow with many copies of one point
+    search = NeighbourSearch(points[first])
     # One isolated point far away would stretch the box, and the radius with it.
-    typical = points[~isolated(points)]
+    typical = points[~_isolated(search)[group]]
     reach = radius * (longest_side(typical) or 1.0)  # a single point has no size: one world unit
     candidates = generator.uniform(*growing_box(typical, reach), size=(num_candidates, 3))
-    kept, nearest = _within_reach(points, candidates, reach)
+    kept, nearest = _within_reach(search, candidates, reach)
+    nearest = first[nearest]
     # Candidates are independent, so the first ones are a uniform choice among those kept.
     kept, nearest = kept[:max_points], nearest[:max_points]
     colors = perturbed_colors(
@@ -127,21 +131,10 @@ def nearest_distance_scales(
     first, group, copies = distinct(points)
     if len(first) < 4:
         return _as_float32(np.full(len(points), _few_points_scale(points)))
-    distances = _bounded(_neighbour_distances(points[first], SCALE_RULES[rule]))
+    search = NeighbourSearch(points[first])
+    distances = _bounded(_neighbour_distances(search, SCALE_RULES[rule]))
     distances[copies > 1] = np.median(distances)
     return _as_float32(distances[group])
-
-
-def isolated(points: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
-    """Mark the points whose nearest other point is beyond ``ISOLATED_FACTOR`` times the 99th
-    percentile of such distances.
-    """
-    points = _checked(points)
-    first, group, _ = distinct(points)
-    if len(first) < 4:
-        return np.zeros(len(points), bool)
-    distances = _neighbour_distances(points[first], 1)
-    return (distances > _isolation_cap(distances))[group]
 
 
 def _check_options(
@@ -187,26 +180,21 @@ def _checked(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
 
 
 def _within_reach(
-    points: Float[np.ndarray, "P 3"], candidates: Float[np.ndarray, "Q 3"], reach: float
+    search: NeighbourSearch, candidates: Float[np.ndarray, "Q 3"], reach: float
 ) -> tuple[Int[np.ndarray, " R"], Int[np.ndarray, " R"]]:
     """Return indices of the candidates nearer than ``reach`` to a point, and of the point nearest
     to each of them.
     """
-    from scipy.spatial import cKDTree
-
-    first, _, _ = distinct(points)  # the tree is slow with many copies of one point
-    distances, nearest = cKDTree(points[first]).query(
-        candidates, distance_upper_bound=reach, workers=-1
-    )
+    distances, nearest = search.nearest(candidates, reach)
     kept = np.flatnonzero(distances < reach)
     logger.info(
         "growing: %d of %d candidates lie within %.4g of %d points",
         len(kept),
         len(candidates),
         reach,
-        len(points),
+        len(search.order),
     )
-    return kept, first[nearest[kept]]
+    return kept, nearest[kept]
 
 
 def distinct(
@@ -226,14 +214,23 @@ def distinct(
     return order[is_new], group, np.bincount(group)
 
 
-def _neighbour_distances(
-    points: Float[np.ndarray, "D 3"], neighbours: int
-) -> Float[np.ndarray, " D"]:
+def _neighbour_distances(search: NeighbourSearch, neighbours: int) -> Float[np.ndarray, " D"]:
     """Compute the root mean square distance to the nearest ``neighbours`` other points."""
-    from scipy.spatial import cKDTree
+    distances = np.empty(len(search.order))
+    for found in search.of_points(neighbours + 1):
+        others = found.distances[:, 1:]  # column 0 is the point itself
+        distances[found.rows] = np.sqrt(np.mean(others**2, axis=1))
+    return distances
 
-    distances, _ = cKDTree(points).query(points, k=neighbours + 1, workers=-1)
-    return np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1))  # column 0 is the point itself
+
+def _isolated(search: NeighbourSearch) -> Bool[np.ndarray, " D"]:
+    """Mark the distinct points whose nearest other point is beyond ``ISOLATED_FACTOR`` times the
+    99th percentile of such distances; none of fewer than four.
+    """
+    if len(search.order) < 4:
+        return np.zeros(len(search.order), bool)
+    distances = _neighbour_distances(search, 1)
+    return distances > _isolation_cap(distances)
 
 
 def _bounded(distances: Float[np.ndarray, " D"]) -> Float[np.ndarray, " D"]:

@@ -13,7 +13,7 @@ deviation ``COLOR_TOLERANCE``:
          opacity x mean cross-section
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from torch import Tensor
 
 from ..splatting.projection import quats_to_rotations
 from .densify import Change
+from .neighbours import NeighbourSearch
 from .sh import C0
 
 DUPLICATE = 0.07
@@ -32,7 +33,7 @@ the original, for untrained clouds too.
 COLOR_TOLERANCE = 0.1
 NEIGHBOURS = 4
 PAIRS_AT_ONCE = 2**18
-"""Pairs whose covariances are in memory at the same time."""
+"""Pairs whose properties are in memory at the same time."""
 LOG_THINNEST = -12.0
 """Smallest logarithm of the ratio of an axis to the longest one; shorter axes are clamped to it, so
 that covariances are well conditioned in float64.
@@ -43,8 +44,11 @@ class _Shapes(NamedTuple):
     """Properties of the Gaussians that the costs depend on, float64 on the CPU."""
 
     means: Float[Tensor, "N 3"]
-    covariances: Float[Tensor, "N 3 3"]
+    log_scales: Float[Tensor, "N 3"]
+    """At least ``LOG_THINNEST`` below the largest."""
+    quats: Float[Tensor, "N 4"]
     traces: Float[Tensor, " N"]
+    """Of the covariances."""
     log_determinants: Float[Tensor, " N"]
     opacities: Float[Tensor, " N"]
     weights: Float[Tensor, " N"]
@@ -88,14 +92,10 @@ def duplicates(
     Returns:
         the pairs, and their costs including ``spent``.
     """
-    shapes = _shapes(params)
-    pairs = _neighbours(shapes.means)
-    found = torch.cat([_costs_of_duplicates(shapes, p) for p in pairs.split(PAIRS_AT_ONCE)])
+    pairs, found = _cheap_pairs(_shapes(params))
     # accumulated, so that a sequence of small merges can't change the result by much
     costs = found + spent[pairs].amax(1)
-    order = costs.argsort(stable=True)[
-        : int((costs <= DUPLICATE).sum())
-    ]  # NaN, the cost of Gaussians that aren't finite, is sorted to the end
+    order = costs.argsort(stable=True)[: int((costs <= DUPLICATE).sum())]
     taken, chosen = set(), []
     for row, (first, second) in zip(order.tolist(), pairs[order].tolist(), strict=True):
         if first not in taken and second not in taken:
@@ -110,36 +110,60 @@ def _shapes(params: Mapping[str, Tensor]) -> _Shapes:
         for name in ("means", "log_scales", "quats", "logit_opacities")
     )
     log_scales = log_scales.maximum(log_scales.amax(1, keepdim=True) + LOG_THINNEST)
-    axes = quats_to_rotations(quats) * log_scales.exp()[:, None]
     opacities = logits.sigmoid()
     harmonics = params["sh0"] if "sh0" in params else params["sh"]
     colors = C0 * harmonics[:, 0].detach().cpu().double()
     weights = opacities * (log_scales.sum(1) * (2 / 3)).exp()
     traces = (2 * log_scales).exp().sum(1)
-    covariances = axes @ axes.transpose(1, 2)
-    return _Shapes(means, covariances, traces, 2 * log_scales.sum(1), opacities, weights, colors)
+    log_determinants = 2 * log_scales.sum(1)
+    return _Shapes(means, log_scales, quats, traces, log_determinants, opacities, weights, colors)
 
 
-def _neighbours(means: Float[Tensor, "N 3"]) -> Int[Tensor, "P 2"]:
-    """Pair every finite Gaussian with its nearest neighbours, each pair once, smaller row first."""
-    from scipy.spatial import cKDTree
+def _covariances(shapes: _Shapes, rows: Int[Tensor, " P"]) -> Float[Tensor, "P 3 3"]:
+    axes = quats_to_rotations(shapes.quats[rows]) * shapes.log_scales[rows].exp()[:, None]
+    return axes @ axes.transpose(1, 2)
 
-    rows = means.isfinite().all(1).nonzero()[:, 0]
+
+def _cheap_pairs(shapes: _Shapes) -> tuple[Int[Tensor, "P 2"], Float[Tensor, " P"]]:
+    """Return the pairs of neighbours that cost at most ``DUPLICATE``, each once and its smaller row
+    first, in ascending order, and their costs. Gaussians that aren't finite are in none.
+    """
+    keys, costs, count = [], [], len(shapes.means)
+    for pairs in _neighbours(shapes.means):
+        found = _costs_of_duplicates(shapes, pairs)
+        low, high = pairs[found <= DUPLICATE].unbind(1)
+        keys.append(low * count + high)
+        costs.append(found[found <= DUPLICATE])
+    if not keys:
+        return torch.zeros(0, 2, dtype=torch.long), torch.zeros(0, dtype=torch.float64)
+    keys, places = np.unique(torch.cat(keys).numpy(), return_index=True)
+    keys = torch.from_numpy(keys)
+    return torch.stack([keys // count, keys % count], 1), torch.cat(costs)[places]
+
+
+def _neighbours(means: Float[Tensor, "N 3"]) -> Iterator[Int[Tensor, "P 2"]]:
+    """Pair every finite Gaussian with its nearest neighbours, smaller row first, at most
+    ``PAIRS_AT_ONCE`` pairs at a time; most pairs come twice.
+    """
+    rows = means.isfinite().all(1).nonzero()[:, 0].numpy()
     if len(rows) < 2:
-        return torch.zeros(0, 2, dtype=torch.long)
-    points, count = means[rows].numpy(), len(rows)
-    _, found = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, count), workers=-1)
-    nearest = torch.from_numpy(found)
-    pairs = torch.stack([torch.arange(len(rows))[:, None].expand_as(nearest), nearest], -1).reshape(
-        -1, 2
-    )
+        return
+    points, count = means.numpy()[rows], min(NEIGHBOURS + 1, len(rows))
+    for found in NeighbourSearch(points).of_points(count):
+        yield from _pairs(rows, np.repeat(found.rows, count), found.nearest.reshape(-1))
     # Many copies of one point all have the same few nearest neighbours, hence only one or two
     # disjoint pairs; pairs of neighbours in sorted order are added for them.
-    order = torch.from_numpy(np.lexsort(points.T))
-    pairs = torch.cat([pairs, torch.stack([order[:-1], order[1:]], 1)])
-    low, high = pairs[pairs[:, 0] != pairs[:, 1]].sort(1).values.unbind(1)
-    keys = (low * count + high).unique()
-    return rows[torch.stack([keys // count, keys % count], 1)]
+    order = np.lexsort(points.T)
+    yield from _pairs(rows, order[:-1], order[1:])
+
+
+def _pairs(
+    rows: Int[np.ndarray, " N"], first: Int[np.ndarray, " P"], second: Int[np.ndarray, " P"]
+) -> Iterator[Int[Tensor, "P 2"]]:
+    """Yield pairs of two different Gaussians from their places in ``rows``."""
+    different = first != second
+    pairs = np.stack([rows[first[different]], rows[second[different]]], 1)
+    yield from torch.from_numpy(np.sort(pairs, axis=1)).split(PAIRS_AT_ONCE)
 
 
 def _moments(
@@ -152,10 +176,9 @@ def _moments(
     f = shapes.weights[i] / (shapes.weights[i] + shapes.weights[j])
     apart = shapes.means[i] - shapes.means[j]
     means = shapes.means[j] + f[:, None] * apart
-    within = (
-        f[:, None, None] * shapes.covariances[i] + (1 - f)[:, None, None] * shapes.covariances[j]
-    )
-    return f, means, within + (f * (1 - f))[:, None, None] * apart[:, :, None] * apart[:, None]
+    weight, first, second = f[:, None, None], _covariances(shapes, i), _covariances(shapes, j)
+    within = weight * first + (1 - weight) * second
+    return f, means, within + weight * (1 - weight) * apart[:, :, None] * apart[:, None]
 
 
 def _costs_of_duplicates(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
@@ -222,7 +245,8 @@ def _together(params: Mapping[str, Tensor], pairs: Int[Tensor, "P 2"]) -> dict[s
     """
     from scipy.spatial.transform import Rotation
 
-    shapes = _shapes(params)
+    params = {name: value.detach().cpu()[pairs.flatten()] for name, value in params.items()}
+    shapes, pairs = _shapes(params), torch.arange(2 * len(pairs)).view(-1, 2)
     f, means, covariances = _moments(shapes, pairs)
     summed, product = shapes.opacities[pairs].sum(1), shapes.opacities[pairs].prod(1)
     opacities = summed - product
@@ -241,6 +265,6 @@ def _together(params: Mapping[str, Tensor], pairs: Int[Tensor, "P 2"]) -> dict[s
     mixed["logit_opacities"] = opacities.clamp(1e-6, 1 - 1e-6).logit()
     for name in params:
         if name not in mixed:
-            i, j = params[name].detach().cpu().double()[pairs].unbind(1)
+            i, j = params[name].double()[pairs].unbind(1)
             mixed[name] = j + f[:, None, None] * (i - j)
     return mixed
