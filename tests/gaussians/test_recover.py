@@ -57,6 +57,22 @@ def test_a_recovery_never_lowers_the_quality(monkeypatch, bearable):
     assert scales == [scale for scale in LR_SCALES if scale >= bearable]
 
 
+def test_a_recovery_of_many_gaussians_takes_fewer_steps(monkeypatch):
+    taken = []
+
+    def recover_with(cloud, views, images, steps, *rest):
+        taken.append(steps)
+        return cloud
+
+    monkeypatch.setattr(recover, "recover", recover_with)
+    monkeypatch.setattr(recover, "MOST", 200)
+    cloud = ball()
+    recovery = Recovery(cloud, *views(cloud, 4, 4, size=16), steps=9)
+    for count in (100, 200, 600):
+        recovery(cloud.rows(slice(count)), 0)
+    assert taken == [9, 9, 3]
+
+
 def test_a_recovery_begins_near_the_rates_of_the_one_before(monkeypatch):
     cloud, scales, bearable = ball(), [], iter([1 / 16] * 5 + [1.0] * 3)
     train_views, val_views = views(cloud, 8, 4, size=32)

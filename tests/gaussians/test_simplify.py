@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.helpers.pruning import ball
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.gaussians import recover
 from threestudio_gaussiandreamer.gaussians import simplify as simplifying
 from threestudio_gaussiandreamer.gaussians.recover import LR_SCALES, Recovery
@@ -87,6 +88,28 @@ def test_a_large_cloud_loses_its_hidden_gaussians_without_a_recovery(monkeypatch
     kept = recovery(cloud, 48)
     assert len(simplify(cloud, Budget(count=200), kept).means) == 200
     assert fitted and max(fitted) < simplifying.KEEP * len(cloud.means)
+
+
+def test_a_large_cloud_is_ranked_when_few_are_left(monkeypatch):
+    """Its contribution, which rendering it has given, takes no backward pass of all Gaussians."""
+    monkeypatch.setattr(simplifying, "LARGE", 450)
+    monkeypatch.setattr(simplifying, "LOSSLESS", 30.0)
+    ranked = []
+
+    def rank(cloud, views, seed):
+        ranked.append(len(cloud.means))
+        return view_importance(cloud, views, seed)
+
+    cloud = ball()
+    simplify(cloud, Budget(count=200), recovery(cloud, 48), rank=rank)
+    assert ranked and max(ranked) < len(cloud.means)
+
+
+def test_a_large_cloud_that_no_view_shows_is_a_named_error(monkeypatch):
+    monkeypatch.setattr(simplifying, "LARGE", 450)
+    hidden = ball()._replace(logit_opacities=torch.full((600,), -20.0))
+    with pytest.raises(UserError, match="none of the 600 Gaussians"):
+        simplify(hidden, Budget(count=200), recovery(hidden, 48))
 
 
 def test_a_large_cloud_keeps_what_its_images_need(monkeypatch):

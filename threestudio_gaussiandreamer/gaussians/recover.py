@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..core.streams import generator
 from .gaussians import Gaussians
-from .views import Views, bounds, draw, psnr_lower_bound, render_all
+from .views import Views, bounds, draw, psnr_lower_bound, render_with_contribution
 
 LEARNING_RATES = {
     "means": 2e-4,
@@ -30,6 +30,9 @@ LR_SCALES = (1.0, 1 / 4, 1 / 16, 1 / 64)
 decrease near an optimum, so a small error needs a small rate.
 """
 VIEWS_PER_STEP = 4
+MOST = 100_000
+"""Of more Gaussians a recovery takes fewer steps, so that it takes no longer: further rounds, with
+a recovery each, follow."""
 
 
 class Round(NamedTuple):
@@ -52,7 +55,7 @@ class Recovery:
         train_views: the views that are fitted.
         val_views: other views, on which a recovery is accepted or rejected, since the PSNR of the
             fitted views improves even when that of others falls by a dB.
-        steps: Adam steps per recovery.
+        steps: Adam steps per recovery of at most ``MOST`` Gaussians.
         seed: for the order of the views.
         as_stored: converts Gaussians to what is read back from the file that will be written;
             quality is measured on the result.
@@ -71,8 +74,9 @@ class Recovery:
         sh_reach: float = math.inf,
     ) -> None:
         self.train_views, self.val_views = train_views, val_views
-        self.train_images = render_all(original, train_views)
-        self.val_images = render_all(original, val_views)
+        self.train_images, trained = render_with_contribution(original, train_views)
+        self.val_images, validated = render_with_contribution(original, val_views)
+        self.contribution = torch.maximum(trained, validated)  # (N,) of the original
         self.steps, self.seed = steps, seed
         self.as_stored, self.sh_reach = as_stored, sh_reach
         self.first_scale = 0  # index into LR_SCALES
@@ -85,13 +89,14 @@ class Recovery:
         round's."""
         cloud = best = clamp_constant_sh(cloud, self.sh_reach)
         reached = self.quality(cloud)
+        steps = math.ceil(self.steps * min(1.0, MOST / len(cloud.means)))
         for tried in range(self.first_scale, len(LR_SCALES)):
             self.first_scale = max(0, tried - 1)
             recovered = recover(
                 cloud,
                 self.train_views,
                 self.train_images,
-                self.steps,
+                steps,
                 self.seed + round_number,
                 self.sh_reach,
                 LR_SCALES[tried],

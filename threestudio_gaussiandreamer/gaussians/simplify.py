@@ -1,12 +1,14 @@
 """Reduce the number of Gaussians at the same image quality: prune by importance in rounds, and
 recover after each round by fitting images of the original.
 
-A large cloud is first pruned at once to the fewest Gaussians with the same images. Then duplicates
-are merged (``merge.py``). Then each round computes the importance in the training views (the score
-``removal`` of ``importance.py``), keeps the best 80 %, and fits them to images of the original
-(``recover.py``). Pruning many more at once gives worse results than training with the smaller
-number from the start."""
+A large cloud is first pruned at once to the fewest Gaussians with the same images, by the
+contribution of each, which rendering the images to be kept has given, and then by importance. Then
+duplicates are merged (``merge.py``). Then each round computes the importance in the training views
+(the score ``removal`` of ``importance.py``), keeps the best 80 %, and fits them to images of the
+original (``recover.py``). Pruning many more at once gives worse results than training with the
+smaller number from the start."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple, Optional
 
@@ -75,6 +77,7 @@ def simplify(
     """Prune in rounds down to the smallest cloud that meets the budget.
 
     Args:
+        cloud: the original of ``recovery``.
         recovery: fits the remaining Gaussians after each round, and measures the quality.
         report: called after each round that was kept.
         rank: returns the importance of each Gaussian, given the cloud, views and a seed.
@@ -100,39 +103,44 @@ class _Search:
         self.rounds = 0
 
     def run(self, cloud: Gaussians) -> Gaussians:
-        self._take(cloud)
+        self.cloud = cloud
+        self._reduce(self.recovery.contribution)
         if not self.scores.any():
             raise UserError(
                 f"none of the {len(cloud.means)} Gaussians is visible in any view, so they "
                 "can't be ranked"
             )
         self._fit_within_reach()
-        self._reduce()
+        self._reduce(self.scores)
         self._merge()
         self._prune()
         return self.cloud
 
+    @functools.cached_property
+    def scores(self) -> Float[Tensor, " N"]:
+        """The importance of the Gaussians, ranked when it is first needed."""
+        return self.rank(self.cloud, self.recovery.train_views, self.recovery.seed)
+
     def _take(self, cloud: Gaussians) -> None:
         self.cloud = cloud
-        self.scores = self.rank(cloud, self.recovery.train_views, self.recovery.seed)
+        self.__dict__.pop("scores", None)
 
     def _fit_within_reach(self) -> None:
         """Run a recovery before the first round if some colours exceed the file's range."""
         if float(self.cloud.sh[:, 0].abs().amax()) > self.recovery.sh_reach:
             self._take(self.recovery(self.cloud, self.rounds).cloud)
 
-    def _reduce(self) -> None:
+    def _reduce(self, scores: Float[Tensor, " N"]) -> None:
         """Prune a large cloud at once, as far as its images stay the same without a recovery."""
+        if len(self.cloud.means) <= LARGE:
+            return
         least = max(LOSSLESS, (self.budget.psnr or 0.0) + RESERVE)
 
         def same(kept: Bool[Tensor, " N"]) -> bool:
             return self.recovery.quality(self.cloud.rows(kept.nonzero()[:, 0])) >= least
 
-        while (here := len(self.cloud.means)) > LARGE:
-            count = smallest_count(self.scores, self.budget.count or 1, same)
-            if count > (1 - SMALLEST_DROP) * here:
-                return
-            self._take(keep_best(self.cloud, self.scores, count))
+        count = smallest_count(scores, self.budget.count or 1, same)
+        self._take(keep_best(self.cloud, scores, count))
 
     def _merge(self) -> None:
         values = self.cloud._asdict()

@@ -4,7 +4,7 @@ Recovery, pruning and the choice of initial points compare Gaussians with an ear
 themselves in such views, not with training images."""
 
 import math
-from typing import NamedTuple, Optional
+from typing import Any, NamedTuple, Optional
 
 import torch
 from jaxtyping import Float
@@ -30,7 +30,7 @@ plane.
 """
 MAX_RADIUS = 1e15
 """Largest radius of a cloud, in its units: squares of distances stay within float32's range."""
-VIEWS_PER_CALL, GAUSSIANS_PER_CALL = 4, 4_000_000
+VIEWS_PER_CALL, GAUSSIANS_PER_CALL = 4, 2_000_000
 """Most views that are rendered at once, and most of their Gaussians together, for which the
 rasteriser needs about half a kilobyte each. One view of more is rendered all the same.
 """
@@ -54,8 +54,18 @@ class Views(NamedTuple):
     """Screen-space dilation, square pixels."""
     antialias: bool = False
 
+    def rows(self, index: Any) -> "Views":
+        """Select views; ``index`` is anything that indexes a tensor's first dimension."""
+        per_view = ("viewmats", "Ks", "positions", "backgrounds")
+        given = {name: getattr(self, name) for name in per_view}
+        return self._replace(**{k: v if v is None else v[index] for k, v in given.items()})
 
-def bounds(cloud: Gaussians) -> tuple[Float[Tensor, "3"], float]:
+
+Ball = tuple[Float[Tensor, "3"], float]
+"""Centre and radius."""
+
+
+def bounds(cloud: Gaussians) -> Ball:
     """Return the centre and the radius of the visible Gaussians.
 
     The centre is the opacity-weighted median of the positions. The ball of that radius around it
@@ -81,6 +91,7 @@ def views_around(
     *,
     turn: float = 0.0,
     to_z_up: Optional[Float[Tensor, "3 3"]] = None,
+    ball: Optional[Ball] = None,
     sines: tuple[float, float] = SINES,
     distances: tuple[float, ...] = DISTANCES,
 ) -> Views:
@@ -95,13 +106,14 @@ def views_around(
         size: width and height of their images, pixels.
         turn: azimuth of the first view, degrees.
         to_z_up: rotation from the cloud's axes to axes with z up.
+        ball: ``bounds(cloud)`` if it is already known.
         sines: of the elevations of the first and the last view.
         distances: relative to that at which the ball of :func:`bounds` fills the view.
 
     Raises:
         UserError: the radius of the cloud exceeds ``MAX_RADIUS``.
     """
-    centre, radius = bounds(cloud)
+    centre, radius = ball or bounds(cloud)
     require_renderable(cloud, radius)
     c2w = _spiral(count, radius, turn, sines, distances).to(centre)
     if to_z_up is not None:
@@ -198,7 +210,20 @@ def _directions(cloud: Gaussians, views: Views, rows: Tensor) -> Float[Tensor, "
 @torch.no_grad()
 def render_all(cloud: Gaussians, views: Views) -> Float[Tensor, "V H W 3"]:
     """Render the images of all views."""
-    return torch.cat([draw(cloud, views, rows)[0] for rows in row_batches(views, len(cloud.means))])
+    return render_with_contribution(cloud, views)[0]
+
+
+@torch.no_grad()
+def render_with_contribution(
+    cloud: Gaussians, views: Views
+) -> tuple[Float[Tensor, "V H W 3"], Float[Tensor, " N"]]:
+    """Render the images of all views; return each Gaussian's largest contribution to any too."""
+    images, contribution = [], torch.zeros_like(cloud.logit_opacities)
+    for rows in row_batches(views, len(cloud.means)):
+        image, contributed = draw(cloud, views, rows)
+        images.append(image)
+        contribution = torch.maximum(contribution, contributed.amax(0))
+    return torch.cat(images), contribution
 
 
 def row_batches(views: Views, gaussians: int) -> tuple[Tensor, ...]:

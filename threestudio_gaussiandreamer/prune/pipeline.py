@@ -33,6 +33,7 @@ from ..gaussians.views import (
     EPS2D,
     LEAST_ERROR,
     Views,
+    bounds,
     views_around,
 )
 from .options import (
@@ -278,9 +279,9 @@ def views_of(stored: StoredCloud, options: PruneOptions) -> list[Views]:
     """Return training, validation and test views, with the viewer's rendering of ``options``."""
     cloud = stored.gaussians.tensors(get_device())
     to_z_up = torch.from_numpy(rotation_between(stored.up, "z"))
-    eps2d = EPS2D if options.eps2d is None else options.eps2d
+    eps2d, ball = EPS2D if options.eps2d is None else options.eps2d, bounds(cloud)
     return [
-        views_around(cloud, count, options.size, turn=turn, to_z_up=to_z_up)._replace(
+        views_around(cloud, count, options.size, turn=turn, to_z_up=to_z_up, ball=ball)._replace(
             eps2d=eps2d, antialias=bool(options.antialias)
         )
         for count, turn in zip((TRAIN_VIEWS, VAL_VIEWS, TEST_VIEWS), TURNS, strict=True)

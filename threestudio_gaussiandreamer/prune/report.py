@@ -42,6 +42,7 @@ def write_report(
     """
     views = views_of(result.before, options)[-1]
     grey = views._replace(backgrounds=None)
+    shown = grey.rows(torch.linspace(0, len(views.viewmats) - 1, SHEET_VIEWS).long())
     files = [result.before, as_stored(result.after, suffix)]
     clouds = [file.gaussians.tensors(get_device()) for file in files]
     sizes = [file_size(stored, suffix) for stored in (result.before, result.after)]
@@ -55,7 +56,7 @@ def write_report(
     }
     with atomic_file(f"{path}.json") as file:
         file.write(json_text(report | {"options": asdict(options)}, indent=2).encode())
-    write_image(f"{path}.png", sheet([render_all(cloud, grey) for cloud in clouds]))
+    write_image(f"{path}.png", sheet([render_all(cloud, shown) for cloud in clouds]))
     _print_report(path, report, before, after, suffix)
     return report
 
@@ -79,11 +80,8 @@ def _cost(cloud: Gaussians, size: int, views: Views) -> Cost:
 
 
 def sheet(images: list[Float[Tensor, "V H W 3"]]) -> UInt8[ndarray, "rows columns 3"]:
-    """Arrange six views, ordered by elevation, in a row for each set of images, as bytes."""
-    rows = [
-        torch.cat(list(views[torch.linspace(0, len(views) - 1, SHEET_VIEWS).long()]), 1)
-        for views in images
-    ]
+    """Arrange each set of images in a row, as bytes."""
+    rows = [torch.cat(list(views), 1) for views in images]
     return (torch.cat(rows, 0).clamp(0, 1).cpu().numpy() * 255).round().astype("uint8")
 
 
@@ -91,10 +89,7 @@ def frame_time(cloud: Gaussians, views: Views) -> float:
     """Measure how long one view takes to render, milliseconds, the median over five."""
     times = []
     for view in range(min(TIMED_VIEWS, len(views.viewmats))):
-        row = slice(view, view + 1)
-        one = views._replace(
-            viewmats=views.viewmats[row], Ks=views.Ks[row], positions=views.positions[row]
-        )
+        one = views.rows(slice(view, view + 1))
         started = time.perf_counter()
         render_all(cloud, one).sum().item()
         times.append(time.perf_counter() - started)
