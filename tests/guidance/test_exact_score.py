@@ -9,10 +9,12 @@ import torch
 from tests.guidance.exact_score_cases import batch, guidance, step, uniform
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion import sds
-from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance, direction_indices
+from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance
+from threestudio_gaussiandreamer.guidance.picture_bank import direction_indices
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.meshes import raycast
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
+from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 
 pytest.importorskip("embreex")
 
@@ -95,12 +97,66 @@ def test_view_exact_without_width_is_a_weighted_squared_error(mesh_path):
 
 def test_the_noise_of_one_picture_cancels_and_is_not_drawn(mesh_path, monkeypatch):
     rgb, views = uniform(3, 16, 16, 3), batch(*VIEWS)
+    in_general(monkeypatch)
     out, grad = step(guidance(mesh_path), rgb, **views)
     monkeypatch.setattr(ExactScoreGuidance, "known_error", lambda *_: None)
     by_noise, expected = step(guidance(mesh_path), rgb, **views)
     assert torch.allclose(grad, expected, rtol=1e-4, atol=1e-5 * expected.abs().max())
     assert torch.isclose(out["loss_sds"], by_noise["loss_sds"], rtol=1e-4)
     assert out.keys() == by_noise.keys() and out["perplexity"] == by_noise["perplexity"] == 1
+
+
+def in_general(monkeypatch):
+    """Turn the pass over the pixels off."""
+    monkeypatch.setattr(ExactScoreGuidance, "_in_one_pass", lambda *_, **__: None)
+
+
+@pytest.mark.skipif(cpu.unavailable() is not None, reason=str(cpu.unavailable()))
+@pytest.mark.parametrize("width", [16, 19])
+@pytest.mark.parametrize("weighting", ["sds", "x0"])
+def test_one_pass_over_the_pixels_gives_the_bits_of_the_general_path(
+    mesh_path, monkeypatch, width, weighting
+):
+    options = {"weighting_strategy": weighting}
+    rgb, views = uniform(3, 16, width, 3), batch(*VIEWS, width=width)
+    views["comp_rgb_bg"] = BACKGROUNDS
+    assert guidance(mesh_path, **options)._in_one_pass(rgb, **views) is not None
+    out, grad = step(guidance(mesh_path, **options), rgb, **views)
+    in_general(monkeypatch)
+    expected, expected_grad = step(guidance(mesh_path, **options), rgb, **views)
+    assert torch.equal(grad, expected_grad) and grad.abs().max() > 0
+    assert out.keys() == expected.keys()
+    for name, value in expected.items():
+        torch.testing.assert_close(
+            torch.as_tensor(out[name]), torch.as_tensor(value), rtol=1e-5, atol=0
+        )
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"std": 0.1},
+        {"mode": "view-agnostic"},
+        {"guidance_scale": 3.0},
+        {"space": "latent", "latent_size": 4},
+        {"image_size": 8},
+        {"grad_clip": 0.1},
+        {"variant_type": "csd-variant", "mode": "direction-bins"},
+    ],
+    ids=lambda options: next(iter(options)),
+)
+def test_other_options_take_the_general_path(mesh_path, options):
+    exact, rgb = guidance(mesh_path, **options), uniform(3, 16, 16, 3)
+    assert exact._in_one_pass(rgb, **batch(*VIEWS)) is None
+
+
+def test_a_background_of_pixels_and_a_render_that_is_not_finite_take_the_general_path(mesh_path):
+    exact, rgb, views = guidance(mesh_path), uniform(3, 16, 16, 3), batch(*VIEWS)
+    assert exact._in_one_pass(rgb, **views, comp_rgb_bg=uniform(3, 16, 16, 3)) is None
+    rgb[1, 0, 0, 0] = torch.inf
+    assert exact._in_one_pass(rgb, **views) is None
+    out, grad = step(exact, rgb, **views)
+    assert out["bad_items"] == 1 and grad.isfinite().all() and grad[0].abs().max() > 0
 
 
 @pytest.mark.parametrize(

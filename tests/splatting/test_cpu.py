@@ -30,10 +30,10 @@ def force(monkeypatch):
 
     def force(name):
         monkeypatch.setenv("GAUSSIANDREAMER_ISA", name)
-        cpu._library.cache_clear()
+        cpu.library.cache_clear()
 
     yield force
-    cpu._library.cache_clear()
+    cpu.library.cache_clear()
 
 
 @pytest.fixture(params=cpu.usable_builds())
@@ -174,16 +174,16 @@ def test_more_memory_than_there_is_is_a_named_error():
 def test_a_build_that_does_not_exist_is_named(force):
     force("v5")
     with pytest.raises(UserError, match="v4"):
-        cpu._library()
+        cpu.library()
 
 
 def test_without_a_library_it_says_what_to_do(monkeypatch, tmp_path):
     monkeypatch.setattr(cpu, "FOLDER", tmp_path)
-    cpu._library.cache_clear()
+    cpu.library.cache_clear()
     try:
         assert "compiler" in cpu.unavailable()
     finally:
-        cpu._library.cache_clear()
+        cpu.library.cache_clear()
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")

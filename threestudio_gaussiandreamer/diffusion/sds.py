@@ -8,6 +8,7 @@ Notation of DDPM (Ho et al. 2020): ``abar`` is the cumulative product of 1 - bet
 to z's type."""
 
 from collections.abc import Callable
+from typing import Optional
 
 import torch
 from jaxtyping import Float, Int
@@ -139,25 +140,38 @@ def weight(name: str, abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
     return WEIGHTS[name](abar)
 
 
-def sds_loss(x: Float[Tensor, "B *d"], grad: Float[Tensor, "B *d"]) -> Float[Tensor, ""]:
-    """Compute 0.5 sum grad^2 / B, a loss whose gradient with respect to x is grad / B.
+def sds_loss(
+    x: Float[Tensor, "B *d"],
+    grad: Float[Tensor, "B *d"],
+    *,
+    squares: Optional[Float[Tensor, ""]] = None,
+    slope: float = 1.0,
+) -> Float[Tensor, ""]:
+    """Compute 0.5 sum grad^2 / B, a loss whose gradient with respect to x is slope grad / B.
 
     This is threestudio's 0.5 sum |x - stop(x - grad)|^2 / B without the rounding of x - grad.
+
+    Args:
+        squares: sum grad^2 if it is already known.
+        slope: d latent / dx, where ``grad`` is that with respect to a latent, linear in x.
     """
-    return _GivenGradient.apply(x, grad.detach())
+    squares = grad.detach().square().sum() if squares is None else squares
+    loss = 0.5 * squares / max(len(grad), 1)
+    return _GivenGradient.apply(x, grad.detach(), loss, slope)
 
 
 class _GivenGradient(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, x, grad):
+    def forward(ctx, x, grad, loss, slope):
         ctx.save_for_backward(grad)
-        return 0.5 * grad.square().sum() / max(len(grad), 1)
+        ctx.slope = slope
+        return loss.clone()
 
     @staticmethod
     @once_differentiable
     def backward(ctx, upstream):
         (grad,) = ctx.saved_tensors
-        return upstream / max(len(grad), 1) * grad, None
+        return upstream / max(len(grad), 1) * ctx.slope * grad, None, None, None
 
 
 def ddim_step(

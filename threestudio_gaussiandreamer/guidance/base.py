@@ -44,7 +44,7 @@ from dataclasses import dataclass, field
 from typing import Any, Optional
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..core.errors import UserError, unknown
@@ -205,19 +205,26 @@ class ScoreDistillation(ScoreModel):
                 self._count_bad(bad)
                 self.variant.learn(self, latents.detach(), condition, batch, ~bad)
             loss = _masked_loss(images, latents, grad, bad)
-            norms = grad.flatten(1).norm(dim=1)
-            out = {
-                "loss_sds": loss,
-                "grad_norm": norms.norm(),
-                "min_step": self.min_step,
-                "max_step": self.max_step,
-            }
-            out |= {f"grad_norm_{i}": norm for i, norm in enumerate(norms)}
-            out |= {"bad_items": float(bad.sum()), "evaluations": float(self.evaluations)}
-            out |= self.report() | self.variant.report()
+            out = self._result(loss, grad.flatten(1).norm(dim=1), bad)
             if guidance_eval:
                 out["eval"] = score_pictures(self, self.add_noise(latents), prompt_utils, batch)
         return out
+
+    def _result(
+        self, loss: Float[Tensor, ""], norms: Float[Tensor, " B"], bad: Bool[Tensor, " B"]
+    ) -> dict[str, Any]:
+        """Return the loss and what is logged, from the norm of the gradient of each item and which
+        items are bad.
+        """
+        out = {
+            "loss_sds": loss,
+            "grad_norm": norms.norm(),
+            "min_step": self.min_step,
+            "max_step": self.max_step,
+        }
+        out |= {f"grad_norm_{i}": norm for i, norm in enumerate(norms)}
+        out |= {"bad_items": float(bad.sum()), "evaluations": float(self.evaluations)}
+        return out | self.report() | self.variant.report()
 
     def known_error(
         self, latents: Float[Tensor, "B c h w"], condition: Any

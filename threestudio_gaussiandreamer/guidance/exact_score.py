@@ -39,11 +39,11 @@ towards far views. To measure multi-face alone, give cameras and bank the same s
 angle of view."""
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Optional, Tuple
+from typing import Any, Optional, Tuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..cameras import OrbitRanges, camera_pool
@@ -55,35 +55,17 @@ from ..diffusion.exact_score import LinearLatent, color_matrix, denoise, squared
 from ..host import register
 from ..meshes.load import AXES, load_mesh
 from ..meshes.raycast import MeshCaster
-from ..prompts.view_prompts import view_directions
+from ..splatting.cpu.known_picture import known_gradient
 from .base import GUIDANCE_SCALE, ScoreDistillation
 from .known_truth import MeshTruth, background_of, composite, resized
+from .picture_bank import Bank, Mixture, bank_modes, direction_indices, rows_of
+from .variants.sds import SDS
 
 MODES = ("view-exact", "direction-bins", "view-agnostic")
 SPACES = ("pixel", "latent")
 MAX_MODE_BYTES = 2**31
 BANK_BYTES = 16
 """Memory per pixel of the bank while it is cast, bytes."""
-
-
-class Bank(NamedTuple):
-    """Pictures of the mesh from random views around it, at one size."""
-
-    rgba: UInt8[Tensor, "K H W 4"]
-    """Premultiplied."""
-    pooled: Float[Tensor, "K 4 h w"]
-    """float32 in [0, 1], averaged over the latent's pixels."""
-    latent: LinearLatent
-
-
-class Mixture(NamedTuple):
-    """The modes of one item's mixture distribution."""
-
-    modes: Float[Tensor, "K c h w"]
-    log_prior: Optional[Float[Tensor, " K"]]
-    """0 for the modes of the conditional mixture, -inf for others, which belong only to the
-    unconditional mixture; None if all are conditional and no unconditional mixture is needed.
-    """
 
 
 @register("exact-score-guidance")
@@ -153,6 +135,62 @@ class ExactScoreGuidance(ScoreDistillation):
 
     # Score distillation
     # ---------------------------------------------------------------------------------------
+
+    def __call__(
+        self, rgb: Float[Tensor, "B H W c"], prompt_utils: Any = None, **options: Any
+    ) -> dict[str, Any]:
+        """See :meth:`ScoreDistillation.__call__`; one pass over the pixels where there can be."""
+        found = self._in_one_pass(rgb.detach(), **options)
+        if found is None:
+            return super().__call__(rgb, prompt_utils, **options)
+        grad, squares = found
+        self.evaluations, self._perplexity = 0, 1.0
+        bad = torch.zeros(len(rgb), dtype=torch.bool)
+        self._count_bad(bad)
+        loss = sds.sds_loss(rgb, grad, squares=squares.sum().float(), slope=2.0)
+        return self._result(loss, squares.sqrt().float(), bad)
+
+    @torch.no_grad()
+    def _in_one_pass(
+        self,
+        rgb: Float[Tensor, "B H W c"],
+        *,
+        c2w: Tensor,
+        fovy: Tensor,
+        comp_rgb_bg: Optional[Tensor] = None,
+        rgb_as_latents: bool = False,
+        guidance_eval: bool = False,
+        **batch: Any,
+    ) -> Optional[tuple[Float[Tensor, "B H W 3"], Float[Tensor, " B"]]]:
+        """Return the gradient of the latents, channels last, and the sum of its squares per item;
+        None if other options, or values that aren't finite, need the general path.
+        """
+        size = rgb.shape[1:3]
+        if rgb_as_latents or guidance_eval or not self._compares_pixels(size):
+            return None
+        background = background_of(comp_rgb_bg, len(rgb), rgb.device)
+        if background.shape[1:3] != (1, 1):
+            return None
+        self._size = tuple(size)
+        pictures = self.truth.pictures(c2w, fovy, *size)
+        _, abar = self.draw_timesteps(rgb)
+        weight = sds.weight(self.options.weighting_strategy, abar).float()
+        background, scale = background[:, 0, 0].contiguous(), (abar / (1 - abar)).sqrt().float()
+        found = known_gradient(rgb, pictures, background, scale, weight)
+        return found if found is not None and found[1].isfinite().all() else None
+
+    def _compares_pixels(self, size: tuple[int, int]) -> bool:
+        """Return whether the score is that of one picture per item without width, of the pixels of
+        renders of this size, and nothing but its weight is applied to it.
+        """
+        options = self.options
+        return (
+            (options.mode, options.space, options.std) == ("view-exact", "pixel", 0)
+            and self._picture_size(*size) == tuple(size)
+            and not self.guided
+            and self.grad_clip is None
+            and type(self.variant) is SDS
+        )
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B c h w"]:
         self._size = self._picture_size(*rgb.shape[-2:])
@@ -270,7 +308,7 @@ class ExactScoreGuidance(ScoreDistillation):
                 return Mixture(own, None)
             return Mixture(
                 torch.cat(
-                    [*own_views, bank_modes(_rows(self.bank(*self._size), members), background)]
+                    [*own_views, bank_modes(rows_of(self.bank(*self._size), members), background)]
                 ),
                 None,
             )
@@ -352,36 +390,3 @@ class ExactScoreGuidance(ScoreDistillation):
                 " system.guidance.image_size that is a multiple of system.guidance.latent_size"
             )
         return factor
-
-
-def direction_indices(
-    elevation: Float[Tensor, " B"], azimuth: Float[Tensor, " B"]
-) -> Int[Tensor, " B"]:
-    """Classify views in degrees by threestudio's rules for view-dependent prompts: 0 side, 1 front,
-    2 back, 3 overhead.
-    """
-    indices = torch.zeros_like(azimuth, dtype=torch.long)
-    for index, direction in enumerate(view_directions(45, 45, 60)):
-        indices[direction.condition(elevation, azimuth, azimuth)] = index
-    return indices
-
-
-def bank_modes(bank: Bank, background: Float[Tensor, "bh bw 3"]) -> Float[Tensor, "K c h w"]:
-    """Encode the bank on a background of one colour (1, 1, 3) or of pixels (H', W', 3)."""
-    if background.shape[:2] == (1, 1):  # pooling and compositing commute
-        pooled = bank.pooled.to(background.device)
-        return bank.latent.encode_pooled(
-            pooled[:, :3] + (1 - pooled[:, 3:]) * background.reshape(3, 1, 1)
-        )
-    return torch.cat(
-        [bank.latent.encode(composite(rgba, background[None])) for rgba in bank.rgba.split(16)]
-    )
-
-
-def _rows(bank: Bank, members: Bool[Tensor, " K"]) -> Bank:
-    members = members.to(bank.rgba.device)
-    return (
-        bank
-        if members.all()
-        else bank._replace(rgba=bank.rgba[members], pooled=bank.pooled[members])
-    )

@@ -29,14 +29,14 @@ BUILDS = ("v4", "v3", "base")  # best first
 def unavailable() -> Optional[str]:
     """Return why the library can't be used on this machine, or None if it can."""
     try:
-        _library()
+        library()
     except (OSError, UserError) as error:
         return str(error)
 
 
 def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
     """Draw all views of a validated scene."""
-    kernel = CpuKernel(options, scene.tracked, torch.get_num_threads(), _library())
+    kernel = CpuKernel(options, scene.tracked, torch.get_num_threads(), library())
     return autograd.rasterize(kernel, scene, options)
 
 
@@ -155,8 +155,13 @@ def usable_builds() -> list[str]:
 
 
 @functools.cache
-def _library() -> ctypes.CDLL:
-    """Load the build that GAUSSIANDREAMER_ISA names, else the best one."""
+def library() -> ctypes.CDLL:
+    """Load the build that GAUSSIANDREAMER_ISA names, else the best one.
+
+    Raises:
+        OSError: it isn't built.
+        UserError: this machine or installation doesn't have the named one.
+    """
     forced, usable = os.environ.get("GAUSSIANDREAMER_ISA"), usable_builds()
     if forced and forced not in BUILDS:
         raise unknown("instruction set in GAUSSIANDREAMER_ISA", forced, BUILDS)

@@ -5,6 +5,7 @@
 // depend on the number of threads, so results are bit-identical for any.
 #include "bin.h"
 #include "blend.h"
+#include "known_picture.h"
 #include "project_backward.h"
 
 struct SplatState {
@@ -129,6 +130,10 @@ int64_t splat_backward(SplatState* state, const splat::Scene* scene, const Splat
 
 void splat_release(SplatState* state) {
   if (state) splat::states().give(std::unique_ptr<SplatState>(state));
+}
+
+int64_t splat_known_gradients(const SplatKnownPictures* in, const SplatKnownGradient* out) {
+  return splat::guarded([&] { splat::known_gradients(*in, *out); });
 }
 
 const char* splat_best_isa() {

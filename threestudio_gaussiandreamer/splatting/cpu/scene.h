@@ -36,6 +36,21 @@ struct SplatGradients {
 // State of a forward pass that its backward pass needs.
 struct SplatState;
 
+struct SplatKnownPictures {
+  const float* render;      // (B, H, W, 3) in [0, 1]
+  const uint8_t* picture;   // (B, 4, H, W) premultiplied colour and coverage
+  const float* background;  // (B, 3)
+  const float* scale;       // (B) of the error of the latent
+  const float* weight;      // (B) of the gradient
+  int64_t items, height, width;
+  int32_t threads;
+};
+
+struct SplatKnownGradient {
+  float* gradient;  // (B, H, W, 3), with respect to the latent 2 render - 1
+  double* squares;  // (B, H), its squares, summed over a row
+};
+
 #pragma GCC visibility push(default)
 extern "C" {
 // 0, or the bytes of memory that would have been needed. If `state` is not null, it receives what a backward pass needs, to be
@@ -43,6 +58,7 @@ extern "C" {
 int64_t splat_forward(const splat::Scene*, const SplatSettings*, const SplatPictures*, SplatState** state);
 int64_t splat_backward(SplatState*, const splat::Scene*, const SplatSettings*, const SplatUpstream*, const SplatGradients*);
 void splat_release(SplatState*);  // null is ignored
+int64_t splat_known_gradients(const SplatKnownPictures*, const SplatKnownGradient*);
 // The best build for this processor: "v4", "v3" or "base".
 const char* splat_best_isa();
 }

@@ -1,0 +1,74 @@
+"""The compiled pass of score distillation towards one known picture per render."""
+
+import ctypes
+from collections.abc import Callable
+from typing import Optional
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from ...core.errors import UserError
+from ..scene import address
+from .backend import library
+
+
+class _Pictures(ctypes.Structure):
+    """``SplatKnownPictures`` of scene.h."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in "render picture background scale weight".split()),
+        *((name, ctypes.c_int64) for name in "items height width".split()),
+        ("threads", ctypes.c_int32),
+    ]
+
+
+class _Gradient(ctypes.Structure):
+    """``SplatKnownGradient`` of scene.h."""
+
+    _fields_ = [("gradient", ctypes.c_void_p), ("squares", ctypes.c_void_p)]
+
+
+def known_gradient(
+    render: Float[Tensor, "B H W 3"],
+    pictures: UInt8[Tensor, "B H W 4"],
+    background: Float[Tensor, "B 3"],
+    scale: Float[Tensor, " B"],
+    weight: Float[Tensor, " B"],
+) -> Optional[tuple[Float[Tensor, "B H W 3"], Float[Tensor, " B"]]]:
+    """Compute w s (x - x_1), the gradient of score distillation with respect to the latent
+    x = 2 render - 1, where x_1 is the latent of a picture on the background.
+
+    Args:
+        pictures: premultiplied, in memory a plane per channel.
+        scale: s, of the error of the latent.
+        weight: w.
+
+    Returns:
+        the gradient, bit for bit that of plain torch, and the sum of its squares per item, float64;
+        None where the library or the tensors aren't of the kind that it takes.
+    """
+    planes = pictures.movedim(-1, 1)
+    float32 = (render, background, scale, weight)
+    taken = all(x.dtype == torch.float32 and x.is_contiguous() for x in float32)
+    function = _function() if render.device.type == "cpu" else None
+    if function is None or not (taken and planes.is_contiguous()):
+        return None
+    items, height, width, _ = render.shape
+    gradient = torch.empty_like(render)
+    squares = torch.empty(items, height, dtype=torch.float64)
+    inputs = map(address, (render, planes, background, scale, weight))
+    sizes = (items, height, width, torch.get_num_threads())
+    function(_Pictures(*inputs, *sizes), _Gradient(*map(address, (gradient, squares))))
+    return gradient, squares.sum(1)
+
+
+def _function() -> Optional[Callable[..., int]]:
+    """Return the function of the library; None if it isn't built, or older than the function."""
+    try:
+        function = library().splat_known_gradients
+    except (OSError, UserError, AttributeError):
+        return None
+    function.argtypes = [ctypes.POINTER(_Pictures), ctypes.POINTER(_Gradient)]
+    function.restype = ctypes.c_int64
+    return function
