@@ -30,7 +30,7 @@ def finished(folder, prompts):
 @pytest.fixture
 def judge(tmp_path):
     torch.manual_seed(0)
-    export.write_judge(tmp_path / "judge.safetensors", models.Judge().state_dict())
+    export.write_weights(tmp_path / "judge.safetensors", models.Judge().state_dict())
     return str(tmp_path / "judge.safetensors")
 
 

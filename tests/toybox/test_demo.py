@@ -12,12 +12,17 @@ from PIL import Image
 
 from tests.toybox.test_text_to_3d import PROMPT, QUICK
 from threestudio_gaussiandreamer.launch.experiment import main as launcher
-from threestudio_gaussiandreamer.toybox import demo
+from threestudio_gaussiandreamer.models.bundled import JUDGE
+from threestudio_gaussiandreamer.toybox import demo, models
+from threestudio_gaussiandreamer.toybox.export import write_weights
 from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
 from threestudio_gaussiandreamer.toybox.world import withheld
 
 OPTIONS = [option for option in QUICK if "=t" not in option[-3:] and "timestamp" not in option]
 OPTIONS += ["system.pages=false", "system.exporter={formats: [ply], save_video: false}"]
+
+FULL_SIZE = models.Judge.CHANNELS
+"""Of the judge, before a fixture makes it smaller."""
 
 
 @pytest.fixture
@@ -90,7 +95,10 @@ def test_wrong_input_is_named(tmp_path, capsys, words, message):
 
 
 @pytest.mark.slow
-def test_ctrl_c_writes_a_checkpoint_from_which_the_demo_continues(exported, tmp_path):
+def test_ctrl_c_writes_a_checkpoint_and_tells_how_to_continue(exported, tmp_path, monkeypatch):
+    # the other process builds a judge of full size; the other networks' sizes are in their files
+    monkeypatch.setattr(models.Judge, "CHANNELS", FULL_SIZE)
+    write_weights(exported / JUDGE, models.Judge().state_dict())
     options = [*arguments(exported, tmp_path, PROMPT), "trainer.max_steps=500"]
     command = [sys.executable, "-m", "threestudio_gaussiandreamer.toybox.demo", *options]
     root = Path(__file__).parents[2]

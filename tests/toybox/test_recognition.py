@@ -56,13 +56,22 @@ def test_faces_on_all_sides():
 def test_an_exported_judge_is_loaded(tmp_path):
     torch.manual_seed(0)
     judge = models.Judge()
-    export.write_judge(tmp_path / "judge.safetensors", judge.state_dict())
+    export.write_weights(tmp_path / "judge.safetensors", judge.state_dict())
     loaded = recognition.load_judge(tmp_path / "judge.safetensors")
     pictures = torch.rand(2, 3, 128, 128)
     for name, values in recognition.probabilities(judge, pictures).items():
         torch.testing.assert_close(
             recognition.probabilities(loaded, pictures)[name], values, atol=1e-2, rtol=0
         )
+
+
+def test_the_message_about_a_judge_of_another_size_is_one_line(tmp_path, monkeypatch):
+    path = tmp_path / "judge.safetensors"
+    export.write_weights(path, models.Judge().state_dict())
+    monkeypatch.setattr(models.Judge, "CHANNELS", (8, 8, 8, 8))
+    with pytest.raises(UserError, match="judge") as caught:
+        recognition.load_judge(path)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"\x08\0\0\0\0\0\0\0{}      "])

@@ -54,7 +54,8 @@ def load_judge(name: str) -> Judge:
             "(python -m threestudio_gaussiandreamer.toybox.export), and give its file as --judge"
         ) from None
     except (OSError, SafetensorError, RuntimeError) as error:
-        raise UserError(f"{str(path)!r} isn't a judge of the toybox: {error}") from error
+        reason = str(error).partition("\n")[0]  # torch lists every parameter that differs
+        raise UserError(f"{str(path)!r} isn't a judge of the toybox: {reason}") from error
     return judge.eval()
 
 
