@@ -25,6 +25,15 @@ def test_random_depends_on_the_step_alone_and_rests_in_evaluation():
     assert torch.equal(background.eval().color(4), torch.ones(4, 3))
 
 
+def test_random_colours_are_held_for_so_many_steps():
+    background, colors = FlatBackground({"mode": "random", "hold_steps": 3}), []
+    for step in range(6):
+        background.update_step(0, step)
+        colors.append(background.color(2))
+    assert all(torch.equal(colors[i], colors[i - i % 3]) for i in range(6))
+    assert not torch.equal(colors[0], colors[3])
+
+
 def test_learned_starts_at_the_colour_stays_in_range_and_learns():
     background = FlatBackground(
         {"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": [0, 0.1, 0.2, 10]}

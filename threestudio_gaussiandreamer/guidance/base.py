@@ -32,6 +32,7 @@ grad_clip           clamp each element of the latent's gradient to +- this; none
 weighting_strategy  w(t): sds (1 - abar), uniform (1), fantasia3d (sqrt(abar) (1 - abar)),
                     x0 (sqrt((1 - abar) / abar): the gradient is x minus the denoised x),
                     rectified_flow (1 + sqrt((1 - abar) / abar): the error of a flow's velocity)
+reuse_steps         steps of the same views that one prediction serves, see ``reuse.py``
 max_bad_steps       stop after this many steps in a row in which the score of some item was NaN or
                     infinite
 max_items_eval      how many items ``guidance_eval`` shows; 0 or less = all, as in threestudio
@@ -52,6 +53,7 @@ from ..core.options import at_least, checked_options, in_range, one_of, schedule
 from ..diffusion import sds
 from ..host import C, find, names, parse_structured, warn
 from .particles import GaussianParticles, ParticleModel
+from .reuse import Error, KeptPrediction
 from .score_model import GUIDANCE_SCALE, ScoreModel
 from .score_pictures import score_pictures
 from .variants import Variant
@@ -72,6 +74,7 @@ class ScoreDistillation(ScoreModel):
         variant: dict = field(default_factory=dict)
         grad_clip: Any = field(default=None, metadata=schedule(min=0))
         weighting_strategy: str = field(default="sds", metadata=one_of(sds.WEIGHTS))
+        reuse_steps: int = field(default=1, metadata=in_range(1, 1000, "steps"))
         max_bad_steps: int = field(default=10, metadata=at_least(1))
         max_items_eval: int = 4
         eval_steps: int = field(default=20, metadata=in_range(1, 1000))
@@ -147,6 +150,7 @@ class ScoreDistillation(ScoreModel):
         self.options = checked_options(self.Config, self.cfg, "system.guidance.")
         super().configure()
         self.variant = variant_class(self.cfg)(self.cfg.variant)
+        self._kept = KeptPrediction(self.options.reuse_steps)
         self.bad_items = self.bad_steps = 0
         self.update_step(0, 0)
 
@@ -200,10 +204,12 @@ class ScoreDistillation(ScoreModel):
             latents = (images if rgb_as_latents else self.encode(images, **batch)).float()
             with torch.no_grad():
                 condition = self.condition(prompt_utils, **batch)
-                grad, bad = self._gradient(*self.variant.error(self, latents, condition, batch))
+                error, fresh = self._error(latents, condition, batch, guidance_eval)
+                grad, bad = self._gradient(*error)
             if not guidance_eval:  # an evaluation isn't a training step
                 self._count_bad(bad)
-                self.variant.learn(self, latents.detach(), condition, batch, ~bad)
+                if fresh:
+                    self.variant.learn(self, latents.detach(), condition, batch, ~bad)
             loss = _masked_loss(images, latents, grad, bad)
             out = self._result(loss, grad.flatten(1).norm(dim=1), bad)
             if guidance_eval:
@@ -225,6 +231,34 @@ class ScoreDistillation(ScoreModel):
         out |= {f"grad_norm_{i}": norm for i, norm in enumerate(norms)}
         out |= {"bad_items": float(bad.sum()), "evaluations": float(self.evaluations)}
         return out | self.report() | self.variant.report()
+
+    def _error(
+        self,
+        latents: Float[Tensor, "B c h w"],
+        condition: Any,
+        batch: dict[str, Any],
+        guidance_eval: bool,
+    ) -> tuple[Error, bool]:
+        """Compute the variant's error; also return whether it is that of a new prediction."""
+
+        def predict() -> Error:
+            return self.variant.error(self, latents, condition, batch)
+
+        if guidance_eval:
+            return predict(), True
+        return self._kept.error(self.step, latents, batch, predict)
+
+    def state(self) -> dict[str, Tensor]:
+        """Return the tensors that a checkpoint needs to resume; empty for most configurations."""
+        return self.variant.state() | self._kept.state()
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Restore what :meth:`state` returned.
+
+        Raises:
+            UserError: the tensors aren't those of this configuration.
+        """
+        self.variant.restore(self, self._kept.restore(state, self.device))
 
     def known_error(
         self, latents: Float[Tensor, "B c h w"], condition: Any

@@ -117,7 +117,7 @@ def learnt_weights(guidance: Any) -> dict[str, Tensor]:
     model.
     """
     if isinstance(guidance, ScoreDistillation):
-        return guidance.variant.state()
+        return guidance.state()
     return {name: parameter.detach() for name, parameter in trainable_parameters(guidance).items()}
 
 
@@ -128,7 +128,7 @@ def restore_learnt(guidance: Any, weights: dict[str, Tensor]) -> None:
         UserError: names or shapes differ from the parameters that the guidance trains.
     """
     if isinstance(guidance, ScoreDistillation):
-        guidance.variant.restore(guidance, weights)
+        guidance.restore(weights)
         return
     own = trainable_parameters(guidance)
     if {name: parameter.shape for name, parameter in own.items()} != {

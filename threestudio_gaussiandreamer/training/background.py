@@ -1,13 +1,14 @@
 """Background ``gaussiandreamer-background``: one colour per view, composited inside the rasteriser.
 
-======  ============================================================================================
-option  meaning
-======  ============================================================================================
-mode    ``fixed``: always ``color``; ``random``: in training a random colour per view, otherwise
-        ``color``; ``learned``
-color   RGB in [0, 1]
-lr      learning rate of the learned colour: a number or a schedule
-======  ============================================================================================
+==========  ========================================================================================
+option      meaning
+==========  ========================================================================================
+mode        ``fixed``: always ``color``; ``random``: in training a random colour per view, otherwise
+            ``color``; ``learned``
+color       RGB in [0, 1]
+lr          learning rate of the learned colour: a number or a schedule
+hold_steps  consecutive steps with the same random colours
+==========  ========================================================================================
 """
 
 from dataclasses import dataclass, field
@@ -18,8 +19,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..core.distributed import first_item
-from ..core.options import checked_options, each, in_range, one_of, schedule
-from ..core.streams import generator
+from ..core.options import at_least, checked_options, each, in_range, one_of, schedule
+from ..core.streams import generator, held
 from ..host import BaseBackground, C, register, run_seed
 
 MODES = ("fixed", "random", "learned")
@@ -34,6 +35,7 @@ class FlatBackground(BaseBackground):
             default=(0.0, 0.0, 0.0), metadata=each(in_range(0, 1))
         )
         lr: Any = field(default=1e-2, metadata=schedule(min=0))
+        hold_steps: int = field(default=1, metadata=at_least(1))
 
     cfg: Config
 
@@ -67,10 +69,10 @@ class FlatBackground(BaseBackground):
         if self.options.mode == "learned":
             return torch.sigmoid(self.logit).expand(batch_size, 3)
         if self.options.mode == "random" and self.training:
-            first = first_item(batch_size)
+            first, step = first_item(batch_size), held(self.step, self.options.hold_steps)
             return torch.stack(
                 [
-                    torch.rand(3, generator=generator(run_seed(), "background", self.step, item))
+                    torch.rand(3, generator=generator(run_seed(), "background", step, item))
                     for item in range(first, first + batch_size)
                 ]
             ).to(self.fixed)

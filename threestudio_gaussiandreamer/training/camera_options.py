@@ -63,6 +63,7 @@ class CameraConfig:
     progressive_until: int = field(default=0, metadata=at_least(0, "steps"))
     rays_d_normalize: bool = True
     train_views: int = field(default=0, metadata=count_of("views", 0, CAMERA_BYTES))
+    hold_steps: int = field(default=1, metadata=at_least(1, "steps"))
     rays: bool = False
     n_view: int = field(default=1, metadata=in_range(1, 64, "views"))
 
