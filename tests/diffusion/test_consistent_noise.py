@@ -6,9 +6,11 @@ import torch
 
 from threestudio_gaussiandreamer.cameras import orbit_c2w, ray_directions
 from threestudio_gaussiandreamer.diffusion.consistent_noise import (
-    SAMPLES,
+    LATTICES,
     TABLE,
-    attach_noise,
+    attached_noise,
+    cell_size,
+    surface_cells,
     surface_points,
 )
 
@@ -37,13 +39,15 @@ def table(seed=0, channels=4):
     return torch.randn(TABLE, channels, generator=torch.Generator().manual_seed(seed))
 
 
-def image_noise(views, size, seed=1, channels=4):
-    return torch.randn(views, channels, size, size, generator=torch.Generator().manual_seed(seed))
+def noise_of(size, table, view, draws=None):
+    """Return the noise of latents of size x size pixels, with background ``draws`` from 0."""
+    draws = torch.arange(len(view[0]), dtype=torch.int32) if draws is None else draws
+    return attached_noise((size, size), table, draws, *view)
 
 
 def test_points_lie_on_the_surface():
     depth, opacity, c2w, fovy = ball([0.0, 70.0], 64)
-    points = torch.stack(surface_points(depth[..., 0], c2w, fovy), -1)
+    points = surface_points(depth[..., 0], c2w, fovy).movedim(1, -1)
     inside = opacity[..., 0] > 0
     assert inside.float().mean() > 0.2
     torch.testing.assert_close(
@@ -57,43 +61,55 @@ def test_pixels_are_standard_normal_and_hardly_correlated():
     size, samples = 32, []
     view = ball([20.0], 128)
     for seed in range(200):
-        samples.append(attach_noise(image_noise(1, size, seed), table(seed), *view)[0, 0])
+        samples.append(noise_of(size, table(seed), view)[0, 0])
     noise = torch.stack(samples)
     # of 200 seeds and 1024 pixels: 5 standard deviations of a mean and of a variance
     assert abs(float(noise.mean())) < 5 / (200 * size**2 / 4) ** 0.5
     assert abs(float(noise.var()) - 1) < 0.03
     neighbours = (noise[:, :, 1:] * noise[:, :, :-1]).mean(0)[8:24, 8:24]
-    # the nearest points of two pixels share a cell with a probability of at most a half
+    # two neighbouring pixels share a cell of a lattice with a probability below a quarter
     assert abs(float(neighbours.mean())) < 0.25
 
 
 def test_near_views_see_the_same_noise_and_far_views_do_not():
     size, view = 32, ball([0.0, 0.0, 0.5, 90.0], 128)
-    noise = attach_noise(image_noise(4, size), table(), *view)
+    noise = noise_of(size, table(), view)
     centre = noise[:, :, 12:20, 12:20].flatten(1)
     correlation = torch.corrcoef(centre)
     assert torch.equal(centre[0], centre[1])
     assert correlation[0, 2] > 0.5 and abs(correlation[0, 3]) < 0.2
-    independent = image_noise(4, size)[:, :, 12:20, 12:20].flatten(1)
-    assert abs(torch.corrcoef(independent)[0, 2]) < 0.2
 
 
-def test_the_background_keeps_the_noise_of_the_image():
-    size, view = 32, ball([0.0, 40.0], 128)
-    plain = image_noise(2, size)
-    noise = attach_noise(plain, table(), *view)
-    corner = (slice(None), slice(None), slice(0, 4), slice(0, 4))
-    assert torch.equal(noise[corner], plain[corner])
-    assert not torch.equal(noise[:, :, 16, 16], plain[:, :, 16, 16])
+def test_the_background_has_noise_of_its_own_in_each_view_and_draw():
+    size, view = 32, ball([0.0, 0.0], 128)
+    noise = noise_of(size, table(), view)
+    again = noise_of(size, table(), view, torch.tensor([0, 7], dtype=torch.int32))
+    corner = (slice(None), slice(0, 6), slice(0, 6))
+    assert torch.equal(noise[0], again[0])
+    assert torch.equal(noise[1, :, 16, 16], again[1, :, 16, 16])  # the surface
+    for a, b in ((noise[0], noise[1]), (noise[1], again[1])):
+        correlation = torch.corrcoef(torch.stack([a[corner].flatten(), b[corner].flatten()]))
+        assert abs(float(correlation[0, 1])) < 0.25  # three deviations of 144 numbers
+    assert len(noise[0][corner].unique()) == 4 * 6 * 6
 
 
-def test_points_of_one_cell_count_as_one_value():
-    """Seen from very near, all points of a pixel may lie in one cell: still variance 1
-    (five deviations of it are 0.2)."""
-    depth, opacity = torch.full((1, 8, 8, 1), 0.1), torch.ones(1, 8, 8, 1)
-    c2w, fovy = orbit_c2w(*torch.tensor([[10.0], [20.0], [3.0]])), torch.tensor([0.5])
-    values = [
-        attach_noise(image_noise(1, 4, seed), table(seed), depth, opacity, c2w, fovy)
-        for seed in range(300)
-    ]
-    assert SAMPLES == 2 and abs(float(torch.stack(values).var()) - 1) < 0.2
+def test_a_background_is_standard_normal_and_its_pixels_are_independent():
+    view = ball([0.0], 128)
+    nothing = (view[0], torch.zeros_like(view[1]), *view[2:])
+    noise = noise_of(64, table(), nothing)[0]
+    assert abs(float(noise.mean())) < 5 / 2**7 and abs(float(noise.var()) - 1) < 0.06
+    neighbours = (noise[:, :, 1:] * noise[:, :, :-1]).mean()
+    assert abs(float(neighbours)) < 0.04  # five deviations of 16,000 products
+
+
+def test_a_pixel_is_the_sum_of_its_cells_in_all_lattices():
+    depth, opacity, c2w, fovy = view = ball([30.0], 32)
+    size = cell_size(c2w, fovy, 32)
+    rows = surface_cells(depth[..., 0], c2w, fovy, size)
+    values = table()
+    expected = sum(values[row.long()] for row in rows).movedim(-1, 1) / LATTICES**0.5
+    inside = opacity[:, None, :, :, 0] > 0
+    found = noise_of(32, values, view)
+    torch.testing.assert_close(found * inside, expected * inside)
+    same = (rows[0] == rows[1]) & inside[:, 0]
+    assert LATTICES == 2 and float(same.float().mean()) < 0.01

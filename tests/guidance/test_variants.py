@@ -14,8 +14,8 @@ from tests.helpers.mixture_guidance import (
     mixture_guidance,
     noise_of,
 )
-from threestudio_gaussiandreamer.core.streams import generator
-from threestudio_gaussiandreamer.diffusion.consistent_noise import attach_noise
+from threestudio_gaussiandreamer.diffusion.consistent_noise import attached_noise
+from threestudio_gaussiandreamer.diffusion.noise_table import NoiseTable
 
 EXACT = 1e-10
 """Largest error: only rounding of float64, and the noise, which is drawn in float32, is given."""
@@ -190,14 +190,14 @@ def test_sdi_is_threestudios_step_by_step():
         cond, uncond = both_scores(guidance, z, torch.tensor([t]))
         return cond + scale * (cond - uncond)
 
-    z = x
+    z, table = x, NoiseTable(0, 3)
     times = [*range(0, int(t), 100), int(t)]
     for index, (now, later) in enumerate(zip(times, times[1:], strict=False)):
         eps = predicted(z, now, -7.5)
         original = (z - (1 - abars[now]) ** 0.5 * eps) / abars[now] ** 0.5
         z = abars[later] ** 0.5 * original + (1 - abars[later]) ** 0.5 * eps
         variance = (1 - abars[now]) / (1 - abars[later]) * (1 - abars[later] / abars[now])
-        drawn = torch.randn(1, 1, 3, generator=generator(0, f"inversion {index}", 11))
+        drawn = table.draw((1, 1, 3), f"inversion {index}", 11, [0])[0]
         z = z + 0.3 * drawn.double() * variance**0.5
     denoised = (z - (1 - abars[t]) ** 0.5 * predicted(z, int(t), 7.5)) / abars[t] ** 0.5
     weight = ((1 - abars[t]) / abars[t]) ** 0.5
@@ -249,9 +249,10 @@ def test_cfd_uses_the_surfaces_noise():
         "c2w": torch.eye(4).repeat(2, 1, 1),
         "fovy": torch.full((2,), 0.8),
     }
-    noise = attach_noise(
-        guidance.normal(x, "noise"),
+    noise = attached_noise(
+        x.shape[-2:],
         guidance.variant.table(guidance.step + 1, x),  # the same in another step
+        guidance.variant.draws(guidance.step, x),
         *(batch[name] for name in ("depth", "opacity", "c2w", "fovy")),
     )
     t, a, sigma, *_ = draws(guidance, x)

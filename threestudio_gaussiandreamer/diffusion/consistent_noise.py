@@ -1,13 +1,16 @@
 """Gaussian noise that is attached to surfaces, so that all views of a point see the same noise.
 
-Space is divided into cubic cells, each with its own standard normal values, one per channel. A
-pixel of the latent covers ``SAMPLES`` x ``SAMPLES`` points of the rendered surface; its noise is
-the sum of their cells' values over the square root of the sum's variance, so each pixel is standard
-normal, and pixels are independent unless they see the same cell. A cell's size is a power of two,
-from half the distance of two such points at the origin to all of it (surfaces are nearer to the
-camera than the origin, so their points are closer): views from similar distances share their cells.
+Space is divided into cubic cells, each with its own standard normal values, one per channel, in
+``LATTICES`` ways that are shifted against each other. A pixel of the latent looks up the cells of
+the point of the rendered surface at its centre, one per lattice; its noise is their sum over the
+square root of their number. Each pixel is thus standard normal, and pixels are independent unless
+they see the same cell. A cell's size is a power of two, from half the distance of two such points
+at the origin to all of it: views from similar distances share their cells.
 
-The values stand in a table that a hash of the cell looks up."""
+The values stand in a table that a hash of the cell looks up. The pixels of the background look up
+rows that change with each draw."""
+
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
@@ -16,19 +19,21 @@ from torch import Tensor
 
 from ..cameras import focal_length
 
-SAMPLES = 2
+LATTICES = 2
 TABLE = 2**16
 """Rows of the table of values, a power of two."""
 PRIMES = (73856093, 19349663, 83492791)
-"""Factors of the hash of Teschner et al. (2003)."""
+"""Of Teschner et al. (2003). Rows are sums of the products, modulo ``TABLE``: other than with their
+exclusive or, cells that are near each other never share a row.
+"""
 OPAQUE = 0.5
-"""Alpha below which a point belongs to the background, which has the noise of the image."""
+"""Alpha below which a pixel belongs to the background."""
 
 
 def surface_points(
-    depth: Float[Tensor, "B h w"], c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"]
-) -> list[Float[Tensor, "B h w"]]:
-    """Return the three world coordinates of the points on the rendered surface.
+    depth: Float[Tensor, "B h w"], c2w: Float[Tensor, "B 3 4"], fovy: Float[Tensor, " B"]
+) -> Float[Tensor, "B 3 h w"]:
+    """Return the world coordinates of the points on the rendered surface.
 
     Args:
         depth: along the optical axis, at the centres of h x w pixels.
@@ -38,26 +43,45 @@ def surface_points(
     focal = focal_length(fovy, height)[:, None]
     right = (torch.arange(width, device=depth.device) + 0.5 - width / 2) / focal
     up = (height / 2 - 0.5 - torch.arange(height, device=depth.device)) / focal
-    axes = c2w[:, :3, :, None]
-    return [
-        axis[:, 3, None]
-        + depth * ((axis[:, 0] * right - axis[:, 2])[:, None] + (axis[:, 1] * up)[..., None])
-        for axis in axes.unbind(1)
-    ]
+    x, y, z, position = c2w[:, :3, :, None].unbind(2)
+    rays = (x * right[:, None] - z)[:, :, None] + (y * up[:, None])[..., None]
+    return rays.mul_(depth[:, None]).add_(position[..., None])
 
 
-def cells(points: list[Float[Tensor, "B h w"]], size: Float[Tensor, " B"]) -> Int[Tensor, "B h w"]:
-    """Return the hash of each point's cell, in [0, TABLE).
+def surface_cells(
+    depth: Float[Tensor, "B h w"],
+    c2w: Float[Tensor, "B 4 4"],
+    fovy: Float[Tensor, " B"],
+    size: Float[Tensor, " B"],
+) -> list[Int[Tensor, "B h w"]]:
+    """Return the row of each point's cell, a hash, for each lattice.
 
     Args:
-        points: the three coordinates.
         size: of the cells, world units.
     """
-    scale = (1 / size)[:, None, None]
-    x, y, z = (
-        torch.floor(axis * scale).int() * prime for axis, prime in zip(points, PRIMES, strict=True)
+    points = surface_points(depth, c2w[:, :3] / size[:, None, None], fovy)
+    primes = torch.tensor(PRIMES, dtype=torch.int32, device=depth.device)[:, None, None]
+    rows = []
+    for lattice in range(LATTICES):
+        shifted = points.add_(1 / LATTICES) if lattice else points
+        x, y, z = shifted.floor().int().mul_(primes).unbind(1)
+        rows.append(x.add_(y).add_(z).add_(mark(lattice)).bitwise_and_(TABLE - 1))
+    return rows
+
+
+def mark(lattice: int) -> int:
+    """Return what makes the rows of a lattice differ from those of others."""
+    return lattice * TABLE // LATTICES
+
+
+@lru_cache(maxsize=4)
+def background_cells(height: int, width: int, device: torch.device) -> Int[Tensor, "h w"]:
+    """Return a number for each pixel of an image, of which its row follows."""
+    rows, columns = (
+        torch.arange(n, dtype=torch.int32, device=device) * prime
+        for n, prime in zip((height, width), PRIMES, strict=False)
     )
-    return (x ^ y ^ z) & (TABLE - 1)
+    return rows[:, None] + columns
 
 
 def cell_size(
@@ -69,55 +93,44 @@ def cell_size(
         height: of the latent, pixels.
     """
     footprint = c2w[:, :3, 3].norm(dim=1) / focal_length(fovy, height)
-    return torch.exp2(torch.floor(torch.log2(footprint.clamp_min(1e-6) / SAMPLES)))
+    return torch.exp2(torch.floor(torch.log2(footprint.clamp_min(1e-6))))
 
 
-def attach_noise(
-    image_noise: Float[Tensor, "B c h w"],
+def attached_noise(
+    size: tuple[int, int],
     table: Float[Tensor, "TABLE c"],
+    draws: Int[Tensor, " B"],
     depth: Float[Tensor, "B H W 1"],
     opacity: Float[Tensor, "B H W 1"],
     c2w: Float[Tensor, "B 4 4"],
     fovy: Float[Tensor, " B"],
 ) -> Float[Tensor, "B c h w"]:
-    """Return the noise of the latents' pixels: that of the surface where there is one.
+    """Return standard normal noise, attached to the surface where there is one.
 
     Args:
-        image_noise: standard normal noise, for pixels of the background.
+        size: (h, w) of the latents.
         table: standard normal values of the cells.
+        draws: random int32 numbers in [0, TABLE), from which the background's noise follows.
         depth: of the renderer, along the optical axis.
     """
-    height, width = image_noise.shape[-2:]
-    grid = (SAMPLES * height, SAMPLES * width)
     c2w, fovy = c2w.float(), fovy.float()
-    points = surface_points(_sampled(depth, grid), c2w, fovy)
-    samples = _samples(cells(points, cell_size(c2w, fovy, height)))
-    values = sum(table.index_select(0, sample.flatten()) for sample in samples)
-    noise = (values / _deviation(samples).reshape(-1, 1)).unflatten(0, (-1, height, width))
-    surface = _sampled(opacity, (height, width))[:, None] >= OPAQUE
-    return torch.where(surface, noise.movedim(-1, 1).to(image_noise), image_noise)
+    cells = surface_cells(_sampled(depth, size), c2w, fovy, cell_size(c2w, fovy, size[0]))
+    behind = background_cells(*size, depth.device) + draws[:, None, None]
+    is_surface = _sampled(opacity, size) >= OPAQUE
+    rows = [
+        torch.where(is_surface, cell, (behind + mark(lattice)) & (TABLE - 1)).flatten()
+        for lattice, cell in enumerate(cells)
+    ]
+    values = sum(table.index_select(0, row) for row in rows).unflatten(0, (len(depth), -1))
+    return values.mT.contiguous().mul_(LATTICES**-0.5).unflatten(2, size)
 
 
 def _sampled(images: Float[Tensor, "B H W 1"], size: tuple[int, int]) -> Float[Tensor, "B h w"]:
-    """Return the nearest pixels; between an edge and what is behind it there is no surface."""
-    return F.interpolate(images.movedim(-1, 1).float(), size, mode="nearest")[:, 0]
-
-
-def _samples(hashed: Int[Tensor, "B H W"]) -> list[Int[Tensor, "B h w"]]:
-    """Return the points of the pixels, by their place within a pixel."""
-    return [
-        hashed[:, row::SAMPLES, column::SAMPLES]
-        for row in range(SAMPLES)
-        for column in range(SAMPLES)
-    ]
-
-
-def _deviation(samples: list[Int[Tensor, "B h w"]]) -> Float[Tensor, "B h w"]:
-    """Return the standard deviation of the sum of the samples' values: a pair of equal cells adds 2
-    to the variance of different ones.
+    """Return the pixels nearest to the centres of h x w pixels; between an edge and what is behind
+    it there is no surface.
     """
-    variance = torch.full(samples[0].shape, float(len(samples)), device=samples[0].device)
-    for i, first in enumerate(samples):
-        for second in samples[:i]:
-            variance += 2 * (first == second)
-    return variance.sqrt_()
+    images, (height, width) = images[..., 0], size
+    if images.shape[1] % height == 0 == images.shape[2] % width:  # as below, but a view
+        rows, columns = images.shape[1] // height, images.shape[2] // width
+        return images[:, rows // 2 :: rows, columns // 2 :: columns].float().contiguous()
+    return F.interpolate(images[:, None].float(), size, mode="nearest-exact")[:, 0]

@@ -1,6 +1,6 @@
 """DDIM inversion: the deterministic trajectory from a clean latent towards noise."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Optional
 
 import torch
@@ -22,6 +22,17 @@ class Step(NamedTuple):
 
 
 Predict = Callable[[Step], Float[Tensor, "R c h w"]]
+Fresh = Callable[[Step], Sequence[Float[Tensor, "c h w"]]]
+
+
+class Factors(NamedTuple):
+    """What each step multiplies for each item: z by ``ratio``, the predicted noise by ``slope``,
+    fresh noise by ``deviation``.
+    """
+
+    ratio: Float[Tensor, "K B 1 1 1"]
+    slope: Float[Tensor, "K B 1 1 1"]
+    deviation: list[list[float]]
 
 
 def invert(
@@ -32,7 +43,7 @@ def invert(
     stride: int,
     *,
     eta: float = 0.0,
-    fresh: Optional[Predict] = None,
+    fresh: Optional[Fresh] = None,
 ) -> Float[Tensor, "B c h w"]:
     """Follow DDIM (Song et al. 2021, eq. 12 with eta 0) from x, taken as the latent of timestep 0,
     to each item's timestep t.
@@ -43,17 +54,41 @@ def invert(
         stride: timesteps of one step; the last one ends at t.
         eta: standard deviation of the noise that a step adds, as a share of that of DDPM's reverse
             step (Song et al. 2021, eq. 16), as threestudio's SDI does.
-        fresh: returns the standard normal noise that a step adds; needed if ``eta`` isn't 0.
+        fresh: returns the standard normal noise that a step adds to each of its items; needed if
+            ``eta`` isn't 0.
     """
-    z, alphas_cumprod = x, alphas_cumprod.to(x.device)
-    for index, start in enumerate(range(0, int(t.max()), stride)):
-        rows = (t > start).nonzero()[:, 0]
-        chosen = z if len(rows) == len(z) else z[rows]
-        step = Step(index, rows, chosen, torch.full_like(rows, start))
-        now, later = alphas_cumprod[start], alphas_cumprod[t[rows].clamp_max(start + stride)]
-        moved = sds.ddim_step(step.z, predict(step), now.expand(len(rows)), later)
+    # in the order of their last timesteps, so that the items of a step are a slice
+    t, order = t.sort(stable=True)
+    starts = torch.arange(0, int(t[-1]), stride, device=t.device)
+    factors = _factors(starts, t, alphas_cumprod.to(x.device), stride, eta, x)
+    z, spare = x[order], torch.empty_like(x)
+    for index, first in enumerate((t <= starts[:, None]).sum(1).tolist()):
+        step = Step(index, order[first:], z[first:], starts[index].expand(len(t) - first))
+        moved = torch.mul(z[first:], factors.ratio[index, first:], out=spare[first:])
+        moved.addcmul_(factors.slope[index, first:], predict(step))
         if eta and fresh is not None:
-            deviation = ((1 - now) / (1 - later) * (1 - later / now)).sqrt()
-            moved = moved + sds.per_item(eta * deviation, moved) * fresh(step)
-        z = moved if len(rows) == len(z) else z.index_copy(0, rows, moved)
-    return z
+            for own, noise, by in zip(
+                moved, fresh(step), factors.deviation[index][first:], strict=True
+            ):
+                own.add_(noise, alpha=by)
+        if first:
+            spare[:first] = z[:first]
+        z, spare = spare, z
+    return spare.index_copy_(0, order, z)
+
+
+def _factors(
+    starts: Int[Tensor, " K"],
+    t: Int[Tensor, " B"],
+    alphas_cumprod: Float[Tensor, " T"],
+    stride: int,
+    eta: float,
+    like: Float[Tensor, "B c h w"],
+) -> Factors:
+    """Compute the factors of all steps at once."""
+    now = alphas_cumprod[starts][:, None]
+    later = alphas_cumprod[torch.minimum(starts[:, None] + stride, t)]
+    deviation = eta * ((1 - now) / (1 - later) * (1 - later / now)).clamp_min(0).sqrt()
+    shape = (*later.shape, *[1] * (like.dim() - 1))
+    ratio, slope = (factor.to(like).view(shape) for factor in sds.ddim_factors(now, later))
+    return Factors(ratio, slope, deviation.tolist())

@@ -130,7 +130,7 @@ def classifier_free(
 
     threestudio's formula is eps_c + g (eps_c - eps_u): its g = 100 is scale = 101 here.
     """
-    return eps_uncond + scale * (eps_cond - eps_uncond)
+    return torch.lerp(eps_uncond, eps_cond, scale)
 
 
 def weight(name: str, abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
@@ -183,9 +183,16 @@ def ddim_step(
     """Take one deterministic DDIM step to the noise level ``abar_next``, lower or higher (Song et
     al. 2021 eq. 12 with eta 0).
     """
-    ratio = (abar_next / abar).sqrt()
-    slope = (1 - abar_next).sqrt() - ratio * (1 - abar).sqrt()
+    ratio, slope = ddim_factors(abar, abar_next)
     return per_item(ratio, z) * z + per_item(slope, z) * eps
+
+
+def ddim_factors(
+    abar: Float[Tensor, "*b"], abar_next: Float[Tensor, "*b"]
+) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
+    """Return what :func:`ddim_step` multiplies z and the noise by."""
+    ratio = (abar_next / abar).sqrt()
+    return ratio, (1 - abar_next).sqrt() - ratio * (1 - abar).sqrt()
 
 
 def ddim_sample(

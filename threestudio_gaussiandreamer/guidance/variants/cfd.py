@@ -19,13 +19,14 @@ from dataclasses import dataclass, field
 from typing import Any, Optional
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ...core import streams
+from ...core.distributed import first_item
 from ...core.errors import UserError
 from ...core.options import at_least
-from ...diffusion.consistent_noise import TABLE, attach_noise
+from ...diffusion.consistent_noise import TABLE, attached_noise
 from ...host import register, run_seed
 from .base import Batch, Error, Variant
 
@@ -52,9 +53,10 @@ class CFD(Variant):
                 f"cfd-variant attaches noise to the rendered surface: give the guidance the "
                 f"renderer's {' and '.join(missing)}, as gaussiandreamer-system does"
             )
-        noise = attach_noise(
-            guidance.normal(latents, "noise"),
+        noise = attached_noise(
+            latents.shape[-2:],
             self.table(guidance.step, latents),
+            self.draws(guidance.step, latents),
             *(batch[name] for name in (*self.RENDERS, "c2w", "fovy")),
         )
         noised = guidance.noised(latents, noise)
@@ -68,3 +70,13 @@ class CFD(Variant):
             values = torch.randn(TABLE, latents.shape[1], generator=generator)
             self._table = epoch, values.to(latents.device)
         return self._table[1]
+
+    @staticmethod
+    def draws(step: int, latents: Float[Tensor, "B c h w"]) -> Int[Tensor, " B"]:
+        """Return a random row of the table for each item of this step."""
+        first = first_item(len(latents))
+        rows = [
+            streams.derive_seed(run_seed(), "background cells", step, item) % TABLE
+            for item in range(first, first + len(latents))
+        ]
+        return torch.tensor(rows, dtype=torch.int32, device=latents.device)

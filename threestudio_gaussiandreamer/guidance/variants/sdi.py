@@ -18,15 +18,17 @@ The paper also anneals t linearly (``timestep_schedule: linear``), with a ``guid
 which is 8.5 here."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Optional
 
 from jaxtyping import Float
 from torch import Tensor
 
+from ...core.distributed import first_item
 from ...core.options import in_range
 from ...diffusion import sds
 from ...diffusion.inversion import Step, invert
-from ...host import register
+from ...diffusion.noise_table import NoiseTable
+from ...host import register, run_seed
 from ..score_model import GUIDANCE_SCALE
 from .base import Batch, Error, Variant
 
@@ -43,21 +45,33 @@ class SDI(Variant):
 
     cfg: Config
 
+    def configure(self) -> None:
+        super().configure()
+        self._table: Optional[NoiseTable] = None
+
     def error(
         self, guidance: Any, latents: Float[Tensor, "B c h w"], condition: Any, batch: Batch
     ) -> Error:
         t, abar = guidance.draw_timesteps(latents)
         stride = max(1, len(guidance.alphas_cumprod) // self.cfg.inversion_steps)
+        scale, eta = self.cfg.inversion_scale, self.cfg.eta
 
         def predict(step: Step) -> Tensor:
             chosen = guidance.select(condition, step.rows)
-            return guidance.guided_noise(step.z, step.t, chosen, self.cfg.inversion_scale)
+            return guidance.guided_noise(step.z, step.t, chosen, scale)
 
-        def fresh(step: Step) -> Tensor:
-            return guidance.normal(latents, f"inversion {step.index}", step.rows)
+        def fresh(step: Step) -> list[Tensor]:
+            return self._fresh(guidance.step, latents, step)
 
-        z = invert(
-            predict, latents, t, guidance.alphas_cumprod, stride, eta=self.cfg.eta, fresh=fresh
-        )
-        noise = (z - sds.per_item(abar.sqrt(), z) * latents) / sds.per_item((1 - abar).sqrt(), z)
+        z = invert(predict, latents, t, guidance.alphas_cumprod, stride, eta=eta, fresh=fresh)
+        noise = z.addcmul(sds.per_item(-abar.sqrt(), z), latents)
+        noise.div_(sds.per_item((1 - abar).sqrt(), z))
         return guidance.predict_noise(z, t, condition) - noise, abar
+
+    def _fresh(self, now: int, latents: Float[Tensor, "B c h w"], step: Step) -> list[Tensor]:
+        """Draw the noise of one step of the inversion."""
+        shape, first = latents.shape[1:], first_item(len(latents))
+        if self._table is None or self._table.numel < shape.numel():
+            self._table = NoiseTable(run_seed(), shape.numel(), latents.device)
+        items = [first + row for row in step.rows.tolist()]
+        return self._table.draw(shape, f"inversion {step.index}", now, items)
