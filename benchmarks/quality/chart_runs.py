@@ -102,7 +102,7 @@ RUNS = {
         SECONDS,
         curves=False,
         size=256,
-        chosen_on=(TUNED_ON, "duck"),
+        chosen_on=(TUNED_ON, "spot", "duck"),
     ),
     "preset": Chart(
         "Effect of the rasteriser's presets", "cpu_seconds", SECONDS, curves=True, marks_paper=True

@@ -259,7 +259,7 @@ def dilation_jobs() -> Iterator[Job]:
         )
 
 
-DEMOS = {"draft": ("demo-draft", 255), "default": ("", 500), "best": ("demo-best", 2000)}
+DEMOS = {"draft": ("demo-draft", 255), "default": ("", 500), "best": ("demo-best", 3000)}
 """The demo's variants: the overlay and the steps of each."""
 
 
