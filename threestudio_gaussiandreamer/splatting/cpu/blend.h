@@ -45,19 +45,14 @@ SPLAT_FN bool blend_strip(BlendScratch& scratch, const StripPixels& pixels, cons
   return live;
 }
 
-// The largest weight of each of `count` splats, to their slots; those without any touch no block, for the backward pass. `masks`
-// (2, count) may be null.
-inline void store_peaks(const Intersection* intersections, int count, const PeakRow* rows, float* peaks, uint32_t* masks) {
+// The largest weight of each of `count` splats, to their slots.
+inline void store_peaks(const Intersection* intersections, int count, const PeakRow* rows, float* peaks) {
   for (int i = 0; i < count; i += LANES) {
     Floats columns[LANES];
     for (int l = 0; l < LANES; l++) columns[l] = load(rows[i + l].lanes);
     transpose(columns);
     for (int l = 1; l < LANES; l++) columns[0] = maximum(columns[0], columns[l]);
-    const Ints used = columns[0] > 0.0f;
-    for (int l = 0; l < std::min(LANES, count - i); l++) {
-      peaks[intersections[i + l].slot] = columns[0][l];
-      if (masks) masks[i + l] &= used[l], masks[count + i + l] &= used[l];
-    }
+    for (int l = 0; l < std::min(LANES, count - i); l++) peaks[intersections[i + l].slot] = columns[0][l];
   }
 }
 
@@ -75,13 +70,12 @@ inline void blend_list(const ForwardCall& call, View& view, const TileFrame& fra
   int first = frame.begin;
   for (; first < frame.end && live.any(); first += CHUNK) {
     const int count = std::min(CHUNK, frame.end - first);
-    uint32_t* masks = call.keep ? view.block_masks.data() + 2 * int64_t(first) : nullptr;
-    stage<true>(view, frame, first, count, masks, scratch.staged);
+    stage<true>(view, frame, first, count, call.keep ? view.block_masks.data() + 2 * int64_t(first) : nullptr, scratch.staged);
     std::memset(scratch.peaks, 0, sizeof(PeakRow) * count);
     for_each_live_strip(scratch.staged, live, [&](const StripPixels& pixels, const BlockList& list, int length) {
       return blend_strip(scratch, pixels, list, length, limits);
     });
-    store_peaks(view.intersections.data() + first, count, scratch.peaks, view.peaks.data(), masks);
+    store_peaks(view.intersections.data() + first, count, scratch.peaks, view.peaks.data());
   }
   skip_rest(view, std::min(first, frame.end), frame.end, call.keep);
 }

@@ -159,28 +159,26 @@ inline Vec3<float> background_sum(const float* alpha, const UpstreamPlanes& up) 
   return total;
 }
 
-// To the slots of the splats that have any weight in the tile; nobody reads the others.
-inline void store_sums(const View& view, const BackwardScratch& scratch, int first, int count, float* slots) {
-  for (int i = 0; i < count; i++) {
-    if (!(scratch.staged.touching[0][i] | scratch.staged.touching[1][i])) continue;
-    stream(slots + int64_t(view.intersections[first + i].slot) * ROW, scratch.sums + i * ROW, ROW);
-  }
+inline void store_sums(const View& view, const float* sums, int first, int count, float* slots) {
+  for (int i = 0; i < count; i++) stream(slots + int64_t(view.intersections[first + i].slot) * ROW, sums + i * ROW, ROW);
 }
 
-// The rows of sums of all intersections of one tile, each into its slot.
+// The rows of sums of all intersections of one tile, each into its slot; those behind the last chunk that contributes are zero.
 template <bool ABSOLUTE>
 inline void blend_list_backward(const BackwardCall& call, View& view, const TileFrame& frame, BackwardScratch& scratch) {
   const BlendLimits limits = limits_of(call.settings);
   LiveStrips live;
   start_transmittance(view, frame, scratch.transmittance);
-  for (int first = frame.begin; first < frame.end && live.any(); first += CHUNK) {
+  for (int first = frame.begin; first < frame.end; first += CHUNK) {
     const int count = std::min(CHUNK, frame.end - first);
     std::memset(scratch.sums, 0, sizeof(float) * ROW * count);
-    stage<false>(view, frame, first, count, view.block_masks.data() + 2 * int64_t(first), scratch.staged);
-    for_each_live_strip(scratch.staged, live, [&](const StripPixels& pixels, const BlockList& list, int length) {
-      return blend_strip_backward<ABSOLUTE>(scratch, pixels, list, length, limits);
-    });
-    store_sums(view, scratch, first, count, call.slots(view));
+    if (live.any()) {
+      stage<false>(view, frame, first, count, view.block_masks.data() + 2 * int64_t(first), scratch.staged);
+      for_each_live_strip(scratch.staged, live, [&](const StripPixels& pixels, const BlockList& list, int length) {
+        return blend_strip_backward<ABSOLUTE>(scratch, pixels, list, length, limits);
+      });
+    }
+    store_sums(view, scratch.sums, first, count, call.slots(view));
   }
   end_streams();
 }

@@ -13,24 +13,17 @@ struct ViewmatSums {
   Vec3<Floats> translation;
 };
 
-// Sums each Gaussian's slots in their order, as LANES rows, without those of tiles where it has no weight, which aren't set;
-// returns which of the Gaussians have any.
+// Sums each Gaussian's slots in their order, as LANES rows; returns which of the Gaussians have any.
 inline Ints gather_slots(const View& view, const float* slots, Group group, float* rows) {
-  alignas(64) static constexpr float NONE[ROW] = {};
   Ints drawn = {};
   for (int l = 0; l < LANES; l++) {
     const bool exists = l < group.count;
     const int64_t begin = exists ? view.slot_begin(group.first + l) : 0, end = exists ? view.slot_end(group.first + l) : 0;
     Floats sum[ROW / LANES] = {};
-    bool any = false;
-    for (int64_t slot = begin; slot < end; slot++) {
-      const bool used = view.peaks[slot] > 0.0f;
-      const float* row = used ? slots + slot * ROW : NONE;  // chosen without a branch, which nothing could predict
-      for (int k = 0; k < ROW / LANES; k++) sum[k] += load(row + k * LANES);
-      any |= used;
-    }
+    for (int64_t slot = begin; slot < end; slot++)
+      for (int k = 0; k < ROW / LANES; k++) sum[k] += load(slots + slot * ROW + k * LANES);
     for (int k = 0; k < ROW / LANES; k++) store(rows + l * ROW + k * LANES, sum[k]);
-    drawn[l] = any ? -1 : 0;
+    drawn[l] = begin < end ? -1 : 0;
   }
   return drawn;
 }
