@@ -68,6 +68,8 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "README.md": {"measured": readme_table},
     "docs/distillation.md": {
         "quality": variant_tables.quality,
+        "blind": variant_tables.blind,
+        "cheaper": variant_tables.cheaper,
         "overhead": variant_tables.overhead,
     },
     "docs/failures.md": {"tables": failure_table.tables},

@@ -74,8 +74,14 @@ class VariantBench(Bench):
 
 
 def variant_names() -> list[str]:
-    """Return the registered variants."""
-    return [name for name in names() if issubclass(find(name), Variant)]
+    """Return the package's variants, without those of extensions."""
+    own = Variant.__module__.rpartition(".")[0]
+    found = {name: find(name) for name in names()}
+    return [
+        name
+        for name, part in found.items()
+        if issubclass(part, Variant) and part.__module__.startswith(own)
+    ]
 
 
 def measure(bench: VariantBench, name: str, pairs: int) -> dict[str, Any]:

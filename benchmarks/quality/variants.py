@@ -1,52 +1,72 @@
 """Which score distillation is worth its time: each variant against the exact score of an object.
 
-    python -m benchmarks.quality.variants                            # all missing runs, then charts
-    python -m benchmarks.quality.variants --variants csd ism --scales 7.5 --seeds 0 1 2
-    python -m benchmarks.quality.variants --list                     # print what would run
+    python -m benchmarks.quality.variants --objects toy.glb path/to/spot.glb path/to/duck.glb
+    python -m benchmarks.quality.variants --lines SDS ISM --seconds 600   # no longer than that
+    python -m benchmarks.quality.variants --list                          # print what would run
 
-Each run trains configs/demo.yaml at 64^2 for 240 steps with one variant and one guidance scale. The
-score knows pictures of the object from the side of the camera (`mode: direction-bins`), in a latent
-of 16^2 pixels; colours aren't bounded, so that saturation shows. ``evaluations`` of the score model
-are one per view and prompt; ``saturation`` is that of the held-out views relative to the truth's.
-Rows are appended to docs/charts/variants.csv as runs end, and runs in it are skipped. The
-charts show each variant at the scale with the best median, and the paper's recipe, clipped SDS at
-100: docs/charts/variants_seconds.png and variants_evaluations.png."""
+Each run is the base recipe (`recipe.py`) at 64^2 for 240 steps with one line's options and one
+guidance scale. The score knows pictures of the object from the side of the camera
+(``direction-bins``) or only pictures from all sides (``view-agnostic``), in a latent of 16^2
+pixels; colours aren't bounded, so that saturation shows. All scales are tried on the first object
+with the first seed; what remains is run at the scale that is best there, and the paper's recipe,
+clipped SDS, at its own. Then other objects, the view-blind score, and the other seeds follow.
+
+``evaluations`` of the score model are one per view and prompt; ``saturation`` is that of the
+held-out views relative to the truth's. Rows are appended to docs/charts/variants.csv as runs end,
+and runs in it are skipped. ``--pictures`` keeps eight test views of each run, from which
+``benchmarks.quality.variant_charts`` computes the diversity over the seeds, and draws."""
 
 import argparse
 import csv
 import json
+import os
+import shutil
 import statistics
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Optional
 
 from tqdm import tqdm
 
-from benchmarks.quality import runs
-from benchmarks.quality.chart_runs import PAPER, SECONDS, Chart, Row, draw, ends, grouped
+from benchmarks.quality import forked, runs
+from benchmarks.quality.chart_runs import Row, ends, grouped, objects_of
 from benchmarks.quality.jobs import BINS, steps
 
 CHART = "variants"
-STEPS, SIZE = 240, 64
-COMMON = BINS | steps(STEPS) | {
+STEPS, SIZE, VIEWS = 240, 64, 4
+PICTURES = 8
+PARTS = 4
+"""How often a run is scored."""
+COMMON = BINS | {
+    "use_timestamp": "false",
+    "tag": "run",
     "data.width": SIZE,
     "data.height": SIZE,
+    "data.eval_width": SIZE,
+    "data.eval_height": SIZE,
+    "data.n_test_views": PICTURES,
     "system.guidance.bank_views": 200,
     "system.geometry.bound_colors": "false",
-    "system.evaluation.every": STEPS // 6,
+    "system.evaluation.size": runs.SIZE,
+    "system.exporter.formats": "[ply]",
+    "system.exporter.save_video": "false",
     "trainer.log_every_n_steps": 1,
+    "trainer.val_check_interval": 100000,
+    "trainer.enable_progress_bar": "false",
 }  # fmt: skip
+BINNED, BLIND = TRUTHS = ("direction-bins", "view-agnostic")
 SCALES = (2.0, 8.5, 31.0, 101.0)
 """threestudio's 1, 7.5, 30 and 100."""
+MILD = SCALES[:2]
 FALLING = {
     "system.guidance.max_step_percent": 0.98,
     "system.guidance.timestep_steps": STEPS,
     "system.guidance.timestep_schedule": "linear",
 }
-CLIPPED = "SDS, clipped"
+SDS, CLIPPED = "SDS", "SDS, clipped"
 CLIP = {"system.guidance.grad_clip": [0, 1.5, 2.0, STEPS]}
 
 
@@ -55,23 +75,64 @@ class Line(NamedTuple):
 
     variant: str
     options: dict[str, Any]
+    own_scale: Optional[float] = None
+    """The guidance scale of its paper, or the nearest in ``SCALES``; None if it names none."""
+    scales: tuple[float, ...] = SCALES
 
 
-LINES = {
-    "SDS": Line("sds", {}),
-    CLIPPED: Line("sds", CLIP),
+def length(total: int) -> dict[str, Any]:
+    """Return the options of a run of ``total`` steps."""
+    return steps(total) | {"system.evaluation.every": total // PARTS}
+
+
+def views(count: int) -> dict[str, Any]:
+    """Return the options of a run with ``count`` views a step, and as many views in all."""
+    return length(STEPS * VIEWS // count) | {"data.batch_size": count}
+
+
+def held(count: int, total: int) -> dict[str, Any]:
+    """Return the options of a run of ``total`` steps with one prediction per ``count`` steps."""
+    keys = ("system.guidance.reuse_steps", "data.hold_steps", "system.background.hold_steps")
+    return length(total) | dict.fromkeys(keys, count)
+
+
+DISTILLATIONS = {
+    SDS: Line("sds", {}, 101.0),
+    CLIPPED: Line("sds", CLIP, 101.0),
     "SDS, rescaled": Line("sds", {"system.guidance.recon_std_rescale": 0.5}),
-    "SDS, guidance interval": Line("sds", {"system.guidance.guidance_interval": [0.2, 0.8]}),
-    "SDS, DreamTime": Line("sds", FALLING | {"system.guidance.timestep_schedule": "dreamtime"}),
+    "SDS, DreamTime": Line(
+        "sds", FALLING | {"system.guidance.timestep_schedule": "dreamtime"}, 101.0
+    ),
     "CSD": Line("csd", {}),
-    "NFSD": Line("nfsd", {}),
-    "VSD": Line("vsd", {}),
-    "SDI": Line("sdi", FALLING | {"system.guidance.weighting_strategy": "x0"}),
-    "ISM": Line("ism", {}),
+    "NFSD": Line("nfsd", {}, 8.5),
+    "VSD": Line("vsd", {}, 8.5),
+    "ISM": Line("ism", {}, 8.5),
     "CFD": Line("cfd", FALLING),
+    "SDI": Line("sdi", FALLING | {"system.guidance.weighting_strategy": "x0"}, 8.5),
 }
+CHEAPER = {
+    "SDS, guidance interval": Line("sds", {"system.guidance.guidance_interval": [0.2, 0.8]}),
+    "SDS, falling t": Line("sds", FALLING),
+    "SDS, a quarter of the steps": Line("sds", length(STEPS // 4), scales=MILD),
+    "SDS, half the steps": Line("sds", length(STEPS // 2), scales=MILD),
+    "SDS, twice the steps": Line("sds", length(STEPS * 2), scales=MILD),
+    **{
+        f"SDS, {count} view{'s' * (count > 1)}": Line("sds", views(count), scales=MILD)
+        for count in (1, 2, 8)
+    },
+    "SDS, 4 steps each, 240 steps": Line("sds", held(4, STEPS), scales=MILD),
+    "SDS, 2 steps each, 480 steps": Line("sds", held(2, 2 * STEPS), scales=MILD),
+    "SDS, 4 steps each, 960 steps": Line("sds", held(4, 4 * STEPS), scales=MILD),
+}
+"""SDS with fewer evaluations per step, or fewer steps."""
+LINES = DISTILLATIONS | CHEAPER
 PAPER_SCALE = 101.0
-COLUMNS = ["variant", "x", "object", "seed", "step", "cpu_seconds", "evaluations"]
+BLIND_LINES = [label for label in DISTILLATIONS if label != "CSD"]
+"""CSD is refused, since without a direction there is no difference to follow."""
+BLIND_SCALE = 8.5
+"""Without effect there: the conditional score is the unconditional one."""
+KEY = ("truth", "variant", "x", "object", "seed")
+COLUMNS = ["truth", "variant", "x", "object", "seed", "step", "cpu_seconds", "evaluations"]
 COLUMNS += ["gaussians", "psnr", "ssim", "multi_face", "out_of_gamut", "saturation"]
 COLUMNS += ["machine", "commit"]
 
@@ -79,73 +140,128 @@ COLUMNS += ["machine", "commit"]
 class Todo(NamedTuple):
     """One run."""
 
+    truth: str
     label: str
     scale: float
     mesh: str
     seed: int
+    pictures: Optional[Path] = None
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Its place in the CSV."""
+        return (
+            self.truth,
+            self.label,
+            f"{self.scale:g}",
+            runs.object_name(self.mesh),
+            str(self.seed),
+        )
 
 
 def main() -> None:
     arguments = parse_arguments()
-    todo = list(missing(arguments))
-    if arguments.list:
-        print("\n".join(f"{t.label}, scale {t.scale:g}, {t.mesh}, seed {t.seed}" for t in todo))
-        return
+    deadline = time.monotonic() + arguments.seconds
     failed = 0
-    with ThreadPoolExecutor(arguments.jobs) as pool:
-        running = {pool.submit(measure, item): item for item in todo}
-        for done in tqdm(as_completed(running), total=len(todo), unit="run", disable=None):
-            if error := done.exception():
+    for stage in (all_scales, best_scale_only):
+        todo = [item for item in stage(arguments) if item.key not in runs.measured_in(CHART, *KEY)]
+        if arguments.list:
+            print("\n".join(", ".join(item.key) for item in todo))
+            continue
+        ended = forked.results(measure, todo, arguments.jobs, deadline)
+        for item, result in tqdm(ended, total=len(todo), unit="run", disable=None):
+            if isinstance(result, Exception):
                 failed += 1
-                tqdm.write(str(error), file=sys.stderr)
+                tqdm.write(f"{', '.join(item.key)}: {result}", file=sys.stderr)
             else:
-                runs.append_rows(CHART, COLUMNS, done.result())
-    draw_charts(runs.rows_of(CHART))
-    sys.exit(f"{failed} of {len(todo)} runs failed" if failed else 0)
+                runs.append_rows(CHART, COLUMNS, result)
+    sys.exit(f"{failed} runs failed" if failed else 0)
 
 
 def parse_arguments() -> argparse.Namespace:
     parser = runs.argument_parser(__doc__)
-    parser.add_argument(
-        "--variants", nargs="+", choices=sorted({line.variant for line in LINES.values()})
-    )
-    parser.add_argument("--scales", type=float, nargs="+", default=list(SCALES))
+    parser.add_argument("--lines", nargs="+", choices=LINES, default=list(LINES))
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="end after that")
+    parser.add_argument("--pictures", type=Path, help="folder for test views of each run")
     runs.add_jobs(parser)
     parser.add_argument("--list", action="store_true", help="only print what would run")
     return parser.parse_args()
 
 
-def missing(arguments: argparse.Namespace) -> Iterator[Todo]:
-    """Yield the runs that the CSV doesn't have."""
-    done = runs.measured_in(CHART, "variant", "x", "object", "seed")
+def all_scales(arguments: argparse.Namespace) -> Iterator[Todo]:
+    """Yield the runs that the choice of scales needs."""
+    for scale in SCALES:
+        for label in (label for label in arguments.lines if scale in LINES[label].scales):
+            yield todo_of(arguments, BINNED, label, scale, arguments.objects[0], arguments.seeds[0])
+
+
+def best_scale_only(arguments: argparse.Namespace) -> Iterator[Todo]:
+    """Yield the runs at the best scales so far, and the paper's recipe."""
+    best = best_scales(runs.rows_of(CHART))
+    lines = [label for label in arguments.lines if label in best]
     for seed in arguments.seeds:
         for mesh in arguments.objects:
-            for scale in arguments.scales:
-                for label, line in LINES.items():
-                    wanted = arguments.variants is None or line.variant in arguments.variants
-                    key = label, f"{scale:g}", runs.object_name(mesh), str(seed)
-                    if wanted and key not in done:
-                        yield Todo(label, scale, mesh, seed)
+            for label in lines:
+                for scale in sorted(scales_of(label, best)):
+                    yield todo_of(arguments, BINNED, label, scale, mesh, seed)
+        for mesh in arguments.objects:
+            for label in (label for label in BLIND_LINES if label in lines):
+                yield todo_of(arguments, BLIND, label, BLIND_SCALE, mesh, seed)
 
 
-def options_of(label: str, scale: float) -> dict[str, Any]:
+def todo_of(arguments: argparse.Namespace, *place: Any) -> Todo:
+    return Todo(*place, pictures=arguments.pictures)
+
+
+def scales_of(label: str, best: dict[str, str]) -> set[float]:
+    """Return the scales at which a line is run with all objects and seeds."""
+    return {float(best[label])} | ({PAPER_SCALE} if label == CLIPPED else set())
+
+
+def best_scales(rows: list[Row]) -> dict[str, str]:
+    """Return the scale of each line with the largest median dB at the end on the first object,
+    where all scales are tried.
+    """
+    rows = [row for row in rows if row["truth"] == BINNED]
+    first = objects_of(rows)[0] if rows else ""
+    best = {}
+    tried = [row for row in rows if row["object"] == first]
+    for label, own in grouped(tried, lambda row: row["variant"]).items():
+        scales = grouped(own, lambda row: row["x"])
+        best[label] = max(scales, key=lambda x: median_end(scales[x]))
+    return best
+
+
+def median_end(rows: list[Row]) -> float:
+    return statistics.median(float(row["psnr"]) for row in ends(rows))
+
+
+def options_of(label: str, scale: float, truth: str = BINNED) -> dict[str, Any]:
     """Return the options of a line's runs at a guidance scale."""
     line = LINES[label]
     chosen = {
         "system.guidance.variant_type": f"{line.variant}-variant",
         "system.guidance.guidance_scale": scale,
+        "system.guidance.mode": truth,
     }
-    return COMMON | line.options | chosen
+    return COMMON | length(STEPS) | line.options | chosen
 
 
 def measure(todo: Todo) -> list[dict[str, Any]]:
     """Make one run; return its rows, one per scored step."""
+    own = {
+        "seed": todo.seed,
+        "system.guidance.bank_seed": todo.seed,
+        "system.guidance.mesh": os.path.abspath(todo.mesh) if os.sep in todo.mesh else todo.mesh,
+    }
     with tempfile.TemporaryDirectory() as folder:
-        save = runs.train(Path(folder), todo.mesh, todo.seed, options_of(todo.label, todo.scale))
+        options = options_of(todo.label, todo.scale, todo.truth) | own
+        save = forked.train(Path(folder), options)
         metrics = json.loads((save / "metrics.json").read_text())
         per_step = evaluations_per_step(save.parent)
-    place = {"variant": todo.label, "x": f"{todo.scale:g}", "seed": todo.seed}
-    place |= {"object": runs.object_name(todo.mesh)}
+        if todo.pictures:
+            keep_pictures(save, todo)
+    place = dict(zip(KEY, todo.key, strict=True))
     points = {scores["step"]: scores for scores in (*metrics["curve"], metrics["result"])}
     return [
         scores | place | {"evaluations": f"{per_step * step:.0f}"}
@@ -161,45 +277,15 @@ def evaluations_per_step(folder: Path) -> float:
     return statistics.mean(float(value) for value in values if value)
 
 
-# ---- charts --------------------------------------------------------------------------------------
+def picture_folder(pictures: Path, key: tuple[str, ...]) -> Path:
+    """Return the folder of a run's test views."""
+    return pictures / "_".join(key).replace(", ", "-").replace(" ", "-")
 
 
-def best_scales(rows: list[Row]) -> dict[str, str]:
-    """Return the scale of each line with the largest median dB at the end, over all objects."""
-
-    def median_end(same: list[Row]) -> float:
-        of_objects = grouped(same, lambda row: row["object"]).values()
-        return statistics.median(float(row["psnr"]) for own in of_objects for row in ends(own))
-
-    best = {}
-    for label, own in grouped(rows, lambda row: row["variant"]).items():
-        scales = grouped(own, lambda row: row["x"])
-        best[label] = max(scales, key=lambda x: median_end(scales[x]))
-    return best
-
-
-def at_best(rows: list[Row]) -> list[Row]:
-    """Return the rows of each line at its best scale, which its label then has."""
-    best = best_scales(rows)
-    return [
-        row | {"variant": f"{row['variant']}, s = {row['x']}"}
-        for row in rows
-        if row["x"] == best[row["variant"]]
-    ] + [
-        row | {"variant": PAPER}
-        for row in rows
-        if row["variant"] == CLIPPED and row["x"] == f"{PAPER_SCALE:g}" != best[CLIPPED]
-    ]
-
-
-def draw_charts(rows: list[Row]) -> None:
-    if not rows:
-        return
-    title = "Variants of score distillation at their best guidance scales s"
-    axes = {"cpu_seconds": SECONDS, "evaluations": "evaluations of the score model"}
-    for column, label in axes.items():
-        chart = Chart(title, column, label, curves=True, size=SIZE)
-        print(draw(f"{CHART}_{column.removeprefix('cpu_')}", chart, at_best(rows)))
+def keep_pictures(save: Path, todo: Todo) -> None:
+    """Copy the test views of a run."""
+    (found,) = save.glob("it*-test")
+    shutil.copytree(found, picture_folder(todo.pictures, todo.key), dirs_exist_ok=True)
 
 
 if __name__ == "__main__":

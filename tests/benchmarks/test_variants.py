@@ -3,10 +3,20 @@
 import csv
 import json
 
+import numpy as np
 import pytest
 
-from benchmarks.quality import runs, variant_overhead, variants
+from benchmarks.quality import (
+    forked,
+    runs,
+    variant_charts,
+    variant_overhead,
+    variant_tables,
+    variants,
+)
 from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.core import images
+from threestudio_gaussiandreamer.guidance.variants import Variant
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
@@ -27,8 +37,18 @@ def test_every_variant_is_timed_with_its_calls(tmp_path, monkeypatch):
     assert calls["sdi-variant"] > 1 and calls["ism-variant"] > 1
 
 
+def test_the_variants_of_extensions_are_not_timed(monkeypatch):
+    own = type("Extension", (Variant,), {"__module__": "custom.extension"})
+    monkeypatch.setattr(
+        variant_overhead, "find", {"sds-variant": find("sds-variant"), "a": own}.get
+    )
+    monkeypatch.setattr(variant_overhead, "names", lambda: ["sds-variant", "a"])
+    assert variant_overhead.variant_names() == ["sds-variant"]
+
+
 def test_every_line_names_a_registered_variant():
-    assert {find(f"{line.variant}-variant") for line in variants.LINES.values()}
+    for line in variants.LINES.values():
+        assert issubclass(find(f"{line.variant}-variant"), Variant)
 
 
 @pytest.fixture
@@ -37,47 +57,103 @@ def charts(tmp_path, monkeypatch):
     return tmp_path
 
 
-def fake_train(folder, mesh, seed, options):
+def fake_train(folder, options):
     """Write what a run writes: scores that fall with the distance of the scale from 8.5."""
     save = folder / "demo/run/save"
     logs = folder / "demo/run/csv_logs/version_0"
     save.mkdir(parents=True), logs.mkdir(parents=True)
     (logs / "metrics.csv").write_text("step,train/evaluations\n0,8\n1,\n2,4\n")
+    (save / "it9-test").mkdir()
+    (save / "it9-test/0.png").write_bytes(b"a picture")
     scale = options["system.guidance.guidance_scale"]
-    scores = {"psnr": 30 - abs(scale - 8.5) + seed, "ssim": 0.9, "cpu_seconds": 2.0}
+    scores = {"psnr": 30 - abs(scale - 8.5), "ssim": 0.9, "cpu_seconds": 2.0}
     last = scores | {"step": variants.STEPS, "cpu_seconds": 5.0}
     content = {"curve": [scores | {"step": 30}, last], "result": last}
     (save / "metrics.json").write_text(json.dumps(content))
     return save
 
 
-def test_runs_are_measured_once_and_each_line_is_drawn_at_its_best_scale(charts, monkeypatch):
-    pytest.importorskip("matplotlib")
-    monkeypatch.setattr(runs, "train", fake_train)
-    drawn = []
-    monkeypatch.setattr(variants, "draw", lambda name, chart, rows: drawn.append((name, rows)))
-    chosen = ["--variants", "csd", "--scales", "2", "8.5", "--jobs", "1"]
-    for seeds, expected in ((["0"], 4), (["0", "1"], 8)):
-        monkeypatch.setattr("sys.argv", ["", *chosen, "--seeds", *seeds])
+def in_this_process(function, items, jobs, deadline):
+    for item in items:
+        yield item, function(item)
+
+
+def test_a_line_runs_at_its_best_scale_only_and_once(charts, monkeypatch):
+    monkeypatch.setattr(forked, "train", fake_train)
+    monkeypatch.setattr(forked, "results", in_this_process)
+    chosen = ["--lines", "SDS, clipped", "--objects", "toy.glb", "a/spot.glb"]
+    pictures = ["--pictures", str(charts / "pictures")]
+    for _ in range(2):
+        monkeypatch.setattr("sys.argv", ["", *chosen, *pictures, "--seeds", "0"])
         with pytest.raises(SystemExit) as end:
             variants.main()
         rows = runs.rows_of("variants")
-        assert end.value.code == 0 and len(rows) == expected
+        assert not end.value.code and len(rows) == 2 * (4 + 2 + 2)
     assert rows[0]["evaluations"] == f"{6 * 30}" and rows[1]["evaluations"] == f"{6 * 240}"
-    assert [name for name, _ in drawn[-2:]] == ["variants_seconds", "variants_evaluations"]
-    assert {row["variant"] for row in drawn[-1][1]} == {"CSD, s = 8.5"}
+    spot = {(row["truth"], row["x"]) for row in rows if row["object"] == "spot"}
+    assert spot == {(variants.BINNED, "8.5"), (variants.BINNED, "101"), (variants.BLIND, "8.5")}
+    kept = charts / "pictures/direction-bins_SDS-clipped_8.5_spot_0/0.png"
+    assert kept.read_bytes() == b"a picture"
+
+
+def test_a_run_that_fails_is_named_and_the_others_go_on(charts, monkeypatch, capsys):
+    def results(function, items, jobs, deadline):
+        for item in items:
+            yield item, RuntimeError("no memory") if item.scale == 2 else function(item)
+
+    monkeypatch.setattr(forked, "train", fake_train)
+    monkeypatch.setattr(forked, "results", results)
+    monkeypatch.setattr("sys.argv", ["", "--lines", "CSD"])
+    with pytest.raises(SystemExit) as end:
+        variants.main()
+    assert end.value.code == "1 runs failed"
+    assert "CSD, 2, toy, 0: no memory" in capsys.readouterr().err
+    assert {row["x"] for row in runs.rows_of("variants")} == {"8.5", "31", "101"}
+
+
+def row(label, x, psnr, **place):
+    own = {"truth": variants.BINNED, "object": "toy", "seed": "0", "step": "9", "machine": "a"}
+    scores = {"multi_face": "0", "out_of_gamut": "0.01", "saturation": "1", "cpu_seconds": "2"}
+    given = {"variant": label, "x": x, "psnr": psnr, "evaluations": "100"}
+    return own | scores | given | place
 
 
 def test_the_papers_recipe_is_drawn_beside_a_better_scale():
-    place = {"object": "toy", "seed": "0", "step": "9"}
+    rows = [row(variants.CLIPPED, "101", "20"), row(variants.CLIPPED, "8.5", "25")]
+    shown = variant_charts.at_best(rows, variants.DISTILLATIONS)
+    assert [found["variant"] for found in shown] == ["SDS, clipped, s = 8.5", "the paper's recipe"]
+
+
+def test_the_scale_of_a_lines_own_paper_is_marked():
+    rows = [row("ISM", "8.5", "20"), row("CSD", "8.5", "20")]
+    shown = variant_charts.at_best(rows, variants.LINES)
+    assert [found["variant"] for found in shown] == ["ISM, s = 8.5 (its paper's)", "CSD, s = 8.5"]
+
+
+def test_diversity_is_the_difference_between_seeds(charts, monkeypatch):
+    rows = [row("SDS", "2", "20", seed=seed) for seed in "012"] + [row("CSD", "2", "20")]
+    for found, level in zip(rows, (0, 51, 102, 0), strict=True):
+        key = tuple(found[name] for name in variants.KEY)
+        folder = variants.picture_folder(charts / "pictures", key)
+        folder.mkdir(parents=True)
+        for view in range(2):
+            images.write(folder / f"{view}.png", np.full((4, 4, 3), level, np.uint8))
+    variant_charts.write_diversity(charts / "pictures", rows)
+    (written,) = runs.rows_of("variants_diversity")
+    assert written["variant"] == "SDS" and written["seeds"] == "3"
+    assert float(written["diversity"]) == pytest.approx((0.2 + 0.4 + 0.2) / 3, abs=1e-3)
+
+
+def test_a_cheaper_line_is_compared_with_sds_of_as_many_evaluations():
     rows = [
-        place | {"variant": variants.CLIPPED, "x": x, "psnr": psnr}
-        for x, psnr in (("101", "20"), ("8.5", "25"))
+        row("SDS, half the steps", "2", "20", evaluations="100"),
+        row("SDS", "2", "22", evaluations="400"),
+        row("SDS, 2 views", "2", "23", evaluations="200"),
+        row("SDS, 8 views", "2", "23", evaluations="900"),
     ]
-    assert [row["variant"] for row in variants.at_best(rows)] == [
-        "SDS, clipped, s = 8.5",
-        "the paper's recipe",
-    ]
+    best = variants.best_scales(rows)
+    gains = [variant_tables.gain_of(found, rows, best) for found in rows]
+    assert gains == [pytest.approx(0), pytest.approx(0), pytest.approx(2), None]
 
 
 @pytest.mark.parametrize("label", variants.LINES)
