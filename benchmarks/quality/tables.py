@@ -257,6 +257,7 @@ def page() -> str:
     seconds = ("scene", "x", "budget", "gaussians", "psnr", "seconds", "threads")
     tried = ("change", "base", "object", "steps", "psnr", "gain", "cpu_seconds", "floaters")
     others = [
+        section("Objects that nothing was tuned on", "unseen", unseen_table()),
         section("Changes of the demo that were tried", "tried", plain_table("tried", tried)),
         section("Growing by gradients", "grown", run_table("grown")),
         section("Pruning after the run", "after_run", other_table("after_run", ("variant", "x"))),
