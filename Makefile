@@ -14,8 +14,9 @@ demo: $(VENV)/ready                ## train the bundled toy from a coarse prior,
 	$(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
 
 PROMPT =
-demo-text: $(VENV)/ready-for-models ## text to 3D with the bundled models, offline, on the CPU; make demo-text PROMPT="a red fox with a green scarf"
-	$(BIN)/python -m threestudio_gaussiandreamer.toybox.demo $(if $(PROMPT),"$(PROMPT)")
+MODELS = toybox
+demo-text: $(VENV)/ready-for-models ## text to 3D with small models, offline, on the CPU; make demo-text MODELS=folder PROMPT="a red fox with a green scarf"
+	$(BIN)/python -m threestudio_gaussiandreamer.toybox.demo $(if $(PROMPT),"$(PROMPT)") --models $(MODELS)
 
 test: $(VENV)/ready-for-tests      ## every test that isn't slow, one worker per core
 	$(PYTEST) -m "not slow"

@@ -55,7 +55,7 @@ def test_a_missing_file_is_named(folder):
         model_part("toybox", POINTS)
 
 
-def test_missing_models_are_named(folder, monkeypatch):
+def test_a_package_without_models_says_how_to_train_them(folder, monkeypatch):
     monkeypatch.setattr(bundled, "FOLDER", folder / "nowhere")
-    with pytest.raises(UserError, match="nowhere/clip' is missing: install the package again"):
+    with pytest.raises(UserError, match="contains no trained models; train them"):
         model_part("toybox", CLIP)

@@ -31,6 +31,12 @@ REINSTALL = (
     f"threestudio_gaussiandreamer/assets/{NAME})"
 )
 
+UNTRAINED = (
+    f"{NAME}: this version of the package contains no trained models; train them (make "
+    "train-toybox), export them (python -m threestudio_gaussiandreamer.toybox.export .toybox "
+    f"models) and give the folder models instead of {NAME}"
+)
+
 
 def model_part(name: str, part: str) -> str:
     """Return the path of one of the bundled models if ``name`` is their name, or that of one in the
@@ -40,7 +46,8 @@ def model_part(name: str, part: str) -> str:
         part: DIFFUSION, CLIP, POINTS or JUDGE.
 
     Raises:
-        UserError: a bundled file is missing or damaged; the message says how to install it again.
+        UserError: a bundled file is missing or damaged; the message says how to install it again,
+            or how to train the models if the package has none.
     """
     if name == NAME:
         require_intact(FOLDER, part)
@@ -67,6 +74,8 @@ def require_intact(folder: Path, part: str) -> None:
     for name, expected in digests.items():
         if name.partition("/")[0] == part:
             _require_file(folder / name, expected)
+    if not digests:
+        raise UserError(UNTRAINED)
     if not any(name.partition("/")[0] == part for name in digests):
         raise UserError(f"the bundled model {str(folder / part)!r} is missing: {REINSTALL}")
 
