@@ -185,7 +185,7 @@ def test_another_part_forgets_the_options_that_only_the_earlier_one_has():
     cfg = load_config(
         demo, cli_args=["system.geometry.prior_type=random-prior", "system.geometry.prior.size=0.5"]
     )
-    assert dict(cfg.system.geometry.prior) == {"num_points": 8000, "size": 0.5}
+    assert dict(cfg.system.geometry.prior) == {"num_points": 16000, "size": 0.5}
     check_config(cfg)
     wrong = load_config(
         demo, cli_args=["system.geometry.prior_type=random-prior", "system.geometry.prior.sise=0.5"]

@@ -167,6 +167,7 @@ def test_a_non_finite_gaussian_is_named(measured):
     "int32 overflow",
     bar="600 k over all of 8192 x 8192: the exact memory in a named error, none allocated",
 )
+@pytest.mark.slow  # counts 3.9e10 pairs
 @pytest.mark.skipif("cpu" not in BACKENDS, reason="the kernel isn't built")
 def test_more_tile_intersections_than_32_bits_count(measured):
     """At 1024 x 1024 the kernel's 32-pixel tiles make 6e8 pairs, which fit; here they are 3.9e10,
