@@ -171,12 +171,13 @@ def test_the_table_of_five_seeds(measured):
 @pytest.mark.slow
 @row("A4", "Colour drift, background shortcut")
 def test_the_cloud_does_not_depend_on_the_background(tmp_path, measured):
-    """Only the alpha error differs between backgrounds, mostly at the outline. With the usual
+    """Only the alpha error differs between backgrounds, mostly at the outline; the spread is below
+    1 dB at the end of the demo's schedules, not yet after three fifths of them. With the usual
     dilation of 0.3 square pixels instead of the demo's 0.03 the spread is larger, and larger still
     for training on black alone, as in the paper's code.
     """
     ended = trained(
-        tmp_path, 300, 96, "system.geometry.prior.num_points=3000", "data.train_views=60"
+        tmp_path, 500, 96, "system.geometry.prior.num_points=3000", "data.train_views=60"
     )
     state = ended.checkpoint()["state_dict"]
     cloud = find("gaussiandreamer-cloud")({})
