@@ -94,11 +94,7 @@ def argument_parser(doc: str, seeds: Sequence[int] = (0,)) -> argparse.ArgumentP
 
 def add_jobs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--jobs",
-        "--workers",
-        type=int,
-        default=os.cpu_count(),
-        help="runs side by side, one thread each",
+        "--jobs", type=int, default=os.cpu_count(), help="runs side by side, one thread each"
     )
 
 

@@ -47,6 +47,17 @@ def per_object(rows: list[Row], objects: list[str]) -> list[str]:
     return [f"{median_end(of_object[name]):.1f}" if name in of_object else "–" for name in objects]
 
 
+def faults(found: list[Row]) -> list[str]:
+    """Return the medians of the multi-face rate and of the share of colours out of gamut."""
+    shares = median(found, "multi_face"), 100 * median(found, "out_of_gamut")
+    return [f"{shares[0]:.2f}", f"{shares[1]:.1f} %"]
+
+
+def line_of(label: str) -> str:
+    """Return the line that a label with its scale is of."""
+    return CLIPPED if label == PAPER else label.partition(", s =")[0]
+
+
 def quality() -> str:
     """Return the scores of each distillation at its best guidance scale, best first."""
     rows = rows_of(CHART)
@@ -57,13 +68,12 @@ def quality() -> str:
         found = last(own)
         cells = [
             *per_object(own, objects),
-            f"{median(found, 'multi_face'):.2f}",
-            f"{100 * median(found, 'out_of_gamut'):.1f} %",
+            *faults(found),
             f"{median(found, 'saturation'):.2f}",
             f"{median(found, 'evaluations'):,.0f}",
             f"{median(found, 'cpu_seconds'):.0f}",
             tried(label, rows),
-            diversity(CLIPPED if label == PAPER else label.partition(", s =")[0], found[0]["x"]),
+            diversity(line_of(label), found[0]["x"]),
             own_scale(label, rows),
         ]
         first = [row for row in own if row["object"] == objects[0]]
@@ -85,7 +95,7 @@ def head_of(rows: list[Row]) -> str:
 
 def tried(label: str, rows: list[Row]) -> str:
     """Return the guidance scales at which a line was run."""
-    name = CLIPPED if label == PAPER else label.partition(", s =")[0]
+    name = line_of(label)
     scales = {float(row["x"]) for row in rows if (row["truth"], row["variant"]) == (BINNED, name)}
     return ", ".join(f"{scale:g}" for scale in sorted(scales))
 
@@ -126,11 +136,8 @@ def blind() -> str:
     lines = []
     for label, own in grouped(rows, lambda row: row["variant"]).items():
         found = last(own)
-        cells = [
-            f"{median(found, 'multi_face'):.2f}",
-            f"{100 * median(found, 'out_of_gamut'):.1f} %",
-        ]
-        lines.append((median(found, "psnr"), [label, *per_object(own, objects), *cells]))
+        cells = [label, *per_object(own, objects), *faults(found)]
+        lines.append((median(found, "psnr"), cells))
     heads = ["variant", *(f"dB, {name}" for name in objects), "multi-face", "out of gamut"]
     return markdown(heads, [cells for _, cells in sorted(lines, key=lambda line: -line[0])])
 
