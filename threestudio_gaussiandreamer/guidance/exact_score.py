@@ -55,7 +55,7 @@ from ..diffusion.exact_score import LinearLatent, color_matrix, denoise, squared
 from ..host import register
 from ..meshes.load import AXES, load_mesh
 from ..meshes.raycast import MeshCaster
-from ..splatting.cpu.known_picture import known_gradient
+from ..splatting.cpu import known_picture
 from .base import GUIDANCE_SCALE, ScoreDistillation
 from .known_truth import MeshTruth, background_of, composite, resized
 from .picture_bank import Bank, Mixture, bank_modes, direction_indices, rows_of
@@ -166,7 +166,9 @@ class ExactScoreGuidance(ScoreDistillation):
         None if other options, or values that aren't finite, need the general path.
         """
         size = rgb.shape[1:3]
-        if rgb_as_latents or guidance_eval or not self._compares_pixels(size):
+        if rgb_as_latents or guidance_eval or not known_picture.is_available(rgb.device):
+            return None
+        if not self._compares_pixels(size):
             return None
         background = background_of(comp_rgb_bg, len(rgb), rgb.device)
         if background.shape[1:3] != (1, 1):
@@ -176,7 +178,7 @@ class ExactScoreGuidance(ScoreDistillation):
         _, abar = self.draw_timesteps(rgb)
         weight = sds.weight(self.options.weighting_strategy, abar).float()
         background, scale = background[:, 0, 0].contiguous(), (abar / (1 - abar)).sqrt().float()
-        found = known_gradient(rgb, pictures, background, scale, weight)
+        found = known_picture.known_gradient(rgb, pictures, background, scale, weight)
         return found if found is not None and found[1].isfinite().all() else None
 
     def _compares_pixels(self, size: tuple[int, int]) -> bool:

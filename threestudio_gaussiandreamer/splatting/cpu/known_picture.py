@@ -1,6 +1,7 @@
 """The compiled pass of score distillation towards one known picture per render."""
 
 import ctypes
+import functools
 from collections.abc import Callable
 from typing import Optional
 
@@ -29,6 +30,11 @@ class _Gradient(ctypes.Structure):
     _fields_ = [("gradient", ctypes.c_void_p), ("squares", ctypes.c_void_p)]
 
 
+def is_available(device: torch.device) -> bool:
+    """Return whether there is a pass for tensors on ``device``."""
+    return device.type == "cpu" and _function() is not None
+
+
 def known_gradient(
     render: Float[Tensor, "B H W 3"],
     pictures: UInt8[Tensor, "B H W 4"],
@@ -51,18 +57,18 @@ def known_gradient(
     planes = pictures.movedim(-1, 1)
     float32 = (render, background, scale, weight)
     taken = all(x.dtype == torch.float32 and x.is_contiguous() for x in float32)
-    function = _function() if render.device.type == "cpu" else None
-    if function is None or not (taken and planes.is_contiguous()):
+    if not (is_available(render.device) and taken and planes.is_contiguous()):
         return None
     items, height, width, _ = render.shape
     gradient = torch.empty_like(render)
     squares = torch.empty(items, height, dtype=torch.float64)
     inputs = map(address, (render, planes, background, scale, weight))
     sizes = (items, height, width, torch.get_num_threads())
-    function(_Pictures(*inputs, *sizes), _Gradient(*map(address, (gradient, squares))))
+    _function()(_Pictures(*inputs, *sizes), _Gradient(*map(address, (gradient, squares))))
     return gradient, squares.sum(1)
 
 
+@functools.cache
 def _function() -> Optional[Callable[..., int]]:
     """Return the function of the library; None if it isn't built, or older than the function."""
     try:
