@@ -171,11 +171,7 @@ def load_module_weights(
     checkpoint = load_checkpoint(path, map_location)
     state = checkpoint["state_dict"]
     if module_name:
-        state = {
-            key.removeprefix(f"{module_name}."): value
-            for key, value in state.items()
-            if key.startswith(f"{module_name}.")
-        }
+        state = entries_below(state, f"{module_name}.")
     for ignored in ignore_modules or []:
         state = {key: value for key, value in state.items() if not key.startswith(f"{ignored}.")}
     if not state:
@@ -184,6 +180,13 @@ def load_module_weights(
             f"{sorted(checkpoint['state_dict'])}"
         )
     return state, checkpoint["epoch"], checkpoint["global_step"]
+
+
+def entries_below(state: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """Return the entries whose names begin with ``prefix``, without it."""
+    return {
+        name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)
+    }
 
 
 def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:

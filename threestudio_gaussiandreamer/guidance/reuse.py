@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..core.checkpoint_file import entries_below
 from ..diffusion.sds import per_item
 
 SAME = ("c2w", "fovy", "comp_rgb_bg")
@@ -76,11 +77,7 @@ class KeptPrediction:
         self, state: dict[str, Tensor], device: torch.device | str = "cpu"
     ) -> dict[str, Tensor]:
         """Restore what :meth:`state` returned; return the entries of others."""
-        own = {
-            name.removeprefix(PREFIX): value.to(device)
-            for name, value in state.items()
-            if name.startswith(PREFIX)
-        }
+        own = {name: value.to(device) for name, value in entries_below(state, PREFIX).items()}
         if own and self.steps > 1:
             views = {name: own[f"views.{name}"] for name in SAME if f"views.{name}" in own}
             latents, error, abar = (own[name] for name in ("latents", "error", "abar"))

@@ -32,16 +32,16 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
         UserError: the file is missing, unreadable, refused, or holds no tensors by name.
     """
     file = existing_file(path, kind)
+    if zipfile.is_zipfile(file):
+        require_plain_archive(file)
     try:
-        content = _read_safetensors(file) if file.suffix == ".safetensors" else _unpickled(file)
+        content = _read(file)
     except pickle.UnpicklingError as error:
         raise UserError(
             f"{kind} {path!r} holds more than tensors, or is no file of PyTorch, and is not "
             "unpickled, since that could run code:"
             f" {str(error).strip().splitlines()[0][:200]}"
         ) from error
-    except UserError:
-        raise
     except Exception as error:  # torch raises various exceptions for damaged pickles
         raise UserError(
             f"{kind} {path!r} can't be read: {type(error).__name__}: {str(error).strip()[:200]}"
@@ -55,20 +55,14 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
     return dict(state)
 
 
-def _read_safetensors(file: Path) -> dict[str, Tensor]:
-    from safetensors.torch import load_file
+def _read(file: Path) -> Any:
+    """Read safetensors or a pickle."""
+    if file.suffix == ".safetensors":
+        from safetensors.torch import load_file
 
-    return load_file(file)
-
-
-def _unpickled(file: Path) -> Any:
-    """Read a pickle. Zip files are memory-mapped, so that unused tensors (optimiser state) aren't
-    read.
-    """
-    is_zip = zipfile.is_zipfile(file)
-    if is_zip:
-        require_plain_archive(file)
-    return torch.load(file, map_location="cpu", weights_only=True, mmap=is_zip)
+        return load_file(file)
+    # zip files are memory-mapped, so that unused tensors (optimiser state) aren't read
+    return torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
 
 
 def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> None:

@@ -6,7 +6,6 @@ the encoder's gradients must be useful.
 
 import functools
 import math
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -19,15 +18,14 @@ from ..cameras import Orbit, to_opencv
 from ..core.streams import numpy_generator
 from ..splatting import rasterize
 from . import models
-from .batches import StepData, batches, normal
-from .loop import Stage, checkpoint_path
+from .batches import StepData, normal
+from .loop import Stage, is_trained
 from .sheet import contact_sheet
 from .views import (
     DISTANCE,
     FOVY_DEG,
     SIZE,
     Shard,
-    Shards,
     held_out_shard,
     with_backgrounds,
 )
@@ -81,19 +79,16 @@ class AutoencoderStage(Stage):
     images = 200_000
 
     def build(self) -> nn.Module:
-        self.shards = Shards(
-            self.options.shards_folder(), self.options.seed, objects=self.options.shard_objects
-        )
+        self.shards = self.options.shards()
         return models.autoencoder()
 
     def frozen(self) -> tuple[str, ...]:
         """Freeze the encoder once the U-Net is trained on its latents; the decoder may improve."""
-        users = (checkpoint_path(self.options.folder, name) for name in ("unet-small", "unet"))
-        return ("encoder.", "quant_conv.") if any(path.exists() for path in users) else ()
+        trained = is_trained(self.options.folder, "unet-small", "unet")
+        return ("encoder.", "quant_conv.") if trained else ()
 
-    def batches(self, step: int) -> Iterator[AutoencoderBatch]:
-        data = AutoencoderData(self.options, self.shards, self.batch)
-        return batches(data, step, self.device, self.options.workers)
+    def data(self) -> AutoencoderData:
+        return AutoencoderData(self.shards, self.batch, self.options.pool)
 
     def loss(self, model: nn.Module, batch: AutoencoderBatch) -> tuple[Tensor, dict[str, Tensor]]:
         images = batch.images * 2 - 1

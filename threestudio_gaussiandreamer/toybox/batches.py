@@ -11,7 +11,6 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from ..core.streams import numpy_generator
-from .loop import Options
 from .views import Shards, row_batch
 
 PREFETCHED = 4
@@ -25,9 +24,10 @@ class StepData(Dataset, ABC):
     Objects are sent to worker processes, so they hold no networks.
     """
 
-    options: Options
     shards: Shards
     batch: int
+    pool: int
+    """Number of shards that are visited cyclically."""
     stream: ClassVar[str]
     """Name of the streams of random numbers."""
     per_object: ClassVar[bool] = False
@@ -36,15 +36,9 @@ class StepData(Dataset, ABC):
     def __getitem__(self, step: int) -> Any:
         """Return the batch of ``step``: a tensor or a named tuple of tensors, on the CPU."""
         seed = self.shards.seed
-        index, rows = row_batch(
-            self.shards,
-            f"{self.stream}-rows",
-            self.batch,
-            self.options.pool,
-            step,
-            per_object=self.per_object,
-        )
-        return self.make(index, rows, numpy_generator(seed, f"{self.stream}-batch", step))
+        stream, per_object = f"{self.stream}-rows", self.per_object
+        place = row_batch(self.shards, stream, self.batch, self.pool, step, per_object=per_object)
+        return self.make(*place, numpy_generator(seed, f"{self.stream}-batch", step))
 
     @abstractmethod
     def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> Any:

@@ -1,7 +1,6 @@
 """Train CLIP's image encoder on the features of the trained text encoder, which stay fixed."""
 
 import functools
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,16 +10,17 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from ..core.checkpoint_file import entries_below
 from ..core.streams import numpy_generator
 from ..models.clip import MEAN, STD
 from . import models
-from .batches import StepData, batches
+from .batches import StepData
 from .classifiers import accuracies, classified
 from .loop import Stage, averaged_weights
 from .module_digest import digest
 from .text_batches import label_tensor, open_tokenizer, token_ids, training_prompts, view_prompts
 from .text_stage import TEXT_PARTS, text_features, with_trained_text
-from .views import VIEWS, Shards, held_out_shard, with_backgrounds
+from .views import VIEWS, held_out_shard, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.3
 LARGEST_SCALE = 100.0
@@ -65,9 +65,7 @@ class ClipStage(Stage):
 
     def build(self) -> nn.Module:
         self.tokenizer = open_tokenizer(self.options.folder)
-        self.shards = Shards(
-            self.options.shards_folder(), self.options.seed, objects=self.options.shard_objects
-        )
+        self.shards = self.options.shards()
         clip = with_trained_text(models.clip_model(len(self.tokenizer)), self.options.folder)
         self.text_digest = digest(clip.text_model)
         heads = models.AttributeHeads(models.FEATURES)
@@ -79,9 +77,8 @@ class ClipStage(Stage):
     def depends(self) -> dict[str, str]:
         return {"text": self.text_digest}
 
-    def batches(self, step: int) -> Iterator[ClipBatch]:
-        data = ClipData(self.options, self.shards, self.batch, self.tokenizer)
-        return batches(data, step, self.device, self.options.workers)
+    def data(self) -> ClipData:
+        return ClipData(self.shards, self.batch, self.options.pool, self.tokenizer)
 
     def loss(self, model: nn.Module, batch: ClipBatch) -> tuple[Tensor, dict[str, Tensor]]:
         text, image = clip_features(model["clip"], batch.ids, batch.pixels)
@@ -141,13 +138,6 @@ def trained_clip(folder: Any, vocabulary_size: int) -> Any:
     Raises:
         UserError: it isn't trained.
     """
-    weights = averaged_weights(folder, "clip")
     clip = models.clip_model(vocabulary_size)
-    clip.load_state_dict(
-        {
-            name.removeprefix("clip."): value
-            for name, value in weights.items()
-            if name.startswith("clip.")
-        }
-    )
+    clip.load_state_dict(entries_below(averaged_weights(folder, "clip"), "clip."))
     return clip.eval().requires_grad_(False)

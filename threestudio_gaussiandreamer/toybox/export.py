@@ -30,7 +30,7 @@ from ..core.files import atomic_file, output_folder
 from ..models.bundled import write_digests
 from . import models
 from .clip_stage import trained_clip
-from .loop import averaged_weights, checkpoint_path
+from .loop import averaged_weights, checkpoint_path, is_trained
 from .text_batches import open_tokenizer
 from .unet_stage import LATENT_SCALE, frozen_autoencoder
 
@@ -52,9 +52,9 @@ def export(training: Path, target: Path) -> dict[str, Any]:
     clip = trained_clip(training, len(tokenizer))
     write_clip(target / "clip", clip, training / "tokenizer")
     write_stable_diffusion(target / "stable-diffusion", training, clip)
-    if checkpoint_path(training, "points").exists():
+    if is_trained(training, "points"):
         write_weights(target / "points.safetensors", averaged_weights(training, "points"))
-    if checkpoint_path(training, "judge").exists():
+    if is_trained(training, "judge"):
         write_weights(target / "judge.safetensors", averaged_weights(training, "judge"))
     record = training_record(training)
     with atomic_file(target / "training.json") as file:
@@ -112,7 +112,7 @@ def training_record(training: Path) -> dict[str, Any]:
     """Return what each network of a training has seen, and its last losses."""
     record = {}
     for name in STAGES:
-        if checkpoint_path(training, name).exists():
+        if is_trained(training, name):
             content = load_file(checkpoint_path(training, name))
             record[name] = {
                 "images": content["images"],

@@ -1,7 +1,6 @@
 """Train the judge, a classifier that evaluates the other networks, on data of a separate seed."""
 
 import functools
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -11,12 +10,12 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ..core.streams import numpy_generator
-from .batches import StepData, batches
+from .batches import StepData
 from .classifiers import accuracies, classified
 from .loop import Stage
 from .models import Judge
 from .text_batches import label_tensor
-from .views import Shards, held_out_shard, with_backgrounds
+from .views import held_out_shard, with_backgrounds
 
 SEED_OFFSET = 1000
 """Added to the seed, so that the judge and the other networks have no training pictures in common.
@@ -47,14 +46,11 @@ class JudgeStage(Stage):
 
     def build(self) -> nn.Module:
         self.seed = self.options.seed + SEED_OFFSET
-        self.shards = Shards(
-            self.options.shards_folder(), self.seed, objects=self.options.shard_objects
-        )
+        self.shards = self.options.shards(self.seed)
         return Judge()
 
-    def batches(self, step: int) -> Iterator[JudgeBatch]:
-        data = JudgeData(self.options, self.shards, self.batch)
-        return batches(data, step, self.device, self.options.workers)
+    def data(self) -> JudgeData:
+        return JudgeData(self.shards, self.batch, self.options.pool)
 
     def loss(self, model: nn.Module, batch: JudgeBatch) -> tuple[Tensor, dict[str, Tensor]]:
         loss, right = classified(model(batch.images), batch.labels)

@@ -20,12 +20,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
+from torch.utils.data import Dataset
 
-from ..core.checkpoint_file import load_file, save_file
+from ..core.checkpoint_file import entries_below, load_file, save_file
 from ..core.errors import UserError
-from ..core.files import atomic_file
 from ..core.images import write as write_picture
 from ..core.signals import restore_handlers, set_handlers
+from .batches import batches
+from .curves import write_curves
+from .views import Shards
 
 EMA_DECAY = 0.999
 WARMUP, DECAY_SHARE = 200, 0.3
@@ -59,6 +62,11 @@ class Options:
     def shards_folder(self) -> Path:
         return self.folder / "shards"
 
+    def shards(self, seed: Optional[int] = None) -> Shards:
+        """Return the shards of a seed; None for that of the training."""
+        seed = self.seed if seed is None else seed
+        return Shards(self.shards_folder(), seed, objects=self.shard_objects)
+
 
 class Stage(ABC):
     """The training of one network, ``model``; :class:`Training` also averages its weights."""
@@ -83,8 +91,12 @@ class Stage(ABC):
         """Build the network with random weights, and load the networks that its training uses."""
 
     @abstractmethod
+    def data(self) -> Dataset:
+        """Return the batches, indexed by step, on the CPU; it is sent to worker processes."""
+
     def batches(self, step: int) -> Iterator[Any]:
         """Yield the batches from ``step`` on, on the stage's device."""
+        return batches(self.data(), step, self.device, self.options.workers)
 
     @abstractmethod
     def loss(self, model: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
@@ -333,6 +345,11 @@ def checkpoint_path(folder: Path, name: str) -> Path:
     return Path(folder) / f"{name}.pt"
 
 
+def is_trained(folder: Path, *names: str) -> bool:
+    """Return whether there is a checkpoint of any of these stages."""
+    return any(checkpoint_path(folder, name).exists() for name in names)
+
+
 def averaged_weights(folder: Path, name: str) -> dict[str, Tensor]:
     """Read the averaged weights of a stage's checkpoint.
 
@@ -342,48 +359,4 @@ def averaged_weights(folder: Path, name: str) -> dict[str, Tensor]:
     path = checkpoint_path(folder, name)
     if not path.exists():
         raise UserError(f"{path} is missing: train the stage {name!r} first")
-    ema = load_file(path)["ema"]
-    return {
-        key.removeprefix("module."): value
-        for key, value in ema.items()
-        if key.startswith("module.")
-    }
-
-
-def write_curves(path: Path, history: list[dict[str, float]]) -> None:
-    """Write the history as CSV, and as a chart beside it."""
-    if not history:
-        return
-    columns = list(history[-1])
-    lines = [
-        ",".join(columns),
-        *(",".join(str(row.get(name, "")) for name in columns) for row in history),
-    ]
-    with atomic_file(path, durable=False) as file:
-        file.write(("\n".join(lines) + "\n").encode())
-    write_picture(
-        path.with_suffix(".png"), curve(np.array([[row["images"], row["loss"]] for row in history]))
-    )
-
-
-def curve(points: np.ndarray, size: tuple[int, int] = (640, 320)) -> np.ndarray:
-    """Draw (images, loss) with a logarithmic loss axis, uint8 (H, W, 3)."""
-    from PIL import Image, ImageDraw
-
-    chart = Image.new("RGB", size, "white")
-    draw = ImageDraw.Draw(chart)
-    x, y = points[:, 0], np.log(np.maximum(points[:, 1], 1e-12))
-    left, top, right, bottom = 60, 10, size[0] - 10, size[1] - 25
-    place = np.stack(
-        [
-            left + (right - left) * x / max(x.max(), 1),
-            bottom - (bottom - top) * (y - y.min()) / max(np.ptp(y), 1e-9),
-        ],
-        1,
-    )
-    draw.rectangle((left, top, right, bottom), outline="grey")
-    draw.line([tuple(row) for row in place.tolist()], fill="blue")
-    draw.text((4, top), f"{np.exp(y.max()):.3g}", fill="black")
-    draw.text((4, bottom - 10), f"{np.exp(y.min()):.3g}", fill="black")
-    draw.text((right - 140, bottom + 8), f"{int(x.max())} images", fill="black")
-    return np.asarray(chart)
+    return entries_below(load_file(path)["ema"], "module.")

@@ -1,7 +1,6 @@
 """Training the text-to-points model in Point-E's format, on CLIP's text features."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,13 +16,13 @@ from ..priors.karras import cosine_alphas_cumprod, guided_denoiser, karras_sigma
 from ..priors.point_e import BIASES, SCALES, mean_of
 from ..splatting import rasterize
 from . import models
-from .batches import StepData, batches, normal, torch_generator
+from .batches import StepData, normal, torch_generator
 from .loop import Stage
 from .module_digest import digest
 from .sheet import contact_sheet
 from .text_batches import object_prompts, open_tokenizer, token_ids
-from .text_stage import frozen_text
-from .views import BACKGROUND, FOVY_DEG, VIEWS, Shards, held_out_shard
+from .text_stage import frozen_text, text_features
+from .views import BACKGROUND, FOVY_DEG, VIEWS, held_out_shard
 from .world import RADIUS
 
 POINTS = 256
@@ -76,17 +75,15 @@ class PointsStage(Stage):
     def build(self) -> nn.Module:
         self.tokenizer = open_tokenizer(self.options.folder)
         self.clip = frozen_text(self.options.folder, len(self.tokenizer)).to(self.device)
-        objects = self.options.shard_objects
-        self.shards = Shards(self.options.shards_folder(), self.options.seed, objects=objects)
+        self.shards = self.options.shards()
         self.alphas_cumprod = torch.from_numpy(cosine_alphas_cumprod()).to(self.device)
         return models.points_model()
 
     def depends(self) -> dict[str, str]:
         return {"text": digest(self.clip.text_model)}
 
-    def batches(self, step: int) -> Iterator[PointsBatch]:
-        data = PointsData(self.options, self.shards, self.batch, self.tokenizer)
-        return batches(data, step, self.device, self.options.workers)
+    def data(self) -> PointsData:
+        return PointsData(self.shards, self.batch, self.options.pool, self.tokenizer)
 
     def loss(self, model: nn.Module, batch: PointsBatch) -> tuple[Tensor, dict[str, Tensor]]:
         condition = self.condition(batch.ids) * ~batch.empty[:, None]
@@ -101,9 +98,8 @@ class PointsStage(Stage):
     @torch.no_grad()
     def condition(self, ids: Int[Tensor, "B 32"]) -> Float[Tensor, "B D"]:
         """Return CLIP's text features with unit variance, as the Point-E prior gives them."""
-        output = self.clip.text_model(ids).pooler_output
-        features = self.clip.text_projection(output).float()
-        return features / features.norm(dim=-1, keepdim=True) * features.shape[-1] ** 0.5
+        features = text_features(self.clip.text_model, self.clip.text_projection, ids)
+        return features * features.shape[-1] ** 0.5
 
     @torch.no_grad()
     def sheet(self, model: nn.Module) -> np.ndarray:

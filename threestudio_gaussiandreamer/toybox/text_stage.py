@@ -7,7 +7,6 @@ parts from classifiers much earlier than from the contrastive loss.
 """
 
 import functools
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,11 +16,11 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
+from ..core.checkpoint_file import entries_below
 from ..core.streams import numpy_generator
 from . import models, words
-from .batches import batches
 from .classifiers import IGNORED, accuracies, classified
-from .loop import Options, Stage, averaged_weights, checkpoint_path
+from .loop import Stage, averaged_weights, is_trained
 from .text_batches import open_tokenizer, token_ids
 from .views import LABELS, label_row, random_angles
 from .world import draw_attributes
@@ -39,12 +38,12 @@ class TextBatch(NamedTuple):
 class TextData(Dataset):
     """Prompts of random objects; a batch is a function of (seed, step)."""
 
-    options: Options
+    seed: int
     batch: int
     tokenizer: Any
 
     def __getitem__(self, step: int) -> TextBatch:
-        return text_batch(self.tokenizer, self.options.seed, step * self.batch, self.batch)
+        return text_batch(self.tokenizer, self.seed, step * self.batch, self.batch)
 
 
 def text_batch(
@@ -84,12 +83,10 @@ class TextStage(Stage):
 
     def frozen(self) -> tuple[str, ...]:
         """Freeze the encoder once other networks are trained on it."""
-        users = (checkpoint_path(self.options.folder, name) for name in USERS)
-        return TEXT_PARTS if any(path.exists() for path in users) else ()
+        return TEXT_PARTS if is_trained(self.options.folder, *USERS) else ()
 
-    def batches(self, step: int) -> Iterator[TextBatch]:
-        data = TextData(self.options, self.batch, self.tokenizer)
-        return batches(data, step, self.device, self.options.workers)
+    def data(self) -> TextData:
+        return TextData(self.options.seed, self.batch, self.tokenizer)
 
     def loss(self, model: nn.Module, batch: TextBatch) -> tuple[Tensor, dict[str, Tensor]]:
         loss, right = classified(self._logits(model, batch.ids), batch.labels)
@@ -142,12 +139,7 @@ def with_trained_text(clip: Any, folder: Any) -> Any:
     """
     weights = averaged_weights(folder, "text")
     for name in TEXT_PARTS:
-        found = {
-            key.removeprefix(f"{name}."): value
-            for key, value in weights.items()
-            if key.startswith(f"{name}.")
-        }
-        getattr(clip, name).load_state_dict(found)
+        getattr(clip, name).load_state_dict(entries_below(weights, f"{name}."))
     return clip
 
 

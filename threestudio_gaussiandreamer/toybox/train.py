@@ -33,7 +33,6 @@ from .loop import Options, Stage, Training
 from .points_stage import PointsStage
 from .text_stage import TextStage
 from .unet_stage import SmallUNetStage, UNetStage
-from .views import Shards
 from .warm_start import start_from
 
 STAGES: dict[str, type[Stage]] = {
@@ -140,7 +139,7 @@ def render_shards(options: Options, seeds: Sequence[int], workers: int) -> None:
 
 def _render(job: tuple[Options, int, int]) -> None:
     options, seed, index = job
-    Shards(options.shards_folder(), seed, objects=options.shard_objects).ensure(index)
+    options.shards(seed).ensure(index)
 
 
 def train(

@@ -1,7 +1,6 @@
 """Training the U-Net on the autoencoder's latents and the text encoder's tokens."""
 
 import functools
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -17,13 +16,13 @@ from ..core.files import atomic_file
 from ..core.streams import generator, numpy_generator
 from ..diffusion import sds
 from . import models
-from .batches import StepData, batches, normal, torch_generator
-from .loop import Stage, averaged_weights, checkpoint_path
+from .batches import StepData, normal, torch_generator
+from .loop import Stage, averaged_weights, is_trained
 from .module_digest import digest
 from .sheet import contact_sheet
 from .text_batches import open_tokenizer, token_ids, training_prompts, view_prompts
 from .text_stage import frozen_text
-from .views import SIZE, Shards, held_out_shard, with_backgrounds
+from .views import SIZE, held_out_shard, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.05
 """Fraction of pictures with a random background. It is small because with a fraction of 0.5 score
@@ -89,9 +88,7 @@ class UNetStage(Stage):
     def build(self) -> nn.Module:
         folder = self.options.folder
         self.tokenizer = open_tokenizer(folder)
-        self.shards = Shards(
-            self.options.shards_folder(), self.options.seed, objects=self.options.shard_objects
-        )
+        self.shards = self.options.shards()
         self.text_model = frozen_text(folder, len(self.tokenizer)).text_model.to(self.device)
         self.vae = frozen_autoencoder(folder).to(self.device)
         self.encoder_digest = digest(self.vae.encoder)
@@ -103,7 +100,7 @@ class UNetStage(Stage):
 
     def _start(self, network: nn.Module) -> nn.Module:
         """Load the weights of the training on small pictures, if there was one."""
-        if checkpoint_path(self.options.folder, SmallUNetStage.name).exists():
+        if is_trained(self.options.folder, SmallUNetStage.name):
             weights = averaged_weights(self.options.folder, SmallUNetStage.name)
             network.load_state_dict(weights)
         return network
@@ -116,11 +113,10 @@ class UNetStage(Stage):
     def depends(self) -> dict[str, str]:
         return {"text": digest(self.text_model), "autoencoder": self.encoder_digest}
 
-    def batches(self, step: int) -> Iterator[UNetBatch]:
+    def data(self) -> UNetData:
         pool = tqdm(range(self.options.pool), "latents", unit="shard", disable=None)
         moments = tuple(self._moments(index) for index in pool)
-        data = UNetData(self.options, self.shards, self.batch, self.tokenizer, moments)
-        return batches(data, step, self.device, self.options.workers)
+        return UNetData(self.shards, self.batch, self.options.pool, self.tokenizer, moments)
 
     def loss(self, model: nn.Module, batch: UNetBatch) -> tuple[Tensor, dict[str, Tensor]]:
         abar, noise, x = self.alphas_cumprod[batch.t], batch.noise, batch.latents * self.scale

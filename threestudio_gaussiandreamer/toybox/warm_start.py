@@ -7,9 +7,10 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from ..core.checkpoint_file import entries_below
 from ..core.errors import UserError
 from ..core.files import existing_file
-from .loop import Options, Progress, Stage, Training, checkpoint_path
+from .loop import Options, Progress, Stage, Training, is_trained
 from .text_stage import TEXT_PARTS
 from .unet_stage import LATENT_SCALE
 
@@ -32,7 +33,7 @@ def start_from(weights: Path, options: Options, stages: dict[str, type[Stage]]) 
     if not (options.folder / "tokenizer").exists():
         shutil.copytree(weights / "stable-diffusion" / "tokenizer", options.folder / "tokenizer")
     for name, stage in stages.items():
-        if name in record and not checkpoint_path(options.folder, name).exists():
+        if name in record and not is_trained(options.folder, name):
             training = Training(stage(options))
             _load(training.model, READERS[name](weights), weights, name)
             training.ema.module.load_state_dict(training.model.state_dict())
@@ -79,11 +80,8 @@ def _read(path: Path) -> dict[str, Tensor]:
 
 
 def _read_text(weights: Path) -> dict[str, Tensor]:
-    return {
-        key.removeprefix("clip."): value
-        for key, value in _read_clip(weights).items()
-        if key.startswith(tuple(f"clip.{name}." for name in TEXT_PARTS))
-    }
+    named = entries_below(_read_clip(weights), "clip.")
+    return {key: value for key, value in named.items() if key.startswith(TEXT_PARTS)}
 
 
 READERS = {
