@@ -141,6 +141,7 @@ def test_one_pass_over_the_pixels_gives_the_bits_of_the_general_path(
         {"space": "latent", "latent_size": 4},
         {"image_size": 8},
         {"grad_clip": 0.1},
+        {"reuse_steps": 2},
         {"variant_type": "csd-variant", "mode": "direction-bins"},
     ],
     ids=lambda options: next(iter(options)),

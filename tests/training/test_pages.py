@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -56,6 +57,17 @@ def test_the_poster_has_a_transparent_background(save):
     poster = np.asarray(Image.open(save / "it2-export" / "poster.png"))
     assert poster.shape == (512, 512, 4)
     assert poster[0, 0, 3] == 0 and poster[..., 3].max() > 60
+
+
+def test_a_run_without_ffmpeg_exports_its_cloud_all_the_same(
+    tmp_path, painted_box, monkeypatch, capfd
+):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert launch(tmp_path, painted_box, "system.prompt_processor.prompt=a box", *SHORT) == 0
+    save = run_folder(tmp_path) / "save"
+    assert (save / "it2-export" / "gaussians.ply").is_file()
+    assert not list(save.glob("*.mp4"))
+    assert "pip install imageio-ffmpeg" in capfd.readouterr().err
 
 
 def test_the_turntable_is_an_animated_picture_too(save):

@@ -17,6 +17,7 @@ _COLOR_MAPS = {
 }
 """Knots at equal distances over [0, 1]."""
 _MP4_OPTIONS = {
+    "format": "FFMPEG",  # else imageio without imageio-ffmpeg takes another plugin, and fails in it
     "codec": "libx264",
     "pixelformat": "yuv420p",
     "macro_block_size": 1,
@@ -162,6 +163,8 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
         if mp4:
             _require_whole_mp4(part)
         os.replace(part, path)
+    except ImportError as error:
+        raise UserError(f"the video {path} needs ffmpeg: pip install imageio-ffmpeg") from error
     except (OSError, RuntimeError) as error:
         raise UserError(f"the video {path} could not be written: {error}") from error
     finally:

@@ -192,6 +192,7 @@ class ExactScoreGuidance(ScoreDistillation):
             and not self.guided
             and self.grad_clip is None
             and type(self.variant) is SDS
+            and options.reuse_steps == 1
         )
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B c h w"]:

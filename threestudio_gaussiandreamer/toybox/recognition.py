@@ -2,7 +2,8 @@
 
 ===========  ===================================================================================
 kind         whether the kind with the highest probability, averaged over the views, is the prompt's
-colors       the same for the body's colour and the pattern's: both must be right
+colors       the same for the body's colour and the pattern's: both must be right, in either order
+             for stripes and checks, which look alike with their colours exchanged
 pattern      the same for the pattern
 accessory    the same for the coloured part, the accessory and its colour: all three must be right
 multi_face   share of the views that the judge takes for views from another quadrant; NaN for
@@ -22,7 +23,7 @@ from ..core.errors import UserError
 from ..models.bundled import JUDGE, model_part
 from .models import Judge
 from .views import DISTANCE, FOVY_DEG, LABELS
-from .world import Attributes
+from .world import COLORS, Attributes
 
 ELEVATION_DEG = 15.0
 OFFSETS_DEG = (-22.5, 22.5)
@@ -30,6 +31,8 @@ OFFSETS_DEG = (-22.5, 22.5)
 +-45 degrees, where the right answer is ambiguous.
 """
 ALIKE_FROM_ALL_SIDES = ("mug", "mushroom")
+EXCHANGEABLE = ("striped", "checkered")
+"""Patterns that look alike with their two colours exchanged."""
 
 
 def load_judge(name: str) -> Judge:
@@ -88,10 +91,20 @@ def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, bool]:
         right[name] = int(found[name].mean(dim=0).argmax()) == index
     return {
         "kind": right["kind"],
-        "colors": right["color"] and right["second"],
+        "colors": colors_recognized(found, wanted)
+        if wanted.pattern in EXCHANGEABLE
+        else right["color"] and right["second"],
         "pattern": right["pattern"],
         "accessory": right["part"] and right["accessory"] and right["accessory_color"],
     }
+
+
+def colors_recognized(found: dict[str, Tensor], wanted: Attributes) -> bool:
+    """Return whether the two most probable colours are the prompt's, in either order."""
+    both = found["color"] + found["second"][:, : len(COLORS)]
+    names = list(COLORS)
+    best = {names[index] for index in both.mean(dim=0).topk(2).indices.tolist()}
+    return best == {wanted.color, wanted.second}
 
 
 def multi_face(found: dict[str, Tensor], wanted: Attributes) -> float:

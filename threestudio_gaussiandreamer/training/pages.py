@@ -78,11 +78,17 @@ def write_pages(system: Any, folder: str) -> None:
 
 
 def write_turntable(system: Any) -> None:
-    """Write the pictures ``it<step>-test/<number>.png`` as a video, and fewer of them as WebP."""
+    """Write the pictures ``it<step>-test/<number>.png`` as a video, and fewer of them as WebP.
+
+    A video that can't be written is a warning, since the exports follow.
+    """
     step = system.true_global_step
     name = f"it{step}-test"
     options = {"save_format": "mp4", "fps": 30, "name": "test", "step": step}
-    system.save_img_sequence(name, name, r"(\d+)\.png", **options)
+    try:
+        system.save_img_sequence(name, name, r"(\d+)\.png", **options)
+    except UserError as error:
+        warn(str(error))
     folder = Path(system.get_save_dir(), name)
     if not system.cfg.pages:
         return
