@@ -66,6 +66,7 @@ def readme_table() -> str:
 
 SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "README.md": {"measured": readme_table},
+    "docs/cuda.md": {"gpu": splatting.gpu},
     "docs/distillation.md": {
         "quality": variant_tables.quality,
         "blind": variant_tables.blind,

@@ -1,7 +1,9 @@
 """The tables of docs/rasteriser.md, from docs/charts/rasteriser.csv, docs/charts/growth.csv,
-benchmarks/results/splatting.csv and benchmarks/results/kernel.csv.
+benchmarks/results/splatting.csv and benchmarks/results/kernel.csv, and that of docs/cuda.md, from
+benchmarks/results/gpu-<device>.json.
 """
 
+import json
 from pathlib import Path
 
 from benchmarks.markdown import markdown, read
@@ -136,3 +138,49 @@ def growth() -> str:
         for row in read(GROWTH)
     )
     return markdown(("Gaussians", "CPU s", "peak memory, MB"), rows)
+
+
+def gpu() -> str:
+    """Return what each run of ``gpu_check`` found, one column per GPU."""
+    files = sorted((ROOT / "benchmarks/results").glob("gpu-*.json"))
+    runs = [json.loads(path.read_text()) for path in files]
+    rows = {
+        "image, largest relative error": lambda run: _largest_error(run, "image"),
+        "gradients, largest relative error": lambda run: _largest_error(run, "gradient"),
+        "the same bits again": lambda run: _all(run["correct"]["relative_errors"], "same_bits"),
+        "compute-sanitizer (memcheck, racecheck)": _sanitized,
+        "first image with an empty cache, with a filled one": lambda run: (
+            f"{run['compile']['first']:.1f} s, {run['compile']['later']:.1f} s"
+        ),
+        "forward and backward, fast": lambda run: _bench(run, "fast"),
+        "forward and backward, balanced": lambda run: _bench(run, "balanced"),
+        "forward and backward, accurate": lambda run: _bench(run, "accurate"),
+        "forward and backward, gsplat": lambda run: _bench(run, "gsplat"),
+        "times faster than gsplat (fast)": lambda run: (
+            f"{run['bench']['times_faster_than_gsplat']:.2f}"
+        ),
+        "pruning 100,000 to 25,000, twice": lambda run: (
+            " and ".join(f"{seconds:.1f}" for seconds in run["prune"]["seconds"]) + " s"
+        ),
+    }
+    table = [(title, *map(cell, runs)) for title, cell in rows.items()]
+    return markdown(("", *(run["device"] for run in runs)), table)
+
+
+def _largest_error(run: dict, name: str) -> str:
+    errors = run["correct"]["relative_errors"].values()
+    return f"{max(error[name] for error in errors):.0e}"
+
+
+def _all(found: dict[str, dict], name: str) -> str:
+    return "yes" if all(entry[name] for entry in found.values()) else "no"
+
+
+def _sanitized(run: dict) -> str:
+    tools = {name: tool for name, tool in run["sanitize"].items() if name != "section_seconds"}
+    return "clean" if all("clean" in tool for tool in tools.values()) else json.dumps(tools)
+
+
+def _bench(run: dict, name: str) -> str:
+    found = run["bench"][name]
+    return f"{found['ms']:.2f} ms, {found['mb']:.0f} MB"
