@@ -16,7 +16,9 @@ had); "withheld" ones are of combinations that no training had.
 
 import argparse
 import contextlib
+import hashlib
 import io
+import json
 import multiprocessing
 import os
 import statistics
@@ -67,6 +69,8 @@ class Task(NamedTuple):
     prompt: Prompt
     seed: int
     models: str
+    keep: Path | None = None
+    """Folder of runs that are kept, to be scored again later."""
 
     @property
     def key(self) -> tuple[str, ...]:
@@ -104,16 +108,29 @@ def measured(task: Task) -> dict[str, float]:
     """Make and score the pictures or the run of a task."""
     from benchmarks.quality import toybox_scores as scores
 
-    text, start = task.prompt.text, time.process_time()
+    text = task.prompt.text
     if task.variant.name == TRUTH:
         return scores.of_truth(task.prompt, task.models)
     if task.variant.name == SAMPLES:
         return scores.of_samples(text, task.variant.x, task.seed, task.models)
+    if task.keep:
+        name = hashlib.blake2b(repr(task.key).encode(), digest_size=8).hexdigest()
+        return scored(task, task.keep / name)
     with tempfile.TemporaryDirectory() as folder:
-        run(task, Path(folder))
-        seconds = time.process_time() - start
-        found = scores.of_run(Path(folder) / "toybox/run", text, task.models)
-    return found | {"cpu_seconds": seconds}
+        return scored(task, Path(folder))
+
+
+def scored(task: Task, folder: Path) -> dict[str, float]:
+    """Score a run, which is made unless the folder has it."""
+    from benchmarks.quality import toybox_scores as scores
+
+    record = folder / "seconds.json"
+    if not record.exists():
+        start = time.process_time()
+        run(task, folder)
+        record.write_text(json.dumps(time.process_time() - start))
+    found = scores.of_run(folder / "toybox/run", task.prompt.text, task.models)
+    return found | {"cpu_seconds": json.loads(record.read_text())}
 
 
 def run(task: Task, folder: Path) -> None:
@@ -168,6 +185,7 @@ def parse_arguments() -> argparse.Namespace:
     add("--count", type=int, default=20, help="of prompts of each sort (default: 20)")
     add("--seeds", type=int, nargs="+", default=[0])
     add("--models", default="toybox", help="toybox, or the folder of an export")
+    add("--keep", type=Path, help="folder for the runs; those that it has are only scored")
     add("--seconds", type=float, help="stop after this time; runs under way are given up")
     add("--out", type=Path, default=CHARTS, help="folder of toybox.csv (default: docs/charts)")
     add("--list", action="store_true", help="only print what would run")
@@ -192,7 +210,7 @@ def tasks(arguments: argparse.Namespace) -> Iterator[Task]:
             for sort in arguments.prompts:
                 for prompt in prompts(sort, arguments.count):
                     for one in variants:
-                        yield Task(one, prompt, seed, arguments.models)
+                        yield Task(one, prompt, seed, arguments.models, arguments.keep)
 
 
 def unique(items: Iterator[Task]) -> list[Task]:

@@ -23,23 +23,7 @@ PROMPT_SEED = 5000
 """Of the attributes and words of prompts; trainings use others."""
 PAPER_SCALE = 101.0
 """threestudio's 100."""
-PAPER_RATES = {
-    "system.geometry.lr_means": 5e-5,
-    "system.geometry.lr_scales": 1e-3,
-    "system.geometry.lr_quats": 1e-2,
-    "system.geometry.lr_opacities": 1e-2,
-    "system.geometry.lr_sh": 1.25e-2,
-}
-PAPER = PAPER_RATES | {
-    "trainer.max_steps": 1200,
-    "system.guidance.max_step_percent": "[500,0.98,0.55,501]",
-    "system.guidance.guidance_scale": PAPER_SCALE,
-    "system.geometry.init_opacity": 0.1,
-    "system.geometry.grow.radius": 0.01,
-    "system.renderer.eps2d": 0.3,
-    "system.geometry.bound_colors": "false",
-}
-"""The numbers of gaussiandreamer.yaml, at the toybox's size and cameras."""
+PAPER = "configs/toybox-paper.yaml"
 BALL = {
     "system.geometry.prior_type": "random-prior",
     "system.geometry.prior": "{num_points: 3000, size: 0.8, color: grey}",
@@ -88,7 +72,7 @@ def steps(count: int) -> dict[str, Any]:
 def references() -> Iterator[Variant]:
     """The judge's ceiling, and the 2D model's own samples over its guidance scale."""
     yield Variant(TRUTH)
-    for scale in (1, 2, 4, GUIDANCE):
+    for scale in (1, 2, GUIDANCE, 8):
         yield Variant(SAMPLES, scale)
 
 
@@ -97,13 +81,13 @@ def default() -> Iterator[Variant]:
 
 
 def over_steps() -> Iterator[Variant]:
-    for count in (150, 300, 600, 1200):
+    for count in (75, 150, 300, 600):
         yield Variant("steps", count, steps(count))
 
 
 def over_guidance() -> Iterator[Variant]:
     """Scales of guidance, 1 without guidance and the last that of the paper."""
-    for scale in (1, 2, 4, 7.5, 15, 30, PAPER_SCALE):
+    for scale in (1, 2, 4, 8, 15, 30, PAPER_SCALE):
         yield Variant("guidance scale", scale, {"system.guidance.guidance_scale": scale})
 
 
@@ -174,7 +158,21 @@ def rates() -> Iterator[Variant]:
 
 
 def paper() -> Iterator[Variant]:
-    yield Variant("the paper's recipe", 0, PAPER)
+    yield Variant("the paper's recipe", 0, overlay(PAPER))
+
+
+def overlay(name: str) -> dict[str, Any]:
+    """Return the options of a configuration that is laid over toybox.yaml."""
+    return dict(flattened(yaml.safe_load((ROOT / name).read_text())))
+
+
+def flattened(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the leaves of nested options by their dotted names."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from flattened(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
 
 
 CHARTS: dict[str, Callable[[], Iterator[Variant]]] = {

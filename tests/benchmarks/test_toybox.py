@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from benchmarks.quality import runs, toybox, toybox_jobs, toybox_tables
+from benchmarks.quality import runs, toybox, toybox_jobs, toybox_scores, toybox_tables
 from benchmarks.quality.toybox_jobs import CONFIG, DEFAULT, SAMPLES, STEPS, TRUTH, Variant, prompts
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.launch.config import load_config
@@ -48,6 +48,21 @@ def test_schedules_are_scaled_to_the_steps():
     assert len(rates) == 5 and all(rate[-1] == STEPS // 2 for rate in rates)
     own = {"system.guidance.max_step_percent": [start, high, low, end]}
     assert own.items() <= toybox_jobs.steps(STEPS).items()
+
+
+def test_the_draft_has_half_of_the_steps():
+    draft = toybox_jobs.overlay("configs/toybox-draft.yaml")
+    assert draft == toybox_jobs.steps(STEPS // 2) | {"trainer.val_check_interval": STEPS // 2}
+
+
+def test_a_kept_run_is_only_scored(tmp_path, monkeypatch):
+    ran = []
+    monkeypatch.setattr(toybox, "run", lambda task, folder: ran.append(folder.mkdir(parents=True)))
+    monkeypatch.setattr(toybox_scores, "of_run", lambda folder, text, models: {"kind": 1.0})
+    task = toybox.Task(Variant(DEFAULT), prompts("seen", 1)[0], 0, "models", tmp_path)
+    first, second = toybox.measured(task), toybox.measured(task)
+    assert first == second and first["kind"] == 1 and first["cpu_seconds"] >= 0
+    assert len(ran) == 1
 
 
 def test_another_kind_of_the_same_colour_misleads_the_prior():
