@@ -51,6 +51,8 @@ QUICK = {
     "trainer.log_every_n_steps": 100, "system.exporter": "{formats: [ply], save_video: false}",
 }  # fmt: skip
 """Options that leave out what isn't measured: pages, video and pictures."""
+RUN = "toybox/run"
+"""Where these options put a run."""
 
 
 ENVIRONMENT = {
@@ -114,10 +116,14 @@ def measured(task: Task) -> dict[str, float]:
     if task.variant.name == SAMPLES:
         return scores.of_samples(text, task.variant.x, task.seed, task.models)
     if task.keep:
-        name = hashlib.blake2b(repr(task.key).encode(), digest_size=8).hexdigest()
-        return scored(task, task.keep / name)
+        return scored(task, kept(task))
     with tempfile.TemporaryDirectory() as folder:
         return scored(task, Path(folder))
+
+
+def kept(task: Task) -> Path:
+    """Return the folder of a kept run."""
+    return task.keep / hashlib.blake2b(repr(task.key).encode(), digest_size=8).hexdigest()
 
 
 def scored(task: Task, folder: Path) -> dict[str, float]:
@@ -129,7 +135,7 @@ def scored(task: Task, folder: Path) -> dict[str, float]:
         start = time.process_time()
         run(task, folder)
         record.write_text(json.dumps(time.process_time() - start))
-    found = scores.of_run(folder / "toybox/run", task.prompt.text, task.models)
+    found = scores.of_run(folder / RUN, task.prompt.text, task.models)
     return found | {"cpu_seconds": json.loads(record.read_text())}
 
 

@@ -124,12 +124,18 @@ def card() -> str:
         return "*No models are bundled yet.*"
     record = json.loads((FOLDER / RECORD).read_text(encoding="utf-8"))
     lines = [
-        (f"`{name}`", f"{seen['images']:,}", f"{seen['hours']:.1f}", withheld(seen["withheld"]))
+        (f"`{name}`", f"{seen['images']:,}", trained(seen), withheld(seen["withheld"]))
         for name, seen in record.items()
     ]
     size = sum(path.stat().st_size for path in FOLDER.rglob("*") if path.is_file())
-    head = ("network", "pictures or prompts seen", "hours", "on withheld combinations")
+    head = ("network", "pictures or prompts seen", "trained for", "on withheld combinations")
     return f"{markdown(head, lines)}\n\nAll files together: {size / 1e6:.1f} MB."
+
+
+def trained(seen: dict[str, Any]) -> str:
+    """Return minutes and device of each of a network's trainings."""
+    times = [f"{60 * part['hours']:.0f} min, {part['device']}" for part in seen["trainings"]]
+    return "; then ".join(times)
 
 
 def withheld(numbers: dict[str, Any]) -> str:

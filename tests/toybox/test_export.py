@@ -114,6 +114,13 @@ def test_the_record_lists_what_was_tested(exported):
     assert record["clip"]["images"] == 8 and record["unet"]["steps"] == 1
 
 
+def test_the_record_keeps_earlier_trainings():
+    earlier = [{"device": "another", "hours": 0.1}]
+    content = {"seconds": 7200.0, "device": "cpu", "earlier": earlier}
+    assert export.trainings(content) == [*earlier, {"device": "cpu", "hours": 2.0}]
+    assert export.trainings({"seconds": 0.0, "earlier": earlier}) == earlier
+
+
 def test_digests_of_all_files_are_written(exported):
     digests = read_digests(exported)
     assert {"points.safetensors", "clip/model.safetensors", "training.json"} < set(digests)
@@ -122,8 +129,13 @@ def test_digests_of_all_files_are_written(exported):
 
 def test_a_training_continues_from_the_weights(exported, trained, tmp_path):
     there = options(tmp_path)
+    record = json.loads((exported / "training.json").read_text())
+    record["judge"]["trainings"] = [{"device": "another", "hours": 0.1}]
+    weights = tmp_path / "weights"
+    shutil.copytree(exported, weights)
+    (weights / "training.json").write_text(json.dumps(record))
     tokenizer_before = (trained / "tokenizer" / "vocab.json").read_bytes()
-    warm_start.start_from(exported, there, STAGES)
+    warm_start.start_from(weights, there, STAGES)
     assert (tmp_path / "tokenizer" / "vocab.json").read_bytes() == tokenizer_before
     for name in export.STAGES:
         expected, found = averaged_weights(trained, name), averaged_weights(tmp_path, name)
@@ -131,6 +143,7 @@ def test_a_training_continues_from_the_weights(exported, trained, tmp_path):
             if "heads" not in key or name == "judge":
                 assert torch.allclose(found[key], value, **HALF), key
         run = training(tmp_path, name)
+        assert run.earlier == record[name]["trainings"] and run.progress.seconds == 0
         before = run.progress.images
         assert before == training(trained, name).progress.images
         run.run(before + 4)

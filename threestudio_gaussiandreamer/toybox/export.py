@@ -117,11 +117,18 @@ def training_record(training: Path) -> dict[str, Any]:
             record[name] = {
                 "images": content["images"],
                 "steps": content["step"],
-                "hours": round(content["seconds"] / 3600, 3),
+                "trainings": trainings(content),
                 "last": content["history"][-1] if content["history"] else {},
                 "withheld": content["measured"],
             }
     return record
+
+
+def trainings(content: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return device and hours of a checkpoint's training, after those that it started from."""
+    hours = round(content["seconds"] / 3600, 3)
+    own = [{"device": content.get("device", "cpu"), "hours": hours}] if hours else []
+    return content.get("earlier", []) + own
 
 
 def _save(network: Any, folder: Path) -> None:

@@ -147,6 +147,8 @@ class Training:
         )
         self.progress = Progress()
         self.measured: dict[str, float] = {}
+        self.earlier: list[dict[str, Any]] = []
+        """Device and hours of the trainings whose exported weights this one started from."""
         self.target, self.limit = stage.images, math.inf
         self.signum = 0
         if self.path.exists():
@@ -238,6 +240,8 @@ class Training:
             "depends": self.stage.depends(),
             "constants": self.stage.constants,
             "measured": self.measured,
+            "earlier": self.earlier,
+            "device": _device_name(self.stage.device),
             **vars(self.progress),
         }
         save_file(self.path, content)
@@ -261,6 +265,7 @@ class Training:
         self.progress = Progress(**{name: content[name] for name in vars(Progress())})
         self.stage.constants.update(content["constants"])
         self.measured = content["measured"]
+        self.earlier = content.get("earlier", [])
         log.info("%s: resumed after %d images", self.stage.name, self.progress.images)
 
     @torch.no_grad()
@@ -322,6 +327,10 @@ class _Sums:
         means = {name: float(value) / self.count for name, value in self.values.items()}
         self.count, self.values = 0, {}
         return means
+
+
+def _device_name(device: torch.device) -> str:
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
 
 def _average(averages: list[Tensor], current: list[Tensor], count: Any) -> None:
