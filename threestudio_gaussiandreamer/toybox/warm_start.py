@@ -42,7 +42,7 @@ def start_from(weights: Path, options: Options, stages: dict[str, type[Stage]]) 
                 training.stage.constants[LATENT_SCALE] = _latent_scale(weights)
             seen = record[name]
             training.progress = Progress(seen["steps"], seen["images"])
-            training.earlier = seen["trainings"]
+            training.earlier, training.measured = seen["trainings"], seen["withheld"]
             training.save()
 
 
