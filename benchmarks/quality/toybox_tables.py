@@ -107,6 +107,13 @@ def results() -> str:
     return markdown(("variant", "prompts", *titles, "haze, %", "Gaussians", "CPU seconds"), lines)
 
 
+def summary() -> str:
+    """Return kind / colours / pattern / accessory of toybox.yaml, in percent."""
+    rows = [row for row in measured() if row["variant"] == DEFAULT]
+    means = [estimate(rows, name).mean for name in RECOGNIZED[:4]]
+    return " / ".join(f"{100 * mean:.0f}" for mean in means) if rows else NOT_MEASURED
+
+
 def line_of(name: str, rows: list[Row], prefix: str = "") -> list[str]:
     prompts = len({row["prompt"] for row in rows})
     cells = [percent(estimate(rows, column, prefix)) for column in RECOGNIZED]
