@@ -21,6 +21,7 @@ import io
 import json
 import multiprocessing
 import os
+import shutil
 import statistics
 import sys
 import tempfile
@@ -132,6 +133,7 @@ def scored(task: Task, folder: Path) -> dict[str, float]:
 
     record = folder / "seconds.json"
     if not record.exists():
+        shutil.rmtree(folder, ignore_errors=True)  # of a run that was interrupted
         start = time.process_time()
         run(task, folder)
         record.write_text(json.dumps(time.process_time() - start))

@@ -47,6 +47,17 @@ def test_one_wrong_attribute_is_missed_alone(change, missed):
     assert [name for name, right in found.items() if not right] == [missed]
 
 
+@pytest.mark.parametrize(
+    ("pattern", "right"), [("striped", True), ("checkered", True), ("dotted", False)]
+)
+def test_colours_may_be_exchanged_where_nobody_can_tell(pattern, right):
+    wanted = FOX._replace(pattern=pattern)
+    exchanged = wanted._replace(color=wanted.second, second=wanted.color)
+    assert recognition.recognized(sure(exchanged), wanted)["colors"] is right
+    plain = wanted._replace(second=None)
+    assert not recognition.recognized(sure(plain), wanted)["colors"]
+
+
 def test_faces_on_all_sides():
     assert recognition.multi_face(sure(FOX, sides=[0] * 8), FOX) == 0.75
     mug = Attributes("mug", "red")

@@ -100,11 +100,14 @@ def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, bool]:
 
 
 def colors_recognized(found: dict[str, Tensor], wanted: Attributes) -> bool:
-    """Return whether the two most probable colours are the prompt's, in either order."""
-    both = found["color"] + found["second"][:, : len(COLORS)]
-    names = list(COLORS)
-    best = {names[index] for index in both.mean(dim=0).topk(2).indices.tolist()}
-    return best == {wanted.color, wanted.second}
+    """Return whether there are two colours, and the most probable ones are the prompt's, in either
+    order.
+    """
+    color, second = (found[name].mean(dim=0) for name in ("color", "second"))
+    if LABELS["second"][int(second.argmax())] == "none":
+        return False
+    best = (color + second[: len(COLORS)]).topk(2).indices.tolist()
+    return {LABELS["color"][index] for index in best} == {wanted.color, wanted.second}
 
 
 def multi_face(found: dict[str, Tensor], wanted: Attributes) -> float:
