@@ -26,6 +26,7 @@ OVERLAYS = (
         )
     }
     | {"polish.yaml": "gaussiandreamer.yaml"}
+    | {f"toybox-{name}.yaml": "toybox.yaml" for name in ("draft", "paper")}
 )
 """What each is laid over."""
 MANDATORY = {

@@ -63,6 +63,7 @@ def test_a_run_without_ffmpeg_exports_its_cloud_all_the_same(
     tmp_path, painted_box, monkeypatch, capfd
 ):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.delitem(sys.modules, "imageio.plugins.ffmpeg", raising=False)
     assert launch(tmp_path, painted_box, "system.prompt_processor.prompt=a box", *SHORT) == 0
     save = run_folder(tmp_path) / "save"
     assert (save / "it2-export" / "gaussians.ply").is_file()
