@@ -52,7 +52,7 @@ QUICK = {
     "trainer.log_every_n_steps": 100, "system.exporter": "{formats: [ply], save_video: false}",
 }  # fmt: skip
 """Options that leave out what isn't measured: pages, video and pictures."""
-RUN = "toybox/run"
+RUN = f"{QUICK['name']}/{QUICK['tag']}"
 """Where these options put a run."""
 
 

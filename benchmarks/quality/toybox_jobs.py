@@ -12,6 +12,7 @@ from threestudio_gaussiandreamer.core.streams import numpy_generator
 from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
 from threestudio_gaussiandreamer.toybox.words import describe
 from threestudio_gaussiandreamer.toybox.world import KINDS, draw_attributes
+from threestudio_gaussiandreamer.view.config_changes import leaves
 
 CONFIG = yaml.safe_load((ROOT / "configs/toybox.yaml").read_text())
 STEPS = CONFIG["trainer"]["max_steps"]
@@ -163,16 +164,7 @@ def paper() -> Iterator[Variant]:
 
 def overlay(name: str) -> dict[str, Any]:
     """Return the options of a configuration that is laid over toybox.yaml."""
-    return dict(flattened(yaml.safe_load((ROOT / name).read_text())))
-
-
-def flattened(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the leaves of nested options by their dotted names."""
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from flattened(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
+    return dict(leaves(yaml.safe_load((ROOT / name).read_text())))
 
 
 CHARTS: dict[str, Callable[[], Iterator[Variant]]] = {

@@ -3,7 +3,9 @@ benchmarks/results/splatting.csv and benchmarks/results/kernel.csv, and that of 
 benchmarks/results/gpu-<device>.json.
 """
 
+import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.markdown import markdown, read
@@ -144,18 +146,18 @@ def gpu() -> str:
     """Return what each run of ``gpu_check`` found, one column per GPU."""
     files = sorted((ROOT / "benchmarks/results").glob("gpu-*.json"))
     runs = [json.loads(path.read_text()) for path in files]
-    rows = {
-        "image, largest relative error": lambda run: _largest_error(run, "image"),
-        "gradients, largest relative error": lambda run: _largest_error(run, "gradient"),
-        "the same bits again": lambda run: _all(run["correct"]["relative_errors"], "same_bits"),
+    rows: dict[str, Callable[[dict], str]] = {
+        "image, largest relative error": lambda run: f"{max(_errors(run, 'image')):.0e}",
+        "gradients, largest relative error": lambda run: f"{max(_errors(run, 'gradient')):.0e}",
+        "the same bits again": lambda run: "yes" if all(_errors(run, "same_bits")) else "no",
         "compute-sanitizer (memcheck, racecheck)": _sanitized,
         "first image with an empty cache, with a filled one": lambda run: (
             f"{run['compile']['first']:.1f} s, {run['compile']['later']:.1f} s"
         ),
-        "forward and backward, fast": lambda run: _bench(run, "fast"),
-        "forward and backward, balanced": lambda run: _bench(run, "balanced"),
-        "forward and backward, accurate": lambda run: _bench(run, "accurate"),
-        "forward and backward, gsplat": lambda run: _bench(run, "gsplat"),
+    }
+    for name in (*PRESETS, "gsplat"):
+        rows[f"forward and backward, {name}"] = functools.partial(_bench, name)
+    rows |= {
         "times faster than gsplat (fast)": lambda run: (
             f"{run['bench']['times_faster_than_gsplat']:.2f}"
         ),
@@ -163,17 +165,20 @@ def gpu() -> str:
             " and ".join(f"{seconds:.1f}" for seconds in run["prune"]["seconds"]) + " s"
         ),
     }
-    table = [(title, *map(cell, runs)) for title, cell in rows.items()]
+    table = [(title, *(_measured(cell, run) for run in runs)) for title, cell in rows.items()]
     return markdown(("", *(run["device"] for run in runs)), table)
 
 
-def _largest_error(run: dict, name: str) -> str:
-    errors = run["correct"]["relative_errors"].values()
-    return f"{max(error[name] for error in errors):.0e}"
+def _measured(cell: Callable[[dict], str], run: dict) -> str:
+    """Return a cell; a section that failed or was skipped lacks its keys."""
+    try:
+        return cell(run)
+    except KeyError:
+        return "not measured"
 
 
-def _all(found: dict[str, dict], name: str) -> str:
-    return "yes" if all(entry[name] for entry in found.values()) else "no"
+def _errors(run: dict, name: str) -> list[float]:
+    return [error[name] for error in run["correct"]["relative_errors"].values()]
 
 
 def _sanitized(run: dict) -> str:
@@ -181,6 +186,6 @@ def _sanitized(run: dict) -> str:
     return "clean" if all("clean" in tool for tool in tools.values()) else json.dumps(tools)
 
 
-def _bench(run: dict, name: str) -> str:
+def _bench(name: str, run: dict) -> str:
     found = run["bench"][name]
     return f"{found['ms']:.2f} ms, {found['mb']:.0f} MB"

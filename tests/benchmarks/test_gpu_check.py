@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.splatting import bench_scenes, gpu_check, gpu_kernels, gpu_processes
+from benchmarks.splatting import bench_scenes, gpu_check, gpu_kernels, gpu_processes, tables
 
 ROOT = Path(__file__).parents[2]
 
@@ -93,3 +93,19 @@ def test_without_a_gpu_it_says_why(tmp_path):
     done = check("--out", tmp_path / "report.json")
     assert done.returncode == 2 and "nothing was checked" in done.stderr
     assert "nothing was checked" in json.loads((tmp_path / "report.json").read_text())["failed"]
+
+
+def test_the_table_names_what_was_not_measured(tmp_path, monkeypatch):
+    results = tmp_path / "benchmarks/results"
+    results.mkdir(parents=True)
+    found = {
+        "device": "a GPU",
+        "correct": {"failed": "x"},
+        "bench": {"fast": {"ms": 2.0, "mb": 3.0}, "gsplat": {"unavailable": "x"}},
+    }
+    (results / "gpu-a.json").write_text(json.dumps(found))
+    monkeypatch.setattr(tables, "ROOT", tmp_path)
+    lines = tables.gpu().splitlines()
+    assert "| forward and backward, fast | 2.00 ms, 3 MB |" in lines
+    assert "| forward and backward, gsplat | not measured |" in lines
+    assert "| the same bits again | not measured |" in lines
