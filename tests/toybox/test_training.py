@@ -12,7 +12,14 @@ import torch
 from tests.toybox.helpers import copied, options, training
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.toybox import loop, points_stage, train, unet_stage, views
+from threestudio_gaussiandreamer.toybox import (
+    judge_stage,
+    loop,
+    points_stage,
+    train,
+    unet_stage,
+    views,
+)
 from threestudio_gaussiandreamer.toybox.classifiers import IGNORED
 from threestudio_gaussiandreamer.toybox.text_stage import told_labels
 from threestudio_gaussiandreamer.toybox.train import STAGES, main, render_shards
@@ -317,6 +324,26 @@ def test_points_go_to_point_es_units_and_back():
     front = torch.tensor([[[0.8, 0, 0, 1.0, 0, 0]]])
     expected = torch.tensor([0, -1.0, 0, 1, -1, -1])  # Point-E's front is -y
     assert torch.allclose(points_stage.network_units(front)[0, :, 0], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("degradation", judge_stage.DEGRADATIONS)
+def test_degraded_pictures_stay_pictures_of_the_object(degradation):
+    """The pictures of a batch differ from the clean ones, but little enough to be recognised."""
+    images = torch.full((6, 3, 64, 64), 0.5)
+    images[:, :, 16:48, 16:48] = torch.tensor([0.9, 0.1, 0.1])[:, None, None]
+    for seed in range(8):
+        found = degradation(images, np.random.default_rng(seed))
+        assert found.shape == images.shape and found.min() >= 0 and found.max() <= 1
+        assert 0 < (found - images).abs().mean() < 0.12
+        middle = found[:, :, 24:40, 24:40].mean(dim=(2, 3))
+        assert (middle - images[:, :, 32, 32]).abs().max() < 0.12
+
+
+def test_a_quarter_of_the_judges_pictures_stays_clean():
+    images = torch.rand(9, 3, 64, 64)
+    found = judge_stage.degraded(images, np.random.default_rng(0))
+    assert found.shape == images.shape
+    assert torch.equal(found[:3], images[:3]) and not torch.equal(found[3:], images[3:])
 
 
 def test_only_directions_that_prompts_tell_are_labels():

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ..core.streams import numpy_generator
-from .batches import StepData
+from .batches import StepData, normal
 from .classifiers import accuracies, classified
 from .loop import Stage
 from .models import Judge
@@ -37,7 +37,7 @@ class JudgeData(StepData):
 
 
 class JudgeStage(Stage):
-    """Minimise the cross entropy of every attribute on clean, blurred and noisy pictures."""
+    """Minimise the cross entropy of every attribute on clean and degraded pictures."""
 
     name = "judge"
     batch_size = 64
@@ -47,13 +47,15 @@ class JudgeStage(Stage):
     def build(self) -> nn.Module:
         self.seed = self.options.seed + SEED_OFFSET
         self.shards = self.options.shards(self.seed)
-        return Judge()
+        return Judge().to(memory_format=torch.channels_last)  # 1.5 times faster on a CPU
 
     def data(self) -> JudgeData:
         return JudgeData(self.shards, self.batch, self.options.pool)
 
     def loss(self, model: nn.Module, batch: JudgeBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        loss, right = classified(model(batch.images), batch.labels)
+        loss, right = classified(
+            model(batch.images.contiguous(memory_format=torch.channels_last)), batch.labels
+        )
         return loss, {"right": right}
 
     @functools.cached_property
@@ -72,13 +74,36 @@ class JudgeStage(Stage):
 def degraded(
     images: Float[Tensor, "B 3 s s"], rng: np.random.Generator
 ) -> Float[Tensor, "B 3 s s"]:
-    """Blur a third of the batch by shrinking and enlarging it, and add noise to another third."""
-    third = len(images) // 3
+    """Blur a quarter of the batch, add noise to another, make another one mottled."""
+    clean, *others = images.tensor_split(4)
+    return torch.cat([clean, *(f(part, rng) for f, part in zip(DEGRADATIONS, others, strict=True))])
+
+
+def blurred(images: Float[Tensor, "B 3 s s"], rng: np.random.Generator) -> Float[Tensor, "B 3 s s"]:
+    """Shrink the pictures by a random factor up to 2, and enlarge them again."""
     size = images.shape[-1]
-    small = F.interpolate(
-        images[:third], (int(rng.integers(size // 2, size)),) * 2, mode="bilinear", antialias=True
-    )
-    blurred = F.interpolate(small, (size, size), mode="bilinear") if third else images[:0]
-    noise = rng.normal(0, rng.uniform(0, 0.06), images[third : 2 * third].shape).astype(np.float32)
-    noisy = (images[third : 2 * third] + torch.from_numpy(noise)).clamp(0, 1)
-    return torch.cat([blurred, noisy, images[2 * third :]])
+    small = (int(rng.integers(size // 2, size)),) * 2
+    small_images = F.interpolate(images, small, mode="bilinear", antialias=True)
+    return F.interpolate(small_images, (size, size), mode="bilinear")
+
+
+def noisy(images: Float[Tensor, "B 3 s s"], rng: np.random.Generator) -> Float[Tensor, "B 3 s s"]:
+    """Add normal noise of a random standard deviation up to 0.06."""
+    return (images + rng.uniform(0, 0.06) * normal(rng, images.shape)).clamp(0, 1)
+
+
+def mottled(images: Float[Tensor, "B 3 s s"], rng: np.random.Generator) -> Float[Tensor, "B 3 s s"]:
+    """Vary colours and positions smoothly over a few pixels, as in renders of coarse Gaussians.
+
+    Colours vary by a standard deviation of up to 0.1, positions by up to 1.5 pixels.
+    """
+    count, _, size, _ = images.shape
+    grid = size // int(rng.integers(2, 8))
+    field = F.interpolate(normal(rng, (count, 5, grid, grid)), (size, size), mode="bilinear")
+    moves = field[:, 3:].movedim(1, -1) * rng.uniform(0, 1.5) * 2 / size
+    places = F.affine_grid(torch.eye(2, 3).expand(count, 2, 3), list(images.shape), False) + moves
+    moved = F.grid_sample(images, places, padding_mode="border", align_corners=False)
+    return (moved + rng.uniform(0, 0.1) * field[:, :3]).clamp(0, 1)
+
+
+DEGRADATIONS = (blurred, noisy, mottled)

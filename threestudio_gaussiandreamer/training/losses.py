@@ -1,5 +1,11 @@
-"""The weighted losses of a step: those that the guidance returns, and regularisers of the rendered
-alpha; ``system.loss.lambda_<name>`` is the weight of each, a number or a schedule.
+"""The weighted losses of a step: those that the guidance returns, and regularisers of the renders;
+``system.loss.lambda_<name>`` is the weight of each, a number or a schedule.
+
+========  ==========================================================================================
+sparsity  mean sqrt(alpha^2 + 0.01)
+opaque    entropy of alpha, smallest if every alpha is 0 or 1
+tv        total variation: mean absolute difference of neighbouring pixels' colours, over each axis
+========  ==========================================================================================
 """
 
 from collections.abc import Iterable, Mapping
@@ -12,20 +18,23 @@ from ..core.errors import UserError, unknown
 from ..core.schedule import Schedule, parse_schedule
 from ..guidance.base import ScoreDistillation
 
-REGULARISERS = ("sparsity", "opaque")
+REGULARISERS = ("sparsity", "opaque", "tv")
 
 
 def weighted_losses(
-    guided: Mapping[str, Any], alpha: Float[Tensor, "B H W 1"], weights: Mapping[str, float]
+    guided: Mapping[str, Any], out: Mapping[str, Any], weights: Mapping[str, float]
 ) -> dict[str, Tensor]:
     """Compute the weighted ``loss_*`` of a guidance, and the weighted regularisers.
+
+    Args:
+        out: of the renderer; the regularisers use ``opacity`` and ``comp_rgb``.
 
     Raises:
         UserError: there is a weight without a loss, or a loss without a weight.
     """
     raw = {k.removeprefix("loss_"): v for k, v in guided.items() if k.startswith("loss_")}
     check_weights(weights, raw)
-    raw |= {name: regulariser(name, alpha) for name in REGULARISERS if weights.get(name)}
+    raw |= {name: regulariser(name, out) for name in REGULARISERS if weights.get(name)}
     return {name: value * weights[name] for name, value in raw.items()}
 
 
@@ -100,12 +109,18 @@ def check_weights(weights: Iterable[str], losses: Iterable[str]) -> None:
             )
 
 
-def regulariser(name: str, alpha: Float[Tensor, "B H W 1"]) -> Float[Tensor, ""]:
-    """Compute one of threestudio's regularisers of the rendered alpha: ``sparsity`` is mean
-    sqrt(alpha^2 + 0.01), ``opaque`` the entropy, which is smallest if every alpha is 0 or 1.
-    """
+def regulariser(name: str, out: Mapping[str, Any]) -> Float[Tensor, ""]:
+    """Compute one of REGULARISERS of the renderer's outputs; the first two are threestudio's."""
+    if name == "tv":
+        return total_variation(out["comp_rgb"])
+    alpha = out["opacity"]
     if name == "sparsity":
         return (alpha**2 + 0.01).sqrt().mean()
     clamped = alpha.clamp(1e-3, 1 - 1e-3)
     # torch forbids its binary_cross_entropy under mixed precision
     return -(clamped * clamped.log() + (1 - clamped) * (1 - clamped).log()).mean()
+
+
+def total_variation(images: Float[Tensor, "B H W 3"]) -> Float[Tensor, ""]:
+    """Return the mean absolute difference of vertical neighbours plus that of horizontal ones."""
+    return images.diff(dim=1).abs().mean() + images.diff(dim=2).abs().mean()

@@ -245,7 +245,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         out = self(batch)
         self.density.before_backward(out, self.global_step)
         guided = self.guide(out, batch)
-        losses = self.losses(guided, out["opacity"])
+        losses = self.losses(guided, out)
         loss = torch.stack(list(losses.values())).sum()
         self.manual_backward(loss)
         average_gradients(
@@ -280,11 +280,11 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         for part in [self.geometry, *([self.background] if own_background else [])]:
             part.set_learning_rates(optimizer, self.true_current_epoch, self.true_global_step)
 
-    def losses(self, guided: dict[str, Any], alpha: Tensor) -> dict[str, Tensor]:
-        """Return the weighted losses of the guidance and the regularisers of alpha, by name."""
+    def losses(self, guided: dict[str, Any], out: dict[str, Any]) -> dict[str, Tensor]:
+        """Return the weighted losses of the guidance and the regularisers of the renders."""
         now = self.true_current_epoch, self.true_global_step
         weights = {name: C(weight, *now) for name, weight in self.loss_weights.items()}
-        return weighted_losses(guided, alpha, weights)
+        return weighted_losses(guided, out, weights)
 
     def guide(self, out: dict[str, Any], batch: dict[str, Any], **options: Any) -> dict[str, Any]:
         """Call the guidance with these renders, the whole batch, the renders' background, and the

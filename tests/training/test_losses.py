@@ -1,0 +1,45 @@
+"""The regularisers of the renders, against values computed by hand."""
+
+import math
+
+import pytest
+import torch
+
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.training.losses import (
+    REGULARISERS,
+    regulariser,
+    total_variation,
+    weighted_losses,
+)
+
+
+def test_total_variation_of_a_step_edge():
+    image = torch.zeros(1, 4, 5, 3)
+    image[:, :, 2:] = 0.5  # one of the four differences of a row is at the edge
+    assert float(total_variation(image)) == pytest.approx(0.5 / 4)
+
+
+def test_total_variation_smooths_noise_and_leaves_flat_pictures_alone():
+    noise = torch.rand(2, 8, 8, 3, requires_grad=True)
+    before = total_variation(noise)
+    before.backward()
+    assert total_variation(noise.detach() - 0.1 * noise.grad.sign()) < before
+    assert float(total_variation(torch.full((1, 8, 8, 3), 0.3))) == 0
+
+
+def test_each_regulariser_is_weighted_and_computed_only_where_it_has_a_weight():
+    out = {"opacity": torch.full((1, 4, 4, 1), 0.5), "comp_rgb": torch.rand(1, 4, 4, 3)}
+    guided = {"loss_sds": torch.tensor(2.0), "grad_norm": torch.tensor(1.0)}
+    weights = {"sds": 0.5, **dict.fromkeys(REGULARISERS, 3.0)}
+    losses = weighted_losses(guided, out, weights)
+    assert float(losses.pop("sds")) == 1.0
+    assert losses == {name: 3 * regulariser(name, out) for name in REGULARISERS}
+    assert float(losses["sparsity"]) == pytest.approx(3 * math.sqrt(0.26))
+    assert float(losses["opaque"]) == pytest.approx(3 * math.log(2))
+    assert set(weighted_losses(guided, {}, {"sds": 1.0, "tv": 0.0})) == {"sds"}
+
+
+def test_a_weight_without_a_loss_is_named():
+    with pytest.raises(UserError, match="did you mean 'lambda_tv'"):
+        weighted_losses({"loss_sds": torch.zeros(())}, {}, {"sds": 1.0, "tvv": 1.0})
