@@ -11,7 +11,7 @@ from pathlib import Path
 
 from benchmarks.markdown import markdown
 from benchmarks.models import memory
-from benchmarks.quality import failure_table, formats, variant_tables
+from benchmarks.quality import failure_table, formats, toybox_variants, variant_tables
 from benchmarks.quality import mesh as mesh_quality
 from benchmarks.quality import tables as quality
 from benchmarks.quality import toybox_tables as toybox
@@ -74,6 +74,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "blind": variant_tables.blind,
         "cheaper": variant_tables.cheaper,
         "overhead": variant_tables.overhead,
+        "learned": toybox_variants.distillations,
     },
     "docs/failures.md": {"tables": failure_table.tables},
     "docs/formats.md": {"formats": formats.table, "producers": formats.producers},
@@ -98,7 +99,11 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "speed": viewers.page_speed,
         "live": viewers.live_view,
     },
-    "docs/toybox.md": {"models": toybox.card, "toybox": toybox.results},
+    "docs/toybox.md": {
+        "models": toybox.card,
+        "toybox": toybox.results,
+        "settings": toybox_variants.settings,
+    },
     "docs/several_processes.md": {"ddp": ddp.table},
     "docs/scale.md": {
         "units": scale.unit_costs,

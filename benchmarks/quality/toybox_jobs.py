@@ -110,6 +110,39 @@ def schedules() -> Iterator[Variant]:
     yield Variant("recon_std_rescale 0.5", 0, rescaled)
 
 
+def distillations() -> Iterator[Variant]:
+    """Other score distillations, at the configuration's guidance scale; timesteps fall where their
+    papers let them.
+    """
+    falling = {
+        "system.guidance.max_step_percent": 0.98,
+        "system.guidance.timestep_schedule": "linear",
+        "system.guidance.timestep_steps": STEPS,
+    }
+    own_options = {
+        "csd": {},
+        "nfsd": {},
+        "ism": {},
+        "vsd": {},
+        "cfd": falling,
+        "sdi": falling | {"system.guidance.weighting_strategy": "x0"},
+    }
+    for name, options in own_options.items():
+        yield Variant(
+            name.upper(), GUIDANCE, {"system.guidance.variant_type": f"{name}-variant", **options}
+        )
+
+
+def cheaper() -> Iterator[Variant]:
+    """One prediction for several steps of the same views, and half of the views."""
+    keys = ("system.guidance.reuse_steps", "data.hold_steps", "system.background.hold_steps")
+    for count in (2, 4):
+        yield Variant("steps with one prediction", count, dict.fromkeys(keys, count))
+    interval = {"system.guidance.guidance_interval": [0.2, 0.8]}
+    yield Variant("guidance interval", 0, interval)
+    yield Variant("views a step", 2, {"data.batch_size": 2})
+
+
 def starts() -> Iterator[Variant]:
     """What the second stage starts from, with and without the views' directions in the prompts."""
     yield Variant("prior, no view prompts", 0, WITHOUT_VIEWS)
@@ -146,6 +179,13 @@ def haze() -> Iterator[Variant]:
     yield Variant("opaque", 1, {"system.loss.lambda_opaque": 1.0})
 
 
+def smoothness() -> Iterator[Variant]:
+    """Weights of the renders' total variation, which keeps flat parts flat."""
+    yield Variant("no total variation", 0, {"system.loss.lambda_tv": 0})
+    for weight in (50, 600):
+        yield Variant("total variation", weight, {"system.loss.lambda_tv": weight})
+
+
 def rates() -> Iterator[Variant]:
     """All learning rates times a factor."""
     geometry = CONFIG["system"]["geometry"]
@@ -179,6 +219,9 @@ CHARTS: dict[str, Callable[[], Iterator[Variant]]] = {
     "growing": growing,
     "counts": counts,
     "paper": paper,
+    "distillations": distillations,
+    "cheaper": cheaper,
+    "smoothness": smoothness,
 }
 
 

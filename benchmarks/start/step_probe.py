@@ -22,6 +22,7 @@ PACKAGE = "threestudio_gaussiandreamer."
 MARK = "MEASURED "
 FIRST, LAST = map(int, os.environ["STEP_WINDOW"].split())
 SYSTEM = find("gaussiandreamer-system")
+DIFFUSION = find("gaussiandreamer-stable-diffusion-guidance")
 CALLS = {
     "rasteriser": (
         ("training.renderer", "rasterize"),
@@ -94,6 +95,44 @@ def measure_calls() -> None:
             measure(part, owner, name)
 
 
+class EncoderEnd(torch.autograd.Function):
+    """The identity; its backward is the first of the encoder's backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, latents: torch.Tensor) -> torch.Tensor:
+        return latents.view_as(latents)
+
+    @staticmethod
+    def backward(ctx: Any, grad: torch.Tensor) -> torch.Tensor:
+        switch()
+        running.append("score")
+        return grad
+
+
+class EncoderStart(torch.autograd.Function):
+    """The identity; its backward is the last of the encoder's backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, rgb: torch.Tensor) -> torch.Tensor:
+        return rgb.view_as(rgb)
+
+    @staticmethod
+    def backward(ctx: Any, grad: torch.Tensor) -> torch.Tensor:
+        switch()
+        running.pop()
+        return grad
+
+
+def with_backward_measured(encode: Any) -> Any:
+    """Attribute the backward pass of a guidance's encoder to the score."""
+
+    @functools.wraps(encode)
+    def measured_encode(guidance: Any, rgb: torch.Tensor, **batch: Any) -> torch.Tensor:
+        return EncoderEnd.apply(encode(guidance, EncoderStart.apply(rgb), **batch))
+
+    return measured_encode
+
+
 def configured(build: Any) -> Any:
     """Measure the steps of the optimiser that ``build`` makes."""
 
@@ -149,6 +188,7 @@ class EmptyNetworks(ScoreDistillation):
 
 
 measure_calls()
+DIFFUSION.encode = with_backward_measured(DIFFUSION.encode)
 SYSTEM.configure_optimizers = configured(SYSTEM.configure_optimizers)
 SYSTEM.on_train_batch_start = before_a_batch(SYSTEM.on_train_batch_start)
 since = time.process_time()

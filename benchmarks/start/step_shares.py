@@ -2,12 +2,14 @@
 
     python -m benchmarks.start.step_shares [--against another/checkout] [--rounds 2]
 
-Runs the demo's step (4 views of 256 x 256 pixels, the exact score), and one of 4 x 512 x 512 with
-empty networks of Stable Diffusion's shapes; both checkouts alternate, each run in a new process
-with one thread. Writes ``benchmarks/results/step.csv``."""
+Runs the demo's step (4 views of 256 x 256 pixels, the exact score), one of 4 x 512 x 512 with empty
+networks of Stable Diffusion's shapes, and that of toybox.yaml, 4 x 128 x 128 with learned models;
+both checkouts alternate, each run in a new process with one thread. Replaces the rows of these
+workloads in ``benchmarks/results/step.csv``."""
 
 import csv
 from pathlib import Path
+from typing import NamedTuple
 
 from benchmarks.start.launched import ROOT, checkouts_of, commit_of, paired_parser, run_with_probe
 
@@ -18,11 +20,23 @@ WINDOW = (50, 100)
 """The first and the last step: the demo samples the removal error and prunes in them."""
 FEW_VIEWS = ("data.train_views=24", "system.evaluation.views=1", "system.evaluation.size=16")
 """What only matters before and after these steps: target images and evaluation."""
+
+
+class Workload(NamedTuple):
+    options: tuple[str, ...]
+    config: str = "configs/demo.yaml"
+
+
 WORKLOADS = {
-    "demo": FEW_VIEWS,
-    "empty networks, 4 × 512²": (
-        *FEW_VIEWS, "data.width=512", "data.height=512",
-        "system.guidance_type=empty-networks-guidance",
+    "demo": Workload(FEW_VIEWS),
+    "empty networks, 4 × 512²": Workload(
+        (
+            *FEW_VIEWS, "data.width=512", "data.height=512",
+            "system.guidance_type=empty-networks-guidance",
+        )
+    ),
+    "learned models, 4 × 128²": Workload(
+        ("system.prompt_processor.prompt=a red fox with a green scarf",), "configs/toybox.yaml"
     ),
 }  # fmt: skip
 THREADS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -34,7 +48,7 @@ def main() -> None:
     parser.add_argument("--steps", nargs=2, type=int, default=WINDOW, metavar=("FIRST", "LAST"))
     args = parser.parse_args()
     checkouts = checkouts_of(args.against)
-    rows = []
+    rows = [row for row in earlier_rows() if row[0] not in args.workloads]
     for number in range(args.rounds):
         for workload in args.workloads:
             for name, checkout in checkouts.items():
@@ -46,11 +60,19 @@ def main() -> None:
         csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
 
 
-def milliseconds(checkout: Path, options: tuple[str, ...], window: list[int]) -> dict[str, float]:
+def earlier_rows() -> list[list[str]]:
+    if not RESULTS.exists():
+        return []
+    with open(RESULTS, newline="") as file:
+        return list(csv.reader(file))[1:]
+
+
+def milliseconds(checkout: Path, workload: Workload, window: list[int]) -> dict[str, float]:
     """Return the processor milliseconds of each part of a step, the mean of a window of steps."""
     first, last = window
     environment = {**THREADS, "STEP_WINDOW": f"{first} {last}"}
-    found = run_with_probe(PROBE, checkout, *options, environment=environment)
+    options, config = workload
+    found = run_with_probe(PROBE, checkout, *options, config=config, environment=environment)
     return {part: 1000 * value / (last - first) for part, value in found.items()}
 
 

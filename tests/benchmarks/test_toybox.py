@@ -7,7 +7,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from benchmarks.quality import runs, toybox, toybox_jobs, toybox_scores, toybox_tables
+from benchmarks.quality import (
+    runs,
+    toybox,
+    toybox_jobs,
+    toybox_scores,
+    toybox_tables,
+    toybox_variants,
+)
 from benchmarks.quality.toybox_jobs import CONFIG, DEFAULT, SAMPLES, STEPS, TRUTH, Variant, prompts
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.launch.config import load_config
@@ -131,12 +138,31 @@ def test_rows_become_tables_and_charts(monkeypatch, tmp_path, fake):
     assert toybox_tables.results() == toybox_tables.NOT_MEASURED
     work(monkeypatch, tmp_path, "--charts", "default", "guidance", "--count", 3)
     lines = toybox_tables.results().splitlines()
-    assert len(lines) == 2 + 2 + 7 and lines[2].startswith(f"| {DEFAULT} | 3 | 100 (100 – 100) |")
+    assert len(lines) == 2 + 2 and lines[2].startswith(f"| {DEFAULT} | 3 | 100 (100 – 100) |")
     assert lines[3].startswith("| its prior's points | 3 | 50 (50 – 50) |")
     pytest.importorskip("matplotlib")
     toybox_tables.main()
     assert (tmp_path / "toybox_guidance.png").is_file()
     assert not (tmp_path / "toybox_steps.png").exists()
+
+
+def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypatch):
+    """Of three prompts the variant has two; it misses the accessory that one of them asks for."""
+    right = dict.fromkeys(toybox_tables.RECOGNIZED, "1") | {"multi_face": "0.25", "seed": "0"}
+    prompts = {"0": "a red fox", "1": "a red fox with a blue hat", "2": "a blue car"}
+    rows = [
+        right | {"variant": DEFAULT, "x": "0", "index": i, "prompt": text, "cpu_seconds": "50"}
+        for i, text in prompts.items()
+    ]
+    other = {"variant": "CSD", "x": "4", "cpu_seconds": "70"}
+    rows += [rows[0] | other, rows[1] | other | {"accessory": "0", "multi_face": ""}]
+    monkeypatch.setattr(toybox_variants, "measured", lambda: rows)
+    monkeypatch.setattr(
+        toybox_variants.toybox_jobs, "CHARTS", {"mine": lambda: [Variant("CSD", 4), Variant("no")]}
+    )
+    head, _, line = toybox_variants.table("mine").splitlines()
+    assert line.startswith("| CSD 4 | 2 | 83 | -17 (")  # kind and colours of three attributes
+    assert line.endswith("| 25 | +0 (+0 – +0) | 70 | 50 |") and len(head.split("|")) == 10
 
 
 def test_columns_of_prompts_that_ask_for_nothing_are_left_out():

@@ -1,0 +1,100 @@
+"""Tables of variants of toybox.yaml, each compared with toybox.yaml itself on the same prompts and
+seeds: the paired tables of docs/toybox.md and docs/distillation.md, from docs/charts/toybox.csv.
+
+``recognised`` is the share of the attributes that a prompt asks for (kind, colours, pattern,
+accessory) that the judge finds in the result.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from benchmarks.markdown import markdown
+from benchmarks.quality import toybox_jobs
+from benchmarks.quality.toybox_tables import (
+    NOT_MEASURED,
+    RECOGNIZED,
+    Row,
+    asks_for,
+    measured,
+    median_of,
+)
+from threestudio_gaussiandreamer.evaluation.intervals import paired, per_prompt
+
+HEAD = ("variant", "prompts", "recognised, %", "− toybox.yaml", "multi-face, %", "− toybox.yaml")
+HEAD += ("CPU seconds", "of toybox.yaml")
+
+
+def distillations() -> str:
+    """Return the table of score distillations and of cheaper steps with the learned models."""
+    return table("paper", "distillations", "cheaper")
+
+
+def settings() -> str:
+    """Return the table of all other settings."""
+    others = ("paper", "distillations", "cheaper", "references", "default")
+    return table(*(name for name in toybox_jobs.CHARTS if name not in others))
+
+
+def table(*charts: str) -> str:
+    """Return a line for each variant of these charts that has been measured."""
+    rows = measured()
+    pairs = ((name, pairs_of(rows, name, x)) for name, x in keys(charts))
+    lines = [line_of(name, *both) for name, both in pairs if both[0]]
+    return markdown(HEAD, lines) if lines else NOT_MEASURED
+
+
+def keys(charts: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield name and ``x`` of the variants of charts, once each."""
+    found = (variant.key for chart in charts for variant in toybox_jobs.CHARTS[chart]())
+    yield from dict.fromkeys(found)
+
+
+def pairs_of(rows: Sequence[Row], name: str, x: str) -> tuple[list[Row], list[Row]]:
+    """Return the rows of a variant, and those of toybox.yaml with the same prompts and seeds."""
+    plain = {place(row): row for row in rows if row["variant"] == toybox_jobs.DEFAULT}
+    own = [row for row in rows if (row["variant"], row["x"]) == (name, x)]
+    own = [row for row in own if place(row) in plain]
+    return own, [plain[place(row)] for row in own]
+
+
+def place(row: Row) -> tuple[str, str]:
+    return row["index"], row["seed"]
+
+
+def line_of(name: str, own: list[Row], plain: list[Row]) -> tuple[str, ...]:
+    x = own[0]["x"]
+    recognised = [values_of(rows, recognised_share) for rows in (own, plain)]
+    faces = [values_of(rows, multi_face) for rows in (own, plain)]
+    return (
+        name if x == "0" else f"{name} {x}",
+        str(len({row["prompt"] for row in own})),
+        mean(recognised[0]), difference(*recognised),
+        mean(faces[0]), difference(*faces),
+        median_of(own, "cpu_seconds"),
+        median_of(plain, "cpu_seconds"),
+    )  # fmt: skip
+
+
+def values_of(rows: list[Row], measure: Callable[[Row], float]) -> dict[str, float]:
+    """Return the mean of each prompt."""
+    return per_prompt([row["prompt"] for row in rows], np.array([measure(row) for row in rows]))
+
+
+def recognised_share(row: Row) -> float:
+    names = [name for name in RECOGNIZED if name != "multi_face" and asks_for(row["prompt"], name)]
+    return float(np.mean([float(row[name]) for name in names]))
+
+
+def multi_face(row: Row) -> float:
+    return float(row["multi_face"] or "nan")
+
+
+def mean(values: dict[str, float]) -> str:
+    return f"{100 * np.nanmean(list(values.values())):.0f}"
+
+
+def difference(own: dict[str, float], plain: dict[str, float]) -> str:
+    """Return the mean paired difference with its bootstrap interval."""
+    found = paired(own, plain)
+    return f"{100 * found.mean:+.0f} ({100 * found.low:+.0f} – {100 * found.high:+.0f})"
