@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.markdown import markdown
-from benchmarks.models import memory
+from benchmarks.models import memory, precision
 from benchmarks.quality import failure_table, formats, toybox_variants, variant_tables
 from benchmarks.quality import mesh as mesh_quality
 from benchmarks.quality import tables as quality
@@ -75,6 +75,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "cheaper": variant_tables.cheaper,
         "overhead": variant_tables.overhead,
         "learned": toybox_variants.distillations,
+        "precision": precision.table,
     },
     "docs/failures.md": {"tables": failure_table.tables},
     "docs/formats.md": {"formats": formats.table, "producers": formats.producers},

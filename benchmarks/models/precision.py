@@ -1,0 +1,111 @@
+"""Processor time of the bundled models' networks in float32 and bfloat16, in both memory formats.
+
+    python -m benchmarks.models.precision [--rounds 7]
+
+Calls of one training step of toybox.yaml, one thread: the autoencoder's encoder on 4 pictures of
+128 x 128 with its gradient, and the U-Net on 8 latents. The settings alternate; ``cpu_ms`` is the
+median of the rounds, ``error`` the largest difference to float32, relative to the largest value.
+Writes ``benchmarks/results/precision.csv``."""
+
+import argparse
+import contextlib
+import csv
+import itertools
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from benchmarks.markdown import markdown, read
+from benchmarks.quality.runs import ROOT, commit, machine
+from threestudio_gaussiandreamer.models.bundled import FOLDER
+
+RESULTS = ROOT / "benchmarks/results/precision.csv"
+COLUMNS = ("network", "format", "precision", "cpu_ms", "error", "machine", "commit")
+FORMATS = {"contiguous": torch.contiguous_format, "channels last": torch.channels_last}
+PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+VIEWS = 4
+
+
+class Setting(NamedTuple):
+    network: str
+    format: str
+    precision: str
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=7)
+    rounds = parser.parse_args().rounds
+    torch.set_num_threads(1)
+    calls = networks()
+    settings = [Setting(*values) for values in itertools.product(calls, FORMATS, PRECISIONS)]
+    times: dict[Setting, list[float]] = {setting: [] for setting in settings}
+    found: dict[Setting, Tensor] = {}
+    for _ in range(rounds + 1):  # the first one isn't counted
+        for setting in settings:
+            seconds, found[setting] = timed(calls[setting.network], setting)
+            times[setting].append(seconds)
+    with open(RESULTS, "w", newline="") as file:
+        rows = (row_of(setting, times[setting][1:], found) for setting in settings)
+        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
+
+
+def networks() -> dict[str, Callable[[torch.memory_format], Tensor]]:
+    """Return a call of each network, a function of the memory format."""
+    from diffusers import AutoencoderKL, UNet2DConditionModel
+
+    folder = FOLDER / "stable-diffusion"
+    vae = AutoencoderKL.from_pretrained(folder / "vae").float().requires_grad_(False)
+    unet = UNet2DConditionModel.from_pretrained(folder / "unet").float().requires_grad_(False)
+    generator = torch.Generator().manual_seed(0)
+    images = torch.rand(VIEWS, 3, 128, 128, generator=generator)
+    latents = torch.randn(2 * VIEWS, 4, 16, 16, generator=generator)
+    tokens = torch.randn(2 * VIEWS, 32, unet.config.cross_attention_dim, generator=generator)
+
+    def encode(layout: torch.memory_format) -> Tensor:
+        pixels = images.clone(memory_format=layout).requires_grad_()
+        vae.to(memory_format=layout).encode(pixels).latent_dist.mean.float().sum().backward()
+        return pixels.grad
+
+    @torch.no_grad()
+    def predict(layout: torch.memory_format) -> Tensor:
+        noisy = latents.contiguous(memory_format=layout)
+        times = torch.full((2 * VIEWS,), 300)
+        return unet.to(memory_format=layout)(noisy, times, encoder_hidden_states=tokens).sample
+
+    return {"encoder and its gradient": encode, "U-Net": predict}
+
+
+def timed(call: Callable[[torch.memory_format], Tensor], setting: Setting) -> tuple[float, Tensor]:
+    start = time.process_time()
+    with autocast(PRECISIONS[setting.precision]):
+        result = call(FORMATS[setting.format])
+    return time.process_time() - start, result.float()
+
+
+def autocast(dtype: torch.dtype) -> contextlib.AbstractContextManager:
+    return torch.autocast("cpu", dtype=dtype, enabled=dtype is not torch.float32)
+
+
+def row_of(setting: Setting, times: list[float], found: dict[Setting, Tensor]) -> Iterator[str]:
+    exact = found[Setting(setting.network, "contiguous", "float32")]
+    error = float((found[setting] - exact).abs().max() / exact.abs().max())
+    yield from setting
+    yield f"{1000 * statistics.median(times):.1f}"
+    yield f"{error:.1e}"
+    yield from (machine(), commit())
+
+
+def table() -> str:
+    """Return the table of docs/distillation.md."""
+    head = ("network", "memory format", "precision", "CPU ms", "largest relative error")
+    keys = ("network", "format", "precision", "cpu_ms", "error")
+    return markdown(head, [tuple(row[key] for key in keys) for row in read(RESULTS)])
+
+
+if __name__ == "__main__":
+    main()
