@@ -30,6 +30,7 @@ from tqdm import tqdm
 
 from benchmarks.quality.jobs import JOBS, OWN_OBJECTS, STEPS, WITHOUT_OBJECTS, Job
 from benchmarks.quality.recipe import CONFIGS, RECIPE, recipe
+from benchmarks.start.launched import commit_of
 
 ROOT = Path(__file__).resolve().parents[2]
 CHARTS = ROOT / "docs/charts"
@@ -265,12 +266,7 @@ def machine() -> str:
 
 
 def commit() -> str:
-    command = ["git", "rev-parse", "--short", "HEAD"]
-    try:
-        answer = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
-    except OSError:  # there is no git
-        return "unknown"
-    return answer.stdout.strip() or "unknown"
+    return commit_of(ROOT)
 
 
 if __name__ == "__main__":

@@ -57,8 +57,13 @@ def run_with_probe(
 
 
 def commit_of(checkout: Path) -> str:
+    """Return the checkout's commit; "unknown" without git or outside of a repository."""
     command = ["git", "-C", str(checkout), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True)
+    except OSError:  # there is no git
+        return "unknown"
+    return answer.stdout.strip() or "unknown"
 
 
 def paired_parser(doc: str, rounds: int) -> argparse.ArgumentParser:
