@@ -3,6 +3,7 @@ any model.
 """
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -17,7 +18,7 @@ from threestudio_gaussiandreamer.models.bundled import digest_of, read_digests
 from threestudio_gaussiandreamer.models.clip import PictureText, clip_source
 from threestudio_gaussiandreamer.priors.point_e import PointEPrior
 from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
-from threestudio_gaussiandreamer.toybox import export, models, warm_start
+from threestudio_gaussiandreamer.toybox import export, loop, models, warm_start
 from threestudio_gaussiandreamer.toybox.export import main
 from threestudio_gaussiandreamer.toybox.loop import averaged_weights
 from threestudio_gaussiandreamer.toybox.text_batches import token_ids
@@ -131,6 +132,7 @@ def test_a_training_continues_from_the_weights(exported, trained, tmp_path):
     there = options(tmp_path)
     record = json.loads((exported / "training.json").read_text())
     record["judge"]["trainings"] = [{"device": "another", "hours": 0.1}]
+    record["judge"]["last"] = {"images": 8, "seconds": 360.0, "loss": 0.5}
     weights = tmp_path / "weights"
     shutil.copytree(exported, weights)
     (weights / "training.json").write_text(json.dumps(record))
@@ -144,9 +146,27 @@ def test_a_training_continues_from_the_weights(exported, trained, tmp_path):
                 assert torch.allclose(found[key], value, **HALF), key
         run = training(tmp_path, name)
         assert run.earlier == record[name]["trainings"] and run.progress.seconds == 0
+        assert run.progress.history == ([record[name]["last"]] if record[name]["last"] else [])
         before = run.progress.images
         assert before == training(trained, name).progress.images
         run.run(before + 4)
+
+
+def test_a_continued_training_logs_its_own_rate(exported, tmp_path, monkeypatch, capsys):
+    """Pictures and seconds of the training that it started from don't count."""
+    weights = tmp_path / "weights"
+    shutil.copytree(exported, weights)
+    record = json.loads((exported / "training.json").read_text())
+    record["judge"] |= {
+        "images": 10**9,
+        "last": {"images": 10**9, "seconds": 1e6, "loss": 0.5},
+    }
+    (weights / "training.json").write_text(json.dumps(record))
+    warm_start.start_from(weights, options(tmp_path), {"judge": STAGES["judge"]})
+    monkeypatch.setattr(loop, "LOG_EVERY", 1)
+    training(tmp_path, "judge").run(10**9 + 8)
+    rates = re.findall(r"judge  1000000\d+/\d+  ([\d.]+)/s", capsys.readouterr().out)
+    assert rates and all(float(rate) < 1e5 for rate in rates)
 
 
 def test_weights_of_another_size_are_refused(exported, tmp_path, monkeypatch):

@@ -280,11 +280,15 @@ class Training:
 
     def _log(self, means: dict[str, float]) -> None:
         progress = self.progress
+        before = progress.history[-1] if progress.history else {"images": 0, "seconds": 0.0}
+        seconds = progress.seconds - before["seconds"]
+        if seconds <= 0:  # the last entry is of the training whose weights this one started from
+            seconds = progress.seconds
+        rate = (progress.images - before["images"]) / max(seconds, 1e-9)
         progress.history.append(
             {"images": progress.images, "seconds": round(progress.seconds, 1), **means}
         )
         numbers = "  ".join(f"{name} {value:.4g}" for name, value in means.items())
-        rate = progress.images / max(progress.seconds, 1e-9)
         print(
             f"{self.stage.name}  {progress.images}/{self.target}  {rate:.1f}/s  {numbers}",
             flush=True,

@@ -41,7 +41,8 @@ def start_from(weights: Path, options: Options, stages: dict[str, type[Stage]]) 
             if name == "unet":
                 training.stage.constants[LATENT_SCALE] = _latent_scale(weights)
             seen = record[name]
-            training.progress = Progress(seen["steps"], seen["images"])
+            last = [seen["last"]] if seen["last"] else []
+            training.progress = Progress(seen["steps"], seen["images"], history=last)
             training.earlier, training.measured = seen["trainings"], seen["withheld"]
             training.save()
 
