@@ -134,13 +134,15 @@ def distillations() -> Iterator[Variant]:
 
 
 def cheaper() -> Iterator[Variant]:
-    """One prediction for several steps of the same views, and half of the views."""
+    """One prediction for several steps of the same views, and half of the views a step."""
     keys = ("system.guidance.reuse_steps", "data.hold_steps", "system.background.hold_steps")
     for count in (2, 4):
         yield Variant("steps with one prediction", count, dict.fromkeys(keys, count))
     interval = {"system.guidance.guidance_interval": [0.2, 0.8]}
     yield Variant("guidance interval", 0, interval)
     yield Variant("views a step", 2, {"data.batch_size": 2})
+    more_steps = steps(2 * STEPS) | {"data.batch_size": 2}
+    yield Variant("views a step, twice the steps", 2, more_steps)
 
 
 def starts() -> Iterator[Variant]:
