@@ -5,6 +5,7 @@ under a learned score.
     python -m benchmarks.quality.toybox --charts default starts --prompts withheld --count 20
     python -m benchmarks.quality.toybox --variant "wide 0 system.geometry.scale_factor=2"
     python -m benchmarks.quality.toybox --models FOLDER --jobs 16 --seconds 340 --out DIR
+    python -m benchmarks.quality.toybox --keep RUNS --only-score            # by another judge
 
 Each run is configs/toybox.yaml with a few options changed, on one thread. The judge sees eight
 views of its result, of its prior's points, of the 2D model's own samples, and of the object itself;
@@ -54,7 +55,8 @@ QUICK = {
 """Options that leave out what isn't measured: pages, video and pictures."""
 RUN = f"{QUICK['name']}/{QUICK['tag']}"
 """Where these options put a run."""
-
+RECORD = "seconds.json"
+"""CPU seconds of a kept run, written when it has ended."""
 
 ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",
@@ -127,11 +129,16 @@ def kept(task: Task) -> Path:
     return task.keep / hashlib.blake2b(repr(task.key).encode(), digest_size=8).hexdigest()
 
 
+def needs_no_run(task: Task) -> bool:
+    """Return whether the task's run is kept, or it has none."""
+    return task.variant.name in (TRUTH, SAMPLES) or (kept(task) / RECORD).exists()
+
+
 def scored(task: Task, folder: Path) -> dict[str, float]:
     """Score a run, which is made unless the folder has it."""
     from benchmarks.quality import toybox_scores as scores
 
-    record = folder / "seconds.json"
+    record = folder / RECORD
     if not record.exists():
         shutil.rmtree(folder, ignore_errors=True)  # of a run that was interrupted
         start = time.process_time()
@@ -174,6 +181,8 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     done = {tuple(row[name] for name in KEY) for row in rows_of(CHART, arguments.out)}
     todo = [task for task in unique(tasks(arguments)) if task.key not in done]
+    if arguments.only_score:
+        todo = [task for task in todo if needs_no_run(task)]
     if arguments.list:
         print("\n".join(" | ".join((*task.key, task.prompt.text)) for task in todo))
         return
@@ -194,11 +203,14 @@ def parse_arguments() -> argparse.Namespace:
     add("--seeds", type=int, nargs="+", default=[0])
     add("--models", default="toybox", help="toybox, or the folder of an export")
     add("--keep", type=Path, help="folder for the runs; those that it has are only scored")
+    add("--only-score", action="store_true", help="make no run that --keep doesn't have")
     add("--seconds", type=float, help="stop after this time; runs under way are given up")
     add("--out", type=Path, default=CHARTS, help="folder of toybox.csv (default: docs/charts)")
     add("--list", action="store_true", help="only print what would run")
     add_jobs(parser)
     arguments = parser.parse_args()
+    if arguments.only_score and not arguments.keep:
+        parser.error("--only-score: give the folder of the runs as --keep")
     if arguments.charts is None:
         arguments.charts = [] if arguments.variant else list(VARIANTS)
     return arguments

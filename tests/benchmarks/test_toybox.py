@@ -67,9 +67,11 @@ def test_a_kept_run_is_only_scored(tmp_path, monkeypatch):
     monkeypatch.setattr(toybox, "run", lambda task, folder: ran.append(folder.mkdir(parents=True)))
     monkeypatch.setattr(toybox_scores, "of_run", lambda folder, text, models: {"kind": 1.0})
     task = toybox.Task(Variant(DEFAULT), prompts("seen", 1)[0], 0, "models", tmp_path)
+    assert not toybox.needs_no_run(task)
+    assert toybox.needs_no_run(task._replace(variant=Variant(toybox_jobs.TRUTH)))
     first, second = toybox.measured(task), toybox.measured(task)
     assert first == second and first["kind"] == 1 and first["cpu_seconds"] >= 0
-    assert len(ran) == 1
+    assert len(ran) == 1 and toybox.needs_no_run(task)
 
 
 def test_another_kind_of_the_same_colour_misleads_the_prior():
@@ -91,6 +93,13 @@ def test_tasks_come_in_order_of_priority_and_once(monkeypatch):
         (name, seed, index) for name in ("mine", DEFAULT) for seed in (0, 1) for index in (0, 1)
     ]
     assert found[0].variant == Variant("mine", 2, {"a.b": "[0,1]", "c": "x"})
+
+
+def test_scoring_alone_needs_the_folder_of_the_runs(monkeypatch, capsys):
+    with pytest.raises(SystemExit):
+        parsed(monkeypatch, "--only-score")
+    assert "give the folder of the runs as --keep" in capsys.readouterr().err
+    assert parsed(monkeypatch, "--only-score", "--keep", "runs").only_score
 
 
 @pytest.fixture
