@@ -3,9 +3,9 @@
     python -m benchmarks.models.precision [--rounds 7]
 
 Calls of one training step of toybox.yaml, one thread: the autoencoder's encoder on 4 pictures of
-128 x 128 with its gradient, and the U-Net on 8 latents. The settings alternate; ``cpu_ms`` is the
-median of the rounds, ``error`` the largest difference to float32, relative to the largest value.
-Writes ``benchmarks/results/precision.csv``."""
+128 x 128 with its gradient, and the U-Net on 8 latents; bfloat16 by autocast. The settings
+alternate; ``cpu_ms`` is the median of the rounds, ``error`` the largest difference to float32,
+relative to the largest value. Writes ``benchmarks/results/precision.csv``."""
 
 import argparse
 import contextlib
@@ -54,8 +54,13 @@ def main() -> None:
         csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
 
 
-def networks() -> dict[str, Callable[[torch.memory_format], Tensor]]:
-    """Return a call of each network, a function of the memory format."""
+class Network(NamedTuple):
+    module: torch.nn.Module
+    call: Callable[[torch.memory_format], Tensor]
+    """Calls the module with inputs in a memory format."""
+
+
+def networks() -> dict[str, Network]:
     from diffusers import AutoencoderKL, UNet2DConditionModel
 
     folder = FOLDER / "stable-diffusion"
@@ -68,22 +73,24 @@ def networks() -> dict[str, Callable[[torch.memory_format], Tensor]]:
 
     def encode(layout: torch.memory_format) -> Tensor:
         pixels = images.clone(memory_format=layout).requires_grad_()
-        vae.to(memory_format=layout).encode(pixels).latent_dist.mean.float().sum().backward()
+        vae.encode(pixels).latent_dist.mean.float().sum().backward()
         return pixels.grad
 
     @torch.no_grad()
     def predict(layout: torch.memory_format) -> Tensor:
         noisy = latents.contiguous(memory_format=layout)
         times = torch.full((2 * VIEWS,), 300)
-        return unet.to(memory_format=layout)(noisy, times, encoder_hidden_states=tokens).sample
+        return unet(noisy, times, encoder_hidden_states=tokens).sample
 
-    return {"encoder and its gradient": encode, "U-Net": predict}
+    return {"encoder and its gradient": Network(vae, encode), "U-Net": Network(unet, predict)}
 
 
-def timed(call: Callable[[torch.memory_format], Tensor], setting: Setting) -> tuple[float, Tensor]:
+def timed(network: Network, setting: Setting) -> tuple[float, Tensor]:
+    layout = FORMATS[setting.format]
+    network.module.to(memory_format=layout)
     start = time.process_time()
     with autocast(PRECISIONS[setting.precision]):
-        result = call(FORMATS[setting.format])
+        result = network.call(layout)
     return time.process_time() - start, result.float()
 
 

@@ -5,14 +5,15 @@ under a learned score.
     python -m benchmarks.quality.toybox --charts default starts --prompts withheld --count 20
     python -m benchmarks.quality.toybox --variant "wide 0 system.geometry.scale_factor=2"
     python -m benchmarks.quality.toybox --models FOLDER --jobs 16 --seconds 340 --out DIR
-    python -m benchmarks.quality.toybox --keep RUNS --only-score            # by another judge
+    python -m benchmarks.quality.toybox --keep RUNS --only-score --out DIR  # by another judge
 
 Each run is configs/toybox.yaml with a few options changed, on one thread. The judge sees eight
 views of its result, of its prior's points, of the 2D model's own samples, and of the object itself;
 CPU seconds are those of a whole run without imports and video, in a process that keeps its networks
 loaded. Rows are appended to toybox.csv as runs end, in the order chart, seed, prompt, variant; rows
-in it are skipped. Settings were chosen on "seen" prompts (of combinations that trainings may have
-had); "withheld" ones are of combinations that no training had.
+in it are skipped, so delete those of another configuration, of other models or of another judge.
+Settings were chosen on "seen" prompts, of combinations that trainings may have had; "withheld" ones
+are of combinations that no training had.
 """
 
 import argparse
@@ -38,7 +39,15 @@ from benchmarks.quality.runs import CHARTS, add_jobs, append_rows, rows_of
 from benchmarks.quality.toybox_jobs import (
     CHARTS as VARIANTS,
 )
-from benchmarks.quality.toybox_jobs import SAMPLES, TRUTH, Prompt, Variant, options_of, prompts
+from benchmarks.quality.toybox_jobs import (
+    CONFIG,
+    SAMPLES,
+    TRUTH,
+    Prompt,
+    Variant,
+    options_of,
+    prompts,
+)
 
 CHART = "toybox"
 RECOGNIZED = ("kind", "colors", "pattern", "accessory", "multi_face")
@@ -125,8 +134,9 @@ def measured(task: Task) -> dict[str, float]:
 
 
 def kept(task: Task) -> Path:
-    """Return the folder of a kept run."""
-    return task.keep / hashlib.blake2b(repr(task.key).encode(), digest_size=8).hexdigest()
+    """Return the folder of a kept run, which depends on all of its options."""
+    content = repr((task.key, task.variant.options, CONFIG)).encode()
+    return task.keep / hashlib.blake2b(content, digest_size=8).hexdigest()
 
 
 def needs_no_run(task: Task) -> bool:
@@ -179,10 +189,7 @@ def row_of(task: Task, found: dict[str, Any]) -> dict[str, Any]:
 def main() -> None:
     arguments = parse_arguments()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    done = {tuple(row[name] for name in KEY) for row in rows_of(CHART, arguments.out)}
-    todo = [task for task in unique(tasks(arguments)) if task.key not in done]
-    if arguments.only_score:
-        todo = [task for task in todo if needs_no_run(task)]
+    todo = missing(arguments)
     if arguments.list:
         print("\n".join(" | ".join((*task.key, task.prompt.text)) for task in todo))
         return
@@ -209,8 +216,8 @@ def parse_arguments() -> argparse.Namespace:
     add("--list", action="store_true", help="only print what would run")
     add_jobs(parser)
     arguments = parser.parse_args()
-    if arguments.only_score and not arguments.keep:
-        parser.error("--only-score: give the folder of the runs as --keep")
+    if arguments.only_score and (not arguments.keep or arguments.out == CHARTS):
+        parser.error("--only-score: give the runs' folder as --keep and a new one as --out")
     if arguments.charts is None:
         arguments.charts = [] if arguments.variant else list(VARIANTS)
     return arguments
@@ -239,6 +246,13 @@ def unique(items: Iterator[Task]) -> list[Task]:
     for task in items:
         found.setdefault(task.key, task)
     return list(found.values())
+
+
+def missing(arguments: argparse.Namespace) -> list[Task]:
+    """Return the tasks whose rows aren't in the CSV; with ``--only-score`` those without a run."""
+    done = {tuple(row[name] for name in KEY) for row in rows_of(CHART, arguments.out)}
+    todo = [task for task in unique(tasks(arguments)) if task.key not in done]
+    return [task for task in todo if not arguments.only_score or needs_no_run(task)]
 
 
 def work(todo: list[Task], arguments: argparse.Namespace, pool: Executor) -> int:

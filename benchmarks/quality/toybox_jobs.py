@@ -17,7 +17,7 @@ from threestudio_gaussiandreamer.view.config_changes import leaves
 CONFIG = yaml.safe_load((ROOT / "configs/toybox.yaml").read_text())
 STEPS = CONFIG["trainer"]["max_steps"]
 GUIDANCE = CONFIG["system"]["guidance"]["guidance_scale"]
-DEFAULT = "toybox.yaml"
+DEFAULT, PAPER_RECIPE = "toybox.yaml", "the paper's recipe"
 SAMPLES, TRUTH = "the 2D model's samples", "ground truth"
 """Variants without a run: what the 2D model draws, and ray-cast views of the object itself."""
 PROMPT_SEED = 5000
@@ -111,8 +111,8 @@ def schedules() -> Iterator[Variant]:
 
 
 def distillations() -> Iterator[Variant]:
-    """Other score distillations, at the configuration's guidance scale; timesteps fall where their
-    papers let them.
+    """Other score distillations, at the configuration's guidance scale; CFD and SDI use their
+    papers' decreasing timesteps.
     """
     falling = {
         "system.guidance.max_step_percent": 0.98,
@@ -134,7 +134,9 @@ def distillations() -> Iterator[Variant]:
 
 
 def cheaper() -> Iterator[Variant]:
-    """One prediction for several steps of the same views, and half of the views a step."""
+    """One prediction for several steps of the same views; no guidance at some timesteps; half of
+    the views a step, in as many steps and in twice as many.
+    """
     keys = ("system.guidance.reuse_steps", "data.hold_steps", "system.background.hold_steps")
     for count in (2, 4):
         yield Variant("steps with one prediction", count, dict.fromkeys(keys, count))
@@ -201,7 +203,7 @@ def rates() -> Iterator[Variant]:
 
 
 def paper() -> Iterator[Variant]:
-    yield Variant("the paper's recipe", 0, overlay(PAPER))
+    yield Variant(PAPER_RECIPE, 0, overlay(PAPER))
 
 
 def overlay(name: str) -> dict[str, Any]:

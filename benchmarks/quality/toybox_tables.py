@@ -17,13 +17,12 @@ import numpy as np
 
 from benchmarks.markdown import markdown
 from benchmarks.quality.runs import CHARTS, rows_of
+from benchmarks.quality.toybox_jobs import DEFAULT, PAPER_RECIPE, SAMPLES, TRUTH
 from threestudio_gaussiandreamer.evaluation.intervals import Estimate, bootstrap, per_prompt
 from threestudio_gaussiandreamer.models.bundled import FOLDER, RECORD
 from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
 
 CHART = "toybox"
-DEFAULT, SAMPLES, TRUTH = "toybox.yaml", "the 2D model's samples", "ground truth"
-PAPER_RECIPE = "the paper's recipe"
 RECOGNIZED = ("kind", "colors", "pattern", "accessory", "multi_face")
 TITLES = {"colors": "colours", "multi_face": "multi-face"}
 NOT_MEASURED = "*Not measured yet: it needs trained models.*"

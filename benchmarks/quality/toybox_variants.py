@@ -19,7 +19,7 @@ from benchmarks.quality.toybox_tables import (
     measured,
     median_of,
 )
-from threestudio_gaussiandreamer.evaluation.intervals import paired, per_prompt
+from threestudio_gaussiandreamer.evaluation.intervals import bootstrap, paired, per_prompt
 
 HEAD = ("variant", "prompts", "recognised, %", "− toybox.yaml", "multi-face, %", "− toybox.yaml")
 HEAD += ("CPU seconds", "of toybox.yaml")
@@ -87,14 +87,17 @@ def recognised_share(row: Row) -> float:
 
 
 def multi_face(row: Row) -> float:
-    return float(row["multi_face"] or "nan")
+    return float(row["multi_face"])
 
 
 def mean(values: dict[str, float]) -> str:
-    return f"{100 * np.nanmean(list(values.values())):.0f}"
+    found = bootstrap(np.array(list(values.values()), float))
+    return f"{100 * found.mean:.0f}" if found.count else ""
 
 
 def difference(own: dict[str, float], plain: dict[str, float]) -> str:
-    """Return the mean paired difference with its bootstrap interval."""
+    """Return the mean paired difference, with its bootstrap interval if there are two prompts."""
     found = paired(own, plain)
+    if found.count < 2:
+        return f"{100 * found.mean:+.0f}" if found.count else ""
     return f"{100 * found.mean:+.0f} ({100 * found.low:+.0f} – {100 * found.high:+.0f})"

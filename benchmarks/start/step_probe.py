@@ -96,7 +96,9 @@ def measure_calls() -> None:
 
 
 class EncoderEnd(torch.autograd.Function):
-    """The identity; its backward is the first of the encoder's backward pass."""
+    """The identity, at the encoder's output: its backward pass begins that of the encoder, whose
+    time belongs to the score.
+    """
 
     @staticmethod
     def forward(ctx: Any, latents: torch.Tensor) -> torch.Tensor:
@@ -110,7 +112,7 @@ class EncoderEnd(torch.autograd.Function):
 
 
 class EncoderStart(torch.autograd.Function):
-    """The identity; its backward is the last of the encoder's backward pass."""
+    """The identity, at the encoder's input: its backward pass ends that of the encoder."""
 
     @staticmethod
     def forward(ctx: Any, rgb: torch.Tensor) -> torch.Tensor:
@@ -119,7 +121,7 @@ class EncoderStart(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: torch.Tensor) -> torch.Tensor:
         switch()
-        running.pop()
+        assert running.pop() == "score"
         return grad
 
 
@@ -153,6 +155,7 @@ def before_a_batch(begin: Any) -> Any:
             seconds.update(dict.fromkeys(seconds, 0.0))
         if system.global_step == LAST:
             switch()
+            assert running == [OTHER], running
             print(f"\n{MARK}{json.dumps(seconds)}", flush=True)
             os._exit(0)
         return begin(system, *args)

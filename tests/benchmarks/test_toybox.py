@@ -96,10 +96,28 @@ def test_tasks_come_in_order_of_priority_and_once(monkeypatch):
 
 
 def test_scoring_alone_needs_the_folder_of_the_runs(monkeypatch, capsys):
-    with pytest.raises(SystemExit):
-        parsed(monkeypatch, "--only-score")
-    assert "give the folder of the runs as --keep" in capsys.readouterr().err
-    assert parsed(monkeypatch, "--only-score", "--keep", "runs").only_score
+    for words in (["--out", "new"], ["--keep", "runs"]):
+        with pytest.raises(SystemExit):
+            parsed(monkeypatch, "--only-score", *words)
+        assert "give the runs' folder as --keep" in capsys.readouterr().err
+
+
+def test_of_the_missing_rows_only_those_of_kept_runs_are_scored(monkeypatch, tmp_path):
+    words = ["--charts", "default", "--prompts", "seen", "--count", 3, "--keep", tmp_path / "runs"]
+    words += ["--out", tmp_path]
+    tasks = toybox.missing(parsed(monkeypatch, *words))
+    assert len(tasks) == 3
+    toybox.kept(tasks[1]).mkdir(parents=True)
+    (toybox.kept(tasks[1]) / toybox.RECORD).write_text("1.0")
+    assert toybox.missing(parsed(monkeypatch, *words, "--only-score")) == [tasks[1]]
+    runs.append_rows(toybox.CHART, toybox.COLUMNS, [toybox.row_of(tasks[1], {})], tmp_path)
+    assert toybox.missing(parsed(monkeypatch, *words, "--only-score")) == []
+
+
+def test_runs_with_other_options_are_kept_apart(tmp_path):
+    task = toybox.Task(Variant("mine", 1, {"a": "1"}), prompts("seen", 1)[0], 0, "models", tmp_path)
+    other = task._replace(variant=Variant("mine", 1, {"a": "2"}))
+    assert task.key == other.key and toybox.kept(task) != toybox.kept(other)
 
 
 @pytest.fixture
@@ -164,14 +182,14 @@ def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypat
         for i, text in prompts.items()
     ]
     other = {"variant": "CSD", "x": "4", "cpu_seconds": "70"}
-    rows += [rows[0] | other, rows[1] | other | {"accessory": "0", "multi_face": ""}]
+    rows += [rows[0] | other, rows[1] | other | {"accessory": "0", "multi_face": "nan"}]
     monkeypatch.setattr(toybox_variants, "measured", lambda: rows)
     monkeypatch.setattr(
         toybox_variants.toybox_jobs, "CHARTS", {"mine": lambda: [Variant("CSD", 4), Variant("no")]}
     )
     head, _, line = toybox_variants.table("mine").splitlines()
     assert line.startswith("| CSD 4 | 2 | 83 | -17 (")  # kind and colours of three attributes
-    assert line.endswith("| 25 | +0 (+0 – +0) | 70 | 50 |") and len(head.split("|")) == 10
+    assert line.endswith("| 25 | +0 | 70 | 50 |") and len(head.split("|")) == 10
 
 
 def test_columns_of_prompts_that_ask_for_nothing_are_left_out():

@@ -152,15 +152,16 @@ def test_a_training_continues_from_the_weights(exported, trained, tmp_path):
         run.run(before + 4)
 
 
-def test_a_continued_training_logs_its_own_rate(exported, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("images, seconds", [(10**9, 1e6), (0, 0.0)])
+def test_a_continued_training_logs_its_own_rate(
+    exported, tmp_path, monkeypatch, capsys, images, seconds
+):
     """Pictures and seconds of the training that it started from don't count."""
     weights = tmp_path / "weights"
     shutil.copytree(exported, weights)
     record = json.loads((exported / "training.json").read_text())
-    record["judge"] |= {
-        "images": 10**9,
-        "last": {"images": 10**9, "seconds": 1e6, "loss": 0.5},
-    }
+    last = {"images": images, "seconds": seconds, "loss": 0.5}
+    record["judge"] |= {"images": 10**9, "last": last}
     (weights / "training.json").write_text(json.dumps(record))
     warm_start.start_from(weights, options(tmp_path), {"judge": STAGES["judge"]})
     monkeypatch.setattr(loop, "LOG_EVERY", 1)

@@ -339,11 +339,12 @@ def test_degraded_pictures_stay_pictures_of_the_object(degradation):
         assert (middle - images[:, :, 32, 32]).abs().max() < 0.12
 
 
-def test_a_quarter_of_the_judges_pictures_stays_clean():
-    images = torch.rand(9, 3, 64, 64)
+@pytest.mark.parametrize("count, clean", [(1, 1), (3, 1), (9, 3)])
+def test_a_quarter_of_the_judges_pictures_stays_clean(count, clean):
+    images = torch.rand(count, 3, 64, 64)
     found = judge_stage.degraded(images, np.random.default_rng(0))
-    assert found.shape == images.shape
-    assert torch.equal(found[:3], images[:3]) and not torch.equal(found[3:], images[3:])
+    assert found.shape == images.shape and torch.equal(found[:clean], images[:clean])
+    assert all(not torch.equal(a, b) for a, b in zip(found[clean:], images[clean:], strict=True))
 
 
 def test_only_directions_that_prompts_tell_are_labels():

@@ -239,6 +239,22 @@ def test_regularisers_have_real_gradients_on_the_real_alpha(tmp_path, painted_bo
     assert sign * (opacity - 0.7) > 0.02
 
 
+def test_total_variation_evens_out_colours_in_training(tmp_path, painted_box):
+    base = [
+        "trainer.max_steps=15",
+        "trainer.val_check_interval=15",
+        "system.geometry.init_opacity=0.9",
+        "system.loss.lambda_sds=0",
+    ]
+    spread = []
+    for weight in (0, 1000):
+        out = tmp_path / str(weight)
+        assert launch(out, painted_box, *base, f"system.loss.lambda_tv={weight}") == 0
+        cloud = cloud_of(run_folder(out) / "ckpts" / "last.ckpt")
+        spread.append(float(cloud["geometry.sh0"].std(dim=0).mean()))
+    assert spread[1] < 0.95 * spread[0]
+
+
 def test_a_learned_background_learns_and_is_in_the_checkpoint(tmp_path, painted_box):
     config = mocked_config(
         tmp_path, painted_box, background={"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": 0.1}

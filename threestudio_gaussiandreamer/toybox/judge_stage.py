@@ -76,7 +76,8 @@ def degraded(
 ) -> Float[Tensor, "B 3 s s"]:
     """Blur a quarter of the batch, add noise to another, make another one mottled."""
     clean, *others = images.tensor_split(4)
-    return torch.cat([clean, *(f(part, rng) for f, part in zip(DEGRADATIONS, others, strict=True))])
+    pairs = zip(DEGRADATIONS, others, strict=True)
+    return torch.cat([clean, *(f(part, rng) if len(part) else part for f, part in pairs)])
 
 
 def blurred(images: Float[Tensor, "B 3 s s"], rng: np.random.Generator) -> Float[Tensor, "B 3 s s"]:
@@ -95,7 +96,8 @@ def noisy(images: Float[Tensor, "B 3 s s"], rng: np.random.Generator) -> Float[T
 def mottled(images: Float[Tensor, "B 3 s s"], rng: np.random.Generator) -> Float[Tensor, "B 3 s s"]:
     """Vary colours and positions smoothly over a few pixels, as in renders of coarse Gaussians.
 
-    Colours vary by a standard deviation of up to 0.1, positions by up to 1.5 pixels.
+    Before the interpolation, which lowers both, colours have a standard deviation of up to 0.1 and
+    shifts one of up to 1.5 pixels.
     """
     count, _, size, _ = images.shape
     grid = size // int(rng.integers(2, 8))

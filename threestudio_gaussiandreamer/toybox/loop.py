@@ -150,6 +150,8 @@ class Training:
         self.earlier: list[dict[str, Any]] = []
         """Device and hours of the trainings whose exported weights this one started from."""
         self.target, self.limit = stage.images, math.inf
+        self.logged = 0, 0.0
+        """Images and seconds at the last log."""
         self.signum = 0
         if self.path.exists():
             self._resume()
@@ -179,6 +181,7 @@ class Training:
 
     def _loop(self) -> None:
         progress, sums = self.progress, _Sums()
+        self.logged = progress.images, progress.seconds
         batches = self.stage.batches(progress.step)
         saved = shown = started = time.monotonic()
         for batch in batches:
@@ -280,11 +283,9 @@ class Training:
 
     def _log(self, means: dict[str, float]) -> None:
         progress = self.progress
-        before = progress.history[-1] if progress.history else {"images": 0, "seconds": 0.0}
-        seconds = progress.seconds - before["seconds"]
-        if seconds <= 0:  # the last entry is of the training whose weights this one started from
-            seconds = progress.seconds
-        rate = (progress.images - before["images"]) / max(seconds, 1e-9)
+        images, seconds = self.logged
+        rate = (progress.images - images) / max(progress.seconds - seconds, 1e-9)
+        self.logged = progress.images, progress.seconds
         progress.history.append(
             {"images": progress.images, "seconds": round(progress.seconds, 1), **means}
         )

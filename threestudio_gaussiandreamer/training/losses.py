@@ -6,6 +6,9 @@ sparsity  mean sqrt(alpha^2 + 0.01)
 opaque    entropy of alpha, smallest if every alpha is 0 or 1
 tv        total variation: mean absolute difference of neighbouring pixels' colours, over each axis
 ========  ==========================================================================================
+
+All are means over pixels, whereas score distillation is a sum over latents: raise their weights in
+proportion to height x width.
 """
 
 from collections.abc import Iterable, Mapping
@@ -27,7 +30,7 @@ def weighted_losses(
     """Compute the weighted ``loss_*`` of a guidance, and the weighted regularisers.
 
     Args:
-        out: of the renderer; the regularisers use ``opacity`` and ``comp_rgb``.
+        out: the renderer's outputs; the regularisers use ``opacity`` and ``comp_rgb``.
 
     Raises:
         UserError: there is a weight without a loss, or a loss without a weight.
@@ -110,7 +113,11 @@ def check_weights(weights: Iterable[str], losses: Iterable[str]) -> None:
 
 
 def regulariser(name: str, out: Mapping[str, Any]) -> Float[Tensor, ""]:
-    """Compute one of REGULARISERS of the renderer's outputs; the first two are threestudio's."""
+    """Compute one of REGULARISERS; ``sparsity`` and ``opaque`` are threestudio's.
+
+    Args:
+        out: the renderer's outputs.
+    """
     if name == "tv":
         return total_variation(out["comp_rgb"])
     alpha = out["opacity"]
@@ -123,4 +130,5 @@ def regulariser(name: str, out: Mapping[str, Any]) -> Float[Tensor, ""]:
 
 def total_variation(images: Float[Tensor, "B H W 3"]) -> Float[Tensor, ""]:
     """Return the mean absolute difference of vertical neighbours plus that of horizontal ones."""
-    return images.diff(dim=1).abs().mean() + images.diff(dim=2).abs().mean()
+    differences = images.diff(dim=1), images.diff(dim=2)
+    return sum(found.abs().sum() / max(found.numel(), 1) for found in differences)

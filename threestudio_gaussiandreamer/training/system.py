@@ -12,7 +12,7 @@ option         meaning
 =============  =====================================================================================
 loss.lambda_*  weight of each loss, a number or a schedule: ``sds`` and every other ``loss_*`` of
                the guidance; ``sparsity`` mean sqrt(alpha^2 + 0.01); ``opaque`` entropy of alpha,
-               which pushes it to 0 or 1
+               which pushes it to 0 or 1; ``tv`` total variation, see ``losses.py``
 optimizer      name (a torch optimiser) and args; the learning rates belong to the geometry and the
                background
 evaluation     views, size (pixels), supersample, every (steps; 0: only at start and end): PSNR and
