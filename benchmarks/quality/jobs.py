@@ -70,6 +70,12 @@ class Job(NamedTuple):
     """
 
 
+def held(count: int) -> dict[str, Any]:
+    """Return the options of a run with one prediction of the score model per ``count`` steps."""
+    keys = ("system.guidance.reuse_steps", "data.hold_steps", "system.background.hold_steps")
+    return dict.fromkeys(keys, count)
+
+
 def steps(count: int) -> dict[str, Any]:
     """Return the options of a run of ``count`` steps, with its schedules in proportion."""
     second = SECOND_STAGE * count // STEPS

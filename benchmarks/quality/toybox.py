@@ -37,10 +37,9 @@ from tqdm import tqdm
 
 from benchmarks.quality.runs import CHARTS, add_jobs, append_rows, rows_of
 from benchmarks.quality.toybox_jobs import (
-    CHARTS as VARIANTS,
-)
-from benchmarks.quality.toybox_jobs import (
+    CHART,
     CONFIG,
+    RECOGNIZED,
     SAMPLES,
     TRUTH,
     Prompt,
@@ -48,9 +47,10 @@ from benchmarks.quality.toybox_jobs import (
     options_of,
     prompts,
 )
+from benchmarks.quality.toybox_jobs import (
+    CHARTS as VARIANTS,
+)
 
-CHART = "toybox"
-RECOGNIZED = ("kind", "colors", "pattern", "accessory", "multi_face")
 KEY = ("variant", "x", "withheld", "index", "seed")
 COLUMNS = [*KEY, "prompt", "cpu_seconds", "gaussians"]
 COLUMNS += [*RECOGNIZED, "clip", "haze", "faint", *(f"prior_{name}" for name in RECOGNIZED)]

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from benchmarks.quality.jobs import held
 from benchmarks.quality.runs import ROOT
 from threestudio_gaussiandreamer.core.streams import numpy_generator
 from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
@@ -14,6 +15,10 @@ from threestudio_gaussiandreamer.toybox.words import describe
 from threestudio_gaussiandreamer.toybox.world import KINDS, draw_attributes
 from threestudio_gaussiandreamer.view.config_changes import leaves
 
+CHART = "toybox"
+ATTRIBUTES = ("kind", "colors", "pattern", "accessory")
+RECOGNIZED = (*ATTRIBUTES, "multi_face")
+"""Columns of what the judge finds in a result."""
 CONFIG = yaml.safe_load((ROOT / "configs/toybox.yaml").read_text())
 STEPS = CONFIG["trainer"]["max_steps"]
 GUIDANCE = CONFIG["system"]["guidance"]["guidance_scale"]
@@ -94,38 +99,36 @@ def over_guidance() -> Iterator[Variant]:
 
 def schedules() -> Iterator[Variant]:
     """Ranges of timesteps, and clipping."""
-    constant = {"system.guidance.max_step_percent": 0.98}
-    yield Variant("timesteps up to 0.98 throughout", 0, constant)
+    yield Variant("timesteps up to 0.98 throughout", 0, {"system.guidance.max_step_percent": 0.98})
     low = {"system.guidance.max_step_percent": CONFIG["system"]["guidance"]["max_step_percent"]}
     yield Variant("timesteps from 0.2", 0, low | {"system.guidance.min_step_percent": 0.2})
-    falling = {
-        "system.guidance.timestep_schedule": "sqrt",
-        "system.guidance.timestep_steps": STEPS,
-        **constant,
-    }
-    yield Variant("timesteps that fall by the root of the step", 0, falling)
+    yield Variant("timesteps that fall by the root of the step", 0, falling("sqrt"))
     for clip in (0.1, 0.5):
         yield Variant("grad_clip", clip, {"system.guidance.grad_clip": clip})
     rescaled = {"system.guidance.recon_std_rescale": 0.5}
     yield Variant("recon_std_rescale 0.5", 0, rescaled)
 
 
+def falling(schedule: str) -> dict[str, Any]:
+    """Return the options of timesteps that fall in the course of the run."""
+    return {
+        "system.guidance.max_step_percent": 0.98,
+        "system.guidance.timestep_schedule": schedule,
+        "system.guidance.timestep_steps": STEPS,
+    }
+
+
 def distillations() -> Iterator[Variant]:
     """Other score distillations, at the configuration's guidance scale; CFD and SDI use their
     papers' decreasing timesteps.
     """
-    falling = {
-        "system.guidance.max_step_percent": 0.98,
-        "system.guidance.timestep_schedule": "linear",
-        "system.guidance.timestep_steps": STEPS,
-    }
     own_options = {
         "csd": {},
         "nfsd": {},
         "ism": {},
         "vsd": {},
-        "cfd": falling,
-        "sdi": falling | {"system.guidance.weighting_strategy": "x0"},
+        "cfd": falling("linear"),
+        "sdi": falling("linear") | {"system.guidance.weighting_strategy": "x0"},
     }
     for name, options in own_options.items():
         yield Variant(
@@ -137,9 +140,8 @@ def cheaper() -> Iterator[Variant]:
     """One prediction for several steps of the same views; no guidance at some timesteps; half of
     the views a step, in as many steps and in twice as many.
     """
-    keys = ("system.guidance.reuse_steps", "data.hold_steps", "system.background.hold_steps")
     for count in (2, 4):
-        yield Variant("steps with one prediction", count, dict.fromkeys(keys, count))
+        yield Variant("steps with one prediction", count, held(count))
     interval = {"system.guidance.guidance_interval": [0.2, 0.8]}
     yield Variant("guidance interval", 0, interval)
     yield Variant("views a step", 2, {"data.batch_size": 2})

@@ -17,13 +17,19 @@ import numpy as np
 
 from benchmarks.markdown import markdown
 from benchmarks.quality.runs import CHARTS, rows_of
-from benchmarks.quality.toybox_jobs import DEFAULT, PAPER_RECIPE, SAMPLES, TRUTH
+from benchmarks.quality.toybox_jobs import (
+    ATTRIBUTES,
+    CHART,
+    DEFAULT,
+    PAPER_RECIPE,
+    RECOGNIZED,
+    SAMPLES,
+    TRUTH,
+)
 from threestudio_gaussiandreamer.evaluation.intervals import Estimate, bootstrap, per_prompt
 from threestudio_gaussiandreamer.models.bundled import FOLDER, RECORD
 from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
 
-CHART = "toybox"
-RECOGNIZED = ("kind", "colors", "pattern", "accessory", "multi_face")
 TITLES = {"colors": "colours", "multi_face": "multi-face"}
 NOT_MEASURED = "*Not measured yet: it needs trained models.*"
 Row = dict[str, str]
@@ -85,9 +91,13 @@ def variants(rows: Iterable[Row]) -> Iterator[tuple[str, list[Row]]]:
     """Yield name and rows of each variant, in the order of their measurement."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
-        name = row["variant"] if row["x"] == "0" else f"{row['variant']} {row['x']}"
-        groups.setdefault(name, []).append(row)
+        groups.setdefault(title_of(row), []).append(row)
     yield from groups.items()
+
+
+def title_of(row: Row) -> str:
+    """Return the variant's name with the number that it varies, if any."""
+    return row["variant"] if row["x"] == "0" else f"{row['variant']} {row['x']}"
 
 
 # ---- tables --------------------------------------------------------------------------------------
@@ -111,7 +121,7 @@ def results() -> str:
 def summary() -> str:
     """Return kind / colours / pattern / accessory of toybox.yaml, in percent."""
     rows = [row for row in measured() if row["variant"] == DEFAULT]
-    means = [estimate(rows, name).mean for name in RECOGNIZED[:4]]
+    means = [estimate(rows, name).mean for name in ATTRIBUTES]
     return " / ".join(f"{100 * mean:.0f}" for mean in means) if rows else NOT_MEASURED
 
 

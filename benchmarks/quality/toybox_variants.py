@@ -5,7 +5,9 @@ seeds: the paired tables of docs/toybox.md and docs/distillation.md, from docs/c
 accessory) that the judge finds in the result.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+import statistics
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -13,41 +15,38 @@ from benchmarks.markdown import markdown
 from benchmarks.quality import toybox_jobs
 from benchmarks.quality.toybox_tables import (
     NOT_MEASURED,
-    RECOGNIZED,
     Row,
     asks_for,
     measured,
     median_of,
+    title_of,
 )
-from threestudio_gaussiandreamer.evaluation.intervals import bootstrap, paired, per_prompt
+from threestudio_gaussiandreamer.evaluation.intervals import paired, per_prompt
 
 HEAD = ("variant", "prompts", "recognised, %", "− toybox.yaml", "multi-face, %", "− toybox.yaml")
 HEAD += ("CPU seconds", "of toybox.yaml")
+DISTILLATIONS = ("paper", "distillations", "cheaper")
+"""Charts that docs/distillation.md shows; docs/toybox.md shows the others."""
 
 
 def distillations() -> str:
     """Return the table of score distillations and of cheaper steps with the learned models."""
-    return table("paper", "distillations", "cheaper")
+    return table(*DISTILLATIONS)
 
 
 def settings() -> str:
     """Return the table of all other settings."""
-    others = ("paper", "distillations", "cheaper", "references", "default")
+    others = (*DISTILLATIONS, "references", "default")
     return table(*(name for name in toybox_jobs.CHARTS if name not in others))
 
 
 def table(*charts: str) -> str:
     """Return a line for each variant of these charts that has been measured."""
     rows = measured()
-    pairs = ((name, pairs_of(rows, name, x)) for name, x in keys(charts))
-    lines = [line_of(name, *both) for name, both in pairs if both[0]]
+    keys = dict.fromkeys(one.key for chart in charts for one in toybox_jobs.CHARTS[chart]())
+    pairs = (pairs_of(rows, *key) for key in keys)
+    lines = [line_of(own, plain) for own, plain in pairs if own]
     return markdown(HEAD, lines) if lines else NOT_MEASURED
-
-
-def keys(charts: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield name and ``x`` of the variants of charts, once each."""
-    found = (variant.key for chart in charts for variant in toybox_jobs.CHARTS[chart]())
-    yield from dict.fromkeys(found)
 
 
 def pairs_of(rows: Sequence[Row], name: str, x: str) -> tuple[list[Row], list[Row]]:
@@ -62,12 +61,11 @@ def place(row: Row) -> tuple[str, str]:
     return row["index"], row["seed"]
 
 
-def line_of(name: str, own: list[Row], plain: list[Row]) -> tuple[str, ...]:
-    x = own[0]["x"]
+def line_of(own: list[Row], plain: list[Row]) -> tuple[str, ...]:
     recognised = [values_of(rows, recognised_share) for rows in (own, plain)]
     faces = [values_of(rows, multi_face) for rows in (own, plain)]
     return (
-        name if x == "0" else f"{name} {x}",
+        title_of(own[0]),
         str(len({row["prompt"] for row in own})),
         mean(recognised[0]), difference(*recognised),
         mean(faces[0]), difference(*faces),
@@ -82,7 +80,7 @@ def values_of(rows: list[Row], measure: Callable[[Row], float]) -> dict[str, flo
 
 
 def recognised_share(row: Row) -> float:
-    names = [name for name in RECOGNIZED if name != "multi_face" and asks_for(row["prompt"], name)]
+    names = [name for name in toybox_jobs.ATTRIBUTES if asks_for(row["prompt"], name)]
     return float(np.mean([float(row[name]) for name in names]))
 
 
@@ -91,8 +89,8 @@ def multi_face(row: Row) -> float:
 
 
 def mean(values: dict[str, float]) -> str:
-    found = bootstrap(np.array(list(values.values()), float))
-    return f"{100 * found.mean:.0f}" if found.count else ""
+    known = [value for value in values.values() if not math.isnan(value)]
+    return f"{100 * statistics.fmean(known):.0f}" if known else ""
 
 
 def difference(own: dict[str, float], plain: dict[str, float]) -> str:

@@ -33,7 +33,7 @@ from tqdm import tqdm
 
 from benchmarks.quality import forked, runs
 from benchmarks.quality.chart_runs import Row, ends, grouped, objects_of
-from benchmarks.quality.jobs import BINS, steps
+from benchmarks.quality.jobs import BINS, held, steps
 
 CHART = "variants"
 STEPS, SIZE, VIEWS = 240, 64, 4
@@ -90,12 +90,6 @@ def views(count: int) -> dict[str, Any]:
     return length(STEPS * VIEWS // count) | {"data.batch_size": count}
 
 
-def held(count: int, total: int) -> dict[str, Any]:
-    """Return the options of a run of ``total`` steps with one prediction per ``count`` steps."""
-    keys = ("system.guidance.reuse_steps", "data.hold_steps", "system.background.hold_steps")
-    return length(total) | dict.fromkeys(keys, count)
-
-
 DISTILLATIONS = {
     SDS: Line("sds", {}, 101.0),
     CLIPPED: Line("sds", CLIP, 101.0),
@@ -120,9 +114,9 @@ CHEAPER = {
         f"SDS, {count} view{'s' * (count > 1)}": Line("sds", views(count), scales=MILD)
         for count in (1, 2, 8)
     },
-    "SDS, 4 steps each, 240 steps": Line("sds", held(4, STEPS), scales=MILD),
-    "SDS, 2 steps each, 480 steps": Line("sds", held(2, 2 * STEPS), scales=MILD),
-    "SDS, 4 steps each, 960 steps": Line("sds", held(4, 4 * STEPS), scales=MILD),
+    "SDS, 4 steps each, 240 steps": Line("sds", length(STEPS) | held(4), scales=MILD),
+    "SDS, 2 steps each, 480 steps": Line("sds", length(2 * STEPS) | held(2), scales=MILD),
+    "SDS, 4 steps each, 960 steps": Line("sds", length(4 * STEPS) | held(4), scales=MILD),
 }
 """SDS with fewer evaluations per step, or fewer steps."""
 LINES = DISTILLATIONS | CHEAPER

@@ -64,16 +64,25 @@ def switch() -> None:
     since = now
 
 
+def enter(part: str) -> None:
+    switch()
+    running.append(part)
+
+
+def leave(part: str) -> None:
+    switch()
+    ended = running.pop()
+    assert ended == part, (ended, part)
+
+
 def measured(part: str, call: Any) -> Any:
     @functools.wraps(call)
     def within(*args: Any, **options: Any) -> Any:
-        switch()
-        running.append(part)
+        enter(part)
         try:
             return call(*args, **options)
         finally:
-            switch()
-            running.pop()
+            leave(part)
 
     return within
 
@@ -95,42 +104,17 @@ def measure_calls() -> None:
             measure(part, owner, name)
 
 
-class EncoderEnd(torch.autograd.Function):
-    """The identity, at the encoder's output: its backward pass begins that of the encoder, whose
-    time belongs to the score.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, latents: torch.Tensor) -> torch.Tensor:
-        return latents.view_as(latents)
-
-    @staticmethod
-    def backward(ctx: Any, grad: torch.Tensor) -> torch.Tensor:
-        switch()
-        running.append("score")
-        return grad
-
-
-class EncoderStart(torch.autograd.Function):
-    """The identity, at the encoder's input: its backward pass ends that of the encoder."""
-
-    @staticmethod
-    def forward(ctx: Any, rgb: torch.Tensor) -> torch.Tensor:
-        return rgb.view_as(rgb)
-
-    @staticmethod
-    def backward(ctx: Any, grad: torch.Tensor) -> torch.Tensor:
-        switch()
-        assert running.pop() == "score"
-        return grad
-
-
 def with_backward_measured(encode: Any) -> Any:
     """Attribute the backward pass of a guidance's encoder to the score."""
 
     @functools.wraps(encode)
     def measured_encode(guidance: Any, rgb: torch.Tensor, **batch: Any) -> torch.Tensor:
-        return EncoderEnd.apply(encode(guidance, EncoderStart.apply(rgb), **batch))
+        pixels = rgb.view_as(rgb)  # its gradient is that of the encoder alone
+        latents = encode(guidance, pixels, **batch)
+        if latents.requires_grad:
+            latents.register_hook(lambda grad: enter("score"))
+            pixels.register_hook(lambda grad: leave("score"))
+        return latents
 
     return measured_encode
 

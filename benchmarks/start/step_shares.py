@@ -11,6 +11,7 @@ import csv
 from pathlib import Path
 from typing import NamedTuple
 
+from benchmarks.markdown import read
 from benchmarks.start.launched import ROOT, checkouts_of, commit_of, paired_parser, run_with_probe
 
 RESULTS = ROOT / "benchmarks/results/step.csv"
@@ -48,7 +49,8 @@ def main() -> None:
     parser.add_argument("--steps", nargs=2, type=int, default=WINDOW, metavar=("FIRST", "LAST"))
     args = parser.parse_args()
     checkouts = checkouts_of(args.against)
-    rows = [row for row in earlier_rows() if row[0] not in args.workloads]
+    earlier = read(RESULTS) if RESULTS.exists() else []
+    rows = [tuple(row.values()) for row in earlier if row["workload"] not in args.workloads]
     for number in range(args.rounds):
         for workload in args.workloads:
             for name, checkout in checkouts.items():
@@ -58,13 +60,6 @@ def main() -> None:
                 rows += [(*place, part, f"{ms:.3f}") for part, ms in parts.items()]
     with open(RESULTS, "w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
-
-
-def earlier_rows() -> list[list[str]]:
-    if not RESULTS.exists():
-        return []
-    with open(RESULTS, newline="") as file:
-        return list(csv.reader(file))[1:]
 
 
 def milliseconds(checkout: Path, workload: Workload, window: list[int]) -> dict[str, float]:

@@ -150,11 +150,11 @@ class Training:
         self.earlier: list[dict[str, Any]] = []
         """Device and hours of the trainings whose exported weights this one started from."""
         self.target, self.limit = stage.images, math.inf
-        self.logged = 0, 0.0
-        """Images and seconds at the last log."""
         self.signum = 0
         if self.path.exists():
             self._resume()
+        self.logged = self.progress.images, self.progress.seconds
+        """Images and seconds at the last log."""
         self._freeze()
 
     @property
@@ -181,7 +181,6 @@ class Training:
 
     def _loop(self) -> None:
         progress, sums = self.progress, _Sums()
-        self.logged = progress.images, progress.seconds
         batches = self.stage.batches(progress.step)
         saved = shown = started = time.monotonic()
         for batch in batches:

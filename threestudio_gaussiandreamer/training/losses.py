@@ -11,7 +11,7 @@ All are means over pixels, whereas score distillation is a sum over latents: rai
 proportion to height x width.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Optional
 
 from jaxtyping import Float
@@ -20,8 +20,6 @@ from torch import Tensor
 from ..core.errors import UserError, unknown
 from ..core.schedule import Schedule, parse_schedule
 from ..guidance.base import ScoreDistillation
-
-REGULARISERS = ("sparsity", "opaque", "tv")
 
 
 def weighted_losses(
@@ -37,7 +35,7 @@ def weighted_losses(
     """
     raw = {k.removeprefix("loss_"): v for k, v in guided.items() if k.startswith("loss_")}
     check_weights(weights, raw)
-    raw |= {name: regulariser(name, out) for name in REGULARISERS if weights.get(name)}
+    raw |= {name: call(out) for name, call in REGULARISERS.items() if weights.get(name)}
     return {name: value * weights[name] for name, value in raw.items()}
 
 
@@ -112,17 +110,13 @@ def check_weights(weights: Iterable[str], losses: Iterable[str]) -> None:
             )
 
 
-def regulariser(name: str, out: Mapping[str, Any]) -> Float[Tensor, ""]:
-    """Compute one of REGULARISERS; ``sparsity`` and ``opaque`` are threestudio's.
+def sparsity(alpha: Float[Tensor, "B H W 1"]) -> Float[Tensor, ""]:
+    """Return the mean of sqrt(alpha^2 + 0.01), as in threestudio."""
+    return (alpha**2 + 0.01).sqrt().mean()
 
-    Args:
-        out: the renderer's outputs.
-    """
-    if name == "tv":
-        return total_variation(out["comp_rgb"])
-    alpha = out["opacity"]
-    if name == "sparsity":
-        return (alpha**2 + 0.01).sqrt().mean()
+
+def entropy(alpha: Float[Tensor, "B H W 1"]) -> Float[Tensor, ""]:
+    """Return the mean entropy of alpha, clamped to [1e-3, 1 - 1e-3], as in threestudio."""
     clamped = alpha.clamp(1e-3, 1 - 1e-3)
     # torch forbids its binary_cross_entropy under mixed precision
     return -(clamped * clamped.log() + (1 - clamped) * (1 - clamped).log()).mean()
@@ -132,3 +126,11 @@ def total_variation(images: Float[Tensor, "B H W 3"]) -> Float[Tensor, ""]:
     """Return the mean absolute difference of vertical neighbours plus that of horizontal ones."""
     differences = images.diff(dim=1), images.diff(dim=2)
     return sum(found.abs().sum() / max(found.numel(), 1) for found in differences)
+
+
+REGULARISERS: dict[str, Callable[[Mapping[str, Any]], Tensor]] = {
+    "sparsity": lambda out: sparsity(out["opacity"]),
+    "opaque": lambda out: entropy(out["opacity"]),
+    "tv": lambda out: total_variation(out["comp_rgb"]),
+}
+"""Functions of the renderer's outputs."""
