@@ -10,8 +10,9 @@ under a learned score.
 Each run is configs/toybox.yaml with a few options changed, on one thread. The judge sees eight
 views of its result, of its prior's points, of the 2D model's own samples, and of the object itself;
 CPU seconds are those of a whole run without imports and video, in a process that keeps its networks
-loaded. Rows are appended to toybox.csv as runs end, in the order chart, seed, prompt, variant; rows
-in it are skipped, so delete those of another configuration, of other models or of another judge.
+loaded. Rows are appended to toybox.csv as runs end, in the order chart, seed, prompt, variant. Rows
+that it has of this configuration and these models, which the column "setup" identifies, are
+skipped; delete those of another judge.
 Settings were chosen on "seen" prompts, of combinations that trainings may have had; "withheld" ones
 are of combinations that no training had.
 """
@@ -38,7 +39,6 @@ from tqdm import tqdm
 from benchmarks.quality.runs import CHARTS, add_jobs, append_rows, rows_of
 from benchmarks.quality.toybox_jobs import (
     CHART,
-    CONFIG,
     RECOGNIZED,
     SAMPLES,
     TRUTH,
@@ -46,12 +46,13 @@ from benchmarks.quality.toybox_jobs import (
     Variant,
     options_of,
     prompts,
+    setup,
 )
 from benchmarks.quality.toybox_jobs import (
     CHARTS as VARIANTS,
 )
 
-KEY = ("variant", "x", "withheld", "index", "seed")
+KEY = ("variant", "x", "withheld", "index", "seed", "setup")
 COLUMNS = [*KEY, "prompt", "cpu_seconds", "gaussians"]
 COLUMNS += [*RECOGNIZED, "clip", "haze", "faint", *(f"prior_{name}" for name in RECOGNIZED)]
 COLUMNS += ["options", "machine", "commit"]
@@ -89,7 +90,12 @@ class Task(NamedTuple):
     @property
     def key(self) -> tuple[str, ...]:
         place = (str(int(self.prompt.withheld)), str(self.prompt.index), str(self.seed))
-        return (*self.variant.key, *place)
+        return (*self.variant.key, *place, self.setup)
+
+    @property
+    def setup(self) -> str:
+        """Models and configuration, on which only the views of the object itself don't depend."""
+        return "" if self.variant.name == TRUTH else setup(self.models)
 
 
 # ---- in the processes ----------------------------------------------------------------------------
@@ -135,7 +141,7 @@ def measured(task: Task) -> dict[str, float]:
 
 def kept(task: Task) -> Path:
     """Return the folder of a kept run, which depends on all of its options."""
-    content = repr((task.key, task.variant.options, CONFIG)).encode()
+    content = repr((task.key, task.variant.options)).encode()
     return task.keep / hashlib.blake2b(content, digest_size=8).hexdigest()
 
 

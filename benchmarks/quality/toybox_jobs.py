@@ -2,7 +2,10 @@
 prompts for them.
 """
 
+import functools
+import hashlib
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
@@ -10,6 +13,13 @@ import yaml
 from benchmarks.quality.jobs import held
 from benchmarks.quality.runs import ROOT
 from threestudio_gaussiandreamer.core.streams import numpy_generator
+from threestudio_gaussiandreamer.models.bundled import (
+    FOLDER,
+    JUDGE,
+    NAME,
+    RECORD,
+    read_digests,
+)
 from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
 from threestudio_gaussiandreamer.toybox.words import describe
 from threestudio_gaussiandreamer.toybox.world import KINDS, draw_attributes
@@ -36,6 +46,7 @@ BALL = {
     "system.geometry.grow.enabled": "false",
 }
 WITHOUT_VIEWS = {"system.guidance.view_dependent_prompting": "false"}
+ONE_SIDE = {"system.prompt_processor.view_dependent_left_and_right": "false"}
 WRONG_PRIOR = "another kind's prior"
 """A variant whose prior gets the prompt with the next kind of object in place of its own."""
 
@@ -57,6 +68,19 @@ class Prompt(NamedTuple):
     text: str
     index: int
     withheld: bool
+
+
+@functools.cache
+def setup(models: str = NAME) -> str:
+    """Return a digest of what every result depends on: toybox.yaml and the networks but the judge.
+
+    Args:
+        models: "toybox", or the folder of an export.
+    """
+    folder = FOLDER if models == NAME else Path(models)
+    digests = read_digests(folder) or {models: ""}
+    networks = sorted(item for item in digests.items() if item[0] not in (JUDGE, RECORD))
+    return hashlib.blake2b(repr((CONFIG, networks)).encode(), digest_size=4).hexdigest()
 
 
 def steps(count: int) -> dict[str, Any]:
@@ -152,6 +176,7 @@ def cheaper() -> Iterator[Variant]:
 def starts() -> Iterator[Variant]:
     """What the second stage starts from, with and without the views' directions in the prompts."""
     yield Variant("prior, no view prompts", 0, WITHOUT_VIEWS)
+    yield Variant('"side view" for left and right', 0, ONE_SIDE)
     yield Variant(WRONG_PRIOR)
     yield Variant("grey ball", 0, BALL)
     yield Variant("grey ball, no view prompts", 0, BALL | WITHOUT_VIEWS)

@@ -2,7 +2,8 @@
 seeds: the paired tables of docs/toybox.md and docs/distillation.md, from docs/charts/toybox.csv.
 
 ``recognised`` is the share of the attributes that a prompt asks for (kind, colours, pattern,
-accessory) that the judge finds in the result.
+accessory) that the judge finds in the result. A dagger marks variants that were only measured with
+earlier models or an earlier toybox.yaml, on both sides of the comparison.
 """
 
 import math
@@ -50,22 +51,29 @@ def table(*charts: str) -> str:
 
 
 def pairs_of(rows: Sequence[Row], name: str, x: str) -> tuple[list[Row], list[Row]]:
-    """Return the rows of a variant, and those of toybox.yaml with the same prompts and seeds."""
+    """Return the rows of a variant, and those of toybox.yaml with the same prompts, seeds, models
+    and configuration: the present ones, or those before if nothing was measured with them.
+    """
     plain = {place(row): row for row in rows if row["variant"] == toybox_jobs.DEFAULT}
     own = [row for row in rows if (row["variant"], row["x"]) == (name, x)]
     own = [row for row in own if place(row) in plain]
+    own = [row for row in own if is_present(row)] or own
     return own, [plain[place(row)] for row in own]
 
 
-def place(row: Row) -> tuple[str, str]:
-    return row["index"], row["seed"]
+def place(row: Row) -> tuple[str, str, str]:
+    return row["index"], row["seed"], row["setup"]
+
+
+def is_present(row: Row) -> bool:
+    return row["setup"] == toybox_jobs.setup()
 
 
 def line_of(own: list[Row], plain: list[Row]) -> tuple[str, ...]:
     recognised = [values_of(rows, recognised_share) for rows in (own, plain)]
     faces = [values_of(rows, multi_face) for rows in (own, plain)]
     return (
-        title_of(own[0]),
+        title_of(own[0]) + ("" if is_present(own[0]) else " †"),
         str(len({row["prompt"] for row in own})),
         mean(recognised[0]), difference(*recognised),
         mean(faces[0]), difference(*faces),

@@ -176,6 +176,7 @@ def test_rows_become_tables_and_charts(monkeypatch, tmp_path, fake):
 def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypatch):
     """Of three prompts the variant has two; it misses the accessory that one of them asks for."""
     right = dict.fromkeys(toybox_tables.RECOGNIZED, "1") | {"multi_face": "0.25", "seed": "0"}
+    right["setup"] = toybox_jobs.setup()
     prompts = {"0": "a red fox", "1": "a red fox with a blue hat", "2": "a blue car"}
     rows = [
         right | {"variant": DEFAULT, "x": "0", "index": i, "prompt": text, "cpu_seconds": "50"}
@@ -190,6 +191,21 @@ def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypat
     head, _, line = toybox_variants.table("mine").splitlines()
     assert line.startswith("| CSD 4 | 2 | 83 | -17 (")  # kind and colours of three attributes
     assert line.endswith("| 25 | +0 | 70 | 50 |") and len(head.split("|")) == 10
+    earlier = [row | {"setup": "earlier"} for row in rows]
+    rows.append(earlier[0] | other)  # isn't paired with results of other models
+    assert toybox_variants.table("mine").splitlines()[2] == line
+    rows[:] = earlier
+    assert toybox_variants.table("mine").splitlines()[2] == line.replace("CSD 4", "CSD 4 †")
+
+
+def test_results_of_other_models_are_measured_again(monkeypatch, tmp_path):
+    words = ["--charts", "references", "default", "--count", 1, "--out", tmp_path]
+    tasks = toybox.missing(parsed(monkeypatch, *words))
+    rows = [toybox.row_of(task, {}) for task in tasks]
+    runs.append_rows(toybox.CHART, toybox.COLUMNS, rows, tmp_path)
+    assert toybox.missing(parsed(monkeypatch, *words)) == []
+    found = toybox.missing(parsed(monkeypatch, *words, "--models", tmp_path / "others"))
+    assert [task.variant for task in found] == [t.variant for t in tasks if t.variant.name != TRUTH]
 
 
 def test_columns_of_prompts_that_ask_for_nothing_are_left_out():

@@ -1,6 +1,7 @@
 """Helpers of the prompt processor tests."""
 
 from threestudio_gaussiandreamer.host import find
+from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
 
 
 def processor(models, kind="stable-diffusion", **options):

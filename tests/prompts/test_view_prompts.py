@@ -53,6 +53,35 @@ def test_each_view_gets_the_prompt_of_its_direction(models):
     assert torch.equal(out.get_text_embeddings(*turned), out.get_text_embeddings(*where))
 
 
+def test_left_and_right_sides_have_their_own_prompts(models):
+    out = processor(models, view_dependent_left_and_right=True)()
+    names = ("left side", "right side", "front", "back", "overhead")
+    assert out.prompts_vd == [f"a fox, {name} view" for name in names]
+    where = views((0.0, 90.0), (0.0, -90.0), (0.0, 0.0), (0.0, 180.0), (70.0, 90.0), (0.0, 450.0))
+    cond, uncond = out.get_text_embeddings(*where).chunk(2)
+    assert torch.equal(cond, out.text_embeddings_vd[[0, 1, 2, 3, 4, 0]])
+    assert torch.equal(uncond, out.uncond_text_embeddings_vd[[0, 1, 2, 3, 4, 0]])
+    assert not torch.equal(cond[0], cond[1])
+    same = processor(models, view_dependent_left_and_right=True, prompt_side="a fox's flank")()
+    assert same.prompts_vd[:2] == ["a fox's flank"] * 2
+
+
+def test_perp_neg_of_left_and_right_sides(models):
+    """A view's interpolation and negative prompts are those of its own side."""
+    out = processor(models, use_perp_neg=True, view_dependent_left_and_right=True)()
+    left, right, front, back, _ = out.text_embeddings_vd
+    angles = views((0.0, 30.0), (0.0, -30.0), (0.0, 120.0), (0.0, -120.0))
+    embeddings, weights = out.get_text_embeddings_perp_neg(*angles)
+    positive, negative = embeddings[:4], embeddings[8:].unflatten(0, (4, 2))
+    for row, (one, other, share) in enumerate(
+        [(front, left, 2 / 3), (front, right, 2 / 3), (left, back, 2 / 3), (right, back, 2 / 3)]
+    ):
+        torch.testing.assert_close(positive[row], share * one + (1 - share) * other)
+    for row, pair in enumerate([(front, left), (front, right), (left, front), (right, front)]):
+        assert torch.equal(negative[row], torch.stack(pair))
+    assert torch.equal(weights[0], weights[1]) and torch.equal(weights[2], weights[3])
+
+
 def test_without_view_dependence_every_view_gets_the_prompt_itself(models):
     out = processor(models)()
     cond, uncond = out.get_text_embeddings(

@@ -240,6 +240,19 @@ def test_the_unet_starts_from_the_one_of_small_pictures(folder, tmp_path):
         assert torch.equal(weights[name], value), name
 
 
+def test_only_named_parameters_are_trained(folder, tmp_path):
+    place = copied(folder, tmp_path / "run")
+    training(place, "unet").run(4)
+    before = loop.averaged_weights(place, "unet")
+    run = training(place, "unet", only="attentions")
+    run.run(run.progress.images + 4)
+    after = loop.averaged_weights(place, "unet")
+    changed = {key for key in before if not torch.equal(before[key], after[key])}
+    assert changed and all("attentions" in key for key in changed)
+    with pytest.raises(UserError, match="--only 'attention_layers'.*down_blocks"):
+        training(place, "unet", only="attention_layers")
+
+
 def test_curves_are_written(folder):
     rows = (folder / "clip.csv").read_text().splitlines()
     assert rows[0].startswith("images,seconds,loss") and len(rows) == 3
@@ -305,9 +318,10 @@ def test_the_ema_starts_short():
     assert average[0] == pytest.approx(1 - loop.EMA_DECAY)
 
 
-def test_min_snr_weight_of_v():
-    abar = torch.tensor([0.5, 0.99], dtype=torch.float64)
-    assert torch.allclose(unet_stage.min_snr_weight(abar), torch.tensor([0.5, 0.05]).double())
+def test_the_weight_of_v_is_truncated():
+    abar = torch.tensor([0.01, 0.5, 0.99], dtype=torch.float64)
+    expected = torch.tensor([1, 1, 0.06], dtype=torch.float64)
+    assert torch.allclose(unet_stage.truncated_weight(abar), expected)
 
 
 def test_latents_are_scaled_to_unit_variance():
@@ -353,7 +367,7 @@ def test_only_directions_that_prompts_tell_are_labels():
     told = torch.arange(8) < 4
     found = told_labels(labels, told)
     quadrant = list(views.LABELS).index("quadrant")
-    assert found[:, quadrant].tolist() == [0, IGNORED, 2, *[IGNORED] * 5]
+    assert found[:, quadrant].tolist() == [0, 1, 2, 3, *[IGNORED] * 4]
     assert torch.equal(found[:, :quadrant], labels[:, :quadrant])
 
 

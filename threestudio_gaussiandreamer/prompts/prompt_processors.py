@@ -15,6 +15,8 @@ prompt_library                 a JSON list of texts, or an object of such lists 
                                load/prompt_library.json)
 prompt_front, _side, _back,    the whole prompt of a direction, in place of "<prompt>, front view"
 _overhead
+view_dependent_left_and_right  write "left side view" and "right side view" in place of "side
+                               view", for models that know the words; not in threestudio
 view_dependent_prompt_front    write "front view of <prompt>" in place of "<prompt>, front view"
 front_threshold, back_...      half the width of front and back, degrees of azimuth
 overhead_threshold             elevation above which a view is overhead, degrees
@@ -87,6 +89,7 @@ class TextEncoderPromptProcessor(BaseObject):
         prompt_back: Optional[str] = None
         prompt_overhead: Optional[str] = None
         negative_prompt: str = NEGATIVE_PROMPT
+        view_dependent_left_and_right: bool = False
         view_dependent_prompt_front: bool = False
         front_threshold: float = field(default=45.0, metadata=in_range(0, 180, "degrees"))
         back_threshold: float = field(default=45.0, metadata=in_range(0, 180, "degrees"))
@@ -133,9 +136,13 @@ class TextEncoderPromptProcessor(BaseObject):
         """Encode all prompts of this run."""
         cfg = self.cfg
         thresholds = (cfg.front_threshold, cfg.back_threshold, cfg.overhead_threshold)
-        directions = view_directions(*thresholds, prefix=cfg.view_dependent_prompt_front)
-        prompts_vd = [
-            cfg.get(f"prompt_{direction.name}") or direction.prompt(self.prompt)
+        directions = view_directions(
+            *thresholds,
+            prefix=cfg.view_dependent_prompt_front,
+            left_and_right=cfg.view_dependent_left_and_right,
+        )
+        prompts_vd = [  # prompt_side is that of both sides
+            cfg.get(f"prompt_{direction.name.split()[-1]}") or direction.prompt(self.prompt)
             for direction in directions
         ]
         info(f"prompts: {'; '.join(prompts_vd)}")
@@ -146,8 +153,8 @@ class TextEncoderPromptProcessor(BaseObject):
         return PromptEmbeddings(
             text_embeddings=found[:1],
             uncond_text_embeddings=found[1:2],
-            text_embeddings_vd=found[2:6],
-            uncond_text_embeddings_vd=found[6:],
+            text_embeddings_vd=found[2 : 2 + len(directions)],
+            uncond_text_embeddings_vd=found[2 + len(directions) :],
             directions=directions,
             direction2idx={direction.name: index for index, direction in enumerate(directions)},
             use_perp_neg=cfg.use_perp_neg,

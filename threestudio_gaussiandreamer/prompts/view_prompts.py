@@ -40,6 +40,7 @@ def view_directions(
     overhead_threshold: float,
     *,
     prefix: bool = False,
+    left_and_right: bool = False,
 ) -> List[Direction]:
     """Return threestudio's four directions in its order: side, front, back, overhead.
 
@@ -48,9 +49,11 @@ def view_directions(
             azimuth.
         overhead_threshold: elevation above which a view is overhead, degrees.
         prefix: write "front view of a fox" instead of "a fox, front view".
+        left_and_right: distinguish "left side", azimuths above 0, and "right side" in place of
+            "side".
     """
     conditions: Dict[str, Condition] = {
-        "side": lambda elevation, azimuth, distance: torch.ones_like(elevation, dtype=torch.bool),
+        **(LEFT_AND_RIGHT if left_and_right else SIDE),
         "front": lambda elevation, azimuth, distance: shifted(azimuth).abs() < front_threshold,
         "back": lambda elevation, azimuth, distance: shifted(azimuth).abs() > 180 - back_threshold,
         "overhead": lambda elevation, azimuth, distance: elevation > overhead_threshold,
@@ -59,6 +62,15 @@ def view_directions(
         Direction(name, _prompt_maker(name, prefix), str, condition)
         for name, condition in conditions.items()
     ]
+
+
+SIDE: Dict[str, Condition] = {
+    "side": lambda elevation, azimuth, distance: torch.ones_like(elevation, dtype=torch.bool)
+}
+LEFT_AND_RIGHT: Dict[str, Condition] = {
+    "left side": lambda elevation, azimuth, distance: shifted(azimuth) >= 0,
+    "right side": lambda elevation, azimuth, distance: shifted(azimuth) < 0,
+}
 
 
 def _prompt_maker(name: str, prefix: bool) -> Callable[[str], str]:
@@ -90,8 +102,8 @@ class PromptEmbeddings:
 
     text_embeddings: Float[Tensor, "1 N F"]
     uncond_text_embeddings: Float[Tensor, "1 N F"]
-    text_embeddings_vd: Float[Tensor, "4 N F"]
-    uncond_text_embeddings_vd: Float[Tensor, "4 N F"]
+    text_embeddings_vd: Float[Tensor, "D N F"]
+    uncond_text_embeddings_vd: Float[Tensor, "D N F"]
     directions: List[Direction]
     direction2idx: Dict[str, int]
     use_perp_neg: bool
@@ -168,37 +180,47 @@ class PromptEmbeddings:
         device = self.text_embeddings_vd.device
         rows = self.direction_indices(elevation, azimuth, camera_distances).to(device)
         overhead = rows == self.direction2idx["overhead"]
-        angle = shifted(azimuth).abs().to(device)
-        pair, share = self._interpolation(angle)
+        angle, side = shifted(azimuth).abs().to(device), self._side_rows(azimuth).to(device)
+        pair, share = self._interpolation(angle, side)
         embeddings, uncond = self.text_embeddings_vd, self.uncond_text_embeddings_vd[rows]
         first = share.to(embeddings)[:, None, None]
         positive = first * embeddings[pair[:, 0]] + (1 - first) * embeddings[pair[:, 1]]
         # overhead views aren't interpolated, and have no other directions as negative prompts
         positive = torch.where(overhead[:, None, None], embeddings[rows], positive)
         negative = torch.where(
-            overhead[:, None, None, None], uncond[:, None], embeddings[self._negative_rows(angle)]
+            overhead[:, None, None, None],
+            uncond[:, None],
+            embeddings[self._negative_rows(angle, side)],
         )
         weights = torch.where(overhead[:, None], 0.0, self._negative_weights(angle, share))
         return torch.cat([positive, uncond, negative.flatten(0, 1)]), weights.to(elevation.device)
 
+    def _side_rows(self, azimuth: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
+        """Return the row of each view's side: left, right, or the only one."""
+        both = self.direction2idx.get("side", 0)
+        left, right = (self.direction2idx.get(f"{name} side", both) for name in ("left", "right"))
+        return torch.where(shifted(azimuth) >= 0, left, right)
+
     def _interpolation(
-        self, angle: Float[Tensor, " B"]
+        self, angle: Float[Tensor, " B"], side: Int[Tensor, " B"]
     ) -> Tuple[Int[Tensor, "B 2"], Float[Tensor, " B"]]:
         """Return the two directions that each view lies between, and the share of the first one in
         the interpolated prompt, in [0, 1].
         """
-        side, front, back = (self.direction2idx[name] for name in ("side", "front", "back"))
+        front, back = (torch.full_like(side, self.direction2idx[k]) for k in ("front", "back"))
         in_front = angle < 90
         pair = torch.where(
-            in_front[:, None], angle.new_tensor([front, side]), angle.new_tensor([side, back])
-        ).long()
+            in_front[:, None], torch.stack([front, side], 1), torch.stack([side, back], 1)
+        )
         return pair, torch.where(in_front, 1 - angle / 90, 2 - angle / 90)
 
-    def _negative_rows(self, angle: Float[Tensor, " B"]) -> Int[Tensor, "B 2"]:
-        side, front = self.direction2idx["side"], self.direction2idx["front"]
+    def _negative_rows(
+        self, angle: Float[Tensor, " B"], side: Int[Tensor, " B"]
+    ) -> Int[Tensor, "B 2"]:
+        front = torch.full_like(side, self.direction2idx["front"])
         return torch.where(
-            (angle < 90)[:, None], angle.new_tensor([front, side]), angle.new_tensor([side, front])
-        ).long()
+            (angle < 90)[:, None], torch.stack([front, side], 1), torch.stack([side, front], 1)
+        )
 
     def _negative_weights(
         self, angle: Float[Tensor, " B"], share: Float[Tensor, " B"]

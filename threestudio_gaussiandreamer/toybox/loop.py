@@ -54,6 +54,10 @@ class Options:
     """Either "float32", or "bfloat16" for autocast on GPUs."""
     save_seconds: float = 300.0
     sheet_seconds: float = 1200.0
+    only: str = ""
+    """Substring of the names of the parameters to train; the others stay fixed."""
+    rate: Optional[float] = None
+    """Learning rate; None for the default of each stage."""
     batch: Optional[int] = None
     """Batch size; None for the default of each stage."""
     workers: int = 0
@@ -81,6 +85,7 @@ class Stage(ABC):
         self.options = options
         self.device = torch.device(options.device)
         self.batch = options.batch or self.batch_size
+        self.rate = options.rate or self.learning_rate
         self.constants: dict[str, float] = {}
         """Constants that are needed to use the trained network; stored in the checkpoint."""
         torch.manual_seed(options.seed)
@@ -143,7 +148,7 @@ class Training:
         self.model = stage.model
         self.ema = AveragedModel(self.model, multi_avg_fn=_average, use_buffers=False)
         self.optimizer = torch.optim.AdamW(
-            self.model.parameters(), lr=stage.learning_rate, betas=(0.9, 0.99), weight_decay=0.01
+            self.model.parameters(), lr=stage.rate, betas=(0.9, 0.99), weight_decay=0.01
         )
         self.progress = Progress()
         self.measured: dict[str, float] = {}
@@ -211,7 +216,7 @@ class Training:
         progress, device = self.progress, self.stage.device.type
         factor = rate_factor(progress.step, self.done)
         for group in self.optimizer.param_groups:
-            group["lr"] = self.stage.learning_rate * factor
+            group["lr"] = self.stage.rate * factor
         mixed = self.stage.options.precision == "bfloat16"
         with torch.autocast(device, dtype=torch.bfloat16, enabled=mixed):
             loss, metrics = self.stage.loss(self.model, batch)
@@ -272,13 +277,24 @@ class Training:
 
     @torch.no_grad()
     def _freeze(self) -> None:
-        """Freeze parameters at their averages, with which dependent networks were trained."""
-        prefixes = self.stage.frozen()
+        """Freeze parameters at their averages: those with which dependent networks were trained,
+        and those that the option ``only`` leaves out.
+
+        Raises:
+            UserError: that leaves none.
+        """
+        prefixes, only = self.stage.frozen(), self.stage.options.only
         averages = dict(self.ema.module.named_parameters())
         for name, parameter in self.model.named_parameters():
-            if name.startswith(prefixes):
+            if name.startswith(prefixes) or only not in name:
                 parameter.copy_(averages[name])
                 parameter.requires_grad_(False)
+        if not any(parameter.requires_grad for parameter in self.model.parameters()):
+            groups = sorted({name.rpartition(".")[0] for name in averages})
+            raise UserError(
+                f"--only {only!r}: the network {self.stage.name!r} has no free parameter of that "
+                f"name; it has {', '.join(groups[:8])}, ..."
+            )
 
     def _log(self, means: dict[str, float]) -> None:
         progress = self.progress

@@ -29,7 +29,15 @@ def samples(
         seed: of the noise.
     """
     named = {"pretrained_model_name_or_path": model}
-    prompts = find(PROMPTS)({**named, "prompt": prompt, "negative_prompt": "", "use_cache": False})
+    prompts = find(PROMPTS)(
+        {
+            **named,
+            "prompt": prompt,
+            "negative_prompt": "",
+            "view_dependent_left_and_right": True,
+            "use_cache": False,
+        }
+    )
     guidance = find(GUIDANCE)({**named, "guidance_scale": guidance_scale})
     condition = guidance.condition(
         prompts(), elevation=orbit.elevation, azimuth=orbit.azimuth, camera_distances=orbit.distance

@@ -7,6 +7,7 @@ parts from classifiers much earlier than from the contrastive loss.
 """
 
 import functools
+import re
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -26,6 +27,7 @@ from .views import LABELS, label_row, random_angles
 from .world import draw_attributes
 
 HELD_OUT = 512
+NAMED_QUADRANT = re.compile("(front|back|backside|left side|right side) view")
 
 
 class TextBatch(NamedTuple):
@@ -60,7 +62,7 @@ def text_batch(
         )
         texts.append(text)
         labels.append(torch.from_numpy(label_row(attributes, azimuth)))
-    told = torch.tensor(["view" in text for text in texts])
+    told = torch.tensor([NAMED_QUADRANT.search(text) is not None for text in texts])
     return TextBatch(token_ids(tokenizer, texts), told_labels(torch.stack(labels), told))
 
 
@@ -120,14 +122,11 @@ def text_features(
 def told_labels(labels: Int[Tensor, "B L"], told: Tensor) -> Int[Tensor, "B L"]:
     """Return the labels with IGNORED in place of directions that a prompt doesn't tell.
 
-    Those are directions that it leaves out, and left and right, which are both called side.
-
     Args:
-        told: (B,) bool, whether the prompt names the direction.
+        told: (B,) bool, whether the prompt names the quadrant.
     """
     labels, quadrant = labels.clone(), list(LABELS).index("quadrant")
-    unknown = ~told | (labels[:, quadrant] % 2 == 1)
-    labels[:, quadrant] = torch.where(unknown, IGNORED, labels[:, quadrant])
+    labels[:, quadrant] = torch.where(told, labels[:, quadrant], IGNORED)
     return labels
 
 

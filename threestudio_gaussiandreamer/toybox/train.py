@@ -73,6 +73,8 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     )
     add("--threads", type=int, help="of torch")
     add("--batch", type=int, help="pictures of one step; default: the stage's own")
+    add("--rate", type=float, help="learning rate; default: the stage's own")
+    add("--only", default="", help="train parameters with this in their names; others stay fixed")
     add(
         "--pool",
         type=int,
@@ -105,6 +107,8 @@ def options_of(args: argparse.Namespace) -> Options:
             raise UserError(f"--{name} {shown(value)}: expected at least 1")
     if args.workers < 0:
         raise UserError(f"--workers {shown(args.workers)}: expected 0 or more")
+    if args.rate is not None and not (is_number(args.rate) and args.rate > 0):
+        raise UserError(f"--rate {args.rate}: expected more than 0")
     if not args.minutes > 0:
         raise UserError(f"--minutes {args.minutes}: expected more than 0")
     for name in ("save_minutes", "sheet_minutes"):
@@ -122,6 +126,8 @@ def options_of(args: argparse.Namespace) -> Options:
         device=args.device,
         pool=args.pool,
         precision=args.precision,
+        rate=args.rate,
+        only=args.only,
         batch=args.batch,
         workers=args.workers,
         save_seconds=60 * args.save_minutes,

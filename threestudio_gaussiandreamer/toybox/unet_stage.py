@@ -73,7 +73,7 @@ def kept_moments(path: Path) -> Float[Tensor, "2 N 4 s s"]:
 
 
 class UNetStage(Stage):
-    """Train v-prediction (Salimans and Ho 2022) with min-SNR weights (Hang et al. 2023).
+    """Train v-prediction with truncated SNR + 1 weights (Salimans and Ho 2022).
 
     One prompt in ten is empty, for classifier-free guidance.
     """
@@ -131,7 +131,7 @@ class UNetStage(Stage):
             "mse": errors.mean(),
             "mse_high_noise": errors[high].sum() / high.sum().clamp(min=1),
         }
-        return (min_snr_weight(abar).to(errors) * errors).mean(), metrics
+        return (truncated_weight(abar).to(errors) * errors).mean(), metrics
 
     @torch.no_grad()
     def tokens(self, texts: list[str]) -> Float[Tensor, "B 32 W"]:
@@ -217,10 +217,14 @@ class SmallUNetStage(UNetStage):
         return network
 
 
-def min_snr_weight(abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
-    """Return min(SNR, gamma) / (SNR + 1), the weight of v's squared error."""
+def truncated_weight(abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
+    """Return the weight of v's squared error, (min(SNR, gamma) + 1) / (SNR + 1).
+
+    That of the picture's error is min(SNR, gamma) + 1: truncated as Hang et al. 2023 do, but not
+    falling to 0 with the SNR, since the words for left and right count where noise hides both.
+    """
     snr = abar / (1 - abar)
-    return snr.clamp(max=SNR_GAMMA) / (snr + 1)
+    return (snr.clamp(max=SNR_GAMMA) + 1) / (snr + 1)
 
 
 def latent_scale(moments: Float[Tensor, "2 N 4 h w"]) -> float:

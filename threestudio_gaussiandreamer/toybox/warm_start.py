@@ -1,7 +1,6 @@
 """Continue a training from published weights: the inverse of ``export.py``."""
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +10,19 @@ from ..core.checkpoint_file import entries_below
 from ..core.errors import UserError
 from ..core.files import existing_file
 from .loop import Options, Progress, Stage, Training, is_trained
+from .new_words import grow_embeddings, grow_tokenizer, separate
 from .text_stage import TEXT_PARTS
 from .unet_stage import LATENT_SCALE
+
+CLIP_TEXT = tuple(f"clip.{name}." for name in TEXT_PARTS)
 
 
 def start_from(weights: Path, options: Options, stages: dict[str, type[Stage]]) -> None:
     """Write a checkpoint for every stage of ``weights`` that the training folder has none of.
 
-    Optimisers start without state; the attribute classifiers, which aren't published, start at
-    random.
+    Words of the toybox that the weights don't know get tokens with distinct embeddings; the
+    networks that read the text encoder learn what they mean. Optimisers start without state; the
+    attribute classifiers, which aren't published, start at random.
 
     Args:
         weights: a folder that ``toybox.export`` wrote.
@@ -30,12 +33,18 @@ def start_from(weights: Path, options: Options, stages: dict[str, type[Stage]]) 
     """
     path = existing_file(weights / "training.json", "record of the toybox's weights")
     record = json.loads(path.read_text(encoding="utf-8"))
-    if not (options.folder / "tokenizer").exists():
-        shutil.copytree(weights / "stable-diffusion" / "tokenizer", options.folder / "tokenizer")
+    new_words = grow_tokenizer(weights / "clip", options.folder / "tokenizer")
     for name, stage in stages.items():
         if name in record and not is_trained(options.folder, name):
             training = Training(stage(options))
-            _load(training.model, READERS[name](weights), weights, name)
+            state = READERS[name](weights)
+            if name == "text":
+                grow_embeddings(state, training.model, weights / "clip", training.stage.tokenizer)
+            if name == "clip":  # its text encoder is the one above
+                state = {k: v for k, v in state.items() if not k.startswith(CLIP_TEXT)}
+            _load(training.model, state, weights, name)
+            if name == "text" and new_words:
+                separate(training.model, training.stage.tokenizer, new_words, options.seed)
             training.ema.module.load_state_dict(training.model.state_dict())
             training.ema.n_averaged.fill_(record[name]["steps"])
             if name == "unet":

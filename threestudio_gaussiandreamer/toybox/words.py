@@ -75,10 +75,12 @@ OPENINGS = (
     "{}",
 )
 """Templates for the object's description; "a {}" is drawn most often."""
-DIRECTIONS = ("side", "front", "back", "overhead")
+DIRECTIONS = ("left side", "right side", "front", "back", "overhead")
 FRONT_HALF = BACK_HALF = 45.0
 OVERHEAD = 60.0
 """Thresholds of the prompt processors, degrees."""
+UNNAMED_SIDE_SHARE = 0.1
+"""Fraction of the side views whose prompts say "side view", as threestudio's do."""
 EMPTY_SHARE, PLAIN_SHARE, PREFIX_SHARE = 0.1, 0.2, 0.04
 """Shares of prompts that are empty, that name no direction, and that name it in front ("side view
 of ...").
@@ -86,15 +88,20 @@ of ...").
 
 
 def direction(elevation: float, azimuth: float) -> str:
-    """Return the direction of a view, with the prompt processors' thresholds.
+    """Return the direction of a view, with the prompt processors' thresholds and
+    ``view_dependent_left_and_right``.
 
     Args:
         elevation, azimuth: degrees.
     """
-    angle = abs((azimuth + 180) % 360 - 180)
+    shifted = (azimuth + 180) % 360 - 180
     if elevation > OVERHEAD:
         return "overhead"
-    return "front" if angle < FRONT_HALF else "back" if angle > 180 - BACK_HALF else "side"
+    if abs(shifted) < FRONT_HALF:
+        return "front"
+    if abs(shifted) > 180 - BACK_HALF:
+        return "back"
+    return "left side" if shifted >= 0 else "right side"
 
 
 def describe(attributes: Attributes, rng: np.random.Generator) -> str:
@@ -127,6 +134,8 @@ def prompt_of(
     text, view = describe(attributes, rng), direction(elevation, azimuth)
     if share < EMPTY_SHARE + PLAIN_SHARE:
         return text
+    if view.endswith("side") and rng.random() < UNNAMED_SIDE_SHARE:
+        view = "side"
     if share < EMPTY_SHARE + PLAIN_SHARE + PREFIX_SHARE:
         return f"{'backside' if view == 'back' else view} view of {text}"
     return f"{text}, {view} view"
