@@ -51,7 +51,7 @@ def of_truth(prompt: Prompt, models: str) -> dict[str, float]:
 def of_samples(prompt: str, scale: float, seed: int, models: str) -> dict[str, float]:
     """Score what the 2D model draws for the directions of the judge's views."""
     pictures = samples(models, prompt, recognition.views(), guidance_scale=scale, seed=seed)
-    return scores(models).of_samples(pictures, prompt)
+    return scores(models).of_pictures(pictures, prompt)
 
 
 def haze(cloud: Gaussians) -> dict[str, float]:

@@ -42,25 +42,15 @@ class Scores:
             found |= metric.score(asset)
         return found
 
-    def of_samples(self, pictures: Float[Tensor, "V 3 s s"], prompt: str) -> dict[str, Any]:
-        """Score samples of the 2D model for the directions of the judge's views.
-
-        "Side view" doesn't say which side, so the multi-face rate takes either for right.
-        """
-        return self.of_pictures(pictures, prompt, sides_alike=True)
-
-    def of_pictures(
-        self, pictures: Float[Tensor, "V 3 s s"], prompt: str, *, sides_alike: bool = False
-    ) -> dict[str, Any]:
+    def of_pictures(self, pictures: Float[Tensor, "V 3 s s"], prompt: str) -> dict[str, Any]:
         """Score pictures from the judge's views; empty if the prompt names no object."""
         wanted = attributes_in(prompt)
         if wanted is None:
             return {}
         found = recognition.probabilities(self.judge, pictures)
         right = recognition.recognized(found, wanted)
-        seen = either_side(found) if sides_alike else found
         numbers = {name: float(right[name]) for name in ATTRIBUTES}
-        return numbers | {"multi_face": recognition.multi_face(seen, wanted)}
+        return numbers | {"multi_face": recognition.multi_face(found, wanted)}
 
 
 def result_of(run: Path, prompt: str) -> Asset:
@@ -86,14 +76,3 @@ def drawn(cloud: PointCloud) -> Gaussians:
         init_opacity=OPAQUE,
     )
     return gaussians_on_points(cloud, options)
-
-
-def either_side(found: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Take views from the left and from the right for the same: in the rows of one, give it the
-    other's probability.
-    """
-    quadrant = found["quadrant"].clone()
-    for rows, own, other in ((slice(2, 4), 1, 3), (slice(6, 8), 3, 1)):
-        quadrant[rows, own] += quadrant[rows, other]
-        quadrant[rows, other] = 0
-    return found | {"quadrant": quadrant}

@@ -216,7 +216,7 @@ def stages_of(prompt: str, place: Path, models: str, scores: Scores) -> Stages:
     pictures = {name: shown(asset) for name, asset in assets.items()}
     found = {name: scores.of_asset(asset) for name, asset in assets.items()}
     own = samples(models, prompt, recognition.views(), guidance_scale=GUIDANCE)
-    found["2D model"] = scores.of_samples(own, prompt)
+    found["2D model"] = scores.of_pictures(own, prompt)
     pictures["2D model"] = own[SHOWN]
     return Stages(pictures, found)
 
