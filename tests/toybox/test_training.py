@@ -19,6 +19,7 @@ from threestudio_gaussiandreamer.toybox import (
     train,
     unet_stage,
     views,
+    words,
 )
 from threestudio_gaussiandreamer.toybox.classifiers import IGNORED
 from threestudio_gaussiandreamer.toybox.text_stage import told_labels
@@ -79,7 +80,7 @@ def test_a_sheet_is_drawn(folder, name, monkeypatch):
     assert picture.dtype == np.uint8 and picture.shape[2] == 3 and picture.std() > 0
 
 
-@pytest.mark.parametrize("name", ["text", "clip", "judge", "autoencoder"])
+@pytest.mark.parametrize("name", ["text", "clip", "judge", "autoencoder", "unet"])
 def test_a_stage_is_measured_on_withheld_objects(folder, name):
     stage = STAGES[name](options(folder))
     numbers = stage.evaluate(stage.model.eval())
@@ -238,6 +239,17 @@ def test_the_unet_starts_from_the_one_of_small_pictures(folder, tmp_path):
     weights = training(place, "unet").model.state_dict()
     for name, value in loop.averaged_weights(place, "unet-small").items():
         assert torch.equal(weights[name], value), name
+
+
+def test_the_unet_is_measured_with_the_prompts_of_opposite_views(folder):
+    stage = STAGES["unet"](options(folder))
+    (_, own), (_, opposite) = stage.held_out
+    assert all(torch.equal(a, b) for a, b in zip(own[:3], opposite[:3], strict=True))
+    texts = [stage.tokenizer.batch_decode(b.ids, skip_special_tokens=True) for b in (own, opposite)]
+    for text, other in zip(*texts, strict=True):
+        direction = next(name for name in words.OPPOSITE if f"{name} view" in text)
+        assert other == text.replace(f"{direction} view", f"{words.OPPOSITE[direction]} view")
+    assert not torch.equal(own.ids, opposite.ids)
 
 
 def test_only_named_parameters_are_trained(folder, tmp_path):

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from ..core.files import atomic_file
 from ..core.streams import generator, numpy_generator
 from ..diffusion import sds
-from . import models
+from . import models, words
 from .batches import StepData, normal, torch_generator
 from .loop import Stage, averaged_weights, is_trained
 from .module_digest import digest
@@ -31,6 +31,7 @@ distillation produced haze around the object.
 SNR_GAMMA = 5.0
 LATENT_SCALE = "latent_scale"
 TIMESTEPS = models.SCHEDULE["num_train_timesteps"]
+HELD_OUT, HELD_OUT_TIMESTEP = 256, 800
 SAMPLES, SAMPLE_STEPS, SAMPLE_GUIDANCE = 24, 25, 3.0
 
 
@@ -119,19 +120,47 @@ class UNetStage(Stage):
         return UNetData(self.shards, self.batch, self.options.pool, self.tokenizer, moments)
 
     def loss(self, model: nn.Module, batch: UNetBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        abar, noise, x = self.alphas_cumprod[batch.t], batch.noise, batch.latents * self.scale
-        z = sds.add_noise(x, noise, abar)
-        v = sds.per_item(abar.sqrt(), x) * noise - sds.per_item((1 - abar).sqrt(), x) * x
-        with torch.no_grad():
-            tokens = self.text_model(batch.ids).last_hidden_state
-        predicted = model(z, batch.t, encoder_hidden_states=tokens).sample
-        errors = (predicted.float() - v).square().mean(dim=(1, 2, 3))
+        abar, errors = self.alphas_cumprod[batch.t], self._errors(model, batch)
         high = abar < 0.1
         metrics = {
             "mse": errors.mean(),
             "mse_high_noise": errors[high].sum() / high.sum().clamp(min=1),
         }
         return (truncated_weight(abar).to(errors) * errors).mean(), metrics
+
+    def _errors(self, model: nn.Module, batch: UNetBatch) -> Float[Tensor, " B"]:
+        """Return the squared errors of v."""
+        abar, noise, x = self.alphas_cumprod[batch.t], batch.noise, batch.latents * self.scale
+        z = sds.add_noise(x, noise, abar)
+        v = sds.per_item(abar.sqrt(), x) * noise - sds.per_item((1 - abar).sqrt(), x) * x
+        with torch.no_grad():
+            tokens = self.text_model(batch.ids).last_hidden_state
+        predicted = model(z, batch.t, encoder_hidden_states=tokens).sample
+        return (predicted.float() - v).square().mean(dim=(1, 2, 3))
+
+    @torch.no_grad()
+    def evaluate(self, model: nn.Module) -> dict[str, float]:
+        """Return the errors of v at a timestep where prompts decide the view, with prompts of the
+        pictures' own directions, and of the opposite ones.
+        """
+        return {name: float(self._errors(model, batch).mean()) for name, batch in self.held_out}
+
+    @functools.cached_property
+    def held_out(self) -> list[tuple[str, UNetBatch]]:
+        """Return pictures of withheld objects, which no training saw, with either prompts."""
+        shard = held_out_shard(self.options.shards_folder(), self.options.seed)
+        rows = np.flatnonzero(shard.elevation < words.OVERHEAD)[:HELD_OUT]
+        rng = numpy_generator(self.options.seed, "unet-held-out")
+        images = with_backgrounds(shard.rgba[rows], rng, random_share=0).to(self.device)
+        latents = self.vae.encode(self._shrunk(images) * 2 - 1).latent_dist.mean
+        noise = torch.randn(latents.shape, generator=generator(self.options.seed, "unet-held-out"))
+        t = torch.full((len(rows),), HELD_OUT_TIMESTEP, device=self.device)
+        found = []
+        for name, opposite in (("mse_at_800", False), ("mse_at_800_opposite_view", True)):
+            rng = numpy_generator(self.options.seed, "unet-held-out-prompts")
+            ids = token_ids(self.tokenizer, view_prompts(shard, rows, rng, opposite=opposite))
+            found.append((name, UNetBatch(latents, noise.to(latents), t, ids.to(self.device))))
+        return found
 
     @torch.no_grad()
     def tokens(self, texts: list[str]) -> Float[Tensor, "B 32 W"]:

@@ -76,6 +76,13 @@ OPENINGS = (
 )
 """Templates for the object's description; "a {}" is drawn most often."""
 DIRECTIONS = ("left side", "right side", "front", "back", "overhead")
+OPPOSITE = {
+    "front": "back",
+    "back": "front",
+    "left side": "right side",
+    "right side": "left side",
+    "overhead": "overhead",
+}
 FRONT_HALF = BACK_HALF = 45.0
 OVERHEAD = 60.0
 """Thresholds of the prompt processors, degrees."""
