@@ -256,7 +256,10 @@ def unique(items: Iterator[Task]) -> list[Task]:
 
 def missing(arguments: argparse.Namespace) -> list[Task]:
     """Return the tasks whose rows aren't in the CSV; with ``--only-score`` those without a run."""
-    done = {tuple(row[name] for name in KEY) for row in rows_of(CHART, arguments.out)}
+    rows = rows_of(CHART, arguments.out)
+    if rows and list(rows[0]) != COLUMNS:
+        sys.exit(f"{arguments.out / CHART}.csv has other columns: give another folder as --out")
+    done = {tuple(row[name] for name in KEY) for row in rows}
     todo = [task for task in unique(tasks(arguments)) if task.key not in done]
     return [task for task in todo if not arguments.only_score or needs_no_run(task)]
 

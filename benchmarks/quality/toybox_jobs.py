@@ -77,7 +77,7 @@ def setup(models: str = NAME) -> str:
     Args:
         models: "toybox", or the folder of an export.
     """
-    folder = FOLDER if models == NAME else Path(models)
+    folder = FOLDER if models == NAME else Path(models).expanduser()
     digests = read_digests(folder) or {models: ""}
     networks = sorted(item for item in digests.items() if item[0] not in (JUDGE, RECORD))
     return hashlib.blake2b(repr((CONFIG, networks)).encode(), digest_size=4).hexdigest()

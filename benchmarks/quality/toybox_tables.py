@@ -32,7 +32,7 @@ from threestudio_gaussiandreamer.models.bundled import FOLDER, RECORD
 from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
 
 TITLES = {"colors": "colours", "multi_face": "multi-face"}
-NOT_MEASURED = "*Not measured yet: it needs trained models.*"
+NOT_MEASURED = "*Not measured yet with the present models and configuration.*"
 Row = dict[str, str]
 
 

@@ -57,7 +57,8 @@ def pairs_of(rows: Sequence[Row], name: str, x: str) -> tuple[list[Row], list[Ro
     plain = {place(row): row for row in rows if row["variant"] == toybox_jobs.DEFAULT}
     own = [row for row in rows if (row["variant"], row["x"]) == (name, x)]
     own = [row for row in own if place(row) in plain]
-    own = [row for row in own if is_present(row)] or own
+    last = own[-1]["setup"] if own else ""
+    own = [row for row in own if is_present(row)] or [row for row in own if row["setup"] == last]
     return own, [plain[place(row)] for row in own]
 
 

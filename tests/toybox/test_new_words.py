@@ -1,6 +1,7 @@
 """Trainings that continue from weights whose vocabulary lacks words of the toybox."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -8,7 +9,10 @@ import torch
 from transformers import CLIPModel, CLIPTokenizer
 
 from tests.toybox.helpers import options
+from threestudio_gaussiandreamer.core.checkpoint_file import load_file
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.toybox import new_words, warm_start, words
+from threestudio_gaussiandreamer.toybox.loop import checkpoint_path
 from threestudio_gaussiandreamer.toybox.text_batches import open_tokenizer, token_ids
 from threestudio_gaussiandreamer.toybox.text_stage import frozen_text
 from threestudio_gaussiandreamer.toybox.train import STAGES
@@ -20,10 +24,15 @@ TEXTS = ["a red fox with a green scarf, front view", "", "a mug"]
 @pytest.fixture
 def grown(exported, tmp_path, monkeypatch):
     """A training that started from weights without two of the words."""
-    vocabulary = words.vocabulary()
-    monkeypatch.setattr(words, "vocabulary", lambda: sorted([*vocabulary, "wombat", "aardvark"]))
-    warm_start.start_from(exported, options(tmp_path), {name: STAGES[name] for name in CHANGED})
-    return tmp_path
+    monkeypatch.setattr(new_words, "SEPARATION_STEPS", 5)
+    monkeypatch.setitem(words.NOUNS, "fox", ("fox", "wombat", "aardvark"))
+    weights, folder = tmp_path / "weights", tmp_path / "training"
+    shutil.copytree(exported, weights)
+    record = json.loads((weights / "training.json").read_text())
+    record["text"]["withheld"] = {"kind": 0.9, "quadrant": 0.8}
+    (weights / "training.json").write_text(json.dumps(record))
+    warm_start.start_from(weights, options(folder), {name: STAGES[name] for name in CHANGED})
+    return folder
 
 
 CHANGED = ("text", "clip")
@@ -35,6 +44,14 @@ def test_new_words_are_tokens(grown):
     ids = token_ids(tokenizer, ["a wombat", "an aardvark"])
     wombat, aardvark = frozen_text(grown, len(tokenizer)).text_model(ids).pooler_output
     assert not torch.allclose(wombat, aardvark, atol=1e-3)
+    record = load_file(checkpoint_path(grown, "text"))
+    assert record["measured"] == {"kind": 0.9}  # what new words can't change
+
+
+def test_a_tokenizer_without_the_words_is_refused(trained, monkeypatch):
+    monkeypatch.setitem(words.NOUNS, "fox", ("fox", "wombat"))
+    with pytest.raises(UserError, match="doesn't know wombat: export the training"):
+        open_tokenizer(trained)
 
 
 def test_texts_of_known_words_are_encoded_as_before(grown, exported):

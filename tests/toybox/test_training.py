@@ -19,10 +19,9 @@ from threestudio_gaussiandreamer.toybox import (
     train,
     unet_stage,
     views,
-    words,
 )
 from threestudio_gaussiandreamer.toybox.classifiers import IGNORED
-from threestudio_gaussiandreamer.toybox.text_stage import told_labels
+from threestudio_gaussiandreamer.toybox.text_stage import NAMED_QUADRANT, told_labels
 from threestudio_gaussiandreamer.toybox.train import STAGES, main, render_shards
 
 pytestmark = pytest.mark.usefixtures("small_world")
@@ -241,30 +240,6 @@ def test_the_unet_starts_from_the_one_of_small_pictures(folder, tmp_path):
         assert torch.equal(weights[name], value), name
 
 
-def test_the_unet_is_measured_with_the_prompts_of_opposite_views(folder):
-    stage = STAGES["unet"](options(folder))
-    (_, own), (_, opposite) = stage.held_out
-    assert all(torch.equal(a, b) for a, b in zip(own[:3], opposite[:3], strict=True))
-    texts = [stage.tokenizer.batch_decode(b.ids, skip_special_tokens=True) for b in (own, opposite)]
-    for text, other in zip(*texts, strict=True):
-        direction = next(name for name in words.OPPOSITE if f"{name} view" in text)
-        assert other == text.replace(f"{direction} view", f"{words.OPPOSITE[direction]} view")
-    assert not torch.equal(own.ids, opposite.ids)
-
-
-def test_only_named_parameters_are_trained(folder, tmp_path):
-    place = copied(folder, tmp_path / "run")
-    training(place, "unet").run(4)
-    before = loop.averaged_weights(place, "unet")
-    run = training(place, "unet", only="attentions")
-    run.run(run.progress.images + 4)
-    after = loop.averaged_weights(place, "unet")
-    changed = {key for key in before if not torch.equal(before[key], after[key])}
-    assert changed and all("attentions" in key for key in changed)
-    with pytest.raises(UserError, match="--only 'attention_layers'.*down_blocks"):
-        training(place, "unet", only="attention_layers")
-
-
 def test_curves_are_written(folder):
     rows = (folder / "clip.csv").read_text().splitlines()
     assert rows[0].startswith("images,seconds,loss") and len(rows) == 3
@@ -314,8 +289,13 @@ def test_workers_render_the_same_shards_as_a_training(tmp_path):
 def test_worker_processes_make_the_same_batches(folder, name):
     here, there = (STAGES[name](options(folder, workers=workers)) for workers in (0, 1))
     pairs = zip(here.batches(3), there.batches(3), strict=True)
-    for one, other in itertools.islice(pairs, 3):
-        assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # as in the worker processes; sums are rounded otherwise
+    try:
+        for one, other in itertools.islice(pairs, 3):
+            assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+    finally:
+        torch.set_num_threads(threads)
 
 
 # Formulas -----------------------------------------------------------------------------------
@@ -371,6 +351,22 @@ def test_a_quarter_of_the_judges_pictures_stays_clean(count, clean):
     found = judge_stage.degraded(images, np.random.default_rng(0))
     assert found.shape == images.shape and torch.equal(found[:clean], images[:clean])
     assert all(not torch.equal(a, b) for a, b in zip(found[clean:], images[clean:], strict=True))
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("a fox, left side view", True),
+        ("right side view of a fox", True),
+        ("backside view of a fox", True),
+        ("a fox, front view", True),
+        ("a fox, side view", False),
+        ("a fox, overhead view", False),
+        ("a fox", False),
+    ],
+)
+def test_prompts_that_name_a_quadrant(text, named):
+    assert bool(NAMED_QUADRANT.search(text)) == named
 
 
 def test_only_directions_that_prompts_tell_are_labels():

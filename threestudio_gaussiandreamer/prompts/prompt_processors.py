@@ -14,7 +14,7 @@ prompt_file                    a UTF-8 file whose content is the prompt; overrid
 prompt_library                 a JSON list of texts, or an object of such lists (threestudio's
                                load/prompt_library.json)
 prompt_front, _side, _back,    the whole prompt of a direction, in place of "<prompt>, front view"
-_overhead
+_overhead                      (``prompt_side`` is that of both sides)
 view_dependent_left_and_right  write "left side view" and "right side view" in place of "side
                                view", for models that know the words; not in threestudio
 view_dependent_prompt_front    write "front view of <prompt>" in place of "<prompt>, front view"
@@ -129,7 +129,8 @@ class TextEncoderPromptProcessor(BaseObject):
             half=half,
             revision=self.cfg.revision,
         )
-        warn_of_unknown_words(folder, self.prompt)
+        sides = ", left right" if self.cfg.view_dependent_left_and_right else ""
+        warn_of_unknown_words(folder, self.prompt + sides)
         self._output = self._encoded(folder)
 
     def _encoded(self, folder: Path) -> PromptEmbeddings:
@@ -141,7 +142,7 @@ class TextEncoderPromptProcessor(BaseObject):
             prefix=cfg.view_dependent_prompt_front,
             left_and_right=cfg.view_dependent_left_and_right,
         )
-        prompts_vd = [  # prompt_side is that of both sides
+        prompts_vd = [
             cfg.get(f"prompt_{direction.name.split()[-1]}") or direction.prompt(self.prompt)
             for direction in directions
         ]

@@ -1,10 +1,10 @@
 """Text embeddings per view, the output of prompt processors with a text encoder. The interface is
 threestudio's.
 
-The direction of a view (side, front, back or overhead) selects the prompt, such as "a fox, front
-view". With Perp-Neg (Armandpour et al. 2023) a view between two directions gets their interpolated
-embedding, and the other directions as negative prompts whose weights decay with the angle. Angles
-are in degrees; azimuth 0 is the front."""
+The direction of a view (side, or left and right side; front, back, overhead) selects the prompt,
+such as "a fox, front view". With Perp-Neg (Armandpour et al. 2023) a view between two directions
+gets their interpolated embedding, and the other directions as negative prompts whose weights decay
+with the angle. Angles are in degrees; azimuth 0 is the front."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -42,15 +42,15 @@ def view_directions(
     prefix: bool = False,
     left_and_right: bool = False,
 ) -> List[Direction]:
-    """Return threestudio's four directions in its order: side, front, back, overhead.
+    """Return threestudio's directions in its order: side, front, back, overhead.
 
     Args:
         front_threshold, back_threshold: half the width of the front and the back, degrees of
             azimuth.
         overhead_threshold: elevation above which a view is overhead, degrees.
         prefix: write "front view of a fox" instead of "a fox, front view".
-        left_and_right: distinguish "left side", azimuths above 0, and "right side" in place of
-            "side".
+        left_and_right: "left side", the object's own (azimuths in [0, 180)), and "right side" in
+            place of "side".
     """
     conditions: Dict[str, Condition] = {
         **(LEFT_AND_RIGHT if left_and_right else SIDE),
@@ -197,8 +197,8 @@ class PromptEmbeddings:
 
     def _side_rows(self, azimuth: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
         """Return the row of each view's side: left, right, or the only one."""
-        both = self.direction2idx.get("side", 0)
-        left, right = (self.direction2idx.get(f"{name} side", both) for name in ("left", "right"))
+        names = ("left side", "right side") if "left side" in self.direction2idx else ("side",) * 2
+        left, right = (self.direction2idx[name] for name in names)
         return torch.where(shifted(azimuth) >= 0, left, right)
 
     def _interpolation(

@@ -290,10 +290,10 @@ class Training:
                 parameter.copy_(averages[name])
                 parameter.requires_grad_(False)
         if not any(parameter.requires_grad for parameter in self.model.parameters()):
-            groups = sorted({name.rpartition(".")[0] for name in averages})
+            groups = sorted({name.partition(".")[0] for name in averages})
             raise UserError(
-                f"--only {only!r}: the network {self.stage.name!r} has no free parameter of that "
-                f"name; it has {', '.join(groups[:8])}, ..."
+                f"--only {only!r}: {self.stage.name!r} has no such parameters to train; the parts "
+                f"of the network are {', '.join(groups)}"
             )
 
     def _log(self, means: dict[str, float]) -> None:

@@ -16,8 +16,8 @@ from tqdm import tqdm
 from ..core.files import existing_file
 from ..core.streams import numpy_generator
 from . import words
-from .text_batches import token_ids
-from .tokenizer import write_tokenizer
+from .text_batches import token_ids, unknown_words
+from .tokenizer import WORDS, write_tokenizer
 from .views import random_angles
 from .world import draw_attributes
 
@@ -38,11 +38,10 @@ def grow_tokenizer(weights: Path, folder: Path) -> list[str]:
     Returns:
         The words of the toybox that the weights don't know, sorted.
     """
-    text = existing_file(weights / "words.txt", "list of words").read_text(encoding="utf-8")
-    known = text.split()
-    new = sorted(set(words.vocabulary()) - set(known))
+    new = unknown_words(weights)
     if not folder.exists():
         if new:
+            known = (weights / WORDS).read_text(encoding="utf-8").split()
             write_tokenizer(folder, sorted([*known, *new]))
         else:
             shutil.copytree(weights.parent / "stable-diffusion" / "tokenizer", folder)
@@ -61,7 +60,7 @@ def grow_embeddings(
     """
     path = existing_file(weights / "vocab.json", "vocabulary")
     old, new = json.loads(path.read_text(encoding="utf-8")), tokenizer.get_vocab()
-    trained, fresh = state[EMBEDDINGS], model.state_dict()[EMBEDDINGS]
+    trained, fresh = state[EMBEDDINGS], model.state_dict()[EMBEDDINGS].cpu()
     if trained.shape[1] != fresh.shape[1]:
         return  # weights of another model, which are refused when they are loaded
     rows = fresh * (_length(trained) / fresh.norm(dim=1, keepdim=True))
@@ -80,8 +79,9 @@ def separate(model: nn.Module, tokenizer: Any, new_words: Sequence[str], seed: i
     Args:
         model: has the text encoder as ``text_model``; changed in place.
     """
-    ids = torch.tensor(tokenizer.convert_tokens_to_ids([f"{word}</w>" for word in new_words]))
     embeddings = model["text_model"].embeddings.token_embedding.weight
+    tokens = tokenizer.convert_tokens_to_ids([f"{word}</w>" for word in new_words])
+    ids = torch.tensor(tokens, device=embeddings.device)
     table = embeddings.detach().clone()
     longest, rows = LENGTHENED * _length(table), table[ids].requires_grad_(True)
     optimizer = torch.optim.Adam([rows], lr=SEPARATION_RATE)
@@ -91,7 +91,7 @@ def separate(model: nn.Module, tokenizer: Any, new_words: Sequence[str], seed: i
             continue
         weights = {"embeddings.token_embedding.weight": table.index_copy(0, ids, rows)}
         first, second = (
-            functional_call(model["text_model"], weights, (token_ids(tokenizer, texts),))
+            functional_call(model["text_model"], weights, (token_ids(tokenizer, texts).to(ids),))
             for texts in zip(*pairs, strict=True)
         )
         apart = (first.last_hidden_state - second.last_hidden_state).flatten(1).norm(dim=1)

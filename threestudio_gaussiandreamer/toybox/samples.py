@@ -21,7 +21,7 @@ GUIDANCE = "gaussiandreamer-stable-diffusion-guidance"
 def samples(
     model: str, prompt: str, orbit: Orbit, *, guidance_scale: float, seed: int = 0
 ) -> Float[Tensor, "V 3 s s"]:
-    """Draw a picture in [0, 1] for the direction of each view by DDIM.
+    """Draw a picture in [0, 1] for the direction of each view by DDIM; prompts name left and right.
 
     Args:
         model: ``toybox``, a folder or a hub id.

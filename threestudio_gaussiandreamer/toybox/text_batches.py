@@ -9,19 +9,37 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from ..core.errors import UserError
+from ..core.files import existing_file
 from . import words
-from .tokenizer import LENGTH, write_tokenizer
+from .tokenizer import LENGTH, WORDS, write_tokenizer
 from .views import Shard, attributes_of
 
 
 def open_tokenizer(folder: Path) -> Any:
-    """Load the training's tokenizer, which is written on first use."""
+    """Load the training's tokenizer, which is written on first use.
+
+    Raises:
+        UserError: it is of an earlier version of the toybox, and lacks words.
+    """
     from transformers import CLIPTokenizer
 
     place = Path(folder) / "tokenizer"
     if not (place / "tokenizer_config.json").exists():
         write_tokenizer(place, words.vocabulary())
+    if missing := unknown_words(place):
+        raise UserError(
+            f"the tokenizer {str(place)!r} doesn't know {', '.join(missing)}: export the training "
+            "(python -m threestudio_gaussiandreamer.toybox.export), and continue it in another "
+            "folder with --from-weights"
+        )
     return CLIPTokenizer.from_pretrained(str(place))
+
+
+def unknown_words(tokenizer: Path) -> list[str]:
+    """Return the words of the toybox that the tokenizer in a folder doesn't know, sorted."""
+    file = existing_file(tokenizer / WORDS, "list of words")
+    return sorted(set(words.vocabulary()) - set(file.read_text(encoding="utf-8").split()))
 
 
 def token_ids(tokenizer: Any, texts: Sequence[str]) -> Int[Tensor, "B 32"]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from ..prompts.known_words import WORDS_FILE
 
 START, END = "<|startoftext|>", "<|endoftext|>"
+WORDS = Path(WORDS_FILE).name
 LENGTH = 32
 """Tokens of a prompt, start and end included; longer ones are cut."""
 
@@ -31,7 +32,7 @@ def write_tokenizer(folder: Path, words: Sequence[str]) -> None:
     _write_json(folder / "vocab.json", {token: index for index, token in enumerate(tokens)})
     lines = ["#version: 0.2", *(" ".join(pair) for pair in merges)]
     (folder / "merges.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    (folder / Path(WORDS_FILE).name).write_text("\n".join(words) + "\n", encoding="utf-8")
+    (folder / WORDS).write_text("\n".join(words) + "\n", encoding="utf-8")
     special = {"bos_token": START, "eos_token": END, "unk_token": END, "pad_token": END}
     _write_json(folder / "special_tokens_map.json", special)
     settings = {

@@ -101,6 +101,8 @@ def options_of(args: argparse.Namespace) -> Options:
     for name in args.stages:
         if name not in STAGES:
             raise unknown("stage", name, STAGES)
+    if args.only and len(args.stages) != 1:
+        raise UserError(f"--only {args.only}: give the stage that it is for as --stages, e.g. unet")
     for name in ("images", "threads", "batch", "pool"):
         value = getattr(args, name)
         if value is not None and value < 1:

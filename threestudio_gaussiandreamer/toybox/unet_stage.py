@@ -74,7 +74,8 @@ def kept_moments(path: Path) -> Float[Tensor, "2 N 4 s s"]:
 
 
 class UNetStage(Stage):
-    """Train v-prediction with truncated SNR + 1 weights (Salimans and Ho 2022).
+    """Train v-prediction with the weights SNR + 1 of Salimans and Ho (2022), where the SNR is
+    truncated as in Hang et al. (2023).
 
     One prompt in ten is empty, for classifier-free guidance.
     """
@@ -147,7 +148,7 @@ class UNetStage(Stage):
 
     @functools.cached_property
     def held_out(self) -> list[tuple[str, UNetBatch]]:
-        """Return pictures of withheld objects, which no training saw, with either prompts."""
+        """Return pictures of withheld objects with prompts of their own and of opposite views."""
         shard = held_out_shard(self.options.shards_folder(), self.options.seed)
         rows = np.flatnonzero(shard.elevation < words.OVERHEAD)[:HELD_OUT]
         rng = numpy_generator(self.options.seed, "unet-held-out")
@@ -249,8 +250,9 @@ class SmallUNetStage(UNetStage):
 def truncated_weight(abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
     """Return the weight of v's squared error, (min(SNR, gamma) + 1) / (SNR + 1).
 
-    That of the picture's error is min(SNR, gamma) + 1: truncated as Hang et al. 2023 do, but not
-    falling to 0 with the SNR, since the words for left and right count where noise hides both.
+    That of the picture's error is min(SNR, gamma) + 1. It doesn't fall to 0 with the SNR as
+    min(SNR, gamma) does, so that high noise levels keep their weight: only there does the prompt
+    decide between left and right.
     """
     snr = abar / (1 - abar)
     return (snr.clamp(max=SNR_GAMMA) + 1) / (snr + 1)

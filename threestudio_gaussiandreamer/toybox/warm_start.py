@@ -1,5 +1,6 @@
 """Continue a training from published weights: the inverse of ``export.py``."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,9 @@ from .text_stage import TEXT_PARTS
 from .unet_stage import LATENT_SCALE
 
 CLIP_TEXT = tuple(f"clip.{name}." for name in TEXT_PARTS)
+
+OF_DIRECTIONS = ("quadrant", "text_finds_object")
+"""Measurements that depend on the words for directions, which new words may change."""
 
 
 def start_from(weights: Path, options: Options, stages: dict[str, type[Stage]]) -> None:
@@ -33,6 +37,7 @@ def start_from(weights: Path, options: Options, stages: dict[str, type[Stage]]) 
     """
     path = existing_file(weights / "training.json", "record of the toybox's weights")
     record = json.loads(path.read_text(encoding="utf-8"))
+    options = dataclasses.replace(options, only="")  # which may be of one stage alone
     new_words = grow_tokenizer(weights / "clip", options.folder / "tokenizer")
     for name, stage in stages.items():
         if name in record and not is_trained(options.folder, name):
@@ -52,7 +57,12 @@ def start_from(weights: Path, options: Options, stages: dict[str, type[Stage]]) 
             seen = record[name]
             last = [seen["last"]] if seen["last"] else []
             training.progress = Progress(seen["steps"], seen["images"], history=last)
-            training.earlier, training.measured = seen["trainings"], seen["withheld"]
+            training.earlier = seen["trainings"]
+            training.measured = {
+                key: value
+                for key, value in seen["withheld"].items()
+                if not (new_words and key in OF_DIRECTIONS)
+            }
             training.save()
 
 
