@@ -2,8 +2,8 @@
 seeds: the paired tables of docs/toybox.md and docs/distillation.md, from docs/charts/toybox.csv.
 
 ``recognised`` is the share of the attributes that a prompt asks for (kind, colours, pattern,
-accessory) that the judge finds in the result. A dagger marks variants that were only measured with
-earlier models or an earlier toybox.yaml, on both sides of the comparison.
+accessory) that the judge finds in the result. A dagger marks comparisons of which both sides were
+measured with earlier models or an earlier toybox.yaml.
 """
 
 import math
@@ -45,21 +45,21 @@ def table(*charts: str) -> str:
     """Return a line for each variant of these charts that has been measured."""
     rows = measured()
     keys = dict.fromkeys(one.key for chart in charts for one in toybox_jobs.CHARTS[chart]())
-    pairs = (pairs_of(rows, *key) for key in keys)
-    lines = [line_of(own, plain) for own, plain in pairs if own]
+    pairs = [pair for key in keys for pair in pairs_of(rows, *key)]
+    lines = [line_of(own, plain) for own, plain in pairs]
     return markdown(HEAD, lines) if lines else NOT_MEASURED
 
 
-def pairs_of(rows: Sequence[Row], name: str, x: str) -> tuple[list[Row], list[Row]]:
-    """Return the rows of a variant, and those of toybox.yaml with the same prompts, seeds, models
-    and configuration: the present ones, or those before if nothing was measured with them.
+def pairs_of(rows: Sequence[Row], name: str, x: str) -> list[tuple[list[Row], list[Row]]]:
+    """Return the rows of a variant, and those of toybox.yaml with the same prompts and seeds: one
+    pair for each state of models and configuration with which both were measured.
     """
     plain = {place(row): row for row in rows if row["variant"] == toybox_jobs.DEFAULT}
-    own = [row for row in rows if (row["variant"], row["x"]) == (name, x)]
-    own = [row for row in own if place(row) in plain]
-    last = own[-1]["setup"] if own else ""
-    own = [row for row in own if is_present(row)] or [row for row in own if row["setup"] == last]
-    return own, [plain[place(row)] for row in own]
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        if (row["variant"], row["x"]) == (name, x) and place(row) in plain:
+            groups.setdefault(row["setup"], []).append(row)
+    return [(own, [plain[place(row)] for row in own]) for own in groups.values()]
 
 
 def place(row: Row) -> tuple[str, str, str]:
