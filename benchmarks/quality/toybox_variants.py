@@ -36,17 +36,28 @@ def distillations() -> str:
 
 
 def settings() -> str:
-    """Return the table of all other settings."""
+    """Return the table of the models before the present ones, and of all other settings."""
     others = (*DISTILLATIONS, "references", "default")
-    return table(*(name for name in toybox_jobs.CHARTS if name not in others))
+    charts = (name for name in toybox_jobs.CHARTS if name not in others)
+    return table(*charts, first=earlier_models(measured()))
 
 
-def table(*charts: str) -> str:
-    """Return a line for each variant of these charts that has been measured."""
+def earlier_models(rows: Sequence[Row]) -> list[tuple[str, ...]]:
+    """Compare toybox.yaml with the last models or configuration before the present ones."""
+    rows = [row for row in rows if row["variant"] == toybox_jobs.DEFAULT]
+    present = {place(row)[:2]: row for row in rows if is_present(row)}
+    own = [row for row in rows if not is_present(row) and place(row)[:2] in present]
+    own = [row for row in own if row["setup"] == own[-1]["setup"]]
+    plain = [present[place(row)[:2]] for row in own]
+    return [line_of("earlier models", own, plain)] if own else []
+
+
+def table(*charts: str, first: Sequence[tuple[str, ...]] = ()) -> str:
+    """Return the lines ``first``, and one for each variant of these charts that was measured."""
     rows = measured()
     keys = dict.fromkeys(one.key for chart in charts for one in toybox_jobs.CHARTS[chart]())
     pairs = [pair for key in keys for pair in pairs_of(rows, *key)]
-    lines = [line_of(own, plain) for own, plain in pairs]
+    lines = [*first, *(line_of(marked_title(own[0]), own, plain) for own, plain in pairs)]
     return markdown(HEAD, lines) if lines else NOT_MEASURED
 
 
@@ -70,11 +81,15 @@ def is_present(row: Row) -> bool:
     return row["setup"] == toybox_jobs.setup()
 
 
-def line_of(own: list[Row], plain: list[Row]) -> tuple[str, ...]:
+def marked_title(row: Row) -> str:
+    return title_of(row) + ("" if is_present(row) else " †")
+
+
+def line_of(title: str, own: list[Row], plain: list[Row]) -> tuple[str, ...]:
     recognised = [values_of(rows, recognised_share) for rows in (own, plain)]
     faces = [values_of(rows, multi_face) for rows in (own, plain)]
     return (
-        title_of(own[0]) + ("" if is_present(own[0]) else " †"),
+        title,
         str(len({row["prompt"] for row in own})),
         mean(recognised[0]), difference(*recognised),
         mean(faces[0]), difference(*faces),
