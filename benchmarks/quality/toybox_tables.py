@@ -90,7 +90,12 @@ def measured() -> list[Row]:
 
 def present() -> list[Row]:
     """Return those of the bundled models and of toybox.yaml as they are."""
-    return [row for row in measured() if row["setup"] in ("", setup())]
+    return [row for row in measured() if is_present(row)]
+
+
+def is_present(row: Row) -> bool:
+    """Return whether a row is of the present models and toybox.yaml, or depends on neither."""
+    return row["setup"] in ("", setup())
 
 
 def variants(rows: Iterable[Row]) -> Iterator[tuple[str, list[Row]]]:

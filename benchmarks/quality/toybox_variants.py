@@ -18,6 +18,7 @@ from benchmarks.quality.toybox_tables import (
     NOT_MEASURED,
     Row,
     asks_for,
+    is_present,
     measured,
     median_of,
     title_of,
@@ -75,10 +76,6 @@ def pairs_of(rows: Sequence[Row], name: str, x: str) -> list[tuple[list[Row], li
 
 def place(row: Row) -> tuple[str, str, str]:
     return row["index"], row["seed"], row["setup"]
-
-
-def is_present(row: Row) -> bool:
-    return row["setup"] == toybox_jobs.setup()
 
 
 def marked_title(row: Row) -> str:

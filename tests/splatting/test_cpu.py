@@ -17,6 +17,7 @@ import torch
 from tests.helpers.splatting_contract import KernelContract
 from tests.helpers.splatting_draws import draw
 from tests.helpers.splatting_scenes import cameras, equal, random_cloud
+from tests.helpers.threads import torch_threads
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import rasterize
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
@@ -55,15 +56,12 @@ class TestCpuKernel(KernelContract):
 def test_the_number_of_threads_changes_no_bit(isa, views):
     """Also with more Gaussians than one task takes, or more threads than views; twice each."""
     cloud, camera = random_cloud(9000, seed=10, size=0.03), cameras(views, 150, 90)
-    background, threads, results = torch.tensor([0.2, 0.5, 0.9]), torch.get_num_threads(), []
-    try:
-        for count in (1, 2, 4, 1, 2, 4):
-            torch.set_num_threads(count)
+    background, results = torch.tensor([0.2, 0.5, 0.9]), []
+    for count in (1, 2, 4, 1, 2, 4):
+        with torch_threads(count):
             results.append(
                 draw("cpu", cloud, camera, 150, 90, background, camera_gradient=True, absgrad=True)
             )
-    finally:
-        torch.set_num_threads(threads)
     assert all(equal(results[0], other) for other in results[1:])
 
 

@@ -13,6 +13,7 @@ from tests.helpers.splatting_scenes import (
     run,
     scene_of,
 )
+from tests.helpers.threads import torch_threads
 from tests.splatting.torch_backend_cases import compare
 from threestudio_gaussiandreamer.splatting import rasterize, tiles, torch_backend
 from threestudio_gaussiandreamer.splatting.options import RasterizeOptions
@@ -123,13 +124,10 @@ def test_the_number_of_threads_changes_no_bit(width, height):
         random_cloud(3000, seed=10, size=0.05).to(torch.float32),
         cameras(2 if width > 8 else 1, width, height),
     )
-    threads, results = torch.get_num_threads(), []
-    try:
-        for count in (1, 2, 3):
-            torch.set_num_threads(count)
+    results = []
+    for count in (1, 2, 3):
+        with torch_threads(count):
             results.append(run(cloud, *camera, width, height, backend="torch"))
-    finally:
-        torch.set_num_threads(threads)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0].out, other.out, strict=True))
         assert all(torch.equal(grad, other.grads[name]) for name, grad in results[0].grads.items())

@@ -65,7 +65,8 @@ def test_texts_of_known_words_are_encoded_as_before(grown, exported):
 
 
 def test_a_known_vocabulary_is_kept(exported, tmp_path):
-    assert new_words.grow_tokenizer(exported / "clip", tmp_path / "tokenizer") == []
+    source = exported / "stable-diffusion" / "tokenizer"
+    assert new_words.grow_tokenizer(source, tmp_path / "tokenizer") == []
     kept, given = (
         json.loads((f / "vocab.json").read_text())
         for f in (tmp_path / "tokenizer", exported / "clip")

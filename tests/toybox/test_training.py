@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.helpers.threads import torch_threads
 from tests.toybox.helpers import copied, options, training
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -20,8 +21,6 @@ from threestudio_gaussiandreamer.toybox import (
     unet_stage,
     views,
 )
-from threestudio_gaussiandreamer.toybox.classifiers import IGNORED
-from threestudio_gaussiandreamer.toybox.text_stage import NAMED_QUADRANT, told_labels
 from threestudio_gaussiandreamer.toybox.train import STAGES, main, render_shards
 
 pytestmark = pytest.mark.usefixtures("small_world")
@@ -254,6 +253,9 @@ def test_curves_are_written(folder):
         (["--pool", "-3"], "--pool -3: expected at least 1"),
         (["--device", "cuda"], "sees no GPU"),
         (["--device", "cpuu"], "unknown device 'cpuu': did you mean 'cpu'"),
+        (["--only", "attentions"], "--stages, e.g. unet"),
+        (["--rate", "0"], "--rate 0.0: expected more than 0"),
+        (["--rate", "nan"], "--rate nan: expected more than 0"),
         (["--minutes", "0"], "--minutes 0.0: expected more than 0"),
         (["--minutes", "nan"], "--minutes nan: expected more than 0"),
         (["--workers", "-1"], "--workers -1: expected 0 or more"),
@@ -289,13 +291,9 @@ def test_workers_render_the_same_shards_as_a_training(tmp_path):
 def test_worker_processes_make_the_same_batches(folder, name):
     here, there = (STAGES[name](options(folder, workers=workers)) for workers in (0, 1))
     pairs = zip(here.batches(3), there.batches(3), strict=True)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # as in the worker processes; sums are rounded otherwise
-    try:
+    with torch_threads(1):  # as in the worker processes; sums are rounded otherwise
         for one, other in itertools.islice(pairs, 3):
             assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
-    finally:
-        torch.set_num_threads(threads)
 
 
 # Formulas -----------------------------------------------------------------------------------
@@ -351,32 +349,6 @@ def test_a_quarter_of_the_judges_pictures_stays_clean(count, clean):
     found = judge_stage.degraded(images, np.random.default_rng(0))
     assert found.shape == images.shape and torch.equal(found[:clean], images[:clean])
     assert all(not torch.equal(a, b) for a, b in zip(found[clean:], images[clean:], strict=True))
-
-
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ("a fox, left side view", True),
-        ("right side view of a fox", True),
-        ("backside view of a fox", True),
-        ("a fox, front view", True),
-        ("a fox, side view", False),
-        ("a fox, overhead view", False),
-        ("a fox", False),
-    ],
-)
-def test_prompts_that_name_a_quadrant(text, named):
-    assert bool(NAMED_QUADRANT.search(text)) == named
-
-
-def test_only_directions_that_prompts_tell_are_labels():
-    quadrants = torch.arange(8) % 4  # front, left, back, right
-    labels = quadrants[:, None].repeat(1, len(views.LABELS))
-    told = torch.arange(8) < 4
-    found = told_labels(labels, told)
-    quadrant = list(views.LABELS).index("quadrant")
-    assert found[:, quadrant].tolist() == [0, 1, 2, 3, *[IGNORED] * 4]
-    assert torch.equal(found[:, :quadrant], labels[:, :quadrant])
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import torch
 from tests.toybox.helpers import copied, options, training
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.toybox import loop, warm_start, words
-from threestudio_gaussiandreamer.toybox.train import STAGES, main
+from threestudio_gaussiandreamer.toybox.train import STAGES
 
 pytestmark = pytest.mark.usefixtures("small_world")
 
@@ -47,16 +47,3 @@ def test_a_part_of_one_network_is_trained_on_from_weights(exported, tmp_path):
     run = training(tmp_path, "unet", only="attentions")
     free = {name for name, value in run.model.named_parameters() if value.requires_grad}
     assert free and all("attentions" in name for name in free)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--only", "attentions"], "--stages, e.g. unet"),
-        (["--rate", "0"], "--rate 0.0: expected more than 0"),
-        (["--rate", "nan"], "--rate nan: expected more than 0"),
-    ],
-)
-def test_bad_options_are_one_message(tmp_path, capsys, arguments, message):
-    assert main([str(tmp_path), *arguments]) == 2
-    assert message in capsys.readouterr().err

@@ -14,7 +14,7 @@ from ..core.checkpoint_file import entries_below
 from ..core.streams import numpy_generator
 from ..models.clip import MEAN, STD
 from . import models
-from .batches import StepData
+from .batches import StepData, moved
 from .classifiers import accuracies, classified
 from .loop import Stage, averaged_weights
 from .module_digest import digest
@@ -97,8 +97,8 @@ class ClipStage(Stage):
         rng = numpy_generator(self.options.seed, "clip-held-out")
         ids = token_ids(self.tokenizer, view_prompts(shard, rows, rng))
         pixels = clip_pixels(with_backgrounds(shard.rgba, rng, random_share=0))
-        values = (pixels, ids, label_tensor(shard, rows), torch.ones(len(rows), dtype=torch.bool))
-        return ClipBatch(*(value.to(self.device) for value in values))
+        has_text = torch.ones(len(rows), dtype=torch.bool)
+        return moved(ClipBatch(pixels, ids, label_tensor(shard, rows), has_text), self.device)
 
     def evaluate(self, model: nn.Module) -> dict[str, float]:
         batch = self.held_out

@@ -16,8 +16,8 @@ from tqdm import tqdm
 from ..core.files import existing_file
 from ..core.streams import numpy_generator
 from . import words
-from .text_batches import token_ids, unknown_words
-from .tokenizer import WORDS, write_tokenizer
+from .text_batches import missing_words, token_ids
+from .tokenizer import words_of, write_tokenizer
 from .views import random_angles
 from .world import draw_attributes
 
@@ -29,36 +29,36 @@ tokens are letters and pieces that occur in no prompt, and have shorter embeddin
 SEPARATION_STEPS, SEPARATION_PROMPTS, SEPARATION_RATE = 150, 24, 0.02
 
 
-def grow_tokenizer(weights: Path, folder: Path) -> list[str]:
-    """Write a tokenizer of the weights' words and the toybox's, unless ``folder`` exists.
+def grow_tokenizer(source: Path, folder: Path) -> list[str]:
+    """Write a tokenizer of the words of ``source`` and of the toybox, unless ``folder`` exists.
 
     Args:
-        weights: folder of the weights' tokenizer.
+        source: folder of the weights' tokenizer.
 
     Returns:
         The words of the toybox that the weights don't know, sorted.
     """
-    new = unknown_words(weights)
+    known = words_of(source)
+    new = missing_words(known)
     if not folder.exists():
         if new:
-            known = (weights / WORDS).read_text(encoding="utf-8").split()
             write_tokenizer(folder, sorted([*known, *new]))
         else:
-            shutil.copytree(weights.parent / "stable-diffusion" / "tokenizer", folder)
+            shutil.copytree(source, folder)
     return new
 
 
 def grow_embeddings(
-    state: dict[str, Tensor], model: nn.Module, weights: Path, tokenizer: Any
+    state: dict[str, Tensor], model: nn.Module, source: Path, tokenizer: Any
 ) -> None:
     """Arrange the token embeddings of ``state``, the weights of a text encoder, for ``tokenizer``.
 
     New tokens keep the random embeddings of ``model``, lengthened to those of trained words.
 
     Args:
-        weights: folder of the tokenizer of ``state``.
+        source: folder of the tokenizer of ``state``.
     """
-    path = existing_file(weights / "vocab.json", "vocabulary")
+    path = existing_file(source / "vocab.json", "vocabulary")
     old, new = json.loads(path.read_text(encoding="utf-8")), tokenizer.get_vocab()
     trained, fresh = state[EMBEDDINGS], model.state_dict()[EMBEDDINGS].cpu()
     if trained.shape[1] != fresh.shape[1]:

@@ -10,9 +10,8 @@ from jaxtyping import Int
 from torch import Tensor
 
 from ..core.errors import UserError
-from ..core.files import existing_file
 from . import words
-from .tokenizer import LENGTH, WORDS, write_tokenizer
+from .tokenizer import LENGTH, words_of, write_tokenizer
 from .views import Shard, attributes_of
 
 
@@ -27,7 +26,7 @@ def open_tokenizer(folder: Path) -> Any:
     place = Path(folder) / "tokenizer"
     if not (place / "tokenizer_config.json").exists():
         write_tokenizer(place, words.vocabulary())
-    if missing := unknown_words(place):
+    if missing := missing_words(words_of(place)):
         raise UserError(
             f"the tokenizer {str(place)!r} doesn't know {', '.join(missing)}: export the training "
             "(python -m threestudio_gaussiandreamer.toybox.export), and continue it in another "
@@ -36,10 +35,9 @@ def open_tokenizer(folder: Path) -> Any:
     return CLIPTokenizer.from_pretrained(str(place))
 
 
-def unknown_words(tokenizer: Path) -> list[str]:
-    """Return the words of the toybox that the tokenizer in a folder doesn't know, sorted."""
-    file = existing_file(tokenizer / WORDS, "list of words")
-    return sorted(set(words.vocabulary()) - set(file.read_text(encoding="utf-8").split()))
+def missing_words(known: Sequence[str]) -> list[str]:
+    """Return the words of the toybox that aren't in ``known``, sorted."""
+    return sorted(set(words.vocabulary()) - set(known))
 
 
 def token_ids(tokenizer: Any, texts: Sequence[str]) -> Int[Tensor, "B 32"]:

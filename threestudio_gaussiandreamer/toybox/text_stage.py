@@ -20,6 +20,7 @@ from torch.utils.data import Dataset
 from ..core.checkpoint_file import entries_below
 from ..core.streams import numpy_generator
 from . import models, words
+from .batches import moved
 from .classifiers import IGNORED, accuracies, classified
 from .loop import Stage, averaged_weights, is_trained
 from .text_batches import open_tokenizer, token_ids
@@ -102,7 +103,7 @@ class TextStage(Stage):
     def held_out(self) -> TextBatch:
         """Return prompts of withheld combinations, which no training saw."""
         batch = text_batch(self.tokenizer, self.options.seed, 0, HELD_OUT, held_out=True)
-        return TextBatch(*(value.to(self.device) for value in batch))
+        return moved(batch, self.device)
 
     def evaluate(self, model: nn.Module) -> dict[str, float]:
         return accuracies(self._logits(model, self.held_out.ids), self.held_out.labels)

@@ -7,6 +7,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..core.files import existing_file
 from ..prompts.known_words import WORDS_FILE
 
 START, END = "<|startoftext|>", "<|endoftext|>"
@@ -41,6 +42,15 @@ def write_tokenizer(folder: Path, words: Sequence[str]) -> None:
         "do_lower_case": True,
     }
     _write_json(folder / "tokenizer_config.json", special | settings)
+
+
+def words_of(folder: Path) -> list[str]:
+    """Return the list of words beside a tokenizer.
+
+    Raises:
+        UserError: there is none.
+    """
+    return existing_file(folder / WORDS, "list of words").read_text(encoding="utf-8").split()
 
 
 def word_merges(words: Sequence[str]) -> list[tuple[str, str]]:

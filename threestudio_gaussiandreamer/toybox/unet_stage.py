@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -16,7 +16,7 @@ from ..core.files import atomic_file
 from ..core.streams import generator, numpy_generator
 from ..diffusion import sds
 from . import models, words
-from .batches import StepData, normal, torch_generator
+from .batches import StepData, moved, normal, torch_generator
 from .loop import Stage, averaged_weights, is_trained
 from .module_digest import digest
 from .sheet import contact_sheet
@@ -152,15 +152,15 @@ class UNetStage(Stage):
         shard = held_out_shard(self.options.shards_folder(), self.options.seed)
         rows = np.flatnonzero(shard.elevation < words.OVERHEAD)[:HELD_OUT]
         rng = numpy_generator(self.options.seed, "unet-held-out")
-        images = with_backgrounds(shard.rgba[rows], rng, random_share=0).to(self.device)
-        latents = self.vae.encode(self._shrunk(images) * 2 - 1).latent_dist.mean
+        latents = self._posteriors(shard.rgba[rows], rng, random_share=0)[0].cpu()
         noise = torch.randn(latents.shape, generator=generator(self.options.seed, "unet-held-out"))
-        t = torch.full((len(rows),), HELD_OUT_TIMESTEP, device=self.device)
+        t = torch.full((len(rows),), HELD_OUT_TIMESTEP)
         found = []
-        for name, opposite in (("mse_at_800", False), ("mse_at_800_opposite_view", True)):
+        for suffix, opposite in (("", False), ("_opposite_view", True)):
             rng = numpy_generator(self.options.seed, "unet-held-out-prompts")
             ids = token_ids(self.tokenizer, view_prompts(shard, rows, rng, opposite=opposite))
-            found.append((name, UNetBatch(latents, noise.to(latents), t, ids.to(self.device))))
+            batch = moved(UNetBatch(latents, noise, t, ids), self.device)
+            found.append((f"mse_at_{HELD_OUT_TIMESTEP}{suffix}", batch))
         return found
 
     @torch.no_grad()
@@ -168,7 +168,6 @@ class UNetStage(Stage):
         """Return the text encoder's last hidden states."""
         return self.text_model(token_ids(self.tokenizer, texts).to(self.device)).last_hidden_state
 
-    @torch.no_grad()
     def _moments(self, index: int) -> Path:
         """Return the file of a shard's posteriors, which is written on first use: their means and
         deviations (2, N, 4, s, s), float16.
@@ -180,20 +179,27 @@ class UNetStage(Stage):
             path.parent.mkdir(parents=True, exist_ok=True)
             rgba = self.shards.get(index).rgba
             rng = numpy_generator(self.options.seed, "unet-backgrounds", index)
-            parts = np.array_split(rgba, -(-len(rgba) // ENCODED_AT_ONCE))
-            images = (
-                with_backgrounds(part, rng, random_share=RANDOM_BACKGROUNDS) for part in parts
-            )
-            posteriors = [
-                self.vae.encode(self._shrunk(part.to(self.device)) * 2 - 1).latent_dist
-                for part in images
-            ]
-            moments = torch.stack(
-                [torch.cat([getattr(p, name) for p in posteriors]) for name in ("mean", "std")]
-            )
+            moments = self._posteriors(rgba, rng, random_share=RANDOM_BACKGROUNDS)
             with atomic_file(path, durable=False) as file:
                 torch.save(moments.half().cpu(), file)
         return path
+
+    @torch.no_grad()
+    def _posteriors(
+        self, rgba: UInt8[np.ndarray, "N H W 4"], rng: np.random.Generator, *, random_share: float
+    ) -> Float[Tensor, "2 N 4 s s"]:
+        """Return means and deviations of the posteriors of pictures, composited over backgrounds
+        of which this share is random.
+        """
+        parts = np.array_split(rgba, -(-len(rgba) // ENCODED_AT_ONCE))
+        images = (with_backgrounds(part, rng, random_share=random_share) for part in parts)
+        posteriors = [
+            self.vae.encode(self._shrunk(part.to(self.device)) * 2 - 1).latent_dist
+            for part in images
+        ]
+        return torch.stack(
+            [torch.cat([getattr(p, name) for p in posteriors]) for name in ("mean", "std")]
+        )
 
     def _shrunk(self, images: Float[Tensor, "B 3 128 128"]) -> Float[Tensor, "B 3 s s"]:
         return F.avg_pool2d(images, self.reduction) if self.reduction > 1 else images

@@ -7,15 +7,12 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from ..core.checkpoint_file import entries_below
 from ..core.errors import UserError
 from ..core.files import existing_file
 from .loop import Options, Progress, Stage, Training, is_trained
 from .new_words import grow_embeddings, grow_tokenizer, separate
 from .text_stage import TEXT_PARTS
 from .unet_stage import LATENT_SCALE
-
-CLIP_TEXT = tuple(f"clip.{name}." for name in TEXT_PARTS)
 
 OF_DIRECTIONS = ("quadrant", "text_finds_object")
 """Measurements that depend on the words for directions, which new words may change."""
@@ -38,15 +35,14 @@ def start_from(weights: Path, options: Options, stages: dict[str, type[Stage]]) 
     path = existing_file(weights / "training.json", "record of the toybox's weights")
     record = json.loads(path.read_text(encoding="utf-8"))
     options = dataclasses.replace(options, only="")  # which may be of one stage alone
-    new_words = grow_tokenizer(weights / "clip", options.folder / "tokenizer")
+    tokenizer = weights / "stable-diffusion" / "tokenizer"
+    new_words = grow_tokenizer(tokenizer, options.folder / "tokenizer")
     for name, stage in stages.items():
         if name in record and not is_trained(options.folder, name):
             training = Training(stage(options))
             state = READERS[name](weights)
             if name == "text":
-                grow_embeddings(state, training.model, weights / "clip", training.stage.tokenizer)
-            if name == "clip":  # its text encoder is the one above
-                state = {k: v for k, v in state.items() if not k.startswith(CLIP_TEXT)}
+                grow_embeddings(state, training.model, tokenizer, training.stage.tokenizer)
             _load(training.model, state, weights, name)
             if name == "text" and new_words:
                 separate(training.model, training.stage.tokenizer, new_words, options.seed)
@@ -88,10 +84,13 @@ def _read_diffusers(name: str) -> Any:
 def _read_clip(weights: Path) -> dict[str, Tensor]:
     from transformers import CLIPModel
 
-    return {
-        f"clip.{key}": value
-        for key, value in CLIPModel.from_pretrained(weights / "clip").float().state_dict().items()
-    }
+    return CLIPModel.from_pretrained(weights / "clip").float().state_dict()
+
+
+def _read_clip_stage(weights: Path) -> dict[str, Tensor]:
+    """Read all but the text encoder, which the stage has from the one before."""
+    state = _read_clip(weights)
+    return {f"clip.{key}": state[key] for key in state if not key.startswith(TEXT_PARTS)}
 
 
 def _read(path: Path) -> dict[str, Tensor]:
@@ -101,13 +100,13 @@ def _read(path: Path) -> dict[str, Tensor]:
 
 
 def _read_text(weights: Path) -> dict[str, Tensor]:
-    named = entries_below(_read_clip(weights), "clip.")
-    return {key: value for key, value in named.items() if key.startswith(TEXT_PARTS)}
+    state = _read_clip(weights)
+    return {key: value for key, value in state.items() if key.startswith(TEXT_PARTS)}
 
 
 READERS = {
     "text": _read_text,
-    "clip": _read_clip,
+    "clip": _read_clip_stage,
     "autoencoder": _read_diffusers("vae"),
     "unet": _read_diffusers("unet"),
     "points": lambda weights: _read(weights / "points.safetensors"),

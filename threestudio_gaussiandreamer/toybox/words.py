@@ -75,7 +75,6 @@ OPENINGS = (
     "{}",
 )
 """Templates for the object's description; "a {}" is drawn most often."""
-DIRECTIONS = ("left side", "right side", "front", "back", "overhead")
 OPPOSITE = {
     "front": "back",
     "back": "front",
@@ -83,6 +82,7 @@ OPPOSITE = {
     "right side": "left side",
     "overhead": "overhead",
 }
+"""The directions of views, each with the opposite one."""
 FRONT_HALF = BACK_HALF = 45.0
 OVERHEAD = 60.0
 """Thresholds of the prompt processors, degrees."""
@@ -160,7 +160,7 @@ def _phrases() -> Iterator[str]:
         for words in (*NOUNS.values(), *COLOR_WORDS.values(), *ACCESSORY_WORDS.values())
         for word in words
     )
-    yield from (*PARTS.values(), *OPENINGS, *DIRECTIONS, "backside view of , an with and wearing")
+    yield from (*PARTS.values(), *OPENINGS, *OPPOSITE, "backside view of , an with and wearing")
     yield "striped stripes dotted dots spots polka spotted checkered checks"
     yield "two tone half below above bottom top"
 
