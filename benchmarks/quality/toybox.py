@@ -42,6 +42,7 @@ from benchmarks.quality.toybox_jobs import (
     RECOGNIZED,
     SAMPLES,
     TRUTH,
+    WORLD,
     Prompt,
     Variant,
     options_of,
@@ -94,8 +95,8 @@ class Task(NamedTuple):
 
     @property
     def setup(self) -> str:
-        """Models and configuration, on which only the views of the object itself don't depend."""
-        return "" if self.variant.name == TRUTH else setup(self.models)
+        """The version of the objects for views of them; models and configuration for all others."""
+        return WORLD if self.variant.name == TRUTH else setup(self.models)
 
 
 # ---- in the processes ----------------------------------------------------------------------------

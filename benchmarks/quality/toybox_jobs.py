@@ -22,7 +22,7 @@ from threestudio_gaussiandreamer.models.bundled import (
 )
 from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
 from threestudio_gaussiandreamer.toybox.words import describe
-from threestudio_gaussiandreamer.toybox.world import KINDS, draw_attributes
+from threestudio_gaussiandreamer.toybox.world import KINDS, VERSION, draw_attributes
 from threestudio_gaussiandreamer.view.config_changes import leaves
 
 CHART = "toybox"
@@ -35,6 +35,8 @@ GUIDANCE = CONFIG["system"]["guidance"]["guidance_scale"]
 DEFAULT, PAPER_RECIPE = "toybox.yaml", "the paper's recipe"
 SAMPLES, TRUTH = "the 2D model's samples", "ground truth"
 """Variants without a run: what the 2D model draws, and ray-cast views of the object itself."""
+WORLD = f"world {VERSION}"
+"""What the views of the objects themselves depend on."""
 PROMPT_SEED = 5000
 """Of the attributes and words of prompts; trainings use others."""
 PAPER_SCALE = 101.0

@@ -25,6 +25,7 @@ from benchmarks.quality.toybox_jobs import (
     RECOGNIZED,
     SAMPLES,
     TRUTH,
+    WORLD,
     setup,
 )
 from threestudio_gaussiandreamer.evaluation.intervals import Estimate, bootstrap, per_prompt
@@ -94,8 +95,8 @@ def present() -> list[Row]:
 
 
 def is_present(row: Row) -> bool:
-    """Return whether a row is of the present models and toybox.yaml, or depends on neither."""
-    return row["setup"] in ("", setup())
+    """Return whether a row is of the present models and toybox.yaml, or of the present objects."""
+    return row["setup"] in (WORLD, setup())
 
 
 def variants(rows: Iterable[Row]) -> Iterator[tuple[str, list[Row]]]:

@@ -29,6 +29,11 @@ HEAD = ("variant", "prompts", "recognised, %", "− toybox.yaml", "multi-face, %
 HEAD += ("CPU seconds", "of toybox.yaml")
 DISTILLATIONS = ("paper", "distillations", "cheaper")
 """Charts that docs/distillation.md shows; docs/toybox.md shows the others."""
+EARLIER = {
+    "7ac24043": "models before the words for left and right",
+    "2d37b05f": "models of the objects of version 1",
+}
+"""Earlier states of models and configuration, by the column ``setup``."""
 
 
 def distillations() -> str:
@@ -37,20 +42,22 @@ def distillations() -> str:
 
 
 def settings() -> str:
-    """Return the table of the models before the present ones, and of all other settings."""
+    """Return the table of earlier models, and of all settings but the distillation's."""
     others = (*DISTILLATIONS, "references", "default")
     charts = (name for name in toybox_jobs.CHARTS if name not in others)
     return table(*charts, first=earlier_models(measured()))
 
 
 def earlier_models(rows: Sequence[Row]) -> list[tuple[str, ...]]:
-    """Compare toybox.yaml with the last models or configuration before the present ones."""
+    """Return a line for each of the states in EARLIER, compared with the present one."""
     rows = [row for row in rows if row["variant"] == toybox_jobs.DEFAULT]
     present = {place(row)[:2]: row for row in rows if is_present(row)}
-    own = [row for row in rows if not is_present(row) and place(row)[:2] in present]
-    own = [row for row in own if row["setup"] == own[-1]["setup"]]
-    plain = [present[place(row)[:2]] for row in own]
-    return [line_of("earlier models", own, plain)] if own else []
+    lines = []
+    for setup, title in EARLIER.items():
+        own = [row for row in rows if row["setup"] == setup and place(row)[:2] in present]
+        if own:
+            lines.append(line_of(title, own, [present[place(row)[:2]] for row in own]))
+    return lines
 
 
 def table(*charts: str, first: Sequence[tuple[str, ...]] = ()) -> str:

@@ -57,6 +57,6 @@ def test_the_prompt_processor_warns_and_continues(models, caplog, tmp_path, monk
     monkeypatch.chdir(tmp_path)
     copy = Path(shutil.copytree(models["stable-diffusion"], tmp_path / "model"))
     (copy / WORDS_FILE).write_text("a\n")
-    out = processor({"stable-diffusion": copy})()
-    assert "'fox'" in caplog.text
+    out = processor({"stable-diffusion": copy}, prompt_back="a tail")()
+    assert "'fox'" in caplog.text and "'tail'" in caplog.text
     assert out.text_embeddings.isfinite().all()

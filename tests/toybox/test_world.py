@@ -63,7 +63,9 @@ def test_every_kind_has_a_mesh_inside_the_sphere(kind):
         distance = np.linalg.norm(mesh.vertices, axis=1)
         assert distance.max() == pytest.approx(world.RADIUS)
         assert np.isfinite(mesh.uv).all() and (0 <= mesh.uv).all() and (mesh.uv <= 1).all()
-        assert ((0.69 < mesh.vertex_colors) & (mesh.vertex_colors <= 1)).all()
+        assert (world.PART_SHADE * 0.69 < mesh.vertex_colors).all() and (
+            mesh.vertex_colors <= 1
+        ).all()
 
 
 @pytest.mark.parametrize("kind", ["fox", "house", "robot"])
@@ -80,6 +82,37 @@ def test_a_pattern_shows_both_colors(pattern):
     attributes = world.Attributes("mug", "blue", pattern, "yellow")
     for color in ("blue", "yellow"):
         assert share_of(attributes, color) > 0.1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("pattern", world.PATTERNS[1:])
+def test_a_pattern_covers_the_object_on_all_sides(kind, pattern):
+    points = points_of(world.Attributes(kind, "blue", pattern, "yellow"))
+    yellow = hue_matches(points[:, 3:], "yellow")
+    around = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    for side in range(4):
+        inside = np.abs((around - 90 * side + 180) % 360 - 180) < 45
+        assert yellow[inside].sum() > 0.05 * inside.sum()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_surface_has_more_periods_than_the_texture(kind):
+    attributes = world.Attributes(kind, "blue", "dotted", "yellow")
+    share = world.SIZE / (world.SIZE + world.CELL)
+    for seed in range(20):
+        u, v = mesh_of(attributes, seed).uv.T
+        assert u[u < share].max() < share * (1 - 1 / world.SIZE) and v.max() < 1 - 1 / world.SIZE
+
+
+def test_a_part_without_a_color_has_the_pattern_but_is_darker():
+    def sail(**part):
+        points = points_of(world.Attributes("boat", "blue", "checkered", "yellow", **part))
+        return points[points[:, 2] > 0.2]
+
+    yellow = hue_matches(sail()[:, 3:], "yellow")
+    assert 0.2 < yellow.mean() < 0.8
+    assert sail()[yellow, 3].max() < world.PART_SHADE
+    assert not hue_matches(sail(part="red")[:, 3:], "yellow").any()
 
 
 def test_two_tone_has_the_second_color_above():
@@ -188,7 +221,9 @@ def test_a_shard_is_a_function_of_seed_and_index(shards):
     for first, second in zip(shard, again, strict=True):
         assert np.array_equal(first, second)
     assert not np.array_equal(shard.rgba, shards.make(1).rgba)
-    assert [path.name for path in shards.folder.iterdir()] == ["train-0-6x4-00000.npz"]
+    assert [path.name for path in shards.folder.iterdir()] == [
+        f"train-world{world.VERSION}-0-6x4-00000.npz"
+    ]
 
 
 def test_a_truncated_shard_is_rendered_again(shards):

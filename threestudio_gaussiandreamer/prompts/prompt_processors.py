@@ -129,8 +129,6 @@ class TextEncoderPromptProcessor(BaseObject):
             half=half,
             revision=self.cfg.revision,
         )
-        sides = ", left right" if self.cfg.view_dependent_left_and_right else ""
-        warn_of_unknown_words(folder, self.prompt + sides)
         self._output = self._encoded(folder)
 
     def _encoded(self, folder: Path) -> PromptEmbeddings:
@@ -148,9 +146,9 @@ class TextEncoderPromptProcessor(BaseObject):
         ]
         info(f"prompts: {'; '.join(prompts_vd)}")
         negative_vd = [direction.negative_prompt(cfg.negative_prompt) for direction in directions]
-        found = self._embeddings(
-            folder, [self.prompt, cfg.negative_prompt, *prompts_vd, *negative_vd]
-        )
+        texts = [self.prompt, cfg.negative_prompt, *prompts_vd, *negative_vd]
+        warn_of_unknown_words(folder, " ".join(texts))
+        found = self._embeddings(folder, texts)
         return PromptEmbeddings(
             text_embeddings=found[:1],
             uncond_text_embeddings=found[1:2],

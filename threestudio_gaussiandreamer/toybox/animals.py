@@ -191,15 +191,17 @@ def turtle(p: Proportions) -> Model:
     bend = np.linspace(0, np.pi / 2, 7)
     profile = [(0.0, 0.16), *zip(np.cos(bend) * 1.0, 0.16 + 0.5 * p() * np.sin(bend), strict=True)]
     shell = lathe("body", profile)
-    stretched = shell._replace(vertices=shell.vertices * [length, wide, 1.0])
-    x = length + 0.22
+    stretched = shell._replace(
+        vertices=shell.vertices * [length, wide, 1.0], uv=shell.uv * (length + wide) / 2
+    )
+    x = length + 0.26
     shapes = [
         stretched,
         ring("part", (0, 0, 0.18), (length * 0.96, wide * 0.96), 0.09, height=0.08),
     ]
     shapes += [
-        ellipsoid("part", (x, 0, 0.4), (0.24, 0.18, 0.17)),
-        limb("part", (0.7 * length, 0, 0.2), (x, 0, 0.38), 0.12),
+        ellipsoid("part", (x, 0, 0.46), (0.29, 0.23, 0.22)),
+        limb("part", (0.7 * length, 0, 0.2), (x, 0, 0.42), 0.14),
     ]
     shapes += [
         ellipsoid("part", (i * 0.5, j * (wide + 0.06), 0.1), (0.22, 0.17, 0.1))
@@ -208,7 +210,7 @@ def turtle(p: Proportions) -> Model:
     ]
     shapes += [
         cone("part", (-0.9 * length, 0, 0.16), (-length - 0.28, 0, 0.1), 0.1),
-        *eyes(x + 0.16, 0.12, 0.47, 0.045),
+        *eyes(x + 0.2, 0.15, 0.55, 0.055),
     ]
     return Model(
         shapes,

@@ -94,7 +94,7 @@ def ring(
     """Make a torus around an ellipse with half axes ``radii`` (x, y), of half height ``height``."""
     height = thickness if height is None else height
     a, b = np.meshgrid(
-        np.linspace(0, 2 * np.pi, SEGMENTS + 1), np.linspace(0, 2 * np.pi, 9), indexing="ij"
+        np.linspace(-np.pi, np.pi, SEGMENTS + 1), np.linspace(0, 2 * np.pi, 9), indexing="ij"
     )
     around = np.stack([np.cos(a), np.sin(a)], -1)
     flat = around * (np.asarray(radii, float) + thickness * np.cos(b)[..., None])
@@ -135,7 +135,7 @@ def joined(shapes: list[Shape]) -> tuple[Shape, list[str]]:
 def _revolve(role: str, profile: np.ndarray, kind, center, axis, segments: int) -> Shape:
     """Revolve a profile; with ``kind`` "sphere" its points are their own normals."""
     rows, slopes = (profile, profile) if kind == "sphere" else _sharp(profile)
-    angle = np.linspace(0, 2 * np.pi, segments + 1)
+    angle = np.linspace(-np.pi, np.pi, segments + 1)  # a pattern's seam is at the back
     around = np.stack([np.cos(angle), np.sin(angle)], 1)
     vertices = np.concatenate(
         [

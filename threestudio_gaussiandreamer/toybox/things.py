@@ -87,8 +87,8 @@ def boat(p: Proportions) -> Model:
 def plane(p: Proportions) -> Model:
     long, span = 0.8 * p(), 0.85 * p()
     shapes = [
-        ellipsoid("body", (0, 0, 0.5), (long, 0.2 * p(), 0.21)),
-        ellipsoid("glass", (0.42 * long, 0, 0.66), (0.22, 0.12, 0.11)),
+        ellipsoid("body", (0, 0, 0.5), (long, 0.26 * p(), 0.27)),
+        ellipsoid("glass", (0.42 * long, 0, 0.71), (0.22, 0.14, 0.12)),
     ]
     shapes += [
         box("part", (0.1, 0, 0.46), (0.2 * p(), span, 0.035)),
@@ -105,7 +105,7 @@ def plane(p: Proportions) -> Model:
             limb("dark", (0.2, s * 0.2, 0.12), (0.2, s * 0.3, 0.12), 0.11),
         ]
     return Model(
-        shapes, Anchors((0.02, 0, 0.69), 0.2, (-0.42 * long, 0, 0.5), (0.2, 0.2), (1, 0, 0))
+        shapes, Anchors((0.02, 0, 0.75), 0.2, (-0.42 * long, 0, 0.5), (0.25, 0.25), (1, 0, 0))
     )
 
 
@@ -118,7 +118,8 @@ def house(p: Proportions) -> Model:
         box("part", (0, 0, top + roof), (deep + 0.12, wide + 0.1, roof), (0.04, 0.94)),
     ]
     shapes += [
-        box("dark", (deep, 0, 0.24), (0.03, 0.14, 0.24)),
+        box("pale", (deep, 0, 0.27), (0.025, 0.2, 0.27)),
+        box("dark", (deep, 0, 0.23), (0.035, 0.14, 0.23)),
         box("warm", (-0.2, 0.3, top + 1.4 * roof), (0.1, 0.1, 0.8 * roof + 0.12)),
     ]
     shapes += [
@@ -214,19 +215,19 @@ def mushroom(p: Proportions) -> Model:
 
 
 def robot(p: Proportions) -> Model:
-    wide, head = 0.36 * p(), 0.25 * p()
-    z = 0.86 + 0.36 + head
+    wide, head = 0.44 * p(), 0.25 * p()
+    z = 1.3 + head
     shapes = [
-        box("body", (0, 0, 0.8), (0.25, wide, 0.36)),
+        box("body", (0, 0, 0.84), (0.3, wide, 0.42)),
         box("part", (0, 0, z), (0.9 * head, 1.1 * head, head)),
     ]
     shapes += [
-        limb("dark", (0, 0, 1.1), (0, 0, z), 0.1),
+        limb("dark", (0, 0, 1.2), (0, 0, z), 0.1),
         limb("dark", (0, 0, z + head), (0, 0, z + head + 0.2), 0.03),
     ]
     shapes += [
         ellipsoid("warm", (0, 0, z + head + 0.22), (0.07, 0.07, 0.07), rings=6),
-        box("pale", (0.25, 0, 0.88), (0.02, 0.6 * wide, 0.13)),
+        box("pale", (0.3, 0, 0.98), (0.02, 0.5 * wide, 0.13)),
     ]
     shapes += [
         box("dark", (0.9 * head, 0, z - 0.1), (0.02, 0.13, 0.03)),
@@ -234,11 +235,11 @@ def robot(p: Proportions) -> Model:
     ]
     for s in (-1, 1):
         shapes += [
-            limb("part", (0, s * (wide + 0.1), 1.05), (0.1, s * (wide + 0.14), 0.52), 0.08),
+            limb("part", (0, s * (wide + 0.1), 1.12), (0.1, s * (wide + 0.14), 0.55), 0.08),
             box("dark", (0.04, s * 0.19, 0.06), (0.2, 0.13, 0.06)),
         ]
         shapes += [
             limb("part", (0, s * 0.19, 0.1), (0, s * 0.19, 0.5), 0.09),
-            ellipsoid("dark", (0.11, s * (wide + 0.14), 0.46), (0.1, 0.1, 0.1)),
+            ellipsoid("dark", (0.11, s * (wide + 0.14), 0.49), (0.1, 0.1, 0.1)),
         ]
-    return Model(shapes, Anchors((0, 0, z + 0.97 * head), 0.2, (0, 0, 1.17), (0.17, 0.17)))
+    return Model(shapes, Anchors((0, 0, z + 0.97 * head), 0.2, (0, 0, 1.28), (0.17, 0.17)))

@@ -21,7 +21,7 @@ from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh, sample_surface, surface_colors
 from ..meshes.raycast import MeshCaster
 from .kinds import ACCESSORIES, KINDS
-from .world import COLORS, PATTERNS, Attributes, draw_attributes, object_mesh
+from .world import COLORS, PATTERNS, VERSION, Attributes, draw_attributes, object_mesh
 
 SIZE = 128
 """Height and width of the pictures, pixels."""
@@ -103,7 +103,8 @@ class Shards:
     def path(self, index: int) -> Path:
         """Return the file of shard ``index``."""
         sort = "held-out" if self.held_out else "train"
-        return self.folder / f"{sort}-{self.seed}-{self.objects}x{self.views}-{index:05d}.npz"
+        name = f"{sort}-world{VERSION}-{self.seed}-{self.objects}x{self.views}-{index:05d}.npz"
+        return self.folder / name
 
     def ensure(self, index: int) -> None:
         """Render shard ``index`` into its file, unless that exists and is complete."""

@@ -18,9 +18,11 @@ from jaxtyping import Float
 
 from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh
-from .kinds import ACCESSORIES, KINDS, Model, Proportions, accessory
+from .kinds import ACCESSORIES, KINDS, Proportions, accessory
 from .shapes import Shape, joined
 
+VERSION = 2
+"""Changes with the objects of a (seed, index), so that no training reads pictures of others."""
 RADIUS = 0.8
 """Radius of the bounding sphere of all objects, world units: half the longest side of objects from
 Point-E at its default scale of 1.6.
@@ -48,13 +50,15 @@ DETAILS: dict[str, tuple[float, float, float]] = {
 """Colours of details that prompts never mention."""
 PATTERNS = ("plain", "striped", "dotted", "checkered", "two-tone")
 PART_SHADE = 0.82
-"""Factor on the body's colour for a part that has no own colour."""
+"""Factor on the body's colours for a part that has no own colour."""
 LIGHT = np.array([0.25, -0.35, 0.9]) / np.linalg.norm([0.25, -0.35, 0.9])
 AMBIENT = 0.70
 CELL = 16
 """Texels per period of a pattern."""
-PERIODS = 8
-"""Periods of the pattern in the texture; a surface with more repeats the last texel's colour."""
+PERIODS = 16
+"""Periods of the pattern in the texture, more than any surface has."""
+PERIOD = {"striped": 0.34, "dotted": 0.34, "checkered": 0.46}
+"""Length of a pattern's period before objects are scaled to RADIUS."""
 WITHHELD_SHARE = 0.04
 
 
@@ -135,14 +139,15 @@ def object_mesh(attributes: Attributes, rng: np.random.Generator) -> Mesh:
     shapes = list(model.shapes)
     if attributes.accessory:
         shapes += accessory(attributes.accessory, model.anchors, proportions)
-    shape, roles = joined(shapes)
+    shape, names = joined(shapes)
+    roles = np.array(names)
     vertices = _centred(shape.vertices)
     return Mesh(
         vertices=vertices,
         faces=shape.faces,
-        uv=_texture_coordinates(attributes.pattern, shape, roles, _body_heights(model, shape), rng),
+        uv=_texture_coordinates(attributes, shape, roles, rng),
         texture=texture(attributes),
-        vertex_colors=np.repeat(_light(shape.normals)[:, None], 3, axis=1).astype(np.float32),
+        vertex_colors=_shading(attributes, shape, roles),
     )
 
 
@@ -152,14 +157,17 @@ def _centred(vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
     return vertices * (RADIUS / np.linalg.norm(vertices, axis=1).max())
 
 
+def _shading(attributes: Attributes, shape: Shape, roles: np.ndarray) -> Float[np.ndarray, "V 3"]:
+    """Return the light, darker on parts that have the body's colours."""
+    light = _light(shape.normals)
+    if not attributes.part:
+        light = np.where(roles == "part", PART_SHADE, 1.0) * light
+    return np.repeat(light[:, None], 3, axis=1).astype(np.float32)
+
+
 def _light(normals: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, " V"]:
     """Return half-Lambert light from above, never below AMBIENT."""
     return AMBIENT + (1 - AMBIENT) * (0.5 + 0.5 * normals @ LIGHT)
-
-
-def _body_heights(model: Model, shape: Shape) -> tuple[float, float]:
-    body = np.concatenate([s.vertices[:, 2] for s in model.shapes if s.role == "body"])
-    return float(body.min()), float(body.max())
 
 
 # Texture: the pattern's PERIODS^2 periods, and to the right of them one column of cells, a plain c
@@ -169,13 +177,13 @@ SIZE = CELL * PERIODS
 
 
 def texture(attributes: Attributes) -> Float[np.ndarray, "H W 3"]:
-    """Draw the object's colours: float32 (128, 144, 3), row 0 on top."""
+    """Draw the object's colours: float32 (256, 272, 3), row 0 on top."""
     first = np.float32(COLORS[attributes.color])
     second = np.float32(COLORS[attributes.second]) if attributes.second else first
     mask = _pattern_mask(attributes.pattern)
     pattern = np.where(mask[..., None], second, first)
-    part = np.float32(COLORS[attributes.part]) if attributes.part else first * PART_SHADE
-    extra = np.float32(COLORS[attributes.accessory_color]) if attributes.accessory_color else part
+    part = np.float32(COLORS[attributes.part]) if attributes.part else first
+    extra = np.float32(COLORS[attributes.accessory_color]) if attributes.accessory_color else first
     plain = np.stack([part, extra, *(np.float32(DETAILS[name]) for name in DETAILS)])
     column = np.zeros((SIZE, CELL, 3), np.float32)
     column[: CELL * len(plain)] = np.repeat(plain, CELL, axis=0)[:, None]
@@ -183,7 +191,7 @@ def texture(attributes: Attributes) -> Float[np.ndarray, "H W 3"]:
 
 
 def _pattern_mask(pattern: str) -> np.ndarray:
-    """Return the mask of the second colour, (128, 128) bool; row 0 is the top."""
+    """Return the mask of the second colour, (256, 256) bool; row 0 is the top."""
     y, x = (np.indices((CELL, CELL)) + 0.5) / CELL
     cells = {
         "plain": np.zeros((CELL, CELL), bool),
@@ -197,25 +205,29 @@ def _pattern_mask(pattern: str) -> np.ndarray:
 
 
 def _texture_coordinates(
-    pattern: str,
+    attributes: Attributes,
     shape: Shape,
-    roles: list[str],
-    heights: tuple[float, float],
+    roles: np.ndarray,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "V 2"]:
-    """Return uv of each vertex: the body's in the pattern, others in their colour's cell."""
-    period = {"striped": 0.3, "dotted": 0.29, "checkered": 0.42}.get(pattern, 1.0) * rng.uniform(
-        0.85, 1.15
-    )
-    height = (shape.vertices[:, 2] - heights[0]) / max(heights[1] - heights[0], 1e-6)
-    along = {"two-tone": height * PERIODS, "striped": (shape.vertices[:, 2] - heights[0]) / period}
+    """Return uv of each vertex: in the pattern for the body, and for parts without an own colour;
+    in their colour's cell for others.
+    """
+    pattern = attributes.pattern
+    period = PERIOD.get(pattern, 1.0) * rng.uniform(0.85, 1.15)
+    patterned = (roles == "body") | ((roles == "part") & (not attributes.part))
+    height = shape.vertices[:, 2] - shape.vertices[roles == "body", 2].min()
+    along = {
+        "two-tone": (height / height[roles == "body"].max()).clip(0, 1) * PERIODS,
+        "striped": height / period,
+    }
     v = along.get(pattern, shape.uv[:, 1] / period)
     u = shape.uv[:, 0] / period
-    body = np.stack([_inside(u), _inside(v)], 1) * [SIZE / (SIZE + CELL), 1.0]
-    roles = np.array(roles)
+    uv = np.stack([_inside(u), _inside(v)], 1) * [SIZE / (SIZE + CELL), 1.0]
     for row, role in enumerate(PLAIN_ROLES):
-        body[roles == role] = [(SIZE + CELL / 2) / (SIZE + CELL), 1 - (row + 0.5) * CELL / SIZE]
-    return body
+        cell = [(SIZE + CELL / 2) / (SIZE + CELL), 1 - (row + 0.5) * CELL / SIZE]
+        uv[(roles == role) & ~patterned] = cell
+    return uv
 
 
 def _inside(periods: Float[np.ndarray, " V"]) -> Float[np.ndarray, " V"]:
