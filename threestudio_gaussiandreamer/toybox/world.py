@@ -14,7 +14,7 @@ import hashlib
 from typing import NamedTuple, Optional
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh
@@ -141,13 +141,14 @@ def object_mesh(attributes: Attributes, rng: np.random.Generator) -> Mesh:
         shapes += accessory(attributes.accessory, model.anchors, proportions)
     shape, names = joined(shapes)
     roles = np.array(names)
+    like_body = (roles == "part") & (not attributes.part)
     vertices = _centred(shape.vertices)
     return Mesh(
         vertices=vertices,
         faces=shape.faces,
-        uv=_texture_coordinates(attributes, shape, roles, rng),
+        uv=_texture_coordinates(attributes.pattern, shape, roles, like_body, rng),
         texture=texture(attributes),
-        vertex_colors=_shading(attributes, shape, roles),
+        vertex_colors=_shading(shape.normals, like_body),
     )
 
 
@@ -157,11 +158,11 @@ def _centred(vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
     return vertices * (RADIUS / np.linalg.norm(vertices, axis=1).max())
 
 
-def _shading(attributes: Attributes, shape: Shape, roles: np.ndarray) -> Float[np.ndarray, "V 3"]:
+def _shading(
+    normals: Float[np.ndarray, "V 3"], like_body: Bool[np.ndarray, " V"]
+) -> Float[np.ndarray, "V 3"]:
     """Return the light, darker on parts that have the body's colours."""
-    light = _light(shape.normals)
-    if not attributes.part:
-        light = np.where(roles == "part", PART_SHADE, 1.0) * light
+    light = np.where(like_body, PART_SHADE, 1.0) * _light(normals)
     return np.repeat(light[:, None], 3, axis=1).astype(np.float32)
 
 
@@ -170,7 +171,7 @@ def _light(normals: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, " V"]:
     return AMBIENT + (1 - AMBIENT) * (0.5 + 0.5 * normals @ LIGHT)
 
 
-# Texture: the pattern's PERIODS^2 periods, and to the right of them one column of cells, a plain c
+# Texture: the pattern's PERIODS^2 periods, and to the right of them a column of cells, each plain
 
 PLAIN_ROLES = ("part", "accessory", *DETAILS)
 SIZE = CELL * PERIODS
@@ -205,20 +206,20 @@ def _pattern_mask(pattern: str) -> np.ndarray:
 
 
 def _texture_coordinates(
-    attributes: Attributes,
+    pattern: str,
     shape: Shape,
     roles: np.ndarray,
+    like_body: Bool[np.ndarray, " V"],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "V 2"]:
-    """Return uv of each vertex: in the pattern for the body, and for parts without an own colour;
-    in their colour's cell for others.
+    """Return uv of each vertex: in the pattern for the body, and for parts ``like_body``; in their
+    colour's cell for others.
     """
-    pattern = attributes.pattern
     period = PERIOD.get(pattern, 1.0) * rng.uniform(0.85, 1.15)
-    patterned = (roles == "body") | ((roles == "part") & (not attributes.part))
-    height = shape.vertices[:, 2] - shape.vertices[roles == "body", 2].min()
+    body = roles == "body"
+    height = shape.vertices[:, 2] - shape.vertices[body, 2].min()
     along = {
-        "two-tone": (height / height[roles == "body"].max()).clip(0, 1) * PERIODS,
+        "two-tone": (height / height[body].max()).clip(0, 1) * PERIODS,
         "striped": height / period,
     }
     v = along.get(pattern, shape.uv[:, 1] / period)
@@ -226,7 +227,7 @@ def _texture_coordinates(
     uv = np.stack([_inside(u), _inside(v)], 1) * [SIZE / (SIZE + CELL), 1.0]
     for row, role in enumerate(PLAIN_ROLES):
         cell = [(SIZE + CELL / 2) / (SIZE + CELL), 1 - (row + 0.5) * CELL / SIZE]
-        uv[(roles == role) & ~patterned] = cell
+        uv[(roles == role) & ~like_body] = cell
     return uv
 
 
