@@ -48,6 +48,7 @@ from benchmarks.quality.toybox_jobs import (
     options_of,
     prompts,
     setup,
+    setup_of_samples,
 )
 from benchmarks.quality.toybox_jobs import (
     CHARTS as VARIANTS,
@@ -95,8 +96,11 @@ class Task(NamedTuple):
 
     @property
     def setup(self) -> str:
-        """The version of the objects for views of them; models and configuration for all others."""
-        return WORLD if self.variant.name == TRUTH else setup(self.models)
+        """What the row depends on: the objects, the models, or models and configuration."""
+        if self.variant.name == TRUTH:
+            return WORLD
+        is_run = self.variant.name != SAMPLES
+        return setup(self.models) if is_run else setup_of_samples(self.models)
 
 
 # ---- in the processes ----------------------------------------------------------------------------

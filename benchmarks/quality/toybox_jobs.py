@@ -42,6 +42,7 @@ PROMPT_SEED = 5000
 PAPER_SCALE = 101.0
 """threestudio's 100."""
 PAPER = "configs/toybox-paper.yaml"
+IMAGE_TARGETS = "configs/toybox-image-targets.yaml"
 BALL = {
     "system.geometry.prior_type": "random-prior",
     "system.geometry.prior": "{num_points: 3000, size: 0.8, color: grey}",
@@ -74,15 +75,29 @@ class Prompt(NamedTuple):
 
 @functools.cache
 def setup(models: str = NAME) -> str:
-    """Return a digest of what every result depends on: toybox.yaml and the networks but the judge.
+    """Return a digest of what every run depends on: toybox.yaml and the networks but the judge.
 
     Args:
         models: "toybox", or the folder of an export.
     """
+    return digest((CONFIG, networks(models)))
+
+
+@functools.cache
+def setup_of_samples(models: str = NAME) -> str:
+    """Return what the 2D model's own samples depend on: a digest of the networks but the judge."""
+    return f"models {digest(networks(models))}"
+
+
+def networks(models: str) -> list[tuple[str, str]]:
+    """Return the files of all networks but the judge, and their digests."""
     folder = FOLDER if models == NAME else Path(models).expanduser()
     digests = read_digests(folder) or {models: ""}
-    networks = sorted(item for item in digests.items() if item[0] not in (JUDGE, RECORD))
-    return hashlib.blake2b(repr((CONFIG, networks)).encode(), digest_size=4).hexdigest()
+    return sorted(item for item in digests.items() if item[0] not in (JUDGE, RECORD))
+
+
+def digest(content: Any) -> str:
+    return hashlib.blake2b(repr(content).encode(), digest_size=4).hexdigest()
 
 
 def steps(count: int) -> dict[str, Any]:
@@ -133,6 +148,27 @@ def schedules() -> Iterator[Variant]:
         yield Variant("grad_clip", clip, {"system.guidance.grad_clip": clip})
     rescaled = {"system.guidance.recon_std_rescale": 0.5}
     yield Variant("recon_std_rescale 0.5", 0, rescaled)
+
+
+def image_targets() -> Iterator[Variant]:
+    """Towards pictures of few views: as in the overlay; their number and strength; when; and with
+    shapes.
+    """
+    own = overlay(IMAGE_TARGETS)
+    yield Variant("image targets", 0, own)
+    yield Variant("image targets train shapes too", 0, own | targets(colors_only="false"))
+    for views in (3, 6):
+        yield Variant("views of image targets", views, own | targets(views=views))
+    for strength in (0.5, 0.9):
+        yield Variant("strength of image targets", strength, own | targets(strength=strength))
+    yield Variant("image targets from step 60", 0, own | targets(start=60, stop=120))
+    low = "system.guidance.max_step_percent"
+    yield Variant("largest timestep 0.3 at the end", 0, {low: own[low]})
+
+
+def targets(**options: Any) -> dict[str, Any]:
+    """Return options of the stage."""
+    return {f"system.image_targets.{name}": value for name, value in options.items()}
 
 
 def falling(schedule: str) -> dict[str, Any]:
@@ -245,6 +281,7 @@ CHARTS: dict[str, Callable[[], Iterator[Variant]]] = {
     "default": default,
     "guidance": over_guidance,
     "haze": haze,
+    "image_targets": image_targets,
     "rates": rates,
     "schedules": schedules,
     "starts": starts,

@@ -27,6 +27,7 @@ from benchmarks.quality.toybox_jobs import (
     TRUTH,
     WORLD,
     setup,
+    setup_of_samples,
 )
 from threestudio_gaussiandreamer.evaluation.intervals import Estimate, bootstrap, per_prompt
 from threestudio_gaussiandreamer.models.bundled import FOLDER, RECORD
@@ -95,8 +96,8 @@ def present() -> list[Row]:
 
 
 def is_present(row: Row) -> bool:
-    """Return whether a row is of the present models and toybox.yaml, or of the present objects."""
-    return row["setup"] in (WORLD, setup())
+    """Return whether a row is of the present objects, models, or models and toybox.yaml."""
+    return row["setup"] in (WORLD, setup_of_samples(), setup())
 
 
 def variants(rows: Iterable[Row]) -> Iterator[tuple[str, list[Row]]]:

@@ -27,13 +27,18 @@ LENGTHS = ("SDS, a quarter of the steps", "SDS, half the steps", SDS, "SDS, twic
 
 
 def overhead() -> str:
-    """Return the CPU time of each variant beside its calls of the score model."""
+    """Return the CPU time of each variant beside its calls of the score model, at each size."""
     rows = read(RESULTS / "variant_overhead.csv")
-    setting = "{gaussians} Gaussians, {views} views of {size}², an empty score model, {machine}"
-    columns = ("variant", "evaluations", "extra_ms", "percent")
-    heads = ("variant", "calls per view", "ms more than SDS", "% of a step")
-    table = markdown(heads, ([row[column] for column in columns] for row in rows))
-    return f"{setting.format(**rows[0])}:\n\n{table}"
+    setting = "{gaussians} Gaussians, {views} views, an empty score model, {machine}"
+    sizes = list(dict.fromkeys(row["size"] for row in rows))
+    lines = [
+        [name, own[-1]["evaluations"]]
+        + [cell for row in own for cell in (row["extra_ms"], row["percent"])]
+        for name, own in grouped(rows, lambda row: row["variant"]).items()
+    ]
+    heads = ["variant", "calls per view"]
+    heads += [head for size in sizes for head in (f"{size}²: ms more than SDS", "% of a step")]
+    return f"{setting.format(**rows[0])}:\n\n{markdown(heads, lines)}"
 
 
 def last(rows: Iterable[Row]) -> list[Row]:

@@ -26,7 +26,7 @@ register_parts()
 
 def test_every_variant_is_timed_with_its_calls(tmp_path, monkeypatch):
     monkeypatch.setattr(variant_overhead, "RESULTS", tmp_path / "overhead.csv")
-    sizes = ["--gaussians", "20", "--size", "16", "--views", "1", "--pairs", "2"]
+    sizes = ["--gaussians", "20", "--sizes", "16", "--views", "1", "--pairs", "2"]
     monkeypatch.setattr("sys.argv", ["", *sizes])
     variant_overhead.main()
     with (tmp_path / "overhead.csv").open() as file:

@@ -26,7 +26,7 @@ OVERLAYS = (
         )
     }
     | {"polish.yaml": "gaussiandreamer.yaml"}
-    | {f"toybox-{name}.yaml": "toybox.yaml" for name in ("draft", "paper")}
+    | {f"toybox-{name}.yaml": "toybox.yaml" for name in ("draft", "paper", "image-targets")}
 )
 """What each is laid over."""
 MANDATORY = {

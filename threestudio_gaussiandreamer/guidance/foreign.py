@@ -4,7 +4,7 @@ guidances have.
 
 import inspect
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -119,6 +119,22 @@ def learnt_weights(guidance: Any) -> dict[str, Tensor]:
     if isinstance(guidance, ScoreDistillation):
         return guidance.state()
     return {name: parameter.detach() for name, parameter in trainable_parameters(guidance).items()}
+
+
+def require_learnt(weights: Any, what: str) -> None:
+    """Check what a checkpoint has in place of the result of :func:`learnt_weights`; None is fine.
+
+    Args:
+        what: the file, for messages.
+
+    Raises:
+        UserError: it isn't a mapping of tensors.
+    """
+    weights = {} if weights is None else weights
+    if not isinstance(weights, Mapping) or not all(
+        isinstance(value, Tensor) for value in weights.values()
+    ):
+        raise UserError(f"{what}: its guidance isn't a mapping of tensors")
 
 
 def restore_learnt(guidance: Any, weights: dict[str, Tensor]) -> None:

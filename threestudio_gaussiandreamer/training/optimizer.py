@@ -21,8 +21,15 @@ def make_optimizer(options: Any, groups: Groups) -> torch.optim.Optimizer:
     return kind(groups, lr=0.0, **ours | dict(options.get("args", {})))
 
 
-def check_optimizer(options: Any) -> None:
-    """Raise UserError for a name that ``torch.optim`` lacks, or arguments that it refuses."""
+def check_optimizer(options: Any, scheduler: Any = None) -> None:
+    """Raise UserError for a name that ``torch.optim`` lacks, arguments that it refuses, or a
+    scheduler.
+    """
+    if scheduler is not None:
+        raise UserError(
+            "scheduler isn't used: learning rates are schedules themselves, for instance "
+            "system.geometry.lr_means"
+        )
     for key in options:
         if key not in ("name", "args"):
             raise unknown("key system.optimizer.", key, ("name", "args"))

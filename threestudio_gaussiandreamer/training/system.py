@@ -13,20 +13,19 @@ option         meaning
 loss.lambda_*  weight of each loss, a number or a schedule: ``sds`` and every other ``loss_*`` of
                the guidance; ``sparsity`` mean sqrt(alpha^2 + 0.01); ``opaque`` entropy of alpha,
                which pushes it to 0 or 1; ``tv`` total variation, see ``losses.py``
-optimizer      name (a torch optimiser) and args; the learning rates belong to the geometry and the
-               background
+optimizer      name (a torch optimiser) and args; geometry and background have the learning rates
 evaluation     views, size (pixels), supersample, every (steps; 0: only at start and end): PSNR and
                SSIM on held-out views
 prune          options of a second, pruned export. Its budget is one of count; bytes (of the SPZ
                file if it is exported, else of the PLY); psnr (dB, to the unpruned cloud); within
                (dB that may be lost against the ground truth). quality, size and steps are as in
                the prune command; eps2d and antialias by default the renderer's
+image_targets  a stage of training towards a few pictures of the 2D model: see ``image_targets.py``
 pages          write a page that shows the cloud in a browser, and more: see ``pages.py``
 =============  =====================================================================================
 """
 
 import contextlib
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
@@ -44,6 +43,7 @@ from ..guidance.foreign import (
     call_guidance,
     learnt_weights,
     own_randomness,
+    require_learnt,
     restore_learnt,
     trainable_groups,
 )
@@ -58,6 +58,7 @@ from .events import log_numbers, log_scores
 from .export import GaussianSavers, export, export_companions, exported_files
 from .finite import CHECK_EVERY, optimizer_tensors, require_finite
 from .held_out import EvaluationConfig, HeldOut, Measurements
+from .image_targets import ImageTargets, ImageTargetsConfig, check_image_targets
 from .loss_scale import LossScale
 from .losses import check_losses, loggable, logged_names, weight_schedules, weighted_losses
 from .optimizer import check_optimizer, make_optimizer
@@ -76,6 +77,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         exporter_type: str = "gaussiandreamer-exporter"
         evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
         prune: PruneOptions = field(default_factory=PruneOptions)
+        image_targets: ImageTargetsConfig = field(default_factory=ImageTargetsConfig)
         pages: bool = True
 
         def __post_init__(self) -> None:
@@ -89,12 +91,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             for name, weight in cfg.loss.items():
                 validate_schedule(weight, f"loss.{name}")
             check_losses(find(cfg.guidance_type), cfg.loss)
-            if cfg.scheduler is not None:
-                raise UserError(
-                    "scheduler isn't used: learning rates are schedules themselves, for "
-                    "instance system.geometry.lr_means"
-                )
-            check_optimizer(cfg.optimizer)
+            check_image_targets(cfg)
+            check_optimizer(cfg.optimizer, cfg.scheduler)
 
     cfg: Config
 
@@ -118,12 +116,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         if "geometry.means" in checkpoint["state_dict"]:
             names = {name: f"geometry.{name}" for name in SHAPES}
             require_cloud(checkpoint["state_dict"], names, what)
-        learnt = checkpoint.get("guidance")
-        learnt = {} if learnt is None else learnt
-        if not isinstance(learnt, Mapping) or not all(
-            isinstance(value, Tensor) for value in learnt.values()
-        ):
-            raise UserError(f"{what}: its guidance isn't a mapping of tensors")
+        require_learnt(checkpoint.get("guidance"), what)
 
     # -- start -------------------------------------------------------------------------------------
 
@@ -132,6 +125,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.loss_weights = weight_schedules(self.options.loss)
         super().configure()
         self.density = DensityControl(self.geometry)
+        self.image_targets = ImageTargets(self.options.image_targets)
         self.automatic_optimization = False
         self.__dict__["guidance"] = self.measurements = self.prompt_utils = None
         self.loss_scale = LossScale()
@@ -223,9 +217,9 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def on_train_start(self) -> None:
         self.require_finite()
-        problem = self.density.schedule_problem(self.global_step, self.trainer.max_steps)
-        if problem:
-            warn(problem)
+        for part in (self.density, self.image_targets):
+            if problem := part.schedule_problem(self.global_step, self.trainer.max_steps):
+                warn(problem)
         if self.global_step == 0:
             save_first_cloud(self)
         if self.measurements:
@@ -242,15 +236,17 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         optimizer = self.optimizers()
         self.set_learning_rates(optimizer)
+        batch = self.image_targets.batch(batch, self.global_step, self.background)
         out = self(batch)
         self.density.before_backward(out, self.global_step)
-        guided = self.guide(out, batch)
+        guided = self.supervise(out, batch)
         losses = self.losses(guided, out)
         loss = torch.stack(list(losses.values())).sum()
         self.manual_backward(loss)
         average_gradients(
             parameter for group in optimizer.param_groups for parameter in group["params"]
         )
+        self.image_targets.hold_shapes(optimizer, self.global_step)
         loss_scale = self.loss_scale.value(self.trainer)
         self.density.after_backward(out["rasterized"], batch["width"], batch["height"], loss_scale)
         optimizer.step()
@@ -284,7 +280,13 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         """Return the weighted losses of the guidance and the regularisers of the renders."""
         now = self.true_current_epoch, self.true_global_step
         weights = {name: C(weight, *now) for name, weight in self.loss_weights.items()}
-        return weighted_losses(guided, out, weights)
+        return weighted_losses(guided, out, self.image_targets.loss_weights(weights, now[1]))
+
+    def supervise(self, out: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
+        """Return the losses of this step's renders, and what is logged with them."""
+        if not self.image_targets.is_active(self.global_step):
+            return self.guide(out, batch)
+        return self.image_targets.guide(self.guidance, out, self.prompt_utils, batch)
 
     def guide(self, out: dict[str, Any], batch: dict[str, Any], **options: Any) -> dict[str, Any]:
         """Call the guidance with these renders, the whole batch, the renders' background, and the
@@ -385,9 +387,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.ensure_cloud()
         self.require_finite()
 
-    def on_test_start(self) -> None:
-        self.ensure_cloud()
-        self.require_finite()
+    on_test_start = on_validation_start
 
     def on_predict_start(self) -> None:
         self.ensure_cloud()
