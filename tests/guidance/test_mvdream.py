@@ -155,7 +155,8 @@ def test_memory_savers_keep_the_views_together(model, prompts, options):
     rgb = renders()
     plain, _ = gradient(tiny.guidance(KIND, model), prompts, rgb)
     saving, _ = gradient(tiny.guidance(KIND, model, **options), prompts, rgb)
-    assert relative(saving, plain.double()) < 1e-5
+    # both are float32, and sums in another order differ by the processor
+    assert relative(saving, plain.double()) < 1e-4
 
 
 def test_half_precision(model, prompts, monkeypatch):
