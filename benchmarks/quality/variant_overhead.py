@@ -4,10 +4,10 @@
 
 A step: views drawn and differentiated, the shared path of score distillation on latents of an
 eighth of the pictures' size, as Stable Diffusion's (512^2 in the paper), Adam. The score model is
-empty: it returns its input, so a variant's further calls of it
-cost nothing, and what remains is everything else that the variant does. Steps of SDS and of the
-variant alternate; the overhead is the median of the differences of two neighbouring steps, relative
-to the median step of SDS. ``evaluations``: calls of the score model per view and step, on average.
+empty: it returns its input, so a variant's further calls of it cost nothing, and what remains is
+everything else that the variant does. Steps of SDS and of the variant alternate; the overhead is
+the median of the differences of two neighbouring steps, relative to the median step of SDS.
+``evaluations``: calls of the score model per view and step, on average.
 Writes ``benchmarks/results/variant_overhead.csv``. The bar: at most 2 % at 512^2."""
 
 import argparse

@@ -82,6 +82,12 @@ def make_batch(
     return batch
 
 
+def orbit_batch(orbit: Orbit, height: int, width: int) -> dict[str, Any]:
+    """Make the host's batch of the views of ``orbit``, with the lights at the cameras."""
+    c2w = orbit.c2w
+    return make_batch(orbit, c2w, c2w[:, :3, 3].clone(), height, width)
+
+
 class TrainCameras(IterableDataset, Updateable):
     """An endless stream of training batches; a resumed run's begins at ``start_step``."""
 
@@ -153,9 +159,7 @@ class TrainCameras(IterableDataset, Updateable):
     def _views_of_pool(self, height: int, width: int) -> dict[str, Any]:
         """Return one batch of all views of the pool, with any lights."""
         if (height, width) not in self._views_by_size:
-            c2w = self.pool.c2w
-            views = make_batch(self.pool, c2w, c2w[:, :3, 3], height, width)
-            self._views_by_size[height, width] = views
+            self._views_by_size[height, width] = orbit_batch(self.pool, height, width)
         return self._views_by_size[height, width]
 
     def _sample(self, batch_size: int, ranges: OrbitRanges, rng: torch.Generator) -> Orbit:

@@ -31,7 +31,7 @@ from ..meshes.mesh import SurfaceDistance
 from ..meshes.raycast import over_background
 from ..metrics import floater_mass, multi_face_rate, out_of_gamut, psnr, saturation, ssim
 from .camera_options import MAX_SIDE
-from .data import make_batch
+from .data import orbit_batch
 
 VIEW_BYTES = 40
 """Memory per pixel, bytes: ground truth with coverage (16), ground truth over the background (12)
@@ -51,12 +51,6 @@ class EvaluationConfig:
         pixels = cfg.views * cfg.size**2
         what = f"{cfg.views} pictures of {cfg.size} x {cfg.size} pixels, twice"
         require_memory("size", VIEW_BYTES * pixels, what)
-
-
-def orbit_batch(orbit: Orbit, size: int) -> dict[str, Any]:
-    """Make the host's batch of the views of ``orbit``, square pictures of ``size`` pixels."""
-    c2w = orbit.c2w
-    return make_batch(orbit, c2w, c2w[:, :3, 3].clone(), size, size)
 
 
 class HeldOut:
@@ -113,7 +107,8 @@ class HeldOut:
         images, backgrounds = [], []
         for start in range(0, self.cfg.views, chunk):
             part = self.orbit.rows(slice(start, start + chunk))
-            out = renderer(**orbit_batch(part, self.cfg.size * renderer.cfg.downsample))
+            side = self.cfg.size * renderer.cfg.downsample
+            out = renderer(**orbit_batch(part, side, side))
             images.append(out["comp_rgb"].cpu())
             backgrounds.append(out["comp_rgb_bg"].cpu().mean((1, 2)))
         for module, training in modes:

@@ -32,7 +32,6 @@ from dataclasses import dataclass, field
 from typing import Any, Optional
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -42,9 +41,10 @@ from ..core.errors import UserError
 from ..core.options import at_least, between, in_range, positive
 from ..guidance.base import GUIDANCE_SCALE, NonFiniteScore, ScoreDistillation
 from ..guidance.image_to_image import image_to_image
+from ..guidance.known_truth import resized
 from ..host import find, info, parse_structured
 from .background import FlatBackground
-from .data import make_batch
+from .data import orbit_batch
 from .geometry import LEARNING_RATES
 from .losses import REGULARISERS
 
@@ -124,10 +124,8 @@ class ImageTargets(nn.Module):
             self.pictures = None
             return batch
         if isinstance(background, FlatBackground):
-            background.step = self.cfg.start
-        orbit, device = self.orbit, batch["c2w"].device
-        c2w = orbit.c2w
-        own = make_batch(orbit, c2w, c2w[:, :3, 3], batch["height"], batch["width"])
+            background.update_step(0, self.cfg.start)
+        own, device = orbit_batch(self.orbit, batch["height"], batch["width"]), batch["c2w"].device
         return {name: v.to(device) if torch.is_tensor(v) else v for name, v in own.items()}
 
     @property
@@ -157,7 +155,8 @@ class ImageTargets(nn.Module):
                 lambda: self.draw(guidance, rgb.detach(), prompt_utils, batch).cpu()
             ).to(rgb.device)
         targets = self.pictures.to(rgb.device)  # a checkpoint's are on the CPU
-        error = (shrunk(rgb, targets.shape[1:3]) - targets).square().sum()
+        renders = resized(rgb.movedim(-1, 1), tuple(targets.shape[1:3])).movedim(1, -1)
+        error = (renders - targets).square().sum()
         evaluations = {"evaluations": float(guidance.evaluations)}
         return {f"loss_{NAME}": 0.5 * error / len(rgb), **evaluations}
 
@@ -223,11 +222,3 @@ class ImageTargets(nn.Module):
         pictures = state_dict.get(f"{prefix}pictures")
         self.pictures = torch.empty_like(pictures) if isinstance(pictures, Tensor) else None
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-
-def shrunk(images: Float[Tensor, "V H W 3"], size: tuple[int, int]) -> Float[Tensor, "V h w 3"]:
-    """Resize images to ``size``, unless they have it."""
-    if images.shape[1:3] == tuple(size):
-        return images
-    resized = F.interpolate(images.movedim(-1, 1), tuple(size), mode="bilinear", antialias=True)
-    return resized.movedim(1, -1)
