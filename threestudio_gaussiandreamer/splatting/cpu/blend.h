@@ -6,33 +6,35 @@
 
 namespace splat {
 
-// The largest weight of a splat, per lane of a strip.
+// The largest weight of a splat, per lane of a block.
 struct alignas(64) PeakRow {
   float lanes[ROW];
 };
 
 struct BlendScratch {
   Staged staged;
-  alignas(64) PeakRow peaks[CHUNK];
+  alignas(64) PeakRow peaks[CHUNK + 1];
   alignas(64) float transmittance[TILE_PIXELS];
   Planes planes;
 };
 
-// Blends the splats of `list` into a strip of `p`; false when all its pixels have stopped.
-SPLAT_FN bool blend_strip(BlendScratch& scratch, const StripPixels& pixels, const BlockList& list, int count,
-                          const BlendLimits& limits) {
+// Blends the splats of `list` into a block; returns after how many of them all its pixels have stopped, or 0.
+SPLAT_FN int blend_block(BlendScratch& scratch, const BlockPixels& pixels, const uint16_t* list, int count,
+                         const BlendLimits& limits) {
   Planes& p = scratch.planes;
   const int at = pixels.first;
   Floats transmittance = load(scratch.transmittance + at), sum = load(p.alpha + at);
   Floats red = load(p.red + at), green = load(p.green + at), blue = load(p.blue + at), depth = load(p.depth + at);
   bool live = true;
-  for (int i = 0; i < count && live;) {
-    for (const int stop = std::min(i + CHECK_EVERY, count); i < stop; i++) {
-      const LocalSplat& s = row_at(scratch.staged.splats, list[i]);
-      float* peak = row_at(scratch.peaks, list[i]).lanes;
-      Floats y1, y2;
-      const Floats alpha = alpha_of(power_at(s, pixels, y1, y2), limits.log2_alpha_min, limits.alpha_max);
-      const Floats weight = weight_of(alpha, transmittance, limits.stop);
+  int i = 0;
+  for (; i < count && live; i += BATCH) {
+    const BatchSplats splats = {scratch.staged, list + i};
+    Batch y1, y2;
+    const Batch alphas = alpha_of(power_at(splats, pixels, y1, y2), limits.log2_alpha_min, limits.alpha_max);
+    for (int k = 0; k < BATCH; k++) {
+      const LocalSplat& s = splats[k];
+      const Floats alpha = alphas.of[k], weight = weight_of(alpha, transmittance, limits.stop);
+      float* peak = row_at(scratch.peaks, splats.list[k]).lanes;
       transmittance -= alpha * transmittance;
       sum += weight, red += weight * s.red, green += weight * s.green, blue += weight * s.blue, depth += weight * s.depth;
       store(peak, maximum(weight, load(peak)));
@@ -42,7 +44,7 @@ SPLAT_FN bool blend_strip(BlendScratch& scratch, const StripPixels& pixels, cons
   }
   store(scratch.transmittance + at, transmittance), store(p.alpha + at, sum);
   store(p.red + at, red), store(p.green + at, green), store(p.blue + at, blue), store(p.depth + at, depth);
-  return live;
+  return live ? 0 : std::min(i, count);
 }
 
 // The largest weight of each of `count` splats, to their slots.
@@ -56,28 +58,30 @@ inline void store_peaks(const Intersection* intersections, int count, const Peak
   }
 }
 
-// Intersections behind the last chunk that contributes touch no block and have no weight.
-inline void skip_rest(View& view, int first, int end, bool keep) {
-  if (keep && first < end) std::fill(view.block_masks.data() + 2 * int64_t(first), view.block_masks.data() + 2 * int64_t(end), 0);
+// Intersections behind the last chunk that contributes are in no list and have no weight.
+inline void skip_rest(View& view, int tile, int first, int end, bool keep) {
   for (int i = first; i < end; i++) view.peaks[view.intersections[i].slot] = 0.0f;
+  for (; keep && first < end; first += CHUNK) std::fill_n(view.lists_of(tile, first).lengths, BLOCKS, 0);
 }
 
-// Blends all intersections of a tile into the planes; stores in the view which blocks each of them overlaps.
-inline void blend_list(const ForwardCall& call, View& view, const TileFrame& frame, BlendScratch& scratch) {
+// Blends all intersections of a tile into the planes; the view keeps the lists of each block's splats.
+inline void blend_tile_splats(const ForwardCall& call, View& view, int tile, const TileFrame& frame, BlendScratch& scratch) {
   const BlendLimits limits = limits_of(call.settings);
-  LiveStrips live;
+  ChunkLists unkept;
+  LiveBlocks live = LiveBlocks().set();
   start_transmittance(view, frame, scratch.transmittance);
   int first = frame.begin;
   for (; first < frame.end && live.any(); first += CHUNK) {
     const int count = std::min(CHUNK, frame.end - first);
-    stage<true>(view, frame, first, count, call.keep ? view.block_masks.data() + 2 * int64_t(first) : nullptr, scratch.staged);
+    stage<true>(view, frame, first, count, scratch.staged);
     std::memset(scratch.peaks, 0, sizeof(PeakRow) * count);
-    for_each_live_strip(scratch.staged, live, [&](const StripPixels& pixels, const BlockList& list, int length) {
-      return blend_strip(scratch, pixels, list, length, limits);
+    ChunkLists& lists = call.keep ? view.lists_of(tile, first) : unkept;
+    list_live_blocks(scratch.staged, live, lists, [&](const BlockPixels& pixels, const uint16_t* list, int length) {
+      return blend_block(scratch, pixels, list, length, limits);
     });
     store_peaks(view.intersections.data() + first, count, scratch.peaks, view.peaks.data());
   }
-  skip_rest(view, std::min(first, frame.end), frame.end, call.keep);
+  skip_rest(view, tile, first, frame.end, call.keep);
 }
 
 // One tile of one view into the pictures and, for a backward pass, into the view.
@@ -86,7 +90,7 @@ inline void blend_tile(const ForwardCall& call, View& view, int tile) {
   BlendScratch scratch;
   prefetch_tile<true>(pictures_of(call, view.index), frame, call.settings.downsample);
   std::memset(&scratch.planes, 0, sizeof scratch.planes);
-  if (frame.begin < frame.end) blend_list(call, view, frame, scratch);
+  if (frame.begin < frame.end) blend_tile_splats(call, view, tile, frame, scratch);
   write_tile(call, view.index, frame, scratch.planes);
   if (!call.keep || frame.begin == frame.end) return;
   stream(view.planes[tile].red, scratch.planes.red, sizeof(Planes) / sizeof(float));

@@ -19,18 +19,17 @@ struct BackwardScratch {
   UpstreamPlanes upstream;
 };
 
-// Per splat (rows) and pixel of a strip (lanes): LANES splats at a time.
+// Per splat (rows) and pixel of a block (lanes): LANES splats at a time.
 struct PairRows {
   Floats u[LANES], weight[LANES], abs_x[LANES], abs_y[LANES];
-  alignas(64) float y1[LANES], y2[LANES];  // at the strip's first pixel
+  alignas(64) float y1[LANES], y2[LANES];  // at the block's first pixel
 };
 
-// Over a strip, one splat per lane, counted from the strip's first pixel.
+// Over a block, one splat per lane, counted from the block's first pixel.
 SPLAT_FN Moments<Floats> moments_of(const Floats* u) {
-  constexpr int ROWS = LANES / BLOCK;
   Floats s0[4] = {}, s1[4] = {}, s2[4] = {};
-  for (int y = 0; y < ROWS; y++) {
-    const Floats* p = u + BLOCK * y;
+  for (int y = 0; y < BLOCK_HEIGHT; y++) {
+    const Floats* p = u + BLOCK_WIDTH * y;
     s0[y] = (p[0] + p[1]) + (p[2] + p[3]);
     s1[y] = p[1] + 2.0f * p[2] + 3.0f * p[3];
     s2[y] = p[1] + 4.0f * p[2] + 9.0f * p[3];
@@ -51,9 +50,9 @@ SPLAT_FN Floats weighted_sum(const Floats* rows, const float* weights) {
   return even + odd;
 }
 
-// One row of sums per splat, from the rows of its pairs with the pixels of a strip.
+// One row of sums per splat, from the rows of its pairs with the pixels of a block.
 template <bool ABSOLUTE>
-SPLAT_FN void sum_pairs(PairRows& rows, const Floats* splats, const UpstreamPlanes& up, const StripPixels& pixels, Floats* sums) {
+SPLAT_FN void sum_pairs(PairRows& rows, const Floats* splats, const UpstreamPlanes& up, const BlockPixels& pixels, Floats* sums) {
   transpose(rows.u), transpose(rows.weight);
   whiten_moments(moments_of(rows.u), splats[0], splats[1], splats[2], load(rows.y1), load(rows.y2), sums);
   sums[RED] = weighted_sum(rows.weight, up.red + pixels.first), sums[GREEN] = weighted_sum(rows.weight, up.green + pixels.first);
@@ -65,9 +64,9 @@ SPLAT_FN void sum_pairs(PairRows& rows, const Floats* splats, const UpstreamPlan
   }
 }
 
-// Adds the sums of `count` <= LANES splats over a strip to those over the tile.
+// Adds the sums of `count` <= LANES splats over a block to those over the tile.
 template <bool ABSOLUTE>
-SPLAT_FN void add_pairs(BackwardScratch& scratch, PairRows& rows, const StripPixels& pixels, const uint32_t* list, int count) {
+SPLAT_FN void add_pairs(BackwardScratch& scratch, PairRows& rows, const BlockPixels& pixels, const uint16_t* list, int count) {
   Floats splats[4], sums[ROW] = {};
   load_quad_columns([&](int l) { return &row_at(scratch.staged.splats, list[std::min(l, count - 1)]).a; }, splats);
   sum_pairs<ABSOLUTE>(rows, splats, scratch.upstream, pixels, sums);
@@ -82,32 +81,45 @@ SPLAT_FN void add_pairs(BackwardScratch& scratch, PairRows& rows, const StripPix
 
 SPLAT_FN Floats absolute(Floats x) { return maximum(x, -x); }
 
-// The state of a strip in the pass front to back.
-struct StripState {
+// The state of a block in the pass front to back.
+struct BlockState {
   Floats red, green, blue, depth, alpha;  // upstream
   Floats transmittance, behind;
 };
 
-SPLAT_FN StripState load_strip(const BackwardScratch& s, int at) {
+SPLAT_FN BlockState load_block(const BackwardScratch& s, int at) {
   const UpstreamPlanes& up = s.upstream;
   return {load(up.red + at),   load(up.green + at),        load(up.blue + at), load(up.depth + at),
           load(up.alpha + at), load(s.transmittance + at), load(s.behind + at)};
 }
 
-// Blends one splat into a strip again and stores what its gradient needs in row `j`.
+// d loss / d weight of the splats of a batch.
+SPLAT_FN Batch values_of(const BatchSplats& s, const BlockState& block) {
+  Batch value = each([&](int k) { return s[k].depth * block.depth + block.alpha; });
+  value = each([&](int k) { return s[k].blue * block.blue + value.of[k]; });
+  value = each([&](int k) { return s[k].green * block.green + value.of[k]; });
+  return each([&](int k) { return s[k].red * block.red + value.of[k]; });
+}
+
+// Blends a batch of splats into a block again and stores what their gradients need in the rows from `first` on.
 template <bool ABSOLUTE>
-SPLAT_FN void blend_backward(const LocalSplat& s, const StripPixels& pixels, const BlendLimits& limits, StripState& strip,
-                             PairRows& rows, int j) {
-  Floats y1, y2;
-  const Floats alpha = alpha_of(power_at(s, pixels, y1, y2), limits.log2_alpha_min, limits.alpha_max);
-  const Floats weight = weight_of(alpha, strip.transmittance, limits.stop);
-  const Floats value =
-      s.red * strip.red + (s.green * strip.green + (s.blue * strip.blue + (s.depth * strip.depth + strip.alpha)));
-  strip.behind -= weight * value;
-  const Floats u = blend_vjp(alpha, strip.transmittance, weight, value, strip.behind, limits.alpha_max, limits.stop);
-  strip.transmittance -= alpha * strip.transmittance;
-  rows.u[j] = u, rows.weight[j] = weight, rows.y1[j] = y1[0], rows.y2[j] = y2[0];
-  if constexpr (ABSOLUTE) rows.abs_x[j] = absolute(u * s.a * y1), rows.abs_y[j] = absolute(u * (s.b * y1 + s.c * y2));
+SPLAT_FN void blend_backward(const BatchSplats& splats, const BlockPixels& pixels, const BlendLimits& limits, BlockState& block,
+                             PairRows& rows, int first) {
+  Batch y1, y2;
+  const Batch alphas = alpha_of(power_at(splats, pixels, y1, y2), limits.log2_alpha_min, limits.alpha_max);
+  const Batch odds = alphas / (1.0f - alphas), values = values_of(splats, block);
+  for (int k = 0; k < BATCH; k++) {
+    const int j = first + k;
+    const LocalSplat& s = splats[k];
+    const Floats alpha = alphas.of[k], value = values.of[k], weight = weight_of(alpha, block.transmittance, limits.stop);
+    block.behind -= weight * value;
+    const Floats u =
+        blend_vjp(alpha, odds.of[k], block.transmittance, weight, value, block.behind, limits.alpha_max, limits.stop);
+    block.transmittance -= alpha * block.transmittance;
+    rows.u[j] = u, rows.weight[j] = weight, rows.y1[j] = y1.of[k][0], rows.y2[j] = y2.of[k][0];
+    if constexpr (ABSOLUTE)
+      rows.abs_x[j] = absolute(u * s.a * y1.of[k]), rows.abs_y[j] = absolute(u * (s.b * y1.of[k] + s.c * y2.of[k]));
+  }
 }
 
 // Zeros for the rows from `first` on.
@@ -118,24 +130,22 @@ template <bool ABSOLUTE> SPLAT_FN void clear_rows(PairRows& rows, int first) {
   }
 }
 
-// Visits the splats of `list` in a strip again; false when all its pixels have stopped.
+// Visits the splats of `list` in a block again.
 template <bool ABSOLUTE>
-SPLAT_FN bool blend_strip_backward(BackwardScratch& scratch, const StripPixels& pixels, const BlockList& list, int length,
+SPLAT_FN void blend_block_backward(BackwardScratch& scratch, const BlockPixels& pixels, const uint16_t* list, int length,
                                    const BlendLimits& limits) {
-  StripState strip = load_strip(scratch, pixels.first);
-  bool live = true;
-  for (int i = 0; i < length && live; i += LANES) {
+  BlockState block = load_block(scratch, pixels.first);
+  for (int i = 0; i < length; i += LANES) {
     PairRows rows;
     const int count = std::min(LANES, length - i);
-    for (int j = 0; j < count; j++)
-      blend_backward<ABSOLUTE>(row_at(scratch.staged.splats, list[i + j]), pixels, limits, strip, rows, j);
-    clear_rows<ABSOLUTE>(rows, count);
+    int filled = 0;
+    for (; filled < count; filled += BATCH)
+      blend_backward<ABSOLUTE>({scratch.staged, list + i + filled}, pixels, limits, block, rows, filled);
+    clear_rows<ABSOLUTE>(rows, filled);
     add_pairs<ABSOLUTE>(scratch, rows, pixels, list + i, count);
-    strip.transmittance = select(strip.transmittance >= limits.stop, strip.transmittance, Floats{});
-    live = any_at_least(strip.transmittance, limits.stop);
+    block.transmittance = select(block.transmittance >= limits.stop, block.transmittance, Floats{});
   }
-  store(scratch.transmittance + pixels.first, strip.transmittance), store(scratch.behind + pixels.first, strip.behind);
-  return live;
+  store(scratch.transmittance + pixels.first, block.transmittance), store(scratch.behind + pixels.first, block.behind);
 }
 
 // The sum behind the first splat: weight * value over all splats, and the background's share.
@@ -165,19 +175,18 @@ inline void store_sums(const View& view, const float* sums, int first, int count
 
 // The rows of sums of all intersections of one tile, each into its slot; those behind the last chunk that contributes are zero.
 template <bool ABSOLUTE>
-inline void blend_list_backward(const BackwardCall& call, View& view, const TileFrame& frame, BackwardScratch& scratch) {
+inline void blend_lists_backward(const BackwardCall& call, View& view, int tile, const TileFrame& frame,
+                                 BackwardScratch& scratch) {
   const BlendLimits limits = limits_of(call.settings);
-  LiveStrips live;
   start_transmittance(view, frame, scratch.transmittance);
   for (int first = frame.begin; first < frame.end; first += CHUNK) {
     const int count = std::min(CHUNK, frame.end - first);
     std::memset(scratch.sums, 0, sizeof(float) * ROW * count);
-    if (live.any()) {
-      stage<false>(view, frame, first, count, view.block_masks.data() + 2 * int64_t(first), scratch.staged);
-      for_each_live_strip(scratch.staged, live, [&](const StripPixels& pixels, const BlockList& list, int length) {
-        return blend_strip_backward<ABSOLUTE>(scratch, pixels, list, length, limits);
-      });
-    }
+    const ChunkLists& lists = view.lists_of(tile, first);
+    if (!lists.empty()) stage<false>(view, frame, first, count, scratch.staged);
+    for_each_listed_block(lists, [&](const BlockPixels& pixels, const uint16_t* list, int length) {
+      blend_block_backward<ABSOLUTE>(scratch, pixels, list, length, limits);
+    });
     store_sums(view, scratch.sums, first, count, call.slots(view));
   }
   end_streams();
@@ -196,9 +205,9 @@ inline Vec3<float> blend_tile_backward(const BackwardCall& call, View& view, int
   }
   start_behind(view.planes[tile], background_of(call.scene, view.index), scratch);
   if (call.out.absgrad)
-    blend_list_backward<true>(call, view, frame, scratch);
+    blend_lists_backward<true>(call, view, tile, frame, scratch);
   else
-    blend_list_backward<false>(call, view, frame, scratch);
+    blend_lists_backward<false>(call, view, tile, frame, scratch);
   return background_sum(view.planes[tile].alpha, scratch.upstream);
 }
 

@@ -93,32 +93,6 @@ SPLAT_FN bool any_at_least(Floats x, float bound) {
 #endif
 }
 
-#if defined(__AVX512F__)
-// 2^x, relative error 1.6e-7: a minimax polynomial of x - floor(x), scaled by 2^floor(x).
-SPLAT_FN Floats exp2(Floats x) {
-  const Floats r = (Floats)_mm512_reduce_ps((__m512)x, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);
-  Floats y = 0.0018775766948238015f * r + 0.00898933969438076f;
-  y = y * r + 0.05582631751894951f;
-  y = y * r + 0.24015361070632935f;
-  y = y * r + 0.6931530833244324f;
-  y = y * r + 0.9999999403953552f;
-  return (Floats)_mm512_scalef_ps((__m512)y, (__m512)x);
-}
-#else
-// 2^x for -126 <= x < 128, relative error 3e-7; undefined below. Adding 1.5 * 2^23 rounds to an integer n, which is then both
-// subtracted and, in the low bits, added to the exponent; a minimax polynomial approximates the rest in [-1/2, 1/2].
-SPLAT_FN Floats exp2(Floats x) {
-  const float rounder = 12582912.0f;
-  const Floats rounded = x + rounder, r = x - (rounded - rounder);
-  Floats y = 0.001327647129073739f * r + 0.009675540961325169f;
-  y = y * r + 0.05550713092088699f;
-  y = y * r + 0.24022120237350464f;
-  y = y * r + 0.6931469440460205f;
-  y = y * r + 1.0f;
-  return (Floats)((Ints)y + ((Ints)rounded << 23));
-}
-#endif
-
 // log2(x) of a normal x > 0, relative error 2e-7: exponent + 2 atanh((m - 1) / (m + 1)) / ln 2 with m in [sqrt(1/2), sqrt(2)).
 SPLAT_FN Floats log2(Floats x) {
   const Ints shifted = (Ints)x - 0x3f3504f3;  // the bits of sqrt(1/2)

@@ -26,12 +26,12 @@ inline Vec3<float> background_of(const Scene& scene, int view) {
 
 // LANES adjacent pixels of a row of a block-ordered plane; `run` counts them from the left.
 SPLAT_FN int run_at(int row, int run) {
-  return ((row / BLOCK) * BLOCKS_PER_ROW + run * (LANES / BLOCK)) * BLOCK_PIXELS + row % BLOCK * BLOCK;
+  return ((row / BLOCK_HEIGHT) * BLOCKS_PER_ROW + run * (LANES / BLOCK_WIDTH)) * LANES + row % BLOCK_HEIGHT * BLOCK_WIDTH;
 }
 
 // Run `run` of output row `row`: as rendered, or the mean of 2x2 pixels.
 template <int DOWNSAMPLE> SPLAT_FN Floats fetch(const float* plane, int row, int run) {
-  const auto at = [&](int y, int x) { return load_quads([&](int block) { return plane + run_at(y, x) + block * BLOCK_PIXELS; }); };
+  const auto at = [&](int y, int x) { return load_quads([&](int block) { return plane + run_at(y, x) + block * LANES; }); };
   if constexpr (DOWNSAMPLE == 1) return at(row, run);
   const Floats left = at(2 * row, 2 * run) + at(2 * row + 1, 2 * run);
   const Floats right = at(2 * row, 2 * run + 1) + at(2 * row + 1, 2 * run + 1);
@@ -43,7 +43,7 @@ template <int DOWNSAMPLE> SPLAT_FN Floats fetch(const float* plane, int row, int
 // The adjoint of `fetch`, onto a plane that only this function writes.
 template <int DOWNSAMPLE> SPLAT_FN void spread(float* plane, int row, int run, Floats value) {
   const auto put = [&](int y, int x, Floats v) {
-    store_quads([&](int block) { return plane + run_at(y, x) + block * BLOCK_PIXELS; }, v);
+    store_quads([&](int block) { return plane + run_at(y, x) + block * LANES; }, v);
   };
   if constexpr (DOWNSAMPLE == 1) return put(row, run, value);
   const Floats quarter = 0.25f * value;

@@ -1,13 +1,14 @@
 // Shared by the forward and the backward blend: the splats of a tile in its own coordinates, and which blocks they touch.
 #pragma once
 
+#include <bitset>
+
+#include "batch.h"
 #include "calls.h"
 
 namespace splat {
 
-constexpr int CHUNK = 512;      // splats staged at a time
-constexpr int PREFETCH = 32;    // splats ahead
-constexpr int CHECK_EVERY = 4;  // splats between two tests whether all pixels of a strip have stopped
+constexpr int PREFETCH = 32;  // splats ahead
 
 struct TileFrame {
   int left, top;
@@ -49,35 +50,35 @@ SPLAT_FN void store_local(const SplatLanes& s, LocalSplat* local) {
 
 // Bits [first, end) where the ellipse comes near a pixel centre of a column of blocks, in one row of blocks.
 SPLAT_FN Ints blocks_in_row(const Ellipse<Floats>& ellipse, int row) {
-  const Floats zero = {}, top = zero + (row * BLOCK + 0.5f), bottom = top + float(BLOCK - 1), side = zero + float(BLOCKS_PER_ROW);
+  const Floats zero = {}, side = zero + float(BLOCKS_PER_ROW);
+  const Floats top = zero + (row * BLOCK_HEIGHT + 0.5f), bottom = top + float(BLOCK_HEIGHT - 1);
   const Span<Floats> x = row_span(ellipse, top, bottom);
-  const Ints first = __builtin_convertvector(clamp((x.low + 0.499f) * (1.0f / BLOCK), zero, side), Ints);
-  const Ints end = __builtin_convertvector(clamp((x.high + (BLOCK - 0.499f)) * (1.0f / BLOCK), zero, side), Ints);
+  const Ints first = __builtin_convertvector(clamp((x.low + 0.499f) * (1.0f / BLOCK_WIDTH), zero, side), Ints);
+  const Ints end = __builtin_convertvector(clamp((x.high + (BLOCK_WIDTH - 0.499f)) * (1.0f / BLOCK_WIDTH), zero, side), Ints);
   const Ints one = Ints{} + 1;
   return meets_rows(ellipse, top - 1e-3f, bottom + 1e-3f) & ((one << end) - 1) & ~((one << first) - 1);
 }
 
-// Bit 8 r + c is set when the splat touches block (r, c) of the tile; rows 0 to 3 are the first half.
-SPLAT_FN void block_masks(const SplatLanes& s, Ints halves[2]) {
+constexpr int MASK_WORDS = BLOCKS / 32;
+
+// Bit 8 r + c is set when the splat touches block (r, c) of the tile; a word has four rows.
+SPLAT_FN void block_masks(const SplatLanes& s, Ints words[MASK_WORDS]) {
   const Ellipse<Floats> ellipse = {s.x, s.y, s.extent_y, s.c * s.c, s.level, s.inverse_a, s.tilt, s.slant};
-  halves[0] = halves[1] = Ints{};
-  for (int row = 0; row < BLOCKS_PER_ROW; row++) halves[row / 4] |= blocks_in_row(ellipse, row) << (8 * (row % 4));
+  std::fill(words, words + MASK_WORDS, Ints{});
+  for (int row = 0; row < BLOCK_ROWS; row++) words[row / 4] |= blocks_in_row(ellipse, row) << (8 * (row % 4));
 }
 
 // The staged splats of a chunk and which blocks each of them touches.
 struct Staged {
-  alignas(64) LocalSplat splats[CHUNK];
-  alignas(64) uint32_t touching[2][CHUNK];  // halves of the masks; zero behind the last splat, up to a whole group
-  int groups;                               // of 64 splats
+  alignas(64) LocalSplat splats[CHUNK + 1];  // the last one is invisible
+  alignas(64) uint32_t touching[MASK_WORDS][CHUNK];  // a bit per block; zero behind the last splat, up to a whole group
+  int groups;                                        // of 64 splats
 #if !defined(__AVX512F__)
-  uint64_t splats_of[CHUNK];  // [64 splats][block], one bit per splat
+  uint64_t splats_of[BLOCKS / 64][CHUNK];  // [64 blocks][64 splats][block], one bit per splat
 #endif
 };
 
-// Where the splats of a block are among the staged ones, front to back: the first float of each row of ROW floats.
-using BlockList = uint32_t[CHUNK + 16];
-
-template <class Row> SPLAT_FN Row& row_at(Row* rows, uint32_t position) {
+template <class Row> SPLAT_FN Row& row_at(Row* rows, uint16_t position) {
   static_assert(sizeof(Row) == sizeof(float) * ROW, "a row");
   return *reinterpret_cast<Row*>(reinterpret_cast<uintptr_t>(rows) + sizeof(float) * position);
 }
@@ -85,15 +86,16 @@ template <class Row> SPLAT_FN Row& row_at(Row* rows, uint32_t position) {
 #if defined(__AVX512F__)
 SPLAT_FN void list_splats(Staged&) {}
 
-// Writes the splats that touch a block; returns how many.
-SPLAT_FN int list_block(const Staged& staged, int block, BlockList& list) {
+// Writes the splats that touch a block; returns how many. Up to 16 more are overwritten.
+SPLAT_FN int list_block(const Staged& staged, int block, uint16_t* list) {
   const __m512i bit = _mm512_set1_epi32(int(1u << block % 32)), step = _mm512_set1_epi32(16 * ROW);
   __m512i positions = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
   positions = _mm512_mullo_epi32(positions, _mm512_set1_epi32(ROW));
   int count = 0;
   for (int i = 0; i < staged.groups * 64; i += 16) {
     const __mmask16 touching = _mm512_test_epi32_mask(_mm512_load_si512(staged.touching[block / 32] + i), bit);
-    _mm512_storeu_si512(list + count, _mm512_maskz_compress_epi32(touching, positions));
+    const __m256i splats = _mm512_cvtepi32_epi16(_mm512_maskz_compress_epi32(touching, positions));
+    _mm256_storeu_si256(reinterpret_cast<__m256i*>(list + count), splats);
     count += __builtin_popcount(touching);
     positions = _mm512_add_epi32(positions, step);
   }
@@ -113,9 +115,12 @@ inline void transpose_bits(uint64_t* words) {
 
 // From the blocks of each splat to the splats of each block.
 inline void list_splats(Staged& staged) {
-  for (int i = 0; i < staged.groups * 64; i++)
-    staged.splats_of[i] = uint64_t(staged.touching[1][i]) << 32 | staged.touching[0][i];
-  for (int group = 0; group < staged.groups; group++) transpose_bits(staged.splats_of + group * 64);
+  for (int part = 0; part < BLOCKS / 64; part++) {
+    uint64_t* words = staged.splats_of[part];
+    for (int i = 0; i < staged.groups * 64; i++)
+      words[i] = uint64_t(staged.touching[2 * part + 1][i]) << 32 | staged.touching[2 * part][i];
+    for (int group = 0; group < staged.groups; group++) transpose_bits(words + group * 64);
+  }
 }
 
 // The positions of the bits of each byte, low to high.
@@ -130,16 +135,17 @@ struct BitPositions {
 };
 constexpr BitPositions BIT_POSITIONS;
 
-// Writes the splats that touch a block; returns how many.
-SPLAT_FN int list_block(const Staged& staged, int block, BlockList& list) {
+// Writes the splats that touch a block; returns how many. Up to 16 more are overwritten.
+SPLAT_FN int list_block(const Staged& staged, int block, uint16_t* list) {
   typedef uint8_t Bytes __attribute__((vector_size(8)));
-  typedef uint32_t Words __attribute__((vector_size(32)));
+  typedef uint16_t Words __attribute__((vector_size(16)));
+  const uint64_t* words = staged.splats_of[block / 64] + block % 64;
   int count = 0;
   for (int group = 0; group < staged.groups; group++)
-    for (uint64_t word = staged.splats_of[group * 64 + block], first = group * 64; word; word >>= 8, first += 8) {
+    for (uint64_t word = words[group * 64], first = group * 64; word; word >>= 8, first += 8) {
       Bytes positions;
       std::memcpy(&positions, BIT_POSITIONS.of[word & 255], sizeof positions);
-      const Words splats = (__builtin_convertvector(positions, Words) + uint32_t(first)) * ROW;
+      const Words splats = (__builtin_convertvector(positions, Words) + uint16_t(first)) * ROW;
       std::memcpy(list + count, &splats, sizeof splats);
       count += BIT_POSITIONS.count[word & 255];
     }
@@ -147,83 +153,99 @@ SPLAT_FN int list_block(const Staged& staged, int block, BlockList& list) {
 }
 #endif
 
-// Transforms `count` splats to the coordinates of a tile; the masks of the blocks that they overlap are computed, or read from
-// `masks` (2, count), which may be null when they are computed.
-template <bool FIND>
-SPLAT_FN void stage(const View& view, const TileFrame& frame, int first, int count, uint32_t* masks, Staged& staged) {
+// Transforms `count` splats to the coordinates of a tile.
+template <bool FIND_BLOCKS> SPLAT_FN void stage(const View& view, const TileFrame& frame, int first, int count, Staged& staged) {
   for (int i = 0; i < count; i += LANES) {
     for (int l = 0; l < LANES; l++)
       __builtin_prefetch(&view.splats[view.intersections[std::min(first + i + l + PREFETCH, frame.end - 1)].gaussian]);
     const SplatLanes splats = load_splats(view, frame, first + i, count - i);
     store_local(splats, staged.splats + i);
-    if (!FIND) continue;
-    Ints halves[2];
-    block_masks(splats, halves);
-    for (int half = 0; half < 2; half++) std::memcpy(staged.touching[half] + i, &halves[half], sizeof halves[half]);
+    if (!FIND_BLOCKS) continue;
+    Ints words[MASK_WORDS];
+    block_masks(splats, words);
+    for (int w = 0; w < MASK_WORDS; w++) std::memcpy(staged.touching[w] + i, &words[w], sizeof words[w]);
   }
+  staged.splats[CHUNK] = LocalSplat(), staged.splats[CHUNK].log2_opacity = -1e30f;
+  if (!FIND_BLOCKS) return;
   staged.groups = (count + 63) / 64;
-  for (int half = 0; half < 2; half++) {
-    if (FIND && masks) std::memcpy(masks + half * count, staged.touching[half], sizeof(uint32_t) * count);
-    if (!FIND) std::memcpy(staged.touching[half], masks + half * count, sizeof(uint32_t) * count);
-    std::fill(staged.touching[half] + count, staged.touching[half] + staged.groups * 64, 0);
-  }
+  for (uint32_t* words : staged.touching) std::fill(words + count, words + staged.groups * 64, 0);
   list_splats(staged);
 }
 
-// The pixel centres of a strip in tile coordinates.
-struct StripPixels {
+inline int whole_batches(int length) { return (length + BATCH - 1) / BATCH * BATCH; }
+
+// Room for the lists of all blocks that the staged splats touch.
+inline uint16_t* reserve_lists(const Staged& staged, ChunkLists& lists) {
+  int64_t pairs = 0;
+  for (const uint32_t* words : staged.touching)
+    for (int i = 0; i < staged.groups * 64; i++) pairs += __builtin_popcount(words[i]);
+  return lists.splats.reserve(pairs + BLOCKS * BATCH + 16);
+}
+
+// The pixel centres of a block in tile coordinates.
+struct BlockPixels {
   int first;  // in the planes
   float left, top;
   Floats x, y;
 };
 
-SPLAT_FN StripPixels strip_pixels(int block, int strip) {
+SPLAT_FN BlockPixels block_pixels(int block) {
   Floats column, row;
-  for (int l = 0; l < LANES; l++) column[l] = float(l % BLOCK), row[l] = float(l / BLOCK);
-  const float left = (block % BLOCKS_PER_ROW) * BLOCK + 0.5f;
-  const float top = (block / BLOCKS_PER_ROW) * BLOCK + strip * (LANES / BLOCK) + 0.5f;
-  return {block * BLOCK_PIXELS + strip * LANES, left, top, column + left, row + top};
+  for (int l = 0; l < LANES; l++) column[l] = float(l % BLOCK_WIDTH), row[l] = float(l / BLOCK_WIDTH);
+  const float left = (block % BLOCKS_PER_ROW) * BLOCK_WIDTH + 0.5f, top = (block / BLOCKS_PER_ROW) * BLOCK_HEIGHT + 0.5f;
+  return {block * LANES, left, top, column + left, row + top};
 }
 
-// y of a splat at the pixels of a strip, and its log2(alpha) there before cap and threshold.
-SPLAT_FN Floats power_at(const LocalSplat& s, const StripPixels& pixels, Floats& y1, Floats& y2) {
-  y1 = s.a * pixels.x + (s.b * pixels.y + s.shift_x);
-  y2 = s.c * pixels.y + s.shift_y;
-  return (s.log2_opacity - y1 * y1) - y2 * y2;
+// The splats of a batch: those of `list` from `first` on.
+struct BatchSplats {
+  const Staged& staged;
+  const uint16_t* list;
+
+  const LocalSplat& operator[](int k) const { return row_at(staged.splats, list[k]); }
+};
+
+// y of the splats of a batch at the pixels of a block, and their log2(alpha) there before cap and threshold.
+SPLAT_FN Batch power_at(const BatchSplats& s, const BlockPixels& pixels, Batch& y1, Batch& y2) {
+  y1 = each([&](int k) { return s[k].b * pixels.y + s[k].shift_x; });
+  y2 = each([&](int k) { return s[k].c * pixels.y + s[k].shift_y; });
+  y1 = each([&](int k) { return s[k].a * pixels.x + y1.of[k]; });
+  const Batch power = each([&](int k) { return s[k].log2_opacity - y1.of[k] * y1.of[k]; });
+  return power - y2 * y2;
 }
 
 // Transmittance 1 for pixels of the image, 0 for those of the tile that lie outside of it: they have stopped already.
 inline void start_transmittance(const View& view, const TileFrame& frame, float* transmittance) {
   if (frame.inside) return (void)std::fill(transmittance, transmittance + TILE_PIXELS, 1.0f);
   for (int block = 0; block < BLOCKS; block++)
-    for (int p = 0; p < BLOCK_PIXELS; p++) {
-      const int x = frame.left + block % BLOCKS_PER_ROW * BLOCK + p % BLOCK;
-      const int y = frame.top + block / BLOCKS_PER_ROW * BLOCK + p / BLOCK;
-      transmittance[block * BLOCK_PIXELS + p] = x < view.camera.size.x && y < view.camera.size.y ? 1.0f : 0.0f;
+    for (int p = 0; p < LANES; p++) {
+      const int x = frame.left + block % BLOCKS_PER_ROW * BLOCK_WIDTH + p % BLOCK_WIDTH;
+      const int y = frame.top + block / BLOCKS_PER_ROW * BLOCK_HEIGHT + p / BLOCK_WIDTH;
+      transmittance[block * LANES + p] = x < view.camera.size.x && y < view.camera.size.y ? 1.0f : 0.0f;
     }
 }
 
-// Which strips still have pixels that haven't stopped: a bit per block for each strip.
-struct LiveStrips {
-  uint64_t blocks[STRIPS];
+// Which blocks still have pixels that haven't stopped.
+using LiveBlocks = std::bitset<BLOCKS>;
 
-  LiveStrips() { std::fill(blocks, blocks + STRIPS, ~uint64_t(0)); }
-  bool any() const {
-    return std::any_of(blocks, blocks + STRIPS, [](uint64_t b) { return b != 0; });
-  }
-};
-
-// Calls blend(pixels, list, length), which returns whether the strip continues, for each unfinished strip and the splats that
-// overlap it.
-template <class Blend> SPLAT_FN void for_each_live_strip(const Staged& staged, LiveStrips& live, Blend blend) {
-  BlockList list;
+// Lists the splats of each live block and calls blend(pixels, list, length) for it, which returns how many it needed, or 0 if
+// the block continues behind all of them.
+template <class Blend> SPLAT_FN void list_live_blocks(const Staged& staged, LiveBlocks& live, ChunkLists& lists, Blend blend) {
+  uint16_t* list = reserve_lists(staged, lists);
   for (int block = 0; block < BLOCKS; block++) {
-    uint64_t alive = 0;
-    for (int strip = 0; strip < STRIPS; strip++) alive |= live.blocks[strip] >> block & 1;
-    const int length = alive ? list_block(staged, block, list) : 0;
-    for (int strip = 0; length && strip < STRIPS; strip++)
-      if (live.blocks[strip] >> block & 1 && !blend(strip_pixels(block, strip), list, length))
-        live.blocks[strip] &= ~(uint64_t(1) << block);
+    int length = live[block] ? list_block(staged, block, list) : 0;
+    std::fill(list + length, list + whole_batches(length), CHUNK * ROW);
+    if (const int needed = length ? blend(block_pixels(block), list, length) : 0) length = needed, live.reset(block);
+    lists.lengths[block] = uint16_t(length), list += whole_batches(length);
+  }
+}
+
+// Calls blend(pixels, list, length) for the listed blocks.
+template <class Blend> SPLAT_FN void for_each_listed_block(const ChunkLists& lists, Blend blend) {
+  const uint16_t* list = lists.splats.data();
+  for (int block = 0; block < BLOCKS; block++) {
+    const int length = lists.lengths[block];
+    if (length) blend(block_pixels(block), list, length);
+    list += whole_batches(length);
   }
 }
 

@@ -1,6 +1,7 @@
 // Data of one view between the stages, and between a forward pass and its backward pass.
 #pragma once
 
+#include <algorithm>
 #include <deque>
 #include <vector>
 
@@ -11,9 +12,11 @@
 
 namespace splat {
 
-// A tile is 8 x 8 blocks of 4 x 4 pixels; a strip is as many pixels of a block as there are lanes.
-constexpr int TILE = 32, BLOCK = 4, BLOCKS_PER_ROW = TILE / BLOCK, BLOCKS = BLOCKS_PER_ROW * BLOCKS_PER_ROW;
-constexpr int BLOCK_PIXELS = BLOCK * BLOCK, TILE_PIXELS = TILE * TILE, STRIPS = BLOCK_PIXELS / LANES;
+// A block has as many pixels as there are lanes: 4 columns, and 4, 2 or 1 rows.
+constexpr int TILE = 32, TILE_PIXELS = TILE * TILE;
+constexpr int BLOCK_WIDTH = 4, BLOCK_HEIGHT = LANES / BLOCK_WIDTH;
+constexpr int BLOCKS_PER_ROW = TILE / BLOCK_WIDTH, BLOCK_ROWS = TILE / BLOCK_HEIGHT, BLOCKS = BLOCKS_PER_ROW * BLOCK_ROWS;
+constexpr int CHUNK = 512;  // splats of a tile that are blended at a time
 
 constexpr int SLICE = 2048;  // Gaussians projected by one task
 
@@ -43,6 +46,17 @@ struct Intersection {
   int32_t gaussian, slot;
 };
 
+// The splats of a chunk that are blended into each block: block after block, front to back, each list filled up to whole
+// batches. A splat is the position of its first float among the chunk's, each of which has ROW floats.
+struct ChunkLists {
+  uint16_t lengths[BLOCKS];
+  Buffer<uint16_t> splats;
+
+  bool empty() const {
+    return std::all_of(lengths, lengths + BLOCKS, [](uint16_t length) { return length == 0; });
+  }
+};
+
 // Sums of weight * (colour, depth, 1) per pixel of a tile, block after block. 1 - alpha is the weight of the background.
 struct Planes {
   alignas(64) float red[TILE_PIXELS], green[TILE_PIXELS], blue[TILE_PIXELS], depth[TILE_PIXELS], alpha[TILE_PIXELS];
@@ -60,7 +74,7 @@ struct View {
   bool counted;               // by the projection, as one part
   Buffer<int32_t> tile_begin;    // (tiles + 1) into intersections
   Buffer<Intersection> intersections;         // by tile, then by depth
-  Buffer<uint32_t> block_masks;  // the blocks that each intersection touches: two halves per chunk, see tile.h
+  std::deque<ChunkLists> lists;  // never shrinks
   Buffer<float> peaks;           // per slot, the largest weight of the Gaussian in the tile
   Buffer<Planes> planes;         // (tiles) before the background; those of empty tiles aren't set
 
@@ -73,6 +87,8 @@ struct View {
   }
 
   int tiles() const { return tiles_x * tiles_y; }
+  // The lists of the chunk of a tile that begins at an intersection.
+  ChunkLists& lists_of(int tile, int first) { return lists[first / CHUNK + tile]; }
   const Slice& slice_of(int64_t gaussian) const { return slices[gaussian / SLICE]; }
   Coverage& coverage(int64_t gaussian) { return coverages[gaussian + gaussian / SLICE]; }
   const Coverage& coverage(int64_t gaussian) const { return coverages[gaussian + gaussian / SLICE]; }

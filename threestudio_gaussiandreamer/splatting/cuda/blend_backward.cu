@@ -62,7 +62,7 @@ SPLAT_FN void blend_pair(const LocalSplat& s, const Pixel& pixel, const Settings
   weight = weight_of(alpha, p.transmittance, settings.stop);
   const float value = dot_quads({s.red, s.green, s.blue, s.depth}, p.d_color_depth) + p.d_alpha;
   p.behind -= weight * value;
-  u = blend_vjp(alpha, p.transmittance, weight, value, p.behind, settings.alpha_max, settings.stop);
+  u = blend_vjp(alpha, alpha / (1.0f - alpha), p.transmittance, weight, value, p.behind, settings.alpha_max, settings.stop);
   p.transmittance = transmit(alpha, p.transmittance, settings.stop);
 }
 

@@ -279,10 +279,11 @@ template <class F> SPLAT_FN F weight_of(F alpha, F transmittance, float stop) {
   return select(transmittance >= zero + stop, alpha * transmittance, zero);
 }
 
-// d loss / d ln(alpha), zero where the cap holds or the pixel has stopped. `value` is d loss / d weight, `behind` is
-// the sum of weight * value over everything behind, background included.
-template <class F> SPLAT_FN F blend_vjp(F alpha, F transmittance, F weight, F value, F behind, float alpha_max, float stop) {
-  const F zero = {}, u = weight * value - behind * alpha / (1.0f - alpha);
+// d loss / d ln(alpha), zero where the cap holds or the pixel has stopped. `odds` is alpha / (1 - alpha), `value` is
+// d loss / d weight, `behind` is the sum of weight * value over everything behind, background included.
+template <class F>
+SPLAT_FN F blend_vjp(F alpha, F odds, F transmittance, F weight, F value, F behind, float alpha_max, float stop) {
+  const F zero = {}, u = weight * value - behind * odds;
   return select((alpha < zero + alpha_max) & (transmittance >= zero + stop), u, zero);
 }
 
