@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import torch
 
+from benchmarks.quality.runs import machine
 from benchmarks.splatting.bench_scenes import Scene, make_camera, make_cotangents, make_scene
 from benchmarks.splatting.bench_splatting import PROTOTYPE, contender
 from benchmarks.splatting.scenes import trained
@@ -40,6 +41,7 @@ COLUMNS = (
     "commit",
     "forward_ms",
     "both_ms",
+    "machine",
 )
 CASES = ("surface 512", "surface 1024", "demo 256")
 VIEWS = 4  # of the demo
@@ -128,7 +130,8 @@ def measure(name: str, build: str, checkouts: dict[str, Path], rounds: int) -> l
     contenders = {
         label: kernel_passes(checkout, build, case) for label, checkout in checkouts.items()
     }
-    if build == "v4" and case.name == "surface" and (PROTOTYPE / "proto.cpp").exists():
+    runs = "v4" in cpu.usable_builds() and (PROTOTYPE / "proto.cpp").exists()
+    if runs and case.name == "surface":
         contenders["prototype"] = prototype_passes(case)
     best = best_times(contenders, rounds)
     first = next(iter(best.values()))[1]
@@ -136,7 +139,13 @@ def measure(name: str, build: str, checkouts: dict[str, Path], rounds: int) -> l
         print(f"{name:12} {build:4} {label:9} {both:7.2f} ms   {both / first:.2f}", flush=True)
     where = (case.name, len(case.cloud.means), len(case.viewmats), case.size, build)
     return [
-        (*where, label, commit_of(checkouts[label]) if label in checkouts else "", *found)
+        (
+            *where,
+            label,
+            commit_of(checkouts[label]) if label in checkouts else "",
+            *found,
+            machine(),
+        )
         for label, found in best.items()
     ]
 

@@ -113,7 +113,8 @@ def speedup() -> str:
 def kernel() -> str:
     """Return times of the CPU kernel before and now, and ratios, also to the prototype."""
     cells: dict[tuple[str, str], dict[str, dict[str, str]]] = {}
-    for row in read(KERNEL):
+    rows = read(KERNEL)
+    for row in rows:
         views = f"{row['views']} × " if row["views"] != "1" else ""
         where = f"{row['scene']}, {int(row['gaussians']):,} Gaussians, {views}{row['size']}²"
         cells.setdefault((where, row["build"]), {})[row["contender"]] = row
@@ -126,7 +127,8 @@ def kernel() -> str:
         table.append((where, build, f"{ms['before']:.1f}", f"{ms['now']:.1f}", *ratios))
     first = next(iter(cells.values()))
     before, now = (f"{name} ({first[name]['commit']}), ms" for name in ("before", "now"))
-    return markdown(("scene", "build", before, now, "now / before", "now / prototype"), table)
+    head = ("scene", "build", before, now, "now / before", "now / prototype")
+    return f"{rows[0]['machine']}:\n\n{markdown(head, table)}"
 
 
 def growth() -> str:
