@@ -29,6 +29,7 @@ from ..launch.folder_lock import FolderInUse, claim
 from .autoencoder_stage import AutoencoderStage
 from .clip_stage import ClipStage
 from .judge_stage import SEED_OFFSET, JudgeStage
+from .kinds import KINDS
 from .loop import Options, Stage, Training
 from .points_stage import PointsStage
 from .text_stage import TextStage
@@ -82,6 +83,13 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         help="shards of 1024 pictures that a stage visits cyclically",
     )
     add(
+        "--more",
+        nargs="+",
+        default=[],
+        metavar="KIND",
+        help="kinds of objects that half of the pictures show, e.g. those drawn worst",
+    )
+    add(
         "--workers",
         type=int,
         default=0,
@@ -101,6 +109,9 @@ def options_of(args: argparse.Namespace) -> Options:
     for name in args.stages:
         if name not in STAGES:
             raise unknown("stage", name, STAGES)
+    for kind in args.more:
+        if kind not in KINDS:
+            raise unknown("kind", kind, KINDS)
     if args.only and len(args.stages) != 1:
         raise UserError(f"--only {args.only}: give the stage that it is for as --stages, e.g. unet")
     for name in ("images", "threads", "batch", "pool"):
@@ -127,6 +138,7 @@ def options_of(args: argparse.Namespace) -> Options:
         seed=args.seed,
         device=args.device,
         pool=args.pool,
+        more=tuple(sorted(set(args.more))),
         precision=args.precision,
         rate=args.rate,
         only=args.only,
