@@ -82,13 +82,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         default=40,
         help="shards of 1024 pictures that a stage visits cyclically",
     )
-    add(
-        "--more",
-        nargs="+",
-        default=[],
-        metavar="KIND",
-        help="kinds of objects that half of the pictures show, e.g. those drawn worst",
-    )
+    add("--more", nargs="+", default=[], metavar="KIND", help="kinds that half of the objects have")
     add(
         "--workers",
         type=int,
@@ -106,12 +100,10 @@ def options_of(args: argparse.Namespace) -> Options:
     Raises:
         UserError: an unknown stage, a number out of range, or no such device.
     """
-    for name in args.stages:
-        if name not in STAGES:
-            raise unknown("stage", name, STAGES)
-    for kind in args.more:
-        if kind not in KINDS:
-            raise unknown("kind", kind, KINDS)
+    for what, given, known in (("stage", args.stages, STAGES), ("kind", args.more, KINDS)):
+        for name in given:
+            if name not in known:
+                raise unknown(what, name, known)
     if args.only and len(args.stages) != 1:
         raise UserError(f"--only {args.only}: give the stage that it is for as --stages, e.g. unet")
     for name in ("images", "threads", "batch", "pool"):
