@@ -248,7 +248,6 @@ def test_curves_are_written(folder):
     ("arguments", "message"),
     [
         (["--stages", "unett"], "did you mean 'unet'"),
-        (["--more", "turtel"], "did you mean 'turtle'"),
         (["--images", "0"], "--images 0: expected at least 1"),
         (["--pool", "-3"], "--pool -3: expected at least 1"),
         (["--device", "cuda"], "sees no GPU"),

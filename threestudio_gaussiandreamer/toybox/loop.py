@@ -50,8 +50,6 @@ class Options:
     pool: int = 40
     """Number of shards of training data; a stage visits them in a cycle."""
     shard_objects: int = 256
-    more: tuple[str, ...] = ()
-    """Kinds of half of the objects; the others, or all if empty, have random ones."""
     precision: str = "float32"
     """Either "float32", or "bfloat16" for autocast on GPUs."""
     save_seconds: float = 300.0
@@ -71,7 +69,7 @@ class Options:
     def shards(self, seed: Optional[int] = None) -> Shards:
         """Return the shards of a seed; None for that of the training."""
         seed = self.seed if seed is None else seed
-        return Shards(self.shards_folder(), seed, objects=self.shard_objects, more=self.more)
+        return Shards(self.shards_folder(), seed, objects=self.shard_objects)
 
 
 class Stage(ABC):

@@ -29,7 +29,6 @@ from ..launch.folder_lock import FolderInUse, claim
 from .autoencoder_stage import AutoencoderStage
 from .clip_stage import ClipStage
 from .judge_stage import SEED_OFFSET, JudgeStage
-from .kinds import KINDS
 from .loop import Options, Stage, Training
 from .points_stage import PointsStage
 from .text_stage import TextStage
@@ -82,7 +81,6 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         default=40,
         help="shards of 1024 pictures that a stage visits cyclically",
     )
-    add("--more", nargs="+", default=[], metavar="KIND", help="kinds that half of the objects have")
     add(
         "--workers",
         type=int,
@@ -100,10 +98,9 @@ def options_of(args: argparse.Namespace) -> Options:
     Raises:
         UserError: an unknown stage, a number out of range, or no such device.
     """
-    for what, given, known in (("stage", args.stages, STAGES), ("kind", args.more, KINDS)):
-        for name in given:
-            if name not in known:
-                raise unknown(what, name, known)
+    for name in args.stages:
+        if name not in STAGES:
+            raise unknown("stage", name, STAGES)
     if args.only and len(args.stages) != 1:
         raise UserError(f"--only {args.only}: give the stage that it is for as --stages, e.g. unet")
     for name in ("images", "threads", "batch", "pool"):
@@ -130,7 +127,6 @@ def options_of(args: argparse.Namespace) -> Options:
         seed=args.seed,
         device=args.device,
         pool=args.pool,
-        more=tuple(sorted(set(args.more))),
         precision=args.precision,
         rate=args.rate,
         only=args.only,

@@ -79,7 +79,6 @@ class Shards:
         held_out: whether the objects are those withheld from training.
         objects: number of objects per shard.
         views: number of views per object.
-        more: kinds of every second object; the others, or all if empty, have random ones.
     """
 
     def __init__(
@@ -90,24 +89,22 @@ class Shards:
         held_out: bool = False,
         objects: int = OBJECTS,
         views: int = VIEWS,
-        more: tuple[str, ...] = (),
     ) -> None:
         self.folder, self.seed, self.held_out = Path(folder), seed, held_out
-        self.objects, self.views, self.more = objects, views, more
+        self.objects, self.views = objects, views
         self.get = lru_cache(maxsize=2)(self._get)
         self.get_light = lru_cache(maxsize=LIGHT_SHARDS)(self._get_light)
 
     def __reduce__(self) -> tuple:
         """Send to other processes without what is cached."""
-        names = ("held_out", "objects", "views", "more")
-        known = {name: getattr(self, name) for name in names}
+        known = {"held_out": self.held_out, "objects": self.objects, "views": self.views}
         return partial(Shards, self.folder, self.seed, **known), ()
 
     def path(self, index: int) -> Path:
         """Return the file of shard ``index``."""
         sort = "held-out" if self.held_out else "train"
-        objects = "-".join([f"{self.objects}x{self.views}", *self.more])
-        return self.folder / f"{sort}-world{VERSION}-{self.seed}-{objects}-{index:05d}.npz"
+        name = f"{sort}-world{VERSION}-{self.seed}-{self.objects}x{self.views}-{index:05d}.npz"
+        return self.folder / name
 
     def ensure(self, index: int) -> None:
         """Render shard ``index`` into its file, unless that exists and is complete."""
@@ -142,8 +139,7 @@ class Shards:
         )
 
     def _object(self, index: int) -> tuple:
-        kinds = self.more if self.more and index % 2 else tuple(KINDS)
-        attributes = draw_attributes(self.seed, index, held_out=self.held_out, kinds=kinds)
+        attributes = draw_attributes(self.seed, index, held_out=self.held_out)
         rng = numpy_generator(self.seed, "toybox-object", int(self.held_out), index)
         mesh = object_mesh(attributes, rng)
         orbit = draw_orbit(self.views, rng)

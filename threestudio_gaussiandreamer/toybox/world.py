@@ -11,7 +11,6 @@ generalisation.
 """
 
 import hashlib
-from collections.abc import Container
 from typing import NamedTuple, Optional
 
 import numpy as np
@@ -77,17 +76,13 @@ class Attributes(NamedTuple):
     accessory_color: Optional[str] = None
 
 
-def draw_attributes(
-    seed: int, index: int, *, held_out: bool = False, kinds: Container[str] = tuple(KINDS)
-) -> Attributes:
-    """Draw the attributes of object ``index``, either withheld from training or not, of one of
-    these kinds.
-    """
+def draw_attributes(seed: int, index: int, *, held_out: bool = False) -> Attributes:
+    """Draw the attributes of object ``index``, either withheld from training or not."""
     for attempt in range(10_000):
         attributes = _draw(numpy_generator(seed, "toybox-attributes", attempt, index))
-        if attributes.kind in kinds and withheld(attributes) == held_out:
+        if withheld(attributes) == held_out:
             return attributes
-    raise AssertionError("one in 25 combinations is withheld, and each kind has some")
+    raise AssertionError("one in 25 combinations is withheld")
 
 
 def _draw(rng: np.random.Generator) -> Attributes:
