@@ -127,8 +127,8 @@ def kernel() -> str:
         table.append((where, build, f"{ms['before']:.1f}", f"{ms['now']:.1f}", *ratios))
     first = next(iter(cells.values()))
     before, now = (f"{name} ({first[name]['commit']}), ms" for name in ("before", "now"))
-    head = ("scene", "build", before, now, "now / before", "now / prototype")
-    return f"{rows[0]['machine']}:\n\n{markdown(head, table)}"
+    head = ("scene", "build", before, now, "now / before", "now / AVX-512 prototype")
+    return f"{', '.join(sorted({row['machine'] for row in rows}))}:\n\n{markdown(head, table)}"
 
 
 def growth() -> str:

@@ -80,6 +80,12 @@ class KernelContract(LimitsContract):
         cloud.opacities[:150] = 0.9999
         compare(backend, cloud, cameras(1, 66, 50), 66, 50, BACKGROUND, preset="fast")
 
+    def test_more_than_a_chunk_of_gaussians_over_whole_tiles(self, backend):
+        """Faint ones, so that none is hidden; the CPU kernel keeps no lists of so many pairs."""
+        cloud = random_cloud(600, seed=6, size=0.6)
+        cloud.opacities.mul_(0.02)
+        compare(backend, cloud, cameras(2, 34, 18), 34, 18, BACKGROUND, preset="accurate")
+
     def test_thousands_of_gaussians_on_hundreds_of_tiles(self, backend):
         """Against the torch backend in float64, which is exact and many times faster than the
         specification.

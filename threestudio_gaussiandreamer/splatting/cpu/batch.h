@@ -76,7 +76,8 @@ SPLAT_FN Batch exp2(const Batch& x) {
   y = y * r + 0.24022120237350464f;
   y = y * r + 0.6931469440460205f;
   y = y * r + 1.0f;
-  return each([&](int k) { return (Floats)((Ints)y.of[k] + ((Ints)rounded.of[k] << 23)); });
+  using Bits = Vector<LANES>::Unsigned;
+  return each([&](int k) { return (Floats)((Bits)y.of[k] + ((Bits)rounded.of[k] << 23)); });
 }
 #endif
 

@@ -70,7 +70,7 @@ template <class Visit> SPLAT_FN void for_each_of_part(const View& view, const De
 inline void number_slots(View& view) {
   view.intersection_count = 0;
   for (Slice& slice : view.slices) slice.first_slot = int32_t(view.intersection_count), view.intersection_count += slice.slots;
-  check_memory(view.intersection_count * int64_t(sizeof(Intersection) + sizeof(uint16_t) * BLOCKS + sizeof(float) * ROW));
+  check_memory(view.intersection_count * int64_t(sizeof(Intersection)));
   if (view.intersection_count > INT32_MAX) throw OutOfMemory{view.intersection_count * int64_t(sizeof(float) * ROW)};
 }
 

@@ -67,16 +67,15 @@ inline void skip_rest(View& view, int tile, int first, int end, bool keep) {
 // Blends all intersections of a tile into the planes; the view keeps the lists of each block's splats.
 inline void blend_tile_splats(const ForwardCall& call, View& view, int tile, const TileFrame& frame, BlendScratch& scratch) {
   const BlendLimits limits = limits_of(call.settings);
-  ChunkLists unkept;
   LiveBlocks live = LiveBlocks().set();
   start_transmittance(view, frame, scratch.transmittance);
   int first = frame.begin;
   for (; first < frame.end && live.any(); first += CHUNK) {
     const int count = std::min(CHUNK, frame.end - first);
-    stage<true>(view, frame, first, count, scratch.staged);
+    stage(view, frame, first, count, true, scratch.staged);
     std::memset(scratch.peaks, 0, sizeof(PeakRow) * count);
-    ChunkLists& lists = call.keep ? view.lists_of(tile, first) : unkept;
-    list_live_blocks(scratch.staged, live, lists, [&](const BlockPixels& pixels, const uint16_t* list, int length) {
+    ChunkLists* lists = call.keep ? &view.lists_of(tile, first) : nullptr;
+    for_each_live_block(scratch.staged, live, lists, [&](const BlockPixels& pixels, const uint16_t* list, int length) {
       return blend_block(scratch, pixels, list, length, limits);
     });
     store_peaks(view.intersections.data() + first, count, scratch.peaks, view.peaks.data());

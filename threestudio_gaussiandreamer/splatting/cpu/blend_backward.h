@@ -175,7 +175,7 @@ inline void store_sums(const View& view, const float* sums, int first, int count
 
 // The rows of sums of all intersections of one tile, each into its slot; those behind the last chunk that contributes are zero.
 template <bool ABSOLUTE>
-inline void blend_lists_backward(const BackwardCall& call, View& view, int tile, const TileFrame& frame,
+inline void blend_lists_backward(const BackwardCall& call, const View& view, int tile, const TileFrame& frame,
                                  BackwardScratch& scratch) {
   const BlendLimits limits = limits_of(call.settings);
   start_transmittance(view, frame, scratch.transmittance);
@@ -183,8 +183,8 @@ inline void blend_lists_backward(const BackwardCall& call, View& view, int tile,
     const int count = std::min(CHUNK, frame.end - first);
     std::memset(scratch.sums, 0, sizeof(float) * ROW * count);
     const ChunkLists& lists = view.lists_of(tile, first);
-    if (!lists.empty()) stage<false>(view, frame, first, count, scratch.staged);
-    for_each_listed_block(lists, [&](const BlockPixels& pixels, const uint16_t* list, int length) {
+    if (!lists.empty()) stage(view, frame, first, count, !lists.kept, scratch.staged);
+    for_each_listed_block(scratch.staged, lists, [&](const BlockPixels& pixels, const uint16_t* list, int length) {
       blend_block_backward<ABSOLUTE>(scratch, pixels, list, length, limits);
     });
     store_sums(view, scratch.sums, first, count, call.slots(view));
@@ -193,7 +193,7 @@ inline void blend_lists_backward(const BackwardCall& call, View& view, int tile,
 }
 
 // One tile of one view: fills the slots of its intersections, returns d loss / d background.
-inline Vec3<float> blend_tile_backward(const BackwardCall& call, View& view, int tile) {
+inline Vec3<float> blend_tile_backward(const BackwardCall& call, const View& view, int tile) {
   const TileFrame frame = frame_of(view, tile);
   BackwardScratch scratch;
   read_tile(call, view.index, frame, scratch.upstream);

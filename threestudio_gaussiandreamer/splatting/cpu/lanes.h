@@ -24,6 +24,7 @@ constexpr int LANES = 4;
 template <int N> struct Vector {
   typedef float Float __attribute__((vector_size(4 * N)));
   typedef int32_t Int __attribute__((vector_size(4 * N)));
+  typedef uint32_t Unsigned __attribute__((vector_size(4 * N)));
 };
 using Floats = Vector<LANES>::Float;
 using Ints = Vector<LANES>::Int;

@@ -78,6 +78,9 @@ struct Staged {
 #endif
 };
 
+// The splats of one block, see ChunkLists; has room for whole vectors behind the last one.
+using BlockList = uint16_t[CHUNK + 16];
+
 template <class Row> SPLAT_FN Row& row_at(Row* rows, uint16_t position) {
   static_assert(sizeof(Row) == sizeof(float) * ROW, "a row");
   return *reinterpret_cast<Row*>(reinterpret_cast<uintptr_t>(rows) + sizeof(float) * position);
@@ -86,8 +89,8 @@ template <class Row> SPLAT_FN Row& row_at(Row* rows, uint16_t position) {
 #if defined(__AVX512F__)
 SPLAT_FN void list_splats(Staged&) {}
 
-// Writes the splats that touch a block; returns how many. Up to 16 more are overwritten.
-SPLAT_FN int list_block(const Staged& staged, int block, uint16_t* list) {
+// Writes the splats that touch a block; returns how many.
+SPLAT_FN int list_block(const Staged& staged, int block, BlockList& list) {
   const __m512i bit = _mm512_set1_epi32(int(1u << block % 32)), step = _mm512_set1_epi32(16 * ROW);
   __m512i positions = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
   positions = _mm512_mullo_epi32(positions, _mm512_set1_epi32(ROW));
@@ -135,8 +138,8 @@ struct BitPositions {
 };
 constexpr BitPositions BIT_POSITIONS;
 
-// Writes the splats that touch a block; returns how many. Up to 16 more are overwritten.
-SPLAT_FN int list_block(const Staged& staged, int block, uint16_t* list) {
+// Writes the splats that touch a block; returns how many.
+SPLAT_FN int list_block(const Staged& staged, int block, BlockList& list) {
   typedef uint8_t Bytes __attribute__((vector_size(8)));
   typedef uint16_t Words __attribute__((vector_size(16)));
   const uint64_t* words = staged.splats_of[block / 64] + block % 64;
@@ -153,34 +156,26 @@ SPLAT_FN int list_block(const Staged& staged, int block, uint16_t* list) {
 }
 #endif
 
-// Transforms `count` splats to the coordinates of a tile.
-template <bool FIND_BLOCKS> SPLAT_FN void stage(const View& view, const TileFrame& frame, int first, int count, Staged& staged) {
+// Transforms `count` splats to the coordinates of a tile, and finds the blocks that they touch.
+SPLAT_FN void stage(const View& view, const TileFrame& frame, int first, int count, bool find_blocks, Staged& staged) {
   for (int i = 0; i < count; i += LANES) {
     for (int l = 0; l < LANES; l++)
       __builtin_prefetch(&view.splats[view.intersections[std::min(first + i + l + PREFETCH, frame.end - 1)].gaussian]);
     const SplatLanes splats = load_splats(view, frame, first + i, count - i);
     store_local(splats, staged.splats + i);
-    if (!FIND_BLOCKS) continue;
+    if (!find_blocks) continue;
     Ints words[MASK_WORDS];
     block_masks(splats, words);
     for (int w = 0; w < MASK_WORDS; w++) std::memcpy(staged.touching[w] + i, &words[w], sizeof words[w]);
   }
   staged.splats[CHUNK] = LocalSplat(), staged.splats[CHUNK].log2_opacity = -1e30f;
-  if (!FIND_BLOCKS) return;
+  if (!find_blocks) return;
   staged.groups = (count + 63) / 64;
   for (uint32_t* words : staged.touching) std::fill(words + count, words + staged.groups * 64, 0);
   list_splats(staged);
 }
 
 inline int whole_batches(int length) { return (length + BATCH - 1) / BATCH * BATCH; }
-
-// Room for the lists of all blocks that the staged splats touch.
-inline uint16_t* reserve_lists(const Staged& staged, ChunkLists& lists) {
-  int64_t pairs = 0;
-  for (const uint32_t* words : staged.touching)
-    for (int i = 0; i < staged.groups * 64; i++) pairs += __builtin_popcount(words[i]);
-  return lists.splats.reserve(pairs + BLOCKS * BATCH + 16);
-}
 
 // The pixel centres of a block in tile coordinates.
 struct BlockPixels {
@@ -227,25 +222,46 @@ inline void start_transmittance(const View& view, const TileFrame& frame, float*
 // Which blocks still have pixels that haven't stopped.
 using LiveBlocks = std::bitset<BLOCKS>;
 
-// Lists the splats of each live block and calls blend(pixels, list, length) for it, which returns how many it needed, or 0 if
-// the block continues behind all of them.
-template <class Blend> SPLAT_FN void list_live_blocks(const Staged& staged, LiveBlocks& live, ChunkLists& lists, Blend blend) {
-  uint16_t* list = reserve_lists(staged, lists);
+// Writes the splats that touch a block, filled up to whole batches with the invisible one; returns how many touch it.
+SPLAT_FN int list_batches(const Staged& staged, int block, BlockList& list) {
+  const int length = list_block(staged, block, list);
+  std::fill(list + length, list + whole_batches(length), CHUNK * ROW);
+  return length;
+}
+
+// Whether the lists of all blocks are short enough to be kept; if so, there is room for them.
+inline bool can_keep(const Staged& staged, ChunkLists& lists) {
+  int64_t pairs = 0;
+  for (const uint32_t* words : staged.touching)
+    for (int i = 0; i < staged.groups * 64; i++) pairs += __builtin_popcount(words[i]);
+  if (pairs <= KEPT_PAIRS * CHUNK) lists.splats.reserve(pairs + BLOCKS * BATCH);
+  return pairs <= KEPT_PAIRS * CHUNK;
+}
+
+// Calls blend(pixels, list, length) for each live block and the splats that touch it; it returns how many it needed, or 0 if
+// the block continues behind all of them. Keeps the lists unless `lists` is null.
+template <class Blend> SPLAT_FN void for_each_live_block(const Staged& staged, LiveBlocks& live, ChunkLists* lists, Blend blend) {
+  BlockList list;
+  uint16_t* keep = nullptr;
+  if (lists && (lists->kept = can_keep(staged, *lists))) keep = lists->splats.data();
   for (int block = 0; block < BLOCKS; block++) {
-    int length = live[block] ? list_block(staged, block, list) : 0;
-    std::fill(list + length, list + whole_batches(length), CHUNK * ROW);
+    int length = live[block] ? list_batches(staged, block, list) : 0;
     if (const int needed = length ? blend(block_pixels(block), list, length) : 0) length = needed, live.reset(block);
-    lists.lengths[block] = uint16_t(length), list += whole_batches(length);
+    if (lists) lists->lengths[block] = uint16_t(length);
+    if (keep) keep = std::copy(list, list + whole_batches(length), keep);
   }
 }
 
-// Calls blend(pixels, list, length) for the listed blocks.
-template <class Blend> SPLAT_FN void for_each_listed_block(const ChunkLists& lists, Blend blend) {
-  const uint16_t* list = lists.splats.data();
+// Calls blend(pixels, list, length) again for the same blocks and splats.
+template <class Blend> SPLAT_FN void for_each_listed_block(const Staged& staged, const ChunkLists& lists, Blend blend) {
+  BlockList list;
+  const uint16_t* kept = lists.splats.data();
   for (int block = 0; block < BLOCKS; block++) {
     const int length = lists.lengths[block];
-    if (length) blend(block_pixels(block), list, length);
-    list += whole_batches(length);
+    if (!length) continue;
+    if (!lists.kept) list_batches(staged, block, list);
+    blend(block_pixels(block), lists.kept ? kept : list, length);
+    if (lists.kept) kept += whole_batches(length);
   }
 }
 

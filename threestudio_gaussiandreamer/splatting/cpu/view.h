@@ -46,10 +46,13 @@ struct Intersection {
   int32_t gaussian, slot;
 };
 
+constexpr int KEPT_PAIRS = 512 / LANES;  // of splats and blocks, per splat of a chunk; the lists of chunks with more aren't kept
+
 // The splats of a chunk that are blended into each block: block after block, front to back, each list filled up to whole
 // batches. A splat is the position of its first float among the chunk's, each of which has ROW floats.
 struct ChunkLists {
   uint16_t lengths[BLOCKS];
+  bool kept;  // else there are the lengths only
   Buffer<uint16_t> splats;
 
   bool empty() const {
@@ -89,6 +92,7 @@ struct View {
   int tiles() const { return tiles_x * tiles_y; }
   // The lists of the chunk of a tile that begins at an intersection.
   ChunkLists& lists_of(int tile, int first) { return lists[first / CHUNK + tile]; }
+  const ChunkLists& lists_of(int tile, int first) const { return lists[first / CHUNK + tile]; }
   const Slice& slice_of(int64_t gaussian) const { return slices[gaussian / SLICE]; }
   Coverage& coverage(int64_t gaussian) { return coverages[gaussian + gaussian / SLICE]; }
   const Coverage& coverage(int64_t gaussian) const { return coverages[gaussian + gaussian / SLICE]; }

@@ -2,7 +2,7 @@
 //
 // Generic in F: `float` (one Gaussian or pixel per thread) or a SIMD vector of floats (one per lane). No standard header is
 // needed, so CUDA source can include this file too; `SPLAT_FN` carries its function qualifiers. Vectors need the overloads
-// of `square_root`, `exp2` and `log2` declared before this file is included.
+// of `square_root` and `log2` declared before this file is included, and one of `exp2`.
 //
 // The image model is EWA splatting (Zwicker et al. 2001) as in 3D Gaussian Splatting (Kerbl et al. 2023): a Gaussian whose
 // mean is t in camera coordinates becomes a 2-D Gaussian with covariance J W S W' J' + eps I. In place of that covariance
