@@ -31,6 +31,7 @@ from tqdm import tqdm
 from benchmarks.quality.jobs import JOBS, OWN_OBJECTS, STEPS, WITHOUT_OBJECTS, Job
 from benchmarks.quality.recipe import CONFIGS, RECIPE, recipe
 from benchmarks.start.launched import commit_of
+from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 
 ROOT = Path(__file__).resolve().parents[2]
 CHARTS = ROOT / "docs/charts"
@@ -45,6 +46,7 @@ COLUMNS += ["machine", "commit"]
 
 def main() -> None:
     arguments = parse_arguments()
+    require_kernel()
     measured = {
         chart: measured_in(chart, "variant", "x", "object", "seed") for chart in arguments.charts
     }
@@ -97,6 +99,14 @@ def add_jobs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--jobs", type=int, default=os.cpu_count(), help="runs side by side, one thread each"
     )
+
+
+def require_kernel() -> None:
+    """Exit unless the CPU kernel can run, since plain torch in its place takes many times as long.
+
+    Called by benchmarks that note seconds."""
+    if reason := cpu.unavailable():
+        sys.exit(f"this would measure plain torch: {reason}")
 
 
 def measure_missing(

@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from benchmarks.quality.runs import CHARTS, add_jobs, append_rows, rows_of
+from benchmarks.quality.runs import CHARTS, add_jobs, append_rows, require_kernel, rows_of
 from benchmarks.quality.toybox_jobs import (
     CHART,
     RECOGNIZED,
@@ -204,6 +204,7 @@ def main() -> None:
     if arguments.list:
         print("\n".join(" | ".join((*task.key, task.prompt.text)) for task in todo))
         return
+    require_kernel()
     os.environ |= ENVIRONMENT
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(arguments.jobs, mp_context=spawn, initializer=prepare) as pool:

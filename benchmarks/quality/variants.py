@@ -155,6 +155,7 @@ class Todo(NamedTuple):
 
 def main() -> None:
     arguments = parse_arguments()
+    runs.require_kernel()
     deadline = time.monotonic() + arguments.seconds
     failed = 0
     for stage in (all_scales, best_scale_only):
