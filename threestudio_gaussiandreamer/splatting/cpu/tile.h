@@ -70,7 +70,7 @@ SPLAT_FN void block_masks(const SplatLanes& s, Ints words[MASK_WORDS]) {
 
 // The staged splats of a chunk and which blocks each of them touches.
 struct Staged {
-  alignas(64) LocalSplat splats[CHUNK + 1];  // the last one is invisible
+  alignas(64) LocalSplat splats[CHUNK + 1];          // the last one is invisible
   alignas(64) uint32_t touching[MASK_WORDS][CHUNK];  // a bit per block; zero behind the last splat, up to a whole group
   int groups;                                        // of 64 splats
 #if !defined(__AVX512F__)
