@@ -66,11 +66,17 @@ template <class Visit> SPLAT_FN void for_each_of_part(const View& view, const De
   }
 }
 
+// What intersections take: they and their peaks, and for a backward pass their lists and gradients.
+inline int64_t bytes_of(int64_t intersections, bool keep) {
+  const int64_t drawn = sizeof(Intersection) + sizeof(float), kept = sizeof(uint16_t) * KEPT_PAIRS + sizeof(float) * ROW;
+  return intersections * (drawn + (keep ? kept : 0));
+}
+
 // Sets each slice's first slot and the number of intersections.
-inline void number_slots(View& view) {
+inline void number_slots(View& view, bool keep) {
   view.intersection_count = 0;
   for (Slice& slice : view.slices) slice.first_slot = int32_t(view.intersection_count), view.intersection_count += slice.slots;
-  check_memory(view.intersection_count * int64_t(sizeof(Intersection)));
+  check_memory(bytes_of(view.intersection_count, keep));
   if (view.intersection_count > INT32_MAX) throw OutOfMemory{view.intersection_count * int64_t(sizeof(float) * ROW)};
 }
 
@@ -122,7 +128,7 @@ inline void build_view(const ForwardCall& call, View& view, int index, int threa
   if (view.counted) std::fill_n(view.histogram.reserve(view.tiles()), view.tiles(), 0);
   view.camera = make_camera(call.scene, index);
   parallel_for(view.slices.size(), threads, 1, [&](int64_t i) { project_slice(call, view, i); });
-  number_slots(view);
+  number_slots(view, call.keep);
   const int64_t visible = gather_keys(view);
   deal_to_tiles(view, sort_by_depth(view, visible), visible, threads);
 }

@@ -35,17 +35,11 @@ static void blend_views(const ForwardCall& call, Views& views) {
                [&](int64_t i) { store_contributions(call, views[i / slices], i % slices); });
 }
 
-// What the intersections of all views will need, a backward pass included.
-static void check_memory(const ForwardCall& call, const Views& views) {
-  const int64_t kept = sizeof(uint16_t) * KEPT_PAIRS + sizeof(float) * ROW;
-  int64_t intersections = 0;
-  for (int v = 0; v < call.scene.views; v++) intersections += views[v].intersection_count;
-  check_memory(intersections * (int64_t(sizeof(Intersection) + sizeof(float)) + (call.keep ? kept : 0)));
-}
-
 static void forward(const ForwardCall& call, Views& views) {
   build_views(call, views);
-  check_memory(call, views);
+  int64_t intersections = 0;
+  for (int v = 0; v < call.scene.views; v++) intersections += views[v].intersection_count;
+  check_memory(bytes_of(intersections, call.keep));
   blend_views(call, views);
 }
 
