@@ -49,7 +49,6 @@ static int64_t slices_of(const Scene& scene) { return (scene.gaussians + BACKWAR
 static void prepare(BackwardCall& call) {
   int64_t slots = 0;
   for (int v = 0; v < call.scene.views; v++) call.first_slots.push_back(slots), slots += call.views[v].intersection_count;
-  check_memory(slots * ROW * int64_t(sizeof(float)));
   call.work.slots.reserve(slots * ROW);
   call.work.background.reserve(3 * int64_t(call.views[0].tiles()) * call.scene.views);
   const int64_t viewmats = call.out.viewmats ? 16 * slices_of(call.scene) * call.scene.views : 0;
