@@ -23,7 +23,8 @@ from .particles import ParticleModel, Renders, State
 from .score_pictures import Noised
 
 if TYPE_CHECKING:
-    from .text_to_image import Condition, TextToImageDistillation
+    from .text_condition import Condition
+    from .text_to_image import TextToImageDistillation
 
 ADAPTED = re.compile(r"\.(to_q|to_k|to_v|to_out\.0)$")
 """Layers of an attention block that get a low-rank addition."""

@@ -41,7 +41,8 @@ from ..models.multiview_unet import CAMERA, attend_across_views, load_multiview_
 from ..models.pooled_embeddings import pack, unpack
 from .base import GUIDANCE_SCALE
 from .stable_diffusion import StableDiffusionGuidance
-from .text_to_image import Condition, Embeddings, Latents, Timesteps, view_of_row
+from .text_condition import Condition, view_of_row
+from .text_to_image import Embeddings, Latents, Timesteps
 
 SAME = 1e-2
 """Largest difference of angles that count as equal, degrees."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from ..core.errors import UserError
 from ..host import register
@@ -57,11 +58,11 @@ class StableDiffusionXLGuidance(StableDiffusionGuidance):
     def require_inputs(self) -> None:
         self.require_text_to_image(self.vae.config.latent_channels, ("text_time",))
 
-    def run_network(self, z: Latents, t: Timesteps, embeddings: Embeddings) -> Latents:
+    def run_network(
+        self, z: Latents, t: Timesteps, embeddings: Embeddings, **inputs: Tensor
+    ) -> Latents:
         tokens, pooled = unpack(embeddings.to(self.dtype), self.pooled_width)
         side = float(self.image_size)
         sizes = z.new_tensor([side, side, 0, 0, side, side]).expand(len(z), SIZES)
-        added = {"text_embeds": pooled, "time_ids": sizes}
-        return self.unet(
-            z.to(self.dtype), t, encoder_hidden_states=tokens, added_cond_kwargs=added
-        ).sample
+        inputs["added_cond_kwargs"] = {"text_embeds": pooled, "time_ids": sizes}
+        return self.unet(z.to(self.dtype), t, encoder_hidden_states=tokens, **inputs).sample

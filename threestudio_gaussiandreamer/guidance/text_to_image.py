@@ -7,7 +7,7 @@ option                              meaning
 pretrained_model_name_or_path       the model, the prompt processor's: a folder or a hub id;
                                     ``revision`` of a hub id
 guidance_scale                      of classifier-free guidance; 1 is none (threestudio's 100 is 101
-                                    here)
+                                    here). Networks that take it need one evaluation per view
 ..._step_percent, grad_clip,        see ``guidance/base.py``
 weighting_strategy, ...
 view_dependent_prompting            use the prompt of each view's direction
@@ -29,7 +29,7 @@ enable_memory_efficient_attention   torch's own attention is so already; accepte
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Optional
+from typing import Any, ClassVar, Optional
 
 import torch
 import torch.nn.functional as F
@@ -49,6 +49,8 @@ from .base import ScoreDistillation
 from .half_precision import HALF_TYPES, weights_type
 from .lora import LoRAParticles, check_adaptable
 from .particles import ParticleModel
+from .scale_input import scale_input
+from .text_condition import Condition, view_of_row
 
 TERMINAL_ABAR = 2.0**-24
 """Replaces an ``abar`` of exactly 0, which schedules with zero terminal SNR have at the last step,
@@ -60,33 +62,6 @@ Latents = Float[Tensor, "kB c h w"]
 Timesteps = Int[Tensor, " kB"]
 Embeddings = Float[Tensor, "kB N F"]
 """Inputs of the network, a row for each row of a :class:`Condition`."""
-
-
-class Condition(NamedTuple):
-    """The text embeddings of B views, k rows per view. What else a model is conditioned on is in
-    further tokens of each row (``models/pooled_embeddings.py``).
-    """
-
-    embeddings: Float[Tensor, "kB N F"]
-    """Prompts of all views, negative prompts of all views, and with Perp-Neg two further rows for
-    each view, adjacent.
-    """
-    negative_weights: Optional[Float[Tensor, "B 2"]]
-    """The weights of the two Perp-Neg rows, <= 0; None without Perp-Neg."""
-    empty: Optional[Float[Tensor, "1 N F"]] = None
-    """The embedding of an empty prompt, if the variant needs it and the prompts have it."""
-
-    def select(self, rows: Int[Tensor, " R"]) -> "Condition":
-        """Return the conditions of some views."""
-        views = len(self.embeddings) // (2 if self.negative_weights is None else 4)
-        index = torch.cat([rows, views + rows])
-        if self.negative_weights is None:
-            return self._replace(embeddings=self.embeddings[index])
-        pairs = 2 * (views + rows)[:, None] + torch.arange(2, device=rows.device)
-        return self._replace(
-            embeddings=self.embeddings[torch.cat([index, pairs.flatten()])],
-            negative_weights=self.negative_weights[rows],
-        )
 
 
 class TextToImageDistillation(ScoreDistillation):
@@ -112,6 +87,8 @@ class TextToImageDistillation(ScoreDistillation):
     components: ClassVar[tuple[str, ...]] = ("unet", "scheduler")
     family: ClassVar[Family] = STABLE_DIFFUSION
     """The models that this guidance takes."""
+    scale_width: Optional[int] = None
+    """Width of the guidance scale's embedding; None if the network doesn't take the scale."""
 
     # Loading
     # ----------------------------------------------------------------------------------------------
@@ -188,10 +165,11 @@ class TextToImageDistillation(ScoreDistillation):
             )
 
     def load_denoiser(self, folder: Path) -> None:
-        """Load the network that predicts the noise, and set ``text_width``."""
+        """Load the network that predicts the noise, and set ``text_width`` and ``scale_width``."""
         from diffusers import UNet2DConditionModel
 
         self.unet = self.network(UNet2DConditionModel, folder, "unet", self.prepare_denoiser)
+        self.scale_width = self.unet.config.time_cond_proj_dim
         self.text_width = self.unet.config.encoder_hid_dim or self.unet.config.cross_attention_dim
 
     def size_of_images(self, factor: int = 1) -> int:
@@ -344,6 +322,22 @@ class TextToImageDistillation(ScoreDistillation):
     def check_particle_model(cls, cfg: Any) -> None:
         check_adaptable(cfg)
 
+    def guided_noise(
+        self,
+        z: Float[Tensor, "B c h w"],
+        t: Int[Tensor, " B"],
+        condition: Condition,
+        scale: float,
+        *,
+        rescale: float = 0.0,
+    ) -> Float[Tensor, "B c h w"]:
+        """Predict the noise with guidance, in one evaluation per view if the network takes the
+        scale; Perp-Neg and ``rescale`` need further predictions.
+        """
+        if self.scale_width is None or rescale or condition.negative_weights is not None:
+            return super().guided_noise(z, t, condition, scale, rescale=rescale)
+        return self.noise(z, t, condition.embeddings[: len(z)], scale).to(z)
+
     def predict(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition
     ) -> tuple[Tensor, Optional[Tensor]]:
@@ -360,25 +354,34 @@ class TextToImageDistillation(ScoreDistillation):
         ), eps[batch : 2 * batch]
 
     def noise(
-        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], embeddings: Float[Tensor, "kB N F"]
+        self,
+        z: Float[Tensor, "B c h w"],
+        t: Int[Tensor, " B"],
+        embeddings: Float[Tensor, "kB N F"],
+        scale: float = 1.0,
     ) -> Float[Tensor, "kB c h w"]:
         """Predict the noise, float32, for each row of ``embeddings`` and the latent of its view, in
         one forward pass of the network.
+
+        Args:
+            scale: of guidance, for a network that takes it; 1 for none.
         """
         self.evaluations += len(embeddings)
         rows = view_of_row(len(z), len(embeddings)).to(z.device)
         z, t = z[rows], t[rows]
-        output = self.run_network(z, t, embeddings).float()
+        inputs = scale_input(scale, self.scale_width, z.to(self.dtype))
+        output = self.run_network(z, t, embeddings, **inputs).float()
         # models may also predict the variance of the reverse step, in further channels
         return PREDICTIONS[self.prediction_type](output[:, : z.shape[1]], z, self._abar[t])
 
-    def run_network(self, z: Latents, t: Timesteps, embeddings: Embeddings) -> Latents:
+    def run_network(
+        self, z: Latents, t: Timesteps, embeddings: Embeddings, **inputs: Tensor
+    ) -> Latents:
         """Return the output of the network, of the model's prediction type, for as many rows of
         ``embeddings`` as of latents; subclasses pass the model's further inputs.
         """
-        return self.unet(
-            z.to(self.dtype), t, encoder_hidden_states=embeddings.to(self.dtype)
-        ).sample
+        tokens = embeddings.to(self.dtype)
+        return self.unet(z.to(self.dtype), t, encoder_hidden_states=tokens, **inputs).sample
 
     def resized(self, images: Float[Tensor, "B 3 H W"], size: int) -> Float[Tensor, "B 3 s s"]:
         """Resize images to the model's size, with antialiasing if they shrink by more than a factor
@@ -390,9 +393,3 @@ class TextToImageDistillation(ScoreDistillation):
         return F.interpolate(
             images, (size, size), mode="bilinear", align_corners=False, antialias=antialias
         )
-
-
-def view_of_row(views: int, rows: int) -> Int[Tensor, " kB"]:
-    """Return the view of each row of a :class:`Condition`: 0..B-1, 0..B-1, then 0, 0, 1, 1, ..."""
-    order = torch.arange(views)
-    return torch.cat([order, order, order.repeat_interleave(2)])[:rows]

@@ -1,0 +1,40 @@
+"""What a text-to-image model is conditioned on in a step."""
+
+from typing import NamedTuple, Optional
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+class Condition(NamedTuple):
+    """The text embeddings of B views, k rows per view. What else a model is conditioned on is in
+    further tokens of each row (``models/pooled_embeddings.py``).
+    """
+
+    embeddings: Float[Tensor, "kB N F"]
+    """Prompts of all views, negative prompts of all views, and with Perp-Neg two further rows for
+    each view, adjacent.
+    """
+    negative_weights: Optional[Float[Tensor, "B 2"]]
+    """The weights of the two Perp-Neg rows, <= 0; None without Perp-Neg."""
+    empty: Optional[Float[Tensor, "1 N F"]] = None
+    """The embedding of an empty prompt, if the variant needs it and the prompts have it."""
+
+    def select(self, rows: Int[Tensor, " R"]) -> "Condition":
+        """Return the conditions of some views."""
+        views = len(self.embeddings) // (2 if self.negative_weights is None else 4)
+        index = torch.cat([rows, views + rows])
+        if self.negative_weights is None:
+            return self._replace(embeddings=self.embeddings[index])
+        pairs = 2 * (views + rows)[:, None] + torch.arange(2, device=rows.device)
+        return self._replace(
+            embeddings=self.embeddings[torch.cat([index, pairs.flatten()])],
+            negative_weights=self.negative_weights[rows],
+        )
+
+
+def view_of_row(views: int, rows: int) -> Int[Tensor, " kB"]:
+    """Return the view of each row of a :class:`Condition`: 0..B-1, 0..B-1, then 0, 0, 1, 1, ..."""
+    order = torch.arange(views)
+    return torch.cat([order, order, order.repeat_interleave(2)])[:rows]
