@@ -41,8 +41,7 @@ from ..models.multiview_unet import CAMERA, attend_across_views, load_multiview_
 from ..models.pooled_embeddings import pack, unpack
 from .base import GUIDANCE_SCALE
 from .stable_diffusion import StableDiffusionGuidance
-from .text_condition import Condition, view_of_row
-from .text_to_image import Embeddings, Latents, Timesteps
+from .text_condition import Condition, Embeddings, Latents, Timesteps, view_of_row
 
 SAME = 1e-2
 """Largest difference of angles that count as equal, degrees."""
@@ -62,6 +61,10 @@ class MVDreamGuidance(StableDiffusionGuidance):
         @staticmethod
         def check(cfg: Any) -> None:
             StableDiffusionGuidance.Config.check(cfg)
+            if cfg.view_contrast:
+                raise UserError(
+                    "view_contrast: this model has one prompt for all views: set it to 0"
+                )
             if cfg.max_items_eval > 0 and cfg.max_items_eval % cfg.n_view:
                 raise UserError(
                     f"max_items_eval: expected a multiple of n_view={cfg.n_view}, or 0, got "

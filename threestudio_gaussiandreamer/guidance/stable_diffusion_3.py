@@ -35,7 +35,7 @@ from ..models.pooled_embeddings import unpack
 from ..prompts.pooled_prompt_processors import STABLE_DIFFUSION_3
 from .base import GUIDANCE_SCALE
 from .stable_diffusion import StableDiffusionGuidance
-from .text_to_image import Embeddings, Latents, Timesteps
+from .text_condition import Embeddings, Latents, Timesteps
 
 
 @register("gaussiandreamer-stable-diffusion-3-guidance")

@@ -6,6 +6,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+Latents = Float[Tensor, "kB c h w"]
+Timesteps = Int[Tensor, " kB"]
+Embeddings = Float[Tensor, "kB N F"]
+"""Inputs of the network, a row for each row of a :class:`Condition`."""
+
 
 class Condition(NamedTuple):
     """The text embeddings of B views, k rows per view. What else a model is conditioned on is in
@@ -20,13 +25,21 @@ class Condition(NamedTuple):
     """The weights of the two Perp-Neg rows, <= 0; None without Perp-Neg."""
     empty: Optional[Float[Tensor, "1 N F"]] = None
     """The embedding of an empty prompt, if the variant needs it and the prompts have it."""
+    opposite: Optional[Float[Tensor, "B N F"]] = None
+    """The prompts of the opposite views; None without view contrast."""
+
+    @property
+    def has_other_prompts(self) -> bool:
+        """Whether the conditional prediction also depends on the prompts of other views."""
+        return self.negative_weights is not None or self.opposite is not None
 
     def select(self, rows: Int[Tensor, " R"]) -> "Condition":
         """Return the conditions of some views."""
         views = len(self.embeddings) // (2 if self.negative_weights is None else 4)
         index = torch.cat([rows, views + rows])
         if self.negative_weights is None:
-            return self._replace(embeddings=self.embeddings[index])
+            opposite = None if self.opposite is None else self.opposite[rows]
+            return self._replace(embeddings=self.embeddings[index], opposite=opposite)
         pairs = 2 * (views + rows)[:, None] + torch.arange(2, device=rows.device)
         return self._replace(
             embeddings=self.embeddings[torch.cat([index, pairs.flatten()])],

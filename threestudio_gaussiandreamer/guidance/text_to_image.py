@@ -11,6 +11,7 @@ guidance_scale                      of classifier-free guidance; 1 is none (thre
 ..._step_percent, grad_clip,        see ``guidance/base.py``
 weighting_strategy, ...
 view_dependent_prompting            use the prompt of each view's direction
+view_contrast, view_contrast_from   see ``guidance/view_contrast.py``
 image_size                          height and width that the model sees, pixels; none = what it was
                                     trained with
 half_precision_weights              half precision on a GPU; images, latents, gradients and
@@ -50,18 +51,13 @@ from .half_precision import HALF_TYPES, weights_type
 from .lora import LoRAParticles, check_adaptable
 from .particles import ParticleModel
 from .scale_input import scale_input
-from .text_condition import Condition, view_of_row
+from .text_condition import Condition, Embeddings, Latents, Timesteps, view_of_row
+from .view_contrast import check_view_contrast, contrasted, opposite
 
 TERMINAL_ABAR = 2.0**-24
 """Replaces an ``abar`` of exactly 0, which schedules with zero terminal SNR have at the last step,
 since ``predict_x0`` divides by its square root.
 """
-
-
-Latents = Float[Tensor, "kB c h w"]
-Timesteps = Int[Tensor, " kB"]
-Embeddings = Float[Tensor, "kB N F"]
-"""Inputs of the network, a row for each row of a :class:`Condition`."""
 
 
 class TextToImageDistillation(ScoreDistillation):
@@ -74,6 +70,8 @@ class TextToImageDistillation(ScoreDistillation):
         pretrained_model_name_or_path: str = ""
         revision: Optional[str] = None
         view_dependent_prompting: bool = True
+        view_contrast: float = field(default=0.0, metadata=in_range(0, 100))
+        view_contrast_from: float = field(default=0.4, metadata=in_range(0, 1))
         image_size: Optional[int] = field(default=None, metadata=in_range(1, 4096, "pixels"))
         half_precision_weights: bool = True
         half_precision_type: str = field(default="float16", metadata=one_of(HALF_TYPES))
@@ -82,6 +80,11 @@ class TextToImageDistillation(ScoreDistillation):
         enable_attention_slicing: bool = False
         enable_sequential_cpu_offload: bool = False
         enable_memory_efficient_attention: bool = False
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            ScoreDistillation.Config.check(cfg)
+            check_view_contrast(cfg)
 
     cfg: Config
     components: ClassVar[tuple[str, ...]] = ("unet", "scheduler")
@@ -274,6 +277,9 @@ class TextToImageDistillation(ScoreDistillation):
             batch["camera_distances"],
             self.cfg.view_dependent_prompting,
         )
+        other = None
+        if self.cfg.view_contrast:
+            other = opposite(prompt_utils, *views).to(self.device)
         if getattr(prompt_utils, "use_perp_neg", False):
             embeddings, weights = prompt_utils.get_text_embeddings_perp_neg(*views)
             weights = weights.to(self.device)
@@ -286,7 +292,8 @@ class TextToImageDistillation(ScoreDistillation):
                 "give system.prompt_processor and system.guidance the same "
                 "pretrained_model_name_or_path"
             )
-        return Condition(embeddings.to(self.device), weights, self._empty_embedding(prompt_utils))
+        empty = self._empty_embedding(prompt_utils)
+        return Condition(embeddings.to(self.device), weights, empty, other)
 
     def _empty_embedding(self, prompt_utils: Any) -> Optional[Float[Tensor, "1 N F"]]:
         """Return the embedding of an empty prompt if the variant needs one and ``prompt_utils`` can
@@ -332,26 +339,22 @@ class TextToImageDistillation(ScoreDistillation):
         rescale: float = 0.0,
     ) -> Float[Tensor, "B c h w"]:
         """Predict the noise with guidance, in one evaluation per view if the network takes the
-        scale; Perp-Neg and ``rescale`` need further predictions.
+        scale; Perp-Neg, view contrast and ``rescale`` need further predictions.
         """
-        if self.scale_width is None or rescale or condition.negative_weights is not None:
+        if self.scale_width is None or rescale or condition.has_other_prompts:
             return super().guided_noise(z, t, condition, scale, rescale=rescale)
         return self.noise(z, t, condition.embeddings[: len(z)], scale).to(z)
 
     def predict(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition
     ) -> tuple[Tensor, Optional[Tensor]]:
-        batch = len(z)
-        if condition.negative_weights is None:
-            eps = self.noise(
-                z, t, condition.embeddings if self.guided else condition.embeddings[:batch]
-            )
-            return eps[:batch], eps[batch:] if self.guided else None
-        eps = self.noise(z, t, condition.embeddings)
-        negative = eps[2 * batch :].unflatten(0, (batch, 2))
-        return perp_neg(
-            eps[:batch], eps[batch : 2 * batch], negative, condition.negative_weights
-        ), eps[batch : 2 * batch]
+        batch, perp = len(z), condition.negative_weights
+        rows = len(condition.embeddings) if self.guided or perp is not None else batch
+        eps = self.noise(z, t, condition.embeddings[:rows])
+        cond, uncond = eps[:batch], eps[batch : 2 * batch] if rows > batch else None
+        if perp is None:
+            return contrasted(self, cond, z, t, condition), uncond
+        return perp_neg(cond, uncond, eps[2 * batch :].unflatten(0, (batch, 2)), perp), uncond
 
     def noise(
         self,
