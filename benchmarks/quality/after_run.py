@@ -46,6 +46,7 @@ COLUMNS = "variant,x,object,seed,psnr,machine,commit".split(",")
 
 def main() -> None:
     arguments = runs.argument_parser(__doc__).parse_args()
+    runs.require_kernel()
     register_parts()
     runs.measure_missing("after_run", COLUMNS, arguments, measured)
     print(table())

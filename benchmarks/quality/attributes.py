@@ -54,6 +54,7 @@ from benchmarks.quality.runs import (
     argument_parser,
     measured_in,
     object_name,
+    require_kernel,
     rows_of,
     train,
 )
@@ -105,6 +106,7 @@ KINDS = {
 
 def main() -> None:
     arguments = parse_arguments()
+    require_kernel()
     register_parts()
     torch.set_num_threads(1)
     measured = measured_in("attributes", "experiment", "variant", "x", "object", "seed")

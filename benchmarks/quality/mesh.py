@@ -30,6 +30,7 @@ from benchmarks.quality.runs import (
     argument_parser,
     measure_missing,
     object_name,
+    require_kernel,
     rows_of,
     train,
 )
@@ -63,6 +64,7 @@ DENSITY = (96,)
 
 def main() -> None:
     arguments = argument_parser(__doc__).parse_args()
+    require_kernel()
     register_parts()
     measure_missing("mesh", COLUMNS, arguments, rows)
     print(draw(rows_of("mesh")))

@@ -26,6 +26,7 @@ from benchmarks.quality.runs import (
     append_rows,
     argument_parser,
     object_name,
+    require_kernel,
     rows_of,
     train,
 )
@@ -53,6 +54,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=262_144, help="Gaussians (default: 262144)")
     parser.add_argument("--steps", type=int, default=600, help="of refinement (default: 600)")
     arguments = parser.parse_args()
+    require_kernel()
     register_parts()
     for seed in arguments.seeds:
         for mesh in arguments.objects:

@@ -161,7 +161,7 @@ def image_targets() -> Iterator[Variant]:
         yield Variant("views of image targets", views, own | targets(views=views))
     for strength in (0.5, 0.9):
         yield Variant("strength of image targets", strength, own | targets(strength=strength))
-    yield Variant("image targets from step 60", 0, own | targets(start=60, stop=120))
+    yield Variant("image targets from step 30", 0, own | targets(start=30, stop=60))
     low = "system.guidance.max_step_percent"
     yield Variant("largest timestep 0.3 at the end", 0, {low: own[low]})
 
@@ -218,6 +218,17 @@ def starts() -> Iterator[Variant]:
     yield Variant(WRONG_PRIOR)
     yield Variant("grey ball", 0, BALL)
     yield Variant("grey ball, no view prompts", 0, BALL | WITHOUT_VIEWS)
+
+
+def view_contrast() -> Iterator[Variant]:
+    """Factors of the contrast with the opposite view's prompt, also at large timesteps only, and
+    Perp-Neg.
+    """
+    name = "system.guidance.view_contrast"
+    for factor in (0.75, 1.5, 3):
+        yield Variant("view contrast", factor, {name: factor})
+    yield Variant("view contrast from 0.55", 1.5, {name: 1.5, f"{name}_from": 0.55})
+    yield Variant("Perp-Neg", 0, {"system.prompt_processor.use_perp_neg": "true"})
 
 
 def growing() -> Iterator[Variant]:
@@ -286,6 +297,7 @@ CHARTS: dict[str, Callable[[], Iterator[Variant]]] = {
     "schedules": schedules,
     "starts": starts,
     "steps": over_steps,
+    "view_contrast": view_contrast,
     "growing": growing,
     "counts": counts,
     "paper": paper,

@@ -30,6 +30,7 @@ HEAD += ("CPU seconds", "of toybox.yaml")
 DISTILLATIONS = ("paper", "distillations", "cheaper")
 """Charts that docs/distillation.md shows; docs/toybox.md shows the others."""
 EARLIER = {
+    "6075424d": "300 steps",
     "7ac24043": "models before the words for left and right",
     "2d37b05f": "models of the objects of version 1",
 }
