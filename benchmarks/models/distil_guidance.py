@@ -123,7 +123,7 @@ def case_of(stage: UNetStage, batch: UNetBatch, scale: float) -> Case:
 
 
 def error(student: nn.Module, case: Case) -> Tensor:
-    inputs = scale_input(case.scale, WIDTH, case.z)
+    inputs = scale_input(case.scale, WIDTH, len(case.z))
     predicted = student(case.z, case.t, encoder_hidden_states=case.tokens, **inputs).sample
     return (predicted - case.guided).square().mean()
 

@@ -45,22 +45,20 @@ def recorded(models, prompt_utils, **options):
 @pytest.mark.parametrize("width", [WIDTH, 256])
 def test_the_embedding_is_that_of_the_published_pipeline(scale, width):
     make = diffusers.LatentConsistencyModelPipeline.get_guidance_scale_embedding
-    own = scale_input(scale, width, torch.zeros(3, 4, 8, 8))["timestep_cond"]
+    own = scale_input(scale, width, 3)["timestep_cond"]
     published = make(None, torch.full((3,), scale - 1), width)
     # angles are up to 7500, so float32 rounds them to 5e-4
     torch.testing.assert_close(own, published, atol=1e-3, rtol=0)
 
 
 def test_other_networks_get_no_scale():
-    assert scale_input(4.0, None, torch.zeros(3, 4, 8, 8)) == {}
+    assert scale_input(4.0, None, 3) == {}
 
 
 def test_one_evaluation_per_view_with_the_scale(models, prompts):
     grad, [(args, inputs)] = recorded(models, prompts[False], guidance_scale=4.0)
     assert len(args[0]) == 4
-    torch.testing.assert_close(
-        inputs["timestep_cond"], scale_input(4.0, WIDTH, args[0])["timestep_cond"]
-    )
+    torch.testing.assert_close(inputs["timestep_cond"], scale_input(4.0, WIDTH, 4)["timestep_cond"])
     other, _ = recorded(models, prompts[False], guidance_scale=8.5)
     assert tiny.relative(other, grad) > 1e-3
 
@@ -70,7 +68,7 @@ def test_the_error_is_the_networks_own_prediction(models, prompts):
     z, t = torch.randn(4, 4, 8, 8, generator=torch.Generator().manual_seed(0)), tiny.TIMESTEPS
     condition = guide.condition(prompts[False], **tiny.BATCH)
     tokens = condition.embeddings[:4]
-    expected = guide.unet(z, t, encoder_hidden_states=tokens, **scale_input(4.0, WIDTH, z)).sample
+    expected = guide.unet(z, t, encoder_hidden_states=tokens, **scale_input(4.0, WIDTH, 4)).sample
     torch.testing.assert_close(guide.predict_noise(z, t, condition), expected)
 
 
@@ -88,8 +86,46 @@ def test_what_needs_other_predictions_gets_them_without_guidance(
     _, calls = recorded(models, prompts[perp_neg], guidance_scale=4.0, **options)
     assert sum(len(args[0]) for args, _ in calls) == rows
     for args, inputs in calls:
-        without = scale_input(1.0, WIDTH, args[0])["timestep_cond"]
+        without = scale_input(1.0, WIDTH, len(args[0]))["timestep_cond"]
         torch.testing.assert_close(inputs["timestep_cond"], without)
+
+
+def test_a_negative_scale_is_extrapolated_and_not_an_input(models, prompts):
+    """The inversion of sdi-variant has one; no network was trained for it."""
+    guide = tiny.guidance(models, guidance_scale=4.0)
+    guide.unet = recorder = tiny.Recorder(guide.unet)
+    z = torch.randn(4, 4, 8, 8, generator=torch.Generator().manual_seed(0))
+    guide.guided_noise(z, tiny.TIMESTEPS, guide.condition(prompts[False], **tiny.BATCH), -6.5)
+    [(args, inputs)] = recorder.calls
+    without = scale_input(1.0, WIDTH, 8)["timestep_cond"]
+    assert len(args[0]) == 8
+    torch.testing.assert_close(inputs["timestep_cond"], without)
+
+
+def test_a_scale_that_no_model_knows_is_warned_of(models, caplog):
+    tiny.guidance(models, guidance_scale=101.0)
+    assert "guidance_scale=101" in caplog.text and "3 to 15" in caplog.text
+    caplog.clear()
+    tiny.guidance(models, guidance_scale=8.5)
+    assert "guidance_scale" not in caplog.text
+
+
+def test_view_contrast_is_that_of_predictions_with_guidance(models):
+    """Continuous at 0, and two evaluations per view in place of three."""
+    options = {"guidance_scale": 4.0, "view_contrast_from": 0.0}
+    prompt_utils = tiny.left_and_right(models)
+    z = torch.randn(4, 4, 8, 8, generator=torch.Generator().manual_seed(0))
+
+    def predicted(contrast, turned=0):
+        guide = tiny.guidance(models, view_contrast=contrast, **options)
+        batch = tiny.BATCH | {"azimuth": tiny.BATCH["azimuth"] + turned}
+        condition = guide.condition(prompt_utils, **batch)
+        guide.evaluations = 0
+        return guide.predict_noise(z, tiny.TIMESTEPS, condition), guide.evaluations
+
+    (plain, few), (other, _), (cond, more) = predicted(0.0), predicted(0.0, 180), predicted(0.5)
+    torch.testing.assert_close(cond, plain + 0.5 * (plain - other))
+    assert (few, more) == (4, 8)
 
 
 @pytest.mark.parametrize("variant", ["nfsd", "vsd", "ism", "sdi"])

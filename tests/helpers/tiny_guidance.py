@@ -45,6 +45,17 @@ def make_prompts(models):
     return {perp: processor({**options, "use_perp_neg": perp})() for perp in (False, True)}
 
 
+def left_and_right(models):
+    """Make embeddings of one prompt that tells the left side from the right one."""
+    options = {
+        "pretrained_model_name_or_path": str(models["epsilon"]),
+        "prompt": "a fox",
+        "use_cache": False,
+        "view_dependent_left_and_right": True,
+    }
+    return find("gaussiandreamer-stable-diffusion-prompt-processor")(options)()
+
+
 def renders(batch=4, size=64, seed=0):
     return torch.rand(
         batch, size, size, 3, generator=torch.Generator().manual_seed(seed)

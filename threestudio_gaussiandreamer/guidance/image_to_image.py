@@ -32,7 +32,7 @@ def image_to_image(
         strength: the timestep that they are noised to, as a share of all; 1 leaves nothing of them.
         num_inference_steps: of DDIM, from that timestep to no noise; at most one per timestep.
         guidance_scale: of classifier-free guidance; without effect if the guidance's own is 1, as
-            it has no unconditional prediction then.
+            it has no unconditional prediction then, unless the network takes the scale.
         batch: the cameras, and what else ``encode`` and ``condition`` need.
     """
     with torch.autocast(rgb.device.type, enabled=False):

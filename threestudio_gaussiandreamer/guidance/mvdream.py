@@ -60,11 +60,11 @@ class MVDreamGuidance(StableDiffusionGuidance):
 
         @staticmethod
         def check(cfg: Any) -> None:
-            StableDiffusionGuidance.Config.check(cfg)
             if cfg.view_contrast:
                 raise UserError(
                     "view_contrast: this model has one prompt for all views: set it to 0"
                 )
+            StableDiffusionGuidance.Config.check(cfg)
             if cfg.max_items_eval > 0 and cfg.max_items_eval % cfg.n_view:
                 raise UserError(
                     f"max_items_eval: expected a multiple of n_view={cfg.n_view}, or 0, got "

@@ -26,12 +26,9 @@ class Condition(NamedTuple):
     empty: Optional[Float[Tensor, "1 N F"]] = None
     """The embedding of an empty prompt, if the variant needs it and the prompts have it."""
     opposite: Optional[Float[Tensor, "B N F"]] = None
-    """The prompts of the opposite views; None without view contrast."""
-
-    @property
-    def has_other_prompts(self) -> bool:
-        """Whether the conditional prediction also depends on the prompts of other views."""
-        return self.negative_weights is not None or self.opposite is not None
+    """The prompts of the opposite views; None without view contrast, and with Perp-Neg, which
+    excludes it.
+    """
 
     def select(self, rows: Int[Tensor, " R"]) -> "Condition":
         """Return the conditions of some views."""

@@ -50,7 +50,7 @@ from .base import ScoreDistillation
 from .half_precision import HALF_TYPES, weights_type
 from .lora import LoRAParticles, check_adaptable
 from .particles import ParticleModel
-from .scale_input import scale_input
+from .scale_input import scale_input, scale_width
 from .text_condition import Condition, Embeddings, Latents, Timesteps, view_of_row
 from .view_contrast import check_view_contrast, contrasted, opposite
 
@@ -172,7 +172,7 @@ class TextToImageDistillation(ScoreDistillation):
         from diffusers import UNet2DConditionModel
 
         self.unet = self.network(UNet2DConditionModel, folder, "unet", self.prepare_denoiser)
-        self.scale_width = self.unet.config.time_cond_proj_dim
+        self.scale_width = scale_width(self.unet, self.cfg)
         self.text_width = self.unet.config.encoder_hid_dim or self.unet.config.cross_attention_dim
 
     def size_of_images(self, factor: int = 1) -> int:
@@ -339,11 +339,13 @@ class TextToImageDistillation(ScoreDistillation):
         rescale: float = 0.0,
     ) -> Float[Tensor, "B c h w"]:
         """Predict the noise with guidance, in one evaluation per view if the network takes the
-        scale; Perp-Neg, view contrast and ``rescale`` need further predictions.
+        scale; Perp-Neg, ``rescale`` and scales below 1 need the unconditional prediction.
         """
-        if self.scale_width is None or rescale or condition.has_other_prompts:
+        perp = condition.negative_weights is not None
+        if self.scale_width is None or rescale or perp or scale <= 1:
             return super().guided_noise(z, t, condition, scale, rescale=rescale)
-        return self.noise(z, t, condition.embeddings[: len(z)], scale).to(z)
+        eps = self.noise(z, t, condition.embeddings[: len(z)], scale)
+        return contrasted(self, eps, z, t, condition, scale).to(z)
 
     def predict(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition
@@ -372,7 +374,7 @@ class TextToImageDistillation(ScoreDistillation):
         self.evaluations += len(embeddings)
         rows = view_of_row(len(z), len(embeddings)).to(z.device)
         z, t = z[rows], t[rows]
-        inputs = scale_input(scale, self.scale_width, z.to(self.dtype))
+        inputs = scale_input(scale, self.scale_width, len(z), device=z.device, dtype=self.dtype)
         output = self.run_network(z, t, embeddings, **inputs).float()
         # models may also predict the variance of the reverse step, in further channels
         return PREDICTIONS[self.prediction_type](output[:, : z.shape[1]], z, self._abar[t])

@@ -12,9 +12,12 @@ away only what is perpendicular to eps_c - eps_u.
 option              meaning
 ==================  ================================================================================
 view_contrast       factor of the difference; 0: none
-view_contrast_from  smallest timestep with it, as a share of all; it needs a further evaluation of
-                    each view at or above that. Large ones decide the view
+view_contrast_from  smallest timestep, as a share of all, at which it is applied; large ones decide
+                    the view. Each view at or above it costs one more evaluation, also where both
+                    sides have the same prompt ("overhead view", "side view")
 ==================  ================================================================================
+
+It is part of guidance, so outside of ``guidance_interval`` there is none.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -73,13 +76,18 @@ def contrasted(
     z: Float[Tensor, "B c h w"],
     t: Int[Tensor, " B"],
     condition: Condition,
+    scale: float = 1.0,
 ) -> Float[Tensor, "B c h w"]:
-    """Return the conditional predictions ``eps`` with view contrast, if the condition has it."""
+    """Return the conditional predictions ``eps`` with view contrast, if the condition has it.
+
+    Args:
+        scale: of guidance in ``eps``, if the network takes it as an input.
+    """
     if condition.opposite is None:
         return eps
     first = guidance.cfg.view_contrast_from * len(guidance.alphas_cumprod)
     rows = (t >= first).nonzero()[:, 0]
     if not len(rows):
         return eps
-    other = guidance.noise(z[rows], t[rows], condition.opposite[rows])
+    other = guidance.noise(z[rows], t[rows], condition.opposite[rows], scale)
     return eps.index_add(0, rows, eps[rows] - other, alpha=guidance.cfg.view_contrast)
