@@ -4,9 +4,9 @@
 
 where o is the prompt of the view from the other side of the object: "front view" for "back view",
 and "left side view" for "right side view" where the prompts tell these apart. It is the negation
-of a concept as in composable diffusion (Liu et al. 2022, arXiv:2206.01714), and lowers the
-multi-face rate of models whose views of a prompt are alike. Perp-Neg (Armandpour et al. 2023) takes
-away only what is perpendicular to eps_c - eps_u.
+of a concept as in composable diffusion (Liu et al. 2022, arXiv:2206.01714), for models whose views
+of a prompt are alike; what it brings is measured in docs/toybox.md. Perp-Neg (Armandpour et al.
+2023) takes away only what is perpendicular to eps_c - eps_u.
 
 ==================  ================================================================================
 option              meaning
