@@ -214,13 +214,13 @@ def scales_of(label: str, best: dict[str, str]) -> set[float]:
 
 
 def best_scales(rows: list[Row]) -> dict[str, str]:
-    """Return the scale of each line with the largest median dB at the end on the first object,
-    where all scales are tried.
+    """Return the scale of each line with the largest dB at the end on the first object with the
+    first seed, with which all scales are tried.
     """
     rows = [row for row in rows if row["truth"] == BINNED]
-    first = objects_of(rows)[0] if rows else ""
+    first = (objects_of(rows)[0], rows[0]["seed"]) if rows else None
     best = {}
-    tried = [row for row in rows if row["object"] == first]
+    tried = [row for row in rows if (row["object"], row["seed"]) == first]
     for label, own in grouped(tried, lambda row: row["variant"]).items():
         scales = grouped(own, lambda row: row["x"])
         best[label] = max(scales, key=lambda x: median_end(scales[x]))

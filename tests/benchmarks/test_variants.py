@@ -161,3 +161,11 @@ def test_the_options_of_every_line_are_valid(label):
     options = variants.options_of(label, 8.5) | {"system.guidance.mesh": "toy.glb"}
     overrides = [f"{key}={value}" for key, value in options.items()]
     check_config(load_config(runs.ROOT / "configs/demo.yaml", cli_args=overrides))
+
+
+def test_scales_are_compared_with_the_seed_that_all_were_run_with():
+    """Other seeds, which only the best scale has, may be worse."""
+    runs_of = [("31", "0", 19.2), ("8.5", "0", 19.1), ("31", "1", 18.9), ("31", "2", 18.8)]
+    common = {"truth": variants.BINNED, "variant": "VSD", "object": "toy", "step": "240"}
+    rows = [common | {"x": x, "seed": seed, "psnr": str(dB)} for x, seed, dB in runs_of]
+    assert variants.best_scales(rows) == {"VSD": "31"}
