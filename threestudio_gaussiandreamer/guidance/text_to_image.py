@@ -342,7 +342,7 @@ class TextToImageDistillation(ScoreDistillation):
         scale; Perp-Neg, ``rescale`` and scales below 1 need the unconditional prediction.
         """
         perp = condition.negative_weights is not None
-        if self.scale_width is None or rescale or perp or scale <= 1:
+        if self.scale_width is None or rescale or perp or scale < 1:
             return super().guided_noise(z, t, condition, scale, rescale=rescale)
         eps = self.noise(z, t, condition.embeddings[: len(z)], scale)
         return contrasted(self, eps, z, t, condition, scale).to(z)
