@@ -35,6 +35,8 @@ GUIDANCE = CONFIG["system"]["guidance"]["guidance_scale"]
 DEFAULT, PAPER_RECIPE = "toybox.yaml", "the paper's recipe"
 SAMPLES, TRUTH = "the 2D model's samples", "ground truth"
 """Variants without a run: what the 2D model draws, and ray-cast views of the object itself."""
+EXACT = "exact score of the object"
+"""A variant whose guidance knows the views of the object, in place of the 2D model."""
 WORLD = f"world {VERSION}"
 """What the views of the objects themselves depend on."""
 PROMPT_SEED = 5000
@@ -121,6 +123,14 @@ def references() -> Iterator[Variant]:
     yield Variant(TRUTH)
     for scale in (1, 2, GUIDANCE, 8):
         yield Variant(SAMPLES, scale)
+
+
+def exact_score() -> Iterator[Variant]:
+    """The same run with a 2D model that makes no errors."""
+    names = ("min_step_percent", "max_step_percent", "weighting_strategy")
+    guidance = {name: CONFIG["system"]["guidance"][name] for name in names}
+    options = {"system.guidance_type": "exact-score-guidance"}
+    yield Variant(EXACT, 0, options | {"system.guidance": {"mesh": "toy.glb", **guidance}})
 
 
 def default() -> Iterator[Variant]:
@@ -289,6 +299,7 @@ def overlay(name: str) -> dict[str, Any]:
 
 CHARTS: dict[str, Callable[[], Iterator[Variant]]] = {
     "references": references,
+    "exact_score": exact_score,
     "default": default,
     "guidance": over_guidance,
     "haze": haze,

@@ -19,6 +19,7 @@ from threestudio_gaussiandreamer.evaluation.text_to_3d import (
     result_of,
 )
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
+from threestudio_gaussiandreamer.meshes.mesh import Mesh
 from threestudio_gaussiandreamer.toybox import recognition
 from threestudio_gaussiandreamer.toybox.samples import samples
 from threestudio_gaussiandreamer.toybox.views import BACKGROUND, SIZE, render
@@ -39,11 +40,15 @@ def of_run(folder: Path, prompt: str, models: str) -> dict[str, float]:
     return found | {"gaussians": len(asset.gaussians.means)}
 
 
-def of_truth(prompt: Prompt, models: str) -> dict[str, float]:
-    """Score ray-cast views of an object with the prompt's attributes: the judge's ceiling."""
+def object_of(prompt: Prompt) -> Mesh:
+    """Return an object with the prompt's attributes."""
     attributes = draw_attributes(PROMPT_SEED, prompt.index, held_out=prompt.withheld)
-    mesh = object_mesh(attributes, numpy_generator(PROMPT_SEED, "benchmark-mesh", prompt.index))
-    rgba = torch.from_numpy(render(mesh, recognition.views())).movedim(-1, 1).float()
+    return object_mesh(attributes, numpy_generator(PROMPT_SEED, "benchmark-mesh", prompt.index))
+
+
+def of_truth(prompt: Prompt, models: str) -> dict[str, float]:
+    """Score ray-cast views of the prompt's object: the judge's ceiling."""
+    rgba = torch.from_numpy(render(object_of(prompt), recognition.views())).movedim(-1, 1).float()
     grey = torch.tensor(BACKGROUND).reshape(1, 3, 1, 1)
     return scores(models).of_pictures(rgba[:, :3] + (1 - rgba[:, 3:]) * grey, prompt.text)
 
