@@ -15,8 +15,9 @@ demo: $(VENV)/ready                ## train the bundled toy from a coarse prior,
 
 PROMPT =
 MODELS = toybox
+demo-text: export TEXT = $(value PROMPT)   # without expansion by make or the shell
 demo-text: $(VENV)/ready-for-models ## text to 3D with small models, offline, on the CPU; make demo-text MODELS=folder PROMPT="a red fox with a green scarf"
-	$(BIN)/python -m threestudio_gaussiandreamer.toybox.demo $(if $(PROMPT),"$(PROMPT)") --models $(MODELS)
+	$(BIN)/python -m threestudio_gaussiandreamer.toybox.demo $(if $(value PROMPT),"$$TEXT") --models $(MODELS)
 
 test: $(VENV)/ready-for-tests      ## every test that isn't slow, one worker per core
 	$(PYTEST) -m "not slow"
@@ -33,7 +34,7 @@ stability: $(VENV)/ready-for-tests          ## every known failure, provoked and
 	$(ENVIRON) $(BIN)/python -m pytest tests/stability --stability-report stability.json; status=$$?; \
 	$(BIN)/python -m tests.stability.report stability.json; rm -f stability.json; exit $$status
 
-fuzz: $(VENV)/ready-for-tests               ## damaged files for every reader, extreme Gaussians, random densification; about half an hour
+fuzz: $(VENV)/ready-for-tests               ## damaged files for every reader, extreme Gaussians, random densification; nearly two hours of one core
 	$(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.robustness.fuzz
 
 long-run: $(VENV)/ready            ## 20,000 steps with 50 random kills, against the undisturbed run; a quarter of an hour

@@ -9,6 +9,8 @@ from .core.errors import UserError
 
 MAX_PSNR = 100.0
 SSIM_WINDOW = 11
+SMALLEST_SIDE = SSIM_WINDOW // 2 + 1
+"""Of images for :func:`ssim`, which are padded by reflection, pixels."""
 
 
 def psnr(image: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
@@ -29,11 +31,11 @@ def ssim(
     and K2 0.03, and the mean is over pixels and channels, as in torchmetrics' defaults.
 
     Raises:
-        UserError: a side has fewer than 6 pixels, too few for the reflection.
+        UserError: a side has fewer pixels than SMALLEST_SIDE.
     """
-    if min(image.shape[-3:-1]) <= SSIM_WINDOW // 2:
+    if min(image.shape[-3:-1]) < SMALLEST_SIDE:
         raise UserError(
-            f"SSIM needs images of at least {SSIM_WINDOW // 2 + 1} pixels a side, not "
+            f"SSIM needs images of at least {SMALLEST_SIDE} pixels a side, not "
             f"{tuple(image.shape[-3:-1])}"
         )
     mean_x, mean_y = _window_mean(image), _window_mean(truth)

@@ -6,7 +6,9 @@ Counts parameters, and the bytes that the VAE's encoder keeps of one image for i
 Writes ``benchmarks/results/models.csv``; ``python -m benchmarks.tables`` makes the table of
 docs/models.md from it."""
 
+import argparse
 import csv
+import io
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -16,6 +18,7 @@ from torch import Tensor, nn
 
 from benchmarks.markdown import markdown, read
 from benchmarks.models.published import MODELS, T5_XXL, Model
+from threestudio_gaussiandreamer.core.files import atomic_file
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks/results/models.csv"
@@ -160,10 +163,15 @@ def cells(row: dict[str, str]) -> tuple[str, ...]:
 
 
 def main() -> None:
-    with open(RESULTS, "w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(row(name, model) for name, model in MODELS.items())
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(row(name, model) for name, model in MODELS.items())
+    with atomic_file(RESULTS) as file:
+        file.write(text.getvalue().encode())
     print(table())
 
 

@@ -28,6 +28,11 @@ the median over the seeds (smallest – largest). Seconds are CPU seconds of one
 included. Floaters are the share of opacity farther than 2 % of the bounding box from the surface.
 The CSV names device and commit of each run.
 
+A row "A − B" is the gain of A over B in dB, between runs with the same seed. The column `x` is the
+quantity that is varied within a variant, named above each table; it is empty where none is. A
+*view-exact* score knows the camera (`mode: view-exact`), *direction bins* the side that the camera
+sees (`mode: direction-bins`), a *view-blind* one neither (`mode: view-agnostic`).
+
 The runs of the base recipe were measured before colours were kept in [0, 1] (the effect is
 under "Colours that viewers show"). Those of the paper's recipe, which doesn't bound colours, were
 repeated after its growing radius became a share of the longest side; their seconds are those of the
@@ -61,6 +66,20 @@ NOTES = {
     "two, by `benchmarks/viewers/spark.py`. `up`: the file's axis; unbounded clouds are from "
     "before `bound_colors`, in z-up files. Seed 0 unless another is named.",
 }
+X = {
+    "count": "Gaussians to keep, or to train with",
+    "size": "width and height of the pictures that are guided, pixels",
+    "batch": "views per step",
+    "iterations": "steps",
+    "rates": "factor of the learning rates that the variant names",
+    "dilation": "`renderer.eps2d`, square pixels",
+    "grown": "Gaussians at the end",
+    "after_run": "Gaussians to keep, of 10,000",
+    "attributes": "Gaussians for `trained`, bits per number for `rounded`, unused for `file`",
+    "viewers": "the viewer's dilation, square pixels",
+    "prune": "Gaussians before pruning",
+}
+"""What the column ``x`` of a chart is."""
 
 
 class Difference(NamedTuple):
@@ -228,7 +247,9 @@ def plain_table(chart: str, columns: Sequence[str]) -> str:
 def section(title: str, chart: str, table: str) -> str:
     picture = f"![{title}](charts/{chart}.png)\n\n"
     shown = picture if (ROOT / f"docs/charts/{chart}.png").is_file() else ""
-    note = f"{NOTES[chart]}\n\n" if chart in NOTES else ""
+    sentences = [NOTES.get(chart, ""), f"`x`: {X[chart]}." if chart in X else ""]
+    note = " ".join(filter(None, sentences))
+    note += "\n\n" if note else ""
     return f"## {title}\n\n{shown}{note}{table}\n\n*[`charts/{chart}.csv`](charts/{chart}.csv)*\n"
 
 

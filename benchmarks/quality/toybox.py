@@ -41,6 +41,7 @@ from benchmarks.quality.runs import CHARTS, add_jobs, append_rows, require_kerne
 from benchmarks.quality.toybox_jobs import (
     CHART,
     EXACT,
+    MODELS_BESIDE_GUIDANCE,
     RECOGNIZED,
     SAMPLES,
     TRUTH,
@@ -71,12 +72,6 @@ RUN = f"{QUICK['name']}/{QUICK['tag']}"
 """Where these options put a run."""
 MODELS = "system.guidance.pretrained_model_name_or_path"
 """The option from which toybox.yaml takes all models."""
-MODELS_BESIDE_GUIDANCE = (
-    "system.prompt_processor.pretrained_model_name_or_path",
-    "system.geometry.prior.checkpoint",
-    "system.geometry.prior.clip",
-)
-"""Those that take it from there, for a guidance without models."""
 RECORD = "seconds.json"
 """CPU seconds of a kept run, written when it has ended."""
 

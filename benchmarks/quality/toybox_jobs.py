@@ -39,6 +39,12 @@ EXACT = "exact score of the object"
 """A variant whose guidance knows the views of the object, in place of the 2D model."""
 WORLD = f"world {VERSION}"
 """What the views of the objects themselves depend on."""
+MODELS_BESIDE_GUIDANCE = (
+    "system.prompt_processor.pretrained_model_name_or_path",
+    "system.geometry.prior.checkpoint",
+    "system.geometry.prior.clip",
+)
+"""The options that take the models from the guidance, for one without models."""
 PROMPT_SEED = 5000
 """Of the attributes and words of prompts; trainings use others."""
 PAPER_SCALE = 101.0
@@ -129,7 +135,8 @@ def exact_score() -> Iterator[Variant]:
     """The same run with a 2D model that makes no errors."""
     names = ("min_step_percent", "max_step_percent", "weighting_strategy")
     guidance = {name: CONFIG["system"]["guidance"][name] for name in names}
-    options = {"system.guidance_type": "exact-score-guidance"}
+    options = dict.fromkeys(MODELS_BESIDE_GUIDANCE, NAME)
+    options |= {"system.guidance_type": "exact-score-guidance"}
     yield Variant(EXACT, 0, options | {"system.guidance": {"mesh": "toy.glb", **guidance}})
 
 

@@ -133,10 +133,10 @@ def diversity(label: str, scale: str) -> str:
 
 
 def blind() -> str:
-    """Return dB and multi-face of each distillation with the view-blind score, best first."""
+    """Return dB and multi-face of each distillation with the view-agnostic score, best first."""
     rows = [row for row in rows_of(CHART) if row["truth"] == BLIND]
     if not rows:
-        return "With the view-blind score nothing has been measured yet."
+        return "With the view-agnostic score nothing has been measured yet."
     objects = objects_of(rows)
     lines = []
     for label, own in grouped(rows, lambda row: row["variant"]).items():

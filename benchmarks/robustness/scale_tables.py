@@ -13,7 +13,6 @@ from benchmarks.robustness.scale import (
     scenarios,
     values_of,
 )
-from benchmarks.robustness.unit_costs import STAGES
 
 MILLION = 1_000_000
 STORAGE_DOLLARS, PUT_DOLLARS = 0.023, 5e-6
@@ -28,7 +27,7 @@ def unit_costs() -> str:
             name,
             f"{statistics.median(seconds[name]):.1f} s, {statistics.median(memory[name]):.0f} MB",
         )
-        for name in STAGES
+        for name in seconds
     ]
     sizes, counts = values_of("files", "bytes"), values_of("files", "files")
     rows += [
@@ -78,8 +77,8 @@ def runs() -> str:
         )
         for row in read(RESULTS)
     ]
-    head = ("assets", "workers", "variant", "hours", "of them the last 1 %", "worker-hours")
-    return markdown((*head, "wasted, %", "failed", "begun again", "dollars"), rows)
+    head = ("workload", "workers", "variant", "hours", "of them the last 1 %", "worker-hours")
+    return markdown((*head, "wasted, %", "failed", "restarted from scratch", "dollars"), rows)
 
 
 def storage() -> str:

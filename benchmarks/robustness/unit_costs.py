@@ -9,6 +9,7 @@ that return at once and the ledger on this disk, without Ray's part.
 """
 
 import argparse
+import csv
 import io
 import json
 import os
@@ -22,7 +23,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from benchmarks.quality.runs import append_rows
+from benchmarks.markdown import read
+from benchmarks.quality.runs import CHARTS, append_rows
+from threestudio_gaussiandreamer.core.files import atomic_file
 from threestudio_gaussiandreamer.farm.assets import Job, Recipe
 from threestudio_gaussiandreamer.farm.board import Beat
 from threestudio_gaussiandreamer.farm.display import Display
@@ -37,8 +40,9 @@ from threestudio_gaussiandreamer.launch.options import parse_arguments
 ROOT = Path(__file__).resolve().parents[2]
 COLUMNS = ("measured", "name", "seed", "value", "unit", "machine", "commit")
 IMPORTS, START = "imports", "configuration, prior, cloud"
-TRAINING, TEST, EXPORT = "training, 1200 steps", "turntable, 120 views", "video, export, pages"
+TRAINING, TEST, EXPORT = "training, {} steps", "turntable, 120 views", "video, export, pages"
 STAGES = (IMPORTS, START, TRAINING, TEST, EXPORT)
+"""With the number of steps of the demo that was measured."""
 KINDS = {
     "checkpoint": ("ckpts/*",),
     "exported clouds and pages": ("save/*-export/**/*",),
@@ -56,6 +60,7 @@ class Clock(pl.Callback):
 
     def __init__(self) -> None:
         self.ends: list[tuple[float, float]] = []
+        self.max_steps = 0
 
     def note(self, *others: Any) -> None:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -63,6 +68,7 @@ class Clock(pl.Callback):
 
     def on_train_batch_start(self, trainer: Any, *others: Any) -> None:
         if trainer.global_step == 0:
+            self.max_steps = trainer.max_steps
             self.note()
 
     def on_fit_end(self, *others: Any) -> None:
@@ -83,7 +89,8 @@ def run_asset(seed: int, folder: Path) -> dict[str, Any]:
     arguments = parse_arguments(argv)
     experiment.prepare(arguments, argv, callbacks=[clock], records_code=False).run()  # as a farm
     clock.note()
-    return {"ends": clock.ends, "files": stored(folder / "demo/run")}
+    files = stored(folder / "demo/run")
+    return {"ends": clock.ends, "max_steps": clock.max_steps, "files": files}
 
 
 def stored(folder: Path) -> dict[str, tuple[int, int]]:
@@ -106,13 +113,30 @@ def asset_rows(seed: int) -> Iterator[dict[str, Any]]:
         raise RuntimeError(done.stderr[-3000:])
     measured = json.loads(done.stdout.splitlines()[-1])
     before = 0.0
-    for stage, (seconds, peak) in zip(STAGES, measured["ends"], strict=True):
+    for name, (seconds, peak) in zip(STAGES, measured["ends"], strict=True):
+        stage = name.format(measured["max_steps"])
         yield row("stage", stage, seed, seconds - before, "s")
         yield row("stage", stage, seed, peak, "MB")
         before = seconds
     for kind, (size, count) in measured["files"].items():
         yield row("files", kind, seed, size, "bytes")
         yield row("files", kind, seed, count, "files")
+
+
+def drop_other_lengths(names: set[str]) -> None:
+    """Remove the assets of a demo with another number of steps from the CSV, since the tables sum
+    the stages and take medians over all rows.
+    """
+    path = CHARTS / "unit_costs.csv"
+    rows = read(path)
+    if {row["name"] for row in rows if row["measured"] == "stage"} <= names:
+        return
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(row for row in rows if row["measured"] == "driver")
+    with atomic_file(path) as file:
+        file.write(text.getvalue().encode())
 
 
 def row(measured: str, name: str, seed: Any, value: float, unit: str) -> dict[str, Any]:
@@ -182,7 +206,9 @@ def main() -> None:
         return
     append_rows("unit_costs", list(COLUMNS), list(driver_rows()))
     for seed in arguments.seeds:
-        append_rows("unit_costs", list(COLUMNS), list(asset_rows(seed)))
+        rows = list(asset_rows(seed))
+        drop_other_lengths({row["name"] for row in rows})
+        append_rows("unit_costs", list(COLUMNS), rows)
         print(f"seed {seed} is measured", flush=True)
 
 

@@ -112,6 +112,14 @@ def test_views_that_cant_be_shared_are_refused(processes, views, size, said):
         TrainCameras(CameraConfig(batch_size=views))
 
 
+def test_views_that_a_model_sees_together_stay_in_one_process(processes):
+    processes(1, 2)
+    with pytest.raises(UserError, match="in groups of 4: set data.batch_size to 8"):
+        TrainCameras(CameraConfig(batch_size=4, n_view=4))
+    batch = TrainCameras(CameraConfig(batch_size=8, n_view=4)).collate(0)
+    assert len(batch["elevation"].unique()) == 1
+
+
 def trained(folder: Path, mesh: Path, ranks: int) -> list[dict[str, torch.Tensor]]:
     """Train in so many processes; return what each has recorded."""
     script = folder / "train.py"

@@ -48,6 +48,17 @@ def test_rows_and_intervals_over_prompts(tmp_path, judge, capsys):
     assert "kind" in capsys.readouterr().out
 
 
+def test_a_damaged_asset_is_named_and_the_others_are_scored(tmp_path, judge, capsys):
+    runs = finished(tmp_path / "runs", PROMPTS)
+    ply = runs / "gaussiandreamer/run1/save/it5-export/gaussians.ply"
+    ply.write_bytes(ply.read_bytes()[:-100])
+    arguments = ["--metrics", "judge", "--judge", judge, "--output", str(tmp_path / "out")]
+    assert main([str(runs), *arguments]) == 2
+    assert "1 of the assets can't be scored: PLY file" in capsys.readouterr().err
+    with open(tmp_path / "out/scorecard.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == len(PROMPTS) - 1
+
+
 def test_a_run_in_several_folders_is_scored_once(tmp_path, judge, monkeypatch):
     runs = finished(tmp_path / "runs", PROMPTS[:2])
     (tmp_path / "link").symlink_to(runs)

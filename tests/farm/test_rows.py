@@ -103,6 +103,12 @@ def test_what_is_wrong_is_named_with_its_line(tmp_path, text, suffix, message):
     assert message in str(refused.value)
 
 
+def test_an_unknown_format_is_named(tmp_path):
+    (tmp_path / "prompts.json").write_text('{"prompt": "a fox"}')
+    with pytest.raises(UserError, match="'.json': did you mean '.jsonl'"):
+        list(read_rows(tmp_path / "prompts.json"))
+
+
 def test_a_missing_list_is_named_with_its_neighbours(tmp_path):
     listed(tmp_path, "a fox")
     with pytest.raises(UserError, match="prompt list .*prompt.txt' does not exist.*prompts.txt"):

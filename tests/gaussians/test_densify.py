@@ -165,6 +165,19 @@ def test_moments_follow_their_gaussian_through_random_changes(seed):
             p.grad = None
 
 
+def test_state_with_one_number_a_gaussian_follows_it():
+    params = {"means": nn.Parameter(torch.rand(5, 3))}
+    optimizer = torch.optim.Adam([{"params": [params["means"]], "name": "means"}])
+    rows, columns = torch.arange(5.0)[:, None], torch.ones(1, 3)  # as Adafactor's
+    optimizer.state[params["means"]] = {"row_var": rows, "col_var": columns}
+    parents = torch.tensor([4, 1])
+    change = densify.Change(parents, torch.tensor([False, True]), {})
+    new = {"means": nn.Parameter(params["means"].detach()[parents])}
+    densify.update_optimizer(optimizer, params, new, change)
+    state = optimizer.state[new["means"]]
+    assert state["row_var"].tolist() == [[4.0], [0.0]] and state["col_var"] is columns
+
+
 def test_prune_to_keeps_the_best_in_their_order():
     change = densify.prune_to(cloud(5), torch.tensor([0.3, 0.9, 0.1, 0.5, 0.2]), 3)
     assert change.parents.tolist() == [0, 1, 3]

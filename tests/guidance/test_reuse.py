@@ -84,6 +84,27 @@ def test_a_resumed_guidance_goes_on_with_the_kept_prediction():
         restore_learnt(other, state)
 
 
+def test_a_prediction_that_isnt_finite_is_not_kept(monkeypatch):
+    guidance, batch = reusing(), views()
+    with monkeypatch.context() as patch:
+        error = guidance.variant.error
+        patch.setattr(
+            guidance.variant, "error", lambda *args: (error(*args)[0] * torch.nan, error(*args)[1])
+        )
+        gradient(guidance, 0, renders(0), batch)
+    found, evaluations = gradient(guidance, 1, renders(1), batch)
+    assert evaluations > 0 and found.isfinite().all()
+
+
+def test_several_processes_predict_in_the_same_steps_after_a_resume(monkeypatch):
+    """A checkpoint has the first process's prediction only."""
+    whole, resumed, batch = reusing(), reusing(), views()
+    gradient(whole, 3, renders(0), batch)
+    monkeypatch.setattr("threestudio_gaussiandreamer.guidance.reuse.world_size", lambda: 2)
+    restore_learnt(resumed, learnt_weights(whole))
+    assert gradient(resumed, 4, renders(1), batch)[1] > 0
+
+
 def test_no_prediction_is_kept_by_default():
     guidance = reusing(steps=1)
     gradient(guidance, 0, renders(0), views())

@@ -117,6 +117,17 @@ def test_a_variant_without_a_gradient_is_refused_before_long_work(mesh_path):
     ExactScoreGuidance.preflight(options | {"mode": "direction-bins"})
 
 
+@pytest.mark.parametrize("variant", ["csd-variant", "nfsd-variant"])
+@pytest.mark.parametrize(
+    "option", [{"guidance_interval": [0.2, 0.8]}, {"recon_std_rescale": 0.5}], ids=str
+)
+def test_options_without_effect_are_refused(mesh_path, variant, option):
+    options = {"mesh": mesh_path, "mode": "direction-bins", "variant_type": variant}
+    with pytest.raises(UserError, match=f"{next(iter(option))} has no effect with {variant}"):
+        ExactScoreGuidance.preflight(options | option)
+    ExactScoreGuidance.preflight(options)
+
+
 def test_surface_noise_without_a_surface_is_an_error():
     guide = mixture_guidance("cfd-variant")
     with pytest.raises(UserError, match="give the guidance the renderer's depth and opacity"):

@@ -117,6 +117,12 @@ def test_weights_of_one_module_are_loaded_from_a_checkpoint(tmp_path):
     assert Points({"weights": f"{tmp_path / 'a.ckpt'}:geometry"}).means.tolist() == [1.0, 2.0]
     with pytest.raises(UserError, match="no parameters of 'nothing'"):
         Points({"weights": f"{tmp_path / 'a.ckpt'}:nothing"})
+    save_file(
+        tmp_path / "b.ckpt",
+        {"state_dict": {"geometry.means": torch.ones(3)}, "epoch": 1, "global_step": 7},
+    )
+    with pytest.raises(UserError, match="b.ckpt:geometry don't fit these options .*size mismatch"):
+        Points({"weights": f"{tmp_path / 'b.ckpt'}:geometry"})
 
 
 def test_a_renderer_refers_to_its_parts_without_owning_them():

@@ -163,7 +163,9 @@ register_parts()
         ("data.eval_camera_distance=1e30", "data.eval_camera_distance: expected a number from"),
         ("system.guidance.guidance_scale=1e38", "system.guidance.guidance_scale: expected a"),
         ("system.loss.lambda_sds=[0,1,1e300,9]", "system.loss.lambda_sds[2]: expected a finite"),
-        ("system.evaluation.size=100000", "system.evaluation.size: expected a number from 1 to"),
+        ("trainer.limit_test_batches=0", "trainer.limit_test_batches: expected more than 0"),
+        ("trial_dir=x", "trial_dir is computed: set exp_root_dir"),
+        ("system.evaluation.size=100000", "system.evaluation.size: expected a number from 6 to"),
         (
             "system.evaluation={size: 9999, views: 9999}",
             "pixels, twice take about 39.99 TB of memory",

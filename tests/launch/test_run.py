@@ -10,6 +10,7 @@ import pytest
 
 from tests.helpers import tiny_parts
 from tests.helpers.tiny_runs import files, only_run
+from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint
 from threestudio_gaussiandreamer.launch import callbacks, experiment, run, run_folder
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.ddp import ReplicatedStrategy
@@ -108,6 +109,17 @@ def test_several_gpus_train_replicas_of_one_cloud(launch, monkeypatch, strategy)
 # -- runs that meet --------------------------------------------------------------------------------
 
 ONE_FOLDER = ["use_timestamp=false", "tag=run"]
+
+
+def test_a_run_from_step_0_puts_earlier_checkpoints_aside(launch):
+    """Else resume=auto may take a later step of the earlier run."""
+    for steps in (4, 2):
+        assert launch("--train", *ONE_FOLDER, f"trainer.max_steps={steps}")[0] == 0
+    folder = Path("outputs/tiny/run")
+    kept = [load_checkpoint(folder / name / "last.ckpt") for name in ("ckpts-2", "ckpts")]
+    assert [content["global_step"] for content in kept] == [4, 2]
+    _, out, err = launch("--train", *ONE_FOLDER, "trainer.max_steps=3", "seed=5", "resume=auto")
+    assert "(step 2)" in out + err and "of another run: seed was 3, now it is 5" in out + err
 
 
 def test_a_run_that_is_refused_leaves_the_folder_of_the_one_that_trains(launch, monkeypatch):

@@ -14,12 +14,12 @@ from threestudio_gaussiandreamer.launch.training_state import check_training_sta
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 
-def read(path: Any, content: dict) -> dict:
+def read(path: Any, content: dict, optimizer: str = "Adam") -> dict:
     """Write, read and check, as a resumed run does."""
     save_file(path, content)
     checkpoint = load_checkpoint(path)
     GaussianDreamerSystem.check_checkpoint(checkpoint, str(path))
-    check_training_state(checkpoint, {"name": "Adam"}, str(path))
+    check_training_state(checkpoint, {"name": optimizer}, str(path))
     return checkpoint
 
 
@@ -126,3 +126,18 @@ def test_a_whole_checkpoint_is_accepted(tmp_path):
     later = whole_checkpoint()
     later["pytorch-lightning_version"] = "10.0.1"
     read(tmp_path / "c.ckpt", later)
+
+
+def test_plain_gradient_descent_has_no_moments(tmp_path):
+    content = whole_checkpoint()
+    state = content["optimizer_states"][0]
+    optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=0.1)
+    (own,) = optimizer.state_dict()["param_groups"]
+    state["state"] = {}
+    with pytest.raises(UserError, match="has no moments"):
+        read(tmp_path / "a.ckpt", content)
+    state["param_groups"] = [
+        {**own, **{name: group[name] for name in ("params", "name")}}
+        for group in state["param_groups"]
+    ]
+    assert read(tmp_path / "b.ckpt", content, "SGD")["global_step"] == 3

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.host.builtin.models import SolidColorBackground
 from threestudio_gaussiandreamer.training.background import FlatBackground
 
 
@@ -34,6 +35,18 @@ def test_random_colours_are_held_for_so_many_steps():
     assert not torch.equal(colors[0], colors[3])
 
 
+def test_the_hosts_random_colour_depends_on_the_step_alone():
+    background = SolidColorBackground({"random_aug": True, "random_aug_prob": 0.5})
+    dirs, colors = torch.zeros(2, 1, 1, 3), []
+    for _ in range(2):
+        for step in range(20):
+            background.update_step(0, step)
+            colors.append(background(dirs))
+    assert all(torch.equal(*pair) for pair in zip(colors[:20], colors[20:], strict=True))
+    plain = [torch.equal(color, torch.ones(2, 1, 1, 3)) for color in colors]
+    assert any(plain) and not all(plain)
+
+
 def test_learned_starts_at_the_colour_stays_in_range_and_learns():
     background = FlatBackground(
         {"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": [0, 0.1, 0.2, 10]}
@@ -56,3 +69,15 @@ def test_learned_starts_at_the_colour_stays_in_range_and_learns():
 def test_wrong_options_are_named(wrong, named):
     with pytest.raises(UserError, match=named):
         FlatBackground(wrong)
+
+
+def test_a_held_colour_is_the_same_in_all_processes_until_the_next_step(monkeypatch):
+    background, colors = FlatBackground({"mode": "random"}), []
+    for first in (0, 4):
+        monkeypatch.setattr(f"{FlatBackground.__module__}.first_item", lambda count, at=first: at)
+        background.update_step(0, 9)
+        background.hold(3)
+        colors.append(background.color(4))
+        background.update_step(0, 10)
+        colors.append(background.color(4))
+    assert torch.equal(colors[0], colors[2]) and not torch.equal(colors[1], colors[3])

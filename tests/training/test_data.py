@@ -29,8 +29,19 @@ def module(**cfg):
 
 
 def batches(data, count, start=0):
-    data.train_dataset.start_step = start
+    data.train_dataset.next_step = lambda: start
     return list(itertools.islice(iter(data.train_dataloader()), count))
+
+
+def test_every_epoch_goes_on_with_the_next_step():
+    data = module()
+    loader = data.train_dataloader()
+    steps = iter([0, 2])
+    data.train_dataset.next_step = lambda: next(steps)
+    epochs = [list(itertools.islice(iter(loader), 2)) for _ in range(2)]
+    whole = batches(module(), 4)
+    for own, expected in zip([*epochs[0], *epochs[1]], whole, strict=True):
+        assert torch.equal(own["c2w"], expected["c2w"])
 
 
 def test_a_training_batch_has_the_hosts_keys_shapes_and_units():
@@ -152,6 +163,7 @@ def test_progressive_views_widen_from_the_evaluation_view():
     "wrong, named",
     [
         ({"elevation_range": [60, -10]}, "elevation_range"),
+        ({"progressive_until": 10, "train_views": 4}, "progressive_until: the angles of a fixed"),
         ({"camera_distance_range": [0, 1]}, "camera_distance_range"),
         ({"fovy_range": [40, 190]}, "fovy_range"),
         ({"height": [16, 32]}, "height"),

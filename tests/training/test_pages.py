@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from benchmarks.viewers.devtools import open_page
 from tests.training.runs import launch, run_folder
 from threestudio_gaussiandreamer.core.images import read
 from threestudio_gaussiandreamer.formats.spz import read_spz
+from threestudio_gaussiandreamer.training.pages import discard_turntable
 
 SHORT = ["trainer.max_steps=2", "trainer.val_check_interval=2"]
 
@@ -76,6 +78,16 @@ def test_the_turntable_is_an_animated_picture_too(save):
     assert turntable.n_frames == len(list((save / "it2-test").glob("*.png"))) == 3
     expected = read(save / "it2-test" / "0.png").astype(float)
     assert np.abs(np.asarray(turntable.convert("RGB")) - expected).mean() < 8
+
+
+def test_pictures_of_an_earlier_test_are_discarded(save):
+    system = SimpleNamespace(get_save_dir=lambda: str(save), true_global_step=2)
+    pictures = list((save / "it2-test").glob("*.png"))
+    kept = {path: path.read_bytes() for path in pictures}
+    discard_turntable(system)
+    assert kept and not any(path.exists() for path in kept)
+    for path, content in kept.items():
+        path.write_bytes(content)
 
 
 IMAGES = "[...document.images].map(image => image.decode().then(() => image.naturalWidth))"

@@ -130,6 +130,17 @@ def test_an_empty_folder_has_an_index(tmp_path):
     assert Tags(write_index(tmp_path)).tags.count("h1") == 1
 
 
+def test_a_page_of_someone_else_is_not_replaced(full_run):
+    page = full_run.parent / "index.html"
+    page.write_text("my own page")
+    with pytest.raises(UserError, match="isn't a page of this package"):
+        write_gallery(full_run.parent)
+    assert page.read_text() == "my own page"
+    page.unlink()
+    for _ in range(2):
+        write_gallery(full_run.parent)
+
+
 def test_the_gallery_shows_prompt_poster_and_scores(full_run):
     page = write_gallery(full_run.parent)
     assert "31.2 dB" in page.read_text()

@@ -61,6 +61,10 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
     """
     path = Path(os.path.expanduser(path))
     if not path.is_file():
+        if (last := path / "ckpts" / "last.ckpt").is_file():
+            raise UserError(
+                f"{path} is the folder of a run, not a checkpoint: did you mean {last}?"
+            )
         if path.is_dir():
             raise UserError(f"{path} is a folder, not a checkpoint" + _siblings(path / "*"))
         raise UserError(f"there is no checkpoint {path}" + _siblings(path))

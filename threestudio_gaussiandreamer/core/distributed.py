@@ -52,21 +52,24 @@ def draw_shared(count: int, draw: Callable[[int], Tensor]) -> Tensor:
     return draw(total)[own_rows(total)]
 
 
-def require_shareable(views: int, option: str) -> None:
+def require_shareable(views: int, option: str, *, together: int = 1) -> None:
     """Check that the processes can share the views of a step equally.
 
     Args:
         option: names the option in the message.
+        together: so many consecutive views stay in one process.
 
     Raises:
         UserError: there are fewer views than processes, or their number is no multiple.
     """
     size = world_size()
-    if views % size:
-        too_few = "fewer than" if views < size else "no multiple of"
+    if views % (size * together):
+        too_few = "fewer than" if views < size * together else "no multiple of"
+        groups = f" in groups of {together}" if together > 1 else ""
         raise UserError(
-            f"{option} is {views}, {too_few} the {size} processes that share the views of a step: "
-            f"set {option} to {size} or a multiple, or use as many processes as divide {views}"
+            f"{option} is {views}, {too_few} the {size} processes that share the views of a step"
+            f"{groups}: set {option} to {size * together} or a multiple, or use as many processes "
+            f"as divide {views // together}"
         )
 
 

@@ -149,7 +149,7 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
     An mp4 of odd size is padded to an even one, which H.264 requires.
 
     Raises:
-        UserError: the disk is full, or there is no ffmpeg.
+        UserError: the disk is full, there is no ffmpeg, or the images differ in size.
     """
     import imageio.v2 as imageio
 
@@ -165,7 +165,7 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
         os.replace(part, path)
     except ImportError as error:
         raise UserError(f"the video {path} needs ffmpeg: pip install imageio-ffmpeg") from error
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, ValueError) as error:  # the last: pictures of several sizes
         raise UserError(f"the video {path} could not be written: {error}") from error
     finally:
         part.unlink(missing_ok=True)

@@ -260,16 +260,18 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     parser.add_argument(
         "results", nargs="+", metavar="RUN_FOLDER|PLY", help="a run's folder, or a PLY of Gaussians"
     )
-    parser.add_argument("--clip", help="folder of a CLIP in transformers' format")
+    parser.add_argument("--clip", help="CLIP folder in transformers' format, or toybox (bundled)")
     parser.add_argument(
         "--prompt", help="the text of all results; default: what each run was asked for"
     )
     parser.add_argument("--prompts-file", help="one prompt for each result, a line each")
     parser.add_argument("--output", default="evaluation", help="folder for clip.json and clip.png")
     parser.add_argument("--seeds", type=int, nargs="+", default=list(defaults.seeds))
-    parser.add_argument("--views", type=int, default=defaults.views, help="on the circle")
-    parser.add_argument("--drawn", type=int, default=defaults.drawn, help="of them, for each seed")
-    parser.add_argument("--size", type=int, default=defaults.size, help="of the pictures, pixels")
+    parser.add_argument(
+        "--views", type=int, default=defaults.views, help="number of views on the circle"
+    )
+    parser.add_argument("--drawn", type=int, default=defaults.drawn, help="views drawn per seed")
+    parser.add_argument("--size", type=int, default=defaults.size, help="width and height, pixels")
     parser.add_argument(
         "--fovy", type=float, default=defaults.fovy_deg, help="vertical field of view, degrees"
     )
@@ -287,7 +289,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     parser.add_argument(
         "--t3bench-method", default="gaussiandreamer", help="its name for what made the results"
     )
-    parser.add_argument("--t3bench-size", type=int, default=512, help="of its pictures, pixels")
+    parser.add_argument("--t3bench-size", type=int, default=512, help="size of its views, pixels")
     return parser.parse_args(argv)
 
 

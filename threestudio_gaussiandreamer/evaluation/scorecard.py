@@ -47,25 +47,36 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     add("folders", nargs="+", metavar="FOLDER", help="a run's folder, or one that holds runs")
     add("--metrics", default="clip", help=f"comma-separated, of {', '.join(METRICS)}")
     add("--against", metavar="FOLDER", help="also score these runs, and print paired differences")
-    add("--clip", help="folder of a CLIP in transformers' format, for clip and directions")
+    add(
+        "--clip",
+        help="folder of a CLIP in transformers' format, or toybox (bundled): clip, directions",
+    )
     add("--imagereward", help="folder with ImageReward.pt and vocab.txt, for imagereward, quality")
-    add("--judge", default=NAME, help="of judge and janus: a file, or toybox, the bundled one")
+    add("--judge", default=NAME, help="model of judge and janus: a file, or toybox (bundled)")
     add("--size", type=int, default=1024, help="width and height of the pictures for CLIP, pixels")
     add("--output", default="evaluation", help="folder for scorecard.csv and scorecard.json")
     return parser.parse_args(argv)
 
 
 def run(args: argparse.Namespace) -> None:
-    """Check files, prompts and output, then score all assets and write the scorecard."""
+    """Check files, prompts and output, then score all assets and write the scorecard.
+
+    Raises:
+        UserError: also if an asset can't be scored, after the scorecard of the others is written.
+    """
     register_parts()
     metrics = open_metrics(args)
     first = find_results(args.folders)
     second = find_results([args.against]) if args.against else []
     output = output_folder(args.output, "--output", FILES)
-    rows = [list(scored(results, metrics)) for results in (first, second)]
-    content = summary(metrics, *rows)
-    write(output, rows[0] + rows[1], content)
-    print("\n".join([*table(content), str(output / "scorecard.csv")]))
+    failed: list[str] = []
+    rows = [list(scored(results, metrics, failed)) for results in (first, second)]
+    if rows[0]:
+        content = summary(metrics, *rows)
+        write(output, rows[0] + rows[1], content)
+        print("\n".join([*table(content), str(output / "scorecard.csv")]))
+    if failed:
+        raise UserError(f"{len(failed)} of the assets can't be scored: {'; '.join(failed)}")
 
 
 def open_metrics(args: argparse.Namespace) -> list[Metric]:
@@ -140,14 +151,24 @@ def run_folders(folder: Path) -> Iterator[Path]:
             yield Path(place)
 
 
-def scored(results: Sequence[Result], metrics: Sequence[Metric]) -> Iterator[dict[str, Any]]:
-    """Yield a row of the table for each result."""
+def scored(
+    results: Sequence[Result], metrics: Sequence[Metric], failed: list[str]
+) -> Iterator[dict[str, Any]]:
+    """Yield a row of the table for each result.
+
+    Args:
+        failed: gets the messages of those that can't be read or scored.
+    """
     for item, result in enumerate(tqdm(results, unit="asset", disable=None)):
-        asset = Asset(result, result.prompt or "", read_result(result), item)
-        row: dict[str, Any] = {"asset": str(result.ply.parents[2]), "prompt": asset.prompt}
-        for metric in metrics:
-            row |= metric.score(asset)
-        yield row
+        row: dict[str, Any] = {"asset": str(result.ply.parents[2]), "prompt": result.prompt or ""}
+        try:
+            asset = Asset(result, row["prompt"], read_result(result), item)
+            for metric in metrics:
+                row |= metric.score(asset)
+        except UserError as error:
+            failed.append(str(error))
+        else:
+            yield row
 
 
 def summary(metrics: Sequence[Metric], first: Rows, second: Rows) -> dict[str, Any]:

@@ -67,25 +67,28 @@ def parse_arguments(argv: Optional[Sequence[str]] = None) -> argparse.Namespace:
         "farm-<prompts> in exp_root_dir)",
     )
     parser.add_argument("--report", action="store_true", help="only write the report")
-    parser.add_argument(
-        "--price", type=positive, help="of an hour of one worker, for the report's cost"
-    )
+    parser.add_argument("--price", type=positive, help="cost of one worker-hour, for the report")
     _add_cluster_options(parser)
     return parse_with_overrides(parser, argv)
 
 
 def _add_cluster_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--address", help="of a Ray cluster, host:port or auto (default: start Ray on this machine)"
+        "--address",
+        help="address of a Ray cluster, host:port or auto (default: start Ray on this machine)",
     )
     parser.add_argument(
-        "--workers", type=whole(1), help="how many (default: as many as fit into the cluster)"
+        "--workers",
+        type=whole(1),
+        help="number of workers (default: as many as fit into the cluster)",
     )
     parser.add_argument(
-        "--gpus", type=whole(0), help="how many to use, one per worker (default: all; 0: the CPU)"
+        "--gpus",
+        type=whole(0),
+        help="number of GPUs, one per worker (default: all; 0: the CPU)",
     )
     parser.add_argument(
-        "--cores", type=whole(1), default=1, help="of each worker (default: %(default)s)"
+        "--cores", type=whole(1), default=1, help="CPU cores per worker (default: %(default)s)"
     )
     parser.add_argument(
         "--retries",

@@ -53,11 +53,14 @@ def read_rows(path: Path) -> Iterator[Row]:
     """Yield the rows of a prompt list; the format follows from the extension.
 
     Raises:
-        UserError: the file is missing, isn't UTF-8 text, or has a line that is too long, an unknown
-            column, or an invalid value; the message names the line.
+        UserError: the file is missing, has another extension, isn't UTF-8 text, or has a line that
+            is too long, an unknown column, or an invalid value; the message names the line.
     """
     existing_file(path, "prompt list")
-    read = FORMATS.get(path.suffix.lower(), _from_text)
+    suffix = path.suffix.lower()
+    if suffix not in (*FORMATS, *TEXT_FILES):
+        raise unknown(f"format of the prompt list {str(path)!r}:", suffix, [*FORMATS, *TEXT_FILES])
+    read = FORMATS.get(suffix, _from_text)
     for line, values in read(path):
         try:
             yield make_row(values, line)
@@ -262,3 +265,5 @@ FORMATS: dict[str, Callable[[Path], Iterator[tuple[int, dict[str, Any]]]]] = {
     ".jsonl": _from_jsonl,
     ".ndjson": _from_jsonl,
 }
+TEXT_FILES = (".txt", "")
+"""Extensions of lists with a prompt in each line."""

@@ -217,8 +217,10 @@ def _moved(
 
 
 def _rows(value: object, old: nn.Parameter, change: Change) -> object:
-    """Gather the rows of a per-Gaussian state tensor; anything else (Adam's step) stays."""
-    if not isinstance(value, Tensor) or value.shape != old.shape:
+    """Gather the rows of a state tensor with a row per Gaussian; anything else (Adam's step,
+    Adafactor's mean over Gaussians) stays.
+    """
+    if not isinstance(value, Tensor) or value.shape[:1] != old.shape[:1]:
         return value
     rows = value[change.parents]
     rows[change.is_new] = 0

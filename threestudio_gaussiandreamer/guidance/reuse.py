@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.checkpoint_file import entries_below
+from ..core.distributed import world_size
 from ..diffusion.sds import per_item
 
 SAME = ("c2w", "fovy", "comp_rgb_bg")
@@ -60,7 +61,8 @@ class KeptPrediction:
             slope = per_item((kept.abar / (1 - kept.abar)).sqrt(), latents)
             return (kept.error + slope * (latents - kept.latents), kept.abar), False
         error, abar = predict()
-        if self.steps > 1:
+        self._kept = None
+        if self.steps > 1 and error.isfinite().all():
             views = {name: batch[name].detach() for name in SAME if batch.get(name) is not None}
             self._kept = Kept(step, latents.detach(), error, abar, views)
         return (error, abar), True
@@ -76,9 +78,13 @@ class KeptPrediction:
     def restore(
         self, state: dict[str, Tensor], device: torch.device | str = "cpu"
     ) -> dict[str, Tensor]:
-        """Restore what :meth:`state` returned; return the entries of others."""
+        """Restore what :meth:`state` returned; return the entries of others.
+
+        With several processes nothing is restored: the checkpoint has the first one's prediction
+        only, and all must predict in the same steps.
+        """
         own = {name: value.to(device) for name, value in entries_below(state, PREFIX).items()}
-        if own and self.steps > 1:
+        if own and self.steps > 1 and world_size() == 1:
             views = {name: own[f"views.{name}"] for name in SAME if f"views.{name}" in own}
             latents, error, abar = (own[name] for name in ("latents", "error", "abar"))
             self._kept = Kept(int(own["step"]), latents, error, abar, views)

@@ -98,7 +98,7 @@ else:
 
     from ..core.devices import get_device
     from ..core.logs import debug, info, warn
-    from .builtin.base import BaseModule, BaseObject, Updateable, parse_structured
+    from .builtin.base import BaseModule, BaseObject, Updateable, parse_structured, run_seed
     from .builtin.models import (
         BaseBackground,
         BaseGeometry,
@@ -112,10 +112,6 @@ else:
 
     NAME = "builtin"
     register_builtin = register
-
-    def run_seed() -> int:
-        """Return the seed of this run, the same in all its processes; 0 if none is set."""
-        return int(os.environ.get("PL_GLOBAL_SEED", 0))
 
 
 def item_seed() -> int:

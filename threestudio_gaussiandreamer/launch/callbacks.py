@@ -163,6 +163,7 @@ class LastCheckpoint(pl.callbacks.Checkpoint):
             self._stop_if_asked(trainer)
 
     def on_train_end(self, trainer: Any, pl_module: Any) -> None:
+        self._save(trainer)  # where max_time or max_epochs ended the run
         self._restore_handlers()
         self._stop_if_asked(trainer)
 

@@ -56,6 +56,10 @@ class ExperimentConfig:
     """See ``live_viewer.py``."""
 
 
+COMPUTED = ("exp_dir", "trial_name", "trial_dir", "new_folder", "n_gpus")
+"""Keys that only a ``parsed.yaml`` may have."""
+
+
 def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus: int = 0) -> Any:
     """Merge YAML files, of which later ones take precedence, and ``key=value`` overrides into the
     configuration of a run. No folder is created.
@@ -75,6 +79,11 @@ def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus:
         _with_prompt_from_file(source)
         for source in [*map(read_yaml, paths), parse_overrides(cli_args)]
     ]
+    if given := [name for name in COMPUTED if name in sources[-1]]:
+        raise UserError(
+            f"{given[0]} is computed: set exp_root_dir, name and tag for the folder of a run, and "
+            "--gpu or trainer.devices for the GPUs"
+        )
     merged = _merge(sources)
     trainer = {name: _trainer_option(merged, name) for name in ("devices", "num_nodes")}
     merged.n_gpus = planned_processes(n_gpus, trainer).total

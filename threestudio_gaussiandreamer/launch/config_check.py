@@ -36,6 +36,7 @@ from ..host.typed_config import parse_structured
 from ..priors.base import Prior
 from ..prompts.prompt_processors import TextEncoderPromptProcessor
 from .live_viewer import ViewerConfig
+from .section_checks import check_sections
 
 MisconfigurationException = pl.utilities.exceptions.MisconfigurationException
 
@@ -109,6 +110,7 @@ def check_config(cfg: Any) -> None:
     check_part("data", cfg.data_type, cfg.data)
     check_part("system", cfg.system_type, cfg.system)
     _check_loss(cfg.system.get("loss"), getattr(find(cfg.system_type), "LOSSES", None))
+    check_sections(cfg)
     _check_loggers(cfg.system.get("loggers"))
     _check_arguments("checkpoint", cfg.checkpoint, pl.callbacks.ModelCheckpoint)
     _check_monitor(cfg)
@@ -147,7 +149,10 @@ def _default(config_class: type, key: str) -> Any:
 
 def _find(path: str, type_name: Any) -> type:
     if not type_name:
-        raise UserError(f"{path} is empty: name a registered part")
+        hint = (
+            " (an overlay needs the configuration that it changes before it: --config A --config B)"
+        )
+        raise UserError(f"{path} is empty: name a registered part{hint * (path == 'data_type')}")
     try:
         return find(type_name)
     except UserError as error:
@@ -296,6 +301,11 @@ def _check_trainer_ranges(trainer: Any) -> None:
         raise UserError(
             "trainer.val_check_interval: expected a number of steps above 0 (for no "
             "validation: trainer.limit_val_batches=0)"
+        )
+    if trainer.get("limit_test_batches") in (0, 0.0):
+        raise UserError(
+            "trainer.limit_test_batches: expected more than 0, since results are exported after "
+            "the test views (for one view: data.n_test_views=1)"
         )
 
 

@@ -120,6 +120,19 @@ def claim(path: Path) -> RunFolder:
             return RunFolder(path, first_made, _lock(path))
 
 
+def set_aside(path: Path) -> Optional[Path]:
+    """Rename a folder to the first of ``path-2``, ``path-3``, ... that doesn't exist, unless it is
+    missing or empty.
+
+    Returns:
+        the new path; None if it wasn't renamed.
+    """
+    if not path.is_dir() or not any(path.iterdir()):
+        return None
+    candidates = (path.with_name(f"{path.name}-{number}") for number in count(2))
+    return path.rename(next(candidate for candidate in candidates if not candidate.exists()))
+
+
 def make_folder(path: Path) -> Optional[Path]:
     """Create a folder and its missing parents. ``mkdir`` is atomic, so of several processes exactly
     one creates ``path``.

@@ -26,10 +26,10 @@ from .callbacks import LastCheckpoint, ProgressBar, RunRecord, Stopped
 from .checkpoints import AtomicCheckpointIO
 from .config_check import MisconfigurationException, build, plain
 from .ddp import environment_plugins, planned_processes, trainer_options
-from .folder_lock import RunFolder, claim, claim_new, require_writable
+from .folder_lock import RunFolder, claim, claim_new, require_writable, set_aside
 from .live_viewer import LiveViewer, ViewerConfig
 from .options import PROGRAM
-from .run_folder import renumber
+from .run_folder import changes_since, renumber
 from .training_state import check_training_state
 
 # errors of the file system that end a run with a message instead of a traceback
@@ -163,6 +163,8 @@ class Run:
                 f"{', '.join(missing)}, which Lightning writes"
             )
         self.check_content(checkpoint)
+        for change in changes_since(self.cfg):
+            warn(f"{self.cfg.resume} is of another run: {change}")
         self.resumed_step = checkpoint["global_step"]
         return checkpoint["epoch"], self.resumed_step
 
@@ -278,13 +280,17 @@ class Run:
                 renumber(self.cfg, number)
         else:
             self.claimed = claim(self.folder)
+        if self.args.stage == "train" and self.cfg.resume is None:
+            if earlier := set_aside(self.last.parent):  # else resume=auto may take one of them
+                info(f"starting at step 0: the checkpoints of an earlier run are now in {earlier}")
 
     def discard_if_unused(self) -> None:
         """Remove the folder if this run created it, has made no step and has written no results."""
         if self.claimed.first_made is None:
             return
         trained = self.trainer is not None and self.trainer.global_step > max(self.resumed_step, 0)
-        results = [*self.folder.glob("save/it*"), *self.folder.glob("ckpts/*.ckpt")]
+        kept = ("save/it*", "save/prior/points.npz", "ckpts/*.ckpt")
+        results = [path for pattern in kept for path in self.folder.glob(pattern)]
         if not trained and not results:
             self.claimed.discard()
 

@@ -9,11 +9,17 @@ from glob import escape as glob_escape
 from pathlib import Path
 from typing import Any
 
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
 from ..core.checkpoint_file import newest_readable
 from ..core.errors import UserError
 from ..core.interpolation import escape
 from ..host import info
 
+SAME = ("system.prompt_processor.prompt", "seed")
+"""Options that a resumed run usually has in common with the one before."""
 SLUG_BYTES = 64
 SLUG_SOURCE = 1024
 """Characters of a text that its slug is made of: normalising takes quadratic time in the length of
@@ -49,6 +55,23 @@ def name_folders(cfg: Any) -> None:
         _resume_newest(cfg, tag)
     elif cfg.resume is not None:
         cfg.resume = escape(os.path.expanduser(cfg.resume))
+
+
+def changes_since(cfg: Any) -> list[str]:
+    """Return how seed and prompt differ from those of the run whose checkpoint is resumed, as its
+    ``parsed.yaml`` has them; nothing if that can't be read.
+    """
+    path = Path(cfg.resume).parent.parent / "configs" / "parsed.yaml"
+    try:
+        earlier = OmegaConf.load(path)
+        pairs = {
+            name: (OmegaConf.select(earlier, name), OmegaConf.select(cfg, name)) for name in SAME
+        }
+    except (OSError, ValueError, YAMLError, OmegaConfBaseException):
+        return []
+    return [
+        f"{name} was {old!r}, now it is {new!r}" for name, (old, new) in pairs.items() if old != new
+    ]
 
 
 def renumber(cfg: Any, count: int) -> None:

@@ -130,7 +130,8 @@ def _check_optimizers(checkpoint: Mapping[str, Any], what: str) -> None:
     for i, state in enumerate(states):
         name = f"{what}: its optimizer_states[{i}]"
         groups = _groups(state, name)
-        if checkpoint["global_step"] > 0 and not state["state"]:
+        has_moments = not all(map(_is_plain_descent, groups))
+        if checkpoint["global_step"] > 0 and has_moments and not state["state"]:
             raise UserError(f"{name} has no moments, though the run is at a later step than 0")
         for group in groups:
             _check_group(group, state["state"], checkpoint["state_dict"], name)
@@ -150,6 +151,11 @@ def _groups(state: Any, name: str) -> list[Mapping]:
     ):
         raise UserError(f"{name}.param_groups isn't a list of groups with params")
     return list(groups)
+
+
+def _is_plain_descent(group: Mapping) -> bool:
+    """Return whether a group is of torch's SGD without momentum, which has no state."""
+    return "nesterov" in group and not group.get("momentum")
 
 
 def _check_group(group: Mapping, moments: Mapping, parameters: Mapping, name: str) -> None:

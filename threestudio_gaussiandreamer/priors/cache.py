@@ -13,7 +13,7 @@ from ..core.files import atomic_file
 from ..formats.array_files import read_arrays
 from ..formats.ply import write_points
 from ..gaussians.point_cloud import PointCloud
-from ..host import info, run_seed
+from ..host import info, run_seed, warn
 from .turntable import save_turntable
 
 
@@ -39,7 +39,10 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
             **{name: value for name, value in cloud._asdict().items() if value is not None},
         )
     write_points(path.with_suffix(".ply"), cloud)
-    save_turntable(cloud, path.with_name("turntable.gif"))
+    try:
+        save_turntable(cloud, path.with_name("turntable.gif"))
+    except (UserError, OSError) as error:  # it is only for inspection
+        warn(str(error))
     return cloud
 
 

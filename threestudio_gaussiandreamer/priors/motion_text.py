@@ -6,6 +6,7 @@ what follows it, up to the first comma or full stop, with "Someone" before it an
 "her", "its" and "their". A small list of rules, no language model: the user can always give the
 text."""
 
+import argparse
 import re
 from typing import Optional
 
@@ -85,10 +86,16 @@ def _sentence(verb: str, rest: str) -> str:
     return re.sub(r"\s+", " ", words).strip()
 
 
-if __name__ == "__main__":
-    import sys
-
-    print(
-        reduced_prompt(" ".join(sys.argv[1:]))
-        or "no verb of motion found: write the sentence yourself"
+def main() -> None:
+    """Print the motion of the prompt on the command line."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m {__spec__.name}",
+        description="Print what a text-to-motion model is asked for a prompt.",
     )
+    parser.add_argument("prompt", nargs="+", help="the prompt, as one argument or as words")
+    prompt = " ".join(parser.parse_args().prompt)
+    print(reduced_prompt(prompt) or "no verb of motion found: write the sentence yourself")
+
+
+if __name__ == "__main__":
+    main()

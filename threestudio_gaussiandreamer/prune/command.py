@@ -47,7 +47,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--steps": {
         "type": int,
         "default": PruneOptions.steps,
-        "help": "of recovery after each round (default: %(default)d)",
+        "help": "recovery steps after each round (default: %(default)d)",
     },
     "--eps2d": {
         "type": float,

@@ -46,10 +46,14 @@ class FlatBackground(BaseBackground):
             self.logit = nn.Parameter(torch.logit(color.clamp(1e-3, 1 - 1e-3)))
         else:
             self.register_buffer("fixed", color, persistent=False)
-        self.step = 0
+        self.step, self.is_shared = 0, False
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
-        self.step = global_step
+        self.step, self.is_shared = global_step, False
+
+    def hold(self, step: int) -> None:
+        """Return the random colours of ``step``, the same in all processes, until the next step."""
+        self.step, self.is_shared = step, True
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Return the optimiser's group of the learned colour; none for the other modes."""
@@ -69,7 +73,8 @@ class FlatBackground(BaseBackground):
         if self.options.mode == "learned":
             return torch.sigmoid(self.logit).expand(batch_size, 3)
         if self.options.mode == "random" and self.training:
-            first, step = first_item(batch_size), held(self.step, self.options.hold_steps)
+            first = 0 if self.is_shared else first_item(batch_size)
+            step = held(self.step, self.options.hold_steps)
             return torch.stack(
                 [
                     torch.rand(3, generator=generator(run_seed(), "background", step, item))

@@ -32,7 +32,9 @@ rays                      add rays_o and rays_d (B, H, W, 3) to every batch
 """
 
 import bisect
+import itertools
 import math
+from collections.abc import Callable
 from typing import Any, Optional
 
 import torch
@@ -89,10 +91,13 @@ def orbit_batch(orbit: Orbit, height: int, width: int) -> dict[str, Any]:
 
 
 class TrainCameras(IterableDataset, Updateable):
-    """An endless stream of training batches; a resumed run's begins at ``start_step``."""
+    """An endless stream of training batches, each epoch's from the step that ``next_step``
+    returns.
+    """
 
     def __init__(self, cfg: CameraConfig) -> None:
-        self.cfg, self.start_step = cfg, 0
+        self.cfg = cfg
+        self.next_step: Callable[[], int] = lambda: 0
         self._views_by_size: dict[tuple[int, int], dict[str, Any]] = {}
         sizes = [
             v if isinstance(v, (list, tuple)) else [v]
@@ -100,7 +105,7 @@ class TrainCameras(IterableDataset, Updateable):
         ]
         stages = max(map(len, sizes))
         for batch_size in sizes[2]:
-            require_shareable(batch_size, "data.batch_size")
+            require_shareable(batch_size, "data.batch_size", together=cfg.n_view)
         self.sizes = list(zip(*[v * stages if len(v) == 1 else v for v in sizes], strict=True))
         self.ranges = OrbitRanges(
             *(
@@ -120,10 +125,7 @@ class TrainCameras(IterableDataset, Updateable):
         )
 
     def __iter__(self):
-        step = self.start_step
-        while True:
-            yield step
-            step += 1
+        yield from itertools.count(self.next_step())
 
     def collate(self, step: int) -> dict[str, Any]:
         """Return this process's views of the batch for ``step``, a function of (seed, step)."""
@@ -271,10 +273,9 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         )
 
     def train_dataloader(self) -> DataLoader:
-        # Lightning calls this after restoring its loops and before fetching the first batch
-        self.train_dataset.start_step = (
-            self.trainer.global_step if self.trainer is not None else self.train_dataset.start_step
-        )
+        trainer = self.trainer
+        if trainer is not None:  # which is at a later step in a resumed run or a later epoch
+            self.train_dataset.next_step = lambda: trainer.global_step
         return DataLoader(
             self.train_dataset, batch_size=None, collate_fn=self.train_dataset.collate
         )

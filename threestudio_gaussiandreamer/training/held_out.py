@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .. import metrics
 from ..cameras import Orbit, held_out_orbit
 from ..core.errors import UserError
 from ..core.files import atomic_file, json_text
@@ -29,7 +30,6 @@ from ..core.memory import require_memory
 from ..core.options import at_least, in_range, is_number, is_whole
 from ..meshes.mesh import SurfaceDistance
 from ..meshes.raycast import over_background
-from ..metrics import floater_mass, multi_face_rate, out_of_gamut, psnr, saturation, ssim
 from .camera_options import MAX_SIDE
 from .data import orbit_batch
 
@@ -42,7 +42,7 @@ and render (12), in float32.
 @dataclass
 class EvaluationConfig:
     views: int = field(default=24, metadata=in_range(1, 100_000))
-    size: int = field(default=256, metadata=in_range(1, MAX_SIDE, "pixels"))
+    size: int = field(default=256, metadata=in_range(metrics.SMALLEST_SIDE, MAX_SIDE, "pixels"))
     supersample: int = field(default=3, metadata=in_range(1, 64, "rays a pixel each way"))
     every: int = field(default=0, metadata=at_least(0, "steps; 0: never"))
 
@@ -127,9 +127,8 @@ class HeldOut:
         wrong = 0.0
         for rows, azimuth, ring in self.rings:
             bank = over_background(ring, backgrounds[rows[0]])
-            wrong += multi_face_rate(images[rows], bank, self.orbit.azimuth[rows], azimuth) * len(
-                rows
-            )
+            rate = metrics.multi_face_rate(images[rows], bank, self.orbit.azimuth[rows], azimuth)
+            wrong += rate * len(rows)
         return wrong / len(images)
 
     def floaters(self, means: Float[Tensor, "N 3"], opacities: Float[Tensor, " N"]) -> float:
@@ -137,7 +136,7 @@ class HeldOut:
         2 % of the longest side of its bounding box.
         """
         distances = torch.from_numpy(self.surface_distance(means.double().cpu().numpy()))
-        return floater_mass(
+        return metrics.floater_mass(
             distances,
             opacities.double().cpu(),
             extent=float(np.ptp(self.caster.mesh.vertices, axis=0).max()),
@@ -212,10 +211,13 @@ class Measurements:
             return scores | {key: self._score(key, self._snapshot(renderer, step))}
 
     @torch.no_grad()
-    def postpone(self, key: str, renderer: Any, step: int) -> None:
-        """Render the cloud now and score it with the next one, or in :meth:`score_postponed`."""
+    def begin(self, renderer: Any) -> None:
+        """Drop the scores of an earlier run in the folder. Render the prior's cloud now, and score
+        it with the next one or in :meth:`score_postponed`, since rendering the truth takes seconds.
+        """
+        self.values, self.seconds = {}, np.zeros(len(CLOCKS))
         with self.paused_clock():
-            self._postponed[key] = self._snapshot(renderer, step)
+            self._postponed["prior"] = self._snapshot(renderer, 0)
 
     @torch.no_grad()
     def score_postponed(self) -> dict[str, dict[str, Any]]:
@@ -235,13 +237,13 @@ class Measurements:
         truth = self.held_out.truth_on(cloud.backgrounds)
         scores = {"step": cloud.step, **cloud.elapsed, "gaussians": len(cloud.means)}
         scores |= {
-            "psnr": round(float(psnr(images, truth).mean()), 3),
-            "ssim": round(float(ssim(images, truth).mean()), 4),
+            "psnr": round(float(metrics.psnr(images, truth).mean()), 3),
+            "ssim": round(float(metrics.ssim(images, truth).mean()), 4),
         }
         scores["multi_face"] = round(self.held_out.multi_face(images, cloud.backgrounds), 4)
         scores["floater_mass"] = round(self.held_out.floaters(cloud.means, cloud.opacities), 5)
-        scores["out_of_gamut"] = round(out_of_gamut(cloud.images), 5)
-        relative = saturation(images) / max(saturation(truth), 1e-6)
+        scores["out_of_gamut"] = round(metrics.out_of_gamut(cloud.images), 5)
+        relative = metrics.saturation(images) / max(metrics.saturation(truth), 1e-6)
         scores["saturation"] = round(relative, 4)
         if key == "curve":
             self.values.setdefault("curve", []).append(scores)

@@ -124,7 +124,7 @@ class ImageTargets(nn.Module):
             self.pictures = None
             return batch
         if isinstance(background, FlatBackground):
-            background.update_step(0, self.cfg.start)
+            background.hold(self.cfg.start)
         own, device = orbit_batch(self.orbit, batch["height"], batch["width"]), batch["c2w"].device
         return {name: v.to(device) if torch.is_tensor(v) else v for name, v in own.items()}
 

@@ -77,6 +77,12 @@ def write_pages(system: Any, folder: str) -> None:
         picture(cloud, options.settings, first_pose(cloud), POSTER_SIZE).save(file, "png")
 
 
+def discard_turntable(system: Any) -> None:
+    """Remove the pictures of an earlier test of the same step, which may have had more views."""
+    for path in Path(system.get_save_dir(), f"it{system.true_global_step}-test").glob("*.png"):
+        path.unlink()
+
+
 def write_turntable(system: Any) -> None:
     """Write the pictures ``it<step>-test/<number>.png`` as a video, and fewer of them as WebP.
 

@@ -62,7 +62,7 @@ from .image_targets import ImageTargets, ImageTargetsConfig, check_image_targets
 from .loss_scale import LossScale
 from .losses import check_losses, loggable, logged_names, weight_schedules, weighted_losses
 from .optimizer import check_optimizer, make_optimizer
-from .pages import save_first_cloud, write_turntable
+from .pages import discard_turntable, save_first_cloud, write_turntable
 from .pictures import rgb_panel, save_pictures
 from .truth import prefetch_truth, true_views
 
@@ -223,8 +223,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         if self.global_step == 0:
             save_first_cloud(self)
         if self.measurements:
-            if self.global_step == 0:  # scored later, since rendering the truth takes seconds
-                self.measurements.postpone("prior", self.renderer, 0)
+            if self.global_step == 0:
+                self.measurements.begin(self.renderer)
             self.measurements.start_clock()
         prefetch_truth(self)
 
@@ -370,12 +370,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         if not self.writes_results:
             return
         name = f"it{self.true_global_step}-test/{int(batch['index'][0])}.png"
-        self.save_image_grid(
-            name,
-            [rgb_panel(self(batch)["comp_rgb"][0])],
-            name="test_step",
-            step=self.true_global_step,
-        )
+        panels = [rgb_panel(self(batch)["comp_rgb"][0])]
+        self.save_image_grid(name, panels, name="test_step", step=self.true_global_step)
 
     def on_test_epoch_end(self) -> None:
         if self.writes_results:
@@ -387,11 +383,13 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.ensure_cloud()
         self.require_finite()
 
-    on_test_start = on_validation_start
+    def on_test_start(self) -> None:
+        self.on_validation_start()
+        if self.writes_results:
+            discard_turntable(self)
 
     def on_predict_start(self) -> None:
-        self.ensure_cloud()
-        self.require_finite()
+        self.on_test_start()
         super().on_predict_start()
 
     def on_predict_epoch_end(self) -> None:

@@ -9,7 +9,7 @@ from ..core.logs import warn
 from .page import decibels
 from .run_files import RunFiles, is_run, step_of
 from .run_index import NAME, write_index
-from .static_page import address, document, element, media
+from .static_page import address, document, element, is_own_page, media
 
 MAX_DEPTH = 3
 """Folders between the gallery's and a run's: an experiment's, and a sweep's above it."""
@@ -42,6 +42,10 @@ def write_gallery(folder: Path) -> Path:
         except UserError as error:
             warn(str(error))
     path = folder / NAME
+    if path.exists() and not is_own_page(path):
+        raise UserError(
+            f"{str(path)!r} isn't a page of this package, so it isn't replaced: move it"
+        )
     cards = "".join(_card(run, folder) for run in runs)
     title = f"{len(runs)} runs in {folder.resolve().name}"
     parts = [element("h1", title), f'<div class="cards">{cards}</div>']

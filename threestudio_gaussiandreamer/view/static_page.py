@@ -32,6 +32,12 @@ def document(title: str, parts: Iterable[str]) -> str:
     )
 
 
+def is_own_page(path: Path) -> bool:
+    """Return whether a file is a page that :func:`document` made."""
+    with open(path, encoding="utf-8", errors="replace") as file:
+        return POLICY in file.read(1000)
+
+
 def element(name: str, text: str, **attributes: str) -> str:
     """Return an element that holds a text, which is escaped, as attributes are."""
     return f"<{name}{_attributes(attributes)}>{html.escape(text)}</{name}>"

@@ -6,7 +6,9 @@ all else is the same for each: the gradient is w(t) e, clipped, without items th
 eps_c and eps_u are the conditional and the unconditional prediction, eps_hat = eps_u +
 guidance_scale (eps_c - eps_u)."""
 
+import dataclasses
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -43,6 +45,9 @@ class Variant(BaseObject, ABC):
     NEEDS_EMPTY_PROMPT: ClassVar[bool] = False
     """Whether :meth:`.ScoreModel.empty_prompt` is called."""
 
+    IGNORES: ClassVar[tuple[str, ...]] = ()
+    """Options of the guidance that have no effect on the error."""
+
     RENDERS: ClassVar[tuple[str, ...]] = ()
     """Outputs of the renderer that :meth:`error` reads from the batch, such as ``depth``."""
 
@@ -65,6 +70,12 @@ class Variant(BaseObject, ABC):
                 "conditional and unconditional score, which is zero with these options of the "
                 "guidance"
             )
+        for option in dataclasses.fields(guidance.Config):
+            if option.name in cls.IGNORES and _plain(cfg[option.name]) != _plain(option.default):
+                raise UserError(
+                    f"system.guidance.{option.name} has no effect with {cfg.variant_type}: leave "
+                    f"it at {option.default}"
+                )
 
     @abstractmethod
     def error(
@@ -114,3 +125,8 @@ class Variant(BaseObject, ABC):
                 f"the checkpoint has {len(state)} tensors of another variant of score "
                 "distillation: resume with the configuration that the run was started with"
             )
+
+
+def _plain(value: Any) -> Any:
+    """Return a tuple or a list of OmegaConf as a list; anything else as it is."""
+    return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value

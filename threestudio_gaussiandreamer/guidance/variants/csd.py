@@ -18,6 +18,7 @@ from .base import Batch, Error, Variant
 @register("csd-variant")
 class CSD(Variant):
     NEEDS_UNCONDITIONAL = NEEDS_TEXT = True
+    IGNORES = ("guidance_interval", "recon_std_rescale")
 
     def error(
         self, guidance: Any, latents: Float[Tensor, "B c h w"], condition: Any, batch: Batch

@@ -32,6 +32,7 @@ from .base import Batch, Error, Variant
 @register("nfsd-variant")
 class NFSD(Variant):
     NEEDS_UNCONDITIONAL = NEEDS_EMPTY_PROMPT = True
+    IGNORES = ("guidance_interval", "recon_std_rescale")
 
     @dataclass
     class Config(Variant.Config):

@@ -1,5 +1,6 @@
 """Base classes of parts: a typed ``Config``, a device, and ``update_step`` on everything below."""
 
+import os
 from dataclasses import dataclass
 from typing import Any, Optional
 
@@ -41,6 +42,33 @@ class Updateable:
             for name, part in attributes.items()
             if not name.startswith("_") and isinstance(part, Updateable)
         ]
+
+
+def run_seed() -> int:
+    """Return the seed of this run, the same in all its processes; 0 if none is set."""
+    return int(os.environ.get("PL_GLOBAL_SEED", 0))
+
+
+def load_parameters(
+    module: nn.Module, state: dict[str, Any], source: str, *, strict: bool = True
+) -> None:
+    """Load parameters into a module.
+
+    Args:
+        source: names the checkpoint in messages.
+        strict: see :meth:`torch.nn.Module.load_state_dict`.
+
+    Raises:
+        UserError: a parameter has another shape here, or names differ with ``strict``.
+    """
+    try:
+        module.load_state_dict(state, strict=strict)
+    except RuntimeError as error:
+        reasons = "; ".join(line.strip() for line in str(error).splitlines()[1:])
+        raise UserError(
+            f"the weights of {source} don't fit these options ({reasons}): use those of the run "
+            "that wrote the file, such as its sh_degree"
+        ) from error
 
 
 def update_if_possible(part: Any, epoch: int, global_step: int) -> None:
@@ -107,5 +135,5 @@ class BaseModule(Part, nn.Module):
                 f"{source!r}"
             )
         state_dict, epoch, global_step = load_module_weights(path, module_name=module_name)
-        self.load_state_dict(state_dict)
+        load_parameters(self, state_dict, source)
         self.do_update_step(epoch, global_step, on_load_weights=True)

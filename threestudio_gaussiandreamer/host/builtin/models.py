@@ -7,8 +7,10 @@ from typing import Any, NamedTuple, Optional, Tuple
 import torch
 from torch import Tensor, nn
 
+from ...core.distributed import draw_shared
 from ...core.options import check_options, one_of
-from .base import BaseModule, BaseObject
+from ...core.streams import generator
+from .base import BaseModule, BaseObject, run_seed
 from .registry import register
 
 
@@ -84,8 +86,8 @@ class BaseBackground(BaseModule):
 
 @register("solid-color-background")
 class SolidColorBackground(BaseBackground):
-    """One colour for all pixels, fixed or learned; ``random_aug`` replaces it by a random one with
-    some probability.
+    """One colour for all pixels, fixed or learned; ``random_aug`` replaces it in some steps of
+    training by a random one for each view, both as functions of (seed, step).
     """
 
     @dataclass
@@ -104,13 +106,19 @@ class SolidColorBackground(BaseBackground):
             self.env_color = nn.Parameter(color)
         else:
             self.register_buffer("env_color", color)
+        self.step = 0
+
+    def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
+        self.step = global_step
 
     def forward(self, dirs: Tensor) -> Tensor:
         shape = (*dirs.shape[:-1], self.cfg.n_output_dims)
-        if self.training and self.cfg.random_aug and torch.rand(()) < self.cfg.random_aug_prob:
-            return torch.rand(
-                dirs.shape[0], 1, 1, self.cfg.n_output_dims, device=dirs.device
-            ).expand(shape)
+        rng = generator(run_seed(), "background", self.step)
+        is_random = self.training and self.cfg.random_aug
+        if is_random and torch.rand((), generator=rng) < self.cfg.random_aug_prob:
+            own = (1, 1, self.cfg.n_output_dims)
+            colors = draw_shared(len(dirs), lambda count: torch.rand(count, *own, generator=rng))
+            return colors.to(dirs).expand(shape)
         return self.env_color.to(dirs).expand(shape)
 
 

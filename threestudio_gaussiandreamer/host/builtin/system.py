@@ -12,7 +12,13 @@ from ...core.checkpoint_file import load_module_weights
 from ...core.errors import UserError
 from ...core.logs import info, warn
 from ...core.schedule import C
-from .base import Updateable, parse_structured, update_end_if_possible, update_if_possible
+from .base import (
+    Updateable,
+    load_parameters,
+    parse_structured,
+    update_end_if_possible,
+    update_if_possible,
+)
 from .models import Exporter
 from .registry import find
 from .savers import SaverMixin
@@ -61,7 +67,7 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         exist here are skipped.
         """
         state_dict, epoch, global_step = load_module_weights(weights, ignore_modules=ignore_modules)
-        self.load_state_dict(state_dict, strict=False)
+        load_parameters(self, state_dict, weights, strict=False)
         self.do_update_step(epoch, global_step, on_load_weights=True)
 
     def set_resume_status(self, current_epoch: int, global_step: int) -> None:

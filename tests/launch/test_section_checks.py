@@ -1,0 +1,60 @@
+"""Options of different sections that contradict each other."""
+
+from pathlib import Path
+
+import pytest
+
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.config_check import check_config
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+PERP_NEG = "system.prompt_processor.use_perp_neg=true"
+HELD = ("system.guidance.reuse_steps=4", "data.hold_steps=4")
+
+
+def check(names, *overrides):
+    register_parts()
+    paths = [CONFIGS / f"{name}.yaml" for name in names]
+    given = ["system.prompt_processor.prompt=a fox"] if "demo" not in names else []
+    check_config(load_config(*paths, cli_args=[*given, *overrides]))
+
+
+MVDREAM = ("gaussiandreamer", "gaussiandreamer-mvdream")
+WRONG = [
+    (MVDREAM, ["data.n_view=2"], "data.n_view: the guidance sees 4 views"),
+    (MVDREAM, [PERP_NEG], "this guidance has one prompt for all"),
+    (
+        ("gaussiandreamer",),
+        [PERP_NEG, "system.guidance.view_dependent_prompting=false"],
+        "set system.guidance.view_dependent_prompting=true",
+    ),
+    (("toybox",), [PERP_NEG, "system.guidance.view_contrast=1"], "view_contrast does"),
+    (
+        ("gaussiandreamer",),
+        ["system.prompt_processor_type=plain-prompt-processor", "system.prompt_processor={}"],
+        "needs a prompt processor that encodes text",
+    ),
+    (("demo",), HELD[:1], "set data.hold_steps=4"),
+    (("demo",), HELD, "set system.background.hold_steps=4"),
+]
+
+
+@pytest.mark.parametrize(("names", "overrides", "message"), WRONG)
+def test_contradictions_are_named(names, overrides, message):
+    with pytest.raises(UserError, match=message):
+        check(names, *overrides)
+
+
+@pytest.mark.parametrize(
+    ("names", "overrides"),
+    [
+        (("toybox",), [PERP_NEG]),
+        (("toybox",), HELD),  # with a fixed background
+        (("demo",), [*HELD, "system.background.hold_steps=4"]),
+        (MVDREAM, []),
+    ],
+)
+def test_valid_combinations_pass(names, overrides):
+    check(names, *overrides)

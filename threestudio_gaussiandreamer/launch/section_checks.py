@@ -1,0 +1,73 @@
+"""Checks of options that contradict each other in different sections of a configuration, where each
+section is valid by itself.
+"""
+
+from typing import Any
+
+from ..core.errors import UserError
+from ..host import find, parse_structured
+
+DATA = ("gaussiandreamer-datamodule", "random-camera-datamodule")
+"""Data modules that draw new views in each step, unless ``hold_steps`` is more than 1."""
+
+
+def check_sections(cfg: Any) -> None:
+    """Check the guidance's options against those of the cameras, background and prompts.
+
+    Args:
+        cfg: a configuration whose sections have been checked.
+
+    Raises:
+        UserError: they contradict each other.
+    """
+    name = cfg.system.get("guidance_type")
+    options = getattr(find(name), "Config", None) if name else None
+    if options is None:
+        return
+    guidance = parse_structured(options, cfg.system.get("guidance"))
+    _check_view_groups(guidance, cfg.data)
+    _check_reuse(guidance, cfg)
+    if "view_dependent_prompting" in guidance:
+        _check_prompts(guidance, cfg.system)
+
+
+def _check_view_groups(guidance: Any, data: Any) -> None:
+    """Raise UserError unless a model that sees several views together gets them together."""
+    together, given = guidance.get("n_view", 1), data.get("n_view", 1)
+    if together not in (1, given):
+        raise UserError(
+            f"data.n_view: the guidance sees {together} views of an object together, got {given}: "
+            f"set data.n_view={together} and data.batch_size to a multiple of it"
+        )
+
+
+def _check_reuse(guidance: Any, cfg: Any) -> None:
+    """Raise UserError where a prediction could never be used again."""
+    if guidance.get("reuse_steps", 1) == 1:
+        return
+    wanted = f"system.guidance.reuse_steps={guidance.reuse_steps} needs steps of the same"
+    if cfg.data_type in DATA and cfg.data.get("hold_steps", 1) == 1:
+        raise UserError(f"{wanted} views: set data.hold_steps={guidance.reuse_steps}")
+    background = cfg.system.get("background") or {}
+    if background.get("mode") == "random" and background.get("hold_steps", 1) == 1:
+        raise UserError(
+            f"{wanted} background: set system.background.hold_steps={guidance.reuse_steps}"
+        )
+
+
+def _check_prompts(guidance: Any, system: Any) -> None:
+    """Raise UserError where a guidance by text can't use the prompts."""
+    if system.get("prompt_processor_type") == "plain-prompt-processor":
+        raise UserError(
+            f"system.prompt_processor_type: {system.guidance_type} needs a prompt processor that "
+            "encodes text, plain-prompt-processor doesn't"
+        )
+    if not (system.get("prompt_processor") or {}).get("use_perp_neg"):
+        return
+    refused = "system.prompt_processor.use_perp_neg: Perp-Neg compares the prompts of views"
+    if guidance.get("n_view", 1) > 1:
+        raise UserError(f"{refused}, and this guidance has one prompt for all: set it to false")
+    if not guidance.view_dependent_prompting:
+        raise UserError(f"{refused}: set system.guidance.view_dependent_prompting=true")
+    if guidance.get("view_contrast"):
+        raise UserError(f"{refused}, as system.guidance.view_contrast does: set one of them to 0")
