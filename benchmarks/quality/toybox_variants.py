@@ -29,6 +29,8 @@ HEAD = ("variant", "prompts", "recognised, %", "− toybox.yaml", "multi-face, %
 HEAD += ("CPU seconds", "of toybox.yaml")
 DISTILLATIONS = ("paper", "distillations", "cheaper")
 """Charts that docs/distillation.md shows; docs/toybox.md shows the others."""
+ENOUGH = 8
+"""Rows of the present state of which those of earlier ones say nothing more."""
 EARLIER = {
     "6075424d": "300 steps",
     "7ac24043": "models before the words for left and right",
@@ -72,14 +74,16 @@ def table(*charts: str, first: Sequence[tuple[str, ...]] = ()) -> str:
 
 def pairs_of(rows: Sequence[Row], name: str, x: str) -> list[tuple[list[Row], list[Row]]]:
     """Return the rows of a variant, and those of toybox.yaml with the same prompts and seeds: one
-    pair for each state of models and configuration with which both were measured.
+    pair for each state of models and configuration with which both were measured, or that of the
+    present one alone if it has as many as ENOUGH.
     """
     plain = {place(row): row for row in rows if row["variant"] == toybox_jobs.DEFAULT}
     groups: dict[str, list[Row]] = {}
     for row in rows:
         if (row["variant"], row["x"]) == (name, x) and place(row) in plain:
             groups.setdefault(row["setup"], []).append(row)
-    return [(own, [plain[place(row)] for row in own]) for own in groups.values()]
+    present = [own for own in groups.values() if is_present(own[0]) and len(own) >= ENOUGH]
+    return [(own, [plain[place(row)] for row in own]) for own in present or groups.values()]
 
 
 def place(row: Row) -> tuple[str, str, str]:
