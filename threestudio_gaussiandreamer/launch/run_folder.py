@@ -70,7 +70,9 @@ def changes_since(cfg: Any) -> list[str]:
     except (OSError, ValueError, YAMLError, OmegaConfBaseException):
         return []
     return [
-        f"{name} was {old!r}, now it is {new!r}" for name, (old, new) in pairs.items() if old != new
+        f"{name} was {old!r}, now it is {new!r}"
+        for name, (old, new) in pairs.items()
+        if old not in (None, new)
     ]
 
 
