@@ -137,7 +137,8 @@ def exact_score() -> Iterator[Variant]:
     guidance = {name: CONFIG["system"]["guidance"][name] for name in names}
     options = dict.fromkeys(MODELS_BESIDE_GUIDANCE, NAME)
     options |= {"system.guidance_type": "exact-score-guidance"}
-    yield Variant(EXACT, 0, options | {"system.guidance": {"mesh": "toy.glb", **guidance}})
+    guidance |= {"mesh": "toy.glb", "guidance_scale": 1.0}
+    yield Variant(EXACT, 0, options | {"system.guidance": guidance})
 
 
 def default() -> Iterator[Variant]:
