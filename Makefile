@@ -15,7 +15,8 @@ demo: $(VENV)/ready                ## train the bundled toy from a coarse prior,
 
 PROMPT =
 MODELS = toybox
-demo-text: export TEXT = $(value PROMPT)   # without expansion by make or the shell
+# the prompt as it is written, without expansion by make or the shell
+demo-text: export TEXT = $(value PROMPT)
 demo-text: $(VENV)/ready-for-models ## text to 3D with small models, offline, on the CPU; make demo-text MODELS=folder PROMPT="a red fox with a green scarf"
 	$(BIN)/python -m threestudio_gaussiandreamer.toybox.demo $(if $(value PROMPT),"$$TEXT") --models $(MODELS)
 
