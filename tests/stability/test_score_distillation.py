@@ -263,6 +263,7 @@ EDGE = [
     "data.width=[16,24]",
     "data.resolution_milestones=[5]",
     "system.geometry.lr_means=[5,1e-2,1e-3,6]",
+    "data.train_views=0",
     "data.progressive_until=8",
     "system.loss.lambda_sds=[5,1.0,0.5,6]",
 ]
