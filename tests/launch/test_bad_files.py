@@ -207,7 +207,7 @@ def test_a_prompt_arrives_verbatim_and_stays_in_the_output_root(launch_demo, pro
         *tagged_by_the_prompt,
         f"system.prompt_processor.prompt={prompt}",
         "trainer.max_steps=0",
-        "trainer.limit_test_batches=0",
+        "data.n_test_views=1",
     ]
     assert experiment.main(["--config", str(DEMO), "--train", "--gpu", "cpu", *options]) == 0
     assert os.listdir() == ["outputs"]
