@@ -36,7 +36,7 @@ WRONG = [
         ["system.prompt_processor_type=plain-prompt-processor", "system.prompt_processor={}"],
         "needs a prompt processor that encodes text",
     ),
-    (("demo",), HELD[:1], "set data.hold_steps=4"),
+    (("toybox",), HELD[:1], "set data.hold_steps=4"),
     (("demo",), HELD, "set system.background.hold_steps=4"),
 ]
 

@@ -18,7 +18,7 @@ from ..core.files import atomic_file
 from . import assets
 from .rows import Row
 
-NOT_UPLOADED = ("ckpts/epoch=*", "ckpts/*-prev.ckpt", "ckpts/.*", "tb_logs/*")
+NOT_UPLOADED = ("ckpts/epoch=*", "ckpts/*-prev.ckpt", "ckpts/.*", "ckpts-*/*", "tb_logs/*")
 LAST = "ckpts/last.ckpt"
 TRIES, FIRST_WAIT = 4, 0.5
 """Attempts of one transfer, and the seconds before the second one; they double."""

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.checkpoint_file import entries_below
-from ..core.distributed import world_size
+from ..core.distributed import all_sum, world_size
 from ..diffusion.sds import per_item
 
 SAME = ("c2w", "fovy", "comp_rgb_bg")
@@ -62,7 +62,8 @@ class KeptPrediction:
             return (kept.error + slope * (latents - kept.latents), kept.abar), False
         error, abar = predict()
         self._kept = None
-        if self.steps > 1 and error.isfinite().all():
+        # all processes keep theirs or none does, so that all predict in the same steps
+        if self.steps > 1 and not all_sum((~error.isfinite()).any().float()):
             views = {name: batch[name].detach() for name in SAME if batch.get(name) is not None}
             self._kept = Kept(step, latents.detach(), error, abar, views)
         return (error, abar), True

@@ -122,12 +122,12 @@ def claim(path: Path) -> RunFolder:
 
 def set_aside(path: Path) -> Optional[Path]:
     """Rename a folder to the first of ``path-2``, ``path-3``, ... that doesn't exist, unless it is
-    missing or empty.
+    missing or has no checkpoint.
 
     Returns:
         the new path; None if it wasn't renamed.
     """
-    if not path.is_dir() or not any(path.iterdir()):
+    if not any(path.glob("*.ckpt")):
         return None
     candidates = (path.with_name(f"{path.name}-{number}") for number in count(2))
     return path.rename(next(candidate for candidate in candidates if not candidate.exists()))

@@ -134,6 +134,10 @@ class Run:
             self.system.set_resume_status(*checkpoint)
         self.system.set_save_dir(str(self.folder / "save"))
         self.trainer = self.build_trainer()
+        # after the parts, which may read weights from there
+        if self.args.stage == "train" and self.cfg.resume is None and not get_rank():
+            if earlier := set_aside(self.last.parent):  # else resume=auto may take one of them
+                info(f"starting at step 0: the checkpoints of an earlier run are now in {earlier}")
 
     def read_resume(self) -> Optional[tuple[int, int]]:
         """Return the epoch and step of the checkpoint to resume from; None without one. The file is
@@ -280,9 +284,6 @@ class Run:
                 renumber(self.cfg, number)
         else:
             self.claimed = claim(self.folder)
-        if self.args.stage == "train" and self.cfg.resume is None:
-            if earlier := set_aside(self.last.parent):  # else resume=auto may take one of them
-                info(f"starting at step 0: the checkpoints of an earlier run are now in {earlier}")
 
     def discard_if_unused(self) -> None:
         """Remove the folder if this run created it, has made no step and has written no results."""

@@ -389,8 +389,10 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             discard_turntable(self)
 
     def on_predict_start(self) -> None:
-        self.on_test_start()
+        self.on_validation_start()
         super().on_predict_start()
+        if self.writes_results and self.exporter.cfg.save_video:
+            discard_turntable(self)
 
     def on_predict_epoch_end(self) -> None:
         if self.writes_results:
