@@ -127,6 +127,14 @@ def test_an_asset_and_a_ledger_on_s3(s3, tmp_path):
     life_of_a_ledger(s3, tmp_path)
 
 
+def test_checkpoints_of_earlier_attempts_are_not_uploaded(tmp_path):
+    for name in ("ckpts/last.ckpt", "ckpts-2/last.ckpt", "ckpts-2/.part", assets.RESULT):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    names = [str(path.relative_to(tmp_path)) for path in storage.uploaded_files(tmp_path)]
+    assert names == ["ckpts/last.ckpt", assets.RESULT]
+
+
 def test_the_result_is_uploaded_last_and_a_reader_sees_no_half_asset(memory, monkeypatch):
     place, seen = RemotePlace(memory), []
     made(place)

@@ -96,6 +96,14 @@ def test_a_prediction_that_isnt_finite_is_not_kept(monkeypatch):
     assert evaluations > 0 and found.isfinite().all()
 
 
+def test_no_process_keeps_a_prediction_if_that_of_another_isnt_finite(monkeypatch):
+    guidance, batch = reusing(), views()
+    monkeypatch.setattr("threestudio_gaussiandreamer.guidance.reuse.all_sum", lambda bad: bad + 1)
+    assert [gradient(guidance, step, renders(step), batch)[1] > 0 for step in range(2)] == [
+        True
+    ] * 2
+
+
 def test_several_processes_predict_in_the_same_steps_after_a_resume(monkeypatch):
     """A checkpoint has the first process's prediction only."""
     whole, resumed, batch = reusing(), reusing(), views()

@@ -122,6 +122,14 @@ def test_a_run_from_step_0_puts_earlier_checkpoints_aside(launch):
     assert "(step 2)" in out + err and "of another run: seed was 3, now it is 5" in out + err
 
 
+def test_a_run_may_start_from_the_weights_of_the_checkpoints_that_it_puts_aside(launch):
+    assert launch("--train", *ONE_FOLDER)[0] == 0
+    weights = "system.weights=outputs/tiny/run/ckpts/last.ckpt"
+    code, _, err = launch("--train", *ONE_FOLDER, weights)
+    assert code == 0, err
+    assert Path("outputs/tiny/run/ckpts-2/last.ckpt").is_file()
+
+
 def test_a_run_that_is_refused_leaves_the_folder_of_the_one_that_trains(launch, monkeypatch):
     """The rejected run creates the folder and is stopped before it locks it; it continues while the
     other one trains.

@@ -53,6 +53,7 @@ def test_contradictions_are_named(names, overrides, message):
         (("toybox",), [PERP_NEG]),
         (("toybox",), HELD),  # with a fixed background
         (("demo",), [*HELD, "system.background.hold_steps=4"]),
+        (("demo",), [HELD[0], "data.train_views=4", "system.background.hold_steps=4"]),
         (MVDREAM, []),
     ],
 )

@@ -120,6 +120,15 @@ def test_export_writes_the_page_again(save, painted_box, tmp_path):
     assert [shown["label"] for shown in meta(again)["clouds"]] == ["result"]
 
 
+def test_an_export_without_a_video_keeps_the_pictures_of_the_test(painted_box, tmp_path):
+    assert launch(tmp_path, painted_box, *SHORT) == 0
+    run = run_folder(tmp_path)
+    pictures = sorted((run / "save/it2-test").glob("*.png"))
+    options = [f"resume={run / 'ckpts/last.ckpt'}", "system.exporter.save_video=false"]
+    assert launch(tmp_path, painted_box, *options, stage="--export") == 0
+    assert pictures and sorted((run / "save/it2-test").glob("*.png")) == pictures
+
+
 def test_pages_can_be_switched_off(painted_box, tmp_path):
     assert launch(tmp_path, painted_box, "system.pages=false", *SHORT) == 0
     save = run_folder(tmp_path) / "save"
