@@ -1,14 +1,28 @@
-"""CSV files of results as Markdown tables."""
+"""CSV files of results, and their Markdown tables."""
 
 import csv
-from collections.abc import Iterable, Sequence
+import io
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
+
+from threestudio_gaussiandreamer.core.files import atomic_file
 
 
 def read(path: Path) -> list[dict[str, str]]:
     """Return the rows of a CSV; lines that begin with # are comments."""
     with open(path, newline="") as file:
         return list(csv.DictReader(line for line in file if not line.startswith("#")))
+
+
+def write(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write rows as a CSV; the file that is there stays until all of them are made."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with atomic_file(path) as file:
+        file.write(text.getvalue().encode())
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -7,8 +7,6 @@ Writes ``benchmarks/results/models.csv``; ``python -m benchmarks.tables`` makes 
 docs/models.md from it."""
 
 import argparse
-import csv
-import io
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -16,9 +14,8 @@ from unittest.mock import patch
 import torch
 from torch import Tensor, nn
 
-from benchmarks.markdown import markdown, read
+from benchmarks.markdown import markdown, read, write
 from benchmarks.models.published import MODELS, T5_XXL, Model
-from threestudio_gaussiandreamer.core.files import atomic_file
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks/results/models.csv"
@@ -166,12 +163,7 @@ def main() -> None:
     argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     ).parse_args()
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(row(name, model) for name, model in MODELS.items())
-    with atomic_file(RESULTS) as file:
-        file.write(text.getvalue().encode())
+    write(RESULTS, COLUMNS, (row(name, model) for name, model in MODELS.items()))
     print(table())
 
 

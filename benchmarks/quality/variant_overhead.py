@@ -11,8 +11,6 @@ the median of the differences of two neighbouring steps, relative to the median 
 Writes ``benchmarks/results/variant_overhead.csv``. The bar: at most 2 % at 512^2."""
 
 import argparse
-import csv
-import io
 import statistics
 import time
 from pathlib import Path
@@ -22,11 +20,11 @@ import torch
 import torch.nn.functional as F
 from tqdm import tqdm
 
+from benchmarks.markdown import write
 from benchmarks.quality.runs import commit, machine
 from benchmarks.robustness.bench_guards import Bench
 from tests.helpers.pixel_guidance import PixelGuidance
 from threestudio_gaussiandreamer.cameras import orbit_c2w
-from threestudio_gaussiandreamer.core.files import atomic_file
 from threestudio_gaussiandreamer.guidance.variants import Variant
 from threestudio_gaussiandreamer.host import find, names
 
@@ -123,12 +121,7 @@ def main() -> None:
             rows.append(measure(bench, name, options.pairs) | setting)
             line = "{size}: {variant:14} +{extra_ms} ms of {sds_ms}: {percent} %"
             tqdm.write(line.format(**rows[-1]))
-    table = io.StringIO()
-    writer = csv.DictWriter(table, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    with atomic_file(RESULTS) as file:
-        file.write(table.getvalue().encode())
+    write(RESULTS, COLUMNS, rows)
 
 
 if __name__ == "__main__":

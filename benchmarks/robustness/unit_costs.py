@@ -9,7 +9,6 @@ that return at once and the ledger on this disk, without Ray's part.
 """
 
 import argparse
-import csv
 import io
 import json
 import os
@@ -23,9 +22,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from benchmarks.markdown import read
+from benchmarks.markdown import read, write
 from benchmarks.quality.runs import CHARTS, append_rows
-from threestudio_gaussiandreamer.core.files import atomic_file
 from threestudio_gaussiandreamer.farm.assets import Job, Recipe
 from threestudio_gaussiandreamer.farm.board import Beat
 from threestudio_gaussiandreamer.farm.display import Display
@@ -131,12 +129,7 @@ def drop_other_lengths(names: set[str]) -> None:
     rows = read(path)
     if {row["name"] for row in rows if row["measured"] == "stage"} <= names:
         return
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(row for row in rows if row["measured"] == "driver")
-    with atomic_file(path) as file:
-        file.write(text.getvalue().encode())
+    write(path, COLUMNS, (row for row in rows if row["measured"] == "driver"))
 
 
 def row(measured: str, name: str, seed: Any, value: float, unit: str) -> dict[str, Any]:

@@ -58,10 +58,9 @@ def read_rows(path: Path) -> Iterator[Row]:
     """
     existing_file(path, "prompt list")
     suffix = path.suffix.lower()
-    if suffix not in (*FORMATS, *TEXT_FILES):
-        raise unknown(f"format of the prompt list {str(path)!r}:", suffix, [*FORMATS, *TEXT_FILES])
-    read = FORMATS.get(suffix, _from_text)
-    for line, values in read(path):
+    if suffix not in FORMATS:
+        raise unknown(f"format of the prompt list {str(path)!r}:", suffix, FORMATS)
+    for line, values in FORMATS[suffix](path):
         try:
             yield make_row(values, line)
         except UserError as error:
@@ -264,6 +263,6 @@ FORMATS: dict[str, Callable[[Path], Iterator[tuple[int, dict[str, Any]]]]] = {
     ".csv": _from_csv,
     ".jsonl": _from_jsonl,
     ".ndjson": _from_jsonl,
+    ".txt": _from_text,
+    "": _from_text,
 }
-TEXT_FILES = (".txt", "")
-"""Extensions of lists with a prompt in each line."""

@@ -149,10 +149,10 @@ def _default(config_class: type, key: str) -> Any:
 
 def _find(path: str, type_name: Any) -> type:
     if not type_name:
-        hint = (
-            " (an overlay needs the configuration that it changes before it: --config A --config B)"
-        )
-        raise UserError(f"{path} is empty: name a registered part{hint * (path == 'data_type')}")
+        hint = ""
+        if path == "data_type":
+            hint = " (an overlay needs the configuration that it changes before it)"
+        raise UserError(f"{path} is empty: name a registered part{hint}")
     try:
         return find(type_name)
     except UserError as error:

@@ -10,6 +10,7 @@ import os
 import shutil
 import socket
 import tempfile
+from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 from typing import NamedTuple, Optional
@@ -99,13 +100,18 @@ def claim_new(path: Path) -> tuple[RunFolder, int]:
     Raises:
         UserError: no folder can be made there.
     """
-    for number in count(1):
-        candidate = path if number == 1 else path.with_name(f"{path.name}-{number}")
+    for number, candidate in enumerate(numbered(path), 1):
         first_made = make_folder(candidate)
         if first_made is not None:
             with contextlib.suppress(FolderInUse):  # another run has locked it in the meantime
                 return RunFolder(candidate, first_made, _lock(candidate)), number
     raise AssertionError("unreachable")
+
+
+def numbered(path: Path) -> Iterator[Path]:
+    """Yield ``path``, ``path-2``, ``path-3``, ..."""
+    yield path
+    yield from (path.with_name(f"{path.name}-{number}") for number in count(2))
 
 
 def claim(path: Path) -> RunFolder:
@@ -129,8 +135,7 @@ def set_aside(path: Path) -> Optional[Path]:
     """
     if not any(path.glob("*.ckpt")):
         return None
-    candidates = (path.with_name(f"{path.name}-{number}") for number in count(2))
-    return path.rename(next(candidate for candidate in candidates if not candidate.exists()))
+    return path.rename(next(name for name in numbered(path) if not name.exists()))
 
 
 def make_folder(path: Path) -> Optional[Path]:

@@ -11,7 +11,6 @@ from typing import Any
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
 from ..core.checkpoint_file import newest_readable
 from ..core.errors import UserError
@@ -61,13 +60,15 @@ def changes_since(cfg: Any) -> list[str]:
     """Return how seed and prompt differ from those of the run whose checkpoint is resumed, as its
     ``parsed.yaml`` has them; nothing if that can't be read.
     """
-    path = Path(cfg.resume).parent.parent / "configs" / "parsed.yaml"
+    # only here, since a run that isn't resumed needs no reader
+    from ..view.run_files import RunFiles
+
+    earlier = OmegaConf.create(RunFiles(Path(cfg.resume).parent.parent).config)
     try:
-        earlier = OmegaConf.load(path)
         pairs = {
             name: (OmegaConf.select(earlier, name), OmegaConf.select(cfg, name)) for name in SAME
         }
-    except (OSError, ValueError, YAMLError, OmegaConfBaseException):
+    except OmegaConfBaseException:  # of an interpolation, which only an edited file has
         return []
     return [
         f"{name} was {old!r}, now it is {new!r}"

@@ -84,6 +84,7 @@ class CameraConfig:
                 )
         _check_milestones(cfg)
         _check_groups(cfg)
+        _check_pool(cfg)
         _check_memory(cfg)
 
 
@@ -103,12 +104,14 @@ def _check_milestones(cfg: Any) -> None:
 
 
 def _check_groups(cfg: Any) -> None:
-    """Raise UserError where the views of a batch can't be groups of ``n_view``, or a fixed pool has
-    options of random views.
-    """
+    """Raise UserError where the views of a batch can't be groups of ``n_view``."""
     for size in _per_stage(cfg.batch_size, range(len(cfg.resolution_milestones) + 1)):
         if size % cfg.n_view:
             raise UserError(f"batch_size: expected multiples of n_view={cfg.n_view}, got {size}")
+
+
+def _check_pool(cfg: Any) -> None:
+    """Raise UserError where a fixed pool of views has options of random ones."""
     if cfg.n_view > 1 and cfg.train_views:
         raise UserError("train_views: a fixed pool of views has no groups: set n_view=1")
     if cfg.progressive_until and cfg.train_views:

@@ -77,9 +77,14 @@ def write_pages(system: Any, folder: str) -> None:
         picture(cloud, options.settings, first_pose(cloud), POSTER_SIZE).save(file, "png")
 
 
+def turntable_name(system: Any) -> str:
+    """Return the name of the folder of test pictures, and of the video without its suffix."""
+    return f"it{system.true_global_step}-test"
+
+
 def discard_turntable(system: Any) -> None:
     """Remove the pictures of an earlier test of the same step, which may have had more views."""
-    for path in Path(system.get_save_dir(), f"it{system.true_global_step}-test").glob("*.png"):
+    for path in Path(system.get_save_dir(), turntable_name(system)).glob("*.png"):
         path.unlink()
 
 
@@ -88,9 +93,8 @@ def write_turntable(system: Any) -> None:
 
     A video that can't be written is a warning, since the exports follow.
     """
-    step = system.true_global_step
-    name = f"it{step}-test"
-    options = {"save_format": "mp4", "fps": 30, "name": "test", "step": step}
+    name = turntable_name(system)
+    options = {"save_format": "mp4", "fps": 30, "name": "test", "step": system.true_global_step}
     try:
         system.save_img_sequence(name, name, r"(\d+)\.png", **options)
     except UserError as error:

@@ -62,7 +62,7 @@ from .image_targets import ImageTargets, ImageTargetsConfig, check_image_targets
 from .loss_scale import LossScale
 from .losses import check_losses, loggable, logged_names, weight_schedules, weighted_losses
 from .optimizer import check_optimizer, make_optimizer
-from .pages import discard_turntable, save_first_cloud, write_turntable
+from .pages import discard_turntable, save_first_cloud, turntable_name, write_turntable
 from .pictures import rgb_panel, save_pictures
 from .truth import prefetch_truth, true_views
 
@@ -369,7 +369,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         if not self.writes_results:
             return
-        name = f"it{self.true_global_step}-test/{int(batch['index'][0])}.png"
+        name = f"{turntable_name(self)}/{int(batch['index'][0])}.png"
         panels = [rgb_panel(self(batch)["comp_rgb"][0])]
         self.save_image_grid(name, panels, name="test_step", step=self.true_global_step)
 

@@ -8,7 +8,6 @@ guidance_scale (eps_c - eps_u)."""
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -71,7 +70,7 @@ class Variant(BaseObject, ABC):
                 "guidance"
             )
         for option in dataclasses.fields(guidance.Config):
-            if option.name in cls.IGNORES and _plain(cfg[option.name]) != _plain(option.default):
+            if option.name in cls.IGNORES and cfg[option.name] != option.default:
                 raise UserError(
                     f"system.guidance.{option.name} has no effect with {cfg.variant_type}: leave "
                     f"it at {option.default}"
@@ -125,8 +124,3 @@ class Variant(BaseObject, ABC):
                 f"the checkpoint has {len(state)} tensors of another variant of score "
                 "distillation: resume with the configuration that the run was started with"
             )
-
-
-def _plain(value: Any) -> Any:
-    """Return a tuple or a list of OmegaConf as a list; anything else as it is."""
-    return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value

@@ -113,12 +113,12 @@ class SolidColorBackground(BaseBackground):
 
     def forward(self, dirs: Tensor) -> Tensor:
         shape = (*dirs.shape[:-1], self.cfg.n_output_dims)
-        rng = generator(run_seed(), "background", self.step)
-        is_random = self.training and self.cfg.random_aug
-        if is_random and torch.rand((), generator=rng) < self.cfg.random_aug_prob:
-            own = (1, 1, self.cfg.n_output_dims)
-            colors = draw_shared(len(dirs), lambda count: torch.rand(count, *own, generator=rng))
-            return colors.to(dirs).expand(shape)
+        if self.training and self.cfg.random_aug:
+            rng = generator(run_seed(), "background", self.step)
+            if torch.rand((), generator=rng) < self.cfg.random_aug_prob:
+                own = (1, 1, self.cfg.n_output_dims)
+                colors = draw_shared(len(dirs), lambda n: torch.rand(n, *own, generator=rng))
+                return colors.to(dirs).expand(shape)
         return self.env_color.to(dirs).expand(shape)
 
 
