@@ -296,7 +296,7 @@ def changed(made, path, value):
         (("samplers", 0, "wrapS"), 5, "wraps by"),
         (("textures", 0), {"extensions": {"KHR_texture_basisu": {}}}, "KHR_texture_basisu"),
         (("images", 0), {"uri": "https://example.org/a.png"}, "only files beside the mesh"),
-        (("images", 0, "bufferView"), 1, "texture 0 can't be read"),
+        (("images", 0, "bufferView"), 1, "texture 0 is in none of the formats"),
         (("scenes",), 5, "isn't that of a glTF file"),
     ],
 )

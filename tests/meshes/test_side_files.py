@@ -83,6 +83,16 @@ def test_an_obj_with_coordinates_and_no_material_is_grey(head, tmp_path):
     np.testing.assert_array_equal(cloud.colors, HALF)
 
 
+@pytest.mark.parametrize("name", ["p.png", "p.exr", "P.PNG "])
+@pytest.mark.parametrize("content", [b"", b"not a picture"])
+def test_a_texture_of_an_obj_that_is_no_picture_is_refused(name, content, tmp_path):
+    (tmp_path / "a.mtl").write_text(f"newmtl m\nmap_Kd {name}\n")
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + TRIANGLE)
+    (tmp_path / name.strip()).write_bytes(content)
+    with pytest.raises(UserError, match=rf"{name.strip()}.* is in none of the formats PNG"):
+        load_mesh(tmp_path / "a.obj")
+
+
 @pytest.mark.parametrize("picture, expected", [(None, [1, 0.5, 0]), (np.uint16([[0x8080]]), 0.5)])
 def test_an_obj_s_material(picture, expected, tmp_path, caplog):
     """If an image is missing, the material's colour is used; 16-bit images aren't clipped

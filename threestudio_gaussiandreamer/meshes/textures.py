@@ -27,15 +27,25 @@ def decode_texture(data: bytes, name: str, budget: Budget) -> UInt8[np.ndarray, 
     Raises:
         UserError: it can't be decoded, or exceeds the budget.
     """
-    from PIL import Image
+    return decode_image(open_texture(data, name, budget), name, budget)
+
+
+def open_texture(data: bytes, name: str, budget: Budget) -> Any:
+    """Open an image file with Pillow, without loading its texels.
+
+    Raises:
+        UserError: it isn't an image in one of ``FORMATS``.
+    """
+    from PIL import Image, UnidentifiedImageError
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # see budget.spend
-            image = Image.open(io.BytesIO(data), formats=FORMATS)
+            return Image.open(io.BytesIO(data), formats=FORMATS)
+    except UnidentifiedImageError:  # Pillow's message names a Python object
+        fail(budget.path, f"the texture {name} is in none of the formats {', '.join(FORMATS)}")
     except (*UNREADABLE, Image.DecompressionBombError) as error:
         fail(budget.path, f"the texture {name} can't be read: {error}")
-    return decode_image(image, name, budget)
 
 
 def decode_image(image: Any, name: str, budget: Budget) -> UInt8[np.ndarray, "H W 3"]:

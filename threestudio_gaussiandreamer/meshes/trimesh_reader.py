@@ -14,7 +14,10 @@ from .colors import linear_to_srgb, unit_rgb
 from .gltf import LARGEST_UV
 from .mesh import GREY, MAX_NON_FINITE, Mesh
 from .side_files import SideFiles
-from .textures import decode_image
+from .textures import decode_image, open_texture
+
+MATERIALS = ".mtl"
+"""Ending of an OBJ's material libraries; all other files that trimesh asks for are textures."""
 
 UNSET_COLOR = (102, 102, 102)
 """trimesh's default for materials without a colour; ignored, since it would darken the texture."""
@@ -76,6 +79,9 @@ class _Resolver:
     def get(self, name: str) -> bytes:
         try:
             content = self._files.read(name)
+            if content is not None and not name.strip().lower().endswith(MATERIALS):
+                # trimesh would read the part without a texture that can't be opened
+                open_texture(content, repr(name[:80]), self.budget)
         except UserError as error:
             self.refused = self.refused or error
             raise
