@@ -148,6 +148,22 @@ def test_the_gallery_shows_prompt_poster_and_scores(full_run):
     assert (full_run / "index.html").is_file()
 
 
+def test_the_gallery_leaves_out_a_folder_that_cant_be_read(full_run, monkeypatch):
+    """Patched, since root can read every folder."""
+    closed = full_run.parent / "closed"
+    closed.mkdir()
+    is_file = Path.is_file
+
+    def refuse(path):
+        if closed in path.parents:
+            raise PermissionError(13, "Permission denied", str(path))
+        return is_file(path)
+
+    monkeypatch.setattr(Path, "is_file", refuse)
+    page = write_gallery(full_run.parent).read_text()
+    assert full_run.name in unquote(page) and "closed" not in page
+
+
 def test_a_gallery_needs_runs(tmp_path):
     with pytest.raises(UserError, match="holds no run.*configs/parsed.yaml"):
         write_gallery(tmp_path)

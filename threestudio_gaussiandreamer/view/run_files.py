@@ -125,8 +125,11 @@ def is_cloud(path: Path) -> bool:
 
 
 def is_run(folder: Path) -> bool:
-    """Return whether a folder is that of a run."""
-    return (folder / "configs" / "parsed.yaml").is_file()
+    """Return whether a folder is that of a run; no if it can't be read."""
+    try:
+        return (folder / "configs" / "parsed.yaml").is_file()
+    except OSError:  # no permission, or too long a name
+        return False
 
 
 def section(content: Any, *keys: str) -> Mapping[str, Any]:
