@@ -92,7 +92,7 @@ def distil(stage: UNetStage, seconds: float) -> nn.Module:
 def held_out_batch(stage: UNetStage) -> UNetBatch:
     """Return pictures of withheld objects, at timesteps from the first to the last."""
     [(_, batch), *_] = stage.held_out
-    batch = UNetBatch(*(value[:HELD_OUT] for value in batch))
+    batch = UNetBatch(*(value[:HELD_OUT] for value in batch[:4]))
     return batch._replace(t=torch.linspace(20, 980, HELD_OUT).long())
 
 

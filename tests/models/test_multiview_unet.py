@@ -11,6 +11,7 @@ from threestudio_gaussiandreamer.models.multiview_unet import (
     load_multiview_unet,
     parted,
     unet_options,
+    views_attended_together,
 )
 
 diffusers = pytest.importorskip("diffusers")
@@ -103,3 +104,15 @@ def test_a_model_without_cameras_is_refused(tmp_path):
     folder = tiny_large_models.mvdream(tmp_path / "plain", camera_dim=None)
     with pytest.raises(UserError, match="camera_dim is None; 16 is expected"):
         load(folder)
+
+
+def test_views_are_attended_together_only_within_the_block(folder):
+    unet, values = load(folder), inputs(VIEWS)
+    alone = predict(unet, *values)
+    with views_attended_together(unet, VIEWS):
+        together = predict(unet, *values)
+    with views_attended_together(unet, 1):
+        assert torch.equal(predict(unet, *values), alone)
+    assert torch.equal(predict(unet, *values), alone)
+    assert torch.equal(predict(attend_across_views(unet, VIEWS), *values), together)
+    assert not torch.allclose(together, alone, atol=1e-3)

@@ -10,13 +10,16 @@ diffusers' own UNet computes it:
   every self-attention and parted after it.
 """
 
+import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.utils.hooks import RemovableHandle
 
 from ..core.errors import UserError
 from .model_files import component_weights, files_below, loading_errors
@@ -100,18 +103,34 @@ def _ldm_name(name: str) -> str:
 
 def attend_across_views(unet: nn.Module, views: int) -> nn.Module:
     """Let every self-attention of a UNet see the tokens of ``views`` consecutive rows together."""
+    _join_attention(unet, views)
+    return unet
 
+
+@contextlib.contextmanager
+def views_attended_together(unet: nn.Module, views: int) -> Iterator[None]:
+    """Do as :func:`attend_across_views` within a ``with`` block; nothing for one view."""
+    hooks = _join_attention(unet, views) if views > 1 else []
+    try:
+        yield
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+def _join_attention(unet: nn.Module, views: int) -> list[RemovableHandle]:
     def join(module: nn.Module, args: tuple[Any, ...]) -> tuple[Any, ...]:
         return joined(args[0], views), *args[1:]
 
     def part(module: nn.Module, args: tuple[Any, ...], output: Tensor) -> Tensor:
         return parted(output, views)
 
-    for name, module in unet.named_modules():
-        if name.endswith(".attn1"):
-            module.register_forward_pre_hook(join)
-            module.register_forward_hook(part)
-    return unet
+    return [
+        hook
+        for name, module in unet.named_modules()
+        if name.endswith(".attn1")
+        for hook in (module.register_forward_pre_hook(join), module.register_forward_hook(part))
+    ]
 
 
 def joined(tokens: Float[Tensor, "R L F"], views: int) -> Float[Tensor, "G vL F"]:

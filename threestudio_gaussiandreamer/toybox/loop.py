@@ -51,7 +51,7 @@ class Options:
     """Number of shards of training data; a stage visits them in a cycle."""
     shard_objects: int = 256
     precision: str = "float32"
-    """Either "float32", or "bfloat16" for autocast on GPUs."""
+    """Either "float32", or "bfloat16" for autocast on GPUs and on CPUs that multiply it."""
     save_seconds: float = 300.0
     sheet_seconds: float = 1200.0
     only: str = ""

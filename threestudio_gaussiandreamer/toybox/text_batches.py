@@ -14,6 +14,9 @@ from . import words
 from .tokenizer import LENGTH, words_of, write_tokenizer
 from .views import Shard, attributes_of
 
+JOINED_PLAIN_SHARE = 0.03
+"""Fraction of objects with joined views whose prompts name no direction."""
+
 
 def open_tokenizer(folder: Path) -> Any:
     """Load the training's tokenizer, which is written on first use.
@@ -58,6 +61,28 @@ def training_prompts(shard: Shard, rows: np.ndarray, rng: np.random.Generator) -
         words.prompt_of(attributes_of(row), elevation, azimuth, rng)
         for row, elevation, azimuth in views
     ]
+
+
+def joined_prompts(
+    shard: Shard, objects: np.ndarray, views: int, rng: np.random.Generator
+) -> list[str]:
+    """Write prompts for all views of these objects: the same words, and each view's direction.
+
+    Some objects have only empty prompts, and some only prompts without a direction.
+    """
+    return [text for row in objects for text in _prompts_of_object(shard, row, views, rng)]
+
+
+def _prompts_of_object(shard: Shard, row: int, views: int, rng: np.random.Generator) -> list[str]:
+    share = rng.random()
+    if share < words.EMPTY_SHARE:
+        return [""] * views
+    text = words.describe(attributes_of(shard.labels[row * views]), rng)
+    if share < words.EMPTY_SHARE + JOINED_PLAIN_SHARE:
+        return [text] * views
+    rows = slice(row * views, (row + 1) * views)
+    angles = zip(shard.elevation[rows], shard.azimuth[rows], strict=True)
+    return [f"{text}, {words.direction(*view)} view" for view in angles]
 
 
 def object_prompts(labels: np.ndarray, rng: np.random.Generator) -> list[str]:

@@ -69,7 +69,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         "--precision",
         choices=["float32", "bfloat16"],
         default="float32",
-        help="bfloat16: autocast, on a GPU",
+        help="bfloat16: autocast, on a GPU or a CPU that multiplies it",
     )
     add("--threads", type=int, help="of torch")
     add("--batch", type=int, help="pictures of one step; default: the stage's own")

@@ -1,7 +1,7 @@
 """Training the U-Net on the autoencoder's latents and the text encoder's tokens."""
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -15,12 +15,19 @@ from tqdm import tqdm
 from ..core.files import atomic_file
 from ..core.streams import generator, numpy_generator
 from ..diffusion import sds
+from ..models.multiview_unet import views_attended_together
 from . import models, words
 from .batches import StepData, moved, normal, torch_generator
 from .loop import Stage, averaged_weights, is_trained
 from .module_digest import digest
 from .sheet import contact_sheet
-from .text_batches import open_tokenizer, token_ids, training_prompts, view_prompts
+from .text_batches import (
+    joined_prompts,
+    open_tokenizer,
+    token_ids,
+    training_prompts,
+    view_prompts,
+)
 from .text_stage import frozen_text
 from .views import SIZE, held_out_shard, with_backgrounds
 
@@ -35,9 +42,12 @@ HELD_OUT, HELD_OUT_TIMESTEP = 256, 800
 SAMPLES, SAMPLE_STEPS, SAMPLE_GUIDANCE = 24, 25, 3.0
 
 
+SINGLE_EVERY = 4
+"""One step in so many is of single pictures, the others of objects with joined views."""
 ENCODED_AT_ONCE = 64
 MOMENTS_IN_MEMORY = 256
 """Number of shards whose latents a process keeps in memory, 4 MB each."""
+ONE_VIEW = torch.tensor(1)
 
 
 class UNetBatch(NamedTuple):
@@ -47,6 +57,8 @@ class UNetBatch(NamedTuple):
     t: Int[Tensor, " B"]
     ids: Int[Tensor, "B 32"]
     """Tokens of the prompts."""
+    views: Int[Tensor, ""] = ONE_VIEW
+    """Number of consecutive pictures whose self-attention is joined."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +70,48 @@ class UNetData(StepData):
 
     def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> UNetBatch:
         texts = training_prompts(self.shards.get_light(index), rows, rng)
+        t = sds.stratified_timesteps(len(rows), TIMESTEPS, torch_generator(rng))
+        return self._noised(index, rows, t, texts, rng)
+
+    def _noised(
+        self,
+        index: int,
+        rows: np.ndarray,
+        t: Int[Tensor, " B"],
+        texts: list[str],
+        rng: np.random.Generator,
+    ) -> UNetBatch:
+        """Draw latents and noise of these pictures of shard ``index``."""
         mean, std = kept_moments(self.moments[index])[:, torch.from_numpy(rows)].float()
-        return UNetBatch(
-            mean + std * normal(rng, mean.shape),
-            normal(rng, mean.shape),
-            sds.stratified_timesteps(len(rows), TIMESTEPS, torch_generator(rng)),
-            token_ids(self.tokenizer, texts),
-        )
+        latents = mean + std * normal(rng, mean.shape)
+        noise = normal(rng, mean.shape)
+        return UNetBatch(latents, noise, t, token_ids(self.tokenizer, texts))
+
+
+@dataclass(frozen=True)
+class JoinedViewsData(UNetData):
+    """Batches of which one in ``SINGLE_EVERY`` is of single pictures; the others are of objects,
+    all views of each at one timestep.
+    """
+
+    stream = "unet-joined"
+    per_object = True
+
+    def __getitem__(self, step: int) -> UNetBatch:
+        views = self.shards.views
+        if step % SINGLE_EVERY == 0 or self.batch < views:
+            singles = UNetData(self.shards, self.batch, self.pool, self.tokenizer, self.moments)
+            return singles[step]
+        objects = replace(self, batch=self.batch // views)
+        return StepData.__getitem__(objects, step)
+
+    def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> UNetBatch:
+        views = self.shards.views
+        texts = joined_prompts(self.shards.get_light(index), rows, views, rng)
+        t = sds.stratified_timesteps(len(rows), TIMESTEPS, torch_generator(rng))
+        pictures = (rows[:, None] * views + np.arange(views)).reshape(-1)
+        batch = self._noised(index, pictures, t.repeat_interleave(views), texts, rng)
+        return batch._replace(views=torch.tensor(views))
 
 
 @functools.lru_cache(maxsize=MOMENTS_IN_MEMORY)
@@ -77,7 +124,10 @@ class UNetStage(Stage):
     """Train v-prediction with the weights SNR + 1 of Salimans and Ho (2022), where the SNR is
     truncated as in Hang et al. (2023).
 
-    One prompt in ten is empty, for classifier-free guidance.
+    One prompt in ten is empty, for classifier-free guidance. In most steps the self-attention joins
+    the views of an object, as in MVDream (Shi et al. 2023, section 3.1), so that their prompts and
+    what the views have in common have to tell the directions apart; the weights are the same with
+    and without joined views.
     """
 
     name = "unet"
@@ -86,6 +136,7 @@ class UNetStage(Stage):
     images = 4_000_000
     reduction: ClassVar[int] = 1
     """Factor by which pictures are shrunk."""
+    data_class: ClassVar[type[UNetData]] = JoinedViewsData
 
     def build(self) -> nn.Module:
         folder = self.options.folder
@@ -118,7 +169,7 @@ class UNetStage(Stage):
     def data(self) -> UNetData:
         pool = tqdm(range(self.options.pool), "latents", unit="shard", disable=None)
         moments = tuple(self._moments(index) for index in pool)
-        return UNetData(self.shards, self.batch, self.options.pool, self.tokenizer, moments)
+        return self.data_class(self.shards, self.batch, self.options.pool, self.tokenizer, moments)
 
     def loss(self, model: nn.Module, batch: UNetBatch) -> tuple[Tensor, dict[str, Tensor]]:
         abar, errors = self.alphas_cumprod[batch.t], self._errors(model, batch)
@@ -136,7 +187,8 @@ class UNetStage(Stage):
         v = sds.per_item(abar.sqrt(), x) * noise - sds.per_item((1 - abar).sqrt(), x) * x
         with torch.no_grad():
             tokens = self.text_model(batch.ids).last_hidden_state
-        predicted = model(z, batch.t, encoder_hidden_states=tokens).sample
+        with views_attended_together(model, int(batch.views)):
+            predicted = model(z, batch.t, encoder_hidden_states=tokens).sample
         return (predicted.float() - v).square().mean(dim=(1, 2, 3))
 
     @torch.no_grad()
@@ -248,6 +300,7 @@ class SmallUNetStage(UNetStage):
     name = "unet-small"
     images = 4_000_000
     reduction = 2
+    data_class = UNetData
 
     def _start(self, network: nn.Module) -> nn.Module:
         return network
