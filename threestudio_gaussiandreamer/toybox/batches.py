@@ -34,7 +34,9 @@ class StepData(Dataset, ABC):
     """Whether rows are objects instead of pictures."""
 
     def __getitem__(self, step: int) -> Any:
-        """Return the batch of ``step``: a tensor or a named tuple of tensors, on the CPU."""
+        """Return the batch of ``step``: a tensor, or a named tuple of tensors and numbers, on the
+        CPU.
+        """
         seed = self.shards.seed
         stream, per_object = f"{self.stream}-rows", self.per_object
         place = row_batch(self.shards, stream, self.batch, self.pool, step, per_object=per_object)
@@ -65,10 +67,12 @@ def batches(data: Dataset, step: int, device: torch.device, workers: int = 0) ->
 
 
 def moved(batch: Any, device: torch.device) -> Any:
-    """Return a tensor or a named tuple of tensors on ``device``."""
+    """Return a tensor, or a named tuple of tensors and numbers, on ``device``."""
     if isinstance(batch, torch.Tensor):
         return batch.to(device, non_blocking=True)
-    return type(batch)(*(value.to(device, non_blocking=True) for value in batch))
+    if isinstance(batch, tuple):
+        return type(batch)(*(moved(value, device) for value in batch))
+    return batch
 
 
 def torch_generator(rng: np.random.Generator) -> torch.Generator:

@@ -80,9 +80,13 @@ def _prompts_of_object(shard: Shard, row: int, views: int, rng: np.random.Genera
     text = words.describe(attributes_of(shard.labels[row * views]), rng)
     if share < words.EMPTY_SHARE + JOINED_PLAIN_SHARE:
         return [text] * views
-    rows = slice(row * views, (row + 1) * views)
+    names = _directions(shard, np.arange(row * views, (row + 1) * views))
+    return [f"{text}, {name} view" for name in names]
+
+
+def _directions(shard: Shard, rows: np.ndarray) -> list[str]:
     angles = zip(shard.elevation[rows], shard.azimuth[rows], strict=True)
-    return [f"{text}, {words.direction(*view)} view" for view in angles]
+    return [words.direction(*view) for view in angles]
 
 
 def object_prompts(labels: np.ndarray, rng: np.random.Generator) -> list[str]:
@@ -99,8 +103,7 @@ def view_prompts(
         opposite: name the opposite direction instead.
     """
     texts = object_prompts(shard.labels[rows], rng)
-    angles = zip(shard.elevation[rows], shard.azimuth[rows], strict=True)
-    names = [words.direction(*view) for view in angles]
+    names = _directions(shard, rows)
     if opposite:
         names = [words.OPPOSITE[name] for name in names]
     return [f"{text}, {name} view" for text, name in zip(texts, names, strict=True)]

@@ -1,7 +1,7 @@
 """Training the U-Net on the autoencoder's latents and the text encoder's tokens."""
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
+from torch.utils.data import Dataset
 from tqdm import tqdm
 
 from ..core.files import atomic_file
@@ -47,7 +48,6 @@ SINGLE_EVERY = 4
 ENCODED_AT_ONCE = 64
 MOMENTS_IN_MEMORY = 256
 """Number of shards whose latents a process keeps in memory, 4 MB each."""
-ONE_VIEW = torch.tensor(1)
 
 
 class UNetBatch(NamedTuple):
@@ -57,7 +57,7 @@ class UNetBatch(NamedTuple):
     t: Int[Tensor, " B"]
     ids: Int[Tensor, "B 32"]
     """Tokens of the prompts."""
-    views: Int[Tensor, ""] = ONE_VIEW
+    views: int = 1
     """Number of consecutive pictures whose self-attention is joined."""
 
 
@@ -90,20 +90,10 @@ class UNetData(StepData):
 
 @dataclass(frozen=True)
 class JoinedViewsData(UNetData):
-    """Batches of which one in ``SINGLE_EVERY`` is of single pictures; the others are of objects,
-    all views of each at one timestep.
-    """
+    """Batches of objects, all views of each at one timestep."""
 
     stream = "unet-joined"
     per_object = True
-
-    def __getitem__(self, step: int) -> UNetBatch:
-        views = self.shards.views
-        if step % SINGLE_EVERY == 0 or self.batch < views:
-            singles = UNetData(self.shards, self.batch, self.pool, self.tokenizer, self.moments)
-            return singles[step]
-        objects = replace(self, batch=self.batch // views)
-        return StepData.__getitem__(objects, step)
 
     def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> UNetBatch:
         views = self.shards.views
@@ -111,7 +101,18 @@ class JoinedViewsData(UNetData):
         t = sds.stratified_timesteps(len(rows), TIMESTEPS, torch_generator(rng))
         pictures = (rows[:, None] * views + np.arange(views)).reshape(-1)
         batch = self._noised(index, pictures, t.repeat_interleave(views), texts, rng)
-        return batch._replace(views=torch.tensor(views))
+        return batch._replace(views=views)
+
+
+@dataclass(frozen=True)
+class MixedData(Dataset):
+    """One batch in ``SINGLE_EVERY`` of single pictures, the others of objects."""
+
+    singles: UNetData
+    objects: JoinedViewsData
+
+    def __getitem__(self, step: int) -> UNetBatch:
+        return (self.objects if step % SINGLE_EVERY else self.singles)[step]
 
 
 @functools.lru_cache(maxsize=MOMENTS_IN_MEMORY)
@@ -136,7 +137,7 @@ class UNetStage(Stage):
     images = 4_000_000
     reduction: ClassVar[int] = 1
     """Factor by which pictures are shrunk."""
-    data_class: ClassVar[type[UNetData]] = JoinedViewsData
+    joins_views: ClassVar[bool] = True
 
     def build(self) -> nn.Module:
         folder = self.options.folder
@@ -166,10 +167,15 @@ class UNetStage(Stage):
     def depends(self) -> dict[str, str]:
         return {"text": digest(self.text_model), "autoencoder": self.encoder_digest}
 
-    def data(self) -> UNetData:
+    def data(self) -> Dataset:
         pool = tqdm(range(self.options.pool), "latents", unit="shard", disable=None)
         moments = tuple(self._moments(index) for index in pool)
-        return self.data_class(self.shards, self.batch, self.options.pool, self.tokenizer, moments)
+        rest = (self.options.pool, self.tokenizer, moments)
+        singles = UNetData(self.shards, self.batch, *rest)
+        objects = self.batch // self.shards.views
+        if not (self.joins_views and objects):
+            return singles
+        return MixedData(singles, JoinedViewsData(self.shards, objects, *rest))
 
     def loss(self, model: nn.Module, batch: UNetBatch) -> tuple[Tensor, dict[str, Tensor]]:
         abar, errors = self.alphas_cumprod[batch.t], self._errors(model, batch)
@@ -187,7 +193,7 @@ class UNetStage(Stage):
         v = sds.per_item(abar.sqrt(), x) * noise - sds.per_item((1 - abar).sqrt(), x) * x
         with torch.no_grad():
             tokens = self.text_model(batch.ids).last_hidden_state
-        with views_attended_together(model, int(batch.views)):
+        with views_attended_together(model, batch.views):
             predicted = model(z, batch.t, encoder_hidden_states=tokens).sample
         return (predicted.float() - v).square().mean(dim=(1, 2, 3))
 
@@ -300,7 +306,7 @@ class SmallUNetStage(UNetStage):
     name = "unet-small"
     images = 4_000_000
     reduction = 2
-    data_class = UNetData
+    joins_views = False
 
     def _start(self, network: nn.Module) -> nn.Module:
         return network
