@@ -292,7 +292,7 @@ def test_worker_processes_make_the_same_batches(folder, name):
     pairs = zip(here.batches(3), there.batches(3), strict=True)
     with torch_threads(1):  # as in the worker processes; sums are rounded otherwise
         for one, other in itertools.islice(pairs, 3):
-            assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+            torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
 # Formulas -----------------------------------------------------------------------------------
