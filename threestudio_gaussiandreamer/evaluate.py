@@ -2,7 +2,7 @@
 
 import sys
 
-from .evaluation.scorecard import main
+from .core.command import run_main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_main(f"{__package__}.evaluation.scorecard"))

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from threestudio_gaussiandreamer.core.command import exit_code, run_command
+from threestudio_gaussiandreamer.core.command import exit_code, run_command, run_main
 from threestudio_gaussiandreamer.core.errors import UserError
 
 
@@ -65,3 +65,36 @@ def test_nobody_reads_the_message_about_a_closed_pipe_either(monkeypatch):
 def test_the_exit_code_is_that_of_the_work_without_a_standard_output(monkeypatch):
     monkeypatch.setattr(sys, "stdout", None)
     assert run_command(len, lambda args: print("unread"), []) == 0
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """Write a module that can be imported, and forget it afterwards."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def write(text):
+        (tmp_path / "command_of_a_test.py").write_text(text)
+        return "command_of_a_test"
+
+    yield write
+    sys.modules.pop("command_of_a_test", None)
+
+
+def test_a_command_is_imported_and_run(module):
+    assert run_main(module("def main():\n    return 7")) == 7
+
+
+@pytest.mark.parametrize("lost", [False, True])
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_a_signal_during_the_import_is_one_line(module, name, code, lost, capsys):
+    """Some libraries catch what is raised while they are imported."""
+    stop = f"os.kill(os.getpid(), signal.{name})"
+    if lost:
+        stop = f"try:\n    {stop}\nexcept BaseException:\n    pass"
+    assert run_main(module(f"import os, signal\n{stop}\ndef main():\n    return 7")) == code
+    assert capsys.readouterr().err == "stopped\n"
+
+
+def test_an_error_of_the_import_keeps_its_traceback(module):
+    with pytest.raises(ModuleNotFoundError, match="no_such_library"):
+        run_main(module("import no_such_library"))

@@ -2,6 +2,7 @@
 traceback."""
 
 import contextlib
+import importlib
 import os
 import signal
 import sys
@@ -11,6 +12,7 @@ from typing import Any, Optional
 
 from .errors import Terminated, UserError
 from .output import tolerant_output
+from .signals import raised_signals
 
 
 def run_command(
@@ -42,6 +44,23 @@ def run_command(
         except Exception as error:
             return exit_code(error)
     return 0
+
+
+def run_main(module: str) -> int:
+    """Import a module, which may take seconds, and return the exit code of its ``main()``. A stop
+    signal during the import ends the process with one line, as it does later.
+    """
+    received: Sequence[int] = ()
+    try:
+        with raised_signals() as received:
+            main = importlib.import_module(module).main
+    except BaseException:
+        if not received:
+            raise
+    if received:  # also if the import has caught the exception
+        print("stopped", file=sys.stderr)
+        return 128 + received[0]
+    return main()
 
 
 def exit_code(error: Exception, verbose: bool = False) -> int:

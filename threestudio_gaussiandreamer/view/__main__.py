@@ -2,6 +2,6 @@
 
 import sys
 
-from .command import main
+from ..core.command import run_main
 
-sys.exit(main())
+sys.exit(run_main(f"{__package__}.command"))
