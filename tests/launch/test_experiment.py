@@ -126,6 +126,7 @@ def test_the_seed_decides(launch):
         (["--train", "system.fail_in=step 0"], "failed in step 0, as asked"),
         (["--train", "resume=nothing.ckpt"], "there is no checkpoint nothing.ckpt"),
         (["--train", "resume=tiny.yaml"], "tiny.yaml isn't a checkpoint"),
+        (["--train", "resume=atuo"], "did you mean resume=auto, the newest one of this run?"),
         (["--train", "exp_root_dir=tiny.yaml/x"], "can't be written"),
         (["--train", "seed=-1"], "seed"),
         (["--train", "--gpu", "0"], "--gpu 0: torch"),

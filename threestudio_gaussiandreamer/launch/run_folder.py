@@ -5,6 +5,7 @@ import hashlib
 import os
 import unicodedata
 from datetime import datetime
+from difflib import get_close_matches
 from glob import escape as glob_escape
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from ..core.errors import UserError
 from ..core.interpolation import escape
 from ..host import info
 
+AUTO = "auto"
+"""The value of ``resume`` that means the newest checkpoint."""
 SAME = ("system.prompt_processor.prompt", "seed")
 """Options that a resumed run usually has in common with the one before."""
 SLUG_BYTES = 64
@@ -50,10 +53,11 @@ def name_folders(cfg: Any) -> None:
     cfg.timestamp = cfg.timestamp or ""
     _require_folder_name(tag, cfg.timestamp)
     _set_trial(cfg, tag + cfg.timestamp)
-    if cfg.resume == "auto":
+    if cfg.resume == AUTO:
         _resume_newest(cfg, tag)
     elif cfg.resume is not None:
         cfg.resume = escape(os.path.expanduser(cfg.resume))
+        _require_no_misspelling(cfg.resume)
 
 
 def changes_since(cfg: Any) -> list[str]:
@@ -135,6 +139,15 @@ def safe_name(text: str) -> str:
 def _set_trial(cfg: Any, trial_name: str) -> None:
     cfg.trial_name = trial_name
     cfg.trial_dir = escape(os.path.join(cfg.exp_dir, trial_name))
+
+
+def _require_no_misspelling(resume: str) -> None:
+    """Raise UserError for something like ``resume=atuo``, unless there is such a file."""
+    if get_close_matches(resume.lower(), [AUTO], cutoff=0.75) and not os.path.exists(resume):
+        raise UserError(
+            f"resume={resume}: there is no such checkpoint; did you mean resume={AUTO}, the newest "
+            "one of this run?"
+        )
 
 
 def _resume_newest(cfg: Any, tag: str) -> None:
