@@ -274,6 +274,13 @@ def test_a_learned_background_learns_and_is_in_the_checkpoint(tmp_path, painted_
     )  # on its way from grey to the mock's (0.9, 0.2, 0.1)
 
 
+@pytest.mark.parametrize(("opacity", "warned"), [("1e-6", True), ("0.1", False)])
+def test_a_first_cloud_that_no_view_shows_is_named(tmp_path, painted_box, capsys, opacity, warned):
+    options = [f"system.geometry.init_opacity={opacity}", "trainer.max_steps=1"]
+    assert launch(tmp_path, painted_box, *options, "trainer.log_every_n_steps=0") == 0
+    assert ("no Gaussian is visible in the first step's views" in capsys.readouterr().err) == warned
+
+
 def test_the_weight_of_a_loss_that_is_never_returned_is_named(tmp_path, painted_box, capsys):
     assert (
         launch(tmp_path, painted_box, "system.loss.lambda_spasity=1.0", "trainer.max_steps=2") == 2

@@ -1,4 +1,5 @@
-"""Stop a run whose parameters or optimiser state aren't finite, before they are saved.
+"""Stop a run whose parameters or optimiser state aren't finite, before they are saved; warn of one
+whose first renders are empty.
 
 Adam's moments stay NaN once they are, and the rasteriser skips Gaussians with NaN. Without this
 check such a run would end without an error, and with holes in the object.
@@ -7,9 +8,11 @@ check such a run would end without an error, and with holes in the object.
 from collections.abc import Iterable, Iterator
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..core.errors import UserError
+from ..host import warn
 
 CHECK_EVERY = 25
 """Optimiser steps between two checks, each of which synchronises with the device once."""
@@ -60,3 +63,12 @@ def require_finite(tensors: Named, step: int) -> None:
         "losses that overflow float32 (system.loss) and too large learning rates "
         "(system.geometry.lr_*)"
     )
+
+
+def warn_if_invisible(opacity: Float[Tensor, "B H W 1"], step: int) -> None:
+    """Warn if the renders of the first step are empty: nothing has a gradient then."""
+    if step == 0 and not opacity.any():
+        warn(
+            "no Gaussian is visible in the first step's views, so nothing is trained: check the "
+            "prior's size and place, system.geometry.init_opacity, and the cameras' distances"
+        )

@@ -56,7 +56,7 @@ from .background import FlatBackground
 from .density import DensityControl, RenderedQuality
 from .events import log_numbers, log_scores
 from .export import GaussianSavers, export, export_companions, exported_files
-from .finite import CHECK_EVERY, optimizer_tensors, require_finite
+from .finite import CHECK_EVERY, optimizer_tensors, require_finite, warn_if_invisible
 from .held_out import EvaluationConfig, HeldOut, Measurements
 from .image_targets import ImageTargets, ImageTargetsConfig, check_image_targets
 from .loss_scale import LossScale
@@ -238,11 +238,11 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.set_learning_rates(optimizer)
         batch = self.image_targets.batch(batch, self.global_step, self.background)
         out = self(batch)
+        warn_if_invisible(out["opacity"], self.global_step)
         self.density.before_backward(out, self.global_step)
         guided = self.supervise(out, batch)
         losses = self.losses(guided, out)
-        loss = torch.stack(list(losses.values())).sum()
-        self.manual_backward(loss)
+        self.manual_backward(torch.stack(list(losses.values())).sum())
         average_gradients(
             parameter for group in optimizer.param_groups for parameter in group["params"]
         )
