@@ -18,6 +18,7 @@ from threestudio_gaussiandreamer.launch.ddp import (
     Processes,
     ReplicatedStrategy,
     environment_plugins,
+    is_lost_process,
     planned_processes,
     train_alone,
     trainer_options,
@@ -104,6 +105,10 @@ def test_lightning_starts_the_processes_in_a_job_with_one_task(environment):
     assert (
         environment_plugins(Processes(2, 1, "SLURM")) == environment_plugins(Processes(1, 1)) == []
     )
+
+
+def test_a_single_run_has_lost_no_process():
+    assert not is_lost_process(RuntimeError("Connection closed by peer"))
 
 
 # ---- whole runs ----------------------------------------------------------------------------------
@@ -216,6 +221,32 @@ def written(folder):
     those in the working directory belong to.
     """
     return {name for name in files(folder) if not name.startswith(("tb_logs", "code"))}
+
+
+DIES = """
+import os
+from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
+
+def step(self, batch, index, train=GaussianDreamerSystem.training_step):
+    if os.environ.get("LOCAL_RANK") == "1" and self.global_step == 2:
+        os.kill(os.getpid(), 9)
+    return train(self, batch, index)
+
+GaussianDreamerSystem.training_step = step
+"""
+"""An extension that kills the second process in its third step."""
+
+
+@pytest.mark.slow
+def test_a_killed_process_ends_the_others_with_one_message(mesh, tmp_path):
+    extension = tmp_path / "custom" / "dies"
+    extension.mkdir(parents=True)
+    (extension / "__init__.py").write_text(DIES)
+    line = command(tmp_path, mesh, "trainer.devices=2", "trainer.max_steps=100000")
+    process = started(tmp_path, line)
+    said = process.communicate(timeout=900)[0]
+    assert process.returncode == 2, said[-3000:]
+    assert "another process of this run has ended" in said and "Traceback" not in said
 
 
 @pytest.mark.slow

@@ -11,18 +11,22 @@ for ``--gpu 0,1`` or ``trainer.devices=2`` (without a GPU: processes on the CPU)
 
 import importlib
 import os
+import re
 from collections.abc import Mapping
 from datetime import timedelta
 from typing import Any, NamedTuple, Optional
 
 import torch
 
+from ..core.distributed import is_active
 from ..core.errors import UserError
 from ..host import pl
 
 LONGEST_WAIT = timedelta(hours=12)
 """A process waits so long for the others, for instance while the first one renders results."""
 SLURM, TORCHRUN = "SLURM", "torchrun"
+LOST_CONNECTION = re.compile(r"\bpeer\b|\bconnection\b|\bsocket\b|\bremote\b|timed out", re.I)
+"""In the messages of Gloo and NCCL about a process that no longer answers."""
 
 
 class Processes(NamedTuple):
@@ -83,6 +87,11 @@ def planned_processes(n_gpus: int, trainer: Mapping[str, Any]) -> Processes:
             "(--gpus-per-node), or run with --gpu cpu"
         )
     return found
+
+
+def is_lost_process(error: Exception) -> bool:
+    """Return whether an exception says that another process of this run no longer answers."""
+    return is_active() and bool(LOST_CONNECTION.search(str(error)))
 
 
 def train_alone() -> None:

@@ -25,7 +25,7 @@ from ..view.run_index import note_time, write_index
 from .callbacks import LastCheckpoint, ProgressBar, RunRecord, Stopped
 from .checkpoints import AtomicCheckpointIO
 from .config_check import MisconfigurationException, build, plain
-from .ddp import environment_plugins, planned_processes, trainer_options
+from .ddp import environment_plugins, is_lost_process, planned_processes, trainer_options
 from .folder_lock import RunFolder, claim, claim_new, require_writable, set_aside
 from .live_viewer import LiveViewer, ViewerConfig
 from .options import PROGRAM
@@ -307,7 +307,8 @@ def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
 
     Raises:
         UserError: the checkpoint's parameters or optimiser don't match the configuration, or the
-            trainer's options are incompatible with the system or with each other.
+            trainer's options are incompatible with the system or with each other, or another
+            process of the run has ended.
         KeyboardInterrupt: Ctrl-C outside of training, which Lightning converts to SystemExit(1).
     """
     try:
@@ -319,6 +320,11 @@ def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
     except MisconfigurationException as error:
         raise UserError(f"trainer: {error}") from error
     except (RuntimeError, ValueError, KeyError) as error:
+        if is_lost_process(error):
+            raise UserError(
+                "another process of this run has ended, so this one stops; the same command with "
+                f"resume=auto goes on from the last checkpoint ({str(error).strip()})"
+            ) from error
         if isinstance(error, ValueError) and _raised_by_lightning(error):
             raise UserError(f"trainer: {str(error).strip()}") from error
         if (
