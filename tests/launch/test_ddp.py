@@ -13,6 +13,7 @@ import torch
 from tests.helpers.tiny_runs import files
 from tests.training import runs
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch import ddp
 from threestudio_gaussiandreamer.launch.ddp import (
     LONGEST_WAIT,
     Processes,
@@ -107,8 +108,28 @@ def test_lightning_starts_the_processes_in_a_job_with_one_task(environment):
     )
 
 
-def test_a_single_run_has_lost_no_process():
-    assert not is_lost_process(RuntimeError("Connection closed by peer"))
+def raised(error, module):
+    """Return the error as raised by a function of a module of this name."""
+    try:
+        exec("raise error", {"__name__": module, "error": error})
+    except Exception as caught:
+        return caught
+
+
+@pytest.mark.parametrize(
+    ("error", "module", "active", "lost"),
+    [
+        (RuntimeError("Connection closed by peer"), "torch.distributed.c10d", True, True),
+        (RuntimeError("writev: Broken pipe"), "torch.distributed.c10d", True, True),
+        (RuntimeError("Connection closed by peer"), "torch.distributed.c10d", False, False),
+        (RuntimeError("shapes differ"), "torch.distributed.c10d", True, False),
+        (RuntimeError("CUDA error: the launch timed out"), "torch.cuda", True, False),
+        (UserError("with a network connection: download it"), "ours.hub", True, False),
+    ],
+)
+def test_which_errors_mean_a_lost_process(monkeypatch, error, module, active, lost):
+    monkeypatch.setattr(ddp, "is_active", lambda: active)
+    assert is_lost_process(raised(error, module)) == lost
 
 
 # ---- whole runs ----------------------------------------------------------------------------------
@@ -162,6 +183,17 @@ def free_port():
         return str(probe.getsockname()[1])
 
 
+def two_tasks(folder, line):
+    """Start a command as SLURM's two tasks, on a machine each."""
+    job = SLURM | {"SLURM_NTASKS": "2", "SLURM_NTASKS_PER_NODE": "1", "SLURM_JOB_ID": "7"}
+    job |= {"MASTER_PORT": free_port(), "MASTER_ADDR": "127.0.0.1"}
+    tasks = [
+        job | {"SLURM_PROCID": str(rank), "SLURM_NODEID": str(rank), "SLURM_LOCALID": "0"}
+        for rank in (0, 1)
+    ]
+    return [started(folder, line, **task) for task in tasks]
+
+
 def require_same_training(ours, theirs):
     """Compare the results of runs with different numbers of processes: as many Gaussians, and the
     same quality but for the order of sums in float32.
@@ -203,14 +235,7 @@ def test_four_processes_of_torchrun_on_two_machines(alone, mesh, tmp_path):
 
 @pytest.mark.slow
 def test_two_tasks_of_slurm_on_two_machines(alone, mesh, tmp_path):
-    line = command(tmp_path, mesh, "trainer.max_steps=6")
-    job = SLURM | {"SLURM_NTASKS": "2", "SLURM_NTASKS_PER_NODE": "1", "SLURM_JOB_ID": "7"}
-    job |= {"MASTER_PORT": free_port(), "MASTER_ADDR": "127.0.0.1"}
-    tasks = [
-        job | {"SLURM_PROCID": str(rank), "SLURM_NODEID": str(rank), "SLURM_LOCALID": "0"}
-        for rank in (0, 1)
-    ]
-    require_success(*(started(tmp_path, line, **task) for task in tasks))
+    require_success(*two_tasks(tmp_path, command(tmp_path, mesh, "trainer.max_steps=6")))
     require_same_training(runs.run_folder(tmp_path), alone)
     assert written(runs.run_folder(tmp_path)) == written(alone)
     assert (runs.run_folder(tmp_path) / "cmd.txt").read_text().count("\n") == 1
@@ -228,7 +253,7 @@ import os
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 def step(self, batch, index, train=GaussianDreamerSystem.training_step):
-    if os.environ.get("LOCAL_RANK") == "1" and self.global_step == 2:
+    if os.environ["SLURM_PROCID"] == "1" and self.global_step == 2:
         os.kill(os.getpid(), 9)
     return train(self, batch, index)
 
@@ -238,15 +263,19 @@ GaussianDreamerSystem.training_step = step
 
 
 @pytest.mark.slow
-def test_a_killed_process_ends_the_others_with_one_message(mesh, tmp_path):
+def test_a_process_that_has_lost_another_one_says_so(mesh, tmp_path):
+    """Two tasks of SLURM, since Lightning kills the processes that it has started itself."""
     extension = tmp_path / "custom" / "dies"
     extension.mkdir(parents=True)
     (extension / "__init__.py").write_text(DIES)
-    line = command(tmp_path, mesh, "trainer.devices=2", "trainer.max_steps=100000")
-    process = started(tmp_path, line)
-    said = process.communicate(timeout=900)[0]
-    assert process.returncode == 2, said[-3000:]
-    assert "another process of this run has ended" in said and "Traceback" not in said
+    first, second = two_tasks(tmp_path, command(tmp_path, mesh, "trainer.max_steps=6"))
+    try:
+        said = first.communicate(timeout=300)[0]
+        assert first.returncode == 2, said[-3000:]
+        assert "another process of this run has ended" in said and "Traceback" not in said
+        assert second.wait(timeout=60) == -9
+    finally:
+        first.kill(), second.kill()
 
 
 @pytest.mark.slow

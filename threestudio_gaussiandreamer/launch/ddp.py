@@ -12,6 +12,7 @@ for ``--gpu 0,1`` or ``trainer.devices=2`` (without a GPU: processes on the CPU)
 import importlib
 import os
 import re
+import traceback
 from collections.abc import Mapping
 from datetime import timedelta
 from typing import Any, NamedTuple, Optional
@@ -25,7 +26,9 @@ from ..host import pl
 LONGEST_WAIT = timedelta(hours=12)
 """A process waits so long for the others, for instance while the first one renders results."""
 SLURM, TORCHRUN = "SLURM", "torchrun"
-LOST_CONNECTION = re.compile(r"\bpeer\b|\bconnection\b|\bsocket\b|\bremote\b|timed out", re.I)
+LOST_CONNECTION = re.compile(
+    r"\bpeer\b|\bconnection\b|\bsocket\b|\bremote\b|timed out|broken pipe|pair closure", re.I
+)
 """In the messages of Gloo and NCCL about a process that no longer answers."""
 
 
@@ -90,8 +93,11 @@ def planned_processes(n_gpus: int, trainer: Mapping[str, Any]) -> Processes:
 
 
 def is_lost_process(error: Exception) -> bool:
-    """Return whether an exception says that another process of this run no longer answers."""
-    return is_active() and bool(LOST_CONNECTION.search(str(error)))
+    """Return whether torch.distributed says that another process of this run doesn't answer."""
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    raised_by = frame.f_globals.get("__name__", "")
+    from_torch = isinstance(error, RuntimeError) and raised_by.startswith("torch.distributed")
+    return is_active() and from_torch and bool(LOST_CONNECTION.search(str(error)))
 
 
 def train_alone() -> None:
