@@ -248,6 +248,7 @@ def test_curves_are_written(folder):
     ("arguments", "message"),
     [
         (["--stages", "unett"], "did you mean 'unet'"),
+        (["--batch", "6"], "give a multiple of 4, or less for single views"),
         (["--images", "0"], "--images 0: expected at least 1"),
         (["--pool", "-3"], "--pool -3: expected at least 1"),
         (["--device", "cuda"], "sees no GPU"),

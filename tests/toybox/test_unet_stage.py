@@ -26,11 +26,6 @@ def test_the_unet_is_measured_with_the_prompts_of_opposite_views(folder):
     assert not torch.equal(own.ids, opposite.ids)
 
 
-def test_a_batch_that_splits_objects_is_refused(folder):
-    with pytest.raises(UserError, match="--batch 6: .* give a multiple of 4, or less"):
-        STAGES["unet"](dataclasses.replace(options(folder), batch=6))
-
-
 def test_most_batches_are_all_views_of_objects_at_one_timestep(folder):
     stage = STAGES["unet"](dataclasses.replace(options(folder), batch=2 * views.VIEWS))
     data = stage.data()

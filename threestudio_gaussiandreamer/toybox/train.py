@@ -33,6 +33,7 @@ from .loop import Options, Stage, Training
 from .points_stage import PointsStage
 from .text_stage import TextStage
 from .unet_stage import SmallUNetStage, UNetStage
+from .views import VIEWS
 from .warm_start import start_from
 
 STAGES: dict[str, type[Stage]] = {
@@ -103,20 +104,7 @@ def options_of(args: argparse.Namespace) -> Options:
             raise unknown("stage", name, STAGES)
     if args.only and len(args.stages) != 1:
         raise UserError(f"--only {args.only}: give the stage that it is for as --stages, e.g. unet")
-    for name in ("images", "threads", "batch", "pool"):
-        value = getattr(args, name)
-        if value is not None and value < 1:
-            raise UserError(f"--{name} {shown(value)}: expected at least 1")
-    if args.workers < 0:
-        raise UserError(f"--workers {shown(args.workers)}: expected 0 or more")
-    if args.rate is not None and not (is_number(args.rate) and args.rate > 0):
-        raise UserError(f"--rate {args.rate}: expected more than 0")
-    if not args.minutes > 0:
-        raise UserError(f"--minutes {args.minutes}: expected more than 0")
-    for name in ("save_minutes", "sheet_minutes"):
-        if not is_number(getattr(args, name)) or getattr(args, name) < 0:
-            option = f"--{name.replace('_', '-')}"
-            raise UserError(f"{option} {getattr(args, name)}: expected minutes, 0 or more")
+    _require_numbers(args)
     if args.device.startswith("cuda") and not torch.cuda.is_available():
         raise UserError(f"--device {args.device}: PyTorch sees no GPU here; give cpu")
     devices = ["cpu", "cuda", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
@@ -135,6 +123,29 @@ def options_of(args: argparse.Namespace) -> Options:
         save_seconds=60 * args.save_minutes,
         sheet_seconds=60 * args.sheet_minutes,
     )
+
+
+def _require_numbers(args: argparse.Namespace) -> None:
+    """Raise UserError for a number out of its range."""
+    for name in ("images", "threads", "batch", "pool"):
+        value = getattr(args, name)
+        if value is not None and value < 1:
+            raise UserError(f"--{name} {shown(value)}: expected at least 1")
+    if UNetStage.name in args.stages and (args.batch or 0) > VIEWS and args.batch % VIEWS:
+        raise UserError(
+            f"--batch {args.batch}: most steps of {UNetStage.name} are of all {VIEWS} views of "
+            f"objects: give a multiple of {VIEWS}, or less for single views"
+        )
+    if args.workers < 0:
+        raise UserError(f"--workers {shown(args.workers)}: expected 0 or more")
+    if args.rate is not None and not (is_number(args.rate) and args.rate > 0):
+        raise UserError(f"--rate {args.rate}: expected more than 0")
+    if not args.minutes > 0:
+        raise UserError(f"--minutes {args.minutes}: expected more than 0")
+    for name in ("save_minutes", "sheet_minutes"):
+        if not is_number(getattr(args, name)) or getattr(args, name) < 0:
+            option = f"--{name.replace('_', '-')}"
+            raise UserError(f"{option} {getattr(args, name)}: expected minutes, 0 or more")
 
 
 def render_shards(options: Options, seeds: Sequence[int], workers: int) -> None:

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 from tqdm import tqdm
 
-from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..core.streams import generator, numpy_generator
 from ..diffusion import sds
@@ -144,12 +143,6 @@ class UNetStage(Stage):
         folder = self.options.folder
         self.tokenizer = open_tokenizer(folder)
         self.shards = self.options.shards()
-        views = self.shards.views
-        if self.joins_views and self.batch > views and self.batch % views:
-            raise UserError(
-                f"--batch {self.batch}: most steps of {self.name} are of all {views} views of "
-                f"objects: give a multiple of {views}, or less for single views"
-            )
         self.text_model = frozen_text(folder, len(self.tokenizer)).text_model.to(self.device)
         self.vae = frozen_autoencoder(folder).to(self.device)
         self.encoder_digest = digest(self.vae.encoder)
