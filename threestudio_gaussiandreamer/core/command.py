@@ -47,8 +47,9 @@ def run_command(
 
 
 def run_main(module: str) -> int:
-    """Import a module, which may take seconds, and return the exit code of its ``main()``. A stop
-    signal during the import ends the process with one line, as it does later.
+    """Import a module, which may take seconds, and return the exit code of its ``main()``.
+
+    A stop signal during the import ends the process with one line and the signal's exit code.
     """
     received: Sequence[int] = ()
     try:
@@ -58,7 +59,8 @@ def run_main(module: str) -> int:
         if not received:
             raise
     if received:  # also if the import has caught the exception
-        print("stopped", file=sys.stderr)
+        with tolerant_output():
+            print("stopped", file=sys.stderr)
         return 128 + received[0]
     return main()
 

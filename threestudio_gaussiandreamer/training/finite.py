@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..core.distributed import all_max
 from ..core.errors import UserError
 from ..host import warn
 
@@ -66,9 +67,9 @@ def require_finite(tensors: Named, step: int) -> None:
 
 
 def warn_if_invisible(opacity: Float[Tensor, "B H W 1"], step: int) -> None:
-    """Warn if the renders of the first step are empty: nothing has a gradient then."""
-    if step == 0 and not opacity.any():
+    """Warn if all renders of the first step are empty: it then trains no Gaussian."""
+    if step == 0 and not all_max(opacity.detach().amax()):
         warn(
-            "no Gaussian is visible in the first step's views, so nothing is trained: check the "
-            "prior's size and place, system.geometry.init_opacity, and the cameras' distances"
+            "no Gaussian is visible in the first step's views, so it trains none: check size and "
+            "place of the prior, system.geometry.init_opacity, and the cameras' distances"
         )
