@@ -3,6 +3,7 @@
 """
 
 import difflib
+import traceback
 from collections.abc import Iterable
 
 
@@ -31,3 +32,9 @@ def unknown(kind: str, name: str, choices: Iterable[str]) -> UserError:
         else f"choose from {', '.join(choices) or 'nothing: none exist'}."
     )
     return UserError(f"unknown {kind} {name!r}: {hint}")
+
+
+def raised_in(error: BaseException, package: str) -> bool:
+    """Return whether code of a package raised an error itself, rather than code that it called."""
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    return frame.f_globals.get("__name__", "").startswith(package)

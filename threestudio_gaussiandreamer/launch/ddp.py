@@ -12,7 +12,6 @@ for ``--gpu 0,1`` or ``trainer.devices=2`` (without a GPU: processes on the CPU)
 import importlib
 import os
 import re
-import traceback
 from collections.abc import Mapping
 from datetime import timedelta
 from typing import Any, NamedTuple, Optional
@@ -20,7 +19,7 @@ from typing import Any, NamedTuple, Optional
 import torch
 
 from ..core.distributed import is_active
-from ..core.errors import UserError
+from ..core.errors import UserError, raised_in
 from ..host import pl
 
 LONGEST_WAIT = timedelta(hours=12)
@@ -94,9 +93,7 @@ def planned_processes(n_gpus: int, trainer: Mapping[str, Any]) -> Processes:
 
 def is_lost_process(error: Exception) -> bool:
     """Return whether torch.distributed says that another process of this run doesn't answer."""
-    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-    raised_by = frame.f_globals.get("__name__", "")
-    from_torch = isinstance(error, RuntimeError) and raised_by.startswith("torch.distributed")
+    from_torch = isinstance(error, RuntimeError) and raised_in(error, "torch.distributed")
     return is_active() and from_torch and bool(LOST_CONNECTION.search(str(error)))
 
 

@@ -9,14 +9,13 @@ import errno
 import shlex
 import threading
 import time
-import traceback
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Optional
 
 from ..core.checkpoint_file import load_checkpoint
-from ..core.errors import UserError
+from ..core.errors import UserError, raised_in
 from ..core.logs import get_rank
 from ..host import find, info, pl, warn
 from ..host.typed_config import parse_structured
@@ -325,12 +324,12 @@ def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
                 "another process of this run has ended, so this one stops; the same command with "
                 f"resume=auto goes on from the last checkpoint ({str(error).strip()})"
             ) from error
-        if isinstance(error, ValueError) and _raised_by_lightning(error):
+        if isinstance(error, ValueError) and raised_in(error, pl.__name__):
             raise UserError(f"trainer: {str(error).strip()}") from error
         if (
             checkpoint is None
             or isinstance(error, UserError)
-            or not (is_mismatch(error) or _raised_by_lightning(error))
+            or not (is_mismatch(error) or raised_in(error, pl.__name__))
         ):
             raise
         raise UserError(
@@ -372,12 +371,6 @@ def write_errors(folder: Path) -> Iterator[None]:
 
 def _is_write_error(error: Optional[BaseException]) -> bool:
     return isinstance(error, OSError) and error.errno in WRITE_ERRORS
-
-
-def _raised_by_lightning(error: Exception) -> bool:
-    """Return whether Lightning itself raised an error, rather than code that it called."""
-    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-    return frame.f_globals.get("__name__", "").startswith(pl.__name__)
 
 
 def is_mismatch(error: Exception) -> bool:
