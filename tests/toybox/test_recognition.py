@@ -54,8 +54,27 @@ def test_colours_may_be_exchanged_where_nobody_can_tell(pattern, right):
     wanted = FOX._replace(pattern=pattern)
     exchanged = wanted._replace(color=wanted.second, second=wanted.color)
     assert recognition.recognized(sure(exchanged), wanted)["colors"] is right
-    plain = wanted._replace(second=None)
+    plain = wanted._replace(pattern="plain", second=None)
     assert not recognition.recognized(sure(plain), wanted)["colors"]
+
+
+def test_the_two_colours_of_a_pattern_differ():
+    """Where each colour alone is most probably red, the second is the next most probable one."""
+    found = sure(FOX)
+    red, white = (LABELS["second"].index(name) for name in ("red", "white"))
+    found["second"] = torch.zeros_like(found["second"])
+    found["second"][:, red], found["second"][:, white] = 0.6, 0.4
+    assert recognition.most_probable_pattern(found) == ("striped", "red", "white")
+
+
+def test_a_pattern_has_a_second_colour_and_plain_objects_have_none():
+    found = sure(FOX)
+    none, white = (LABELS["second"].index(name) for name in ("none", "white"))
+    found["second"][:, none], found["second"][:, white] = 0.7, 0.3
+    assert recognition.most_probable_pattern(found) == ("striped", "red", "white")
+    striped, plain = (LABELS["pattern"].index(name) for name in ("striped", "plain"))
+    found["pattern"][:, striped], found["pattern"][:, plain] = 0.2, 0.8
+    assert recognition.most_probable_pattern(found) == ("plain", "red", "none")
 
 
 def test_faces_on_all_sides():

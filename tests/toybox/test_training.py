@@ -279,11 +279,12 @@ def test_a_folder_that_can_not_be_made_is_one_message(tmp_path, capsys):
 @pytest.mark.slow  # starts processes
 def test_workers_render_the_same_shards_as_a_training(tmp_path):
     there = loop.Options(folder=tmp_path, pool=2, shard_objects=1)
-    render_shards(there, [0, 1000], workers=1)
-    shards, of_judge = there.shards(0), there.shards(1000)
-    paths = {one.path(index) for one in (shards, of_judge) for index in (0, 1)}
+    sorts = there.shards(), *judge_stage.judge_shards(there)
+    render_shards(sorts, count=2, workers=1)
+    paths = {one.path(index) for one in sorts for index in (0, 1)}
     assert set(there.shards_folder().iterdir()) == paths
-    assert np.array_equal(shards.get(1).rgba, shards.make(1).rgba)
+    for one in sorts:
+        assert np.array_equal(one.get(1).rgba, one.make(1).rgba)
 
 
 @pytest.mark.slow  # starts processes

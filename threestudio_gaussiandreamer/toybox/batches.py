@@ -47,6 +47,18 @@ class StepData(Dataset, ABC):
         """Make the batch of these rows of shard ``index``."""
 
 
+@dataclass(frozen=True)
+class MixedData(Dataset):
+    """One batch in ``every`` of ``first``, the others of ``second``."""
+
+    first: StepData
+    second: StepData
+    every: int
+
+    def __getitem__(self, step: int) -> Any:
+        return (self.second if step % self.every else self.first)[step]
+
+
 def batches(data: Dataset, step: int, device: torch.device, workers: int = 0) -> Iterator[Any]:
     """Yield the batches from ``step`` on, on ``device``.
 

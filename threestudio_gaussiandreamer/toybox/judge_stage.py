@@ -1,7 +1,7 @@
 """Train the judge, a classifier that evaluates the other networks, on data of a separate seed."""
 
 import functools
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -10,16 +10,26 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ..core.streams import numpy_generator
-from .batches import StepData, normal
+from .batches import MixedData, StepData, moved, normal
 from .classifiers import accuracies, classified
-from .loop import Stage
+from .loop import Options, Stage
 from .models import Judge
+from .splat_shards import SplatShards
 from .text_batches import label_tensor
-from .views import held_out_shard, with_backgrounds
+from .views import Shards, held_out_shard, with_backgrounds
 
 SEED_OFFSET = 1000
 """Added to the seed, so that the judge and the other networks have no training pictures in common.
 """
+CAST_EVERY = 3
+
+
+def judge_shards(options: Options) -> tuple[Shards, SplatShards]:
+    """Return the judge's training data: ray-cast objects, and other objects as Gaussians."""
+    seed = options.seed + SEED_OFFSET
+    return options.shards(seed), SplatShards(
+        options.shards_folder(), seed + 1, objects=options.shard_objects
+    )
 
 
 class JudgeBatch(NamedTuple):
@@ -29,15 +39,26 @@ class JudgeBatch(NamedTuple):
 
 class JudgeData(StepData):
     stream = "judge"
+    degrades: ClassVar[bool] = True
 
     def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> JudgeBatch:
         shard = self.shards.get(index)
         images = with_backgrounds(shard.rgba[rows], rng, random_share=0.5)
-        return JudgeBatch(degraded(images, rng), label_tensor(shard, rows))
+        images = degraded(images, rng) if self.degrades else images
+        return JudgeBatch(images, label_tensor(shard, rows))
+
+
+class JudgeSplatData(JudgeData):
+    """Batches of renders of Gaussians, which are imperfect themselves."""
+
+    stream = "judge-splats"
+    degrades = False
 
 
 class JudgeStage(Stage):
-    """Minimise the cross entropy of every attribute on clean and degraded pictures."""
+    """Minimise the cross entropy of every attribute on renders of Gaussians and, in one step of
+    CAST_EVERY, on clean and degraded ray-cast pictures.
+    """
 
     name = "judge"
     batch_size = 64
@@ -45,12 +66,13 @@ class JudgeStage(Stage):
     images = 400_000
 
     def build(self) -> nn.Module:
-        self.seed = self.options.seed + SEED_OFFSET
-        self.shards = self.options.shards(self.seed)
+        self.shards, self.splats = judge_shards(self.options)
         return Judge().to(memory_format=torch.channels_last)  # 1.5 times faster on a CPU
 
-    def data(self) -> JudgeData:
-        return JudgeData(self.shards, self.batch, self.options.pool)
+    def data(self) -> MixedData:
+        rest = (self.batch, self.options.pool)
+        casts, splats = JudgeData(self.shards, *rest), JudgeSplatData(self.splats, *rest)
+        return MixedData(casts, splats, CAST_EVERY)
 
     def loss(self, model: nn.Module, batch: JudgeBatch) -> tuple[Tensor, dict[str, Tensor]]:
         loss, right = classified(
@@ -59,16 +81,22 @@ class JudgeStage(Stage):
         return loss, {"right": right}
 
     @functools.cached_property
-    def held_out(self) -> JudgeBatch:
-        """Return withheld objects, which no training saw."""
-        shard = held_out_shard(self.options.shards_folder(), self.seed)
-        images = with_backgrounds(
-            shard.rgba, numpy_generator(self.seed, "judge-held-out"), random_share=0
-        )
-        return JudgeBatch(images.to(self.device), torch.from_numpy(shard.labels).to(self.device))
+    def held_out(self) -> list[JudgeBatch]:
+        """Return withheld objects, which no training saw: ray-cast, and as Gaussians."""
+        folder, seed, batches = self.options.shards_folder(), self.shards.seed, []
+        for sort in (Shards, SplatShards):
+            shard = held_out_shard(folder, seed, sort)
+            rng = numpy_generator(seed, "judge-held-out")
+            images = with_backgrounds(shard.rgba, rng, random_share=0)
+            batches.append(moved(JudgeBatch(images, torch.from_numpy(shard.labels)), self.device))
+        return batches
 
     def evaluate(self, model: nn.Module) -> dict[str, float]:
-        return accuracies(model(self.held_out.images), self.held_out.labels)
+        """Return the share recognised of each attribute, and the mean of all in renders of
+        Gaussians.
+        """
+        found, in_splats = (accuracies(model(one.images), one.labels) for one in self.held_out)
+        return found | {"all_in_splats": float(np.mean(list(in_splats.values())))}
 
 
 def degraded(

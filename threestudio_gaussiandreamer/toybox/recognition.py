@@ -2,8 +2,9 @@
 
 ===========  ===================================================================================
 kind         whether the kind with the highest probability, averaged over the views, is the prompt's
-colors       the same for the body's colour and the pattern's: both must be right, in either order
-             for stripes and checks, which look alike with their colours exchanged
+colors       whether the body's colour and the pattern's are right, in either order for stripes and
+             checks, which look alike with their colours exchanged; of the most probable combination
+             of pattern and two different colours
 pattern      the same for the pattern
 accessory    the same for the coloured part, the accessory and its colour: all three must be right
 multi_face   share of the views that the judge takes for views from another quadrant; NaN for
@@ -11,11 +12,13 @@ multi_face   share of the views that the judge takes for views from another quad
 ===========  ===================================================================================
 """
 
+import functools
 import math
 from pathlib import Path
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..cameras import Orbit
@@ -23,7 +26,7 @@ from ..core.errors import UserError
 from ..models.bundled import JUDGE, model_part
 from .models import Judge
 from .views import DISTANCE, FOVY_DEG, LABELS
-from .world import COLORS, Attributes
+from .world import Attributes
 
 ELEVATION_DEG = 15.0
 OFFSETS_DEG = (-22.5, 22.5)
@@ -84,30 +87,43 @@ def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, bool]:
     """Return for each attribute of the prompt whether the pictures show it.
 
     For an attribute that the prompt doesn't name, the judge's most probable class must be "none".
+    Colours and pattern are those of :func:`most_probable_pattern`.
     """
     right = {}
     for name, value in wanted._asdict().items():
         index = LABELS[name].index(value or "none")
         right[name] = int(found[name].mean(dim=0).argmax()) == index
+    pattern, *colors = most_probable_pattern(found)
+    asked = [wanted.color, wanted.second or "none"]
+    exchanged = wanted.pattern in EXCHANGEABLE and colors == asked[::-1]
     return {
         "kind": right["kind"],
-        "colors": colors_recognized(found, wanted)
-        if wanted.pattern in EXCHANGEABLE
-        else right["color"] and right["second"],
-        "pattern": right["pattern"],
+        "colors": colors == asked or exchanged,
+        "pattern": pattern == wanted.pattern,
         "accessory": right["part"] and right["accessory"] and right["accessory_color"],
     }
 
 
-def colors_recognized(found: dict[str, Tensor], wanted: Attributes) -> bool:
-    """Return whether there are two colours, and the most probable ones are the prompt's, in either
-    order.
+def most_probable_pattern(found: dict[str, Tensor]) -> tuple[str, str, str]:
+    """Return the most probable pattern and its two colours, among those that objects can have: two
+    different colours, or plain with "none" as the second one.
     """
-    color, second = (found[name].mean(dim=0) for name in ("color", "second"))
-    if LABELS["second"][int(second.argmax())] == "none":
-        return False
-    best = (color + second[: len(COLORS)]).topk(2).indices.tolist()
-    return {LABELS["color"][index] for index in best} == {wanted.color, wanted.second}
+    names = ("pattern", "color", "second")
+    pattern, color, second = (found[name].mean(dim=0) for name in names)
+    joint = pattern[:, None, None] * color[:, None] * second
+    index = int(torch.where(_possible(), joint, -1).argmax())
+    place = np.unravel_index(index, joint.shape)
+    first, *others = (LABELS[name][int(i)] for name, i in zip(names, place, strict=True))
+    return first, *others
+
+
+@functools.cache
+def _possible() -> Bool[Tensor, "pattern color second"]:
+    """Return which combinations of :func:`most_probable_pattern` objects can have."""
+    plain = torch.tensor([name == "plain" for name in LABELS["pattern"]])
+    none = torch.tensor([name == "none" for name in LABELS["second"]])
+    different = torch.tensor([[a != b for b in LABELS["second"]] for a in LABELS["color"]])
+    return (plain[:, None, None] == none) & different
 
 
 def multi_face(found: dict[str, Tensor], wanted: Attributes) -> float:

@@ -28,12 +28,12 @@ from ..core.signals import interrupt
 from ..launch.folder_lock import FolderInUse, claim
 from .autoencoder_stage import AutoencoderStage
 from .clip_stage import ClipStage
-from .judge_stage import SEED_OFFSET, JudgeStage
+from .judge_stage import JudgeStage, judge_shards
 from .loop import Options, Stage, Training
 from .points_stage import PointsStage
 from .text_stage import TextStage
 from .unet_stage import SmallUNetStage, UNetStage
-from .views import VIEWS
+from .views import VIEWS, Shards
 from .warm_start import start_from
 
 STAGES: dict[str, type[Stage]] = {
@@ -148,17 +148,18 @@ def _require_numbers(args: argparse.Namespace) -> None:
             raise UserError(f"{option} {getattr(args, name)}: expected minutes, 0 or more")
 
 
-def render_shards(options: Options, seeds: Sequence[int], workers: int) -> None:
-    """Render all missing shards of these seeds in ``workers`` processes."""
-    jobs = [(options, seed, index) for seed in seeds for index in range(options.pool)]
+def render_shards(sorts: Sequence[Shards], count: int, workers: int) -> None:
+    """Render the missing ones of the first ``count`` shards of each sort in ``workers`` processes.
+    """
+    jobs = [(shards, index) for shards in sorts for index in range(count)]
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for count, _ in enumerate(pool.map(_render, jobs), 1):
-            print(f"rendered {count}/{len(jobs)} shards", flush=True)
+        for done, _ in enumerate(pool.map(_render, jobs), 1):
+            print(f"rendered {done}/{len(jobs)} shards", flush=True)
 
 
-def _render(job: tuple[Options, int, int]) -> None:
-    options, seed, index = job
-    options.shards(seed).ensure(index)
+def _render(job: tuple[Shards, int]) -> None:
+    shards, index = job
+    shards.ensure(index)
 
 
 def train(
@@ -217,8 +218,9 @@ def run(args: argparse.Namespace) -> None:
     if args.threads:
         torch.set_num_threads(args.threads)
     if args.workers:
-        seeds = [options.seed] + [options.seed + SEED_OFFSET] * ("judge" in args.stages)
-        render_shards(options, seeds, min(args.workers, os.cpu_count() or 1))
+        of_judge = judge_shards(options) if JudgeStage.name in args.stages else ()
+        workers = min(args.workers, os.cpu_count() or 1)
+        render_shards([options.shards(), *of_judge], options.pool, workers)
     if args.from_weights:
         start_from(args.from_weights, options, STAGES)
     train(options, args.stages, args.images, 60 * args.minutes)

@@ -18,7 +18,7 @@ from ..core.streams import generator, numpy_generator
 from ..diffusion import sds
 from ..models.multiview_unet import views_attended_together
 from . import models, words
-from .batches import StepData, moved, normal, torch_generator
+from .batches import MixedData, StepData, moved, normal, torch_generator
 from .loop import Stage, averaged_weights, is_trained
 from .module_digest import digest
 from .sheet import contact_sheet
@@ -104,17 +104,6 @@ class JoinedViewsData(UNetData):
         return batch._replace(views=views)
 
 
-@dataclass(frozen=True)
-class MixedData(Dataset):
-    """One batch in ``SINGLE_EVERY`` of single pictures, the others of objects."""
-
-    singles: UNetData
-    objects: JoinedViewsData
-
-    def __getitem__(self, step: int) -> UNetBatch:
-        return (self.objects if step % SINGLE_EVERY else self.singles)[step]
-
-
 @functools.lru_cache(maxsize=MOMENTS_IN_MEMORY)
 def kept_moments(path: Path) -> Float[Tensor, "2 N 4 s s"]:
     """Read the means and deviations of a shard's posteriors, float16."""
@@ -175,7 +164,9 @@ class UNetStage(Stage):
         objects = self.batch // self.shards.views
         if not (self.joins_views and objects):
             return singles
-        return MixedData(singles, JoinedViewsData(self.shards, objects, *rest))
+        return MixedData(
+            singles, JoinedViewsData(self.shards, objects, *rest), SINGLE_EVERY
+        )
 
     def loss(self, model: nn.Module, batch: UNetBatch) -> tuple[Tensor, dict[str, Tensor]]:
         abar, errors = self.alphas_cumprod[batch.t], self._errors(model, batch)

@@ -81,6 +81,9 @@ class Shards:
         views: number of views per object.
     """
 
+    file_names = "train", "held-out"
+    """How the names of the files begin, of objects for training and of withheld ones."""
+
     def __init__(
         self,
         folder: Path,
@@ -98,11 +101,11 @@ class Shards:
     def __reduce__(self) -> tuple:
         """Send to other processes without what is cached."""
         known = {"held_out": self.held_out, "objects": self.objects, "views": self.views}
-        return partial(Shards, self.folder, self.seed, **known), ()
+        return partial(type(self), self.folder, self.seed, **known), ()
 
     def path(self, index: int) -> Path:
         """Return the file of shard ``index``."""
-        sort = "held-out" if self.held_out else "train"
+        sort = self.file_names[self.held_out]
         name = f"{sort}-world{VERSION}-{self.seed}-{self.objects}x{self.views}-{index:05d}.npz"
         return self.folder / name
 
@@ -143,7 +146,7 @@ class Shards:
         rng = numpy_generator(self.seed, "toybox-object", int(self.held_out), index)
         mesh = object_mesh(attributes, rng)
         orbit = draw_orbit(self.views, rng)
-        images = render(mesh, orbit)
+        images = self._pictures(mesh, orbit, rng)
         labels = np.stack([label_row(attributes, float(a)) for a in orbit.azimuth])
         rgba = (images * 255).round().astype(np.uint8)
         return (
@@ -154,15 +157,20 @@ class Shards:
             surface_points(mesh, rng),
         )
 
+    def _pictures(
+        self, mesh: Mesh, orbit: Orbit, rng: np.random.Generator
+    ) -> Float[np.ndarray, "N s s 4"]:
+        return render(mesh, orbit)
+
 
 def _is_whole(path: Path) -> bool:
     """Return whether a file is a complete zip archive; a truncated one lacks the end record."""
     return path.is_file() and zipfile.is_zipfile(path)
 
 
-def held_out_shard(folder: Path, seed: int) -> Shard:
+def held_out_shard(folder: Path, seed: int, sort: type[Shards] = Shards) -> Shard:
     """Return the shard of withheld objects for evaluation."""
-    return Shards(folder, seed, held_out=True, objects=HELD_OUT_OBJECTS).get(0)
+    return sort(folder, seed, held_out=True, objects=HELD_OUT_OBJECTS).get(0)
 
 
 def draw_orbit(count: int, rng: np.random.Generator) -> Orbit:
