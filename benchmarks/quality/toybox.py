@@ -11,8 +11,8 @@ Each run is configs/toybox.yaml with a few options changed, on one thread. The j
 views of its result, of its prior's points, of the 2D model's own samples, and of the object itself;
 CPU seconds are those of a whole run without imports and video, in a process that keeps its networks
 loaded. Rows are appended to toybox.csv as runs end, in the order chart, seed, prompt, variant. Rows
-that it has of this configuration and these models, which the column "setup" identifies, are
-skipped; delete those of another judge.
+that it has of this configuration, these models and this judge, which the columns "setup" and
+"judge" identify, are skipped.
 Settings were chosen on "seen" prompts, of combinations that trainings may have had; "withheld" ones
 are of combinations that no training had.
 """
@@ -48,6 +48,7 @@ from benchmarks.quality.toybox_jobs import (
     WORLD,
     Prompt,
     Variant,
+    judge_of,
     options_of,
     prompts,
     setup,
@@ -57,7 +58,7 @@ from benchmarks.quality.toybox_jobs import (
     CHARTS as VARIANTS,
 )
 
-KEY = ("variant", "x", "withheld", "index", "seed", "setup")
+KEY = ("variant", "x", "withheld", "index", "seed", "setup", "judge")
 COLUMNS = [*KEY, "prompt", "cpu_seconds", "gaussians"]
 COLUMNS += [*RECOGNIZED, "clip", "haze", "faint", *(f"prior_{name}" for name in RECOGNIZED)]
 COLUMNS += ["options", "machine", "commit"]
@@ -96,6 +97,11 @@ class Task(NamedTuple):
 
     @property
     def key(self) -> tuple[str, ...]:
+        return (*self.made_of, judge_of(self.models))
+
+    @property
+    def made_of(self) -> tuple[str, ...]:
+        """What identifies the pictures, without the judge."""
         place = (str(int(self.prompt.withheld)), str(self.prompt.index), str(self.seed))
         return (*self.variant.key, *place, self.setup)
 
@@ -151,7 +157,7 @@ def measured(task: Task) -> dict[str, float]:
 
 def kept(task: Task) -> Path:
     """Return the folder of a kept run, which depends on all of its options."""
-    content = repr((task.key, task.variant.options)).encode()
+    content = repr((task.made_of, task.variant.options)).encode()
     return task.keep / hashlib.blake2b(content, digest_size=8).hexdigest()
 
 

@@ -97,11 +97,20 @@ def setup_of_samples(models: str = NAME) -> str:
     return f"models {digest(networks(models))}"
 
 
+@functools.cache
+def judge_of(models: str = NAME) -> str:
+    """Return what every score depends on beside the pictures: a digest of the judge."""
+    return _digests(models).get(JUDGE, "none")[:8]
+
+
 def networks(models: str) -> list[tuple[str, str]]:
     """Return the files of all networks but the judge, and their digests."""
+    return sorted(item for item in _digests(models).items() if item[0] not in (JUDGE, RECORD))
+
+
+def _digests(models: str) -> dict[str, str]:
     folder = FOLDER if models == NAME else Path(models).expanduser()
-    digests = read_digests(folder) or {models: ""}
-    return sorted(item for item in digests.items() if item[0] not in (JUDGE, RECORD))
+    return read_digests(folder) or {models: ""}
 
 
 def digest(content: Any) -> str:

@@ -27,6 +27,7 @@ from benchmarks.quality.toybox_jobs import (
     SAMPLES,
     TRUTH,
     WORLD,
+    judge_of,
     setup,
     setup_of_samples,
 )
@@ -97,8 +98,11 @@ def present() -> list[Row]:
 
 
 def is_present(row: Row) -> bool:
-    """Return whether a row is of the present objects, models, or models and toybox.yaml."""
-    return row["setup"] in (WORLD, setup_of_samples(), setup())
+    """Return whether a row is of the present objects, models, or models and toybox.yaml, and by the
+    present judge.
+    """
+    known = (WORLD, setup_of_samples(), setup())
+    return row["setup"] in known and row["judge"] == judge_of()
 
 
 def variants(rows: Iterable[Row]) -> Iterator[tuple[str, list[Row]]]:

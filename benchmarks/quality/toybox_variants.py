@@ -3,7 +3,7 @@ seeds: the paired tables of docs/toybox.md and docs/distillation.md, from docs/c
 
 ``recognised`` is the share of the attributes that a prompt asks for (kind, colours, pattern,
 accessory) that the judge finds in the result. A dagger marks comparisons of which both sides were
-measured with earlier models or an earlier toybox.yaml.
+measured with earlier models or an earlier toybox.yaml, or scored by an earlier judge.
 """
 
 import math
@@ -32,6 +32,7 @@ DISTILLATIONS = ("paper", "distillations", "cheaper")
 ENOUGH = 8
 """Rows of the present state of which those of earlier ones say nothing more."""
 EARLIER = {
+    "91562c50": "U-Net before its last training",
     "943e902e": "U-Net before the training on joined views",
     "6075424d": "300 steps",
     "7ac24043": "models before the words for left and right",
@@ -53,14 +54,21 @@ def settings() -> str:
 
 
 def earlier_models(rows: Sequence[Row]) -> list[tuple[str, ...]]:
-    """Return a line for each of the states in EARLIER, compared with the present one."""
+    """Return a line for each of the states in EARLIER and each judge, compared with the present
+    state, or the last one that this judge scored.
+    """
     rows = [row for row in rows if row["variant"] == toybox_jobs.DEFAULT]
-    present = {place(row)[:2]: row for row in rows if is_present(row)}
+    rows = sorted(rows, key=is_present)
     lines = []
-    for setup, title in EARLIER.items():
-        own = [row for row in rows if row["setup"] == setup and place(row)[:2] in present]
-        if own:
-            lines.append(line_of(title, own, [present[place(row)[:2]] for row in own]))
+    for judge in dict.fromkeys(row["judge"] for row in reversed(rows)):
+        scored = [row for row in rows if row["judge"] == judge]
+        base = scored[-1]
+        plain = {place(row)[:2]: row for row in scored if row["setup"] == base["setup"]}
+        for setup, title in EARLIER.items():
+            own = [row for row in scored if row["setup"] == setup and place(row)[:2] in plain]
+            if own and setup != base["setup"]:
+                title += "" if is_present(base) else " †"
+                lines.append(line_of(title, own, [plain[place(row)[:2]] for row in own]))
     return lines
 
 
@@ -75,20 +83,20 @@ def table(*charts: str, first: Sequence[tuple[str, ...]] = ()) -> str:
 
 def pairs_of(rows: Sequence[Row], name: str, x: str) -> list[tuple[list[Row], list[Row]]]:
     """Return the rows of a variant, and those of toybox.yaml with the same prompts and seeds: one
-    pair for each state of models and configuration with which both were measured, or that of the
-    present one alone if it has as many as ENOUGH.
+    pair for each state of models, configuration and judge with which both were measured, or that of
+    the present one alone if it has as many as ENOUGH.
     """
     plain = {place(row): row for row in rows if row["variant"] == toybox_jobs.DEFAULT}
-    groups: dict[str, list[Row]] = {}
+    groups: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
         if (row["variant"], row["x"]) == (name, x) and place(row) in plain:
-            groups.setdefault(row["setup"], []).append(row)
+            groups.setdefault(place(row)[2:], []).append(row)
     present = [own for own in groups.values() if is_present(own[0]) and len(own) >= ENOUGH]
     return [(own, [plain[place(row)] for row in own]) for own in present or groups.values()]
 
 
-def place(row: Row) -> tuple[str, str, str]:
-    return row["index"], row["seed"], row["setup"]
+def place(row: Row) -> tuple[str, ...]:
+    return row["index"], row["seed"], row["setup"], row["judge"]
 
 
 def marked_title(row: Row) -> str:

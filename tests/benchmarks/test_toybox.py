@@ -114,6 +114,13 @@ def test_of_the_missing_rows_only_those_of_kept_runs_are_scored(monkeypatch, tmp
     assert toybox.missing(parsed(monkeypatch, *words, "--only-score")) == []
 
 
+def test_a_kept_run_is_scored_again_by_another_judge(monkeypatch, tmp_path):
+    task = toybox.Task(Variant("mine"), prompts("seen", 1)[0], 0, "models", tmp_path)
+    key, folder = task.key, toybox.kept(task)
+    monkeypatch.setattr(toybox, "judge_of", lambda models: "another")
+    assert task.key != key and toybox.kept(task) == folder
+
+
 def test_runs_with_other_options_are_kept_apart(tmp_path):
     task = toybox.Task(Variant("mine", 1, {"a": "1"}), prompts("seen", 1)[0], 0, "models", tmp_path)
     other = task._replace(variant=Variant("mine", 1, {"a": "2"}))
@@ -176,7 +183,7 @@ def test_rows_become_tables_and_charts(monkeypatch, tmp_path, fake):
 def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypatch):
     """Of three prompts the variant has two; it misses the accessory that one of them asks for."""
     right = dict.fromkeys(toybox_tables.RECOGNIZED, "1") | {"multi_face": "0.25", "seed": "0"}
-    right["setup"] = toybox_jobs.setup()
+    right |= {"setup": toybox_jobs.setup(), "judge": toybox_jobs.judge_of()}
     prompts = {"0": "a red fox", "1": "a red fox with a blue hat", "2": "a blue car"}
     rows = [
         right | {"variant": DEFAULT, "x": "0", "index": i, "prompt": text, "cpu_seconds": "50"}
@@ -203,6 +210,22 @@ def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypat
     assert toybox_variants.earlier_models(rows[:3]) == []
 
 
+def test_earlier_models_are_compared_by_the_same_judge(monkeypatch):
+    """A judge who didn't score the present models compares with the last ones that it scored."""
+    right = dict.fromkeys(toybox_tables.RECOGNIZED, "1")
+    right |= {"variant": DEFAULT, "x": "0", "index": "0", "seed": "0", "prompt": "a red fox"}
+    right["cpu_seconds"] = "50"
+    now = {"setup": toybox_jobs.setup(), "judge": toybox_jobs.judge_of()}
+    rows = [right | {"setup": "a", "judge": "first"}, right | {"setup": "b", "judge": "first"}]
+    rows += [right | now, right | now | {"setup": "b", "kind": "0"}]
+    monkeypatch.setattr(toybox_variants, "EARLIER", {"b": "state b", "a": "state a"})
+    lines = toybox_variants.earlier_models(rows)
+    assert [line[:4] for line in lines] == [
+        ("state b", "1", "50", "-50"),
+        ("state a †", "1", "100", "+0"),
+    ]
+
+
 def test_results_of_other_models_are_measured_again(monkeypatch, tmp_path):
     words = ["--charts", "references", "default", "--count", 1, "--out", tmp_path]
     tasks = toybox.missing(parsed(monkeypatch, *words))
@@ -210,7 +233,7 @@ def test_results_of_other_models_are_measured_again(monkeypatch, tmp_path):
     runs.append_rows(toybox.CHART, toybox.COLUMNS, rows, tmp_path)
     assert toybox.missing(parsed(monkeypatch, *words)) == []
     found = toybox.missing(parsed(monkeypatch, *words, "--models", tmp_path / "others"))
-    assert [task.variant for task in found] == [t.variant for t in tasks if t.variant.name != TRUTH]
+    assert [task.variant for task in found] == [t.variant for t in tasks]
 
 
 def test_columns_of_prompts_that_ask_for_nothing_are_left_out():
