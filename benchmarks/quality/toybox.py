@@ -5,7 +5,7 @@ under a learned score.
     python -m benchmarks.quality.toybox --charts default starts --prompts withheld --count 20
     python -m benchmarks.quality.toybox --variant "wide 0 system.geometry.scale_factor=2"
     python -m benchmarks.quality.toybox --models FOLDER --jobs 16 --seconds 340 --out DIR
-    python -m benchmarks.quality.toybox --keep RUNS --only-score --out DIR  # by another judge
+    python -m benchmarks.quality.toybox --keep RUNS --only-score            # by another judge
 
 Each run is configs/toybox.yaml with a few options changed, on one thread. The judge sees eight
 views of its result, of its prior's points, of the 2D model's own samples, and of the object itself;
@@ -107,7 +107,7 @@ class Task(NamedTuple):
 
     @property
     def setup(self) -> str:
-        """What the row depends on: the objects, the models, or models and configuration."""
+        """What the pictures depend on: the objects, the models, or models and configuration."""
         if self.variant.name == TRUTH:
             return WORLD
         is_run = self.variant.name != SAMPLES
@@ -253,8 +253,8 @@ def parse_arguments() -> argparse.Namespace:
     add("--list", action="store_true", help="only print what would run")
     add_jobs(parser)
     arguments = parser.parse_args()
-    if arguments.only_score and (not arguments.keep or arguments.out == CHARTS):
-        parser.error("--only-score: give the runs' folder as --keep and a new one as --out")
+    if arguments.only_score and not arguments.keep:
+        parser.error("--only-score: give the runs' folder as --keep")
     if arguments.charts is None:
         arguments.charts = [] if arguments.variant else list(VARIANTS)
     return arguments

@@ -18,8 +18,11 @@ from threestudio_gaussiandreamer.models.bundled import (
     JUDGE,
     NAME,
     RECORD,
+    digest_of,
+    model_part,
     read_digests,
 )
+from threestudio_gaussiandreamer.toybox import recognition
 from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
 from threestudio_gaussiandreamer.toybox.words import describe
 from threestudio_gaussiandreamer.toybox.world import KINDS, VERSION, draw_attributes
@@ -99,18 +102,19 @@ def setup_of_samples(models: str = NAME) -> str:
 
 @functools.cache
 def judge_of(models: str = NAME) -> str:
-    """Return what every score depends on beside the pictures: a digest of the judge."""
-    return _digests(models).get(JUDGE, "none")[:8]
+    """Return what every score depends on beside the pictures: a digest of the judge's file, and the
+    version of how its probabilities are read.
+    """
+    path = Path(model_part(models, JUDGE)).expanduser()
+    digest = digest_of(path)[:8] if path.is_file() else "none"
+    return f"{digest} reading {recognition.VERSION}"
 
 
 def networks(models: str) -> list[tuple[str, str]]:
     """Return the files of all networks but the judge, and their digests."""
-    return sorted(item for item in _digests(models).items() if item[0] not in (JUDGE, RECORD))
-
-
-def _digests(models: str) -> dict[str, str]:
     folder = FOLDER if models == NAME else Path(models).expanduser()
-    return read_digests(folder) or {models: ""}
+    digests = read_digests(folder) or {models: ""}
+    return sorted(item for item in digests.items() if item[0] not in (JUDGE, RECORD))
 
 
 def digest(content: Any) -> str:

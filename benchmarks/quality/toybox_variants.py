@@ -38,7 +38,7 @@ EARLIER = {
     "7ac24043": "models before the words for left and right",
     "2d37b05f": "models of the objects of version 1",
 }
-"""Earlier states of models and configuration, by the column ``setup``."""
+"""Earlier states of models and configuration, by the column ``setup``; the newest first."""
 
 
 def distillations() -> str:
@@ -58,18 +58,24 @@ def earlier_models(rows: Sequence[Row]) -> list[tuple[str, ...]]:
     state, or the last one that this judge scored.
     """
     rows = [row for row in rows if row["variant"] == toybox_jobs.DEFAULT]
-    rows = sorted(rows, key=is_present)
     lines = []
-    for judge in dict.fromkeys(row["judge"] for row in reversed(rows)):
+    for judge in dict.fromkeys(row["judge"] for row in sorted(rows, key=is_present, reverse=True)):
         scored = [row for row in rows if row["judge"] == judge]
-        base = scored[-1]
-        plain = {place(row)[:2]: row for row in scored if row["setup"] == base["setup"]}
+        base = newest(scored)
+        plain = {place(row)[:2]: row for row in scored if row["setup"] == base}
+        mark = "" if is_present(next(iter(plain.values()))) else " †"
         for setup, title in EARLIER.items():
             own = [row for row in scored if row["setup"] == setup and place(row)[:2] in plain]
-            if own and setup != base["setup"]:
-                title += "" if is_present(base) else " †"
-                lines.append(line_of(title, own, [plain[place(row)[:2]] for row in own]))
+            if own and setup != base:
+                lines.append(line_of(title + mark, own, [plain[place(row)[:2]] for row in own]))
     return lines
+
+
+def newest(rows: Sequence[Row]) -> str:
+    """Return the newest state that these rows have; EARLIER begins with the newest."""
+    setups = [row["setup"] for row in rows]
+    order = [toybox_jobs.setup(), *EARLIER]
+    return min(setups, key=lambda setup: order.index(setup) if setup in order else len(order))
 
 
 def table(*charts: str, first: Sequence[tuple[str, ...]] = ()) -> str:

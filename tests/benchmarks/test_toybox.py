@@ -19,6 +19,8 @@ from benchmarks.quality.toybox_jobs import CONFIG, DEFAULT, SAMPLES, STEPS, TRUT
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
+from threestudio_gaussiandreamer.models.bundled import DIFFUSION, JUDGE, RECORD
+from threestudio_gaussiandreamer.toybox import recognition
 from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
 from threestudio_gaussiandreamer.toybox.world import withheld
 
@@ -96,10 +98,9 @@ def test_tasks_come_in_order_of_priority_and_once(monkeypatch):
 
 
 def test_scoring_alone_needs_the_folder_of_the_runs(monkeypatch, capsys):
-    for words in (["--out", "new"], ["--keep", "runs"]):
-        with pytest.raises(SystemExit):
-            parsed(monkeypatch, "--only-score", *words)
-        assert "give the runs' folder as --keep" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        parsed(monkeypatch, "--only-score")
+    assert "give the runs' folder as --keep" in capsys.readouterr().err
 
 
 def test_of_the_missing_rows_only_those_of_kept_runs_are_scored(monkeypatch, tmp_path):
@@ -208,6 +209,29 @@ def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypat
     (first,) = toybox_variants.earlier_models(rows)
     assert first[:4] == ("the first", "3", "100", "+0 (+0 – +0)")
     assert toybox_variants.earlier_models(rows[:3]) == []
+
+
+def test_rows_of_another_judge_are_not_of_the_present_state(monkeypatch):
+    """Of two scores of the same runs, those of the bundled judge are shown."""
+    right = dict.fromkeys(toybox_tables.RECOGNIZED, "1") | {"variant": DEFAULT, "x": "0"}
+    right |= {"index": "0", "seed": "0", "prompt": "a red fox", "cpu_seconds": "50"}
+    right |= {"setup": toybox_jobs.setup(), "judge": toybox_jobs.judge_of()}
+    plain = [right, right | {"judge": "another", "kind": "0"}]
+    assert [toybox_tables.is_present(row) for row in plain] == [True, False]
+    mine = [row | {"variant": "mine"} for row in plain]
+    assert toybox_variants.pairs_of(plain + mine[1:], "mine", "0") == [(mine[1:], plain[1:])]
+    assert toybox_variants.pairs_of(plain[:1] + mine[1:], "mine", "0") == []
+
+
+def test_the_judge_is_identified_by_its_file(tmp_path):
+    assert toybox_jobs.judge_of().endswith(f"reading {recognition.VERSION}")
+    found = set()
+    for name, content in (("a", b"one"), ("b", b"two"), ("c", b"one")):
+        (tmp_path / name / DIFFUSION).mkdir(parents=True)
+        (tmp_path / name / RECORD).touch()
+        (tmp_path / name / JUDGE).write_bytes(content)
+        found.add(toybox_jobs.judge_of(str(tmp_path / name)))
+    assert len(found) == 2 and toybox_jobs.judge_of() not in found
 
 
 def test_earlier_models_are_compared_by_the_same_judge(monkeypatch):

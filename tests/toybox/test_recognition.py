@@ -70,11 +70,24 @@ def test_the_two_colours_of_a_pattern_differ():
 def test_a_pattern_has_a_second_colour_and_plain_objects_have_none():
     found = sure(FOX)
     none, white = (LABELS["second"].index(name) for name in ("none", "white"))
-    found["second"][:, none], found["second"][:, white] = 0.7, 0.3
+    found["second"][:, none], found["second"][:, white] = 0.5, 0.3
     assert recognition.most_probable_pattern(found) == ("striped", "red", "white")
     striped, plain = (LABELS["pattern"].index(name) for name in ("striped", "plain"))
     found["pattern"][:, striped], found["pattern"][:, plain] = 0.2, 0.8
     assert recognition.most_probable_pattern(found) == ("plain", "red", "none")
+
+
+def test_an_uncertain_second_colour_does_not_make_an_object_plain():
+    """Half of the probability says "none", the other half is spread over two colours."""
+    found = sure(FOX)
+    found["pattern"][:] = 0.0
+    for name, values in {"pattern": {"striped": 0.6, "plain": 0.4}}.items():
+        for value, probability in values.items():
+            found[name][:, LABELS[name].index(value)] = probability
+    found["second"][:] = 0.0
+    for value, probability in {"none": 0.5, "white": 0.3, "pink": 0.2}.items():
+        found["second"][:, LABELS["second"].index(value)] = probability
+    assert recognition.most_probable_pattern(found) == ("striped", "red", "white")
 
 
 def test_faces_on_all_sides():

@@ -38,7 +38,7 @@ def test_gaussians_without_errors_look_like_the_object(without_errors):
 @pytest.mark.parametrize("name", [*ERRORS, "BLENDED"])
 def test_each_error_makes_the_pictures_differ_more(monkeypatch, without_errors, name):
     before = difference(*drawn_and_cast())
-    monkeypatch.setattr(splat_shards, name, 2000 if name == "BLENDED" else 1.0)
+    monkeypatch.setattr(splat_shards, name, 100 if name == "BLENDED" else 1.0)
     assert difference(*drawn_and_cast()) > 1.1 * before
 
 

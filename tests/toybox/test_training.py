@@ -297,6 +297,25 @@ def test_worker_processes_make_the_same_batches(folder, name):
             torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
+def test_the_judge_has_data_of_its_own(tmp_path):
+    """Its seeds are no other stage's, and most of its batches show Gaussians."""
+    there = loop.Options(folder=tmp_path, seed=3, pool=1, shard_objects=1)
+    casts, splats = judge_stage.judge_shards(there)
+    assert len({there.shards().seed, casts.seed, splats.seed}) == 3
+    data = STAGES["judge"](there).data()
+    for step, (own, place) in enumerate([(data.first, 0), (data.second, 0), (data.second, 1)]):
+        assert torch.equal(data[step].images, own[place].images)
+    paths = [part.shards.path(0) for part in (data.first, data.second)]
+    assert paths == [casts.path(0), splats.path(0)]
+    assert torch.equal(data[judge_stage.CAST_EVERY].images, data.first[1].images)
+
+
+def test_the_judge_is_measured_on_both_sorts_of_pictures(folder):
+    cast, gaussians = STAGES["judge"](options(folder)).held_out
+    assert torch.equal(cast.labels, gaussians.labels)
+    assert not torch.equal(cast.images, gaussians.images)
+
+
 # Formulas -----------------------------------------------------------------------------------
 
 

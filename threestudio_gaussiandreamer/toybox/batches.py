@@ -49,14 +49,17 @@ class StepData(Dataset, ABC):
 
 @dataclass(frozen=True)
 class MixedData(Dataset):
-    """One batch in ``every`` of ``first``, the others of ``second``."""
+    """One batch in ``every`` of ``first``, the others of ``second``; each gives its batches in its
+    own order, without gaps.
+    """
 
     first: StepData
     second: StepData
     every: int
 
     def __getitem__(self, step: int) -> Any:
-        return (self.second if step % self.every else self.first)[step]
+        cycle, place = divmod(step, self.every)
+        return self.second[cycle * (self.every - 1) + place - 1] if place else self.first[cycle]
 
 
 def batches(data: Dataset, step: int, device: torch.device, workers: int = 0) -> Iterator[Any]:

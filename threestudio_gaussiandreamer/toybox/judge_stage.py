@@ -22,6 +22,7 @@ SEED_OFFSET = 1000
 """Added to the seed, so that the judge and the other networks have no training pictures in common.
 """
 CAST_EVERY = 3
+"""One step in so many is of ray-cast pictures, the others of renders of Gaussians."""
 
 
 def judge_shards(options: Options) -> tuple[Shards, SplatShards]:
@@ -40,6 +41,7 @@ class JudgeBatch(NamedTuple):
 class JudgeData(StepData):
     stream = "judge"
     degrades: ClassVar[bool] = True
+    """Whether most pictures are blurred, noisy or mottled."""
 
     def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> JudgeBatch:
         shard = self.shards.get(index)
@@ -96,7 +98,7 @@ class JudgeStage(Stage):
         Gaussians.
         """
         found, in_splats = (accuracies(model(one.images), one.labels) for one in self.held_out)
-        return found | {"all_in_splats": float(np.mean(list(in_splats.values())))}
+        return found | {"mean_in_renders_of_gaussians": float(np.mean(list(in_splats.values())))}
 
 
 def degraded(

@@ -2,11 +2,10 @@
 
 ===========  ===================================================================================
 kind         whether the kind with the highest probability, averaged over the views, is the prompt's
-colors       whether the body's colour and the pattern's are right, in either order for stripes and
-             checks, which look alike with their colours exchanged; of the most probable combination
-             of pattern and two different colours
-pattern      the same for the pattern
-accessory    the same for the coloured part, the accessory and its colour: all three must be right
+colors       whether the body's colour and the pattern's are the prompt's; for stripes and checks,
+             which look alike with their colours exchanged, in either order
+pattern      whether the pattern is the prompt's
+accessory    whether the coloured part, the accessory and its colour all are the prompt's
 multi_face   share of the views that the judge takes for views from another quadrant; NaN for
              objects that look alike from all sides
 ===========  ===================================================================================
@@ -16,7 +15,6 @@ import functools
 import math
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -28,6 +26,10 @@ from .models import Judge
 from .views import DISTANCE, FOVY_DEG, LABELS
 from .world import Attributes
 
+VERSION = 2
+"""Changes with what is read from the same probabilities, so that no scores of different readings
+are compared. Version 1 read every attribute alone.
+"""
 ELEVATION_DEG = 15.0
 OFFSETS_DEG = (-22.5, 22.5)
 """Azimuths of a quadrant's two views, relative to its middle. They keep away from its borders, at
@@ -89,10 +91,10 @@ def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, bool]:
     For an attribute that the prompt doesn't name, the judge's most probable class must be "none".
     Colours and pattern are those of :func:`most_probable_pattern`.
     """
-    right = {}
-    for name, value in wanted._asdict().items():
-        index = LABELS[name].index(value or "none")
-        right[name] = int(found[name].mean(dim=0).argmax()) == index
+    right = {
+        name: most_probable(found, name) == (getattr(wanted, name) or "none")
+        for name in ("kind", "part", "accessory", "accessory_color")
+    }
     pattern, *colors = most_probable_pattern(found)
     asked = [wanted.color, wanted.second or "none"]
     exchanged = wanted.pattern in EXCHANGEABLE and colors == asked[::-1]
@@ -104,22 +106,27 @@ def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, bool]:
     }
 
 
+def most_probable(found: dict[str, Tensor], name: str) -> str:
+    """Return the class with the highest probability, averaged over the views."""
+    return LABELS[name][int(found[name].mean(dim=0).argmax())]
+
+
 def most_probable_pattern(found: dict[str, Tensor]) -> tuple[str, str, str]:
-    """Return the most probable pattern and its two colours, among those that objects can have: two
-    different colours, or plain with "none" as the second one.
+    """Return the most probable pattern, and the most probable two colours with it, among the
+    combinations that objects have: two different colours, or plain with "none" as the second one.
+
+    The probability of a combination is the product of the three, averaged over the views.
     """
-    names = ("pattern", "color", "second")
-    pattern, color, second = (found[name].mean(dim=0) for name in names)
-    joint = pattern[:, None, None] * color[:, None] * second
-    index = int(torch.where(_possible(), joint, -1).argmax())
-    place = np.unravel_index(index, joint.shape)
-    first, *others = (LABELS[name][int(i)] for name, i in zip(names, place, strict=True))
-    return first, *others
+    pattern, color, second = (found[name].mean(dim=0) for name in ("pattern", "color", "second"))
+    joint = pattern[:, None, None] * color[:, None] * second * _possible()
+    chosen = int(joint.sum(dim=(1, 2)).argmax())
+    first, other = divmod(int(joint[chosen].argmax()), len(second))
+    return LABELS["pattern"][chosen], LABELS["color"][first], LABELS["second"][other]
 
 
 @functools.cache
 def _possible() -> Bool[Tensor, "pattern color second"]:
-    """Return which combinations of :func:`most_probable_pattern` objects can have."""
+    """Return which combinations of pattern, colour and second colour objects can have."""
     plain = torch.tensor([name == "plain" for name in LABELS["pattern"]])
     none = torch.tensor([name == "none" for name in LABELS["second"]])
     different = torch.tensor([[a != b for b in LABELS["second"]] for a in LABELS["color"]])

@@ -16,9 +16,12 @@ from ..meshes.mesh import Mesh, face_areas, sample_surface, surface_colors
 from ..splatting import rasterize
 from .views import SIZE, Shards
 
+VERSION = 1
+"""Changes with :func:`imperfect_gaussians`, so that no training reads earlier pictures."""
 COUNT = (800, 4000)
 """Range of the number of Gaussians."""
 WAVES = 6
+"""Number of plane waves of a smooth error."""
 WAVELENGTH = (0.15, 0.8)
 """Range of the wavelengths of smooth errors, world units."""
 COLOR_SHIFT, SHAPE_SHIFT = 0.06, 0.025
@@ -33,13 +36,14 @@ COLOR_ERROR, COLOR_NOISE = 0.08, 0.12
 class SplatShards(Shards):
     """Shards whose pictures are renders of :func:`imperfect_gaussians`."""
 
-    file_names = "splats", "held-out-splats"
+    file_names = f"splats{VERSION}", f"held-out-splats{VERSION}"
 
     def _pictures(
         self, mesh: Mesh, orbit: Orbit, rng: np.random.Generator
     ) -> Float[np.ndarray, "N s s 4"]:
         gaussians = [torch.from_numpy(np.float32(x)) for x in imperfect_gaussians(mesh, rng)]
         viewmats, Ks = to_opencv(orbit.c2w, orbit.fovy, SIZE, SIZE)
+        # the dilation is that of configs/toybox.yaml
         drawn = rasterize(*gaussians, viewmats, Ks, SIZE, SIZE, preset="fast", eps2d=0.1)
         alpha = drawn.alpha.reshape(*drawn.image.shape[:-1], 1)
         return torch.cat([drawn.image, alpha], dim=-1).clamp(0, 1).numpy()
@@ -52,7 +56,8 @@ def imperfect_gaussians(mesh: Mesh, rng: np.random.Generator) -> tuple[np.ndarra
     Gaussians of an object.
 
     Returns:
-        Means, quaternions, scales, opacities and colours, as ``rasterize`` takes them.
+        Means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and colours (N, 3) in
+        [0, 1].
     """
     count = int(rng.integers(*COUNT))
     points, faces, barycentric = sample_surface(mesh, count, rng)
@@ -74,7 +79,8 @@ def smooth_field(
     """Evaluate a random smooth vector field, a sum of plane waves, at these points.
 
     Args:
-        deviation: standard deviation of each component.
+        points: world units.
+        deviation: standard deviation of each component, in the unit of the result.
     """
     directions = rng.normal(size=(3, WAVES))
     lengths = rng.uniform(*WAVELENGTH, WAVES)

@@ -164,9 +164,7 @@ class UNetStage(Stage):
         objects = self.batch // self.shards.views
         if not (self.joins_views and objects):
             return singles
-        return MixedData(
-            singles, JoinedViewsData(self.shards, objects, *rest), SINGLE_EVERY
-        )
+        return MixedData(singles, JoinedViewsData(self.shards, objects, *rest), SINGLE_EVERY)
 
     def loss(self, model: nn.Module, batch: UNetBatch) -> tuple[Tensor, dict[str, Tensor]]:
         abar, errors = self.alphas_cumprod[batch.t], self._errors(model, batch)
