@@ -103,6 +103,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "docs/toybox.md": {
         "models": toybox.card,
         "toybox": toybox.results,
+        "judges": toybox.judges,
         "settings": toybox_variants.settings,
     },
     "docs/several_processes.md": {"ddp": ddp.table},

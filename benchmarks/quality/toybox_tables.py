@@ -36,6 +36,7 @@ from threestudio_gaussiandreamer.models.bundled import FOLDER, RECORD
 from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
 
 TITLES = {"colors": "colours", "multi_face": "multi-face"}
+HEAD = [f"{TITLES.get(name, name)}, %" for name in RECOGNIZED]
 NOT_MEASURED = "*Not measured yet with the present models and configuration.*"
 Row = dict[str, str]
 
@@ -132,8 +133,24 @@ def results() -> str:
         lines.append(line_of(name, same))
         if name == DEFAULT:
             lines.append(line_of("its prior's points", same, "prior_"))
-    titles = [f"{TITLES.get(name, name)}, %" for name in RECOGNIZED]
-    return markdown(("variant", "prompts", *titles, "haze, %", "Gaussians", "CPU seconds"), lines)
+    return markdown(("variant", "prompts", *HEAD, "haze, %", "Gaussians", "CPU seconds"), lines)
+
+
+def judges() -> str:
+    """Return what the present judge and earlier ones recognise in the same pictures."""
+    groups: dict[tuple[str, str], dict[str, list[Row]]] = {}
+    for row in measured():
+        if row["variant"] in (TRUTH, DEFAULT):
+            group = groups.setdefault((row["variant"], row["setup"]), {})
+            group.setdefault(row["judge"], []).append(row)
+    lines = []
+    for (name, _), scored in groups.items():
+        prompts = {row["prompt"] for row in scored.get(judge_of(), [])}
+        for judge, rows in scored.items():
+            same = [row for row in rows if row["prompt"] in prompts]
+            if same and len(scored) > 1:
+                lines.append([name, judge, *line_of(name, same)[1 : 2 + len(RECOGNIZED)]])
+    return markdown(("pictures", "judge", "prompts", *HEAD), lines) if lines else NOT_MEASURED
 
 
 def summary() -> str:

@@ -32,7 +32,7 @@ DISTILLATIONS = ("paper", "distillations", "cheaper")
 ENOUGH = 8
 """Rows of the present state of which those of earlier ones say nothing more."""
 EARLIER = {
-    "91562c50": "U-Net before its last training",
+    "91562c50": "U-Net before 184,000 further pictures",
     "943e902e": "U-Net before the training on joined views",
     "6075424d": "300 steps",
     "7ac24043": "models before the words for left and right",

@@ -223,6 +223,19 @@ def test_rows_of_another_judge_are_not_of_the_present_state(monkeypatch):
     assert toybox_variants.pairs_of(plain[:1] + mine[1:], "mine", "0") == []
 
 
+def test_judges_are_compared_on_the_same_pictures(monkeypatch):
+    right = dict.fromkeys([*toybox_tables.RECOGNIZED, "haze", "gaussians", "cpu_seconds"], "1")
+    right |= {"variant": TRUTH, "x": "0", "seed": "0", "setup": toybox_jobs.WORLD}
+    texts = ("a red fox", "a blue car")
+    rows = [right | {"prompt": text, "judge": "other", "kind": "0"} for text in texts]
+    monkeypatch.setattr(toybox_tables, "measured", lambda: rows)
+    assert toybox_tables.judges() == toybox_tables.NOT_MEASURED
+    rows.append(right | {"prompt": "a red fox", "judge": toybox_jobs.judge_of()})
+    earlier, present = toybox_tables.judges().splitlines()[2:]
+    assert earlier.startswith("| ground truth | other | 1 | 0 (")
+    assert present.startswith(f"| ground truth | {toybox_jobs.judge_of()} | 1 | 100 (")
+
+
 def test_the_judge_is_identified_by_its_file(tmp_path):
     assert toybox_jobs.judge_of().endswith(f"reading {recognition.VERSION}")
     found = set()
