@@ -9,8 +9,6 @@ from collections.abc import Collection
 from difflib import get_close_matches
 from pathlib import Path
 
-from ..host import warn
-
 WORDS_FILE = "tokenizer/words.txt"
 SHOWN = 8
 """Largest number of words that the warning names."""
@@ -27,6 +25,8 @@ def warn_of_unknown_words(folder: Path, prompt: str) -> None:
     known = path.read_text(encoding="utf-8").split()
     unknown = unknown_words(prompt, known)
     if unknown:
+        from ..host import warn  # brings Lightning, which readers of WORDS_FILE don't need
+
         shown = ", ".join(_with_near(word, known) for word in unknown[:SHOWN])
         more = f" and {len(unknown) - SHOWN} more" if len(unknown) > SHOWN else ""
         warn(
