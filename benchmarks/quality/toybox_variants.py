@@ -63,7 +63,7 @@ def earlier_models(rows: Sequence[Row]) -> list[tuple[str, ...]]:
         scored = [row for row in rows if row["judge"] == judge]
         base = newest(scored)
         plain = {place(row)[:2]: row for row in scored if row["setup"] == base}
-        mark = "" if is_present(next(iter(plain.values()))) else " †"
+        mark = "" if any(map(is_present, scored)) else " †"
         for setup, title in EARLIER.items():
             own = [row for row in scored if row["setup"] == setup and place(row)[:2] in plain]
             if own and setup != base:

@@ -211,26 +211,29 @@ def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypat
     assert toybox_variants.earlier_models(rows[:3]) == []
 
 
-def test_rows_of_another_judge_are_not_of_the_present_state(monkeypatch):
+def row(**changes: str) -> dict[str, str]:
+    """Return a present row of toybox.yaml in which all is recognised, with these changes."""
+    right = dict.fromkeys([*toybox_tables.RECOGNIZED, "haze", "gaussians", "cpu_seconds"], "1")
+    right |= {"variant": DEFAULT, "x": "0", "index": "0", "seed": "0", "prompt": "a red fox"}
+    return right | {"setup": toybox_jobs.setup(), "judge": toybox_jobs.judge_of()} | changes
+
+
+def test_rows_of_another_judge_are_not_of_the_present_state():
     """Of two scores of the same runs, those of the bundled judge are shown."""
-    right = dict.fromkeys(toybox_tables.RECOGNIZED, "1") | {"variant": DEFAULT, "x": "0"}
-    right |= {"index": "0", "seed": "0", "prompt": "a red fox", "cpu_seconds": "50"}
-    right |= {"setup": toybox_jobs.setup(), "judge": toybox_jobs.judge_of()}
-    plain = [right, right | {"judge": "another", "kind": "0"}]
-    assert [toybox_tables.is_present(row) for row in plain] == [True, False]
-    mine = [row | {"variant": "mine"} for row in plain]
+    plain = [row(), row(judge="another", kind="0")]
+    assert [toybox_tables.is_present(one) for one in plain] == [True, False]
+    mine = [one | {"variant": "mine"} for one in plain]
     assert toybox_variants.pairs_of(plain + mine[1:], "mine", "0") == [(mine[1:], plain[1:])]
     assert toybox_variants.pairs_of(plain[:1] + mine[1:], "mine", "0") == []
 
 
 def test_judges_are_compared_on_the_same_pictures(monkeypatch):
-    right = dict.fromkeys([*toybox_tables.RECOGNIZED, "haze", "gaussians", "cpu_seconds"], "1")
-    right |= {"variant": TRUTH, "x": "0", "seed": "0", "setup": toybox_jobs.WORLD}
+    truth = {"variant": TRUTH, "setup": toybox_jobs.WORLD}
     texts = ("a red fox", "a blue car")
-    rows = [right | {"prompt": text, "judge": "other", "kind": "0"} for text in texts]
+    rows = [row(**truth, prompt=text, judge="other", kind="0") for text in texts]
     monkeypatch.setattr(toybox_tables, "measured", lambda: rows)
     assert toybox_tables.judges() == toybox_tables.NOT_MEASURED
-    rows.append(right | {"prompt": "a red fox", "judge": toybox_jobs.judge_of()})
+    rows.append(row(**truth))
     earlier, present = toybox_tables.judges().splitlines()[2:]
     assert earlier.startswith("| ground truth | other | 1 | 0 (")
     assert present.startswith(f"| ground truth | {toybox_jobs.judge_of()} | 1 | 100 (")
@@ -248,13 +251,9 @@ def test_the_judge_is_identified_by_its_file(tmp_path):
 
 
 def test_earlier_models_are_compared_by_the_same_judge(monkeypatch):
-    """A judge who didn't score the present models compares with the last ones that it scored."""
-    right = dict.fromkeys(toybox_tables.RECOGNIZED, "1")
-    right |= {"variant": DEFAULT, "x": "0", "index": "0", "seed": "0", "prompt": "a red fox"}
-    right["cpu_seconds"] = "50"
-    now = {"setup": toybox_jobs.setup(), "judge": toybox_jobs.judge_of()}
-    rows = [right | {"setup": "a", "judge": "first"}, right | {"setup": "b", "judge": "first"}]
-    rows += [right | now, right | now | {"setup": "b", "kind": "0"}]
+    """For a judge that didn't score the present models, the base is the newest state it scored."""
+    rows = [row(setup="a", judge="first"), row(setup="b", judge="first")]
+    rows += [row(), row(setup="b", kind="0")]
     monkeypatch.setattr(toybox_variants, "EARLIER", {"b": "state b", "a": "state a"})
     lines = toybox_variants.earlier_models(rows)
     assert [line[:4] for line in lines] == [

@@ -62,7 +62,6 @@ def test_the_two_colours_of_a_pattern_differ():
     """Where each colour alone is most probably red, the second is the next most probable one."""
     found = sure(FOX)
     red, white = (LABELS["second"].index(name) for name in ("red", "white"))
-    found["second"] = torch.zeros_like(found["second"])
     found["second"][:, red], found["second"][:, white] = 0.6, 0.4
     assert recognition.most_probable_pattern(found) == ("striped", "red", "white")
 
@@ -80,13 +79,11 @@ def test_a_pattern_has_a_second_colour_and_plain_objects_have_none():
 def test_an_uncertain_second_colour_does_not_make_an_object_plain():
     """Half of the probability says "none", the other half is spread over two colours."""
     found = sure(FOX)
-    found["pattern"][:] = 0.0
-    for name, values in {"pattern": {"striped": 0.6, "plain": 0.4}}.items():
-        for value, probability in values.items():
-            found[name][:, LABELS[name].index(value)] = probability
-    found["second"][:] = 0.0
-    for value, probability in {"none": 0.5, "white": 0.3, "pink": 0.2}.items():
-        found["second"][:, LABELS["second"].index(value)] = probability
+    for name, values in {
+        "pattern": {"striped": 0.6, "plain": 0.4},
+        "second": {"none": 0.5, "white": 0.3, "pink": 0.2},
+    }.items():
+        found[name] = torch.tensor([[values.get(one, 0.0) for one in LABELS[name]]] * 8)
     assert recognition.most_probable_pattern(found) == ("striped", "red", "white")
 
 

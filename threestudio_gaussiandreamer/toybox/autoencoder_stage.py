@@ -14,21 +14,14 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from ..cameras import Orbit, to_opencv
+from ..cameras import Orbit
 from ..core.streams import numpy_generator
-from ..splatting import rasterize
 from . import models
 from .batches import StepData, normal
 from .loop import Stage, is_trained
 from .sheet import contact_sheet
-from .views import (
-    DISTANCE,
-    FOVY_DEG,
-    SIZE,
-    Shard,
-    held_out_shard,
-    with_backgrounds,
-)
+from .splat_shards import render_gaussians
+from .views import DISTANCE, FOVY_DEG, Shard, held_out_shard, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.15
 SPLAT_SHARE = 0.2
@@ -145,10 +138,8 @@ def rough_render(shard: Shard, row: int, rng: np.random.Generator) -> UInt8[np.n
     gaussians = rough_gaussians(shard.points[row // views].astype(np.float32), rng)
     angles = (shard.elevation[row], shard.azimuth[row], np.mean(DISTANCE), math.radians(FOVY_DEG))
     orbit = Orbit(*(torch.tensor([float(value)]) for value in angles))
-    viewmats, Ks = to_opencv(orbit.c2w, orbit.fovy, SIZE, SIZE)
-    drawn = rasterize(*gaussians, viewmats, Ks, SIZE, SIZE, preset="fast")
-    rgba = torch.cat([drawn.image[0], drawn.alpha[0].reshape(SIZE, SIZE, 1)], dim=-1)
-    return (rgba.clamp(0, 1) * 255).round().byte().numpy()
+    (rgba,) = render_gaussians(gaussians, orbit, eps2d=0.3)
+    return (rgba * 255).round().astype(np.uint8)
 
 
 def rough_gaussians(points: Float[np.ndarray, "P 6"], rng: np.random.Generator) -> list[Tensor]:

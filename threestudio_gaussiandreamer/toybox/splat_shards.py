@@ -6,10 +6,13 @@ colours. No network of the toybox takes part in these renders, so the judge stay
 those that it evaluates.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from ..cameras import Orbit, to_opencv
 from ..meshes.mesh import Mesh, face_areas, sample_surface, surface_colors
@@ -42,11 +45,22 @@ class SplatShards(Shards):
         self, mesh: Mesh, orbit: Orbit, rng: np.random.Generator
     ) -> Float[np.ndarray, "N s s 4"]:
         gaussians = [torch.from_numpy(np.float32(x)) for x in imperfect_gaussians(mesh, rng)]
-        viewmats, Ks = to_opencv(orbit.c2w, orbit.fovy, SIZE, SIZE)
-        # the dilation is that of configs/toybox.yaml
-        drawn = rasterize(*gaussians, viewmats, Ks, SIZE, SIZE, preset="fast", eps2d=0.1)
-        alpha = drawn.alpha.reshape(*drawn.image.shape[:-1], 1)
-        return torch.cat([drawn.image, alpha], dim=-1).clamp(0, 1).numpy()
+        return render_gaussians(gaussians, orbit, eps2d=0.1)  # as configs/toybox.yaml
+
+
+def render_gaussians(
+    gaussians: Sequence[Tensor], orbit: Orbit, *, eps2d: float
+) -> Float[np.ndarray, "N s s 4"]:
+    """Render Gaussians from these cameras; return premultiplied RGBA in [0, 1].
+
+    Args:
+        gaussians: means, quaternions, scales, opacities and colours, as ``rasterize`` takes them.
+        eps2d: dilation, square pixels.
+    """
+    viewmats, Ks = to_opencv(orbit.c2w, orbit.fovy, SIZE, SIZE)
+    drawn = rasterize(*gaussians, viewmats, Ks, SIZE, SIZE, preset="fast", eps2d=eps2d)
+    alpha = drawn.alpha.reshape(*drawn.image.shape[:-1], 1)
+    return torch.cat([drawn.image, alpha], dim=-1).clamp(0, 1).numpy()
 
 
 def imperfect_gaussians(mesh: Mesh, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
