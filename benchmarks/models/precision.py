@@ -3,12 +3,12 @@
     python -m benchmarks.models.precision [--rounds 7]
 
 Calls of one training step of toybox.yaml, one thread: the autoencoder's encoder on 4 pictures of
-128 x 128 with its gradient, and the U-Net on 8 latents; bfloat16 by autocast. The settings
-alternate; ``cpu_ms`` is the median of the rounds, ``error`` the largest difference to float32,
-relative to the largest value. Writes ``benchmarks/results/precision.csv``."""
+128 x 128 with its gradient, and the U-Net on 8 latents. Weights and inputs are of the precision's
+type, as with ``half_precision_on_cpu``. The settings alternate; ``cpu_ms`` is the median of the
+rounds, ``error`` the largest difference to float32, relative to the largest value. Writes
+``benchmarks/results/precision.csv``."""
 
 import argparse
-import contextlib
 import csv
 import itertools
 import statistics
@@ -41,13 +41,14 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     rounds = parser.parse_args().rounds
     torch.set_num_threads(1)
-    calls = networks()
-    settings = [Setting(*values) for values in itertools.product(calls, FORMATS, PRECISIONS)]
+    calls = {precision: networks(dtype) for precision, dtype in PRECISIONS.items()}
+    names = (calls["float32"], FORMATS, PRECISIONS)
+    settings = [Setting(*values) for values in itertools.product(*names)]
     times: dict[Setting, list[float]] = {setting: [] for setting in settings}
     found: dict[Setting, Tensor] = {}
     for _ in range(rounds + 1):  # the first one isn't counted
         for setting in settings:
-            seconds, found[setting] = timed(calls[setting.network], setting)
+            seconds, found[setting] = timed(calls[setting.precision][setting.network], setting)
             times[setting].append(seconds)
     with open(RESULTS, "w", newline="") as file:
         rows = (row_of(setting, times[setting][1:], found) for setting in settings)
@@ -60,16 +61,18 @@ class Network(NamedTuple):
     """Calls the module with inputs in a memory format."""
 
 
-def networks() -> dict[str, Network]:
+def networks(dtype: torch.dtype) -> dict[str, Network]:
     from diffusers import AutoencoderKL, UNet2DConditionModel
 
     folder = FOLDER / "stable-diffusion"
-    vae = AutoencoderKL.from_pretrained(folder / "vae").float().requires_grad_(False)
-    unet = UNet2DConditionModel.from_pretrained(folder / "unet").float().requires_grad_(False)
+    vae = AutoencoderKL.from_pretrained(folder / "vae", torch_dtype=dtype).requires_grad_(False)
+    unet = UNet2DConditionModel.from_pretrained(folder / "unet", torch_dtype=dtype)
+    unet.requires_grad_(False)
     generator = torch.Generator().manual_seed(0)
-    images = torch.rand(VIEWS, 3, 128, 128, generator=generator)
-    latents = torch.randn(2 * VIEWS, 4, 16, 16, generator=generator)
-    tokens = torch.randn(2 * VIEWS, 32, unet.config.cross_attention_dim, generator=generator)
+    images = torch.rand(VIEWS, 3, 128, 128, generator=generator).to(dtype)
+    latents = torch.randn(2 * VIEWS, 4, 16, 16, generator=generator).to(dtype)
+    width = unet.config.cross_attention_dim
+    tokens = torch.randn(2 * VIEWS, 32, width, generator=generator).to(dtype)
 
     def encode(layout: torch.memory_format) -> Tensor:
         pixels = images.clone(memory_format=layout).requires_grad_()
@@ -89,13 +92,8 @@ def timed(network: Network, setting: Setting) -> tuple[float, Tensor]:
     layout = FORMATS[setting.format]
     network.module.to(memory_format=layout)
     start = time.process_time()
-    with autocast(PRECISIONS[setting.precision]):
-        result = network.call(layout)
+    result = network.call(layout)
     return time.process_time() - start, result.float()
-
-
-def autocast(dtype: torch.dtype) -> contextlib.AbstractContextManager:
-    return torch.autocast("cpu", dtype=dtype, enabled=dtype is not torch.float32)
 
 
 def row_of(setting: Setting, times: list[float], found: dict[Setting, Tensor]) -> Iterator[str]:

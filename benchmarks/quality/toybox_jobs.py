@@ -159,13 +159,16 @@ def default() -> Iterator[Variant]:
 
 
 def over_steps() -> Iterator[Variant]:
-    for count in (75, 150, 300, 600):
+    """Numbers of steps beside the configuration's."""
+    for count in (75, 300, 600):
         yield Variant("steps", count, steps(count))
 
 
 def over_guidance() -> Iterator[Variant]:
-    """Scales of guidance, 1 without guidance and the last that of the paper."""
-    for scale in (1, 2, 4, 8, 15, 30, PAPER_SCALE):
+    """Scales of guidance beside the configuration's, 1 without guidance and the last that of the
+    paper.
+    """
+    for scale in (1, 2, 8, 15, 30, PAPER_SCALE):
         yield Variant("guidance scale", scale, {"system.guidance.guidance_scale": scale})
 
 

@@ -22,9 +22,11 @@ from benchmarks.quality.toybox_jobs import (
     CHART,
     DEFAULT,
     EXACT,
+    GUIDANCE,
     PAPER_RECIPE,
     RECOGNIZED,
     SAMPLES,
+    STEPS,
     TRUTH,
     WORLD,
     judge_of,
@@ -45,6 +47,8 @@ class Line(NamedTuple):
     """A chart of results against a number that runs vary."""
 
     variant: str
+    own: float
+    """The number in toybox.yaml, whose runs are in the chart too."""
     x_column: str
     x_label: str
     star: str = ""
@@ -52,8 +56,10 @@ class Line(NamedTuple):
 
 
 LINES = {
-    "toybox_guidance": Line("guidance scale", "x", "guidance scale (star: the paper's)", "101"),
-    "toybox_steps": Line("steps", "cpu_seconds", "CPU seconds of a run, one thread"),
+    "toybox_guidance": Line(
+        "guidance scale", GUIDANCE, "x", "guidance scale (star: the paper's)", "101"
+    ),
+    "toybox_steps": Line("steps", STEPS, "cpu_seconds", "CPU seconds of a run, one thread"),
 }
 
 
@@ -201,9 +207,16 @@ def withheld(numbers: dict[str, Any]) -> str:
 def main() -> None:
     rows = present()
     for name, line in LINES.items():
-        own = [row for row in rows if row["variant"] == line.variant]
-        if own:
-            print(draw(name, line, own, references(rows)))
+        if varied := [row for row in rows if row["variant"] == line.variant]:
+            print(draw(name, line, varied + default_at(line, varied, rows), references(rows)))
+
+
+def default_at(line: Line, varied: list[Row], rows: list[Row]) -> list[Row]:
+    """Return the rows of toybox.yaml, of prompts and seeds that the chart has, as its own point."""
+    shown = {(row["prompt"], row["seed"]) for row in varied}
+    own = [row for row in rows if row["variant"] == DEFAULT]
+    same = [row for row in own if (row["prompt"], row["seed"]) in shown]
+    return [row | {"x": f"{line.own:g}"} for row in same]
 
 
 def references(rows: list[Row]) -> dict[str, Callable[[str], float]]:

@@ -218,6 +218,17 @@ def row(**changes: str) -> dict[str, str]:
     return right | {"setup": toybox_jobs.setup(), "judge": toybox_jobs.judge_of()} | changes
 
 
+def test_the_configuration_itself_is_a_point_of_a_chart():
+    """Its runs of the chart's prompts and seeds aren't made a second time."""
+    line = toybox_tables.LINES["toybox_guidance"]
+    varied = [row(variant=line.variant, x="8")]
+    same, other = row(), row(seed="1")
+    found = toybox_tables.default_at(line, varied, [*varied, same, other])
+    assert found == [same | {"x": f"{toybox_jobs.GUIDANCE:g}"}]
+    for name, own in (("guidance", toybox_jobs.GUIDANCE), ("steps", STEPS)):
+        assert own not in [variant.x for variant in toybox_jobs.CHARTS[name]()]
+
+
 def test_rows_of_another_judge_are_not_of_the_present_state():
     """Of two scores of the same runs, those of the bundled judge are shown."""
     plain = [row(), row(judge="another", kind="0")]

@@ -20,9 +20,14 @@ from tests.helpers.tiny_guidance import (
     renders,
 )
 from threestudio_gaussiandreamer.core import streams
-from threestudio_gaussiandreamer.guidance import text_to_image
+from threestudio_gaussiandreamer.guidance import half_precision, text_to_image
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
-from threestudio_gaussiandreamer.guidance.half_precision import PerItemLossScale, weights_type
+from threestudio_gaussiandreamer.guidance.half_precision import (
+    PerItemLossScale,
+    channels_last,
+    weights_type,
+)
+from threestudio_gaussiandreamer.guidance.stable_diffusion import StableDiffusionGuidance
 
 pytest.importorskip("diffusers")
 
@@ -248,13 +253,30 @@ def half(monkeypatch):
     monkeypatch.setattr(text_to_image, "weights_type", lambda *options: torch.float16)
 
 
-def test_half_precision_is_for_gpus():
-    assert weights_type(True, torch.device("cuda")) == torch.float16
-    assert (
-        weights_type(True, torch.device("cpu"))
-        == weights_type(False, torch.device("cuda"))
-        == torch.float32
-    )
+@pytest.mark.parametrize("native", [False, True])
+def test_half_precision_on_a_cpu_is_bfloat16_where_it_is_native(monkeypatch, native):
+    monkeypatch.setattr(half_precision, "cpu_multiplies_bfloat16", lambda: native)
+    cpu, gpu = torch.device("cpu"), torch.device("cuda")
+    cfg = StableDiffusionGuidance.Config(enable_channels_last_format=True)
+    assert (weights_type(cfg, gpu), weights_type(cfg, cpu)) == (torch.float16, torch.float32)
+    cfg.half_precision_on_cpu = True
+    assert weights_type(cfg, cpu) == (torch.bfloat16 if native else torch.float32)
+    assert channels_last(cfg, weights_type(cfg, cpu), cpu) is not native
+    assert channels_last(cfg, torch.bfloat16, gpu)
+    cfg.half_precision_weights = False
+    assert weights_type(cfg, gpu) == weights_type(cfg, cpu) == torch.float32
+
+
+def test_the_gradient_in_bfloat16_on_a_cpu(models, prompts, monkeypatch):
+    monkeypatch.setattr(half_precision, "cpu_multiplies_bfloat16", lambda: True)
+    options = {"half_precision_on_cpu": True, "enable_channels_last_format": True}
+    guide, rgb = guidance(models, guidance_scale=4.0, **options), renders()
+    assert guide.unet.dtype == guide.vae.dtype == torch.bfloat16
+    assert guide.vae.encoder.conv_in.weight.is_contiguous()
+    mine, _ = gradient(guide, prompts[False], rgb)
+    expected = reference_gradient(models["epsilon"], "epsilon", prompts[False], rgb, scale=4.0)
+    assert mine.dtype == torch.float32
+    assert 0 < relative(mine, expected) < 0.1  # bfloat16 rounds to 4e-3
 
 
 def test_half_precision_stays_inside_the_networks(models, prompts, half):

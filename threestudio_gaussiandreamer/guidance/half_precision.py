@@ -1,8 +1,9 @@
-"""Half-precision networks with float32 inputs and outputs: their dtype, and a scaling of gradients
-that prevents overflow and underflow in the backward pass.
+"""Half-precision networks with float32 inputs and outputs: their dtype and memory layout, and a
+scaling of gradients that prevents overflow and underflow in the backward pass.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,11 +22,35 @@ factor of 500, and elements 10^9 times smaller than the largest don't vanish.
 HALF_TYPES = {"float16": torch.float16, "bfloat16": torch.bfloat16}
 
 
-def weights_type(half: bool, device: torch.device, half_type: str = "float16") -> torch.dtype:
-    """Return the type named ``half_type`` on a GPU if ``half`` is set, else float32. On the CPU
-    half precision has no advantage.
+def weights_type(cfg: Any, device: torch.device) -> torch.dtype:
+    """Return the number type of a network's weights: on a GPU ``half_precision_type``; on a CPU
+    bfloat16, if ``half_precision_on_cpu`` is set and the CPU multiplies it; else float32.
+
+    Args:
+        cfg: options of a guidance by a text-to-image model; all of it is float32 unless
+            ``half_precision_weights`` is set.
     """
-    return HALF_TYPES[half_type] if half and device.type == "cuda" else torch.float32
+    if not cfg.half_precision_weights:
+        return torch.float32
+    if device.type == "cuda":
+        return HALF_TYPES[cfg.half_precision_type]
+    native = cfg.half_precision_on_cpu and cpu_multiplies_bfloat16()
+    return torch.bfloat16 if native else torch.float32
+
+
+def cpu_multiplies_bfloat16() -> bool:
+    """Return whether the CPU has instructions that multiply bfloat16 (AVX-512 BF16, AMX). Others
+    convert each number, which takes more time than float32.
+    """
+    names = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")  # torch has no public ones
+    return any(getattr(torch.cpu, name, bool)() for name in names)
+
+
+def channels_last(cfg: Any, dtype: torch.dtype, device: torch.device) -> bool:
+    """Return whether to lay weights out channels last: if ``enable_channels_last_format`` is set,
+    but not in bfloat16 on a CPU, where the other layout is faster.
+    """
+    return cfg.enable_channels_last_format and (device.type, dtype) != ("cpu", torch.bfloat16)
 
 
 class PerItemLossScale:

@@ -17,7 +17,9 @@ image_size                          height and width that the model sees, pixels
 half_precision_weights              half precision on a GPU; images, latents, gradients and
                                     splatting stay float32
 half_precision_type                 float16 or bfloat16, whose range is that of float32
-enable_channels_last_format         lay the weights out channels last
+half_precision_on_cpu               bfloat16 on a CPU too, if it has instructions that multiply it:
+                                    faster, and half of the memory
+enable_channels_last_format         lay the weights out channels last; not in bfloat16 on a CPU
 enable_torch_compile                compile the network on its first use
 enable_attention_slicing            attention in slices: less memory, slower
 enable_sequential_cpu_offload       keep the network's weights in the CPU's memory: least memory,
@@ -47,7 +49,7 @@ from ..models.hub import find_model
 from ..models.loaded import keep_on_cpu, loaded
 from ..models.model_files import load_network, load_settings
 from .base import ScoreDistillation
-from .half_precision import HALF_TYPES, weights_type
+from .half_precision import HALF_TYPES, channels_last, weights_type
 from .lora import LoRAParticles, check_adaptable
 from .particles import ParticleModel
 from .scale_input import scale_input, scale_width
@@ -75,6 +77,7 @@ class TextToImageDistillation(ScoreDistillation):
         image_size: Optional[int] = field(default=None, metadata=in_range(1, 4096, "pixels"))
         half_precision_weights: bool = True
         half_precision_type: str = field(default="float16", metadata=one_of(HALF_TYPES))
+        half_precision_on_cpu: bool = False
         enable_channels_last_format: bool = False
         enable_torch_compile: bool = False
         enable_attention_slicing: bool = False
@@ -110,9 +113,7 @@ class TextToImageDistillation(ScoreDistillation):
 
     def configure(self) -> None:
         super().configure()
-        self.dtype = weights_type(
-            self.cfg.half_precision_weights, self.device, self.cfg.half_precision_type
-        )
+        self.dtype = weights_type(self.cfg, self.device)
         folder = self._find(self.cfg, half=self.half)
         info(
             f"loading {self.cfg.pretrained_model_name_or_path} in "
@@ -163,9 +164,7 @@ class TextToImageDistillation(ScoreDistillation):
         """Load the networks; subclasses extend this with their own."""
         self.load_denoiser(folder)
         if self.cfg.enable_memory_efficient_attention:
-            debug(
-                "enable_memory_efficient_attention: torch's attention is memory efficient already"
-            )
+            debug("enable_memory_efficient_attention: torch's attention is so already")
 
     def load_denoiser(self, folder: Path) -> None:
         """Load the network that predicts the noise, and set ``text_width`` and ``scale_width``."""
@@ -237,7 +236,7 @@ class TextToImageDistillation(ScoreDistillation):
         def load() -> nn.Module:
             network = read(network_class, folder, component, half=self.half, torch_dtype=dtype)
             network.requires_grad_(False)
-            if self.cfg.enable_channels_last_format:
+            if channels_last(self.cfg, dtype, self.device):
                 network.to(memory_format=torch.channels_last)
             return prepare(network)
 
