@@ -159,14 +159,18 @@ inline void start_behind(const Planes& planes, const Vec3<float>& background, Ba
   }
 }
 
+inline Vec3<float> over_lanes(const Vec3<Floats>& sum) {
+  Vec3<float> total = {};
+  for (int l = 0; l < LANES; l++) total = total + Vec3<float>{sum.x[l], sum.y[l], sum.z[l]};
+  return total;
+}
+
 // d loss / d background of one tile: the sum over its pixels of (1 - alpha) d loss / d colour, by lane first.
 inline Vec3<float> background_sum(const float* alpha, const UpstreamPlanes& up) {
   Vec3<Floats> sum = {};
   for (int p = 0; p < TILE_PIXELS; p += LANES)
     sum = sum + (1.0f - load(alpha + p)) * Vec3<Floats>{load(up.red + p), load(up.green + p), load(up.blue + p)};
-  Vec3<float> total = {};
-  for (int l = 0; l < LANES; l++) total = total + Vec3<float>{sum.x[l], sum.y[l], sum.z[l]};
-  return total;
+  return over_lanes(sum);
 }
 
 inline void store_sums(const View& view, const float* sums, int first, int count, float* slots) {
@@ -195,14 +199,11 @@ inline void blend_lists_backward(const BackwardCall& call, const View& view, int
 // One tile of one view: fills the slots of its intersections, returns d loss / d background.
 inline Vec3<float> blend_tile_backward(const BackwardCall& call, const View& view, int tile) {
   const TileFrame frame = frame_of(view, tile);
+  const Layers<const float> upstream = upstream_of(call, view.index);
+  if (frame.begin == frame.end) return over_lanes(sum_colors(upstream, frame, call.settings.downsample));
   BackwardScratch scratch;
   read_tile(call, view.index, frame, scratch.upstream);
-  if (tile + 1 < view.tiles())
-    prefetch_tile<false>(upstream_of(call, view.index), frame_of(view, tile + 1), call.settings.downsample);
-  if (frame.begin == frame.end) {
-    std::fill(scratch.behind, scratch.behind + TILE_PIXELS, 0.0f);
-    return background_sum(scratch.behind, scratch.upstream);
-  }
+  if (tile + 1 < view.tiles()) prefetch_tile<false>(upstream, frame_of(view, tile + 1), call.settings.downsample);
   start_behind(view.planes[tile], background_of(call.scene, view.index), scratch);
   if (call.out.absgrad)
     blend_lists_backward<true>(call, view, tile, frame, scratch);
