@@ -5,20 +5,20 @@ BIN     = $(VENV)/bin
 ENVIRON = OMP_WAIT_POLICY=passive
 WORKERS ?= auto
 PYTEST  = $(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
-# without the CPU kernel (no C++ compiler) plain torch renders, and the demo is smaller
+# without the CPU kernel (no C++ compiler) plain torch renders, and the exact demo is smaller
 SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import available_backends as b; print("--config configs/demo-small.yaml" if b()["cpu"] else "")')
 
-.PHONY: demo demo-text test test-slow test-all test-farm docs stability fuzz long-run ablations bench gpu-check train-toybox toybox-sheet charts measure-charts measure-toybox clean
-
-demo: $(VENV)/ready                ## train the bundled toy from a coarse prior, offline, on the CPU
-	$(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
+.PHONY: demo demo-exact test test-slow test-all test-farm docs stability fuzz long-run ablations bench gpu-check train-toybox toybox-sheet charts measure-charts measure-toybox clean
 
 PROMPT =
 MODELS = toybox
 # the prompt as it is written, without expansion by make or the shell
-demo-text: export TEXT = $(value PROMPT)
-demo-text: $(VENV)/ready-for-models ## text to 3D with small models, offline, on the CPU; make demo-text MODELS=folder PROMPT="a red fox with a green scarf"
+demo: export TEXT = $(value PROMPT)
+demo: $(VENV)/ready-for-models     ## text to 3D with small models, offline, on the CPU; make demo MODELS=folder PROMPT="a red fox with a green scarf"
 	$(BIN)/python -m threestudio_gaussiandreamer.toybox.demo $(if $(value PROMPT),"$$TEXT") --models $(MODELS)
+
+demo-exact: $(VENV)/ready          ## train the bundled toy from a coarse prior with the exact score, offline, on the CPU
+	$(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
 
 test: $(VENV)/ready-for-tests      ## every test that isn't slow, one worker per core
 	$(PYTEST) -m "not slow"

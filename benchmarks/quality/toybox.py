@@ -40,6 +40,7 @@ from tqdm import tqdm
 from benchmarks.quality.runs import CHARTS, add_jobs, append_rows, require_kernel, rows_of
 from benchmarks.quality.toybox_jobs import (
     CHART,
+    CONFIG,
     EXACT,
     MODELS_BESIDE_GUIDANCE,
     RECOGNIZED,
@@ -57,6 +58,7 @@ from benchmarks.quality.toybox_jobs import (
 from benchmarks.quality.toybox_jobs import (
     CHARTS as VARIANTS,
 )
+from threestudio_gaussiandreamer.guidance.half_precision import cpu_multiplies_bfloat16
 
 KEY = ("variant", "x", "withheld", "index", "seed", "setup", "judge")
 COLUMNS = [*KEY, "prompt", "cpu_seconds", "gaussians"]
@@ -230,6 +232,8 @@ def main() -> None:
         print("\n".join(" | ".join((*task.key, task.prompt.text)) for task in todo))
         return
     require_kernel()
+    if reason := not_comparable(arguments.out):
+        sys.exit(reason)
     os.environ |= ENVIRONMENT
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(arguments.jobs, mp_context=spawn, initializer=prepare) as pool:
@@ -258,6 +262,17 @@ def parse_arguments() -> argparse.Namespace:
     if arguments.charts is None:
         arguments.charts = [] if arguments.variant else list(VARIANTS)
     return arguments
+
+
+def not_comparable(out: Path) -> str:
+    """Return why rows of this CPU don't belong to those of ``out``; empty if they do."""
+    wanted = CONFIG["system"]["guidance"]["half_precision_on_cpu"]
+    if out.resolve() != CHARTS.resolve() or not wanted or cpu_multiplies_bfloat16():
+        return ""
+    return (
+        f"the rows in {CHARTS} are of networks in bfloat16, which this CPU doesn't multiply: give "
+        "another folder as --out"
+    )
 
 
 def variant(text: str) -> Variant:

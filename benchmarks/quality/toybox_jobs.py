@@ -35,6 +35,7 @@ RECOGNIZED = (*ATTRIBUTES, "multi_face")
 CONFIG = yaml.safe_load((ROOT / "configs/toybox.yaml").read_text())
 STEPS = CONFIG["trainer"]["max_steps"]
 GUIDANCE = CONFIG["system"]["guidance"]["guidance_scale"]
+CONTRAST = CONFIG["system"]["guidance"]["view_contrast"]
 DEFAULT, PAPER_RECIPE = "toybox.yaml", "the paper's recipe"
 SAMPLES, TRUTH = "the 2D model's samples", "ground truth"
 """Variants without a run: what the 2D model draws, and ray-cast views of the object itself."""
@@ -59,7 +60,10 @@ BALL = {
     "system.geometry.prior": "{num_points: 3000, size: 0.8, color: grey}",
     "system.geometry.grow.enabled": "false",
 }
-WITHOUT_VIEWS = {"system.guidance.view_dependent_prompting": "false"}
+WITHOUT_VIEWS = {
+    "system.guidance.view_dependent_prompting": "false",
+    "system.guidance.view_contrast": 0,
+}
 ONE_SIDE = {"system.prompt_processor.view_dependent_left_and_right": "false"}
 WRONG_PRIOR = "another kind's prior"
 """A variant whose prior gets the prompt with the next kind of object in place of its own."""
@@ -165,8 +169,8 @@ def over_steps() -> Iterator[Variant]:
 
 
 def over_guidance() -> Iterator[Variant]:
-    """Scales of guidance beside the configuration's, 1 without guidance and the last that of the
-    paper.
+    """Scales of guidance beside the configuration's, 1 without guidance except for the contrast of
+    views, and the last that of the paper.
     """
     for scale in (1, 2, 8, 15, 30, PAPER_SCALE):
         yield Variant("guidance scale", scale, {"system.guidance.guidance_scale": scale})
@@ -246,7 +250,9 @@ def cheaper() -> Iterator[Variant]:
 
 
 def starts() -> Iterator[Variant]:
-    """What the second stage starts from, with and without the views' directions in the prompts."""
+    """What the second stage starts from, with and without the views' directions in the prompts; a
+    contrast of views needs these.
+    """
     yield Variant("prior, no view prompts", 0, WITHOUT_VIEWS)
     yield Variant('"side view" for left and right', 0, ONE_SIDE)
     yield Variant(WRONG_PRIOR)
@@ -255,14 +261,16 @@ def starts() -> Iterator[Variant]:
 
 
 def view_contrast() -> Iterator[Variant]:
-    """Factors of the contrast with the opposite view's prompt, also at large timesteps only, and
-    Perp-Neg.
+    """Factors of the contrast with the opposite view's prompt beside the configuration's, also at
+    large timesteps only, and Perp-Neg in its place.
     """
     name = "system.guidance.view_contrast"
-    for factor in (0.75, 1.5, 3):
+    yield Variant("no view contrast", 0, {name: 0})
+    for factor in (0.75, 3):
         yield Variant("view contrast", factor, {name: factor})
-    yield Variant("view contrast from 0.55", 1.5, {name: 1.5, f"{name}_from": 0.55})
-    yield Variant("Perp-Neg", 0, {"system.prompt_processor.use_perp_neg": "true"})
+    yield Variant("view contrast from 0.55", CONTRAST, {f"{name}_from": 0.55})
+    perp_neg = {name: 0, "system.prompt_processor.use_perp_neg": "true"}
+    yield Variant("Perp-Neg", 0, perp_neg)
 
 
 def growing() -> Iterator[Variant]:

@@ -6,6 +6,7 @@ accessory) that the judge finds in the result. A dagger marks comparisons of whi
 measured with earlier models or an earlier toybox.yaml, or scored by an earlier judge.
 """
 
+import itertools
 import math
 import statistics
 from collections.abc import Callable, Sequence
@@ -32,6 +33,8 @@ DISTILLATIONS = ("paper", "distillations", "cheaper")
 ENOUGH = 8
 """Rows of the present state of which those of earlier ones say nothing more."""
 EARLIER = {
+    "98917812": "no view contrast",
+    "c9adfc93": "networks in float32",
     "91562c50": "U-Net before 184,000 further pictures",
     "943e902e": "U-Net before the training on joined views",
     "6075424d": "300 steps",
@@ -54,28 +57,28 @@ def settings() -> str:
 
 
 def earlier_models(rows: Sequence[Row]) -> list[tuple[str, ...]]:
-    """Return a line for each of the states in EARLIER and each judge, compared with the present
-    state, or the last one that this judge scored.
+    """Return a line for each of the states in EARLIER and each judge, compared with the state that
+    followed it, of those that this judge scored.
     """
     rows = [row for row in rows if row["variant"] == toybox_jobs.DEFAULT]
     lines = []
     for judge in dict.fromkeys(row["judge"] for row in sorted(rows, key=is_present, reverse=True)):
         scored = [row for row in rows if row["judge"] == judge]
-        base = newest(scored)
-        plain = {place(row)[:2]: row for row in scored if row["setup"] == base}
         mark = "" if any(map(is_present, scored)) else " †"
-        for setup, title in EARLIER.items():
-            own = [row for row in scored if row["setup"] == setup and place(row)[:2] in plain]
-            if own and setup != base:
-                lines.append(line_of(title + mark, own, [plain[place(row)[:2]] for row in own]))
+        states = [[row for row in scored if row["setup"] == setup] for setup in states_of(scored)]
+        for after, before in itertools.pairwise(states):
+            plain = {place(row)[:2]: row for row in after}
+            own = [row for row in before if place(row)[:2] in plain]
+            if own:
+                title = EARLIER[own[0]["setup"]] + mark
+                lines.append(line_of(title, own, [plain[place(row)[:2]] for row in own]))
     return lines
 
 
-def newest(rows: Sequence[Row]) -> str:
-    """Return the newest state that these rows have; EARLIER begins with the newest."""
-    setups = [row["setup"] for row in rows]
-    order = [toybox_jobs.setup(), *EARLIER]
-    return min(setups, key=lambda setup: order.index(setup) if setup in order else len(order))
+def states_of(rows: Sequence[Row]) -> list[str]:
+    """Return the known states that these rows have, the newest first."""
+    found = {row["setup"] for row in rows}
+    return [setup for setup in (toybox_jobs.setup(), *EARLIER) if setup in found]
 
 
 def table(*charts: str, first: Sequence[tuple[str, ...]] = ()) -> str:

@@ -35,7 +35,7 @@ def initial(count: int = 4000) -> Scene:
 
 
 def trained() -> Scene:
-    """The bundled toy after `make demo` at 128^2 with 2,500 Gaussians."""
+    """The bundled toy after `make demo-exact` at 128^2 with 2,500 Gaussians."""
     cloud = read_gaussians(TRAINED)
     tensors = {
         name: torch.as_tensor(getattr(cloud, name)).float()

@@ -1,8 +1,8 @@
-"""Seconds per stage of ``make demo`` from an empty clone, installation included.
+"""Seconds per stage of ``make demo-exact`` from an empty clone, installation included.
 
     python -m benchmarks.start.demo_stages [--folder empty/folder]
 
-Clones this repository's HEAD, and runs the steps of ``make demo`` one after the other: virtual
+Clones this repository's HEAD, and runs the steps of ``make demo-exact`` in turn: virtual
 environment, installation of the dependencies and of the package, the demo. Compiling the kernels is
 timed once more on its own. Needs a package index; pip's cache isn't used. Writes
 ``benchmarks/results/demo_stages.csv``: seconds of the clock, which other programs on the machine
@@ -57,7 +57,7 @@ def stages(clone: Path) -> Iterator[Row]:
     extension.mkdir(parents=True)
     shutil.copy(PROBE, extension / "__init__.py")
     started = time.time()
-    _, output = timed("demo", ["make", "demo"], clone)
+    _, output = timed("demo", ["make", "demo-exact"], clone)
     (line,) = (line for line in output.splitlines() if line.startswith(MARK))
     yield from differences(json.loads(line.removeprefix(MARK)), started)
 

@@ -70,7 +70,7 @@ def _with_share(medians: dict[str, float], parts: list[str]) -> str:
 
 
 def demo_stages() -> str:
-    """Return the seconds of each stage of ``make demo``."""
+    """Return the seconds of each stage of ``make demo-exact``."""
     rows = read(FOLDER / "demo_stages.csv")
     lines = [
         (row["stage"], f"{float(row['seconds']):.1f}", f"{float(row['cpu_seconds']):.1f}")

@@ -103,6 +103,14 @@ def test_scoring_alone_needs_the_folder_of_the_runs(monkeypatch, capsys):
     assert "give the runs' folder as --keep" in capsys.readouterr().err
 
 
+def test_rows_of_other_precisions_are_not_mixed(monkeypatch, tmp_path):
+    monkeypatch.setattr(toybox, "cpu_multiplies_bfloat16", lambda: False)
+    assert "give another folder as --out" in toybox.not_comparable(runs.CHARTS)
+    assert toybox.not_comparable(tmp_path) == ""
+    monkeypatch.setattr(toybox, "cpu_multiplies_bfloat16", lambda: True)
+    assert toybox.not_comparable(runs.CHARTS) == ""
+
+
 def test_of_the_missing_rows_only_those_of_kept_runs_are_scored(monkeypatch, tmp_path):
     words = ["--charts", "default", "--prompts", "seen", "--count", 3, "--keep", tmp_path / "runs"]
     words += ["--out", tmp_path]
@@ -225,8 +233,12 @@ def test_the_configuration_itself_is_a_point_of_a_chart():
     same, other = row(), row(seed="1")
     found = toybox_tables.default_at(line, varied, [*varied, same, other])
     assert found == [same | {"x": f"{toybox_jobs.GUIDANCE:g}"}]
-    for name, own in (("guidance", toybox_jobs.GUIDANCE), ("steps", STEPS)):
-        assert own not in [variant.x for variant in toybox_jobs.CHARTS[name]()]
+    for chart, variant in (
+        ("guidance", Variant("guidance scale", toybox_jobs.GUIDANCE)),
+        ("steps", Variant("steps", STEPS)),
+        ("view_contrast", Variant("view contrast", toybox_jobs.CONTRAST)),
+    ):
+        assert variant.key not in [other.key for other in toybox_jobs.CHARTS[chart]()]
 
 
 def test_rows_of_another_judge_are_not_of_the_present_state():

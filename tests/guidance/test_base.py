@@ -3,6 +3,7 @@ precision.
 """
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -30,6 +31,8 @@ from threestudio_gaussiandreamer.guidance.half_precision import (
 from threestudio_gaussiandreamer.guidance.stable_diffusion import StableDiffusionGuidance
 
 pytest.importorskip("diffusers")
+
+CPUINFO = Path("/proc/cpuinfo")
 
 
 # Against float64 by hand
@@ -265,6 +268,14 @@ def test_half_precision_on_a_cpu_is_bfloat16_where_it_is_native(monkeypatch, nat
     assert channels_last(cfg, torch.bfloat16, gpu)
     cfg.half_precision_weights = False
     assert weights_type(cfg, gpu) == weights_type(cfg, cpu) == torch.float32
+
+
+@pytest.mark.skipif(
+    not (hasattr(torch.cpu, "get_capabilities") and CPUINFO.exists()), reason="nothing to compare"
+)
+def test_which_cpus_multiply_bfloat16():
+    flags = set(CPUINFO.read_text().split())
+    assert half_precision.cpu_multiplies_bfloat16() == bool(flags & {"avx512_bf16", "amx_bf16"})
 
 
 def test_the_gradient_in_bfloat16_on_a_cpu(models, prompts, monkeypatch):

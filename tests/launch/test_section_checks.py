@@ -30,7 +30,7 @@ WRONG = [
         [PERP_NEG, "system.guidance.view_dependent_prompting=false"],
         "set system.guidance.view_dependent_prompting=true",
     ),
-    (("toybox",), [PERP_NEG, "system.guidance.view_contrast=1"], "view_contrast does"),
+    (("toybox",), [PERP_NEG], "or system.guidance.view_contrast=0"),
     (
         ("gaussiandreamer",),
         ["system.prompt_processor_type=plain-prompt-processor", "system.prompt_processor={}"],
@@ -50,7 +50,7 @@ def test_contradictions_are_named(names, overrides, message):
 @pytest.mark.parametrize(
     ("names", "overrides"),
     [
-        (("toybox",), [PERP_NEG]),
+        (("toybox",), [PERP_NEG, "system.guidance.view_contrast=0"]),
         (("toybox",), HELD),  # with a fixed background
         (("demo",), [*HELD, "system.background.hold_steps=4"]),
         (("demo",), [HELD[0], "data.train_views=4", "system.background.hold_steps=4"]),

@@ -27,8 +27,8 @@ def weights_type(cfg: Any, device: torch.device) -> torch.dtype:
     bfloat16, if ``half_precision_on_cpu`` is set and the CPU multiplies it; else float32.
 
     Args:
-        cfg: options of a guidance by a text-to-image model; all of it is float32 unless
-            ``half_precision_weights`` is set.
+        cfg: options of a guidance by a text-to-image model. Without ``half_precision_weights`` the
+            type is float32.
     """
     if not cfg.half_precision_weights:
         return torch.float32
@@ -42,8 +42,8 @@ def cpu_multiplies_bfloat16() -> bool:
     """Return whether the CPU has instructions that multiply bfloat16 (AVX-512 BF16, AMX). Others
     convert each number, which takes more time than float32.
     """
-    names = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")  # torch has no public ones
-    return any(getattr(torch.cpu, name, bool)() for name in names)
+    has = getattr(torch.cpu, "get_capabilities", dict)()  # older torch doesn't report any
+    return any(has.get(name, False) for name in ("avx512_bf16", "amx_bf16"))
 
 
 def channels_last(cfg: Any, dtype: torch.dtype, device: torch.device) -> bool:

@@ -17,8 +17,8 @@ image_size                          height and width that the model sees, pixels
 half_precision_weights              half precision on a GPU; images, latents, gradients and
                                     splatting stay float32
 half_precision_type                 float16 or bfloat16, whose range is that of float32
-half_precision_on_cpu               bfloat16 on a CPU too, if it has instructions that multiply it:
-                                    faster, and half of the memory
+half_precision_on_cpu               with half_precision_weights: bfloat16 on a CPU too, if it has
+                                    instructions that multiply it; faster, and half of the memory
 enable_channels_last_format         lay the weights out channels last; not in bfloat16 on a CPU
 enable_torch_compile                compile the network on its first use
 enable_attention_slicing            attention in slices: less memory, slower
@@ -164,7 +164,7 @@ class TextToImageDistillation(ScoreDistillation):
         """Load the networks; subclasses extend this with their own."""
         self.load_denoiser(folder)
         if self.cfg.enable_memory_efficient_attention:
-            debug("enable_memory_efficient_attention: torch's attention is so already")
+            debug("enable_memory_efficient_attention: torch's attention needs little memory")
 
     def load_denoiser(self, folder: Path) -> None:
         """Load the network that predicts the noise, and set ``text_width`` and ``scale_width``."""

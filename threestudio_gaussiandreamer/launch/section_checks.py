@@ -71,4 +71,7 @@ def _check_prompts(guidance: Any, system: Any) -> None:
     if not guidance.view_dependent_prompting:
         raise UserError(f"{refused}: set system.guidance.view_dependent_prompting=true")
     if guidance.get("view_contrast"):
-        raise UserError(f"{refused}, as system.guidance.view_contrast does: set one of them to 0")
+        raise UserError(
+            f"{refused}, as system.guidance.view_contrast does: set "
+            "system.prompt_processor.use_perp_neg=false, or system.guidance.view_contrast=0"
+        )

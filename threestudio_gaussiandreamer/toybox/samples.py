@@ -1,6 +1,6 @@
 """Draw pictures with the 2D model itself, from the directions of some views.
 
-They show what the score distillation can at best agree with.
+They show what the score distillation is guided towards, without a contrast of views.
 """
 
 import torch
