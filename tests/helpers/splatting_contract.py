@@ -64,6 +64,23 @@ class KernelContract(LimitsContract):
     def test_options(self, backend, options):
         compare(backend, random_cloud(150, seed=1, size=0.2), cameras(2, 34, 18), 34, 18, **options)
 
+    @pytest.mark.parametrize("downsample", [1, 2])
+    def test_the_backgrounds_gradient_where_there_is_nothing_else(self, backend, downsample):
+        """Most tiles have no Gaussian; a loss of alpha alone doesn't depend on the background."""
+        cloud = random_cloud(3, seed=2, size=0.02).to(torch.float32).leaves()
+        width, height = 150 * downsample, 90 * downsample
+        camera = cameras(2, width, height, dtype=torch.float32)
+        background = torch.tensor(BACKGROUND.tolist(), requires_grad=True)
+        options = {"background": background, "backend": backend, "downsample": downsample}
+        out = rasterize(*cloud, *camera, width, height, **options)
+        upstream = torch.rand(out.image.shape, generator=torch.Generator().manual_seed(0))
+        (found,) = torch.autograd.grad(out.image, background, upstream, retain_graph=True)
+        expected = ((1 - out.alpha.detach().double()) * upstream).sum((0, 1, 2))
+        torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=0)
+        assert 0 < out.alpha.count_nonzero() < 0.1 * out.alpha.numel()
+        (none,) = torch.autograd.grad(out.alpha.sum(), background, allow_unused=True)
+        assert none is None or not none.any()
+
     @pytest.mark.parametrize("antialias", [False, True])
     def test_opacity_zero_has_a_gradient_without_alpha_min(self, backend, antialias):
         """``d alpha / d opacity`` is not zero at opacity 0; below zero nothing is rendered."""
