@@ -103,6 +103,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "docs/toybox.md": {
         "models": toybox.card,
         "toybox": toybox.results,
+        "seeds": toybox.seeds,
         "judges": toybox.judges,
         "settings": toybox_variants.settings,
     },

@@ -142,6 +142,22 @@ def results() -> str:
     return markdown(("variant", "prompts", *HEAD, "haze, %", "Gaussians", "CPU seconds"), lines)
 
 
+def seeds() -> str:
+    """Return the results of toybox.yaml for each seed, on the prompts that were run with all."""
+    groups: dict[str, list[Row]] = {}
+    for row in present():
+        if row["variant"] == DEFAULT:
+            groups.setdefault(row["seed"], []).append(row)
+    if len(groups) < 2:
+        return NOT_MEASURED
+    common = set.intersection(*({row["prompt"] for row in rows} for rows in groups.values()))
+    lines = [
+        line_of(seed, [row for row in rows if row["prompt"] in common])[: 2 + len(RECOGNIZED)]
+        for seed, rows in sorted(groups.items())
+    ]
+    return markdown(("seed", "prompts", *HEAD), lines)
+
+
 def judges() -> str:
     """Return what the present judge and earlier ones recognise in the same pictures."""
     groups: dict[tuple[str, str], dict[str, list[Row]]] = {}

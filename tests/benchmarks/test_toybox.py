@@ -241,6 +241,15 @@ def test_the_configuration_itself_is_a_point_of_a_chart():
         assert variant.key not in [other.key for other in toybox_jobs.CHARTS[chart]()]
 
 
+def test_seeds_are_compared_on_the_prompts_that_all_have(monkeypatch):
+    rows = [row(), row(prompt="a blue car", multi_face="0")]
+    monkeypatch.setattr(toybox_tables, "measured", lambda: rows)
+    assert toybox_tables.seeds() == toybox_tables.NOT_MEASURED
+    rows += [row(seed="1", kind="0"), row(seed="2", setup="earlier")]
+    first, second = toybox_tables.seeds().splitlines()[2:]
+    assert first.startswith("| 0 | 1 | 100 (") and second.startswith("| 1 | 1 | 0 (")
+
+
 def test_rows_of_another_judge_are_not_of_the_present_state():
     """Of two scores of the same runs, those of the bundled judge are shown."""
     plain = [row(), row(judge="another", kind="0")]
