@@ -2,11 +2,11 @@
 
     python -m benchmarks.models.precision [--rounds 7]
 
-Calls of one training step of toybox.yaml, one thread: the autoencoder's encoder on 4 pictures of
-128 x 128 with its gradient, and the U-Net on 8 latents. Weights and inputs are of the precision's
-type, as with ``half_precision_on_cpu``. The settings alternate; ``cpu_ms`` is the median of the
-rounds, ``error`` the largest difference to float32, relative to the largest value. Writes
-``benchmarks/results/precision.csv``."""
+Calls of one training step of toybox.yaml without view contrast, one thread: the autoencoder's
+encoder on 4 pictures of 128 x 128 with its gradient, and the U-Net on 8 latents. Weights and inputs
+are of the precision's type, as with ``half_precision_on_cpu``. The settings alternate; ``cpu_ms``
+is the median of the rounds, ``error`` the largest difference to float32, relative to the largest
+value. Writes ``benchmarks/results/precision.csv``."""
 
 import argparse
 import csv

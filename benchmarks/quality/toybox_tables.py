@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.markdown import markdown
+from benchmarks.quality.chart_runs import grouped
 from benchmarks.quality.runs import CHARTS, rows_of
 from benchmarks.quality.toybox_jobs import (
     ATTRIBUTES,
@@ -114,10 +115,7 @@ def is_present(row: Row) -> bool:
 
 def variants(rows: Iterable[Row]) -> Iterator[tuple[str, list[Row]]]:
     """Yield name and rows of each variant, in the order of their measurement."""
-    groups: dict[str, list[Row]] = {}
-    for row in rows:
-        groups.setdefault(title_of(row), []).append(row)
-    yield from groups.items()
+    yield from grouped(rows, title_of).items()
 
 
 def title_of(row: Row) -> str:
@@ -144,15 +142,13 @@ def results() -> str:
 
 def seeds() -> str:
     """Return the results of toybox.yaml for each seed, on the prompts that were run with all."""
-    groups: dict[str, list[Row]] = {}
-    for row in present():
-        if row["variant"] == DEFAULT:
-            groups.setdefault(row["seed"], []).append(row)
+    rows = [row for row in present() if row["variant"] == DEFAULT]
+    groups = grouped(rows, lambda row: row["seed"])
     if len(groups) < 2:
         return NOT_MEASURED
     common = set.intersection(*({row["prompt"] for row in rows} for rows in groups.values()))
     lines = [
-        line_of(seed, [row for row in rows if row["prompt"] in common])[: 2 + len(RECOGNIZED)]
+        scores_of(seed, [row for row in rows if row["prompt"] in common])
         for seed, rows in sorted(groups.items())
     ]
     return markdown(("seed", "prompts", *HEAD), lines)
@@ -160,18 +156,15 @@ def seeds() -> str:
 
 def judges() -> str:
     """Return what the present judge and earlier ones recognise in the same pictures."""
-    groups: dict[tuple[str, str], dict[str, list[Row]]] = {}
-    for row in measured():
-        if row["variant"] in (TRUTH, DEFAULT):
-            group = groups.setdefault((row["variant"], row["setup"]), {})
-            group.setdefault(row["judge"], []).append(row)
+    rows = [row for row in measured() if row["variant"] in (TRUTH, DEFAULT)]
     lines = []
-    for (name, _), scored in groups.items():
+    for (name, _), pictures in grouped(rows, lambda row: (row["variant"], row["setup"])).items():
+        scored = grouped(pictures, lambda row: row["judge"])
         prompts = {row["prompt"] for row in scored.get(judge_of(), [])}
         for judge, rows in scored.items():
             same = [row for row in rows if row["prompt"] in prompts]
             if same and len(scored) > 1:
-                lines.append([name, judge, *line_of(name, same)[1 : 2 + len(RECOGNIZED)]])
+                lines.append([name, *scores_of(judge, same)])
     return markdown(("pictures", "judge", "prompts", *HEAD), lines) if lines else NOT_MEASURED
 
 
@@ -182,15 +175,18 @@ def summary() -> str:
     return " / ".join(f"{100 * mean:.0f}" for mean in means) if rows else NOT_MEASURED
 
 
-def line_of(name: str, rows: list[Row], prefix: str = "") -> list[str]:
+def scores_of(name: str, rows: list[Row], prefix: str = "") -> list[str]:
     prompts = len({row["prompt"] for row in rows})
-    cells = [percent(estimate(rows, column, prefix)) for column in RECOGNIZED]
+    return [name, str(prompts), *(percent(estimate(rows, key, prefix)) for key in RECOGNIZED)]
+
+
+def line_of(name: str, rows: list[Row], prefix: str = "") -> list[str]:
     others = ["", "", ""]
     if not prefix:
         haze = [f"{100 * float(row['haze']):.1f}" for row in rows if row["haze"]]
         others[0] = f"{np.median(np.array(haze, float)):.1f}" if haze else ""
         others[1:] = [median_of(rows, "gaussians"), median_of(rows, "cpu_seconds")]
-    return [name, str(prompts), *cells, *others]
+    return [*scores_of(name, rows, prefix), *others]
 
 
 def card() -> str:

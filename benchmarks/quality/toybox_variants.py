@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks.markdown import markdown
 from benchmarks.quality import toybox_jobs
+from benchmarks.quality.chart_runs import grouped
 from benchmarks.quality.toybox_tables import (
     NOT_MEASURED,
     Row,
@@ -96,10 +97,8 @@ def pairs_of(rows: Sequence[Row], name: str, x: str) -> list[tuple[list[Row], li
     the present one alone if it has as many as ENOUGH.
     """
     plain = {place(row): row for row in rows if row["variant"] == toybox_jobs.DEFAULT}
-    groups: dict[tuple[str, ...], list[Row]] = {}
-    for row in rows:
-        if (row["variant"], row["x"]) == (name, x) and place(row) in plain:
-            groups.setdefault(place(row)[2:], []).append(row)
+    same = (row for row in rows if (row["variant"], row["x"]) == (name, x) and place(row) in plain)
+    groups = grouped(same, lambda row: place(row)[2:])
     present = [own for own in groups.values() if is_present(own[0]) and len(own) >= ENOUGH]
     return [(own, [plain[place(row)] for row in own]) for own in present or groups.values()]
 

@@ -283,7 +283,7 @@ def test_the_judge_is_identified_by_its_file(tmp_path):
 
 
 def test_earlier_models_are_compared_by_the_same_judge(monkeypatch):
-    """For a judge that didn't score the present models, the base is the newest state it scored."""
+    """Each state is compared with the next newer one that the judge scored."""
     rows = [row(setup="a", judge="first"), row(setup="b", judge="first")]
     rows += [row(), row(setup="b", kind="0")]
     monkeypatch.setattr(toybox_variants, "EARLIER", {"b": "state b", "a": "state a"})

@@ -32,6 +32,12 @@ if TYPE_CHECKING:
     from .text_to_image import TextToImageDistillation
 
 
+NOT_WITH_PERP_NEG = (
+    "view_contrast and Perp-Neg both compare the prompts of views: set "
+    "system.prompt_processor.use_perp_neg=false, or system.guidance.view_contrast=0"
+)
+
+
 def check_view_contrast(cfg: Any) -> None:
     """Raise UserError unless the options leave a prompt for each view.
 
@@ -62,10 +68,7 @@ def opposite(
         UserError: the prompts use Perp-Neg, which has negative prompts of its own.
     """
     if getattr(prompt_utils, "use_perp_neg", False):
-        raise UserError(
-            "view_contrast and Perp-Neg both compare the prompts of views: set "
-            "system.prompt_processor.use_perp_neg=false, or system.guidance.view_contrast=0"
-        )
+        raise UserError(NOT_WITH_PERP_NEG)
     embeddings = prompt_utils.get_text_embeddings(elevation, azimuth + 180, *other)
     return embeddings[: len(azimuth)]
 

@@ -5,6 +5,7 @@ section is valid by itself.
 from typing import Any
 
 from ..core.errors import UserError
+from ..guidance.view_contrast import NOT_WITH_PERP_NEG
 from ..host import find, parse_structured
 
 DATA = ("gaussiandreamer-datamodule", "random-camera-datamodule")
@@ -71,7 +72,4 @@ def _check_prompts(guidance: Any, system: Any) -> None:
     if not guidance.view_dependent_prompting:
         raise UserError(f"{refused}: set system.guidance.view_dependent_prompting=true")
     if guidance.get("view_contrast"):
-        raise UserError(
-            f"{refused}, as system.guidance.view_contrast does: set "
-            "system.prompt_processor.use_perp_neg=false, or system.guidance.view_contrast=0"
-        )
+        raise UserError(NOT_WITH_PERP_NEG)
