@@ -112,7 +112,9 @@ inline void fill_tiles(View& view, const DepthOrder& order, int64_t part) {
 // Assigns the Gaussians to the tiles; each part processes a contiguous range, which keeps the order.
 inline void deal_to_tiles(View& view, const uint64_t* keys, int64_t visible, int threads) {
   const DepthOrder order = {keys, visible, int(std::min<int64_t>(threads, visible / SLICE + 1))};
-  view.intersections.reserve(view.intersection_count), view.tile_begin.reserve(view.tiles() + 1);
+  constexpr int AHEAD = PREFETCH + LANES;
+  std::fill_n(view.intersections.reserve(view.intersection_count + AHEAD) + view.intersection_count, AHEAD, Intersection{});
+  view.tile_begin.reserve(view.tiles() + 1);
   if (!view.counted) {
     view.histogram.reserve(size_t(order.parts) * view.tiles());
     parallel_for(order.parts, threads, 1, [&](int64_t part) { count_tiles(view, order, part); });

@@ -75,6 +75,8 @@ inline void blend_tile_splats(const ForwardCall& call, View& view, int tile, con
     stage(view, frame, first, count, true, scratch.staged);
     std::memset(scratch.peaks, 0, sizeof(PeakRow) * count);
     ChunkLists* lists = call.keep ? &view.lists_of(tile, first) : nullptr;
+    if (lists && first > frame.begin)
+      std::memcpy(lists->transmittance.reserve(TILE_PIXELS), scratch.transmittance, sizeof scratch.transmittance);
     for_each_live_block(scratch.staged, live, lists, [&](const BlockPixels& pixels, const uint16_t* list, int length) {
       return blend_block(scratch, pixels, list, length, limits);
     });
@@ -91,9 +93,6 @@ inline void blend_tile(const ForwardCall& call, View& view, int tile) {
   std::memset(&scratch.planes, 0, sizeof scratch.planes);
   if (frame.begin < frame.end) blend_tile_splats(call, view, tile, frame, scratch);
   write_tile(call, view.index, frame, scratch.planes);
-  if (!call.keep || frame.begin == frame.end) return;
-  stream(view.planes[tile].red, scratch.planes.red, sizeof(Planes) / sizeof(float));
-  end_streams();
 }
 
 // The contribution of the Gaussians of a slice: the largest weight in any tile.

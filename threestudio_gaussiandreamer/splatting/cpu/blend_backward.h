@@ -1,9 +1,10 @@
 // Stage 4, backward: from the gradients of the pixels to one row of sums per (splat, tile).
 //
-// The splats are blended front to back once more. The sum behind splat i is then the pixel's total minus the sum so far,
-// so neither lists per pixel nor a division by T are needed. Per pair of splat and pixel only u = d loss / d ln(alpha) and the
-// weight are kept; transposed, LANES splats become lanes, and since y is linear in the pixel's coordinates, six moments of u
-// give the gradients of mean, covariance and opacity.
+// The splats of a block are blended twice: front to back for their alphas and weights, then back to front for `behind`, the
+// value of what lies behind a splat, seen without what lies before it. That needs neither a division by the transmittance nor
+// a difference of sums, and nothing of the pictures. Per pair of splat and pixel only u = d loss / d ln(alpha) and the weight are kept;
+// transposed, LANES splats become lanes, and since y is linear in the pixel's coordinates, six moments of u give the gradients of
+// mean, covariance and opacity.
 #pragma once
 
 #include "output.h"
@@ -12,17 +13,22 @@
 
 namespace splat {
 
+// Alphas and weights in the pixels of a block: of the splats of its list, front to back.
+struct BlendedList {
+  Floats alpha[CHUNK], weight[CHUNK];
+};
+
 struct BackwardScratch {
   Staged staged;
+  BlendedList blended;
   alignas(64) float sums[CHUNK * ROW];
-  alignas(64) float transmittance[TILE_PIXELS], behind[TILE_PIXELS];
+  alignas(64) float transmittance[TILE_PIXELS], behind[TILE_PIXELS], alpha[TILE_PIXELS];
   UpstreamPlanes upstream;
 };
 
 // Per splat (rows) and pixel of a block (lanes): LANES splats at a time.
 struct PairRows {
-  Floats u[LANES], weight[LANES], abs_x[LANES], abs_y[LANES];
-  alignas(64) float y1[LANES], y2[LANES];  // at the block's first pixel
+  Floats u[LANES], abs_x[LANES], abs_y[LANES];
 };
 
 // Over a block, one splat per lane, counted from the block's first pixel.
@@ -50,26 +56,33 @@ SPLAT_FN Floats weighted_sum(const Floats* rows, const float* weights) {
   return even + odd;
 }
 
+// a, b, c, shift_x and shift_y of a LocalSplat, one splat per lane; the others aren't used.
+using LocalColumns = Floats[8];
+
 // One row of sums per splat, from the rows of its pairs with the pixels of a block.
 template <bool ABSOLUTE>
-SPLAT_FN void sum_pairs(PairRows& rows, const Floats* splats, const UpstreamPlanes& up, const BlockPixels& pixels, Floats* sums) {
-  transpose(rows.u), transpose(rows.weight);
-  whiten_moments(moments_of(rows.u), splats[0], splats[1], splats[2], load(rows.y1), load(rows.y2), sums);
-  sums[RED] = weighted_sum(rows.weight, up.red + pixels.first), sums[GREEN] = weighted_sum(rows.weight, up.green + pixels.first);
-  sums[BLUE] = weighted_sum(rows.weight, up.blue + pixels.first),
-  sums[DEPTH] = weighted_sum(rows.weight, up.depth + pixels.first);
+SPLAT_FN void sum_pairs(PairRows& rows, Floats* weights, const LocalColumns& s, const UpstreamPlanes& up, const BlockPixels& pixels,
+                        Floats* sums) {
+  transpose(rows.u), transpose(weights);
+  const Floats y1 = s[0] * pixels.left + (s[1] * pixels.top + s[3]), y2 = s[2] * pixels.top + s[4];
+  whiten_moments(moments_of(rows.u), s[0], s[1], s[2], y1, y2, sums);
+  sums[RED] = weighted_sum(weights, up.red + pixels.first), sums[GREEN] = weighted_sum(weights, up.green + pixels.first);
+  sums[BLUE] = weighted_sum(weights, up.blue + pixels.first), sums[DEPTH] = weighted_sum(weights, up.depth + pixels.first);
   if constexpr (ABSOLUTE) {
     transpose(rows.abs_x), transpose(rows.abs_y);
     sums[ABS_X] = sum_rows(rows.abs_x), sums[ABS_Y] = sum_rows(rows.abs_y);
   }
 }
 
-// Adds the sums of `count` <= LANES splats over a block to those over the tile.
+// Adds the sums of `count` <= LANES splats over a block to those over the tile. Transposes the weights.
 template <bool ABSOLUTE>
-SPLAT_FN void add_pairs(BackwardScratch& scratch, PairRows& rows, const BlockPixels& pixels, const uint16_t* list, int count) {
-  Floats splats[4], sums[ROW] = {};
-  load_quad_columns([&](int l) { return &row_at(scratch.staged.splats, list[std::min(l, count - 1)]).a; }, splats);
-  sum_pairs<ABSOLUTE>(rows, splats, scratch.upstream, pixels, sums);
+SPLAT_FN void add_pairs(BackwardScratch& scratch, PairRows& rows, Floats* weights, const BlockPixels& pixels, const uint16_t* list,
+                        int count) {
+  LocalColumns columns;
+  Floats sums[ROW] = {};
+  load_quad_columns([&](int l) { return &row_at(scratch.staged.splats, list[l]).a; }, columns);
+  load_quad_columns([&](int l) { return &row_at(scratch.staged.splats, list[l]).shift_y; }, columns + 4);
+  sum_pairs<ABSOLUTE>(rows, weights, columns, scratch.upstream, pixels, sums);
   for (int first = 0; first < SUMS; first += LANES) {
     transpose(sums + first);
     for (int l = 0; l < count; l++) {
@@ -81,16 +94,16 @@ SPLAT_FN void add_pairs(BackwardScratch& scratch, PairRows& rows, const BlockPix
 
 SPLAT_FN Floats absolute(Floats x) { return maximum(x, -x); }
 
-// The state of a block in the pass front to back.
+// What the pixels of a block receive, and the state of the pass back to front.
 struct BlockState {
   Floats red, green, blue, depth, alpha;  // upstream
-  Floats transmittance, behind;
+  Floats behind;
 };
 
 SPLAT_FN BlockState load_block(const BackwardScratch& s, int at) {
   const UpstreamPlanes& up = s.upstream;
-  return {load(up.red + at),   load(up.green + at),        load(up.blue + at), load(up.depth + at),
-          load(up.alpha + at), load(s.transmittance + at), load(s.behind + at)};
+  return {load(up.red + at),   load(up.green + at), load(up.blue + at),
+          load(up.depth + at), load(up.alpha + at), load(s.behind + at)};
 }
 
 // d loss / d weight of the splats of a batch.
@@ -101,62 +114,75 @@ SPLAT_FN Batch values_of(const BatchSplats& s, const BlockState& block) {
   return each([&](int k) { return s[k].red * block.red + value.of[k]; });
 }
 
-// Blends a batch of splats into a block again and stores what their gradients need in the rows from `first` on.
+// Front to back: the alphas of a list of splats, zero where a pixel has stopped, and their weights, also added to the tile's alpha.
+SPLAT_FN void blend_again(BackwardScratch& scratch, const BlockPixels& pixels, const uint16_t* list, int length,
+                          const BlendLimits& limits) {
+  BlendedList& blended = scratch.blended;
+  Floats transmittance = load(scratch.transmittance + pixels.first), sum = load(scratch.alpha + pixels.first);
+  for (int i = 0; i < length; i += BATCH) {
+    Batch y1, y2;
+    const Batch alphas = alpha_of(power_at({scratch.staged, list + i}, pixels, y1, y2), limits.log2_alpha_min, limits.alpha_max);
+    for (int k = 0; k < BATCH; k++) {
+      const Floats alpha = select(transmittance >= limits.stop, alphas.of[k], Floats{}), weight = alpha * transmittance;
+      blended.alpha[i + k] = alpha, blended.weight[i + k] = weight;
+      transmittance -= alphas.of[k] * transmittance, sum += weight;
+    }
+    transmittance = select(transmittance >= limits.stop, transmittance, Floats{});  // avoids denormals
+  }
+  for (int i = whole_batches(length); i < whole_vectors(length); i++) blended.weight[i] = Floats{};
+  store(scratch.alpha + pixels.first, sum);
+}
+
+// Back to front: what the gradients of a batch of splats need, to the rows from `row` on.
 template <bool ABSOLUTE>
-SPLAT_FN void blend_backward(const BatchSplats& splats, const BlockPixels& pixels, const BlendLimits& limits, BlockState& block,
-                             PairRows& rows, int first) {
-  Batch y1, y2;
-  const Batch alphas = alpha_of(power_at(splats, pixels, y1, y2), limits.log2_alpha_min, limits.alpha_max);
-  const Batch odds = alphas / (1.0f - alphas), values = values_of(splats, block);
-  for (int k = 0; k < BATCH; k++) {
-    const int j = first + k;
-    const LocalSplat& s = splats[k];
-    const Floats alpha = alphas.of[k], value = values.of[k], weight = weight_of(alpha, block.transmittance, limits.stop);
-    block.behind -= weight * value;
-    const Floats u =
-        blend_vjp(alpha, odds.of[k], block.transmittance, weight, value, block.behind, limits.alpha_max, limits.stop);
-    block.transmittance -= alpha * block.transmittance;
-    rows.u[j] = u, rows.weight[j] = weight, rows.y1[j] = y1.of[k][0], rows.y2[j] = y2.of[k][0];
-    if constexpr (ABSOLUTE)
-      rows.abs_x[j] = absolute(u * s.a * y1.of[k]), rows.abs_y[j] = absolute(u * (s.b * y1.of[k] + s.c * y2.of[k]));
+SPLAT_FN void differentiate(const BatchSplats& splats, const Floats* alphas, const Floats* weights, const BlockPixels& pixels,
+                            float alpha_max, BlockState& block, PairRows& rows, int row) {
+  const Batch values = values_of(splats, block);
+  for (int k = BATCH - 1; k >= 0; k--) {
+    const Floats u = rows.u[row + k] = blend_vjp_back_to_front(alphas[k], weights[k], values.of[k], alpha_max, block.behind);
+    if constexpr (ABSOLUTE) {
+      const LocalSplat& s = splats[k];
+      const Floats y1 = s.a * pixels.x + (s.b * pixels.y + s.shift_x), y2 = s.c * pixels.y + s.shift_y;
+      rows.abs_x[row + k] = absolute(u * s.a * y1), rows.abs_y[row + k] = absolute(u * (s.b * y1 + s.c * y2));
+    }
   }
 }
 
 // Zeros for the rows from `first` on.
 template <bool ABSOLUTE> SPLAT_FN void clear_rows(PairRows& rows, int first) {
   for (int j = first; j < LANES; j++) {
-    rows.u[j] = rows.weight[j] = Floats{}, rows.y1[j] = rows.y2[j] = 0.0f;
+    rows.u[j] = Floats{};
     if constexpr (ABSOLUTE) rows.abs_x[j] = rows.abs_y[j] = Floats{};
   }
 }
 
-// Visits the splats of `list` in a block again.
+// Blends the splats of `list` into a block again and adds up their gradients.
 template <bool ABSOLUTE>
 SPLAT_FN void blend_block_backward(BackwardScratch& scratch, const BlockPixels& pixels, const uint16_t* list, int length,
                                    const BlendLimits& limits) {
+  blend_again(scratch, pixels, list, length, limits);
   BlockState block = load_block(scratch, pixels.first);
-  for (int i = 0; i < length; i += LANES) {
+  for (int first = (length - 1) / LANES * LANES; first >= 0; first -= LANES) {
+    const Floats* alphas = scratch.blended.alpha + first;
+    Floats* weights = scratch.blended.weight + first;
     PairRows rows;
-    const int count = std::min(LANES, length - i);
-    int filled = 0;
-    for (; filled < count; filled += BATCH)
-      blend_backward<ABSOLUTE>({scratch.staged, list + i + filled}, pixels, limits, block, rows, filled);
+    const int filled = std::min(LANES, whole_batches(length - first));
     clear_rows<ABSOLUTE>(rows, filled);
-    add_pairs<ABSOLUTE>(scratch, rows, pixels, list + i, count);
-    block.transmittance = select(block.transmittance >= limits.stop, block.transmittance, Floats{});
+    for (int row = filled - BATCH; row >= 0; row -= BATCH) {
+      const BatchSplats splats = {scratch.staged, list + first + row};
+      differentiate<ABSOLUTE>(splats, alphas + row, weights + row, pixels, limits.alpha_max, block, rows, row);
+    }
+    add_pairs<ABSOLUTE>(scratch, rows, weights, pixels, list + first, std::min(LANES, length - first));
   }
-  store(scratch.transmittance + pixels.first, block.transmittance), store(scratch.behind + pixels.first, block.behind);
+  store(scratch.behind + pixels.first, block.behind);
 }
 
-// The sum behind the first splat: weight * value over all splats, and the background's share.
-inline void start_behind(const Planes& planes, const Vec3<float>& background, BackwardScratch& scratch) {
+// Behind the last splat there is the background.
+inline void start_behind(const Vec3<float>& background, BackwardScratch& scratch) {
   const UpstreamPlanes& up = scratch.upstream;
-  for (int p = 0; p < TILE_PIXELS; p++) {
-    const float alpha = planes.alpha[p], rest = 1.0f - alpha;
-    scratch.behind[p] = up.red[p] * (planes.red[p] + rest * background.x) +
-                        up.green[p] * (planes.green[p] + rest * background.y) +
-                        up.blue[p] * (planes.blue[p] + rest * background.z) + up.depth[p] * planes.depth[p] + up.alpha[p] * alpha;
-  }
+  for (int p = 0; p < TILE_PIXELS; p += LANES)
+    store(scratch.behind + p,
+          load(up.red + p) * background.x + load(up.green + p) * background.y + load(up.blue + p) * background.z);
 }
 
 inline Vec3<float> over_lanes(const Vec3<Floats>& sum) {
@@ -177,17 +203,26 @@ inline void store_sums(const View& view, const float* sums, int first, int count
   for (int i = 0; i < count; i++) stream(slots + int64_t(view.intersections[first + i].slot) * ROW, sums + i * ROW, ROW);
 }
 
+// Of the pixels of a tile, before one of its chunks.
+inline void transmittance_before(const View& view, const TileFrame& frame, int first, const ChunkLists& lists,
+                                 float* transmittance) {
+  if (first == frame.begin) return start_transmittance(view, frame, transmittance);
+  std::copy_n(lists.transmittance.data(), TILE_PIXELS, transmittance);
+}
+
 // The rows of sums of all intersections of one tile, each into its slot; those behind the last chunk that contributes are zero.
 template <bool ABSOLUTE>
 inline void blend_lists_backward(const BackwardCall& call, const View& view, int tile, const TileFrame& frame,
                                  BackwardScratch& scratch) {
   const BlendLimits limits = limits_of(call.settings);
-  start_transmittance(view, frame, scratch.transmittance);
-  for (int first = frame.begin; first < frame.end; first += CHUNK) {
+  for (int first = frame.last_chunk(); first >= frame.begin; first -= CHUNK) {
     const int count = std::min(CHUNK, frame.end - first);
     std::memset(scratch.sums, 0, sizeof(float) * ROW * count);
     const ChunkLists& lists = view.lists_of(tile, first);
-    if (!lists.empty()) stage(view, frame, first, count, !lists.kept, scratch.staged);
+    if (!lists.empty()) {
+      stage(view, frame, first, count, !lists.kept, scratch.staged);
+      transmittance_before(view, frame, first, lists, scratch.transmittance);
+    }
     for_each_listed_block(scratch.staged, lists, [&](const BlockPixels& pixels, const uint16_t* list, int length) {
       blend_block_backward<ABSOLUTE>(scratch, pixels, list, length, limits);
     });
@@ -204,12 +239,13 @@ inline Vec3<float> blend_tile_backward(const BackwardCall& call, const View& vie
   BackwardScratch scratch;
   read_tile(call, view.index, frame, scratch.upstream);
   if (tile + 1 < view.tiles()) prefetch_tile<false>(upstream, frame_of(view, tile + 1), call.settings.downsample);
-  start_behind(view.planes[tile], background_of(call.scene, view.index), scratch);
+  start_behind(background_of(call.scene, view.index), scratch);
+  std::memset(scratch.alpha, 0, sizeof scratch.alpha);
   if (call.out.absgrad)
     blend_lists_backward<true>(call, view, tile, frame, scratch);
   else
     blend_lists_backward<false>(call, view, tile, frame, scratch);
-  return background_sum(view.planes[tile].alpha, scratch.upstream);
+  return background_sum(scratch.alpha, scratch.upstream);
 }
 
 }  // namespace splat

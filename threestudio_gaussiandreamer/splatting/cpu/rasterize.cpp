@@ -25,7 +25,6 @@ static void blend_views(const ForwardCall& call, Views& views) {
   for (int v = 0; v < call.scene.views; v++) {
     views[v].peaks.reserve(views[v].intersection_count);
     if (!call.keep) continue;
-    views[v].planes.reserve(tiles);
     while (views[v].lists.size() < size_t(views[v].intersection_count / CHUNK + tiles)) views[v].lists.emplace_back();
   }
   parallel_for(int64_t(tiles) * call.scene.views, call.settings.threads, TILE_GRAIN,

@@ -8,12 +8,12 @@
 
 namespace splat {
 
-constexpr int PREFETCH = 32;  // splats ahead
-
 struct TileFrame {
   int left, top;
   int begin, end;  // intersections
   bool inside;     // all of its pixels belong to the image
+
+  int last_chunk() const { return begin + std::max(end - begin - 1, 0) / CHUNK * CHUNK; }
 };
 
 inline TileFrame frame_of(const View& view, int tile) {
@@ -33,9 +33,10 @@ struct SplatLanes {
   Floats x, y, a, b, c, log2_opacity, depth, red, green, blue, inverse_a, tilt, slant, extent_x, extent_y, level;
 };
 
-SPLAT_FN SplatLanes load_splats(const View& view, const TileFrame& frame, int at, int count) {
+// The splats of LANES intersections from `at` on, which may reach into the next tile's; the lists leave those out.
+SPLAT_FN SplatLanes load_splats(const View& view, const TileFrame& frame, int at) {
   SplatLanes lanes;
-  load_columns<ROW>([&](int l) { return &view.splats[view.intersections[at + std::min(l, count - 1)].gaussian].x; }, &lanes.x);
+  load_columns<ROW>([&](int l) { return &view.splats[view.intersections[at + l].gaussian].x; }, &lanes.x);
   lanes.x -= float(frame.left), lanes.y -= float(frame.top);
   return lanes;
 }
@@ -65,6 +66,7 @@ constexpr int MASK_WORDS = BLOCKS / 32;
 SPLAT_FN void block_masks(const SplatLanes& s, Ints words[MASK_WORDS]) {
   const Ellipse<Floats> ellipse = {s.x, s.y, s.extent_y, s.c * s.c, s.level, s.inverse_a, s.tilt, s.slant};
   std::fill(words, words + MASK_WORDS, Ints{});
+#pragma GCC unroll 8
   for (int row = 0; row < BLOCK_ROWS; row++) words[row / 4] |= blocks_in_row(ellipse, row) << (8 * (row % 4));
 }
 
@@ -73,7 +75,11 @@ struct Staged {
   alignas(64) LocalSplat splats[CHUNK + 1];          // the last one is invisible
   alignas(64) uint32_t touching[MASK_WORDS][CHUNK];  // a bit per block; zero behind the last splat, up to a whole group
   int groups;                                        // of 64 splats
-#if !defined(__AVX512F__)
+#if defined(__AVX512F__)
+  // The splats that touch the row `row` of blocks: their number, positions, and a bit per block; zero up to a whole vector.
+  int row, in_row;
+  alignas(64) uint32_t row_positions[CHUNK + 16], row_touching[CHUNK + 16];
+#else
   uint64_t splats_of[BLOCKS / 64][CHUNK];  // [64 blocks][64 splats][block], one bit per splat
 #endif
 };
@@ -87,20 +93,38 @@ template <class Row> SPLAT_FN Row& row_at(Row* rows, uint16_t position) {
 }
 
 #if defined(__AVX512F__)
-SPLAT_FN void list_splats(Staged&) {}
+SPLAT_FN void list_splats(Staged& staged) { staged.row = -1; }
 
-// Writes the splats that touch a block; returns how many.
-SPLAT_FN int list_block(const Staged& staged, int block, BlockList& list) {
-  const __m512i bit = _mm512_set1_epi32(int(1u << block % 32)), step = _mm512_set1_epi32(16 * ROW);
+// Lists the splats that touch a row of blocks, so that the list of each of its blocks is a choice of those.
+SPLAT_FN void list_row(Staged& staged, int row) {
+  const uint32_t* words = staged.touching[row / 4];
+  const __m512i all = _mm512_set1_epi32(int(0xffu << 8 * (row % 4))), step = _mm512_set1_epi32(16 * ROW);
   __m512i positions = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
   positions = _mm512_mullo_epi32(positions, _mm512_set1_epi32(ROW));
   int count = 0;
   for (int i = 0; i < staged.groups * 64; i += 16) {
-    const __mmask16 touching = _mm512_test_epi32_mask(_mm512_load_si512(staged.touching[block / 32] + i), bit);
+    const __m512i blocks = _mm512_load_si512(words + i);
+    const __mmask16 touching = _mm512_test_epi32_mask(blocks, all);
+    _mm512_storeu_si512(staged.row_positions + count, _mm512_maskz_compress_epi32(touching, positions));
+    _mm512_storeu_si512(staged.row_touching + count, _mm512_maskz_compress_epi32(touching, blocks));
+    count += __builtin_popcount(touching);
+    positions = _mm512_add_epi32(positions, step);
+  }
+  _mm512_storeu_si512(staged.row_touching + count, _mm512_setzero_si512());
+  staged.row = row, staged.in_row = count;
+}
+
+// Writes the splats that touch a block; returns how many.
+SPLAT_FN int list_block(Staged& staged, int block, BlockList& list) {
+  if (staged.row != block / BLOCKS_PER_ROW) list_row(staged, block / BLOCKS_PER_ROW);
+  const __m512i bit = _mm512_set1_epi32(int(1u << block % 32));
+  int count = 0;
+  for (int i = 0; i < staged.in_row; i += 16) {
+    const __mmask16 touching = _mm512_test_epi32_mask(_mm512_load_si512(staged.row_touching + i), bit);
+    const __m512i positions = _mm512_load_si512(staged.row_positions + i);
     const __m256i splats = _mm512_cvtepi32_epi16(_mm512_maskz_compress_epi32(touching, positions));
     _mm256_storeu_si256(reinterpret_cast<__m256i*>(list + count), splats);
     count += __builtin_popcount(touching);
-    positions = _mm512_add_epi32(positions, step);
   }
   return count;
 }
@@ -159,9 +183,8 @@ SPLAT_FN int list_block(const Staged& staged, int block, BlockList& list) {
 // Transforms `count` splats to the coordinates of a tile, and finds the blocks that they touch.
 SPLAT_FN void stage(const View& view, const TileFrame& frame, int first, int count, bool find_blocks, Staged& staged) {
   for (int i = 0; i < count; i += LANES) {
-    for (int l = 0; l < LANES; l++)
-      __builtin_prefetch(&view.splats[view.intersections[std::min(first + i + l + PREFETCH, frame.end - 1)].gaussian]);
-    const SplatLanes splats = load_splats(view, frame, first + i, count - i);
+    for (int l = 0; l < LANES; l++) __builtin_prefetch(&view.splats[view.intersections[first + i + l + PREFETCH].gaussian]);
+    const SplatLanes splats = load_splats(view, frame, first + i);
     store_local(splats, staged.splats + i);
     if (!find_blocks) continue;
     Ints words[MASK_WORDS];
@@ -176,6 +199,7 @@ SPLAT_FN void stage(const View& view, const TileFrame& frame, int first, int cou
 }
 
 inline int whole_batches(int length) { return (length + BATCH - 1) / BATCH * BATCH; }
+inline int whole_vectors(int length) { return (length + LANES - 1) / LANES * LANES; }
 
 // The pixel centres of a block in tile coordinates.
 struct BlockPixels {
@@ -222,10 +246,10 @@ inline void start_transmittance(const View& view, const TileFrame& frame, float*
 // Which blocks still have pixels that haven't stopped.
 using LiveBlocks = std::bitset<BLOCKS>;
 
-// Writes the splats that touch a block, filled up to whole batches with the invisible one; returns how many touch it.
-SPLAT_FN int list_batches(const Staged& staged, int block, BlockList& list) {
+// Writes the splats that touch a block, filled up to whole vectors with the invisible one; returns how many touch it.
+SPLAT_FN int list_filled(Staged& staged, int block, BlockList& list) {
   const int length = list_block(staged, block, list);
-  std::fill(list + length, list + whole_batches(length), CHUNK * ROW);
+  std::fill(list + length, list + whole_vectors(length), CHUNK * ROW);
   return length;
 }
 
@@ -234,34 +258,34 @@ inline bool can_keep(const Staged& staged, ChunkLists& lists) {
   int64_t pairs = 0;
   for (const uint32_t* words : staged.touching)
     for (int i = 0; i < staged.groups * 64; i++) pairs += __builtin_popcount(words[i]);
-  if (pairs <= KEPT_PAIRS * CHUNK) lists.splats.reserve(pairs + BLOCKS * BATCH);
+  if (pairs <= KEPT_PAIRS * CHUNK) lists.splats.reserve(pairs + BLOCKS * LANES);
   return pairs <= KEPT_PAIRS * CHUNK;
 }
 
 // Calls blend(pixels, list, length) for each live block and the splats that touch it; it returns how many it needed, or 0 if
 // the block continues behind all of them. Keeps the lists unless `lists` is null.
-template <class Blend> SPLAT_FN void for_each_live_block(const Staged& staged, LiveBlocks& live, ChunkLists* lists, Blend blend) {
+template <class Blend> SPLAT_FN void for_each_live_block(Staged& staged, LiveBlocks& live, ChunkLists* lists, Blend blend) {
   BlockList list;
   uint16_t* keep = nullptr;
   if (lists && (lists->kept = can_keep(staged, *lists))) keep = lists->splats.data();
   for (int block = 0; block < BLOCKS; block++) {
-    int length = live[block] ? list_batches(staged, block, list) : 0;
+    int length = live[block] ? list_filled(staged, block, list) : 0;
     if (const int needed = length ? blend(block_pixels(block), list, length) : 0) length = needed, live.reset(block);
     if (lists) lists->lengths[block] = uint16_t(length);
-    if (keep) keep = std::copy(list, list + whole_batches(length), keep);
+    if (keep) keep = std::copy(list, list + whole_vectors(length), keep);
   }
 }
 
 // Calls blend(pixels, list, length) again for the same blocks and splats.
-template <class Blend> SPLAT_FN void for_each_listed_block(const Staged& staged, const ChunkLists& lists, Blend blend) {
+template <class Blend> SPLAT_FN void for_each_listed_block(Staged& staged, const ChunkLists& lists, Blend blend) {
   BlockList list;
   const uint16_t* kept = lists.splats.data();
   for (int block = 0; block < BLOCKS; block++) {
     const int length = lists.lengths[block];
     if (!length) continue;
-    if (!lists.kept) list_batches(staged, block, list);
+    if (!lists.kept) list_filled(staged, block, list);
     blend(block_pixels(block), lists.kept ? kept : list, length);
-    if (lists.kept) kept += whole_batches(length);
+    if (lists.kept) kept += whole_vectors(length);
   }
 }
 

@@ -16,7 +16,8 @@ namespace splat {
 constexpr int TILE = 32, TILE_PIXELS = TILE * TILE;
 constexpr int BLOCK_WIDTH = 4, BLOCK_HEIGHT = LANES / BLOCK_WIDTH;
 constexpr int BLOCKS_PER_ROW = TILE / BLOCK_WIDTH, BLOCK_ROWS = TILE / BLOCK_HEIGHT, BLOCKS = BLOCKS_PER_ROW * BLOCK_ROWS;
-constexpr int CHUNK = 512;  // splats of a tile that are blended at a time
+constexpr int CHUNK = 512;    // splats of a tile that are blended at a time
+constexpr int PREFETCH = 32;  // splats ahead
 
 constexpr int SLICE = 2048;  // Gaussians projected by one task
 
@@ -49,11 +50,12 @@ struct Intersection {
 constexpr int KEPT_PAIRS = 512 / LANES;  // of splats and blocks, per splat of a chunk; the lists of chunks with more aren't kept
 
 // The splats of a chunk that are blended into each block: block after block, front to back, each list filled up to whole
-// batches. A splat is the position of its first float among the chunk's, each of which has ROW floats.
+// vectors. A splat is the position of its first float among the chunk's, each of which has ROW floats.
 struct ChunkLists {
   uint16_t lengths[BLOCKS];
   bool kept;  // else there are the lengths only
   Buffer<uint16_t> splats;
+  Buffer<float> transmittance;  // (TILE_PIXELS) before the chunk; not set in a tile's first one
 
   bool empty() const {
     return std::all_of(lengths, lengths + BLOCKS, [](uint16_t length) { return length == 0; });
@@ -76,10 +78,9 @@ struct View {
   Buffer<int32_t> histogram;  // of the intersections by (part of the Gaussians, tile)
   bool counted;               // by the projection, as one part
   Buffer<int32_t> tile_begin;    // (tiles + 1) into intersections
-  Buffer<Intersection> intersections;         // by tile, then by depth
-  std::deque<ChunkLists> lists;  // never shrinks
-  Buffer<float> peaks;           // per slot, the largest weight of the Gaussian in the tile
-  Buffer<Planes> planes;         // (tiles) before the background; those of empty tiles aren't set
+  Buffer<Intersection> intersections;  // by tile, then by depth; behind them zeros, as many as are read ahead
+  std::deque<ChunkLists> lists;        // never shrinks
+  Buffer<float> peaks;                 // per slot, the largest weight of the Gaussian in the tile
 
   // Allocates everything whose size doesn't depend on the positions of the Gaussians.
   void prepare(const Scene& scene, int view) {

@@ -287,4 +287,12 @@ SPLAT_FN F blend_vjp(F alpha, F odds, F transmittance, F weight, F value, F behi
   return select((alpha < zero + alpha_max) & (transmittance >= zero + stop), u, zero);
 }
 
+// The same back to front, for an alpha that is zero where the pixel has stopped. `behind` is the value of what lies behind the
+// splat, seen without what lies before it, and becomes the value behind the splat before.
+template <class F> SPLAT_FN F blend_vjp_back_to_front(F alpha, F weight, F value, float alpha_max, F& behind) {
+  const F zero = {}, difference = value - behind;
+  behind += alpha * difference;
+  return select(alpha < zero + alpha_max, weight * difference, zero);
+}
+
 }  // namespace splat
