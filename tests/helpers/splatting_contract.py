@@ -95,7 +95,8 @@ class KernelContract(LimitsContract):
         """More than a chunk per tile, early termination, capped alphas; gradients of everything."""
         cloud = random_cloud(3000, seed=4, size=0.06)
         cloud.opacities[:150] = 0.9999
-        compare(backend, cloud, cameras(1, 66, 50), 66, 50, BACKGROUND, preset="fast")
+        options = {"preset": "fast", "absgrad": True}
+        compare(backend, cloud, cameras(1, 66, 50), 66, 50, BACKGROUND, **options)
 
     def test_more_than_a_chunk_of_gaussians_over_whole_tiles(self, backend):
         """Faint ones, so that none is hidden; the CPU kernel keeps no lists of so many pairs."""

@@ -15,8 +15,15 @@ import pytest
 import torch
 
 from tests.helpers.splatting_contract import KernelContract
-from tests.helpers.splatting_draws import draw
-from tests.helpers.splatting_scenes import cameras, equal, random_cloud
+from tests.helpers.splatting_draws import compare, draw
+from tests.helpers.splatting_scenes import (
+    Cloud,
+    cameras,
+    equal,
+    front_camera,
+    one_gaussian,
+    random_cloud,
+)
 from tests.helpers.threads import torch_threads
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import rasterize
@@ -47,6 +54,35 @@ class TestCpuKernel(KernelContract):
     @pytest.fixture
     def backend(self, isa):
         return "cpu"
+
+
+# ---- the two passes ------------------------------------------------------------------------------
+
+
+def test_buffers_that_were_used_before_change_nothing(isa):
+    """Faint Gaussians are drawn up to the last of a tile's three chunks, opaque ones in their place
+    only in the first; the second drawing gets the buffers of the first. Without a background, whose
+    gradient isn't exact behind opaque Gaussians.
+    """
+    faint = random_cloud(1200, seed=6, size=0.6)
+    faint.opacities.mul_(0.02)
+    opaque = faint._replace(opacities=torch.full_like(faint.opacities, 0.9))
+    for cloud in (faint, opaque, faint):
+        compare("cpu", cloud, cameras(1, 34, 18), 34, 18, preset="accurate", absgrad=True)
+
+
+def test_both_passes_stop_at_the_same_gaussian(isa):
+    """Also when the transmittance equals ``stop`` up to its last bit."""
+    generator = torch.Generator().manual_seed(0)
+    row = one_gaussian(scale=1e4)
+    for _ in range(100):
+        opacities = 0.05 + 0.45 * torch.rand(12, generator=generator)
+        stack = Cloud(*(x.repeat(12, *[1] * (x.dim() - 1)) for x in row))
+        stack = stack._replace(opacities=opacities.double())
+        stop = (1 - opacities).cumprod(0)[6].item()
+        for scale in (1 - 1.2e-7, 1, 1 + 1.2e-7):
+            drawn = draw("cpu", stack, front_camera(1, 1, 1.0), 1, 1, stop=stop * scale)
+            assert torch.equal(drawn.out.contribution[0] > 0, drawn.grads["colors"].any(1))
 
 
 # ---- the same bits -------------------------------------------------------------------------------

@@ -31,14 +31,8 @@ SPLAT_FN Batch operator-(const Batch& a, const Batch& b) {
 SPLAT_FN Batch operator*(const Batch& a, const Batch& b) {
   return each([&](int k) { return a.of[k] * b.of[k]; });
 }
-SPLAT_FN Batch operator/(const Batch& a, const Batch& b) {
-  return each([&](int k) { return a.of[k] / b.of[k]; });
-}
 SPLAT_FN Batch operator+(const Batch& a, float b) {
   return each([&](int k) { return a.of[k] + b; });
-}
-SPLAT_FN Batch operator-(float a, const Batch& b) {
-  return each([&](int k) { return a - b.of[k]; });
 }
 SPLAT_FN Batch operator*(float a, const Batch& b) {
   return each([&](int k) { return a * b.of[k]; });

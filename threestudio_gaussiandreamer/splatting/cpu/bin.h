@@ -66,9 +66,10 @@ template <class Visit> SPLAT_FN void for_each_of_part(const View& view, const De
   }
 }
 
-// What intersections take: they and their peaks, and for a backward pass their lists and gradients.
+// What intersections take: they and their peaks, and for a backward pass their lists, gradients and share of the transmittance.
 inline int64_t bytes_of(int64_t intersections, bool keep) {
-  const int64_t drawn = sizeof(Intersection) + sizeof(float), kept = sizeof(uint16_t) * KEPT_PAIRS + sizeof(float) * ROW;
+  const int64_t drawn = sizeof(Intersection) + sizeof(float);
+  const int64_t kept = sizeof(uint16_t) * KEPT_PAIRS + sizeof(float) * (ROW + TILE_PIXELS / CHUNK);
   return intersections * (drawn + (keep ? kept : 0));
 }
 
@@ -77,7 +78,7 @@ inline void number_slots(View& view, bool keep) {
   view.intersection_count = 0;
   for (Slice& slice : view.slices) slice.first_slot = int32_t(view.intersection_count), view.intersection_count += slice.slots;
   check_memory(bytes_of(view.intersection_count, keep));
-  if (view.intersection_count > INT32_MAX) throw OutOfMemory{view.intersection_count * int64_t(sizeof(float) * ROW)};
+  if (view.intersection_count > INT32_MAX - CHUNK) throw OutOfMemory{view.intersection_count * int64_t(sizeof(float) * ROW)};
 }
 
 inline void count_tiles(View& view, const DepthOrder& order, int64_t part) {

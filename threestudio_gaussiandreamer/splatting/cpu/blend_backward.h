@@ -2,9 +2,9 @@
 //
 // The splats of a block are blended twice: front to back for their alphas and weights, then back to front for `behind`, the
 // value of what lies behind a splat, seen without what lies before it. That needs neither a division by the transmittance nor
-// a difference of sums, and nothing of the pictures. Per pair of splat and pixel only u = d loss / d ln(alpha) and the weight are kept;
-// transposed, LANES splats become lanes, and since y is linear in the pixel's coordinates, six moments of u give the gradients of
-// mean, covariance and opacity.
+// a difference of sums, and nothing of the pictures. u = d loss / d ln(alpha) is kept for LANES splats at a time; transposed,
+// the splats become lanes, and since y is linear in the pixel's coordinates, six moments of u give the gradients of mean,
+// covariance and opacity.
 #pragma once
 
 #include "output.h"
@@ -13,7 +13,7 @@
 
 namespace splat {
 
-// Alphas and weights in the pixels of a block: of the splats of its list, front to back.
+// The alphas and weights of the splats of one block's list in its pixels, front to back.
 struct BlendedList {
   Floats alpha[CHUNK], weight[CHUNK];
 };
@@ -59,10 +59,10 @@ SPLAT_FN Floats weighted_sum(const Floats* rows, const float* weights) {
 // a, b, c, shift_x and shift_y of a LocalSplat, one splat per lane; the others aren't used.
 using LocalColumns = Floats[8];
 
-// One row of sums per splat, from the rows of its pairs with the pixels of a block.
+// One row of sums per splat, from the rows of its pairs with the pixels of a block, which are transposed.
 template <bool ABSOLUTE>
-SPLAT_FN void sum_pairs(PairRows& rows, Floats* weights, const LocalColumns& s, const UpstreamPlanes& up, const BlockPixels& pixels,
-                        Floats* sums) {
+SPLAT_FN void sum_pairs(PairRows& rows, Floats* weights, const LocalColumns& s, const UpstreamPlanes& up,
+                        const BlockPixels& pixels, Floats* sums) {
   transpose(rows.u), transpose(weights);
   const Floats y1 = s[0] * pixels.left + (s[1] * pixels.top + s[3]), y2 = s[2] * pixels.top + s[4];
   whiten_moments(moments_of(rows.u), s[0], s[1], s[2], y1, y2, sums);
@@ -74,10 +74,10 @@ SPLAT_FN void sum_pairs(PairRows& rows, Floats* weights, const LocalColumns& s, 
   }
 }
 
-// Adds the sums of `count` <= LANES splats over a block to those over the tile. Transposes the weights.
+// Adds the sums of `count` <= LANES splats over a block to those over the tile; the list has LANES entries, see list_filled.
 template <bool ABSOLUTE>
-SPLAT_FN void add_pairs(BackwardScratch& scratch, PairRows& rows, Floats* weights, const BlockPixels& pixels, const uint16_t* list,
-                        int count) {
+SPLAT_FN void add_pairs(BackwardScratch& scratch, PairRows& rows, Floats* weights, const BlockPixels& pixels,
+                        const uint16_t* list, int count) {
   LocalColumns columns;
   Floats sums[ROW] = {};
   load_quad_columns([&](int l) { return &row_at(scratch.staged.splats, list[l]).a; }, columns);
@@ -114,22 +114,24 @@ SPLAT_FN Batch values_of(const BatchSplats& s, const BlockState& block) {
   return each([&](int k) { return s[k].red * block.red + value.of[k]; });
 }
 
-// Front to back: the alphas of a list of splats, zero where a pixel has stopped, and their weights, also added to the tile's alpha.
+// Front to back: the alphas of a list of splats, zero where a pixel has stopped, and their weights, also added to the tile's
+// alpha. Transmittance and weight are computed as in the forward pass, so that both stop at the same splat.
 SPLAT_FN void blend_again(BackwardScratch& scratch, const BlockPixels& pixels, const uint16_t* list, int length,
                           const BlendLimits& limits) {
   BlendedList& blended = scratch.blended;
   Floats transmittance = load(scratch.transmittance + pixels.first), sum = load(scratch.alpha + pixels.first);
   for (int i = 0; i < length; i += BATCH) {
     Batch y1, y2;
-    const Batch alphas = alpha_of(power_at({scratch.staged, list + i}, pixels, y1, y2), limits.log2_alpha_min, limits.alpha_max);
+    const Batch powers = power_at({scratch.staged, list + i}, pixels, y1, y2);
+    const Batch alphas = alpha_of(powers, limits.log2_alpha_min, limits.alpha_max);
     for (int k = 0; k < BATCH; k++) {
-      const Floats alpha = select(transmittance >= limits.stop, alphas.of[k], Floats{}), weight = alpha * transmittance;
-      blended.alpha[i + k] = alpha, blended.weight[i + k] = weight;
-      transmittance -= alphas.of[k] * transmittance, sum += weight;
+      const Floats alpha = alphas.of[k], weight = weight_of(alpha, transmittance, limits.stop);
+      blended.alpha[i + k] = select(transmittance >= limits.stop, alpha, Floats{}), blended.weight[i + k] = weight;
+      transmittance -= alpha * transmittance, sum += weight;
     }
     transmittance = select(transmittance >= limits.stop, transmittance, Floats{});  // avoids denormals
   }
-  for (int i = whole_batches(length); i < whole_vectors(length); i++) blended.weight[i] = Floats{};
+  for (int i = whole_batches(length); i < whole_vectors(length); i++) blended.weight[i] = Floats{};  // as clear_rows
   store(scratch.alpha + pixels.first, sum);
 }
 
@@ -148,7 +150,7 @@ SPLAT_FN void differentiate(const BatchSplats& splats, const Floats* alphas, con
   }
 }
 
-// Zeros for the rows from `first` on.
+// Zeros for the rows from `first` on: nobody reads their sums, but denormals would be slow.
 template <bool ABSOLUTE> SPLAT_FN void clear_rows(PairRows& rows, int first) {
   for (int j = first; j < LANES; j++) {
     rows.u[j] = Floats{};

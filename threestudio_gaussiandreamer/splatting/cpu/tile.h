@@ -76,7 +76,8 @@ struct Staged {
   alignas(64) uint32_t touching[MASK_WORDS][CHUNK];  // a bit per block; zero behind the last splat, up to a whole group
   int groups;                                        // of 64 splats
 #if defined(__AVX512F__)
-  // The splats that touch the row `row` of blocks: their number, positions, and a bit per block; zero up to a whole vector.
+  // The splats that touch the row `row` of blocks (-1: none is listed yet): their number, their positions, and a bit per block,
+  // which is zero up to a whole vector.
   int row, in_row;
   alignas(64) uint32_t row_positions[CHUNK + 16], row_touching[CHUNK + 16];
 #else
@@ -246,7 +247,8 @@ inline void start_transmittance(const View& view, const TileFrame& frame, float*
 // Which blocks still have pixels that haven't stopped.
 using LiveBlocks = std::bitset<BLOCKS>;
 
-// Writes the splats that touch a block, filled up to whole vectors with the invisible one; returns how many touch it.
+// Writes the splats that touch a block, filled up to whole vectors with the invisible one, since the backward pass reads whole
+// vectors; returns how many touch it.
 SPLAT_FN int list_filled(Staged& staged, int block, BlockList& list) {
   const int length = list_block(staged, block, list);
   std::fill(list + length, list + whole_vectors(length), CHUNK * ROW);
@@ -281,9 +283,9 @@ template <class Blend> SPLAT_FN void for_each_listed_block(Staged& staged, const
   BlockList list;
   const uint16_t* kept = lists.splats.data();
   for (int block = 0; block < BLOCKS; block++) {
-    const int length = lists.lengths[block];
+    int length = lists.lengths[block];
     if (!length) continue;
-    if (!lists.kept) list_filled(staged, block, list);
+    if (!lists.kept) length = std::min(length, list_filled(staged, block, list));
     blend(block_pixels(block), lists.kept ? kept : list, length);
     if (lists.kept) kept += whole_vectors(length);
   }

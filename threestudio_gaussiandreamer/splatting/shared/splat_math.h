@@ -279,19 +279,19 @@ template <class F> SPLAT_FN F weight_of(F alpha, F transmittance, float stop) {
   return select(transmittance >= zero + stop, alpha * transmittance, zero);
 }
 
-// d loss / d ln(alpha), zero where the cap holds or the pixel has stopped. `odds` is alpha / (1 - alpha), `value` is
-// d loss / d weight, `behind` is the sum of weight * value over everything behind, background included.
+// d loss / d ln(alpha) front to back, zero where the cap holds or the pixel has stopped. `odds` is alpha / (1 - alpha),
+// `value` is d loss / d weight, `behind` is the sum of weight * value over everything behind, background included.
 template <class F>
 SPLAT_FN F blend_vjp(F alpha, F odds, F transmittance, F weight, F value, F behind, float alpha_max, float stop) {
   const F zero = {}, u = weight * value - behind * odds;
   return select((alpha < zero + alpha_max) & (transmittance >= zero + stop), u, zero);
 }
 
-// The same back to front, for an alpha that is zero where the pixel has stopped. `behind` is the value of what lies behind the
-// splat, seen without what lies before it, and becomes the value behind the splat before.
-template <class F> SPLAT_FN F blend_vjp_back_to_front(F alpha, F weight, F value, float alpha_max, F& behind) {
-  const F zero = {}, difference = value - behind;
-  behind += alpha * difference;
+// The same back to front, for an alpha that is zero where the pixel has stopped. `value_behind` is the value of what lies behind
+// the splat, seen without what lies before it; it becomes the value behind the splat before.
+template <class F> SPLAT_FN F blend_vjp_back_to_front(F alpha, F weight, F value, float alpha_max, F& value_behind) {
+  const F zero = {}, difference = value - value_behind;
+  value_behind += alpha * difference;
   return select(alpha < zero + alpha_max, weight * difference, zero);
 }
 
