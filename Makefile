@@ -65,7 +65,7 @@ charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbe
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting --from-csv
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.chart_runs
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.attributes --objects
-	$(ENVIRON) $(BIN)/python -m benchmarks.quality.toybox_tables
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.toybox_charts
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.mesh --objects
 
 # the meshes to measure on: make measure-charts OBJECTS="toy.glb path/to/spot.glb path/to/duck.glb"

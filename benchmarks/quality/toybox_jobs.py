@@ -36,6 +36,11 @@ CONFIG = yaml.safe_load((ROOT / "configs/toybox.yaml").read_text())
 STEPS = CONFIG["trainer"]["max_steps"]
 GUIDANCE = CONFIG["system"]["guidance"]["guidance_scale"]
 CONTRAST = CONFIG["system"]["guidance"]["view_contrast"]
+COUNT = sum(
+    CONFIG["system"]["geometry"][stage][name]
+    for stage, name in (("prior", "num_points"), ("grow", "max_points"))
+)
+"""Gaussians."""
 DEFAULT, PAPER_RECIPE = "toybox.yaml", "the paper's recipe"
 SAMPLES, TRUTH = "the 2D model's samples", "ground truth"
 """Variants without a run: what the 2D model draws, and ray-cast views of the object itself."""

@@ -1,7 +1,5 @@
-"""The tables of docs/toybox.md and its charts, from docs/charts/toybox.csv and the bundled models'
-record of their training.
-
-    python -m benchmarks.quality.toybox_tables      # draws docs/charts/toybox_*.png
+"""The tables of docs/toybox.md, from docs/charts/toybox.csv and the bundled models' record of their
+training.
 
 Values are means over prompts with bootstrap intervals; several seeds of a prompt count as one.
 Pattern and accessory are those of prompts that ask for one, since a plain object is easily right.
@@ -9,25 +7,22 @@ Pattern and accessory are those of prompts that ask for one, since a plain objec
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from benchmarks.markdown import markdown
 from benchmarks.quality.chart_runs import grouped
-from benchmarks.quality.runs import CHARTS, rows_of
+from benchmarks.quality.runs import rows_of
 from benchmarks.quality.toybox_jobs import (
     ATTRIBUTES,
     CHART,
     DEFAULT,
     EXACT,
-    GUIDANCE,
     PAPER_RECIPE,
     RECOGNIZED,
     SAMPLES,
-    STEPS,
     TRUTH,
     WORLD,
     judge_of,
@@ -42,26 +37,6 @@ TITLES = {"colors": "colours", "multi_face": "multi-face"}
 HEAD = [f"{TITLES.get(name, name)}, %" for name in RECOGNIZED]
 NOT_MEASURED = "*Not measured yet with the present models and configuration.*"
 Row = dict[str, str]
-
-
-class Line(NamedTuple):
-    """A chart of results against a number that runs vary."""
-
-    variant: str
-    own: float
-    """The number in toybox.yaml, whose runs are in the chart too."""
-    x_column: str
-    x_label: str
-    star: str = ""
-    """The value of ``x`` that is the paper's."""
-
-
-LINES = {
-    "toybox_guidance": Line(
-        "guidance scale", GUIDANCE, "x", "guidance scale (star: the paper's)", "101"
-    ),
-    "toybox_steps": Line("steps", STEPS, "cpu_seconds", "CPU seconds of a run, one thread"),
-}
 
 
 # ---- numbers -------------------------------------------------------------------------------------
@@ -211,80 +186,3 @@ def trained(seen: dict[str, Any]) -> str:
 
 def withheld(numbers: dict[str, Any]) -> str:
     return ", ".join(f"{name} {float(value):.3g}" for name, value in numbers.items())
-
-
-# ---- charts --------------------------------------------------------------------------------------
-
-
-def main() -> None:
-    rows = present()
-    for name, line in LINES.items():
-        if varied := [row for row in rows if row["variant"] == line.variant]:
-            print(draw(name, line, varied + default_at(line, varied, rows), references(rows)))
-
-
-def default_at(line: Line, varied: list[Row], rows: list[Row]) -> list[Row]:
-    """Return the rows of toybox.yaml, of prompts and seeds that the chart has, as its own point."""
-    shown = {(row["prompt"], row["seed"]) for row in varied}
-    own = [row for row in rows if row["variant"] == DEFAULT]
-    same = [row for row in own if (row["prompt"], row["seed"]) in shown]
-    return [row | {"x": f"{line.own:g}"} for row in same]
-
-
-def references(rows: list[Row]) -> dict[str, Callable[[str], float]]:
-    """Return what is drawn as a horizontal line in the panel of a column."""
-    chosen = [row for row in rows if row["variant"] == DEFAULT]
-    best = [row for row in rows if row["variant"] == SAMPLES and row["x"] == "4"]
-    truth = [row for row in rows if row["variant"] == TRUTH]
-    return {
-        "prior": lambda name: estimate(chosen, name, "prior_").mean,
-        "2D model": lambda name: estimate(best, name).mean,
-        "truth": lambda name: estimate(truth, name).mean,
-    }
-
-
-def draw(name: str, line: Line, rows: list[Row], levels: dict[str, Callable[[str], float]]) -> Path:
-    """Draw one figure, a panel per column of RECOGNIZED; return the path."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, panels = plt.subplots(1, len(RECOGNIZED), figsize=(15, 3.6), sharey=True)
-    for panel, column in zip(panels, RECOGNIZED, strict=True):
-        draw_panel(panel, line, column, rows)
-        for (label, level), style in zip(levels.items(), ("--", ":", "-."), strict=True):
-            if not math.isnan(value := level(column)):
-                panel.axhline(100 * value, linestyle=style, color="0.5", label=label)
-        panel.set_title(TITLES.get(column, column), fontsize=10)
-    panels[0].set_ylabel("% of withheld prompts")
-    panels[-1].legend(fontsize=8)
-    figure.supxlabel(line.x_label, fontsize=10)
-    figure.tight_layout()
-    path = CHARTS / f"{name}.png"
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
-
-
-def draw_panel(panel: Any, line: Line, column: str, rows: list[Row]) -> None:
-    """Draw mean and interval of one column at each value of ``x``."""
-    places = sorted({row["x"] for row in rows}, key=float)
-    groups = [[row for row in rows if row["x"] == place] for place in places]
-    found = [estimate(group, column) for group in groups]
-    x = [np.median([float(row[line.x_column]) for row in group]) for group in groups]
-    middle = [100 * value.mean for value in found]
-    panel.fill_between(
-        x, [100 * v.low for v in found], [100 * v.high for v in found], alpha=0.2, linewidth=0
-    )
-    panel.plot(x, middle, marker="o")
-    for place, across, value in zip(places, x, middle, strict=True):
-        if place == line.star:
-            panel.plot([across], [value], marker="*", markersize=14, color="0.15")
-    panel.set_xscale("log")
-    panel.grid(alpha=0.25)
-    panel.spines[["top", "right"]].set_visible(False)
-
-
-if __name__ == "__main__":
-    main()

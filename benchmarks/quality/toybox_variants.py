@@ -27,14 +27,17 @@ from benchmarks.quality.toybox_tables import (
 )
 from threestudio_gaussiandreamer.evaluation.intervals import paired, per_prompt
 
-HEAD = ("variant", "prompts", "recognised, %", "− toybox.yaml", "multi-face, %", "− toybox.yaml")
-HEAD += ("CPU seconds", "of toybox.yaml")
+HEAD = ("variant", "prompts × seeds", "recognised, %", "− toybox.yaml")
+HEAD += ("multi-face, %", "− toybox.yaml", "CPU seconds", "of toybox.yaml")
 DISTILLATIONS = ("paper", "distillations", "cheaper")
 """Charts that docs/distillation.md shows; docs/toybox.md shows the others."""
+SETTINGS = [
+    name for name in toybox_jobs.CHARTS if name not in (*DISTILLATIONS, "references", "default")
+]
 ENOUGH = 8
 """Rows of the present state of which those of earlier ones say nothing more."""
 EARLIER = {
-    "98917812": "no view contrast",
+    "98917812": "before view contrast",
     "c9adfc93": "networks in float32",
     "91562c50": "U-Net before 184,000 further pictures",
     "943e902e": "U-Net before the training on joined views",
@@ -52,9 +55,7 @@ def distillations() -> str:
 
 def settings() -> str:
     """Return the table of earlier models, and of all settings but the distillation's."""
-    others = (*DISTILLATIONS, "references", "default")
-    charts = (name for name in toybox_jobs.CHARTS if name not in others)
-    return table(*charts, first=earlier_models(measured()))
+    return table(*SETTINGS, first=earlier_models(measured()))
 
 
 def earlier_models(rows: Sequence[Row]) -> list[tuple[str, ...]]:
@@ -116,12 +117,19 @@ def line_of(title: str, own: list[Row], plain: list[Row]) -> tuple[str, ...]:
     faces = [values_of(rows, multi_face) for rows in (own, plain)]
     return (
         title,
-        str(len({row["prompt"] for row in own})),
+        counts_of(own),
         mean(recognised[0]), difference(*recognised),
         mean(faces[0]), difference(*faces),
         median_of(own, "cpu_seconds"),
         median_of(plain, "cpu_seconds"),
     )  # fmt: skip
+
+
+def counts_of(rows: Sequence[Row]) -> str:
+    """Return the numbers of prompts and of seeds, both of them where seeds aren't complete."""
+    seeds = [len(same) for same in grouped(rows, lambda row: row["index"]).values()]
+    shown = " to ".join(map(str, sorted({min(seeds), max(seeds)})))
+    return f"{len(seeds)} × {shown}"
 
 
 def values_of(rows: list[Row], measure: Callable[[Row], float]) -> dict[str, float]:

@@ -10,6 +10,7 @@ import pytest
 from benchmarks.quality import (
     runs,
     toybox,
+    toybox_charts,
     toybox_jobs,
     toybox_scores,
     toybox_tables,
@@ -177,16 +178,33 @@ def test_no_run_is_begun_that_would_end_too_late(monkeypatch, tmp_path, fake):
 
 def test_rows_become_tables_and_charts(monkeypatch, tmp_path, fake):
     monkeypatch.setattr(toybox_tables, "rows_of", lambda chart: runs.rows_of(chart, tmp_path))
-    monkeypatch.setattr(toybox_tables, "CHARTS", tmp_path)
+    monkeypatch.setattr(toybox_charts, "CHARTS", tmp_path)
     assert toybox_tables.results() == toybox_tables.NOT_MEASURED
-    work(monkeypatch, tmp_path, "--charts", "default", "guidance", "--count", 3)
+    work(monkeypatch, tmp_path, "--charts", "default", "guidance", "growing", "--count", 8)
     lines = toybox_tables.results().splitlines()
-    assert len(lines) == 2 + 2 and lines[2].startswith(f"| {DEFAULT} | 3 | 100 (100 – 100) |")
-    assert lines[3].startswith("| its prior's points | 3 | 50 (50 – 50) |")
+    assert len(lines) == 2 + 2 and lines[2].startswith(f"| {DEFAULT} | 8 | 100 (100 – 100) |")
+    assert lines[3].startswith("| its prior's points | 8 | 50 (50 – 50) |")
     pytest.importorskip("matplotlib")
-    toybox_tables.main()
-    assert (tmp_path / "toybox_guidance.png").is_file()
-    assert not (tmp_path / "toybox_steps.png").exists()
+    toybox_charts.main()
+    drawn = {path.name for path in tmp_path.glob("*.png")}
+    assert drawn == {"toybox_guidance.png", "toybox_settings.png"}
+
+
+def test_settings_of_a_chart_are_those_of_the_present_state():
+    """Of too few prompts, of earlier models, and those that a line shows, none is drawn."""
+    plain = [row(index=str(i), prompt=f"a red fox {i}") for i in range(toybox_variants.ENOUGH)]
+    own = [one | {"variant": "no growing"} for one in plain]
+    few = [one | {"variant": "no perturbation"} for one in plain[1:]]
+    steps = [one | {"variant": "steps", "x": "75"} for one in plain]
+    earlier = [one | {"setup": "earlier"} for one in (*plain, *few)]
+    found = toybox_charts.settings([*plain, *own, *few, *steps, *earlier])
+    assert [(one.title, one.own, one.plain) for one in found] == [("no growing", own, plain)]
+
+
+def test_seeds_that_are_not_complete_are_told():
+    rows = [row(), row(seed="1"), row(index="1", prompt="a blue car")]
+    assert toybox_variants.counts_of(rows) == "2 × 1 to 2"
+    assert toybox_variants.counts_of(rows[:2]) == "1 × 2"
 
 
 def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypatch):
@@ -205,7 +223,7 @@ def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypat
         toybox_variants.toybox_jobs, "CHARTS", {"mine": lambda: [Variant("CSD", 4), Variant("no")]}
     )
     head, _, line = toybox_variants.table("mine").splitlines()
-    assert line.startswith("| CSD 4 | 2 | 83 | -17 (")  # kind and colours of three attributes
+    assert line.startswith("| CSD 4 | 2 × 1 | 83 | -17 (")  # kind and colours of three attributes
     assert line.endswith("| 25 | +0 | 70 | 50 |") and len(head.split("|")) == 10
     earlier = [row | {"setup": "earlier"} for row in rows]
     rows.append(earlier[0] | other)  # isn't paired with results of other models
@@ -215,7 +233,7 @@ def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypat
     assert toybox_variants.table("mine").splitlines()[2:] == [line, marked]
     monkeypatch.setattr(toybox_variants, "EARLIER", {"none": "others", "earlier": "the first"})
     (first,) = toybox_variants.earlier_models(rows)
-    assert first[:4] == ("the first", "3", "100", "+0 (+0 – +0)")
+    assert first[:4] == ("the first", "3 × 1", "100", "+0 (+0 – +0)")
     assert toybox_variants.earlier_models(rows[:3]) == []
 
 
@@ -228,10 +246,10 @@ def row(**changes: str) -> dict[str, str]:
 
 def test_the_configuration_itself_is_a_point_of_a_chart():
     """Its runs of the chart's prompts and seeds aren't made a second time."""
-    line = toybox_tables.LINES["toybox_guidance"]
+    line = toybox_charts.LINES["toybox_guidance"]
     varied = [row(variant=line.variant, x="8")]
     same, other = row(), row(seed="1")
-    found = toybox_tables.default_at(line, varied, [*varied, same, other])
+    found = toybox_charts.default_at(line, varied, [*varied, same, other])
     assert found == [same | {"x": f"{toybox_jobs.GUIDANCE:g}"}]
     for chart, variant in (
         ("guidance", Variant("guidance scale", toybox_jobs.GUIDANCE)),
@@ -289,8 +307,8 @@ def test_earlier_models_are_compared_by_the_same_judge(monkeypatch):
     monkeypatch.setattr(toybox_variants, "EARLIER", {"b": "state b", "a": "state a"})
     lines = toybox_variants.earlier_models(rows)
     assert [line[:4] for line in lines] == [
-        ("state b", "1", "50", "-50"),
-        ("state a †", "1", "100", "+0"),
+        ("state b", "1 × 1", "50", "-50"),
+        ("state a †", "1 × 1", "100", "+0"),
     ]
 
 

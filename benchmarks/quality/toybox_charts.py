@@ -1,0 +1,233 @@
+"""The charts of docs/toybox.md, from docs/charts/toybox.csv.
+
+    python -m benchmarks.quality.toybox_charts      # draws docs/charts/toybox_*.png
+
+Lines show results against a number that runs vary; `toybox_settings.png` shows the difference of
+each other setting to toybox.yaml on the same prompts and seeds, and its seconds. Bands and bars are
+bootstrap intervals over prompts.
+"""
+
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.quality import toybox_jobs
+from benchmarks.quality.runs import CHARTS
+from benchmarks.quality.toybox_jobs import (
+    COUNT,
+    DEFAULT,
+    EXACT,
+    GUIDANCE,
+    RECOGNIZED,
+    SAMPLES,
+    STEPS,
+    TRUTH,
+)
+from benchmarks.quality.toybox_tables import (
+    TITLES,
+    Row,
+    estimate,
+    is_present,
+    measured,
+    present,
+    title_of,
+)
+from benchmarks.quality.toybox_variants import (
+    ENOUGH,
+    SETTINGS,
+    multi_face,
+    pairs_of,
+    recognised_share,
+    values_of,
+)
+from threestudio_gaussiandreamer.evaluation.intervals import paired
+
+
+class Line(NamedTuple):
+    """A chart of results against a number that runs vary."""
+
+    variant: str
+    own: float
+    """The number in toybox.yaml, whose runs are in the chart too."""
+    x_column: str
+    x_label: str
+    star: str = ""
+    """The value of ``x`` that is the paper's."""
+
+
+LINES = {
+    "toybox_guidance": Line(
+        "guidance scale", GUIDANCE, "x", "guidance scale (star: the paper's)", "101"
+    ),
+    "toybox_steps": Line("steps", STEPS, "cpu_seconds", "CPU seconds, one thread; at the points: steps"),
+    "toybox_count": Line("Gaussians", COUNT, "x", "Gaussians"),
+}
+
+
+def main() -> None:
+    rows = present()
+    for name, line in LINES.items():
+        if varied := [row for row in rows if row["variant"] == line.variant]:
+            print(draw(name, line, varied + default_at(line, varied, rows), references(rows)))
+    if found := settings(measured()):
+        print(draw_settings(found))
+
+
+# ---- results against a number --------------------------------------------------------------------
+
+
+def default_at(line: Line, varied: list[Row], rows: list[Row]) -> list[Row]:
+    """Return the rows of toybox.yaml, of prompts and seeds that the chart has, as its own point."""
+    shown = {(row["prompt"], row["seed"]) for row in varied}
+    own = [row for row in rows if row["variant"] == DEFAULT]
+    same = [row for row in own if (row["prompt"], row["seed"]) in shown]
+    return [row | {"x": f"{line.own:g}"} for row in same]
+
+
+def references(rows: list[Row]) -> dict[str, Callable[[str], float]]:
+    """Return what is drawn as a horizontal line in the panel of a column."""
+    chosen = [row for row in rows if row["variant"] == DEFAULT]
+    best = [row for row in rows if row["variant"] == SAMPLES and row["x"] == "4"]
+    truth = [row for row in rows if row["variant"] == TRUTH]
+    return {
+        "prior": lambda name: estimate(chosen, name, "prior_").mean,
+        "2D model": lambda name: estimate(best, name).mean,
+        "truth": lambda name: estimate(truth, name).mean,
+    }
+
+
+def draw(name: str, line: Line, rows: list[Row], levels: dict[str, Callable[[str], float]]) -> Path:
+    """Draw one figure, a panel per column of RECOGNIZED; return the path."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(1, len(RECOGNIZED), figsize=(15, 3.6), sharey=True)
+    for panel, column in zip(panels, RECOGNIZED, strict=True):
+        draw_panel(panel, line, column, rows)
+        for (label, level), style in zip(levels.items(), ("--", ":", "-."), strict=True):
+            if not math.isnan(value := level(column)):
+                panel.axhline(100 * value, linestyle=style, color="0.5", label=label)
+        panel.set_title(TITLES.get(column, column), fontsize=10)
+    panels[0].set_ylabel("%")
+    panels[-1].legend(fontsize=8)
+    figure.supxlabel(line.x_label, fontsize=10)
+    figure.tight_layout()
+    path = CHARTS / f"{name}.png"
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return path
+
+
+def draw_panel(panel: Any, line: Line, column: str, rows: list[Row]) -> None:
+    """Draw mean and interval of one column at each value of ``x``, and the value itself where the
+    axis has another number.
+    """
+    from matplotlib import ticker
+
+    places = sorted({row["x"] for row in rows}, key=float)
+    groups = [[row for row in rows if row["x"] == place] for place in places]
+    found = [estimate(group, column) for group in groups]
+    x = [np.median([float(row[line.x_column]) for row in group]) for group in groups]
+    middle = [100 * value.mean for value in found]
+    panel.fill_between(
+        x, [100 * v.low for v in found], [100 * v.high for v in found], alpha=0.2, linewidth=0
+    )
+    panel.plot(x, middle, marker="o")
+    for place, across, value in zip(places, x, middle, strict=True):
+        if place == line.star:
+            panel.plot([across], [value], marker="*", markersize=14, color="0.15")
+        if line.x_column != "x":
+            above = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center"}
+            panel.annotate(place, (across, value), fontsize=8, color="C0", **above)
+    panel.set_xscale("log")
+    panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+    panel.xaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    panel.xaxis.set_minor_formatter(ticker.NullFormatter())
+    finish(panel)
+
+
+# ---- settings against toybox.yaml ----------------------------------------------------------------
+
+
+class Setting(NamedTuple):
+    """A variant of toybox.yaml, and toybox.yaml itself on the same prompts and seeds."""
+
+    title: str
+    own: list[Row]
+    plain: list[Row]
+
+
+def settings(rows: Sequence[Row]) -> list[Setting]:
+    """Return the settings that were measured with the present models and configuration."""
+    keys = dict.fromkeys(one.key for chart in SETTINGS for one in toybox_jobs.CHARTS[chart]())
+    lines = {line.variant for line in LINES.values()}
+    pairs = (pair for key in keys if key[0] not in {EXACT, *lines} for pair in pairs_of(rows, *key))
+    return [
+        Setting(title_of(own[0]), own, plain)
+        for own, plain in pairs
+        if is_present(own[0]) and len(own) >= ENOUGH
+    ]
+
+
+def draw_settings(found: Sequence[Setting]) -> Path:
+    """Draw differences and seconds, a line per setting; return the path."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(
+        1, 3, figsize=(13, 1.4 + 0.32 * len(found)), sharey=True, width_ratios=(2, 2, 1)
+    )
+    draw_differences(panels[0], found, recognised_share, "recognised attributes, points")
+    draw_differences(panels[1], found, multi_face, "multi-face, points")
+    draw_seconds(panels[2], found)
+    panels[0].set_yticks(range(len(found)), [one.title for one in found])
+    panels[0].invert_yaxis()
+    figure.suptitle("Settings of toybox.yaml: difference on the same prompts and seeds", fontsize=11)
+    figure.tight_layout()
+    path = CHARTS / "toybox_settings.png"
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return path
+
+
+def draw_differences(
+    panel: Any, found: Sequence[Setting], measure: Callable[[Row], float], label: str
+) -> None:
+    """Draw the mean difference of each setting to toybox.yaml, and its interval."""
+    for place, one in enumerate(found):
+        value = paired(values_of(one.own, measure), values_of(one.plain, measure))
+        panel.plot([100 * value.low, 100 * value.high], [place, place], color="C0", linewidth=1.6)
+        panel.plot([100 * value.mean], [place], "o", color="C0")
+    panel.axvline(0, color="0.5", linewidth=1)
+    finish(panel, label)
+
+
+def draw_seconds(panel: Any, found: Sequence[Setting]) -> None:
+    """Draw the median seconds of each setting's runs, and those of toybox.yaml as a tick."""
+    for place, one in enumerate(found):
+        own, plain = (
+            statistics.median(float(row["cpu_seconds"]) for row in rows)
+            for rows in (one.own, one.plain)
+        )
+        panel.plot([own], [place], "o", color="C1")
+        panel.plot([plain], [place], "|", color="0.5", markersize=12)
+    panel.set_xlim(left=0)
+    finish(panel, "CPU seconds (tick: toybox.yaml)")
+
+
+def finish(panel: Any, label: str = "") -> None:
+    panel.set_xlabel(label, fontsize=9)
+    panel.grid(alpha=0.25)
+    panel.spines[["top", "right"]].set_visible(False)
+
+
+if __name__ == "__main__":
+    main()
