@@ -63,7 +63,9 @@ LINES = {
     "toybox_guidance": Line(
         "guidance scale", GUIDANCE, "x", "guidance scale (star: the paper's)", "101"
     ),
-    "toybox_steps": Line("steps", STEPS, "cpu_seconds", "CPU seconds, one thread; at the points: steps"),
+    "toybox_steps": Line(
+        "steps", STEPS, "cpu_seconds", "CPU seconds, one thread; at the points: steps"
+    ),
     "toybox_count": Line("Gaussians", COUNT, "x", "Gaussians"),
 }
 
@@ -190,7 +192,8 @@ def draw_settings(found: Sequence[Setting]) -> Path:
     draw_seconds(panels[2], found)
     panels[0].set_yticks(range(len(found)), [one.title for one in found])
     panels[0].invert_yaxis()
-    figure.suptitle("Settings of toybox.yaml: difference on the same prompts and seeds", fontsize=11)
+    title = "Settings of toybox.yaml: difference on the same prompts and seeds"
+    figure.suptitle(title, fontsize=11)
     figure.tight_layout()
     path = CHARTS / "toybox_settings.png"
     figure.savefig(path, dpi=110)
