@@ -148,6 +148,7 @@ def draw_panel(panel: Any, line: Line, column: str, rows: list[Row]) -> None:
             above = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center"}
             panel.annotate(place, (across, value), fontsize=8, color="C0", **above)
     panel.set_xscale("log")
+    panel.margins(x=0.1)
     panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
     panel.xaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
     panel.xaxis.set_minor_formatter(ticker.NullFormatter())
@@ -222,6 +223,7 @@ def draw_seconds(panel: Any, found: Sequence[Setting]) -> None:
         )
         panel.plot([own], [place], "o", color="C1")
         panel.plot([plain], [place], "|", color="0.5", markersize=12)
+    panel.margins(x=0.1)
     panel.set_xlim(left=0)
     finish(panel, "CPU seconds (tick: toybox.yaml)")
 
