@@ -176,8 +176,6 @@ def title_of(name: str, chosen_on: tuple[str, ...] = (TUNED_ON,)) -> str:
 
 def draw_panel(panel: Any, chart: Chart, labels: list[str], rows: list[Row]) -> None:
     """Draw all lines of one object, in the order and colours of their labels."""
-    from matplotlib import ticker
-
     lines = grouped(rows, lambda row: label_of(chart, row))
     common = lines.get(chart.common, [])
     for index, label in enumerate(labels):
@@ -189,13 +187,20 @@ def draw_panel(panel: Any, chart: Chart, labels: list[str], rows: list[Row]) -> 
             panel, chart, chosen, style, "*" if PAPER in label else "o"
         )
     if chart.log_x:
-        panel.set_xscale("log")
-        panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
-        panel.xaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
-        panel.xaxis.set_minor_formatter(ticker.NullFormatter())
+        set_log_x(panel)
     panel.set_xlabel(chart.x_label)
     panel.grid(alpha=0.25)
     panel.spines[["top", "right"]].set_visible(False)
+
+
+def set_log_x(panel: Any) -> None:
+    """Make the horizontal axis logarithmic, with plain numbers at 1, 2 and 5."""
+    from matplotlib import ticker
+
+    panel.set_xscale("log")
+    panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+    panel.xaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    panel.xaxis.set_minor_formatter(ticker.NullFormatter())
 
 
 def label_of(chart: Chart, row: Row) -> str:

@@ -8,14 +8,11 @@ bootstrap intervals over prompts.
 """
 
 import math
-import statistics
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from benchmarks.quality import toybox_jobs
+from benchmarks.quality.chart_runs import median, set_log_x
 from benchmarks.quality.runs import CHARTS
 from benchmarks.quality.toybox_jobs import (
     COUNT,
@@ -40,7 +37,7 @@ from benchmarks.quality.toybox_variants import (
     ENOUGH,
     SETTINGS,
     multi_face,
-    pairs_of,
+    pairs_of_charts,
     recognised_share,
     values_of,
 )
@@ -119,23 +116,17 @@ def draw(name: str, line: Line, rows: list[Row], levels: dict[str, Callable[[str
     panels[0].set_ylabel("%")
     panels[-1].legend(fontsize=8)
     figure.supxlabel(line.x_label, fontsize=10)
-    figure.tight_layout()
-    path = CHARTS / f"{name}.png"
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return saved(figure, name)
 
 
 def draw_panel(panel: Any, line: Line, column: str, rows: list[Row]) -> None:
     """Draw mean and interval of one column at each value of ``x``, and the value itself where the
     axis has another number.
     """
-    from matplotlib import ticker
-
     places = sorted({row["x"] for row in rows}, key=float)
     groups = [[row for row in rows if row["x"] == place] for place in places]
     found = [estimate(group, column) for group in groups]
-    x = [np.median([float(row[line.x_column]) for row in group]) for group in groups]
+    x = [median(group, line.x_column) for group in groups]
     middle = [100 * value.mean for value in found]
     panel.fill_between(
         x, [100 * v.low for v in found], [100 * v.high for v in found], alpha=0.2, linewidth=0
@@ -147,11 +138,8 @@ def draw_panel(panel: Any, line: Line, column: str, rows: list[Row]) -> None:
         if line.x_column != "x":
             above = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center"}
             panel.annotate(place, (across, value), fontsize=8, color="C0", **above)
-    panel.set_xscale("log")
+    set_log_x(panel)
     panel.margins(x=0.1)
-    panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
-    panel.xaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
-    panel.xaxis.set_minor_formatter(ticker.NullFormatter())
     finish(panel)
 
 
@@ -161,20 +149,21 @@ def draw_panel(panel: Any, line: Line, column: str, rows: list[Row]) -> None:
 class Setting(NamedTuple):
     """A variant of toybox.yaml, and toybox.yaml itself on the same prompts and seeds."""
 
-    title: str
     own: list[Row]
     plain: list[Row]
+
+    @property
+    def title(self) -> str:
+        return title_of(self.own[0])
 
 
 def settings(rows: Sequence[Row]) -> list[Setting]:
     """Return the settings that were measured with the present models and configuration."""
-    keys = dict.fromkeys(one.key for chart in SETTINGS for one in toybox_jobs.CHARTS[chart]())
-    lines = {line.variant for line in LINES.values()}
-    pairs = (pair for key in keys if key[0] not in {EXACT, *lines} for pair in pairs_of(rows, *key))
+    others = {EXACT, *(line.variant for line in LINES.values())}
     return [
-        Setting(title_of(own[0]), own, plain)
-        for own, plain in pairs
-        if is_present(own[0]) and len(own) >= ENOUGH
+        Setting(own, plain)
+        for own, plain in pairs_of_charts(rows, SETTINGS)
+        if own[0]["variant"] not in others and is_present(own[0]) and len(own) >= ENOUGH
     ]
 
 
@@ -195,11 +184,7 @@ def draw_settings(found: Sequence[Setting]) -> Path:
     panels[0].invert_yaxis()
     title = "Settings of toybox.yaml: difference on the same prompts and seeds"
     figure.suptitle(title, fontsize=11)
-    figure.tight_layout()
-    path = CHARTS / "toybox_settings.png"
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return saved(figure, "toybox_settings")
 
 
 def draw_differences(
@@ -217,21 +202,31 @@ def draw_differences(
 def draw_seconds(panel: Any, found: Sequence[Setting]) -> None:
     """Draw the median seconds of each setting's runs, and those of toybox.yaml as a tick."""
     for place, one in enumerate(found):
-        own, plain = (
-            statistics.median(float(row["cpu_seconds"]) for row in rows)
-            for rows in (one.own, one.plain)
-        )
-        panel.plot([own], [place], "o", color="C1")
-        panel.plot([plain], [place], "|", color="0.5", markersize=12)
+        panel.plot([median(one.own, "cpu_seconds")], [place], "o", color="C1")
+        panel.plot([median(one.plain, "cpu_seconds")], [place], "|", color="0.5", markersize=12)
     panel.margins(x=0.1)
     panel.set_xlim(left=0)
     finish(panel, "CPU seconds (tick: toybox.yaml)")
+
+
+# ---- both ----------------------------------------------------------------------------------------
 
 
 def finish(panel: Any, label: str = "") -> None:
     panel.set_xlabel(label, fontsize=9)
     panel.grid(alpha=0.25)
     panel.spines[["top", "right"]].set_visible(False)
+
+
+def saved(figure: Any, name: str) -> Path:
+    """Write a finished figure, and close it; return its path."""
+    import matplotlib.pyplot as plt
+
+    figure.tight_layout()
+    path = CHARTS / f"{name}.png"
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return path
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ measured with earlier models or an earlier toybox.yaml, or scored by an earlier 
 import itertools
 import math
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -85,11 +85,17 @@ def states_of(rows: Sequence[Row]) -> list[str]:
 
 def table(*charts: str, first: Sequence[tuple[str, ...]] = ()) -> str:
     """Return the lines ``first``, and one for each variant of these charts that was measured."""
-    rows = measured()
-    keys = dict.fromkeys(one.key for chart in charts for one in toybox_jobs.CHARTS[chart]())
-    pairs = [pair for key in keys for pair in pairs_of(rows, *key)]
+    pairs = pairs_of_charts(measured(), charts)
     lines = [*first, *(line_of(marked_title(own[0]), own, plain) for own, plain in pairs)]
     return markdown(HEAD, lines) if lines else NOT_MEASURED
+
+
+def pairs_of_charts(
+    rows: Sequence[Row], charts: Iterable[str]
+) -> Iterator[tuple[list[Row], list[Row]]]:
+    """Yield the pairs of each variant of these charts."""
+    keys = dict.fromkeys(one.key for chart in charts for one in toybox_jobs.CHARTS[chart]())
+    return (pair for key in keys for pair in pairs_of(rows, *key))
 
 
 def pairs_of(rows: Sequence[Row], name: str, x: str) -> list[tuple[list[Row], list[Row]]]:

@@ -29,8 +29,7 @@ SPLAT_FN int blend_block(BlendScratch& scratch, const BlockPixels& pixels, const
   int i = 0;
   for (; i < count && live; i += BATCH) {
     const BatchSplats splats = {scratch.staged, list + i};
-    Batch y1, y2;
-    const Batch alphas = alpha_of(power_at(splats, pixels, y1, y2), limits.log2_alpha_min, limits.alpha_max);
+    const Batch alphas = alpha_of(power_at(splats, pixels), limits.log2_alpha_min, limits.alpha_max);
     for (int k = 0; k < BATCH; k++) {
       const LocalSplat& s = splats[k];
       const Floats alpha = alphas.of[k], weight = weight_of(alpha, transmittance, limits.stop);

@@ -121,8 +121,7 @@ SPLAT_FN void blend_again(BackwardScratch& scratch, const BlockPixels& pixels, c
   BlendedList& blended = scratch.blended;
   Floats transmittance = load(scratch.transmittance + pixels.first), sum = load(scratch.alpha + pixels.first);
   for (int i = 0; i < length; i += BATCH) {
-    Batch y1, y2;
-    const Batch powers = power_at({scratch.staged, list + i}, pixels, y1, y2);
+    const Batch powers = power_at({scratch.staged, list + i}, pixels);
     const Batch alphas = alpha_of(powers, limits.log2_alpha_min, limits.alpha_max);
     for (int k = 0; k < BATCH; k++) {
       const Floats alpha = alphas.of[k], weight = weight_of(alpha, transmittance, limits.stop);

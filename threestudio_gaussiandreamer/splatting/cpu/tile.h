@@ -13,7 +13,7 @@ struct TileFrame {
   int begin, end;  // intersections
   bool inside;     // all of its pixels belong to the image
 
-  int last_chunk() const { return begin + std::max(end - begin - 1, 0) / CHUNK * CHUNK; }
+  int last_chunk() const { return begin + (end - begin - 1) / CHUNK * CHUNK; }
 };
 
 inline TileFrame frame_of(const View& view, int tile) {
@@ -66,7 +66,7 @@ constexpr int MASK_WORDS = BLOCKS / 32;
 SPLAT_FN void block_masks(const SplatLanes& s, Ints words[MASK_WORDS]) {
   const Ellipse<Floats> ellipse = {s.x, s.y, s.extent_y, s.c * s.c, s.level, s.inverse_a, s.tilt, s.slant};
   std::fill(words, words + MASK_WORDS, Ints{});
-#pragma GCC unroll 8
+#pragma GCC unroll 8  // the shifts become constants
   for (int row = 0; row < BLOCK_ROWS; row++) words[row / 4] |= blocks_in_row(ellipse, row) << (8 * (row % 4));
 }
 
@@ -224,10 +224,10 @@ struct BatchSplats {
   const LocalSplat& operator[](int k) const { return row_at(staged.splats, list[k]); }
 };
 
-// y of the splats of a batch at the pixels of a block, and their log2(alpha) there before cap and threshold.
-SPLAT_FN Batch power_at(const BatchSplats& s, const BlockPixels& pixels, Batch& y1, Batch& y2) {
-  y1 = each([&](int k) { return s[k].b * pixels.y + s[k].shift_x; });
-  y2 = each([&](int k) { return s[k].c * pixels.y + s[k].shift_y; });
+// log2(alpha) of the splats of a batch at the pixels of a block, before cap and threshold.
+SPLAT_FN Batch power_at(const BatchSplats& s, const BlockPixels& pixels) {
+  Batch y1 = each([&](int k) { return s[k].b * pixels.y + s[k].shift_x; });
+  const Batch y2 = each([&](int k) { return s[k].c * pixels.y + s[k].shift_y; });
   y1 = each([&](int k) { return s[k].a * pixels.x + y1.of[k]; });
   const Batch power = each([&](int k) { return s[k].log2_opacity - y1.of[k] * y1.of[k]; });
   return power - y2 * y2;
