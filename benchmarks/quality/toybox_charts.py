@@ -2,8 +2,9 @@
 
     python -m benchmarks.quality.toybox_charts      # draws docs/charts/toybox_*.png
 
-Lines show results against a number that runs vary; `toybox_settings.png` shows the difference of
-each other setting to toybox.yaml on the same prompts and seeds, and its seconds. Bands and bars are
+Lines show results against a number that runs vary; `toybox_settings.png` and
+`toybox_distillations.png` show the difference of each other setting, and of each other score
+distillation, to toybox.yaml on the same prompts and seeds, and its seconds. Bands and bars are
 bootstrap intervals over prompts.
 """
 
@@ -34,6 +35,7 @@ from benchmarks.quality.toybox_tables import (
     title_of,
 )
 from benchmarks.quality.toybox_variants import (
+    DISTILLATIONS,
     ENOUGH,
     SETTINGS,
     multi_face,
@@ -65,6 +67,7 @@ LINES = {
     ),
     "toybox_count": Line("Gaussians", COUNT, "x", "Gaussians"),
 }
+COMPARISONS = {"toybox_settings": SETTINGS, "toybox_distillations": DISTILLATIONS}
 
 
 def main() -> None:
@@ -72,8 +75,9 @@ def main() -> None:
     for name, line in LINES.items():
         if varied := [row for row in rows if row["variant"] == line.variant]:
             print(draw(name, line, varied + default_at(line, varied, rows), references(rows)))
-    if found := settings(measured()):
-        print(draw_settings(found))
+    for name, charts in COMPARISONS.items():
+        if found := settings(measured(), charts):
+            print(draw_settings(name, found))
 
 
 # ---- results against a number --------------------------------------------------------------------
@@ -157,17 +161,19 @@ class Setting(NamedTuple):
         return title_of(self.own[0])
 
 
-def settings(rows: Sequence[Row]) -> list[Setting]:
-    """Return the settings that were measured with the present models and configuration."""
+def settings(rows: Sequence[Row], charts: Sequence[str]) -> list[Setting]:
+    """Return the settings of some charts that were measured with the present models and
+    configuration.
+    """
     others = {EXACT, *(line.variant for line in LINES.values())}
     return [
         Setting(own, plain)
-        for own, plain in pairs_of_charts(rows, SETTINGS)
+        for own, plain in pairs_of_charts(rows, charts)
         if own[0]["variant"] not in others and is_present(own[0]) and len(own) >= ENOUGH
     ]
 
 
-def draw_settings(found: Sequence[Setting]) -> Path:
+def draw_settings(name: str, found: Sequence[Setting]) -> Path:
     """Draw differences and seconds, a line per setting; return the path."""
     import matplotlib
 
@@ -182,9 +188,9 @@ def draw_settings(found: Sequence[Setting]) -> Path:
     draw_seconds(panels[2], found)
     panels[0].set_yticks(range(len(found)), [one.title for one in found])
     panels[0].invert_yaxis()
-    title = "Settings of toybox.yaml: difference on the same prompts and seeds"
+    title = "Difference to toybox.yaml on the same prompts and seeds"
     figure.suptitle(title, fontsize=11)
-    return saved(figure, "toybox_settings")
+    return saved(figure, name)
 
 
 def draw_differences(

@@ -58,6 +58,10 @@ PROMPT_SEED = 5000
 """Of the attributes and words of prompts; trainings use others."""
 PAPER_SCALE = 101.0
 """threestudio's 100."""
+PAPER_SCALES = {"nfsd": 7.5, "ism": 7.5, "vsd": 7.5, "sdi": 8.5}
+"""Of other score distillations, in this package's convention; for CSD, whose paper has none, and
+CFD, 8 is taken.
+"""
 PAPER = "configs/toybox-paper.yaml"
 IMAGE_TARGETS = "configs/toybox-image-targets.yaml"
 BALL = {
@@ -224,8 +228,8 @@ def falling(schedule: str) -> dict[str, Any]:
 
 
 def distillations() -> Iterator[Variant]:
-    """Other score distillations, at the configuration's guidance scale; CFD and SDI use their
-    papers' decreasing timesteps.
+    """Other score distillations at several guidance scales, the last that of its paper; CFD and SDI
+    use their papers' decreasing timesteps.
     """
     own_options = {
         "csd": {},
@@ -236,9 +240,11 @@ def distillations() -> Iterator[Variant]:
         "sdi": falling("linear") | {"system.guidance.weighting_strategy": "x0"},
     }
     for name, options in own_options.items():
-        yield Variant(
-            name.upper(), GUIDANCE, {"system.guidance.variant_type": f"{name}-variant", **options}
-        )
+        options = options | {"system.guidance.variant_type": f"{name}-variant"}
+        for scale in (2, GUIDANCE, PAPER_SCALES.get(name, 8)):
+            yield Variant(
+                name.upper(), scale, options | {"system.guidance.guidance_scale": scale}
+            )
 
 
 def cheaper() -> Iterator[Variant]:

@@ -180,14 +180,15 @@ def test_rows_become_tables_and_charts(monkeypatch, tmp_path, fake):
     monkeypatch.setattr(toybox_tables, "rows_of", lambda chart: runs.rows_of(chart, tmp_path))
     monkeypatch.setattr(toybox_charts, "CHARTS", tmp_path)
     assert toybox_tables.results() == toybox_tables.NOT_MEASURED
-    work(monkeypatch, tmp_path, "--charts", "default", "guidance", "growing", "--count", 8)
+    charts = ["default", "guidance", "growing", "distillations"]
+    work(monkeypatch, tmp_path, "--charts", *charts, "--count", 8)
     lines = toybox_tables.results().splitlines()
     assert len(lines) == 2 + 2 and lines[2].startswith(f"| {DEFAULT} | 8 | 100 (100 – 100) |")
     assert lines[3].startswith("| its prior's points | 8 | 50 (50 – 50) |")
     pytest.importorskip("matplotlib")
     toybox_charts.main()
     drawn = {path.name for path in tmp_path.glob("*.png")}
-    assert drawn == {"toybox_guidance.png", "toybox_settings.png"}
+    assert drawn == {"toybox_guidance.png", *(f"{name}.png" for name in toybox_charts.COMPARISONS)}
 
 
 def test_settings_of_a_chart_are_those_of_the_present_state():
@@ -197,7 +198,9 @@ def test_settings_of_a_chart_are_those_of_the_present_state():
     few = [one | {"variant": "no perturbation"} for one in plain[1:]]
     steps = [one | {"variant": "steps", "x": "75"} for one in plain]
     earlier = [one | {"setup": "earlier"} for one in (*plain, *few)]
-    found = toybox_charts.settings([*plain, *own, *few, *steps, *earlier])
+    found = toybox_charts.settings(
+        [*plain, *own, *few, *steps, *earlier], toybox_variants.SETTINGS
+    )
     assert [(one.title, one.own, one.plain) for one in found] == [("no growing", own, plain)]
 
 
