@@ -242,9 +242,7 @@ def distillations() -> Iterator[Variant]:
     for name, options in own_options.items():
         options = options | {"system.guidance.variant_type": f"{name}-variant"}
         for scale in (2, GUIDANCE, PAPER_SCALES.get(name, 8)):
-            yield Variant(
-                name.upper(), scale, options | {"system.guidance.guidance_scale": scale}
-            )
+            yield Variant(name.upper(), scale, options | {"system.guidance.guidance_scale": scale})
 
 
 def cheaper() -> Iterator[Variant]:
