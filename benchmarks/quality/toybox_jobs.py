@@ -58,9 +58,9 @@ PROMPT_SEED = 5000
 """Of the attributes and words of prompts; trainings use others."""
 PAPER_SCALE = 101.0
 """threestudio's 100."""
-PAPER_SCALES = {"nfsd": 7.5, "ism": 7.5, "vsd": 7.5, "sdi": 8.5}
-"""Of other score distillations, in this package's convention; for CSD, whose paper has none, and
-CFD, 8 is taken.
+LARGEST_SCALES = {"csd": 8, "nfsd": 7.5, "ism": 7.5, "vsd": 7.5, "cfd": 8, "sdi": 8.5}
+"""Of other score distillations: those of their papers, in this package's convention, except CSD's,
+whose paper has none, and CFD's.
 """
 PAPER = "configs/toybox-paper.yaml"
 IMAGE_TARGETS = "configs/toybox-image-targets.yaml"
@@ -228,8 +228,8 @@ def falling(schedule: str) -> dict[str, Any]:
 
 
 def distillations() -> Iterator[Variant]:
-    """Other score distillations at several guidance scales, the last that of its paper; CFD and SDI
-    use their papers' decreasing timesteps.
+    """Other score distillations at several guidance scales; CFD and SDI use their papers'
+    decreasing timesteps.
     """
     own_options = {
         "csd": {},
@@ -241,7 +241,7 @@ def distillations() -> Iterator[Variant]:
     }
     for name, options in own_options.items():
         options = options | {"system.guidance.variant_type": f"{name}-variant"}
-        for scale in (2, GUIDANCE, PAPER_SCALES.get(name, 8)):
+        for scale in (2, GUIDANCE, LARGEST_SCALES[name]):
             yield Variant(name.upper(), scale, options | {"system.guidance.guidance_scale": scale})
 
 
