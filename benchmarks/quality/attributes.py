@@ -39,12 +39,12 @@ from benchmarks.quality.chart_runs import (
     median,
     objects_of,
     papers_ends,
+    saved,
     spread,
     title_of,
 )
 from benchmarks.quality.rounding import ROUNDED
 from benchmarks.quality.runs import (
-    CHARTS,
     RENDERER,
     ROOT,
     SIZE,
@@ -280,10 +280,7 @@ def draw(measurements: list[dict[str, str]]) -> Path:
     figure.suptitle("Which attributes a scene needs", x=0.01, ha="left", fontweight="bold")
     figure.text(0.01, 0.945, caption(measurements), fontsize=8, color="0.35")
     figure.tight_layout(rect=(0, 0, 1, 0.95), h_pad=4)
-    path = CHARTS / "attributes.png"
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return saved(figure, "attributes")
 
 
 def draw_bytes(panel: Any, measurements: list[dict[str, str]]) -> None:

@@ -10,6 +10,7 @@ import argparse
 import statistics
 from collections import defaultdict
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.quality.runs import CHARTS, SIZE, rows_of
@@ -158,6 +159,13 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
     figure.legend(handles, labels, loc="lower center", ncols=columns, frameon=False, fontsize=9)
     figure.text(0.01, 0.905, caption(rows, chart.size), fontsize=8, color="0.35")
     figure.tight_layout(rect=(0, 0.06 + 0.04 * ((len(labels) - 1) // columns), 1, 0.93))
+    return saved(figure, name)
+
+
+def saved(figure: Any, name: str) -> Path:
+    """Write a finished figure to docs/charts, and close it; return its path."""
+    import matplotlib.pyplot as plt
+
     path = CHARTS / f"{name}.png"
     figure.savefig(path, dpi=110)
     plt.close(figure)

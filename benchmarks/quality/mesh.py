@@ -22,9 +22,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.markdown import markdown
-from benchmarks.quality.chart_runs import COLOURS, Row, caption, objects_of
+from benchmarks.quality.chart_runs import COLOURS, Row, caption, objects_of, saved
 from benchmarks.quality.runs import (
-    CHARTS,
     RENDERER,
     ROOT,
     argument_parser,
@@ -192,10 +191,7 @@ def draw(measured_rows: list[Row]) -> Path:
     figure.suptitle("Textured meshes of a cloud", x=0.01, ha="left", fontweight="bold")
     figure.text(0.01, 0.905, caption(measured_rows), fontsize=8, color="0.35")
     figure.tight_layout(rect=(0, 0, 1, 0.93))
-    path = CHARTS / "mesh.png"
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return saved(figure, "mesh")
 
 
 def line(rows_of_object: list[Row], variant: str) -> tuple[list[float], list[float]]:

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.quality.chart_runs import saved
 from benchmarks.quality.runs import (
-    CHARTS,
     append_rows,
     argument_parser,
     object_name,
@@ -175,9 +175,7 @@ def draw() -> Path:
     figure.suptitle("Pruning a dense cloud of 262,144 Gaussians", x=0.01, ha="left")
     figure.text(0.01, 0.9, f"{SIZE}², one seed; {machines}; commit {commits}", fontsize=8)
     figure.tight_layout(rect=(0, 0, 1, 0.95))
-    figure.savefig(CHARTS / f"{CHART}.png", dpi=110)
-    plt.close(figure)
-    return CHARTS / f"{CHART}.png"
+    return saved(figure, CHART)
 
 
 if __name__ == "__main__":

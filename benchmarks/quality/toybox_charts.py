@@ -13,8 +13,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.quality.chart_runs import median, set_log_x
-from benchmarks.quality.runs import CHARTS
+from benchmarks.quality.chart_runs import median, saved, set_log_x
 from benchmarks.quality.toybox_jobs import (
     COUNT,
     DEFAULT,
@@ -120,6 +119,7 @@ def draw(name: str, line: Line, rows: list[Row], levels: dict[str, Callable[[str
     panels[0].set_ylabel("%")
     panels[-1].legend(fontsize=8)
     figure.supxlabel(line.x_label, fontsize=10)
+    figure.tight_layout()
     return saved(figure, name)
 
 
@@ -190,6 +190,7 @@ def draw_settings(name: str, found: Sequence[Setting]) -> Path:
     panels[0].invert_yaxis()
     title = "Difference to toybox.yaml on the same prompts and seeds"
     figure.suptitle(title, fontsize=11)
+    figure.tight_layout()
     return saved(figure, name)
 
 
@@ -222,17 +223,6 @@ def finish(panel: Any, label: str = "") -> None:
     panel.set_xlabel(label, fontsize=9)
     panel.grid(alpha=0.25)
     panel.spines[["top", "right"]].set_visible(False)
-
-
-def saved(figure: Any, name: str) -> Path:
-    """Write a finished figure, and close it; return its path."""
-    import matplotlib.pyplot as plt
-
-    figure.tight_layout()
-    path = CHARTS / f"{name}.png"
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
 
 
 if __name__ == "__main__":
