@@ -7,6 +7,7 @@ Lines are medians over the seeds, bands and bars the whole range. Each panel is 
 were tuned on the first."""
 
 import argparse
+import math
 import statistics
 from collections import defaultdict
 from collections.abc import Callable, Iterable
@@ -279,7 +280,9 @@ def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Ro
 
 
 def median(rows: list[Row], column: str) -> float:
-    return statistics.median(float(row[column]) for row in rows)
+    """Return the median of the rows that have a value, NaN if none has."""
+    values = [float(row[column]) for row in rows if row[column]]
+    return statistics.median(values) if values else math.nan
 
 
 def spread(rows: list[Row]) -> tuple[float, float, float]:

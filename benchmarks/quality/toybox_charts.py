@@ -41,6 +41,7 @@ from benchmarks.quality.toybox_variants import (
     pairs_of_charts,
     recognised_share,
     values_of,
+    with_seconds,
 )
 from threestudio_gaussiandreamer.evaluation.intervals import paired
 
@@ -209,8 +210,9 @@ def draw_differences(
 def draw_seconds(panel: Any, found: Sequence[Setting]) -> None:
     """Draw the median seconds of each setting's runs, and those of toybox.yaml as a tick."""
     for place, one in enumerate(found):
-        panel.plot([median(one.own, "cpu_seconds")], [place], "o", color="C1")
-        panel.plot([median(one.plain, "cpu_seconds")], [place], "|", color="0.5", markersize=12)
+        own, plain = with_seconds(one.own, one.plain)
+        panel.plot([median(own, "cpu_seconds")], [place], "o", color="C1")
+        panel.plot([median(plain, "cpu_seconds")], [place], "|", color="0.5", markersize=12)
     panel.margins(x=0.1)
     panel.set_xlim(left=0)
     finish(panel, "CPU seconds (tick: toybox.yaml)")

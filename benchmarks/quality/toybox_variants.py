@@ -126,9 +126,15 @@ def line_of(title: str, own: list[Row], plain: list[Row]) -> tuple[str, ...]:
         counts_of(own),
         mean(recognised[0]), difference(*recognised),
         mean(faces[0]), difference(*faces),
-        median_of(own, "cpu_seconds"),
-        median_of(plain, "cpu_seconds"),
+        *(median_of(rows, "cpu_seconds") for rows in with_seconds(own, plain)),
     )  # fmt: skip
+
+
+def with_seconds(own: list[Row], plain: list[Row]) -> tuple[list[Row], list[Row]]:
+    """Return the rows of the pairs in which both have CPU seconds."""
+    pairs = zip(own, plain, strict=True)
+    timed = [pair for pair in pairs if all(row["cpu_seconds"] for row in pair)]
+    return [first for first, _ in timed], [second for _, second in timed]
 
 
 def counts_of(rows: Sequence[Row]) -> str:

@@ -2,6 +2,7 @@
 
 import argparse
 import itertools
+import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -105,14 +106,6 @@ def test_scoring_alone_needs_the_folder_of_the_runs(monkeypatch, capsys):
     assert "give the runs' folder as --keep" in capsys.readouterr().err
 
 
-def test_rows_of_other_precisions_are_not_mixed(monkeypatch, tmp_path):
-    monkeypatch.setattr(toybox, "cpu_multiplies_bfloat16", lambda: False)
-    assert "give another folder as --out" in toybox.not_comparable(runs.CHARTS)
-    assert toybox.not_comparable(tmp_path) == ""
-    monkeypatch.setattr(toybox, "cpu_multiplies_bfloat16", lambda: True)
-    assert toybox.not_comparable(runs.CHARTS) == ""
-
-
 def test_of_the_missing_rows_only_those_of_kept_runs_are_scored(monkeypatch, tmp_path):
     words = ["--charts", "default", "--prompts", "seen", "--count", 3, "--keep", tmp_path / "runs"]
     words += ["--out", tmp_path]
@@ -169,6 +162,18 @@ def test_rows_are_appended_and_failures_counted(monkeypatch, tmp_path, fake):
     rows = runs.rows_of(toybox.CHART, tmp_path)
     assert sorted(row["index"] for row in rows) == ["0", "1", "2"] and len(fake) == 6
     assert {row["variant"] for row in rows} == {DEFAULT} and rows[0]["kind"] == "1"
+
+
+def test_seconds_of_networks_in_float32_are_left_out_of_the_charts(monkeypatch, tmp_path, fake):
+    """Beside those of networks in bfloat16 they can't be compared."""
+    words, seconds = ["--charts", "default", "--count", 1], {}
+    for place, charts in ((tmp_path / "charts", tmp_path / "charts"), (tmp_path, runs.CHARTS)):
+        for native in (True, False):
+            monkeypatch.setattr(toybox, "CHARTS", charts)
+            monkeypatch.setattr(toybox, "cpu_multiplies_bfloat16", lambda native=native: native)
+            assert work(monkeypatch, place, *words) == 0
+        seconds[place] = [row["cpu_seconds"] for row in runs.rows_of(toybox.CHART, place)]
+    assert seconds == {tmp_path / "charts": ["2", ""], tmp_path: ["2", "2"]}
 
 
 def test_no_run_is_begun_that_would_end_too_late(monkeypatch, tmp_path, fake):
@@ -243,6 +248,15 @@ def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypat
     (first,) = toybox_variants.earlier_models(rows)
     assert first[:4] == ("the first", "3 × 1", "100", "+0 (+0 – +0)")
     assert toybox_variants.earlier_models(rows[:3]) == []
+
+
+def test_seconds_are_of_the_pairs_that_have_them():
+    own = [row(cpu_seconds="10"), row(seed="1", cpu_seconds=""), row(seed="2", cpu_seconds="30")]
+    plain = [row(cpu_seconds="5"), row(cpu_seconds="7"), row(cpu_seconds="")]
+    assert toybox_variants.line_of("mine", own, plain)[-2:] == ("10", "5")
+    assert toybox_variants.line_of("mine", own[1:], plain[1:])[-2:] == ("", "")
+    assert chart_runs.median(own, "cpu_seconds") == 20
+    assert math.isnan(chart_runs.median(own[1:2], "cpu_seconds"))
 
 
 def row(**changes: str) -> dict[str, str]:
