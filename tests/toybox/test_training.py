@@ -258,6 +258,8 @@ def test_curves_are_written(folder):
         (["--rate", "nan"], "--rate nan: expected more than 0"),
         (["--minutes", "0"], "--minutes 0.0: expected more than 0"),
         (["--minutes", "nan"], "--minutes nan: expected more than 0"),
+        (["--seed", "1000"], "--seed 1000: expected 0 to 999"),
+        (["--seed", "-1"], "--seed -1: expected 0 to 999"),
         (["--workers", "-1"], "--workers -1: expected 0 or more"),
         (["--save-minutes", "nan"], "--save-minutes nan: expected minutes"),
         (["--sheet-minutes", "-1"], "--sheet-minutes -1.0: expected minutes"),

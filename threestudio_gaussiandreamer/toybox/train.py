@@ -28,7 +28,7 @@ from ..core.signals import interrupt
 from ..launch.folder_lock import FolderInUse, claim
 from .autoencoder_stage import AutoencoderStage
 from .clip_stage import ClipStage
-from .judge_stage import JudgeStage, judge_shards
+from .judge_stage import SEED_OFFSET, JudgeStage, judge_shards
 from .loop import Options, Stage, Training
 from .points_stage import PointsStage
 from .text_stage import TextStage
@@ -131,6 +131,11 @@ def _require_numbers(args: argparse.Namespace) -> None:
         value = getattr(args, name)
         if value is not None and value < 1:
             raise UserError(f"--{name} {shown(value)}: expected at least 1")
+    if not 0 <= args.seed < SEED_OFFSET:
+        raise UserError(
+            f"--seed {shown(args.seed)}: expected 0 to {SEED_OFFSET - 1}; larger seeds are of the "
+            "objects that the judge learns from"
+        )
     if UNetStage.name in args.stages and (args.batch or 0) > VIEWS and args.batch % VIEWS:
         raise UserError(
             f"--batch {args.batch}: most steps of {UNetStage.name} are of all {VIEWS} views of "
