@@ -1,6 +1,9 @@
 """Trainings of a few steps on a few pictures."""
 
+import contextlib
+import resource
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 from threestudio_gaussiandreamer.toybox import loop
@@ -25,3 +28,14 @@ def copied(source: Path, target: Path) -> Path:
     """Copy a folder of checkpoints, tokenizer and pictures."""
     shutil.copytree(source, target)
     return target
+
+
+@contextlib.contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """Let writing beyond ``size`` bytes fail, as it does where the disk is full."""
+    earlier = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, earlier[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, earlier)

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 import torch
 
-from tests.toybox.helpers import options, training
+from tests.toybox.helpers import largest_file, options, training
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.guidance import stable_diffusion  # noqa: F401
 from threestudio_gaussiandreamer.host import find
-from threestudio_gaussiandreamer.models.bundled import digest_of, read_digests
+from threestudio_gaussiandreamer.models.bundled import DIGESTS, digest_of, read_digests
 from threestudio_gaussiandreamer.models.clip import PictureText, clip_source
 from threestudio_gaussiandreamer.priors.point_e import PointEPrior
 from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
 from threestudio_gaussiandreamer.toybox import export, loop, models, warm_start
 from threestudio_gaussiandreamer.toybox.export import main
 from threestudio_gaussiandreamer.toybox.loop import averaged_weights
-from threestudio_gaussiandreamer.toybox.text_batches import token_ids
+from threestudio_gaussiandreamer.toybox.text_batches import open_tokenizer, token_ids
 from threestudio_gaussiandreamer.toybox.train import STAGES
 
 PROMPT = "a red fox with a green scarf"
@@ -193,10 +193,28 @@ def test_a_target_that_can_not_be_made_is_one_message(tmp_path, capsys):
     assert "TARGET: the folder" in capsys.readouterr().err
 
 
-def test_an_error_of_the_file_system_is_one_message(trained, tmp_path, capsys, monkeypatch):
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
+@pytest.mark.parametrize("size", [100, 3000, 8000])
+def test_a_full_disk_is_one_message_and_the_export_can_be_repeated(
+    trained, tmp_path, capsys, size
+):
+    """It fails in different files: weights, vocabulary, configuration."""
+    target = tmp_path / "models"
+    with largest_file(size):
+        assert main([str(trained), str(target)]) == 2
+    assert "cannot write" in capsys.readouterr().err
+    assert main([str(trained), str(target)]) == 0
+    assert sorted(read_digests(target)) == sorted(
+        path.relative_to(target).as_posix()
+        for path in target.rglob("*")
+        if path.is_file() and path.name != DIGESTS
+    )
 
-    monkeypatch.setattr(shutil, "copytree", full)
-    assert main([str(trained), str(tmp_path / "models")]) == 2
-    assert "No space left on device" in capsys.readouterr().err
+
+@pytest.mark.parametrize("size", [500, 3000, 20000])
+def test_a_full_disk_at_the_start_from_weights_is_mended_by_a_second_call(exported, tmp_path, size):
+    """It fails in the configuration of the tokenizer, in its vocabulary, and in a checkpoint."""
+    start = exported, options(tmp_path), {"text": STAGES["text"]}
+    with largest_file(size), pytest.raises(UserError, match="cannot write"):
+        warm_start.start_from(*start)
+    warm_start.start_from(*start)
+    assert loop.is_trained(tmp_path, "text") and open_tokenizer(tmp_path)

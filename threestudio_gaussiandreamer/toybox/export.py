@@ -15,7 +15,6 @@ SHA256SUMS            digests of all other files
 import argparse
 import functools
 import json
-import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,6 +31,7 @@ from . import models
 from .clip_stage import trained_clip
 from .loop import averaged_weights, checkpoint_path, is_trained
 from .text_batches import open_tokenizer
+from .tokenizer import copy_tokenizer
 from .unet_stage import LATENT_SCALE, frozen_autoencoder
 
 STAGES = ("text", "clip", "autoencoder", "unet", "points", "judge")
@@ -66,7 +66,7 @@ def export(training: Path, target: Path) -> dict[str, Any]:
 def write_clip(folder: Path, clip: Any, tokenizer: Path) -> None:
     """Write a whole CLIP with its tokenizer."""
     _save(clip, folder)
-    shutil.copytree(tokenizer, folder, dirs_exist_ok=True)
+    copy_tokenizer(tokenizer, folder)
 
 
 def write_stable_diffusion(folder: Path, training: Path, clip: Any) -> None:
@@ -81,7 +81,7 @@ def write_stable_diffusion(folder: Path, training: Path, clip: Any) -> None:
     vae.register_to_config(scaling_factor=content["constants"][LATENT_SCALE])
     for name, network in (("text_encoder", text_encoder), ("vae", vae), ("unet", unet)):
         _save(network, folder / name)
-    shutil.copytree(training / "tokenizer", folder / "tokenizer", dirs_exist_ok=True)
+    copy_tokenizer(training / "tokenizer", folder / "tokenizer")
     models.scheduler().save_pretrained(folder / "scheduler")
     with atomic_file(folder / "model_index.json", durable=False) as file:
         file.write(json.dumps(MODEL_INDEX, indent=2).encode())
@@ -132,10 +132,13 @@ def trainings(content: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _save(network: Any, folder: Path) -> None:
+    from safetensors import SafetensorError
+
     try:
         network.half().save_pretrained(str(folder), safe_serialization=True)
-    except OSError as error:
-        raise UserError(f"cannot write {str(folder)!r}: {error.strerror or error}") from error
+    except (OSError, SafetensorError) as error:  # the latter if the disk is full
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"cannot write {str(folder)!r}: {reason}") from error
     finally:
         network.float()
 

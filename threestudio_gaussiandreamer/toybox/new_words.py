@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from ..core.files import existing_file
 from ..core.streams import numpy_generator
 from . import words
 from .text_batches import missing_words, token_ids
-from .tokenizer import words_of, write_tokenizer
+from .tokenizer import copy_tokenizer, is_complete, words_of, write_tokenizer
 from .views import random_angles
 from .world import draw_attributes
 
@@ -30,7 +29,8 @@ SEPARATION_STEPS, SEPARATION_PROMPTS, SEPARATION_RATE = 150, 24, 0.02
 
 
 def grow_tokenizer(source: Path, folder: Path) -> list[str]:
-    """Write a tokenizer of the words of ``source`` and of the toybox, unless ``folder`` exists.
+    """Write a tokenizer of the words of ``source`` and of the toybox, unless ``folder`` has
+    one.
 
     Args:
         source: folder of the weights' tokenizer.
@@ -40,11 +40,11 @@ def grow_tokenizer(source: Path, folder: Path) -> list[str]:
     """
     known = words_of(source)
     new = missing_words(known)
-    if not folder.exists():
+    if not is_complete(folder):
         if new:
             write_tokenizer(folder, sorted([*known, *new]))
         else:
-            shutil.copytree(source, folder)
+            copy_tokenizer(source, folder)
     return new
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..core.errors import UserError
 from . import words
-from .tokenizer import LENGTH, words_of, write_tokenizer
+from .tokenizer import LENGTH, is_complete, words_of, write_tokenizer
 from .views import Shard, attributes_of
 
 JOINED_PLAIN_SHARE = 0.03
@@ -22,12 +22,13 @@ def open_tokenizer(folder: Path) -> Any:
     """Load the training's tokenizer, which is written on first use.
 
     Raises:
-        UserError: it is of an earlier version of the toybox, and lacks words.
+        UserError: it is of an earlier version of the toybox, and lacks words; or it can't be
+            written.
     """
     from transformers import CLIPTokenizer
 
     place = Path(folder) / "tokenizer"
-    if not (place / "tokenizer_config.json").exists():
+    if not is_complete(place):
         write_tokenizer(place, words.vocabulary())
     if missing := missing_words(words_of(place)):
         raise UserError(

@@ -7,11 +7,13 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..core.files import existing_file
+from ..core.files import atomic_file, existing_file, output_folder
 from ..prompts.known_words import WORDS_FILE
 
 START, END = "<|startoftext|>", "<|endoftext|>"
 WORDS = Path(WORDS_FILE).name
+SETTINGS = "tokenizer_config.json"
+"""The file that is written last: a folder that has it is complete."""
 LENGTH = 32
 """Tokens of a prompt, start and end included; longer ones are cut."""
 
@@ -19,8 +21,11 @@ LENGTH = 32
 def write_tokenizer(folder: Path, words: Sequence[str]) -> None:
     """Write the vocabulary, merges and configuration of a CLIPTokenizer into ``folder``, and the
     list of ``words`` that prompts/known_words.py reads.
+
+    Raises:
+        UserError: the disk is full, or the folder can't be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    output_folder(folder, "the tokenizer")
     merges = word_merges(words)
     letters = byte_letters()
     tokens = [
@@ -32,8 +37,8 @@ def write_tokenizer(folder: Path, words: Sequence[str]) -> None:
     ]
     _write_json(folder / "vocab.json", {token: index for index, token in enumerate(tokens)})
     lines = ["#version: 0.2", *(" ".join(pair) for pair in merges)]
-    (folder / "merges.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    (folder / WORDS).write_text("\n".join(words) + "\n", encoding="utf-8")
+    _write(folder / "merges.txt", "\n".join(lines) + "\n")
+    _write(folder / WORDS, "\n".join(words) + "\n")
     special = {"bos_token": START, "eos_token": END, "unk_token": END, "pad_token": END}
     _write_json(folder / "special_tokens_map.json", special)
     settings = {
@@ -41,7 +46,24 @@ def write_tokenizer(folder: Path, words: Sequence[str]) -> None:
         "tokenizer_class": "CLIPTokenizer",
         "do_lower_case": True,
     }
-    _write_json(folder / "tokenizer_config.json", special | settings)
+    _write_json(folder / SETTINGS, special | settings)
+
+
+def copy_tokenizer(source: Path, folder: Path) -> None:
+    """Copy the files of a tokenizer.
+
+    Raises:
+        UserError: the disk is full, or the folder can't be written.
+    """
+    output_folder(folder, "the tokenizer")
+    for path in sorted(source.iterdir(), key=lambda path: path.name == SETTINGS):
+        with atomic_file(folder / path.name) as file:
+            file.write(path.read_bytes())
+
+
+def is_complete(folder: Path) -> bool:
+    """Return whether the tokenizer in ``folder`` has been written to its end."""
+    return (folder / SETTINGS).is_file()
 
 
 def words_of(folder: Path) -> list[str]:
@@ -90,4 +112,9 @@ def _merged(pieces: list[str], pair: tuple[str, str]) -> list[str]:
 
 
 def _write_json(path: Path, content: dict) -> None:
-    path.write_text(json.dumps(content, ensure_ascii=False, indent=0), encoding="utf-8")
+    _write(path, json.dumps(content, ensure_ascii=False, indent=0))
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_file(path) as file:
+        file.write(text.encode())
