@@ -11,9 +11,10 @@ Each run is configs/toybox.yaml with a few options changed, on one thread. The j
 views of its result, of its prior's points, of the 2D model's own samples, and of the object itself;
 CPU seconds are those of a whole run without imports and video, in a process that keeps its networks
 loaded. A CPU that doesn't multiply bfloat16 computes the networks in float32, with the same results
-in more seconds, which are left out of docs/charts. Rows are appended to toybox.csv as runs end, in the order chart, seed, prompt, variant. Rows
-that it has of this configuration, these models and this judge, which the columns "setup" and
-"judge" identify, are skipped.
+in more seconds, which are left out of docs/charts.
+Rows are appended to toybox.csv as runs end, in the order chart, seed, prompt, variant. Rows that it
+has of this configuration, these models and this judge, which the columns "setup" and "judge"
+identify, are skipped.
 Settings were chosen on "seen" prompts, of combinations that trainings may have had; "withheld" ones
 are of combinations that no training had.
 """
@@ -344,7 +345,9 @@ def noted(done: Future, out: Path) -> bool:
         tqdm.write(str(error), file=sys.stderr)
         return False
     row = done.result()
-    append_rows(CHART, COLUMNS, [row if seconds_comparable(out) else row | {"cpu_seconds": ""}], out)
+    if not seconds_comparable(out):
+        row = row | {"cpu_seconds": ""}
+    append_rows(CHART, COLUMNS, [row], out)
     return True
 
 

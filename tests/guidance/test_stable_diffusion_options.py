@@ -4,7 +4,6 @@ import json
 
 import pytest
 import torch
-import torch.nn.functional as F
 
 from tests.helpers import tiny_models
 from tests.helpers.tiny_guidance import Recorder, gradient, guidance, relative, renders
@@ -92,13 +91,10 @@ def test_a_model_without_one_size_is_asked_for(tmp_path, trained):
     assert guidance({"epsilon": folder}, image_size=64).image_size == 64
 
 
-def test_halving_is_the_mean_of_four_pixels_and_more_loses_none(models):
-    guide = guidance(models)
-    images = renders(2, 128).detach().movedim(-1, 1)
-    torch.testing.assert_close(guide.resized(images, 64), F.avg_pool2d(images, 2))
-    images = renders(1, 256).movedim(-1, 1)
-    (grad,) = torch.autograd.grad(guide.resized(images, 16).sum(), images)
-    assert (grad > 0).all()
+@pytest.mark.parametrize("scale, warned", [(-5, True), (0, False), (101, False), (1e6, True)])
+def test_an_unusual_guidance_scale_is_told(models, caplog, scale, warned):
+    guidance(models, guidance_scale=scale)
+    assert ("guidance_scale" in caplog.text) == warned
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from ..host import register, register_builtin
 from ..models.families import DEEP_FLOYD as FAMILY
 from ..prompts.prompt_processors import DEEP_FLOYD
 from .base import GUIDANCE_SCALE
+from .model_images import resized
 from .text_to_image import TextToImageDistillation
 
 
@@ -39,7 +40,7 @@ class DeepFloydGuidance(TextToImageDistillation):
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B 3 s s"]:
         """Return the pixels themselves, in [-1, 1]."""
-        return self.resized(rgb, self.image_size) * 2 - 1
+        return resized(rgb, self.image_size) * 2 - 1
 
     def decode(self, latents: Float[Tensor, "B 3 s s"]) -> Float[Tensor, "B 3 s s"]:
         return (latents / 2 + 0.5).clamp(0, 1)

@@ -27,6 +27,7 @@ from ..host import register, register_builtin, warn
 from ..prompts.prompt_processors import STABLE_DIFFUSION
 from .base import NonFiniteScore
 from .half_precision import PerItemLossScale
+from .model_images import resized
 from .text_to_image import TextToImageDistillation
 
 
@@ -85,7 +86,7 @@ class StableDiffusionGuidance(TextToImageDistillation):
         """Draw latents from the VAE's posterior, scaled to unit variance, float32. The draw is a
         function of (seed, step, item).
         """
-        images = self.resized(rgb, self.image_size) * 2 - 1
+        images = resized(rgb, self.image_size) * 2 - 1
         if self.vae_dtype == torch.float32:
             return self._encode(images)
         loss_scale = PerItemLossScale(self._count_bad_backwards)

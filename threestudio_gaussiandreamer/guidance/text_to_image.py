@@ -35,14 +35,13 @@ from pathlib import Path
 from typing import Any, ClassVar, Optional
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ..core.errors import UserError, unknown
 from ..core.options import in_range, one_of
 from ..diffusion.noise_prediction import PREDICTIONS, perp_neg
-from ..host import debug, info, parse_structured
+from ..host import debug, info, parse_structured, warn
 from ..models.extras import require_extra
 from ..models.families import STABLE_DIFFUSION, Family
 from ..models.hub import find_model
@@ -51,11 +50,14 @@ from ..models.model_files import load_network, load_settings
 from .base import ScoreDistillation
 from .half_precision import HALF_TYPES, channels_last, weights_type
 from .lora import LoRAParticles, check_adaptable
+from .model_images import size_of_images
 from .particles import ParticleModel
 from .scale_input import scale_input, scale_width
 from .text_condition import Condition, Embeddings, Latents, Timesteps, view_of_row
 from .view_contrast import check_view_contrast, contrasted, opposite
 
+USUAL_SCALES = 200
+"""Guidance scales above this, twice the paper's, are worth a warning."""
 TERMINAL_ABAR = 2.0**-24
 """Replaces an ``abar`` of exactly 0, which schedules with zero terminal SNR have at the last step,
 since ``predict_x0`` divides by its square root.
@@ -121,6 +123,12 @@ class TextToImageDistillation(ScoreDistillation):
         )
         self.set_schedule(folder)
         self.load(folder)
+        scale = self.cfg.guidance_scale
+        if self.scale_width is None and not 0 <= scale <= USUAL_SCALES:
+            warn(
+                f"system.guidance.guidance_scale={scale:g}: expected 1 (none) to {USUAL_SCALES}; "
+                "larger scales saturate results, and those below 0 lead away from the prompt"
+            )
 
     @property
     def half(self) -> bool:
@@ -175,19 +183,8 @@ class TextToImageDistillation(ScoreDistillation):
         self.text_width = self.unet.config.encoder_hid_dim or self.unet.config.cross_attention_dim
 
     def size_of_images(self, factor: int = 1) -> int:
-        """Return height and width of the images for the model, pixels: ``image_size``, or
-        ``factor`` times the latent size that the model was trained with.
-
-        Raises:
-            UserError: neither is known.
-        """
-        trained = self.denoiser.config.sample_size
-        if self.cfg.image_size is None and not isinstance(trained, int):
-            raise UserError(
-                f"{self.cfg.pretrained_model_name_or_path} has sample_size {trained}: set "
-                "system.guidance.image_size, pixels"
-            )
-        return self.cfg.image_size or trained * factor
+        """Return height and width of the images for the model; see ``guidance/model_images.py``."""
+        return size_of_images(self.cfg, self.denoiser.config.sample_size, factor)
 
     def require_text_to_image(
         self, channels: int, embedding_types: tuple[Optional[str], ...] = (None, "text")
@@ -386,14 +383,3 @@ class TextToImageDistillation(ScoreDistillation):
         """
         tokens = embeddings.to(self.dtype)
         return self.unet(z.to(self.dtype), t, encoder_hidden_states=tokens, **inputs).sample
-
-    def resized(self, images: Float[Tensor, "B 3 H W"], size: int) -> Float[Tensor, "B 3 s s"]:
-        """Resize images to the model's size, with antialiasing if they shrink by more than a factor
-        of 2, since bilinear sampling would skip pixels.
-        """
-        if images.shape[-2:] == (size, size):
-            return images
-        antialias = max(images.shape[-2:]) > 2 * size
-        return F.interpolate(
-            images, (size, size), mode="bilinear", align_corners=False, antialias=antialias
-        )
