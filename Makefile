@@ -12,10 +12,11 @@ SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import
 
 PROMPT =
 MODELS = toybox
-# the prompt as it is written, without expansion by make or the shell
+# both as they are written, without expansion by make or the shell; an empty prompt is reported
 demo: export TEXT = $(value PROMPT)
+demo: export FOLDER = $(value MODELS)
 demo: $(VENV)/ready-for-models     ## text to 3D with small models, offline, on the CPU; make demo MODELS=folder PROMPT="a red fox with a green scarf"
-	$(BIN)/python -m threestudio_gaussiandreamer.toybox.demo $(if $(value PROMPT),"$$TEXT") --models $(MODELS)
+	$(BIN)/python -m threestudio_gaussiandreamer.toybox.demo $(if $(filter command,$(origin PROMPT)),"$$TEXT") --models "$$FOLDER"
 
 demo-exact: $(VENV)/ready          ## train the bundled toy from a coarse prior with the exact score, offline, on the CPU
 	$(BIN)/python launch.py --config configs/demo.yaml $(SMALLER) --train
@@ -55,8 +56,9 @@ docs: $(VENV)/ready-for-tests      ## the generated parts of README and docs/: a
 	$(BIN)/python -m benchmarks.tables
 
 TOYBOX = .toybox
-train-toybox: $(VENV)/ready-for-models       ## train small models on generated objects, from scratch; hours on a CPU, resumable
+train-toybox: $(VENV)/ready-for-models       ## train small models on generated objects, from scratch, and export them to .toybox/models; hours on a CPU, resumable
 	$(ENVIRON) $(BIN)/python -m threestudio_gaussiandreamer.toybox.train $(TOYBOX)
+	$(BIN)/python -m threestudio_gaussiandreamer.toybox.export $(TOYBOX) $(TOYBOX)/models
 
 toybox-sheet: $(VENV)/ready-for-models       ## docs/images/toybox-world.png: 100 objects of the toybox
 	$(BIN)/python -m threestudio_gaussiandreamer.toybox.world_sheet docs/images/toybox-world.png

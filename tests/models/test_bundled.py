@@ -55,7 +55,26 @@ def test_a_missing_file_is_named(folder):
         model_part("toybox", POINTS)
 
 
-def test_a_package_without_models_says_how_to_train_them(folder, monkeypatch):
-    monkeypatch.setattr(bundled, "FOLDER", folder / "nowhere")
-    with pytest.raises(UserError, match="contains no trained models; train them"):
+@pytest.mark.parametrize("part", [CLIP, "another"])
+def test_without_the_list_or_the_part_the_package_is_to_be_installed_again(folder, part):
+    if part == CLIP:
+        (folder / "SHA256SUMS").unlink()
+    with pytest.raises(UserError, match="(SHA256SUMS|another)' is missing: install the package"):
+        model_part("toybox", part)
+
+
+@pytest.mark.parametrize("content", [b"abc\n", b"\xff\x00\x80\n", b"0" * 64 + b"\n"])
+def test_a_damaged_list_of_digests_is_named(folder, content):
+    (folder / "SHA256SUMS").write_bytes(content)
+    with pytest.raises(UserError, match="SHA256SUMS' is damaged: install the package again"):
         model_part("toybox", CLIP)
+
+
+def test_damaged_files_of_an_export_are_named_unless_it_has_no_digests(folder, monkeypatch):
+    monkeypatch.setattr(bundled, "FOLDER", folder / "elsewhere")
+    (folder / "clip/weights").write_text("other")
+    with pytest.raises(UserError, match="clip/weights' is damaged: write the folder again"):
+        model_part(str(folder), CLIP)
+    assert model_part(str(folder), "another")  # an export needn't have all parts
+    (folder / "SHA256SUMS").unlink()
+    assert model_part(str(folder), CLIP)

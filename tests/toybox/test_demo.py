@@ -1,5 +1,6 @@
 """The demo of text to 3D: runs, sheet, table, and going on after an interruption."""
 
+import json
 import os
 import signal
 import subprocess
@@ -12,11 +13,12 @@ from PIL import Image
 
 from tests.toybox.test_text_to_3d import PROMPT, QUICK
 from threestudio_gaussiandreamer.launch.experiment import main as launcher
-from threestudio_gaussiandreamer.models.bundled import JUDGE
+from threestudio_gaussiandreamer.models.bundled import JUDGE, write_digests
 from threestudio_gaussiandreamer.toybox import demo, models
 from threestudio_gaussiandreamer.toybox.export import write_weights
 from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
 from threestudio_gaussiandreamer.toybox.world import withheld
+from threestudio_gaussiandreamer.view.run_files import read_json
 
 OPTIONS = [option for option in QUICK if "=t" not in option[-3:] and "timestamp" not in option]
 OPTIONS += ["system.pages=false", "system.exporter={formats: [ply], save_video: false}"]
@@ -68,6 +70,7 @@ def test_an_interrupted_demo_continues(exported, tmp_path, monkeypatch, in_proce
         monkeypatch.setattr(demo, "launch", interrupted)
 
     def interrupted(options):
+        time.sleep(0.5)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(demo, "launch", stopped)
@@ -76,6 +79,10 @@ def test_an_interrupted_demo_continues(exported, tmp_path, monkeypatch, in_proce
     assert demo.main(words) == 0
     (folder,) = tmp_path.iterdir()
     assert len(in_process) == 2 and (folder / "sheet.png").is_file()
+    first, second = (read_json(folder / f"prompt{i}.json", dict)["seconds"] for i in (1, 2))
+    assert first > 0 and second >= 0.5  # with those before the interruption
+    record = json.loads((folder / "runs/prompt2_a_blue_mug" / demo.SECONDS).read_text())
+    assert record["seconds"] == second
 
 
 def test_an_error_of_a_run_ends_the_demo(exported, tmp_path, in_process):
@@ -86,7 +93,13 @@ def test_an_error_of_a_run_ends_the_demo(exported, tmp_path, in_process):
 
 @pytest.mark.parametrize(
     ("words", "message"),
-    [([""], "a prompt is empty"), ([PROMPT, "--output", "{file}"], "--output")],
+    [
+        ([""], "a prompt is empty"),
+        ([PROMPT, "  "], "a prompt is empty"),
+        (["a red \udcff"], "isn't valid UTF-8"),
+        ([PROMPT, "--output", "{file}"], "--output"),
+        ([PROMPT, "--models", "{file}"], "expected toybox, or a folder of toybox.export"),
+    ],
 )
 def test_wrong_input_is_named(tmp_path, capsys, words, message):
     (tmp_path / "file").touch()
@@ -99,6 +112,7 @@ def test_ctrl_c_writes_a_checkpoint_and_tells_how_to_continue(exported, tmp_path
     # the other process builds a judge of full size; the other networks' sizes are in their files
     monkeypatch.setattr(models.Judge, "CHANNELS", FULL_SIZE)
     write_weights(exported / JUDGE, models.Judge().state_dict())
+    write_digests(exported)
     options = [*arguments(exported, tmp_path, PROMPT), "trainer.max_steps=500"]
     command = [sys.executable, "-m", "threestudio_gaussiandreamer.toybox.demo", *options]
     root = Path(__file__).parents[2]

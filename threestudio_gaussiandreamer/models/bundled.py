@@ -2,12 +2,13 @@
 
 The folder of any training's export (``toybox/export.py``) can be named in its place. Of either, the
 option for a diffusion model takes the sub-folder ``stable-diffusion``, that for a CLIP takes
-``clip``, and that for Point-E's weights takes ``points.safetensors``. Digests of the bundled files
-detect damage before anything is loaded.
+``clip``, and that for Point-E's weights takes ``points.safetensors``. Digests of the files detect
+damage before anything is loaded.
 """
 
 import functools
 import hashlib
+import re
 from pathlib import Path
 
 from ..core.errors import UserError
@@ -19,6 +20,8 @@ RECORD, DIGESTS = "training.json", "SHA256SUMS"
 """The export's record of its training, which marks such a folder, and the digests of its other
 files in the format of ``sha256sum``.
 """
+LINE = re.compile(rb"([0-9a-f]{64})  ([!-~]+)")
+"""A line of the list of digests."""
 DIFFUSION, CLIP, POINTS, JUDGE = (
     "stable-diffusion",
     "clip",
@@ -31,10 +34,9 @@ REINSTALL = (
     f"threestudio_gaussiandreamer/assets/{NAME})"
 )
 
-UNTRAINED = (
-    f"{NAME}: this version of the package contains no trained models; train them (make "
-    "train-toybox), export them (python -m threestudio_gaussiandreamer.toybox.export .toybox "
-    f"models) and give the folder models instead of {NAME}"
+EXPORT_AGAIN = (
+    "write the folder again (python -m threestudio_gaussiandreamer.toybox.export); if you changed "
+    f"it yourself, delete its {DIGESTS}"
 )
 
 
@@ -46,17 +48,22 @@ def model_part(name: str, part: str) -> str:
         part: DIFFUSION, CLIP, POINTS or JUDGE.
 
     Raises:
-        UserError: a bundled file is missing or damaged; the message says how to install it again,
-            or how to train the models if the package has none.
+        UserError: a file is missing or damaged; the message says how to install it or to write it
+            again.
     """
     if name == NAME:
         require_intact(FOLDER, part)
         return str(FOLDER / part)
     folder = Path(name).expanduser()
-    return str(folder / part) if _is_export(folder) else name
+    if not is_export(folder):
+        return name
+    if (folder / DIGESTS).is_file():
+        require_intact(folder, part)
+    return str(folder / part)
 
 
-def _is_export(folder: Path) -> bool:
+def is_export(folder: Path) -> bool:
+    """Return whether ``toybox/export.py`` wrote this folder."""
     try:
         return (folder / RECORD).is_file() and (folder / DIFFUSION).is_dir()
     except (OSError, ValueError):  # the name is too long, or contains NUL
@@ -68,24 +75,31 @@ def require_intact(folder: Path, part: str) -> None:
     """Compare the files of a part with their digests, once per process.
 
     Raises:
-        UserError: one is missing or differs.
+        UserError: one is missing or differs; or the list of digests, or a bundled part in it.
     """
     digests = read_digests(folder)
-    for name, expected in digests.items():
-        if name.partition("/")[0] == part:
-            _require_file(folder / name, expected)
-    if not digests:
-        raise UserError(UNTRAINED)
-    if not any(name.partition("/")[0] == part for name in digests):
-        raise UserError(f"the bundled model {str(folder / part)!r} is missing: {REINSTALL}")
+    files = [name for name in digests if name.partition("/")[0] == part]
+    for name in files:
+        _require_file(folder, name, digests[name])
+    if folder == FOLDER and not files:
+        missing = part if digests else DIGESTS
+        raise UserError(f"{str(folder / missing)!r} is missing: {REINSTALL}")
 
 
 def read_digests(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of each file by its path below ``folder``; empty without a list."""
+    """Return the SHA-256 of each file by its path below ``folder``; empty without a list.
+
+    Raises:
+        UserError: the list is damaged.
+    """
     path = folder / DIGESTS
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    pairs = (line.split(maxsplit=1) for line in lines if line.strip())
-    return {name: digest for digest, name in pairs}
+    lines = path.read_bytes().splitlines() if path.is_file() else []
+    digests = {}
+    for line in lines:
+        if not (found := LINE.fullmatch(line)):
+            raise UserError(f"{str(path)!r} is damaged: {_remedy(folder)}")
+        digests[found[2].decode()] = found[1].decode()
+    return digests
 
 
 def write_digests(folder: Path) -> None:
@@ -101,11 +115,16 @@ def digest_of(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _require_file(path: Path, expected: str) -> None:
+def _require_file(folder: Path, name: str, expected: str) -> None:
+    path = folder / name
     try:
         found = digest_of(path)
     except OSError as error:
         reason = error.strerror or error
-        raise UserError(f"the bundled model file {str(path)!r}: {reason}; {REINSTALL}") from error
+        raise UserError(f"the file {str(path)!r}: {reason}; {_remedy(folder)}") from error
     if found != expected:
-        raise UserError(f"the bundled model file {str(path)!r} is damaged: {REINSTALL}")
+        raise UserError(f"the file {str(path)!r} is damaged: {_remedy(folder)}")
+
+
+def _remedy(folder: Path) -> str:
+    return REINSTALL if folder == FOLDER else EXPORT_AGAIN

@@ -22,7 +22,7 @@ def warn_of_unknown_words(folder: Path, prompt: str) -> None:
     path = folder / WORDS_FILE
     if not path.is_file():
         return
-    known = path.read_text(encoding="utf-8").split()
+    known = path.read_text(encoding="utf-8", errors="replace").split()
     unknown = unknown_words(prompt, known)
     if unknown:
         from ..host import warn  # brings Lightning, which readers of WORDS_FILE don't need

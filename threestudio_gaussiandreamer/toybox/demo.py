@@ -6,6 +6,7 @@ recognises into a new folder of ``outputs/demo``. After Ctrl-C the same command 
 """
 
 import argparse
+import contextlib
 import functools
 import math
 import re
@@ -13,7 +14,7 @@ import subprocess
 import sys
 import textwrap
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
@@ -31,7 +32,7 @@ from ..core.signals import interrupt, raised_signals
 from ..evaluation.asset_metrics import Asset, rendered
 from ..evaluation.text_to_3d import ATTRIBUTES, Scores, prior_of, result_of
 from ..launch.folder_lock import FolderInUse, RunFolder, claim, claim_new
-from ..models.bundled import NAME
+from ..models.bundled import NAME, is_export
 from ..view.run_files import read_json
 from . import recognition
 from .samples import samples
@@ -88,11 +89,14 @@ def run(args: argparse.Namespace) -> None:
     """Train the prompts that aren't finished, then write sheet and table.
 
     Raises:
-        UserError: a prompt is empty, or another demo uses the folder.
+        UserError: a prompt is empty or no text, there are no such models, or another demo uses the
+            folder.
         SystemExit: the launcher has failed, and said why.
     """
-    if not all(prompt.strip() for prompt in args.prompts):
-        raise UserError('a prompt is empty: give one such as "a red fox with a green scarf"')
+    for prompt in args.prompts:
+        require_text(prompt)
+    if args.models != NAME and not is_export(Path(args.models).expanduser()):
+        raise UserError(f"--models {args.models}: expected {NAME}, or a folder of toybox.export")
     root = output_folder(args.output, "--output")
     recognition.load_judge(args.models)  # a missing file is reported before the training
     claimed = open_folder(root, {key: vars(args)[key] for key in ("prompts", "options", "models")})
@@ -102,6 +106,16 @@ def run(args: argparse.Namespace) -> None:
         write_results(claimed.path, args, runs)
     finally:
         claimed.release()
+
+
+def require_text(prompt: str) -> None:
+    """Raise UserError for a prompt that is empty or can't be encoded."""
+    if not prompt.strip():
+        raise UserError(f'a prompt is empty: give one such as "{PROMPTS[0]}"')
+    try:
+        prompt.encode()
+    except UnicodeEncodeError as error:
+        raise UserError(f"the prompt {prompt!r} isn't valid UTF-8") from error
 
 
 def open_folder(root: Path, record: dict[str, Any]) -> RunFolder:
@@ -144,20 +158,33 @@ def train(folder: Path, index: int, args: argparse.Namespace) -> Path:
     with atomic_file(text, durable=False) as file:
         file.write(prompt.encode())
     print(f"\n{index + 1}/{len(args.prompts)}: {prompt}", flush=True)
-    start = time.monotonic()
-    launch([
-        f"exp_root_dir={folder}",
-        "name=runs",
-        f"tag={place.name}",
-        "use_timestamp=false",
-        "resume=auto",
-        f"system.prompt_processor.prompt_file={text}",
-        f"system.guidance.pretrained_model_name_or_path={args.models}",
-        *args.options,
-    ])  # fmt: skip
+    spent = text.with_suffix(".json")
+    with timed(spent):
+        launch([
+            f"exp_root_dir={folder}",
+            "name=runs",
+            f"tag={place.name}",
+            "use_timestamp=false",
+            "resume=auto",
+            f"system.prompt_processor.prompt_file={text}",
+            f"system.guidance.pretrained_model_name_or_path={args.models}",
+            *args.options,
+        ])  # fmt: skip
     with atomic_file(place / SECONDS) as file:
-        file.write(json_text({"seconds": round(time.monotonic() - start, 1)}).encode())
+        file.write(spent.read_bytes())
     return place
+
+
+@contextlib.contextmanager
+def timed(path: Path) -> Iterator[None]:
+    """Add the seconds of this block to those that are in a file."""
+    start, earlier = time.monotonic(), read_json(path, dict).get("seconds", 0.0)
+    try:
+        yield
+    finally:
+        with atomic_file(path, durable=False) as file:
+            seconds = round(earlier + time.monotonic() - start, 1)
+            file.write(json_text({"seconds": seconds}).encode())
 
 
 def name_of(index: int, prompt: str) -> str:

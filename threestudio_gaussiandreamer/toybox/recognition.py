@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ..cameras import Orbit
 from ..core.errors import UserError
-from ..models.bundled import JUDGE, model_part
+from ..models.bundled import JUDGE, NAME, model_part
 from .models import Judge
 from .views import DISTANCE, FOVY_DEG, LABELS
 from .world import Attributes
@@ -58,8 +58,8 @@ def load_judge(name: str) -> Judge:
         judge.load_state_dict({name: value.float() for name, value in weights.items()})
     except FileNotFoundError:
         raise UserError(
-            f"there is no judge at {str(path)!r}: train one (make train-toybox), export it "
-            "(python -m threestudio_gaussiandreamer.toybox.export), and give its file as --judge"
+            f"there is no judge at {str(path)!r}: give {NAME}, or the export of a training that has "
+            "one (make train-toybox)"
         ) from None
     except (OSError, SafetensorError, RuntimeError) as error:
         reason = str(error).partition("\n")[0]  # torch lists every parameter that differs
