@@ -218,3 +218,10 @@ def test_a_full_disk_at_the_start_from_weights_is_mended_by_a_second_call(export
         warm_start.start_from(*start)
     warm_start.start_from(*start)
     assert loop.is_trained(tmp_path, "text") and open_tokenizer(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"{", b"[]", b'{"text": 3}', b"\xff"])
+def test_a_damaged_record_of_weights_is_named(tmp_path, content):
+    (tmp_path / "training.json").write_bytes(content)
+    with pytest.raises(UserError, match="training.json' is damaged"):
+        warm_start.start_from(tmp_path, options(tmp_path / "run"), STAGES)

@@ -11,7 +11,7 @@ import torch
 
 from tests.helpers.threads import torch_threads
 from tests.toybox.helpers import copied, options, training
-from threestudio_gaussiandreamer.core.checkpoint_file import load_file
+from threestudio_gaussiandreamer.core.checkpoint_file import load_file, save_file
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.toybox import (
     judge_stage,
@@ -196,6 +196,46 @@ def test_a_damaged_checkpoint_is_refused(folder, tmp_path):
     run.path.write_bytes(content)
     with pytest.raises(UserError, match="judge.pt"):
         training(tmp_path / "run", "judge")
+
+
+def test_a_file_of_another_sort_is_named(folder, tmp_path):
+    run = training(copied(folder, tmp_path / "run"), "judge")
+    save_file(run.path, {"a": torch.zeros(1)})
+    with pytest.raises(UserError, match="judge.pt isn't a checkpoint of .*: it has no constants"):
+        training(tmp_path / "run", "judge")
+
+
+def test_another_version_of_torch_is_told(folder, tmp_path, caplog):
+    caplog.set_level("INFO")
+    run = training(copied(folder, tmp_path / "run"), "judge")
+    run.run(4)
+    training(tmp_path / "run", "judge")
+    assert "torch" not in caplog.text
+    save_file(run.path, load_file(run.path) | {"torch": "1.0"})
+    resumed = training(tmp_path / "run", "judge")
+    assert f"begun with torch 1.0, continued with {torch.__version__}" in caplog.text
+    assert resumed.run(8).images == 8
+
+
+def test_the_unet_of_small_pictures_is_not_trained_after_the_other(folder, tmp_path, capsys):
+    place = copied(folder, tmp_path / "run")
+    training(place, "unet").run(4)
+    train.train(options(place), ["unet-small"], 4)
+    assert "unet-small: not trained, since unet has begun" in capsys.readouterr().out
+    assert not (place / "unet-small.pt").exists()
+
+
+def test_incomplete_latents_are_made_again(folder, tmp_path):
+    """A power failure may leave an empty file."""
+    place = copied(folder, tmp_path / "run")
+    training(place, "unet").run(4)
+    files = list((place / "latents").iterdir())
+    contents = {path: path.read_bytes() for path in files}
+    for path in files:
+        path.write_bytes(b"")
+    training(place, "unet").run(8)
+    made = [path for path in files if path.stat().st_size]
+    assert made and all(path.read_bytes() == contents[path] for path in made)
 
 
 def test_stages_that_need_others_name_them(tmp_path):

@@ -3,14 +3,18 @@
 import json
 import math
 import os
+import time
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from difflib import get_close_matches
+from glob import escape as glob_escape
 from pathlib import Path
 from threading import get_ident
 from typing import Any, BinaryIO
 
 from .errors import UserError
+
+ABANDONED_SECONDS = 3600
 
 
 def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] = ()) -> Path:
@@ -89,6 +93,17 @@ def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bi
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_abandoned(path: str | os.PathLike) -> None:
+    """Delete temporary files that killed processes have left while they wrote ``path``: those that
+    haven't been written for an hour.
+    """
+    path = Path(path)
+    for left in path.parent.glob(f".{glob_escape(_shortened(path.name))}.*.tmp"):
+        with suppress(OSError):  # another process may have deleted it
+            if time.time() - left.stat().st_mtime > ABANDONED_SECONDS:
+                left.unlink()
 
 
 def json_text(content: Any, **options: Any) -> str:

@@ -249,13 +249,14 @@ class Training:
             "measured": self.measured,
             "earlier": self.earlier,
             "device": _device_name(self.stage.device),
+            "torch": str(torch.__version__),
             **vars(self.progress),
         }
         save_file(self.path, content)
         write_curves(self.path.with_suffix(".csv"), self.progress.history)
 
     def _resume(self) -> None:
-        content = load_file(self.path)
+        content = _training_checkpoint(self.path)
         if content["depends"] != self.stage.depends():
             changed = [
                 name
@@ -274,6 +275,11 @@ class Training:
         self.measured = content["measured"]
         self.earlier = content.get("earlier", [])
         log.info("%s: resumed after %d images", self.stage.name, self.progress.images)
+        if (version := content.get("torch", torch.__version__)) != torch.__version__:
+            log.warning(
+                "%s: begun with torch %s, continued with %s: the result differs in rounding from "
+                "that of an uninterrupted training", self.stage.name, version, torch.__version__
+            )  # fmt: skip
 
     @torch.no_grad()
     def _freeze(self) -> None:
@@ -347,6 +353,23 @@ class _Sums:
         means = {name: float(value) / self.count for name, value in self.values.items()}
         self.count, self.values = 0, {}
         return means
+
+
+def _training_checkpoint(path: Path) -> dict[str, Any]:
+    """Read the checkpoint of a stage.
+
+    Raises:
+        UserError: it is damaged, or no such checkpoint.
+    """
+    content = load_file(path)
+    needed = {"model", "ema", "optimizer", "depends", "constants", "measured", *vars(Progress())}
+    missing = needed - set(content if isinstance(content, dict) else ())
+    if missing:
+        raise UserError(
+            f"{path} isn't a checkpoint of the toybox's training: it has no "
+            f"{', '.join(sorted(missing))}"
+        )
+    return content
 
 
 def _device_name(device: torch.device) -> str:

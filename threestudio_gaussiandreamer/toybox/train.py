@@ -29,7 +29,7 @@ from ..launch.folder_lock import FolderInUse, claim
 from .autoencoder_stage import AutoencoderStage
 from .clip_stage import ClipStage
 from .judge_stage import SEED_OFFSET, JudgeStage, judge_shards
-from .loop import Options, Stage, Training
+from .loop import Options, Stage, Training, is_trained
 from .points_stage import PointsStage
 from .text_stage import TextStage
 from .unet_stage import SmallUNetStage, UNetStage
@@ -174,12 +174,16 @@ def train(
     seconds: float = math.inf,
 ) -> None:
     """Train the stages in order, each until ``images`` were seen or ``seconds`` have passed.
+    ``unet-small``, from which ``unet`` begins, is left out if that has begun.
 
     Raises:
         UserError: another process trains one of them in this folder.
         Terminated, KeyboardInterrupt: a signal stopped one, after it wrote its checkpoint.
     """
     for name in (name for name in STAGES if name in stages):
+        if name == SmallUNetStage.name and is_trained(options.folder, UNetStage.name):
+            print(f"{name}: not trained, since {UNetStage.name} has begun", flush=True)
+            continue
         with locked(options.folder, name):
             training = Training(STAGES[name](options))
             progress = training.run(images, seconds)

@@ -30,7 +30,7 @@ from .text_batches import (
     view_prompts,
 )
 from .text_stage import frozen_text
-from .views import SIZE, held_out_shard, with_backgrounds
+from .views import SIZE, held_out_shard, is_whole, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.05
 """Fraction of pictures with a random background. It is small because with a fraction of 0.5 score
@@ -222,7 +222,7 @@ class UNetStage(Stage):
         shard = self.shards.path(index).stem
         name = f"{self.encoder_digest[:12]}-{SIZE // self.reduction}-{shard}.pt"
         path = self.options.folder / "latents" / name
-        if not path.exists():
+        if not is_whole(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             rgba = self.shards.get(index).rgba
             rng = numpy_generator(self.options.seed, "unet-backgrounds", index)

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 
 from ..cameras import Orbit, orbit_c2w
-from ..core.files import atomic_file
+from ..core.files import atomic_file, remove_abandoned
 from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh, sample_surface, surface_colors
 from ..meshes.raycast import MeshCaster
@@ -112,9 +112,10 @@ class Shards:
     def ensure(self, index: int) -> None:
         """Render shard ``index`` into its file, unless that exists and is complete."""
         path = self.path(index)
-        if _is_whole(path):
+        if is_whole(path):
             return
         self.folder.mkdir(parents=True, exist_ok=True)
+        remove_abandoned(path)
         shard = self.make(index)
         with atomic_file(path, durable=False) as file:
             np.savez(file, **shard._asdict())
@@ -163,7 +164,7 @@ class Shards:
         return render(mesh, orbit)
 
 
-def _is_whole(path: Path) -> bool:
+def is_whole(path: Path) -> bool:
     """Return whether a file is a complete zip archive; a truncated one lacks the end record."""
     return path.is_file() and zipfile.is_zipfile(path)
 

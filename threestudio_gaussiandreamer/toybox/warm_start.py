@@ -9,6 +9,8 @@ from torch import Tensor, nn
 
 from ..core.errors import UserError
 from ..core.files import existing_file
+from ..models.bundled import RECORD
+from ..view.run_files import read_json
 from .loop import Options, Progress, Stage, Training, is_trained
 from .new_words import grow_embeddings, grow_tokenizer, separate
 from .text_stage import TEXT_PARTS
@@ -32,8 +34,7 @@ def start_from(weights: Path, options: Options, stages: dict[str, type[Stage]]) 
     Raises:
         UserError: a file is missing or holds another model.
     """
-    path = existing_file(weights / "training.json", "record of the toybox's weights")
-    record = json.loads(path.read_text(encoding="utf-8"))
+    record = read_record(weights)
     options = dataclasses.replace(options, only="")  # which may be of one stage alone
     tokenizer = weights / "stable-diffusion" / "tokenizer"
     new_words = grow_tokenizer(tokenizer, options.folder / "tokenizer")
@@ -60,6 +61,19 @@ def start_from(weights: Path, options: Options, stages: dict[str, type[Stage]]) 
                 if not (new_words and key in OF_DIRECTIONS)
             }
             training.save()
+
+
+def read_record(weights: Path) -> dict[str, Any]:
+    """Return what ``training.json`` says about each network.
+
+    Raises:
+        UserError: it is missing or damaged.
+    """
+    path = existing_file(weights / RECORD, "record of the toybox's weights")
+    record = read_json(path, dict)
+    if not record or not all(isinstance(seen, dict) for seen in record.values()):
+        raise UserError(f"the record of the toybox's weights {str(path)!r} is damaged")
+    return record
 
 
 def _load(model: nn.Module, state: dict[str, Tensor], weights: Path, name: str) -> None:
