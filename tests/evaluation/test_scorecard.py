@@ -118,7 +118,12 @@ def test_wrong_input_is_named(tmp_path, judge, capsys, arguments, message):
     assert message in capsys.readouterr().err
 
 
-def test_a_run_without_a_prompt_is_named(tmp_path, judge, capsys):
-    run = finished(tmp_path / "runs", [""])
-    assert main([str(run), "--metrics", "judge", "--judge", judge]) == 2
-    assert "has no prompt" in capsys.readouterr().err
+def test_a_run_without_a_prompt_is_named_after_the_others_are_scored(tmp_path, judge, capsys):
+    runs = finished(tmp_path / "runs", ["", PROMPTS[0]])
+    output = tmp_path / "out"
+    arguments = ["--metrics", "judge", "--judge", judge, "--output", str(output)]
+    assert main([str(runs), *arguments]) == 2
+    assert "1 of the assets can't be scored" in (error := capsys.readouterr().err)
+    assert "run0" in error and "has no prompt" in error
+    with open(output / "scorecard.csv", newline="") as file:
+        assert [row["prompt"] for row in csv.DictReader(file)] == [PROMPTS[0]]

@@ -76,14 +76,13 @@ def test_finished_runs_are_scored_with_the_models_of_one_folder(finished, export
         ("a red fox with a skarf", "'skarf' (near: scarf)"),
         ("zzz qqq", "'zzz', 'qqq'"),
         ("ein roter Fuchs 狐狸 🦊", "'狐狸'"),
-        ("a red fox " * 400, None),
+        ("a red fox " * 400, "the text encoder takes 32: what comes last has no effect"),
     ],
     ids=["misspelt", "unknown words only", "other scripts", "4 kB"],
 )
 def test_any_text_is_a_prompt(exported, tmp_path, capsys, prompt, warned):
     assert run(exported, tmp_path, prompt, "trainer.max_steps=1", "system.pages=false") == 0
-    errors = capsys.readouterr().err
-    assert warned in errors if warned else "wasn't trained on" not in errors
+    assert warned in capsys.readouterr().err
 
 
 def test_an_empty_prompt_is_requested(exported, tmp_path, capsys):

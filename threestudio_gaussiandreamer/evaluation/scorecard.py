@@ -123,7 +123,7 @@ def find_results(folders: Sequence[str]) -> list[Result]:
     """Find the finished runs in these folders, sorted by path; a run in several of them once.
 
     Raises:
-        UserError: a folder doesn't exist or holds no finished run, or a run's prompt is unknown.
+        UserError: a folder doesn't exist or holds no finished run.
     """
     found: dict[Path, Result] = {}
     for folder in folders:
@@ -134,11 +134,6 @@ def find_results(folders: Sequence[str]) -> list[Result]:
             raise UserError(f"{folder!r} holds no finished run, which has a save/it*-export folder")
         new = [place for place in runs if place.resolve() not in found]
         found |= {place.resolve(): find_result(str(place)) for place in new}
-    if without_prompt := [result for result in found.values() if not result.prompt]:
-        raise UserError(
-            f"{str(without_prompt[0].ply)!r} has no prompt in its run's configs/parsed.yaml: "
-            "metrics of the scorecard compare renders with prompts"
-        )
     return list(found.values())
 
 
@@ -160,8 +155,9 @@ def scored(
         failed: gets the messages of those that can't be read or scored.
     """
     for item, result in enumerate(tqdm(results, unit="asset", disable=None)):
-        row: dict[str, Any] = {"asset": str(result.ply.parents[2]), "prompt": result.prompt or ""}
+        row: dict[str, Any] = {"asset": str(result.ply.parents[2])}
         try:
+            row["prompt"] = prompt_of(result)
             asset = Asset(result, row["prompt"], read_result(result), item)
             for metric in metrics:
                 row |= metric.score(asset)
@@ -169,6 +165,17 @@ def scored(
             failed.append(str(error))
         else:
             yield row
+
+
+def prompt_of(result: Result) -> str:
+    """Return the prompt of a run, with which metrics compare its renders.
+
+    Raises:
+        UserError: its configuration has none.
+    """
+    if not result.prompt:
+        raise UserError(f"{str(result.ply)!r} has no prompt in its run's configs/parsed.yaml")
+    return result.prompt
 
 
 def summary(metrics: Sequence[Metric], first: Rows, second: Rows) -> dict[str, Any]:

@@ -5,6 +5,7 @@ networks.
 As in diffusers' pipelines, texts are padded to the model's length, and longer ones truncated with a
 warning. The result is float32, without gradients."""
 
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from .model_files import free_memory, load_network, load_settings
 
 LENGTH = 77
 """Number of tokens that CLIP, and DeepFloyd IF with T5, were trained with."""
+SHOWN = 300
+"""Characters of a prompt in a warning."""
 
 
 def encode_clip(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
@@ -123,7 +126,7 @@ def _tokenize(tokenizer: Any, texts: list[str], length: int) -> Any:
         if count > length:
             warn(
                 f"the prompt has {count} tokens, the text encoder takes {length}: what comes "
-                f"last has no effect: {text!r}"
+                f"last has no effect: {textwrap.shorten(text, SHOWN)!r}"
             )
     return tokenizer(
         texts, padding="max_length", max_length=length, truncation=True, return_tensors="pt"
