@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.markdown import markdown
-from benchmarks.models import memory, precision
+from benchmarks.models import memory, precision, training_rate
 from benchmarks.quality import failure_table, formats, toybox_variants, variant_tables
 from benchmarks.quality import mesh as mesh_quality
 from benchmarks.quality import tables as quality
@@ -105,6 +105,8 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "toybox": toybox.results,
         "seeds": toybox.seeds,
         "judges": toybox.judges,
+        "training rate": training_rate.table,
+        "whole runs": start.whole_runs,
         "settings": toybox_variants.settings,
     },
     "docs/several_processes.md": {"ddp": ddp.table},

@@ -1,4 +1,6 @@
-"""The measured parts of docs/step_time.md, and the seconds of a conversion in docs/mesh.md."""
+"""The measured parts of docs/step_time.md, the seconds of conversions in docs/mesh.md, and those of
+whole runs in docs/toybox.md.
+"""
 
 import statistics
 from collections.abc import Iterable
@@ -32,6 +34,23 @@ def first_step() -> str:
     table = [(stage, *(f"{medians[name, stage]:.2f}" for name in checkouts)) for stage in stages]
     sums = [sum(medians[name, stage] for stage in stages) for name in checkouts]
     return markdown(head, [*table, ("all", *(f"{total:.2f}" for total in sums))])
+
+
+def whole_runs() -> str:
+    """Return median seconds and memory of whole runs with the small learned models."""
+    rows = read(FOLDER / "whole_run.csv")
+    numbers = ("seconds", "prior_seconds", "cpu_seconds", "peak_mb")
+    lines = []
+    for name, place in _unique((row["configuration"], _place(row)) for row in rows):
+        same = [row for row in rows if (row["configuration"], _place(row)) == (name, place)]
+        medians = [statistics.median(float(row[number]) for row in same) for number in numbers]
+        lines.append((name, place, str(len(same)), *(f"{value:.0f}" for value in medians)))
+    head = ("configuration", "cores", "runs", "seconds", "until the prior's points", "CPU seconds")
+    return markdown((*head, "peak memory, MB"), lines)
+
+
+def _place(row: dict[str, str]) -> str:
+    return f"{row['cores']}, {row['machine']}"
 
 
 def _heading(rows: Rows, checkout: str) -> str:

@@ -58,8 +58,8 @@ def load_judge(name: str) -> Judge:
         judge.load_state_dict({name: value.float() for name, value in weights.items()})
     except FileNotFoundError:
         raise UserError(
-            f"there is no judge at {str(path)!r}: give {NAME}, or the export of a training that has "
-            "one (make train-toybox)"
+            f"there is no judge at {str(path)!r}: give {NAME}, or the export of a training that "
+            "has one (make train-toybox)"
         ) from None
     except (OSError, SafetensorError, RuntimeError) as error:
         reason = str(error).partition("\n")[0]  # torch lists every parameter that differs

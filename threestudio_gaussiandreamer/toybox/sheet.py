@@ -7,18 +7,20 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-TEXT_HEIGHT, LINE = 47, 11
-"""Pixels below each picture, and from line to line."""
+LINE = 11
+"""Pixels from line to line of the texts."""
 
 
 def contact_sheet(
     images: Float[torch.Tensor, "N 3 H W"], texts: Sequence[str] = (), columns: int = 10
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Arrange pictures (values in [0, 1]) in rows, each with its text below it."""
+    """Arrange pictures (values in [0, 1]) in rows, each with its whole text below it."""
     from PIL import Image, ImageDraw
 
     height, width = images.shape[-2:]
-    cell = height + (TEXT_HEIGHT if texts else 0)
+    wrapped = [textwrap.wrap(text, width // 6) for text in texts] or [[]] * len(images)
+    most = max(map(len, wrapped), default=0)
+    cell = height + (most * LINE + 3 if most else 0)
     rows = -(-len(images) // columns)
     sheet = Image.new("RGB", (columns * width, rows * cell), "white")
     draw = ImageDraw.Draw(sheet)
@@ -26,7 +28,6 @@ def contact_sheet(
     for index, image in enumerate(pixels):
         x, y = index % columns * width, index // columns * cell
         sheet.paste(Image.fromarray(image), (x, y))
-        lines = textwrap.wrap(texts[index], width // 6)[: TEXT_HEIGHT // LINE] if texts else []
-        for line, words in enumerate(lines):
+        for line, words in enumerate(wrapped[index]):
             draw.text((x + 2, y + height + line * LINE), words, fill="black")
     return np.asarray(sheet)

@@ -76,7 +76,7 @@ class TextStage(Stage):
     name = "text"
     batch_size = 128
     learning_rate = 1e-3
-    images = 600_000
+    images = 200_000
 
     def build(self) -> nn.Module:
         self.tokenizer = open_tokenizer(self.options.folder)
