@@ -25,7 +25,8 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.guidance.scale_input import scale_input
 from threestudio_gaussiandreamer.models.bundled import write_digests
-from threestudio_gaussiandreamer.toybox.loop import Options, averaged_weights
+from threestudio_gaussiandreamer.toybox.checkpoints import averaged_weights
+from threestudio_gaussiandreamer.toybox.loop import Options
 from threestudio_gaussiandreamer.toybox.unet_stage import UNetBatch, UNetStage
 
 WIDTH = 64

@@ -5,7 +5,7 @@
 Lines show results against a number that runs vary; `toybox_settings.png` and
 `toybox_distillations.png` show the difference of each other setting, and of each other score
 distillation, to toybox.yaml on the same prompts and seeds, and its seconds. Bands and bars are
-bootstrap intervals over prompts.
+bootstrap intervals over prompts. `toybox_seconds.png` shows all of them against seconds.
 """
 
 import math
@@ -13,12 +13,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from benchmarks.quality.chart_runs import median, saved, set_log_x
 from benchmarks.quality.toybox_jobs import (
     COUNT,
     DEFAULT,
     EXACT,
     GUIDANCE,
+    PAPER_RECIPE,
     RECOGNIZED,
     SAMPLES,
     STEPS,
@@ -32,6 +35,7 @@ from benchmarks.quality.toybox_tables import (
     measured,
     present,
     title_of,
+    variants,
 )
 from benchmarks.quality.toybox_variants import (
     DISTILLATIONS,
@@ -78,6 +82,8 @@ def main() -> None:
     for name, charts in COMPARISONS.items():
         if found := settings(measured(), charts):
             print(draw_settings(name, found))
+    if shown := with_known_seconds(rows):
+        print(draw_against_seconds("toybox_seconds", shown))
 
 
 # ---- results against a number --------------------------------------------------------------------
@@ -216,6 +222,43 @@ def draw_seconds(panel: Any, found: Sequence[Setting]) -> None:
     panel.margins(x=0.1)
     panel.set_xlim(left=0)
     finish(panel, "CPU seconds (tick: toybox.yaml)")
+
+
+# ---- results against seconds ---------------------------------------------------------------------
+
+
+def with_known_seconds(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Return the rows of each kind of run that has enough of them with CPU seconds."""
+    timed = [row for row in rows if row["cpu_seconds"] and row["variant"] != EXACT]
+    return {title: same for title, same in variants(timed) if len(same) >= ENOUGH}
+
+
+def draw_against_seconds(name: str, shown: dict[str, list[Row]]) -> Path:
+    """Draw each kind of run as a point: recognised attributes and multi-face rate against median
+    seconds; toybox.yaml large, the paper's recipe as a star.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(1, 2, figsize=(14, 5), layout="constrained")
+    colors = plt.get_cmap("tab20").colors
+    markers = {DEFAULT: ("D", 11), PAPER_RECIPE: ("*", 16)}
+    for panel, measure in zip(panels, (recognised_share, multi_face), strict=True):
+        for place, (title, rows) in enumerate(shown.items()):
+            marker, size = markers.get(title, ("osv^"[place // len(colors)], 7))
+            mean = float(np.nanmean(list(values_of(rows, measure).values())))
+            color = colors[place % len(colors)]
+            panel.plot([median(rows, "cpu_seconds")], [100 * mean], marker, color=color,
+                       markersize=size, label=title, markeredgecolor="0.2")  # fmt: skip
+        set_log_x(panel)
+    finish(panels[0], "CPU seconds, one thread")
+    finish(panels[1], "CPU seconds, one thread")
+    panels[0].set_ylabel("recognised attributes, %")
+    panels[1].set_ylabel("multi-face, %")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
+    return saved(figure, name)
 
 
 # ---- both ----------------------------------------------------------------------------------------

@@ -42,6 +42,7 @@ COUNT = sum(
 )
 """Gaussians."""
 DEFAULT, PAPER_RECIPE = "toybox.yaml", "the paper's recipe"
+RANDOM_STARTS = "grey ball", "grey ball, no view prompts"
 SAMPLES, TRUTH = "the 2D model's samples", "ground truth"
 """Variants without a run: what the 2D model draws, and ray-cast views of the object itself."""
 EXACT = "exact score of the object"
@@ -265,8 +266,8 @@ def starts() -> Iterator[Variant]:
     yield Variant("prior, no view prompts", 0, WITHOUT_VIEWS)
     yield Variant('"side view" for left and right', 0, ONE_SIDE)
     yield Variant(WRONG_PRIOR)
-    yield Variant("grey ball", 0, BALL)
-    yield Variant("grey ball, no view prompts", 0, BALL | WITHOUT_VIEWS)
+    for name, options in zip(RANDOM_STARTS, ({}, WITHOUT_VIEWS), strict=True):
+        yield Variant(name, 0, BALL | options)
 
 
 def view_contrast() -> Iterator[Variant]:

@@ -21,6 +21,7 @@ from benchmarks.quality.toybox_jobs import (
     DEFAULT,
     EXACT,
     PAPER_RECIPE,
+    RANDOM_STARTS,
     RECOGNIZED,
     SAMPLES,
     TRUTH,
@@ -49,9 +50,15 @@ def asks_for(prompt: str, name: str) -> bool:
     return bool(has.get(name, True))
 
 
+def is_about(row: Row, name: str, prefix: str = "") -> bool:
+    """Return whether a row has a value of a column, and its prompt what the column is about."""
+    value = row[prefix + name]
+    return bool(value) and not math.isnan(float(value)) and asks_for(row["prompt"], name)
+
+
 def estimate(rows: Iterable[Row], name: str, prefix: str = "") -> Estimate:
     """Return the mean over prompts of a column, and its interval."""
-    chosen = [row for row in rows if row[prefix + name] and asks_for(row["prompt"], name)]
+    chosen = [row for row in rows if is_about(row, name, prefix)]
     values = np.array([float(row[prefix + name]) for row in chosen])
     means = per_prompt([row["prompt"] for row in chosen], values)
     return bootstrap(np.array(list(means.values()), float))
@@ -103,7 +110,7 @@ def title_of(row: Row) -> str:
 
 def results() -> str:
     """Return the table of toybox.yaml, its prior's points, the paper's recipe, and references."""
-    shown = (DEFAULT, EXACT, PAPER_RECIPE, TRUTH, SAMPLES)
+    shown = (DEFAULT, EXACT, PAPER_RECIPE, TRUTH, SAMPLES, *RANDOM_STARTS)
     rows = [row for row in present() if row["variant"] in shown]
     if not rows:
         return NOT_MEASURED
@@ -112,7 +119,19 @@ def results() -> str:
         lines.append(line_of(name, same))
         if name == DEFAULT:
             lines.append(line_of("its prior's points", same, "prior_"))
-    return markdown(("variant", "prompts", *HEAD, "haze, %", "Gaussians", "CPU seconds"), lines)
+    table = markdown(("variant", "prompts", *HEAD, "haze, %", "Gaussians", "CPU seconds"), lines)
+    return f"{table}\n\n{counts([row for row in rows if row['variant'] == DEFAULT])}"
+
+
+def counts(rows: Sequence[Row]) -> str:
+    """Return a sentence with the numbers of prompts that the columns are about."""
+    prompts = {name: {row["prompt"] for row in rows if is_about(row, name)} for name in RECOGNIZED}
+    return (
+        f"Of the {len(prompts['kind'])} prompts of `{DEFAULT}`, {len(prompts['pattern'])} ask for "
+        f"a pattern, {len(prompts['accessory'])} for an accessory or a coloured part, and "
+        f"{len(prompts['multi_face'])} are of objects whose sides differ, which a multi-face rate "
+        "needs."
+    )
 
 
 def seeds() -> str:

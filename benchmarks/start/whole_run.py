@@ -60,7 +60,8 @@ def measured(name: str) -> dict[str, str]:
         process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
         _, status, usage = os.wait4(process.pid, 0)
         seconds = time.time() - began
-        if process.returncode := os.waitstatus_to_exitcode(status):
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
             raise RuntimeError(f"{name}: the run ended with {process.returncode}")
         points = Path(folder) / "runs/run/save/prior/points.npz"
         prior = points.stat().st_mtime - began

@@ -3,6 +3,7 @@
 import argparse
 import itertools
 import math
+import re
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -189,8 +190,9 @@ def test_rows_become_tables_and_charts(monkeypatch, tmp_path, fake):
     charts = ["default", "guidance", "growing", "distillations"]
     work(monkeypatch, tmp_path, "--charts", *charts, "--count", 8)
     lines = toybox_tables.results().splitlines()
-    assert len(lines) == 2 + 2 and lines[2].startswith(f"| {DEFAULT} | 8 | 100 (100 – 100) |")
+    assert len(lines) == 2 + 2 + 2 and lines[2].startswith(f"| {DEFAULT} | 8 | 100 (100 – 100) |")
     assert lines[3].startswith("| its prior's points | 8 | 50 (50 – 50) |")
+    assert re.match(r"Of the 8 prompts of `toybox.yaml`, \d ask for a pattern", lines[-1])
     pytest.importorskip("matplotlib")
     toybox_charts.main()
     drawn = {path.name for path in tmp_path.glob("*.png")}
@@ -198,6 +200,7 @@ def test_rows_become_tables_and_charts(monkeypatch, tmp_path, fake):
         "toybox_guidance.png",
         "toybox_settings.png",
         "toybox_distillations.png",
+        "toybox_seconds.png",
     }
 
 
@@ -208,9 +211,7 @@ def test_settings_of_a_chart_are_those_of_the_present_state():
     few = [one | {"variant": "no perturbation"} for one in plain[1:]]
     steps = [one | {"variant": "steps", "x": "75"} for one in plain]
     earlier = [one | {"setup": "earlier"} for one in (*plain, *few)]
-    found = toybox_charts.settings(
-        [*plain, *own, *few, *steps, *earlier], toybox_variants.SETTINGS
-    )
+    found = toybox_charts.settings([*plain, *own, *few, *steps, *earlier], toybox_variants.SETTINGS)
     assert [(one.title, one.own, one.plain) for one in found] == [("no growing", own, plain)]
 
 

@@ -18,9 +18,9 @@ from threestudio_gaussiandreamer.models.bundled import DIGESTS, digest_of, read_
 from threestudio_gaussiandreamer.models.clip import PictureText, clip_source
 from threestudio_gaussiandreamer.priors.point_e import PointEPrior
 from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
-from threestudio_gaussiandreamer.toybox import export, loop, models, warm_start
+from threestudio_gaussiandreamer.toybox import checkpoints, export, loop, models, warm_start
+from threestudio_gaussiandreamer.toybox.checkpoints import averaged_weights
 from threestudio_gaussiandreamer.toybox.export import main
-from threestudio_gaussiandreamer.toybox.loop import averaged_weights
 from threestudio_gaussiandreamer.toybox.text_batches import open_tokenizer, token_ids
 from threestudio_gaussiandreamer.toybox.train import STAGES
 
@@ -194,9 +194,7 @@ def test_a_target_that_can_not_be_made_is_one_message(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("size", [100, 3000, 8000])
-def test_a_full_disk_is_one_message_and_the_export_can_be_repeated(
-    trained, tmp_path, capsys, size
-):
+def test_a_full_disk_is_one_message_and_the_export_can_be_repeated(trained, tmp_path, capsys, size):
     """It fails in different files: weights, vocabulary, configuration."""
     target = tmp_path / "models"
     with largest_file(size):
@@ -217,7 +215,7 @@ def test_a_full_disk_at_the_start_from_weights_is_mended_by_a_second_call(export
     with largest_file(size), pytest.raises(UserError, match="cannot write"):
         warm_start.start_from(*start)
     warm_start.start_from(*start)
-    assert loop.is_trained(tmp_path, "text") and open_tokenizer(tmp_path)
+    assert checkpoints.is_trained(tmp_path, "text") and open_tokenizer(tmp_path)
 
 
 @pytest.mark.parametrize("content", [b"{", b"[]", b'{"text": 3}', b"\xff"])

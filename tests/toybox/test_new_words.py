@@ -12,7 +12,7 @@ from tests.toybox.helpers import options
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.toybox import new_words, warm_start, words
-from threestudio_gaussiandreamer.toybox.loop import checkpoint_path
+from threestudio_gaussiandreamer.toybox.checkpoints import checkpoint_path
 from threestudio_gaussiandreamer.toybox.text_batches import open_tokenizer, token_ids
 from threestudio_gaussiandreamer.toybox.text_stage import frozen_text
 from threestudio_gaussiandreamer.toybox.train import STAGES

@@ -9,7 +9,13 @@ import torch
 
 from tests.toybox.helpers import copied, options, training
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.toybox import loop, text_batches, views, warm_start, words
+from threestudio_gaussiandreamer.toybox import (
+    checkpoints,
+    text_batches,
+    views,
+    warm_start,
+    words,
+)
 from threestudio_gaussiandreamer.toybox.train import STAGES
 
 pytestmark = pytest.mark.usefixtures("small_world")
@@ -58,10 +64,10 @@ def test_joined_prompts_have_the_same_words_and_the_directions_of_their_pictures
 def test_only_named_parameters_are_trained(folder, tmp_path):
     place = copied(folder, tmp_path / "run")
     training(place, "unet").run(4)
-    before = loop.averaged_weights(place, "unet")
+    before = checkpoints.averaged_weights(place, "unet")
     run = training(place, "unet", only="attentions")
     run.run(run.progress.images + 4)
-    after = loop.averaged_weights(place, "unet")
+    after = checkpoints.averaged_weights(place, "unet")
     changed = {key for key in before if not torch.equal(before[key], after[key])}
     assert changed and all("attentions" in key for key in changed)
     with pytest.raises(UserError, match="--only 'attention_layers'.*down_blocks"):
