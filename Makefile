@@ -56,7 +56,7 @@ docs: $(VENV)/ready-for-tests      ## the generated parts of README and docs/: a
 	$(BIN)/python -m benchmarks.tables
 
 TOYBOX = .toybox
-train-toybox: $(VENV)/ready-for-models       ## train small models on generated objects, from scratch, and export them to .toybox/models; hours on a CPU, resumable
+train-toybox: $(VENV)/ready-for-models       ## train small models on generated objects, from scratch, and export them to .toybox/models; days on a CPU, resumable
 	$(ENVIRON) $(BIN)/python -m threestudio_gaussiandreamer.toybox.train $(TOYBOX)
 	$(BIN)/python -m threestudio_gaussiandreamer.toybox.export $(TOYBOX) $(TOYBOX)/models
 

@@ -18,7 +18,8 @@ from ..cameras import Orbit
 from ..core.streams import numpy_generator
 from . import models
 from .batches import StepData, normal
-from .loop import Stage, is_trained
+from .checkpoints import is_trained
+from .loop import Stage
 from .sheet import contact_sheet
 from .splat_shards import render_gaussians
 from .views import DISTANCE, FOVY_DEG, Shard, held_out_shard, with_backgrounds

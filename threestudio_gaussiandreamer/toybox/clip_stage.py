@@ -15,8 +15,9 @@ from ..core.streams import numpy_generator
 from ..models.clip import MEAN, STD
 from . import models
 from .batches import StepData, moved
+from .checkpoints import averaged_weights
 from .classifiers import accuracies, classified
-from .loop import Stage, averaged_weights
+from .loop import Stage
 from .module_digest import digest
 from .text_batches import label_tensor, open_tokenizer, token_ids, training_prompts, view_prompts
 from .text_stage import TEXT_PARTS, text_features, with_trained_text

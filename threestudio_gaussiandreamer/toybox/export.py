@@ -28,8 +28,8 @@ from ..core.errors import UserError
 from ..core.files import atomic_file, output_folder
 from ..models.bundled import write_digests
 from . import models
+from .checkpoints import averaged_weights, checkpoint_path, is_trained
 from .clip_stage import trained_clip
-from .loop import averaged_weights, checkpoint_path, is_trained
 from .text_batches import open_tokenizer
 from .tokenizer import copy_tokenizer
 from .unet_stage import LATENT_SCALE, frozen_autoencoder

@@ -22,11 +22,12 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import Dataset
 
-from ..core.checkpoint_file import entries_below, load_file, save_file
+from ..core.checkpoint_file import save_file
 from ..core.errors import UserError
 from ..core.images import write as write_picture
 from ..core.signals import restore_handlers, set_handlers
 from .batches import batches
+from .checkpoints import checkpoint_path, read_checkpoint
 from .curves import write_curves
 from .views import Shards
 
@@ -138,6 +139,8 @@ class Progress:
 
 
 LOG_EVERY = 50
+SAVED = "model", "ema", "optimizer", "depends", "constants", "measured"
+"""Entries of a checkpoint beside those of Progress that a resumed training needs."""
 
 
 class Training:
@@ -256,7 +259,7 @@ class Training:
         write_curves(self.path.with_suffix(".csv"), self.progress.history)
 
     def _resume(self) -> None:
-        content = _training_checkpoint(self.path)
+        content = read_checkpoint(self.path, {*SAVED, *vars(Progress())})
         if content["depends"] != self.stage.depends():
             changed = [
                 name
@@ -355,23 +358,6 @@ class _Sums:
         return means
 
 
-def _training_checkpoint(path: Path) -> dict[str, Any]:
-    """Read the checkpoint of a stage.
-
-    Raises:
-        UserError: it is damaged, or no such checkpoint.
-    """
-    content = load_file(path)
-    needed = {"model", "ema", "optimizer", "depends", "constants", "measured", *vars(Progress())}
-    missing = needed - set(content if isinstance(content, dict) else ())
-    if missing:
-        raise UserError(
-            f"{path} isn't a checkpoint of the toybox's training: it has no "
-            f"{', '.join(sorted(missing))}"
-        )
-    return content
-
-
 def _device_name(device: torch.device) -> str:
     return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
@@ -390,25 +376,3 @@ def rate_factor(step: int, done: float) -> float:
         done: fraction of the training that is done.
     """
     return min(1.0, (step + 1) / WARMUP) * min(1.0, max(0.0, 1 - done) / DECAY_SHARE)
-
-
-def checkpoint_path(folder: Path, name: str) -> Path:
-    """Return the path of a stage's checkpoint."""
-    return Path(folder) / f"{name}.pt"
-
-
-def is_trained(folder: Path, *names: str) -> bool:
-    """Return whether there is a checkpoint of any of these stages."""
-    return any(checkpoint_path(folder, name).exists() for name in names)
-
-
-def averaged_weights(folder: Path, name: str) -> dict[str, Tensor]:
-    """Read the averaged weights of a stage's checkpoint.
-
-    Raises:
-        UserError: the stage isn't trained yet, or its file is damaged.
-    """
-    path = checkpoint_path(folder, name)
-    if not path.exists():
-        raise UserError(f"{path} is missing: train the stage {name!r} first")
-    return entries_below(load_file(path)["ema"], "module.")

@@ -21,8 +21,9 @@ from ..core.checkpoint_file import entries_below
 from ..core.streams import numpy_generator
 from . import models, words
 from .batches import moved
+from .checkpoints import averaged_weights, is_trained
 from .classifiers import IGNORED, accuracies, classified
-from .loop import Stage, averaged_weights, is_trained
+from .loop import Stage
 from .text_batches import open_tokenizer, token_ids
 from .views import LABELS, label_row, random_angles
 from .world import draw_attributes

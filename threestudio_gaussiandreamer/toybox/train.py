@@ -27,9 +27,10 @@ from ..core.options import is_number, shown
 from ..core.signals import interrupt
 from ..launch.folder_lock import FolderInUse, claim
 from .autoencoder_stage import AutoencoderStage
+from .checkpoints import is_trained
 from .clip_stage import ClipStage
 from .judge_stage import SEED_OFFSET, JudgeStage, judge_shards
-from .loop import Options, Stage, Training, is_trained
+from .loop import Options, Stage, Training
 from .points_stage import PointsStage
 from .text_stage import TextStage
 from .unet_stage import SmallUNetStage, UNetStage
@@ -154,8 +155,7 @@ def _require_numbers(args: argparse.Namespace) -> None:
 
 
 def render_shards(sorts: Sequence[Shards], count: int, workers: int) -> None:
-    """Render the missing ones of the first ``count`` shards of each sort in ``workers`` processes.
-    """
+    """Render the missing ones of the first ``count`` shards of each sort, in parallel."""
     jobs = [(shards, index) for shards in sorts for index in range(count)]
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         for done, _ in enumerate(pool.map(_render, jobs), 1):

@@ -19,7 +19,8 @@ from ..diffusion import sds
 from ..models.multiview_unet import views_attended_together
 from . import models, words
 from .batches import MixedData, StepData, moved, normal, torch_generator
-from .loop import Stage, averaged_weights, is_trained
+from .checkpoints import averaged_weights, is_trained
+from .loop import Stage
 from .module_digest import digest
 from .sheet import contact_sheet
 from .text_batches import (

@@ -11,7 +11,8 @@ from ..core.errors import UserError
 from ..core.files import existing_file
 from ..models.bundled import RECORD
 from ..view.run_files import read_json
-from .loop import Options, Progress, Stage, Training, is_trained
+from .checkpoints import is_trained
+from .loop import Options, Progress, Stage, Training
 from .new_words import grow_embeddings, grow_tokenizer, separate
 from .text_stage import TEXT_PARTS
 from .unet_stage import LATENT_SCALE
