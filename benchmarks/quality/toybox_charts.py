@@ -228,9 +228,13 @@ def draw_seconds(panel: Any, found: Sequence[Setting]) -> None:
 
 
 def with_known_seconds(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Return the rows of each kind of run that has enough of them with CPU seconds."""
-    timed = [row for row in rows if row["cpu_seconds"] and row["variant"] != EXACT]
-    return {title: same for title, same in variants(timed) if len(same) >= ENOUGH}
+    """Return the rows of each kind of run of which there are enough, some with CPU seconds."""
+    others = [row for row in rows if row["variant"] != EXACT]
+    return {
+        title: same
+        for title, same in variants(others)
+        if len(same) >= ENOUGH and not math.isnan(median(same, "cpu_seconds"))
+    }
 
 
 def draw_against_seconds(name: str, shown: dict[str, list[Row]]) -> Path:
