@@ -52,7 +52,8 @@ NOTES = {
     "quality": "The three are the configurations as they are, with their own steps. The base "
     "recipe was the default before. Best, the base recipe and the paper's were timed on an AMD "
     "EPYC; draft and default on an Intel Xeon beside other work, where the base recipe takes "
-    'longer too ("Changes of the demo that were tried").',
+    'longer too ("Changes of the demo that were tried"), all before the CPU kernel became faster. '
+    "So dB can be compared across the rows, and seconds between draft and default only.",
     "tried": "One change each, seed 0, 256². `gain`: dB above the row with the letter `base`; "
     "`floaters` in %. A, B and C are the base recipe with what they name; the demo is C with 500 "
     "steps. Flat first Gaussians and steps by curvature aren't in the code.",

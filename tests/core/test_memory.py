@@ -23,10 +23,10 @@ def test_a_count_is_a_whole_number_that_the_memory_holds(monkeypatch):
 
 
 def test_the_memory_of_a_container_counts(monkeypatch, tmp_path):
-    whole = memory._main_memory()
+    whole = memory.main_memory()
     assert whole > 2**28
     (tmp_path / "limit").write_text("123456\n")
     monkeypatch.setattr(memory, "CGROUP_LIMIT", tmp_path / "limit")
-    assert memory._main_memory() == 123456
+    assert memory.main_memory() == 123456
     (tmp_path / "limit").write_text("max\n")
-    assert memory._main_memory() >= whole
+    assert memory.main_memory() >= whole

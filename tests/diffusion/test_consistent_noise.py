@@ -3,6 +3,7 @@
 import math
 
 import torch
+import torch.nn.functional as F
 
 from threestudio_gaussiandreamer.cameras import orbit_c2w, ray_directions
 from threestudio_gaussiandreamer.diffusion.consistent_noise import (
@@ -55,6 +56,18 @@ def test_points_lie_on_the_surface():
     )
     rays = ray_directions(c2w, fovy, 64, 64, normalize=False)
     torch.testing.assert_close(points, c2w[:, None, None, :3, 3] + depth * rays)
+
+
+def test_a_model_that_gets_renders_squeezed_sees_the_noise_of_the_same_points():
+    """A pixel of latents as wide as high is in the middle of three square ones."""
+    depth, opacity, *cameras = ball([20.0], 96)
+    wide = [F.pad(image[..., 0], (96, 96))[..., None] for image in (depth, opacity)]
+    draws = torch.zeros(1, dtype=torch.int32)
+    squeezed = attached_noise((32, 32), table(), draws, *wide, *cameras)
+    whole = attached_noise((32, 96), table(), draws, *wide, *cameras)
+    inside = wide[1][0, 1::3, 4::9, 0] > 0
+    assert inside.sum() > 50
+    assert torch.equal(squeezed[..., inside], whole[..., 1::3][..., inside])
 
 
 def test_pixels_are_standard_normal_and_hardly_correlated():

@@ -203,6 +203,36 @@ def test_the_empty_prompt_is_encoded_for_the_variant_that_needs_it(models, promp
     assert not any(torch.equal(nfsd.empty[0], embedding) for embedding in nfsd.embeddings)
 
 
+def test_an_empty_negative_prompt_is_the_empty_prompt(models):
+    """It isn't evaluated a second time."""
+    pytest.importorskip("diffusers")
+    folder = models["epsilon"]
+    evaluations = []
+    for negative in ("ugly", ""):
+        prompt_utils = find("gaussiandreamer-stable-diffusion-prompt-processor")(
+            {"pretrained_model_name_or_path": str(folder), "prompt": "a fox"}
+            | {"negative_prompt": negative, "use_cache": False}
+        )()
+        guide = tiny.guidance(models, variant_type="nfsd-variant")
+        _, out = tiny.gradient(guide, prompt_utils, tiny.renders())
+        evaluations.append(out["evaluations"])
+    assert evaluations == [3 * 4, 2 * 4]
+
+
+@pytest.mark.parametrize("variant, evaluations", [("sds", 4), ("ism", 4), ("sdi", 4)])
+def test_without_guidance_the_last_prediction_is_of_one_prompt(
+    models, prompts, variant, evaluations
+):
+    pytest.importorskip("diffusers")
+    found = {}
+    for scale in (1.0, 1.5):
+        options = {"guidance_scale": scale, "variant_type": f"{variant}-variant"}
+        guide = tiny.guidance(models, **options)
+        _, out = tiny.gradient(guide, prompts[False], tiny.renders())
+        found[scale] = out["evaluations"]
+    assert found[1.5] - found[1.0] == evaluations
+
+
 def test_a_guidance_with_its_own_conditions_must_say_how_to_select_them():
     guide, x = mixture_guidance(guidance_interval=[0.3, 0.7]), latents(12)
     noised = guide.add_noise(x)

@@ -47,6 +47,31 @@ def test_every_variant_gives_a_gradient(models, kind, variant):
     assert not torch.allclose(grad, plain)
 
 
+def test_several_views_together_have_an_empty_prompt_with_their_cameras(models):
+    folder, prompt_utils = models["mvdream"]
+    guide = tiny.guidance("mvdream", folder, variant_type="nfsd-variant")
+    condition = guide.condition(prompt_utils, **ring())
+    negative = condition.embeddings[4:]
+    assert condition.empty.shape == negative.shape and not torch.equal(condition.empty, negative)
+    z, t = torch.randn(4, 4, 8, 8), torch.full((4,), 600)
+    assert not torch.allclose(
+        guide.empty_prompt(z, t, condition), guide.unconditional(z, t, condition)
+    )
+    rows = torch.tensor([2, 0])
+    assert torch.equal(condition.select(rows).empty, condition.empty[rows])
+
+
+@pytest.mark.parametrize("variant", ["csd-variant", "nfsd-variant"])
+def test_an_option_without_effect_may_be_off(models, variant):
+    """MVDream's ``recon_std_rescale`` is 0.5 unless given."""
+    folder, _ = models["mvdream"]
+    part = type(tiny.guidance("mvdream", folder))
+    options = {"pretrained_model_name_or_path": str(folder), "variant_type": variant}
+    part.preflight(options | {"recon_std_rescale": 0.0})
+    with pytest.raises(UserError, match="recon_std_rescale has no effect"):
+        part.preflight(options | {"recon_std_rescale": 0.3})
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_lora_is_trained_in_unets_of_single_views(models, kind):
     folder, prompt_utils = models[kind]

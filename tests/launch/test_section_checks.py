@@ -37,7 +37,9 @@ WRONG = [
         "needs a prompt processor that encodes text",
     ),
     (("toybox",), HELD[:1], "set data.hold_steps=4"),
+    (("toybox",), (HELD[0], "data.hold_steps=3"), "set data.hold_steps=4"),
     (("demo",), HELD, "set system.background.hold_steps=4"),
+    (("demo",), (*HELD, "system.background.mode=learned"), "a learned one changes in each step"),
 ]
 
 

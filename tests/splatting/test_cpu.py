@@ -25,6 +25,7 @@ from tests.helpers.splatting_scenes import (
     random_cloud,
 )
 from tests.helpers.threads import torch_threads
+from threestudio_gaussiandreamer.core import memory
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import rasterize
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
@@ -200,6 +201,22 @@ def test_more_memory_than_there_is_is_a_named_error():
     )
     with pytest.raises(UserError, match="GiB"), torch.no_grad():
         rasterize(*cloud, *camera, 8192, 8192, backend="cpu")
+
+
+def test_the_limit_is_the_memory_of_the_container(monkeypatch, tmp_path):
+    cloud = random_cloud(50_000).to(torch.float32)
+    scene = *cloud, *cameras(4, 256, 256, dtype=torch.float32), 256, 256
+    build = cpu._path(cpu.usable_builds()[0])
+    monkeypatch.setattr(memory, "CGROUP_LIMIT", tmp_path / "memory.max")
+    (tmp_path / "memory.max").write_text(str(1 << 20))
+    try:
+        cpu.load_library(build)
+        with pytest.raises(UserError, match="GiB"):
+            rasterize(*scene, backend="cpu")
+    finally:
+        monkeypatch.undo()
+        cpu.load_library(build)
+    rasterize(*scene, backend="cpu")
 
 
 # ---- the library ---------------------------------------------------------------------------------

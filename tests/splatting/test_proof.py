@@ -8,6 +8,7 @@ from tests.helpers.splatting_scenes import cameras, random_cloud
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import backends, rasterize
 from threestudio_gaussiandreamer.splatting.cuda import driver, proof, stages
+from threestudio_gaussiandreamer.training.renderer import check_backend
 
 pytestmark = pytest.mark.skipif(unavailable() is not None, reason=str(unavailable()))
 CPU = torch.device("cpu")
@@ -87,13 +88,22 @@ def test_a_broken_kernel_means_plain_torch_and_one_warning(use, caplog, kernel):
         picture("cuda")
 
 
+def test_broken_kernels_are_refused_before_a_run_begins(use):
+    use(BrokenDevice("blend"))
+    with pytest.raises(UserError, match="a.backend: cuda can't be used here: .*differ from plain"):
+        check_backend("a.backend", "cuda")
+    check_backend("a.backend", "auto")
+    use(HostDevice())
+    check_backend("a.backend", "torch")
+
+
 def test_the_verdict_about_broken_kernels_is_cached_until_its_file_is_removed(use, tmp_path):
     use(BrokenDevice("blend"))
     picture()
     mended = use(HostDevice())
     assert torch.equal(picture(), picture("torch")) and not mended.launched
     (verdict,) = (tmp_path / "cubins").iterdir()
-    with pytest.raises(UserError, match=f"delete {verdict} to try again"):
+    with pytest.raises(UserError, match=f"delete {verdict} and start again"):
         picture("cuda")
     verdict.unlink()
     use(mended)
@@ -116,11 +126,53 @@ def test_a_failed_launch_means_plain_torch(use, caplog, error):
     assert f"its kernels fail on a small scene: {error}" in caplog.text
 
 
-def test_memory_that_is_short_is_no_verdict(use, tmp_path):
-    use(BrokenDevice("project", error=torch.cuda.OutOfMemoryError("no memory, says the test")))
-    with pytest.raises(torch.cuda.OutOfMemoryError):
+@pytest.mark.parametrize(
+    "error",
+    [
+        torch.cuda.OutOfMemoryError("no memory, says the test"),
+        RuntimeError("CUDA error: out of memory"),
+        UserError("CUDA failed at loading blend.cu: out of memory (2)."),
+    ],
+)
+def test_memory_that_is_short_is_no_verdict(use, tmp_path, error):
+    use(BrokenDevice("project", error=error))
+    with pytest.raises(type(error)):
         picture()
     assert not (tmp_path / "cubins").exists()
+
+
+def test_an_error_of_earlier_work_is_no_verdict(use, tmp_path, monkeypatch):
+    def fails(*_):
+        raise RuntimeError("CUDA error: device-side assert triggered")
+
+    use(HostDevice())
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="device-side"):
+        patch.setattr(proof.torch_backend, "rasterize", fails)
+        picture()
+    assert not (tmp_path / "cubins").exists()
+    device = use(HostDevice())
+    picture()
+    assert "blend" in device.launched
+
+
+@pytest.mark.parametrize("warns", [False, True])
+def test_deterministic_algorithms_are_switched_on_again(use, monkeypatch, warns):
+    """Plain torch's cumulative sum would raise an error on a GPU."""
+    seen, draw = [], proof.torch_backend.rasterize
+
+    def noted(*arguments):
+        seen.append(torch.are_deterministic_algorithms_enabled())
+        return draw(*arguments)
+
+    monkeypatch.setattr(proof.torch_backend, "rasterize", noted)
+    use(HostDevice())
+    try:
+        torch.use_deterministic_algorithms(True, warn_only=warns)
+        picture()
+        assert torch.are_deterministic_algorithms_enabled() and seen == [False]
+        assert torch.is_deterministic_algorithms_warn_only_enabled() == warns
+    finally:
+        torch.use_deterministic_algorithms(False)
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])

@@ -285,6 +285,20 @@ def test_a_trained_cloud_above_the_cap_keeps_what_contributes(sphere_points, tmp
     )
 
 
+@pytest.mark.parametrize("degree, told", [(0, True), (2, False)])
+def test_colours_by_direction_that_are_dropped_are_told(
+    sphere_points, tmp_path, caplog, degree, told
+):
+    trained = started(sphere_points, sh_degree=2)
+    trained.sh_rest.data[:, 5] = 0.1  # of degree 2
+    write_cloud(str(tmp_path / "a.ply"), StoredCloud(Gaussians.of(trained).arrays()))
+    prior = {"prior_type": "gaussians-prior", "prior": {"path": str(tmp_path / "a.ply")}}
+    geometry = GaussianCloud({**prior, "sh_degree": degree})
+    geometry.initialize("anything")
+    assert (f"system.geometry.sh_degree={degree} drops the bands" in caplog.text) == told
+    assert geometry.sh_rest.shape[1] == (degree + 1) ** 2 - 1
+
+
 @register("test-two-points-prior")
 class TwoPoints:
     def __init__(self, cfg):

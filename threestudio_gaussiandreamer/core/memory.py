@@ -18,10 +18,11 @@ def memory_bytes() -> int:
 
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     found = [torch.cuda.get_device_properties(i).total_memory for i in range(gpus)]
-    return max([_main_memory(), *found])
+    return max([main_memory(), *found])
 
 
-def _main_memory() -> int:
+def main_memory() -> int:
+    """Return the bytes of the machine's or its container's memory, which a GPU's isn't part of."""
     try:
         pages, size = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):  # not a POSIX system

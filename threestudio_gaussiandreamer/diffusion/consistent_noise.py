@@ -31,17 +31,21 @@ OPAQUE = 0.5
 
 
 def surface_points(
-    depth: Float[Tensor, "B h w"], c2w: Float[Tensor, "B 3 4"], fovy: Float[Tensor, " B"]
+    depth: Float[Tensor, "B h w"],
+    c2w: Float[Tensor, "B 3 4"],
+    fovy: Float[Tensor, " B"],
+    aspect: float = 1.0,
 ) -> Float[Tensor, "B 3 h w"]:
     """Return the world coordinates of the points on the rendered surface.
 
     Args:
         depth: along the optical axis, at the centres of h x w pixels.
         c2w: OpenGL cameras, see ``cameras.py``; fovy in radians.
+        aspect: width of a pixel over its height.
     """
     height, width = depth.shape[1:]
     focal = focal_length(fovy, height)[:, None]
-    right = (torch.arange(width, device=depth.device) + 0.5 - width / 2) / focal
+    right = (torch.arange(width, device=depth.device) + 0.5 - width / 2) * aspect / focal
     up = (height / 2 - 0.5 - torch.arange(height, device=depth.device)) / focal
     x, y, z, position = c2w[:, :3, :, None].unbind(2)
     rays = (x * right[:, None] - z)[:, :, None] + (y * up[:, None])[..., None]
@@ -53,13 +57,15 @@ def surface_cells(
     c2w: Float[Tensor, "B 4 4"],
     fovy: Float[Tensor, " B"],
     size: Float[Tensor, " B"],
+    aspect: float = 1.0,
 ) -> list[Int[Tensor, "B h w"]]:
     """Return the row of each point's cell, a hash, for each lattice.
 
     Args:
         size: of the cells, world units.
+        aspect: width of a pixel over its height.
     """
-    points = surface_points(depth, c2w[:, :3] / size[:, None, None], fovy)
+    points = surface_points(depth, c2w[:, :3] / size[:, None, None], fovy, aspect)
     primes = torch.tensor(PRIMES, dtype=torch.int32, device=depth.device)[:, None, None]
     rows = []
     for lattice in range(LATTICES):
@@ -111,10 +117,13 @@ def attached_noise(
         size: (h, w) of the latents.
         table: standard normal values of the cells.
         draws: random int32 numbers in [0, TABLE), from which the background's noise follows.
-        depth: of the renderer, along the optical axis.
+        depth: of the renderer, along the optical axis; renders needn't have the latents' aspect
+            ratio, since models get them squeezed to a square.
     """
     c2w, fovy = c2w.float(), fovy.float()
-    cells = surface_cells(_sampled(depth, size), c2w, fovy, cell_size(c2w, fovy, size[0]))
+    aspect = (depth.shape[2] / depth.shape[1]) / (size[1] / size[0])
+    cell = cell_size(c2w, fovy, size[0])
+    cells = surface_cells(_sampled(depth, size), c2w, fovy, cell, aspect)
     behind = background_cells(*size, depth.device) + draws[:, None, None]
     is_surface = _sampled(opacity, size) >= OPAQUE
     rows = [

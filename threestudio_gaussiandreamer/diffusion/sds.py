@@ -134,7 +134,7 @@ def classifier_free(
 
 
 def weight(name: str, abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
-    """Compute the weight w(t) of the named strategy: "sds", "uniform" or "fantasia3d"."""
+    """Compute the weight w(t) of the strategy with this name in ``WEIGHTS``."""
     if name not in WEIGHTS:
         raise unknown("weighting_strategy", name, WEIGHTS)
     return WEIGHTS[name](abar)

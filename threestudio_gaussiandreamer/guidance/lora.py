@@ -215,7 +215,7 @@ class LoRAParticles(ParticleModel):
 def particle_noise(
     score: "TextToImageDistillation", latents: Float[Tensor, "B c h w"], sample: int
 ) -> Noised:
-    """Add noise at timesteps between the first and the last, uniform, drawn independently of those
+    """Add noise at timesteps from 1 to the last, uniform, drawn independently of those
     of the error.
     """
     count = len(score.alphas_cumprod)

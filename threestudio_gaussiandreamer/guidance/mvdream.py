@@ -127,8 +127,10 @@ class MVDreamGuidance(StableDiffusionGuidance):
         embeddings = condition.embeddings
         cameras = camera_matrices(batch["c2w"].to(embeddings))
         rows = view_of_row(len(cameras), len(embeddings)).to(embeddings.device)
-        # an empty prompt's embedding has no cameras
-        return Condition(pack(embeddings, cameras[rows]), None)
+        empty = condition.empty
+        if empty is not None:
+            empty = pack(empty.expand(len(cameras), -1, -1), cameras)
+        return Condition(pack(embeddings, cameras[rows]), None, empty)
 
     def draw_timesteps(
         self, latents: Float[Tensor, "B c h w"]

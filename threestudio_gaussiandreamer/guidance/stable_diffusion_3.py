@@ -3,7 +3,8 @@ flow, Stable Diffusion 3 or 3.5 (Esser et al. 2024).
 
 The transformer predicts the velocity v = eps - x of the path z = (1 - sigma) x + sigma eps. Here it
 is converted to a prediction of the noise of a diffusion with the same ratio of picture and noise
-(``diffusion/rectified_flow.py``), so that all options and variants of score distillation apply.
+(``diffusion/rectified_flow.py``), so that all options of score distillation apply, and all
+variants but VSD, whose LoRA is of a UNet.
 With ``weighting_strategy: rectified_flow`` the gradient is that of RFDS (Yang et al. 2024,
 "Text-to-image rectified flow as plug-and-play priors", arXiv 2406.03293, the baseline loss),
 

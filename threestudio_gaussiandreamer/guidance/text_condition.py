@@ -23,8 +23,10 @@ class Condition(NamedTuple):
     """
     negative_weights: Optional[Float[Tensor, "B 2"]]
     """The weights of the two Perp-Neg rows, <= 0; None without Perp-Neg."""
-    empty: Optional[Float[Tensor, "1 N F"]] = None
-    """The embedding of an empty prompt, if the variant needs it and the prompts have it."""
+    empty: Optional[Float[Tensor, "_ N F"]] = None
+    """The embedding of an empty prompt, if the variant needs it, the prompts have it, and it isn't
+    that of the negative prompt; B rows if it depends on the view.
+    """
     opposite: Optional[Float[Tensor, "B N F"]] = None
     """The prompts of the opposite views; None without view contrast, and with Perp-Neg, which
     excludes it.
@@ -34,13 +36,15 @@ class Condition(NamedTuple):
         """Return the conditions of some views."""
         views = len(self.embeddings) // (2 if self.negative_weights is None else 4)
         index = torch.cat([rows, views + rows])
+        empty = self.empty if self.empty is None or len(self.empty) == 1 else self.empty[rows]
         if self.negative_weights is None:
             opposite = None if self.opposite is None else self.opposite[rows]
-            return self._replace(embeddings=self.embeddings[index], opposite=opposite)
+            return self._replace(embeddings=self.embeddings[index], empty=empty, opposite=opposite)
         pairs = 2 * (views + rows)[:, None] + torch.arange(2, device=rows.device)
         return self._replace(
             embeddings=self.embeddings[torch.cat([index, pairs.flatten()])],
             negative_weights=self.negative_weights[rows],
+            empty=empty,
         )
 
 

@@ -288,8 +288,12 @@ class TextToImageDistillation(ScoreDistillation):
                 "give system.prompt_processor and system.guidance the same "
                 "pretrained_model_name_or_path"
             )
+        embeddings = embeddings.to(self.device)
         empty = self._empty_embedding(prompt_utils)
-        return Condition(embeddings.to(self.device), weights, empty, other)
+        views = len(batch["elevation"])
+        if empty is not None and (embeddings[views : 2 * views] == empty).all():
+            empty = None  # the negative prompt is empty
+        return Condition(embeddings, weights, empty, other)
 
     def _empty_embedding(self, prompt_utils: Any) -> Optional[Float[Tensor, "1 N F"]]:
         """Return the embedding of an empty prompt if the variant needs one and ``prompt_utils`` can
@@ -338,6 +342,8 @@ class TextToImageDistillation(ScoreDistillation):
         scale; Perp-Neg, ``rescale`` and scales below 1 need the unconditional prediction.
         """
         perp = condition.negative_weights is not None
+        if scale == 1 and not perp:
+            return contrasted(self, self.conditional(z, t, condition), z, t, condition).to(z)
         if self.scale_width is None or rescale or perp or scale < 1:
             return super().guided_noise(z, t, condition, scale, rescale=rescale)
         eps = self.noise(z, t, condition.embeddings[: len(z)], scale)

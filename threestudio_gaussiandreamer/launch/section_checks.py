@@ -47,10 +47,13 @@ def _check_reuse(guidance: Any, cfg: Any) -> None:
     if guidance.get("reuse_steps", 1) == 1:
         return
     wanted = f"system.guidance.reuse_steps={guidance.reuse_steps} needs steps of the same"
-    changes = cfg.data.get("hold_steps", 1) == 1 and not cfg.data.get("train_views", 0)
+    held = cfg.data.get("hold_steps", 1)
+    changes = held < guidance.reuse_steps and not cfg.data.get("train_views", 0)
     if cfg.data_type in DATA and changes:
         raise UserError(f"{wanted} views: set data.hold_steps={guidance.reuse_steps}")
     background = cfg.system.get("background") or {}
+    if background.get("mode") == "learned":
+        raise UserError(f"{wanted} background, and a learned one changes in each step")
     if background.get("mode") == "random" and background.get("hold_steps", 1) == 1:
         raise UserError(
             f"{wanted} background: set system.background.hold_steps={guidance.reuse_steps}"

@@ -63,6 +63,13 @@ def available_backends() -> dict[str, Optional[str]]:
     return {name: backend.load().unavailable() for name, backend in BACKENDS.items()}
 
 
+def refusal(name: str, device: torch.device) -> Optional[str]:
+    """Return why a backend can't draw on a device, or None if it can. Where that is due, it is
+    compared with plain torch there.
+    """
+    return BACKENDS[name].refuses(torch.empty(0, device=device))
+
+
 def choose_backend(name: str, tensor: Tensor) -> Backend:
     """Return the backend with this name, or for "auto" the first one that supports the tensor.
 

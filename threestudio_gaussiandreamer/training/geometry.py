@@ -225,6 +225,7 @@ class GaussianCloud(BaseGeometry):
         if self.cfg.keep_attributes and hasattr(prior, "gaussians"):
             arrays = prior.gaussians(prompt)
             trained = most_visible(arrays.tensors(), self.cfg.max_gaussians, self.means.device)
+            self.warn_of_dropped_bands(trained.sh)
             self.set_arrays(**trained._asdict())
             cloud = prior.cloud(arrays)
         else:
@@ -234,6 +235,16 @@ class GaussianCloud(BaseGeometry):
         if self.cfg.budget is not None:
             self.merge_duplicates()
         return cloud
+
+    def warn_of_dropped_bands(self, sh: Any) -> None:
+        """Warn if spherical harmonics have colours by direction that ``sh_degree`` leaves out."""
+        if torch.as_tensor(sh)[:, self.bands :].any():
+            degree = round(sh.shape[1] ** 0.5) - 1
+            logger.warning(
+                "the prior's colours depend on the view, with spherical harmonics of degree %d: "
+                "system.geometry.sh_degree=%d drops the bands above; set it to %d to keep them",
+                degree, self.cfg.sh_degree, degree,
+            )  # fmt: skip
 
     def merge_duplicates(self) -> None:
         """Merge groups of near-identical Gaussians, until the budget is met or none are left."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from ..core.devices import get_device
 from ..core.errors import UserError, unknown
 
 DEFAULTS = {"betas": (0.9, 0.99), "eps": 1e-15}
@@ -40,8 +41,8 @@ def check_optimizer(options: Any, scheduler: Any = None) -> None:
     if not isinstance(arguments, Mapping):
         raise UserError(f"optimizer.args: expected keys and values, got {arguments!r}")
     try:
-        make_optimizer(options, [_some_group(), _some_group()])
-    except (TypeError, ValueError, AssertionError) as error:
+        make_optimizer(options, [_some_group(), _some_group()]).step()
+    except Exception as error:  # of many types
         accepted = inspect.signature(getattr(torch.optim, name)).parameters.keys()
         accepted = accepted - {"params", "lr"}  # which the groups bring
         wrong = [unknown("argument", key, accepted) for key in arguments if key not in accepted]
@@ -51,4 +52,6 @@ def check_optimizer(options: Any, scheduler: Any = None) -> None:
 
 
 def _some_group() -> dict[str, Any]:
-    return {"params": [torch.zeros(1, requires_grad=True)], "lr": 0.0}
+    parameter = torch.zeros(1, requires_grad=True, device=get_device())
+    parameter.grad = torch.zeros_like(parameter)
+    return {"params": [parameter], "lr": 0.0}

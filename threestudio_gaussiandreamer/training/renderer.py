@@ -25,10 +25,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .. import cameras
+from ..core.devices import get_device
 from ..core.errors import UserError, unknown
 from ..core.options import at_least, checked_options, in_range, one_of, positive, rule
 from ..host import Rasterizer, register
 from ..splatting import PRESETS, Rasterized, available_backends, rasterize
+from ..splatting.backends import refusal
 from .background import FlatBackground
 
 
@@ -43,10 +45,10 @@ def check_backend(option: str, name: str) -> None:
     reasons = available_backends()
     if name not in reasons:
         raise unknown(option, name, ["auto", *reasons])
-    if reasons[name] is not None:
+    reason = reasons[name] or refusal(name, get_device())
+    if reason is not None:
         raise UserError(
-            f"{option}: {name} can't be used here: {reasons[name]} (auto takes the fastest that "
-            "can)"
+            f"{option}: {name} can't be used here: {reason} (auto takes the fastest that can)"
         )
 
 

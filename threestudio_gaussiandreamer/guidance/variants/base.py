@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 Error = tuple[Float[Tensor, "B c h w"], Float[Tensor, " B"]]
 """The error e, and abar of each item, float64, of which w(t) is a function."""
 Batch = dict[str, Any]
+OFF = {"recon_std_rescale": 0.0}
+"""Values with which options do nothing, where a guidance's default is another."""
 
 
 class Variant(BaseObject, ABC):
@@ -70,7 +72,8 @@ class Variant(BaseObject, ABC):
                 "guidance"
             )
         for option in dataclasses.fields(guidance.Config):
-            if option.name in cls.IGNORES and cfg[option.name] != option.default:
+            neutral = (option.default, OFF.get(option.name, option.default))
+            if option.name in cls.IGNORES and cfg[option.name] not in neutral:
                 raise UserError(
                     f"system.guidance.{option.name} has no effect with {cfg.variant_type}: leave "
                     f"it at {option.default}"

@@ -5,6 +5,9 @@ score over one interval of a deterministic trajectory, without random noise.
     z_t = one more step of it, from s to t
     e = eps_hat(z_t, t) - eps_u(z_s, s)
 
+"Unconditional" is the guidance's own: with a negative prompt, which the paper hasn't there, the
+prediction for that.
+
 =========  =========================================================================================
 option     meaning
 =========  =========================================================================================

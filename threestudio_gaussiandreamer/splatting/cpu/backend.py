@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ...core.errors import UserError, unknown
+from ...core.memory import main_memory
 from .. import autograd
 from ..autograd import Drawn, SceneGradients, Upstream, Wanted
 from ..channels import CHANNELS
@@ -206,4 +207,7 @@ def load_library(path: pathlib.Path) -> ctypes.CDLL:
     ]
     library.splat_release.argtypes = [ctypes.c_void_p]
     library.splat_best_isa.restype = ctypes.c_char_p
+    library.splat_set_memory.argtypes = [ctypes.c_int64]
+    library.splat_set_memory.restype = None
+    library.splat_set_memory(main_memory())
     return library

@@ -1,6 +1,7 @@
 // Buffers that only grow, and pools of objects that own such buffers.
 #pragma once
 
+#include <atomic>
 #include <cstddef>
 #include <cstdint>
 #include <cstdlib>
@@ -11,7 +12,6 @@
 #include <pthread.h>
 #if defined(__linux__)
 #include <sys/mman.h>
-#include <unistd.h>
 #endif
 
 namespace splat {
@@ -21,12 +21,10 @@ struct OutOfMemory {
   int64_t bytes;
 };
 
-inline int64_t memory_of_machine() {
-#if defined(__linux__)
-  return int64_t(sysconf(_SC_PHYS_PAGES)) * sysconf(_SC_PAGESIZE);
-#else
-  return int64_t(1) << 36;
-#endif
+// The memory of the machine or its container, which the caller of the library knows.
+inline std::atomic<int64_t>& memory_of_machine() {
+  static std::atomic<int64_t> bytes{int64_t(1) << 36};
+  return bytes;
 }
 
 // Linux overcommits memory and later kills the process, so larger requests are refused here.

@@ -111,6 +111,8 @@ template <class Body> static int64_t guarded(const Body& body) {
 
 extern "C" {
 
+void splat_set_memory(int64_t bytes) { splat::memory_of_machine() = bytes; }
+
 int64_t splat_forward(const splat::Scene* scene, const SplatSettings* settings, const SplatPictures* out, SplatState** state) {
   return splat::guarded([&] {
     std::unique_ptr<SplatState> own = splat::states().take();

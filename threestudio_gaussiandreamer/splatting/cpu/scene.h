@@ -58,6 +58,8 @@ extern "C" {
 int64_t splat_forward(const splat::Scene*, const SplatSettings*, const SplatPictures*, SplatState** state);
 int64_t splat_backward(SplatState*, const splat::Scene*, const SplatSettings*, const SplatUpstream*, const SplatGradients*);
 void splat_release(SplatState*);  // null is ignored
+// Limits what a call may take; the memory of the machine or its container.
+void splat_set_memory(int64_t bytes);
 int64_t splat_known_gradients(const SplatKnownPictures*, const SplatKnownGradient*);
 // The best build for this processor: "v4", "v3" or "base".
 const char* splat_best_isa();

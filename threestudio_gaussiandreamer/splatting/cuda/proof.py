@@ -4,9 +4,11 @@ A small fixed scene is rendered and differentiated by the kernels in float32 and
 float64, on the same device. The result is cached beside the compiled kernels; it is computed again
 for another GPU, driver, compiler, torch version or source of the kernels."""
 
+import contextlib
 import functools
 import hashlib
 import math
+from collections.abc import Iterator
 from types import ModuleType
 from typing import Optional
 
@@ -32,7 +34,8 @@ def failure(device: torch.device) -> Optional[str]:
     """Return why the kernels must not be used on this GPU, or None if they are right.
 
     Raises:
-        torch.cuda.OutOfMemoryError: the GPU has no memory left; nothing is cached.
+        UserError, RuntimeError: the GPU has no memory left, or fails without the kernels too;
+            nothing is cached.
     """
     return _failure(device)
 
@@ -52,7 +55,7 @@ def _failure(device: torch.device) -> Optional[str]:
         return None
     return (
         f"{stored.decode()} [{gpu}, torch {torch.__version__}]. Please report this line; delete "
-        f"{nvrtc.cached_path(name)} to try again"
+        f"{nvrtc.cached_path(name)} and start again to repeat the comparison"
     )
 
 
@@ -65,13 +68,20 @@ def _key(gpu: str) -> str:
 
 
 def _compare(device: torch.device) -> str:
-    """Return how the kernels fail on the scene; empty if they are right."""
-    try:
-        errors = errors_on(device)
-    except torch.cuda.OutOfMemoryError:
-        raise
-    except (UserError, RuntimeError) as error:
-        return f"its kernels fail on a small scene: {error}"
+    """Return how the kernels fail on the scene; empty if they are right.
+
+    Raises:
+        UserError, RuntimeError: memory is short, or plain torch or earlier work on the GPU fails,
+            which says nothing about the kernels.
+    """
+    with _default_algorithms():
+        expected = _drawn(torch_backend, device, torch.float64)
+        try:
+            errors = _errors(_drawn(kernels, device, torch.float32), expected)
+        except (UserError, RuntimeError) as error:
+            if isinstance(error, torch.cuda.OutOfMemoryError) or "out of memory" in str(error):
+                raise
+            return f"its kernels fail on a small scene: {error}"
     # ``not <=`` instead of ``>``, so that NaN counts as wrong
     wrong = [f"{name} by {size:.1e}" for name, size in errors.items() if not size <= TOLERANCE]
     if not wrong:
@@ -82,16 +92,45 @@ def _compare(device: torch.device) -> str:
     )
 
 
+@contextlib.contextmanager
+def _default_algorithms() -> Iterator[None]:
+    """Let torch use its default algorithms: plain torch's backward pass has a cumulative sum, which
+    ``torch.use_deterministic_algorithms`` refuses on GPUs.
+    """
+    strict, warns = (
+        torch.are_deterministic_algorithms_enabled(),
+        torch.is_deterministic_algorithms_warn_only_enabled(),
+    )
+    torch.use_deterministic_algorithms(False)
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(strict, warn_only=warns)
+
+
 def errors_on(device: torch.device) -> dict[str, float]:
     """Return the relative error of each output and gradient of the kernels."""
-    with torch.inference_mode(False), torch.enable_grad():
-        found = _draw(kernels, _scene(device, torch.float32))
-        expected = _draw(torch_backend, _scene(device, torch.float64))
+    found = _drawn(kernels, device, torch.float32)
+    return _errors(found, _drawn(torch_backend, device, torch.float64))
+
+
+def _errors(found: dict[str, Tensor], expected: dict[str, Tensor]) -> dict[str, float]:
     errors = [
         (found[name].double() - true).abs().max() / true.abs().max()
         for name, true in expected.items()
     ]
     return dict(zip(expected, torch.stack(errors).tolist(), strict=True))
+
+
+def _drawn(backend: ModuleType, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
+    """Render and differentiate the scene, and wait for the results, so that errors of the GPU are
+    raised here.
+    """
+    with torch.inference_mode(False), torch.enable_grad():
+        results = _draw(backend, _scene(device, dtype))
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return results
 
 
 def _draw(backend: ModuleType, scene: Scene) -> dict[str, Tensor]:
