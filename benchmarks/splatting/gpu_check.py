@@ -1,9 +1,9 @@
 """All checks and measurements that need an NVIDIA GPU, in one command: `make gpu-check`.
 
-    python -m benchmarks.splatting.gpu_check                          # exit 0: all well; 1:
-                                                            something failed; 2: no GPU
-    python -m benchmarks.splatting.gpu_check --device cpu --small     # the same flow, tiny, on the
-                                                            CPU: does this script work?
+    python -m benchmarks.splatting.gpu_check
+    python -m benchmarks.splatting.gpu_check --device cpu --small     # tests this script itself
+
+The exit code is 0 if all is well, 1 if something failed, and 2 without a GPU.
 
 ========  ==========================================================================================
 section   what it does

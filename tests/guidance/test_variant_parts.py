@@ -100,6 +100,7 @@ def test_a_variant_of_a_user_is_one_file():
             "guidance.variant.rank: expected a number from 1",
         ),
         ({"timestep_schedule": "dreamtim", "timestep_steps": 9}, "did you mean 'dreamtime'"),
+        ({"timestep_steps": 9}, "timestep_steps: timestep_schedule=uniform doesn't use it"),
         ({"timestep_schedule": "sqrt"}, "timestep_steps: .*sqrt needs the number of steps"),
         ({"guidance_interval": [0.6, 0.4]}, "guidance_interval: expected"),
         ({"recon_std_rescale": 1.5}, "recon_std_rescale: expected a number from 0 to 1"),

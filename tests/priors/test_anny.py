@@ -67,6 +67,8 @@ def test_a_texture_colours_the_body(with_tiny_anny, tmp_path):
         make(**options)("")
     with pytest.raises(UserError, match="texture .*does not exist"):
         make(texture="nothing.png").preflight()
+    with pytest.raises(UserError, match="isn't shown with color=random: set color=null"):
+        make(texture=str(tmp_path / "skin.png")).preflight()
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,11 @@ class ScoreModel(BaseObject, ABC):
                 sds.step_range(
                     C(cfg.min_step_percent, step, step), C(cfg.max_step_percent, step, step)
                 )
+            if cfg.timestep_schedule == "uniform" and cfg.timestep_steps:
+                raise UserError(
+                    "timestep_steps: timestep_schedule=uniform doesn't use it: choose one of "
+                    f"{', '.join(SCHEDULES)}, or set it to 0"
+                )
             if cfg.timestep_schedule != "uniform" and not cfg.timestep_steps:
                 raise UserError(
                     f"timestep_steps: timestep_schedule={cfg.timestep_schedule} needs the number "

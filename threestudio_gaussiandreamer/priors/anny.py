@@ -107,6 +107,10 @@ class AnnyPrior(Prior):
         data_folder()
         if self.cfg.texture:
             existing_file(self.cfg.texture, "texture")
+            if self.cfg.color is not None:
+                raise UserError(
+                    f"texture: it isn't shown with color={self.cfg.color}: set color=null"
+                )
         if self.cfg.pose not in POSES:
             self._pose(load_body(self._person()))
 

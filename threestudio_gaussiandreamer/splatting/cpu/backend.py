@@ -191,9 +191,12 @@ def load_library(path: pathlib.Path) -> ctypes.CDLL:
     """Load one build and declare its functions.
 
     Raises:
-        OSError: there is no such file, or it needs another system library.
+        OSError: there is no such file, it needs another system library, or it is of an earlier
+            version.
     """
     library = ctypes.CDLL(str(path))
+    if not hasattr(library, "splat_set_memory"):
+        raise OSError(f"{path} is of an earlier version: install the package again")
     library.splat_forward.restype = library.splat_backward.restype = ctypes.c_int64
     library.splat_forward.argtypes = [
         ctypes.POINTER(SceneStruct),

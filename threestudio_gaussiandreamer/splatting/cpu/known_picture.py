@@ -64,8 +64,8 @@ def known_gradient(
     squares = torch.empty(items, height, dtype=torch.float64)
     inputs = map(address, (render, planes, background, scale, weight))
     sizes = (items, height, width, torch.get_num_threads())
-    _function()(_Pictures(*inputs, *sizes), _Gradient(*map(address, (gradient, squares))))
-    return gradient, squares.sum(1)
+    failed = _function()(_Pictures(*inputs, *sizes), _Gradient(*map(address, (gradient, squares))))
+    return None if failed else (gradient, squares.sum(1))  # out of memory
 
 
 @functools.cache
