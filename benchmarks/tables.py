@@ -7,7 +7,6 @@ stale.
 
 import re
 from collections.abc import Callable
-from pathlib import Path
 
 from benchmarks.markdown import markdown
 from benchmarks.models import memory, precision, training_rate
@@ -130,16 +129,19 @@ def filled(text: str, sections: dict[str, Callable[[], str]]) -> str:
     return text
 
 
-def pages() -> dict[Path, str]:
-    """Return the text of every page with generated parts."""
-    made = {ROOT / name: filled((ROOT / name).read_text(), s) for name, s in SECTIONS.items()}
-    return made | {
-        ROOT / "docs/results.md": quality.page(),
-        ROOT / "docs/stability.md": stability.page(),
-    }
+WHOLE = {"docs/results.md": quality.page, "docs/stability.md": stability.page}
+PAGES = (*SECTIONS, *WHOLE)
+"""The pages with generated parts."""
+
+
+def text_of(page: str) -> str:
+    """Return the text of one of PAGES."""
+    if page in WHOLE:
+        return WHOLE[page]()
+    return filled((ROOT / page).read_text(), SECTIONS[page])
 
 
 if __name__ == "__main__":
-    for path, text in pages().items():
-        path.write_text(text)
-        print(path.relative_to(ROOT))
+    for name in PAGES:
+        (ROOT / name).write_text(text_of(name))
+        print(name)
