@@ -70,6 +70,15 @@ def test_a_damaged_list_of_digests_is_named(folder, content):
         model_part("toybox", CLIP)
 
 
+def test_other_files_of_a_folder_may_have_any_names(folder, monkeypatch):
+    """An export lists those that its folder had before."""
+    monkeypatch.setattr(bundled, "FOLDER", folder / "elsewhere")
+    (folder / "my notes, für später.txt").write_text("a")
+    bundled.write_digests(folder)
+    assert "my notes, für später.txt" in bundled.read_digests(folder)
+    assert model_part(str(folder), CLIP) == str(folder / CLIP)
+
+
 def test_damaged_files_of_an_export_are_named_unless_it_has_no_digests(folder, monkeypatch):
     monkeypatch.setattr(bundled, "FOLDER", folder / "elsewhere")
     (folder / "clip/weights").write_text("other")

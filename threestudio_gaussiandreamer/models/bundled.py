@@ -8,6 +8,7 @@ damage before anything is loaded.
 
 import functools
 import hashlib
+import os
 import re
 from pathlib import Path
 
@@ -20,7 +21,7 @@ RECORD, DIGESTS = "training.json", "SHA256SUMS"
 """The export's record of its training, which marks such a folder, and the digests of its other
 files in the format of ``sha256sum``.
 """
-LINE = re.compile(rb"([0-9a-f]{64})  ([!-~]+)")
+LINE = re.compile(rb"([0-9a-f]{64})  (.+)")
 """A line of the list of digests."""
 DIFFUSION, CLIP, POINTS, JUDGE = (
     "stable-diffusion",
@@ -98,7 +99,7 @@ def read_digests(folder: Path) -> dict[str, str]:
     for line in lines:
         if not (found := LINE.fullmatch(line)):
             raise UserError(f"{str(path)!r} is damaged: {_remedy(folder)}")
-        digests[found[2].decode()] = found[1].decode()
+        digests[os.fsdecode(found[2])] = found[1].decode()
     return digests
 
 
