@@ -9,10 +9,10 @@ begins with random weights. Writes ``benchmarks/results/training_rate.csv``.
 
 import argparse
 import csv
-import os
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
@@ -29,20 +29,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=25, help="of the CPU, of each stage")
     arguments = parser.parse_args()
-    os.environ["OMP_NUM_THREADS"] = "1"  # before torch is imported
-    from threestudio_gaussiandreamer.toybox.train import STAGES
-
-    with tempfile.TemporaryDirectory() as folder:
-        rows = [
-            (name, *measured(name, Path(folder), arguments.seconds), machine(), commit())
-            for name in tqdm(STAGES, unit="stage")
-        ]
-    with open(RESULTS, "w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
-
-
-def measured(name: str, folder: Path, seconds: float) -> tuple[str, str]:
-    """Train a stage; return the pictures that it saw, and its CPU seconds."""
     import torch
 
     from threestudio_gaussiandreamer.models.bundled import FOLDER
@@ -51,9 +37,19 @@ def measured(name: str, folder: Path, seconds: float) -> tuple[str, str]:
     from threestudio_gaussiandreamer.toybox.warm_start import start_from
 
     torch.set_num_threads(1)
-    options = Options(folder=folder, pool=2)
-    start_from(FOLDER, options, STAGES)
-    training = Training(STAGES[name](options))
+    with tempfile.TemporaryDirectory() as folder:
+        options = Options(folder=Path(folder), pool=2)
+        start_from(FOLDER, options, STAGES)
+        rows = [
+            (name, *measured(Training(stage(options)), arguments.seconds), machine(), commit())
+            for name, stage in tqdm(STAGES.items(), unit="stage")
+        ]
+    with open(RESULTS, "w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
+
+
+def measured(training: Any, seconds: float) -> tuple[str, str]:
+    """Train a stage; return the pictures that it saw, and its CPU seconds."""
     batches = training.stage.batches(training.progress.step)
     for _ in range(WARM_UP):
         training.train_step(next(batches))

@@ -257,8 +257,7 @@ def draw_against_seconds(name: str, shown: dict[str, list[Row]]) -> Path:
             panel.plot([median(rows, "cpu_seconds")], [100 * mean], marker, color=color,
                        markersize=size, label=title, markeredgecolor="0.2")  # fmt: skip
         set_log_x(panel)
-    finish(panels[0], "CPU seconds, one thread")
-    finish(panels[1], "CPU seconds, one thread")
+        finish(panel, "CPU seconds, one thread")
     panels[0].set_ylabel("recognised attributes, %")
     panels[1].set_ylabel("multi-face, %")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)

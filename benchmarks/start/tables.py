@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from benchmarks.markdown import markdown, read
+from benchmarks.quality.chart_runs import grouped
 
 FOLDER = Path(__file__).resolve().parents[1] / "results"
 RESULTS = FOLDER / "start.csv"
@@ -41,8 +42,8 @@ def whole_runs() -> str:
     rows = read(FOLDER / "whole_run.csv")
     numbers = ("seconds", "prior_seconds", "cpu_seconds", "peak_mb")
     lines = []
-    for name, place in _unique((row["configuration"], _place(row)) for row in rows):
-        same = [row for row in rows if (row["configuration"], _place(row)) == (name, place)]
+    groups = grouped(rows, lambda row: (row["configuration"], _place(row)))
+    for (name, place), same in groups.items():
         medians = [statistics.median(float(row[number]) for row in same) for number in numbers]
         lines.append((name, place, str(len(same)), *(f"{value:.0f}" for value in medians)))
     head = ("configuration", "cores", "runs", "seconds", "until the prior's points", "CPU seconds")

@@ -118,6 +118,12 @@ def test_wrong_input_is_named(tmp_path, judge, capsys, arguments, message):
     assert message in capsys.readouterr().err
 
 
+def test_a_run_without_a_prompt_is_named(tmp_path, judge, capsys):
+    run = finished(tmp_path / "runs", [""])
+    assert main([str(run), "--metrics", "judge", "--judge", judge]) == 2
+    assert "has no prompt" in capsys.readouterr().err
+
+
 def test_a_run_without_a_prompt_is_named_after_the_others_are_scored(tmp_path, judge, capsys):
     runs = finished(tmp_path / "runs", ["", PROMPTS[0]])
     output = tmp_path / "out"

@@ -71,7 +71,7 @@ def test_right_kernels_are_used_and_compared_once(use):
 
 def test_right_kernels_are_far_from_the_tolerance(use):
     use(HostDevice())
-    errors = proof.errors_on(CPU)
+    errors = proof.errors_on(CPU, proof.expected_on(CPU))
     assert max(errors.values()) < proof.TOLERANCE / 10
     assert len(errors) == 12
 

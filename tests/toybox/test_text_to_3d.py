@@ -82,7 +82,9 @@ def test_finished_runs_are_scored_with_the_models_of_one_folder(finished, export
 )
 def test_any_text_is_a_prompt(exported, tmp_path, capsys, prompt, warned):
     assert run(exported, tmp_path, prompt, "trainer.max_steps=1", "system.pages=false") == 0
-    assert warned in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert warned in errors
+    assert ("wasn't trained on" in errors) == (len(prompt) < 1000)  # the long one has known words
 
 
 def test_an_empty_prompt_is_requested(exported, tmp_path, capsys):

@@ -9,7 +9,7 @@ from threestudio_gaussiandreamer.meshes.load import AXES
 from threestudio_gaussiandreamer.prompts.view_prompts import view_directions
 from threestudio_gaussiandreamer.toybox import views, words, world
 from threestudio_gaussiandreamer.toybox.kinds import ACCESSORIES, KINDS, ORIENTED
-from threestudio_gaussiandreamer.toybox.sheet import contact_sheet
+from threestudio_gaussiandreamer.toybox.sheet import LINE, contact_sheet
 from threestudio_gaussiandreamer.toybox.tokenizer import LENGTH, write_tokenizer
 from threestudio_gaussiandreamer.toybox.world_sheet import main
 
@@ -294,8 +294,8 @@ def test_a_batch_is_a_function_of_its_step(shards):
 def test_the_sheet_shows_every_object_with_its_prompt(tmp_path):
     assert main([str(tmp_path / "world.png"), "--count", "12"]) == 0
     sheet = np.asarray(Image.open(tmp_path / "world.png"))
-    assert sheet.shape[1:] == (10 * views.SIZE, 3) and len(sheet) % 2 == 0
-    cell = len(sheet) // 2
+    cell = views.SIZE + 5 * LINE + 3  # five lines of the longest prompt
+    assert sheet.shape == (2 * cell, 10 * views.SIZE, 3)
     texts = sheet[views.SIZE : cell, : 10 * views.SIZE]
     assert all((part < 128).any() for part in np.split(texts, 10, axis=1))
     assert (sheet[cell:, 2 * views.SIZE :] == 255).all()

@@ -13,7 +13,6 @@ import re
 import shutil
 import zipfile
 from collections.abc import Iterator, Mapping
-from glob import escape as glob_escape
 from pathlib import Path
 from typing import Any, Optional
 
@@ -21,7 +20,7 @@ import torch
 
 from .archive import require_plain_archive
 from .errors import UserError
-from .files import atomic_file
+from .files import atomic_file, temporaries_of
 from .logs import warn
 from .options import is_whole, shown
 
@@ -236,7 +235,7 @@ def _prepare_folder(path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # temporary files of processes that were killed while saving
-        for stale in path.parent.glob(f".{glob_escape(path.name)}.*.tmp"):
+        for stale in temporaries_of(path):
             stale.unlink(missing_ok=True)
     except OSError as error:
         raise UserError(

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 from .errors import UserError
 
 ABANDONED_SECONDS = 3600
+"""Age from which a temporary file is taken for that of a killed process."""
 
 
 def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] = ()) -> Path:
@@ -95,12 +96,17 @@ def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bi
         temporary.unlink(missing_ok=True)
 
 
+def temporaries_of(path: str | os.PathLike) -> Iterator[Path]:
+    """Yield the temporary files of :func:`atomic_file` for ``path``, of any process."""
+    path = Path(path)
+    return path.parent.glob(f".{glob_escape(_shortened(path.name))}.*.tmp")
+
+
 def remove_abandoned(path: str | os.PathLike) -> None:
     """Delete temporary files that killed processes have left while they wrote ``path``: those that
     haven't been written for an hour.
     """
-    path = Path(path)
-    for left in path.parent.glob(f".{glob_escape(_shortened(path.name))}.*.tmp"):
+    for left in temporaries_of(path):
         with suppress(OSError):  # another process may have deleted it
             if time.time() - left.stat().st_mtime > ABANDONED_SECONDS:
                 left.unlink()

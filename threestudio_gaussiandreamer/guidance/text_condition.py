@@ -24,8 +24,8 @@ class Condition(NamedTuple):
     negative_weights: Optional[Float[Tensor, "B 2"]]
     """The weights of the two Perp-Neg rows, <= 0; None without Perp-Neg."""
     empty: Optional[Float[Tensor, "_ N F"]] = None
-    """The embedding of an empty prompt, if the variant needs it, the prompts have it, and it isn't
-    that of the negative prompt; B rows if it depends on the view.
+    """The embedding of an empty prompt, if the variant needs it and the prompts have it; B rows if
+    it depends on the view.
     """
     opposite: Optional[Float[Tensor, "B N F"]] = None
     """The prompts of the opposite views; None without view contrast, and with Perp-Neg, which

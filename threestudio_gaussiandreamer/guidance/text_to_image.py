@@ -288,12 +288,8 @@ class TextToImageDistillation(ScoreDistillation):
                 "give system.prompt_processor and system.guidance the same "
                 "pretrained_model_name_or_path"
             )
-        embeddings = embeddings.to(self.device)
         empty = self._empty_embedding(prompt_utils)
-        views = len(batch["elevation"])
-        if empty is not None and (embeddings[views : 2 * views] == empty).all():
-            empty = None  # the negative prompt is empty
-        return Condition(embeddings, weights, empty, other)
+        return Condition(embeddings.to(self.device), weights, empty, other)
 
     def _empty_embedding(self, prompt_utils: Any) -> Optional[Float[Tensor, "1 N F"]]:
         """Return the embedding of an empty prompt if the variant needs one and ``prompt_utils`` can

@@ -164,7 +164,9 @@ class TextEncoderPromptProcessor(BaseObject):
             prompt=self.prompt,
             prompts_vd=prompts_vd,
             # on first use, since few guidances need it
-            empty=functools.cache(lambda: self._embeddings(folder, [""])),
+            empty=functools.cache(lambda: self._embeddings(folder, [""]))
+            if any((cfg.negative_prompt, *negative_vd))
+            else None,
         )
 
     def _embeddings(self, folder: Path, texts: list[str]) -> Float[Tensor, "T N F"]:

@@ -114,7 +114,9 @@ class PromptEmbeddings:
     prompt: str
     prompts_vd: List[str]
     empty: Optional[Callable[[], Float[Tensor, "1 N F"]]] = None
-    """Returns the embedding of an empty prompt; not in threestudio."""
+    """Returns the embedding of an empty prompt; None if the negative prompt is empty too. Not in
+    threestudio.
+    """
 
     def direction_indices(
         self,

@@ -41,7 +41,9 @@ def check_optimizer(options: Any, scheduler: Any = None) -> None:
     if not isinstance(arguments, Mapping):
         raise UserError(f"optimizer.args: expected keys and values, got {arguments!r}")
     try:
-        make_optimizer(options, [_some_group(), _some_group()]).step()
+        optimizer = make_optimizer(options, [_some_group(), _some_group()])
+        if not (arguments.get("capturable") and get_device().type == "cuda"):
+            optimizer.step()  # on the CPU, which would refuse what a GPU takes
     except Exception as error:  # of many types
         accepted = inspect.signature(getattr(torch.optim, name)).parameters.keys()
         accepted = accepted - {"params", "lr"}  # which the groups bring
@@ -52,6 +54,6 @@ def check_optimizer(options: Any, scheduler: Any = None) -> None:
 
 
 def _some_group() -> dict[str, Any]:
-    parameter = torch.zeros(1, requires_grad=True, device=get_device())
+    parameter = torch.zeros(1, requires_grad=True)
     parameter.grad = torch.zeros_like(parameter)
     return {"params": [parameter], "lr": 0.0}

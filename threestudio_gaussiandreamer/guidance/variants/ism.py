@@ -5,8 +5,8 @@ score over one interval of a deterministic trajectory, without random noise.
     z_t = one more step of it, from s to t
     e = eps_hat(z_t, t) - eps_u(z_s, s)
 
-"Unconditional" is the guidance's own: with a negative prompt, which the paper hasn't there, the
-prediction for that.
+eps_u is the guidance's unconditional prediction: that for the negative prompt, if there is one. The
+paper has the empty prompt there.
 
 =========  =========================================================================================
 option     meaning

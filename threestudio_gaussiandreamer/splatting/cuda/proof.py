@@ -75,9 +75,9 @@ def _compare(device: torch.device) -> str:
             which says nothing about the kernels.
     """
     with _default_algorithms():
-        expected = _drawn(torch_backend, device, torch.float64)
+        expected = expected_on(device)
         try:
-            errors = _errors(_drawn(kernels, device, torch.float32), expected)
+            errors = errors_on(device, expected)
         except (UserError, RuntimeError) as error:
             if isinstance(error, torch.cuda.OutOfMemoryError) or "out of memory" in str(error):
                 raise
@@ -108,13 +108,14 @@ def _default_algorithms() -> Iterator[None]:
         torch.use_deterministic_algorithms(strict, warn_only=warns)
 
 
-def errors_on(device: torch.device) -> dict[str, float]:
+def expected_on(device: torch.device) -> dict[str, Tensor]:
+    """Return the outputs and gradients of plain torch in float64."""
+    return _drawn(torch_backend, device, torch.float64)
+
+
+def errors_on(device: torch.device, expected: dict[str, Tensor]) -> dict[str, float]:
     """Return the relative error of each output and gradient of the kernels."""
     found = _drawn(kernels, device, torch.float32)
-    return _errors(found, _drawn(torch_backend, device, torch.float64))
-
-
-def _errors(found: dict[str, Tensor], expected: dict[str, Tensor]) -> dict[str, float]:
     errors = [
         (found[name].double() - true).abs().max() / true.abs().max()
         for name, true in expected.items()
