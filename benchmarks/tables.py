@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 
 from benchmarks.markdown import markdown
-from benchmarks.models import memory, precision, training_rate
+from benchmarks.models import loading, memory, precision, training_rate
 from benchmarks.quality import failure_table, formats, toybox_variants, variant_tables
 from benchmarks.quality import mesh as mesh_quality
 from benchmarks.quality import tables as quality
@@ -105,6 +105,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "seeds": toybox.seeds,
         "judges": toybox.judges,
         "training rate": training_rate.table,
+        "loading": loading.table,
         "whole runs": start.whole_runs,
         "settings": toybox_variants.settings,
     },

@@ -1,0 +1,19 @@
+"""Each part's models are loaded and timed."""
+
+import csv
+import sys
+
+import pytest
+
+from benchmarks.models import loading
+
+
+def test_each_part_is_loaded_and_timed(monkeypatch, tmp_path):
+    pytest.importorskip("diffusers")
+    monkeypatch.setattr(loading, "RESULTS", tmp_path / "loading.csv")
+    monkeypatch.setattr(sys, "argv", ["loading", "--rounds", "1"])
+    loading.main()
+    rows = list(csv.DictReader(open(tmp_path / "loading.csv")))
+    assert [row["part"] for row in rows] == list(loading.LOADERS)
+    assert all(float(row["cpu_seconds"]) > 0 for row in rows)
+    assert len(loading.table().splitlines()) == 9
