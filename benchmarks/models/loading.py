@@ -7,14 +7,16 @@ processor also encodes a prompt with its views, the prior samples ten points in 
 medians of the rounds to ``benchmarks/results/loading.csv``."""
 
 import argparse
-import csv
 import statistics
 import time
 from collections.abc import Callable
 
-from benchmarks.markdown import markdown, read
+from benchmarks.markdown import markdown, read, write
 from benchmarks.quality.runs import ROOT, commit, machine
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.models.bundled import NAME
+from threestudio_gaussiandreamer.toybox import recognition
 
 RESULTS = ROOT / "benchmarks/results/loading.csv"
 COLUMNS = ("part", "cpu_seconds", "machine", "commit")
@@ -25,37 +27,36 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=5)
     rounds = parser.parse_args().rounds
+    register_parts()
     times: dict[str, list[float]] = {name: [] for name in LOADERS}
     for _ in range(rounds + 1):  # the first one imports the libraries, and isn't counted
         for name, load in LOADERS.items():
             start = time.process_time()
             load()
             times[name].append(time.process_time() - start)
-    with open(RESULTS, "w", newline="") as file:
-        rows = (
-            (name, f"{statistics.median(own[1:]):.3f}", machine(), commit())
-            for name, own in times.items()
-        )
-        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
+    common = {"machine": machine(), "commit": commit()}
+    write(RESULTS, COLUMNS, (row_of(name, own[1:]) | common for name, own in times.items()))
+
+
+def row_of(name: str, times: list[float]) -> dict[str, str]:
+    return {"part": name, "cpu_seconds": f"{statistics.median(times):.3f}"}
 
 
 def load_prompt_processor() -> None:
     options = {"prompt": PROMPT, "negative_prompt": "", "use_cache": False}
-    make("gaussiandreamer-stable-diffusion-prompt-processor", options | MODELS)
+    find("gaussiandreamer-stable-diffusion-prompt-processor")(options | MODELS)
 
 
 def load_guidance() -> None:
-    make("gaussiandreamer-stable-diffusion-guidance", MODELS)
+    find("gaussiandreamer-stable-diffusion-guidance")(MODELS)
 
 
 def load_prior() -> None:
     options = {"checkpoint": NAME, "clip": NAME, "upsampler": None}
-    make("point-e-prior", options | {"num_steps": 1, "num_points": 10})(PROMPT)
+    find("point-e-prior")(options | {"num_steps": 1, "num_points": 10})(PROMPT)
 
 
 def load_judge() -> None:
-    from threestudio_gaussiandreamer.toybox import recognition
-
     recognition.load_judge(NAME)
 
 
@@ -66,15 +67,6 @@ LOADERS: dict[str, Callable[[], None]] = {
     "prior: points, CLIP's text tower": load_prior,
     "judge": load_judge,
 }
-
-
-def make(name: str, options: dict) -> Callable:
-    """Return a part of the package."""
-    from threestudio_gaussiandreamer import register_parts
-    from threestudio_gaussiandreamer.host import find
-
-    register_parts()
-    return find(name)(options)
 
 
 def table() -> str:

@@ -9,17 +9,16 @@ is the median of the rounds, ``error`` the largest difference to float32, relati
 value. Writes ``benchmarks/results/precision.csv``."""
 
 import argparse
-import csv
 import itertools
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from benchmarks.markdown import markdown, read
+from benchmarks.markdown import markdown, read, write
 from benchmarks.quality.runs import ROOT, commit, machine
 from threestudio_gaussiandreamer.models.bundled import FOLDER
 
@@ -50,9 +49,7 @@ def main() -> None:
         for setting in settings:
             seconds, found[setting] = timed(calls[setting.precision][setting.network], setting)
             times[setting].append(seconds)
-    with open(RESULTS, "w", newline="") as file:
-        rows = (row_of(setting, times[setting][1:], found) for setting in settings)
-        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
+    write(RESULTS, COLUMNS, (row_of(own, times[own][1:], found) for own in settings))
 
 
 class Network(NamedTuple):
@@ -96,13 +93,11 @@ def timed(network: Network, setting: Setting) -> tuple[float, Tensor]:
     return time.process_time() - start, result.float()
 
 
-def row_of(setting: Setting, times: list[float], found: dict[Setting, Tensor]) -> Iterator[str]:
+def row_of(setting: Setting, times: list[float], found: dict[Setting, Tensor]) -> dict[str, str]:
     exact = found[Setting(setting.network, "contiguous", "float32")]
     error = float((found[setting] - exact).abs().max() / exact.abs().max())
-    yield from setting
-    yield f"{1000 * statistics.median(times):.1f}"
-    yield f"{error:.1e}"
-    yield from (machine(), commit())
+    numbers = {"cpu_ms": f"{1000 * statistics.median(times):.1f}", "error": f"{error:.1e}"}
+    return setting._asdict() | numbers | {"machine": machine(), "commit": commit()}
 
 
 def table() -> str:

@@ -8,7 +8,6 @@ begins with random weights. Writes ``benchmarks/results/training_rate.csv``.
 """
 
 import argparse
-import csv
 import tempfile
 import time
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from benchmarks.markdown import markdown, read
+from benchmarks.markdown import markdown, read, write
 from benchmarks.quality.runs import ROOT, commit, machine
 
 RESULTS = ROOT / "benchmarks/results/training_rate.csv"
@@ -37,18 +36,18 @@ def main() -> None:
     from threestudio_gaussiandreamer.toybox.warm_start import start_from
 
     torch.set_num_threads(1)
+    common = {"machine": machine(), "commit": commit()}
     with tempfile.TemporaryDirectory() as folder:
         options = Options(folder=Path(folder), pool=2)
         start_from(FOLDER, options, STAGES)
         rows = [
-            (name, *measured(Training(stage(options)), arguments.seconds), machine(), commit())
+            {"stage": name, **measured(Training(stage(options)), arguments.seconds), **common}
             for name, stage in tqdm(STAGES.items(), unit="stage")
         ]
-    with open(RESULTS, "w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
+    write(RESULTS, COLUMNS, rows)
 
 
-def measured(training: Any, seconds: float) -> tuple[str, str]:
+def measured(training: Any, seconds: float) -> dict[str, str]:
     """Train a stage; return the pictures that it saw, and its CPU seconds."""
     batches = training.stage.batches(training.progress.step)
     for _ in range(WARM_UP):
@@ -57,7 +56,7 @@ def measured(training: Any, seconds: float) -> tuple[str, str]:
     while time.process_time() - start < seconds:
         training.train_step(next(batches))
     took = time.process_time() - start
-    return str(training.progress.images - seen), f"{took:.1f}"
+    return {"images": str(training.progress.images - seen), "cpu_seconds": f"{took:.1f}"}
 
 
 def table() -> str:

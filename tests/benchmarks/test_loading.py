@@ -1,11 +1,15 @@
-"""Each part's models are loaded and timed."""
+"""Each part's models are loaded and timed; the committed times are within the bound."""
 
 import csv
 import sys
 
 import pytest
 
+from benchmarks.markdown import read
 from benchmarks.models import loading
+
+SECONDS = 2.0
+"""CPU seconds in which the models are loaded, after the libraries are imported."""
 
 
 def test_each_part_is_loaded_and_timed(monkeypatch, tmp_path):
@@ -17,3 +21,7 @@ def test_each_part_is_loaded_and_timed(monkeypatch, tmp_path):
     assert [row["part"] for row in rows] == list(loading.LOADERS)
     assert all(float(row["cpu_seconds"]) > 0 for row in rows)
     assert len(loading.table().splitlines()) == 9
+
+
+def test_the_measured_times_are_within_the_bound():
+    assert sum(float(row["cpu_seconds"]) for row in read(loading.RESULTS)) < SECONDS
