@@ -10,7 +10,13 @@ from collections.abc import Callable
 
 from benchmarks.markdown import markdown
 from benchmarks.models import loading, memory, precision, training_rate
-from benchmarks.quality import failure_table, formats, toybox_variants, variant_tables
+from benchmarks.quality import (
+    default_against,
+    failure_table,
+    formats,
+    toybox_variants,
+    variant_tables,
+)
 from benchmarks.quality import mesh as mesh_quality
 from benchmarks.quality import tables as quality
 from benchmarks.quality import toybox_tables as toybox
@@ -91,6 +97,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "step": start.step_parts,
         "start": start.first_step,
         "stages": start.demo_stages,
+        "default": default_against.table,
     },
     "docs/robustness.md": {"fuzz": robustness.fuzz, "long run": robustness.long_run},
     "docs/farm.md": {"farm": robustness.farm},

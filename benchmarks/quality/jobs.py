@@ -286,8 +286,8 @@ def quality_jobs() -> Iterator[Job]:
 
 
 def unseen_jobs() -> Iterator[Job]:
-    """The demo and its draft on objects that nothing was tuned on."""
-    return demo_jobs("unseen", "draft", "default")
+    """The demo, its draft and its best variant on objects that nothing was tuned on."""
+    return demo_jobs("unseen", *DEMOS)
 
 
 def failure_jobs() -> Iterator[Job]:

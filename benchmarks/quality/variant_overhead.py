@@ -6,7 +6,8 @@ A step: views drawn and differentiated, the shared path of score distillation on
 eighth of the pictures' size, as Stable Diffusion's (512^2 in the paper), Adam. The score model is
 empty: it returns its input, so a variant's further calls of it cost nothing, and what remains is
 everything else that the variant does. Steps of SDS and of the variant alternate; the overhead is
-the median of the differences of two neighbouring steps, relative to the median step of SDS.
+the median of the differences of the guidance's seconds in two neighbouring steps, relative to the
+median whole step of SDS. SDS against itself shows the scatter.
 ``evaluations``: calls of the score model per view and step, on average.
 Writes ``benchmarks/results/variant_overhead.csv``. The bar: at most 2 % at 512^2."""
 
@@ -14,7 +15,7 @@ import argparse
 import statistics
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -50,6 +51,13 @@ class EmptyScore(PixelGuidance):
         return z
 
 
+class Seconds(NamedTuple):
+    """CPU seconds of a step."""
+
+    whole: float
+    guidance: float
+
+
 class VariantBench(Bench):
     """A training step with any variant."""
 
@@ -59,17 +67,20 @@ class VariantBench(Bench):
         c2w = orbit_c2w(torch.full((views,), 15.0), azimuths, torch.full((views,), 2.7))
         self.batch = {"c2w": c2w, "fovy": torch.full((views,), 0.87)}
 
-    def step_with(self, guidance: EmptyScore) -> float:
-        """Make a step; return its CPU seconds."""
+    def step_with(self, guidance: EmptyScore) -> Seconds:
+        """Make a step and time it."""
         start = time.process_time()
         out = self.forward()
+        drawn = time.process_time()
         surface = {"depth": out.depth.detach(), "opacity": out.alpha.detach()}
         surface["depth"] = surface["depth"] / surface["opacity"].clamp_min(1e-6)
-        guidance(out.image, **self.batch, **surface)["loss_sds"].backward()
+        loss = guidance(out.image, **self.batch, **surface)["loss_sds"]
+        guidance.update_step(0, guidance.step + 1)
+        guided = time.process_time()
+        loss.backward()
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-        guidance.update_step(0, guidance.step + 1)
-        return time.process_time() - start
+        return Seconds(time.process_time() - start, guided - drawn)
 
 
 def variant_names() -> list[str]:
@@ -92,8 +103,8 @@ def measure(bench: VariantBench, name: str, pairs: int) -> dict[str, Any]:
     for _ in range(pairs):
         times.append((bench.step_with(plain), bench.step_with(other)))
         calls.append(other.evaluations / len(bench.batch["c2w"]))
-    sds = statistics.median(first for first, _ in times)
-    extra = statistics.median(second - first for first, second in times)
+    sds = statistics.median(first.whole for first, _ in times)
+    extra = statistics.median(second.guidance - first.guidance for first, second in times)
     return {
         "variant": name,
         "sds_ms": f"{1e3 * sds:.2f}",

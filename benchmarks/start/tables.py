@@ -90,17 +90,19 @@ def _with_share(medians: dict[str, float], parts: list[str]) -> str:
 
 
 def demo_stages() -> str:
-    """Return the seconds of each stage of ``make demo-exact``."""
+    """Return the seconds of each stage of the demos, from an empty clone."""
     rows = read(FOLDER / "demo_stages.csv")
-    lines = [
-        (row["stage"], f"{float(row['seconds']):.1f}", f"{float(row['cpu_seconds']):.1f}")
-        for row in rows
-    ]
+    targets, stages = (_unique(row[key] for row in rows) for key in ("target", "stage"))
+    found = {(row["target"], row["stage"]): row for row in rows}
+    numbers = [(target, name) for target in targets for name in ("seconds", "cpu_seconds")]
+    lines = []
+    for stage in stages:
+        own = [(found.get((target, stage)), name) for target, name in numbers]
+        lines.append((stage, *(f"{float(row[name]):.1f}" if row else "" for row, name in own)))
     whole = [row for row in rows if not row["stage"].startswith("of it")]
-    sums = [sum(float(row[name]) for row in whole) for name in ("seconds", "cpu_seconds")]
-    return markdown(
-        ("stage", "seconds", "CPU seconds"), [*lines, ("all", *(f"{s:.0f}" for s in sums))]
-    )
+    sums = [sum(float(r[name]) for r in whole if r["target"] == t) for t, name in numbers]
+    head = [f"make {t}, {name.replace('cpu_', 'CPU ')}" for t, name in numbers]
+    return markdown(("stage", *head), [*lines, ("all", *(f"{total:.0f}" for total in sums))])
 
 
 def conversion() -> str:

@@ -28,9 +28,10 @@ def config(path, **system):
         "prior": {"num_points": 60},
         "grow": {"num_candidates": 100},
     }
+    evaluation = {"views": 2, "size": 16, "every": 0}
     cfg |= {
         "data": {**cfg["data"], **sizes},
-        "system": {**cfg["system"], "geometry": geometry, **system},
+        "system": {**cfg["system"], "geometry": geometry, "evaluation": evaluation, **system},
     }
     cfg |= {"tag": "t", "use_timestamp": False}
     cfg["trainer"] |= {

@@ -149,8 +149,8 @@ def test_an_entry_that_is_no_picture_is_dropped():
     assert own.pictures is None
 
 
-@pytest.mark.parametrize("stop", [3, 4, 6])
-def test_a_run_that_was_stopped_there_continues_bit_for_bit(tmp_path, painted_box, stop):
+def test_a_stopped_run_continues_bit_for_bit(tmp_path, painted_box):
+    """Stopped before the stage, within it, and at its end."""
     options = [*STAGE, "checkpoint.every_n_train_steps=1"]
 
     def train(name, steps, *more):
@@ -159,10 +159,12 @@ def test_a_run_that_was_stopped_there_continues_bit_for_bit(tmp_path, painted_bo
         )
         return run_folder(tmp_path / name) / "ckpts" / "last.ckpt"
 
-    whole = train("whole", 8)
-    stopped = train("parts", stop)
-    assert ("image_targets.pictures" in cloud_of(stopped)) == (stop in (4, 6))
-    assert same(cloud_of(whole), cloud_of(train("parts", 8, f"resume={stopped}")))
+    whole = cloud_of(train("whole", 8))
+    for stop in (3, 4, 6):
+        name = f"stopped at {stop}"
+        stopped = train(name, stop)
+        assert ("image_targets.pictures" in cloud_of(stopped)) == (stop in (4, 6))
+        assert same(whole, cloud_of(train(name, 8, f"resume={stopped}"))), name
 
 
 def test_a_guidance_without_pictures_is_refused(tmp_path, painted_box, capsys):
