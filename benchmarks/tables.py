@@ -25,6 +25,7 @@ from benchmarks.quality.tables import DIFFERENCES, difference_row, last_rows, me
 from benchmarks.robustness import ddp
 from benchmarks.robustness import scale_tables as scale
 from benchmarks.robustness import tables as robustness
+from benchmarks.splatting import half_precision
 from benchmarks.splatting import tables as splatting
 from benchmarks.start import tables as start
 from benchmarks.viewers import tables as viewers
@@ -92,6 +93,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "contenders": splatting.contenders,
         "kernel": splatting.kernel,
         "growth": splatting.growth,
+        "half precision": half_precision.table,
     },
     "docs/step_time.md": {
         "step": start.step_parts,

@@ -3,7 +3,7 @@ direction of the prompt and that of the data's domain, without the predicted noi
 
     e = delta_D + guidance_scale delta_C,   delta_C = eps_c - eps_0
     delta_D = eps_0                         if t < threshold, where the noise in eps_0 is small
-            = eps_0 - eps_n                 otherwise
+            = eps_0 - eps_n                 otherwise        (the paper's eq. 6)
 
 eps_0 is the prediction for an empty prompt, eps_n that for the negative prompt. A score model
 without a negative prompt has delta_D = 0 at large t, and eps_0 is its unconditional score.

@@ -127,7 +127,7 @@ inline void deal_to_tiles(View& view, const uint64_t* keys, int64_t visible, int
 // Stages 1 to 3 of one view.
 inline void build_view(const ForwardCall& call, View& view, int index, int threads) {
   view.prepare(call.scene, index);
-  view.counted = threads == 1;
+  view.counted = threads == 1, view.intersection_count = 0;
   if (view.counted) std::fill_n(view.histogram.reserve(view.tiles()), view.tiles(), 0);
   view.camera = make_camera(call.scene, index);
   parallel_for(view.slices.size(), threads, 1, [&](int64_t i) { project_slice(call, view, i); });

@@ -124,6 +124,8 @@ inline void project_slice(const ForwardCall& call, View& view, int64_t index) {
   const int64_t end = std::min<int64_t>(call.scene.gaussians, (index + 1) * SLICE);
   for_each_group(index * SLICE, end, [&](Group group) { project_group(call, view, slice, group); });
   (&view.coverage(end - 1))[1] = no_coverage(slice);
+  // more intersections can't be numbered: number_slots refuses the view, and needs no counts by tile
+  if (view.counted) view.counted = (view.intersection_count += slice.slots) <= INT32_MAX;
 }
 
 }  // namespace splat
