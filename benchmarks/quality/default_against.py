@@ -74,11 +74,13 @@ def table() -> str:
     """Return the medians of both checkouts, and that of the pairs' ratios of seconds."""
     lines = []
     for mesh, same in grouped(read(RESULTS), lambda row: row["object"]).items():
-        sides = [[row for row in same if row["checkout"] == side] for side in ("before", "now")]
-        found = [[[float(row[key]) for row in side] for key in NUMBERS] for side in sides]
-        cells = [spread(values, digits) for side in found for values, digits in zip(side, (2, 1), strict=True)]
-        pairs = zip(found[1][1], found[0][1], strict=True)
-        lines.append((mesh, *cells, spread([now / before for now, before in pairs])))
+        before, now = (
+            [[float(row[key]) for row in same if row["checkout"] == side] for key in NUMBERS]
+            for side in ("before", "now")
+        )
+        cells = [text for dB, seconds in (before, now) for text in (spread(dB), spread(seconds, 1))]
+        ratios = [after / earlier for after, earlier in zip(now[1], before[1], strict=True)]
+        lines.append((mesh, *cells, spread(ratios)))
     commits = {row["checkout"]: row["commit"] for row in read(RESULTS)}
     head = [f"{side} ({commits[side]}), {key}" for side in commits for key in ("dB", "CPU s")]
     return markdown(("object", *head, "seconds now / before"), lines)

@@ -59,7 +59,7 @@ def main() -> None:
 
 
 def pairs_of(scene: Scene) -> Pairs:
-    """Evaluate the scene's Gaussians at random pixels, with the cap of alpha and no other cutoff."""
+    """Evaluate the scene's Gaussians at random pixels, with no cutoff but the cap of alpha."""
     pixels = torch.randperm(SIZE * SIZE, generator=torch.Generator().manual_seed(SIZE))[:PIXELS]
     viewmat, K = (x[None].double() for x in make_camera(SIZE))
     options = RasterizeOptions(alpha_min=0.0, stop=0.0)

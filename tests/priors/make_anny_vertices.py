@@ -1,4 +1,4 @@
-"""Vertices of a body of the package anny's own model, with which ``test_makehuman.py`` compares ours.
+"""Vertices of a body of the package anny's own model; ``test_makehuman.py`` compares ours.
 
     python -m tests.priors.make_anny_vertices
 
