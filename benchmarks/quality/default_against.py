@@ -8,9 +8,6 @@ process with one thread. The other checkout needs its own kernels (``python setu
 ``benchmarks/results/default.csv``."""
 
 import json
-import os
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +16,7 @@ from benchmarks.markdown import markdown, read, write
 from benchmarks.quality.chart_runs import grouped
 from benchmarks.quality.runs import machine
 from benchmarks.quality.tables import spread
-from benchmarks.start.launched import ROOT, checkouts_of, commit_of, paired_parser
+from benchmarks.start.launched import ROOT, checkouts_of, commit_of, launch, paired_parser
 from benchmarks.start.step_shares import THREADS
 
 RESULTS = ROOT / "benchmarks/results/default.csv"
@@ -56,15 +53,8 @@ def trained(checkout: Path, mesh: str, seed: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         options = {"exp_root_dir": folder, "name": "run", "tag": "run", "use_timestamp": "false"}
         options |= {"seed": seed, "system.guidance.mesh": mesh}
-        command = [sys.executable, checkout / "launch.py", "--train", "--gpu", "cpu"]
-        command += ["--config", checkout / "configs/demo.yaml"]
-        done = subprocess.run(
-            [*map(str, command), *(f"{key}={value}" for key, value in options.items())],
-            cwd=folder,
-            env=os.environ | THREADS | {"PYTHONPATH": str(checkout)},
-            capture_output=True,
-            text=True,
-        )
+        words = [f"{key}={value}" for key, value in options.items()]
+        done = launch(checkout, folder, *words, environment=THREADS)
         if done.returncode:
             raise RuntimeError(f"{checkout} failed:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}")
         return json.loads(Path(folder, "run/run/save/metrics.json").read_text())["result"]

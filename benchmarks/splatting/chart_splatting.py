@@ -93,13 +93,8 @@ def truth(scene: Scene, size: int) -> Truth:
     rng = torch.Generator().manual_seed(size)
     pixels = torch.randperm(size * size, generator=rng)[:PIXELS].sort().values
     cotangent = torch.randn(len(pixels), 3, generator=rng, dtype=torch.float64) / len(pixels)
-    viewmat, K = (x[None].double() for x in make_camera(size))
     leaves = [x.double().requires_grad_() for x in scene]
-    options = RasterizeOptions(alpha_min=0.0, stop=0.0)
-    inputs = as_scene(named(*leaves, viewmat, K, background=None), size, size)
-    splats = project(inputs, options)
-    ordered = reference.sort(splats, leaves[4][None], 0)
-    centres = reference.pixel_centres(size, size, splats.depths)[pixels]
+    options, ordered, centres = at_pixels(leaves, size, pixels)
     chunks = centres.split(64)
     image = torch.cat(
         [
@@ -109,6 +104,19 @@ def truth(scene: Scene, size: int) -> Truth:
     )[:, :3]
     image.backward(cotangent)
     return Truth(pixels, image.detach(), cotangent, [x.grad for x in leaves])
+
+
+def at_pixels(
+    leaves: list[Tensor], size: int, pixels: Tensor
+) -> tuple[RasterizeOptions, reference.Sorted, Tensor]:
+    """Return options without cutoffs, the sorted splats of a scene in float64, and the centres of
+    some pixels, for the reference.
+    """
+    viewmat, K = (x[None].double() for x in make_camera(size))
+    options = RasterizeOptions(alpha_min=0.0, stop=0.0)
+    splats = project(as_scene(named(*leaves, viewmat, K, background=None), size, size), options)
+    ordered = reference.sort(splats, leaves[4][None], 0)
+    return options, ordered, reference.pixel_centres(size, size, splats.depths)[pixels]
 
 
 def measured(scene: Scene, size: int, setting: Setting, true: Truth) -> dict[str, float]:

@@ -16,12 +16,9 @@ from torch import Tensor
 
 from benchmarks.markdown import markdown, read, write
 from benchmarks.quality.runs import ROOT
-from benchmarks.splatting.bench_scenes import Scene, make_camera
+from benchmarks.splatting.bench_scenes import Scene
+from benchmarks.splatting.chart_splatting import at_pixels
 from benchmarks.splatting.scenes import scenes
-from threestudio_gaussiandreamer.splatting import reference
-from threestudio_gaussiandreamer.splatting.options import RasterizeOptions
-from threestudio_gaussiandreamer.splatting.projection import project
-from threestudio_gaussiandreamer.splatting.validation import as_scene, named
 
 RESULTS = ROOT / "benchmarks/results/half_precision.csv"
 COLUMNS = ("format", "scene", "psnr", "gradient")
@@ -61,12 +58,7 @@ def main() -> None:
 def pairs_of(scene: Scene) -> Pairs:
     """Evaluate the scene's Gaussians at random pixels, with no cutoff but the cap of alpha."""
     pixels = torch.randperm(SIZE * SIZE, generator=torch.Generator().manual_seed(SIZE))[:PIXELS]
-    viewmat, K = (x[None].double() for x in make_camera(SIZE))
-    options = RasterizeOptions(alpha_min=0.0, stop=0.0)
-    leaves = [x.double() for x in scene]
-    splats = project(as_scene(named(*leaves, viewmat, K, background=None), SIZE, SIZE), options)
-    ordered = reference.sort(splats, leaves[4][None], 0)
-    centres = reference.pixel_centres(SIZE, SIZE, splats.depths)[pixels]
+    options, ordered, centres = at_pixels([x.double() for x in scene], SIZE, pixels)
     x, y = (centres - ordered.means2d[:, None]).unbind(-1)
     a, k, c = ordered.conics[:, None].unbind(-1)
     gauss = torch.exp(-0.5 * (a * (x - k * y) ** 2 + c * y**2))

@@ -42,18 +42,29 @@ def run_with_probe(
         extension = Path(folder, "custom", "probe")
         extension.mkdir(parents=True)
         shutil.copy(probe, extension / "__init__.py")
-        command = [sys.executable, checkout / "launch.py", "--config", checkout / config, "--train"]
-        done = subprocess.run(
-            [*map(str, command), "--gpu", "cpu", *overrides],
-            cwd=folder,
-            env=os.environ | {"PYTHONPATH": str(checkout)} | dict(environment),
-            capture_output=True,
-            text=True,
-        )
+        done = launch(checkout, folder, *overrides, config=config, environment=environment)
     for line in done.stdout.splitlines():
         if line.startswith(MARK):
             return json.loads(line.removeprefix(MARK))
     raise RuntimeError(f"{checkout} measured nothing:\n{done.stdout}\n{done.stderr}")
+
+
+def launch(
+    checkout: Path,
+    folder: str,
+    *overrides: str,
+    config: str = "configs/demo.yaml",
+    environment: Mapping[str, str] = {},
+) -> subprocess.CompletedProcess[str]:
+    """Train with a checkout on the CPU in ``folder``; arguments as of :func:`run_with_probe`."""
+    command = [sys.executable, checkout / "launch.py", "--config", checkout / config, "--train"]
+    return subprocess.run(
+        [*map(str, command), "--gpu", "cpu", *overrides],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(checkout)} | dict(environment),
+        capture_output=True,
+        text=True,
+    )
 
 
 def commit_of(checkout: Path) -> str:

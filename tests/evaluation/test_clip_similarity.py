@@ -235,7 +235,7 @@ def test_it_is_a_command(plys, tmp_path):
 
 @pytest.mark.slow
 def test_shapes_and_types_hold(clip, plys, tmp_path):
-    """Every call within ``evaluation`` is checked, as with ``--typecheck``."""
+    """Every call is checked, as with ``--typecheck``."""
     arguments = [
         plys[0],
         "--clip",
@@ -250,11 +250,8 @@ def test_shapes_and_types_hold(clip, plys, tmp_path):
         "4",
     ]
     code = f"""
-import jaxtyping
 from threestudio_gaussiandreamer.core import typecheck
-jaxtyping.install_import_hook(
-    "threestudio_gaussiandreamer.evaluation", "threestudio_gaussiandreamer.core.typecheck.check"
-)
+typecheck.install()
 from threestudio_gaussiandreamer.evaluation.clip_similarity import main
 raise SystemExit(main({arguments!r}))
 """

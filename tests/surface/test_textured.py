@@ -111,8 +111,9 @@ def test_a_missing_library_is_named_with_its_extra(library, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_whole_conversion_at_its_defaults():
-    gaussians, faces = painted_ball(5000), MeshOptions().faces
-    mesh = mesh_from_gaussians(gaussians)
+@pytest.mark.parametrize("faces", [5000, 20000])
+def test_the_whole_conversion_at_its_defaults(faces):
+    gaussians = painted_ball(5000)
+    mesh = mesh_from_gaussians(gaussians, MeshOptions(faces=faces))
     assert closed(mesh) and faces * 0.9 < len(mesh.faces) <= faces
     assert psnr_to_cloud(mesh, gaussians, 256) > 25
