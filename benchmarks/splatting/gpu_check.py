@@ -8,16 +8,17 @@ The exit code is 0 if all is well, 1 if something failed, and 2 without a GPU.
 ========  ==========================================================================================
 section   what it does
 ========  ==========================================================================================
-compile   first use of the kernels with an empty cache, and a later start
+compile   first use of the kernels with an empty cache, a later start, and the comparison with
+          plain torch that precedes the first use
 correct   image and all gradients against plain torch in float64, on small and large clouds; the
           same bits again
 sanitize  compute-sanitizer (memcheck, racecheck) on a small picture, where that tool exists
 bench     4 views of 1024^2, 100,000 Gaussians, forward and backward, beside gsplat (as installed,
-          else its wheel is fetched; it builds here, which takes nvcc)
+          else its wheel is fetched; it builds here, which takes nvcc); one view of 1,000,000
 prune     the prune command on a cloud of 100,000, to a quarter: seconds, dB, and the same bits
           again
 train     steps of configs/gaussiandreamer.yaml with a UNet and VAE of Stable Diffusion 2.1's size
-          and random weights
+          and random weights, and with networks that do nothing; lines that wait for the GPU
 ========  ==========================================================================================
 
 Whatever touches the GPU runs in a process of its own, with a limit of its own and within --minutes:
@@ -38,7 +39,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.splatting import gpu_kernels, gpu_runs
+from benchmarks.splatting import gpu_kernels, gpu_prune, gpu_training
 from benchmarks.splatting.bench_splatting import describe_machine
 from benchmarks.splatting.gpu_processes import failures, guarded, in_process
 
@@ -142,18 +143,19 @@ SECTIONS: dict[str, Section] = {
     "correct": gpu_kernels.correct,
     "sanitize": gpu_kernels.sanitize,
     "bench": gpu_kernels.bench,
-    "prune": gpu_runs.prune,
-    "train": gpu_runs.train,
+    "prune": gpu_prune.prune,
+    "train": gpu_training.train,
 }
 PARTS: dict[str, Section] = {
     "about": describe_device,
     "first_picture": gpu_kernels.first_picture,
+    "comparison": gpu_kernels.comparison,
     "errors": gpu_kernels.errors,
     "speed": gpu_kernels.speed,
     "gsplat_steps": gpu_kernels.gsplat_steps,
-    "prune_twice": gpu_runs.prune_twice,
-    "make_model": gpu_runs.make_model,
-    "train_steps": gpu_runs.train_steps,
+    "prune_twice": gpu_prune.prune_twice,
+    "make_model": gpu_training.make_model,
+    "train_steps": gpu_training.train_steps,
 }
 
 

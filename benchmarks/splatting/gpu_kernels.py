@@ -153,13 +153,38 @@ def trimmed(value: Tensor, exact: Tensor) -> float:
 
 def compile_kernels(args: argparse.Namespace) -> dict[str, Any]:
     """Return the seconds from the first call to its image, in new processes: with an empty cache,
-    and with a filled one.
+    with a filled one, and with compiled kernels but without the verdict on this GPU; and those of
+    the comparison that gives the verdict, alone.
     """
     with tempfile.TemporaryDirectory() as cache:
-        return {
-            name: in_process("first_picture", args, {"GAUSSIANDREAMER_CACHE": cache})["seconds"]
-            for name in ("first", "later")
-        }
+        environment = {"GAUSSIANDREAMER_CACHE": cache}
+        first, later = (in_process("first_picture", args, environment) for _ in range(2))
+        for verdict in Path(cache).glob("**/proof-*"):
+            verdict.unlink()
+        judged = in_process("first_picture", args, environment)
+        alone = in_process("comparison", args, environment)
+    return {
+        "first": first["seconds"],
+        "later": later["seconds"],
+        "without_verdict": judged["seconds"],
+        "comparison": alone,
+    }
+
+
+def comparison(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the seconds of the first comparison with plain torch in a process, and of another."""
+    from threestudio_gaussiandreamer.splatting.cuda import proof
+
+    if args.device != "cuda":
+        return {"skipped": "needs a GPU"}
+    seconds = []
+    for _ in range(2):
+        synchronize(args)
+        started = time.perf_counter()
+        if verdict := proof._compare(torch.device("cuda", 0)):
+            raise RuntimeError(verdict)
+        seconds.append(round(time.perf_counter() - started, 4))
+    return {"seconds": seconds[0], "again": seconds[1]}
 
 
 def first_picture(args: argparse.Namespace) -> dict[str, Any]:
@@ -253,6 +278,10 @@ def speed(args: argparse.Namespace) -> dict[str, Any]:
             args, drawer(scene, size, views, args.device, preset=preset), repetitions
         )
         print(preset, found[preset])
+    large = on(args.device, make_scene(2 * count if args.small else 1_000_000))
+    found["large"] = {"gaussians": len(large.means), "views": 1} | timed(
+        args, drawer(large, size, 1, args.device), repetitions // 2
+    )
     return found
 
 

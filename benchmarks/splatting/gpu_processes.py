@@ -16,6 +16,7 @@ from typing import Any
 SECONDS = {
     "about": 60,
     "first_picture": 60,
+    "comparison": 60,
     "errors": 120,
     "sanitize": 90,
     "speed": 60,

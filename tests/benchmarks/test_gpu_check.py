@@ -26,10 +26,9 @@ def test_every_section_runs_and_reports(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((tmp_path / "report.json").read_text())
     assert all(cell["gradient"] < 2e-5 for cell in report["correct"]["relative_errors"].values())
-    assert (
-        report["train"]["default"]["seconds_per_step"] > 0
-        and report["train"]["lowmem"]["seconds_per_step"] > 0
-    )
+    default, lowmem = report["train"]["default"], report["train"]["lowmem"]
+    assert default["ms_per_step"] > default["unet_ms"] > 0 and lowmem["ms_per_step"] > 0
+    assert default["unet_ms"] > default["empty_networks"]["unet_ms"] > 0
     assert report["prune"]["gaussians"] == [800, 200] and report["prune"]["psnr"] > 20
     assert report["compile"]["first"] > 0 and report["bench"]["fast"]["ms"] > 0
 

@@ -1,0 +1,227 @@
+"""The section of ``gpu_check`` that trains: milliseconds of a step of the paper's configuration, with
+a U-Net and a VAE of Stable Diffusion's size and with networks that do nothing, and the lines that
+wait for the GPU."""
+
+import argparse
+import contextlib
+import os
+import tempfile
+import time
+import traceback
+import unittest.mock
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from benchmarks.splatting.gpu_kernels import synchronize
+from benchmarks.splatting.gpu_processes import guarded, in_process
+
+ROOT = Path(__file__).resolve().parents[2]
+STEPS_OF_A_RUN = 1200
+
+
+def train(args: argparse.Namespace) -> dict[str, Any]:
+    """Return seconds per step and memory of the paper's configuration, and of its low-memory
+    variant.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {"GPU_CHECK_MODEL": str(Path(folder) / "model"), "HF_HUB_OFFLINE": "1"}
+        in_process("make_model", args, environment)
+        overlays = {"default": "", "lowmem": "gaussiandreamer-lowmem.yaml"}
+        return {
+            name: guarded(
+                lambda _, overlay=overlay: in_process(
+                    "train_steps", args, environment | {"GPU_CHECK_OVERLAY": overlay}
+                ),
+                args,
+            )
+            for name, overlay in overlays.items()
+        }
+
+
+def make_model(args: argparse.Namespace) -> dict[str, Any]:
+    from tests.helpers import tiny_models
+
+    sizes = tiny_models.TINY if args.small else tiny_models.STABLE_DIFFUSION_2_1
+    return {
+        "folder": str(
+            tiny_models.stable_diffusion(Path(os.environ["GPU_CHECK_MODEL"]), sizes=sizes)
+        )
+    }
+
+
+def train_steps(args: argparse.Namespace) -> dict[str, Any]:
+    """Train for some steps; without an overlay, also with networks that do nothing."""
+    found = steps_of(args)
+    if args.device == "cuda":
+        found["peak_gb"] = round(torch.cuda.max_memory_allocated() / 2**30, 2)
+    if os.environ["GPU_CHECK_OVERLAY"]:
+        return found
+    with empty_networks():
+        found["empty_networks"] = steps_of(args)
+    share = found["empty_networks"]["ms_per_step"] / found["unet_ms"]
+    return found | {"empty_step_over_unet": round(share, 3)}
+
+
+def steps_of(args: argparse.Namespace) -> dict[str, Any]:
+    """Run the launcher for some steps; return what a :class:`StepProbe` found."""
+    from threestudio_gaussiandreamer.guidance.stable_diffusion import StableDiffusionGuidance
+    from threestudio_gaussiandreamer.launch import experiment
+    from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
+
+    probe = StepProbe(args)
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as patches:
+        for owner, name in (
+            (GaussianDreamerSystem, "training_step"),
+            (StableDiffusionGuidance, "run_network"),
+        ):
+            call = getattr(probe, name)(getattr(owner, name))
+            patches.enter_context(unittest.mock.patch.object(owner, name, call))
+        code = experiment.main(training_arguments(args, probe.last + 2, folder))
+    if code:
+        raise RuntimeError(f"the launcher ended with {code}")
+    return probe.found()
+
+
+class StepProbe:
+    """Times the steps from ``first`` to ``last`` without waiting within them, and then records
+    which lines wait for the GPU in one more step.
+    """
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self.args, self.step = args, 0
+        self.first, self.last = (1, 3) if args.small else (10, 40)
+        self.times: dict[int, float] = {}
+        self.unet: list[tuple[Any, Any]] = []
+        self.waits: list[str] = []
+        self.watch = contextlib.ExitStack()
+
+    def training_step(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def step(system: Any, *arguments: Any) -> Any:
+            if self.step in (self.first, self.last):
+                synchronize(self.args)
+                self.times[self.step] = time.perf_counter()
+            if self.step == self.last:
+                self.watch.enter_context(waits_into(self.waits, self.args))
+            if self.step == self.last + 1:
+                self.watch.close()
+            self.step += 1
+            return original(system, *arguments)
+
+        return step
+
+    def run_network(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def evaluate(*arguments: Any, **options: Any) -> Any:
+            before = moment(self.args)
+            result = original(*arguments, **options)
+            if self.first < self.step <= self.last:
+                self.unet.append((before, moment(self.args)))
+            return result
+
+        return evaluate
+
+    def found(self) -> dict[str, Any]:
+        steps = self.last - self.first
+        per_step = (self.times[self.last] - self.times[self.first]) / steps
+        synchronize(self.args)
+        return {
+            "ms_per_step": round(1e3 * per_step, 2),
+            "extrapolated_minutes_for_1200_steps": round(per_step * STEPS_OF_A_RUN / 60, 2),
+            "unet_ms": round(sum(milliseconds(*both) for both in self.unet) / steps, 3),
+            "waits": self.waits,
+        }
+
+
+def moment(args: argparse.Namespace) -> Any:
+    """Return a point in time: of the GPU, or on a CPU in seconds."""
+    if args.device != "cuda":
+        return time.perf_counter()
+    event = torch.cuda.Event(enable_timing=True)
+    event.record()
+    return event
+
+
+def milliseconds(before: Any, after: Any) -> float:
+    """Return the time between two moments."""
+    if isinstance(before, float):
+        return 1e3 * (after - before)
+    return before.elapsed_time(after)
+
+
+@contextlib.contextmanager
+def waits_into(lines: list[str], args: argparse.Namespace) -> Iterator[None]:
+    """Append the lines of this repository at which torch waits for the GPU."""
+
+    def note(message: Any, *_: Any, **__: Any) -> None:
+        if "synchroniz" not in str(message):
+            return
+        stack = traceback.extract_stack()
+        own = [f for f in stack if Path(f.filename).is_relative_to(ROOT) and f.filename != __file__]
+        lines.append(f"{Path(own[-1].filename).relative_to(ROOT)}:{own[-1].lineno} {own[-1].line}")
+
+    if args.device != "cuda":
+        yield
+        return
+    with warnings.catch_warnings(), unittest.mock.patch.object(warnings, "showwarning", note):
+        warnings.simplefilter("always")
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            yield
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+
+
+@contextlib.contextmanager
+def empty_networks() -> Iterator[None]:
+    """Replace the U-Net by zeros and the VAE by means of 8 x 8 pixels."""
+    from threestudio_gaussiandreamer.guidance.stable_diffusion import StableDiffusionGuidance
+
+    def zeros(self: Any, z: Tensor, *_: Any, **__: Any) -> Tensor:
+        return torch.zeros_like(z)
+
+    def pooled(self: Any, images: Tensor) -> tuple[Tensor, Tensor]:
+        small = F.avg_pool2d(images, 8)
+        latents = torch.cat([small, small[:, :1]], 1)
+        return latents, torch.zeros_like(latents)
+
+    patch = unittest.mock.patch.object
+    with (
+        patch(StableDiffusionGuidance, "run_network", zeros),
+        patch(StableDiffusionGuidance, "_moments", pooled),
+    ):
+        yield
+
+
+def training_arguments(args: argparse.Namespace, steps: int, folder: str) -> list[str]:
+    """Return the paper's configuration with a mesh instead of Shap-E, which plays no part in a
+    step.
+    """
+    overlays = [
+        part
+        for name in ("gaussiandreamer.yaml", os.environ["GPU_CHECK_OVERLAY"])
+        if name
+        for part in ("--config", name)
+    ]
+    sizes = (
+        {"data.width": 64, "data.height": 64, "system.geometry.grow.num_candidates": 2000}
+        if args.small
+        else {}
+    )
+    options = sizes | {
+        "exp_root_dir": folder, "system.prompt_processor.prompt": "a fox",
+        "system.prompt_processor.pretrained_model_name_or_path": os.environ["GPU_CHECK_MODEL"],
+        "system.guidance.pretrained_model_name_or_path": os.environ["GPU_CHECK_MODEL"],
+        "system.geometry.prior_type": "mesh-prior", "system.geometry.prior.path": "toy.glb",
+        "system.geometry.prior.num_points": 500 if args.small else 80_000,
+        "system.geometry.grow.max_points": 100 if args.small else 20_000,
+        "trainer.max_steps": steps, "trainer.val_check_interval": 100_000,
+        "trainer.enable_progress_bar": "false", "data.n_test_views": 1, "data.eval_width": 64,
+        "data.eval_height": 64, "system.exporter.save_video": "false",
+    }  # fmt: skip
+    device = [] if args.device == "cuda" else ["--gpu", "cpu"]
+    return [*overlays, "--train", *device, *(f"{key}={value}" for key, value in options.items())]
