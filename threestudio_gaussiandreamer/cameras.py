@@ -129,8 +129,8 @@ def to_opencv(
     """Convert the host's OpenGL cameras to ``(viewmats, Ks)``: flip the camera's y and z axes, then
     invert the rigid motion.
     """
-    flip = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=c2w.dtype, device=c2w.device)
-    return world_to_camera(c2w * flip), intrinsics(fovy, height, width)
+    flipped = torch.cat([c2w[..., :1], -c2w[..., 1:3], c2w[..., 3:]], dim=-1)
+    return world_to_camera(flipped), intrinsics(fovy, height, width)
 
 
 def world_to_camera(c2w: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 4 4"]:

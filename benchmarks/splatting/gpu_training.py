@@ -1,6 +1,6 @@
-"""The section of ``gpu_check`` that trains: milliseconds of a step of the paper's configuration, with
-a U-Net and a VAE of Stable Diffusion's size and with networks that do nothing, and the lines that
-wait for the GPU."""
+"""The section of ``gpu_check`` that trains: milliseconds of a step of the paper's configuration,
+with a U-Net and a VAE of Stable Diffusion's size and with networks that do nothing, and the lines
+that wait for the GPU."""
 
 import argparse
 import contextlib
@@ -79,6 +79,7 @@ def steps_of(args: argparse.Namespace) -> dict[str, Any]:
         for owner, name in (
             (GaussianDreamerSystem, "training_step"),
             (StableDiffusionGuidance, "run_network"),
+            (StableDiffusionGuidance, "_encode"),
         ):
             call = getattr(probe, name)(getattr(owner, name))
             patches.enter_context(unittest.mock.patch.object(owner, name, call))
@@ -98,6 +99,7 @@ class StepProbe:
         self.first, self.last = (1, 3) if args.small else (10, 40)
         self.times: dict[int, float] = {}
         self.unet: list[tuple[Any, Any]] = []
+        self.vae: list[tuple[Any, Any]] = []
         self.waits: list[str] = []
         self.watch = contextlib.ExitStack()
 
@@ -119,20 +121,41 @@ class StepProbe:
         def evaluate(*arguments: Any, **options: Any) -> Any:
             before = moment(self.args)
             result = original(*arguments, **options)
-            if self.first < self.step <= self.last:
-                self.unet.append((before, moment(self.args)))
+            self.note(self.unet, before)
             return result
 
         return evaluate
+
+    def _encode(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def encode(guidance: Any, images: Tensor) -> Tensor:
+            images, before = images.view_as(images), moment(self.args)
+            latents = original(guidance, images)
+            self.note(self.vae, before)
+            entered: list[Any] = []  # by the backward pass
+            latents.register_hook(lambda _: entered.append(moment(self.args)))
+            images.register_hook(lambda _: self.note(self.vae, *entered))
+            return latents
+
+        return encode
+
+    def note(self, times: list[tuple[Any, Any]], before: Any) -> None:
+        """Add the time since ``before``, if the step is one of those that are timed."""
+        if self.first < self.step <= self.last:
+            times.append((before, moment(self.args)))
 
     def found(self) -> dict[str, Any]:
         steps = self.last - self.first
         per_step = (self.times[self.last] - self.times[self.first]) / steps
         synchronize(self.args)
+        unet, vae = (
+            sum(milliseconds(*both) for both in times) / steps for times in (self.unet, self.vae)
+        )
         return {
             "ms_per_step": round(1e3 * per_step, 2),
             "extrapolated_minutes_for_1200_steps": round(per_step * STEPS_OF_A_RUN / 60, 2),
-            "unet_ms": round(sum(milliseconds(*both) for both in self.unet) / steps, 3),
+            "unet_ms": round(unet, 3),
+            "vae_ms": round(vae, 3),
+            "other_ms": round(1e3 * per_step - unet - vae, 3),
             "waits": self.waits,
         }
 
@@ -158,11 +181,13 @@ def waits_into(lines: list[str], args: argparse.Namespace) -> Iterator[None]:
     """Append the lines of this repository at which torch waits for the GPU."""
 
     def note(message: Any, *_: Any, **__: Any) -> None:
-        if "synchroniz" not in str(message):
+        if "called a synchronizing" not in str(message):
             return
-        stack = traceback.extract_stack()
-        own = [f for f in stack if Path(f.filename).is_relative_to(ROOT) and f.filename != __file__]
-        lines.append(f"{Path(own[-1].filename).relative_to(ROOT)}:{own[-1].lineno} {own[-1].line}")
+        frames = [frame for frame in traceback.extract_stack() if frame.filename != __file__]
+        own = [frame for frame in frames if Path(frame.filename).is_relative_to(ROOT)]
+        called = "" if frames[-1] is own[-1] else f" in {frames[-1].filename}:{frames[-1].lineno}"
+        place = f"{Path(own[-1].filename).relative_to(ROOT)}:{own[-1].lineno}"
+        lines.append(f"{place} {own[-1].line}{called}")
 
     if args.device != "cuda":
         yield

@@ -71,7 +71,7 @@ def test_right_kernels_are_used_and_compared_once(use):
 
 def test_right_kernels_are_far_from_the_tolerance(use):
     use(HostDevice())
-    errors = proof.errors_on(CPU, proof.expected_on(CPU))
+    errors = proof.errors_on(CPU, proof.reference())
     assert max(errors.values()) < proof.TOLERANCE / 10
     assert len(errors) == 12
 
@@ -157,7 +157,7 @@ def test_an_error_of_earlier_work_is_no_verdict(use, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("warns", [False, True])
 def test_deterministic_algorithms_are_switched_on_again(use, monkeypatch, warns):
-    """Plain torch's cumulative sum would raise an error on a GPU."""
+    """What they refuse would count as a failure of the kernels."""
     seen, draw = [], proof.torch_backend.rasterize
 
     def noted(*arguments):

@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .host_copies import to_device
+
 
 def derive_seed(seed: int, stream: str, step: int = 0, item: int = 0) -> int:
     """Return a 63-bit seed that is a hash of (seed, stream, step, item)."""
@@ -50,4 +52,4 @@ def normal_per_item(
     items = torch.empty(shape)
     for b, item in enumerate(items, first):
         item.normal_(generator=generator(seed, stream, step, b))
-    return items.to(device)
+    return to_device(items, device)

@@ -40,6 +40,7 @@ eval_steps          DDIM steps from the noise to ``imgs_final``
 ==================  ================================================================================
 """
 
+import functools
 from abc import abstractmethod
 from dataclasses import dataclass, field
 from typing import Any, Optional
@@ -49,9 +50,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..core.errors import UserError, unknown
+from ..core.host_copies import DelayedReads
 from ..core.options import at_least, checked_options, in_range, one_of, schedule
 from ..diffusion import sds
 from ..host import C, find, names, parse_structured, warn
+from .bad_items import bad_items, masked_loss, may_have_any
 from .particles import GaussianParticles, ParticleModel
 from .reuse import Error, KeptPrediction
 from .score_model import GUIDANCE_SCALE, ScoreModel
@@ -152,6 +155,7 @@ class ScoreDistillation(ScoreModel):
         self.variant = variant_class(self.cfg)(self.cfg.variant)
         self._kept = KeptPrediction(self.options.reuse_steps)
         self.bad_items = self.bad_steps = 0
+        self.reads = DelayedReads()
         self.update_step(0, 0)
 
     @property
@@ -196,7 +200,7 @@ class ScoreDistillation(ScoreModel):
 
         Raises:
             NonFiniteScore: in each of the last ``max_bad_steps`` steps the score of at least one
-                item wasn't finite.
+                item wasn't finite. On a GPU it may be raised a step later.
         """
         self.evaluations = 0
         with torch.autocast(rgb.device.type, enabled=False):
@@ -210,7 +214,7 @@ class ScoreDistillation(ScoreModel):
                 self._count_bad(bad)
                 if fresh:
                     self.variant.learn(self, latents.detach(), condition, batch, ~bad)
-            loss = _masked_loss(images, latents, grad, bad)
+            loss = masked_loss(images, latents, grad, bad)
             out = self._result(loss, grad.flatten(1).norm(dim=1), bad)
             if guidance_eval:
                 out["eval"] = score_pictures(self, self.add_noise(latents), prompt_utils, batch)
@@ -229,7 +233,7 @@ class ScoreDistillation(ScoreModel):
             "max_step": self.max_step,
         }
         out |= {f"grad_norm_{i}": norm for i, norm in enumerate(norms)}
-        out |= {"bad_items": float(bad.sum()), "evaluations": float(self.evaluations)}
+        out |= {"bad_items": bad.sum(), "evaluations": float(self.evaluations)}
         return out | self.report() | self.variant.report()
 
     def _error(
@@ -277,46 +281,31 @@ class ScoreDistillation(ScoreModel):
             the gradient, zero for items in which it isn't finite, and a mask of those, (B,) bool.
         """
         grad = sds.per_item(sds.weight(self.options.weighting_strategy, abar), error) * error
-        bad = _bad_items(grad)
-        if bad.any():
-            grad[bad] = 0
+        bad = bad_items(grad)
+        if may_have_any(bad):
+            grad = grad.masked_fill(bad.reshape(-1, *[1] * (grad.dim() - 1)), 0.0)
         return grad if self.grad_clip is None else grad.clamp(-self.grad_clip, self.grad_clip), bad
 
-    def _count_bad(self, bad: Tensor) -> None:
+    def _count_bad(self, bad: Bool[Tensor, " B"]) -> None:
+        self.reads.submit(bad, functools.partial(self._note_bad, self.step))
+
+    def _note_bad(self, step: int, bad: Bool[Tensor, " B"]) -> None:
+        """Count the bad items of a step; warn of them, or raise NonFiniteScore."""
         count = int(bad.sum())
         self.bad_items += count
         self.bad_steps = self.bad_steps + 1 if count else 0
         if self.bad_steps >= self.options.max_bad_steps:
             raise NonFiniteScore(
                 f"the score model returned NaN or infinity in {self.bad_steps} steps in a row"
-                f" (step {self.step}, {self.bad_items} items so far):"
+                f" (step {step}, {self.bad_items} items so far):"
                 " use full precision (half_precision_weights=false), and check the model and "
                 "the prior"
             )
         if count:
             warn(
-                f"step {self.step}: the score of {count} of {len(bad)} items isn't finite; "
+                f"step {step}: the score of {count} of {len(bad)} items isn't finite; "
                 "they are left out"
             )
-
-
-def _bad_items(grad: Tensor) -> Tensor:
-    """Return which items contain NaN or infinity, (B,) bool. If the sum over all elements is finite
-    then so are the elements, so the usual case needs a single reduction.
-    """
-    if grad.sum().isfinite():
-        return torch.zeros(len(grad), dtype=torch.bool, device=grad.device)
-    return ~torch.isfinite(grad).flatten(1).all(dim=1)
-
-
-def _masked_loss(images: Tensor, latents: Tensor, grad: Tensor, bad: Tensor) -> Tensor:
-    """Compute the loss without the bad items. Their ``grad`` is zero, and the gradients of their
-    renders are set to exactly zero.
-    """
-    if bad.any() and images.requires_grad:
-        # If the encoder's derivative is infinite, the product with a zero gradient is NaN.
-        images.register_hook(lambda gradient: gradient.masked_fill(bad.reshape(-1, 1, 1, 1), 0.0))
-    return sds.sds_loss(latents, grad)
 
 
 def variant_class(cfg: Any) -> type[Variant]:

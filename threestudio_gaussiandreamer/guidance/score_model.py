@@ -15,6 +15,7 @@ from torch import Tensor
 from ..core import streams
 from ..core.distributed import first_item
 from ..core.errors import UserError
+from ..core.host_copies import to_device
 from ..core.options import at_least, in_range, interval, one_of, schedule
 from ..diffusion import sds
 from ..diffusion.noise_prediction import rescaled
@@ -203,7 +204,7 @@ class ScoreModel(BaseObject, ABC):
         else:
             t = torch.full((len(latents),), self._scheduled_timestep())
         abar = self.alphas_cumprod.double().cpu()[t]
-        return t.to(latents.device), abar.to(latents.device)
+        return to_device(t, latents.device), to_device(abar, latents.device)
 
     def _scheduled_timestep(self) -> int:
         limits = (self.min_step, self.max_step)

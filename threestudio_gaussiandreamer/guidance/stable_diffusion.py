@@ -13,6 +13,7 @@ enable_vae_tiling    encode and decode in overlapping tiles: for images much lar
 ===================  ===============================================================================
 """
 
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -121,6 +122,9 @@ class StableDiffusionGuidance(TextToImageDistillation):
         return (images / 2 + 0.5).clamp(0, 1)
 
     def _count_bad_backwards(self, bad: Bool[Tensor, " B"]) -> None:
+        self.reads.submit(bad, functools.partial(self._note_bad_backward, self.step))
+
+    def _note_bad_backward(self, step: int, bad: Bool[Tensor, " B"]) -> None:
         """Count consecutive backward passes in which the encoder's gradient of some items wasn't
         finite and was set to zero; raise NonFiniteScore after ``max_bad_steps``.
         """
@@ -130,11 +134,11 @@ class StableDiffusionGuidance(TextToImageDistillation):
         if self._bad_backwards >= self.cfg.max_bad_steps:
             raise NonFiniteScore(
                 f"the gradient of the VAE was NaN or infinite in {self._bad_backwards} steps "
-                f"in a row (step {self.step}): "
+                f"in a row (step {step}): "
                 "set system.guidance.half_precision_weights=false"
             )
         if count:
             warn(
-                f"step {self.step}: the VAE's gradient of {count} of {len(bad)} items isn't "
+                f"step {step}: the VAE's gradient of {count} of {len(bad)} items isn't "
                 "finite; they are left out"
             )

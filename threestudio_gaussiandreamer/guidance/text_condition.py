@@ -48,7 +48,7 @@ class Condition(NamedTuple):
         )
 
 
-def view_of_row(views: int, rows: int) -> Int[Tensor, " kB"]:
+def view_of_row(views: int, rows: int, device: torch.device | str = "cpu") -> Int[Tensor, " kB"]:
     """Return the view of each row of a :class:`Condition`: 0..B-1, 0..B-1, then 0, 0, 1, 1, ..."""
-    order = torch.arange(views)
+    order = torch.arange(views, device=device)
     return torch.cat([order, order, order.repeat_interleave(2)])[:rows]

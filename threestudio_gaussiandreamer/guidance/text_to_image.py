@@ -370,7 +370,7 @@ class TextToImageDistillation(ScoreDistillation):
             scale: of guidance, for a network that takes it; 1 for none.
         """
         self.evaluations += len(embeddings)
-        rows = view_of_row(len(z), len(embeddings)).to(z.device)
+        rows = view_of_row(len(z), len(embeddings), z.device)
         z, t = z[rows], t[rows]
         inputs = scale_input(scale, self.scale_width, len(z), device=z.device, dtype=self.dtype)
         output = self.run_network(z, t, embeddings, **inputs).float()

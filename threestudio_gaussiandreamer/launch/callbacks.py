@@ -9,7 +9,10 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+
+import torch
 
 from ..core.files import atomic_file
 from ..core.signals import interrupt, restore_handlers, set_handlers
@@ -130,6 +133,27 @@ class ProgressBar(pl.callbacks.TQDMProgressBar):
     def on_exception(self, trainer: Any, pl_module: Any, exception: BaseException) -> None:
         # end the bar's line, so that the next message starts on its own
         print(file=sys.stderr)
+
+
+class LearningRates(pl.callbacks.LearningRateMonitor):
+    """Lightning's monitor, but the rates stay on the host: a copy of each to the GPU would wait for
+    the GPU.
+    """
+
+    def on_train_batch_start(self, trainer: Any, *args: Any, **kwargs: Any) -> None:
+        super().on_train_batch_start(_OnHost(trainer), *args, **kwargs)
+
+
+class _OnHost:
+    """A trainer whose parameters seem to be on the CPU."""
+
+    strategy = SimpleNamespace(root_device=torch.device("cpu"))
+
+    def __init__(self, trainer: Any) -> None:
+        self._trainer = trainer
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._trainer, name)
 
 
 class LastCheckpoint(pl.callbacks.Checkpoint):

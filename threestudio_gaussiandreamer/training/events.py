@@ -6,30 +6,68 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from ..core.host_copies import DelayedReads
 from ..core.images import read as read_image
 from ..host import info
 
 LOGGED_SCORES = ("psnr", "ssim", "multi_face", "floater_mass")
 
 
-def log_numbers(trainer: Any, numbers: Mapping[str, Any], shown: Iterable[str] = ()) -> None:
-    """Log numbers of the training step that has just ended, as ``LightningModule.log_dict`` does.
-
-    Also where callbacks look for them (``trainer.callback_metrics``). ``log_dict`` would take about
-    a millisecond of processor time for each number, since it copies the number's description.
-
-    Args:
-        numbers: values or tensors of one element, by name.
-        shown: names of those that the progress bar shows.
+class StepLog:
+    """Logs the numbers of training steps. Those of a GPU are logged when they have arrived, usually
+    in the next step, so that the host doesn't wait for the GPU.
     """
-    values = {name: float(number) for name, number in numbers.items()}
-    trainer.callback_metrics.update({name: torch.tensor(v) for name, v in values.items()})
-    trainer.progress_bar_metrics.update({name: values[name] for name in shown})
-    for logger in trainer.loggers:
+
+    def __init__(self) -> None:
+        self._reads = DelayedReads()
+
+    def log(self, trainer: Any, numbers: Mapping[str, Any], shown: Iterable[str] = ()) -> None:
+        """Log numbers of the training step that has just ended, as ``LightningModule.log_dict``
+        does, also where callbacks look for them (``trainer.callback_metrics``). ``log_dict`` would
+        take about a millisecond of processor time for each, since it copies the number's
+        description.
+
+        Args:
+            numbers: values or tensors of one element, by name.
+            shown: names of those that the progress bar shows.
+        """
+        tensors = {name: value for name, value in numbers.items() if isinstance(value, Tensor)}
         # as Lightning, which counts these steps from 0
-        logger.log_metrics(values | {"epoch": trainer.current_epoch}, step=trainer.global_step - 1)
-        logger.save()
+        epoch, step = trainer.current_epoch, trainer.global_step - 1
+
+        def log(found: Float[Tensor, " N"]) -> None:
+            arrived = dict(zip(tensors, found.tolist(), strict=True))
+            values = {name: float(arrived.get(name, value)) for name, value in numbers.items()}
+            trainer.callback_metrics.update({name: torch.tensor(v) for name, v in values.items()})
+            trainer.progress_bar_metrics.update({name: values[name] for name in shown})
+            for logger in trainer.loggers:
+                logger.log_metrics(values | {"epoch": epoch}, step=step)
+                logger.save()
+
+        self._reads.submit(_joined(tensors.values()), log)
+        # a monitored number must be that of the step whose checkpoint is written
+        if any(getattr(saver, "monitor", None) for saver in trainer.checkpoint_callbacks):
+            self.flush()
+
+    def flush(self) -> None:
+        """Log the numbers that haven't been logged yet; waits for the GPU."""
+        self._reads.flush()
+
+
+def log_numbers(trainer: Any, numbers: Mapping[str, Any]) -> None:
+    """Log numbers of the training step that has just ended, at once."""
+    log = StepLog()
+    log.log(trainer, numbers)
+    log.flush()
+
+
+def _joined(numbers: Iterable[Tensor]) -> Float[Tensor, " N"]:
+    """Return tensors of one element as one of float64."""
+    flat = [number.detach().reshape(1).double() for number in numbers]
+    return torch.cat(flat) if flat else torch.empty(0, dtype=torch.float64)
 
 
 def log_scores(

@@ -48,10 +48,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from ..core.errors import UserError
+from ..core.host_copies import DelayedReads
 from ..core.nested import adopt_nested
 from ..core.options import (
     at_least,
@@ -127,7 +128,7 @@ class GaussianCloud(BaseGeometry):
     def configure(self) -> None:
         self.options = checked_options(self.Config, self.cfg, "system.geometry.")
         self.bands = (self.cfg.sh_degree + 1) ** 2
-        self._warned = False
+        self._warned, self._reads = False, DelayedReads()
         self._allocate(0)
 
     # -- size --------------------------------------------------------------------------------------
@@ -278,21 +279,28 @@ class GaussianCloud(BaseGeometry):
 
     @torch.no_grad()
     def warn_of_clamped_sizes(self) -> None:
-        """Warn once if some Gaussians have scales at the bounds of ``LOG_SCALE_RANGE``."""
+        """Warn once if some Gaussians have scales at the bounds of ``LOG_SCALE_RANGE``; on a GPU in
+        a later call.
+        """
+        if self._warned or not len(self):
+            return
         low, high = LOG_SCALE_RANGE
         clamped = ((self.log_scales < low) | (self.log_scales > high)).any(-1)
-        if self._warned or not clamped.any():
-            return
-        self._warned = True
-        logger.warning(
-            "%d of %d Gaussians are drawn at e^%g or e^%g, the bounds of their sizes; the first is "
-            "number %d",
-            clamped.sum(),
-            len(self),
-            low,
-            high,
-            clamped.nonzero()[0],
-        )
+        self._reads.submit(torch.stack([clamped.sum(), clamped.int().argmax()]), self._warn)
+
+    def _warn(self, clamped: Int[Tensor, "2"]) -> None:
+        """Warn of clamped sizes, given their number and the first Gaussian that has one."""
+        count, first = clamped.tolist()
+        if count and not self._warned:
+            self._warned = True
+            logger.warning(
+                "%d of %d Gaussians are drawn at e^%g or e^%g, the bounds of their sizes; the "
+                "first is number %d",
+                count,
+                len(self),
+                *LOG_SCALE_RANGE,
+                first,
+            )
 
     def parameters_by_name(self) -> dict[str, nn.Parameter]:
         return {name: getattr(self, name) for name in PARAMETERS}

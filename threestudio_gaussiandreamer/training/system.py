@@ -54,7 +54,7 @@ from ..priors.cache import cached_cloud
 from ..prune import PruneOptions
 from .background import FlatBackground
 from .density import DensityControl, RenderedQuality
-from .events import log_numbers, log_scores
+from .events import StepLog, log_numbers, log_scores
 from .export import GaussianSavers, export, export_companions, exported_files
 from .finite import CHECK_EVERY, optimizer_tensors, require_finite, warn_if_invisible
 from .held_out import EvaluationConfig, HeldOut, Measurements
@@ -129,6 +129,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.automatic_optimization = False
         self.__dict__["guidance"] = self.measurements = self.prompt_utils = None
         self.loss_scale = LossScale()
+        self.step_log = StepLog()
         self._learnt: Optional[dict[str, Tensor]] = None
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -164,6 +165,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.require_finite()  # before the file of an earlier, good state is replaced
+        self.step_log.flush()
         if self.measurements:  # the prior's cloud isn't in this file, so score it now
             scores = self.measurements.score_postponed()
             log_scores(self.loggers, scores, self.cfg.evaluation.views)
@@ -313,19 +315,16 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         """Log what the guidance returned, the weighted losses and their sum, the number of
         Gaussians and, if there is a ground truth, PSNR, every ``log_every_n_steps``.
         """
-        if not self._log_now():
+        every = self.trainer.log_every_n_steps
+        if not every or self.global_step % every:
             return
         numbers, loss = loggable(guided, losses), sum(losses.values()).detach()
         shown = {"loss": loss, "gaussians": len(self.geometry)}
         truth = true_views(self.guidance, batch, out)
         if truth is not None:
             shown["dB"] = psnr(out["comp_rgb"].detach(), truth).mean()
-        log_numbers(self.trainer, numbers | shown, shown)
+        self.step_log.log(self.trainer, numbers | shown, shown)
         self.geometry.warn_of_clamped_sizes()
-
-    def _log_now(self) -> bool:
-        every = self.trainer.log_every_n_steps
-        return bool(every) and self.global_step % every == 0
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_end(outputs, batch, batch_idx)
@@ -342,6 +341,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             log_scores(self.loggers, scores, self.cfg.evaluation.views)
 
     def on_train_end(self) -> None:
+        self.step_log.flush()
         if self.measurements:
             self.measurements.stop_clock()
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ...core.errors import UserError
+from ...core.host_copies import HostCopy
 from . import nvrtc
 from .stages import Argument
 
@@ -120,18 +121,14 @@ class Readback:
 
     def __init__(self, ends: Tensor):
         """Start the copy of ``ends``, cumulative sums of the numbers."""
-        self.ends = torch.empty(len(ends), dtype=ends.dtype, pin_memory=True)
-        self.ends.copy_(ends.contiguous(), non_blocking=True)
-        self.arrived = torch.cuda.Event()
-        self.arrived.record()
+        self.copy = HostCopy(ends.contiguous())
 
     def ready(self) -> bool:
-        return self.arrived.query()
+        return self.copy.ready()
 
     def values(self) -> list[int]:
         """Wait for the copy, and return the differences of the cumulative sums."""
-        self.arrived.synchronize()
-        return [end - begin for begin, end in pairwise([0, *self.ends.tolist()])]
+        return [end - begin for begin, end in pairwise([0, *self.copy.values().tolist()])]
 
 
 @functools.cache

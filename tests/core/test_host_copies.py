@@ -1,0 +1,65 @@
+"""Values of a GPU, used in order and without waiting for them; as on a CPU, at once."""
+
+import pytest
+import torch
+
+from threestudio_gaussiandreamer.core.host_copies import DelayedReads, HostCopy, to_device
+
+
+@pytest.fixture
+def arrive(monkeypatch):
+    """Let values arrive only when the test says so; returns a function that says it."""
+    arrived = set()
+    monkeypatch.setattr(HostCopy, "ready", lambda copy: int(copy.values()) in arrived)
+    return arrived.add
+
+
+def test_values_of_a_cpu_are_used_at_once():
+    reads, used = DelayedReads(), []
+    reads.submit(torch.tensor(3), used.append)
+    assert used == [torch.tensor(3)]
+
+
+def test_values_are_used_in_order_once_they_have_arrived(arrive):
+    reads, used = DelayedReads(), []
+    for number in (1, 2, 3):
+        reads.submit(torch.tensor(number), used.append)
+    assert not used
+    arrive(1), arrive(3)
+    reads.submit(torch.tensor(4), used.append)
+    assert used == [1]
+    reads.flush()
+    assert used == [1, 2, 3, 4]
+
+
+def test_what_the_use_raises_is_raised_once(arrive):
+    def fail(values):
+        raise ValueError(int(values))
+
+    reads, used = DelayedReads(), []
+    reads.submit(torch.tensor(1), fail)
+    reads.submit(torch.tensor(2), used.append)
+    with pytest.raises(ValueError, match="1"):
+        reads.flush()
+    reads.flush()
+    assert used == [2]
+
+
+def test_a_copy_has_no_graph():
+    assert not HostCopy(torch.ones(2, requires_grad=True)).values().requires_grad
+
+
+def test_to_the_cpu_nothing_is_copied():
+    values = torch.ones(2)
+    assert to_device(values, "cpu") is values
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_copies_of_a_gpu_are_right_and_do_not_wait():
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        values = to_device(torch.arange(5), "cuda") + 1
+        copy = HostCopy(values)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert copy.values().tolist() == [1, 2, 3, 4, 5] and copy.ready()

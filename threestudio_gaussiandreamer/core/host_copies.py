@@ -1,0 +1,67 @@
+"""Copies between the host and a GPU that don't make the host wait for the GPU's earlier work.
+
+Training queues a step's work while the GPU computes; the host waits only where it must decide by a
+number. Numbers that are logged or counted are therefore read when they have arrived."""
+
+from collections import deque
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+
+class HostCopy:
+    """A copy of a tensor to the host. That of a GPU's tensor is under way; that of a CPU's is the
+    tensor itself.
+    """
+
+    def __init__(self, values: Tensor) -> None:
+        self._values, self._arrived = values.detach(), None
+        if values.is_cuda:
+            self._values = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
+            self._values.copy_(values.detach(), non_blocking=True)
+            self._arrived = torch.cuda.Event()
+            self._arrived.record(torch.cuda.current_stream(values.device))
+
+    def ready(self) -> bool:
+        """Return whether the values have arrived."""
+        return self._arrived is None or self._arrived.query()
+
+    def values(self) -> Tensor:
+        """Return the values; wait for them if they haven't arrived."""
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        return self._values
+
+
+class DelayedReads:
+    """Calls functions with values of a GPU as soon as they have arrived, in the order of
+    submission; with values of a CPU at once.
+    """
+
+    def __init__(self) -> None:
+        self._pending: deque[tuple[HostCopy, Callable[[Tensor], None]]] = deque()
+
+    def submit(self, values: Tensor, use: Callable[[Tensor], None]) -> None:
+        """Call ``use`` with these values, now or in a later call of a method. What it raises is
+        raised there.
+        """
+        self._pending.append((HostCopy(values), use))
+        while self._pending and self._pending[0][0].ready():
+            self._call_first()
+
+    def flush(self) -> None:
+        """Wait for all values that have been submitted."""
+        while self._pending:
+            self._call_first()
+
+    def _call_first(self) -> None:
+        copy, use = self._pending.popleft()
+        use(copy.values())
+
+
+def to_device(values: Tensor, device: torch.device | str) -> Tensor:
+    """Copy a tensor of the host to a device, without waiting for the device's earlier work."""
+    if torch.device(device).type != "cuda":
+        return values.to(device)
+    return values.pin_memory().to(device, non_blocking=True)
