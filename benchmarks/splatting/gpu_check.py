@@ -19,6 +19,7 @@ prune     the prune command on a cloud of 100,000, to a quarter: seconds, dB, an
           again
 train     steps of configs/gaussiandreamer.yaml with a UNet and VAE of Stable Diffusion 2.1's size
           and random weights, and with networks that do nothing; lines that wait for the GPU
+demos     whole runs of configs/demo.yaml and configs/toybox.yaml
 ========  ==========================================================================================
 
 Whatever touches the GPU runs in a process of its own, with a limit of its own and within --minutes:
@@ -65,10 +66,12 @@ def main(argv: list[str]) -> int:
             write(args, report)
         return 2
     report |= guarded(about, args)
-    for name, section in SECTIONS.items():
+    report |= others(args, report)
+    for name in args.sections:
         started = time.monotonic()
-        report[name] = guarded(section, args) | {
-            "section_seconds": round(time.monotonic() - started, 1)
+        report[name] = guarded(SECTIONS[name], args) | {
+            "section_seconds": round(time.monotonic() - started, 1),
+            "machine": report["machine"],
         }
         print(f"{name:9} {json.dumps(report[name])}", flush=True)
         write(args, report)
@@ -86,6 +89,13 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
         help="tiny clouds, pictures and models, and nothing is fetched",
     )
     parser.add_argument(
+        "--sections",
+        nargs="+",
+        choices=SECTIONS,
+        default=list(SECTIONS),
+        help="only these; the report keeps its others",
+    )
+    parser.add_argument(
         "--minutes",
         type=float,
         default=9.0,
@@ -98,9 +108,21 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     return args
 
 
-def write(args: argparse.Namespace, report: dict[str, Any]) -> None:
+def place(args: argparse.Namespace, report: dict[str, Any]) -> Path:
+    """Return the path of the report."""
     safe = "".join(letter if letter.isalnum() else "-" for letter in report["device"])
-    path = args.out or ROOT / f"benchmarks/results/gpu-{safe}.json"
+    return args.out or ROOT / f"benchmarks/results/gpu-{safe}.json"
+
+
+def others(args: argparse.Namespace, report: dict[str, Any]) -> dict[str, Any]:
+    """Return the sections of an earlier report that are not asked for."""
+    path = place(args, report)
+    earlier = json.loads(path.read_text()) if path.is_file() else {}
+    return {name: earlier[name] for name in SECTIONS if name in earlier.keys() - args.sections}
+
+
+def write(args: argparse.Namespace, report: dict[str, Any]) -> None:
+    path = place(args, report)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(report, indent=2) + "\n")
     print(f"written to {path}", flush=True)
@@ -145,6 +167,7 @@ SECTIONS: dict[str, Section] = {
     "bench": gpu_kernels.bench,
     "prune": gpu_prune.prune,
     "train": gpu_training.train,
+    "demos": gpu_training.demos,
 }
 PARTS: dict[str, Section] = {
     "about": describe_device,
@@ -156,6 +179,7 @@ PARTS: dict[str, Section] = {
     "prune_twice": gpu_prune.prune_twice,
     "make_model": gpu_training.make_model,
     "train_steps": gpu_training.train_steps,
+    "demo_runs": gpu_training.demo_runs,
 }
 
 

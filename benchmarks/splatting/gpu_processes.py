@@ -25,6 +25,7 @@ SECONDS = {
     "prune_twice": 90,
     "make_model": 100,
     "train_steps": 150,
+    "demo_runs": 150,
 }
 """Time limit of each part."""
 

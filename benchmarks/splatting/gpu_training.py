@@ -1,16 +1,17 @@
-"""The section of ``gpu_check`` that trains: milliseconds of a step of the paper's configuration,
-with a U-Net and a VAE of Stable Diffusion's size and with networks that do nothing, and the lines
-that wait for the GPU."""
+"""The sections of ``gpu_check`` that train: milliseconds of a step of the paper's configuration,
+with a U-Net and a VAE of Stable Diffusion's size and with networks that do nothing, whole runs of
+both demos, and the lines that wait for the GPU."""
 
 import argparse
 import contextlib
+import json
 import os
 import tempfile
 import time
 import traceback
 import unittest.mock
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from benchmarks.splatting.gpu_kernels import synchronize
 from benchmarks.splatting.gpu_processes import guarded, in_process
 
 ROOT = Path(__file__).resolve().parents[2]
-STEPS_OF_A_RUN = 1200
+WINDOWS = {False: (10, 40), True: (1, 3)}
+"""The first step that is timed and the one after the last, of a check and of a small one."""
 
 
 def train(args: argparse.Namespace) -> dict[str, Any]:
@@ -57,24 +59,54 @@ def make_model(args: argparse.Namespace) -> dict[str, Any]:
 
 def train_steps(args: argparse.Namespace) -> dict[str, Any]:
     """Train for some steps; without an overlay, also with networks that do nothing."""
-    found = steps_of(args)
+    found = run_of(args, training_arguments(args))
+    if found["waits"]:
+        found["failed"] = f"a step waits for the GPU at {', '.join(found['waits'])}"
     if args.device == "cuda":
         found["peak_gb"] = round(torch.cuda.max_memory_allocated() / 2**30, 2)
     if os.environ["GPU_CHECK_OVERLAY"]:
         return found
     with empty_networks():
-        found["empty_networks"] = steps_of(args)
+        found["empty_networks"] = run_of(args, training_arguments(args))
     share = found["empty_networks"]["ms_per_step"] / found["unet_ms"]
     return found | {"empty_step_over_unet": round(share, 3)}
 
 
-def steps_of(args: argparse.Namespace) -> dict[str, Any]:
-    """Run the launcher for some steps; return what a :class:`StepProbe` found."""
+def demos(args: argparse.Namespace) -> dict[str, Any]:
+    return in_process("demo_runs", args)
+
+
+def demo_runs(args: argparse.Namespace) -> dict[str, Any]:
+    """Train as both demos do."""
+    quick = {"data.n_test_views": 1, "system.exporter.save_video": "false"}
+    short = {"trainer.max_steps": 6, "data.eval_width": 64, "data.eval_height": 64}
+    few = {"data.train_views": 4, "system.evaluation.views": 1, "system.evaluation.size": 16}
+    points = {"system.geometry.prior.num_steps": 2, "system.geometry.grow.num_candidates": 20_000}
+    prompt = {"system.prompt_processor.prompt": "a red fox with a green scarf"}
+    runs = {"demo.yaml": few, "toybox.yaml": points}
+    if not args.small:
+        short, runs = {}, dict.fromkeys(runs, {})
+    runs["toybox.yaml"] = runs["toybox.yaml"] | prompt
+    return {
+        config: guarded(
+            lambda _, own=(config, options): run_of(
+                args, launcher_arguments(args, [own[0]], quick | short | own[1])
+            ),
+            args,
+        )
+        for config, options in runs.items()
+    }
+
+
+def run_of(args: argparse.Namespace, arguments: list[str]) -> dict[str, Any]:
+    """Run the launcher; return what a :class:`StepProbe` found, the seconds of the run, and PSNR on
+    held-out views if the guidance knows a truth.
+    """
     from threestudio_gaussiandreamer.guidance.stable_diffusion import StableDiffusionGuidance
     from threestudio_gaussiandreamer.launch import experiment
     from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
-    probe = StepProbe(args)
+    probe, started = StepProbe(args), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as patches:
         for owner, name in (
             (GaussianDreamerSystem, "training_step"),
@@ -83,10 +115,13 @@ def steps_of(args: argparse.Namespace) -> dict[str, Any]:
         ):
             call = getattr(probe, name)(getattr(owner, name))
             patches.enter_context(unittest.mock.patch.object(owner, name, call))
-        code = experiment.main(training_arguments(args, probe.last + 2, folder))
+        code = experiment.main([*arguments, f"exp_root_dir={folder}"])
+        seconds = time.perf_counter() - started
+        scores = [json.loads(path.read_text()) for path in Path(folder).glob("*/*/**/metrics.json")]
     if code:
         raise RuntimeError(f"the launcher ended with {code}")
-    return probe.found()
+    quality = {"psnr": round(scores[0]["result"]["psnr"], 2)} if scores else {}
+    return probe.found() | quality | {"seconds": round(seconds, 1)}
 
 
 class StepProbe:
@@ -96,7 +131,7 @@ class StepProbe:
 
     def __init__(self, args: argparse.Namespace) -> None:
         self.args, self.step = args, 0
-        self.first, self.last = (1, 3) if args.small else (10, 40)
+        self.first, self.last = WINDOWS[args.small]
         self.times: dict[int, float] = {}
         self.unet: list[tuple[Any, Any]] = []
         self.vae: list[tuple[Any, Any]] = []
@@ -147,12 +182,11 @@ class StepProbe:
         steps = self.last - self.first
         per_step = (self.times[self.last] - self.times[self.first]) / steps
         synchronize(self.args)
-        unet, vae = (
+        unet, vae = (  # 0 without these networks
             sum(milliseconds(*both) for both in times) / steps for times in (self.unet, self.vae)
         )
         return {
             "ms_per_step": round(1e3 * per_step, 2),
-            "extrapolated_minutes_for_1200_steps": round(per_step * STEPS_OF_A_RUN / 60, 2),
             "unet_ms": round(unet, 3),
             "vae_ms": round(vae, 3),
             "other_ms": round(1e3 * per_step - unet - vae, 3),
@@ -222,31 +256,35 @@ def empty_networks() -> Iterator[None]:
         yield
 
 
-def training_arguments(args: argparse.Namespace, steps: int, folder: str) -> list[str]:
-    """Return the paper's configuration with a mesh instead of Shap-E, which plays no part in a
-    step.
+def training_arguments(args: argparse.Namespace) -> list[str]:
+    """Return a few steps of the paper's configuration with a mesh instead of Shap-E, which plays no
+    part in a step.
     """
-    overlays = [
-        part
-        for name in ("gaussiandreamer.yaml", os.environ["GPU_CHECK_OVERLAY"])
-        if name
-        for part in ("--config", name)
-    ]
+    configs = filter(None, ("gaussiandreamer.yaml", os.environ["GPU_CHECK_OVERLAY"]))
     sizes = (
         {"data.width": 64, "data.height": 64, "system.geometry.grow.num_candidates": 2000}
         if args.small
         else {}
     )
     options = sizes | {
-        "exp_root_dir": folder, "system.prompt_processor.prompt": "a fox",
+        "system.prompt_processor.prompt": "a fox",
         "system.prompt_processor.pretrained_model_name_or_path": os.environ["GPU_CHECK_MODEL"],
         "system.guidance.pretrained_model_name_or_path": os.environ["GPU_CHECK_MODEL"],
         "system.geometry.prior_type": "mesh-prior", "system.geometry.prior.path": "toy.glb",
         "system.geometry.prior.num_points": 500 if args.small else 80_000,
         "system.geometry.grow.max_points": 100 if args.small else 20_000,
-        "trainer.max_steps": steps, "trainer.val_check_interval": 100_000,
-        "trainer.enable_progress_bar": "false", "data.n_test_views": 1, "data.eval_width": 64,
-        "data.eval_height": 64, "system.exporter.save_video": "false",
+        "trainer.max_steps": WINDOWS[args.small][1] + 2, "trainer.val_check_interval": 100_000,
+        "data.n_test_views": 1, "data.eval_width": 64, "data.eval_height": 64,
+        "system.exporter.save_video": "false",
     }  # fmt: skip
+    return launcher_arguments(args, configs, options)
+
+
+def launcher_arguments(
+    args: argparse.Namespace, configs: Iterable[str], options: dict[str, Any]
+) -> list[str]:
+    """Return the arguments of a training run without a progress bar."""
+    options = options | {"trainer.enable_progress_bar": "false"}
+    overlays = [part for name in configs for part in ("--config", name)]
     device = [] if args.device == "cuda" else ["--gpu", "cpu"]
     return [*overlays, "--train", *device, *(f"{key}={value}" for key, value in options.items())]

@@ -29,6 +29,8 @@ def test_every_section_runs_and_reports(tmp_path):
     default, lowmem = report["train"]["default"], report["train"]["lowmem"]
     assert default["ms_per_step"] > default["unet_ms"] > 0 and lowmem["ms_per_step"] > 0
     assert default["unet_ms"] > default["empty_networks"]["unet_ms"] > 0
+    assert report["demos"]["demo.yaml"]["psnr"] > 10
+    assert report["demos"]["toybox.yaml"]["unet_ms"] > 0
     assert report["prune"]["gaussians"] == [800, 200] and report["prune"]["psnr"] > 20
     assert report["compile"]["first"] > 0 and report["bench"]["fast"]["ms"] > 0
 
@@ -62,6 +64,19 @@ def test_each_section_is_written_before_the_next_one_runs(monkeypatch, tmp_path)
     with pytest.raises(SystemExit):
         gpu_check.main(["--device", "cpu", "--out", str(tmp_path / "report.json")])
     assert json.loads((tmp_path / "report.json").read_text())["compile"]["first"] == 1.0
+
+
+def test_the_sections_that_are_not_asked_for_are_kept(monkeypatch, tmp_path):
+    monkeypatch.setattr(gpu_check, "about", lambda args: {"device": "cpu"})
+    sections = {"compile": lambda args: {"first": 2.0}, "correct": lambda args: {}}
+    monkeypatch.setattr(gpu_check, "SECTIONS", sections)
+    path = tmp_path / "report.json"
+    path.write_text(json.dumps({"compile": {"first": 1.0}, "correct": {"kept": True}, "old": 3}))
+    arguments = ["--device", "cpu", "--out", str(path), "--sections", "compile"]
+    assert gpu_check.main(arguments) == 0
+    report = json.loads(path.read_text())
+    assert report["compile"]["first"] == 2.0 and "machine" in report["compile"]
+    assert report["correct"] == {"kept": True} and "old" not in report
 
 
 def test_a_part_that_hangs_ends_with_all_that_it_started():
