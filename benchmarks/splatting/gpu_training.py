@@ -167,8 +167,9 @@ class StepProbe:
             latents = original(guidance, images)
             self.note(self.vae, before)
             entered: list[Any] = []  # by the backward pass
-            latents.register_hook(lambda _: entered.append(moment(self.args)))
-            images.register_hook(lambda _: self.note(self.vae, *entered))
+            if latents.requires_grad:
+                latents.register_hook(lambda _: entered.append(moment(self.args)))
+                images.register_hook(lambda _: self.note(self.vae, *entered))
             return latents
 
         return encode

@@ -156,6 +156,9 @@ def gpu() -> str:
         "first image with an empty cache, with a filled one": lambda run: (
             f"{run['compile']['first']:.1f} s, {run['compile']['later']:.1f} s"
         ),
+        "comparison at the first use: plain torch, kernels": lambda run: (
+            "{reference:.3f} s, {kernels:.3f} s".format(**run["compile"]["comparison"])
+        ),
     }
     for name in (*PRESETS, "gsplat"):
         rows[f"forward and backward, {name}"] = functools.partial(_bench, name)
@@ -163,12 +166,33 @@ def gpu() -> str:
         "times faster than gsplat (fast)": lambda run: (
             f"{run['bench']['times_faster_than_gsplat']:.2f}"
         ),
+        "one view of 1,000,000 Gaussians, balanced": functools.partial(_bench, "large"),
         "pruning 100,000 to 25,000, twice": lambda run: (
             " and ".join(f"{seconds:.1f}" for seconds in run["prune"]["seconds"]) + " s"
         ),
     }
+    rows |= _training_rows()
     table = [(title, *(_measured(cell, run) for run in runs)) for title, cell in rows.items()]
     return markdown(("", *(run["device"] for run in runs)), table)
+
+
+def _training_rows() -> dict[str, Callable[[dict], str]]:
+    rows: dict[str, Callable[[dict], str]] = {}
+    for name, title in {"default": "", "lowmem": ", low memory"}.items():
+        rows[f"training step{title}: all; U-Net, VAE, the rest"] = functools.partial(_step, name)
+    return rows | {
+        "training step without networks": lambda run: (
+            f"{run['train']['default']['empty_networks']['ms_per_step']:.1f} ms"
+        ),
+        "lines of a step that wait for the GPU": lambda run: str(
+            len(run["train"]["default"]["waits"])
+        ),
+        "a run of `demo.yaml`": lambda run: (
+            "{seconds:.0f} s, {ms_per_step:.1f} ms a step, {psnr:.2f} dB".format(
+                **run["demos"]["demo.yaml"]
+            )
+        ),
+    }
 
 
 def _measured(cell: Callable[[dict], str], run: dict) -> str:
@@ -184,8 +208,14 @@ def _errors(run: dict, name: str) -> list[float]:
 
 
 def _sanitized(run: dict) -> str:
-    tools = {name: tool for name, tool in run["sanitize"].items() if name != "section_seconds"}
+    tools = {name: run["sanitize"][name] for name in ("memcheck", "racecheck")}
     return "clean" if all("clean" in tool for tool in tools.values()) else json.dumps(tools)
+
+
+def _step(name: str, run: dict) -> str:
+    found = run["train"][name]
+    parts = ", ".join(f"{found[part]:.1f}" for part in ("unet_ms", "vae_ms", "other_ms"))
+    return f"{found['ms_per_step']:.1f} ms; {parts} ms; {found['peak_gb']:.1f} GiB"
 
 
 def _bench(name: str, run: dict) -> str:

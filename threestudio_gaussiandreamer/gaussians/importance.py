@@ -26,6 +26,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..core.distributed import all_sum, draw_shared
+from ..core.host_copies import to_device
 from .densify import Change, prune_to
 
 SCORES = ("removal", "contribution", "opacity", "random")
@@ -93,7 +94,7 @@ def removal_error(
             0, 2, (count, *images.shape[1:]), generator=rng, dtype=torch.float32
         ),
     )
-    signs = signs.to(images).mul_(2).sub_(1)
+    signs = to_device(signs, images.device).to(images).mul_(2).sub_(1)
     outputs, upstream = [images], [signs]
     if added is not None:
         outputs.append(added.alpha)

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from ..core.distributed import average_gradients, first_item
 from ..core.errors import UserError
+from ..core.host_copies import to_device
 from ..core.streams import generator
 from ..diffusion import sds
 from ..host import run_seed
@@ -222,6 +223,6 @@ def particle_noise(
     stream = f"lora timestep {sample}"
     options = {"seed": run_seed(), "step": score.step, "num_train": count, "stream": stream}
     t = sds.timesteps(len(latents), 0, count - 1, **options, first=first_item(len(latents)))
-    abar = score.alphas_cumprod.double().cpu()[t].to(latents.device)
+    abar = to_device(score.alphas_cumprod.double().cpu()[t], latents.device)
     noise = score.normal(latents, f"lora noise {sample}")
-    return Noised(t.to(latents.device), abar, noise, sds.add_noise(latents, noise, abar))
+    return Noised(to_device(t, latents.device), abar, noise, sds.add_noise(latents, noise, abar))

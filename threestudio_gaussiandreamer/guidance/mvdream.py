@@ -126,7 +126,7 @@ class MVDreamGuidance(StableDiffusionGuidance):
             )
         embeddings = condition.embeddings
         cameras = camera_matrices(batch["c2w"].to(embeddings))
-        rows = view_of_row(len(cameras), len(embeddings)).to(embeddings.device)
+        rows = view_of_row(len(cameras), len(embeddings), embeddings.device)
         empty = condition.empty
         if empty is not None:
             empty = pack(empty.expand(len(cameras), -1, -1), cameras)

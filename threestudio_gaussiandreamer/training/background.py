@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..core.distributed import first_item
+from ..core.host_copies import to_device
 from ..core.options import at_least, checked_options, each, in_range, one_of, schedule
 from ..core.streams import generator, held
 from ..host import BaseBackground, C, register, run_seed
@@ -75,12 +76,11 @@ class FlatBackground(BaseBackground):
         if self.options.mode == "random" and self.training:
             first = 0 if self.is_shared else first_item(batch_size)
             step = held(self.step, self.options.hold_steps)
-            return torch.stack(
-                [
-                    torch.rand(3, generator=generator(run_seed(), "background", step, item))
-                    for item in range(first, first + batch_size)
-                ]
-            ).to(self.fixed)
+            colors = [
+                torch.rand(3, generator=generator(run_seed(), "background", step, item))
+                for item in range(first, first + batch_size)
+            ]
+            return to_device(torch.stack(colors), self.fixed.device).to(self.fixed)
         return self.fixed.expand(batch_size, 3)
 
     def forward(self, dirs: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B H W 3"]:

@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..core.distributed import all_max, all_sum, draw_shared
+from ..core.host_copies import to_device
 from ..core.streams import generator
 from ..gaussians import densify, importance
 from ..gaussians.densify import Change, Rules, Statistics
@@ -155,9 +156,8 @@ class DensityControl:
         image = pictures["comp_rgb"]
         # Composite over a random background per view, so that Gaussians of the background's colour
         # still have a removal error.
-        random = draw_shared(
-            len(image), lambda count: torch.rand(count, 1, 1, 3, generator=rng)
-        ).to(image)
+        random = draw_shared(len(image), lambda count: torch.rand(count, 1, 1, 3, generator=rng))
+        random = to_device(random, image.device).to(image)
         added = AddedBackground(pictures["opacity"], random - pictures["comp_rgb_bg"].detach())
         self.cloud.removal += importance.removal_error(
             image, pictures["gaussian_opacities"], rng, added

@@ -98,8 +98,12 @@ def _compare(device: torch.device) -> str:
 @contextlib.contextmanager
 def _default_algorithms() -> Iterator[None]:
     """Let torch use its default algorithms: an operation that
-    ``torch.use_deterministic_algorithms`` refuses is no failure of the kernels.
+    ``torch.use_deterministic_algorithms`` refuses is no failure of the kernels. Its call imports
+    torch's compiler, so it is made only where that is due.
     """
+    if not torch.are_deterministic_algorithms_enabled():
+        yield
+        return
     strict, warns = (
         torch.are_deterministic_algorithms_enabled(),
         torch.is_deterministic_algorithms_warn_only_enabled(),
