@@ -62,7 +62,6 @@ PUBLISHED = {
     "docs/scale.md": ["The 15 minutes of GaussianDreamer"],
     "docs/evaluation.md": ["100 times the cosine", "428 M, 1.7 GB", "2.5 G, 10 GB"],
     "docs/models.md": [
-        "(intended for 12 GB, not measured)",
         "1.7 + 0.2 GB, text encoder 1.4 GB",
         "8.6 + 9.5 GB",
         "1.3 + 0.9 + 0.5 GB in float32",
