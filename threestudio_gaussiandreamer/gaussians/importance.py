@@ -95,11 +95,11 @@ def removal_error(
         ),
     )
     signs = to_device(signs, images.device).to(images).mul_(2).sub_(1)
-    outputs, upstream = [images], [signs]
+    # a sum of products: given gradients, torch imports all of its symbolic shapes
+    total = (images * signs).sum()
     if added is not None:
-        outputs.append(added.alpha)
-        upstream.append(-(signs * added.color).sum(-1, keepdim=True))
-    (gradients,) = torch.autograd.grad(outputs, opacities, upstream, retain_graph=True)
+        total = total - (added.alpha * (signs * added.color).sum(-1, keepdim=True)).sum()
+    (gradients,) = torch.autograd.grad(total, opacities, retain_graph=True)
     gradients = all_sum(gradients)
     return (opacities.detach() * gradients).square().nan_to_num(nan=0.0)
 

@@ -94,6 +94,10 @@ if _threestudio_is_importable():
         return lambda cls: cls
 
 else:
+    from .builtin.late_packages import import_lightning
+
+    import_lightning()
+
     import lightning.pytorch as pl
 
     from ..core.devices import get_device

@@ -1,0 +1,176 @@
+"""Packages that Lightning and torch's optimisers import, and that a run doesn't use: most of
+torchmetrics, which imports ``scipy.signal``, ``transformers`` and ``matplotlib``, and torch's
+compiler. Together they take more time than all else that a run imports.
+
+They are put into ``sys.modules`` without being run. They run at the first use of anything but the
+few names that Lightning and the optimisers need, which are defined here; from then on the package
+is as if it had been imported."""
+
+import functools
+import importlib
+import logging
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from importlib import metadata
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec, module_from_spec
+from types import ModuleType
+from typing import Any, Optional
+
+import torch
+
+_lock = threading.RLock()
+
+
+class LatePackage(ModuleType):
+    """A package whose source hasn't run yet. :meth:`run` turns it into a usual module."""
+
+    _submodules: tuple[str, ...] = ()
+    """Those that can be imported before the package has run."""
+
+    def run(self) -> None:
+        """Run the package's source in this module."""
+        with _lock:
+            if not isinstance(self, LatePackage):  # another thread has run it
+                return
+            self.__class__ = ModuleType
+            try:
+                self.__spec__.loader.exec_module(self)
+            except BaseException:
+                sys.modules.pop(self.__name__, None)
+                raise
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        self.run()
+        return getattr(self, name)
+
+
+class _Metrics(LatePackage):
+    _submodules = ("metric", "collections", "utilities")
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "Metric":
+            # before metric, which can't be imported first
+            importlib.import_module(f"{self.__name__}.utilities")
+            return importlib.import_module(f"{self.__name__}.metric").Metric
+        if name == "MetricCollection":
+            return importlib.import_module(f"{self.__name__}.collections").MetricCollection
+        return super().__getattr__(name)
+
+
+class _Submodules:
+    """Finder that runs a package before a submodule of it is imported."""
+
+    def find_spec(
+        self, name: str, path: Optional[Sequence[str]] = None, target: Optional[ModuleType] = None
+    ) -> Optional[ModuleSpec]:
+        parent, _, own = name.rpartition(".")
+        package = sys.modules.get(parent)
+        if not isinstance(package, LatePackage) or own in package._submodules:
+            return None
+        package.run()
+        # the package has imported it, so it must not be imported once more
+        known = sys.modules.get(name)
+        return None if known is None else ModuleSpec(name, _Known(known), is_package=path is None)
+
+
+class _Known:
+    """Loader of a module that is loaded."""
+
+    def __init__(self, module: ModuleType) -> None:
+        self.module, self.spec = module, module.__spec__
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        return self.module
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__spec__ = self.spec
+
+
+def import_lightning() -> None:
+    """Import ``lightning.pytorch``, with torchmetrics and torch's compiler to be run at their first
+    use. Where releases of these packages need more of each other than is defined here, they are
+    imported as usual.
+    """
+    if "lightning" in sys.modules:
+        return
+    _install()
+    try:
+        importlib.import_module("lightning.pytorch")
+    except Exception:
+        _remove("lightning", "torchmetrics", "torch._dynamo")
+        importlib.import_module("lightning.pytorch")
+
+
+def _remove(*packages: str) -> None:
+    """Let these packages be imported again."""
+    for name in [*sys.modules]:
+        if any(name == package or name.startswith(f"{package}.") for package in packages):
+            parent, _, own = name.rpartition(".")
+            vars(sys.modules.get(parent, ModuleType(""))).pop(own, None)
+            del sys.modules[name]
+
+
+def _install() -> None:
+    """Put the packages that haven't been imported into ``sys.modules``."""
+    if not any(isinstance(finder, _Submodules) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _Submodules())
+    if metrics := _late("torchmetrics", _Metrics):
+        metrics.__version__ = metadata.version("torchmetrics")
+        metrics._logger = logging.getLogger("torchmetrics")
+    if compiler := _late("torch._dynamo", LatePackage):
+        torch._dynamo = compiler
+        compiler.OptimizedModule = _OptimizedModule
+        compiler.disable = _disable
+        compiler.graph_break = lambda *_, **__: None  # it ends a graph; there is none
+
+
+def _late(name: str, kind: type[LatePackage]) -> Optional[LatePackage]:
+    """Put a package that hasn't been imported into ``sys.modules``; return None if it has been, or
+    isn't there.
+    """
+    spec = None if name in sys.modules else find_spec(name)
+    if spec is None:
+        return None
+    module = sys.modules[name] = module_from_spec(spec)
+    module.__class__ = kind
+    return module
+
+
+class _Compiled(type):
+    def __instancecheck__(cls, module: Any) -> bool:
+        compiler = sys.modules["torch._dynamo"]
+        return not isinstance(compiler, LatePackage) and isinstance(
+            module, compiler.OptimizedModule
+        )
+
+
+class _OptimizedModule(metaclass=_Compiled):
+    """Stands for torch's class of compiled modules: nothing is one before the compiler has run."""
+
+
+def _disable(
+    function: Optional[Callable[..., Any]] = None, *args: Any, **options: Any
+) -> Callable[..., Any]:
+    """Return a function that the compiler leaves as it is; its own ``disable`` is called once it
+    has run.
+    """
+    if function is None:
+        return functools.partial(_disable, **options)
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        return disabled()(*arguments, **named)
+
+    @functools.cache
+    def by_compiler() -> Callable[..., Any]:
+        return sys.modules["torch._dynamo"].disable(function, *args, **options)
+
+    def disabled() -> Callable[..., Any]:
+        late = isinstance(sys.modules["torch._dynamo"], LatePackage)
+        return function if late else by_compiler()
+
+    return call
