@@ -21,7 +21,7 @@ import torch
 from benchmarks.splatting.bench_scenes import make_camera, make_scene
 from tests.helpers.pixel_guidance import PixelGuidance
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0
-from threestudio_gaussiandreamer.guidance.bad_items import bad_items
+from threestudio_gaussiandreamer.guidance.non_finite import find_bad_items
 from threestudio_gaussiandreamer.splatting import RasterizeOptions, rasterize, validation
 from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.finite import (
@@ -112,7 +112,7 @@ class Bench:
         torch.where((x >= LOG_SCALE_RANGE[0]) & (x <= LOG_SCALE_RANGE[1]), x, 0)
 
     def bad_items_are_counted(self) -> None:
-        bad = bad_items(self.grad)
+        bad = find_bad_items(self.grad)
         if not bad.any():
             self.guidance._count_bad(bad)
 

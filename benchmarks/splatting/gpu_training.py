@@ -28,7 +28,7 @@ WINDOWS = {False: (10, 40), True: (1, 3)}
 
 
 def train(args: argparse.Namespace) -> dict[str, Any]:
-    """Return seconds per step and memory of the paper's configuration, and of its low-memory
+    """Return milliseconds per step and memory of the paper's configuration, and of its low-memory
     variant.
     """
     with tempfile.TemporaryDirectory() as folder:
@@ -218,8 +218,13 @@ def waits_into(lines: list[str], args: argparse.Namespace) -> Iterator[None]:
     def note(message: Any, *_: Any, **__: Any) -> None:
         if "called a synchronizing" not in str(message):
             return
-        frames = [frame for frame in traceback.extract_stack() if frame.filename != __file__]
-        own = [frame for frame in frames if Path(frame.filename).is_relative_to(ROOT)]
+        ours = (__file__, warnings.__file__)
+        frames = [frame for frame in traceback.extract_stack() if frame.filename not in ours]
+        own = [
+            frame
+            for frame in frames
+            if Path(frame.filename).is_relative_to(ROOT) and "site-packages" not in frame.filename
+        ]
         called = "" if frames[-1] is own[-1] else f" in {frames[-1].filename}:{frames[-1].lineno}"
         place = f"{Path(own[-1].filename).relative_to(ROOT)}:{own[-1].lineno}"
         lines.append(f"{place} {own[-1].line}{called}")

@@ -184,8 +184,9 @@ def _training_rows() -> dict[str, Callable[[dict], str]]:
         "training step without networks": lambda run: (
             f"{run['train']['default']['empty_networks']['ms_per_step']:.1f} ms"
         ),
-        "lines of a step that wait for the GPU": lambda run: str(
-            len(run["train"]["default"]["waits"])
+        "waits for the GPU in a step": lambda run: str(len(run["train"]["default"]["waits"])),
+        "an earlier state that waited": lambda run: "{ms_per_step:.1f} ms, {count} waits".format(
+            **run["train_that_waited"], count=len(run["train_that_waited"]["waits"])
         ),
         "a run of `demo.yaml`": lambda run: (
             "{seconds:.0f} s, {ms_per_step:.1f} ms a step, {psnr:.2f} dB".format(

@@ -1,9 +1,16 @@
 """Values of a GPU, used in order and without waiting for them; as on a CPU, at once."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.core.host_copies import DelayedReads, HostCopy, to_device
+from threestudio_gaussiandreamer.core.host_copies import (
+    DelayedReads,
+    HostCopy,
+    flush_reads,
+    to_device,
+)
 
 
 @pytest.fixture
@@ -26,9 +33,12 @@ def test_values_are_used_in_order_once_they_have_arrived(arrive):
         reads.submit(torch.tensor(number), used.append)
     assert not used
     arrive(1), arrive(3)
-    reads.submit(torch.tensor(4), used.append)
+    reads.poll()
     assert used == [1]
-    reads.flush()
+    arrive(2)
+    reads.submit(torch.tensor(4), used.append)
+    assert used == [1, 2, 3]
+    flush_reads(None, SimpleNamespace(reads="another package's"), SimpleNamespace(reads=reads))
     assert used == [1, 2, 3, 4]
 
 

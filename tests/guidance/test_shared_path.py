@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 from tests.guidance.exact_score_cases import step, uniform
 from threestudio_gaussiandreamer.core import streams
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.host_copies import HostCopy, flush_reads
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore, ScoreDistillation
 
@@ -154,6 +155,18 @@ def test_ten_bad_steps_in_a_row_end_the_run_with_a_named_error():
     with pytest.raises(NonFiniteScore, match="10 steps in a row"):
         step(guidance, rgb)
     assert guidance.bad_items == 30
+
+
+def test_bad_steps_of_a_gpu_are_counted_when_their_numbers_arrive(monkeypatch):
+    monkeypatch.setattr(HostCopy, "ready", lambda copy: False)
+    guidance, rgb = Stub({"max_bad_steps": 3}), uniform(2, 4, 4, 3)
+    guidance.corrupt = lambda eps, step: eps * math.nan
+    for at in range(5):
+        guidance.update_step(0, at)
+        _, grad = step(guidance, rgb)
+        assert (grad == 0).all() and guidance.bad_items == 0
+    with pytest.raises(NonFiniteScore, match=r"3 steps in a row \(step 2, 6 items so far\)"):
+        flush_reads(guidance)
 
 
 def test_autocast_changes_nothing():

@@ -3,6 +3,7 @@
 import importlib
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
 
 import pytest
@@ -42,6 +43,19 @@ def test_a_package_runs_before_its_submodules_and_neither_twice(package, submodu
     assert package.runs == 1 and package.used is sys.modules["slow_to_run.used"]
     assert module is sys.modules[f"slow_to_run.{submodule}"] and module.__spec__.origin
     assert importlib.reload(package.used).value is not package.name
+
+
+def test_another_thread_waits_until_a_package_has_run(package, tmp_path):
+    source = tmp_path / "slow_to_run" / "__init__.py"
+    source.write_text("import time\ntime.sleep(0.2)\nname = 1\n")
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(lambda _: package.name, range(2))) == [1, 1]
+
+
+def test_all_names_of_a_package_can_be_imported(package):
+    namespace = {}
+    exec("from slow_to_run import *", namespace)
+    assert namespace["name"] is package.name
 
 
 def test_a_package_that_fails_can_be_imported_again(package, tmp_path):

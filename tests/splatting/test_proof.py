@@ -141,13 +141,14 @@ def test_memory_that_is_short_is_no_verdict(use, tmp_path, error):
     assert not (tmp_path / "cubins").exists()
 
 
-def test_an_error_of_earlier_work_is_no_verdict(use, tmp_path, monkeypatch):
+@pytest.mark.parametrize("failing", ["_require_torch", "reference"])
+def test_an_error_of_earlier_work_or_of_torch_is_no_verdict(use, tmp_path, monkeypatch, failing):
     def fails(*_):
         raise RuntimeError("CUDA error: device-side assert triggered")
 
     use(HostDevice())
     with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="device-side"):
-        patch.setattr(proof.torch_backend, "rasterize", fails)
+        patch.setattr(proof, failing, fails)
         picture()
     assert not (tmp_path / "cubins").exists()
     device = use(HostDevice())

@@ -13,6 +13,7 @@ from tests.stability.rows import row
 from tests.stability.small_runs import Ended, launch, require_equal_ends
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.host_copies import HostCopy
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.host import C, register
 from threestudio_gaussiandreamer.launch import run
@@ -89,6 +90,28 @@ def test_bad_steps_are_counted_and_the_tenth_in_a_row_ends_the_run(tmp_path, mon
     logged = ended.logged("train/bad_items")
     assert logged[:6] == [0, 1, 0, 1, 0, 2], logged
     measured("counted in the log; named error after 10")
+
+
+@row("A4", "fp16 overflow in VAE/UNet")
+@pytest.mark.parametrize("ended_by", ["checkpoint", "end"])
+def test_bad_steps_end_the_run_also_if_they_are_known_late(
+    tmp_path, monkeypatch, measured, ended_by
+):
+    """As on a GPU, where numbers are read when they have arrived: here not before they must be."""
+    monkeypatch.setattr(HostCopy, "ready", lambda copy: False)
+    bad = {step: {0: math.nan} for step in range(3, 50)}
+    monkeypatch.setattr(CorruptedScore, "corrupted", bad)
+    guided = [
+        "system.guidance_type=stability-corrupted-guidance",
+        "system.geometry.prior.path=toy.glb",
+    ]
+    every = {"checkpoint": 14, "end": 100}[ended_by]
+    options = ["trainer.max_steps=16", f"checkpoint.every_n_train_steps={every}"]
+    ended = launch(tmp_path, *guided, *options)
+    assert ended.code == 2 and "NaN or infinity in 10 steps in a row (step 12" in ended.err
+    logged = ended.logged("train/bad_items")
+    assert logged == [0, 0, 0] + [1] * (14 - 3 if every == 14 else 16 - 3), logged
+    measured("named error, and all steps in the log")
 
 
 # ---- mixed precision -----------------------------------------------------------------------------

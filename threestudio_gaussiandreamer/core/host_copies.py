@@ -5,6 +5,7 @@ number. Numbers that are logged or counted are therefore read when they have arr
 
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -47,6 +48,10 @@ class DelayedReads:
         raised there.
         """
         self._pending.append((HostCopy(values), use))
+        self.poll()
+
+    def poll(self) -> None:
+        """Use the values that have arrived."""
         while self._pending and self._pending[0][0].ready():
             self._call_first()
 
@@ -58,6 +63,18 @@ class DelayedReads:
     def _call_first(self) -> None:
         copy, use = self._pending.popleft()
         use(copy.values())
+
+
+def flush_reads(*parts: Any) -> None:
+    """Wait for the values that parts have submitted to their ``reads``; other parts are left out.
+
+    Raises:
+        whatever the use of a value raises.
+    """
+    for part in parts:
+        reads = getattr(part, "reads", None)
+        if isinstance(reads, DelayedReads):
+            reads.flush()
 
 
 def to_device(values: Tensor, device: torch.device | str) -> Tensor:

@@ -54,7 +54,7 @@ from ..core.host_copies import DelayedReads
 from ..core.options import at_least, checked_options, in_range, one_of, schedule
 from ..diffusion import sds
 from ..host import C, find, names, parse_structured, warn
-from .bad_items import bad_items, masked_loss, may_have_any
+from .non_finite import find_bad_items, masked_loss, may_have_any
 from .particles import GaussianParticles, ParticleModel
 from .reuse import Error, KeptPrediction
 from .score_model import GUIDANCE_SCALE, ScoreModel
@@ -200,7 +200,8 @@ class ScoreDistillation(ScoreModel):
 
         Raises:
             NonFiniteScore: in each of the last ``max_bad_steps`` steps the score of at least one
-                item wasn't finite. On a GPU it may be raised a step later.
+                item wasn't finite. On a GPU it is raised when that is known, which may be in a
+                later step, also in its backward pass.
         """
         self.evaluations = 0
         with torch.autocast(rgb.device.type, enabled=False):
@@ -233,7 +234,7 @@ class ScoreDistillation(ScoreModel):
             "max_step": self.max_step,
         }
         out |= {f"grad_norm_{i}": norm for i, norm in enumerate(norms)}
-        out |= {"bad_items": bad.sum(), "evaluations": float(self.evaluations)}
+        out |= {"bad_items": bad.sum().float(), "evaluations": float(self.evaluations)}
         return out | self.report() | self.variant.report()
 
     def _error(
@@ -281,7 +282,7 @@ class ScoreDistillation(ScoreModel):
             the gradient, zero for items in which it isn't finite, and a mask of those, (B,) bool.
         """
         grad = sds.per_item(sds.weight(self.options.weighting_strategy, abar), error) * error
-        bad = bad_items(grad)
+        bad = find_bad_items(grad)
         if may_have_any(bad):
             grad = grad.masked_fill(bad.reshape(-1, *[1] * (grad.dim() - 1)), 0.0)
         return grad if self.grad_clip is None else grad.clamp(-self.grad_clip, self.grad_clip), bad

@@ -81,13 +81,15 @@ def own_randomness(step: int) -> Iterator[None]:
     A resumed run thus draws the same values as an uninterrupted one, and rendering validation
     pictures doesn't change the values that training draws."""
     devices = [torch.cuda.current_device()] if torch.cuda.is_available() else []
+    seed = derive_seed(item_seed(), "guidance", step)
     with torch.random.fork_rng(devices):
-        # without a GPU torch.manual_seed records a stack trace for each missing device kind: a
+        # torch.manual_seed records a stack trace for each kind of device that is missing: a
         # millisecond each step
-        gpu = devices or torch.backends.mps.is_available()
-        (torch.manual_seed if gpu else torch.default_generator.manual_seed)(
-            derive_seed(item_seed(), "guidance", step)
-        )
+        torch.default_generator.manual_seed(seed)
+        if devices:
+            torch.cuda.manual_seed(seed)
+        elif torch.backends.mps.is_available():
+            torch.mps.manual_seed(seed)
         yield
 
 

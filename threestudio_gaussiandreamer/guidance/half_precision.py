@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
+from .non_finite import find_bad_items
+
 PEAK = 64.0
 """Gradients are scaled so that their largest element is in [PEAK, 2 PEAK) when they enter the
 backward pass of a half-precision network.
@@ -99,7 +101,7 @@ class _Enter(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None]:
-        bad = ~torch.isfinite(grad).flatten(1).all(dim=1)
+        bad = find_bad_items(grad)
         ctx.loss_scale.on_result(bad)
         per_item = (-1, *[1] * (grad.dim() - 1))
         return torch.where(bad.reshape(per_item), 0.0, grad) / ctx.loss_scale.scale.reshape(

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from ..core.files import atomic_file
+from ..core.host_copies import flush_reads
 from ..core.signals import interrupt, restore_handlers, set_handlers
 from ..host import pl, warn
 from .checkpoints import AtomicCheckpointIO
@@ -133,6 +134,14 @@ class ProgressBar(pl.callbacks.TQDMProgressBar):
     def on_exception(self, trainer: Any, pl_module: Any, exception: BaseException) -> None:
         # end the bar's line, so that the next message starts on its own
         print(file=sys.stderr)
+
+
+class LastNumbers(pl.callbacks.Callback):
+    """Log the numbers of the last steps if an exception ends training."""
+
+    def on_exception(self, trainer: Any, pl_module: Any, exception: BaseException) -> None:
+        with contextlib.suppress(RuntimeError):  # of a GPU that has failed
+            flush_reads(getattr(pl_module, "step_log", None))
 
 
 class LearningRates(pl.callbacks.LearningRateMonitor):

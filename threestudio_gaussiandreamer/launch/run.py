@@ -21,7 +21,7 @@ from ..host import find, info, pl, warn
 from ..host.typed_config import parse_structured
 from ..view.live import LiveView, serve_until_stopped
 from ..view.run_index import note_time, write_index
-from .callbacks import LastCheckpoint, LearningRates, ProgressBar, RunRecord, Stopped
+from .callbacks import LastCheckpoint, LastNumbers, LearningRates, ProgressBar, RunRecord, Stopped
 from .checkpoints import AtomicCheckpointIO
 from .config_check import MisconfigurationException, build, plain
 from .ddp import environment_plugins, is_lost_process, planned_processes, trainer_options
@@ -256,6 +256,7 @@ class Run:
         callbacks = [
             pl.callbacks.ModelCheckpoint(dirpath=str(self.last.parent), **checkpointing),
             LearningRates(logging_interval="step"),
+            LastNumbers(),
             RunRecord(self.folder, self.cfg, self.sources, self.command, self.records_code),
             last,
         ]

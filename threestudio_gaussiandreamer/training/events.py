@@ -17,14 +17,14 @@ LOGGED_SCORES = ("psnr", "ssim", "multi_face", "floater_mass")
 
 
 class StepLog:
-    """Logs the numbers of training steps. Those of a GPU are logged when they have arrived, usually
-    in the next step, so that the host doesn't wait for the GPU.
+    """Logs the numbers of training steps in order. Those of a GPU are logged when they have
+    arrived, so that the host doesn't wait for the GPU; see ``reads``.
     """
 
     def __init__(self) -> None:
-        self._reads = DelayedReads()
+        self.reads = DelayedReads()
 
-    def log(self, trainer: Any, numbers: Mapping[str, Any], shown: Iterable[str] = ()) -> None:
+    def write(self, trainer: Any, numbers: Mapping[str, Any], shown: Iterable[str] = ()) -> None:
         """Log numbers of the training step that has just ended, as ``LightningModule.log_dict``
         does, also where callbacks look for them (``trainer.callback_metrics``). ``log_dict`` would
         take about a millisecond of processor time for each, since it copies the number's
@@ -34,39 +34,32 @@ class StepLog:
             numbers: values or tensors of one element, by name.
             shown: names of those that the progress bar shows.
         """
-        tensors = {name: value for name, value in numbers.items() if isinstance(value, Tensor)}
+        on_gpu = {
+            name: value.detach()
+            for name, value in numbers.items()
+            if isinstance(value, Tensor) and value.is_cuda
+        }
+        known = {name: None if name in on_gpu else float(value) for name, value in numbers.items()}
         # as Lightning, which counts these steps from 0
-        epoch, step = trainer.current_epoch, trainer.global_step - 1
+        names, epoch, step = (*on_gpu,), trainer.current_epoch, trainer.global_step - 1
 
-        def log(found: Float[Tensor, " N"]) -> None:
-            arrived = dict(zip(tensors, found.tolist(), strict=True))
-            values = {name: float(arrived.get(name, value)) for name, value in numbers.items()}
+        def write(found: Float[Tensor, " N"]) -> None:
+            values = known | dict(zip(names, found.tolist(), strict=True))
             trainer.callback_metrics.update({name: torch.tensor(v) for name, v in values.items()})
             trainer.progress_bar_metrics.update({name: values[name] for name in shown})
             for logger in trainer.loggers:
                 logger.log_metrics(values | {"epoch": epoch}, step=step)
                 logger.save()
 
-        self._reads.submit(_joined(tensors.values()), log)
+        self.reads.submit(_joined(on_gpu.values()), write)
         # a monitored number must be that of the step whose checkpoint is written
         if any(getattr(saver, "monitor", None) for saver in trainer.checkpoint_callbacks):
-            self.flush()
-
-    def flush(self) -> None:
-        """Log the numbers that haven't been logged yet; waits for the GPU."""
-        self._reads.flush()
-
-
-def log_numbers(trainer: Any, numbers: Mapping[str, Any]) -> None:
-    """Log numbers of the training step that has just ended, at once."""
-    log = StepLog()
-    log.log(trainer, numbers)
-    log.flush()
+            self.reads.flush()
 
 
 def _joined(numbers: Iterable[Tensor]) -> Float[Tensor, " N"]:
     """Return tensors of one element as one of float64."""
-    flat = [number.detach().reshape(1).double() for number in numbers]
+    flat = [number.reshape(1).double() for number in numbers]
     return torch.cat(flat) if flat else torch.empty(0, dtype=torch.float64)
 
 

@@ -42,6 +42,7 @@ keep_attributes     with gaussians-prior: start from all attributes of that clou
 """
 
 import contextlib
+import functools
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -128,7 +129,7 @@ class GaussianCloud(BaseGeometry):
     def configure(self) -> None:
         self.options = checked_options(self.Config, self.cfg, "system.geometry.")
         self.bands = (self.cfg.sh_degree + 1) ** 2
-        self._warned, self._reads = False, DelayedReads()
+        self._warned, self.reads = False, DelayedReads()
         self._allocate(0)
 
     # -- size --------------------------------------------------------------------------------------
@@ -279,17 +280,20 @@ class GaussianCloud(BaseGeometry):
 
     @torch.no_grad()
     def warn_of_clamped_sizes(self) -> None:
-        """Warn once if some Gaussians have scales at the bounds of ``LOG_SCALE_RANGE``; on a GPU in
-        a later call.
+        """Warn once if some Gaussians have scales at the bounds of ``LOG_SCALE_RANGE``; on a GPU
+        when their number has arrived, see ``reads``.
         """
         if self._warned or not len(self):
             return
         low, high = LOG_SCALE_RANGE
         clamped = ((self.log_scales < low) | (self.log_scales > high)).any(-1)
-        self._reads.submit(torch.stack([clamped.sum(), clamped.int().argmax()]), self._warn)
+        found = torch.stack([clamped.sum(), clamped.int().argmax()])
+        self.reads.submit(found, functools.partial(self._warn, len(self)))
 
-    def _warn(self, clamped: Int[Tensor, "2"]) -> None:
-        """Warn of clamped sizes, given their number and the first Gaussian that has one."""
+    def _warn(self, gaussians: int, clamped: Int[Tensor, "2"]) -> None:
+        """Warn of clamped sizes, given the number of Gaussians, that of clamped ones and the first
+        of them.
+        """
         count, first = clamped.tolist()
         if count and not self._warned:
             self._warned = True
@@ -297,7 +301,7 @@ class GaussianCloud(BaseGeometry):
                 "%d of %d Gaussians are drawn at e^%g or e^%g, the bounds of their sizes; the "
                 "first is number %d",
                 count,
-                len(self),
+                gaussians,
                 *LOG_SCALE_RANGE,
                 first,
             )

@@ -178,8 +178,12 @@ class Measurements:
         self._started = _now()
 
     def stop_clock(self) -> None:
-        """Add the time since :meth:`start_clock` to the training time."""
+        """Add the time since :meth:`start_clock` to the training time, with that of the work which
+        the GPU has left.
+        """
         if self._started is not None:
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
             self.seconds += _now() - self._started
             self._started = None
 

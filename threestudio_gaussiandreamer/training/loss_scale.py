@@ -13,6 +13,11 @@ class LossScale:
     def __init__(self) -> None:
         self.skipped_steps = 0
 
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Return what is logged."""
+        return {"train/skipped_steps": self.skipped_steps}
+
     def value(self, trainer: Any) -> float:
         """Return the current factor on the gradients; 1 without mixed precision."""
         scaler = getattr(trainer.precision_plugin, "scaler", None)

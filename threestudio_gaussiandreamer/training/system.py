@@ -35,6 +35,7 @@ from torch import Tensor
 
 from ..core.distributed import average_gradients, from_first, rank
 from ..core.errors import UserError
+from ..core.host_copies import flush_reads
 from ..core.nested import adopt_nested
 from ..core.options import checked_options
 from ..gaussians.stored_state import SHAPES, require_cloud
@@ -54,7 +55,7 @@ from ..priors.cache import cached_cloud
 from ..prune import PruneOptions
 from .background import FlatBackground
 from .density import DensityControl, RenderedQuality
-from .events import StepLog, log_numbers, log_scores
+from .events import StepLog, log_scores
 from .export import GaussianSavers, export, export_companions, exported_files
 from .finite import CHECK_EVERY, optimizer_tensors, require_finite, warn_if_invisible
 from .held_out import EvaluationConfig, HeldOut, Measurements
@@ -164,8 +165,9 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             restore_learnt(self.guidance, self._learnt)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        self.require_finite()  # before the file of an earlier, good state is replaced
-        self.step_log.flush()
+        # before the file of an earlier, good state is replaced
+        flush_reads(self.step_log, self.geometry, self.guidance)
+        self.require_finite()
         if self.measurements:  # the prior's cloud isn't in this file, so score it now
             scores = self.measurements.score_postponed()
             log_scores(self.loggers, scores, self.cfg.evaluation.views)
@@ -254,7 +256,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         optimizer.step()
         self.geometry.clamp_colors()
         if self.loss_scale.has_skipped(self.trainer, loss_scale):
-            log_numbers(self.trainer, {"train/skipped_steps": self.loss_scale.skipped_steps})
+            self.step_log.write(self.trainer, self.loss_scale.numbers)
         if self.global_step % CHECK_EVERY == 0:
             self.require_finite()
         optimizer.zero_grad(set_to_none=True)
@@ -270,7 +272,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         # optimiser in Lightning's wrapper.
         outcome = self.density.after_step(optimizer.optimizer, self.global_step, check)
         if outcome.measured:
-            log_numbers(self.trainer, outcome.measured)
+            self.step_log.write(self.trainer, outcome.measured)
             info(f"step {self.global_step}: {outcome}")
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
@@ -295,14 +297,10 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         further outputs of the renderer that it names.
         """
         options |= {name: out[name].detach() for name in getattr(self.guidance, "renders", ())}
+        options["comp_rgb_bg"] = out["comp_rgb_bg"]
         with own_randomness(self.true_global_step):
             return call_guidance(
-                self.guidance,
-                out["comp_rgb"],
-                self.prompt_utils,
-                batch,
-                comp_rgb_bg=out["comp_rgb_bg"],
-                **options,
+                self.guidance, out["comp_rgb"], self.prompt_utils, batch, **options
             )
 
     def report(
@@ -323,11 +321,12 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         truth = true_views(self.guidance, batch, out)
         if truth is not None:
             shown["dB"] = psnr(out["comp_rgb"].detach(), truth).mean()
-        self.step_log.log(self.trainer, numbers | shown, shown)
+        self.step_log.write(self.trainer, numbers | shown, shown)
         self.geometry.warn_of_clamped_sizes()
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_end(outputs, batch, batch_idx)
+        self.step_log.reads.poll()
         every = self.options.evaluation.every
         if every and self.global_step % every == 0:
             self.score("curve")
@@ -337,11 +336,12 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     def score(self, key: str) -> None:
         """Score the cloud on the held-out views, if the ground truth is a mesh."""
         if self.measurements:
+            flush_reads(self.step_log)
             scores = self.measurements.score(key, self.renderer, self.global_step)
             log_scores(self.loggers, scores, self.cfg.evaluation.views)
 
     def on_train_end(self) -> None:
-        self.step_log.flush()
+        flush_reads(self.step_log, self.geometry, self.guidance)
         if self.measurements:
             self.measurements.stop_clock()
 

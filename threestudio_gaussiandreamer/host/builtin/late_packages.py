@@ -21,6 +21,8 @@ from typing import Any, Optional
 import torch
 
 _lock = threading.RLock()
+_running: set[str] = set()
+"""Packages that are being run, by the thread that has the lock."""
 
 
 class LatePackage(ModuleType):
@@ -30,21 +32,26 @@ class LatePackage(ModuleType):
     """Those that can be imported before the package has run."""
 
     def run(self) -> None:
-        """Run the package's source in this module."""
+        """Run the package's source in this module; has no effect while this thread runs it."""
         with _lock:
-            if not isinstance(self, LatePackage):  # another thread has run it
+            if not isinstance(self, LatePackage) or self.__name__ in _running:
                 return
-            self.__class__ = ModuleType
+            _running.add(self.__name__)
             try:
                 self.__spec__.loader.exec_module(self)
             except BaseException:
                 sys.modules.pop(self.__name__, None)
                 raise
+            finally:
+                _running.remove(self.__name__)
+            self.__class__ = ModuleType
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
+        if name.startswith("__") and name != "__all__":
             raise AttributeError(name)
         self.run()
+        if isinstance(self, LatePackage):  # it is being run, and hasn't come to this name
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
         return getattr(self, name)
 
 
@@ -74,7 +81,7 @@ class _Submodules:
         package.run()
         # the package has imported it, so it must not be imported once more
         known = sys.modules.get(name)
-        return None if known is None else ModuleSpec(name, _Known(known), is_package=path is None)
+        return None if known is None else ModuleSpec(name, _Known(known))
 
 
 class _Known:
@@ -97,11 +104,12 @@ def import_lightning() -> None:
     """
     if "lightning" in sys.modules:
         return
-    _install()
     try:
+        _install()
         importlib.import_module("lightning.pytorch")
     except Exception:
-        _remove("lightning", "torchmetrics", "torch._dynamo")
+        late = isinstance(sys.modules.get("torch._dynamo"), LatePackage)
+        _remove("lightning", "torchmetrics", *(["torch._dynamo"] if late else []))
         importlib.import_module("lightning.pytorch")
 
 

@@ -77,8 +77,7 @@ def _compare(device: torch.device) -> str:
     """
     with _default_algorithms():
         expected = reference()
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)  # an error of earlier work is raised here
+        _require_torch(device)
         try:
             errors = errors_on(device, expected)
         except (UserError, RuntimeError) as error:
@@ -98,21 +97,29 @@ def _compare(device: torch.device) -> str:
 @contextlib.contextmanager
 def _default_algorithms() -> Iterator[None]:
     """Let torch use its default algorithms: an operation that
-    ``torch.use_deterministic_algorithms`` refuses is no failure of the kernels. Its call imports
-    torch's compiler, so it is made only where that is due.
+    ``torch.use_deterministic_algorithms`` refuses is no failure of the kernels. That function
+    imports torch's compiler, so it is called only if they are on.
     """
     if not torch.are_deterministic_algorithms_enabled():
         yield
         return
-    strict, warns = (
-        torch.are_deterministic_algorithms_enabled(),
-        torch.is_deterministic_algorithms_warn_only_enabled(),
-    )
+    warns = torch.is_deterministic_algorithms_warn_only_enabled()
     torch.use_deterministic_algorithms(False)
     try:
         yield
     finally:
-        torch.use_deterministic_algorithms(strict, warn_only=warns)
+        torch.use_deterministic_algorithms(True, warn_only=warns)
+
+
+def _require_torch(device: torch.device) -> None:
+    """Let torch compute on the device, where an error of earlier work is raised, and one that has
+    nothing to do with the kernels.
+    """
+    with torch.inference_mode(False), torch.enable_grad():
+        ones = torch.ones(2, device=device, requires_grad=True)
+        (ones * ones).sum().backward()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
 
 
 def reference() -> dict[str, Tensor]:

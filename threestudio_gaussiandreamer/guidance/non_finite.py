@@ -7,7 +7,7 @@ from torch import Tensor
 from ..diffusion import sds
 
 
-def bad_items(grad: Tensor) -> Tensor:
+def find_bad_items(grad: Tensor) -> Tensor:
     """Return which items contain NaN or infinity, (B,) bool. If the sum over all elements is finite
     then so are the elements, so on a CPU the usual case needs a single reduction.
     """
