@@ -1,7 +1,7 @@
 """Compare the CUDA kernels with plain torch on a GPU, once, before they are used there.
 
 A small fixed scene is rendered and differentiated by the kernels in float32 and by plain torch in
-float64 on the CPU: on the GPU its many small kernels would have to be loaded, which takes a hundred
+float64 on the CPU: on the GPU its many small kernels would have to be loaded, which takes many
 times longer than the comparison. The result is cached beside the compiled kernels; it is computed
 again for another GPU, driver, compiler, torch version or source of the kernels."""
 
