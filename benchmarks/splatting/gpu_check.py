@@ -66,7 +66,7 @@ def main(argv: list[str]) -> int:
             write(args, report)
         return 2
     report |= guarded(about, args)
-    report |= others(args, report)
+    report |= earlier_sections(args, report)
     for name in args.sections:
         started = time.monotonic()
         report[name] = guarded(SECTIONS[name], args) | {
@@ -114,7 +114,7 @@ def place(args: argparse.Namespace, report: dict[str, Any]) -> Path:
     return args.out or ROOT / f"benchmarks/results/gpu-{safe}.json"
 
 
-def others(args: argparse.Namespace, report: dict[str, Any]) -> dict[str, Any]:
+def earlier_sections(args: argparse.Namespace, report: dict[str, Any]) -> dict[str, Any]:
     """Return the sections of an earlier report that are not asked for."""
     path = place(args, report)
     earlier = json.loads(path.read_text()) if path.is_file() else {}

@@ -25,6 +25,21 @@ from benchmarks.splatting.gpu_processes import guarded, in_process
 ROOT = Path(__file__).resolve().parents[2]
 WINDOWS = {False: (10, 40), True: (1, 3)}
 """The first step that is timed and the one after the last, of a check and of a small one."""
+SMALL_PICTURES = {"data.eval_width": 64, "data.eval_height": 64}
+DEMOS = {
+    "demo.yaml": {},
+    "toybox.yaml": {"system.prompt_processor.prompt": "a red fox with a green scarf"},
+}
+"""Their options."""
+SMALL_DEMOS = {
+    "demo.yaml": {
+        "data.train_views": 4, "system.evaluation.views": 1, "system.evaluation.size": 16,
+    },
+    "toybox.yaml": {
+        "system.geometry.prior.num_steps": 2, "system.geometry.grow.num_candidates": 20_000,
+    },
+}  # fmt: skip
+"""Further options of a small check."""
 
 
 def train(args: argparse.Namespace) -> dict[str, Any]:
@@ -78,24 +93,18 @@ def demos(args: argparse.Namespace) -> dict[str, Any]:
 
 def demo_runs(args: argparse.Namespace) -> dict[str, Any]:
     """Train as both demos do."""
-    quick = {"data.n_test_views": 1, "system.exporter.save_video": "false"}
-    short = {"trainer.max_steps": 6, "data.eval_width": 64, "data.eval_height": 64}
-    few = {"data.train_views": 4, "system.evaluation.views": 1, "system.evaluation.size": 16}
-    points = {"system.geometry.prior.num_steps": 2, "system.geometry.grow.num_candidates": 20_000}
-    prompt = {"system.prompt_processor.prompt": "a red fox with a green scarf"}
-    runs = {"demo.yaml": few, "toybox.yaml": points}
-    if not args.small:
-        short, runs = {}, dict.fromkeys(runs, {})
-    runs["toybox.yaml"] = runs["toybox.yaml"] | prompt
     return {
-        config: guarded(
-            lambda _, own=(config, options): run_of(
-                args, launcher_arguments(args, [own[0]], quick | short | own[1])
-            ),
-            args,
-        )
-        for config, options in runs.items()
+        config: guarded(lambda _, config=config: run_of(args, demo_arguments(args, config)), args)
+        for config in DEMOS
     }
+
+
+def demo_arguments(args: argparse.Namespace, config: str) -> list[str]:
+    """Return the arguments of a demo without a turntable, which plays no part in training."""
+    options = {"data.n_test_views": 1, "system.exporter.save_video": "false"} | DEMOS[config]
+    if args.small:
+        options |= SMALL_PICTURES | SMALL_DEMOS[config] | {"trainer.max_steps": 6}
+    return launcher_arguments(args, [config], options)
 
 
 def run_of(args: argparse.Namespace, arguments: list[str]) -> dict[str, Any]:
@@ -272,7 +281,7 @@ def training_arguments(args: argparse.Namespace) -> list[str]:
         if args.small
         else {}
     )
-    options = sizes | {
+    options = sizes | SMALL_PICTURES | {
         "system.prompt_processor.prompt": "a fox",
         "system.prompt_processor.pretrained_model_name_or_path": os.environ["GPU_CHECK_MODEL"],
         "system.guidance.pretrained_model_name_or_path": os.environ["GPU_CHECK_MODEL"],
@@ -280,8 +289,7 @@ def training_arguments(args: argparse.Namespace) -> list[str]:
         "system.geometry.prior.num_points": 500 if args.small else 80_000,
         "system.geometry.grow.max_points": 100 if args.small else 20_000,
         "trainer.max_steps": WINDOWS[args.small][1] + 2, "trainer.val_check_interval": 100_000,
-        "data.n_test_views": 1, "data.eval_width": 64, "data.eval_height": 64,
-        "system.exporter.save_video": "false",
+        "data.n_test_views": 1, "system.exporter.save_video": "false",
     }  # fmt: skip
     return launcher_arguments(args, configs, options)
 

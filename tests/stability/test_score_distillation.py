@@ -65,6 +65,12 @@ def test_bad_items_are_masked_and_the_others_keep_every_bit(items, value, measur
     )
 
 
+CORRUPTED = (
+    "system.guidance_type=stability-corrupted-guidance",
+    "system.geometry.prior.path=toy.glb",
+)
+
+
 @row("A4", "fp16 overflow in VAE/UNet")
 def test_bad_steps_are_counted_and_the_tenth_in_a_row_ends_the_run(tmp_path, monkeypatch, measured):
     """One bad item in steps 1 and 3, then both from step 5 on: steps 5 to 14 are ten in a row."""
@@ -74,11 +80,9 @@ def test_bad_steps_are_counted_and_the_tenth_in_a_row_ends_the_run(tmp_path, mon
         **{step: {0: math.nan, 1: math.nan} for step in range(5, 50)},
     }
     monkeypatch.setattr(CorruptedScore, "corrupted", bad)
-    guided = [
-        "system.guidance_type=stability-corrupted-guidance",
-        "system.geometry.prior.path=toy.glb",
-    ]
-    ended = launch(tmp_path, *guided, "trainer.max_steps=50", "checkpoint.every_n_train_steps=14")
+    ended = launch(
+        tmp_path, *CORRUPTED, "trainer.max_steps=50", "checkpoint.every_n_train_steps=14"
+    )
     assert (
         ended.code == 2
         and "NaN or infinity in 10 steps in a row (step 14" in ended.err
@@ -93,24 +97,19 @@ def test_bad_steps_are_counted_and_the_tenth_in_a_row_ends_the_run(tmp_path, mon
 
 
 @row("A4", "fp16 overflow in VAE/UNet")
-@pytest.mark.parametrize("ended_by", ["checkpoint", "end"])
+@pytest.mark.parametrize("every, steps", [(14, 14), (100, 16)], ids=["checkpoint", "end"])
 def test_bad_steps_end_the_run_also_if_they_are_known_late(
-    tmp_path, monkeypatch, measured, ended_by
+    tmp_path, monkeypatch, measured, every, steps
 ):
     """As on a GPU, where numbers are read when they have arrived: here not before they must be."""
     monkeypatch.setattr(HostCopy, "ready", lambda copy: False)
     bad = {step: {0: math.nan} for step in range(3, 50)}
     monkeypatch.setattr(CorruptedScore, "corrupted", bad)
-    guided = [
-        "system.guidance_type=stability-corrupted-guidance",
-        "system.geometry.prior.path=toy.glb",
-    ]
-    every = {"checkpoint": 14, "end": 100}[ended_by]
     options = ["trainer.max_steps=16", f"checkpoint.every_n_train_steps={every}"]
-    ended = launch(tmp_path, *guided, *options)
+    ended = launch(tmp_path, *CORRUPTED, *options)
     assert ended.code == 2 and "NaN or infinity in 10 steps in a row (step 12" in ended.err
     logged = ended.logged("train/bad_items")
-    assert logged == [0, 0, 0] + [1] * (14 - 3 if every == 14 else 16 - 3), logged
+    assert logged == [0] * 3 + [1] * (steps - 3), logged
     measured("named error, and all steps in the log")
 
 

@@ -54,7 +54,7 @@ from ..core.host_copies import DelayedReads
 from ..core.options import at_least, checked_options, in_range, one_of, schedule
 from ..diffusion import sds
 from ..host import C, find, names, parse_structured, warn
-from .non_finite import find_bad_items, masked_loss, may_have_any
+from .non_finite import find_bad_items, masked_loss, may_have_any, without_bad_items
 from .particles import GaussianParticles, ParticleModel
 from .reuse import Error, KeptPrediction
 from .score_model import GUIDANCE_SCALE, ScoreModel
@@ -284,7 +284,7 @@ class ScoreDistillation(ScoreModel):
         grad = sds.per_item(sds.weight(self.options.weighting_strategy, abar), error) * error
         bad = find_bad_items(grad)
         if may_have_any(bad):
-            grad = grad.masked_fill(bad.reshape(-1, *[1] * (grad.dim() - 1)), 0.0)
+            grad = without_bad_items(grad, bad)
         return grad if self.grad_clip is None else grad.clamp(-self.grad_clip, self.grad_clip), bad
 
     def _count_bad(self, bad: Bool[Tensor, " B"]) -> None:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from .non_finite import find_bad_items
+from .non_finite import find_bad_items, without_bad_items
 
 PEAK = 64.0
 """Gradients are scaled so that their largest element is in [PEAK, 2 PEAK) when they enter the
@@ -103,7 +103,5 @@ class _Enter(torch.autograd.Function):
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None]:
         bad = find_bad_items(grad)
         ctx.loss_scale.on_result(bad)
-        per_item = (-1, *[1] * (grad.dim() - 1))
-        return torch.where(bad.reshape(per_item), 0.0, grad) / ctx.loss_scale.scale.reshape(
-            per_item
-        ), None
+        scale = ctx.loss_scale.scale.reshape(-1, *[1] * (grad.dim() - 1))
+        return without_bad_items(grad, bad) / scale, None

@@ -21,11 +21,16 @@ def may_have_any(bad: Bool[Tensor, " B"]) -> bool:
     return bad.is_cuda or bool(bad.any())
 
 
+def without_bad_items(values: Tensor, bad: Bool[Tensor, " B"]) -> Tensor:
+    """Return the values, (B, ...), with those of bad items set to zero."""
+    return values.masked_fill(bad.reshape(-1, *[1] * (values.dim() - 1)), 0.0)
+
+
 def masked_loss(images: Tensor, latents: Tensor, grad: Tensor, bad: Tensor) -> Tensor:
     """Compute the loss without the bad items. Their ``grad`` is zero, and the gradients of their
     renders are set to exactly zero.
     """
     if images.requires_grad and may_have_any(bad):
         # If the encoder's derivative is infinite, the product with a zero gradient is NaN.
-        images.register_hook(lambda gradient: gradient.masked_fill(bad.reshape(-1, 1, 1, 1), 0.0))
+        images.register_hook(lambda gradient: without_bad_items(gradient, bad))
     return sds.sds_loss(latents, grad)

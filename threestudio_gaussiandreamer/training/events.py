@@ -40,18 +40,19 @@ class StepLog:
             if isinstance(value, Tensor) and value.is_cuda
         }
         known = {name: None if name in on_gpu else float(value) for name, value in numbers.items()}
-        # as Lightning, which counts these steps from 0
-        names, epoch, step = (*on_gpu,), trainer.current_epoch, trainer.global_step - 1
+        late = tuple(on_gpu)  # not the tensors, whose memory is needed
+        epoch = trainer.current_epoch
+        step = trainer.global_step - 1  # as Lightning, which counts these steps from 0
 
-        def write(found: Float[Tensor, " N"]) -> None:
-            values = known | dict(zip(names, found.tolist(), strict=True))
+        def log(found: Float[Tensor, " N"]) -> None:
+            values = known | dict(zip(late, found.tolist(), strict=True))
             trainer.callback_metrics.update({name: torch.tensor(v) for name, v in values.items()})
             trainer.progress_bar_metrics.update({name: values[name] for name in shown})
             for logger in trainer.loggers:
                 logger.log_metrics(values | {"epoch": epoch}, step=step)
                 logger.save()
 
-        self.reads.submit(_joined(on_gpu.values()), write)
+        self.reads.submit(_joined(on_gpu.values()), log)
         # a monitored number must be that of the step whose checkpoint is written
         if any(getattr(saver, "monitor", None) for saver in trainer.checkpoint_callbacks):
             self.reads.flush()

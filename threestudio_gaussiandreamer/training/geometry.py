@@ -42,14 +42,13 @@ keep_attributes     with gaussians-prior: start from all attributes of that clou
 """
 
 import contextlib
-import functools
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ..core.errors import UserError
@@ -281,30 +280,26 @@ class GaussianCloud(BaseGeometry):
     @torch.no_grad()
     def warn_of_clamped_sizes(self) -> None:
         """Warn once if some Gaussians have scales at the bounds of ``LOG_SCALE_RANGE``; on a GPU
-        when their number has arrived, see ``reads``.
+        when it is known, see ``reads``.
         """
-        if self._warned or not len(self):
-            return
-        low, high = LOG_SCALE_RANGE
-        clamped = ((self.log_scales < low) | (self.log_scales > high)).any(-1)
-        found = torch.stack([clamped.sum(), clamped.int().argmax()])
-        self.reads.submit(found, functools.partial(self._warn, len(self)))
+        if not self._warned:
+            low, high = LOG_SCALE_RANGE
+            clamped = ((self.log_scales < low) | (self.log_scales > high)).any(-1)
+            self.reads.submit(clamped, self._warn)
 
-    def _warn(self, gaussians: int, clamped: Int[Tensor, "2"]) -> None:
-        """Warn of clamped sizes, given the number of Gaussians, that of clamped ones and the first
-        of them.
-        """
-        count, first = clamped.tolist()
-        if count and not self._warned:
-            self._warned = True
-            logger.warning(
-                "%d of %d Gaussians are drawn at e^%g or e^%g, the bounds of their sizes; the "
-                "first is number %d",
-                count,
-                gaussians,
-                *LOG_SCALE_RANGE,
-                first,
-            )
+    def _warn(self, clamped: Bool[Tensor, " N"]) -> None:
+        """Warn of the Gaussians whose sizes are clamped, unless there has been a warning."""
+        if self._warned or not clamped.any():
+            return
+        self._warned = True
+        logger.warning(
+            "%d of %d Gaussians are drawn at e^%g or e^%g, the bounds of their sizes; the first is "
+            "number %d",
+            clamped.sum(),
+            len(clamped),
+            *LOG_SCALE_RANGE,
+            clamped.nonzero()[0],
+        )
 
     def parameters_by_name(self) -> dict[str, nn.Parameter]:
         return {name: getattr(self, name) for name in PARAMETERS}

@@ -108,8 +108,9 @@ def import_lightning() -> None:
         _install()
         importlib.import_module("lightning.pytorch")
     except Exception:
-        late = isinstance(sys.modules.get("torch._dynamo"), LatePackage)
-        _remove("lightning", "torchmetrics", *(["torch._dynamo"] if late else []))
+        _remove("lightning", "torchmetrics")
+        if _compiler() is None:  # once it has run, it can't be imported again
+            _remove("torch._dynamo")
         importlib.import_module("lightning.pytorch")
 
 
@@ -118,7 +119,8 @@ def _remove(*packages: str) -> None:
     for name in [*sys.modules]:
         if any(name == package or name.startswith(f"{package}.") for package in packages):
             parent, _, own = name.rpartition(".")
-            vars(sys.modules.get(parent, ModuleType(""))).pop(own, None)
+            if parent in sys.modules:
+                vars(sys.modules[parent]).pop(own, None)
             del sys.modules[name]
 
 
@@ -148,12 +150,16 @@ def _late(name: str, kind: type[LatePackage]) -> Optional[LatePackage]:
     return module
 
 
+def _compiler() -> Optional[ModuleType]:
+    """Return torch's compiler, or None if it hasn't run."""
+    compiler = sys.modules.get("torch._dynamo")
+    return None if isinstance(compiler, LatePackage) else compiler
+
+
 class _Compiled(type):
     def __instancecheck__(cls, module: Any) -> bool:
-        compiler = sys.modules["torch._dynamo"]
-        return not isinstance(compiler, LatePackage) and isinstance(
-            module, compiler.OptimizedModule
-        )
+        compiler = _compiler()
+        return compiler is not None and isinstance(module, compiler.OptimizedModule)
 
 
 class _OptimizedModule(metaclass=_Compiled):
@@ -169,16 +175,12 @@ def _disable(
     if function is None:
         return functools.partial(_disable, **options)
 
+    @functools.cache
+    def disabled(compiler: Optional[ModuleType]) -> Callable[..., Any]:
+        return function if compiler is None else compiler.disable(function, *args, **options)
+
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        return disabled()(*arguments, **named)
-
-    @functools.cache
-    def by_compiler() -> Callable[..., Any]:
-        return sys.modules["torch._dynamo"].disable(function, *args, **options)
-
-    def disabled() -> Callable[..., Any]:
-        late = isinstance(sys.modules["torch._dynamo"], LatePackage)
-        return function if late else by_compiler()
+        return disabled(_compiler())(*arguments, **named)
 
     return call
