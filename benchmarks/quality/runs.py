@@ -249,7 +249,7 @@ def append(job: Job, mesh: str, seed: int, metrics: dict[str, Any]) -> None:
 def append_rows(
     chart: str, columns: list[str], rows: list[dict[str, Any]], folder: Optional[Path] = None
 ) -> None:
-    """Append rows to a chart's CSV, with processor and commit."""
+    """Append rows to a chart's CSV, with processor, unless they have it, and commit."""
     path, here = (folder or CHARTS) / f"{chart}.csv", {"machine": machine(), "commit": commit()}
     path.parent.mkdir(parents=True, exist_ok=True)
     new = not path.is_file()
@@ -259,7 +259,7 @@ def append_rows(
         )
         if new:
             writer.writeheader()
-        writer.writerows(row | here for row in rows)
+        writer.writerows(here | row for row in rows)
 
 
 def machine() -> str:

@@ -6,12 +6,14 @@ under a learned score.
     python -m benchmarks.quality.toybox --variant "wide 0 system.geometry.scale_factor=2"
     python -m benchmarks.quality.toybox --models FOLDER --jobs 16 --seconds 340 --out DIR
     python -m benchmarks.quality.toybox --keep RUNS --only-score            # by another judge
+    python -m benchmarks.quality.toybox --gpu 0 --jobs 16                   # rows in toybox_gpu.csv
 
 Each run is configs/toybox.yaml with a few options changed, on one thread. The judge sees eight
 views of its result, of its prior's points, of the 2D model's own samples, and of the object itself;
 CPU seconds are those of a whole run without imports and video, in a process that keeps its networks
 loaded. A CPU that doesn't multiply bfloat16 computes the networks in float32, with the same results
-in more seconds, which are left out of docs/charts.
+in more seconds, which are left out of docs/charts. Seconds on a GPU, which the runs side by side
+share, are left out too.
 Rows are appended to toybox.csv as runs end, in the order chart, seed, prompt, variant. Rows that it
 has of this configuration, these models and this judge, which the columns "setup" and "judge"
 identify, are skipped.
@@ -44,6 +46,7 @@ from benchmarks.quality.toybox_jobs import (
     CHART,
     CONFIG,
     EXACT,
+    GPU_CHART,
     MODELS_BESIDE_GUIDANCE,
     RECOGNIZED,
     SAMPLES,
@@ -80,13 +83,10 @@ MODELS = "system.guidance.pretrained_model_name_or_path"
 RECORD = "seconds.json"
 """CPU seconds of a kept run, written when it has ended."""
 
-ENVIRONMENT = {
-    "OMP_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "OMP_WAIT_POLICY": "passive",
-    "CUDA_VISIBLE_DEVICES": "",
-}
-"""Of the processes: one thread, and no GPU, which so small networks can't use."""
+ENVIRONMENT = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+"""Of the processes: one thread."""
+CPU = "cpu"
+"""In place of a GPU's number."""
 
 
 class Task(NamedTuple):
@@ -98,6 +98,7 @@ class Task(NamedTuple):
     models: str
     keep: Path | None = None
     """Folder of runs that are kept, to be scored again later."""
+    gpu: str = CPU
 
     @property
     def key(self) -> tuple[str, ...]:
@@ -138,10 +139,19 @@ def measure(task: Task) -> dict[str, Any]:
     messages = io.StringIO()
     try:
         with contextlib.redirect_stdout(messages), contextlib.redirect_stderr(messages):
-            return row_of(task, measured(task))
+            return row_of(task, measured(task)) | gpu_of(task)
     except Exception as error:
         shown = " | ".join(task.key)
         raise RuntimeError(f"{shown}: {error}\n{messages.getvalue()[-2000:]}") from error
+
+
+def gpu_of(task: Task) -> dict[str, str]:
+    """Return the GPU's name for the column "machine", without seconds; empty for the CPU."""
+    if task.gpu == CPU:
+        return {}
+    import torch
+
+    return {"machine": torch.cuda.get_device_name(), "cpu_seconds": ""}
 
 
 def measured(task: Task) -> dict[str, float]:
@@ -161,7 +171,8 @@ def measured(task: Task) -> dict[str, float]:
 
 def kept(task: Task) -> Path:
     """Return the folder of a kept run, which depends on all of its options."""
-    content = repr((task.made_of, task.variant.options)).encode()
+    gpu = () if task.gpu == CPU else ("GPU",)
+    content = repr((task.made_of, task.variant.options, *gpu)).encode()
     return task.keep / hashlib.blake2b(content, digest_size=8).hexdigest()
 
 
@@ -199,7 +210,7 @@ def run(task: Task, folder: Path) -> None:
     options |= dict.fromkeys(MODELS_BESIDE_GUIDANCE if exact else (MODELS,), task.models)
     arguments = [f"{key}={value}" for key, value in options.items()]
     with truth_known(task.prompt) if exact else contextlib.nullcontext():
-        code = launch(["--config", "toybox.yaml", "--train", "--gpu", "cpu", *arguments])
+        code = launch(["--config", "toybox.yaml", "--train", "--gpu", task.gpu, *arguments])
     if code:
         raise RuntimeError(f"the launcher returned {code}")
 
@@ -234,7 +245,8 @@ def main() -> None:
         print("\n".join(" | ".join((*task.key, task.prompt.text)) for task in todo))
         return
     require_kernel()
-    os.environ |= ENVIRONMENT
+    gpu = "" if arguments.gpu == CPU else arguments.gpu
+    os.environ |= ENVIRONMENT | {"CUDA_VISIBLE_DEVICES": gpu}
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(arguments.jobs, mp_context=spawn, initializer=prepare) as pool:
         failed = work(todo, arguments, pool)
@@ -250,6 +262,7 @@ def parse_arguments() -> argparse.Namespace:
     add("--count", type=int, default=20, help="of prompts of each sort (default: 20)")
     add("--seeds", type=int, nargs="+", default=[0])
     add("--models", default="toybox", help="toybox, or the folder of an export")
+    add("--gpu", default=CPU, help="number of the GPU, whose runs have a CSV of their own")
     add("--keep", type=Path, help="folder for the runs; those that it has are only scored")
     add("--only-score", action="store_true", help="make no run that --keep doesn't have")
     add("--seconds", type=float, help="stop after this time; runs under way are given up")
@@ -257,6 +270,7 @@ def parse_arguments() -> argparse.Namespace:
     add("--list", action="store_true", help="only print what would run")
     add_jobs(parser)
     arguments = parser.parse_args()
+    arguments.chart = CHART if arguments.gpu == CPU else GPU_CHART
     if arguments.only_score and not arguments.keep:
         parser.error("--only-score: give the runs' folder as --keep")
     if arguments.charts is None:
@@ -279,12 +293,13 @@ def variant(text: str) -> Variant:
 def tasks(arguments: argparse.Namespace) -> Iterator[Task]:
     """Yield all tasks in order of priority."""
     charts = [list(VARIANTS[name]()) for name in arguments.charts]
+    keep = arguments.keep
     for variants in (arguments.variant, *charts):
         for seed in arguments.seeds:
             for sort in arguments.prompts:
                 for prompt in prompts(sort, arguments.count):
                     for one in variants:
-                        yield Task(one, prompt, seed, arguments.models, arguments.keep)
+                        yield Task(one, prompt, seed, arguments.models, keep, arguments.gpu)
 
 
 def unique(items: Iterator[Task]) -> list[Task]:
@@ -297,9 +312,10 @@ def unique(items: Iterator[Task]) -> list[Task]:
 
 def missing(arguments: argparse.Namespace) -> list[Task]:
     """Return the tasks whose rows aren't in the CSV; with ``--only-score`` those without a run."""
-    rows = rows_of(CHART, arguments.out)
+    rows = rows_of(arguments.chart, arguments.out)
     if rows and list(rows[0]) != COLUMNS:
-        sys.exit(f"{arguments.out / CHART}.csv has other columns: give another folder as --out")
+        path = arguments.out / f"{arguments.chart}.csv"
+        sys.exit(f"{path} has other columns: give another folder as --out")
     done = {tuple(row[name] for name in KEY) for row in rows}
     todo = [task for task in unique(tasks(arguments)) if task.key not in done]
     return [task for task in todo if not arguments.only_score or needs_no_run(task)]
@@ -324,7 +340,7 @@ def work(todo: list[Task], arguments: argparse.Namespace, pool: Executor) -> int
             for future in wait(running, left, FIRST_COMPLETED).done:
                 task, began = running.pop(future)
                 durations.append(time.monotonic() - began)
-                failed += not noted(future, arguments.out)
+                failed += not noted(future, arguments)
                 bar.update()
     finally:
         if running:  # given up, or an error
@@ -339,15 +355,15 @@ def startable(queue: Iterator[Task], free: int, durations: list[float], end: flo
     return [task for _, task in zip(range(free), queue, strict=False)]
 
 
-def noted(done: Future, out: Path) -> bool:
+def noted(done: Future, arguments: argparse.Namespace) -> bool:
     """Append the row of a task that has ended; return whether it succeeded."""
     if error := done.exception():
         tqdm.write(str(error), file=sys.stderr)
         return False
     row = done.result()
-    if not seconds_comparable(out):
+    if not seconds_comparable(arguments.out):
         row = row | {"cpu_seconds": ""}
-    append_rows(CHART, COLUMNS, [row], out)
+    append_rows(arguments.chart, COLUMNS, [row], arguments.out)
     return True
 
 

@@ -29,6 +29,8 @@ from threestudio_gaussiandreamer.toybox.world import KINDS, VERSION, draw_attrib
 from threestudio_gaussiandreamer.view.config_changes import leaves
 
 CHART = "toybox"
+GPU_CHART = "toybox_gpu"
+"""Of runs on a GPU, whose networks compute in float16."""
 ATTRIBUTES = ("kind", "colors", "pattern", "accessory")
 RECOGNIZED = (*ATTRIBUTES, "multi_face")
 """Columns of what the judge finds in a result."""
