@@ -81,6 +81,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "cheaper": variant_tables.cheaper,
         "overhead": variant_tables.overhead,
         "learned": toybox_variants.distillations,
+        "learned on a GPU": toybox_variants.on_gpu,
         "precision": precision.table,
     },
     "docs/failures.md": {"tables": failure_table.tables},

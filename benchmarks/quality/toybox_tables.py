@@ -77,9 +77,9 @@ def median_of(rows: Sequence[Row], name: str, digits: int = 0) -> str:
     return f"{np.median(values):.{digits}f}" if values else ""
 
 
-def measured() -> list[Row]:
+def measured(chart: str = CHART) -> list[Row]:
     """Return the rows of withheld prompts."""
-    return [row for row in rows_of(CHART) if row["withheld"] == "1"]
+    return [row for row in rows_of(chart) if row["withheld"] == "1"]
 
 
 def present() -> list[Row]:

@@ -1,5 +1,6 @@
 """Tables of variants of toybox.yaml, each compared with toybox.yaml itself on the same prompts and
-seeds: the paired tables of docs/toybox.md and docs/distillation.md, from docs/charts/toybox.csv.
+seeds: the paired tables of docs/toybox.md and docs/distillation.md, from docs/charts/toybox.csv and
+toybox_gpu.csv.
 
 ``recognised`` is the share of the attributes that a prompt asks for (kind, colours, pattern,
 accessory) that the judge finds in the result. A dagger marks comparisons of which both sides were
@@ -51,6 +52,18 @@ EARLIER = {
 def distillations() -> str:
     """Return the table of score distillations and of cheaper steps with the learned models."""
     return table(*DISTILLATIONS)
+
+
+def on_gpu() -> str:
+    """Return the table of runs on a GPU, of which the first line is toybox.yaml on CPUs."""
+    rows = measured(toybox_jobs.GPU_CHART)
+    plain = {place(row): row for row in rows if row["variant"] == toybox_jobs.DEFAULT}
+    same = [row for row in measured() if row["variant"] == toybox_jobs.DEFAULT]
+    same = [row for row in same if place(row) in plain]
+    first = line_of(f"{toybox_jobs.DEFAULT} on CPUs", same, [plain[place(row)] for row in same])
+    pairs = pairs_of_charts(rows, DISTILLATIONS)
+    lines = [first, *(line_of(title_of(own[0]), own, plain) for own, plain in pairs)]
+    return markdown(HEAD[:-2], [line[:-2] for line in lines]) if plain else NOT_MEASURED
 
 
 def settings() -> str:

@@ -193,6 +193,9 @@ def _training_rows() -> dict[str, Callable[[dict], str]]:
                 **run["demos"]["demo.yaml"]
             )
         ),
+        "a run of `toybox.yaml`": lambda run: "{seconds:.0f} s, {ms_per_step:.1f} ms a step".format(
+            **run["demos"]["toybox.yaml"]
+        ),
     }
 
 

@@ -1,11 +1,11 @@
 """``cfd-variant``: noise that is consistent across views (Yan et al. 2025, Consistent Flow
-Distillation, arXiv:2501.05445): noise attached to the rendered surface, the same in all views and
-steps.
+Distillation, arXiv:2501.05445, eq. 9): noise attached to the rendered surface, the same in all
+views and steps.
 
     e = eps_hat(z_t, t) - eps,   z_t = sqrt(abar) x + sqrt(1 - abar) eps,   eps = noise(surface)
 
-How noise is attached: ``diffusion/consistent_noise.py``. The background's noise is drawn in
-each step, as in SDS. The paper's t falls in the course of a run: use
+``diffusion/consistent_noise.py`` attaches noise, in place of the paper's eq. 12. The background's
+noise is drawn in each step, as in SDS. The paper's t falls in the course of a run: use
 ``timestep_schedule: linear`` with it.
 
 =======  ===========================================================================================

@@ -1,4 +1,4 @@
-"""``csd-variant``: classifier score distillation (Yu et al. 2023, arXiv:2310.19415): of the
+"""``csd-variant``: classifier score distillation (Yu et al. 2023, arXiv:2310.19415, eq. 7): of the
 classifier-free guidance only the difference that the prompt makes.
 
     e = guidance_scale (eps_c(z_t, t) - eps_u(z_t, t))

@@ -1,5 +1,6 @@
-"""``ism-variant``: interval score matching (Liang et al. 2023, LucidDreamer, arXiv:2311.11284): the
-score over one interval of a deterministic trajectory, without random noise.
+"""``ism-variant``: interval score matching (Liang et al. 2023, LucidDreamer, arXiv:2311.11284,
+section 3.2): the score over one interval of a deterministic trajectory, without random noise. The
+trajectory is DDIM inversion, the paper's eq. 9.
 
     z_s = unconditional DDIM inversion of x to s = t - interval
     z_t = one more step of it, from s to t

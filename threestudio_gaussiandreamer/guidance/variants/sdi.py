@@ -1,5 +1,6 @@
-"""``sdi-variant``: score distillation via inversion (Lukoianov et al. 2024, arXiv:2405.15891):
-noise from DDIM inversion of the render, in place of random noise.
+"""``sdi-variant``: score distillation via inversion (Lukoianov et al. 2024, arXiv:2405.15891,
+eq. 10): noise from DDIM inversion of the render, in place of random noise. It approximates the
+fixed point of eq. 8, the noise that the network predicts for the render with this noise.
 
     z_t = DDIM inversion of x to t with scale inversion_scale
     e = eps_hat(z_t, t) - eps,   eps = (z_t - sqrt(abar) x) / sqrt(1 - abar)
