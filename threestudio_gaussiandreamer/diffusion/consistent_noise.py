@@ -11,6 +11,7 @@ The values stand in a table that a hash of the cell looks up. The pixels of the 
 rows that change with each draw."""
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -49,7 +50,7 @@ def surface_points(
     up = (height / 2 - 0.5 - torch.arange(height, device=depth.device)) / focal
     x, y, z, position = c2w[:, :3, :, None].unbind(2)
     rays = (x * right[:, None] - z)[:, :, None] + (y * up[:, None])[..., None]
-    return rays.mul_(depth[:, None]).add_(position[..., None])
+    return torch.addcmul(position[..., None], rays, depth[:, None])
 
 
 def surface_cells(
@@ -58,7 +59,7 @@ def surface_cells(
     fovy: Float[Tensor, " B"],
     size: Float[Tensor, " B"],
     aspect: float = 1.0,
-) -> list[Int[Tensor, "B h w"]]:
+) -> Int[Tensor, "L B h w"]:
     """Return the row of each point's cell, a hash, for each lattice.
 
     Args:
@@ -66,28 +67,36 @@ def surface_cells(
         aspect: width of a pixel over its height.
     """
     points = surface_points(depth, c2w[:, :3] / size[:, None, None], fovy, aspect)
-    primes = torch.tensor(PRIMES, dtype=torch.int32, device=depth.device)[:, None, None]
-    rows = []
-    for lattice in range(LATTICES):
-        shifted = points.add_(1 / LATTICES) if lattice else points
-        x, y, z = shifted.floor().int().mul_(primes).unbind(1)
-        rows.append(x.add_(y).add_(z).add_(mark(lattice)).bitwise_and_(TABLE - 1))
-    return rows
+    lattices = _lattices(depth.device)
+    cells = (points + lattices.shifts).floor_().int().mul_(lattices.primes)
+    return cells.sum(2, dtype=torch.int32).add_(lattices.marks).bitwise_and_(TABLE - 1)
 
 
-def mark(lattice: int) -> int:
-    """Return what makes the rows of a lattice differ from those of others."""
-    return lattice * TABLE // LATTICES
+class Lattices(NamedTuple):
+    """What differs between the lattices, and the factors of the hash."""
+
+    shifts: Float[Tensor, "L 1 1 1 1"]
+    """In cells, along all axes."""
+    marks: Int[Tensor, "L 1 1 1"]
+    """Make the rows of one lattice differ from those of the others."""
+    primes: Int[Tensor, "3 1 1"]
 
 
 @lru_cache(maxsize=4)
-def background_cells(height: int, width: int, device: torch.device) -> Int[Tensor, "h w"]:
-    """Return a number for each pixel of an image, of which its row follows."""
+def _lattices(device: torch.device) -> Lattices:
+    number = torch.arange(LATTICES, dtype=torch.int32, device=device)[:, None, None, None]
+    primes = torch.tensor(PRIMES, dtype=torch.int32, device=device)[:, None, None]
+    return Lattices(number[..., None] / LATTICES, number * (TABLE // LATTICES), primes)
+
+
+@lru_cache(maxsize=4)
+def background_cells(height: int, width: int, device: torch.device) -> Int[Tensor, "L 1 h w"]:
+    """Return a number for each lattice and pixel of an image, of which its row follows."""
     rows, columns = (
         torch.arange(n, dtype=torch.int32, device=device) * prime
         for n, prime in zip((height, width), PRIMES, strict=False)
     )
-    return rows[:, None] + columns
+    return _lattices(device).marks + rows[:, None] + columns
 
 
 def cell_size(
@@ -126,12 +135,9 @@ def attached_noise(
     cells = surface_cells(_sampled(depth, size), c2w, fovy, cell, aspect)
     behind = background_cells(*size, depth.device) + draws[:, None, None]
     is_surface = _sampled(opacity, size) >= OPAQUE
-    rows = [
-        torch.where(is_surface, cell, (behind + mark(lattice)) & (TABLE - 1)).flatten()
-        for lattice, cell in enumerate(cells)
-    ]
-    values = sum(table.index_select(0, row) for row in rows).unflatten(0, (len(depth), -1))
-    return values.mT.contiguous().mul_(LATTICES**-0.5).unflatten(2, size)
+    rows = torch.where(is_surface, cells, behind.bitwise_and_(TABLE - 1))
+    values = table.index_select(0, rows.flatten()).view(LATTICES, len(depth), -1, table.shape[1])
+    return values.sum(0).mT.contiguous().mul_(LATTICES**-0.5).unflatten(2, size)
 
 
 def _sampled(images: Float[Tensor, "B H W 1"], size: tuple[int, int]) -> Float[Tensor, "B h w"]:
