@@ -32,6 +32,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
+from benchmarks.figures import pyplot
 from benchmarks.quality.chart_runs import (
     PAPER,
     caption,
@@ -252,10 +253,7 @@ def draw(measurements: list[dict[str, str]]) -> Path:
     """Draw one column per object: the effect of attributes per byte above, of rounding below;
     return the path.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     objects = objects_of(measurements)
     figure, panels = plt.subplots(

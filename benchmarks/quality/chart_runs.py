@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from benchmarks.figures import pyplot
 from benchmarks.quality.runs import CHARTS, SIZE, rows_of
 
 Row = dict[str, str]
@@ -136,10 +137,7 @@ def papers_ends() -> list[Row]:
 
 def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
     """Draw one figure, a panel per object; return the path."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     objects = objects_of(rows)
     figure, panels = plt.subplots(
@@ -165,11 +163,9 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
 
 def saved(figure: Any, name: str) -> Path:
     """Write a finished figure to docs/charts, and close it; return its path."""
-    import matplotlib.pyplot as plt
-
     path = CHARTS / f"{name}.png"
     figure.savefig(path, dpi=110)
-    plt.close(figure)
+    pyplot().close(figure)
     return path
 
 

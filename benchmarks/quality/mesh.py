@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks.figures import pyplot
 from benchmarks.markdown import markdown
 from benchmarks.quality.chart_runs import COLOURS, Row, caption, objects_of, saved
 from benchmarks.quality.runs import (
@@ -166,10 +167,7 @@ MARKERS = {"faces": "o", "texture": "s", "resolution": "^", "density": "x"}
 
 def draw(measured_rows: list[Row]) -> Path:
     """Draw PSNR against faces, texture size and seconds; return the path."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     figure, panels = plt.subplots(1, 3, figsize=(13.8, 4.6), sharey=True)
     for index, name in enumerate(objects_of(measured_rows)):

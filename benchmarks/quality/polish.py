@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.figures import pyplot
 from benchmarks.quality.chart_runs import saved
 from benchmarks.quality.runs import (
     append_rows,
@@ -151,11 +152,9 @@ def as_row(method: str, gaussians: int, psnr: float, seconds: int) -> dict[str, 
 
 def draw() -> Path:
     """Draw the rounds of pruning of each object; return the figure's path."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
     from matplotlib import ticker
+
+    plt = pyplot()
 
     figure, panel = plt.subplots(figsize=(6.4, 4.2))
     rounds = [row for row in rows_of(CHART) if row["method"] == "pruned"]

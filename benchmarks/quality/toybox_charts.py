@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.figures import pyplot
 from benchmarks.quality.chart_runs import median, saved, set_log_x
 from benchmarks.quality.toybox_jobs import (
     COUNT,
@@ -111,10 +112,7 @@ def references(rows: list[Row]) -> dict[str, Callable[[str], float]]:
 
 def draw(name: str, line: Line, rows: list[Row], levels: dict[str, Callable[[str], float]]) -> Path:
     """Draw one figure, a panel per column of RECOGNIZED; return the path."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     figure, panels = plt.subplots(1, len(RECOGNIZED), figsize=(15, 3.6), sharey=True)
     for panel, column in zip(panels, RECOGNIZED, strict=True):
@@ -182,10 +180,7 @@ def settings(rows: Sequence[Row], charts: Sequence[str]) -> list[Setting]:
 
 def draw_settings(name: str, found: Sequence[Setting]) -> Path:
     """Draw differences and seconds, a line per setting; return the path."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     figure, panels = plt.subplots(
         1, 3, figsize=(13, 1.4 + 0.32 * len(found)), sharey=True, width_ratios=(2, 2, 1)
@@ -241,10 +236,7 @@ def draw_against_seconds(name: str, shown: dict[str, list[Row]]) -> Path:
     """Draw each kind of run as a point: recognised attributes and multi-face rate against median
     seconds; toybox.yaml large, the paper's recipe as a star.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     figure, panels = plt.subplots(1, 2, figsize=(14, 5), layout="constrained")
     colors = plt.get_cmap("tab20").colors

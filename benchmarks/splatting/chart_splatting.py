@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from benchmarks.figures import pyplot
 from benchmarks.splatting.bench_scenes import Scene, make_camera
 from benchmarks.splatting.bench_splatting import describe_machine
 from benchmarks.splatting.scenes import scenes
@@ -231,10 +232,7 @@ PICTURES = (
 
 
 def draw(rows: list[dict[str, str]]) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     names = list(dict.fromkeys(row["scene"] for row in rows))
     for axes in PICTURES:

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.figures import pyplot
 from benchmarks.splatting.bench_scenes import make_cotangents
 from benchmarks.splatting.bench_splatting import contender, make_leaves, memory_now, reset_peak
 
@@ -63,10 +64,7 @@ def slope(rows: list[dict[str, float]], column: str) -> float:
 
 
 def draw_chart(rows: list[dict[str, float]]) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     figure, panels = plt.subplots(1, 2, figsize=(9, 3.6))
     for panel, (column, title) in zip(panels, PANELS.items(), strict=True):

@@ -31,6 +31,8 @@ from pathlib import Path
 from typing import Any, Optional
 
 import numpy as np
+import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int
 
 from ..core.options import at_least
@@ -145,7 +147,7 @@ def smoothed_colors(cloud: PointCloud, neighbours: int) -> Float[np.ndarray, "P 
     """Return each colour averaged over the ``neighbours`` nearest points, itself among them."""
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(cloud.points)
+    tree, colors = cKDTree(cloud.points), torch.from_numpy(np.array(cloud.colors))
     neighbours = min(neighbours, len(cloud.points))
 
     def average(points: Float[np.ndarray, "Q 3"]) -> Float[np.ndarray, "Q 3"]:
@@ -153,7 +155,7 @@ def smoothed_colors(cloud: PointCloud, neighbours: int) -> Float[np.ndarray, "P 
         nearest: Int[np.ndarray, "Q K"] = tree.query(
             points, k=range(1, neighbours + 1), workers=-1
         )[1]
-        return cloud.colors[nearest].mean(axis=1)
+        return F.embedding_bag(torch.from_numpy(nearest), colors, mode="mean").numpy()
 
     rows = min(SMOOTHING_ROWS, max(1, SMOOTHING_ENTRIES // neighbours))
     starts = range(0, len(cloud.points), rows)
