@@ -58,12 +58,13 @@ def on_gpu() -> str:
     """Return the table of runs on a GPU, of which the first line is toybox.yaml on CPUs."""
     rows = measured(toybox_jobs.GPU_CHART)
     plain = {place(row): row for row in rows if row["variant"] == toybox_jobs.DEFAULT}
-    same = [row for row in measured() if row["variant"] == toybox_jobs.DEFAULT]
-    same = [row for row in same if place(row) in plain]
+    on_cpus = (row for row in measured() if row["variant"] == toybox_jobs.DEFAULT)
+    if not (same := [row for row in on_cpus if place(row) in plain]):
+        return NOT_MEASURED
     first = line_of(f"{toybox_jobs.DEFAULT} on CPUs", same, [plain[place(row)] for row in same])
     pairs = pairs_of_charts(rows, DISTILLATIONS)
     lines = [first, *(line_of(title_of(own[0]), own, plain) for own, plain in pairs)]
-    return markdown(HEAD[:-2], [line[:-2] for line in lines]) if plain else NOT_MEASURED
+    return markdown(HEAD[:-2], [line[:-2] for line in lines])
 
 
 def settings() -> str:

@@ -3,9 +3,11 @@
 import argparse
 import itertools
 import math
+import os
 import re
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
@@ -130,6 +132,48 @@ def test_runs_with_other_options_are_kept_apart(tmp_path):
     task = toybox.Task(Variant("mine", 1, {"a": "1"}), prompts("seen", 1)[0], 0, "models", tmp_path)
     other = task._replace(variant=Variant("mine", 1, {"a": "2"}))
     assert task.key == other.key and toybox.kept(task) != toybox.kept(other)
+
+
+def test_runs_on_a_gpu_have_rows_and_folders_of_their_own(monkeypatch, tmp_path):
+    given = []
+
+    def launch(words):
+        given.append(words)
+        (folder,) = (word.partition("=")[2] for word in words if word.startswith("exp_root_dir="))
+        Path(folder).mkdir(parents=True)
+
+    monkeypatch.setattr("threestudio_gaussiandreamer.launch.experiment.main", launch)
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda: "a GPU")
+    monkeypatch.setattr(toybox_scores, "of_run", lambda folder, text, models: {"kind": 1.0})
+    monkeypatch.setattr(
+        toybox, "ProcessPoolExecutor", lambda *args, **kwargs: ThreadPoolExecutor(1)
+    )
+    monkeypatch.setattr(toybox, "require_kernel", lambda: None)
+    monkeypatch.setattr("os.environ", dict(os.environ))
+    words = ["", "--charts", "default", "--count", 1, "--keep", tmp_path / "runs"]
+    for gpu in ("cpu", "0"):
+        monkeypatch.setattr("sys.argv", [*map(str, words), "--gpu", gpu, "--out", str(tmp_path)])
+        with pytest.raises(SystemExit) as ended:
+            toybox.main()
+        assert ended.value.code == 0
+    assert [words[words.index("--gpu") + 1] for words in given] == ["cpu", "0"]
+    (on_cpu,), (on_gpu,) = (
+        runs.rows_of(chart, tmp_path) for chart in (toybox.CHART, toybox_jobs.GPU_CHART)
+    )
+    assert on_gpu["machine"] == "a GPU" != on_cpu["machine"] and on_gpu["kind"] == "1"
+    assert not on_gpu["cpu_seconds"] and on_cpu["cpu_seconds"]
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "0"
+
+
+def test_variants_on_a_gpu_are_compared_there(monkeypatch):
+    charts = {toybox.CHART: [row(kind="0"), row(index="1")], toybox_jobs.GPU_CHART: []}
+    monkeypatch.setattr(toybox_variants, "measured", lambda chart=toybox.CHART: charts[chart])
+    assert toybox_variants.on_gpu() == toybox_tables.NOT_MEASURED
+    charts[toybox_jobs.GPU_CHART] += [row(), row(variant="CSD", x="4", colors="0")]
+    lines = toybox_variants.on_gpu().splitlines()
+    assert lines[2].startswith("| toybox.yaml on CPUs | 1 × 1 | 50 | -50 |")
+    assert lines[3].startswith("| CSD 4 | 1 × 1 | 50 | -50 |") and len(lines) == 4
+    assert len({line.count("|") for line in lines}) == 1
 
 
 @pytest.fixture
