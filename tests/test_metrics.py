@@ -1,10 +1,12 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.metrics import (
+    _window_mean,
     azimuth_difference,
     floater_mass,
     multi_face_rate,
@@ -47,6 +49,18 @@ def test_ssim_agrees_with_torchmetrics(noise):
     # both are float32 with E[x^2] - E[x]^2 against a constant of 9e-4
     torch.testing.assert_close(ssim(a, b), expected, rtol=0, atol=2e-4)
     torch.testing.assert_close(ssim(a[0], b[0]), ssim(a, b)[0], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("sides", [(6, 7), (11, 30)])
+def test_the_window_of_ssim_is_a_gaussian_over_images_padded_by_reflection(sides):
+    """Against a sum over each window in NumPy."""
+    image = images(*sides, 2).double()
+    offsets = np.arange(-5, 6)
+    weights = np.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * 1.5**2))
+    padded = np.pad(image.numpy(), ((5, 5), (5, 5), (0, 0)), mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (11, 11), axis=(0, 1))
+    expected = np.einsum("hwcij,ij->hwc", windows, weights / weights.sum())
+    np.testing.assert_allclose(_window_mean(image).numpy(), expected, rtol=0, atol=1e-14)
 
 
 def test_ssim_of_equal_images_is_one_and_small_ones_are_refused():

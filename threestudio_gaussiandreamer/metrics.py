@@ -119,12 +119,12 @@ def saturation(images: Float[Tensor, "*batch 3"]) -> float:
 
 
 def _window_mean(images: Float[Tensor, "*batch H W C"]) -> Float[Tensor, "*batch H W C"]:
-    """Compute the Gaussian-weighted mean of the window around each pixel, one axis at a time.
-
-    A sum of shifted images takes a fifth of the time of a convolution on a CPU.
+    """Compute the Gaussian-weighted mean of the window around each pixel, one axis at a time: a sum
+    of shifted images, which on a CPU takes less time than a convolution of one channel.
     """
     half = SSIM_WINDOW // 2
-    weights = torch.softmax(-(torch.arange(-half, half + 1.0) ** 2) / (2 * 1.5**2), dim=0)
+    offsets = torch.arange(-half, half + 1, dtype=torch.float64)
+    weights = torch.softmax(-(offsets**2) / (2 * 1.5**2), dim=0)
     for dim in (-3, -2):
         size = images.shape[dim]
         places = torch.arange(-half, size + half, device=images.device).abs()

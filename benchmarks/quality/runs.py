@@ -249,7 +249,7 @@ def append(job: Job, mesh: str, seed: int, metrics: dict[str, Any]) -> None:
 def append_rows(
     chart: str, columns: list[str], rows: list[dict[str, Any]], folder: Optional[Path] = None
 ) -> None:
-    """Append rows to a chart's CSV, with processor, unless they have it, and commit."""
+    """Append rows to a chart's CSV, with processor and commit unless a row has its own."""
     path, here = (folder or CHARTS) / f"{chart}.csv", {"machine": machine(), "commit": commit()}
     path.parent.mkdir(parents=True, exist_ok=True)
     new = not path.is_file()

@@ -14,9 +14,9 @@ CPU seconds are those of a whole run without imports and video, in a process tha
 loaded. A CPU that doesn't multiply bfloat16 computes the networks in float32, with the same results
 in more seconds, which are left out of docs/charts. Seconds on a GPU, which the runs side by side
 share, are left out too.
-Rows are appended to toybox.csv as runs end, in the order chart, seed, prompt, variant. Rows that it
-has of this configuration, these models and this judge, which the columns "setup" and "judge"
-identify, are skipped.
+Rows are appended to toybox.csv, or toybox_gpu.csv, as runs end, in the order chart, seed, prompt,
+variant. Rows that it has of this configuration, these models and this judge, which the columns
+"setup" and "judge" identify, are skipped.
 Settings were chosen on "seen" prompts, of combinations that trainings may have had; "withheld" ones
 are of combinations that no training had.
 """
@@ -245,12 +245,32 @@ def main() -> None:
         print("\n".join(" | ".join((*task.key, task.prompt.text)) for task in todo))
         return
     require_kernel()
-    gpu = "" if arguments.gpu == CPU else arguments.gpu
-    os.environ |= ENVIRONMENT | {"CUDA_VISIBLE_DEVICES": gpu}
+    os.environ |= ENVIRONMENT
+    choose_device(arguments.gpu)
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(arguments.jobs, mp_context=spawn, initializer=prepare) as pool:
         failed = work(todo, arguments, pool)
     sys.exit(f"{failed} of {len(todo)} failed" if failed else 0)
+
+
+def choose_device(gpu: str) -> None:
+    """Let the processes see that GPU alone, or the one that CUDA_VISIBLE_DEVICES names already."""
+    if gpu == CPU:
+        os.environ["CUDA_VISIBLE_DEVICES"] = ""
+        return
+    import torch
+
+    visible = os.environ.setdefault("CUDA_VISIBLE_DEVICES", gpu)
+    if torch.cuda.device_count() != 1:
+        found = torch.cuda.device_count()
+        sys.exit(f"--gpu {gpu}: {found} GPUs with CUDA_VISIBLE_DEVICES={visible} in place of one")
+
+
+def device(text: str) -> str:
+    """Parse "cpu" or the number of a GPU."""
+    if text != CPU and not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is neither cpu nor the number of a GPU")
+    return text
 
 
 def parse_arguments() -> argparse.Namespace:
@@ -262,11 +282,11 @@ def parse_arguments() -> argparse.Namespace:
     add("--count", type=int, default=20, help="of prompts of each sort (default: 20)")
     add("--seeds", type=int, nargs="+", default=[0])
     add("--models", default="toybox", help="toybox, or the folder of an export")
-    add("--gpu", default=CPU, help="number of the GPU, whose runs have a CSV of their own")
+    add("--gpu", type=device, default=CPU, help="its number; its runs have a CSV of their own")
     add("--keep", type=Path, help="folder for the runs; those that it has are only scored")
     add("--only-score", action="store_true", help="make no run that --keep doesn't have")
     add("--seconds", type=float, help="stop after this time; runs under way are given up")
-    add("--out", type=Path, default=CHARTS, help="folder of toybox.csv (default: docs/charts)")
+    add("--out", type=Path, default=CHARTS, help="folder of the CSV (default: docs/charts)")
     add("--list", action="store_true", help="only print what would run")
     add_jobs(parser)
     arguments = parser.parse_args()

@@ -57,14 +57,14 @@ def distillations() -> str:
 def on_gpu() -> str:
     """Return the table of runs on a GPU, of which the first line is toybox.yaml on CPUs."""
     rows = measured(toybox_jobs.GPU_CHART)
-    plain = {place(row): row for row in rows if row["variant"] == toybox_jobs.DEFAULT}
-    on_cpus = (row for row in measured() if row["variant"] == toybox_jobs.DEFAULT)
-    if not (same := [row for row in on_cpus if place(row) in plain]):
-        return NOT_MEASURED
-    first = line_of(f"{toybox_jobs.DEFAULT} on CPUs", same, [plain[place(row)] for row in same])
+    default = [row for row in rows if row["variant"] == toybox_jobs.DEFAULT and is_present(row)]
+    on_cpus = {place(row): row for row in measured() if row["variant"] == toybox_jobs.DEFAULT}
+    both = [row for row in default if place(row) in on_cpus]
+    same = [on_cpus[place(row)] for row in both]
+    lines = [line_of(f"{toybox_jobs.DEFAULT} on CPUs", same, both)] if both else []
     pairs = pairs_of_charts(rows, DISTILLATIONS)
-    lines = [first, *(line_of(title_of(own[0]), own, plain) for own, plain in pairs)]
-    return markdown(HEAD[:-2], [line[:-2] for line in lines])
+    lines += [line_of(marked_title(own[0]), own, plain) for own, plain in pairs]
+    return markdown(HEAD[:-2], [line[:-2] for line in lines]) if lines else NOT_MEASURED
 
 
 def settings() -> str:

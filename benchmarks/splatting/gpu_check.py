@@ -115,10 +115,11 @@ def place(args: argparse.Namespace, report: dict[str, Any]) -> Path:
 
 
 def earlier_sections(args: argparse.Namespace, report: dict[str, Any]) -> dict[str, Any]:
-    """Return the sections of an earlier report that are not asked for."""
+    """Return the sections of an earlier report that are not asked for, with their machine."""
     path = place(args, report)
     earlier = json.loads(path.read_text()) if path.is_file() else {}
-    return {name: earlier[name] for name in SECTIONS if name in earlier.keys() - args.sections}
+    kept = [name for name in SECTIONS if name in earlier.keys() - args.sections]
+    return {name: {"machine": earlier["machine"]} | earlier[name] for name in kept}
 
 
 def write(args: argparse.Namespace, report: dict[str, Any]) -> None:

@@ -72,12 +72,13 @@ def test_the_sections_that_are_not_asked_for_are_kept(monkeypatch, tmp_path):
     sections = {"compile": lambda args: {"first": 2.0}, "correct": lambda args: {}}
     monkeypatch.setattr(gpu_check, "SECTIONS", sections)
     path = tmp_path / "report.json"
-    path.write_text(json.dumps({"compile": {"first": 1.0}, "correct": {"kept": True}, "old": 3}))
+    earlier = {"compile": {"first": 1.0}, "correct": {"kept": True}, "old": 3}
+    path.write_text(json.dumps({"machine": "another"} | earlier))
     arguments = ["--device", "cpu", "--out", str(path), "--sections", "compile"]
     assert gpu_check.main(arguments) == 0
     report = json.loads(path.read_text())
     assert report["compile"]["first"] == 2.0 and "machine" in report["compile"]
-    assert report["correct"] == {"kept": True} and "old" not in report
+    assert report["correct"] == {"machine": "another", "kept": True} and "old" not in report
 
 
 def test_a_part_that_hangs_ends_with_all_that_it_started(tmp_path):

@@ -1,6 +1,7 @@
 """The benchmark of text to 3D with learned models: prompts, variants, order, rows and tables."""
 
 import argparse
+import contextlib
 import itertools
 import math
 import os
@@ -149,7 +150,8 @@ def test_runs_on_a_gpu_have_rows_and_folders_of_their_own(monkeypatch, tmp_path)
         toybox, "ProcessPoolExecutor", lambda *args, **kwargs: ThreadPoolExecutor(1)
     )
     monkeypatch.setattr(toybox, "require_kernel", lambda: None)
-    monkeypatch.setattr("os.environ", dict(os.environ))
+    monkeypatch.setattr("os.environ", dict(os.environ) | {"CUDA_VISIBLE_DEVICES": ""})
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
     words = ["", "--charts", "default", "--count", 1, "--keep", tmp_path / "runs"]
     for gpu in ("cpu", "0"):
         monkeypatch.setattr("sys.argv", [*map(str, words), "--gpu", gpu, "--out", str(tmp_path)])
@@ -162,7 +164,26 @@ def test_runs_on_a_gpu_have_rows_and_folders_of_their_own(monkeypatch, tmp_path)
     )
     assert on_gpu["machine"] == "a GPU" != on_cpu["machine"] and on_gpu["kind"] == "1"
     assert not on_gpu["cpu_seconds"] and on_cpu["cpu_seconds"]
-    assert os.environ["CUDA_VISIBLE_DEVICES"] == "0"
+
+
+@pytest.mark.parametrize(
+    ("before", "count"), [(None, 0), ("3", 0), ("3,4", 2), (None, 1), ("3", 1)]
+)
+def test_runs_see_one_gpu_which_the_environment_may_name(monkeypatch, before, count):
+    environment = {} if before is None else {"CUDA_VISIBLE_DEVICES": before}
+    monkeypatch.setattr("os.environ", environment)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: count)
+    with contextlib.nullcontext() if count == 1 else pytest.raises(SystemExit, match="--gpu 1: "):
+        toybox.choose_device("1")
+    assert environment["CUDA_VISIBLE_DEVICES"] == (before or "1")
+    toybox.choose_device("cpu")
+    assert environment["CUDA_VISIBLE_DEVICES"] == ""
+
+
+def test_a_gpu_is_chosen_by_its_number(monkeypatch, capsys):
+    with pytest.raises(SystemExit):
+        parsed(monkeypatch, "--gpu", "0,1")
+    assert "'0,1' is neither cpu nor the number of a GPU" in capsys.readouterr().err
 
 
 def test_variants_on_a_gpu_are_compared_there(monkeypatch):
@@ -174,6 +195,10 @@ def test_variants_on_a_gpu_are_compared_there(monkeypatch):
     assert lines[2].startswith("| toybox.yaml on CPUs | 1 × 1 | 50 | -50 |")
     assert lines[3].startswith("| CSD 4 | 1 × 1 | 50 | -50 |") and len(lines) == 4
     assert len({line.count("|") for line in lines}) == 1
+    charts[toybox.CHART] = []
+    assert toybox_variants.on_gpu().splitlines()[2:] == lines[3:]
+    charts[toybox_jobs.GPU_CHART] = [one | {"setup": "a"} for one in charts[toybox_jobs.GPU_CHART]]
+    assert [line[:10] for line in toybox_variants.on_gpu().splitlines()[2:]] == ["| CSD 4 † "]
 
 
 @pytest.fixture

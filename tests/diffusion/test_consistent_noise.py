@@ -2,12 +2,14 @@
 
 import math
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 
 from threestudio_gaussiandreamer.cameras import orbit_c2w, ray_directions
 from threestudio_gaussiandreamer.diffusion.consistent_noise import (
     LATTICES,
+    PRIMES,
     TABLE,
     attached_noise,
     cell_size,
@@ -113,6 +115,20 @@ def test_a_background_is_standard_normal_and_its_pixels_are_independent():
     assert abs(float(noise.mean())) < 5 / 2**7 and abs(float(noise.var()) - 1) < 0.06
     neighbours = (noise[:, :, 1:] * noise[:, :, :-1]).mean()
     assert abs(float(neighbours)) < 0.04  # five deviations of 16,000 products
+
+
+def test_cells_are_cubes_of_each_lattice():
+    """The hash of the coordinates, point by point in Python's integers."""
+    depth, opacity, c2w, fovy = ball([30.0, 200.0], 16)
+    size = cell_size(c2w, fovy, 16)
+    points = surface_points(depth[..., 0], c2w[:, :3] / size[:, None, None], fovy)
+    rows = surface_cells(depth[..., 0], c2w, fovy, size)
+    for lattice, view, y, x in np.ndindex(*rows.shape):
+        shifted = points[view, :, y, x].numpy() + np.float32(lattice / LATTICES)
+        cell = [int(c) for c in np.floor(shifted)]
+        expected = sum(c * prime for c, prime in zip(cell, PRIMES, strict=True))
+        expected += lattice * TABLE // LATTICES
+        assert rows[lattice, view, y, x] == expected % TABLE
 
 
 def test_a_pixel_is_the_sum_of_its_cells_in_all_lattices():

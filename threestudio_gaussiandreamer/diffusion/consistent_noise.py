@@ -50,7 +50,7 @@ def surface_points(
     up = (height / 2 - 0.5 - torch.arange(height, device=depth.device)) / focal
     x, y, z, position = c2w[:, :3, :, None].unbind(2)
     rays = (x * right[:, None] - z)[:, :, None] + (y * up[:, None])[..., None]
-    return torch.addcmul(position[..., None], rays, depth[:, None])
+    return rays.mul_(depth[:, None]).add_(position[..., None])
 
 
 def surface_cells(
@@ -91,7 +91,7 @@ def _lattices(device: torch.device) -> Lattices:
 
 @lru_cache(maxsize=4)
 def background_cells(height: int, width: int, device: torch.device) -> Int[Tensor, "L 1 h w"]:
-    """Return a number for each lattice and pixel of an image, of which its row follows."""
+    """Return a number for each lattice and pixel of an image, from which its row follows."""
     rows, columns = (
         torch.arange(n, dtype=torch.int32, device=device) * prime
         for n, prime in zip((height, width), PRIMES, strict=False)

@@ -147,7 +147,8 @@ def smoothed_colors(cloud: PointCloud, neighbours: int) -> Float[np.ndarray, "P 
     """Return each colour averaged over the ``neighbours`` nearest points, itself among them."""
     from scipy.spatial import cKDTree
 
-    tree, colors = cKDTree(cloud.points), torch.from_numpy(np.array(cloud.colors))
+    tree = cKDTree(cloud.points)
+    colors = torch.from_numpy(np.array(cloud.colors))  # a copy: torch warns of read-only arrays
     neighbours = min(neighbours, len(cloud.points))
 
     def average(points: Float[np.ndarray, "Q 3"]) -> Float[np.ndarray, "Q 3"]:
