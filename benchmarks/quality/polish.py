@@ -161,15 +161,13 @@ def draw() -> Path:
     for name in dict.fromkeys(row["object"] for row in rounds):
         own = [row for row in rounds if row["object"] == name]
         counts, decibels = ([float(row[key]) for row in own] for key in ("gaussians", "psnr"))
-        panel.plot(counts, decibels, "o-", label=name)
-        last = (counts[-1], decibels[-1])
-        panel.annotate(f"{last[0]:,.0f}", last, (4, -14), textcoords="offset points")
+        panel.plot(counts, decibels, "o-", label=f"{name}: {counts[-1]:,.0f}")
     panel.axhline(DECIBELS, color="0.6", linestyle=":")
     panel.set(xlabel="Gaussians that remain", ylabel="PSNR to the dense cloud, dB")
     panel.xaxis.set_major_formatter(ticker.StrMethodFormatter("{x:,.0f}"))
     panel.margins(y=0.12)
     panel.grid(alpha=0.25)
-    panel.legend(frameon=False)
+    panel.legend(frameon=False, title="in the end", loc="lower right")
     machines, commits = (", ".join(sorted({row[key] for row in rounds})) for key in COLUMNS[-2:])
     figure.suptitle("Pruning a dense cloud of 262,144 Gaussians", x=0.01, ha="left")
     figure.text(0.01, 0.9, f"{SIZE}², one seed; {machines}; commit {commits}", fontsize=8)
