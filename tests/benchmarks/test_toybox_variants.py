@@ -1,0 +1,88 @@
+"""The tables that compare variants of toybox.yaml with toybox.yaml itself."""
+
+import math
+
+from benchmarks.quality import chart_runs, toybox, toybox_jobs, toybox_tables, toybox_variants
+from benchmarks.quality.toybox_jobs import DEFAULT, Variant
+from tests.helpers.toybox_rows import row
+
+
+def test_variants_on_a_gpu_are_compared_there(monkeypatch):
+    charts = {toybox.CHART: [row(kind="0"), row(index="1")], toybox_jobs.GPU_CHART: []}
+    monkeypatch.setattr(toybox_variants, "measured", lambda chart=toybox.CHART: charts[chart])
+    assert toybox_variants.on_gpu() == toybox_tables.NOT_MEASURED
+    charts[toybox_jobs.GPU_CHART] += [row(), row(variant="CSD", x="4", colors="0")]
+    lines = toybox_variants.on_gpu().splitlines()
+    assert lines[2].startswith("| toybox.yaml on CPUs | 1 × 1 | 50 | -50 |")
+    assert lines[3].startswith("| CSD 4 | 1 × 1 | 50 | -50 |") and len(lines) == 4
+    assert len({line.count("|") for line in lines}) == 1
+    charts[toybox.CHART] = []
+    assert toybox_variants.on_gpu().splitlines()[2:] == lines[3:]
+    charts[toybox_jobs.GPU_CHART] = [one | {"setup": "a"} for one in charts[toybox_jobs.GPU_CHART]]
+    assert [line[:10] for line in toybox_variants.on_gpu().splitlines()[2:]] == ["| CSD 4 † "]
+
+
+def test_seeds_that_are_not_complete_are_told():
+    rows = [row(), row(seed="1"), row(index="1", prompt="a blue car")]
+    assert toybox_variants.counts_of(rows) == "2 × 1 to 2"
+    assert toybox_variants.counts_of(rows[:2]) == "1 × 2"
+
+
+def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypatch):
+    """Of three prompts the variant has two; it misses the accessory that one of them asks for."""
+    right = dict.fromkeys(toybox_tables.RECOGNIZED, "1") | {"multi_face": "0.25", "seed": "0"}
+    right |= {"setup": toybox_jobs.setup(), "judge": toybox_jobs.judge_of()}
+    prompts = {"0": "a red fox", "1": "a red fox with a blue hat", "2": "a blue car"}
+    rows = [
+        right | {"variant": DEFAULT, "x": "0", "index": i, "prompt": text, "cpu_seconds": "50"}
+        for i, text in prompts.items()
+    ]
+    other = {"variant": "CSD", "x": "4", "cpu_seconds": "70"}
+    rows += [rows[0] | other, rows[1] | other | {"accessory": "0", "multi_face": "nan"}]
+    monkeypatch.setattr(toybox_variants, "measured", lambda: rows)
+    monkeypatch.setattr(
+        toybox_variants.toybox_jobs, "CHARTS", {"mine": lambda: [Variant("CSD", 4), Variant("no")]}
+    )
+    head, _, line = toybox_variants.table("mine").splitlines()
+    assert line.startswith("| CSD 4 | 2 × 1 | 83 | -17 (")  # kind and colours of three attributes
+    assert line.endswith("| 25 | +0 | 70 | 50 |") and len(head.split("|")) == 10
+    earlier = [row | {"setup": "earlier"} for row in rows]
+    rows.append(earlier[0] | other)  # isn't paired with results of other models
+    assert toybox_variants.table("mine").splitlines()[2:] == [line]
+    rows[len(rows) - 1 :] = earlier
+    marked = line.replace("CSD 4", "CSD 4 †")
+    assert toybox_variants.table("mine").splitlines()[2:] == [line, marked]
+    monkeypatch.setattr(toybox_variants, "EARLIER", {"none": "others", "earlier": "the first"})
+    (first,) = toybox_variants.earlier_models(rows)
+    assert first[:4] == ("the first", "3 × 1", "100", "+0 (+0 – +0)")
+    assert toybox_variants.earlier_models(rows[:3]) == []
+
+
+def test_seconds_are_of_the_pairs_that_have_them():
+    own = [row(cpu_seconds="10"), row(seed="1", cpu_seconds=""), row(seed="2", cpu_seconds="30")]
+    plain = [row(cpu_seconds="5"), row(cpu_seconds="7"), row(cpu_seconds="")]
+    assert toybox_variants.line_of("mine", own, plain)[-2:] == ("10", "5")
+    assert toybox_variants.line_of("mine", own[1:], plain[1:])[-2:] == ("", "")
+    assert chart_runs.median(own, "cpu_seconds") == 20
+    assert math.isnan(chart_runs.median(own[1:2], "cpu_seconds"))
+
+
+def test_rows_of_another_judge_are_not_of_the_present_state():
+    """Of two scores of the same runs, those of the bundled judge are shown."""
+    plain = [row(), row(judge="another", kind="0")]
+    assert [toybox_tables.is_present(one) for one in plain] == [True, False]
+    mine = [one | {"variant": "mine"} for one in plain]
+    assert toybox_variants.pairs_of(plain + mine[1:], "mine", "0") == [(mine[1:], plain[1:])]
+    assert toybox_variants.pairs_of(plain[:1] + mine[1:], "mine", "0") == []
+
+
+def test_earlier_models_are_compared_by_the_same_judge(monkeypatch):
+    """Each state is compared with the next newer one that the judge scored."""
+    rows = [row(setup="a", judge="first"), row(setup="b", judge="first")]
+    rows += [row(), row(setup="b", kind="0")]
+    monkeypatch.setattr(toybox_variants, "EARLIER", {"b": "state b", "a": "state a"})
+    lines = toybox_variants.earlier_models(rows)
+    assert [line[:4] for line in lines] == [
+        ("state b", "1 × 1", "50", "-50"),
+        ("state a †", "1 × 1", "100", "+0"),
+    ]
