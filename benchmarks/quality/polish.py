@@ -167,7 +167,7 @@ def draw() -> Path:
     panel.xaxis.set_major_formatter(ticker.StrMethodFormatter("{x:,.0f}"))
     panel.margins(y=0.12)
     panel.grid(alpha=0.25)
-    panel.legend(frameon=False, title="in the end", loc="lower right")
+    panel.legend(frameon=False, title="Gaussians in the end", loc="lower right")
     machines, commits = (", ".join(sorted({row[key] for row in rounds})) for key in COLUMNS[-2:])
     figure.suptitle("Pruning a dense cloud of 262,144 Gaussians", x=0.01, ha="left")
     figure.text(0.01, 0.9, f"{SIZE}², one seed; {machines}; commit {commits}", fontsize=8)

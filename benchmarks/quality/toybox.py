@@ -261,8 +261,7 @@ def choose_device(gpu: str) -> None:
     import torch
 
     visible = os.environ.setdefault("CUDA_VISIBLE_DEVICES", gpu)
-    if torch.cuda.device_count() != 1:
-        found = torch.cuda.device_count()
+    if (found := torch.cuda.device_count()) != 1:
         sys.exit(f"--gpu {gpu}: {found} GPUs with CUDA_VISIBLE_DEVICES={visible} in place of one")
 
 
@@ -313,13 +312,13 @@ def variant(text: str) -> Variant:
 def tasks(arguments: argparse.Namespace) -> Iterator[Task]:
     """Yield all tasks in order of priority."""
     charts = [list(VARIANTS[name]()) for name in arguments.charts]
-    keep = arguments.keep
+    common = arguments.models, arguments.keep, arguments.gpu
     for variants in (arguments.variant, *charts):
         for seed in arguments.seeds:
             for sort in arguments.prompts:
                 for prompt in prompts(sort, arguments.count):
                     for one in variants:
-                        yield Task(one, prompt, seed, arguments.models, keep, arguments.gpu)
+                        yield Task(one, prompt, seed, *common)
 
 
 def unique(items: Iterator[Task]) -> list[Task]:
