@@ -15,10 +15,11 @@ from setuptools.command.build_ext import build_ext
 PACKAGE = "threestudio_gaussiandreamer.splatting.cpu"
 NATIVE = Path(*PACKAGE.split("."))
 SHARED = NATIVE.parent / "shared"
-# Not -ffast-math: linking with it makes the whole process flush denormals.
+# Not -ffast-math: linking with it makes the whole process flush denormals. -fno-wrapv undoes the
+# -fwrapv of Python's own flags, which costs the kernel a thirtieth of its time.
 FLAGS = (
-    "-std=c++17 -O3 -g0 -fno-math-errno -fno-trapping-math -ffp-contract=fast "
-    "-fvisibility=hidden -pthread"
+    "-std=c++17 -O3 -g0 -fno-wrapv -fno-math-errno -fno-trapping-math "
+    "-ffp-contract=fast -fvisibility=hidden -pthread"
 ).split()
 X86_BUILDS = {
     "v4": ["-march=x86-64-v4", "-mprefer-vector-width=512"],
