@@ -55,16 +55,29 @@ def distillations() -> str:
 
 
 def on_gpu() -> str:
-    """Return the table of runs on a GPU, of which the first line is toybox.yaml on CPUs."""
+    """Return the table of runs on a GPU, of which the first line is toybox.yaml on CPUs. Runs of
+    these variants that the GPU lacks are taken from CPUs.
+    """
     rows = measured(toybox_jobs.GPU_CHART)
     default = [row for row in rows if row["variant"] == toybox_jobs.DEFAULT and is_present(row)]
     on_cpus = {place(row): row for row in measured() if row["variant"] == toybox_jobs.DEFAULT}
     both = [row for row in default if place(row) in on_cpus]
     same = [on_cpus[place(row)] for row in both]
     lines = [line_of(f"{toybox_jobs.DEFAULT} on CPUs", same, both)] if both else []
-    pairs = pairs_of_charts(rows, DISTILLATIONS)
+    pairs = pairs_of_charts([*rows, *lacking(rows, measured())], DISTILLATIONS)
     lines += [line_of(marked_title(own[0]), own, plain) for own, plain in pairs]
     return markdown(HEAD[:-2], [line[:-2] for line in lines]) if lines else NOT_MEASURED
+
+
+def lacking(rows: Sequence[Row], others: Sequence[Row]) -> list[Row]:
+    """Return those of ``others`` that aren't in ``rows``, of the variants that are."""
+    variants = {title_of(row) for row in rows}
+    done = {(title_of(row), place(row)) for row in rows}
+    return [
+        row
+        for row in others
+        if title_of(row) in variants and (title_of(row), place(row)) not in done
+    ]
 
 
 def settings() -> str:

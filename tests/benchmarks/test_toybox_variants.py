@@ -8,6 +8,7 @@ from tests.helpers.toybox_rows import row
 
 
 def test_variants_on_a_gpu_are_compared_there(monkeypatch):
+    """Of the runs on CPUs only one is of a variant, prompt and seed for which the GPU has none."""
     charts = {toybox.CHART: [row(kind="0"), row(index="1")], toybox_jobs.GPU_CHART: []}
     monkeypatch.setattr(toybox_variants, "measured", lambda chart=toybox.CHART: charts[chart])
     assert toybox_variants.on_gpu() == toybox_tables.NOT_MEASURED
@@ -16,6 +17,10 @@ def test_variants_on_a_gpu_are_compared_there(monkeypatch):
     assert lines[2].startswith("| toybox.yaml on CPUs | 1 × 1 | 50 | -50 |")
     assert lines[3].startswith("| CSD 4 | 1 × 1 | 50 | -50 |") and len(lines) == 4
     assert len({line.count("|") for line in lines}) == 1
+    on_cpus = [row(variant="CSD", x="4"), row(variant="CSD", x="4", index="1", kind="0")]
+    charts[toybox.CHART] += [*on_cpus, row(variant="NFSD", x="4")]
+    *others, csd = toybox_variants.on_gpu().splitlines()
+    assert csd.startswith("| CSD 4 | 2 × 1 | 50 | -50 |") and others == lines[:3]
     charts[toybox.CHART] = []
     assert toybox_variants.on_gpu().splitlines()[2:] == lines[3:]
     charts[toybox_jobs.GPU_CHART] = [one | {"setup": "a"} for one in charts[toybox_jobs.GPU_CHART]]
