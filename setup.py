@@ -16,7 +16,7 @@ PACKAGE = "threestudio_gaussiandreamer.splatting.cpu"
 NATIVE = Path(*PACKAGE.split("."))
 SHARED = NATIVE.parent / "shared"
 # Not -ffast-math: linking with it makes the whole process flush denormals. -fno-wrapv undoes the
-# -fwrapv of Python's own flags, which costs the kernel a thirtieth of its time.
+# -fwrapv of Python's own flags, with which the kernel takes a thirtieth more time.
 FLAGS = (
     "-std=c++17 -O3 -g0 -fno-wrapv -fno-math-errno -fno-trapping-math "
     "-ffp-contract=fast -fvisibility=hidden -pthread"

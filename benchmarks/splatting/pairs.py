@@ -4,12 +4,11 @@
 
 Reports processor seconds of one thread, so that other programs on the machine matter little, and
 ratios of the smallest of all rounds. `surface` is the scene of bench_splatting.py; `demo` is the
-demo's step, four views of 256² of a trained cloud. Writes ``benchmarks/results/kernel.csv``.
+demo's step, four views of 256² of a trained cloud. Appends to ``benchmarks/results/kernel.csv``.
 
 Both checkouts must have been built: ``python setup.py build_ext --inplace``."""
 
 import argparse
-import csv
 import os
 import time
 from collections.abc import Callable
@@ -18,7 +17,7 @@ from typing import NamedTuple
 
 import torch
 
-from benchmarks.quality.runs import machine
+from benchmarks.quality.runs import append_rows
 from benchmarks.splatting.bench_scenes import Scene, make_camera, make_cotangents, make_scene
 from benchmarks.splatting.bench_splatting import PROTOTYPE, contender
 from benchmarks.splatting.scenes import trained
@@ -31,7 +30,7 @@ from threestudio_gaussiandreamer.splatting.scene import Scene as KernelScene
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks/results/kernel.csv"
-COLUMNS = (
+COLUMNS = [
     "scene",
     "gaussians",
     "views",
@@ -42,7 +41,7 @@ COLUMNS = (
     "forward_ms",
     "both_ms",
     "machine",
-)
+]
 CASES = ("surface 512", "surface 1024", "demo 256")
 VIEWS = 4  # of the demo
 Pass = Callable[[], object]
@@ -124,7 +123,7 @@ def best_times(contenders: dict[str, tuple[Pass, Pass]], rounds: int) -> dict[st
     }
 
 
-def measure(name: str, build: str, checkouts: dict[str, Path], rounds: int) -> list[tuple]:
+def measure(name: str, build: str, checkouts: dict[str, Path], rounds: int) -> list[dict]:
     """Measure one case; return rows of the CSV."""
     case = make_case(name)
     contenders = {
@@ -138,14 +137,9 @@ def measure(name: str, build: str, checkouts: dict[str, Path], rounds: int) -> l
     for label, (_, both) in best.items():
         print(f"{name:12} {build:4} {label:9} {both:7.2f} ms   {both / first:.2f}", flush=True)
     where = (case.name, len(case.cloud.means), len(case.viewmats), case.size, build)
+    commits = {label: commit_of(checkout) for label, checkout in checkouts.items()}
     return [
-        (
-            *where,
-            label,
-            commit_of(checkouts[label]) if label in checkouts else "",
-            *found,
-            machine(),
-        )
+        dict(zip(COLUMNS, (*where, label, commits.get(label, ""), *found), strict=False))
         for label, found in best.items()
     ]
 
@@ -167,10 +161,7 @@ def main() -> None:
         for name in CASES
         for row in measure(name, build, checkouts, args.rounds)
     ]
-    with open(RESULTS, "w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        writer.writerows(rows)
+    append_rows(RESULTS.stem, COLUMNS, rows, RESULTS.parent)
 
 
 if __name__ == "__main__":

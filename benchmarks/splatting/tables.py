@@ -5,10 +5,11 @@ benchmarks/results/gpu-<device>.json.
 
 import functools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from benchmarks.markdown import markdown, read
+from benchmarks.quality.chart_runs import grouped
 
 ROOT = Path(__file__).resolve().parents[2]
 ACCURACY, SPEED = ROOT / "docs/charts/rasteriser.csv", ROOT / "benchmarks/results/splatting.csv"
@@ -111,24 +112,37 @@ def speedup() -> str:
 
 
 def kernel() -> str:
-    """Return times of the CPU kernel before and now, and ratios, also to the prototype."""
-    cells: dict[tuple[str, str], dict[str, dict[str, str]]] = {}
-    rows = read(KERNEL)
-    for row in rows:
+    """Return times of the CPU kernel before and now, and ratios, also to the prototype: a table for
+    each machine and pair of commits.
+    """
+    cases: list[dict[str, dict[str, str]]] = []
+    for row in read(KERNEL):
+        if row["contender"] == "before":
+            cases.append({})
+        cases[-1][row["contender"]] = row
+    measured = grouped(
+        cases,
+        lambda case: (case["now"]["machine"], case["before"]["commit"], case["now"]["commit"]),
+    )
+    return "\n\n".join(_kernel_table(*where, found) for where, found in measured.items())
+
+
+def _kernel_table(
+    machine: str, before: str, now: str, cases: Sequence[dict[str, dict[str, str]]]
+) -> str:
+    """Return the table of cases that have rows of "before", "now", and maybe "prototype"."""
+    lines = []
+    for case in cases:
+        row, ms = case["now"], {name: float(row["both_ms"]) for name, row in case.items()}
         views = f"{row['views']} × " if row["views"] != "1" else ""
-        where = f"{row['scene']}, {int(row['gaussians']):,} Gaussians, {views}{row['size']}²"
-        cells.setdefault((where, row["build"]), {})[row["contender"]] = row
-    table = []
-    for (where, build), found in cells.items():
-        ms = {name: float(row["both_ms"]) for name, row in found.items()}
+        scene = f"{row['scene']}, {int(row['gaussians']):,} Gaussians, {views}{row['size']}²"
         ratios = (
             f"{ms['now'] / ms[name]:.2f}" if name in ms else "" for name in ("before", "prototype")
         )
-        table.append((where, build, f"{ms['before']:.1f}", f"{ms['now']:.1f}", *ratios))
-    first = next(iter(cells.values()))
-    before, now = (f"{name} ({first[name]['commit']}), ms" for name in ("before", "now"))
-    head = ("scene", "build", before, now, "now / before", "now / AVX-512 prototype")
-    return f"{', '.join(sorted({row['machine'] for row in rows}))}:\n\n{markdown(head, table)}"
+        lines.append((scene, row["build"], f"{ms['before']:.1f}", f"{ms['now']:.1f}", *ratios))
+    head = ("scene", "build", f"before ({before}), ms", f"now ({now}), ms")
+    head += ("now / before", "now / AVX-512 prototype")
+    return f"{machine}:\n\n{markdown(head, lines)}"
 
 
 def growth() -> str:
