@@ -170,6 +170,29 @@ def ray_directions(
     return F.normalize(directions, dim=-1) if normalize else directions
 
 
+def surface_points(
+    depth: Float[Tensor, "B h w"],
+    c2w: Float[Tensor, "B _ 4"],
+    fovy: Float[Tensor, " B"],
+    aspect: float = 1.0,
+) -> Float[Tensor, "B 3 h w"]:
+    """Return the world coordinates of the points on the rendered surface.
+
+    Args:
+        depth: along the optical axis, at the centres of h x w pixels.
+        c2w: OpenGL cameras; the fourth row isn't needed.
+        fovy: radians.
+        aspect: width of a pixel over its height.
+    """
+    height, width = depth.shape[1:]
+    focal = focal_length(fovy, height)[:, None]
+    right = (torch.arange(width, device=depth.device) + 0.5 - width / 2) * aspect / focal
+    up = (height / 2 - 0.5 - torch.arange(height, device=depth.device)) / focal
+    x, y, z, position = c2w[:, :3, :, None].unbind(2)
+    rays = (x * right[:, None] - z)[:, :, None] + (y * up[:, None])[..., None]
+    return rays.mul_(depth[:, None]).add_(position[..., None])
+
+
 def projection(
     fovy: Float[Tensor, " B"], aspect: float, near: float = 0.01, far: float = 100.0
 ) -> Float[Tensor, "B 4 4"]:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from threestudio_gaussiandreamer.cameras import orbit_c2w, ray_directions
+from threestudio_gaussiandreamer.cameras import orbit_c2w, ray_directions, surface_points
 from threestudio_gaussiandreamer.diffusion.consistent_noise import (
     LATTICES,
     PRIMES,
@@ -14,7 +14,6 @@ from threestudio_gaussiandreamer.diffusion.consistent_noise import (
     attached_noise,
     cell_size,
     surface_cells,
-    surface_points,
 )
 
 FOVY = math.radians(50)

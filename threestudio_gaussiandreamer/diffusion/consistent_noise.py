@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..cameras import focal_length
+from ..cameras import focal_length, surface_points
 
 LATTICES = 2
 TABLE = 2**16
@@ -29,28 +29,6 @@ exclusive or, cells that are near each other never share a row.
 """
 OPAQUE = 0.5
 """Alpha below which a pixel belongs to the background."""
-
-
-def surface_points(
-    depth: Float[Tensor, "B h w"],
-    c2w: Float[Tensor, "B 3 4"],
-    fovy: Float[Tensor, " B"],
-    aspect: float = 1.0,
-) -> Float[Tensor, "B 3 h w"]:
-    """Return the world coordinates of the points on the rendered surface.
-
-    Args:
-        depth: along the optical axis, at the centres of h x w pixels.
-        c2w: OpenGL cameras, see ``cameras.py``; fovy in radians.
-        aspect: width of a pixel over its height.
-    """
-    height, width = depth.shape[1:]
-    focal = focal_length(fovy, height)[:, None]
-    right = (torch.arange(width, device=depth.device) + 0.5 - width / 2) * aspect / focal
-    up = (height / 2 - 0.5 - torch.arange(height, device=depth.device)) / focal
-    x, y, z, position = c2w[:, :3, :, None].unbind(2)
-    rays = (x * right[:, None] - z)[:, :, None] + (y * up[:, None])[..., None]
-    return rays.mul_(depth[:, None]).add_(position[..., None])
 
 
 def surface_cells(

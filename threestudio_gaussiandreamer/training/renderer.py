@@ -176,14 +176,11 @@ def normals_from_depth(
 
     ``depth`` is along the optical axis; the normal is the cross product of the surface's
     differences along rows and columns."""
-    height, width = depth.shape[1:3]
-    points = c2w[:, None, None, :3, 3] + depth * cameras.ray_directions(
-        c2w, fovy, height, width, normalize=False
-    )
-    padded = F.pad(points.permute(0, 3, 1, 2), (1, 1, 1, 1), mode="replicate").permute(0, 2, 3, 1)
-    down, right = (
-        padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1],
-        padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2],
-    )
-    normal = F.normalize(torch.linalg.cross(down, right), dim=-1)
-    return 0.5 + 0.5 * normal * (alpha > 0.5)
+    points = cameras.surface_points(depth[..., 0], c2w, fovy)
+    padded = F.pad(points, (1, 1, 1, 1), mode="replicate")
+    down = padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]
+    right = padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]
+    # several times faster than torch.linalg.cross and F.normalize
+    normal = down.roll(-1, 1) * right.roll(-2, 1) - down.roll(-2, 1) * right.roll(-1, 1)
+    per_length = normal.square().sum(1, keepdim=True).clamp_min(1e-24).rsqrt()
+    return 0.5 + (normal * per_length).movedim(1, -1) * (0.5 * (alpha > 0.5))

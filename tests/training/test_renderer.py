@@ -1,0 +1,41 @@
+"""What the renderer adds to the rasterizer's pictures."""
+
+import torch
+
+from threestudio_gaussiandreamer import cameras
+from threestudio_gaussiandreamer.training.renderer import normals_from_depth
+
+
+def plane(height: int, width: int) -> tuple[torch.Tensor, ...]:
+    """Return depth, camera and field of view of a view from above onto the plane z = 0."""
+    c2w = cameras.orbit_c2w(torch.tensor([50.0]), torch.tensor([30.0]), torch.tensor([2.5]))
+    fovy = torch.tensor([0.7])
+    rays = cameras.ray_directions(c2w, fovy, height, width, normalize=False)
+    return -c2w[:, None, None, 2:3, 3] / rays[..., 2:], c2w, fovy
+
+
+def test_normals_are_those_of_the_depth_surface_in_world_space():
+    depth, c2w, fovy = plane(24, 32)
+    alpha = torch.ones_like(depth)
+    alpha[:, :10] = 0.5
+    normals = normals_from_depth(depth, alpha, c2w, fovy)
+    drawn, nothing = normals[:, 10:], normals[:, :10]
+    up = torch.tensor([0.5, 0.5, 1.0]).expand_as(drawn)
+    torch.testing.assert_close(drawn, up, rtol=0, atol=1e-4)
+    assert (nothing == 0.5).all()
+
+
+def test_normals_have_gradients_where_the_surface_is_degenerate_too():
+    """Where the depth is zero all points are the camera's, and have no normal."""
+    depth, c2w, fovy = plane(8, 8)
+    depth[:, :4] = 0
+    depth.requires_grad_()
+    normals = normals_from_depth(depth, torch.ones_like(depth), c2w, fovy)
+    assert (normals[:, :3] == 0.5).all()
+    normals.square().sum().backward()
+    assert depth.grad.isfinite().all()
+
+    def of(depth: torch.Tensor) -> torch.Tensor:
+        return normals_from_depth(depth, torch.ones_like(depth), c2w.double(), fovy.double())
+
+    assert torch.autograd.gradcheck(of, plane(4, 4)[0].double().requires_grad_())
