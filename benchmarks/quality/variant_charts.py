@@ -8,7 +8,6 @@ docs/charts/variants_diversity.csv: the root mean square difference of the same 
 two seeds, averaged over the views and all pairs, as a share of the range of colours."""
 
 import argparse
-import csv
 import itertools
 import statistics
 from collections.abc import Iterable
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.markdown import write
 from benchmarks.quality import runs
 from benchmarks.quality.chart_runs import PAPER, SECONDS, Chart, Row, draw, grouped
 from benchmarks.quality.variants import (
@@ -91,16 +91,14 @@ def draw_charts(rows: list[Row]) -> None:
 def write_diversity(pictures: Path, rows: list[Row]) -> None:
     """Compute the diversity of each line, scale and object that two seeds or more have run."""
     runs_of = grouped({tuple(row[name] for name in KEY) for row in rows}, lambda key: key[:-1])
-    found = []
+    columns, found = [*KEY[:-1], "seeds", "diversity"], []
     for place, keys in sorted(runs_of.items()):
         folders = [picture_folder(pictures, key) for key in sorted(keys)]
         folders = [folder for folder in folders if folder.is_dir()]
         if len(folders) > 1:
-            found.append((*place, len(folders), f"{difference(folders):.4f}"))
-    with open(runs.CHARTS / f"{DIVERSITY}.csv", "w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*KEY[:-1], "seeds", "diversity"])
-        writer.writerows(found)
+            row = *place, len(folders), f"{difference(folders):.4f}"
+            found.append(dict(zip(columns, row, strict=True)))
+    write(runs.CHARTS / f"{DIVERSITY}.csv", columns, found)
 
 
 def difference(folders: list[Path]) -> float:

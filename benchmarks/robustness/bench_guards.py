@@ -10,7 +10,6 @@ a table and writes ``benchmarks/results/guards.csv``. The bars: all guards of a 
 ``non_finite="error"`` <= 2 % of a forward pass."""
 
 import argparse
-import csv
 import statistics
 import time
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Callable
 
 import torch
 
+from benchmarks.markdown import write
 from benchmarks.splatting.bench_scenes import make_camera, make_scene
 from tests.helpers.pixel_guidance import PixelGuidance
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0
@@ -184,16 +184,18 @@ def report(rows: list[tuple[str, float, float]], options: argparse.Namespace) ->
             f"{name:42} {time_of_guard:8.3f} ms of {whole:8.2f} ms: "
             f"{100 * time_of_guard / whole:5.2f} %"
         )
-    with RESULTS.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(
-            ["gaussians", "size", "views", "threads", "guard", "guard_ms", "whole_ms", "percent"]
-        )
-        for name, time_of_guard, whole in rows:
-            figures = (f"{time_of_guard:.4f}", f"{whole:.3f}", f"{100 * time_of_guard / whole:.3f}")
-            writer.writerow(
-                [options.gaussians, options.size, options.views, options.threads, name, *figures]
-            )
+    place = {name: getattr(options, name) for name in ("gaussians", "size", "views", "threads")}
+    found = [
+        place
+        | {
+            "guard": name,
+            "guard_ms": f"{time_of_guard:.4f}",
+            "whole_ms": f"{whole:.3f}",
+            "percent": f"{100 * time_of_guard / whole:.3f}",
+        }
+        for name, time_of_guard, whole in rows
+    ]
+    write(RESULTS, list(found[0]), found)
 
 
 if __name__ == "__main__":

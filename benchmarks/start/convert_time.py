@@ -6,7 +6,6 @@ Converts each cloud with both checkouts alternately, each time in a new process 
 Seconds are of all threads of the process: on a machine with nothing else to do the command takes
 less time than that. Writes ``benchmarks/results/convert.csv``."""
 
-import csv
 import os
 import resource
 import subprocess
@@ -14,6 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from benchmarks.markdown import write
 from benchmarks.start.launched import ROOT, checkouts_of, commit_of, paired_parser
 from benchmarks.start.step_shares import THREADS
 
@@ -32,9 +32,9 @@ def main() -> None:
             for checkout, folder in checkouts.items():
                 seconds = converted(folder, Path(path).resolve())
                 print(f"{name}, {checkout}: {seconds:.2f} CPU s", flush=True)
-                rows.append((name, checkout, commit_of(folder), number, f"{seconds:.3f}"))
-    with open(RESULTS, "w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
+                row = name, checkout, commit_of(folder), number, f"{seconds:.3f}"
+                rows.append(dict(zip(COLUMNS, row, strict=True)))
+    write(RESULTS, COLUMNS, rows)
 
 
 def converted(checkout: Path, cloud: Path) -> float:

@@ -6,10 +6,10 @@ Runs both checkouts alternately, each time in a new process and an empty folder,
 the first step. Seconds are of all threads of the process, which other programs on the machine
 change little. Writes ``benchmarks/results/start.csv``."""
 
-import csv
 import statistics
 from pathlib import Path
 
+from benchmarks.markdown import write
 from benchmarks.start.launched import ROOT, checkouts_of, commit_of, paired_parser, run_with_probe
 
 RESULTS = ROOT / "benchmarks/results/start.csv"
@@ -34,16 +34,10 @@ def main() -> None:
             print(f"{name}: {ends['first step']:.2f} CPU s", flush=True)
             place = (name, commit_of(checkout), number)
             rows += [(*place, *stage) for stage in seconds_by_stage(ends).items()]
-    write(rows)
+    written = ((*place, f"{seconds:.3f}") for *place, seconds in rows)
+    write(RESULTS, COLUMNS, (dict(zip(COLUMNS, row, strict=True)) for row in written))
     for name in checkouts:
         print(f"{name}: median {median_total(rows, name):.2f} CPU s to the first step")
-
-
-def write(rows: list[tuple]) -> None:
-    with open(RESULTS, "w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        writer.writerows((*row[:4], f"{row[4]:.3f}") for row in rows)
 
 
 def median_total(rows: list[tuple], checkout: str) -> float:

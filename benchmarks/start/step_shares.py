@@ -7,11 +7,10 @@ networks of Stable Diffusion's shapes, and that of toybox.yaml, 4 x 128 x 128 wi
 both checkouts alternate, each run in a new process with one thread. Replaces the rows of these
 workloads in ``benchmarks/results/step.csv``."""
 
-import csv
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.markdown import read
+from benchmarks.markdown import read, write
 from benchmarks.start.launched import ROOT, checkouts_of, commit_of, paired_parser, run_with_probe
 
 RESULTS = ROOT / "benchmarks/results/step.csv"
@@ -50,16 +49,18 @@ def main() -> None:
     args = parser.parse_args()
     checkouts = checkouts_of(args.against)
     earlier = read(RESULTS) if RESULTS.exists() else []
-    rows = [tuple(row.values()) for row in earlier if row["workload"] not in args.workloads]
+    rows = [row for row in earlier if row["workload"] not in args.workloads]
     for number in range(args.rounds):
         for workload in args.workloads:
             for name, checkout in checkouts.items():
                 parts = milliseconds(checkout, WORKLOADS[workload], args.steps)
                 print(f"{workload}, {name}: {sum(parts.values()):.1f} ms", parts, flush=True)
                 place = (workload, name, commit_of(checkout), number)
-                rows += [(*place, part, f"{ms:.3f}") for part, ms in parts.items()]
-    with open(RESULTS, "w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
+                rows += [
+                    dict(zip(COLUMNS, (*place, part, f"{ms:.3f}"), strict=True))
+                    for part, ms in parts.items()
+                ]
+    write(RESULTS, COLUMNS, rows)
 
 
 def milliseconds(checkout: Path, workload: Workload, window: list[int]) -> dict[str, float]:
