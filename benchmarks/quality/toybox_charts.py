@@ -4,16 +4,15 @@
 
 Lines show results against a number that runs vary; `toybox_settings.png` and
 `toybox_distillations.png` show the difference of each other setting, and of each other score
-distillation, to toybox.yaml on the same prompts and seeds, and its seconds. Bands and bars are
-bootstrap intervals over prompts. `toybox_seconds.png` shows all of them against seconds.
+distillation, to toybox.yaml on the same prompts and seeds, and the ratio of their seconds. Bands
+and bars are bootstrap intervals over prompts. `toybox_seconds.png` shows the differences of all of
+them against this ratio.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from benchmarks.figures import pyplot
 from benchmarks.quality.chart_runs import median, saved, set_log_x
@@ -36,7 +35,6 @@ from benchmarks.quality.toybox_tables import (
     measured,
     present,
     title_of,
-    variants,
 )
 from benchmarks.quality.toybox_variants import (
     DISTILLATIONS,
@@ -45,8 +43,9 @@ from benchmarks.quality.toybox_variants import (
     multi_face,
     pairs_of_charts,
     recognised_share,
+    relative_seconds,
+    timed_runs,
     values_of,
-    with_seconds,
 )
 from threestudio_gaussiandreamer.evaluation.intervals import paired
 
@@ -72,6 +71,7 @@ LINES = {
     ),
     "toybox_count": Line("Gaussians", COUNT, "x", "Gaussians"),
 }
+RELATIVE_SECONDS = "CPU seconds / those of toybox.yaml"
 COMPARISONS = {"toybox_settings": SETTINGS, "toybox_distillations": DISTILLATIONS}
 
 
@@ -80,11 +80,13 @@ def main() -> None:
     for name, line in LINES.items():
         if varied := [row for row in rows if row["variant"] == line.variant]:
             print(draw(name, line, varied + default_at(line, varied, rows), references(rows)))
+    ratios = relative_seconds(timed_runs())
     for name, charts in COMPARISONS.items():
         if found := settings(measured(), charts):
-            print(draw_settings(name, found))
-    if shown := with_known_seconds(rows):
-        print(draw_against_seconds("toybox_seconds", shown))
+            print(draw_settings(name, found, ratios))
+    compared = settings(measured(), (*SETTINGS, *DISTILLATIONS), others=(EXACT,))
+    if shown := [one for one in compared if one.title in ratios]:
+        print(draw_against_seconds("toybox_seconds", shown, ratios))
 
 
 # ---- results against a number --------------------------------------------------------------------
@@ -166,11 +168,16 @@ class Setting(NamedTuple):
         return title_of(self.own[0])
 
 
-def settings(rows: Sequence[Row], charts: Sequence[str]) -> list[Setting]:
+VARIED = (EXACT, *(line.variant for line in LINES.values()))
+"""Variants that other charts show."""
+
+
+def settings(
+    rows: Sequence[Row], charts: Sequence[str], others: Sequence[str] = VARIED
+) -> list[Setting]:
     """Return the settings of some charts that were measured with the present models and
-    configuration.
+    configuration, without some variants.
     """
-    others = {EXACT, *(line.variant for line in LINES.values())}
     return [
         Setting(own, plain)
         for own, plain in pairs_of_charts(rows, charts)
@@ -178,8 +185,8 @@ def settings(rows: Sequence[Row], charts: Sequence[str]) -> list[Setting]:
     ]
 
 
-def draw_settings(name: str, found: Sequence[Setting]) -> Path:
-    """Draw differences and seconds, a line per setting; return the path."""
+def draw_settings(name: str, found: Sequence[Setting], ratios: dict[str, float]) -> Path:
+    """Draw differences and relative seconds, a line per setting; return the path."""
     plt = pyplot()
 
     figure, panels = plt.subplots(
@@ -187,7 +194,7 @@ def draw_settings(name: str, found: Sequence[Setting]) -> Path:
     )
     draw_differences(panels[0], found, recognised_share, "recognised attributes, points")
     draw_differences(panels[1], found, multi_face, "multi-face, points")
-    draw_seconds(panels[2], found)
+    draw_seconds(panels[2], found, ratios)
     panels[0].set_yticks(range(len(found)), [one.title for one in found])
     panels[0].invert_yaxis()
     title = "Difference to toybox.yaml on the same prompts and seeds"
@@ -208,50 +215,40 @@ def draw_differences(
     finish(panel, label)
 
 
-def draw_seconds(panel: Any, found: Sequence[Setting]) -> None:
-    """Draw the median seconds of each setting's runs, and those of toybox.yaml as a tick."""
+def draw_seconds(panel: Any, found: Sequence[Setting], ratios: dict[str, float]) -> None:
+    """Draw the ratio of each setting's seconds to those of toybox.yaml, where it is known."""
     for place, one in enumerate(found):
-        own, plain = with_seconds(one.own, one.plain)
-        panel.plot([median(own, "cpu_seconds")], [place], "o", color="C1")
-        panel.plot([median(plain, "cpu_seconds")], [place], "|", color="0.5", markersize=12)
+        panel.plot([ratios.get(one.title, math.nan)], [place], "o", color="C1")
+    panel.axvline(1, color="0.5", linewidth=1)
     panel.margins(x=0.1)
     panel.set_xlim(left=0)
-    finish(panel, "CPU seconds (tick: toybox.yaml)")
+    finish(panel, RELATIVE_SECONDS)
 
 
 # ---- results against seconds ---------------------------------------------------------------------
 
 
-def with_known_seconds(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Return the rows of each kind of run of which there are enough, some with CPU seconds."""
-    others = [row for row in rows if row["variant"] != EXACT]
-    return {
-        title: same
-        for title, same in variants(others)
-        if len(same) >= ENOUGH and not math.isnan(median(same, "cpu_seconds"))
-    }
-
-
-def draw_against_seconds(name: str, shown: dict[str, list[Row]]) -> Path:
-    """Draw each kind of run as a point: recognised attributes and multi-face rate against median
-    seconds; toybox.yaml large, the paper's recipe as a star.
+def draw_against_seconds(name: str, found: Sequence[Setting], ratios: dict[str, float]) -> Path:
+    """Draw each setting as a point: its difference to toybox.yaml in recognised attributes and in
+    the multi-face rate against relative seconds; toybox.yaml itself at (1, 0), the paper's recipe
+    as a star.
     """
     plt = pyplot()
 
-    figure, panels = plt.subplots(1, 2, figsize=(14, 5), layout="constrained")
+    figure, panels = plt.subplots(1, 2, figsize=(14, 6), layout="constrained")
     colors = plt.get_cmap("tab20").colors
-    markers = {DEFAULT: ("D", 11), PAPER_RECIPE: ("*", 16)}
     for panel, measure in zip(panels, (recognised_share, multi_face), strict=True):
-        for place, (title, rows) in enumerate(shown.items()):
-            marker, size = markers.get(title, ("osv^"[place // len(colors)], 7))
-            mean = float(np.nanmean(list(values_of(rows, measure).values())))
-            color = colors[place % len(colors)]
-            panel.plot([median(rows, "cpu_seconds")], [100 * mean], marker, color=color,
-                       markersize=size, label=title, markeredgecolor="0.2")  # fmt: skip
+        panel.plot([1], [0], "D", color="0.2", markersize=11, label=DEFAULT)
+        for place, one in enumerate(found):
+            value = paired(values_of(one.own, measure), values_of(one.plain, measure))
+            marker, size = ("*", 16) if one.title == PAPER_RECIPE else ("osv^"[place // 20], 7)
+            panel.plot([ratios[one.title]], [100 * value.mean], marker, color=colors[place % 20],
+                       markersize=size, label=one.title, markeredgecolor="0.2")  # fmt: skip
+        panel.axhline(0, color="0.5", linewidth=1)
         set_log_x(panel)
-        finish(panel, "CPU seconds, one thread")
-    panels[0].set_ylabel("recognised attributes, %")
-    panels[1].set_ylabel("multi-face, %")
+        finish(panel, RELATIVE_SECONDS)
+    panels[0].set_ylabel("recognised attributes, difference to toybox.yaml, points")
+    panels[1].set_ylabel("multi-face, difference to toybox.yaml, points")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
     return saved(figure, name)
 

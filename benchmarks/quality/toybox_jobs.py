@@ -63,7 +63,7 @@ PAPER_SCALE = 101.0
 """threestudio's 100."""
 LARGEST_SCALES = {"csd": 8, "nfsd": 7.5, "ism": 7.5, "vsd": 7.5, "cfd": 8, "sdi": 8.5}
 """Of other score distillations: those of their papers, in this package's convention, except CSD's,
-whose paper has none, and CFD's.
+whose paper has none, and CFD's, whose code has 75.
 """
 PAPER = "configs/toybox-paper.yaml"
 IMAGE_TARGETS = "configs/toybox-image-targets.yaml"
@@ -78,7 +78,9 @@ WITHOUT_VIEWS = {
 }
 ONE_SIDE = {"system.prompt_processor.view_dependent_left_and_right": "false"}
 WRONG_PRIOR = "another kind's prior"
-"""A variant whose prior gets the prompt with the next kind of object in place of its own."""
+"""Variants whose names begin so have a prior that gets the prompt with the next kind of object in
+place of its own.
+"""
 
 
 class Variant(NamedTuple):
@@ -293,6 +295,20 @@ def growing() -> Iterator[Variant]:
         yield Variant("growing radius", radius, {"system.geometry.grow.radius": radius})
 
 
+def wrong_priors() -> Iterator[Variant]:
+    """The same with a prior of another kind, and the grey ball of ``starts`` with growing."""
+    for one in growing():
+        yield one._replace(name=f"{WRONG_PRIOR}, {one.name}")
+    grown = {name: value for name, value in BALL.items() if not name.endswith("grow.enabled")}
+    yield Variant("grey ball, growing", 0, grown)
+
+
+def prior_quality() -> Iterator[Variant]:
+    """Numbers of steps in which the prior is sampled."""
+    for count in (4, 8, 64):
+        yield Variant("steps of the prior", count, {"system.geometry.prior.num_steps": count})
+
+
 def counts() -> Iterator[Variant]:
     """Numbers of Gaussians, of which a third comes from the prior and the others from growing."""
     for count in (1000, 2000, 4000, 8000):
@@ -354,6 +370,8 @@ CHARTS: dict[str, Callable[[], Iterator[Variant]]] = {
     "steps": over_steps,
     "view_contrast": view_contrast,
     "growing": growing,
+    "wrong_priors": wrong_priors,
+    "prior_quality": prior_quality,
     "counts": counts,
     "paper": paper,
     "distillations": distillations,
@@ -380,7 +398,7 @@ def prompts(sort: str, count: int) -> list[Prompt]:
 
 def options_of(variant: Variant, prompt: str) -> dict[str, Any]:
     """Return the options of a variant's run for a prompt."""
-    if variant.name != WRONG_PRIOR:
+    if not variant.name.startswith(WRONG_PRIOR):
         return variant.options
     return variant.options | {"system.geometry.prior.prompt": of_another_kind(prompt)}
 

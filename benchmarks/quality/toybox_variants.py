@@ -1,6 +1,6 @@
 """Tables of variants of toybox.yaml, each compared with toybox.yaml itself on the same prompts and
 seeds: the paired tables of docs/toybox.md and docs/distillation.md, from docs/charts/toybox.csv and
-toybox_gpu.csv.
+toybox_gpu.csv, and ratios of seconds from benchmarks/results/toybox.csv.
 
 ``recognised`` is the share of the attributes that a prompt asks for (kind, colours, pattern,
 accessory) that the judge finds in the result. A dagger marks comparisons of which both sides were
@@ -17,6 +17,8 @@ import numpy as np
 from benchmarks.markdown import markdown
 from benchmarks.quality import toybox_jobs
 from benchmarks.quality.chart_runs import grouped
+from benchmarks.quality.runs import rows_of
+from benchmarks.quality.tables import RESULTS
 from benchmarks.quality.toybox_tables import (
     NOT_MEASURED,
     Row,
@@ -29,7 +31,8 @@ from benchmarks.quality.toybox_tables import (
 from threestudio_gaussiandreamer.evaluation.intervals import paired, per_prompt
 
 HEAD = ("variant", "prompts × seeds", "recognised, %", "− toybox.yaml")
-HEAD += ("multi-face, %", "− toybox.yaml", "CPU seconds", "of toybox.yaml")
+HEAD += ("multi-face, %", "− toybox.yaml", "haze, %", "of toybox.yaml")
+SECONDS = ("CPU seconds", "of toybox.yaml")
 DISTILLATIONS = ("paper", "distillations", "cheaper")
 """Charts that docs/distillation.md shows; docs/toybox.md shows the others."""
 SETTINGS = [
@@ -50,8 +53,15 @@ EARLIER = {
 
 
 def distillations() -> str:
-    """Return the table of score distillations and of cheaper steps with the learned models."""
-    return table(*DISTILLATIONS)
+    """Return the table of score distillations and of cheaper steps with the learned models, with
+    the ratio of their seconds to those of toybox.yaml in runs that were made for that.
+    """
+    ratios = {title: f"{ratio:.1f}" for title, ratio in relative_seconds(timed_runs()).items()}
+    lines = [
+        (*line_of(marked_title(own[0]), own, plain), ratios.get(title_of(own[0]), ""))
+        for own, plain in pairs_of_charts(measured(), DISTILLATIONS)
+    ]
+    return markdown((*HEAD, "seconds / toybox.yaml's"), lines) if lines else NOT_MEASURED
 
 
 def on_gpu() -> str:
@@ -66,7 +76,7 @@ def on_gpu() -> str:
     lines = [line_of(f"{toybox_jobs.DEFAULT} on CPUs", same, both)] if both else []
     pairs = pairs_of_charts([*rows, *lacking(rows, measured())], DISTILLATIONS)
     lines += [line_of(marked_title(own[0]), own, plain) for own, plain in pairs]
-    return markdown(HEAD[:-2], [line[:-2] for line in lines]) if lines else NOT_MEASURED
+    return markdown(HEAD, lines) if lines else NOT_MEASURED
 
 
 def lacking(rows: Sequence[Row], others: Sequence[Row]) -> list[Row]:
@@ -82,7 +92,10 @@ def lacking(rows: Sequence[Row], others: Sequence[Row]) -> list[Row]:
 
 def settings() -> str:
     """Return the table of earlier models, and of all settings but the distillation's."""
-    return table(*SETTINGS, first=earlier_models(measured()))
+    lines = earlier_models(measured())
+    pairs = pairs_of_charts(measured(), SETTINGS)
+    lines += [timed_line_of(marked_title(own[0]), own, plain) for own, plain in pairs]
+    return markdown((*HEAD, *SECONDS), lines) if lines else NOT_MEASURED
 
 
 def earlier_models(rows: Sequence[Row]) -> list[tuple[str, ...]]:
@@ -100,7 +113,8 @@ def earlier_models(rows: Sequence[Row]) -> list[tuple[str, ...]]:
             own = [row for row in before if place(row)[:2] in plain]
             if own:
                 title = EARLIER[own[0]["setup"]] + mark
-                lines.append(line_of(title, own, [plain[place(row)[:2]] for row in own]))
+                same = [plain[place(row)[:2]] for row in own]
+                lines.append(timed_line_of(title, own, same))
     return lines
 
 
@@ -108,13 +122,6 @@ def states_of(rows: Sequence[Row]) -> list[str]:
     """Return the known states that these rows have, the newest first."""
     found = {row["setup"] for row in rows}
     return [setup for setup in (toybox_jobs.setup(), *EARLIER) if setup in found]
-
-
-def table(*charts: str, first: Sequence[tuple[str, ...]] = ()) -> str:
-    """Return the lines ``first``, and one for each variant of these charts that was measured."""
-    pairs = pairs_of_charts(measured(), charts)
-    lines = [*first, *(line_of(marked_title(own[0]), own, plain) for own, plain in pairs)]
-    return markdown(HEAD, lines) if lines else NOT_MEASURED
 
 
 def pairs_of_charts(
@@ -153,8 +160,42 @@ def line_of(title: str, own: list[Row], plain: list[Row]) -> tuple[str, ...]:
         counts_of(own),
         mean(recognised[0]), difference(*recognised),
         mean(faces[0]), difference(*faces),
-        *(median_of(rows, "cpu_seconds") for rows in with_seconds(own, plain)),
+        *(haze(rows) for rows in (own, plain)),
     )  # fmt: skip
+
+
+def timed_line_of(title: str, own: list[Row], plain: list[Row]) -> tuple[str, ...]:
+    """Return the same with the seconds of both."""
+    seconds = (median_of(rows, "cpu_seconds") for rows in with_seconds(own, plain))
+    return *line_of(title, own, plain), *seconds
+
+
+def haze(rows: list[Row]) -> str:
+    """Return the mean alpha around the object, in percent; nothing where a row has none."""
+    values = [row["haze"] for row in rows]
+    return f"{100 * statistics.fmean(map(float, values)):.1f}" if all(values) else ""
+
+
+def relative_seconds(rows: Iterable[Row]) -> dict[str, float]:
+    """Return the median ratio of each variant's seconds to those of toybox.yaml with the same
+    prompt, seed and present models on the same machine.
+    """
+
+    def where(row: Row) -> tuple[str, ...]:
+        return *place(row), row["machine"]
+
+    timed = grouped((row for row in rows if row["cpu_seconds"] and is_present(row)), title_of)
+    plain = {where(row): float(row["cpu_seconds"]) for row in timed[toybox_jobs.DEFAULT]}
+    ratios = {
+        title: [float(row["cpu_seconds"]) / plain[where(row)] for row in own if where(row) in plain]
+        for title, own in timed.items()
+    }
+    return {title: statistics.median(found) for title, found in ratios.items() if found}
+
+
+def timed_runs() -> list[Row]:
+    """Return the rows that have seconds, and those of runs that were made only for these."""
+    return [*measured(), *rows_of(toybox_jobs.CHART, RESULTS)]
 
 
 def with_seconds(own: list[Row], plain: list[Row]) -> tuple[list[Row], list[Row]]:

@@ -74,6 +74,11 @@ def label_at(label: str, scale: str) -> str:
     return f"{label}, s = {scale}" + " (its paper's)" * (own is not None and f"{own:g}" == scale)
 
 
+def of_one_machine(rows: list[Row]) -> list[Row]:
+    """Return the rows of the machine that has the most, since seconds of two aren't comparable."""
+    return max(grouped(rows, lambda row: row["machine"]).values(), key=len, default=[])
+
+
 def draw_charts(rows: list[Row]) -> None:
     shown = {
         ("variants_seconds", "cpu_seconds"): DISTILLATIONS,
@@ -84,6 +89,8 @@ def draw_charts(rows: list[Row]) -> None:
         title = TITLES.get(name, TITLES["variants"])
         label = SECONDS if column == "cpu_seconds" else EVALUATIONS
         chosen = at_best(rows, lines)
+        if column == "cpu_seconds":
+            chosen = of_one_machine(chosen)
         if chosen:
             print(draw(name, Chart(title, column, label, curves=True, size=SIZE), chosen))
 

@@ -8,7 +8,7 @@ from benchmarks.markdown import markdown, read
 from benchmarks.quality.chart_runs import PAPER, Row, ends, grouped, median, objects_of
 from benchmarks.quality.runs import rows_of
 from benchmarks.quality.tables import RESULTS
-from benchmarks.quality.variant_charts import DIVERSITY, at_best
+from benchmarks.quality.variant_charts import DIVERSITY, at_best, of_one_machine
 from benchmarks.quality.variants import (
     BINNED,
     BLIND,
@@ -76,7 +76,7 @@ def quality() -> str:
             *faults(found),
             f"{median(found, 'saturation'):.2f}",
             f"{median(found, 'evaluations'):,.0f}",
-            f"{median(found, 'cpu_seconds'):.0f}",
+            f"{median(of_one_machine(found), 'cpu_seconds'):.0f}",
             tried(label, rows),
             diversity(line_of(label), found[0]["x"]),
             own_scale(label, rows),
@@ -162,7 +162,7 @@ def cheaper() -> str:
             f"{label}, s = {best[label]}",
             *per_object(own, objects),
             f"{median(last(own), 'evaluations'):,.0f}",
-            f"{median(last(own), 'cpu_seconds'):.0f}",
+            f"{median(of_one_machine(last(own)), 'cpu_seconds'):.0f}",
             tried(f"{label}, s =", rows),
             f"{sorted(gains)[len(gains) // 2]:+.1f}" if gains else "–",
         ]

@@ -76,7 +76,9 @@ class Line(NamedTuple):
     variant: str
     options: dict[str, Any]
     own_scale: Optional[float] = None
-    """The guidance scale of its paper, or the nearest in ``SCALES``; None if it names none."""
+    """The guidance scale of its paper (CFD's is that of its released configuration, 75), or the
+    nearest in ``SCALES``; None if it names none.
+    """
     scales: tuple[float, ...] = SCALES
 
 
@@ -101,7 +103,7 @@ DISTILLATIONS = {
     "NFSD": Line("nfsd", {}, 8.5),
     "VSD": Line("vsd", {}, 8.5),
     "ISM": Line("ism", {}, 8.5),
-    "CFD": Line("cfd", FALLING),
+    "CFD": Line("cfd", FALLING, 101.0),
     "SDI": Line("sdi", FALLING | {"system.guidance.weighting_strategy": "x0"}, 8.5),
 }
 CHEAPER = {
@@ -215,16 +217,30 @@ def scales_of(label: str, best: dict[str, str]) -> set[float]:
 
 def best_scales(rows: list[Row]) -> dict[str, str]:
     """Return the scale of each line with the largest dB at the end on the first object with the
-    first seed, with which all scales are tried.
+    first seed, with which all scales are tried, or, of the scales that were run with all seeds of
+    that one, the one with the largest median.
     """
     rows = [row for row in rows if row["truth"] == BINNED]
-    first = (objects_of(rows)[0], rows[0]["seed"]) if rows else None
-    best = {}
-    tried = [row for row in rows if (row["object"], row["seed"]) == first]
-    for label, own in grouped(tried, lambda row: row["variant"]).items():
-        scales = grouped(own, lambda row: row["x"])
-        best[label] = max(scales, key=lambda x: median_end(scales[x]))
-    return best
+    first = (objects_of(rows)[0], rows[0]["seed"]) if rows else ("", "")
+    on_first = [row for row in rows if row["object"] == first[0]]
+    tried = {(row["variant"], row["x"]) for row in on_first if row["seed"] == first[1]}
+    own = [row for row in on_first if (row["variant"], row["x"]) in tried]
+    return {
+        label: best_of(grouped(found, lambda row: row["x"]), first[1])
+        for label, found in grouped(own, lambda row: row["variant"]).items()
+    }
+
+
+def best_of(scales: dict[str, list[Row]], first: str) -> str:
+    """Return the best of these scales of a line; each is run with the seed ``first``."""
+
+    def end(scale: str, seeds: set[str]) -> float:
+        return median_end([row for row in scales[scale] if row["seed"] in seeds])
+
+    best = max(scales, key=lambda scale: end(scale, {first}))
+    seeds = {row["seed"] for row in scales[best]}
+    complete = [x for x, own in scales.items() if seeds <= {row["seed"] for row in own}]
+    return max(complete, key=lambda scale: end(scale, seeds))
 
 
 def median_end(rows: list[Row]) -> float:

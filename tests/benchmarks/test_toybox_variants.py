@@ -36,27 +36,29 @@ def test_seeds_that_are_not_complete_are_told():
 def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypatch):
     """Of three prompts the variant has two; it misses the accessory that one of them asks for."""
     right = dict.fromkeys(toybox_tables.RECOGNIZED, "1") | {"multi_face": "0.25", "seed": "0"}
-    right |= {"setup": toybox_jobs.setup(), "judge": toybox_jobs.judge_of()}
+    right |= {"setup": toybox_jobs.setup(), "judge": toybox_jobs.judge_of(), "haze": "0.01"}
     prompts = {"0": "a red fox", "1": "a red fox with a blue hat", "2": "a blue car"}
     rows = [
         right | {"variant": DEFAULT, "x": "0", "index": i, "prompt": text, "cpu_seconds": "50"}
         for i, text in prompts.items()
     ]
-    other = {"variant": "CSD", "x": "4", "cpu_seconds": "70"}
+    other = {"variant": "CSD", "x": "4", "cpu_seconds": "70", "haze": "0.02"}
     rows += [rows[0] | other, rows[1] | other | {"accessory": "0", "multi_face": "nan"}]
     monkeypatch.setattr(toybox_variants, "measured", lambda: rows)
     monkeypatch.setattr(
         toybox_variants.toybox_jobs, "CHARTS", {"mine": lambda: [Variant("CSD", 4), Variant("no")]}
     )
-    head, _, line = toybox_variants.table("mine").splitlines()
+    monkeypatch.setattr(toybox_variants, "SETTINGS", ["mine"])
+    monkeypatch.setattr(toybox_variants, "EARLIER", {})
+    head, _, line = toybox_variants.settings().splitlines()
     assert line.startswith("| CSD 4 | 2 × 1 | 83 | -17 (")  # kind and colours of three attributes
-    assert line.endswith("| 25 | +0 | 70 | 50 |") and len(head.split("|")) == 10
+    assert line.endswith("| 25 | +0 | 2.0 | 1.0 | 70 | 50 |") and len(head.split("|")) == 12
     earlier = [row | {"setup": "earlier"} for row in rows]
     rows.append(earlier[0] | other)  # isn't paired with results of other models
-    assert toybox_variants.table("mine").splitlines()[2:] == [line]
+    assert toybox_variants.settings().splitlines()[2:] == [line]
     rows[len(rows) - 1 :] = earlier
     marked = line.replace("CSD 4", "CSD 4 †")
-    assert toybox_variants.table("mine").splitlines()[2:] == [line, marked]
+    assert toybox_variants.settings().splitlines()[2:] == [line, marked]
     monkeypatch.setattr(toybox_variants, "EARLIER", {"none": "others", "earlier": "the first"})
     (first,) = toybox_variants.earlier_models(rows)
     assert first[:4] == ("the first", "3 × 1", "100", "+0 (+0 – +0)")
@@ -66,10 +68,32 @@ def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypat
 def test_seconds_are_of_the_pairs_that_have_them():
     own = [row(cpu_seconds="10"), row(seed="1", cpu_seconds=""), row(seed="2", cpu_seconds="30")]
     plain = [row(cpu_seconds="5"), row(cpu_seconds="7"), row(cpu_seconds="")]
-    assert toybox_variants.line_of("mine", own, plain)[-2:] == ("10", "5")
-    assert toybox_variants.line_of("mine", own[1:], plain[1:])[-2:] == ("", "")
+    assert toybox_variants.timed_line_of("mine", own, plain)[-2:] == ("10", "5")
+    assert toybox_variants.timed_line_of("mine", own[1:], plain[1:])[-2:] == ("", "")
     assert chart_runs.median(own, "cpu_seconds") == 20
     assert math.isnan(chart_runs.median(own[1:2], "cpu_seconds"))
+
+
+def test_seconds_are_relative_to_those_of_the_same_prompt_on_the_same_machine(monkeypatch):
+    plain = [row(cpu_seconds="10"), row(index="1", cpu_seconds="20")]
+    own = {"variant": "CSD", "x": "4", "machine": "a"}
+    rows = [one | {"machine": machine} for one in plain for machine in "ab"]
+    rows += [row(cpu_seconds="15") | own, row(index="1", cpu_seconds="80") | own]
+    rows += [row(cpu_seconds="") | own, row(cpu_seconds="99", seed="1") | own]
+    assert toybox_variants.relative_seconds(rows) == {DEFAULT: 1.0, "CSD 4": 2.75}
+    measured = [one | {"cpu_seconds": ""} for one in rows]
+    monkeypatch.setattr(toybox_variants, "measured", lambda: measured)
+    monkeypatch.setattr(toybox_variants, "rows_of", lambda chart, folder: rows)
+    assert (
+        toybox_variants.distillations()
+        .splitlines()[2]
+        .endswith("| 100 | +0 | 100.0 | 100.0 | 2.8 |")
+    )
+
+
+def test_haze_is_shown_where_all_rows_have_it():
+    assert toybox_variants.haze([row(haze="0.01"), row(haze="0.02")]) == "1.5"
+    assert toybox_variants.haze([row(haze="0.01"), row(haze="")]) == ""
 
 
 def test_rows_of_another_judge_are_not_of_the_present_state():

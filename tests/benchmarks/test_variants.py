@@ -169,3 +169,8 @@ def test_scales_are_compared_with_the_seed_that_all_were_run_with():
     common = {"truth": variants.BINNED, "variant": "VSD", "object": "toy", "step": "240"}
     rows = [common | {"x": x, "seed": seed, "psnr": str(dB)} for x, seed, dB in runs_of]
     assert variants.best_scales(rows) == {"VSD": "31"}
+    more = [
+        common | {"x": "8.5", "seed": seed, "psnr": dB} for seed, dB in (("1", 19), ("2", 18.7))
+    ]
+    assert variants.best_scales(rows + more[:1]) == {"VSD": "31"}
+    assert variants.best_scales(rows + more) == {"VSD": "8.5"}

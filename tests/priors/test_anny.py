@@ -72,6 +72,18 @@ def test_a_texture_colours_the_body(with_tiny_anny, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("option", "default"), [({"frame": 1}, "0"), ({"pose_up": "z"}, "auto")], ids=str
+)
+def test_options_of_a_pose_file_need_one(option, default, with_tiny_anny, tmp_path):
+    np.savez(tmp_path / "a.npz", poses=np.zeros((2, 66)))
+    wanted = f"{next(iter(option))} has no effect with pose=T, .*: leave it at {default}"
+    with pytest.raises(UserError, match=wanted):
+        make(pose="T", **option)
+    make(pose="T", frame=0, pose_up="auto").preflight()
+    make(pose=str(tmp_path / "a.npz"), **option).preflight()
+
+
+@pytest.mark.parametrize(
     ("options", "problem"),
     [
         ({"pose": "siting"}, "unknown pose 'siting': did you mean 'sitting'"),

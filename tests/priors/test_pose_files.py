@@ -10,12 +10,12 @@ from threestudio_gaussiandreamer.priors.body_pose import INDEX, named_pose, pose
 from threestudio_gaussiandreamer.priors.pose_files import read_axis_angles, read_pose
 from threestudio_gaussiandreamer.priors.skeleton import BODY_JOINTS
 
-FRAMES = 3
+FRAMES = 5
 
 
 @pytest.fixture
 def angles():
-    """Rotations of 52 joints in three frames."""
+    """Rotations of 52 joints in all frames."""
     return np.random.default_rng(0).normal(scale=0.4, size=(FRAMES, 52, 3))
 
 
@@ -54,6 +54,36 @@ def test_a_single_frame_needs_no_dimension(shape, angles, tmp_path):
     one = angles[0].reshape(-1)[: np.prod(shape)].reshape(shape)
     np.save(tmp_path / "pose.npy", one)
     found, _ = read_axis_angles(tmp_path / "pose.npy", 0)
+    wanted = Rotation.from_rotvec(angles[0, :BODY_JOINTS]).as_matrix()
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 4, 21, 22])
+@pytest.mark.parametrize("root", [(3,), (1, 3)], ids=str)
+@pytest.mark.parametrize("body", [(63,), (21, 3), (69,), (23, 3)], ids=str)
+def test_body_poses_have_any_number_of_frames(frames, root, body, tmp_path):
+    """Also as many frames as joints."""
+    angles = np.random.default_rng(1).normal(scale=0.4, size=(frames, 24, 3))
+    joints = np.prod(body) // 3
+    path = saved(
+        tmp_path,
+        global_orient=angles[:, 0].reshape(frames, *root),
+        body_pose=angles[:, 1 : joints + 1].reshape(frames, *body),
+    )
+    found, _ = read_axis_angles(path, frames - 1)
+    wanted = Rotation.from_rotvec(angles[-1, :BODY_JOINTS]).as_matrix()
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("root", [(3,), (1, 3), (1, 1, 3)], ids=str)
+@pytest.mark.parametrize("body", [(63,), (21, 3), (1, 63), (1, 21, 3)], ids=str)
+def test_a_single_body_pose_needs_no_dimension(root, body, angles, tmp_path):
+    path = saved(
+        tmp_path,
+        global_orient=angles[0, 0].reshape(root),
+        body_pose=angles[0, 1:BODY_JOINTS].reshape(body),
+    )
+    found, _ = read_axis_angles(path, 0)
     wanted = Rotation.from_rotvec(angles[0, :BODY_JOINTS]).as_matrix()
     np.testing.assert_allclose(found, wanted, atol=1e-9)
 
@@ -99,6 +129,11 @@ def test_a_bvh_gives_the_body_its_pose(up, stick_body, tmp_path):
         ({"poses": np.full((1, 72), 1e300)}, "too large"),
         ({"trans": np.zeros((1, 3))}, "neither an array 'poses' nor 'body_pose'"),
         ({"body_pose": np.zeros((2, 63)), "global_orient": np.zeros((3, 3))}, "global_orient"),
+        ({"body_pose": np.zeros((0, 63))}, r"holds an array \(0, 66\)"),
+        ({"body_pose": np.zeros((0, 63)), "global_orient": np.zeros((0, 3))}, "holds an array"),
+        ({"body_pose": np.zeros((3, 63)), "global_orient": np.zeros(9)}, "global_orient"),
+        ({"body_pose": np.zeros((4, 63)), "global_orient": np.zeros((2, 6))}, "global_orient"),
+        ({"body_pose": np.zeros((2, 63)), "global_orient": np.zeros((2, 3, 3))}, "global_orient"),
         ({"body_pose": np.zeros((2, 60)), "global_orient": np.zeros((2, 3))}, "holds an array"),
     ],
 )
@@ -109,8 +144,8 @@ def test_wrong_arrays_are_refused(arrays, problem, stick_body, tmp_path):
 
 def test_a_frame_beyond_the_end_is_refused(stick_body, angles, tmp_path):
     path = saved(tmp_path, poses=angles.reshape(FRAMES, -1))
-    with pytest.raises(UserError, match="has 3 frames, numbered from 0; there is no 3"):
-        read_pose(str(path), stick_body, frame=3)
+    with pytest.raises(UserError, match="has 5 frames, numbered from 0; there is no 5"):
+        read_pose(str(path), stick_body, frame=FRAMES)
 
 
 def test_missing_and_unknown_files_are_refused(stick_body, tmp_path):

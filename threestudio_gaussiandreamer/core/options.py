@@ -11,7 +11,7 @@ of a field. Every number must be representable in float32 or int64."""
 import dataclasses
 import string
 from collections.abc import Callable, Collection, Mapping, Sequence
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 from .errors import UserError, unknown
@@ -236,6 +236,34 @@ def checked_options(config_class: type, cfg: Any, prefix: str = "") -> SimpleNam
     """
     check_options(config_class, cfg, prefix)
     return _copied_section(config_class, cfg)
+
+
+def require_defaults(
+    config_class: type,
+    cfg: Any,
+    names: Collection[str],
+    reason: str,
+    *,
+    prefix: str = "",
+    neutral: Mapping[str, Any] = MappingProxyType({}),
+) -> None:
+    """Check that options without effect are at their defaults.
+
+    Args:
+        names: the options that have no effect.
+        reason: when that is so, such as "with pose=A".
+        prefix: see :func:`check_options`.
+        neutral: values by name that do nothing, where the default does something.
+
+    Raises:
+        UserError: one of them has another value.
+    """
+    for option in dataclasses.fields(config_class):
+        unset = (option.default, neutral.get(option.name, option.default))
+        if option.name in names and getattr(cfg, option.name) not in unset:
+            raise UserError(
+                f"{prefix}{option.name} has no effect {reason}: leave it at {option.default}"
+            )
 
 
 def _copied_section(config_class: type, cfg: Any) -> SimpleNamespace:

@@ -60,6 +60,7 @@ from .reuse import Error, KeptPrediction
 from .score_model import GUIDANCE_SCALE, ScoreModel
 from .score_pictures import score_pictures
 from .variants import Variant
+from .variants.base import require_unset
 
 __all__ = ["GUIDANCE_SCALE", "NonFiniteScore", "ScoreDistillation"]
 
@@ -108,7 +109,7 @@ class ScoreDistillation(ScoreModel):
         """Return the model of the renders' own distribution that ``vsd-variant`` trains.
 
         Args:
-            options: the variant's.
+            options: the variant's, without effect of those in ``PARTICLES_IGNORE``.
         """
         return GaussianParticles(options.momentum)
 
@@ -127,6 +128,8 @@ class ScoreDistillation(ScoreModel):
         """
         cfg = parse_structured(cls.Config, cfg)
         variant_class(cfg).preflight(cls, cfg)
+        if cfg.guidance_scale == 1:
+            require_unset(cls, cfg, cls.UNGUIDED_IGNORES, "with guidance_scale=1, no guidance")
 
     @classmethod
     def is_text_guided(cls, cfg: Any) -> bool:
@@ -135,6 +138,12 @@ class ScoreDistillation(ScoreModel):
 
     REPORTS: tuple[str, ...] = ()
     """The keys of :meth:`report`, which ``checkpoint.monitor`` may name."""
+
+    UNGUIDED_IGNORES: tuple[str, ...] = ("guidance_interval", "recon_std_rescale")
+    """Options that have no effect if ``guidance_scale`` is 1."""
+
+    PARTICLES_IGNORE: tuple[str, ...] = ("rank", "lr", "samples", "camera_dropout")
+    """Options of ``vsd-variant`` that :meth:`particle_model` doesn't read."""
 
     LOSSES: tuple[str, ...] = ("sds",)
     """Names of the losses that a step returns, without the prefix ``loss_``."""

@@ -54,6 +54,7 @@ from .model_images import size_of_images
 from .particles import ParticleModel
 from .scale_input import scale_input, scale_width
 from .text_condition import Condition, Embeddings, Latents, Timesteps, view_of_row
+from .variants.base import require_unset
 from .view_contrast import check_view_contrast, contrasted, opposite
 
 USUAL_SCALES = 200
@@ -97,6 +98,9 @@ class TextToImageDistillation(ScoreDistillation):
     """The models that this guidance takes."""
     scale_width: Optional[int] = None
     """Width of the guidance scale's embedding; None if the network doesn't take the scale."""
+    # guidance_interval also limits view contrast and Perp-Neg, which need no scale
+    UNGUIDED_IGNORES = ("recon_std_rescale",)
+    PARTICLES_IGNORE = ("momentum",)
 
     # Loading
     # ----------------------------------------------------------------------------------------------
@@ -105,6 +109,8 @@ class TextToImageDistillation(ScoreDistillation):
     def preflight(cls, cfg: Any) -> None:
         cfg = parse_structured(cls.Config, cfg)
         super().preflight(cfg)
+        if not cfg.view_contrast:
+            require_unset(cls, cfg, ("view_contrast_from",), "with view_contrast=0")
         cls._find(cfg, download=False)
 
     @classmethod

@@ -35,7 +35,16 @@ import numpy as np
 
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file
-from ..core.options import Rule, in_range, is_number, is_whole, one_of, rule, satisfies
+from ..core.options import (
+    Rule,
+    in_range,
+    is_number,
+    is_whole,
+    one_of,
+    require_defaults,
+    rule,
+    satisfies,
+)
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.budget import Budget
@@ -95,6 +104,12 @@ class AnnyPrior(Prior):
         scale: float = field(default=1.0, metadata=SCALE)
         num_points: int = field(default=50_000, metadata=points(0))
         color: Any = field(default="random", metadata=COLOR)
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            if cfg.pose in POSES:
+                unused = f"with pose={cfg.pose}, which isn't a file"
+                require_defaults(AnnyPrior.Config, cfg, ("frame", "pose_up"), unused)
 
     cfg: Config
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from ..core.errors import UserError
 from ..core.files import existing_file
-from ..core.options import in_range, one_of
+from ..core.options import in_range, one_of, require_defaults
 from ..formats.gaussian_files import read_stored
 from ..formats.producers import GAUSSIANS, from_producer, producer_axes
 from ..gaussians.axes import AXES, WORLD_UP
@@ -65,6 +65,9 @@ class GaussiansPrior(Prior):
             require_no_axes_beside_producer(cfg, cfg.up)
             if cfg.producer:
                 producer_axes(cfg.producer, GAUSSIANS)
+            elif cfg.normalize is None:
+                unused = "without normalize or producer"
+                require_defaults(GaussiansPrior.Config, cfg, ("scale",), unused)
 
     cfg: Config
 

@@ -8,6 +8,7 @@
 J is 22, 24, 52 or 55 joints in the order of SMPL, SMPL-H or SMPL-X, of which the first 22 are used.
 y is up, but in files with AMASS's frame rate, where z is."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -96,8 +97,8 @@ def _rotations(arrays: dict[str, np.ndarray], path: Path) -> np.ndarray:
             f"pose file {str(path)!r} has neither an array 'poses' nor 'body_pose': {EXPECTED}"
         )
     flat = _flat(arrays["body_pose"])
-    root = _flat(arrays["global_orient"]) if "global_orient" in arrays else np.zeros((len(flat), 3))
-    if len(root) != len(flat) or root.shape[1] != 3:
+    root = _rows(arrays["global_orient"]) if "global_orient" in arrays else np.zeros((len(flat), 3))
+    if root.shape != (len(flat), 3):
         raise UserError(
             f"pose file {str(path)!r} has body_pose {arrays['body_pose'].shape} and global_orient "
             f"{arrays['global_orient'].shape}: {EXPECTED}"
@@ -106,10 +107,15 @@ def _rotations(arrays: dict[str, np.ndarray], path: Path) -> np.ndarray:
 
 
 def _flat(values: np.ndarray) -> np.ndarray:
-    """Reshape (3 J,), (F, 3 J) or (F, J, 3) to two dimensions."""
-    if values.ndim < 2 or values.ndim == 2 and values.shape[1] == 3 and len(values) > 3:
+    """Reshape (3 J,), (J, 3), (F, 3 J) or (F, J, 3) to (frames, 3 J)."""
+    return values.reshape(1, -1) if values.ndim == 2 and values.shape[1] == 3 else _rows(values)
+
+
+def _rows(values: np.ndarray) -> np.ndarray:
+    """Reshape (N,), (F, N) or (F, ...) to (frames, N)."""
+    if values.ndim < 2:
         return values.reshape(1, -1)
-    return values.reshape(len(values), -1)
+    return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
 def _frames(values: np.ndarray, path: Path) -> Float[np.ndarray, "F J 3"]:

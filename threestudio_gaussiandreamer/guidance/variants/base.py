@@ -6,8 +6,8 @@ all else is the same for each: the gradient is w(t) e, clipped, without items th
 eps_c and eps_u are the conditional and the unconditional prediction, eps_hat = eps_u +
 guidance_scale (eps_c - eps_u)."""
 
-import dataclasses
 from abc import ABC, abstractmethod
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ...core.errors import UserError
-from ...core.options import check_options
+from ...core.options import check_options, require_defaults
 from ...host import BaseObject
 
 if TYPE_CHECKING:
@@ -26,6 +26,16 @@ Error = tuple[Float[Tensor, "B c h w"], Float[Tensor, " B"]]
 Batch = dict[str, Any]
 OFF = {"recon_std_rescale": 0.0}
 """Values with which options do nothing, where a guidance's default is another."""
+
+
+def require_unset(
+    guidance: type["ScoreDistillation"], cfg: Any, names: Collection[str], reason: str
+) -> None:
+    """Raise UserError if options of a guidance that have no effect are neither at their defaults
+    nor off; see :func:`.require_defaults`.
+    """
+    prefix = "system.guidance."
+    require_defaults(guidance.Config, cfg, names, reason, prefix=prefix, neutral=OFF)
 
 
 class Variant(BaseObject, ABC):
@@ -71,13 +81,7 @@ class Variant(BaseObject, ABC):
                 "conditional and unconditional score, which is zero with these options of the "
                 "guidance"
             )
-        for option in dataclasses.fields(guidance.Config):
-            neutral = (option.default, OFF.get(option.name, option.default))
-            if option.name in cls.IGNORES and cfg[option.name] not in neutral:
-                raise UserError(
-                    f"system.guidance.{option.name} has no effect with {cfg.variant_type}: leave "
-                    f"it at {option.default}"
-                )
+        require_unset(guidance, cfg, cls.IGNORES, f"with {cfg.variant_type}")
 
     @abstractmethod
     def error(

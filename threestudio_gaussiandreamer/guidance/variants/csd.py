@@ -11,6 +11,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
+from ...core.errors import UserError
 from ...host import register
 from .base import Batch, Error, Variant
 
@@ -19,6 +20,15 @@ from .base import Batch, Error, Variant
 class CSD(Variant):
     NEEDS_UNCONDITIONAL = NEEDS_TEXT = True
     IGNORES = ("guidance_interval", "recon_std_rescale")
+
+    @classmethod
+    def preflight(cls, guidance: Any, cfg: Any) -> None:
+        super().preflight(guidance, cfg)
+        if cfg.guidance_scale == 0:
+            raise UserError(
+                f"system.guidance.guidance_scale: it is the factor of {cfg.variant_type}'s error, "
+                "which is zero with 0: set it to another number"
+            )
 
     def error(
         self, guidance: Any, latents: Float[Tensor, "B c h w"], condition: Any, batch: Batch

@@ -11,7 +11,8 @@ so that with ``weighting_strategy: x0`` the gradient is x minus the denoised z_t
 option           meaning
 ===============  ===================================================================================
 inversion_scale  scale of classifier-free guidance of the inversion; threestudio's -7.5 is -6.5 here
-inversion_steps  DDIM steps from no noise to all; an inversion to t takes its share of them
+inversion_steps  DDIM steps from no noise to all, at most: each is a whole number of timesteps; an
+                 inversion to t takes its share of them
 eta              0 to 1: share of fresh noise in each step of the inversion; threestudio: 0.3
 ===============  ===================================================================================
 
@@ -54,7 +55,8 @@ class SDI(Variant):
         self, guidance: Any, latents: Float[Tensor, "B c h w"], condition: Any, batch: Batch
     ) -> Error:
         t, abar = guidance.draw_timesteps(latents)
-        stride = max(1, len(guidance.alphas_cumprod) // self.cfg.inversion_steps)
+        # rounded up, since each step costs predictions and the option limits their number
+        stride = -(-len(guidance.alphas_cumprod) // self.cfg.inversion_steps)
         scale, eta = self.cfg.inversion_scale, self.cfg.eta
 
         def predict(step: Step) -> Tensor:

@@ -27,8 +27,8 @@ from typing import Any, Optional
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ...core.options import in_range, positive
-from ...host import register
+from ...core.options import in_range, positive, require_defaults
+from ...host import parse_structured, register
 from ..particles import ParticleModel, Renders
 from ..score_pictures import items_of
 from .base import Batch, Error, Variant
@@ -55,6 +55,13 @@ class VSD(Variant):
     def preflight(cls, guidance: Any, cfg: Any) -> None:
         super().preflight(guidance, cfg)
         guidance.check_particle_model(cfg)
+        require_defaults(
+            cls.Config,
+            parse_structured(cls.Config, cfg.variant),
+            guidance.PARTICLES_IGNORE,
+            f"with {guidance.__name__}",
+            prefix="system.guidance.variant.",
+        )
 
     def particles(self, guidance: Any) -> ParticleModel:
         """Return the particle model, which is built on first use, when the networks are loaded."""

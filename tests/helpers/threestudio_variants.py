@@ -1,0 +1,163 @@
+"""threestudio's own SDI and VSD beside this package's, with the same networks, timesteps and noise:
+prints the relative error of each result as JSON. Runs in threestudio's environment.
+"""
+
+import contextlib
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
+
+import threestudio
+import torch
+from diffusers import DDPMScheduler
+from torch.autograd import grad
+
+from tests.helpers import tiny_guidance as tiny
+from threestudio_gaussiandreamer.diffusion import sds
+from threestudio_gaussiandreamer.diffusion.noise_table import NoiseTable
+from threestudio_gaussiandreamer.guidance.lora import particle_noise
+
+VSD = threestudio.find("stable-diffusion-vsd-guidance")
+
+
+class Prompts:
+    """Text embeddings that don't depend on the view's direction."""
+
+    def __init__(self, views, perp_neg=False):
+        self.use_perp_neg = perp_neg
+        self.rows = torch.randn((4 if perp_neg else 2) * views, 77, tiny.tiny_models.TEXT_WIDTH)
+
+    def get_text_embeddings(self, *views, **options):
+        return self.rows
+
+    def get_text_embeddings_perp_neg(self, *views, **options):
+        return self.rows, -torch.rand(len(self.rows) // 4, 2, generator=torch.Generator())
+
+
+def make_models(folder, **settings):
+    """Make tiny models with further settings of the scheduler."""
+    models = tiny.make_models(folder)
+    for model in models.values():
+        path = model / "scheduler" / "scheduler_config.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | settings))
+    return models
+
+
+def their_sdi(models, prediction="epsilon", **options):
+    model = {"pretrained_model_name_or_path": str(models[prediction])}
+    options |= model | {"half_precision_weights": False, "guidance_scale": 7.5}
+    return threestudio.find("stable-diffusion-sdi-guidance")(options)
+
+
+def compare_sdi(models, prediction, eta, perp_neg):
+    """Compare the gradients; both inversions take the steps from 0 to 100, ..., 600 and 650."""
+    plain = 0 if perp_neg else 1  # their scale of guidance is one less, except with Perp-Neg
+    theirs = their_sdi(models, prediction, inversion_eta=eta)
+    variant = {"eta": eta, "inversion_scale": plain - 7.5}
+    options = {"guidance_scale": 7.5 + plain, "weighting_strategy": "x0", "variant": variant}
+    ours = tiny.guidance(models, prediction, variant_type="sdi-variant", **options)
+    for guide in (theirs, ours):
+        guide.min_step = guide.max_step = 650
+    x, noise = torch.randn(1, 4, 8, 8, requires_grad=True), torch.randn(1, 4, 8, 8)
+    arguments = {"prompt_utils": Prompts(1, perp_neg), **tiny.first(1), "rgb_as_latents": True}
+    with mock.patch.object(NoiseTable, "draw", return_value=[noise[0]]):
+        (own,) = grad(ours(x.movedim(1, -1), **arguments)["loss_sds"], x)
+    with (
+        mock.patch("random.random", return_value=0.0),  # no overshoot
+        mock.patch("torch.randn_like", return_value=noise),
+    ):
+        (other,) = grad(theirs(x, **arguments)["loss_sdi"], x)
+    return {"gradient": tiny.relative(own, other * x.numel())}
+
+
+def compare_steps(models):
+    """Compare single steps between the timesteps that threestudio takes by default."""
+    theirs, errors = their_sdi(models, inversion_eta=0.0), []
+    with mock.patch("random.random", return_value=0.5):
+        times = theirs.get_inversion_timesteps(torch.tensor([650]), 1)
+    assert times.tolist() == [-99, 1, 101, 201, 301, 401, 501, 601, 700]
+    z, eps = torch.randn(2, 1, 4, 8, 8)
+    abar = sds.sd_alphas_cumprod()
+    for now, later in zip(times[:-1], times[1:], strict=True):
+        own = sds.ddim_step(z, eps, abar[now.clamp_min(0)][None], abar[later][None])
+        errors.append(tiny.relative(own, theirs.ddim_inversion_step(eps, now, later, z)))
+    return {"step": max(errors)}
+
+
+class GivenNetworks(VSD):
+    """threestudio's VSD with the UNet and the LoRA of one of our guidances, on given latents."""
+
+    def configure(self, ours, folder):
+        self.weights_dtype, self.single_model, self.grad_clip_val = torch.float32, False, None
+        self.scheduler = self.scheduler_lora = DDPMScheduler.from_pretrained(folder / "scheduler")
+        self.alphas, self.num_train_timesteps = self.scheduler.alphas_cumprod, 1000
+        self.set_min_max_steps()
+        lora = ours.variant.particles(ours).lora
+
+        def network(z, t, class_labels=None, cross_attention_kwargs=None, **text):
+            seen = class_labels is not None
+            with lora.applied(ours.unet, class_labels) if seen else contextlib.nullcontext():
+                return ours.unet(z, t, **text)
+
+        pipe = SimpleNamespace(unet=network)
+        network.class_embedding, self.submodules = None, SimpleNamespace(pipe=pipe, pipe_lora=pipe)
+
+    def get_latents(self, rgb_BCHW, rgb_as_latents=False):
+        return rgb_BCHW, None
+
+
+def compare_vsd(models, dropped):
+    """Compare the gradient of two views, the LoRA's loss, and its gradient.
+
+    Args:
+        dropped: train the LoRA without the camera.
+    """
+    variant = {"variant_type": "vsd-variant", "variant": {"camera_dropout": float(dropped)}}
+    ours = tiny.guidance(models, guidance_scale=7.5, **variant)
+    particles = ours.variant.particles(ours)
+    weights = list(particles.lora.parameters())
+    for weight in weights:
+        weight.data += 0.2 * torch.randn(weight.shape)
+    particles.optimizer.step = lambda: None
+    x = torch.randn(2, 4, 8, 8, requires_grad=True)
+    arguments = {"prompt_utils": Prompts(2), **tiny.first(2), "rgb_as_latents": True}
+    arguments |= {"rgb": x.movedim(1, -1), "c2w": torch.randn(2, 4, 4)}
+    out = ours(**arguments)
+    (own,) = grad(out["loss_sds"], x)
+    theirs = GivenNetworks({"guidance_scale": 7.5}, ours, models["epsilon"])
+    draws = ours.add_noise(x), particle_noise(ours, x.detach(), 0)
+    with (
+        mock.patch("random.random", return_value=0.0 if dropped else 1.0),
+        mock.patch("torch.randint", side_effect=[draw.t for draw in draws]),
+        mock.patch("torch.randn_like", side_effect=[draw.noise for draw in draws]),
+    ):
+        their = theirs(mvp_mtx=None, **arguments)
+    pairs = zip(weights, grad(their["loss_lora"], weights), strict=True)
+    loss = float(their["loss_lora"].detach())
+    return {
+        "gradient": tiny.relative(own, *grad(their["loss_vsd"], x)),
+        "loss of the LoRA": abs(out["lora_error"] - loss) / loss,
+        "gradient of the LoRA": max(tiny.relative(weight.grad, other) for weight, other in pairs),
+    }
+
+
+def main(folder):
+    torch.manual_seed(0)
+    published = make_models(folder / "published", clip_sample=False)
+    from_0 = make_models(folder / "from 0", clip_sample=False, steps_offset=0)
+    errors = {"SDI": compare_steps(published)}
+    for prediction in tiny.PREDICTIONS:
+        for eta in (0.0, 0.3):
+            for perp_neg in (False, True):
+                name = f"SDI, {prediction}, eta {eta}{', Perp-Neg' * perp_neg}"
+                errors[name] = compare_sdi(from_0, prediction, eta, perp_neg)
+    for dropped in (False, True):
+        name = "VSD, without camera" if dropped else "VSD"
+        errors[name] = compare_vsd(published, dropped)
+    print(json.dumps(errors))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
