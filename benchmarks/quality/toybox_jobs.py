@@ -78,9 +78,7 @@ WITHOUT_VIEWS = {
 }
 ONE_SIDE = {"system.prompt_processor.view_dependent_left_and_right": "false"}
 WRONG_PRIOR = "another kind's prior"
-"""Variants whose names begin so have a prior that gets the prompt with the next kind of object in
-place of its own.
-"""
+"""How variants begin whose prior's prompt has the next kind of object in place of its own."""
 
 
 class Variant(NamedTuple):
@@ -170,10 +168,6 @@ def exact_score() -> Iterator[Variant]:
     options |= {"system.guidance_type": "exact-score-guidance"}
     guidance |= {"mesh": "toy.glb", "guidance_scale": 1.0}
     yield Variant(EXACT, 0, options | {"system.guidance": guidance})
-
-
-def default() -> Iterator[Variant]:
-    yield Variant(DEFAULT)
 
 
 def over_steps() -> Iterator[Variant]:
@@ -348,10 +342,6 @@ def rates() -> Iterator[Variant]:
         yield Variant("learning rates", factor, changed)
 
 
-def paper() -> Iterator[Variant]:
-    yield Variant(PAPER_RECIPE, 0, overlay(PAPER))
-
-
 def overlay(name: str) -> dict[str, Any]:
     """Return the options of a configuration that is laid over toybox.yaml."""
     return dict(leaves(yaml.safe_load((ROOT / name).read_text())))
@@ -360,7 +350,7 @@ def overlay(name: str) -> dict[str, Any]:
 CHARTS: dict[str, Callable[[], Iterator[Variant]]] = {
     "references": references,
     "exact_score": exact_score,
-    "default": default,
+    "default": lambda: iter([Variant(DEFAULT)]),
     "guidance": over_guidance,
     "haze": haze,
     "image_targets": image_targets,
@@ -373,7 +363,7 @@ CHARTS: dict[str, Callable[[], Iterator[Variant]]] = {
     "wrong_priors": wrong_priors,
     "prior_quality": prior_quality,
     "counts": counts,
-    "paper": paper,
+    "paper": lambda: iter([Variant(PAPER_RECIPE, 0, overlay(PAPER))]),
     "distillations": distillations,
     "cheaper": cheaper,
     "smoothness": smoothness,

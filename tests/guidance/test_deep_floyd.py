@@ -166,3 +166,16 @@ def test_the_schedule_is_the_models_to_its_last_step(model):
     found = guidance(model).alphas_cumprod
     assert found[-1] < 1e-8
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("variant", ["csd", "nfsd", "vsd", "sdi", "ism", "cfd"])
+def test_every_variant_gives_a_gradient(model, prompts, variant):
+    surface = {"depth": torch.full((4, 16, 16, 1), 2.0), "opacity": torch.ones(4, 16, 16, 1)}
+    cameras = {"c2w": torch.eye(4).repeat(4, 1, 1), "fovy": torch.ones(4)}
+    guide = guidance(model, variant_type=f"{variant}-variant")
+    plain, _ = gradient(guidance(model), prompts[False], renders())
+    grad, out = gradient(guide, prompts[False], renders(), **surface, **cameras)
+    assert grad.isfinite().all() and grad.any() and out["bad_items"] == 0
+    assert variant == "vsd" or not torch.allclose(
+        grad, plain
+    )  # a new LoRA predicts what it is given

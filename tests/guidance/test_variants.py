@@ -176,10 +176,10 @@ def test_sdi_without_fresh_noise_follows_the_trajectory(monkeypatch):
     assert_close(error_of(guidance, x), torch.stack(expected))
 
 
-def test_sdi_is_threestudios_step_by_step():
-    """threestudio's inversion of one item (stable_diffusion_sdi_guidance.py, v0.2.3), written again
-    from its formulas: ddim_inversion_step with its variance of DDPM's reverse step, guidance in its
-    convention, and x minus the denoised z_t. Its random overshoot of the last step is left out.
+def test_sdi_with_fresh_noise_follows_the_formulas_step_by_step():
+    """One item, by threestudio's formulas on this package's timesteps: each step with a share of
+    the deviation of DDPM's reverse step, guidance in its convention, and x minus the denoised z_t.
+    tests/host/test_real_variants.py runs threestudio's own code.
     """
     options = {"guidance_scale": 8.5, "weighting_strategy": "x0"}
     guidance, x = mixture_guidance("sdi-variant", step=11, **options), latents(1)
@@ -218,6 +218,29 @@ def test_ism_is_the_change_of_the_score_over_the_interval(monkeypatch):
             alpha = guidance.alphas_cumprod[time]
             scores.append((1 - alpha) ** 0.5 * at / (alpha * STD**2 + 1 - alpha))
         expected.append(scores[1] - scores[0])
+    assert_close(error_of(guidance, x), torch.stack(expected))
+
+
+def test_ism_inverts_with_the_unconditional_score_and_subtracts_it():
+    """Step by step, where the conditional score is another."""
+    guidance, x = mixture_guidance("ism-variant", guidance_scale=7.5), latents(7)
+    abars, expected = guidance.alphas_cumprod, []
+
+    def scores(z, t):
+        return (score[0] for score in both_scores(guidance, z[None], torch.tensor([t])))
+
+    def step(z, eps, now, later):
+        denoised = (z - (1 - abars[now]) ** 0.5 * eps) / abars[now] ** 0.5
+        return abars[later] ** 0.5 * denoised + (1 - abars[later]) ** 0.5 * eps
+
+    for z, t in zip(x, guidance.draw_timesteps(x)[0].tolist(), strict=True):
+        s = max(t - 50, 0)
+        for start in range(0, s, 200):
+            _, uncond = scores(z, start)
+            z = step(z, uncond, start, min(start + 200, s))
+        _, before = scores(z, s)
+        cond, uncond = scores(step(z, before, s, t), t)
+        expected.append(uncond + 7.5 * (cond - uncond) - before)
     assert_close(error_of(guidance, x), torch.stack(expected))
 
 
@@ -261,3 +284,10 @@ def test_cfd_uses_the_surfaces_noise():
     assert_close(error_of(guidance, x, batch), uncond + 7.5 * (cond - uncond) - noise)
     assert torch.equal(noise[0], noise[1])  # two views from the same place
     assert not torch.equal(noise, guidance.normal(x, "noise"))
+
+
+@pytest.mark.parametrize("refresh", [0, 3])
+def test_cfd_draws_new_noise_for_the_cells_after_so_many_steps(refresh):
+    guidance, x = mixture_guidance("cfd-variant", variant={"refresh": refresh}), latents(2)
+    first, second, third = (guidance.variant.table(step, x).clone() for step in (0, 2, 3))
+    assert torch.equal(first, second) and torch.equal(first, third) == (refresh == 0)

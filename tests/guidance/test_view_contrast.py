@@ -74,12 +74,15 @@ def test_each_view_keeps_its_opposite_in_a_guidance_interval(models, views, z):
     torch.testing.assert_close(got[:2], plain[:2])
 
 
-@pytest.mark.parametrize("variant", ["sds", "csd", "nfsd", "ism", "sdi"])
+@pytest.mark.parametrize("variant", ["sds", "csd", "nfsd", "vsd", "ism", "sdi", "cfd"])
 def test_every_variant_follows_it(models, views, variant):
+    surface = {"depth": torch.full((4, 16, 16, 1), 2.0), "opacity": torch.ones(4, 16, 16, 1)}
+    cameras = {"c2w": torch.eye(4).repeat(4, 1, 1), "fovy": torch.ones(4)}
+
     def norm(contrast):
         name = f"{variant}-variant"
         guide = tiny.guidance(models, guidance_scale=4.0, variant_type=name, view_contrast=contrast)
-        return float(guide(tiny.renders(), views, **BATCH)["grad_norm"])
+        return float(guide(tiny.renders(), views, **BATCH | surface | cameras)["grad_norm"])
 
     assert abs(norm(1.0) / norm(0.0) - 1) > 1e-3
 

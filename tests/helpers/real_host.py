@@ -35,8 +35,7 @@ def output_of(module: str, *arguments: str | Path) -> str:
         "PYTHONPATH": os.pathsep.join(str(place) for place in places if str(place)),
     }
     command = [str(HOST / "venv" / "bin" / "python"), "-W", "ignore", "-m", module]
-    done = subprocess.run(
-        [*command, *map(str, arguments)], env=environment, capture_output=True, text=True
-    )
+    command += map(str, arguments)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

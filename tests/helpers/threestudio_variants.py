@@ -2,7 +2,7 @@
 prints the relative error of each result as JSON. Runs in threestudio's environment.
 """
 
-import contextlib
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -13,6 +13,7 @@ import threestudio
 import torch
 from diffusers import DDPMScheduler
 from torch.autograd import grad
+from torch.nn.utils import parameters_to_vector
 
 from tests.helpers import tiny_guidance as tiny
 from threestudio_gaussiandreamer.diffusion import sds
@@ -23,38 +24,35 @@ VSD = threestudio.find("stable-diffusion-vsd-guidance")
 
 
 class Prompts:
-    """Text embeddings that don't depend on the view's direction."""
+    """Random text embeddings, with and without words for the view."""
 
     def __init__(self, views, perp_neg=False):
         self.use_perp_neg = perp_neg
         self.rows = torch.randn((4 if perp_neg else 2) * views, 77, tiny.tiny_models.TEXT_WIDTH)
 
-    def get_text_embeddings(self, *views, **options):
-        return self.rows
+    def get_text_embeddings(
+        self, elevation, azimuth, camera_distances, view_dependent_prompting=True
+    ):
+        return self.rows if view_dependent_prompting else -self.rows
 
     def get_text_embeddings_perp_neg(self, *views, **options):
         return self.rows, -torch.rand(len(self.rows) // 4, 2, generator=torch.Generator())
 
 
-def make_models(folder, **settings):
-    """Make tiny models with further settings of the scheduler."""
-    models = tiny.make_models(folder)
-    for model in models.values():
-        path = model / "scheduler" / "scheduler_config.json"
-        path.write_text(json.dumps(json.loads(path.read_text()) | settings))
-    return models
-
-
-def their_sdi(models, prediction="epsilon", **options):
-    model = {"pretrained_model_name_or_path": str(models[prediction])}
-    options |= model | {"half_precision_weights": False, "guidance_scale": 7.5}
-    return threestudio.find("stable-diffusion-sdi-guidance")(options)
+def their_sdi(models, prediction, eta, steps_offset=1):
+    """Return threestudio's SDI; by default with the steps_offset of Stable Diffusion's files."""
+    options = {"pretrained_model_name_or_path": str(models[prediction]), "inversion_eta": eta}
+    options |= {"half_precision_weights": False, "guidance_scale": 7.5}
+    theirs = threestudio.find("stable-diffusion-sdi-guidance")(options)
+    for scheduler in (theirs.scheduler, theirs.inverse_scheduler):
+        scheduler.register_to_config(clip_sample=False, steps_offset=steps_offset)
+    return theirs
 
 
 def compare_sdi(models, prediction, eta, perp_neg):
     """Compare the gradients; both inversions take the steps from 0 to 100, ..., 600 and 650."""
     plain = 0 if perp_neg else 1  # their scale of guidance is one less, except with Perp-Neg
-    theirs = their_sdi(models, prediction, inversion_eta=eta)
+    theirs = their_sdi(models, prediction, eta, steps_offset=0)
     variant = {"eta": eta, "inversion_scale": plain - 7.5}
     options = {"guidance_scale": 7.5 + plain, "weighting_strategy": "x0", "variant": variant}
     ours = tiny.guidance(models, prediction, variant_type="sdi-variant", **options)
@@ -74,7 +72,7 @@ def compare_sdi(models, prediction, eta, perp_neg):
 
 def compare_steps(models):
     """Compare single steps between the timesteps that threestudio takes by default."""
-    theirs, errors = their_sdi(models, inversion_eta=0.0), []
+    theirs, errors = their_sdi(models, "epsilon", 0.0), []
     with mock.patch("random.random", return_value=0.5):
         times = theirs.get_inversion_timesteps(torch.tensor([650]), 1)
     assert times.tolist() == [-99, 1, 101, 201, 301, 401, 501, 601, 700]
@@ -87,19 +85,25 @@ def compare_steps(models):
 
 
 class GivenNetworks(VSD):
-    """threestudio's VSD with the UNet and the LoRA of one of our guidances, on given latents."""
+    """threestudio's VSD with the UNet and the LoRA of one of our guidances, on given latents. The
+    UNet's own prediction is that of the noise, which it requires; the LoRA's is the model's.
+    """
 
     def configure(self, ours, folder):
         self.weights_dtype, self.single_model, self.grad_clip_val = torch.float32, False, None
-        self.scheduler = self.scheduler_lora = DDPMScheduler.from_pretrained(folder / "scheduler")
+        self.scheduler, self.scheduler_lora = (
+            DDPMScheduler.from_pretrained(folder / "scheduler") for _ in range(2)
+        )
+        self.scheduler.register_to_config(prediction_type="epsilon")
         self.alphas, self.num_train_timesteps = self.scheduler.alphas_cumprod, 1000
         self.set_min_max_steps()
         lora = ours.variant.particles(ours).lora
 
-        def network(z, t, class_labels=None, cross_attention_kwargs=None, **text):
-            seen = class_labels is not None
-            with lora.applied(ours.unet, class_labels) if seen else contextlib.nullcontext():
-                return ours.unet(z, t, **text)
+        def network(z, t, encoder_hidden_states, class_labels=None, cross_attention_kwargs=None):
+            if class_labels is None:
+                return SimpleNamespace(sample=ours.noise(z, t.long(), encoder_hidden_states))
+            with lora.applied(ours.unet, class_labels):
+                return ours.unet(z, t, encoder_hidden_states=encoder_hidden_states)
 
         pipe = SimpleNamespace(unet=network)
         network.class_embedding, self.submodules = None, SimpleNamespace(pipe=pipe, pipe_lora=pipe)
@@ -108,14 +112,17 @@ class GivenNetworks(VSD):
         return rgb_BCHW, None
 
 
-def compare_vsd(models, dropped):
-    """Compare the gradient of two views, the LoRA's loss, and its gradient.
+def compare_vsd(models, prediction, dropped):
+    """Compare the gradient of two views, without words for the view, since threestudio's LoRA gets
+    none; and if the LoRA predicts the noise, its loss and its gradient, since threestudio's loss is
+    the error of v where it predicts v.
 
     Args:
         dropped: train the LoRA without the camera.
     """
     variant = {"variant_type": "vsd-variant", "variant": {"camera_dropout": float(dropped)}}
-    ours = tiny.guidance(models, guidance_scale=7.5, **variant)
+    options = {"guidance_scale": 7.5, "view_dependent_prompting": False}
+    ours = tiny.guidance(models, prediction, **options, **variant)
     particles = ours.variant.particles(ours)
     weights = list(particles.lora.parameters())
     for weight in weights:
@@ -126,7 +133,7 @@ def compare_vsd(models, dropped):
     arguments |= {"rgb": x.movedim(1, -1), "c2w": torch.randn(2, 4, 4)}
     out = ours(**arguments)
     (own,) = grad(out["loss_sds"], x)
-    theirs = GivenNetworks({"guidance_scale": 7.5}, ours, models["epsilon"])
+    theirs = GivenNetworks(options, ours, models[prediction])
     draws = ours.add_noise(x), particle_noise(ours, x.detach(), 0)
     with (
         mock.patch("random.random", return_value=0.0 if dropped else 1.0),
@@ -134,28 +141,25 @@ def compare_vsd(models, dropped):
         mock.patch("torch.randn_like", side_effect=[draw.noise for draw in draws]),
     ):
         their = theirs(mvp_mtx=None, **arguments)
-    pairs = zip(weights, grad(their["loss_lora"], weights), strict=True)
-    loss = float(their["loss_lora"].detach())
-    return {
-        "gradient": tiny.relative(own, *grad(their["loss_vsd"], x)),
-        "loss of the LoRA": abs(out["lora_error"] - loss) / loss,
-        "gradient of the LoRA": max(tiny.relative(weight.grad, other) for weight, other in pairs),
-    }
+    errors = {"gradient": tiny.relative(own, *grad(their["loss_vsd"], x))}
+    if prediction == "epsilon":
+        loss = their["loss_lora"]
+        pair = [weight.grad for weight in weights], grad(loss, weights)
+        errors["gradient of the LoRA"] = tiny.relative(*map(parameters_to_vector, pair))
+        errors["loss of the LoRA"] = abs(out["lora_error"] / float(loss.detach()) - 1)
+    return errors
 
 
 def main(folder):
     torch.manual_seed(0)
-    published = make_models(folder / "published", clip_sample=False)
-    from_0 = make_models(folder / "from 0", clip_sample=False, steps_offset=0)
-    errors = {"SDI": compare_steps(published)}
-    for prediction in tiny.PREDICTIONS:
-        for eta in (0.0, 0.3):
-            for perp_neg in (False, True):
-                name = f"SDI, {prediction}, eta {eta}{', Perp-Neg' * perp_neg}"
-                errors[name] = compare_sdi(from_0, prediction, eta, perp_neg)
-    for dropped in (False, True):
-        name = "VSD, without camera" if dropped else "VSD"
-        errors[name] = compare_vsd(published, dropped)
+    models = tiny.make_models(folder)
+    errors = {"SDI, single steps": compare_steps(models)}
+    for prediction, eta, perp_neg in itertools.product(tiny.PREDICTIONS, (0.0, 0.3), (False, True)):
+        name = f"SDI, {prediction}, eta {eta}{', Perp-Neg' * perp_neg}"
+        errors[name] = compare_sdi(models, prediction, eta, perp_neg)
+    for prediction, dropped in itertools.product(tiny.PREDICTIONS, (False, True)):
+        name = f"VSD, {prediction}{', without the camera' * dropped}"
+        errors[name] = compare_vsd(models, prediction, dropped)
     print(json.dumps(errors))
 
 

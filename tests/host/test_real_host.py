@@ -1,27 +1,14 @@
 """The drop-in inside an unmodified threestudio: all stages on its own launch.py, registry, base
-classes, data module and savers.
-
-Needs ``THREESTUDIO_SRC`` (a checkout of threestudio v0.2.3), ``HOST3_DIR`` (where the harness has
-put the environment that it starts in) and the harness itself, in ``GAUSSIANDREAMER_SHARED`` or
-``../shared``; skipped without."""
+classes, data module and savers; skipped without what ``tests/helpers/real_host.py`` needs.
+"""
 
 import os
 import subprocess
 from pathlib import Path
 
-import pytest
+from tests.helpers.real_host import HARNESS, NEEDED, REPOSITORY, SHARED
 
-REPOSITORY = Path(__file__).resolve().parents[2]
-SHARED = Path(os.environ.get("GAUSSIANDREAMER_SHARED", REPOSITORY.parent / "shared"))
-HARNESS = SHARED / "real_host" / "try_extension.sh"
-HOST = Path(os.environ.get("HOST3_DIR", "no such folder"))
-
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not os.environ.get("THREESTUDIO_SRC"), reason="THREESTUDIO_SRC isn't set"),
-    pytest.mark.skipif(not HARNESS.is_file(), reason="the harness isn't there"),
-    pytest.mark.skipif(not (HOST / "venv").is_dir(), reason="HOST3_DIR has no environment"),
-]
+pytestmark = NEEDED
 
 SMALL = [
     f"system.guidance.mesh={SHARED / 'assets' / 'spot.glb'}",

@@ -142,12 +142,15 @@ def test_all_attributes_of_gaussians_are_scaled(tmp_path):
     assert np.ptp(still.means, axis=0).max() == pytest.approx(2 * SIZE, rel=1e-5)
 
 
-def test_a_scale_that_is_not_applied_to_gaussians_is_refused():
+@pytest.mark.parametrize(
+    ("name", "producer"), [("gaussians-prior", "lgm"), ("point-cloud-prior", "triposg")]
+)
+def test_a_scale_that_is_not_applied_is_refused(name, producer):
     options = {"path": "a.ply", "scale": SCALE}
     with pytest.raises(UserError, match="scale has no effect without normalize or producer: leave"):
-        find("gaussians-prior")(options)
-    for used in ({"producer": "lgm"}, {"normalize": True}, {"normalize": False}, {"scale": 1.0}):
-        find("gaussians-prior")(options | used)
+        find(name)(options)
+    for used in ({"producer": producer}, {"normalize": True}, {"normalize": False}, {"scale": 1.0}):
+        find(name)(options | used)
 
 
 @pytest.mark.parametrize("name", ["mesh-prior", "point-cloud-prior", "gaussians-prior"])

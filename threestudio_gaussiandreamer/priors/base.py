@@ -30,6 +30,7 @@ from ..core.options import (
     is_numbers,
     one_of,
     positive,
+    require_defaults,
     required,
     satisfies,
 )
@@ -103,6 +104,12 @@ def is_normalized(cfg: Any) -> bool:
     producer.
     """
     return bool(cfg.producer) if cfg.normalize is None else cfg.normalize
+
+
+def require_used_scale(config_class: type, cfg: Any) -> None:
+    """Raise UserError if ``scale`` is set where nothing says that points are scaled."""
+    if cfg.normalize is None and not cfg.producer:
+        require_defaults(config_class, cfg, ("scale",), "without normalize or producer")
 
 
 class Prior(BaseObject):

@@ -27,7 +27,7 @@ import numpy as np
 
 from ..core.errors import UserError
 from ..core.files import existing_file
-from ..core.options import in_range, one_of, require_defaults
+from ..core.options import in_range, one_of
 from ..formats.gaussian_files import read_stored
 from ..formats.producers import GAUSSIANS, from_producer, producer_axes
 from ..gaussians.axes import AXES, WORLD_UP
@@ -44,6 +44,7 @@ from .base import (
     is_normalized,
     report_non_finite,
     require_no_axes_beside_producer,
+    require_used_scale,
 )
 
 
@@ -65,9 +66,7 @@ class GaussiansPrior(Prior):
             require_no_axes_beside_producer(cfg, cfg.up)
             if cfg.producer:
                 producer_axes(cfg.producer, GAUSSIANS)
-            elif cfg.normalize is None:
-                unused = "without normalize or producer"
-                require_defaults(GaussiansPrior.Config, cfg, ("scale",), unused)
+            require_used_scale(GaussiansPrior.Config, cfg)
 
     cfg: Config
 

@@ -41,7 +41,16 @@ from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.load import mesh_formats, pose_rotation, read_parts
 from ..meshes.mesh import GREY, vertex_surface_colors
-from .base import PATH, PRODUCER, SCALE, Prior, file_axes, is_normalized, require_axes
+from .base import (
+    PATH,
+    PRODUCER,
+    SCALE,
+    Prior,
+    file_axes,
+    is_normalized,
+    require_axes,
+    require_used_scale,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -62,6 +71,7 @@ class PointCloudPrior(Prior):
         @staticmethod
         def check(cfg: Any) -> None:
             require_axes(cfg, axes_kind(Path(cfg.path)))
+            require_used_scale(PointCloudPrior.Config, cfg)
 
     cfg: Config
 

@@ -11,6 +11,7 @@ so that with ``weighting_strategy: x0`` the gradient is x minus the denoised z_t
 option           meaning
 ===============  ===================================================================================
 inversion_scale  scale of classifier-free guidance of the inversion; threestudio's -7.5 is -6.5 here
+                 without Perp-Neg, and -7.5 with it
 inversion_steps  DDIM steps from no noise to all, at most: each is a whole number of timesteps; an
                  inversion to t takes its share of them
 eta              0 to 1: share of fresh noise in each step of the inversion; threestudio: 0.3
