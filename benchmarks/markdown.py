@@ -25,6 +25,11 @@ def write(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]])
         file.write(text.getvalue().encode())
 
 
+def write_rows(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write rows of values in the order of the columns, as :func:`write` does."""
+    write(path, columns, (dict(zip(columns, row, strict=True)) for row in rows))
+
+
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]

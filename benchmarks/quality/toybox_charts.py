@@ -241,8 +241,9 @@ def draw_against_seconds(name: str, found: Sequence[Setting], ratios: dict[str, 
         panel.plot([1], [0], "D", color="0.2", markersize=11, label=DEFAULT)
         for place, one in enumerate(found):
             value = paired(values_of(one.own, measure), values_of(one.plain, measure))
-            marker, size = ("*", 16) if one.title == PAPER_RECIPE else ("osv^"[place // 20], 7)
-            panel.plot([ratios[one.title]], [100 * value.mean], marker, color=colors[place % 20],
+            turn, color = divmod(place, len(colors))
+            marker, size = ("*", 16) if one.title == PAPER_RECIPE else ("osv^"[turn], 7)
+            panel.plot([ratios[one.title]], [100 * value.mean], marker, color=colors[color],
                        markersize=size, label=one.title, markeredgecolor="0.2")  # fmt: skip
         panel.axhline(0, color="0.5", linewidth=1)
         set_log_x(panel)

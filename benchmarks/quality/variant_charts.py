@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.markdown import write
+from benchmarks.markdown import write_rows
 from benchmarks.quality import runs
 from benchmarks.quality.chart_runs import PAPER, SECONDS, Chart, Row, draw, grouped
 from benchmarks.quality.variants import (
@@ -98,14 +98,13 @@ def draw_charts(rows: list[Row]) -> None:
 def write_diversity(pictures: Path, rows: list[Row]) -> None:
     """Compute the diversity of each line, scale and object that two seeds or more have run."""
     runs_of = grouped({tuple(row[name] for name in KEY) for row in rows}, lambda key: key[:-1])
-    columns, found = [*KEY[:-1], "seeds", "diversity"], []
+    found = []
     for place, keys in sorted(runs_of.items()):
         folders = [picture_folder(pictures, key) for key in sorted(keys)]
         folders = [folder for folder in folders if folder.is_dir()]
         if len(folders) > 1:
-            row = *place, len(folders), f"{difference(folders):.4f}"
-            found.append(dict(zip(columns, row, strict=True)))
-    write(runs.CHARTS / f"{DIVERSITY}.csv", columns, found)
+            found.append((*place, len(folders), f"{difference(folders):.4f}"))
+    write_rows(runs.CHARTS / f"{DIVERSITY}.csv", [*KEY[:-1], "seeds", "diversity"], found)
 
 
 def difference(folders: list[Path]) -> float:

@@ -13,7 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.markdown import write
+from benchmarks.markdown import write_rows
 from benchmarks.start.launched import ROOT, checkouts_of, commit_of, paired_parser
 from benchmarks.start.step_shares import THREADS
 
@@ -32,9 +32,8 @@ def main() -> None:
             for checkout, folder in checkouts.items():
                 seconds = converted(folder, Path(path).resolve())
                 print(f"{name}, {checkout}: {seconds:.2f} CPU s", flush=True)
-                row = name, checkout, commit_of(folder), number, f"{seconds:.3f}"
-                rows.append(dict(zip(COLUMNS, row, strict=True)))
-    write(RESULTS, COLUMNS, rows)
+                rows.append((name, checkout, commit_of(folder), number, f"{seconds:.3f}"))
+    write_rows(RESULTS, COLUMNS, rows)
 
 
 def converted(checkout: Path, cloud: Path) -> float:

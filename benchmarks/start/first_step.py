@@ -9,7 +9,7 @@ change little. Writes ``benchmarks/results/start.csv``."""
 import statistics
 from pathlib import Path
 
-from benchmarks.markdown import write
+from benchmarks.markdown import write_rows
 from benchmarks.start.launched import ROOT, checkouts_of, commit_of, paired_parser, run_with_probe
 
 RESULTS = ROOT / "benchmarks/results/start.csv"
@@ -34,8 +34,7 @@ def main() -> None:
             print(f"{name}: {ends['first step']:.2f} CPU s", flush=True)
             place = (name, commit_of(checkout), number)
             rows += [(*place, *stage) for stage in seconds_by_stage(ends).items()]
-    written = ((*place, f"{seconds:.3f}") for *place, seconds in rows)
-    write(RESULTS, COLUMNS, (dict(zip(COLUMNS, row, strict=True)) for row in written))
+    write_rows(RESULTS, COLUMNS, ((*place, f"{seconds:.3f}") for *place, seconds in rows))
     for name in checkouts:
         print(f"{name}: median {median_total(rows, name):.2f} CPU s to the first step")
 

@@ -10,7 +10,7 @@ workloads in ``benchmarks/results/step.csv``."""
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.markdown import read, write
+from benchmarks.markdown import read, write_rows
 from benchmarks.start.launched import ROOT, checkouts_of, commit_of, paired_parser, run_with_probe
 
 RESULTS = ROOT / "benchmarks/results/step.csv"
@@ -49,18 +49,15 @@ def main() -> None:
     args = parser.parse_args()
     checkouts = checkouts_of(args.against)
     earlier = read(RESULTS) if RESULTS.exists() else []
-    rows = [row for row in earlier if row["workload"] not in args.workloads]
+    rows = [tuple(row.values()) for row in earlier if row["workload"] not in args.workloads]
     for number in range(args.rounds):
         for workload in args.workloads:
             for name, checkout in checkouts.items():
                 parts = milliseconds(checkout, WORKLOADS[workload], args.steps)
                 print(f"{workload}, {name}: {sum(parts.values()):.1f} ms", parts, flush=True)
                 place = (workload, name, commit_of(checkout), number)
-                rows += [
-                    dict(zip(COLUMNS, (*place, part, f"{ms:.3f}"), strict=True))
-                    for part, ms in parts.items()
-                ]
-    write(RESULTS, COLUMNS, rows)
+                rows += [(*place, part, f"{ms:.3f}") for part, ms in parts.items()]
+    write_rows(RESULTS, COLUMNS, rows)
 
 
 def milliseconds(checkout: Path, workload: Workload, window: list[int]) -> dict[str, float]:

@@ -176,6 +176,4 @@ def test_every_variant_gives_a_gradient(model, prompts, variant):
     plain, _ = gradient(guidance(model), prompts[False], renders())
     grad, out = gradient(guide, prompts[False], renders(), **surface, **cameras)
     assert grad.isfinite().all() and grad.any() and out["bad_items"] == 0
-    assert variant == "vsd" or not torch.allclose(
-        grad, plain
-    )  # a new LoRA predicts what it is given
+    assert not torch.allclose(grad, plain)
