@@ -32,6 +32,7 @@ from threestudio_gaussiandreamer.evaluation.intervals import paired, per_prompt
 
 HEAD = ("variant", "prompts × seeds", "recognised, %", "− toybox.yaml")
 HEAD += ("multi-face, %", "− toybox.yaml", "haze, %", "of toybox.yaml")
+WRONG_PRIOR = toybox_jobs.WRONG_PRIOR
 SECONDS = ("CPU seconds", "of toybox.yaml")
 DISTILLATIONS = ("paper", "distillations", "cheaper")
 """Charts that docs/distillation.md shows; docs/toybox.md shows the others."""
@@ -64,9 +65,9 @@ def distillations() -> str:
     return markdown((*HEAD, "seconds / toybox.yaml's"), lines) if lines else NOT_MEASURED
 
 
-def on_gpu() -> str:
-    """Return the table of runs on a GPU, of which the first line is toybox.yaml on CPUs. Runs of
-    these variants that the GPU lacks are taken from CPUs.
+def on_gpu(charts: Iterable[str] = DISTILLATIONS) -> str:
+    """Return the table of these charts' runs on a GPU, of which the first line is toybox.yaml on
+    CPUs. Runs of these variants that the GPU lacks are taken from CPUs.
     """
     rows = measured(toybox_jobs.GPU_CHART)
     default = [row for row in rows if row["variant"] == toybox_jobs.DEFAULT and is_present(row)]
@@ -74,9 +75,26 @@ def on_gpu() -> str:
     both = [row for row in default if place(row) in on_cpus]
     same = [on_cpus[place(row)] for row in both]
     lines = [line_of(f"{toybox_jobs.DEFAULT} on CPUs", same, both)] if both else []
-    pairs = pairs_of_charts([*rows, *lacking(rows, measured())], DISTILLATIONS)
+    pairs = pairs_of_charts([*rows, *lacking(rows, measured())], charts)
     lines += [line_of(marked_title(own[0]), own, plain) for own, plain in pairs]
     return markdown(HEAD, lines) if lines else NOT_MEASURED
+
+
+def settings_on_gpu() -> str:
+    return on_gpu(SETTINGS)
+
+
+def wrong_priors_on_gpu() -> str:
+    """Return the table of parts of growing with a prior of another kind, each compared with the
+    same prior and all of growing.
+    """
+    gpu = measured(toybox_jobs.GPU_CHART)
+    rows = [*gpu, *lacking(gpu, measured())]
+    parts = [one.key for one in toybox_jobs.wrong_priors() if one.name.startswith(WRONG_PRIOR)]
+    pairs = [pair for key in parts for pair in pairs_of(rows, *key, base=WRONG_PRIOR)]
+    lines = [line_of(marked_title(own[0]), own, whole) for own, whole in pairs]
+    head = [title.replace(toybox_jobs.DEFAULT, WRONG_PRIOR) for title in HEAD]
+    return markdown(head, lines) if lines else NOT_MEASURED
 
 
 def lacking(rows: Sequence[Row], others: Sequence[Row]) -> list[Row]:
@@ -132,12 +150,14 @@ def pairs_of_charts(
     return (pair for key in keys for pair in pairs_of(rows, *key))
 
 
-def pairs_of(rows: Sequence[Row], name: str, x: str) -> list[tuple[list[Row], list[Row]]]:
-    """Return the rows of a variant, and those of toybox.yaml with the same prompts and seeds: one
+def pairs_of(
+    rows: Sequence[Row], name: str, x: str, base: str = toybox_jobs.DEFAULT
+) -> list[tuple[list[Row], list[Row]]]:
+    """Return the rows of a variant, and those of ``base`` with the same prompts and seeds: one
     pair for each state of models, configuration and judge with which both were measured, or that of
     the present one alone if it has as many as ENOUGH.
     """
-    plain = {place(row): row for row in rows if row["variant"] == toybox_jobs.DEFAULT}
+    plain = {place(row): row for row in rows if row["variant"] == base}
     same = (row for row in rows if (row["variant"], row["x"]) == (name, x) and place(row) in plain)
     groups = grouped(same, lambda row: place(row)[2:])
     present = [own for own in groups.values() if is_present(own[0]) and len(own) >= ENOUGH]

@@ -27,6 +27,24 @@ def test_variants_on_a_gpu_are_compared_there(monkeypatch):
     assert [line[:10] for line in toybox_variants.on_gpu().splitlines()[2:]] == ["| CSD 4 † "]
 
 
+def test_settings_on_a_gpu_are_compared_there_and_parts_of_growing_with_the_same_prior(monkeypatch):
+    """Of four variants two are settings, of which one is a part of growing with a wrong prior. It
+    is compared with that prior and all of growing, not with toybox.yaml; nothing else is.
+    """
+    wrong = toybox_jobs.WRONG_PRIOR
+    rows = [row(), row(variant="CSD", x="4"), row(variant=wrong, x="0", kind="0")]
+    charts = {toybox.CHART: [], toybox_jobs.GPU_CHART: rows}
+    monkeypatch.setattr(toybox_variants, "measured", lambda chart=toybox.CHART: charts[chart])
+    assert toybox_variants.wrong_priors_on_gpu() == toybox_tables.NOT_MEASURED
+    rows.append(row(variant=f"{wrong}, no growing", x="0", kind="0", colors="0"))
+    lines = toybox_variants.settings_on_gpu().splitlines()[2:]
+    assert lines[0].startswith(f"| {wrong} | 1 × 1 | 50 | -50 |")
+    assert lines[1].startswith(f"| {wrong}, no growing | 1 × 1 | 0 | -100 |") and len(lines) == 2
+    head, _, line = toybox_variants.wrong_priors_on_gpu().splitlines()
+    assert head.count(f"− {wrong}") == 2 and toybox_jobs.DEFAULT not in head
+    assert line.startswith(f"| {wrong}, no growing | 1 × 1 | 0 | -50 |")
+
+
 def test_seeds_that_are_not_complete_are_told():
     rows = [row(), row(seed="1"), row(index="1", prompt="a blue car")]
     assert toybox_variants.counts_of(rows) == "2 × 1 to 2"
