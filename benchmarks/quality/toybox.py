@@ -60,9 +60,7 @@ from benchmarks.quality.toybox_jobs import (
     setup,
     setup_of_samples,
 )
-from benchmarks.quality.toybox_jobs import (
-    CHARTS as VARIANTS,
-)
+from benchmarks.quality.toybox_options import CHARTS as VARIANTS
 from threestudio_gaussiandreamer.guidance.half_precision import cpu_multiplies_bfloat16
 
 KEY = ("variant", "x", "withheld", "index", "seed", "setup", "judge")

@@ -1,16 +1,14 @@
-"""The runs that benchmarks/quality/toybox.py measures: variants of configs/toybox.yaml, and the
-prompts for them.
+"""What the runs of benchmarks/quality/toybox.py are made of: variants of configs/toybox.yaml, which
+toybox_options.py lists, prompts, and digests of what every run depends on.
 """
 
 import functools
 import hashlib
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
 
-from benchmarks.quality.jobs import held
 from benchmarks.quality.runs import ROOT
 from threestudio_gaussiandreamer.core.streams import numpy_generator
 from threestudio_gaussiandreamer.models.bundled import (
@@ -26,7 +24,6 @@ from threestudio_gaussiandreamer.toybox import recognition
 from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
 from threestudio_gaussiandreamer.toybox.words import describe
 from threestudio_gaussiandreamer.toybox.world import KINDS, VERSION, draw_attributes
-from threestudio_gaussiandreamer.view.config_changes import leaves
 
 CHART = "toybox"
 GPU_CHART = "toybox_gpu"
@@ -59,26 +56,7 @@ MODELS_BESIDE_GUIDANCE = (
 """The options that take the models from the guidance, for one without models."""
 PROMPT_SEED = 5000
 """Of the attributes and words of prompts; trainings use others."""
-PAPER_SCALE = 101.0
-"""threestudio's 100."""
-LARGEST_SCALES = {"csd": 8, "nfsd": 7.5, "ism": 7.5, "vsd": 7.5, "cfd": 8, "sdi": 8.5}
-"""Of other score distillations: those of their papers, in this package's convention, except CSD's,
-whose paper has none, and CFD's, whose code has 75.
-"""
-PAPER = "configs/toybox-paper.yaml"
-IMAGE_TARGETS = "configs/toybox-image-targets.yaml"
-BALL = {
-    "system.geometry.prior_type": "random-prior",
-    "system.geometry.prior": "{num_points: 3000, size: 0.8, color: grey}",
-    "system.geometry.grow.enabled": "false",
-}
-WITHOUT_VIEWS = {
-    "system.guidance.view_dependent_prompting": "false",
-    "system.guidance.view_contrast": 0,
-}
-ONE_SIDE = {"system.prompt_processor.view_dependent_left_and_right": "false"}
 WRONG_PRIOR = "another kind's prior"
-"""How variants begin whose prior's prompt has the next kind of object in place of its own."""
 
 
 class Variant(NamedTuple):
@@ -88,6 +66,8 @@ class Variant(NamedTuple):
     x: float = 0.0
     """The number that a chart varies; 0 if it varies none."""
     options: dict[str, Any] = {}
+    wrong_prior: bool = False
+    """Whether the prior's prompt has the next kind of object in place of its own."""
 
     @property
     def key(self) -> tuple[str, str]:
@@ -137,239 +117,6 @@ def digest(content: Any) -> str:
     return hashlib.blake2b(repr(content).encode(), digest_size=4).hexdigest()
 
 
-def steps(count: int) -> dict[str, Any]:
-    """Return the options of a run of ``count`` steps, with its schedules in proportion."""
-    geometry, guidance = CONFIG["system"]["geometry"], CONFIG["system"]["guidance"]
-    rates = {
-        f"system.geometry.{name}": [*value[:3], count]
-        for name, value in geometry.items()
-        if name.startswith("lr_") and isinstance(value, list)
-    }
-    start, high, low, _ = guidance["max_step_percent"]
-    falls = start * count // STEPS
-    return rates | {
-        "trainer.max_steps": count,
-        "system.guidance.max_step_percent": [falls, high, low, falls + 1],
-    }
-
-
-def references() -> Iterator[Variant]:
-    """The judge's ceiling, and the 2D model's own samples over its guidance scale."""
-    yield Variant(TRUTH)
-    for scale in (1, 2, GUIDANCE, 8):
-        yield Variant(SAMPLES, scale)
-
-
-def exact_score() -> Iterator[Variant]:
-    """The same run with a 2D model that makes no errors."""
-    names = ("min_step_percent", "max_step_percent", "weighting_strategy")
-    guidance = {name: CONFIG["system"]["guidance"][name] for name in names}
-    options = dict.fromkeys(MODELS_BESIDE_GUIDANCE, NAME)
-    options |= {"system.guidance_type": "exact-score-guidance"}
-    guidance |= {"mesh": "toy.glb", "guidance_scale": 1.0}
-    yield Variant(EXACT, 0, options | {"system.guidance": guidance})
-
-
-def over_steps() -> Iterator[Variant]:
-    """Numbers of steps beside the configuration's."""
-    for count in (75, 300, 600):
-        yield Variant("steps", count, steps(count))
-
-
-def over_guidance() -> Iterator[Variant]:
-    """Scales of guidance beside the configuration's, 1 without guidance except for the contrast of
-    views, and the last that of the paper.
-    """
-    for scale in (1, 2, 8, 15, 30, PAPER_SCALE):
-        yield Variant("guidance scale", scale, {"system.guidance.guidance_scale": scale})
-
-
-def schedules() -> Iterator[Variant]:
-    """Ranges of timesteps, and clipping."""
-    yield Variant("timesteps up to 0.98 throughout", 0, {"system.guidance.max_step_percent": 0.98})
-    low = {"system.guidance.max_step_percent": CONFIG["system"]["guidance"]["max_step_percent"]}
-    yield Variant("timesteps from 0.2", 0, low | {"system.guidance.min_step_percent": 0.2})
-    yield Variant("timesteps that fall by the root of the step", 0, falling("sqrt"))
-    for clip in (0.1, 0.5):
-        yield Variant("grad_clip", clip, {"system.guidance.grad_clip": clip})
-    rescaled = {"system.guidance.recon_std_rescale": 0.5}
-    yield Variant("recon_std_rescale 0.5", 0, rescaled)
-
-
-def image_targets() -> Iterator[Variant]:
-    """Towards pictures of few views: as in the overlay; their number and strength; when; and with
-    shapes.
-    """
-    own = overlay(IMAGE_TARGETS)
-    yield Variant("image targets", 0, own)
-    yield Variant("image targets train shapes too", 0, own | targets(colors_only="false"))
-    for views in (3, 6):
-        yield Variant("views of image targets", views, own | targets(views=views))
-    for strength in (0.5, 0.9):
-        yield Variant("strength of image targets", strength, own | targets(strength=strength))
-    yield Variant("image targets from step 30", 0, own | targets(start=30, stop=60))
-    low = "system.guidance.max_step_percent"
-    yield Variant("largest timestep 0.3 at the end", 0, {low: own[low]})
-
-
-def targets(**options: Any) -> dict[str, Any]:
-    """Return options of the stage."""
-    return {f"system.image_targets.{name}": value for name, value in options.items()}
-
-
-def falling(schedule: str) -> dict[str, Any]:
-    """Return the options of timesteps that fall in the course of the run."""
-    return {
-        "system.guidance.max_step_percent": 0.98,
-        "system.guidance.timestep_schedule": schedule,
-        "system.guidance.timestep_steps": STEPS,
-    }
-
-
-def distillations() -> Iterator[Variant]:
-    """Other score distillations at several guidance scales; CFD and SDI use their papers'
-    decreasing timesteps.
-    """
-    own_options = {
-        "csd": {},
-        "nfsd": {},
-        "ism": {},
-        "vsd": {},
-        "cfd": falling("linear"),
-        "sdi": falling("linear") | {"system.guidance.weighting_strategy": "x0"},
-    }
-    for name, options in own_options.items():
-        options = options | {"system.guidance.variant_type": f"{name}-variant"}
-        for scale in (2, GUIDANCE, LARGEST_SCALES[name]):
-            yield Variant(name.upper(), scale, options | {"system.guidance.guidance_scale": scale})
-
-
-def cheaper() -> Iterator[Variant]:
-    """One prediction for several steps of the same views; no guidance at some timesteps; half of
-    the views a step, in as many steps and in twice as many.
-    """
-    for count in (2, 4):
-        yield Variant("steps with one prediction", count, held(count))
-    interval = {"system.guidance.guidance_interval": [0.2, 0.8]}
-    yield Variant("guidance interval", 0, interval)
-    yield Variant("views a step", 2, {"data.batch_size": 2})
-    more_steps = steps(2 * STEPS) | {"data.batch_size": 2}
-    yield Variant("views a step, twice the steps", 2, more_steps)
-
-
-def starts() -> Iterator[Variant]:
-    """What the second stage starts from, with and without the views' directions in the prompts; a
-    contrast of views needs these.
-    """
-    yield Variant("prior, no view prompts", 0, WITHOUT_VIEWS)
-    yield Variant('"side view" for left and right', 0, ONE_SIDE)
-    yield Variant(WRONG_PRIOR)
-    for name, options in zip(RANDOM_STARTS, ({}, WITHOUT_VIEWS), strict=True):
-        yield Variant(name, 0, BALL | options)
-
-
-def view_contrast() -> Iterator[Variant]:
-    """Factors of the contrast with the opposite view's prompt beside the configuration's, also at
-    large timesteps only, and Perp-Neg in its place.
-    """
-    name = "system.guidance.view_contrast"
-    yield Variant("no view contrast", 0, {name: 0})
-    for factor in (0.75, 3):
-        yield Variant("view contrast", factor, {name: factor})
-    yield Variant("view contrast from 0.55", CONTRAST, {f"{name}_from": 0.55})
-    perp_neg = {name: 0, "system.prompt_processor.use_perp_neg": "true"}
-    yield Variant("Perp-Neg", 0, perp_neg)
-
-
-def growing() -> Iterator[Variant]:
-    """Algorithm 1 of the paper in parts."""
-    yield Variant("no growing", 0, {"system.geometry.grow.enabled": "false"})
-    yield Variant("no perturbation", 0, {"system.geometry.grow.color_range": "[0.0,0.0]"})
-    for radius in (0.005, 0.04):
-        yield Variant("growing radius", radius, {"system.geometry.grow.radius": radius})
-
-
-def wrong_priors() -> Iterator[Variant]:
-    """The same with a prior of another kind, and the grey ball of ``starts`` with growing."""
-    for one in growing():
-        yield one._replace(name=f"{WRONG_PRIOR}, {one.name}")
-    grown = {name: value for name, value in BALL.items() if not name.endswith("grow.enabled")}
-    yield Variant("grey ball, growing", 0, grown)
-
-
-def prior_quality() -> Iterator[Variant]:
-    """Numbers of steps in which the prior is sampled."""
-    for count in (4, 8, 64):
-        yield Variant("steps of the prior", count, {"system.geometry.prior.num_steps": count})
-
-
-def counts() -> Iterator[Variant]:
-    """Numbers of Gaussians, of which a third comes from the prior and the others from growing."""
-    for count in (1000, 2000, 4000, 8000):
-        numbers = {
-            "system.geometry.prior.num_points": count // 3,
-            "system.geometry.grow.max_points": count - count // 3,
-            "system.geometry.grow.num_candidates": 400_000,
-            "system.geometry.max_gaussians": count,
-        }
-        yield Variant("Gaussians", count, numbers)
-
-
-def haze() -> Iterator[Variant]:
-    """Ways against faint Gaussians around the object."""
-    yield Variant("random backgrounds", 0, {"system.background.mode": "random"})
-    for weight in (1, 5, 20):
-        yield Variant("sparsity", weight, {"system.loss.lambda_sparsity": weight})
-    yield Variant("opaque", 1, {"system.loss.lambda_opaque": 1.0})
-
-
-def smoothness() -> Iterator[Variant]:
-    """Weights of the renders' total variation, which keeps flat parts flat."""
-    yield Variant("no total variation", 0, {"system.loss.lambda_tv": 0})
-    for weight in (50, 600):
-        yield Variant("total variation", weight, {"system.loss.lambda_tv": weight})
-
-
-def rates() -> Iterator[Variant]:
-    """All learning rates times a factor."""
-    geometry = CONFIG["system"]["geometry"]
-    for factor in (0.3, 3):
-        changed = {
-            f"system.geometry.{name}": [value[0], factor * value[1], factor * value[2], value[3]]
-            for name, value in geometry.items()
-            if name.startswith("lr_") and isinstance(value, list)
-        }
-        yield Variant("learning rates", factor, changed)
-
-
-def overlay(name: str) -> dict[str, Any]:
-    """Return the options of a configuration that is laid over toybox.yaml."""
-    return dict(leaves(yaml.safe_load((ROOT / name).read_text())))
-
-
-CHARTS: dict[str, Callable[[], Iterator[Variant]]] = {
-    "references": references,
-    "exact_score": exact_score,
-    "default": lambda: iter([Variant(DEFAULT)]),
-    "guidance": over_guidance,
-    "haze": haze,
-    "image_targets": image_targets,
-    "rates": rates,
-    "schedules": schedules,
-    "starts": starts,
-    "steps": over_steps,
-    "view_contrast": view_contrast,
-    "growing": growing,
-    "wrong_priors": wrong_priors,
-    "prior_quality": prior_quality,
-    "counts": counts,
-    "paper": lambda: iter([Variant(PAPER_RECIPE, 0, overlay(PAPER))]),
-    "distillations": distillations,
-    "cheaper": cheaper,
-    "smoothness": smoothness,
-}
-
-
 def prompts(sort: str, count: int) -> list[Prompt]:
     """Write prompts for objects that no training saw.
 
@@ -388,7 +135,7 @@ def prompts(sort: str, count: int) -> list[Prompt]:
 
 def options_of(variant: Variant, prompt: str) -> dict[str, Any]:
     """Return the options of a variant's run for a prompt."""
-    if not variant.name.startswith(WRONG_PRIOR):
+    if not variant.wrong_prior:
         return variant.options
     return variant.options | {"system.geometry.prior.prompt": of_another_kind(prompt)}
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import numpy as np
 
 from benchmarks.markdown import markdown
-from benchmarks.quality import toybox_jobs
+from benchmarks.quality import toybox_jobs, toybox_options
 from benchmarks.quality.chart_runs import grouped
 from benchmarks.quality.runs import rows_of
 from benchmarks.quality.tables import RESULTS
@@ -37,7 +37,7 @@ SECONDS = ("CPU seconds", "of toybox.yaml")
 DISTILLATIONS = ("paper", "distillations", "cheaper")
 """Charts that docs/distillation.md shows; docs/toybox.md shows the others."""
 SETTINGS = [
-    name for name in toybox_jobs.CHARTS if name not in (*DISTILLATIONS, "references", "default")
+    name for name in toybox_options.CHARTS if name not in (*DISTILLATIONS, "references", "default")
 ]
 ENOUGH = 8
 """Rows of the present state of which those of earlier ones say nothing more."""
@@ -90,7 +90,7 @@ def wrong_priors_on_gpu() -> str:
     """
     gpu = measured(toybox_jobs.GPU_CHART)
     rows = [*gpu, *lacking(gpu, measured())]
-    parts = [one.key for one in toybox_jobs.wrong_priors() if one.name.startswith(WRONG_PRIOR)]
+    parts = [one.key for one in toybox_options.wrong_priors() if one.wrong_prior]
     pairs = [pair for key in parts for pair in pairs_of(rows, *key, base=WRONG_PRIOR)]
     lines = [line_of(marked_title(own[0]), own, whole) for own, whole in pairs]
     head = [title.replace(toybox_jobs.DEFAULT, WRONG_PRIOR) for title in HEAD]
@@ -146,7 +146,7 @@ def pairs_of_charts(
     rows: Sequence[Row], charts: Iterable[str]
 ) -> Iterator[tuple[list[Row], list[Row]]]:
     """Yield the pairs of each variant of these charts."""
-    keys = dict.fromkeys(one.key for chart in charts for one in toybox_jobs.CHARTS[chart]())
+    keys = dict.fromkeys(one.key for chart in charts for one in toybox_options.CHARTS[chart]())
     return (pair for key in keys for pair in pairs_of(rows, *key))
 
 

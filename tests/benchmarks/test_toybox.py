@@ -17,6 +17,7 @@ from benchmarks.quality import (
     toybox,
     toybox_charts,
     toybox_jobs,
+    toybox_options,
     toybox_scores,
     toybox_tables,
     toybox_variants,
@@ -34,7 +35,7 @@ from threestudio_gaussiandreamer.toybox.world import withheld
 register_parts()
 RUNS = [
     variant
-    for variant in itertools.chain.from_iterable(make() for make in toybox_jobs.CHARTS.values())
+    for variant in itertools.chain.from_iterable(make() for make in toybox_options.CHARTS.values())
     if variant.name not in (SAMPLES, TRUTH)
 ]
 
@@ -57,18 +58,18 @@ def test_the_options_of_every_variant_are_accepted(variant, tmp_path):
 
 
 def test_schedules_are_scaled_to_the_steps():
-    options, guidance = toybox_jobs.steps(STEPS // 2), CONFIG["system"]["guidance"]
+    options, guidance = toybox_options.steps(STEPS // 2), CONFIG["system"]["guidance"]
     start, high, low, end = guidance["max_step_percent"]
     assert options["system.guidance.max_step_percent"] == [start // 2, high, low, start // 2 + 1]
     rates = [value for name, value in options.items() if ".lr_" in name]
     assert len(rates) == 5 and all(rate[-1] == STEPS // 2 for rate in rates)
     own = {"system.guidance.max_step_percent": [start, high, low, end]}
-    assert own.items() <= toybox_jobs.steps(STEPS).items()
+    assert own.items() <= toybox_options.steps(STEPS).items()
 
 
 def test_the_draft_has_half_of_the_steps():
-    draft = toybox_jobs.overlay("configs/toybox-draft.yaml")
-    assert draft == toybox_jobs.steps(STEPS // 2) | {"trainer.val_check_interval": STEPS // 2}
+    draft = toybox_options.overlay("configs/toybox-draft.yaml")
+    assert draft == toybox_options.steps(STEPS // 2) | {"trainer.val_check_interval": STEPS // 2}
 
 
 def test_a_kept_run_is_only_scored(tmp_path, monkeypatch):
@@ -84,7 +85,7 @@ def test_a_kept_run_is_only_scored(tmp_path, monkeypatch):
 
 
 def test_another_kind_of_the_same_colour_misleads_the_prior():
-    variant = Variant(toybox_jobs.WRONG_PRIOR)
+    variant = Variant(toybox_jobs.WRONG_PRIOR, wrong_prior=True)
     options = toybox_jobs.options_of(variant, "a red fox with a green scarf")
     assert options["system.geometry.prior.prompt"] == "a red rabbit"
 
@@ -281,7 +282,7 @@ def test_the_configuration_itself_is_a_point_of_a_chart():
         ("steps", Variant("steps", STEPS)),
         ("view_contrast", Variant("view contrast", toybox_jobs.CONTRAST)),
     ):
-        assert variant.key not in [other.key for other in toybox_jobs.CHARTS[chart]()]
+        assert variant.key not in [other.key for other in toybox_options.CHARTS[chart]()]
 
 
 def test_seeds_are_compared_on_the_prompts_that_all_have(monkeypatch):

@@ -2,7 +2,13 @@
 
 import math
 
-from benchmarks.quality import chart_runs, toybox, toybox_jobs, toybox_tables, toybox_variants
+from benchmarks.quality import (
+    chart_runs,
+    toybox,
+    toybox_jobs,
+    toybox_tables,
+    toybox_variants,
+)
 from benchmarks.quality.toybox_jobs import DEFAULT, Variant
 from tests.helpers.toybox_rows import row
 
@@ -64,7 +70,9 @@ def test_variants_are_compared_on_the_prompts_and_seeds_that_both_have(monkeypat
     rows += [rows[0] | other, rows[1] | other | {"accessory": "0", "multi_face": "nan"}]
     monkeypatch.setattr(toybox_variants, "measured", lambda: rows)
     monkeypatch.setattr(
-        toybox_variants.toybox_jobs, "CHARTS", {"mine": lambda: [Variant("CSD", 4), Variant("no")]}
+        toybox_variants.toybox_options,
+        "CHARTS",
+        {"mine": lambda: [Variant("CSD", 4), Variant("no")]},
     )
     monkeypatch.setattr(toybox_variants, "SETTINGS", ["mine"])
     monkeypatch.setattr(toybox_variants, "EARLIER", {})
