@@ -91,7 +91,8 @@ measure-toybox: $(VENV)/ready-for-models     ## text to 3D with the bundled mode
 
 # installed once; again when what is installed changes
 PACKAGE = pyproject.toml setup.py constraints.txt $(wildcard threestudio_gaussiandreamer/splatting/cpu/*.h threestudio_gaussiandreamer/splatting/cpu/*.cpp threestudio_gaussiandreamer/splatting/shared/*.h)
-PIP     = $(BIN)/python -m pip install --quiet --disable-pip-version-check
+# packages have tens of thousands of modules: those that are imported are compiled then
+PIP     = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; sys.exit("Python >= 3.10 is needed, this is " + sys.version) if sys.version_info < (3, 10) else 0'

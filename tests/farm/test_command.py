@@ -1,5 +1,6 @@
 """The command: what is refused before any work, and the lock of the farm's folder."""
 
+import contextlib
 import fcntl
 import os
 import sys
@@ -11,7 +12,9 @@ from threestudio_gaussiandreamer.farm import command
 from threestudio_gaussiandreamer.farm.assets import Recipe, Source
 from threestudio_gaussiandreamer.farm.command import main
 from threestudio_gaussiandreamer.farm.identity import require_same_farm
+from threestudio_gaussiandreamer.farm.ledger import FINISHED
 from threestudio_gaussiandreamer.farm.recipe import check_recipe, make_recipe
+from threestudio_gaussiandreamer.farm.remote_ledger import open_ledger
 from threestudio_gaussiandreamer.farm.rows import Row, read_rows
 from threestudio_gaussiandreamer.farm.storage import Place
 
@@ -100,6 +103,25 @@ def test_the_report_needs_neither_ray_nor_a_finished_asset(farm, monkeypatch, tm
     code, _ = farm("a fox", "--report", f"exp_root_dir={tmp_path}/runs")
     assert code == 0
     assert "waiting" in (tmp_path / "runs/farm-prompts/report/table.csv").read_text()
+
+
+def test_a_finished_farm_needs_no_ray(farm, monkeypatch, tmp_path):
+    """It writes the report; nor does a farm of another configuration start Ray to be refused."""
+    no_ray(monkeypatch)
+    arguments = ["--out", "out", "trainer.max_steps=3"]
+    recipe = make_recipe([str(DEMO)], arguments[2:], cpu=True, cores=1)
+    place = Place(tmp_path / "out")
+    require_same_farm(place, recipe)
+    (tmp_path / "prompts.txt").write_text("a fox")
+    (row,) = read_rows(tmp_path / "prompts.txt")
+    with contextlib.closing(open_ledger(place)) as ledger:
+        ledger.append([{"name": row.name, "key": row.key, "state": FINISHED}])
+    assert farm("a fox", *arguments) == (0, "")
+    assert (tmp_path / "out/report/table.csv").is_file()
+    code, err = farm("a fox", *arguments[:2], "trainer.max_steps=4")
+    assert code == 2 and "belongs to another farm: its overrides is" in err
+    with pytest.raises(AssertionError, match="Ray was started"):
+        farm("a fox\na cat", *arguments)
 
 
 # -- configurations --------------------------------------------------------------------------------

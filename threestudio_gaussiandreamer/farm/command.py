@@ -22,7 +22,7 @@ from . import cluster
 from .assets import Recipe
 from .display import Display
 from .driver import Driver
-from .identity import require_same_farm
+from .identity import OF_MACHINES, identity, require_same_farm, require_same_recipe
 from .ledger import FAILED, FINISHED, Ledger
 from .recipe import check_recipe, jobs_left, make_recipe, root_of
 from .remote_ledger import open_ledger
@@ -145,18 +145,15 @@ def run_farm(args: argparse.Namespace) -> int:
     train_alone()  # whatever has started this process, such as a job of SLURM
     recipe = make_recipe(args.config, overrides, cpu=True, cores=args.cores)
     recipe = check_recipe(recipe, read_rows(args.prompts))
-    with claimed(place), connected(args) as ray:
-        resources = ray.cluster_resources()
-        device = cluster.choose_device(resources, args.gpus, args.cores)
-        count = cluster.count_workers(resources, device, args.gpus, args.workers)
-        recipe = recipe._replace(cpu=not device.gpus)
-        require_same_farm(place, recipe)
+    with claimed(place):
+        known = {name: value for name, value in identity(recipe).items() if name not in OF_MACHINES}
+        require_same_recipe(place, known)
         ledger = open_ledger(place)
         done = sum(ledger.state(row) == FINISHED for row in read_rows(args.prompts))
         try:
             if done < total:
-                count = min(count, total - done)
-                make_assets(args, ray, place, recipe, ledger, device, count, Display(total, done))
+                with connected(args) as ray:
+                    make_assets(args, ray, place, recipe, ledger, Display(total, done))
         finally:
             ledger.close()
     return report(args, place, ledger)
@@ -175,11 +172,15 @@ def make_assets(
     place: Place,
     recipe: Recipe,
     ledger: Ledger,
-    device: cluster.Device,
-    count: int,
     display: Display,
 ) -> None:
     """Start the workers and make all assets that are left."""
+    resources = ray.cluster_resources()
+    device = cluster.choose_device(resources, args.gpus, args.cores)
+    count = cluster.count_workers(resources, device, args.gpus, args.workers)
+    count = min(count, display.total - display.done)
+    recipe = recipe._replace(cpu=not device.gpus)
+    require_same_farm(place, recipe)
     cluster.require_same_version(ray)
     print(
         f"{display.total} assets, {display.done} finished; {count} workers with "

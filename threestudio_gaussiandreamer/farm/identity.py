@@ -13,6 +13,8 @@ from .assets import Recipe
 from .storage import Place
 
 FILE = "farm.json"
+OF_MACHINES = ("device", "cores")
+"""Entries of :func:`identity` that are known only when Ray has told which machines there are."""
 
 
 def identity(recipe: Recipe) -> dict[str, Any]:
@@ -35,10 +37,22 @@ def require_same_farm(place: Place, recipe: Recipe) -> None:
     Raises:
         UserError: the folder belongs to another farm; the message names what differs.
     """
-    ours, content = identity(recipe), place.read(FILE)
+    if not require_same_recipe(place, identity(recipe)):
+        place.write(FILE, json_text(identity(recipe), indent=1).encode())
+
+
+def require_same_recipe(place: Place, ours: dict[str, Any]) -> bool:
+    """Check that a folder's farm, if it has one, has these entries; return whether it has one.
+
+    Args:
+        ours: entries of :func:`identity`.
+
+    Raises:
+        UserError: the folder belongs to another farm; the message names what differs.
+    """
+    content = place.read(FILE)
     if content is None:
-        place.write(FILE, json_text(ours, indent=1).encode())
-        return
+        return False
     try:
         theirs = json.loads(content)
         differs = [name for name in ours if theirs.get(name) != ours[name]]
@@ -50,6 +64,7 @@ def require_same_farm(place: Place, recipe: Recipe) -> None:
             f"{place} belongs to another farm: its {name} is {shown(theirs.get(name))}, here "
             f"{shown(ours[name])}; choose another --out"
         )
+    return True
 
 
 def shown(value: Any) -> str:
