@@ -1,23 +1,83 @@
+import pytest
 import torch
 
-from benchmarks.splatting.half_precision import Pairs, blended
+from benchmarks.markdown import write
+from benchmarks.splatting import half_precision
+from benchmarks.splatting.bench_scenes import make_scene
+from benchmarks.splatting.half_precision import Pairs, blended, errors, subtracted
+from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
+
+CAP = 0.25
 
 
-def test_the_gradient_is_that_of_autograd_and_coarser_sums_are_worse():
+def random_pairs():
+    """Return pairs of which some alphas are capped, a cotangent, and image and gradient by
+    autograd.
+    """
     rng = torch.Generator().manual_seed(0)
     gauss = torch.rand(40, 6, generator=rng).double()
     features, cotangent = (torch.rand(n, 3, generator=rng).double() for n in (40, 6))
     opacities = torch.full((40,), 0.3, dtype=torch.float64, requires_grad=True)
-    alphas = opacities[:, None] * gauss
+    alphas = (opacities[:, None] * gauss).clamp(max=CAP)
     before = torch.cat([torch.ones(1, 6).double(), (1 - alphas[:-1]).cumprod(0)])
     image = torch.einsum("mp,mc->pc", alphas * before, features)
     image.backward(cotangent)
-    pairs = Pairs(alphas.detach(), before.detach(), features, opacities.detach())
-    found, gradient = blended(pairs, cotangent, torch.float64)
-    torch.testing.assert_close(found, image.detach())
-    torch.testing.assert_close(gradient, opacities.grad)
-    errors = []
+    slopes = torch.where(alphas < CAP, gauss, 0)
+    assert (slopes == 0).any()
+    return Pairs(alphas.detach(), slopes, features), cotangent, image.detach(), opacities.grad
+
+
+def test_both_backward_passes_are_that_of_autograd():
+    pairs, cotangent, image, gradient = random_pairs()
+    found, back_to_front = blended(pairs, cotangent, torch.float64)
+    torch.testing.assert_close(found, image)
+    torch.testing.assert_close(back_to_front, gradient)
+    front_to_back = subtracted(pairs, found, cotangent, torch.float64)
+    torch.testing.assert_close(front_to_back, gradient)
+
+
+def test_coarser_sums_are_worse_and_subtraction_is_worse_than_sums_back_to_front():
+    pairs, cotangent, image, gradient = random_pairs()
+    found = []
     for dtype in (torch.float32, torch.float16, torch.bfloat16):
-        rounded, other = blended(pairs, cotangent, dtype)
-        errors.append(torch.stack([(rounded - found).norm(), (other - gradient).norm()]))
-    assert (errors[0] < errors[1] / 100).all() and (errors[1] < errors[2] / 2).all()
+        rounded, back_to_front, front_to_back = half_precision.rounded(pairs, cotangent, dtype)
+        gradients = torch.stack([back_to_front, front_to_back])
+        found.append(
+            torch.cat([(gradients - gradient).norm(dim=1), (rounded - image).norm()[None]])
+        )
+    assert (found[0] < found[1] / 100).all() and (found[1] < found[2] / 2).all()
+    assert all(error[0] < error[1] for error in found)
+
+
+@pytest.mark.skipif(bool(cpu.unavailable()), reason="the kernel isn't built")
+def test_a_preset_is_drawn_at_the_same_pixels(monkeypatch):
+    """The kernel's gradients belong to the same Gaussians as the exact ones."""
+    monkeypatch.setattr(half_precision, "SIZE", 32)
+    scene = make_scene(300)
+    pixels, cotangent = torch.arange(0, 1024, 7), torch.rand(147, 3).double()
+    pairs, ids = half_precision.pairs_of(scene, pixels)
+    exact = blended(pairs, cotangent, torch.float64)
+    relative = []
+    for preset in half_precision.PRESETS:
+        image, gradient = half_precision.drawn(scene, pixels, cotangent, preset)
+        row = errors(image, [gradient[ids], None], *exact)
+        assert row["subtracted"] == ""
+        relative.append((-float(row["psnr"]), float(row["gradient"])))
+    assert relative == sorted(relative, reverse=True) and relative[-1][1] < 1e-2
+
+
+def test_the_table_has_formats_and_presets(tmp_path, monkeypatch):
+    monkeypatch.setattr(half_precision, "RESULTS", tmp_path / "half_precision.csv")
+    rows = [
+        {"sums": sums, "scene": scene, "psnr": "60", "gradient": gradient, "subtracted": rest}
+        for sums in (*half_precision.FORMATS, *half_precision.PRESETS)
+        for scene, gradient in (("trained", "0.002"), ("fog", "0.03"))
+        for rest in ([""] if sums in half_precision.PRESETS else ["0.1"])
+    ]
+    write(half_precision.RESULTS, half_precision.COLUMNS, rows)
+    lines = half_precision.table().splitlines()
+    assert (
+        lines[3]
+        == "| float16 | 60.0 | 60.0 | 2.0e-03, at most 3.0e-02 | 1.0e-01, at most 1.0e-01 |"
+    )
+    assert lines[5].startswith("| preset `fast`, ") and lines[5].endswith("at most 3.0e-02 |  |")
