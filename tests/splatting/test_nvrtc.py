@@ -149,6 +149,15 @@ def test_without_a_compiler_it_says_what_to_install(monkeypatch):
         nvrtc._library.cache_clear()
 
 
+def test_another_library_is_no_compiler(monkeypatch):
+    monkeypatch.setenv("GAUSSIANDREAMER_NVRTC", torch._C.__file__)
+    nvrtc._library.cache_clear()
+    try:
+        assert "undefined symbol: nvrtcGetErrorString" in nvrtc.unavailable()
+    finally:
+        nvrtc._library.cache_clear()
+
+
 def test_the_release_that_torch_was_built_with_is_tried_first(monkeypatch, tmp_path):
     """Both may be installed; a driver of CUDA 12 can't load what the NVRTC of CUDA 13 produces."""
     for place in (
@@ -340,6 +349,12 @@ def test_a_gpu_that_is_too_old_is_named(driver, monkeypatch):
 def test_without_a_driver_it_gives_a_message(driver, monkeypatch):
     monkeypatch.setattr(cuda_driver, "LIBRARY", "libcuda-that-is-not-there.so")
     assert "libcuda-that-is-not-there.so" in cuda_driver.unavailable()
+
+
+def test_a_compiler_that_lacks_a_function_gives_a_message(driver, monkeypatch):
+    """As NVRTC before CUDA 11.2."""
+    monkeypatch.setattr(nvrtc, "_library", lambda: ctypes.CDLL(library()._name))
+    assert "undefined symbol: nvrtcGetNumSupportedArchs" in cuda_driver.unavailable()
 
 
 def test_a_torch_without_cuda_gives_a_message(monkeypatch):

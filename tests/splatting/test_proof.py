@@ -1,33 +1,123 @@
 """The first use of the CUDA kernels on a device: compared with plain torch, in emulation."""
 
+import ctypes
+import functools
+import re
+from collections.abc import Callable
+from typing import NamedTuple
+
 import pytest
 import torch
 
-from tests.helpers.cuda_shim.device import HostDevice, unavailable
+from tests.helpers.cuda_shim.device import HostDevice, library, unavailable
 from tests.helpers.splatting_scenes import cameras, random_cloud
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import backends, rasterize
-from threestudio_gaussiandreamer.splatting.cuda import driver, proof, stages
+from threestudio_gaussiandreamer.splatting.cuda import driver, nvrtc, proof, stages
 from threestudio_gaussiandreamer.training.renderer import check_backend
 
 pytestmark = pytest.mark.skipif(unavailable() is not None, reason=str(unavailable()))
 CPU = torch.device("cpu")
 
 
-class BrokenDevice(HostDevice):
-    """Gives one kernel other constants than the rest, or raises ``error`` instead."""
+needs_nvrtc = pytest.mark.skipif(nvrtc.unavailable() is not None, reason=str(nvrtc.unavailable()))
+DEFAULT, HALVED, ABSOLUTE = proof.OPTIONS
 
-    def __init__(self, kernel: str, eps2d: float = 0.4, error: Exception | None = None) -> None:
+
+def nothing(*_) -> None:
+    """Change nothing."""
+
+
+def other_constants(*arguments, eps2d: float = 0.4) -> None:
+    """Change what the kernel alone is given."""
+    settings = settings_of(arguments)
+    settings.eps2d, settings.alpha_max = eps2d, 0.5
+
+
+def settings_of(arguments) -> stages._Settings:
+    (settings,) = (x for x in arguments if isinstance(x, stages._Settings))
+    return settings
+
+
+def no_antialiasing(*arguments) -> None:
+    settings_of(arguments).antialias = 0
+
+
+def other_constants_if_halved(*arguments) -> None:
+    if settings_of(arguments).downsample == 2:
+        other_constants(*arguments)
+
+
+def alpha_for_depth_if_halved(scene, settings, lists, images, contribution) -> None:
+    if settings.downsample == 2:
+        images.alpha, images.depth = images.depth, images.alpha
+
+
+class Fault(NamedTuple):
+    """One kernel that is given other arguments, or whose last tensor is changed after it ran."""
+
+    kernel: str
+    before: Callable[..., None] = nothing
+    after: Callable[[torch.Tensor], object] = nothing
+    draws: tuple[str, ...] = (DEFAULT, HALVED, ABSOLUTE)
+    """Which of the comparison's draws show it."""
+
+
+FAULTS = {
+    "project": Fault("project", other_constants),
+    "count_tiles": Fault("count_tiles", after=lambda counts: counts.clamp_(max=1)),
+    "list_tiles": Fault("list_tiles", after=lambda owners: owners.zero_()),
+    "find_tiles": Fault("find_tiles", after=lambda begins: begins[1].copy_(begins[0])),
+    "blend": Fault("blend", other_constants),
+    "blend_backward": Fault("blend_backward", other_constants, draws=(DEFAULT, HALVED)),
+    "blend_backward_absolute": Fault("blend_backward_absolute", other_constants, draws=(ABSOLUTE,)),
+    "sum_rows": Fault("sum_rows", after=lambda sums: sums.mul_(1.01)),
+    "project_backward": Fault("project_backward", other_constants),
+    "project, antialias": Fault("project", no_antialiasing, draws=(HALVED, ABSOLUTE)),
+    "project_backward, antialias": Fault(
+        "project_backward", no_antialiasing, draws=(HALVED, ABSOLUTE)
+    ),
+    "blend, downsample": Fault("blend", alpha_for_depth_if_halved, draws=(HALVED, ABSOLUTE)),
+    "blend_backward, downsample": Fault(
+        "blend_backward", other_constants_if_halved, draws=(HALVED,)
+    ),
+    "sums of absolute values": Fault(  # the last two columns
+        "blend_backward_absolute", after=lambda rows: rows[:, -2:].mul_(2), draws=(ABSOLUTE,)
+    ),
+}
+
+
+class BrokenDevice(HostDevice):
+    """Has a fault, or raises ``error`` instead."""
+
+    def __init__(self, fault: Fault, error: Exception | None = None) -> None:
         super().__init__()
-        self.kernel, self.eps2d, self.error = kernel, eps2d, error
+        self.fault, self.error = fault, error
 
     def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments) -> None:
-        if name == self.kernel and self.error is not None:
+        if name != self.fault.kernel:
+            super().launch(name, grid, threads, *arguments)
+            return
+        if self.error is not None:
             raise self.error
-        for argument in arguments if name == self.kernel else ():
-            if isinstance(argument, stages._Settings):
-                argument.eps2d, argument.alpha_max = self.eps2d, 0.9
+        self.fault.before(*arguments)
         super().launch(name, grid, threads, *arguments)
+        self.fault.after(arguments[-1])
+
+
+class CompilingDevice(HostDevice):
+    """Compiles each kernel before it is run, as a GPU does."""
+
+    def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments) -> None:
+        nvrtc.machine_code(driver.UNITS[name], "sm_90")
+        super().launch(name, grid, threads, *arguments)
+
+
+class NamedDevice(HostDevice):
+    """Describes itself as a GPU does."""
+
+    index, target = 0, "sm_90"
+    describe = driver.Gpu.describe
 
 
 @pytest.fixture
@@ -62,9 +152,10 @@ def picture(backend: str = "auto") -> torch.Tensor:
 def test_right_kernels_are_used_and_compared_once(use):
     device = use(HostDevice())
     image = picture()
-    assert device.launched.count("blend") == 2 and device.launched.count("blend_backward") == 1
+    assert device.launched.count("blend") == len(proof.OPTIONS) + 1
+    assert set(device.launched) == set(driver.UNITS)
     assert torch.equal(image, picture("cuda"))
-    assert device.launched.count("blend") == 3
+    assert device.launched.count("blend") == len(proof.OPTIONS) + 2
     again = use(HostDevice())  # the verdict is read from the cache
     assert torch.equal(image, picture()) and again.launched.count("blend_backward") == 0
 
@@ -72,24 +163,29 @@ def test_right_kernels_are_used_and_compared_once(use):
 def test_right_kernels_are_far_from_the_tolerance(use):
     use(HostDevice())
     errors = proof.errors_on(CPU, proof.reference())
-    assert max(errors.values()) < proof.TOLERANCE / 10
-    assert len(errors) == 12
+    assert max(max(sizes.values()) for sizes in errors.values()) < proof.TOLERANCE / 10
+    assert [len(sizes) for sizes in errors.values()] == [12, 12, 13]
 
 
-@pytest.mark.parametrize("kernel", ["project", "blend", "blend_backward", "project_backward"])
-def test_a_broken_kernel_means_plain_torch_and_one_warning(use, caplog, kernel):
-    use(BrokenDevice(kernel))
+@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
+def test_a_broken_kernel_means_plain_torch_and_one_warning(use, caplog, fault):
+    use(BrokenDevice(fault))
     assert torch.equal(picture(), picture("torch"))
     picture()
     (warning,) = [record.getMessage() for record in caplog.records]
-    assert "its kernels differ from plain torch: " in warning and "gradient of " in warning
-    assert "[the stand-in, torch " in warning and "Please report this line" in warning
+    assert "its kernels differ from plain torch: " in warning
+    assert tuple(draw for draw in proof.OPTIONS if f"with {draw}, " in warning) == fault.draws
+    assert "[the stand-in, torch " in warning and "Please report this message" in warning
     with pytest.raises(UserError, match="'cuda' can't run: .*differ from plain torch"):
         picture("cuda")
 
 
+def test_every_kernel_is_broken_in_some_test():
+    assert {fault.kernel for fault in FAULTS.values()} == set(driver.UNITS)
+
+
 def test_broken_kernels_are_refused_before_a_run_begins(use):
-    use(BrokenDevice("blend"))
+    use(BrokenDevice(FAULTS["blend"]))
     with pytest.raises(UserError, match="a.backend: cuda can't be used here: .*differ from plain"):
         check_backend("a.backend", "cuda")
     check_backend("a.backend", "auto")
@@ -98,7 +194,7 @@ def test_broken_kernels_are_refused_before_a_run_begins(use):
 
 
 def test_the_verdict_about_broken_kernels_is_cached_until_its_file_is_removed(use, tmp_path):
-    use(BrokenDevice("blend"))
+    use(BrokenDevice(FAULTS["blend"]))
     picture()
     mended = use(HostDevice())
     assert torch.equal(picture(), picture("torch")) and not mended.launched
@@ -111,9 +207,51 @@ def test_the_verdict_about_broken_kernels_is_cached_until_its_file_is_removed(us
     assert "blend" in mended.launched
 
 
+DRIVERS = {
+    None: "driver of CUDA 13.0",
+    "NVRM version: NVIDIA UNIX x86_64 Kernel Module  570.86.15  Fri\nGCC version:  13.3.0\n": (
+        "driver 570.86.15 of CUDA 13.0"
+    ),
+    "NVRM version: NVIDIA UNIX Open Kernel Module for aarch64  580.65.06  Release\n": (
+        "driver 580.65.06 of CUDA 13.0"
+    ),
+    "of an unknown form": "driver of CUDA 13.0",
+}
+
+
+def test_another_driver_is_compared_again(use, monkeypatch, tmp_path):
+    """Of the same CUDA release; without its own version the release counts."""
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "a GPU")
+    monkeypatch.setattr(driver, "driver_version", lambda: (13, 0))
+    monkeypatch.setattr(nvrtc, "version", lambda: (13, 0))
+    monkeypatch.setattr(driver, "VERSION_FILE", tmp_path / "version")
+    compared, known = [], set()
+    for text, expected in DRIVERS.items():
+        (tmp_path / "version").unlink(missing_ok=True)
+        if text is not None:
+            (tmp_path / "version").write_text(text)
+        device = use(NamedDevice())
+        assert device.describe() == f"a GPU, sm_90, {expected}, NVRTC of CUDA 13.0"
+        assert proof.failure(CPU) is None
+        compared.append(bool(device.launched))
+        assert compared[-1] == (expected not in known)
+        known.add(expected)
+    assert compared == [True, True, True, False]
+
+
+def test_another_text_of_a_kernel_or_torch_is_compared_again(use, monkeypatch):
+    names = {proof._key("a GPU"), proof._key("a GPU"), proof._key("another GPU")}
+    with monkeypatch.context() as patch:
+        patch.setattr(nvrtc, "headers", lambda: {"splat_math.h": "other"})
+        names.add(proof._key("a GPU"))
+    monkeypatch.setattr(torch, "__version__", "other")
+    assert len(names | {proof._key("a GPU")}) == 4
+
+
 def test_a_nan_is_a_difference(use):
-    use(BrokenDevice("project_backward", eps2d=float("nan")))
-    with pytest.raises(UserError, match="gradient of means by nan"):
+    nan = functools.partial(other_constants, eps2d=float("nan"))
+    use(BrokenDevice(Fault("project_backward", nan)))
+    with pytest.raises(UserError, match="with default options, gradient of means by nan"):
         picture("cuda")
 
 
@@ -121,9 +259,65 @@ def test_a_nan_is_a_difference(use):
     "error", [UserError("CUDA failed at launching the kernel blend"), RuntimeError("CUDA error")]
 )
 def test_a_failed_launch_means_plain_torch(use, caplog, error):
-    use(BrokenDevice("blend", error=error))
+    use(BrokenDevice(FAULTS["blend"], error))
     assert torch.equal(picture(), picture("torch"))
     assert f"its kernels fail on a small scene: {error}" in caplog.text
+
+
+@needs_nvrtc
+def test_a_failed_compilation_means_plain_torch(use, caplog, monkeypatch):
+    """The reason is cached, since the key has the source text and the compiler's release."""
+    texts = {"blend": "void f() { undeclared = 1; }"}
+    source = nvrtc.source
+    monkeypatch.setattr(nvrtc, "source", lambda unit: texts.get(unit) or source(unit))
+    monkeypatch.setattr(driver, "UNITS", dict.fromkeys(driver.UNITS, "blend"))
+    use(CompilingDevice())
+    assert torch.equal(picture(), picture("torch"))
+    (warning,) = [record.getMessage() for record in caplog.records]
+    assert "its kernels fail on a small scene: the NVRTC of CUDA " in warning
+    assert "can't compile blend.cu for sm_90" in warning and '"undeclared" is undefined' in warning
+    assert "[the stand-in, torch " in warning and "Please report this message" in warning
+    use(HostDevice())
+    with pytest.raises(UserError, match="'cuda' can't run: .*can't compile blend.cu"):
+        picture("cuda")
+
+
+def missing_library() -> ctypes.CDLL:
+    return ctypes.CDLL("/no/such/libnvrtc.so")
+
+
+def library_without_functions() -> ctypes.CDLL:
+    return ctypes.CDLL(library()._name)
+
+
+LIBRARIES = {
+    "missing": (missing_library, "OSError: /no/such/libnvrtc.so"),
+    "another": (library_without_functions, "AttributeError: .*undefined symbol: nvrtc"),
+}
+
+
+@pytest.mark.parametrize("load, message", LIBRARIES.values(), ids=LIBRARIES)
+@pytest.mark.parametrize("device", [CompilingDevice, NamedDevice])
+def test_a_library_that_fails_means_plain_torch_until_the_next_start(
+    use, caplog, monkeypatch, tmp_path, device, load, message
+):
+    """At the first kernel, and before the GPU's name is known."""
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "a GPU")
+    monkeypatch.setattr(driver, "driver_version", lambda: (13, 0))
+    use(device())
+    with monkeypatch.context() as patch:
+        patch.setattr(nvrtc, "_library", load)
+        assert torch.equal(picture(), picture("torch"))
+        (warning,) = [record.getMessage() for record in caplog.records]
+        gpu = "unknown GPU" if device is NamedDevice else "the stand-in"
+        expected = rf"its compiler or the driver can't be used: {message}.* \[{gpu}, torch "
+        assert re.search(expected, warning) and "Please report this message" in warning
+        with pytest.raises(UserError, match="'cuda' can't run: its compiler or the driver"):
+            picture("cuda")
+    assert not (tmp_path / "cubins").exists()
+    mended = use(HostDevice())
+    picture()
+    assert "blend" in mended.launched
 
 
 @pytest.mark.parametrize(
@@ -135,7 +329,7 @@ def test_a_failed_launch_means_plain_torch(use, caplog, error):
     ],
 )
 def test_memory_that_is_short_is_no_verdict(use, tmp_path, error):
-    use(BrokenDevice("project", error=error))
+    use(BrokenDevice(FAULTS["project"], error))
     with pytest.raises(type(error)):
         picture()
     assert not (tmp_path / "cubins").exists()
@@ -170,7 +364,7 @@ def test_deterministic_algorithms_are_switched_on_again(use, monkeypatch, warns)
     try:
         torch.use_deterministic_algorithms(True, warn_only=warns)
         picture()
-        assert torch.are_deterministic_algorithms_enabled() and seen == [False]
+        assert torch.are_deterministic_algorithms_enabled() and seen == [False] * 2
         assert torch.is_deterministic_algorithms_warn_only_enabled() == warns
     finally:
         torch.use_deterministic_algorithms(False)

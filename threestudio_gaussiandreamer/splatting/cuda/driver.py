@@ -6,8 +6,10 @@ cuda-bindings nor a CUDA toolkit is required."""
 
 import ctypes
 import functools
+import re
 import sys
 from itertools import pairwise
+from pathlib import Path
 from typing import Optional
 
 import torch
@@ -31,6 +33,7 @@ UNITS = {
     "project_backward": "project_backward",
 }
 LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+VERSION_FILE = Path("/proc/driver/nvidia/version")
 
 
 @functools.cache
@@ -63,8 +66,8 @@ class Gpu:
     def describe(self) -> str:
         """Return the names and releases that the kernels' results may depend on."""
         return (
-            f"{torch.cuda.get_device_name(self.index)}, {self.target}, driver of CUDA "
-            f"{_release(driver_version())}, NVRTC of CUDA {_release(nvrtc.version())}"
+            f"{torch.cuda.get_device_name(self.index)}, {self.target}, driver {driver_build()}of "
+            f"CUDA {_release(driver_version())}, NVRTC of CUDA {_release(nvrtc.version())}"
         )
 
     def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Argument) -> None:
@@ -143,6 +146,17 @@ def driver_version() -> tuple[int, int]:
     return release.value // 1000, release.value % 1000 // 10
 
 
+def driver_build() -> str:
+    """Return the driver's own version and a space, as "580.65.06 "; empty where the system has no
+    such file, as Windows, including its Linux subsystem.
+    """
+    try:
+        found = re.search(r"\d+(\.\d+)+", VERSION_FILE.read_text(errors="replace"))
+    except OSError:
+        return ""
+    return f"{found[0]} " if found else ""
+
+
 def _unsuitable() -> Optional[str]:
     """Return why the GPU or the driver can't run the kernels, or None.
 
@@ -151,7 +165,7 @@ def _unsuitable() -> Optional[str]:
     try:
         nvrtc.target_for(torch.cuda.get_device_capability())
         knows, compiler = driver_version(), nvrtc.version()
-    except (OSError, UserError) as error:
+    except (OSError, AttributeError, UserError) as error:  # a library may lack a function
         return str(error)
     if knows[0] < compiler[0]:
         advice = f"update the driver, or install a torch built for CUDA {knows[0]}"

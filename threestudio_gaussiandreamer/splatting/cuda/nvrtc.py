@@ -226,10 +226,10 @@ def _library() -> ctypes.CDLL:
     for candidate in _candidates():
         try:
             library = ctypes.CDLL(candidate)
-        except OSError as error:
+            library.nvrtcGetErrorString.restype = ctypes.c_char_p
+        except (OSError, AttributeError) as error:  # AttributeError: it is another library
             failures.append(str(error))
             continue
-        library.nvrtcGetErrorString.restype = ctypes.c_char_p
         return library
     raise OSError(
         "NVRTC, CUDA's run-time compiler, isn't there: install a CUDA build of torch, or "

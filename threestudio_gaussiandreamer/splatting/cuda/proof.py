@@ -2,8 +2,9 @@
 
 A small fixed scene is rendered and differentiated by the kernels in float32 and by plain torch in
 float64 on the CPU: on the GPU its many small kernels would have to be loaded, which takes many
-times longer than the comparison. The result is cached beside the compiled kernels; it is computed
-again for another GPU, driver, compiler, torch version or source of the kernels."""
+times longer than the comparison. ``OPTIONS`` has the options of each draw. The result is cached
+beside the compiled kernels; it is computed again for another GPU, driver, compiler, torch version
+or source text of the CUDA backend."""
 
 import contextlib
 import functools
@@ -29,6 +30,19 @@ Gaussian that falls on the other side of a threshold in float64 gives 1e-4."""
 GAUSSIANS, WIDTH, HEIGHT = 200, 40, 24  # more than a batch of ``blend``; 3 x 2 tiles
 ANGLES = (0.0, 0.7)
 """Azimuths of the two cameras, radians."""
+OPTIONS = {
+    "default options": RasterizeOptions(),
+    "downsample and antialias": RasterizeOptions(downsample=2, antialias=True),
+    "downsample, antialias and absgrad": RasterizeOptions(
+        downsample=2, antialias=True, absgrad=True
+    ),
+}
+"""The options of each draw: with these, all kernels and all their branches on options run. The
+backward pass has another kernel with ``absgrad``."""
+LIBRARY_ERRORS = (OSError, AttributeError)
+"""What ctypes raises for a library that can't be loaded, or that lacks a function."""
+Results = dict[str, dict[str, Tensor]]
+"""Outputs and gradients by name, of each draw."""
 
 
 def failure(device: torch.device) -> Optional[str]:
@@ -47,17 +61,34 @@ def _failure(device: torch.device) -> Optional[str]:
         gpu = driver.device(device).describe()
     except UserError as error:
         return str(error)
+    except LIBRARY_ERRORS as error:
+        return _unusable(error, "unknown GPU")
     name = f"proof-{_key(gpu)}"
     stored = nvrtc.read_cached(name)
     if stored is None:
-        stored = _compare(device).encode()
+        try:
+            stored = _compare(device).encode()
+        except LIBRARY_ERRORS as error:
+            return _unusable(error, gpu)
         nvrtc.write_cached(name, stored)
     if not stored:
         return None
     return (
-        f"{stored.decode()} [{gpu}, torch {torch.__version__}]. Please report this line; delete "
-        f"{nvrtc.cached_path(name)} and start again to repeat the comparison"
+        f"{stored.decode()} {_request(gpu)}; delete {nvrtc.cached_path(name)} and start again to "
+        "repeat the comparison"
     )
+
+
+def _unusable(error: Exception, gpu: str) -> str:
+    """Return a reason that isn't cached: a library may be mended, which the key doesn't tell."""
+    return (
+        f"its compiler or the driver can't be used: {type(error).__name__}: {error} "
+        f"{_request(gpu)}; the next start tries again"
+    )
+
+
+def _request(gpu: str) -> str:
+    return f"[{gpu}, torch {torch.__version__}]. Please report this message"
 
 
 def _key(gpu: str) -> str:
@@ -74,6 +105,7 @@ def _compare(device: torch.device) -> str:
     Raises:
         UserError, RuntimeError: memory is short, or plain torch or earlier work on the GPU fails,
             which says nothing about the kernels.
+        OSError, AttributeError: a library can't be loaded, or lacks a function.
     """
     with _default_algorithms():
         expected = reference()
@@ -84,14 +116,22 @@ def _compare(device: torch.device) -> str:
             if isinstance(error, torch.cuda.OutOfMemoryError) or "out of memory" in str(error):
                 raise
             return f"its kernels fail on a small scene: {error}"
-    # ``not <=`` instead of ``>``, so that NaN counts as wrong
-    wrong = [f"{name} by {size:.1e}" for name, size in errors.items() if not size <= TOLERANCE]
+    wrong = [
+        f"with {draw}, {', '.join(names)}"
+        for draw, sizes in errors.items()
+        if (names := _wrong(sizes))
+    ]
     if not wrong:
         return ""
     return (
-        f"on a small scene its kernels differ from plain torch: {', '.join(wrong)} (rounding is "
+        f"on a small scene its kernels differ from plain torch: {'; '.join(wrong)} (rounding is "
         f"at most {TOLERANCE:.0e})"
     )
+
+
+def _wrong(errors: dict[str, float]) -> list[str]:
+    """List what differs by more than rounding; ``not <=`` so that NaN counts as wrong."""
+    return [f"{name} by {size:.1e}" for name, size in errors.items() if not size <= TOLERANCE]
 
 
 @contextlib.contextmanager
@@ -122,40 +162,58 @@ def _require_torch(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def reference() -> dict[str, Tensor]:
-    """Return the outputs and gradients of plain torch in float64, on the CPU."""
-    return _drawn(torch_backend, torch.device("cpu"), torch.float64)
+def reference() -> Results:
+    """Return the outputs and gradients of plain torch in float64, on the CPU. The two draws that
+    differ only in ``absgrad`` share one.
+    """
+    default, *_, absolute = OPTIONS.values()
+    plain, full = (
+        _drawn(torch_backend, torch.device("cpu"), torch.float64, options)
+        for options in (default, absolute)
+    )
+    return {draw: full if options.downsample > 1 else plain for draw, options in OPTIONS.items()}
 
 
-def errors_on(device: torch.device, expected: dict[str, Tensor]) -> dict[str, float]:
-    """Return the relative error of each output and gradient of the kernels."""
-    found = _drawn(kernels, device, torch.float32)
+def errors_on(device: torch.device, expected: Results) -> dict[str, dict[str, float]]:
+    """Return the relative error of each output and gradient of the kernels, for each draw."""
     return {
-        name: float((found[name].cpu().double() - true).abs().max() / true.abs().max())
-        for name, true in expected.items()
+        draw: {
+            name: _relative(value, expected[draw][name])
+            for name, value in _drawn(kernels, device, torch.float32, options).items()
+        }
+        for draw, options in OPTIONS.items()
     }
 
 
-def _drawn(backend: ModuleType, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
+def _relative(found: Tensor, true: Tensor) -> float:
+    return float((found.cpu().double() - true).abs().max() / true.abs().max())
+
+
+def _drawn(
+    backend: ModuleType, device: torch.device, dtype: torch.dtype, options: RasterizeOptions
+) -> dict[str, Tensor]:
     """Render and differentiate the scene, and wait for the results, so that errors of the GPU are
-    raised here.
+    raised here. One view is enough for a second draw.
     """
     with torch.inference_mode(False), torch.enable_grad():
-        results = _draw(backend, _scene(device, dtype))
+        views = 1 if options.downsample > 1 else len(ANGLES)
+        results = _draw(backend, _scene(device, dtype).of_views(0, views), options)
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return results
 
 
-def _draw(backend: ModuleType, scene: Scene) -> dict[str, Tensor]:
+def _draw(backend: ModuleType, scene: Scene, options: RasterizeOptions) -> dict[str, Tensor]:
     """Render a scene; return the images and the gradients of a fixed weighted sum of them."""
     leaves = {name: getattr(scene, name).requires_grad_() for name in Scene._fields[:7]}
-    out = backend.rasterize(scene, RasterizeOptions())
+    out = backend.rasterize(scene, options)
     images = {name: getattr(out, name) for name in ("image", "alpha", "depth")}
     # no arguments of ``backward``: given gradients, torch imports all of its symbolic shapes
     sum(_weighted_sum(image) for image in images.values()).backward()
     leaves["means2d"] = out.means2d
     gradients = {f"gradient of {name}": leaf.grad for name, leaf in leaves.items()}
+    if options.absgrad:
+        gradients["absolute gradient of means2d"] = out.means2d.absgrad
     detached = {name: image.detach() for name, image in images.items()}
     return detached | {"contribution": out.contribution.detach()} | gradients
 
