@@ -62,13 +62,13 @@ def test_a_full_disk_is_reported_and_leaves_the_earlier_checkpoint(folder, tmp_p
 @pytest.mark.slow
 def test_after_kills_the_same_command_gives_what_an_uninterrupted_one_gives(tmp_path):
     """The stage of prompts, which needs no pictures; it saves after each of its sixteen steps."""
-    end = ["--stages", "text", "--images", "2048", "--batch", "128", "--save-minutes", "0"]
+    end = ["--stages", "text", "--images", "512", "--batch", "32", "--save-minutes", "0"]
     command = [sys.executable, "-m", "threestudio_gaussiandreamer.toybox.train"]
-    for seen in (128, 1024):
+    for seen in (32, 256):
         process = subprocess.Popen([*command, str(tmp_path / "killed"), *end, "--threads", "1"])
         while seen_in(tmp_path / "killed") < seen:
             assert process.poll() is None
-            time.sleep(0.01)
+            time.sleep(0.1)  # reading the checkpoint takes processor time from the training
         process.kill()
         process.wait()
     for name in ("killed", "whole"):
