@@ -25,7 +25,7 @@ from benchmarks.quality.tables import DIFFERENCES, difference_row, last_rows, me
 from benchmarks.robustness import ddp
 from benchmarks.robustness import scale_tables as scale
 from benchmarks.robustness import tables as robustness
-from benchmarks.splatting import half_precision
+from benchmarks.splatting import growth, half_precision, kernel_tables
 from benchmarks.splatting import tables as splatting
 from benchmarks.start import tables as start
 from benchmarks.viewers import tables as viewers
@@ -92,8 +92,8 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "presets": splatting.presets,
         "thresholds": splatting.thresholds,
         "contenders": splatting.contenders,
-        "kernel": splatting.kernel,
-        "growth": splatting.growth,
+        "kernel": kernel_tables.kernel,
+        "growth": growth.table,
         "half precision": half_precision.table,
     },
     "docs/step_time.md": {

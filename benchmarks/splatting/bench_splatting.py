@@ -29,6 +29,7 @@ from typing import Callable
 import torch
 from torch import Tensor
 
+from benchmarks.quality.runs import machine
 from benchmarks.splatting.bench_scenes import Scene, make_camera, make_cotangents, make_scene
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -216,21 +217,20 @@ def print_row(rows: list[dict]) -> None:
 
 def describe_machine() -> str:
     """Return processor, versions and commit, for the head of the table."""
-    info = pathlib.Path("/proc/cpuinfo")
-    names = (
-        [
-            line.split(":")[1].strip()
-            for line in info.read_text().splitlines()
-            if line.startswith("model name")
-        ]
-        if info.exists()
-        else []
-    )
-    cpu, commit = names[0] if names else platform.processor(), _commit() or "unknown"
     return (
-        f"{cpu}, {os.cpu_count()} threads; Python {platform.python_version()}, torch "
-        f"{torch.__version__}; commit {commit}"
+        f"{processor()}, {os.cpu_count()} threads; Python {platform.python_version()}, torch "
+        f"{torch.__version__}; commit {_commit() or 'unknown'}"
     )
+
+
+def processor() -> str:
+    """Return the processor's name and whether the kernel uses its AVX-512, since names such as
+    "AMD EPYC" stand for several generations; the name alone if the kernel isn't built.
+    """
+    from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
+
+    builds = cpu.usable_builds()
+    return machine() + (f" {'with' if 'v4' in builds else 'without'} AVX-512" if builds else "")
 
 
 def _commit() -> str:
@@ -264,11 +264,11 @@ def available(names: list[str]) -> list[str]:
     return [name for name in names if name not in missing]
 
 
-def write_csv(rows: list[dict], machine: str) -> None:
+def write_csv(rows: list[dict], where: str) -> None:
     path = ROOT / "benchmarks" / "results" / "splatting.csv"
     path.parent.mkdir(exist_ok=True)
     with path.open("w", newline="") as file:
-        file.write(f"# {machine}\n")
+        file.write(f"# {where}\n")
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         writer.writerows(
@@ -314,8 +314,8 @@ def main(argv: list[str]) -> None:
     if args.cell:
         name, *where = args.cell
         return run_cell(name, *map(int, where), args.preset, args.seconds)
-    machine = describe_machine()
-    print(machine)
+    where = describe_machine()
+    print(where)
     args.contenders = available(args.contenders)
     rows = []
     for gaussians in args.gaussians:
@@ -324,7 +324,7 @@ def main(argv: list[str]) -> None:
                 row = run_row(gaussians, size, threads, args)
                 print_row(row)
                 rows += row
-    write_csv(rows, machine)
+    write_csv(rows, where)
 
 
 if __name__ == "__main__":

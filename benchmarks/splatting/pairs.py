@@ -1,14 +1,19 @@
 """Two builds of the CPU kernel, and the AVX-512 prototype, in turns in one process.
 
-    python -m benchmarks.splatting.pairs --against another/checkout [--rounds 20]
+    python -m benchmarks.splatting.pairs --against another/checkout [--rounds 20] [--threads 1 2]
+        [--cases "demo's settings 256"]
 
-Reports processor seconds of one thread, so that other programs on the machine matter little, and
-ratios of the smallest of all rounds. `surface` is the scene of bench_splatting.py; `demo` is the
-demo's step, four views of 256² of a trained cloud. Appends to ``benchmarks/results/kernel.csv``.
+Reports processor seconds of one thread, so that other programs on the machine matter little, or
+seconds of several, and ratios of the smallest of all rounds. `surface` is the scene of
+bench_splatting.py; `demo` is four views of 256² of a small trained cloud; `demo's settings` is as
+many views with the settings of configs/demo.yaml, of that cloud split twice, so that it has about
+as many Gaussians as the demo in the middle of its pruning. Appends to
+``benchmarks/results/kernel.csv``.
 
 Both checkouts must have been built: ``python setup.py build_ext --inplace``."""
 
 import argparse
+import ctypes
 import os
 import time
 from collections.abc import Callable
@@ -16,17 +21,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from omegaconf import DictConfig, OmegaConf
 
+from benchmarks.quality.recipe import CONFIGS
 from benchmarks.quality.runs import append_rows
 from benchmarks.splatting.bench_scenes import Scene, make_camera, make_cotangents, make_scene
-from benchmarks.splatting.bench_splatting import PROTOTYPE, contender
+from benchmarks.splatting.bench_splatting import PROTOTYPE, contender, processor
 from benchmarks.splatting.scenes import trained
 from benchmarks.start.launched import commit_of
+from threestudio_gaussiandreamer.core.streams import generator
+from threestudio_gaussiandreamer.gaussians.densify import clone_and_split
 from threestudio_gaussiandreamer.splatting import autograd
 from threestudio_gaussiandreamer.splatting.autograd import Upstream, Wanted
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 from threestudio_gaussiandreamer.splatting.options import RasterizeOptions
 from threestudio_gaussiandreamer.splatting.scene import Scene as KernelScene
+from threestudio_gaussiandreamer.splatting.validation import smallest_alpha
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks/results/kernel.csv"
@@ -35,6 +45,7 @@ COLUMNS = [
     "gaussians",
     "views",
     "size",
+    "threads",
     "build",
     "contender",
     "commit",
@@ -42,8 +53,8 @@ COLUMNS = [
     "both_ms",
     "machine",
 ]
-CASES = ("surface 512", "surface 1024", "demo 256")
-VIEWS = 4  # of the demo
+DEMO = "demo's settings"
+CASES = ("surface 512", "surface 1024", "demo 256", f"{DEMO} 256")
 Pass = Callable[[], object]
 
 
@@ -60,21 +71,57 @@ class Case(NamedTuple):
 
 def make_case(name: str) -> Case:
     """Return one of ``CASES``; alphas below 1/255 are skipped, as by the prototype."""
-    scene, _, size = name.partition(" ")
+    scene, _, text = name.rpartition(" ")
+    size = int(text)
     if scene == "surface":
-        cameras, cloud, eps2d = [make_camera(int(size))], make_scene(100_000), 0.3
-    else:
-        around = [(30 + 90 * i, 35 - 12 * i, 2 + 0.4 * i, 50 + 4 * i) for i in range(VIEWS)]
-        cameras, cloud, eps2d = [make_camera(int(size), *c) for c in around], trained(), 0.1
-    viewmats, Ks = map(torch.stack, zip(*cameras, strict=True))
-    options = RasterizeOptions(alpha_min=1 / 255, eps2d=eps2d)
-    return Case(scene, cloud, viewmats, Ks, int(size), options)
+        options = RasterizeOptions(alpha_min=1 / 255, eps2d=0.3)
+        return Case(scene, make_scene(100_000), *stacked([make_camera(size)]), size, options)
+    if scene == "demo":
+        options = RasterizeOptions(alpha_min=1 / 255, eps2d=0.1)
+        return Case(scene, trained(), *stacked(cameras_around(4, size)), size, options)
+    demo = OmegaConf.load(CONFIGS / "demo.yaml")
+    assert (demo.data.width, demo.data.height) == (size, size)
+    cloud, views = split_all(split_all(trained())), cameras_around(demo.data.batch_size, size)
+    return Case(scene, cloud, *stacked(views), size, options_of(demo.system.renderer))
 
 
-def kernel_passes(checkout: Path, build: str, case: Case) -> tuple[Pass, Pass]:
+def options_of(renderer: DictConfig) -> RasterizeOptions:
+    """Return the options of a configuration's renderer."""
+    alpha_min = smallest_alpha(renderer.preset, None)
+    return RasterizeOptions(alpha_min=alpha_min, eps2d=renderer.eps2d, antialias=renderer.antialias)
+
+
+def cameras_around(views: int, size: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Return cameras on all sides, within the demo's ranges of elevation, distance and angle."""
+    around = ((30 + 90 * i, 35 - 12 * i, 2 + 0.4 * i, 50 + 4 * i) for i in range(views))
+    return [make_camera(size, *place) for place in around]
+
+
+def stacked(cameras: list[tuple[torch.Tensor, torch.Tensor]]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the viewmats and the Ks of all cameras."""
+    viewmats, Ks = zip(*cameras, strict=True)
+    return torch.stack(viewmats), torch.stack(Ks)
+
+
+def split_all(cloud: Scene) -> Scene:
+    """Replace each Gaussian by two smaller samples of it, as densification does."""
+    every = torch.ones(len(cloud.means), dtype=torch.bool)
+    rest = cloud._asdict()
+    logarithms = {"log_scales": rest.pop("scales").log()}
+    change = clone_and_split(
+        rest | logarithms, clone=~every, split=every, rng=generator(0, "split")
+    )
+    scales = change.values.pop("log_scales").exp()
+    return Scene(**change.values, scales=scales)
+
+
+def load_build(checkout: Path, build: str) -> ctypes.CDLL:
+    return cpu.load_library(checkout / cpu.FOLDER.relative_to(ROOT) / f"libsplat_{build}.so")
+
+
+def kernel_passes(checkout: Path, build: str, case: Case, threads: int) -> tuple[Pass, Pass]:
     """Return a forward and a backward pass of a checkout's kernel, without torch's autograd."""
-    folder = checkout / cpu.FOLDER.relative_to(ROOT)
-    library = cpu.load_library(folder / f"libsplat_{build}.so")
+    library = load_build(checkout, build)
     views = len(case.viewmats)
     cloud, background = case.cloud, torch.zeros(views, 3)
     scene = KernelScene(
@@ -83,7 +130,7 @@ def kernel_passes(checkout: Path, build: str, case: Case) -> tuple[Pass, Pass]:
     image, depth, alpha = (
         x.expand(views, -1, -1, -1).contiguous() for x in make_cotangents(case.size)
     )
-    kernel = cpu.CpuKernel(case.options, True, 1, library)
+    kernel = cpu.CpuKernel(case.options, True, threads, library)
     means2d, saved = torch.zeros(views, len(cloud.means), 2), []
 
     def forward() -> None:
@@ -96,9 +143,9 @@ def kernel_passes(checkout: Path, build: str, case: Case) -> tuple[Pass, Pass]:
     return forward, backward
 
 
-def prototype_passes(case: Case) -> tuple[Pass, Pass]:
+def prototype_passes(case: Case, threads: int) -> tuple[Pass, Pass]:
     """Return the same of the prototype, which draws one view."""
-    draw, drawn = contender("prototype", case.size, "fast", 1), []
+    draw, drawn = contender("prototype", case.size, "fast", threads), []
     leaves = Scene(*(x.clone().requires_grad_() for x in case.cloud))
     cotangents = make_cotangents(case.size)
     return (
@@ -107,39 +154,48 @@ def prototype_passes(case: Case) -> tuple[Pass, Pass]:
     )
 
 
-def best_times(contenders: dict[str, tuple[Pass, Pass]], rounds: int) -> dict[str, tuple]:
+def best_times(
+    contenders: dict[str, tuple[Pass, Pass]], rounds: int, clock: Callable[[], float]
+) -> dict[str, tuple]:
     """Return milliseconds of the forward pass and of both, the smallest of the rounds."""
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in contenders}
     for _ in range(rounds + 1):
         for name, (forward, backward) in contenders.items():
-            start = time.thread_time()
+            start = clock()
             forward()
-            middle = time.thread_time()
+            middle = clock()
             backward()
-            times[name].append((middle - start, time.thread_time() - start))
+            times[name].append((middle - start, clock() - start))
     return {
         name: tuple(round(1e3 * min(column), 2) for column in zip(*found[1:], strict=True))
         for name, found in times.items()
     }
 
 
-def measure(name: str, build: str, checkouts: dict[str, Path], rounds: int) -> list[dict]:
+def measure(
+    name: str, build: str, threads: int, checkouts: dict[str, Path], rounds: int
+) -> list[dict]:
     """Measure one case; return rows of the CSV."""
     case = make_case(name)
     contenders = {
-        label: kernel_passes(checkout, build, case) for label, checkout in checkouts.items()
+        label: kernel_passes(checkout, build, case, threads)
+        for label, checkout in checkouts.items()
     }
     runs = "v4" in cpu.usable_builds() and (PROTOTYPE / "proto.cpp").exists()
     if runs and case.name == "surface":
-        contenders["prototype"] = prototype_passes(case)
-    best = best_times(contenders, rounds)
+        contenders["prototype"] = prototype_passes(case, threads)
+    clock = time.thread_time if threads == 1 else time.perf_counter
+    best = best_times(contenders, rounds, clock)
     first = next(iter(best.values()))[1]
     for label, (_, both) in best.items():
-        print(f"{name:12} {build:4} {label:9} {both:7.2f} ms   {both / first:.2f}", flush=True)
-    where = (case.name, len(case.cloud.means), len(case.viewmats), case.size, build)
+        place = f"{name:20} {threads} {build:4} {label:9}"
+        print(f"{place} {both:7.2f} ms   {both / first:.2f}", flush=True)
+    where = (case.name, len(case.cloud.means), len(case.viewmats), case.size, threads, build)
     commits = {label: commit_of(checkout) for label, checkout in checkouts.items()}
     return [
-        dict(zip(COLUMNS, (*where, label, commits.get(label, ""), *found), strict=False))
+        dict(
+            zip(COLUMNS, (*where, label, commits.get(label, ""), *found, processor()), strict=True)
+        )
         for label, found in best.items()
     ]
 
@@ -150,6 +206,8 @@ def main() -> None:
     )
     parser.add_argument("--against", type=Path, required=True, help="another checkout, built")
     parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1])
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=CASES)
     args = parser.parse_args()
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     torch.set_num_threads(1)
@@ -158,8 +216,9 @@ def main() -> None:
     rows = [
         row
         for build in builds
-        for name in CASES
-        for row in measure(name, build, checkouts, args.rounds)
+        for name in args.cases
+        for threads in args.threads
+        for row in measure(name, build, threads, checkouts, args.rounds)
     ]
     append_rows(RESULTS.stem, COLUMNS, rows, RESULTS.parent)
 
