@@ -10,6 +10,8 @@ import re
 import pytest
 
 from benchmarks.robustness.fuzz import ROOM
+from benchmarks.splatting.gpu_kernels import COMPARISON_AIM
+from benchmarks.splatting.gpu_training import REST_AIM
 from tests.fuzz import runner
 from tests.launch.test_ddp import TOLERANCE
 from tests.test_docs import TEXTS
@@ -35,6 +37,8 @@ CONSTANTS = {
     "docs/several_processes.md": [f"within {TOLERANCE:g} dB"],
     "docs/cuda.md": [
         f"take {LIST_BYTES} bytes per intersection, the backward pass {ROW_BYTES} more",
+        f"The aim of {100 * REST_AIM:g} % of the U-Net's time",
+        f"its aim of {1000 * COMPARISON_AIM:g} ms",
     ],
     "docs/failures.md": [f"farther than {FLOATERS:.0%}".replace("%", " %")],
     "docs/evaluation.md": [f"its {intervals.LEVEL:.0%} bootstrap".replace("%", " %")],

@@ -11,7 +11,7 @@ section   what it does
 compile   first use of the kernels with an empty cache, a later start, and the comparison with
           plain torch that precedes the first use
 correct   image and all gradients against plain torch in float64, on small and large clouds; the
-          same bits again
+          same bits again; plain torch in float32, the fallback, on a small cloud
 sanitize  compute-sanitizer (memcheck, racecheck) on a small picture, where that tool exists
 bench     4 views of 1024^2, 100,000 Gaussians, forward and backward, beside gsplat (as installed,
           else its wheel is fetched; it builds here, which takes nvcc); one view of 1,000,000
@@ -25,9 +25,12 @@ demos     whole runs of configs/demo.yaml and configs/toybox.yaml
 Whatever touches the GPU runs in a process of its own, with a limit of its own and within --minutes:
 a kernel that hangs or ruins its context costs that part alone. What fails is recorded with the end
 of what it printed, and the others go on. The numbers go to benchmarks/results/gpu-<device>.json (or
---out) after each section. All but `prune` and `train` needs no more than torch, NumPy, SciPy and
-jaxtyping, so on a machine without a network `python -m benchmarks.splatting.gpu_check` does where
-`make` can't install the rest."""
+--out) after each section. `compile`, `correct`, `sanitize` and `bench` need torch, NumPy, SciPy and
+jaxtyping; without gsplat and a network to fetch it, `bench` times this package alone. `prune`,
+`train` and `demos` need what the package depends on, such as Lightning and OmegaConf; `train` and
+the run of toybox.yaml in `demos` need diffusers and transformers as well. Where `make` can't
+install these, use `python -m benchmarks.splatting.gpu_check --sections compile correct sanitize
+bench`."""
 
 import argparse
 import json
@@ -147,6 +150,7 @@ def describe_device(args: argparse.Namespace) -> dict[str, Any]:
         "compute_capability": f"{properties.major}.{properties.minor}",
         "memory_gb": round(properties.total_memory / 2**30, 1),
         "torch_cuda": torch.version.cuda,
+        "driver": cuda_driver.driver_build().strip() or None,
         "driver_cuda": guarded(lambda _: {"release": cuda_driver.driver_version()}, args),
         "nvrtc": guarded(
             lambda _: {"release": nvrtc.version(), "library": nvrtc._library()._name}, args
@@ -175,6 +179,7 @@ PARTS: dict[str, Section] = {
     "first_picture": gpu_kernels.first_picture,
     "comparison": gpu_kernels.comparison,
     "errors": gpu_kernels.errors,
+    "fallback": gpu_kernels.fallback,
     "speed": gpu_kernels.speed,
     "gsplat_steps": gpu_kernels.gsplat_steps,
     "prune_twice": gpu_prune.prune_twice,

@@ -18,6 +18,7 @@ SECONDS = {
     "first_picture": 60,
     "comparison": 60,
     "errors": 120,
+    "fallback": 60,
     "sanitize": 90,
     "speed": 60,
     "pip": 90,

@@ -23,6 +23,8 @@ from benchmarks.splatting.gpu_kernels import synchronize
 from benchmarks.splatting.gpu_processes import guarded, in_process
 
 ROOT = Path(__file__).resolve().parents[2]
+REST_AIM = 0.03
+"""What a step should take at most besides U-Net and VAE, over the U-Net's time."""
 WINDOWS = {False: (10, 40), True: (1, 3)}
 """The first step that is timed and the one after the last, of a check and of a small one."""
 SMALL_PICTURES = {"data.eval_width": 64, "data.eval_height": 64}

@@ -10,12 +10,16 @@ from pathlib import Path
 
 from benchmarks.markdown import markdown, read
 from benchmarks.quality.chart_runs import grouped
+from benchmarks.splatting.gpu_kernels import COMPARISON_AIM, beyond_aim
+from benchmarks.splatting.gpu_training import REST_AIM
 
 ROOT = Path(__file__).resolve().parents[2]
 ACCURACY, SPEED = ROOT / "docs/charts/rasteriser.csv", ROOT / "benchmarks/results/splatting.csv"
 KERNEL, GROWTH = ROOT / "benchmarks/results/kernel.csv", ROOT / "docs/charts/growth.csv"
 SCENES = ("initial", "trained", "fog", "needles", "deep", "near plane")
 PRESETS = {"fast": "1/255", "balanced": "1/1024", "accurate": "1/65536"}
+TITLES = {"train_that_waited": "the earlier state"}
+"""Sections of a GPU's report that aren't called by the name of an argument."""
 THRESHOLDS = ("1/64", "1/255", "1/1024", "1/4096", "1/16384", "1/65536", "0")
 CONTENDERS = {
     "cpu": "CPU kernel",
@@ -165,13 +169,16 @@ def gpu() -> str:
     rows: dict[str, Callable[[dict], str]] = {
         "image, largest relative error": lambda run: f"{max(_errors(run, 'image')):.0e}",
         "gradients, largest relative error": lambda run: f"{max(_errors(run, 'gradient')):.0e}",
+        "plain torch in float32: image, gradients": lambda run: (
+            "{image:.0e}, {gradient:.0e}".format(**run["correct"]["fallback"])
+        ),
         "the same bits again": lambda run: "yes" if all(_errors(run, "same_bits")) else "no",
         "compute-sanitizer (memcheck, racecheck)": _sanitized,
         "first image with an empty cache, with a filled one": lambda run: (
-            f"{run['compile']['first']:.1f} s, {run['compile']['later']:.1f} s"
+            f"{run['compile']['first']:.1f} s, {run['compile']['later']:.2f} s"
         ),
-        "comparison at the first use: plain torch, kernels": lambda run: (
-            "{reference:.3f} s, {kernels:.3f} s".format(**run["compile"]["comparison"])
+        f"comparison at the first use (aim: {COMPARISON_AIM:g} s): plain torch, kernels; sum": (
+            lambda run: _comparison(run["compile"]["comparison"])
         ),
     }
     for name in (*PRESETS, "gsplat"):
@@ -185,7 +192,7 @@ def gpu() -> str:
             " and ".join(f"{seconds:.1f}" for seconds in run["prune"]["seconds"]) + " s"
         ),
     }
-    rows |= _training_rows()
+    rows |= _training_rows() | {"commits of the sections": _commits}
     table = [(title, *(_measured(cell, run) for run in runs)) for title, cell in rows.items()]
     return markdown(("", *(run["device"] for run in runs)), table)
 
@@ -195,8 +202,12 @@ def _training_rows() -> dict[str, Callable[[dict], str]]:
     for name, title in {"default": "", "lowmem": ", low memory"}.items():
         rows[f"training step{title}: all; U-Net, VAE, the rest"] = functools.partial(_step, name)
     return rows | {
+        f"the rest over the U-Net (aim: {_percent(REST_AIM, 0)}): default, low memory": _rest,
         "training step without networks": lambda run: (
             f"{run['train']['default']['empty_networks']['ms_per_step']:.1f} ms"
+        ),
+        "that step over the U-Net's time": lambda run: (
+            f"{run['train']['default']['empty_step_over_unet']:.2f}"
         ),
         "waits for the GPU in a step": lambda run: str(len(run["train"]["default"]["waits"])),
         "an earlier state that waited": lambda run: "{ms_per_step:.1f} ms, {count} waits".format(
@@ -228,6 +239,35 @@ def _errors(run: dict, name: str) -> list[float]:
 def _sanitized(run: dict) -> str:
     tools = {name: run["sanitize"][name] for name in ("memcheck", "racecheck")}
     return "clean" if all("clean" in tool for tool in tools.values()) else json.dumps(tools)
+
+
+def _comparison(seconds: dict) -> str:
+    """Return the seconds of the comparison; reports without ``draws`` are of one draw."""
+    draws, beyond = seconds.get("draws", 1), beyond_aim(seconds)
+    return (
+        f"{seconds['reference']:.3f} s, {seconds['kernels']:.3f} s; "
+        f"{seconds['reference'] + seconds['kernels']:.3f} s for {draws} draw{'s' * (draws != 1)}"
+        + (f", {beyond['beyond_aim']} beyond the aim" if beyond else "")
+    )
+
+
+def _rest(run: dict) -> str:
+    steps = (run["train"][name] for name in ("default", "lowmem"))
+    return ", ".join(_percent(step["other_ms"] / step["unet_ms"], 1) for step in steps)
+
+
+def _percent(share: float, digits: int) -> str:
+    return f"{100 * share:.{digits}f} %"
+
+
+def _commits(run: dict) -> str:
+    """Return the sections that ran at each commit."""
+    sections: dict[str, list[str]] = {}
+    for name, section in run.items():
+        if isinstance(section, dict) and "machine" in section:
+            commit = section["machine"].rpartition("commit ")[2]
+            sections.setdefault(commit, []).append(TITLES.get(name, name))
+    return "; ".join(f"`{commit}`: {', '.join(names)}" for commit, names in sections.items())
 
 
 def _step(name: str, run: dict) -> str:

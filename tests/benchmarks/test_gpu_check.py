@@ -30,6 +30,7 @@ def test_every_section_runs_and_reports(tmp_path):
     default, lowmem = report["train"]["default"], report["train"]["lowmem"]
     assert default["ms_per_step"] > default["unet_ms"] > 0 and lowmem["ms_per_step"] > 0
     assert default["unet_ms"] > default["empty_networks"]["unet_ms"] > 0
+    assert 0 < report["correct"]["fallback"]["gradient"] < 2e-5
     assert report["demos"]["demo.yaml"]["psnr"] > 10
     assert report["demos"]["toybox.yaml"]["unet_ms"] > 0
     assert report["prune"]["gaussians"] == [800, 200] and report["prune"]["psnr"] > 20
@@ -46,7 +47,7 @@ def test_a_failed_section_is_recorded_and_the_rest_continues(monkeypatch, tmp_pa
     report = json.loads((tmp_path / "report.json").read_text())
     assert (
         status == 1
-        and len(report["correct"]["failed"]) == len(report["correct"]["relative_errors"]) == 3
+        and len(report["correct"]["failed"]) == len(report["correct"]["relative_errors"]) + 1 == 4
     )
     assert (
         all("gradient by" in words for words in report["correct"]["failed"])
@@ -123,17 +124,89 @@ def test_without_a_gpu_it_says_why(tmp_path):
     assert "nothing was checked" in json.loads((tmp_path / "report.json").read_text())["failed"]
 
 
-def test_the_table_names_what_was_not_measured(tmp_path, monkeypatch):
+def test_the_fallback_is_drawn_on_the_cpu_too():
+    found = gpu_kernels.fallback(gpu_check.parse_arguments(["--device", "cpu", "--small"]))
+    assert 0 < found["image"] < gpu_kernels.IMAGE_ERROR
+    assert 0 < found["gradient"] < gpu_kernels.GRADIENT_ERROR
+
+
+@pytest.mark.parametrize(
+    "slow, words",
+    [
+        ({"image": 1e-7, "gradient": 1e-3}, "gradient by 1.00e-03"),
+        (RuntimeError("no memory"), "RuntimeError: no memory"),
+    ],
+)
+def test_a_wrong_fallback_is_a_failure(monkeypatch, slow, words):
+    right = {"image": 0.0, "gradient": 0.0, "same_bits": True}
+
+    def in_process(name, args):
+        if name == "fallback" and isinstance(slow, Exception):
+            raise slow
+        return slow if name == "fallback" else {"a case": right}
+
+    monkeypatch.setattr(gpu_kernels, "in_process", in_process)
+    found = gpu_kernels.correct(gpu_check.parse_arguments(["--device", "cpu", "--small"]))
+    assert found["failed"] == [f"plain torch in float32: {words}"]
+    assert found["relative_errors"] == {"a case": right}
+
+
+def test_a_comparison_beyond_its_aim_says_so():
+    aim = gpu_kernels.COMPARISON_AIM
+    assert gpu_kernels.beyond_aim({"reference": aim / 2, "kernels": aim}) == {"beyond_aim": "50 %"}
+    assert gpu_kernels.beyond_aim({"reference": aim / 2, "kernels": aim / 4}) == {}
+
+
+def table(tmp_path, monkeypatch, found) -> list[str]:
+    """Return the lines of the table of one report."""
     results = tmp_path / "benchmarks/results"
     results.mkdir(parents=True)
+    (results / "gpu-a.json").write_text(json.dumps(found))
+    monkeypatch.setattr(tables, "ROOT", tmp_path)
+    return tables.gpu().splitlines()
+
+
+def test_the_table_has_aims_and_commits(tmp_path, monkeypatch):
+    default = {"unet_ms": 20.0, "other_ms": 3.0, "empty_step_over_unet": 0.444}
+    found = {
+        "machine": "a CPU; commit 4444444",
+        "device": "a GPU",
+        "compile": {
+            "machine": "a CPU; commit 1111111",
+            "comparison": {"reference": 0.031, "kernels": 0.095},
+        },
+        "correct": {
+            "machine": "a CPU; commit 2222222",
+            "fallback": {"image": 2e-7, "gradient": 3e-6},
+        },
+        "train": {
+            "machine": "a CPU; commit 1111111",
+            "default": default,
+            "lowmem": default | {"other_ms": 3.5},
+        },
+    }
+    lines = table(tmp_path, monkeypatch, found)
+    for row in (
+        "| comparison at the first use (aim: 0.1 s): plain torch, kernels; sum | 0.031 s, 0.095 s; "
+        "0.126 s for 1 draw, 26 % beyond the aim |",
+        "| plain torch in float32: image, gradients | 2e-07, 3e-06 |",
+        "| the rest over the U-Net (aim: 3 %): default, low memory | 15.0 %, 17.5 % |",
+        "| that step over the U-Net's time | 0.44 |",
+        "| commits of the sections | `1111111`: compile, train; `2222222`: correct |",
+    ):
+        assert row in lines
+    found["compile"]["comparison"] = {"reference": 0.03, "kernels": 0.06, "draws": 3}
+    (tmp_path / "benchmarks/results/gpu-a.json").write_text(json.dumps(found))
+    assert "sum | 0.030 s, 0.060 s; 0.090 s for 3 draws |" in tables.gpu()
+
+
+def test_the_table_names_what_was_not_measured(tmp_path, monkeypatch):
     found = {
         "device": "a GPU",
         "correct": {"failed": "x"},
         "bench": {"fast": {"ms": 2.0, "mb": 3.0}, "gsplat": {"unavailable": "x"}},
     }
-    (results / "gpu-a.json").write_text(json.dumps(found))
-    monkeypatch.setattr(tables, "ROOT", tmp_path)
-    lines = tables.gpu().splitlines()
+    lines = table(tmp_path, monkeypatch, found)
     assert "| forward and backward, fast | 2.00 ms, 3 MB |" in lines
     assert "| forward and backward, gsplat | not measured |" in lines
     assert "| the same bits again | not measured |" in lines
