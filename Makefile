@@ -66,10 +66,13 @@ toybox-sheet: $(VENV)/ready-for-models       ## docs/images/toybox-world.png: 10
 
 charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbers beside them
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting --from-csv
+	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.growth --from-csv
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.chart_runs
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.attributes --objects
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.variant_charts
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.toybox_charts
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.mesh --objects
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.polish --objects
 
 # the meshes to measure on: make measure-charts OBJECTS="toy.glb path/to/spot.glb path/to/duck.glb"
 OBJECTS = toy.glb

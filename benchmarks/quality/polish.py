@@ -3,6 +3,7 @@ refinement by score does afterwards: docs/charts/polish.csv and .png.
 
     python -m benchmarks.quality.polish --objects path/to/spot.glb
     python -m benchmarks.quality.polish --objects path/to/spot.glb --count 20000 --steps 50
+    python -m benchmarks.quality.polish --objects                            # the chart only
 
 The cloud is made of points that are uniform on the mesh, with its colours, as large as the distance
 to the nearest point, in a PLY with TripoSplat's axes. *pruned*: rounds of the prune command's
