@@ -1,21 +1,18 @@
-"""The tables of docs/rasteriser.md, from docs/charts/rasteriser.csv, docs/charts/growth.csv,
-benchmarks/results/splatting.csv and benchmarks/results/kernel.csv, and that of docs/cuda.md, from
-benchmarks/results/gpu-<device>.json.
+"""The tables of docs/rasteriser.md from docs/charts/rasteriser.csv and splatting.csv, and that of
+docs/cuda.md, from gpu-<device>.json, both in benchmarks/results.
 """
 
 import functools
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.markdown import markdown, read
-from benchmarks.quality.chart_runs import grouped
 from benchmarks.splatting.gpu_kernels import COMPARISON_AIM, beyond_aim
 from benchmarks.splatting.gpu_training import REST_AIM
 
 ROOT = Path(__file__).resolve().parents[2]
 ACCURACY, SPEED = ROOT / "docs/charts/rasteriser.csv", ROOT / "benchmarks/results/splatting.csv"
-KERNEL, GROWTH = ROOT / "benchmarks/results/kernel.csv", ROOT / "docs/charts/growth.csv"
 SCENES = ("initial", "trained", "fog", "needles", "deep", "near plane")
 PRESETS = {"fast": "1/255", "balanced": "1/1024", "accurate": "1/65536"}
 TITLES = {"train_that_waited": "the earlier state"}
@@ -113,53 +110,6 @@ def speedup() -> str:
     threads = sorted({key[0] for key in ms}, key=int)
     times = " / ".join(f"{ms[n, 'gsplat'] / ms[n, 'cpu']:.0f}" for n in threads)
     return f"{times} times faster ({' / '.join(threads)} threads)"
-
-
-def kernel() -> str:
-    """Return times of the CPU kernel before and now, and ratios, also to the prototype: a table for
-    each machine and pair of commits.
-    """
-    cases: list[dict[str, dict[str, str]]] = []
-    for row in read(KERNEL):
-        if row["contender"] == "before":
-            cases.append({})
-        cases[-1][row["contender"]] = row
-    measured = grouped(
-        cases,
-        lambda case: (case["now"]["machine"], case["before"]["commit"], case["now"]["commit"]),
-    )
-    return "\n\n".join(_kernel_table(*where, found) for where, found in measured.items())
-
-
-def _kernel_table(
-    machine: str, before: str, now: str, cases: Sequence[dict[str, dict[str, str]]]
-) -> str:
-    """Return the table of cases that have rows of "before", "now", and maybe "prototype"."""
-    lines = []
-    for case in cases:
-        row, ms = case["now"], {name: float(row["both_ms"]) for name, row in case.items()}
-        views = f"{row['views']} × " if row["views"] != "1" else ""
-        scene = f"{row['scene']}, {int(row['gaussians']):,} Gaussians, {views}{row['size']}²"
-        ratios = (
-            f"{ms['now'] / ms[name]:.2f}" if name in ms else "" for name in ("before", "prototype")
-        )
-        lines.append((scene, row["build"], f"{ms['before']:.1f}", f"{ms['now']:.1f}", *ratios))
-    head = ("scene", "build", f"before ({before}), ms", f"now ({now}), ms")
-    head += ("now / before", "now / AVX-512 prototype")
-    return f"{machine}:\n\n{markdown(head, lines)}"
-
-
-def growth() -> str:
-    """Return processor seconds and peak memory for each number of Gaussians."""
-    rows = (
-        (
-            f"{int(row['gaussians']):,}",
-            f"{float(row['cpu_seconds']):.2f}",
-            f"{float(row['memory_mb']):.0f}",
-        )
-        for row in read(GROWTH)
-    )
-    return markdown(("Gaussians", "CPU s", "peak memory, MB"), rows)
 
 
 def gpu() -> str:
