@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from benchmarks.splatting import bench_scenes, gpu_check, gpu_kernels, gpu_processes, tables
+from threestudio_gaussiandreamer.splatting.cuda import proof
 
 ROOT = Path(__file__).parents[2]
 
@@ -149,6 +150,16 @@ def test_a_wrong_fallback_is_a_failure(monkeypatch, slow, words):
     found = gpu_kernels.correct(gpu_check.parse_arguments(["--device", "cpu", "--small"]))
     assert found["failed"] == [f"plain torch in float32: {words}"]
     assert found["relative_errors"] == {"a case": right}
+
+
+def test_a_comparison_is_timed_in_two_parts(monkeypatch):
+    monkeypatch.setattr(torch, "zeros", lambda *_, device: None)
+    monkeypatch.setattr(gpu_kernels, "synchronize", lambda args: None)
+    monkeypatch.setattr(proof, "reference", lambda: time.sleep(0.01))
+    monkeypatch.setattr(proof, "errors_on", lambda *_: time.sleep(0.12))
+    found = gpu_kernels.comparison(gpu_check.parse_arguments([]))
+    assert 0 < found["reference"] and 0 < found["kernels"]
+    assert found["draws"] == len(proof.OPTIONS) and found["beyond_aim"].endswith(" %")
 
 
 def test_a_comparison_beyond_its_aim_says_so():
