@@ -129,7 +129,8 @@ def to_opencv(
     """Convert the host's OpenGL cameras to ``(viewmats, Ks)``: flip the camera's y and z axes, then
     invert the rigid motion.
     """
-    flipped = torch.cat([c2w[..., :1], -c2w[..., 1:3], c2w[..., 3:]], dim=-1)
+    flipped = c2w.clone()
+    flipped[:, :, 1:3].neg_()
     return world_to_camera(flipped), intrinsics(fovy, height, width)
 
 

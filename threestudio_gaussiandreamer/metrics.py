@@ -18,7 +18,12 @@ def psnr(image: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]) -> Floa
 
     The result is clamped to [-100, 100] dB; an error that isn't finite gives -100 dB.
     """
-    error = (image - truth).square().mean().nan_to_num(nan=torch.inf)
+    return psnr_of_error((image - truth).square().mean())
+
+
+def psnr_of_error(mean_square: Float[Tensor, ""]) -> Float[Tensor, ""]:
+    """Compute the result of :func:`psnr` from the mean squared error."""
+    error = mean_square.nan_to_num(nan=torch.inf)
     return -10 * error.clamp(10 ** (-MAX_PSNR / 10), 10 ** (MAX_PSNR / 10)).log10()
 
 

@@ -125,6 +125,8 @@ def test_one_pass_over_the_pixels_gives_the_bits_of_the_general_path(
     in_general(monkeypatch)
     expected, expected_grad = step(guidance(mesh_path, **options), rgb, **views)
     assert torch.equal(grad, expected_grad) and grad.abs().max() > 0
+    truth = guidance(mesh_path).truth.render(views, BACKGROUNDS)
+    assert out.pop("error_to_truth") == pytest.approx((rgb - truth).square().mean().item(), 1e-5)
     assert out.keys() == expected.keys()
     for name, value in expected.items():
         torch.testing.assert_close(

@@ -85,25 +85,39 @@ def test_a_configuration_that_can_not_be_read_is_named(launch, monkeypatch):
     assert code == 2 and "error: the configuration tiny.yaml can't be read" in err
 
 
+class Built(Exception):
+    """Raised with the options of the trainer, in place of building it."""
+
+
+@pytest.fixture
+def stop_before_trainer(monkeypatch):
+    def build(section, owner, options):
+        raise Built(options)
+
+    monkeypatch.setattr(run, "build", build)
+
+
 @pytest.mark.parametrize("strategy", [None, "auto", "ddp"])
-def test_several_gpus_train_replicas_of_one_cloud(launch, monkeypatch, strategy):
+def test_several_gpus_train_replicas_of_one_cloud(
+    launch, monkeypatch, stop_before_trainer, strategy
+):
     """Also if the configuration states the default explicitly: DDP's wrapper would keep the
     parameters that densification replaces.
     """
-    built = []
-
-    class Built(Exception):
-        pass
-
-    def build(section, owner, arguments):
-        built.append(arguments)
-        raise Built
-
-    monkeypatch.setattr(run, "build", build)
     monkeypatch.setattr(experiment, "announce_device", lambda gpu: 2)
-    with pytest.raises(Built):
+    with pytest.raises(Built) as built:
         launch("--train", *([f"trainer.strategy={strategy}"] if strategy else []))
-    assert isinstance(built[0]["strategy"], ReplicatedStrategy) and built[0]["devices"] == 2
+    options = built.value.args[0]
+    assert isinstance(options["strategy"], ReplicatedStrategy) and options["devices"] == 2
+
+
+def test_nothing_is_profiled_unless_it_is_asked_for(launch, stop_before_trainer):
+    for overrides, profiler in ([], callbacks.NoProfiler), (["trainer.profiler=simple"], str):
+        with pytest.raises(Built) as built:
+            launch("--train", *overrides)
+        assert type(built.value.args[0]["profiler"]) is profiler
+    with callbacks.NoProfiler().profile("a hook"):
+        pass
 
 
 # -- runs that meet --------------------------------------------------------------------------------

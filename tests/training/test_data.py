@@ -52,6 +52,14 @@ def test_a_training_batch_has_the_hosts_keys_shapes_and_units():
     assert torch.equal(batch["camera_positions"], batch["c2w"][:, :3, 3])
 
 
+def test_a_batch_stays_as_it_is_on_the_cpu_and_is_copied_to_other_devices():
+    data = module()
+    (batch,) = batches(data, 1)
+    assert data.transfer_batch_to_device(batch, torch.device("cpu"), 0) is batch
+    moved = data.transfer_batch_to_device(batch, torch.device("meta"), 0)
+    assert moved["c2w"].is_meta and moved["height"] == 32
+
+
 def test_rays_are_there_when_asked_for():
     (batch,) = batches(module(rays=True), 1)
     assert batch["rays_o"].shape == batch["rays_d"].shape == (4, 32, 48, 3)

@@ -8,6 +8,9 @@ import torch
 
 from tests.training.runs import launch, run_folder
 from threestudio_gaussiandreamer.core.host_copies import HostCopy
+from threestudio_gaussiandreamer.metrics import psnr
+from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
+from threestudio_gaussiandreamer.training import system
 from threestudio_gaussiandreamer.training.events import StepLog
 
 
@@ -61,7 +64,31 @@ def test_a_number_that_is_monitored_is_waited_for(trainer, monkeypatch):
 def test_a_run_logs_each_number_once_at_the_steps_of_the_learning_rates(tmp_path, painted_box):
     steps = ["trainer.max_steps=4", "trainer.log_every_n_steps=2", "trainer.val_check_interval=4"]
     assert launch(tmp_path, painted_box, *steps) == 0
-    with open(run_folder(tmp_path) / "csv_logs" / "version_0" / "metrics.csv") as file:
-        rows = list(csv.DictReader(file))
+    rows = logged_rows(tmp_path)
     for name in ("loss", "dB", "gaussians", "train/loss_sds", "train/grad_norm", "lr-Adam/means"):
         assert [row["step"] for row in rows if row[name]] == ["1", "3"], name
+
+
+@pytest.mark.skipif(cpu.unavailable() is not None, reason=str(cpu.unavailable()))
+def test_the_error_that_a_guidance_returns_is_logged_and_no_truth_is_rendered(
+    tmp_path, painted_box, monkeypatch
+):
+    expected = []
+    render, report = system.true_views, system.GaussianDreamerSystem.report
+
+    def compare(own, out, batch, *numbers):
+        truth = render(own.guidance, batch, out)
+        expected.append(psnr(out["comp_rgb"].detach(), truth).item())
+        report(own, out, batch, *numbers)
+
+    monkeypatch.setattr(system.GaussianDreamerSystem, "report", compare)
+    monkeypatch.delattr(system, "true_views")
+    steps = ["trainer.max_steps=2", "trainer.val_check_interval=2"]
+    assert launch(tmp_path, painted_box, *steps) == 0
+    logged = [float(row["dB"]) for row in logged_rows(tmp_path) if row["dB"]]
+    assert logged == pytest.approx(expected, abs=1e-4) and len(expected) == 2
+
+
+def logged_rows(folder):
+    with open(run_folder(folder) / "csv_logs" / "version_0" / "metrics.csv") as file:
+        return list(csv.DictReader(file))

@@ -8,6 +8,7 @@ import torch
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.training.losses import (
     REGULARISERS,
+    loggable,
     total_variation,
     weighted_losses,
 )
@@ -37,6 +38,13 @@ def test_each_regulariser_is_weighted_and_computed_only_where_it_has_a_weight():
     assert float(losses["sparsity"]) == pytest.approx(3 * math.sqrt(0.26))
     assert float(losses["opaque"]) == pytest.approx(3 * math.log(2))
     assert set(weighted_losses(guided, {}, {"sds": 1.0, "tv": 0.0})) == {"sds"}
+
+
+def test_numbers_of_a_guidance_are_logged_but_not_its_error_to_the_truth():
+    guided = {"loss_sds": torch.tensor(2.0), "grad_norm": 1.0, "error_to_truth": 0.25}
+    guided["pictures"] = torch.zeros(2, 3)
+    numbers = loggable(guided, {"sds": torch.tensor(4.0)})
+    assert numbers == {"train/grad_norm": 1.0, "train/loss_sds": 4.0}
 
 
 def test_a_weight_without_a_loss_is_named():

@@ -146,6 +146,7 @@ def sds_loss(
     *,
     squares: Optional[Float[Tensor, ""]] = None,
     slope: float = 1.0,
+    in_place: bool = False,
 ) -> Float[Tensor, ""]:
     """Compute 0.5 sum grad^2 / B, a loss whose gradient with respect to x is slope grad / B.
 
@@ -154,24 +155,26 @@ def sds_loss(
     Args:
         squares: sum grad^2 if it is already known.
         slope: d latent / dx, where ``grad`` is that with respect to a latent, linear in x.
+        in_place: the backward pass, which then can be run only once, overwrites ``grad``.
     """
     squares = grad.detach().square().sum() if squares is None else squares
     loss = 0.5 * squares / max(len(grad), 1)
-    return _GivenGradient.apply(x, grad.detach(), loss, slope)
+    return _GivenGradient.apply(x, grad.detach(), loss, slope, in_place)
 
 
 class _GivenGradient(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, x, grad, loss, slope):
+    def forward(ctx, x, grad, loss, slope, in_place):
         ctx.save_for_backward(grad)
-        ctx.slope = slope
+        ctx.slope, ctx.in_place = slope, in_place
         return loss.clone()
 
     @staticmethod
     @once_differentiable
     def backward(ctx, upstream):
         (grad,) = ctx.saved_tensors
-        return upstream / max(len(grad), 1) * ctx.slope * grad, None, None, None
+        factor = upstream / max(len(grad), 1) * ctx.slope
+        return grad.mul_(factor) if ctx.in_place else factor * grad, None, None, None, None
 
 
 def ddim_step(

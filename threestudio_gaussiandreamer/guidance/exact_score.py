@@ -143,12 +143,13 @@ class ExactScoreGuidance(ScoreDistillation):
         found = self._in_one_pass(rgb.detach(), **options)
         if found is None:
             return super().__call__(rgb, prompt_utils, **options)
-        grad, squares = found
+        grad, squares, error = found
         self.evaluations, self._perplexity = 0, 1.0
         bad = torch.zeros(len(rgb), dtype=torch.bool)
         self._count_bad(bad)
-        loss = sds.sds_loss(rgb, grad, squares=squares.sum().float(), slope=2.0)
-        return self._result(loss, squares.sqrt().float(), bad)
+        total = squares.sum().float()
+        loss = sds.sds_loss(rgb, grad, squares=total, slope=2.0, in_place=True)
+        return self._result(loss, squares.sqrt().float(), bad) | {"error_to_truth": error}
 
     @torch.no_grad()
     def _in_one_pass(
@@ -161,9 +162,10 @@ class ExactScoreGuidance(ScoreDistillation):
         rgb_as_latents: bool = False,
         guidance_eval: bool = False,
         **batch: Any,
-    ) -> Optional[tuple[Float[Tensor, "B H W 3"], Float[Tensor, " B"]]]:
-        """Return the gradient of the latents, channels last, and the sum of its squares per item;
-        None if other options, or values that aren't finite, need the general path.
+    ) -> Optional[tuple[Float[Tensor, "B H W 3"], Float[Tensor, " B"], float]]:
+        """Return the gradient of the latents, channels last, the sum of its squares per item, and
+        the mean squared error of the renders; None if other options, or values that aren't finite,
+        need the general path.
         """
         size = rgb.shape[1:3]
         if rgb_as_latents or guidance_eval or not known_picture.is_available(rgb.device):
@@ -179,7 +181,11 @@ class ExactScoreGuidance(ScoreDistillation):
         weight = sds.weight(self.options.weighting_strategy, abar).float()
         background, scale = background[:, 0, 0].contiguous(), (abar / (1 - abar)).sqrt().float()
         found = known_picture.known_gradient(rgb, pictures, background, scale, weight)
-        return found if found is not None and found[1].isfinite().all() else None
+        if found is None or not found[1].isfinite().all():
+            return None
+        # the gradient is 2 weight scale (render - picture); plain numbers are faster than tensors
+        factors = zip(found[1].tolist(), weight.tolist(), scale.tolist(), strict=True)
+        return *found, sum(square / (2 * w * s) ** 2 for square, w, s in factors) / rgb.numel()
 
     def _compares_pixels(self, size: tuple[int, int]) -> bool:
         """Return whether the score is that of one picture per item without width, of the pixels of

@@ -3,6 +3,8 @@
 If a guidance has an attribute ``truth`` (a :class:`KnownTruth`), renders of the run are compared
 with that ground truth: the progress bar shows the PSNR, validation pictures include the ground
 truth, ``budget: auto`` measures the loss of PSNR, and, if it is a mesh, held-out views are scored.
+A guidance that has computed the mean squared error of a step's renders to the ground truth returns
+it as ``error_to_truth``; where it doesn't, steps that are logged render the ground truth.
 """
 
 from collections.abc import Callable

@@ -25,6 +25,8 @@ SECONDS_BETWEEN = 60.0
 """Shortest time between two checkpoints, seconds: a crash loses about as much training."""
 SHARE_OF_TIME = 0.01
 """Largest share of the running time that is spent on writing checkpoints."""
+SECONDS_SHOWN = 0.5
+"""Time from one drawing of the progress bar to the next, seconds: one costs as much as a log."""
 SOURCE_ENDINGS = (".py", ".yaml", ".h", ".cpp", ".cu", ".html", ".css", ".js", ".glsl")
 
 
@@ -117,12 +119,21 @@ def write_copy(path: Path, content: bytes) -> None:
 
 
 class ProgressBar(pl.callbacks.TQDMProgressBar):
-    """Lightning's progress bar without the version number. If the output isn't a terminal, it is
-    printed every 100 steps.
+    """Lightning's progress bar without the version number. In training it is drawn about every
+    :data:`SECONDS_SHOWN`; if the output isn't a terminal, it is printed every 100 steps.
     """
 
     def __init__(self) -> None:
         super().__init__(refresh_rate=1 if sys.stderr.isatty() else 100)
+        self._due = 0.0
+
+    def on_train_batch_end(
+        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        now, is_last = time.monotonic(), batch_idx + 1 == self.train_progress_bar.total
+        if self.refresh_rate > 1 or is_last or now >= self._due:
+            self._due = now + SECONDS_SHOWN
+            super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
 
     def get_metrics(self, trainer: Any, pl_module: Any) -> dict[str, Any]:
         metrics = super().get_metrics(trainer, pl_module)
@@ -134,6 +145,15 @@ class ProgressBar(pl.callbacks.TQDMProgressBar):
     def on_exception(self, trainer: Any, pl_module: Any, exception: BaseException) -> None:
         # end the bar's line, so that the next message starts on its own
         print(file=sys.stderr)
+
+
+class NoProfiler(pl.profilers.PassThroughProfiler):
+    """Lightning's profiler that measures nothing, without a generator around each call of a hook:
+    there are dozens in a step.
+    """
+
+    def profile(self, action_name: str) -> contextlib.AbstractContextManager:
+        return contextlib.nullcontext()
 
 
 class LastNumbers(pl.callbacks.Callback):

@@ -21,7 +21,15 @@ from ..host import find, info, pl, warn
 from ..host.typed_config import parse_structured
 from ..view.live import LiveView, serve_until_stopped
 from ..view.run_index import note_time, write_index
-from .callbacks import LastCheckpoint, LastNumbers, LearningRates, ProgressBar, RunRecord, Stopped
+from .callbacks import (
+    LastCheckpoint,
+    LastNumbers,
+    LearningRates,
+    NoProfiler,
+    ProgressBar,
+    RunRecord,
+    Stopped,
+)
 from .checkpoints import AtomicCheckpointIO
 from .config_check import MisconfigurationException, build, plain
 from .ddp import environment_plugins, is_lost_process, planned_processes, trainer_options
@@ -223,6 +231,7 @@ class Run:
         options = {
             "enable_model_summary": False,
             "enable_progress_bar": True,
+            "profiler": NoProfiler(),
             **plain(self.cfg.trainer),
         }
         checkpoint_io = AtomicCheckpointIO()

@@ -280,6 +280,14 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
             self.train_dataset, batch_size=None, collate_fn=self.train_dataset.collate
         )
 
+    def transfer_batch_to_device(
+        self, batch: Any, device: torch.device, dataloader_idx: int
+    ) -> Any:
+        """Return a batch on a device: itself on the CPU, where it was made."""
+        if device.type == "cpu":
+            return batch
+        return super().transfer_batch_to_device(batch, device, dataloader_idx)
+
     def pool_views(self) -> Optional[dict[str, Any]]:
         """Return ``c2w``, ``fovy``, ``height``, ``width``, ``batch_size`` of all views of a fixed
         pool; None where those change.

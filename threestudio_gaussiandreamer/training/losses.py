@@ -46,9 +46,13 @@ def weight_schedules(options: Mapping[str, Any]) -> dict[str, Schedule]:
 
 def loggable(guided: Mapping[str, Any], losses: Mapping[str, Tensor]) -> dict[str, Any]:
     """Return the names and values to log: the scalars of a guidance that aren't losses (guidances
-    also return pictures and latents), and the weighted losses.
+    also return pictures and latents) nor ``error_to_truth``, and the weighted losses.
     """
-    scalars = {k: v for k, v in guided.items() if not k.startswith("loss_") and _is_one_number(v)}
+    scalars = {
+        name: value
+        for name, value in guided.items()
+        if not name.startswith("loss_") and name != "error_to_truth" and _is_one_number(value)
+    }
     weighted = {f"loss_{name}": value.detach() for name, value in losses.items()}
     return {f"train/{name}": value for name, value in (scalars | weighted).items()}
 

@@ -50,7 +50,7 @@ from ..guidance.foreign import (
 )
 from ..guidance.known_truth import truth_of
 from ..host import BaseLift3DSystem, C, find, info, register, validate_schedule, warn
-from ..metrics import psnr
+from ..metrics import psnr, psnr_of_error
 from ..priors.cache import cached_cloud
 from ..prune import PruneOptions
 from .background import FlatBackground
@@ -238,19 +238,19 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         return self.renderer(**batch)
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        optimizer = self.optimizers()
+        optimizer, step = self.optimizers(), self.global_step
         self.set_learning_rates(optimizer)
-        batch = self.image_targets.batch(batch, self.global_step, self.background)
+        batch = self.image_targets.batch(batch, step, self.background)
         out = self(batch)
-        warn_if_invisible(out["opacity"], self.global_step)
-        self.density.before_backward(out, self.global_step)
+        warn_if_invisible(out["opacity"], step)
+        self.density.before_backward(out, step)
         guided = self.supervise(out, batch)
         losses = self.losses(guided, out)
         self.manual_backward(torch.stack(list(losses.values())).sum())
         average_gradients(
             parameter for group in optimizer.param_groups for parameter in group["params"]
         )
-        self.image_targets.hold_shapes(optimizer, self.global_step)
+        self.image_targets.hold_shapes(optimizer, step)
         loss_scale = self.loss_scale.value(self.trainer)
         self.density.after_backward(out["rasterized"], batch["width"], batch["height"], loss_scale)
         optimizer.step()
@@ -318,9 +318,10 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             return
         numbers, loss = loggable(guided, losses), sum(losses.values()).detach()
         shown = {"loss": loss, "gaussians": len(self.geometry)}
-        truth = true_views(self.guidance, batch, out)
-        if truth is not None:
-            shown["dB"] = psnr(out["comp_rgb"].detach(), truth).mean()
+        if "error_to_truth" in guided:
+            shown["dB"] = psnr_of_error(torch.tensor(guided["error_to_truth"]))
+        elif (truth := true_views(self.guidance, batch, out)) is not None:
+            shown["dB"] = psnr(out["comp_rgb"].detach(), truth)
         self.step_log.write(self.trainer, numbers | shown, shown)
         self.geometry.warn_of_clamped_sizes()
 

@@ -36,11 +36,12 @@ class Updateable:
         """Hook that is called after a batch."""
 
     def _updateables(self) -> list["Updateable"]:
-        attributes = {**vars(self), **getattr(self, "_modules", {})}
+        own = vars(self)
         return [
             part
+            for attributes in (own, own.get("_modules", {}))
             for name, part in attributes.items()
-            if not name.startswith("_") and isinstance(part, Updateable)
+            if isinstance(part, Updateable) and not name.startswith("_")
         ]
 
 
