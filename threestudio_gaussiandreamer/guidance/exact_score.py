@@ -147,8 +147,7 @@ class ExactScoreGuidance(ScoreDistillation):
         self.evaluations, self._perplexity = 0, 1.0
         bad = torch.zeros(len(rgb), dtype=torch.bool)
         self._count_bad(bad)
-        total = squares.sum().float()
-        loss = sds.sds_loss(rgb, grad, squares=total, slope=2.0, in_place=True)
+        loss = sds.sds_loss(rgb, grad, squares=squares.sum().float(), slope=2.0, in_place=True)
         return self._result(loss, squares.sqrt().float(), bad) | {"error_to_truth": error}
 
     @torch.no_grad()

@@ -247,9 +247,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         guided = self.supervise(out, batch)
         losses = self.losses(guided, out)
         self.manual_backward(torch.stack(list(losses.values())).sum())
-        average_gradients(
-            parameter for group in optimizer.param_groups for parameter in group["params"]
-        )
+        average_gradients(p for group in optimizer.param_groups for p in group["params"])
         self.image_targets.hold_shapes(optimizer, step)
         loss_scale = self.loss_scale.value(self.trainer)
         self.density.after_backward(out["rasterized"], batch["width"], batch["height"], loss_scale)
