@@ -92,8 +92,9 @@ weight = torch.nn.Parameter(torch.ones(2))
 optimizer = torch.optim.Adam([weight], lr=0.1)
 weight.square().sum().backward()
 optimizer.step(), optimizer.zero_grad()
-late = [isinstance(sys.modules[name], LatePackage) for name in ("torch._dynamo", "torchmetrics")]
-print(late, "scipy.signal" in sys.modules, "transformers" in sys.modules)
+late = ("torch._dynamo", "torchmetrics", "torchmetrics.utilities.plot")
+print([isinstance(sys.modules[name], LatePackage) for name in late])
+print({"scipy.signal", "transformers", "matplotlib"} & sys.modules.keys())
 """
 USED = """
 import torch
@@ -109,6 +110,23 @@ import torchmetrics
 from torchmetrics.functional.regression import mean_squared_error
 assert isinstance(torchmetrics.MeanMetric(), Metric) and mean_squared_error(x, x) == 0
 print("used")
+"""
+PLOTTED = """
+import sys, torch
+import threestudio_gaussiandreamer.host
+from lightning.pytorch.utilities.types import Metric
+
+class Constant(Metric):
+    update = lambda self: None
+    compute = lambda self: torch.tensor(2.0)
+
+import torchmetrics
+for use in (lambda: None, lambda: torchmetrics.MeanMetric):  # before torchmetrics runs, and after
+    use()
+    figure, axes = Constant()._plot(torch.tensor(2.0))
+    print(type(figure).__name__, axes.get_lines()[0].get_ydata())
+import torchmetrics.utilities.plot
+assert callable(torchmetrics.utilities.plot.plot_curve)
 """
 INCOMPATIBLE = f"""
 import importlib.util, sys
@@ -126,11 +144,20 @@ print(type(torchmetrics).__name__, lightning.pytorch.Trainer.__name__)
 @pytest.mark.parametrize(
     "code, printed",
     [
-        (TRAINING, "[True, True] False False"),
+        (TRAINING, "[True, True, True]\nset()"),
         (USED, "used"),
         (INCOMPATIBLE, "module Trainer"),
     ],
 )
-def test_lightning_and_the_optimisers_run_neither_until_they_are_used(code, printed):
+def test_lightning_and_the_optimisers_run_none_until_they_are_used(code, printed):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == printed, done.stderr
+
+
+@pytest.mark.slow
+def test_metrics_are_plotted_as_if_nothing_were_late(monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    done = subprocess.run([sys.executable, "-c", PLOTTED], capture_output=True, text=True)
+    printed = "Figure [2.]\nFigure [2.]"
     assert done.stdout.strip() == printed, done.stderr

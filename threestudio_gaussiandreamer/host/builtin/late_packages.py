@@ -1,6 +1,6 @@
 """Packages that Lightning and torch's optimisers import, and that a run doesn't use: most of
-torchmetrics, which imports ``scipy.signal``, ``transformers`` and ``matplotlib``, and torch's
-compiler. Together they take more time than all else that a run imports.
+torchmetrics, which imports ``scipy.signal`` and ``transformers``; its plots, which import
+``matplotlib``; and torch's compiler. Together they take more time than all else that a run imports.
 
 They are put into ``sys.modules`` without being run. They run at the first use of anything but the
 few names that Lightning and the optimisers need, which are defined here; from then on the package
@@ -13,20 +13,22 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from importlib import metadata
-from importlib.machinery import ModuleSpec
+from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec, module_from_spec
+from pathlib import Path
 from types import ModuleType
 from typing import Any, Optional
 
 import torch
 
+PLOTS = "torchmetrics.utilities.plot"
 _lock = threading.RLock()
 _running: set[str] = set()
 """Packages that are being run, by the thread that has the lock."""
 
 
 class LatePackage(ModuleType):
-    """A package whose source hasn't run yet. :meth:`run` turns it into a usual module."""
+    """A package or module whose source hasn't run yet. :meth:`run` turns it into a usual module."""
 
     _submodules: tuple[str, ...] = ()
     """Those that can be imported before the package has run."""
@@ -61,7 +63,8 @@ class _Metrics(LatePackage):
     def __getattr__(self, name: str) -> Any:
         if name == "Metric":
             # before metric, which can't be imported first
-            importlib.import_module(f"{self.__name__}.utilities")
+            utilities = importlib.import_module(f"{self.__name__}.utilities")
+            utilities.plot = sys.modules[PLOTS]
             return importlib.import_module(f"{self.__name__}.metric").Metric
         if name == "MetricCollection":
             return importlib.import_module(f"{self.__name__}.collections").MetricCollection
@@ -131,6 +134,7 @@ def _install() -> None:
     if metrics := _late("torchmetrics", _Metrics):
         metrics.__version__ = metadata.version("torchmetrics")
         metrics._logger = logging.getLogger("torchmetrics")
+        _install_plots(Path(metrics.__path__[0], "utilities"))
     if compiler := _late("torch._dynamo", LatePackage):
         torch._dynamo = compiler
         compiler.OptimizedModule = _OptimizedModule
@@ -138,11 +142,32 @@ def _install() -> None:
         compiler.graph_break = lambda *_, **__: None  # it ends a graph; there is none
 
 
-def _late(name: str, kind: type[LatePackage]) -> Optional[LatePackage]:
+def _install_plots(folder: Path) -> None:
+    """Put the module of torchmetrics that draws plots into ``sys.modules``; its base class of
+    metrics needs three names of it.
+    """
+    plots = _late(PLOTS, LatePackage, [str(folder)])
+    plots._AX_TYPE = plots._PLOT_OUT_TYPE = object  # of annotations
+
+    def plot_single_or_multi_val(*args: Any, **options: Any) -> Any:
+        LatePackage.run(plots)  # not its own method, which it has lost if it has run
+        return plots.plot_single_or_multi_val(*args, **options)
+
+    plots.plot_single_or_multi_val = plot_single_or_multi_val
+
+
+def _late(
+    name: str, kind: type[LatePackage], folders: Optional[list[str]] = None
+) -> Optional[LatePackage]:
     """Put a package that hasn't been imported into ``sys.modules``; return None if it has been, or
     isn't there.
+
+    Args:
+        folders: where a submodule is, so that its package needn't run to find it.
     """
-    spec = None if name in sys.modules else find_spec(name)
+    if name in sys.modules:
+        return None
+    spec = find_spec(name) if folders is None else PathFinder.find_spec(name, folders)
     if spec is None:
         return None
     module = sys.modules[name] = module_from_spec(spec)
