@@ -14,7 +14,9 @@ from benchmarks.quality import (
     default_against,
     failure_table,
     formats,
+    large_prune,
     toybox_variants,
+    tried,
     variant_tables,
 )
 from benchmarks.quality import mesh as mesh_quality
@@ -25,7 +27,7 @@ from benchmarks.quality.tables import DIFFERENCES, difference_row, last_rows, me
 from benchmarks.robustness import ddp
 from benchmarks.robustness import scale_tables as scale
 from benchmarks.robustness import tables as robustness
-from benchmarks.splatting import growth, half_precision, kernel_tables
+from benchmarks.splatting import block_pairs, growth, half_precision, kernel_tables
 from benchmarks.splatting import tables as splatting
 from benchmarks.start import tables as start
 from benchmarks.viewers import tables as viewers
@@ -88,11 +90,13 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "docs/formats.md": {"formats": formats.table, "producers": formats.producers},
     "docs/mesh.md": {"front": mesh_quality.front, "conversion": start.conversion},
     "docs/models.md": {"memory of models": memory.table},
+    "docs/pruning.md": {"large prune": large_prune.table},
     "docs/rasteriser.md": {
         "presets": splatting.presets,
         "thresholds": splatting.thresholds,
         "contenders": splatting.contenders,
         "kernel": kernel_tables.kernel,
+        "block pairs": block_pairs.table,
         "growth": growth.table,
         "half precision": half_precision.table,
     },
@@ -122,6 +126,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "wrong priors on a GPU": toybox_variants.wrong_priors_on_gpu,
     },
     "docs/several_processes.md": {"ddp": ddp.table},
+    "docs/tried.md": {"tried": tried.table},
     "docs/scale.md": {
         "units": scale.unit_costs,
         "stated": scale.stated,

@@ -76,7 +76,7 @@ def table() -> str:
         (
             f"{int(row['gaussians']):,}",
             f"`{row['budget']}`",
-            f"{row['machine']}, {row['cores'] or 'unknown'} cores",
+            row["machine"] + (f", {row['cores']} cores" if row["cores"] else ""),
             *(row[name] for name in ("commit", "seconds", "cpu_seconds", "peak_gb")),
             f"{int(row['left']):,}",
             f"{float(row['psnr']):.1f}",

@@ -68,16 +68,25 @@ def test_a_preset_is_drawn_at_the_same_pixels(monkeypatch):
 
 def test_the_table_has_formats_and_presets(tmp_path, monkeypatch):
     monkeypatch.setattr(half_precision, "RESULTS", tmp_path / "half_precision.csv")
+    names = (*half_precision.FORMATS, *half_precision.PRESETS)
+    psnr = dict(zip(names, (90, 60, 50, 55, 60, 80), strict=True))
     rows = [
-        {"sums": sums, "scene": scene, "psnr": "60", "gradient": gradient, "subtracted": rest}
-        for sums in (*half_precision.FORMATS, *half_precision.PRESETS)
-        for scene, gradient in (("trained", "0.002"), ("fog", "0.03"))
-        for rest in ([""] if sums in half_precision.PRESETS else ["0.1"])
+        {"sums": sums, "scene": scene, "psnr": db, "gradient": gradient, "subtracted": rest}
+        for sums, db in psnr.items()
+        for scene, gradient in (("trained", db / 1e4), ("fog", "0.03"))
+        for rest in ([""] if sums in half_precision.PRESETS else ["0.007"])
     ]
     write(half_precision.RESULTS, half_precision.COLUMNS, rows)
-    lines = half_precision.table().splitlines()
-    assert (
-        lines[3]
-        == "| float16 | 60.0 | 60.0 | 2.0e-03, at most 3.0e-02 | 1.0e-01, at most 1.0e-01 |"
-    )
-    assert lines[5].startswith("| preset `fast`, ") and lines[5].endswith("at most 3.0e-02 |  |")
+    first, second = half_precision.table().split("\n\n")
+    found = "6.0e-03, at most 3.0e-02 | 7.0e-03, at most 7.0e-03"
+    assert first.splitlines()[3] == f"| float16 | 60.0 | 60.0 | {found} |"
+    assert first.splitlines()[5].startswith("| preset `fast`, ")
+    assert first.endswith("at most 3.0e-02 |  |")
+    assert second.splitlines()[2:] == [
+        "| float16, image | 2 | 0 | 0 |",
+        "| float16, gradient, back to front | 0 | 0 | 1 |",
+        "| float16, gradient, by subtraction | 1 | 1 | 2 |",
+        "| bfloat16, image | 0 | 0 | 0 |",
+        "| bfloat16, gradient, back to front | 1 | 1 | 1 |",
+        "| bfloat16, gradient, by subtraction | 1 | 1 | 2 |",
+    ]

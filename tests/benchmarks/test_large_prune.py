@@ -53,4 +53,8 @@ def test_the_aim_is_that_of_two_cores(tmp_path, monkeypatch):
     assert [line.split(" | ")[-1] for line in lines] == [
         f"{found} |" for found in ("yes", "no", "no", "not measured", "not measured")
     ]
-    assert "| a processor, unknown cores |" in lines[-1] and "| 40.5 |" in lines[0]
+    assert (
+        "| a processor |" in lines[-1]
+        and "| a processor, 4 cores |" in lines[3]
+        and "| 40.5 |" in lines[0]
+    )
