@@ -44,6 +44,8 @@ class Chart(NamedTuple):
     """Whether the points are labelled with the column ``x``."""
     common: str = ""
     """The variant that is also a point of every line without one at its position."""
+    front: tuple[str, ...] = ()
+    """Variants whose medians a line connects."""
 
 
 DECIBEL = "held-out PSNR, dB"
@@ -106,22 +108,26 @@ RUNS = {
         curves=False,
         size=256,
         chosen_on=(TUNED_ON, "spot", "duck"),
+        front=("draft", "default", "best"),
     ),
     "preset": Chart(
         "Effect of the rasteriser's presets", "cpu_seconds", SECONDS, curves=True, marks_paper=True
     ),
 }
+UNSEEN = RUNS["quality"]._replace(title="Draft, default and best on other objects", chosen_on=())
+DRAWN = RUNS | {"unseen": UNSEEN}
+"""With a chart whose table in docs/results.md has other columns than the others'."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
-        "charts", nargs="*", help=f"of {', '.join(RUNS)}; default: all that have been measured"
+        "charts", nargs="*", help=f"of {', '.join(DRAWN)}; default: all that have been measured"
     )
-    for name in parser.parse_args().charts or RUNS:
+    for name in parser.parse_args().charts or DRAWN:
         rows = rows_of(name)
         if rows:
-            print(draw(name, RUNS[name], rows + papers_own(RUNS[name])))
+            print(draw(name, DRAWN[name], rows + papers_own(DRAWN[name])))
 
 
 def papers_own(chart: Chart) -> list[Row]:
@@ -191,6 +197,10 @@ def draw_panel(panel: Any, chart: Chart, labels: list[str], rows: list[Row]) -> 
         (draw_curve if chart.curves else draw_points)(
             panel, chart, chosen, style, "*" if PAPER in label else "o"
         )
+    front = [ends(lines[label]) for label in chart.front if label in lines]
+    places = [(median(runs, chart.x), spread(runs)[1]) for runs in front]
+    if places:
+        panel.plot(*zip(*places, strict=True), color="0.7", linewidth=1, zorder=0)
     if chart.log_x:
         set_log_x(panel)
     panel.set_xlabel(chart.x_label)
