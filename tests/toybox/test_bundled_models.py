@@ -14,6 +14,7 @@ from threestudio_gaussiandreamer.models.bundled import (
     digest_of,
     read_digests,
 )
+from threestudio_gaussiandreamer.view.config_changes import leaves
 
 register_parts()
 pytestmark = pytest.mark.skipif(
@@ -39,11 +40,14 @@ def test_a_few_steps_with_them(tmp_path):
 
 @pytest.mark.slow
 def test_a_whole_run_is_recognised_by_the_judge(tmp_path):
+    """With the draft's options, which take fewer evaluations for the same steps."""
     pytest.importorskip("diffusers")
     cfg = yaml.safe_load((CONFIGS / "toybox.yaml").read_text())
     prior = cfg["system"]["geometry"]["prior"]
     whole = [f"trainer.max_steps={cfg['trainer']['max_steps']}"]
     whole += [f"system.geometry.prior.{key}={prior[key]}" for key in ("num_steps", "num_points")]
+    draft = leaves(yaml.safe_load((CONFIGS / "toybox-draft.yaml").read_text()))
+    whole += [f"{name}={value}" for name, value in draft]
     assert run(NAME, tmp_path, PROMPT, *whole) == 0
     scores = Scores(NAME).of_asset(result_of(tmp_path / "toybox/t", PROMPT))
     assert scores["kind"] and scores["colors"]
