@@ -172,6 +172,22 @@ def test_the_removal_error_is_that_of_leaving_each_gaussian_out():
     assert (samples.mean(0) / exact - 1).abs().amax() < 0.15
 
 
+def test_a_sample_of_the_removal_error_is_that_of_a_sum_of_signed_pixels():
+    """The same to the bit, so that a run prunes as one of an earlier version did."""
+    shape, opacities = (2, 5, 7, 3), torch.rand(4).requires_grad_()
+    images, alpha = (torch.rand(*shape[:3], c, 4) @ opacities for c in (3, 1))
+    color = torch.rand(2, 1, 1, 3) - 0.5
+    signs = torch.randint(0, 2, shape, generator=generator(0, "r"), dtype=torch.float32) * 2 - 1
+    total = (images * signs).sum() - (alpha * (signs * color).sum(-1, keepdim=True)).sum()
+    (gradients,) = torch.autograd.grad(total, opacities, retain_graph=True)
+    added = importance.AddedBackground(alpha, color)
+    found = importance.removal_error(images, opacities, generator(0, "r"), added)
+    assert torch.equal(found, (opacities.detach() * gradients).square()) and found.amin() > 0
+    color = color.expand(shape).clone()  # per pixel
+    added = importance.AddedBackground(alpha, color)
+    assert torch.equal(found, importance.removal_error(images, opacities, generator(0, "r"), added))
+
+
 def pictures(out, opacities, background=(0.0, 0.0, 0.0)):
     """Return the part of a render that sampling reads."""
     behind = torch.tensor(background).reshape(1, 1, 1, 3)

@@ -19,10 +19,10 @@ these Gaussians: their neighbours can often render that pixel as well, and keepi
 all of them lowers the PSNR."""
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple, Optional
+from typing import Any, NamedTuple, Optional
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from ..core.distributed import all_sum, draw_shared
@@ -88,20 +88,46 @@ def removal_error(
         opacities: the tensor that they were rendered with.
         added: a background that the views had but ``images`` don't show.
     """
-    signs = draw_shared(
-        len(images),
-        lambda count: torch.randint(
-            0, 2, (count, *images.shape[1:]), generator=rng, dtype=torch.float32
-        ),
-    )
-    signs = to_device(signs, images.device).to(images).mul_(2).sub_(1)
-    # a sum of products: given gradients, torch imports all of its symbolic shapes
-    total = (images * signs).sum()
+    signs = draw_shared(len(images), lambda count: _draw_signs((count, *images.shape[1:]), rng))
+    signs = to_device(signs, images.device).to(images)
+    # given gradients as an argument, torch imports all of its symbolic shapes
+    total = _GivenGradient.apply(images, signs)
     if added is not None:
-        total = total - (added.alpha * (signs * added.color).sum(-1, keepdim=True)).sum()
+        of_alpha = _sum_of_products(signs, added.color).neg_()
+        total = total + _GivenGradient.apply(added.alpha, of_alpha)
     (gradients,) = torch.autograd.grad(total, opacities, retain_graph=True)
     gradients = all_sum(gradients)
     return (opacities.detach() * gradients).square().nan_to_num(nan=0.0)
+
+
+class _GivenGradient(torch.autograd.Function):
+    """Zero, with a given gradient: that of a sum of products whose value isn't needed."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, gradient: Tensor) -> Tensor:
+        ctx.save_for_backward(gradient)
+        return x.new_zeros(())
+
+    @staticmethod
+    def backward(ctx: Any, one: Tensor) -> tuple[Tensor, None]:
+        return *ctx.saved_tensors, None
+
+
+def _draw_signs(shape: tuple[int, ...], rng: torch.Generator) -> Int8[Tensor, "*shape"]:
+    """Draw -1 and 1: the numbers of ``2 * torch.randint(0, 2, shape) - 1`` in less time."""
+    bits = torch.empty(shape, dtype=torch.bool).random_(generator=rng)
+    return bits.view(torch.int8).mul_(2).sub_(1)
+
+
+def _sum_of_products(
+    a: Float[Tensor, "B H W C"], b: Float[Tensor, "B #H #W C"]
+) -> Float[Tensor, "B H W 1"]:
+    """Sum a b over the channels; torch's sums over a short last dimension are slow."""
+    total = a[..., :1] * b[..., :1]
+    for channel in range(1, a.shape[-1]):
+        at = slice(channel, channel + 1)
+        total.addcmul_(a[..., at], b[..., at])
+    return total
 
 
 def next_count(count: int, keep: float, budget: int) -> int:

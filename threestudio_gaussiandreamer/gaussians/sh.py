@@ -76,7 +76,7 @@ class _Bounded(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         (colors,) = ctx.saved_tensors
         leaves = (colors >= 1) & (gradient < 0) | (colors <= 0) & (gradient > 0)
-        return gradient.masked_fill(leaves, 0)
+        return torch.where(leaves, 0.0, gradient)
 
 
 def bounded_colors(colors: Float[Tensor, "*batch C"]) -> Float[Tensor, "*batch C"]:

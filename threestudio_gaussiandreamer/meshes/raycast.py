@@ -275,16 +275,16 @@ class TargetCache:
         keys = [_key(camera, height, width) for camera in cameras]
         asked = dict(zip(keys, cameras, strict=True))
         missing = {key: camera for key, camera in asked.items() if key not in self._pictures}
+        found = {key: self._pictures[key] for key in asked if key not in missing}
         if missing:
             missing |= self._take_planned(missing, height, width)
-        images = self.caster.render_views(
-            missing.values(), height, width, supersample=self.supersample
-        )
-        found = {key: self._pictures[key] for key in asked if key not in missing}
-        found |= {
-            key: _planes(np.round(image * 255).astype(np.uint8)).to(c2w.device)
-            for key, image in zip(missing, images, strict=True)
-        }
+            images = self.caster.render_views(
+                missing.values(), height, width, supersample=self.supersample
+            )
+            found |= {
+                key: _planes(np.round(image * 255).astype(np.uint8)).to(c2w.device)
+                for key, image in zip(missing, images, strict=True)
+            }
         self._remember(found)
         return torch.stack([found[key] for key in keys]).movedim(1, -1)
 
