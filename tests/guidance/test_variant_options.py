@@ -82,6 +82,8 @@ def test_the_default_of_mvdream_is_not_refused_without_guidance(tmp_path):
         MVDreamGuidance.preflight(options | given)
     with pytest.raises(UserError, match="recon_std_rescale has no effect .*: leave it at 0.5"):
         MVDreamGuidance.preflight(options | {"recon_std_rescale": 0.3})
+    with pytest.raises(UserError, match="guidance_interval has no effect with guidance_scale=1"):
+        MVDreamGuidance.preflight(options | {"guidance_interval": [0.2, 0.8]})
 
 
 def diffusion(models, **options):

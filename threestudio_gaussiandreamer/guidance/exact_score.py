@@ -52,11 +52,12 @@ from ..core.memory import count_of, require_memory
 from ..core.options import at_least, in_range, interval, one_of, positive, required
 from ..diffusion import sds
 from ..diffusion.exact_score import LinearLatent, color_matrix, denoise, squared_distances
-from ..host import register
+from ..host import parse_structured, register
 from ..meshes.load import AXES, load_mesh
 from ..meshes.raycast import MeshCaster
 from ..splatting.cpu import known_picture
 from .base import GUIDANCE_SCALE, ScoreDistillation
+from .exact_score_checks import pooling_factor, require_used
 from .known_truth import MeshTruth, background_of, composite, resized
 from .picture_bank import Bank, Mixture, bank_modes, direction_indices, rows_of
 from .variants.sds import SDS
@@ -106,6 +107,8 @@ class ExactScoreGuidance(ScoreDistillation):
             size, views = cfg.image_size, cfg.bank_views
             what = f"{views} pictures of {size} x {size} pixels"
             require_memory("image_size", BANK_BYTES * views * size**2, what)
+            if cfg.space == "latent" and size:
+                pooling_factor(size, size, cfg.latent_size)
 
     cfg: Config
     REPORTS = ("perplexity",)
@@ -128,6 +131,11 @@ class ExactScoreGuidance(ScoreDistillation):
             cfg.bank_elevation_range, (-180.0, 180.0), cfg.bank_distance_range, cfg.bank_fovy_range
         )
         self.bank_orbit = camera_pool(cfg.bank_views, ranges, cfg.bank_seed, "bank")
+
+    @classmethod
+    def preflight(cls, cfg: Any) -> None:
+        super().preflight(cfg)
+        require_used(cls, parse_structured(cls.Config, cfg))
 
     @classmethod
     def is_text_guided(cls, cfg: Any) -> bool:
@@ -356,7 +364,8 @@ class ExactScoreGuidance(ScoreDistillation):
             cameras, height, width, supersample=self.cfg.supersample, progress="bank of views"
         )
         images = torch.from_numpy(images).to(self.device)
-        factor = self._factor(height, width)
+        in_pixels = self.cfg.space == "pixel"
+        factor = 1 if in_pixels else pooling_factor(height, width, self.cfg.latent_size)
         pooled = F.avg_pool2d(images.movedim(-1, 1), factor)
         latent = LinearLatent(factor)
         if self.cfg.space == "latent":
@@ -386,15 +395,3 @@ class ExactScoreGuidance(ScoreDistillation):
                 " use system.guidance.space=latent, or a smaller system.guidance.image_size"
             )
         return height, width
-
-    def _factor(self, height: int, width: int) -> int:
-        if self.cfg.space == "pixel":
-            return 1
-        factor = height // self.cfg.latent_size
-        if factor * self.cfg.latent_size != height or width % max(factor, 1):
-            raise UserError(
-                f"pictures of {height}x{width} can't be pooled to a latent "
-                f"{self.cfg.latent_size} high: give a"
-                " system.guidance.image_size that is a multiple of system.guidance.latent_size"
-            )
-        return factor

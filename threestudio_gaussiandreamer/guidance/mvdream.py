@@ -73,6 +73,8 @@ class MVDreamGuidance(StableDiffusionGuidance):
 
     cfg: Config
     family = MULTI_VIEW
+    # without view contrast and Perp-Neg, which it doesn't have
+    UNGUIDED_IGNORES = ("guidance_interval", "recon_std_rescale")
 
     def load_denoiser(self, folder: Path) -> None:
         from diffusers import UNet2DConditionModel
