@@ -98,6 +98,8 @@ def test_rows_that_cant_be_drawn_are_left_out(tmp_path, caplog):
         (["in.ply", "a.glb", "--from", "lgm", "--up", "z"], "--from and --up both say"),
         (["in.ply", "a.glb", "--harmonics", "4"], "--harmonics: expected"),
         (["in.ply", "a.glb", "--check", "--size", "2"], "--size: expected"),
+        (["in.ply", "a.spz", "--size", "64"], "--size: has no effect without --check"),
+        (["in.ply", "a.spz", "--gaussians"], "--gaussians: OUT is a .spz file, which always holds"),
         (["in.ply", "a.glb", "--check"], "--check: OUT is a mesh"),
         (["in.ply", "a.glb", "--faces", "5"], "--faces: expected a whole number from 100"),
         (["in.ply", "a.glb", "--texture", "0"], "--texture: expected a whole number from 64"),

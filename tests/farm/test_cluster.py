@@ -29,7 +29,7 @@ def test_as_many_workers_as_fit():
 @pytest.mark.parametrize(
     ("act", "message"),
     [
-        (lambda: choose_device(CPU, 1, 1), "--gpus 1: the cluster has 0 GPUs"),
+        (lambda: choose_device(CPU, 1, 1), "--gpus 1: the cluster has no GPU; give none"),
         (lambda: choose_device(CPU, None, 9), "--cores 9: the cluster has 8 cores"),
         (lambda: count_workers(CPU, Device(0, 4), None, 3), "with 4 cores each, 2 fit"),
         (lambda: count_workers(GPUS, Device(1, 1), None, 3), "with 1 GPU each, 2 fit"),

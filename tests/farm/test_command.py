@@ -100,7 +100,11 @@ def test_a_folder_in_which_another_command_works_is_refused(farm, monkeypatch, t
 
 def test_the_report_needs_neither_ray_nor_a_finished_asset(farm, monkeypatch, tmp_path):
     no_ray(monkeypatch)
-    code, _ = farm("a fox", "--report", f"exp_root_dir={tmp_path}/runs")
+    options = ["--report", f"exp_root_dir={tmp_path}/runs"]
+    code, err = farm("a fox", *options)
+    assert code == 2 and "there is no farm in" in err and not (tmp_path / "runs").exists()
+    require_same_farm(Place(tmp_path / "runs/farm-prompts"), RECIPE)
+    code, _ = farm("a fox", *options)
     assert code == 0
     assert "waiting" in (tmp_path / "runs/farm-prompts/report/table.csv").read_text()
 

@@ -148,8 +148,10 @@ def test_a_count_above_what_is_there_changes_nothing(source, tmp_path):
         (["--bytes", "1"], "--bytes: 1 are too few for one Gaussian, which takes"),
         (["--psnr", "nan"], "--psnr: expected a number"),
         (["--psnr", "-3"], "--psnr: expected a number above 0"),
-        (["--within", "0"], "--within: expected a loss from 0.001 to 30 dB, got 0"),
-        (["--within", "5000"], "--within: expected a loss"),
+        (["--within", "0", "--quality", "35"], "--within: expected a loss from 0.001 to 30 dB, "),
+        (["--within", "5000", "--quality", "35"], "--within: expected a loss"),
+        (["--within", "0.1"], "--within: give the option quality too, the PSNR of the unpruned"),
+        (["--count", "9", "--quality", "35"], "--quality: has no effect without the budget within"),
         (["--within", "0.1", "--quality", "nan"], "--quality: expected a finite number"),
     ],
 )

@@ -38,13 +38,16 @@ from . import to_mesh
 from .check import VIEWS, round_trip
 from .losses import losses
 
+SIZE = 256
+"""Width and height of the views of ``--check`` unless given, pixels."""
+
 
 @dataclass
 class ConvertOptions:
     """The numeric options, with their ranges."""
 
     harmonics: Optional[int] = field(default=None, metadata=in_range(0, MAX_DEGREE))
-    size: int = field(default=256, metadata=in_range(16, 4096, "pixels"))
+    size: Optional[int] = field(default=None, metadata=in_range(16, 4096, "pixels"))
 
 
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -83,8 +86,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--check": {"action": "store_true", "help": f"measure the PSNR of OUT to IN in {VIEWS} views"},
     "--size": {
         "type": int,
-        "default": ConvertOptions.size,
-        "help": "width and height of the views of --check, pixels (default: %(default)d)",
+        "help": f"width and height of the views of --check, pixels (default: {SIZE})",
     },
 }
 
@@ -149,6 +151,10 @@ def _check_options(args: argparse.Namespace, suffix: str, mesh: bool) -> None:
     if args.up_out and (mesh or not FORMATS[suffix].any_up):
         raise UserError(f"--up-out: OUT is a {suffix} file, whose axes are fixed; it is for PLYs")
     check_options(ConvertOptions, ConvertOptions(args.harmonics, args.size), "--")
+    if args.size is not None and not args.check:
+        raise UserError("--size: has no effect without --check")
+    if args.gaussians and suffix != ".glb":
+        raise UserError(f"--gaussians: OUT is a {suffix} file, which always holds Gaussians")
     to_mesh.check_mesh_options(args)
 
 
@@ -173,8 +179,9 @@ def _read(source: Path, args: argparse.Namespace) -> StoredCloud:
 
 
 def _checked(args: argparse.Namespace, stored: StoredCloud, suffix: str) -> str:
-    found = round_trip(stored, read_cloud(args.output), args.size)
+    size = args.size or SIZE
+    found = round_trip(stored, read_cloud(args.output), size)
     return (
-        f"check: {found.mean:.1f} dB in {VIEWS} views of {args.size} x {args.size} pixels, "
+        f"check: {found.mean:.1f} dB in {VIEWS} views of {size} x {size} pixels, "
         f"{found.worst:.1f} dB in the worst one"
     )

@@ -139,7 +139,10 @@ def choose_device(resources: dict[str, float], gpus: Optional[int], cores: int) 
     """
     there, cpus = int(resources.get("GPU", 0)), int(resources.get("CPU", 0))
     if gpus is not None and gpus > there:
-        raise UserError(f"--gpus {gpus}: the cluster has {there} GPUs; give --gpus {there} or less")
+        most = (
+            f"has {there} GPUs; give --gpus {there} or less" if there else "has no GPU; give none"
+        )
+        raise UserError(f"--gpus {gpus}: the cluster {most}")
     if cores > cpus:
         raise UserError(f"--cores {cores}: the cluster has {cpus} cores; give fewer")
     return Device(1 if (there if gpus is None else gpus) else 0, cores)

@@ -22,7 +22,13 @@ from . import cluster
 from .assets import Recipe
 from .display import Display
 from .driver import Driver
-from .identity import OF_MACHINES, identity, require_same_farm, require_same_recipe
+from .identity import (
+    OF_MACHINES,
+    identity,
+    require_farm,
+    require_same_farm,
+    require_same_recipe,
+)
 from .ledger import FAILED, FINISHED, Ledger
 from .recipe import check_recipe, jobs_left, make_recipe, root_of
 from .remote_ledger import open_ledger
@@ -138,6 +144,7 @@ def run_farm(args: argparse.Namespace) -> int:
     root, overrides = split_root(args.overrides)
     place = place_of(args.out or f"{root or root_of(args.config)}/farm-{args.prompts.stem}")
     if args.report:
+        require_farm(place)
         return report(args, place, open_ledger(place, only_read=True))
     if not is_url(str(place)):
         require_writable(place.folder)

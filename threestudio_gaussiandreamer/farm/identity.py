@@ -31,6 +31,12 @@ def identity(recipe: Recipe) -> dict[str, Any]:
     }
 
 
+def require_farm(place: Place) -> None:
+    """Raise UserError unless a farm has been started in a folder."""
+    if place.read(FILE) is None:
+        raise UserError(f"there is no farm in {place}: it has no {FILE}; check --out")
+
+
 def require_same_farm(place: Place, recipe: Recipe) -> None:
     """Check that a folder is new or of the same farm, and note the farm in a new one.
 

@@ -36,8 +36,7 @@ BUDGETS = {
 OPTIONS: dict[str, dict[str, Any]] = {
     "--quality": {
         "type": float,
-        "default": PruneOptions.quality,
-        "help": "dB of the unpruned cloud to the truth, for --within (default: %(default)g)",
+        "help": "dB of the unpruned cloud to the truth, which --within needs, such as 35",
     },
     "--size": {
         "type": int,

@@ -30,7 +30,7 @@ class PruneOptions:
     """The smallest PSNR to the original, dB."""
     within: Any = None
     """The largest loss of PSNR to the ground truth, dB; the original's PSNR is ``quality``."""
-    quality: float = field(default=35.0, metadata=in_range(-200, 200, "dB"))
+    quality: Optional[float] = field(default=None, metadata=in_range(-200, 200, "dB"))
     size: int = field(default=256, metadata=in_range(16, 4096, "pixels"))
     """Height and width of the views in which PSNR is measured, pixels."""
     steps: int = field(default=60, metadata=in_range(1, 100_000))
@@ -48,11 +48,19 @@ class PruneOptions:
         """Check that at most one budget is given, and its value.
 
         Raises:
-            UserError: more than one budget, or a number out of its range.
+            UserError: more than one budget, a number out of its range, or one of ``within`` and
+                ``quality`` without the other.
         """
         given = [name for name in BUDGETS if getattr(cfg, name) is not None]
         if len(given) > 1:
             raise UserError(f"{given[1]}: give one budget only; {given[0]} is set too")
+        if cfg.quality is None and given == ["within"]:
+            raise UserError(
+                "within: give the option quality too, the PSNR of the unpruned cloud to the ground "
+                "truth in dB, such as 35"
+            )
+        if cfg.quality is not None and given != ["within"]:
+            raise UserError("quality: has no effect without the budget within")
         budget_of(cfg, "")
 
 
