@@ -103,13 +103,16 @@ def test_resolvers_of_threestudio(folder, expression, value):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
+        ("resume=", "resume= has no value: write resume=auto, a file, or resume=null"),
         ("abc", "'abc' isn't an override: expected key=value"),
         ("=3", "isn't an override"),
         ("~system", "isn't an override"),
         ("data.views=[1", "the value of data.views isn't valid YAML"),
         ("nmae=x", "unknown key 'nmae': did you mean 'name'"),
         ("seed=x", "seed: Value 'x'"),
-        ("trainer=3", "trainer"),
+        ("trainer=3", "trainer must be a section of keys and values, got 3"),
+        ("system=3", "system must be a section of keys and values, got 3"),
+        ("system=???", "no value for system"),
         ("data.views=${nothing}", "data.views: Interpolation key 'nothing' not found"),
         ("data.views=${nothing:1}", "data.views: Unsupported interpolation type nothing"),
         ("data.views=${div:1,0}", "division"),

@@ -2,6 +2,7 @@
 
 import copy
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,23 @@ from tests.helpers import tiny_parts
 from tests.launch.config_cases import load
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.host import BaseObject, register
 from threestudio_gaussiandreamer.launch.config import load_config
-from threestudio_gaussiandreamer.launch.config_check import check_config
+from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
 from threestudio_gaussiandreamer.launch.extensions import load_extensions
+
+
+@register("optionless-part")
+class OptionlessPart:
+    @dataclass
+    class Config:
+        pass
+
+
+@register("foo-guidance")
+class FooGuidance(BaseObject):
+    LOSSES = ("foo",)
+
 
 # -- the check -------------------------------------------------------------------------------------
 
@@ -101,6 +116,16 @@ def test_a_strategy_whose_package_is_missing_is_refused(folder, monkeypatch, str
         ("trainer.max_steps=many", "trainer.max_steps is 'many' (str); expected one of: int"),
         ("trainer.max_steps=2.5", "trainer.max_steps is 2.5 (float)"),
         ("trainer.precision=17", "trainer: Precision 17 is invalid"),
+        (
+            "trainer.limit_train_batches=2",
+            "trainer.limit_train_batches: views are drawn without end",
+        ),
+        ("trainer.limit_train_batches=0", "set trainer.max_steps for a short run, got 0"),
+        (
+            "trainer.limit_train_batches=1",
+            "trainer.limit_train_batches: views are drawn without end",
+        ),
+        ("trainer.overfit_batches=2", "trainer.overfit_batches: views are drawn without end"),
         ("trainer.accelerator=cpu", "trainer.accelerator is set by --gpu"),
         ("trainer.logger=false", "trainer.logger is set by the launcher"),
         ("checkpoint.every_n_steps=3", "unknown key 'checkpoint.every_n_steps'"),
@@ -118,10 +143,19 @@ def test_a_valid_configuration_passes(folder):
         load(
             "system.loss.lambda_sparsity=[0,0.0,1.0,5]",
             "trainer.limit_val_batches=1",
+            "trainer.limit_train_batches=1.0",
+            "trainer.overfit_batches=0.0",
+            "system.loss.lambda_other=0",
+            "system.loss.lambda_another=null",
             "trainer.max_time=00:01:00:00",
         )
     )
     check_config(load_config("tiny.yaml", cli_args=["system.exporter_type=dummy-exporter"]))
+
+
+def test_a_key_of_a_part_without_options_is_named():
+    with pytest.raises(UserError, match=r"unknown key 'x.foo': choose from nothing: none exist"):
+        check_part("x", "optionless-part", {"foo": 1})
 
 
 # -- extensions ------------------------------------------------------------------------------------
@@ -194,3 +228,24 @@ def test_another_part_forgets_the_options_that_only_the_earlier_one_has():
         check_config(wrong)
     same = load_config(demo, cli_args=["system.geometry.prior_type=mesh-prior"])
     assert "path" in same.system.geometry.prior
+
+
+def test_another_guidance_forgets_the_weights_of_losses_that_it_does_not_return():
+    register_parts()
+    demo = Path(__file__).parents[2] / "configs" / "demo.yaml"
+    path = "system.geometry.prior.path=toy.glb"
+    overrides = ["system.guidance_type=foo-guidance", "system.loss.lambda_foo=1", path]
+    cfg = load_config(demo, cli_args=[*overrides, "system.loss.lambda_tv=2"])
+    assert dict(cfg.system.loss) == {"lambda_foo": 1, "lambda_tv": 2}
+    check_config(cfg)
+    with pytest.raises(UserError, match="give its weight, for instance system.loss.lambda_foo=1"):
+        check_config(load_config(demo, cli_args=[overrides[0], path]))
+
+
+@pytest.mark.parametrize("value", ["0", "0.0", "null"])
+def test_a_weight_of_0_or_null_removes_that_of_an_earlier_file(value):
+    register_parts()
+    demo = Path(__file__).parents[2] / "configs" / "demo.yaml"
+    check_config(load_config(demo, cli_args=[f"system.loss.lambda_other={value}"]))
+    with pytest.raises(UserError, match="leave it out: system.loss.lambda_other=0"):
+        check_config(load_config(demo, cli_args=["system.loss.lambda_other=1"]))

@@ -19,6 +19,7 @@ from ..core.schedule import C_max
 from ..host import find, info, names
 from ..host.typed_config import parse_structured
 from ..prompts.prompts import read_prompt
+from ..training.losses import foreign_weights
 from .config_source import is_text, map_strings, parse_overrides, protect, read_yaml, unprotect
 from .ddp import planned_processes
 from .run_folder import name_folders
@@ -89,6 +90,7 @@ def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus:
     merged.n_gpus = planned_processes(n_gpus, trainer).total
     _require_mandatory(merged)
     _resolve(merged)
+    _zero_null_weights(merged.get("system"))
     cfg = parse_structured(ExperimentConfig, merged)
     name_folders(cfg)
     return cfg
@@ -150,7 +152,20 @@ def _merge(sources: list[DictConfig]) -> DictConfig:
         # YAML reads "trainer:" without content as null
         if section in merged and merged._get_node(section)._is_none():
             merged[section] = {}
+        _require_section(merged, section)
     return merged
+
+
+def _require_section(merged: DictConfig, name: str) -> None:
+    node = merged._get_node(name)
+    if node is None or isinstance(node, DictConfig):
+        return
+    if node._is_interpolation() or node._is_missing():  # reported later
+        return
+    raise UserError(
+        f"{name} must be a section of keys and values, got {node._value()!r}: set a key, such "
+        f"as {name}.<key>=<value>"
+    )
 
 
 def _forget_replaced_parts(earlier: DictConfig, later: DictConfig, path: str = "") -> None:
@@ -170,6 +185,8 @@ def _forget_replaced_parts(earlier: DictConfig, later: DictConfig, path: str = "
             _forget_replaced_parts(mine, theirs, f"{path}{key}.")
         elif section != key and mine is not None and mine._value() != theirs._value():
             _keep_options_of(earlier._get_node(section), theirs._value(), f"{path}{section}")
+            if f"{path}{section}" == "system.guidance":
+                _keep_weights_of(earlier._get_node("loss"), theirs._value())
 
 
 def _keep_options_of(section: Any, type_name: Any, path: str) -> None:
@@ -177,11 +194,28 @@ def _keep_options_of(section: Any, type_name: Any, path: str) -> None:
     if config_class is None or not isinstance(section, DictConfig):
         return
     known = {field.name for field in fields(config_class)}
-    foreign = [key for key in section if key not in known]
+    _leave_out([key for key in section if key not in known], section, type_name, path)
+
+
+def _keep_weights_of(loss: Any, guidance: Any) -> None:
+    """Remove the weights of losses that belong to the replaced guidance."""
+    if guidance in names() and isinstance(loss, DictConfig):
+        _leave_out(foreign_weights(loss, find(guidance)), loss, guidance, "system.loss")
+
+
+def _leave_out(foreign: list[str], section: DictConfig, type_name: str, path: str) -> None:
     for key in foreign:
         section._content.pop(key)
     if foreign:
         info(f"{path}: {type_name} has no {', '.join(foreign)}; left out")
+
+
+def _zero_null_weights(system: Any) -> None:
+    """Replace null among the weights of losses by 0, which parts of the system can compute with."""
+    loss = system.get("loss") if isinstance(system, DictConfig) else None
+    for key in loss if isinstance(loss, DictConfig) else ():
+        if loss[key] is None:
+            loss[key] = 0
 
 
 def _clash(a: DictConfig, b: DictConfig, section: str = "") -> Optional[str]:

@@ -63,6 +63,8 @@ AT_LEAST = {
     "check_val_every_n_epoch": 1,
     "accumulate_grad_batches": 1,
 }
+# the only values that work where views are drawn without end; None: the key isn't given
+DEFAULTS_ONLY = {"limit_train_batches": ("None", "1.0"), "overfit_batches": ("None", "0", "0.0")}
 CLUSTER = {"MASTER_ADDR", "SLURM_NTASKS"}
 KINDS: dict[str, type] = {
     "data": pl.LightningDataModule,
@@ -215,7 +217,7 @@ def _unknown_key(path: str, key: str, choices: Collection[str]) -> UserError:
     hint = (
         f"did you mean {' or '.join(repr(f'{path}.{name}') for name in near)}?"
         if near
-        else f"choose from {', '.join(sorted(choices))}"
+        else f"choose from {', '.join(sorted(choices)) or 'nothing: none exist'}"
     )
     return UserError(f"unknown key '{path}.{key}': {hint}")
 
@@ -229,7 +231,7 @@ def _check_loss(loss: Any, known: Any) -> None:
             )
         if known is not None:
             weights = [name if name.startswith("lambda_") else f"lambda_{name}" for name in known]
-            if key not in weights:
+            if key not in weights and weight != 0:
                 raise _unknown_key("system.loss", key, weights)
         validate_schedule(weight, f"system.loss.{key}")
 
@@ -287,6 +289,12 @@ def _check_trainer_ranges(trainer: Any) -> None:
     for key, lowest in AT_LEAST.items():
         if (trainer.get(key) if trainer.get(key) is not None else lowest) < lowest:
             raise UserError(f"trainer.{key}: expected {lowest} or more, got {trainer[key]}")
+    for key, defaults in DEFAULTS_ONLY.items():
+        if repr(trainer.get(key)) not in defaults:
+            raise UserError(
+                f"trainer.{key}: views are drawn without end, so this has no use; set "
+                f"trainer.max_steps for a short run, got {trainer[key]}"
+            )
     if isinstance(trainer.get("max_time"), (int, float)):
         raise UserError(
             "trainer.max_time: expected a text such as '00:12:00:00' (days, hours, minutes, "

@@ -117,6 +117,9 @@ def is_text(key: str) -> bool:
 def _override(overrides: DictConfig, key: str, value: str) -> None:
     if is_text(key):
         OmegaConf.update(overrides, key, protect(value), force_add=True)
+    elif key == "resume" and not value.strip():
+        # of an unset variable in a script; to start over would set the run's checkpoints aside
+        raise UserError("resume= has no value: write resume=auto, a file, or resume=null")
     elif key.endswith(PATH_ENDINGS):
         OmegaConf.update(
             overrides, key, None if value in ("", "null", "~") else value, force_add=True

@@ -81,7 +81,7 @@ def logged_names(guidance: type, options: Iterable[str]) -> Optional[set[str]]:
     return known | {"dB"} if guidance.KNOWS_TRUTH else known
 
 
-def check_losses(guidance: type, options: Iterable[str]) -> None:
+def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
     """Check the keys of ``system.loss``, if the class of the guidance declares its losses.
 
     Raises:
@@ -95,23 +95,45 @@ def check_losses(guidance: type, options: Iterable[str]) -> None:
             )
     known = getattr(guidance, "LOSSES", None)  # also of guidances that aren't ScoreDistillation
     if known is not None:
-        check_weights([name.removeprefix("lambda_") for name in options], known)
+        check_weights({key.removeprefix("lambda_"): value for key, value in options.items()}, known)
 
 
-def check_weights(weights: Iterable[str], losses: Iterable[str]) -> None:
-    """Raise UserError unless every weight belongs to a loss or a regulariser, and every loss has
-    its weight.
+def check_weights(weights: Mapping[str, Any], losses: Iterable[str]) -> None:
+    """Check that every weight belongs to a loss or a regulariser, and that every loss has a weight.
+
+    A weight of 0 or None without a loss is accepted: this is how an overlay removes the weight of
+    an earlier file.
+
+    Raises:
+        UserError: a weight or a loss has no counterpart.
     """
-    for name in weights:
-        if name not in losses and name not in REGULARISERS:
+    for name, weight in weights.items():
+        if name not in losses and name not in REGULARISERS and not _is_none_or_zero(weight):
             known = [f"lambda_{n}" for n in (*losses, *REGULARISERS)]
-            raise unknown("weight system.loss.lambda_*", f"lambda_{name}", known)
+            error = unknown("weight system.loss.lambda_*", f"lambda_{name}", known)
+            way_out = f"to leave it out: system.loss.lambda_{name}=0"
+            raise UserError(f"{str(error).removesuffix('.')} ({way_out})")
     for name in losses:
         if name not in weights:
             raise UserError(
                 f"the guidance returns loss_{name}: give its weight, for instance "
                 f"system.loss.lambda_{name}=1"
             )
+
+
+def _is_none_or_zero(weight: Any) -> bool:
+    return weight is None or isinstance(weight, (int, float)) and weight == 0
+
+
+def foreign_weights(options: Iterable[str], guidance: Any) -> list[str]:
+    """Return the keys of ``system.loss`` that belong to neither a regulariser nor a loss that the
+    class of the guidance declares as ``LOSSES``; an empty list if it declares none.
+    """
+    losses = getattr(guidance, "LOSSES", None)
+    if losses is None:
+        return []
+    known = {f"lambda_{name}" for name in (*losses, *REGULARISERS)}
+    return [key for key in options if key.startswith("lambda_") and key not in known]
 
 
 def sparsity(alpha: Float[Tensor, "B H W 1"]) -> Float[Tensor, ""]:
