@@ -14,6 +14,7 @@ from threestudio_gaussiandreamer import priors
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.host import find
+from threestudio_gaussiandreamer.priors.base import preflight_prior
 
 for module in pkgutil.iter_modules(priors.__path__):
     importlib.import_module(f"{priors.__name__}.{module.name}")
@@ -35,8 +36,11 @@ class TestGaussians:
             strict=True,
         ):
             np.testing.assert_array_equal(a, b)
-        with pytest.raises(UserError, match="ground"):
-            build("gaussians-prior", assets, ground=True).gaussians("")
+        prior = build("gaussians-prior", assets, ground=True)
+        preflight_prior(prior, keep_attributes=False)
+        for call in (prior.gaussians, lambda _: preflight_prior(prior, keep_attributes=True)):
+            with pytest.raises(UserError, match="ground"):
+                call("")
 
     def test_min_opacity(self, assets):
         arrays = ply.read_gaussians(assets / "gaussians.ply")
@@ -59,7 +63,25 @@ class TestGaussians:
 
     def test_plain_points_are_refused(self, assets):
         with pytest.raises(UserError, match="plain points"):
-            build("gaussians-prior", assets, path="points.ply")("")
+            build("gaussians-prior", assets, path="points.ply").preflight()
+
+    @pytest.mark.parametrize(
+        "name, problem",
+        [
+            ("tri.obj", r"tri.obj': .obj isn't one of the formats that are read: .ply.*\.splat$"),
+            ("ok.npz", r"ok.npz': .npz isn't one of the formats"),
+            ("cloud", "cloud': a name without extension isn't one of the formats"),
+            ("last.ckpt", r".ckpt isn't.*; it is a checkpoint: export it first.*last.ckpt"),
+        ],
+    )
+    def test_the_wrong_kind_of_file_is_named(self, tmp_path, name, problem):
+        (tmp_path / name).write_bytes(b"v 0 0 0")
+        with pytest.raises(UserError, match=problem):
+            find("gaussians-prior")({"path": str(tmp_path / name)}).preflight()
+
+    def test_a_ply_may_have_any_name(self, assets, tmp_path):
+        (tmp_path / "cloud").write_bytes((assets / "gaussians.ply").read_bytes())
+        assert len(find("gaussians-prior")({"path": str(tmp_path / "cloud")})("").points) == 200
 
 
 class TestPointCloud:

@@ -49,6 +49,15 @@ class TestFiles:
         with pytest.raises(UserError, match=f"does not exist.*{source}"):
             prior("a fox")
 
+    def test_preflight_finds_a_missing_file_and_another_format(self, name, assets, tmp_path):
+        build(name, assets).preflight()
+        source = OPTIONS[name]["path"]
+        with pytest.raises(UserError, match=f"does not exist.*{source}"):
+            build(name, assets, path=source.replace(".", "s.")).preflight()
+        (tmp_path / "a.fox").write_bytes(b"x")
+        with pytest.raises(UserError, match=r"\bfox\b"):
+            find(name)({"path": str(tmp_path / "a.fox")}).preflight()
+
     def test_no_path_is_refused_when_built(self, name, assets):
         with pytest.raises(UserError, match="path"):
             find(name)({})
@@ -117,6 +126,11 @@ class TestValidation:
 
 
 class TestMesh:
+    def test_preflight_knows_bundled_meshes(self):
+        find("mesh-prior")({"path": "toy.glb"}).preflight()
+        with pytest.raises(UserError, match="bundled 'toy.glb'"):
+            find("mesh-prior")({"path": "toi.glb"}).preflight()
+
     def test_vertices_as_the_paper(self, assets):
         cloud = build("mesh-prior", assets)("")
         mesh = trimesh.load(assets / "box.ply", process=False)

@@ -60,6 +60,19 @@ def test_a_run_with_a_mocked_guidance_goes_from_prior_to_files(tmp_path, painted
     ).is_file()
 
 
+@pytest.mark.parametrize("path", ["nosuch.glb", "${system.guidance.mesh}s"])
+def test_a_missing_prior_file_is_found_before_any_model_is_loaded(
+    tmp_path, painted_box, capsys, monkeypatch, path
+):
+    monkeypatch.setattr(
+        GaussianDreamerSystem,
+        "prepare_guidance",
+        lambda self: pytest.fail("a model was loaded"),
+    )
+    assert launch(tmp_path, painted_box, f"system.geometry.prior.path={path}") == 2
+    assert "does not exist" in capsys.readouterr().err
+
+
 def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, painted_box, capsys):
     assert (
         launch(tmp_path, painted_box, "trainer.max_steps=60", "trainer.val_check_interval=60") == 0

@@ -51,13 +51,24 @@ def load_mesh(
         UserError: the file is missing, damaged or of an unknown format, has no faces or no area, or
             more than 5 % of its vertices aren't finite; or ``up`` or ``front`` is invalid.
     """
-    path = existing_file(find_mesh(path), "mesh", bundled_meshes())
+    path = mesh_file(path)
     if not scale > 0:
         raise UserError(f"the scale of a mesh must be greater than 0, not {scale}")
     rotation = pose_rotation(_extension(path), up, front)
     mesh = merged(_surfaces(path))
     mesh = _drop_bad_vertices(mesh, path)
     return mesh._replace(vertices=_normalise(mesh, rotation, scale, path))
+
+
+def mesh_file(path: str | Path) -> Path:
+    """Return the path of a mesh, or of the bundled one of that name, without reading it.
+
+    Raises:
+        UserError: the file is missing or its format is unknown.
+    """
+    path = existing_file(find_mesh(path), "mesh", bundled_meshes())
+    _extension(path)
+    return path
 
 
 def find_mesh(path: str | Path) -> Path:

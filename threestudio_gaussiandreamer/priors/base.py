@@ -112,6 +112,21 @@ def require_used_scale(config_class: type, cfg: Any) -> None:
         require_defaults(config_class, cfg, ("scale",), "without normalize or producer")
 
 
+def preflight_prior(prior: Any, keep_attributes: bool) -> None:
+    """Check within seconds that a prior can run; other hosts' priors have no check.
+
+    Args:
+        keep_attributes: whether every attribute of its Gaussians is to be taken, if it has any.
+
+    Raises:
+        UserError: a requirement, such as a file, is missing, or its options exclude that.
+    """
+    if hasattr(prior, "preflight"):
+        prior.preflight()
+    if keep_attributes and hasattr(prior, "preflight_attributes"):
+        prior.preflight_attributes()
+
+
 class Prior(BaseObject):
     """Base class of priors. ``prior(prompt)`` returns the initial points, which depend only on the
     options, the prompt and the seed.

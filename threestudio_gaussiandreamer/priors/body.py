@@ -47,7 +47,11 @@ class BodyPrior(MeshFilePrior):
 
     cfg: Config
 
+    def preflight(self) -> None:
+        existing_file(self.cfg.path, "body mesh")  # no bundled mesh is a body
+        super().preflight()
+
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
-        existing_file(self.cfg.path, "body mesh")
+        self.preflight()
         cloud = colored_cloud(self.load(), self.cfg, generator)
         return cloud._replace(points=cloud.points - cloud.points.mean(axis=0))

@@ -21,6 +21,7 @@ continue that training.
 Limits: the prompt is not read."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Optional
 
 import numpy as np
@@ -28,7 +29,9 @@ import numpy as np
 from ..core.errors import UserError
 from ..core.files import existing_file
 from ..core.options import in_range, one_of
-from ..formats.gaussian_files import read_stored
+from ..formats.compressed_ply import is_compressed_ply
+from ..formats.gaussian_files import READ, read_stored, suffix_of
+from ..formats.ply import is_gaussian_ply
 from ..formats.producers import GAUSSIANS, from_producer, producer_axes
 from ..gaussians.axes import AXES, WORLD_UP
 from ..gaussians.gaussians import Gaussians, opaque, usable
@@ -46,6 +49,8 @@ from .base import (
     require_no_axes_beside_producer,
     require_used_scale,
 )
+
+PLY_SUFFIXES = (".ply", ".compressed.ply")
 
 
 @register("gaussians-prior")
@@ -70,6 +75,26 @@ class GaussiansPrior(Prior):
 
     cfg: Config
 
+    def preflight(self) -> None:
+        """Check that the file exists and that its format is one that is read.
+
+        Raises:
+            UserError: it doesn't, or it isn't.
+        """
+        gaussian_file(self.cfg.path)
+
+    def preflight_attributes(self) -> None:
+        """Check that :meth:`gaussians` can run, as :meth:`preflight` does for the points.
+
+        Raises:
+            UserError: ``ground`` is set, whose points have no trained attributes.
+        """
+        if self.cfg.ground:
+            raise UserError(
+                "ground: ground points have no trained attributes; set "
+                "system.geometry.keep_attributes=false, or ground=false"
+            )
+
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         return self.cloud(self._read())
 
@@ -77,14 +102,10 @@ class GaussiansPrior(Prior):
         """Return every attribute of the trained Gaussians, whatever the prompt.
 
         Raises:
-            UserError: missing, damaged or empty, as :meth:`__call__`; or ``ground``, which has no
-                trained attributes.
+            UserError: missing, damaged or empty, as :meth:`__call__`; or ``ground``, see
+                :meth:`preflight_attributes`.
         """
-        if self.cfg.ground:
-            raise UserError(
-                "ground: ground points have no trained attributes; set "
-                "system.geometry.keep_attributes=false, or ground=false"
-            )
+        self.preflight_attributes()
         return self._read()
 
     @staticmethod
@@ -93,7 +114,7 @@ class GaussiansPrior(Prior):
         return PointCloud(points=arrays.means, colors=sh0_colors(arrays.sh[:, 0]))
 
     def _read(self) -> Gaussians:
-        path = existing_file(self.cfg.path, "file of Gaussians")
+        path = gaussian_file(self.cfg.path)
         stored = read_stored(path, up=None if self.cfg.up == "auto" else self.cfg.up)
         harmonics = stored.gaussians.sh[:, : COEFFICIENTS[-1]]  # more can't be drawn
         stored = stored._replace(gaussians=stored.gaussians._replace(sh=harmonics))
@@ -111,6 +132,29 @@ class GaussiansPrior(Prior):
             )
         kept = arrays.rows(keep)
         return normalized(kept, self.cfg.scale) if is_normalized(self.cfg) else kept
+
+
+def gaussian_file(path: str) -> Path:
+    """Return the path of a file of Gaussians, of which no more than a PLY's header is read.
+
+    Raises:
+        UserError: the file is missing, or its extension isn't one that is read and it isn't a PLY.
+    """
+    file = existing_file(path, "file of Gaussians")
+    if suffix_of(file.name) in PLY_SUFFIXES:
+        if not is_gaussian_ply(file) and not is_compressed_ply(file):
+            read_stored(file)  # raises the error that says what else it is
+    elif suffix_of(file.name) not in READ and not is_gaussian_ply(file):
+        advice = (
+            "; it is a checkpoint: export it first, with --export and resume=" + repr(str(file))
+            if file.suffix.lower() == ".ckpt"
+            else ""
+        )
+        raise UserError(
+            f"file of Gaussians {str(file)!r}: {file.suffix or 'a name without extension'} isn't "
+            f"one of the formats that are read: {', '.join(READ)}{advice}"
+        )
+    return file
 
 
 def normalized(gaussians: Gaussians, scale: float) -> Gaussians:

@@ -39,7 +39,7 @@ from ..core.options import at_least
 from ..formats.producers import MESH
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
-from ..meshes.load import load_mesh
+from ..meshes.load import load_mesh, mesh_file
 from ..meshes.mesh import Mesh, sample_surface, surface_colors, vertex_surface_colors
 from .base import (
     COLOR,
@@ -80,6 +80,14 @@ class MeshFilePrior(Prior):
             file_axes(cfg, MESH)
 
     cfg: Config
+
+    def preflight(self) -> None:
+        """Check that the mesh exists and that its format is one that is read.
+
+        Raises:
+            UserError: it doesn't, or it isn't.
+        """
+        mesh_file(self.cfg.path)
 
     def load(self) -> Mesh:
         """Return the mesh, scaled and turned into the world's axes."""

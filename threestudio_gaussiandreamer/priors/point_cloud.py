@@ -34,6 +34,7 @@ from ..core.files import existing_file
 from ..formats.array_files import read_arrays
 from ..formats.gaussian_files import ply_up
 from ..formats.ply import is_gaussian_ply, read_points, unit_colors
+from ..formats.ply_table import read_header
 from ..formats.producers import GAUSSIANS, MESH
 from ..gaussians.axes import FRONTS
 from ..gaussians.grow import longest_side
@@ -75,12 +76,36 @@ class PointCloudPrior(Prior):
 
     cfg: Config
 
+    def preflight(self) -> None:
+        """Check that the file exists and that its format is one that is read.
+
+        Raises:
+            UserError: it doesn't, or it isn't.
+        """
+        point_file(self.cfg.path)
+
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
-        path = existing_file(self.cfg.path, "point cloud")
+        path = point_file(self.cfg.path)
         cloud = load_points(path)
         axes = file_axes(self.cfg, GAUSSIANS if is_gaussian_ply(path) else MESH)
         cloud = rotated(cloud, to_world(path, *axes))
         return normalized(cloud, self.cfg.scale) if is_normalized(self.cfg) else cloud
+
+
+def point_file(path: str) -> Path:
+    """Return the path of a file of points, of which no more than a PLY's header is read.
+
+    Raises:
+        UserError: the file is missing, its format is unknown, or it isn't the PLY that its name
+            says.
+    """
+    file = existing_file(path, "point cloud")
+    if file.suffix.lower() not in READERS:
+        require_mesh_format(file)
+    elif file.suffix.lower() == ".ply":
+        with open(file, "rb") as opened:
+            read_header(opened, str(file))
+    return file
 
 
 def to_world(path: Path, up: str, front: Optional[str]) -> Float[np.ndarray, "3 3"]:
@@ -171,15 +196,20 @@ def _is_row(line: str) -> bool:
 
 def read_mesh_points(path: Path) -> PointCloud:
     """Return the vertices and points of a mesh file, transformed by its scene graph."""
-    extension, known = path.suffix.lower().lstrip("."), mesh_formats()
-    if extension not in known:
-        raise unknown("point cloud format", path.suffix, [*READERS, *("." + e for e in known)])
+    require_mesh_format(path)
     parts = [part for part in read_parts(path) if len(part.vertices)]
     if not parts:
         raise UserError(f"point cloud {str(path)!r} is empty: it has no vertices")
     colored = any(part.has_colors for part in parts)
     colors = np.concatenate([vertex_surface_colors(part) for part in parts]) if colored else None
     return _cloud(path, np.concatenate([part.vertices for part in parts]), colors)
+
+
+def require_mesh_format(path: Path) -> None:
+    """Raise UserError unless the extension is that of a mesh format."""
+    known = mesh_formats()
+    if path.suffix.lower().lstrip(".") not in known:
+        raise unknown("point cloud format", path.suffix, [*READERS, *("." + e for e in known)])
 
 
 def _from_columns(path: Path, rows: np.ndarray) -> PointCloud:

@@ -51,6 +51,7 @@ from ..guidance.foreign import (
 from ..guidance.known_truth import truth_of
 from ..host import BaseLift3DSystem, C, find, info, register, validate_schedule, warn
 from ..metrics import psnr, psnr_of_error
+from ..priors.base import preflight_prior
 from ..priors.cache import cached_cloud
 from ..prune import PruneOptions
 from .background import FlatBackground
@@ -146,9 +147,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def preflight(self) -> None:
         """Check the requirements of prior and guidance, such as files, before loading models."""
-        prior = None if len(self.geometry) else self.geometry.prior()
-        if hasattr(prior, "preflight"):
-            prior.preflight()
+        if not len(self.geometry):
+            preflight_prior(self.geometry.prior(), self.geometry.cfg.keep_attributes)
         guidance = find(self.cfg.guidance_type)
         if issubclass(guidance, ScoreDistillation):
             guidance.preflight(self.cfg.guidance)
