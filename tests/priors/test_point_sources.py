@@ -12,7 +12,7 @@ from tests.helpers.ply_files import write_raw_gaussians
 from tests.priors.priors_cases import build, rng
 from threestudio_gaussiandreamer import priors
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.formats import ply
+from threestudio_gaussiandreamer.formats import ply, ply_table
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.priors.base import preflight_prior
 
@@ -128,6 +128,40 @@ class TestPointCloud:
         mesh = trimesh.load(assets / "box.ply", process=False)
         mesh.export(assets / "box.off")
         np.testing.assert_allclose(self.read(assets / "box.off").points, mesh.vertices, atol=1e-6)
+
+    @pytest.mark.parametrize("name", ["a.npz", "a.xyz", "a.ply"])
+    @pytest.mark.parametrize("full", [255, 65535])
+    def test_integers_of_8_and_16_bits(self, tmp_path, name, full):
+        colors = self.BYTES * (full // 255)
+        np.testing.assert_allclose(
+            self.read(self.colored(tmp_path / name, colors)).colors, self.BYTES / 255, atol=1e-6
+        )
+
+    @pytest.mark.parametrize("name", ["a.npz", "a.xyz", "a.ply"])
+    @pytest.mark.parametrize(
+        "low, high", [(0, 70000), (0, 300.5), (-100, 100), (-0.5, 1), (-3000, 3000)]
+    )
+    def test_colours_out_of_range_are_refused(self, tmp_path, name, low, high):
+        colors = np.array([[low, 0, 0], [0, high, 0], [0, 0, 1]], float)
+        with pytest.raises(UserError, match=rf"{name}.* from {low:g} to {high:g}; integers"):
+            self.read(self.colored(tmp_path / name, colors))
+
+    def test_colours_a_little_out_of_range_are_clipped(self, tmp_path):
+        colors = np.array([[-0.005, 0.5, 1.9], [0, 0, 0], [1, 1, 1]])
+        found = self.read(self.colored(tmp_path / "a.npz", colors)).colors
+        np.testing.assert_allclose(found, colors.clip(0, 1), atol=1e-6)
+
+    def colored(self, path, colors):
+        """Write the three points in given colours, as float32 where the format has types."""
+        rows = np.concatenate([self.POINTS, colors], axis=1)
+        if path.suffix == ".npz":
+            np.savez(path, points=self.POINTS, colors=colors)
+        elif path.suffix == ".xyz":
+            np.savetxt(path, rows)
+        else:
+            properties = [(name, "float") for name in (*ply.MEANS, *ply.COLORS)]
+            ply_table.write_table(path, properties, rows.astype(np.float32))
+        return path
 
     def test_normalize(self, tmp_path):
         cloud = self.read(self.written(tmp_path, "a.ply"), normalize=True, scale=0.5)

@@ -35,6 +35,10 @@ QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 GAUSSIAN = (*MEANS, *SH_CONSTANT, "opacity", *LOG_SCALES, *QUATS)
 COLORS = ("red", "green", "blue")
 EXACT_COLORS = ("float_red", "float_green", "float_blue")
+MIN_UNIT, MAX_UNIT = -0.01, 2.0
+"""Range of colours that are taken for numbers in [0, 1], to which they are clipped: interpolation
+and high dynamic range exceed it a little.
+"""
 COMPRESSED = "packed_position"
 """A property by which compressed PLY files are recognised."""
 
@@ -280,7 +284,7 @@ def _read_colors(table: PlyTable) -> Float[np.ndarray, "N 3"]:
         ("r", "g", "b"),
     ):
         if all(name in table for name in names):
-            return unit_colors(table[names], table.stored_type(names[0]))
+            return unit_colors(table[names], table.stored_type(names[0]), table.path)
     if all(name in table for name in SH_CONSTANT):
         return sh0_colors(table[SH_CONSTANT])
     logger.info("%s has no colours: grey is used", table.path)
@@ -288,11 +292,31 @@ def _read_colors(table: PlyTable) -> Float[np.ndarray, "N 3"]:
 
 
 def unit_colors(
-    colors: Float[np.ndarray, "N 3"], stored_type: np.dtype
+    colors: Float[np.ndarray, "N 3"], stored_type: np.dtype, path: str | os.PathLike
 ) -> Float[np.ndarray, "N 3"]:
-    """Convert colours stored as integers, or as floats up to 255, to [0, 1]."""
-    if np.issubdtype(stored_type, np.integer):
-        return colors / np.float32(np.iinfo(stored_type).max if stored_type.itemsize < 4 else 255)
+    """Convert colours stored as integers of 8 or 16 bits, or as numbers up to 1, to [0, 1].
+
+    Args:
+        stored_type: an integer type of 1 or 2 bytes says the range; of others the values do.
+        path: the file, for the message.
+
+    Raises:
+        UserError: the values fit none of these ranges.
+    """
+    integer = np.issubdtype(stored_type, np.integer)
     finite = colors[np.isfinite(colors)]
-    # Floats well above 1 are byte values that were stored as floats, as in some text files.
-    return colors / np.float32(255) if finite.size and 2 < finite.max() <= 255 else colors
+    low, high = (finite.min(), finite.max()) if finite.size else (0.0, 0.0)
+    if integer and stored_type.itemsize < 4:
+        full = np.iinfo(stored_type).max
+    elif high <= 255 and (integer or high > MAX_UNIT):
+        full = 255  # floats well above 1 are bytes that were stored as floats, as in text files
+    elif MAX_UNIT < high <= 65535 and (finite == np.rint(finite)).all():
+        full = 65535
+    else:
+        full = 1
+    if low < MIN_UNIT * full or high > MAX_UNIT * full:
+        raise UserError(
+            f"{str(path)!r}: its colours range from {low:g} to {high:g}; integers from 0 to 255, "
+            "or to 65535 where they have 16 bits, or numbers from 0 to 1 were expected"
+        )
+    return colors / np.float32(full)

@@ -17,8 +17,8 @@ producer      the program that wrote the file (docs/formats.md), instead of ``up
 ground, ...   see ``priors/base.py``
 ============  ======================================================================================
 
-Colours are integers up to 255, or numbers up to 1; without any, the points are grey. Limits: the
-prompt is not read."""
+Colours are integers up to 255, whole numbers above 255 up to 65535 (16 bits, as in LAS exports), or
+numbers up to 1; without any, the points are grey. Limits: the prompt is not read."""
 
 import logging
 from collections.abc import Callable
@@ -242,7 +242,7 @@ def _cloud(
         points=np.asarray(
             points, np.float64
         ),  # not float32, which would round points far from the origin before they are centred
-        colors=unit_colors(colors.astype(np.float32), colors.dtype),
+        colors=unit_colors(colors.astype(np.float32), colors.dtype, path),
         normals=None if normals is None else np.asarray(normals, np.float32),
     )
 
