@@ -118,6 +118,23 @@ class TestValidation:
         with pytest.raises(UserError, match="11 of the 200 points of Given"):
             prior("")
 
+    @pytest.mark.parametrize(
+        "returned, kind",
+        [(None, "NoneType"), ((np.zeros((2, 3)),) * 2, "tuple"), (np.zeros((2, 3)), "ndarray")],
+    )
+    def test_anything_but_a_point_cloud_is_refused(self, returned, kind):
+        prior = Given({})
+        prior.cloud = returned
+        with pytest.raises(UserError, match=rf"Given.generate returned {kind}; .* a PointCloud"):
+            prior("")
+
+    def test_a_prior_without_generate_is_refused_when_built(self):
+        class Unfinished(Prior):
+            pass
+
+        with pytest.raises(UserError, match=r"Unfinished has no generate\(prompt, generator\)"):
+            Unfinished({})
+
     def test_empty_and_misshapen_clouds_are_refused(self):
         with pytest.raises(UserError, match="no points"):
             validated(PointCloud(points=np.zeros((0, 3)), colors=np.zeros((0, 3))), "x")

@@ -142,6 +142,11 @@ class Prior(BaseObject):
     cfg: Config
 
     def configure(self) -> None:
+        cls = type(self)
+        if cls.generate is Prior.generate and cls.__call__ is Prior.__call__:
+            raise UserError(
+                f"{cls.__name__} has no generate(prompt, generator), which gives a prior's points"
+            )
         check_options(self.Config, self.cfg)
 
     def preflight(self) -> None:
@@ -199,9 +204,11 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
     1].
 
     Raises:
-        UserError: there are no points, points and colours aren't both (P, 3), or more than 5 % of
-            the rows are not finite.
+        UserError: it isn't a PointCloud, there are no points, points and colours aren't both
+            (P, 3), or more than 5 % of the rows are not finite.
     """
+    if not isinstance(cloud, PointCloud):
+        raise UserError(f"{name}.generate returned {type(cloud).__name__}; expected a PointCloud")
     points, colors = (np.asarray(values, np.float32) for values in (cloud.points, cloud.colors))
     if points.ndim != 2 or points.shape[1:] != (3,) or colors.shape != points.shape:
         raise UserError(
