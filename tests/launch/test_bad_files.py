@@ -244,10 +244,24 @@ def test_a_signal_while_the_test_views_are_rendered_leaves_a_checkpoint_and_prin
         code = experiment.main(["--config", str(DEMO), "--train", "--gpu", "cpu", *SMALL])
     out = capsys.readouterr().out
     last = TRIAL / "ckpts" / "last.ckpt"
-    assert code == 130 and "to resume: " in out and f"resume={last}" in out
+    assert code == 130 and "to resume: " in out and f"resume={last.absolute()}" in out
     shutil.rmtree(TRIAL / "save")
     assert launch_demo(f"resume={last}")[0] == 0
     assert (TRIAL / "save" / "it2-export" / "gaussians.ply").is_file()
+
+
+@pytest.mark.parametrize(
+    ("option", "change"),
+    [
+        ("system.geometry.sh_degree=1", "system.geometry.sh_degree was 0, now it is 1"),
+        ("system.background.mode=learned", "system.background.mode was 'random', now it is"),
+    ],
+)
+def test_a_resumed_run_with_tensors_of_other_sizes_names_the_option(launch_demo, option, change):
+    assert launch_demo()[0] == 0
+    code, err = launch_demo(f"resume={TRIAL}/ckpts/last.ckpt", "trainer.max_steps=3", option)
+    assert code == 2 and f"was made by another configuration: {change}" in err
+    assert "size mismatch" not in err and "Missing key" not in err
 
 
 # -- runs that meet --------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from tests.helpers import tiny_parts
 from tests.launch.config_cases import load
 from threestudio_gaussiandreamer.core.checkpoint_file import save_file
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch import run_folder
 from threestudio_gaussiandreamer.launch.config import dump_config, load_config
 from threestudio_gaussiandreamer.launch.run_folder import safe_name
 
@@ -305,6 +306,31 @@ def test_resume_auto_takes_the_newest_run_of_the_tag(folder):
     save_file(cfg.resume, checkpoint)
     Path(cfg.resume).write_bytes(b"damaged")
     assert load("resume=auto").resume == cfg.trial_dir + "/ckpts/last-prev.ckpt"
+
+
+def test_a_checkpoint_of_another_working_folder_is_continued_in_its_own(folder, monkeypatch):
+    dump_config("parsed.yaml", load())
+    first = load_config("parsed.yaml")
+    last, parsed = (
+        os.path.abspath(name) for name in (f"{first.trial_dir}/ckpts/last.ckpt", "parsed.yaml")
+    )
+    (folder / "elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    cfg = load_config(parsed, cli_args=[f"resume={last}"])
+    assert cfg.trial_dir == str(folder / first.trial_dir) and cfg.trial_name == first.trial_name
+    assert cfg.exp_dir == str(folder / "outputs/tiny")
+
+
+def test_a_run_that_is_moved_on_purpose_is_named_with_the_folder_of_its_checkpoint(
+    folder, monkeypatch
+):
+    messages: list[str] = []
+    monkeypatch.setattr(run_folder, "warn", messages.append)
+    dump_config("parsed.yaml", load())
+    last = f"{load_config('parsed.yaml').trial_dir}/ckpts/last.ckpt"
+    cfg = load_config("parsed.yaml", cli_args=[f"resume={last}", "exp_root_dir=moved"])
+    assert cfg.trial_dir.startswith("moved/tiny/a_red_ball@")
+    assert str(folder / "outputs/tiny") in messages[0] and str(folder / "moved") in messages[0]
 
 
 def test_the_parsed_file_does_not_resume_again(folder):

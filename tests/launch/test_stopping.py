@@ -34,7 +34,7 @@ def test_stopped_and_resumed_equals_never_stopped(launch, name, code, step):
 
     command = shlex.split(re.search("to resume: (.*)", out)[1])
     options = command[command.index("--config") :]
-    assert options[1] == f"{only_run()}/configs/parsed.yaml"
+    assert options[1] == f"{only_run().absolute()}/configs/parsed.yaml"
     assert main([*options, "system.signal_at=-1"]) == 0
     (whole,) = Path("outputs/whole").glob("*/ckpts/last.ckpt")
     assert_same_training(only_run() / "ckpts/last.ckpt", whole)
@@ -104,6 +104,35 @@ def test_a_full_disk_is_named_and_the_earlier_checkpoint_stays(launch, monkeypat
     assert load_file(only_run() / "ckpts/last.ckpt")["global_step"] == 2 and not list(
         only_run().glob("ckpts/.*")
     )
+
+
+def test_the_printed_command_continues_the_run_from_another_folder(launch, monkeypatch):
+    _, out, _ = launch("--train", "system.signal_at=2")
+    run = only_run().absolute()
+    command = shlex.split(re.search("to resume: (.*)", out)[1])
+    Path("elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    assert main([*command[command.index("--config") :], "system.signal_at=-1"]) == 0
+    assert not os.listdir() and "save/it6-test.mp4" in files(run)
+    assert load_file(run / "ckpts/last.ckpt")["global_step"] == 6
+
+
+@pytest.mark.parametrize("error", [ValueError, ZeroDivisionError, UserError])
+def test_an_error_after_training_prints_the_command_and_stays_as_it_is(
+    launch, monkeypatch, capsys, error
+):
+    def fail(self, batch, batch_idx):
+        raise error("of the test")
+
+    monkeypatch.setattr(tiny_parts.TinySystem, "test_step", fail)
+    if error is UserError:
+        code, out, _ = launch("--train")
+        assert code == 2
+    else:
+        with pytest.raises(error, match="of the test"):
+            launch("--train")
+        out = capsys.readouterr().out
+    assert f"resume={only_run().absolute()}/ckpts/last.ckpt" in out
 
 
 def test_ctrl_c_during_the_test_ends_with_130(launch, monkeypatch):

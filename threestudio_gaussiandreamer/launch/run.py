@@ -6,7 +6,6 @@ cmd.txt}``"""
 import argparse
 import contextlib
 import errno
-import shlex
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -35,8 +34,7 @@ from .config_check import MisconfigurationException, build, plain
 from .ddp import environment_plugins, is_lost_process, planned_processes, trainer_options
 from .folder_lock import RunFolder, claim, claim_new, require_writable, set_aside
 from .live_viewer import LiveViewer, ViewerConfig
-from .options import PROGRAM
-from .run_folder import changes_since, renumber
+from .run_folder import SIZES, changes_since, renumber, resume_command
 from .training_state import check_training_state
 
 # errors of the file system that end a run with a message instead of a traceback
@@ -48,6 +46,11 @@ WRITE_ERRORS = (
 # or with a new optimiser
 LIGHTNINGS_KEY = "pytorch-lightning_version"
 TRAINING_KEYS = (LIGHTNINGS_KEY, "loops", "optimizer_states")
+# parts of the messages of torch and Lightning about a state that doesn't match
+MISMATCHES = (
+    *("loading state_dict", "loaded state dict"),
+    *("optimizer_states", "restore training state"),
+)
 
 
 class Run:
@@ -79,6 +82,7 @@ class Run:
         self.sources, self.command = sources, command
         self.claimed = RunFolder(Path(cfg.trial_dir))
         self.resumed_step = -1
+        self.size_changes: list[str] = []
         self.trainer: Any = None
         self.viewer = parse_structured(ViewerConfig, cfg.viewer)
         self.view: Optional[LiveView] = None
@@ -101,7 +105,7 @@ class Run:
         """
         try:
             self.start()
-            with lightning_errors(self.cfg.resume), write_errors(self.folder):
+            with lightning_errors(self.cfg.resume, self.size_changes), write_errors(self.folder):
                 began, start = datetime.now(), time.perf_counter()
                 getattr(self, self.args.stage)()
                 self.write_index(began, time.perf_counter() - start)
@@ -109,14 +113,12 @@ class Run:
             if self.view is not None and self.viewer.keep_serving:
                 serve_until_stopped(self.view)
         except Stopped as stop:
-            print(f"stopped at step {stop.step}; to resume: {self.resume_command()}", flush=True)
+            command = resume_command(self.folder, self.args.gpu)
+            print(f"stopped at step {stop.step}; to resume: {command}", flush=True)
             return 128 + stop.signum
-        except BaseException as stop:
+        except BaseException:
             self.discard_if_unused()
-            interrupted = isinstance(stop, (KeyboardInterrupt, SystemExit))
-            # interrupted after training, while the test views are rendered
-            if interrupted and self.args.stage == "train" and self.last.is_file():
-                print(f"to resume: {self.resume_command()}", flush=True)
+            self.print_resume_command()
             raise
         finally:
             self.claimed.release()
@@ -174,6 +176,7 @@ class Run:
                 f"{', '.join(missing)}, which Lightning writes"
             )
         self.check_content(checkpoint)
+        self.size_changes = changes_since(self.cfg, SIZES)
         for change in changes_since(self.cfg):
             warn(f"{self.cfg.resume} is of another run: {change}")
         self.resumed_step = checkpoint["global_step"]
@@ -304,15 +307,20 @@ class Run:
         if not trained and not results:
             self.claimed.discard()
 
-    def resume_command(self) -> str:
-        device = ["--gpu", self.args.gpu] if self.args.gpu else []
-        parsed = str(self.folder / "configs" / "parsed.yaml")
-        return shlex.join([*PROGRAM, "--config", parsed, "--train", *device, f"resume={self.last}"])
+    def print_resume_command(self) -> None:
+        """Print how to go on after an error, if this run has trained and has a checkpoint."""
+        training = self.args.stage == "train" and self.trainer is not None
+        if training and self.trainer.global_step and self.last.is_file() and not get_rank():
+            with contextlib.suppress(OSError):  # of a closed pipe, which would hide the first error
+                print(f"to resume: {resume_command(self.folder, self.args.gpu)}", flush=True)
 
 
 @contextlib.contextmanager
-def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
+def lightning_errors(checkpoint: Optional[str], changes: Sequence[str] = ()) -> Iterator[None]:
     """Convert exceptions that Lightning raises in this context.
+
+    Args:
+        changes: what may explain a mismatch, in place of torch's message.
 
     Raises:
         UserError: the checkpoint's parameters or optimiser don't match the configuration, or the
@@ -343,7 +351,8 @@ def lightning_errors(checkpoint: Optional[str]) -> Iterator[None]:
         ):
             raise
         raise UserError(
-            f"the checkpoint {checkpoint} was made by another configuration: {str(error).strip()}"
+            f"the checkpoint {checkpoint} was made by another configuration: "
+            f"{'; '.join(changes) or str(error).strip()}"
         ) from error
 
 
@@ -385,13 +394,4 @@ def _is_write_error(error: Optional[BaseException]) -> bool:
 
 def is_mismatch(error: Exception) -> bool:
     """Return whether this is an error of torch or Lightning about a state that doesn't match."""
-    said = str(error)
-    return any(
-        part in said
-        for part in (
-            "loading state_dict",
-            "loaded state dict",
-            "optimizer_states",
-            "restore training state",
-        )
-    )
+    return any(part in str(error) for part in MISMATCHES)

@@ -3,12 +3,14 @@
 
 import hashlib
 import os
+import shlex
 import unicodedata
+from collections.abc import Mapping
 from datetime import datetime
 from difflib import get_close_matches
 from glob import escape as glob_escape
 from pathlib import Path
-from typing import Any
+from typing import Any, Optional
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -16,12 +18,16 @@ from omegaconf.errors import OmegaConfBaseException
 from ..core.checkpoint_file import newest_readable
 from ..core.errors import UserError
 from ..core.interpolation import escape
-from ..host import info
+from ..host import info, warn
+from .options import PROGRAM
 
 AUTO = "auto"
 """The value of ``resume`` that means the newest checkpoint."""
-SAME = ("system.prompt_processor.prompt", "seed")
-"""Options that a resumed run usually has in common with the one before."""
+SAME = {"system.prompt_processor.prompt": None, "seed": None}
+"""Options that a resumed run usually has in common with the one before; the values are the
+defaults, None for options that are always written."""
+SIZES = {"system.geometry.sh_degree": 0, "system.background.mode": "fixed"}
+"""Options that decide which tensors a checkpoint has, and their sizes, and their defaults."""
 SLUG_BYTES = 64
 SLUG_SOURCE = 1024
 """Characters of a text that its slug is made of: normalising takes quadratic time in the length of
@@ -58,11 +64,31 @@ def name_folders(cfg: Any) -> None:
     elif cfg.resume is not None:
         cfg.resume = escape(os.path.expanduser(cfg.resume))
         _require_no_misspelling(cfg.resume)
+        if not cfg.new_folder:
+            _follow_checkpoint(cfg)
 
 
-def changes_since(cfg: Any) -> list[str]:
-    """Return how seed and prompt differ from those of the run whose checkpoint is resumed, as its
+def _follow_checkpoint(cfg: Any) -> None:
+    """Let a run continue in the folder of its checkpoint if only the working folder has changed,
+    that is, if the checkpoint's folder has the same relative path in another working folder.
+    """
+    here, run = Path(cfg.trial_dir), Path(os.path.abspath(cfg.resume)).parent.parent
+    if run.name != cfg.trial_name or os.path.realpath(run) == os.path.realpath(here):
+        return
+    parts = Path(os.path.normpath(here)).parts
+    if run.parts[-len(parts) :] == parts:
+        cfg.exp_dir, cfg.trial_dir = escape(str(run.parent)), escape(str(run))
+        info(f"the run continues in {run}")
+    else:
+        warn(f"the checkpoint is of the run in {run}; this one writes to {os.path.abspath(here)}")
+
+
+def changes_since(cfg: Any, options: Mapping[str, Any] = SAME) -> list[str]:
+    """Return how some options differ from those of the run whose checkpoint is resumed, as its
     ``parsed.yaml`` has them; nothing if that can't be read.
+
+    Args:
+        options: dotted keys, and their defaults.
     """
     # only here, since a run that isn't resumed needs no reader
     from ..view.run_files import RunFiles
@@ -70,7 +96,8 @@ def changes_since(cfg: Any) -> list[str]:
     earlier = OmegaConf.create(RunFiles(Path(cfg.resume).parent.parent).config)
     try:
         pairs = {
-            name: (OmegaConf.select(earlier, name), OmegaConf.select(cfg, name)) for name in SAME
+            name: [OmegaConf.select(source, name, default=default) for source in (earlier, cfg)]
+            for name, default in (options.items() if earlier else ())
         }
     except OmegaConfBaseException:  # of an interpolation, which only an edited file has
         return []
@@ -79,6 +106,15 @@ def changes_since(cfg: Any) -> list[str]:
         for name, (old, new) in pairs.items()
         if old not in (None, new)
     ]
+
+
+def resume_command(folder: Path, gpu: Optional[str]) -> str:
+    """Return the command that resumes the run in ``folder``, valid in any working folder."""
+    program = [os.path.abspath(part) if part.endswith("launch.py") else part for part in PROGRAM]
+    run = folder.absolute()
+    device = ["--gpu", gpu] if gpu else []
+    parsed, last = run / "configs" / "parsed.yaml", run / "ckpts" / "last.ckpt"
+    return shlex.join([*program, "--config", str(parsed), "--train", *device, f"resume={last}"])
 
 
 def renumber(cfg: Any, count: int) -> None:
