@@ -216,6 +216,36 @@ def test_a_cache_folder_that_cannot_be_made(models, tmp_path):
         processor(models, cache_dir=str(tmp_path / "file" / "cache"))
 
 
+def test_a_cache_folder_is_checked_before_the_encoder_is_loaded(models, tmp_path, no_encoder):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="'[^']*file' is no folder.*cache_dir"):
+        processor(models, cache_dir=str(tmp_path / "file" / "cache"))
+
+
+def test_preflight_checks_the_cache_folder_and_makes_none(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    kind = prompt_processors.StableDiffusionPromptProcessor
+    for folder in ("file", "file/cache"):
+        with pytest.raises(UserError, match="cache_dir"):
+            kind.preflight({"cache_dir": folder})
+        kind.preflight({"cache_dir": folder, "use_cache": False})
+    kind.preflight({"cache_dir": "new/cache"})
+    assert not (tmp_path / "new").exists()
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(UserError, match="read-only"):
+        kind.preflight({"cache_dir": "new/cache"})
+
+
+def test_a_read_only_cache_that_holds_all_embeddings_is_enough(models, tmp_path, monkeypatch):
+    processor(models, cache_dir="cache")
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    options = {"pretrained_model_name_or_path": str(models["stable-diffusion"])}
+    prompt_processors.StableDiffusionPromptProcessor.preflight(options | {"cache_dir": "cache"})
+    processor(models, cache_dir="cache")
+    with pytest.raises(UserError, match="read-only.*cache_dir"):
+        processor(models, cache_dir="cache", prompt="another fox")
+
+
 # Which prompt
 # --------------------------------------------------------------------------------------------------
 

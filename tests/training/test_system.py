@@ -60,17 +60,32 @@ def test_a_run_with_a_mocked_guidance_goes_from_prior_to_files(tmp_path, painted
     ).is_file()
 
 
+@pytest.fixture
+def no_models(monkeypatch):
+    """Make loading prompt processor and guidance a failure."""
+    monkeypatch.setattr(
+        GaussianDreamerSystem, "prepare_guidance", lambda self: pytest.fail("a model was loaded")
+    )
+
+
 @pytest.mark.parametrize("path", ["nosuch.glb", "${system.guidance.mesh}s"])
 def test_a_missing_prior_file_is_found_before_any_model_is_loaded(
-    tmp_path, painted_box, capsys, monkeypatch, path
+    tmp_path, painted_box, capsys, no_models, path
 ):
-    monkeypatch.setattr(
-        GaussianDreamerSystem,
-        "prepare_guidance",
-        lambda self: pytest.fail("a model was loaded"),
-    )
     assert launch(tmp_path, painted_box, f"system.geometry.prior.path={path}") == 2
     assert "does not exist" in capsys.readouterr().err
+
+
+def test_a_cache_folder_of_embeddings_is_checked_before_any_model_is_loaded(
+    tmp_path, painted_box, capsys, no_models
+):
+    (tmp_path / "file").write_text("")
+    options = [
+        "system.prompt_processor_type=gaussiandreamer-stable-diffusion-prompt-processor",
+        f"system.prompt_processor.cache_dir={tmp_path}/file/cache",
+    ]
+    assert launch(tmp_path, painted_box, *options) == 2
+    assert "cache_dir" in capsys.readouterr().err
 
 
 def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, painted_box, capsys):

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Optional
@@ -19,6 +20,30 @@ same model and text changes.
 """
 
 Encode = Callable[[list[str]], list[Float[Tensor, "N F"]]]
+
+
+def require_cache_folder(folder: Path) -> None:
+    """Check that embeddings can be written into ``folder``, without making it.
+
+    Raises:
+        UserError: it, or the nearest existing folder above it, is a file or read-only, or it can't
+            be a folder's name.
+    """
+    try:
+        existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    except OSError as error:  # the name is too long
+        raise _unwritable(folder, error.strerror) from error
+    if not existing.is_dir():
+        raise _unwritable(folder, f"{str(existing)!r} is no folder")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise _unwritable(folder, f"{str(existing)!r} is read-only")
+
+
+def _unwritable(folder: Path, reason: Optional[str]) -> UserError:
+    return UserError(
+        f"the folder of text embeddings {str(folder)!r} can't be written ({reason}): set "
+        "system.prompt_processor.cache_dir to another one, or use_cache=false"
+    )
 
 
 class EmbeddingCache:
@@ -61,11 +86,7 @@ class EmbeddingCache:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise UserError(
-                f"the folder of text embeddings {str(self.folder)!r} can't be made "
-                f"({error.strerror}): "
-                "set system.prompt_processor.cache_dir to another one, or use_cache=false"
-            ) from error
+            raise _unwritable(self.folder, error.strerror) from error
         with atomic_file(self.path(text)) as file:
             file.write(
                 save({"embedding": embedding.float().cpu().contiguous()}, metadata={"text": text})
@@ -76,6 +97,7 @@ class EmbeddingCache:
         found = {text: self.read(text) for text in texts}
         missing = [text for text, embedding in found.items() if embedding is None]
         if missing:
+            require_cache_folder(self.folder)  # before the encoder is loaded
             found |= zip(missing, encode(missing), strict=True)
         for text in missing:
             self.write(text, found[text])

@@ -46,10 +46,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.errors import UserError
-from ..core.files import existing_file
+from ..core.files import existing_file, is_folder
 from ..core.options import check_options, in_range
-from ..host import BaseObject, info, register, register_builtin
-from ..models.embedding_cache import EmbeddingCache, Encode
+from ..host import BaseObject, info, parse_structured, register, register_builtin
+from ..models.embedding_cache import EmbeddingCache, Encode, require_cache_folder
 from ..models.extras import require_extra
 from ..models.families import Family
 from ..models.hub import find_model
@@ -116,6 +116,20 @@ class TextEncoderPromptProcessor(BaseObject):
         """Return an embedding (N, F) per text: N tokens of F features. With ``spawn`` this function
         is pickled.
         """
+
+    @classmethod
+    def preflight(cls, cfg: Any) -> None:
+        """Check within seconds that the cache can be used; called before any model is loaded.
+
+        A read-only folder passes if it exists, since it may hold all embeddings of this run.
+
+        Raises:
+            UserError: the cache's folder can't be made.
+        """
+        cfg = parse_structured(cls.Config, cfg)
+        folder = Path(cfg.cache_dir).expanduser()
+        if cfg.use_cache and not is_folder(folder):
+            require_cache_folder(folder)
 
     def configure(self) -> None:
         check_options(self.Config, self.cfg, "system.prompt_processor.")

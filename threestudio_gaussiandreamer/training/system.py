@@ -39,7 +39,6 @@ from ..core.host_copies import flush_reads
 from ..core.nested import adopt_nested
 from ..core.options import checked_options
 from ..gaussians.stored_state import SHAPES, require_cloud
-from ..guidance.base import ScoreDistillation
 from ..guidance.foreign import (
     call_guidance,
     learnt_weights,
@@ -146,12 +145,13 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         return make_optimizer(self.cfg.optimizer, groups)
 
     def preflight(self) -> None:
-        """Check the requirements of prior and guidance, such as files, before loading models."""
+        """Check what prior, prompts and guidance need, such as files, before loading models."""
         if not len(self.geometry):
             preflight_prior(self.geometry.prior(), self.geometry.cfg.keep_attributes)
-        guidance = find(self.cfg.guidance_type)
-        if issubclass(guidance, ScoreDistillation):
-            guidance.preflight(self.cfg.guidance)
+        for name in ("prompt_processor", "guidance"):
+            part = find(self.cfg[f"{name}_type"])
+            if hasattr(part, "preflight"):
+                part.preflight(self.cfg[name])
 
     def prepare_guidance(self) -> None:
         """Build prompt processor and guidance. Called before the prior runs, so that missing
