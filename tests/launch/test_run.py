@@ -136,6 +136,20 @@ def test_a_run_from_step_0_puts_earlier_checkpoints_aside(launch):
     assert "(step 2)" in out + err and "of another run: seed was 3, now it is 5" in out + err
 
 
+def test_a_run_from_step_0_puts_earlier_results_aside(launch):
+    """Else the page of the run may show a later step of the earlier run; its prior serves again."""
+    save = Path("outputs/tiny/run/save")
+    for name in ("it9-export", "prior"):
+        (save / name).mkdir(parents=True)
+        (save / name / "file").write_text(name)
+    assert launch("--train", *ONE_FOLDER)[0] == 0
+    aside = save.with_name("save-2")
+    assert {path.name for path in aside.iterdir()} == {"it9-export", "prior"}
+    assert (save / "prior/file").read_text() == "prior" and not (save / "it9-export").exists()
+    assert launch("--train", *ONE_FOLDER, "resume=auto", "trainer.max_steps=9")[0] == 0
+    assert not save.with_name("save-3").exists()
+
+
 def test_a_run_may_start_from_the_weights_of_the_checkpoints_that_it_puts_aside(launch):
     assert launch("--train", *ONE_FOLDER)[0] == 0
     weights = "system.weights=outputs/tiny/run/ckpts/last.ckpt"

@@ -126,14 +126,29 @@ def claim(path: Path) -> RunFolder:
             return RunFolder(path, first_made, _lock(path))
 
 
-def set_aside(path: Path) -> Optional[Path]:
+def set_run_aside(folder: Path) -> list[Path]:
+    """Rename checkpoints and results of an earlier run: resume=auto could take the ones, and the
+    page of a run shows the cloud of the latest step. The prior's points, which may serve again, are
+    copied back.
+
+    Returns:
+        the new paths.
+    """
+    checkpoints = set_aside(folder / "ckpts", "*.ckpt")
+    results = set_aside(folder / "save", "it*")
+    if results and (results / "prior").is_dir():
+        shutil.copytree(results / "prior", folder / "save" / "prior")
+    return [path for path in (checkpoints, results) if path]
+
+
+def set_aside(path: Path, content: str) -> Optional[Path]:
     """Rename a folder to the first of ``path-2``, ``path-3``, ... that doesn't exist, unless it is
-    missing or has no checkpoint.
+    missing or holds nothing of the pattern ``content``.
 
     Returns:
         the new path; None if it wasn't renamed.
     """
-    if not any(path.glob("*.ckpt")):
+    if not any(path.glob(content)):
         return None
     return path.rename(next(name for name in numbered(path) if not name.exists()))
 

@@ -32,7 +32,7 @@ from .callbacks import (
 from .checkpoints import AtomicCheckpointIO
 from .config_check import MisconfigurationException, build, plain
 from .ddp import environment_plugins, is_lost_process, planned_processes, trainer_options
-from .folder_lock import RunFolder, claim, claim_new, require_writable, set_aside
+from .folder_lock import RunFolder, claim, claim_new, require_writable, set_run_aside
 from .live_viewer import LiveViewer, ViewerConfig
 from .run_folder import SIZES, changes_since, renumber, resume_command
 from .training_state import check_training_state
@@ -145,8 +145,8 @@ class Run:
         self.trainer = self.build_trainer()
         # after the parts, which may read weights from there
         if self.args.stage == "train" and self.cfg.resume is None and not get_rank():
-            if earlier := set_aside(self.last.parent):  # else resume=auto may take one of them
-                info(f"starting at step 0: the checkpoints of an earlier run are now in {earlier}")
+            for earlier in set_run_aside(self.folder):
+                info(f"starting at step 0: files of an earlier run are now in {earlier}")
 
     def read_resume(self) -> Optional[tuple[int, int]]:
         """Return the epoch and step of the checkpoint to resume from; None without one. The file is
