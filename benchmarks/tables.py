@@ -103,6 +103,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "docs/step_time.md": {
         "step": start.step_parts,
         "start": start.first_step,
+        "imports": start.imports,
         "stages": start.demo_stages,
         "default": default_against.table,
     },

@@ -49,11 +49,11 @@ NOTES = {
     "colors": "Ways to keep colours in the range of viewers. `psnr`: rendered with each Gaussian's "
     "colour clamped to [0, 1], as viewers do; `unclamped`: rendered as stored; `above_1`: share of "
     "Gaussians with a channel above 1. Only the first and the chosen one are in the code.",
-    "quality": "The three are the configurations as they are, with their own steps. The base "
-    "recipe was the default before. Best, the base recipe and the paper's were timed on an AMD "
-    "EPYC; draft and default on an Intel Xeon beside other work, where the base recipe takes "
-    'longer too ("Changes of the demo that were tried"), all before the CPU kernel became faster. '
-    "So dB can be compared across the rows, and seconds between draft and default only.",
+    "quality": "The three are the configurations as they are, with their own steps, all on one "
+    "AMD EPYC without AVX-512, beside other work. The base recipe was the default before; it and "
+    "the paper's were timed on another AMD EPYC, before the CPU kernel became faster, so only dB "
+    "can be compared with theirs. Best has fewer seeds than the others where its range is narrow; "
+    "the chart's caption has their numbers.",
     "tried": "One change each, seed 0, 256². `gain`: dB above the row with the letter `base`; "
     "`floaters` in %. A, B and C are the base recipe with what they name; the demo is C with 500 "
     "steps. Flat first Gaussians and steps by curvature aren't in the code. "

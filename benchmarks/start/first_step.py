@@ -4,17 +4,19 @@
 
 Runs both checkouts alternately, each time in a new process and an empty folder, up to the end of
 the first step. Seconds are of all threads of the process, which other programs on the machine
-change little. Writes ``benchmarks/results/start.csv``."""
+change little. Writes ``benchmarks/results/start.csv``. What the imports consist of:
+``benchmarks/start/import_times.py``."""
 
 import statistics
 from pathlib import Path
 
 from benchmarks.markdown import write_rows
+from benchmarks.quality.runs import machine
 from benchmarks.start.launched import ROOT, checkouts_of, commit_of, paired_parser, run_with_probe
 
 RESULTS = ROOT / "benchmarks/results/start.csv"
 PROBE = Path(__file__).with_name("probe.py")
-COLUMNS = ("checkout", "commit", "round", "stage", "cpu_seconds")
+COLUMNS = ("checkout", "commit", "machine", "round", "stage", "cpu_seconds")
 
 
 def seconds_by_stage(ends: dict[str, float]) -> dict[str, float]:
@@ -32,7 +34,7 @@ def main() -> None:
         for name, checkout in checkouts.items():
             ends = run_with_probe(PROBE, checkout)["ends"]
             print(f"{name}: {ends['first step']:.2f} CPU s", flush=True)
-            place = (name, commit_of(checkout), number)
+            place = (name, commit_of(checkout), machine(), number)
             rows += [(*place, *stage) for stage in seconds_by_stage(ends).items()]
     write_rows(RESULTS, COLUMNS, ((*place, f"{seconds:.3f}") for *place, seconds in rows))
     for name in checkouts:
@@ -41,7 +43,7 @@ def main() -> None:
 
 def median_total(rows: list[tuple], checkout: str) -> float:
     totals: dict[int, float] = {}
-    for name, _, number, _, seconds in rows:
+    for name, _, _, number, _, seconds in rows:
         if name == checkout:
             totals[number] = totals.get(number, 0.0) + seconds
     return statistics.median(totals.values())

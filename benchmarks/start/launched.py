@@ -38,15 +38,24 @@ def run_with_probe(
     Raises:
         RuntimeError: the run ended without it.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        extension = Path(folder, "custom", "probe")
-        extension.mkdir(parents=True)
-        shutil.copy(probe, extension / "__init__.py")
-        done = launch(checkout, folder, *overrides, config=config, environment=environment)
+    done = launch_with_probe(probe, checkout, *overrides, config=config, environment=environment)
     for line in done.stdout.splitlines():
         if line.startswith(MARK):
             return json.loads(line.removeprefix(MARK))
     raise RuntimeError(f"{checkout} measured nothing:\n{done.stdout}\n{done.stderr}")
+
+
+def launch_with_probe(
+    probe: Path, checkout: Path, *overrides: str, **options: Any
+) -> subprocess.CompletedProcess[str]:
+    """Train with a checkout in an empty folder with an extension; arguments as of
+    :func:`run_with_probe`.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        extension = Path(folder, "custom", "probe")
+        extension.mkdir(parents=True)
+        shutil.copy(probe, extension / "__init__.py")
+        return launch(checkout, folder, *overrides, **options)
 
 
 def launch(

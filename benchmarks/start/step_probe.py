@@ -1,13 +1,16 @@
 """Extension that divides the processor seconds of training steps among their parts, and ends the
 run after the last one.
 
-``launched.py`` copies this file beside a run. ``STEP_WINDOW`` gives the first and the last step.
-The printed JSON has the seconds of each part, without those of the parts that it calls."""
+``launched.py`` copies this file beside a run. ``STEP_WINDOWS`` has the first and the last step of
+each window, in order. The printed JSON has a list of the seconds of each part for every window,
+without those of the parts that it calls. The progress bar is that of a terminal, and no checkpoint
+is written, since those are due by the clock."""
 
 import functools
 import importlib
 import json
 import os
+import sys
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -16,11 +19,14 @@ import torch
 import torch.nn.functional as F
 
 from threestudio_gaussiandreamer.guidance.base import ScoreDistillation
+from threestudio_gaussiandreamer.guidance.text_to_image import TextToImageDistillation
 from threestudio_gaussiandreamer.host import find, pl, register
+from threestudio_gaussiandreamer.launch import callbacks
 
 PACKAGE = "threestudio_gaussiandreamer."
 MARK = "MEASURED "
-FIRST, LAST = map(int, os.environ["STEP_WINDOW"].split())
+STEPS = [int(step) for step in os.environ["STEP_WINDOWS"].split()]
+FIRSTS, LASTS = STEPS[::2], STEPS[1::2]
 SYSTEM = find("gaussiandreamer-system")
 DIFFUSION = find("gaussiandreamer-stable-diffusion-guidance")
 CALLS = {
@@ -28,7 +34,9 @@ CALLS = {
         ("training.renderer", "rasterize"),
         ("splatting.autograd", "_Rasterize.backward"),
     ),
-    "score": (("training.system", "GaussianDreamerSystem.guide"),),
+    # of the exact score, the pass that compares renders with the known pictures
+    "network": (("splatting.cpu.known_picture", "known_gradient"),),
+    "rest of the score": (("training.system", "GaussianDreamerSystem.guide"),),
     "cameras": (("training.data", "TrainCameras.collate"),),
     "density control": (
         ("training.density", "DensityControl.before_backward"),
@@ -53,6 +61,7 @@ OF_LIGHTNING = {
     ),
 }
 seconds: dict[str, float] = dict.fromkeys([*CALLS, "optimiser", OTHER], 0.0)
+found: list[dict[str, float]] = []
 running, since = [OTHER], 0.0
 
 
@@ -104,19 +113,20 @@ def measure_calls() -> None:
             measure(part, owner, name)
 
 
-def with_backward_measured(encode: Any) -> Any:
-    """Attribute the backward pass of a guidance's encoder to the score."""
+def measure_encoder(guidance: type) -> None:
+    """Attribute both passes of a guidance's encoder to the network."""
+    encode = measured("network", guidance.encode)
 
     @functools.wraps(encode)
     def measured_encode(guidance: Any, rgb: torch.Tensor, **batch: Any) -> torch.Tensor:
         pixels = rgb.view_as(rgb)  # its gradient is that of the encoder alone
         latents = encode(guidance, pixels, **batch)
         if latents.requires_grad:
-            latents.register_hook(lambda grad: enter("score"))
-            pixels.register_hook(lambda grad: leave("score"))
+            latents.register_hook(lambda grad: enter("network"))
+            pixels.register_hook(lambda grad: leave("network"))
         return latents
 
-    return measured_encode
+    guidance.encode = measured_encode
 
 
 def configured(build: Any) -> Any:
@@ -134,14 +144,15 @@ def configured(build: Any) -> Any:
 def before_a_batch(begin: Any) -> Any:
     @functools.wraps(begin)
     def on_train_batch_start(system: Any, *args: Any) -> Any:
-        if system.global_step == FIRST:
-            switch()
-            seconds.update(dict.fromkeys(seconds, 0.0))
-        if system.global_step == LAST:
-            switch()
+        switch()
+        if system.global_step in LASTS:
             assert running == [OTHER], running
-            print(f"\n{MARK}{json.dumps(seconds)}", flush=True)
+            found.append(dict(seconds))
+        if system.global_step == STEPS[-1]:
+            print(f"\n{MARK}{json.dumps({'windows': found})}", flush=True)
             os._exit(0)
+        if system.global_step in FIRSTS:
+            seconds.update(dict.fromkeys(seconds, 0.0))
         return begin(system, *args)
 
     return on_train_batch_start
@@ -174,8 +185,13 @@ class EmptyNetworks(ScoreDistillation):
         return torch.zeros_like(z), None
 
 
+callbacks.SECONDS_BETWEEN = float("inf")
+sys.stderr.isatty = lambda: True
 measure_calls()
-DIFFUSION.encode = with_backward_measured(DIFFUSION.encode)
+measure("network", TextToImageDistillation, "run_network")
+measure("network", EmptyNetworks, "predict")
+for guidance in (DIFFUSION, EmptyNetworks):
+    measure_encoder(guidance)
 SYSTEM.configure_optimizers = configured(SYSTEM.configure_optimizers)
 SYSTEM.on_train_batch_start = before_a_batch(SYSTEM.on_train_batch_start)
 since = time.process_time()

@@ -3,21 +3,25 @@
     python -m benchmarks.start.step_shares [--against another/checkout] [--rounds 2]
 
 Runs the demo's step (4 views of 256 x 256 pixels, the exact score), one of 4 x 512 x 512 with empty
-networks of Stable Diffusion's shapes, and that of toybox.yaml, 4 x 128 x 128 with learned models;
-both checkouts alternate, each run in a new process with one thread. Replaces the rows of these
-workloads in ``benchmarks/results/step.csv``."""
+networks of Stable Diffusion's shapes, and that of toybox.yaml, 4 x 128 x 128 with learned models.
+Early steps of the first two have up to 20,000 Gaussians, late ones 5,000. Both checkouts alternate,
+each run in a new process with one thread. Replaces the rows of these workloads in
+``benchmarks/results/step.csv``; those of workloads that no longer exist are dropped."""
 
 from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.markdown import read, write_rows
+from benchmarks.quality.runs import machine
 from benchmarks.start.launched import ROOT, checkouts_of, commit_of, paired_parser, run_with_probe
 
 RESULTS = ROOT / "benchmarks/results/step.csv"
 PROBE = Path(__file__).with_name("step_probe.py")
-COLUMNS = ("workload", "checkout", "commit", "round", "part", "cpu_ms")
-WINDOW = (50, 100)
-"""The first and the last step: the demo samples the removal error and prunes in them."""
+COLUMNS = ("workload", "steps", "checkout", "commit", "machine", "round", "part", "cpu_ms")
+EARLY, LATE = (50, 100), (350, 400)
+"""The first step of a window, and the one after its last. In the early one the demo samples the
+removal error and prunes."""
+NO_PICTURES = ("trainer.limit_val_batches=0",)
 FEW_VIEWS = ("data.train_views=24", "system.evaluation.views=1", "system.evaluation.size=16")
 """What only matters before and after these steps: target images and evaluation."""
 
@@ -25,6 +29,7 @@ FEW_VIEWS = ("data.train_views=24", "system.evaluation.views=1", "system.evaluat
 class Workload(NamedTuple):
     options: tuple[str, ...]
     config: str = "configs/demo.yaml"
+    windows: tuple[tuple[int, int], ...] = (EARLY, LATE)
 
 
 WORKLOADS = {
@@ -36,7 +41,9 @@ WORKLOADS = {
         )
     ),
     "learned models, 4 × 128²": Workload(
-        ("system.prompt_processor.prompt=a red fox with a green scarf",), "configs/toybox.yaml"
+        ("system.prompt_processor.prompt=a red fox with a green scarf",),
+        "configs/toybox.yaml",
+        (EARLY,),
     ),
 }  # fmt: skip
 THREADS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -45,28 +52,33 @@ THREADS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 def main() -> None:
     parser = paired_parser(__doc__, rounds=2)
     parser.add_argument("--workloads", nargs="+", choices=[*WORKLOADS], default=[*WORKLOADS])
-    parser.add_argument("--steps", nargs=2, type=int, default=WINDOW, metavar=("FIRST", "LAST"))
     args = parser.parse_args()
     checkouts = checkouts_of(args.against)
     earlier = read(RESULTS) if RESULTS.exists() else []
-    rows = [tuple(row.values()) for row in earlier if row["workload"] not in args.workloads]
+    kept = WORKLOADS.keys() - args.workloads
+    rows = [tuple(row.values()) for row in earlier if row["workload"] in kept]
     for number in range(args.rounds):
         for workload in args.workloads:
             for name, checkout in checkouts.items():
-                parts = milliseconds(checkout, WORKLOADS[workload], args.steps)
-                print(f"{workload}, {name}: {sum(parts.values()):.1f} ms", parts, flush=True)
-                place = (workload, name, commit_of(checkout), number)
-                rows += [(*place, part, f"{ms:.3f}") for part, ms in parts.items()]
+                for steps, parts in milliseconds(checkout, WORKLOADS[workload]).items():
+                    total = sum(parts.values())
+                    print(f"{workload}, {steps}, {name}: {total:.1f} ms", parts, flush=True)
+                    place = (workload, steps, name, commit_of(checkout), machine(), number)
+                    rows += [(*place, part, f"{ms:.3f}") for part, ms in parts.items()]
     write_rows(RESULTS, COLUMNS, rows)
 
 
-def milliseconds(checkout: Path, workload: Workload, window: list[int]) -> dict[str, float]:
-    """Return the processor milliseconds of each part of a step, the mean of a window of steps."""
-    first, last = window
-    environment = {**THREADS, "STEP_WINDOW": f"{first} {last}"}
-    options, config = workload
-    found = run_with_probe(PROBE, checkout, *options, config=config, environment=environment)
-    return {part: 1000 * value / (last - first) for part, value in found.items()}
+def milliseconds(checkout: Path, workload: Workload) -> dict[str, dict[str, float]]:
+    """Return the processor milliseconds of each part of a step, the means of each window."""
+    options, config, windows = workload
+    limits = [str(step) for window in windows for step in window]
+    environment = {**THREADS, "STEP_WINDOWS": " ".join(limits)}
+    overrides = (*options, *NO_PICTURES)
+    found = run_with_probe(PROBE, checkout, *overrides, config=config, environment=environment)
+    return {
+        f"{first}–{last}": {part: 1000 * value / (last - first) for part, value in parts.items()}
+        for (first, last), parts in zip(windows, found["windows"], strict=True)
+    }
 
 
 if __name__ == "__main__":

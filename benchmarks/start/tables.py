@@ -9,10 +9,16 @@ from typing import TypeVar
 
 from benchmarks.markdown import markdown, read
 from benchmarks.quality.chart_runs import grouped
+from benchmarks.start.import_times import STANDARD
 
 FOLDER = Path(__file__).resolve().parents[1] / "results"
 RESULTS = FOLDER / "start.csv"
-NOT_THE_REST = ("rasteriser", "score", "optimiser")
+NOT_THE_REST = ("rasteriser", "network", "optimiser")
+LOGS, REST = "logs and progress bar", "**all but rasteriser, network, optimiser**"
+BOUNDS = {LOGS: 0.02, REST: 0.25}
+"""Largest shares of a step that parts are to have."""
+SHOWN_SHARE = 0.01
+"""Smallest share of a package in the table of imports."""
 T = TypeVar("T")
 Rows = list[dict[str, str]]
 
@@ -34,7 +40,8 @@ def first_step() -> str:
     head = ("stage", *(_heading(rows, name) for name in checkouts))
     table = [(stage, *(f"{medians[name, stage]:.2f}" for name in checkouts)) for stage in stages]
     sums = [sum(medians[name, stage] for stage in stages) for name in checkouts]
-    return markdown(head, [*table, ("all", *(f"{total:.2f}" for total in sums))])
+    table = markdown(head, [*table, ("all", *(f"{total:.2f}" for total in sums))])
+    return f"{table}\n\n{_processors(rows)}"
 
 
 def whole_runs() -> str:
@@ -55,38 +62,86 @@ def _place(row: dict[str, str]) -> str:
 
 
 def _heading(rows: Rows, checkout: str) -> str:
-    (commit,) = {row["commit"] for row in rows if row["checkout"] == checkout}
-    return f"{checkout} ({commit}), CPU s"
+    return f"{checkout} ({_commits(row for row in rows if row['checkout'] == checkout)}), CPU s"
+
+
+def _commits(rows: Iterable[dict[str, str]]) -> str:
+    return ", ".join(_unique(row["commit"] for row in rows))
+
+
+def _processors(rows: Rows) -> str:
+    return f"Processor: {', '.join(_unique(row['machine'] for row in rows))}."
 
 
 def step_parts() -> str:
-    """Return the median milliseconds of a step's parts, and their shares of the step now."""
+    """Return the median milliseconds of a step's parts, their shares of the step, and whether they
+    are within BOUNDS.
+    """
     rows = read(FOLDER / "step.csv")
-    pairs = _unique((row["workload"], row["checkout"]) for row in rows)
-    medians = {pair: _medians(rows, pair) for pair in pairs}
-    head = ("processor ms of a step", *(f"{name}, {checkout}" for name, checkout in pairs))
-    parts = list(medians[pairs[0]])
-    cells = {part: [_with_share(medians[pair], [part]) for pair in pairs] for part in parts}
-    rest = [part for part in parts if part not in NOT_THE_REST]
-    cells["**all but rasteriser, score, optimiser**"] = [
-        _with_share(medians[pair], rest) for pair in pairs
+    columns = grouped(
+        rows, lambda row: tuple(row[key] for key in ("workload", "steps", "checkout"))
+    )
+    head = [
+        f"{workload}, steps {steps}, {checkout} ({_commits(own)})"
+        for (workload, steps, checkout), own in columns.items()
     ]
-    cells["all"] = [f"{sum(medians[pair].values()):.1f}" for pair in pairs]
-    return markdown(head, [(part, *values) for part, values in cells.items()])
+    medians = [_medians(own) for own in columns.values()]
+    parts = {part: [part] for part in medians[0]}
+    parts[REST] = [part for part in parts if part not in NOT_THE_REST]
+    lines = [
+        (_with_bound(title), *(_with_share(found, names, title) for found in medians))
+        for title, names in parts.items()
+    ]
+    lines.append(("all", *(f"{sum(found.values()):.1f}" for found in medians)))
+    table = markdown(("processor ms of a step", *head), lines)
+    return f"{table}\n\n{_processors(rows)}"
 
 
-def _medians(rows: Rows, pair: tuple[str, str]) -> dict[str, float]:
-    """Return the median milliseconds of each part, for a workload and a checkout."""
-    own = [row for row in rows if (row["workload"], row["checkout"]) == pair]
+def _medians(rows: Rows) -> dict[str, float]:
+    """Return the median milliseconds of each part."""
+    by_part = grouped(rows, lambda row: row["part"])
     return {
-        part: statistics.median(float(row["cpu_ms"]) for row in own if row["part"] == part)
-        for part in _unique(row["part"] for row in own)
+        part: statistics.median(float(row["cpu_ms"]) for row in same)
+        for part, same in by_part.items()
     }
 
 
-def _with_share(medians: dict[str, float], parts: list[str]) -> str:
+def _with_bound(title: str) -> str:
+    return f"{title}, at most {BOUNDS[title]:.0%}".replace("%", " %") if title in BOUNDS else title
+
+
+def _with_share(medians: dict[str, float], parts: list[str], title: str) -> str:
     milliseconds = sum(medians[part] for part in parts)
-    return f"{milliseconds:.1f} ({milliseconds / sum(medians.values()):.0%})".replace("%", " %")
+    share = milliseconds / sum(medians.values())
+    cell = f"{milliseconds:.1f} ({share:.1%})".replace("%", " %")
+    if title not in BOUNDS:
+        return cell
+    return f"{cell}: {'met' if share <= BOUNDS[title] else 'missed'}"
+
+
+def imports() -> str:
+    """Return the median milliseconds of the packages that a run imports before its first step."""
+    rows = read(FOLDER / "imports.csv")
+    columns = ("own_ms", "cumulative_ms")
+    medians = {
+        package: [statistics.median(float(row[name]) for row in same) for name in columns]
+        for package, same in grouped(rows, lambda row: row["package"]).items()
+    }
+    total = sum(own for own, _ in medians.values())
+    shown = {name: both for name, both in medians.items() if both[1] >= SHOWN_SHARE * total}
+    lines = [
+        (f"`{name}`" if name != STANDARD else name, *(_ms_with_share(ms, total) for ms in both))
+        for name, both in sorted(shown.items(), key=lambda item: -item[1][1])
+    ]
+    others = total - sum(own for own, _ in shown.values())
+    lines.append((f"{len(medians) - len(shown)} others", _ms_with_share(others, total), ""))
+    lines.append(("all", f"{total:.0f}", ""))
+    head = (f"package ({_commits(rows)})", "own modules, ms", "with their imports, ms")
+    return f"{markdown(head, lines)}\n\n{_processors(rows)}"
+
+
+def _ms_with_share(milliseconds: float, total: float) -> str:
+    return f"{milliseconds:.0f} ({milliseconds / total:.0%})".replace("%", " %")
 
 
 def demo_stages() -> str:

@@ -38,6 +38,7 @@ A mixture over the bank doesn't depend on the camera's distance either, so a fai
 towards far views. To measure multi-face alone, give cameras and bank the same single distance and
 angle of view."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Optional, Tuple
 
@@ -188,10 +189,11 @@ class ExactScoreGuidance(ScoreDistillation):
         weight = sds.weight(self.options.weighting_strategy, abar).float()
         background, scale = background[:, 0, 0].contiguous(), (abar / (1 - abar)).sqrt().float()
         found = known_picture.known_gradient(rgb, pictures, background, scale, weight)
-        if found is None or not found[1].isfinite().all():
-            return None
         # the gradient is 2 weight scale (render - picture); plain numbers are faster than tensors
-        factors = zip(found[1].tolist(), weight.tolist(), scale.tolist(), strict=True)
+        squares = [] if found is None else found[1].tolist()
+        if not squares or not math.isfinite(sum(squares)):
+            return None
+        factors = zip(squares, weight.tolist(), scale.tolist(), strict=True)
         return *found, sum(square / (2 * w * s) ** 2 for square, w, s in factors) / rgb.numel()
 
     def _compares_pixels(self, size: tuple[int, int]) -> bool:

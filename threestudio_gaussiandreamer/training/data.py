@@ -139,7 +139,10 @@ class TrainCameras(IterableDataset, Updateable):
             views = self._views_of_pool(height, width)
             lights = self._lights(views["c2w"][index], rng)[rows]
             index = index[rows]
-            batch = {name: v[index] if torch.is_tensor(v) else v for name, v in views.items()}
+            # half the time of v[index]
+            batch = {
+                k: v.index_select(0, index) if torch.is_tensor(v) else v for k, v in views.items()
+            }
             return batch | {"light_positions": lights}
         orbit = (
             self.pool.rows(index)
