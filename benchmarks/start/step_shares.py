@@ -65,7 +65,8 @@ def main() -> None:
                     print(f"{workload}, {steps}, {name}: {total:.1f} ms", parts, flush=True)
                     place = (workload, steps, name, commit_of(checkout), machine(), number)
                     rows += [(*place, part, f"{ms:.3f}") for part, ms in parts.items()]
-    write_rows(RESULTS, COLUMNS, rows)
+    order = [*WORKLOADS]
+    write_rows(RESULTS, COLUMNS, sorted(rows, key=lambda row: order.index(row[0])))
 
 
 def milliseconds(checkout: Path, workload: Workload) -> dict[str, dict[str, float]]:

@@ -31,8 +31,8 @@ def test_rows_of_other_workloads_stay_but_not_of_those_that_no_longer_exist(monk
         measure(monkeypatch, workload)
     rows = list(csv.DictReader(open(tmp_path / "step.csv")))
     assert [(row["workload"], row["cpu_ms"]) for row in rows] == [
-        (second, "3.000"),
         (first, "4.000"),
+        (second, "3.000"),
     ]
     assert all(row["commit"] and row["machine"] and row["steps"] == "5–9" for row in rows)
 
