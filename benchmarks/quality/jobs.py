@@ -265,6 +265,7 @@ def dilation_jobs() -> Iterator[Job]:
         )
 
 
+NOT_ANTIALIASED = "best, not antialiased, dilation 0.1"
 DEMOS = {"draft": ("demo-draft", 255), "default": ("", 500), "best": ("demo-best", 3000)}
 """The demo's variants: the overlay and the steps of each."""
 
@@ -280,8 +281,10 @@ def demo_jobs(chart: str, *variants: str) -> Iterator[Job]:
 
 def quality_jobs() -> Iterator[Job]:
     """The demo, its draft and its best variant, and what they are compared with."""
-    *_, base = jobs = tuple(demo_jobs("quality", *DEMOS))
+    *_, best, base = jobs = tuple(demo_jobs("quality", *DEMOS))
     yield from jobs
+    classic = {"system.renderer.antialias": "false", "system.renderer.eps2d": 0.1}
+    yield best._replace(variant=NOT_ANTIALIASED, options=best.options | classic)
     yield base._replace(variant="the paper's recipe", options=base.options | PAPER)
 
 
