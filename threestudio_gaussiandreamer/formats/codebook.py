@@ -1,7 +1,7 @@
 """Codebooks: few values or vectors that stand for many (Lloyd's algorithm, k-means)."""
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 
 ROUNDS = 12
 """Iterations; later ones hardly reduce the error."""
@@ -13,7 +13,7 @@ BLOCK = 2048
 
 def scalar_codebook(
     values: Float[np.ndarray, "*shape"], size: int = 256
-) -> tuple[Float[np.ndarray, " size"], Int[np.ndarray, "*shape"]]:
+) -> tuple[Float[np.ndarray, " size"], Integer[np.ndarray, "*shape"]]:
     """Return ``size`` ascending values and the index of the nearest one for each of ``values``.
 
     Up to ``size`` different values are kept exactly.
@@ -53,7 +53,7 @@ def _lloyd(
 
 def vector_codebook(
     vectors: Float[np.ndarray, "N D"], size: int
-) -> tuple[Float[np.ndarray, "size D"], Int[np.ndarray, " N"]]:
+) -> tuple[Float[np.ndarray, "size D"], Integer[np.ndarray, " N"]]:
     """Return ``size`` vectors and the index of the nearest one for each of ``vectors``; k-means
     from a fixed seed. Up to ``size`` vectors are kept exactly.
     """
@@ -76,7 +76,7 @@ def vector_codebook(
 
 def _nearest(
     vectors: Float[np.ndarray, "N D"], book: Float[np.ndarray, "K D"]
-) -> Int[np.ndarray, " N"]:
+) -> Integer[np.ndarray, " N"]:
     squares = (book**2).sum(axis=1)
     starts = range(0, len(vectors), BLOCK)
     blocks = (vectors[at : at + BLOCK] for at in starts)

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import BinaryIO, NoReturn
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 
 from ..core.errors import UserError
 from ..core.files import atomic_file, existing_file
@@ -147,7 +147,7 @@ def _packed(
     gaussians: Gaussians,
     values: Float[np.ndarray, "C 256 3 3"],
     limits: Float[np.ndarray, "C 3 2 3"],
-) -> Int[np.ndarray, "N 4"]:
+) -> Integer[np.ndarray, "N 4"]:
     low, size = limits[:, None, :, 0], np.ptp(limits, axis=2)[:, None]
     fractions = (values - low) / np.where(size > 0, size, 1)
     count = len(gaussians.means)
@@ -163,7 +163,7 @@ def _packed(
     return np.stack(words, axis=1).astype("<u4")
 
 
-def _word(fractions: Float[np.ndarray, "N F"], bits: Sequence[int]) -> Int[np.ndarray, " N"]:
+def _word(fractions: Float[np.ndarray, "N F"], bits: Sequence[int]) -> Integer[np.ndarray, " N"]:
     """Pack fractions in [0, 1] into one integer each, the first in the highest bits."""
     word = np.zeros(len(fractions), np.uint32)
     for fraction, width in zip(fractions.T, bits, strict=True):
@@ -172,12 +172,12 @@ def _word(fractions: Float[np.ndarray, "N F"], bits: Sequence[int]) -> Int[np.nd
     return word
 
 
-def _rotation_word(quats: Float[np.ndarray, "N 4"]) -> Int[np.ndarray, " N"]:
+def _rotation_word(quats: Float[np.ndarray, "N 4"]) -> Integer[np.ndarray, " N"]:
     largest, others = packing.without_largest(packing.unit_quats(quats))
     return largest.astype(np.uint32) << 30 | _word(others / sqrt(2) + 0.5, (10, 10, 10))
 
 
-def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Int[np.ndarray, "N C"]:
+def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Integer[np.ndarray, "N C"]:
     by_channel = rest.transpose(0, 2, 1).reshape(len(rest), 3 * rest.shape[1])
     return packing.to_byte(np.floor(256 * (by_channel / (2 * SH_REACH) + 0.5)))
 
@@ -244,30 +244,30 @@ def _chunk_limits(chunks: Float[np.ndarray, "C L"]) -> Float[np.ndarray, "C 3 2 
 def _between(
     fractions: Float[np.ndarray, "N 3"],
     limits: Float[np.ndarray, "C 2 3"],
-    chunks: Int[np.ndarray, " N"],
+    chunks: Integer[np.ndarray, " N"],
 ) -> Float[np.ndarray, "N 3"]:
     low, high = limits[chunks, 0], limits[chunks, 1]
     return low * (1 - fractions) + high * fractions
 
 
-def _fractions(words: Int[np.ndarray, " N"], bits: Sequence[int] = BITS) -> np.ndarray:
+def _fractions(words: Integer[np.ndarray, " N"], bits: Sequence[int] = BITS) -> np.ndarray:
     """Invert :func:`_word`: (N, F) in [0, 1]."""
     shifts = np.cumsum(bits[::-1])[::-1] - bits
     most = (1 << np.array(bits)) - 1
     return (words.astype(np.int64)[:, None] >> shifts & most) / most
 
 
-def _quats(words: Int[np.ndarray, " N"]) -> Float[np.ndarray, "N 4"]:
+def _quats(words: Integer[np.ndarray, " N"]) -> Float[np.ndarray, "N 4"]:
     others = (_fractions(words, (10, 10, 10)) - 0.5) * sqrt(2)
     return packing.with_largest(words.astype(np.int64) >> 30, others)
 
 
-def _bytes_of(words: Int[np.ndarray, " N"]) -> Int[np.ndarray, "N 4"]:
+def _bytes_of(words: Integer[np.ndarray, " N"]) -> Integer[np.ndarray, "N 4"]:
     """Return the bytes from the highest to the lowest."""
     return (words.astype(np.int64)[:, None] >> np.array([24, 16, 8, 0]) & 255).astype(np.uint8)
 
 
-def _harmonics(rest: Int[np.ndarray, "N C"]) -> Float[np.ndarray, "N K 3"]:
+def _harmonics(rest: Integer[np.ndarray, "N C"]) -> Float[np.ndarray, "N K 3"]:
     """Decode f_rest to the middle of each step; 0 and 255 decode to the limits themselves."""
     fractions = (rest.astype(np.float32) + np.float32(0.5)) / 256
     fractions[rest == 0], fractions[rest == 255] = 0, 1

@@ -1,7 +1,7 @@
 """Encodings that several compact formats of Gaussians share: bytes, logits, spatial order."""
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 
 OPACITY_MARGIN = 1 / 2040
 """Opacities that are read from bytes are clamped to this distance from 0 and 1, an eighth of a
@@ -14,7 +14,7 @@ MAX_OPACITY_BYTE = 254
 """Other readers take the logit of the byte over 255, which is infinite at 255."""
 
 
-def morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
+def morton_order(means: Float[np.ndarray, "N 3"]) -> Integer[np.ndarray, " N"]:
     """Return the rows in Morton order: by the interleaved bits of positions, 10 bits per axis."""
     means = means.astype(np.float64)
     low, high = means.min(axis=0, initial=np.inf), means.max(axis=0, initial=-np.inf)
@@ -36,7 +36,7 @@ def unit_quats(quats: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
 
 def without_largest(
     quats: Float[np.ndarray, "N 4"],
-) -> tuple[Int[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
+) -> tuple[Integer[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
     """Return the index of each unit quaternion's largest component, and the other three in their
     order, with the sign that makes the largest positive.
     """
@@ -47,7 +47,7 @@ def without_largest(
 
 
 def with_largest(
-    largest: Int[np.ndarray, " N"], others: Float[np.ndarray, "N 3"]
+    largest: Integer[np.ndarray, " N"], others: Float[np.ndarray, "N 3"]
 ) -> Float[np.ndarray, "N 4"]:
     """Invert :func:`without_largest`; the result is float32."""
     quats = np.empty((len(others), 4), np.float32)
@@ -66,12 +66,12 @@ def opacities(logits: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
 
 def opacity_bytes(
     logits: Float[np.ndarray, " N"], most: int = MAX_OPACITY_BYTE
-) -> Int[np.ndarray, " N"]:
+) -> Integer[np.ndarray, " N"]:
     """Return opacities in steps of 1 / 255, at most ``most``."""
     return to_byte(255 * opacities(logits)).clip(max=most)
 
 
-def logits_of_bytes(alphas: Int[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+def logits_of_bytes(alphas: Integer[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
     """Return finite logits of opacities that are stored in steps of 1 / 255."""
     return logits(alphas / 255, OPACITY_MARGIN)
 
@@ -83,6 +83,6 @@ def logits(values: Float[np.ndarray, " N"], margin: float) -> Float[np.ndarray, 
     return logit(np.clip(values.astype(np.float64), margin, 1 - margin)).astype(np.float32)
 
 
-def to_byte(values: Float[np.ndarray, "*shape"]) -> Int[np.ndarray, "*shape"]:
+def to_byte(values: Float[np.ndarray, "*shape"]) -> Integer[np.ndarray, "*shape"]:
     """Round to integers, clipped to [0, 255]."""
     return np.rint(np.clip(values, 0, 255)).astype("u1")

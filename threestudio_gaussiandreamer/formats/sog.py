@@ -30,7 +30,7 @@ from math import ceil, sqrt
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 
 from ..core.files import atomic_file
 from ..gaussians.axes import VIEWER_UP
@@ -144,7 +144,7 @@ def _numbers(book: Float[np.ndarray, " B"]) -> list[float]:
 
 def _position_steps(
     means: Float[np.ndarray, "N 3"],
-) -> tuple[Int[np.ndarray, "N 3"], dict[str, list[float]]]:
+) -> tuple[Integer[np.ndarray, "N 3"], dict[str, list[float]]]:
     logs = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     low, high = (logs.min(axis=0), logs.max(axis=0)) if len(logs) else (np.zeros(3), np.zeros(3))
     size = np.where(high > low, high - low, 1)
@@ -152,7 +152,7 @@ def _position_steps(
     return steps, {"mins": low.tolist(), "maxs": high.tolist()}
 
 
-def _quat_bytes(quats: Float[np.ndarray, "N 4"]) -> Int[np.ndarray, "N 4"]:
+def _quat_bytes(quats: Float[np.ndarray, "N 4"]) -> Integer[np.ndarray, "N 4"]:
     largest, others = packing.without_largest(packing.unit_quats(quats))
     tags = (FIRST_TAG + largest).astype(np.uint8)
     return np.concatenate([packing.to_byte(255 * (others / sqrt(2) + 0.5)), tags[:, None]], axis=1)
@@ -190,7 +190,7 @@ def palette_size(count: int) -> int:
     return min(size, MAX_PALETTE)
 
 
-def _image(rows: Int[np.ndarray, "N C"]) -> Int[np.ndarray, "H W 4"]:
+def _image(rows: Integer[np.ndarray, "N C"]) -> Integer[np.ndarray, "H W 4"]:
     """Lay rows out as pixels; width and height are multiples of 4, alpha is 255 unless given."""
     width = 4 * max(ceil(sqrt(len(rows)) / 4), 1)
     height = 4 * max(ceil(len(rows) / width / 4), 1)
@@ -200,7 +200,7 @@ def _image(rows: Int[np.ndarray, "N C"]) -> Int[np.ndarray, "H W 4"]:
     return pixels.reshape(height, width, 4)
 
 
-def _webp(pixels: Int[np.ndarray, "H W 4"]) -> bytes:
+def _webp(pixels: Integer[np.ndarray, "H W 4"]) -> bytes:
     from PIL import Image
 
     buffer = io.BytesIO()
@@ -213,13 +213,13 @@ def _webp(pixels: Int[np.ndarray, "H W 4"]) -> bytes:
 
 
 def _positions(
-    steps: Int[np.ndarray, "N 3"], low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
+    steps: Integer[np.ndarray, "N 3"], low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "N 3"]:
     logs = low + (high - low) * (steps / 65535)
     return (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
 
 
-def _quats(rows: Int[np.ndarray, "N 4"], archive: SogArchive) -> Float[np.ndarray, "N 4"]:
+def _quats(rows: Integer[np.ndarray, "N 4"], archive: SogArchive) -> Float[np.ndarray, "N 4"]:
     largest = rows[:, 3].astype(np.int64) - FIRST_TAG
     if (largest < 0).any():
         archive.fail("a quaternion's index of its largest component isn't 0 to 3: it is damaged")

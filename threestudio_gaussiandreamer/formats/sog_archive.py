@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, NoReturn, Optional
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 
 from ..core.errors import UserError
 from ..core.file_memory import require_file_memory
@@ -138,7 +138,7 @@ class SogArchive:
 
     # ---- images ----------------------------------------------------------------------------------
 
-    def rows(self, section: str, index: int = 0) -> Int[np.ndarray, "N 4"]:
+    def rows(self, section: str, index: int = 0) -> Integer[np.ndarray, "N 4"]:
         """Return the pixels of an image, one for each Gaussian."""
         pixels = self._pixels(section, index)
         height, width = pixels.shape[:2]
@@ -147,7 +147,7 @@ class SogArchive:
             self.fail(f"{section} has {size}, too few for {self.count} Gaussians")
         return pixels.reshape(-1, 4)[: self.count]
 
-    def palette(self) -> Optional[Int[np.ndarray, "P K 3"]]:
+    def palette(self) -> Optional[Integer[np.ndarray, "P K 3"]]:
         """Return the entries of the palette of harmonics, K for each; None without any."""
         if not (bands := self._bands()):
             return None
@@ -159,7 +159,7 @@ class SogArchive:
             self.fail(f"the palette of {count} entries of degree {bands} can't have {size}")
         return pixels[..., :3].reshape(-1, coefficients, 3)[:count]
 
-    def _pixels(self, section: str, index: int) -> Int[np.ndarray, "H W 4"]:
+    def _pixels(self, section: str, index: int) -> Integer[np.ndarray, "H W 4"]:
         files = self._section(section).get("files")
         if not isinstance(files, list) or len(files) <= index or not isinstance(files[index], str):
             self.fail(f"its meta.json names no image {index} of {section!r}")
@@ -182,7 +182,9 @@ class SogArchive:
         bits = int.from_bytes(data[at + 1 : at + 5], "little")
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
 
-    def _decoded(self, data: bytes, size: tuple[int, int], name: str) -> Int[np.ndarray, "H W 4"]:
+    def _decoded(
+        self, data: bytes, size: tuple[int, int], name: str
+    ) -> Integer[np.ndarray, "H W 4"]:
         from PIL import Image
 
         try:

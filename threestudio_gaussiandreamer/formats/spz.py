@@ -27,7 +27,7 @@ import os
 from math import ceil, log, log2, sqrt
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Integer
 
 from ..core.errors import UserError
 from ..core.files import atomic_file, existing_file
@@ -161,7 +161,7 @@ def spz_arrays(packed: bytes, name: str = "") -> Gaussians:
     return _decoded(*unpack(packed, name))
 
 
-def _decoded(header: SpzHeader, blocks: list[Int[np.ndarray, "N B"]]) -> Gaussians:
+def _decoded(header: SpzHeader, blocks: list[Integer[np.ndarray, "N B"]]) -> Gaussians:
     positions, alphas, colors, scales, rotations, harmonics = blocks
     read_quats = _from_first_three if header.version == 2 else _from_smallest_three
     return Gaussians(
@@ -205,19 +205,21 @@ def _room(reach: float) -> int:
     return 23 - ceil(log2(max(reach, 2.0**-40) * (1 + 1e-6)))
 
 
-def _fixed_point(means: Float[np.ndarray, "N 3"], fractional_bits: int) -> Int[np.ndarray, "N 9"]:
+def _fixed_point(
+    means: Float[np.ndarray, "N 3"], fractional_bits: int
+) -> Integer[np.ndarray, "N 9"]:
     fixed = np.rint(means.astype(np.float64) * 2.0**fractional_bits)
     low_bytes = fixed.clip(-MAX_FIXED, MAX_FIXED).astype("<i4")[..., None].view("u1")[..., :3]
     return low_bytes.reshape(-1, 9)
 
 
-def _positions(block: Int[np.ndarray, "N 9"], fractional_bits: int) -> Float[np.ndarray, "N 3"]:
+def _positions(block: Integer[np.ndarray, "N 9"], fractional_bits: int) -> Float[np.ndarray, "N 3"]:
     low, middle, high = block.reshape(-1, 3, 3).transpose(2, 0, 1).astype(np.int32)
     fixed = low | middle << 8 | (high ^ 0x80) - 0x80 << 16
     return (fixed * 2.0**-fractional_bits).astype(np.float32)
 
 
-def _smallest_three(quats: Float[np.ndarray, "N 4"]) -> Int[np.ndarray, " N"]:
+def _smallest_three(quats: Float[np.ndarray, "N 4"]) -> Integer[np.ndarray, " N"]:
     largest, others = packing.without_largest(packing.unit_quats(quats)[:, [1, 2, 3, 0]])
     fields = (
         np.rint(np.abs(others) * (511 * sqrt(2))).astype(np.int64).clip(0, 511) | (others < 0) << 9
@@ -225,21 +227,21 @@ def _smallest_three(quats: Float[np.ndarray, "N 4"]) -> Int[np.ndarray, " N"]:
     return (largest << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]).astype("<u4")
 
 
-def _from_smallest_three(block: Int[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
+def _from_smallest_three(block: Integer[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
     word = np.ascontiguousarray(block).view("<u4").astype(np.int64)
     fields = word >> np.array([20, 10, 0]) & 1023
     others = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / (511 * sqrt(2))
     return packing.with_largest(word[:, 0] >> 30, others)[:, [3, 0, 1, 2]]
 
 
-def _from_first_three(block: Int[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4"]:
+def _from_first_three(block: Integer[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4"]:
     xyz = block / 127.5 - 1
     w = np.sqrt(np.clip(1 - (xyz**2).sum(axis=1, keepdims=True), 0, 1))
     return np.concatenate([w, xyz], axis=1).astype(np.float32)
 
 
 def _harmonics(
-    colors: Int[np.ndarray, "N 3"], rest: Int[np.ndarray, "N R"]
+    colors: Integer[np.ndarray, "N 3"], rest: Integer[np.ndarray, "N R"]
 ) -> Float[np.ndarray, "N K 3"]:
     """Decode the harmonics; in place, since they are most of the memory."""
     sh = np.empty((len(colors), 1 + rest.shape[1] // 3, 3), np.float32)
@@ -250,7 +252,7 @@ def _harmonics(
     return sh
 
 
-def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Int[np.ndarray, "N K 3"]:
+def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Integer[np.ndarray, "N K 3"]:
     """Encode harmonics with zero at 128, rounded to the step of each degree, which compresses
     better.
     """

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Integer
 
 from ..core.errors import UserError
 from ..core.file_memory import require_file_memory
@@ -79,7 +79,7 @@ def pack(header: SpzHeader, blocks: Sequence[bytes], comment: str = "") -> bytes
     return b"".join([head, TABLE_OFFSET.pack(offset), table, *packed])
 
 
-def unpack(packed: bytes, name: str) -> tuple[SpzHeader, list[Int[np.ndarray, "N B"]]]:
+def unpack(packed: bytes, name: str) -> tuple[SpzHeader, list[Integer[np.ndarray, "N B"]]]:
     """Unpack header and blocks, and no more than the header's counts require.
 
     Args:

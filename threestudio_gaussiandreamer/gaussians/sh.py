@@ -21,8 +21,8 @@ SHORTEST_DIRECTION = 1e-12
 Colors = Float[Tensor, "*batch C"] | Float[np.ndarray, "*batch C"]
 
 
-def rgb_to_sh0(rgb: Float[Tensor, "*batch C"]) -> Float[Tensor, "*batch C"]:
-    """Return the coefficients of degree 0 for colours in [0, 1]."""
+def rgb_to_sh0(rgb: Colors | float) -> Colors | float:
+    """Return the coefficients of degree 0 for colours in [0, 1], or for one channel."""
     return (rgb - 0.5) / C0
 
 
@@ -37,7 +37,7 @@ def sh0_colors(sh0: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
 
 
 def sh_to_colors(
-    sh: Float[Tensor, "N K C"], dirs: Float[Tensor, "*views N 3"]
+    sh: Float[Tensor, "N K C"], dirs: Float[Tensor, "*views #N 3"]
 ) -> Float[Tensor, "*views N C"]:
     """Compute the colours seen along ``dirs``, clamped at 0.
 
@@ -51,7 +51,7 @@ def sh_to_colors(
 
 
 def sh_to_unclamped_colors(
-    sh: Float[Tensor, "N K C"], dirs: Float[Tensor, "*views N 3"]
+    sh: Float[Tensor, "N K C"], dirs: Float[Tensor, "*views #N 3"]
 ) -> Float[Tensor, "*views N C"]:
     """Compute the colours of :func:`sh_to_colors` without the clamp; same arguments and errors."""
     if sh.shape[-2] not in COEFFICIENTS:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Optional
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 
 from ..core.errors import UserError
 from .budget import fail
@@ -110,7 +110,7 @@ class _Scene:
 
     # -- faces -------------------------------------------------------------------------------------
 
-    def _corners(self, primitive: dict[str, Any], count: int) -> Int[np.ndarray, " C"]:
+    def _corners(self, primitive: dict[str, Any], count: int) -> Integer[np.ndarray, " C"]:
         """Return the vertices in the order in which faces take them."""
         if "indices" not in primitive:
             return np.arange(count)
@@ -121,7 +121,7 @@ class _Scene:
             self.document.fail(f"a face names vertex {values.max()} of {count}")
         return values
 
-    def _faces(self, mode: Any, corners: np.ndarray) -> Int[np.ndarray, "F 3"]:
+    def _faces(self, mode: Any, corners: np.ndarray) -> Integer[np.ndarray, "F 3"]:
         corners = corners.astype(np.int64)
         first = np.arange(max(len(corners) - 2, 0))
         if mode == TRIANGLES:

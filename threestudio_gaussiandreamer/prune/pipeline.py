@@ -271,7 +271,7 @@ def constant_sh_limit(cloud: Gaussians, suffix: str) -> float:
     Viewers clamp colours to [0, 1], so recovered colours stay in that range, or in the input's if
     it is larger, and within what the file can store.
     """
-    largest = max(float(rgb_to_sh0(torch.ones(()))), float(cloud.sh[:, 0].abs().amax()))
+    largest = max(rgb_to_sh0(1.0), float(cloud.sh[:, 0].abs().amax()))
     return min(largest, COLOR_REACH) if suffix == ".spz" else largest
 
 
