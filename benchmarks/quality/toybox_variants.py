@@ -75,7 +75,7 @@ def on_gpu(charts: Iterable[str] = DISTILLATIONS) -> str:
     both = [row for row in default if place(row) in on_cpus]
     same = [on_cpus[place(row)] for row in both]
     lines = [line_of(f"{toybox_jobs.DEFAULT} on CPUs", same, both)] if both else []
-    pairs = pairs_of_charts([*rows, *lacking(rows, measured())], charts)
+    pairs = pairs_of_charts(gpu_rows(), charts)
     lines += [line_of(marked_title(own[0]), own, plain) for own, plain in pairs]
     return markdown(HEAD, lines) if lines else NOT_MEASURED
 
@@ -88,13 +88,18 @@ def wrong_priors_on_gpu() -> str:
     """Return the table of parts of growing with a prior of another kind, each compared with the
     same prior and all of growing.
     """
-    gpu = measured(toybox_jobs.GPU_CHART)
-    rows = [*gpu, *lacking(gpu, measured())]
+    rows = gpu_rows()
     parts = [one.key for one in toybox_options.wrong_priors() if one.wrong_prior]
     pairs = [pair for key in parts for pair in pairs_of(rows, *key, base=WRONG_PRIOR)]
     lines = [line_of(marked_title(own[0]), own, whole) for own, whole in pairs]
     head = [title.replace(toybox_jobs.DEFAULT, WRONG_PRIOR) for title in HEAD]
     return markdown(head, lines) if lines else NOT_MEASURED
+
+
+def gpu_rows() -> list[Row]:
+    """Return the rows of runs on a GPU, and those on CPUs that it lacks of the same variants."""
+    rows = measured(toybox_jobs.GPU_CHART)
+    return [*rows, *lacking(rows, measured())]
 
 
 def lacking(rows: Sequence[Row], others: Sequence[Row]) -> list[Row]:

@@ -22,13 +22,7 @@ from . import cluster
 from .assets import Recipe
 from .display import Display
 from .driver import Driver
-from .identity import (
-    OF_MACHINES,
-    identity,
-    require_farm,
-    require_same_farm,
-    require_same_recipe,
-)
+from .identity import require_farm, require_same_farm, require_same_recipe
 from .ledger import FAILED, FINISHED, Ledger
 from .recipe import check_recipe, jobs_left, make_recipe, root_of
 from .remote_ledger import open_ledger
@@ -153,8 +147,7 @@ def run_farm(args: argparse.Namespace) -> int:
     recipe = make_recipe(args.config, overrides, cpu=True, cores=args.cores)
     recipe = check_recipe(recipe, read_rows(args.prompts))
     with claimed(place):
-        known = {name: value for name, value in identity(recipe).items() if name not in OF_MACHINES}
-        require_same_recipe(place, known)
+        require_same_recipe(place, recipe)
         ledger = open_ledger(place)
         done = sum(ledger.state(row) == FINISHED for row in read_rows(args.prompts))
         try:

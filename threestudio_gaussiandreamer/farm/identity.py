@@ -43,18 +43,24 @@ def require_same_farm(place: Place, recipe: Recipe) -> None:
     Raises:
         UserError: the folder belongs to another farm; the message names what differs.
     """
-    if not require_same_recipe(place, identity(recipe)):
-        place.write(FILE, json_text(identity(recipe), indent=1).encode())
+    ours = identity(recipe)
+    if not _require_entries(place, ours):
+        place.write(FILE, json_text(ours, indent=1).encode())
 
 
-def require_same_recipe(place: Place, ours: dict[str, Any]) -> bool:
-    """Check that a folder's farm, if it has one, has these entries; return whether it has one.
-
-    Args:
-        ours: entries of :func:`identity`.
+def require_same_recipe(place: Place, recipe: Recipe) -> None:
+    """Check the same before Ray has told which machines there are, and note nothing.
 
     Raises:
         UserError: the folder belongs to another farm; the message names what differs.
+    """
+    ours = identity(recipe)
+    _require_entries(place, {name: ours[name] for name in ours if name not in OF_MACHINES})
+
+
+def _require_entries(place: Place, ours: dict[str, Any]) -> bool:
+    """Check that a folder's farm, if it has one, has these entries of :func:`identity`; return
+    whether it has one.
     """
     content = place.read(FILE)
     if content is None:

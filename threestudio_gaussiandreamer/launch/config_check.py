@@ -63,7 +63,8 @@ AT_LEAST = {
     "check_val_every_n_epoch": 1,
     "accumulate_grad_batches": 1,
 }
-# the only values that work where views are drawn without end; None: the key isn't given
+# the only values that work where views are drawn without end, as repr shows them: Lightning takes
+# 1.0 for all batches and 1 for one; None: the key isn't given
 DEFAULTS_ONLY = {"limit_train_batches": ("None", "1.0"), "overfit_batches": ("None", "0", "0.0")}
 CLUSTER = {"MASTER_ADDR", "SLURM_NTASKS"}
 KINDS: dict[str, type] = {
