@@ -26,8 +26,8 @@ COLUMNS = ("scene", "gaussians", "views", "size", "block", "pairs", "pixels", "c
 CASES = ("surface 512", "demo 256", f"{DEMO} 256")
 BLOCKS = {"v4": (4, 4), "v3": (4, 2)}
 """Width and height of a block in each build."""
-BATCH = 4
-"""Splats that the kernel blends at a time."""
+BATCHES = {"v4": 8, "v3": 4}
+"""Splats that each build blends at a time."""
 
 
 class Splats(NamedTuple):
@@ -61,8 +61,8 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for name in CASES:
         case = make_case(name)
-        for width, height in BLOCKS.values():
-            pairs, weights = count(case, width, height)
+        for build, (width, height) in BLOCKS.items():
+            pairs, weights = count(case, width, height, BATCHES[build])
             row = {"scene": case.name, "gaussians": len(case.cloud.means)}
             row |= {"views": len(case.viewmats), "size": case.size, "block": f"{width} × {height}"}
             row |= {"pairs": pairs, "pixels": f"{weights / pairs:.2f}", "commit": commit()}
@@ -72,7 +72,7 @@ def main() -> None:
 
 
 @torch.no_grad()
-def count(case: Case, width: int, height: int) -> tuple[int, int]:
+def count(case: Case, width: int, height: int, batch: int) -> tuple[int, int]:
     """Return the pairs of all views, and the pixels in them that get a weight; blocks must tile the
     image.
     """
@@ -87,17 +87,17 @@ def count(case: Case, width: int, height: int) -> tuple[int, int]:
         owners, blocks = pairs_of(splats, grid, case.options.alpha_min)
         alphas = alphas_of(splats, owners, blocks, grid, case.options)
         live = transmittances(alphas, blocks) >= case.options.stop
-        pairs += blended(blocks, live.any(1))
+        pairs += blended(blocks, live.any(1), batch)
         weights += int((live & (alphas > 0)).sum())
     return pairs, weights
 
 
-def blended(blocks: Tensor, live: Tensor) -> int:
+def blended(blocks: Tensor, live: Tensor, batch: int) -> int:
     """Return how many pairs are blended, if the list of a block ends with the batch after which no
     pixel is live.
     """
     listed, needed = blocks.bincount(), blocks.bincount(live.double()).long()
-    return int(torch.minimum(listed, -(-needed // BATCH) * BATCH).sum())
+    return int(torch.minimum(listed, -(-needed // batch) * batch).sum())
 
 
 def pairs_of(splats: Splats, grid: Blocks, alpha_min: float) -> tuple[Tensor, Tensor]:

@@ -38,12 +38,12 @@ def test_pixels_with_a_weight_are_those_of_the_specification():
     case = small_case()
     expected = sum(int(found.sum()) for found in weights_of(case))
     for width, height in ((4, 4), (4, 2), (1, 1)):
-        found, weights = block_pairs.count(case, width, height)
+        found, weights = block_pairs.count(case, width, height, 4)
         assert weights == expected
     assert expected <= found  # of single pixels: those of a whole batch
     assert (
-        block_pairs.count(small_case(stop=0), 1, 1)[0]
-        == block_pairs.count(small_case(stop=0), 1, 1)[1]
+        block_pairs.count(small_case(stop=0), 1, 1, 4)[0]
+        == block_pairs.count(small_case(stop=0), 1, 1, 4)[1]
     )
 
 
@@ -55,14 +55,15 @@ def test_pairs_are_those_that_reach_a_block():
     within = sum(
         int(found.view(16, 2, 16, 2, -1).any(3).any(1).sum()) for found in weights_of(case)
     )
-    pairs_found, _ = block_pairs.count(case, 2, 2)
+    pairs_found, _ = block_pairs.count(case, 2, 2, 4)
     assert within <= pairs_found < 1.05 * within
 
 
 def test_a_list_ends_with_the_batch_after_which_no_pixel_is_live():
     blocks = torch.tensor([0, 0, 0, 0, 0, 1, 1])
     live = torch.tensor([True, False, False, False, False, True, True])
-    assert block_pairs.blended(blocks, live) == 4 + 2
+    assert block_pairs.blended(blocks, live, 4) == 4 + 2
+    assert block_pairs.blended(blocks, live, 8) == 5 + 2
 
 
 def test_the_table_is_of_the_rows(tmp_path, monkeypatch):

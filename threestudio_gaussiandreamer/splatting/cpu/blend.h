@@ -18,32 +18,44 @@ struct BlendScratch {
   Planes planes;
 };
 
+// The sums over the splats that were blended into a block.
+struct BlockSums {
+  Floats transmittance, alpha, red, green, blue, depth;
+};
+
+// Blends the splats of a batch into a block.
+template <int N>
+SPLAT_FN void blend_batch(BlendScratch& scratch, const BlockPixels& pixels, const uint16_t* list, const BlendLimits& limits,
+                          BlockSums& sums) {
+  const BatchSplats splats = {scratch.staged, list};
+  const Batch<N> alphas = alpha_of(power_at<N>(splats, pixels), limits.log2_alpha_min, limits.alpha_max);
+  for (int k = 0; k < N; k++) {
+    const LocalSplat& s = splats[k];
+    const Floats alpha = alphas.of[k], weight = weight_of(alpha, sums.transmittance, limits.stop);
+    float* peak = row_at(scratch.peaks, list[k]).lanes;
+    sums.transmittance -= alpha * sums.transmittance, sums.alpha += weight;
+    sums.red += weight * s.red, sums.green += weight * s.green, sums.blue += weight * s.blue;
+    sums.depth += weight * s.depth;
+    store(peak, maximum(weight, load(peak)));
+  }
+  sums.transmittance = select(sums.transmittance >= limits.stop, sums.transmittance, Floats{});  // avoids denormals
+}
+
 // Blends the splats of `list` into a block; returns after how many of them all its pixels have stopped, or 0.
 SPLAT_FN int blend_block(BlendScratch& scratch, const BlockPixels& pixels, const uint16_t* list, int count,
                          const BlendLimits& limits) {
   Planes& p = scratch.planes;
   const int at = pixels.first;
-  Floats transmittance = load(scratch.transmittance + at), sum = load(p.alpha + at);
-  Floats red = load(p.red + at), green = load(p.green + at), blue = load(p.blue + at), depth = load(p.depth + at);
+  BlockSums sums = {load(scratch.transmittance + at), load(p.alpha + at), load(p.red + at),
+                    load(p.green + at),               load(p.blue + at),  load(p.depth + at)};
   bool live = true;
-  int i = 0;
-  for (; i < count && live; i += BATCH) {
-    const BatchSplats splats = {scratch.staged, list + i};
-    const Batch alphas = alpha_of(power_at(splats, pixels), limits.log2_alpha_min, limits.alpha_max);
-    for (int k = 0; k < BATCH; k++) {
-      const LocalSplat& s = splats[k];
-      const Floats alpha = alphas.of[k], weight = weight_of(alpha, transmittance, limits.stop);
-      float* peak = row_at(scratch.peaks, splats.list[k]).lanes;
-      transmittance -= alpha * transmittance;
-      sum += weight, red += weight * s.red, green += weight * s.green, blue += weight * s.blue, depth += weight * s.depth;
-      store(peak, maximum(weight, load(peak)));
-    }
-    transmittance = select(transmittance >= limits.stop, transmittance, Floats{});  // avoids denormals
-    live = any_at_least(transmittance, limits.stop);
-  }
-  store(scratch.transmittance + at, transmittance), store(p.alpha + at, sum);
-  store(p.red + at, red), store(p.green + at, green), store(p.blue + at, blue), store(p.depth + at, depth);
-  return live ? 0 : std::min(i, count);
+  const int blended = in_batches(count, [&](auto batch, int i) __attribute__((always_inline)) {
+    blend_batch<batch.value>(scratch, pixels, list + i, limits, sums);
+    return live = any_at_least(sums.transmittance, limits.stop);
+  });
+  store(scratch.transmittance + at, sums.transmittance), store(p.alpha + at, sums.alpha);
+  store(p.red + at, sums.red), store(p.green + at, sums.green), store(p.blue + at, sums.blue), store(p.depth + at, sums.depth);
+  return live ? 0 : blended;
 }
 
 // The largest weight of each of `count` splats, to their slots.

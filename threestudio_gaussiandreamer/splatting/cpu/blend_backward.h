@@ -44,44 +44,51 @@ SPLAT_FN Moments<Floats> moments_of(const Floats* u) {
           (s2[0] + s2[1]) + (s2[2] + s2[3]), s1[1] + 2.0f * s1[2] + 3.0f * s1[3], s0[1] + 4.0f * s0[2] + 9.0f * s0[3]};
 }
 
-SPLAT_FN Floats sum_rows(const Floats* rows) {
-  Floats sum = rows[0];
-  for (int p = 1; p < LANES; p++) sum += rows[p];
+// The pixels of a block, one splat per lane, from its splats' rows.
+struct PixelColumns {
+  Floats of[LANES];
+};
+
+SPLAT_FN PixelColumns pixels_of(const Floats* rows) {
+  PixelColumns pixels;
+  load_columns<LANES>([&](int l) { return reinterpret_cast<const float*>(rows + l); }, pixels.of);
+  return pixels;
+}
+
+SPLAT_FN Floats sum_of(const PixelColumns& pixels) {
+  Floats sum = pixels.of[0];
+  for (int p = 1; p < LANES; p++) sum += pixels.of[p];
   return sum;
 }
 
-SPLAT_FN Floats weighted_sum(const Floats* rows, const float* weights) {
+SPLAT_FN Floats weighted_sum(const PixelColumns& pixels, const float* weights) {
   Floats even = {}, odd = {};
-  for (int p = 0; p < LANES; p += 2) even += rows[p] * weights[p], odd += rows[p + 1] * weights[p + 1];
+  for (int p = 0; p < LANES; p += 2) even += pixels.of[p] * weights[p], odd += pixels.of[p + 1] * weights[p + 1];
   return even + odd;
 }
 
 // a, b, c, shift_x and shift_y of a LocalSplat, one splat per lane; the others aren't used.
 using LocalColumns = Floats[8];
 
-// One row of sums per splat, from the rows of its pairs with the pixels of a block, which are transposed.
+// One row of sums per splat, from the rows of its pairs with the pixels of a block.
 template <bool ABSOLUTE>
-SPLAT_FN void sum_pairs(PairRows& rows, Floats* weights, const LocalColumns& s, const UpstreamPlanes& up,
+SPLAT_FN void sum_pairs(const PairRows& rows, const Floats* weight_rows, const LocalColumns& s, const UpstreamPlanes& up,
                         const BlockPixels& pixels, Floats* sums) {
-  transpose(rows.u), transpose(weights);
   const Floats y1 = s[0] * pixels.left + (s[1] * pixels.top + s[3]), y2 = s[2] * pixels.top + s[4];
-  whiten_moments(moments_of(rows.u), s[0], s[1], s[2], y1, y2, sums);
+  whiten_moments(moments_of(pixels_of(rows.u).of), s[0], s[1], s[2], y1, y2, sums);
+  const PixelColumns weights = pixels_of(weight_rows);
   sums[RED] = weighted_sum(weights, up.red + pixels.first), sums[GREEN] = weighted_sum(weights, up.green + pixels.first);
   sums[BLUE] = weighted_sum(weights, up.blue + pixels.first), sums[DEPTH] = weighted_sum(weights, up.depth + pixels.first);
-  if constexpr (ABSOLUTE) {
-    transpose(rows.abs_x), transpose(rows.abs_y);
-    sums[ABS_X] = sum_rows(rows.abs_x), sums[ABS_Y] = sum_rows(rows.abs_y);
-  }
+  if constexpr (ABSOLUTE) sums[ABS_X] = sum_of(pixels_of(rows.abs_x)), sums[ABS_Y] = sum_of(pixels_of(rows.abs_y));
 }
 
 // Adds the sums of `count` <= LANES splats over a block to those over the tile; the list has LANES entries, see list_filled.
 template <bool ABSOLUTE>
-SPLAT_FN void add_pairs(BackwardScratch& scratch, PairRows& rows, Floats* weights, const BlockPixels& pixels,
+SPLAT_FN void add_pairs(BackwardScratch& scratch, const PairRows& rows, const Floats* weights, const BlockPixels& pixels,
                         const uint16_t* list, int count) {
   LocalColumns columns;
   Floats sums[ROW] = {};
-  load_quad_columns([&](int l) { return &row_at(scratch.staged.splats, list[l]).a; }, columns);
-  load_quad_columns([&](int l) { return &row_at(scratch.staged.splats, list[l]).shift_y; }, columns + 4);
+  load_columns<8>([&](int l) { return &row_at(scratch.staged.splats, list[l]).a; }, columns);
   sum_pairs<ABSOLUTE>(rows, weights, columns, scratch.upstream, pixels, sums);
   for (int first = 0; first < SUMS; first += LANES) {
     transpose(sums + first);
@@ -107,11 +114,11 @@ SPLAT_FN BlockState load_block(const BackwardScratch& s, int at) {
 }
 
 // d loss / d weight of the splats of a batch.
-SPLAT_FN Batch values_of(const BatchSplats& s, const BlockState& block) {
-  Batch value = each([&](int k) { return s[k].depth * block.depth + block.alpha; });
-  value = each([&](int k) { return s[k].blue * block.blue + value.of[k]; });
-  value = each([&](int k) { return s[k].green * block.green + value.of[k]; });
-  return each([&](int k) { return s[k].red * block.red + value.of[k]; });
+SPLAT_FN Batch<BATCH> values_of(const BatchSplats& s, const BlockState& block) {
+  Batch<BATCH> value = each<BATCH>([&](int k) { return s[k].depth * block.depth + block.alpha; });
+  value = each<BATCH>([&](int k) { return s[k].blue * block.blue + value.of[k]; });
+  value = each<BATCH>([&](int k) { return s[k].green * block.green + value.of[k]; });
+  return each<BATCH>([&](int k) { return s[k].red * block.red + value.of[k]; });
 }
 
 // Front to back: the alphas of a list of splats, zero where a pixel has stopped, and their weights, also added to the tile's
@@ -120,16 +127,17 @@ SPLAT_FN void blend_again(BackwardScratch& scratch, const BlockPixels& pixels, c
                           const BlendLimits& limits) {
   BlendedList& blended = scratch.blended;
   Floats transmittance = load(scratch.transmittance + pixels.first), sum = load(scratch.alpha + pixels.first);
-  for (int i = 0; i < length; i += BATCH) {
-    const Batch powers = power_at({scratch.staged, list + i}, pixels);
-    const Batch alphas = alpha_of(powers, limits.log2_alpha_min, limits.alpha_max);
-    for (int k = 0; k < BATCH; k++) {
+  in_batches(length, [&](auto batch, int first) __attribute__((always_inline)) {
+    const auto powers = power_at<batch.value>({scratch.staged, list + first}, pixels);
+    const auto alphas = alpha_of(powers, limits.log2_alpha_min, limits.alpha_max);
+    for (int k = 0; k < batch.value; k++) {
       const Floats alpha = alphas.of[k], weight = weight_of(alpha, transmittance, limits.stop);
-      blended.alpha[i + k] = select(transmittance >= limits.stop, alpha, Floats{}), blended.weight[i + k] = weight;
+      blended.alpha[first + k] = select(transmittance >= limits.stop, alpha, Floats{}), blended.weight[first + k] = weight;
       transmittance -= alpha * transmittance, sum += weight;
     }
     transmittance = select(transmittance >= limits.stop, transmittance, Floats{});  // avoids denormals
-  }
+    return true;
+  });
   for (int i = whole_batches(length); i < whole_vectors(length); i++) blended.weight[i] = Floats{};  // as clear_rows
   store(scratch.alpha + pixels.first, sum);
 }
@@ -138,7 +146,7 @@ SPLAT_FN void blend_again(BackwardScratch& scratch, const BlockPixels& pixels, c
 template <bool ABSOLUTE>
 SPLAT_FN void differentiate(const BatchSplats& splats, const Floats* alphas, const Floats* weights, const BlockPixels& pixels,
                             float alpha_max, BlockState& block, PairRows& rows, int row) {
-  const Batch values = values_of(splats, block);
+  const Batch<BATCH> values = values_of(splats, block);
   for (int k = BATCH - 1; k >= 0; k--) {
     const Floats u = rows.u[row + k] = blend_vjp_back_to_front(alphas[k], weights[k], values.of[k], alpha_max, block.behind);
     if constexpr (ABSOLUTE) {
@@ -165,7 +173,7 @@ SPLAT_FN void blend_block_backward(BackwardScratch& scratch, const BlockPixels& 
   BlockState block = load_block(scratch, pixels.first);
   for (int first = (length - 1) / LANES * LANES; first >= 0; first -= LANES) {
     const Floats* alphas = scratch.blended.alpha + first;
-    Floats* weights = scratch.blended.weight + first;
+    const Floats* weights = scratch.blended.weight + first;
     PairRows rows;
     const int filled = std::min(LANES, whole_batches(length - first));
     clear_rows<ABSOLUTE>(rows, filled);

@@ -163,18 +163,13 @@ template <class Group> SPLAT_FN void store_quads(Group group, Floats v) {
 
 constexpr int ROW = 16;  // floats in a cache line; the rows below
 
-// Columns 0 .. COUNT - 1 of LANES rows, where row l starts at `row(l)`; COUNT is rounded up to whole vectors.
+// Columns 0 .. COUNT - 1 of LANES rows, where row l starts at `row(l)`; COUNT is a multiple of 4. Loading four floats at a time
+// saves half of the shuffles of `transpose`.
 template <int COUNT, class Row> SPLAT_FN void load_columns(Row row, Floats* columns) {
-  for (int first = 0; first < COUNT; first += LANES) {
-    for (int l = 0; l < LANES; l++) columns[first + l] = load(row(l) + first);
-    transpose(columns + first);
+  for (int c = 0; c < COUNT; c += 4) {
+    for (int i = 0; i < 4; i++) columns[c + i] = load_quads([&](int group) { return row(4 * group + i) + c; });
+    transpose_quads(columns[c], columns[c + 1], columns[c + 2], columns[c + 3]);
   }
-}
-
-// Columns 0 to 3 of LANES rows.
-template <class Row> SPLAT_FN void load_quad_columns(Row row, Floats columns[4]) {
-  for (int i = 0; i < 4; i++) columns[i] = load_quads([&](int group) { return row(4 * group + i); });
-  transpose_quads(columns[0], columns[1], columns[2], columns[3]);
 }
 
 // The 16 columns as LANES rows one after the other.

@@ -225,11 +225,11 @@ struct BatchSplats {
 };
 
 // log2(alpha) of the splats of a batch at the pixels of a block, before cap and threshold.
-SPLAT_FN Batch power_at(const BatchSplats& s, const BlockPixels& pixels) {
-  Batch y1 = each([&](int k) { return s[k].b * pixels.y + s[k].shift_x; });
-  const Batch y2 = each([&](int k) { return s[k].c * pixels.y + s[k].shift_y; });
-  y1 = each([&](int k) { return s[k].a * pixels.x + y1.of[k]; });
-  const Batch power = each([&](int k) { return s[k].log2_opacity - y1.of[k] * y1.of[k]; });
+template <int N> SPLAT_FN Batch<N> power_at(const BatchSplats& s, const BlockPixels& pixels) {
+  Batch<N> y1 = each<N>([&](int k) { return s[k].b * pixels.y + s[k].shift_x; });
+  const Batch<N> y2 = each<N>([&](int k) { return s[k].c * pixels.y + s[k].shift_y; });
+  y1 = each<N>([&](int k) { return s[k].a * pixels.x + y1.of[k]; });
+  const Batch<N> power = each<N>([&](int k) { return s[k].log2_opacity - y1.of[k] * y1.of[k]; });
   return power - y2 * y2;
 }
 

@@ -27,7 +27,7 @@ from . import driver, nvrtc
 TOLERANCE = 1e-3
 """Largest error of an output or a gradient, relative to its largest entry. Rounding gives 1e-5; a
 Gaussian that falls on the other side of a threshold in float64 gives 1e-4."""
-GAUSSIANS, WIDTH, HEIGHT = 200, 40, 24  # more than a batch of ``blend``; 3 x 2 tiles
+GAUSSIANS, WIDTH, HEIGHT = 150, 36, 20  # more than a batch of ``blend``; 3 x 2 tiles
 ANGLES = (0.0, 0.7)
 """Azimuths of the two cameras, radians."""
 OPTIONS = {
@@ -39,6 +39,8 @@ OPTIONS = {
 }
 """The options of each draw: with these, all kernels and all their branches on options run. The
 backward pass has another kernel with ``absgrad``."""
+DIFFERENTIATED = ("means", "quats", "scales", "opacities", "viewmats", "colors")
+"""The inputs whose gradients the kernels compute; torch computes that of the background."""
 LIBRARY_ERRORS = (OSError, AttributeError)
 """What ctypes raises for a library that can't be loaded, or that lacks a function."""
 Results = dict[str, dict[str, Tensor]]
@@ -155,9 +157,7 @@ def _require_torch(device: torch.device) -> None:
     """Let torch compute on the device, where an error of earlier work is raised, and one that has
     nothing to do with the kernels.
     """
-    with torch.inference_mode(False), torch.enable_grad():
-        ones = torch.ones(2, device=device, requires_grad=True)
-        (ones * ones).sum().backward()
+    torch.ones(2, device=device)
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
@@ -205,7 +205,7 @@ def _drawn(
 
 def _draw(backend: ModuleType, scene: Scene, options: RasterizeOptions) -> dict[str, Tensor]:
     """Render a scene; return the images and the gradients of a fixed weighted sum of them."""
-    leaves = {name: getattr(scene, name).requires_grad_() for name in Scene._fields[:7]}
+    leaves = {name: getattr(scene, name).requires_grad_() for name in DIFFERENTIATED}
     out = backend.rasterize(scene, options)
     images = {name: getattr(out, name) for name in ("image", "alpha", "depth")}
     # no arguments of ``backward``: given gradients, torch imports all of its symbolic shapes
@@ -219,9 +219,11 @@ def _draw(backend: ModuleType, scene: Scene, options: RasterizeOptions) -> dict[
 
 
 def _weighted_sum(image: Tensor) -> Tensor:
-    """Return a sum in which each entry has another weight."""
-    weights = torch.linspace(-1, 1, image.numel()).to(image)
-    return (image.flatten() * weights).sum()
+    """Return a sum in which each entry has another weight, computed on the CPU: on the GPU each of
+    torch's kernels would have to be loaded.
+    """
+    image = image.cpu().flatten()
+    return (image * torch.linspace(-1, 1, len(image)).to(image)).sum()
 
 
 def _scene(device: torch.device, dtype: torch.dtype) -> Scene:

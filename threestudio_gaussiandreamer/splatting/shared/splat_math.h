@@ -290,9 +290,9 @@ SPLAT_FN F blend_vjp(F alpha, F odds, F transmittance, F weight, F value, F behi
 // The same back to front, for an alpha that is zero where the pixel has stopped. `value_behind` is the value of what lies behind
 // the splat, seen without what lies before it; it becomes the value behind the splat before.
 template <class F> SPLAT_FN F blend_vjp_back_to_front(F alpha, F weight, F value, float alpha_max, F& value_behind) {
-  const F zero = {}, difference = value - value_behind;
-  value_behind += alpha * difference;
-  return select(alpha < zero + alpha_max, weight * difference, zero);
+  const F zero = {}, u = select(alpha < zero + alpha_max, weight * (value - value_behind), zero);
+  value_behind = (1.0f - alpha) * value_behind + alpha * value;  // one operation waits for the splat behind
+  return u;
 }
 
 }  // namespace splat
