@@ -2,7 +2,8 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN     = $(VENV)/bin
-ENVIRON = OMP_WAIT_POLICY=passive
+# tests and measurements start many processes: compiled modules are kept, also where Python is told not to
+ENVIRON = OMP_WAIT_POLICY=passive PYTHONDONTWRITEBYTECODE=
 WORKERS ?= auto
 PYTEST  = $(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 # without the CPU kernel (no C++ compiler) plain torch renders, and the exact demo is smaller
@@ -94,8 +95,9 @@ measure-toybox: $(VENV)/ready-for-models     ## text to 3D with the bundled mode
 
 # installed once; again when what is installed changes
 PACKAGE = pyproject.toml setup.py constraints.txt $(wildcard threestudio_gaussiandreamer/splatting/cpu/*.h threestudio_gaussiandreamer/splatting/cpu/*.cpp threestudio_gaussiandreamer/splatting/shared/*.h)
-# packages have tens of thousands of modules: those that are imported are compiled then
 PIP     = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
+# in place of pip, which uses one core; modules for other versions of Python can't be compiled
+COMPILE = $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true
 
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; sys.exit("Python >= 3.10 is needed, this is " + sys.version) if sys.version_info < (3, 10) else 0'
@@ -103,22 +105,27 @@ $(BIN)/python:
 
 $(VENV)/ready: requirements.txt $(PACKAGE) | $(BIN)/python
 	$(PIP) -r requirements.txt
+	$(COMPILE)
 	touch $@
 
 $(VENV)/ready-for-tests: requirements-dev.txt $(PACKAGE) | $(BIN)/python
 	$(PIP) -r requirements-dev.txt
+	$(COMPILE)
 	touch $@ $(VENV)/ready
 
 $(VENV)/ready-for-charts: $(VENV)/ready
 	$(PIP) -c constraints.txt -e .[charts]
+	$(COMPILE)
 	touch $@
 
 $(VENV)/ready-for-farm: $(VENV)/ready-for-tests
 	$(PIP) -c constraints.txt -e .[cluster,farm-test]
+	$(COMPILE)
 	touch $@
 
 $(VENV)/ready-for-models: $(VENV)/ready
 	$(PIP) -c constraints.txt -e .[diffusion]
+	$(COMPILE)
 	touch $@
 
 clean:                             ## remove what the others made

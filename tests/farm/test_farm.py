@@ -16,7 +16,7 @@ from threestudio_gaussiandreamer.farm import assets, cluster
 
 pytest.importorskip("ray", reason="Ray isn't installed: pip install -e .[cluster]")
 pytestmark = pytest.mark.slow
-COUNT, STEPS = 3, 40
+COUNT, STEPS = 3, 60
 SECONDS = 300
 
 

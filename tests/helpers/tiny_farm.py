@@ -29,7 +29,7 @@ system:
     half_precision_weights: false
   prompt_processor: {cache_dir: CACHE}
   exporter: {save_video: false, formats: [ply, spz]}
-trainer: {max_steps: 12, val_check_interval: 6, enable_progress_bar: false}
+trainer: {max_steps: 12, val_check_interval: 1000, enable_progress_bar: false}
 checkpoint: {save_top_k: 1, every_n_train_steps: 3}
 """
 
