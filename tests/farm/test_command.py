@@ -98,6 +98,13 @@ def test_a_folder_in_which_another_command_works_is_refused(farm, monkeypatch, t
     assert code == 2 and "another farm command is at work in" in err
 
 
+def test_a_file_is_no_farms_folder(farm, monkeypatch, tmp_path):
+    no_ray(monkeypatch)
+    (tmp_path / "out").touch()
+    code, err = farm("a fox", "--out", "out")
+    assert code == 2 and "can't be written" in err and "choose another --out" in err
+
+
 def test_the_report_needs_neither_ray_nor_a_finished_asset(farm, monkeypatch, tmp_path):
     no_ray(monkeypatch)
     options = ["--report", f"exp_root_dir={tmp_path}/runs"]

@@ -141,7 +141,7 @@ def run_farm(args: argparse.Namespace) -> int:
         require_farm(place)
         return report(args, place, open_ledger(place, only_read=True))
     if not is_url(str(place)):
-        require_writable(place.folder)
+        require_writable(place.folder, "--out" if args.out else "exp_root_dir")
     # before Ray starts: this takes a second
     train_alone()  # whatever has started this process, such as a job of SLURM
     recipe = make_recipe(args.config, overrides, cpu=True, cores=args.cores)

@@ -238,6 +238,9 @@ def _noted(path: Path, numbers: list[int]) -> Iterator[str]:
 
 
 def _check_header(path: Path, header: list[str]) -> None:
+    for separator, name in ((";", "semicolons"), ("\t", "tabs")):
+        if len(header) == 1 and separator in header[0]:
+            raise UserError(f"{path}: columns are separated by commas, this file has {name}")
     for column in header:
         if column not in COLUMNS:
             raise UserError(f"{path}: {unknown('column', column, COLUMNS)}")

@@ -185,8 +185,11 @@ def _make_parent(path: Path, attempts: int = 10) -> None:
                 raise
 
 
-def require_writable(folder: Path) -> None:
+def require_writable(folder: Path, option: str = "exp_root_dir") -> None:
     """Check that a run could write its results into ``folder``, which may not exist yet.
+
+    Args:
+        option: what chooses the folder, for the message.
 
     Raises:
         UserError: the nearest existing folder can't be written, a file or folder that a run writes
@@ -204,7 +207,7 @@ def require_writable(folder: Path) -> None:
     except (OSError, ValueError) as error:
         if isinstance(error, UserError):
             raise
-        raise unwritable(folder, error, f" ({existing})" if existing else "") from error
+        raise unwritable(folder, error, f" ({existing})" if existing else "", option) from error
 
 
 def _require_replaceable(folder: Path) -> None:
@@ -231,11 +234,13 @@ def _require_short(folder: Path, existing: Path) -> None:
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
 
 
-def unwritable(folder: Path, error: Exception, where: str = "") -> UserError:
+def unwritable(
+    folder: Path, error: Exception, where: str = "", option: str = "exp_root_dir"
+) -> UserError:
     """Make the error for a folder into which the results can't be written."""
     why = getattr(error, "strerror", None) or str(error)
     return UserError(
-        f"the output folder {folder} can't be written: {why}{where}; choose another exp_root_dir"
+        f"the output folder {folder} can't be written: {why}{where}; choose another {option}"
     )
 
 
