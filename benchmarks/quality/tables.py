@@ -52,15 +52,13 @@ NOTES = {
     "quality": "The three are the configurations as they are, with their own steps, all on one "
     "AMD EPYC without AVX-512, beside other work. The base recipe was the default before; it and "
     "the paper's were timed on another AMD EPYC, before the CPU kernel became faster, so only dB "
-    "can be compared with theirs, and with those of best without antialiasing, as it was before. "
-    "Best itself has one seed.",
+    "can be compared with theirs, and with those of best without antialiasing, as it was before.",
     "tried": "One change each, seed 0, 256². `gain`: dB above the row with the letter `base`; "
     "`floaters` in %. A, B and C are the base recipe with what they name; the demo is C with 500 "
     "steps. Flat first Gaussians and steps by curvature aren't in the code. "
     "[What was tried](tried.md) elsewhere.",
     "unseen": "CC0 meshes with palette textures, a figure and a car, which aren't bundled: "
-    "`Barbarian.glb` of KayKit's Adventurers 1.0, `car_police.gltf` of its City Builder Bits 1.0. "
-    "Best has one seed, the others five.",
+    "`Barbarian.glb` of KayKit's Adventurers 1.0, `car_police.gltf` of its City Builder Bits 1.0.",
     "polish": "262,144 Gaussians on the surface of a mesh, by `benchmarks/quality/polish.py`. "
     "`pruned`: rounds of pruning to 40 dB, dB to the dense cloud on validation views of 128² "
     "(lower bound). `prior` and `refined`: `polish.yaml` over `demo.yaml` with the last count as "
