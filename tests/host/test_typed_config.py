@@ -29,6 +29,20 @@ def test_values_are_typed_and_defaults_filled():
     assert parse_structured(Options).size == 3
 
 
+def test_equal_values_give_configurations_of_their_own():
+    first = parse_structured(Options, {"inner": {"a": 1}})
+    first.inner.a = first.size = 2
+    second = parse_structured(Options, {"inner": {"a": 1}})
+    assert second.inner.a == 1 and second.size == 3
+    assert parse_structured(Options, {"text": "1"}) != parse_structured(Options, {"rates": 1})
+
+
+def test_a_value_that_refers_to_another_section_is_read_each_time():
+    for size in (4, 5):
+        whole = OmegaConf.create({"pixels": size, "part": {"size": "${pixels}"}})
+        assert parse_structured(Options, whole.part).size == size
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [

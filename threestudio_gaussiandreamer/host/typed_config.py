@@ -1,6 +1,7 @@
 """Typed configurations of registered classes. The launcher checks them in both hosts (threestudio
 and the built-in one), and the built-in host passes them to the classes."""
 
+import copy
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -12,17 +13,34 @@ from ..core.errors import UserError, unknown
 from ..core.interpolation import escape
 from ..core.option_types import check_types
 
+MOST_KEPT = 256
+_parsed: dict[tuple[Any, str], DictConfig] = {}
+
 
 def parse_structured(config_class: Any, values: Any = None) -> DictConfig:
     """Fill the dataclass ``config_class`` with ``values`` and check their types; ranges are
     checked by ``core/options.py``.
 
-    Interpolations have been resolved before, so a remaining ``${`` in a string is escaped:
-    OmegaConf must not resolve it.
+    The options of a part are parsed when they are checked and again when it is built, and OmegaConf
+    takes several times as long to build a configuration as to copy one; so results are kept.
 
     Raises:
         UserError: an unknown key, a value of the wrong type or a missing one; the message begins
             with the key.
+    """
+    key = (config_class, repr(values))
+    if "${" in key[1]:  # may refer to values elsewhere
+        return _parse(config_class, values)
+    if key not in _parsed:
+        if len(_parsed) == MOST_KEPT:
+            _parsed.clear()
+        _parsed[key] = _parse(config_class, values)
+    return copy.deepcopy(_parsed[key])
+
+
+def _parse(config_class: Any, values: Any) -> DictConfig:
+    """Parse once. Interpolations have been resolved before, so a remaining ``${`` in a string is
+    escaped: OmegaConf must not resolve it.
     """
     if values is not None and not isinstance(values, Mapping):
         raise UserError(f"expected keys and values, got {values!r}")
