@@ -29,13 +29,20 @@ def check(*arguments):
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
 
 
+OWN_PROCESSES = "errors", "speed"
+"""Parts that the test of a failed section starts as processes."""
+
+
 @pytest.fixture
-def parts_here(monkeypatch):
-    """Run the parts in this process: processes of their own, which the test of a failed section
-    starts, take longer for their imports than the parts themselves.
+def parts_here(request, monkeypatch):
+    """Run the parts in this process, but those in the fixture's parameter: processes of their own
+    take longer for their imports than the parts themselves.
     """
+    elsewhere = getattr(request, "param", ())
 
     def here(name, args, environment=None):
+        if name in elsewhere:
+            return gpu_processes.in_process(name, args, environment)
         with pytest.MonkeyPatch.context() as patch:
             for key, value in (environment or {}).items():
                 patch.setenv(key, value)
@@ -63,7 +70,8 @@ def test_every_section_runs_and_reports(parts_here, tmp_path, capfd):
 
 
 @pytest.mark.slow
-def test_a_failed_section_is_recorded_and_the_rest_continues(monkeypatch, tmp_path):
+@pytest.mark.parametrize("parts_here", [OWN_PROCESSES], indirect=True)
+def test_a_failed_section_is_recorded_and_the_rest_continues(parts_here, monkeypatch, tmp_path):
     monkeypatch.setattr(gpu_kernels, "GRADIENT_ERROR", 0.0)
     monkeypatch.setattr(
         gpu_check, "SECTIONS", {name: gpu_check.SECTIONS[name] for name in ("correct", "bench")}

@@ -1,15 +1,18 @@
 """Fixtures of the toybox tests: a small world, and a folder with trained stages."""
 
+import contextlib
+from collections.abc import Iterator
+
 import pytest
 
-from tests.toybox.helpers import training
+from tests.toybox.helpers import copied, training
 from threestudio_gaussiandreamer.toybox import loop, models, views
 from threestudio_gaussiandreamer.toybox.export import main as export
 
 
-@pytest.fixture(scope="module")
-def small_world():
-    """Make images few and networks small, so that a step takes milliseconds."""
+@contextlib.contextmanager
+def small_sizes() -> Iterator[None]:
+    """Make images few and networks small meanwhile, so that a step takes milliseconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(models, "UNET_CHANNELS", (16, 32))
         patch.setattr(models, "VAE_CHANNELS", (8, 8, 8, 8))
@@ -25,24 +28,36 @@ def small_world():
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, small_world):
-    """A training folder in which text encoder, CLIP and autoencoder are trained for two steps."""
+def small_world():
+    with small_sizes():
+        yield
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    """A training folder in which text encoder, CLIP and autoencoder are trained for two steps; no
+    test changes it, nor those below.
+    """
     folder = tmp_path_factory.mktemp("toybox")
-    for name in ("text", "clip", "autoencoder"):
-        training(folder, name).run(8)
+    with small_sizes():
+        for name in ("text", "clip", "autoencoder"):
+            training(folder, name).run(8)
     return folder
 
 
-@pytest.fixture(scope="module")
-def trained(folder):
+@pytest.fixture(scope="session")
+def trained(folder, tmp_path_factory):
     """A folder in which every stage is trained for a step."""
-    for name in ("unet", "points", "judge"):
-        training(folder, name).run(4)
-    return folder
+    place = copied(folder, tmp_path_factory.mktemp("trained") / "toybox")
+    with small_sizes():
+        for name in ("unet", "points", "judge"):
+            training(place, name).run(4)
+    return place
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def exported(trained, tmp_path_factory):
     target = tmp_path_factory.mktemp("models")
-    assert export([str(trained), str(target)]) == 0
+    with small_sizes():
+        assert export([str(trained), str(target)]) == 0
     return target

@@ -48,6 +48,8 @@ def test_a_whole_run_is_recognised_by_the_judge(tmp_path):
     whole += [f"system.geometry.prior.{key}={prior[key]}" for key in ("num_steps", "num_points")]
     draft = leaves(yaml.safe_load((CONFIGS / "toybox-draft.yaml").read_text()))
     whole += [f"{name}={value}" for name, value in draft]
+    whole += ["system.pages=false", "trainer.limit_val_batches=0"]
+    whole += ["system.exporter={formats: [ply], save_video: false}"]  # what is scored
     assert run(NAME, tmp_path, PROMPT, *whole) == 0
     scores = Scores(NAME).of_asset(result_of(tmp_path / "toybox/t", PROMPT))
     assert scores["kind"] and scores["colors"]

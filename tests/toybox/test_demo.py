@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from tests.toybox.helpers import copied
 from tests.toybox.test_text_to_3d import PROMPT, QUICK
 from threestudio_gaussiandreamer.launch.experiment import main as launcher
 from threestudio_gaussiandreamer.models.bundled import JUDGE, write_digests
-from threestudio_gaussiandreamer.toybox import demo, models
+from threestudio_gaussiandreamer.toybox import demo, models, samples
 from threestudio_gaussiandreamer.toybox.export import write_weights
 from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
 from threestudio_gaussiandreamer.toybox.world import withheld
@@ -29,8 +30,9 @@ FULL_SIZE = models.Judge.CHANNELS
 
 @pytest.fixture
 def in_process(monkeypatch, small_world):
-    """Run the launcher in this process, and note how often."""
+    """Run the launcher in this process, and note how often; draw samples in few steps."""
     runs = []
+    monkeypatch.setattr(samples, "STEPS", 2)
 
     def launch(options):
         runs.append(options)
@@ -111,14 +113,16 @@ def test_wrong_input_is_named(tmp_path, capsys, words, message):
 def test_ctrl_c_writes_a_checkpoint_and_tells_how_to_continue(exported, tmp_path, monkeypatch):
     # the other process builds a judge of full size; the other networks' sizes are in their files
     monkeypatch.setattr(models.Judge, "CHANNELS", FULL_SIZE)
-    write_weights(exported / JUDGE, models.Judge().state_dict())
-    write_digests(exported)
-    options = [*arguments(exported, tmp_path, PROMPT), "trainer.max_steps=500"]
+    folder = copied(exported, tmp_path / "models")
+    write_weights(folder / JUDGE, models.Judge().state_dict())
+    write_digests(folder)
+    options = [*arguments(folder, tmp_path, PROMPT), "trainer.max_steps=500"]
+    options += ["trainer.val_check_interval=2"]  # its first picture tells that training has begun
     command = [sys.executable, "-m", "threestudio_gaussiandreamer.toybox.demo", *options]
     root = Path(__file__).parents[2]
     first = subprocess.Popen(command, cwd=root, start_new_session=True, stdout=subprocess.PIPE)
     deadline = time.monotonic() + 300
-    while not list(tmp_path.glob("*/runs/*/csv_logs/*/metrics.csv")):
+    while not list(tmp_path.glob("*/runs/*/save/it*-0.png")):
         assert time.monotonic() < deadline and first.poll() is None
         time.sleep(0.2)
     os.killpg(first.pid, signal.SIGINT)

@@ -17,7 +17,7 @@ SMALL = [
     "data.n_test_views=3", "data.train_views=12", "system.geometry.prior.num_points=150",
     "system.geometry.prior.color_smoothing=0", "system.geometry.grow.num_candidates=20000",
     "system.geometry.grow.radius=0.05", "system.geometry.grow.max_points=50",
-    "system.evaluation.size=24", "system.evaluation.views=6", "trainer.enable_progress_bar=false",
+    "system.evaluation.size=24", "system.evaluation.views=2", "trainer.enable_progress_bar=false",
     "trainer.log_every_n_steps=1", "use_timestamp=false", "tag=t",
 ]  # fmt: skip
 
