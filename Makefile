@@ -96,8 +96,10 @@ measure-toybox: $(VENV)/ready-for-models     ## text to 3D with the bundled mode
 # installed once; again when what is installed changes
 PACKAGE = pyproject.toml setup.py constraints.txt $(wildcard threestudio_gaussiandreamer/splatting/cpu/*.h threestudio_gaussiandreamer/splatting/cpu/*.cpp threestudio_gaussiandreamer/splatting/shared/*.h)
 PIP     = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
-# in place of pip, which uses one core; modules for other versions of Python can't be compiled
-COMPILE = $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true
+# in place of pip, which uses one core; modules for other versions of Python can't be compiled. A third
+# of the code, of which a few modules are used, is left to the first import.
+LATER   = /(tests?|transformers/models|diffusers/pipelines)/
+COMPILE = $(BIN)/python -m compileall -qq -j 0 -x '$(LATER)' $(VENV)/lib || true
 
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; sys.exit("Python >= 3.10 is needed, this is " + sys.version) if sys.version_info < (3, 10) else 0'
