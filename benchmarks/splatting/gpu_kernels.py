@@ -12,7 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Optional
 
 import torch
 from torch import Tensor
@@ -61,22 +61,29 @@ def cotangents(size: int, views: int, scene: Scene) -> tuple[Tensor, Tensor, Ten
 
 
 def drawer(
-    scene: Scene, size: int, views: int, backend: str, **options: Any
+    scene: Scene,
+    size: int,
+    views: int,
+    backend: str,
+    background: Optional[Tensor] = None,
+    **options: Any,
 ) -> Callable[[], tuple[Tensor, ...]]:
-    """Return a function that computes image, depth, alpha and the gradients of all attributes, for
-    a fixed cotangent.
+    """Return a function that computes image, depth, alpha and the gradients of all attributes, and
+    of the background if there is one, for a fixed cotangent.
     """
     from threestudio_gaussiandreamer.splatting import rasterize
 
     viewmats, Ks = cameras(size, views, scene)
     upstream = cotangents(size // options.get("downsample", 1), views, scene)
+    leaves = [*scene] if background is None else [*scene, background]
+    options |= {"background": background, "backend": backend}
 
     def draw() -> tuple[Tensor, ...]:
-        out = rasterize(*scene, viewmats, Ks, size, size, backend=backend, **options)
+        out = rasterize(*scene, viewmats, Ks, size, size, **options)
         pictures = (out.image, out.depth, out.alpha)
         return (
             *(x.detach() for x in pictures),
-            *torch.autograd.grad(pictures, list(scene), upstream),
+            *torch.autograd.grad(pictures, leaves, upstream),
         )
 
     return draw
@@ -146,12 +153,18 @@ def errors_of(
     itself.
     """
     scene = make_scene(count)
-    draw = drawer(on(args.device, scene), size, views, backend or args.device, **options)
-    once, again = draw(), draw()
-    exact = drawer(on(args.device, scene, torch.float64), size, views, "torch", **options)()
+
+    def drawn(dtype: torch.dtype, name: str) -> Callable[[], tuple[Tensor, ...]]:
+        background = torch.linspace(0, 1, 3 * views).view(views, 3).to(args.device, dtype)
+        inputs = on(args.device, scene, dtype)
+        return drawer(inputs, size, views, name, background.requires_grad_(), **options)
+
+    draw = drawn(torch.float32, backend or args.device)
+    once, again, exact = draw(), draw(), drawn(torch.float64, "torch")()
+    attributes = zip(once[3:-1], exact[3:-1], strict=True)
     return {
         "image": max(relative(a, b) for a, b in zip(once[:3], exact[:3], strict=True)),
-        "gradient": max(trimmed(a, b) for a, b in zip(once[3:], exact[3:], strict=True)),
+        "gradient": max(relative(once[-1], exact[-1]), *(trimmed(a, b) for a, b in attributes)),
         "same_bits": all(torch.equal(a, b) for a, b in zip(once, again, strict=True)),
     }
 

@@ -151,6 +151,22 @@ def test_what_is_timed_is_drawing_alone(monkeypatch):
     assert len(draw()) == 8
 
 
+def test_a_wrong_gradient_of_the_background_is_found(monkeypatch):
+    drawer = gpu_kernels.drawer
+
+    def wrong_in_float32(scene, *arguments, **options):
+        def draw():
+            *others, background = drawer(scene, *arguments, **options)()
+            return *others, background * (1.001 if scene.means.dtype == torch.float32 else 1)
+
+        return draw
+
+    args = gpu_check.parse_arguments(["--device", "cpu"])
+    assert gpu_kernels.errors_of(args, 300, 33, 2, {})["gradient"] < gpu_kernels.GRADIENT_ERROR
+    monkeypatch.setattr(gpu_kernels, "drawer", wrong_in_float32)
+    assert gpu_kernels.errors_of(args, 300, 33, 2, {})["gradient"] == pytest.approx(1e-3, rel=0.01)
+
+
 def test_without_a_gpu_it_says_why(tmp_path):
     done = check("--out", tmp_path / "report.json")
     assert done.returncode == 2 and "nothing was checked" in done.stderr
