@@ -14,7 +14,9 @@ from ..core.interpolation import escape
 from ..core.option_types import check_types
 
 MOST_KEPT = 256
+"""Number of parsed configurations that are kept."""
 _parsed: dict[tuple[Any, str], DictConfig] = {}
+"""By class and text of the values."""
 
 
 def parse_structured(config_class: Any, values: Any = None) -> DictConfig:
