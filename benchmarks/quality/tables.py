@@ -54,9 +54,9 @@ NOTES = {
     "the paper's were timed on another AMD EPYC, before the CPU kernel became faster, so only dB "
     "can be compared with theirs, and with those of best without antialiasing, as it was before.",
     "tried": "One change each, seed 0, 256². `gain`: dB above the row with the letter `base`; "
-    "`floaters` in %. A, B and C are the base recipe with what they name; the demo is C with 500 "
-    "steps. Flat first Gaussians and steps by curvature aren't in the code. "
-    "[What was tried](tried.md) elsewhere.",
+    "`floaters` in %. A, B and C are the base recipe with what they name; the demo, D, is C with "
+    "500 steps. Flat first Gaussians, steps by curvature, merging in a run and splitting by error "
+    "aren't in the code. [What was tried](tried.md) elsewhere.",
     "unseen": "CC0 meshes with palette textures, a figure and a car, which aren't bundled: "
     "`Barbarian.glb` of KayKit's Adventurers 1.0, `car_police.gltf` of its City Builder Bits 1.0.",
     "polish": "262,144 Gaussians on the surface of a mesh, by `benchmarks/quality/polish.py`. "

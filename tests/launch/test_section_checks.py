@@ -11,6 +11,7 @@ from threestudio_gaussiandreamer.launch.config_check import check_config
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 PERP_NEG = "system.prompt_processor.use_perp_neg=true"
+LATENT = "system.guidance.space=latent"
 HELD = ("system.guidance.reuse_steps=4", "data.hold_steps=4")
 
 
@@ -40,6 +41,11 @@ WRONG = [
     (("toybox",), (HELD[0], "data.hold_steps=3"), "set data.hold_steps=4"),
     (("demo",), HELD, "set system.background.hold_steps=4"),
     (("demo",), (*HELD, "system.background.mode=learned"), "a learned one changes in each step"),
+    (("demo",), (LATENT, "data.height=250"), "pictures of 250x256 can't be pooled"),
+    (("demo",), (LATENT, "data.width=[256,250]", "data.resolution_milestones=[9]"), "256x250"),
+    (("demo",), (LATENT, "system.renderer.downsample=2", "data.height=280"), "of 140x128"),
+    (("demo",), (LATENT, "system.guidance.image_size=64", "data.width=252"), "of 64x63"),
+    (("demo",), ("system.guidance.mode=view-agnostic", "data.height=4096"), "needs .* GiB"),
 ]
 
 
@@ -56,6 +62,8 @@ def test_contradictions_are_named(names, overrides, message):
         (("toybox",), HELD),  # with a fixed background
         (("demo",), [*HELD, "system.background.hold_steps=4"]),
         (("demo",), [HELD[0], "data.train_views=4", "system.background.hold_steps=4"]),
+        (("demo",), [LATENT, "data.height=512", "system.renderer.downsample=2"]),
+        (("demo",), ["data.height=250"]),
         (MVDREAM, []),
     ],
 )

@@ -42,8 +42,8 @@ def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] =
 
 
 def near_names(path: Path, bundled: Collection[str] = ()) -> str:
-    """Return the end of the message for a missing file: files in its folder with similar names or
-    the same extension, or a bundled file with a similar name.
+    """Return the end of the message for a missing file: a bundled file and files in its folder with
+    similar names, or files with the same extension.
     """
     folder = path.parent
     names = (
@@ -52,8 +52,9 @@ def near_names(path: Path, bundled: Collection[str] = ()) -> str:
         else []
     )
     near = get_close_matches(path.name, names, n=3, cutoff=0.5)
-    if not near and (meant := get_close_matches(path.name, bundled, n=1, cutoff=0.5)):
-        return f"; did you mean the bundled {meant[0]!r}?"
+    if meant := get_close_matches(path.name, bundled, n=1, cutoff=0.5):
+        others = f" Near names in {str(folder)!r}: {', '.join(near)}." if near else ""
+        return f"; did you mean the bundled {meant[0]!r}?{others}"
     if not folder.is_dir():
         return f": there is no folder {str(folder)!r} either."
     near = near or [name for name in names if Path(name).suffix == path.suffix][:3]

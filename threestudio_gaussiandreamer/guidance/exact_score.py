@@ -58,14 +58,13 @@ from ..meshes.load import AXES, load_mesh
 from ..meshes.raycast import MeshCaster
 from ..splatting.cpu import known_picture
 from .base import GUIDANCE_SCALE, ScoreDistillation
-from .exact_score_checks import pooling_factor, require_used
+from .exact_score_checks import check_render_size, picture_size, pooling_factor, require_used
 from .known_truth import MeshTruth, background_of, composite, resized
 from .picture_bank import Bank, Mixture, bank_modes, direction_indices, rows_of
 from .variants.sds import SDS
 
 MODES = ("view-exact", "direction-bins", "view-agnostic")
 SPACES = ("pixel", "latent")
-MAX_MODE_BYTES = 2**31
 BANK_BYTES = 16
 """Memory per pixel of the bank while it is cast, bytes."""
 
@@ -110,6 +109,8 @@ class ExactScoreGuidance(ScoreDistillation):
             require_memory("image_size", BANK_BYTES * views * size**2, what)
             if cfg.space == "latent" and size:
                 pooling_factor(size, size, cfg.latent_size)
+
+        check_render_size = staticmethod(check_render_size)
 
     cfg: Config
     REPORTS = ("perplexity",)
@@ -379,21 +380,5 @@ class ExactScoreGuidance(ScoreDistillation):
         return LinearLatent() if self.options.space == "pixel" else self.bank(*self._size).latent
 
     def _picture_size(self, height: int, width: int) -> tuple[int, int]:
-        """Return the size of the compared pictures for a render of this size: ``image_size`` high,
-        with the render's aspect.
-        """
-        options = self.options
-        size = options.image_size
-        height, width = (size, max(1, round(width * size / height))) if size else (height, width)
-        needed = 12 * options.bank_views * height * width
-        if (
-            options.space == "pixel"
-            and (options.mode != "view-exact" or self.guided)
-            and needed > MAX_MODE_BYTES
-        ):
-            raise UserError(
-                f"a bank of {options.bank_views} views of {height}x{width} pixels needs "
-                f"{needed / 2**30:.1f} GiB for each item:"
-                " use system.guidance.space=latent, or a smaller system.guidance.image_size"
-            )
-        return height, width
+        """Return the size of the compared pictures for a render of this size."""
+        return picture_size(self.options, self.guided, height, width)

@@ -3,8 +3,11 @@
 from typing import Any
 
 from ..core.errors import UserError
+from .base import variant_class
 from .variants.base import require_unset
 
+MAX_MODE_BYTES = 2**31
+"""Memory of a bank in the pixels' space, for each item."""
 OF_LATENTS = ("latent_size", "latent_channels", "color_matrix")
 OF_BANK = ("bank_views", "bank_includes_view", "bank_elevation_range", "bank_distance_range")
 OF_BANK += ("bank_fovy_range",)
@@ -24,6 +27,34 @@ def require_used(guidance: type, cfg: Any) -> None:
     if cfg.mode == "view-exact" and cfg.guidance_scale == 1:
         reason = "with space=pixel, mode=view-exact and guidance_scale=1, which need no bank"
         require_unset(guidance, cfg, OF_BANK, reason)
+
+
+def check_render_size(cfg: Any, height: int, width: int) -> None:
+    """Check that renders of this size can be compared, see :func:`picture_size`."""
+    guided = cfg.guidance_scale != 1 or variant_class(cfg).NEEDS_UNCONDITIONAL
+    picture_size(cfg, guided, height, width)
+
+
+def picture_size(cfg: Any, guided: bool, height: int, width: int) -> tuple[int, int]:
+    """Return the size of the compared pictures for a render of this size: ``image_size`` high, with
+    the render's aspect.
+
+    Raises:
+        UserError: pictures of that size need too much memory, or can't be pooled to the latent.
+    """
+    size = cfg.image_size
+    height, width = (size, max(1, round(width * size / height))) if size else (height, width)
+    if cfg.space == "latent":
+        pooling_factor(height, width, cfg.latent_size)
+        return height, width
+    needed = 12 * cfg.bank_views * height * width
+    if (cfg.mode != "view-exact" or guided) and needed > MAX_MODE_BYTES:
+        raise UserError(
+            f"a bank of {cfg.bank_views} views of {height}x{width} pixels needs "
+            f"{needed / 2**30:.1f} GiB for each item:"
+            " use system.guidance.space=latent, or a smaller system.guidance.image_size"
+        )
+    return height, width
 
 
 def pooling_factor(height: int, width: int, latent_size: int) -> int:

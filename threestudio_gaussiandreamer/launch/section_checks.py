@@ -7,6 +7,7 @@ from typing import Any
 from ..core.errors import UserError
 from ..guidance.view_contrast import NOT_WITH_PERP_NEG
 from ..host import find, parse_structured
+from ..training.camera_options import sizes_of_stages
 
 DATA = ("gaussiandreamer-datamodule", "random-camera-datamodule")
 """Data modules that draw new views in each step, unless ``hold_steps`` is more than 1."""
@@ -28,6 +29,8 @@ def check_sections(cfg: Any) -> None:
     guidance = parse_structured(options, cfg.system.get("guidance"))
     _check_view_groups(guidance, cfg.data)
     _check_reuse(guidance, cfg)
+    if hasattr(options, "check_render_size") and cfg.data_type in DATA:
+        _check_render_sizes(options, guidance, cfg)
     if "view_dependent_prompting" in guidance:
         _check_prompts(guidance, cfg.system)
 
@@ -58,6 +61,14 @@ def _check_reuse(guidance: Any, cfg: Any) -> None:
         raise UserError(
             f"{wanted} background: set system.background.hold_steps={guidance.reuse_steps}"
         )
+
+
+def _check_render_sizes(options: type, guidance: Any, cfg: Any) -> None:
+    """Raise UserError where the guidance can't compare the renders of a training stage."""
+    data = parse_structured(find(cfg.data_type).Config, cfg.data)
+    downsample = (cfg.system.get("renderer") or {}).get("downsample", 1)
+    for height, width, _ in sizes_of_stages(data):
+        options.check_render_size(guidance, height // downsample, width // downsample)
 
 
 def _check_prompts(guidance: Any, system: Any) -> None:

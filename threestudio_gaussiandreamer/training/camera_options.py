@@ -122,12 +122,17 @@ def _check_pool(cfg: Any) -> None:
 
 def _check_memory(cfg: Any) -> None:
     """Raise UserError for pictures larger than the memory."""
-    stages = range(len(cfg.resolution_milestones) + 1)
-    for height, width, batch in zip(*(_per_stage(cfg[n], stages) for n in LISTED), strict=True):
+    for height, width, batch in sizes_of_stages(cfg):
         what = f"{batch} views of {height} x {width} pixels"
         require_memory("batch_size", TRAIN_BYTES * height * width * batch, what)
     what = f"pictures of {cfg.eval_height} x {cfg.eval_width} pixels"
     require_memory("eval_height", EVAL_BYTES * cfg.eval_height * cfg.eval_width, what)
+
+
+def sizes_of_stages(cfg: Any) -> list[tuple[int, int, int]]:
+    """Return height, width and number of the views in a step of each stage."""
+    stages = range(len(cfg.resolution_milestones) + 1)
+    return list(zip(*(_per_stage(cfg[name], stages) for name in LISTED), strict=True))
 
 
 def _per_stage(given: Any, stages: range) -> list[int]:
