@@ -104,23 +104,6 @@ def test_sds_loss_has_the_gradient_it_is_given():
     torch.testing.assert_close(loss.detach(), 0.5 * grad.square().sum() / 4)
 
 
-def test_sds_loss_of_what_a_latent_is_linear_in():
-    x, grad = torch.ones(4, 2).requires_grad_(), torch.randn(4, 2)
-    loss = sds.sds_loss(x, grad, squares=torch.tensor(6.0), slope=2.0)
-    loss.backward()
-    assert torch.equal(x.grad, grad / 2) and loss.item() == 0.75
-
-
-def test_sds_loss_may_overwrite_its_gradient_but_only_once():
-    x, grad = torch.ones(3, 2).requires_grad_(), torch.randn(3, 2)
-    expected = 0.25 / 3 * 2.0 * grad
-    loss = 0.25 * sds.sds_loss(x, grad, slope=2.0, in_place=True)
-    loss.backward(retain_graph=True)
-    assert torch.equal(x.grad, expected) and torch.equal(grad, expected)
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        loss.backward()
-
-
 def test_ddim_with_the_true_noise_of_a_point_lands_on_it():
     point = torch.randn(1, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 

@@ -8,15 +8,14 @@ Notation of DDPM (Ho et al. 2020): ``abar`` is the cumulative product of 1 - bet
 to z's type."""
 
 from collections.abc import Callable
-from typing import Optional
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from ..core import streams
 from ..core.errors import UserError, unknown
+from ..core.given_gradient import given_gradient
 
 WEIGHTS: dict[str, Callable[[Tensor], Tensor]] = {
     "sds": lambda abar: 1 - abar,
@@ -140,41 +139,13 @@ def weight(name: str, abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
     return WEIGHTS[name](abar)
 
 
-def sds_loss(
-    x: Float[Tensor, "B *d"],
-    grad: Float[Tensor, "B *d"],
-    *,
-    squares: Optional[Float[Tensor, ""]] = None,
-    slope: float = 1.0,
-    in_place: bool = False,
-) -> Float[Tensor, ""]:
-    """Compute 0.5 sum grad^2 / B, a loss whose gradient with respect to x is slope grad / B.
+def sds_loss(x: Float[Tensor, "B *d"], grad: Float[Tensor, "B *d"]) -> Float[Tensor, ""]:
+    """Compute 0.5 sum grad^2 / B, a loss whose gradient with respect to x is grad / B.
 
     This is threestudio's 0.5 sum |x - stop(x - grad)|^2 / B without the rounding of x - grad.
-
-    Args:
-        squares: sum grad^2 if it is already known.
-        slope: d latent / dx, where ``grad`` is that with respect to a latent, linear in x.
-        in_place: the backward pass, which then can be run only once, overwrites ``grad``.
     """
-    squares = grad.detach().square().sum() if squares is None else squares
-    loss = 0.5 * squares / max(len(grad), 1)
-    return _GivenGradient.apply(x, grad.detach(), loss, slope, in_place)
-
-
-class _GivenGradient(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, x, grad, loss, slope, in_place):
-        ctx.save_for_backward(grad)
-        ctx.slope, ctx.in_place = slope, in_place
-        return loss.clone()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, upstream):
-        (grad,) = ctx.saved_tensors
-        factor = upstream / max(len(grad), 1) * ctx.slope
-        return grad.mul_(factor) if ctx.in_place else factor * grad, None, None, None, None
+    grad, items = grad.detach(), max(len(grad), 1)
+    return given_gradient(x, grad * (1 / items), 0.5 * grad.square().sum() / items)
 
 
 def ddim_step(

@@ -19,13 +19,14 @@ these Gaussians: their neighbours can often render that pixel as well, and keepi
 all of them lowers the PSNR."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Optional
+from typing import NamedTuple, Optional
 
 import torch
 from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from ..core.distributed import all_sum, draw_shared
+from ..core.given_gradient import given_gradient
 from ..core.host_copies import to_device
 from .densify import Change, prune_to
 
@@ -90,27 +91,15 @@ def removal_error(
     """
     signs = draw_shared(len(images), lambda count: _draw_signs((count, *images.shape[1:]), rng))
     signs = to_device(signs, images.device).to(images)
-    # given gradients as an argument, torch imports all of its symbolic shapes
-    total = _GivenGradient.apply(images, signs)
+    # of the sum of signed pixels only the gradient is needed
+    zero = images.new_zeros(())
+    total = given_gradient(images, signs, zero)
     if added is not None:
         of_alpha = _sum_of_products(signs, added.color).neg_()
-        total = total + _GivenGradient.apply(added.alpha, of_alpha)
+        total = total + given_gradient(added.alpha, of_alpha, zero)
     (gradients,) = torch.autograd.grad(total, opacities, retain_graph=True)
     gradients = all_sum(gradients)
     return (opacities.detach() * gradients).square().nan_to_num(nan=0.0)
-
-
-class _GivenGradient(torch.autograd.Function):
-    """Zero, with a given gradient: that of a sum of products whose value isn't needed."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, gradient: Tensor) -> Tensor:
-        ctx.save_for_backward(gradient)
-        return x.new_zeros(())
-
-    @staticmethod
-    def backward(ctx: Any, one: Tensor) -> tuple[Tensor, None]:
-        return *ctx.saved_tensors, None
 
 
 def _draw_signs(shape: tuple[int, ...], rng: torch.Generator) -> Int8[Tensor, "*shape"]:

@@ -49,6 +49,7 @@ from torch import Tensor
 
 from ..cameras import OrbitRanges, camera_pool
 from ..core.errors import UserError
+from ..core.given_gradient import given_gradient
 from ..core.memory import count_of, require_memory
 from ..core.options import at_least, in_range, interval, one_of, positive, required
 from ..diffusion import sds
@@ -153,11 +154,11 @@ class ExactScoreGuidance(ScoreDistillation):
         found = self._in_one_pass(rgb.detach(), **options)
         if found is None:
             return super().__call__(rgb, prompt_utils, **options)
-        grad, squares, error = found
+        gradient, squares, error = found
         self.evaluations, self._perplexity = 0, 1.0
         bad = torch.zeros(len(rgb), dtype=torch.bool)
         self._count_bad(bad)
-        loss = sds.sds_loss(rgb, grad, squares=squares.sum().float(), slope=2.0, in_place=True)
+        loss = given_gradient(rgb, gradient, 0.5 * squares.sum().float() / max(len(rgb), 1))
         return self._result(loss, squares.sqrt().float(), bad) | {"error_to_truth": error}
 
     @torch.no_grad()
@@ -172,7 +173,7 @@ class ExactScoreGuidance(ScoreDistillation):
         guidance_eval: bool = False,
         **batch: Any,
     ) -> Optional[tuple[Float[Tensor, "B H W 3"], Float[Tensor, " B"], float]]:
-        """Return the gradient of the latents, channels last, the sum of its squares per item, and
+        """Return the gradient of the renders, the sum of the squares of the latents' per item, and
         the mean squared error of the renders; None if other options, or values that aren't finite,
         need the general path.
         """
@@ -190,7 +191,7 @@ class ExactScoreGuidance(ScoreDistillation):
         weight = sds.weight(self.options.weighting_strategy, abar).float()
         background, scale = background[:, 0, 0].contiguous(), (abar / (1 - abar)).sqrt().float()
         found = known_picture.known_gradient(rgb, pictures, background, scale, weight)
-        # the gradient is 2 weight scale (render - picture); plain numbers are faster than tensors
+        # the latents' gradient is 2 weight scale (render - picture); plain numbers are faster
         squares = [] if found is None else found[1].tolist()
         if not squares or not math.isfinite(sum(squares)):
             return None

@@ -28,13 +28,13 @@ SPLAT_FN Floats load_bytes(const uint8_t* p, int count) {
   return __builtin_convertvector(bytes, Floats) / 255.0f;
 }
 
-// weight * scale * (x - x1), with x = 2 render - 1 and x1 = 2 ((1 - coverage) background + picture) - 1.
-SPLAT_FN Floats known_gradient(Floats render, Floats picture, Floats rest, float background, float scale, float weight) {
+// weight * scale * (x - x1), the gradient of the latent, with x = 2 render - 1 and x1 = 2 ((1 - coverage) background + picture) - 1.
+SPLAT_FN Floats latent_gradient(Floats render, Floats picture, Floats rest, float background, float scale, float weight) {
   const Floats target = rounded(rest * background) + picture;
   return weight * (scale * ((2.0f * render - 1.0f) - (2.0f * target - 1.0f)));
 }
 
-// One row of pixels; returns the sum of the squares.
+// The gradient of the render for one row of pixels; returns the sum of the squares of that of the latent.
 inline double known_gradient_of_row(const SplatKnownPictures& in, int64_t item, const float* render, const uint8_t* picture,
                                     float* gradient) {
   const int64_t plane = in.height * in.width;
@@ -45,10 +45,10 @@ inline double known_gradient_of_row(const SplatKnownPictures& in, int64_t item, 
     const auto bytes = [&](int channel) { return load_bytes(picture + channel * plane + x, count); };
     const Vec3<Floats> c = load_items<3>(render + 3 * x, count, load3<Floats>);
     const Floats rest = 1.0f - bytes(3);
-    const Vec3<Floats> g = {known_gradient(c.x, bytes(0), rest, background[0], scale, weight),
-                            known_gradient(c.y, bytes(1), rest, background[1], scale, weight),
-                            known_gradient(c.z, bytes(2), rest, background[2], scale, weight)};
-    store_items<3>(gradient + 3 * x, count, [&](float* p) { store3(p, g); });
+    const Vec3<Floats> g = {latent_gradient(c.x, bytes(0), rest, background[0], scale, weight),
+                            latent_gradient(c.y, bytes(1), rest, background[1], scale, weight),
+                            latent_gradient(c.z, bytes(2), rest, background[2], scale, weight)};
+    store_items<3>(gradient + 3 * x, count, [&](float* p) { store3(p, in.slope * g); });
     Floats here = dot(g, g);
     for (int l = count; l < LANES; l++) here[l] = 0.0f;
     squares += here;

@@ -21,6 +21,7 @@ class _Pictures(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in "render picture background scale weight".split()),
         *((name, ctypes.c_int64) for name in "items height width".split()),
         ("threads", ctypes.c_int32),
+        ("slope", ctypes.c_float),
     ]
 
 
@@ -42,8 +43,9 @@ def known_gradient(
     scale: Float[Tensor, " B"],
     weight: Float[Tensor, " B"],
 ) -> Optional[tuple[Float[Tensor, "B H W 3"], Float[Tensor, " B"]]]:
-    """Compute w s (x - x_1), the gradient of score distillation with respect to the latent
-    x = 2 render - 1, where x_1 is the latent of a picture on the background.
+    """Compute the gradient of the loss 0.5 sum g^2 / B with respect to the renders, where
+    g = w s (x - x_1) is the gradient of score distillation with respect to the latent
+    x = 2 render - 1, and x_1 the latent of a picture on the background.
 
     Args:
         pictures: premultiplied, in memory a plane per channel.
@@ -51,8 +53,8 @@ def known_gradient(
         weight: w.
 
     Returns:
-        the gradient, bit for bit that of plain torch, and the sum of its squares per item, float64;
-        None where the library or the tensors aren't of the kind that it takes.
+        the gradient, 2 g / B, bit for bit that of plain torch, and the sum of g^2 per item,
+        float64; None where the library or the tensors aren't of the kind that it takes.
     """
     planes = pictures.movedim(-1, 1)
     float32 = (render, background, scale, weight)
@@ -63,8 +65,8 @@ def known_gradient(
     gradient = torch.empty_like(render)
     squares = torch.empty(items, height, dtype=torch.float64)
     inputs = map(address, (render, planes, background, scale, weight))
-    sizes = (items, height, width, torch.get_num_threads())
-    failed = _function()(_Pictures(*inputs, *sizes), _Gradient(*map(address, (gradient, squares))))
+    rest = (items, height, width, torch.get_num_threads(), 2 / max(items, 1))
+    failed = _function()(_Pictures(*inputs, *rest), _Gradient(*map(address, (gradient, squares))))
     return None if failed else (gradient, squares.sum(1))  # out of memory
 
 
@@ -72,7 +74,7 @@ def known_gradient(
 def _function() -> Optional[Callable[..., int]]:
     """Return the function of the library; None if it isn't built, or older than the function."""
     try:
-        function = library().splat_known_gradients
+        function = library().splat_render_gradients
     except (OSError, UserError, AttributeError):
         return None
     function.argtypes = [ctypes.POINTER(_Pictures), ctypes.POINTER(_Gradient)]

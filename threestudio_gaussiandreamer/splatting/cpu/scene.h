@@ -44,11 +44,12 @@ struct SplatKnownPictures {
   const float* weight;      // (B) of the gradient
   int64_t items, height, width;
   int32_t threads;
+  float slope;  // what the gradient of the latent is multiplied by for that of the render
 };
 
 struct SplatKnownGradient {
-  float* gradient;  // (B, H, W, 3), with respect to the latent 2 render - 1
-  double* squares;  // (B, H), its squares, summed over a row
+  float* gradient;  // (B, H, W, 3), with respect to the render
+  double* squares;  // (B, H), squares of that with respect to the latent 2 render - 1, summed over a row
 };
 
 #pragma GCC visibility push(default)
@@ -60,7 +61,7 @@ int64_t splat_backward(SplatState*, const splat::Scene*, const SplatSettings*, c
 void splat_release(SplatState*);  // null is ignored
 // Limits what a call may take; the memory of the machine or its container.
 void splat_set_memory(int64_t bytes);
-int64_t splat_known_gradients(const SplatKnownPictures*, const SplatKnownGradient*);
+int64_t splat_render_gradients(const SplatKnownPictures*, const SplatKnownGradient*);
 // The best build for this processor: "v4", "v3" or "base".
 const char* splat_best_isa();
 }
