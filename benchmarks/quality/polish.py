@@ -1,7 +1,7 @@
 """Polish a dense cloud of another program: how many of 262,144 Gaussians remain at 40 dB, and what
 refinement by score does afterwards: docs/charts/polish.csv and .png.
 
-    python -m benchmarks.quality.polish --objects path/to/spot.glb
+    python -m benchmarks.quality.polish --objects path/to/spot.glb --seeds 0 1 2
     python -m benchmarks.quality.polish --objects path/to/spot.glb --count 20000 --steps 50
     python -m benchmarks.quality.polish --objects                            # the chart only
 
@@ -9,21 +9,22 @@ The cloud is made of points that are uniform on the mesh, with its colours, as l
 to the nearest point, in a PLY with TripoSplat's axes. *pruned*: rounds of the prune command's
 pruning down to 40 dB to that cloud, at 128^2. *prior* and *refined*: `configs/polish.yaml` over
 `configs/demo.yaml`, with as many Gaussians as remained for its budget; dB to ray-cast views of the
-mesh. One seed; what the CSV has is not run again."""
+mesh. What the CSV has is not run again."""
 
 import argparse
 import json
+import statistics
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Optional
 
 import numpy as np
 import torch
 
 from benchmarks.figures import pyplot
-from benchmarks.quality.chart_runs import saved
+from benchmarks.quality.chart_runs import grouped, saved
 from benchmarks.quality.runs import (
     append_rows,
     argument_parser,
@@ -159,19 +160,24 @@ def draw() -> Path:
 
     figure, panel = plt.subplots(figsize=(6.4, 4.2))
     rounds = [row for row in rows_of(CHART) if row["method"] == "pruned"]
-    for name in dict.fromkeys(row["object"] for row in rounds):
-        own = [row for row in rounds if row["object"] == name]
-        counts, decibels = ([float(row[key]) for row in own] for key in ("gaussians", "psnr"))
-        panel.plot(counts, decibels, "o-", label=f"{name}: {counts[-1]:,.0f}")
+    for number, (name, own) in enumerate(grouped(rounds, lambda row: row["object"]).items()):
+        runs = grouped(own, lambda row: row["seed"]).values()
+        remain = statistics.median(int(run[-1]["gaussians"]) for run in runs)
+        label: Optional[str] = f"{name}: {remain:,.0f}"
+        for run in runs:
+            counts, decibels = ([float(row[key]) for row in run] for key in ("gaussians", "psnr"))
+            panel.plot(counts, decibels, "o-", color=f"C{number}", label=label, markersize=4)
+            label = None
     panel.axhline(DECIBELS, color="0.6", linestyle=":")
     panel.set(xlabel="Gaussians that remain", ylabel="PSNR to the dense cloud, dB")
     panel.xaxis.set_major_formatter(ticker.StrMethodFormatter("{x:,.0f}"))
     panel.margins(y=0.12)
     panel.grid(alpha=0.25)
-    panel.legend(frameon=False, title="Gaussians in the end", loc="lower right")
+    panel.legend(frameon=False, title="Gaussians in the end, median", loc="lower right")
     machines, commits = (", ".join(sorted({row[key] for row in rounds})) for key in COLUMNS[-2:])
     figure.suptitle("Pruning a dense cloud of 262,144 Gaussians", x=0.01, ha="left")
-    figure.text(0.01, 0.9, f"{SIZE}², one seed; {machines}; commit {commits}", fontsize=8)
+    seeds = len({row["seed"] for row in rounds})
+    figure.text(0.01, 0.9, f"{SIZE}², {seeds} seeds; {machines}; commit {commits}", fontsize=8)
     figure.tight_layout(rect=(0, 0, 1, 0.95))
     return saved(figure, CHART)
 

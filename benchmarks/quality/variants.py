@@ -8,8 +8,8 @@ Each run is the base recipe (`recipe.py`) at 64^2 for 240 steps with one line's 
 guidance scale. The score knows pictures of the object from the side of the camera
 (``direction-bins``) or only pictures from all sides (``view-agnostic``), in a latent of 16^2
 pixels; colours aren't bounded, so that saturation shows. All scales are tried on the first object
-with the first seed; what remains is run at the scale that is best there, and the paper's recipe,
-clipped SDS, at its own. Then other objects, the view-blind score, and the other seeds follow.
+with all seeds; other objects are run at the scale that is best there, and the paper's recipe,
+clipped SDS, at its own, as is the view-blind score at one scale.
 
 ``evaluations`` of the score model are one per view and prompt; ``saturation`` is that of the
 held-out views relative to the truth's. Rows are appended to docs/charts/variants.csv as runs end,
@@ -187,9 +187,10 @@ def parse_arguments() -> argparse.Namespace:
 
 def all_scales(arguments: argparse.Namespace) -> Iterator[Todo]:
     """Yield the runs that the choice of scales needs."""
-    for scale in SCALES:
-        for label in (label for label in arguments.lines if scale in LINES[label].scales):
-            yield todo_of(arguments, BINNED, label, scale, arguments.objects[0], arguments.seeds[0])
+    for seed in arguments.seeds:
+        for scale in SCALES:
+            for label in (label for label in arguments.lines if scale in LINES[label].scales):
+                yield todo_of(arguments, BINNED, label, scale, arguments.objects[0], seed)
 
 
 def best_scale_only(arguments: argparse.Namespace) -> Iterator[Todo]:
@@ -216,9 +217,8 @@ def scales_of(label: str, best: dict[str, str]) -> set[float]:
 
 
 def best_scales(rows: list[Row]) -> dict[str, str]:
-    """Return the scale of each line with the largest dB at the end on the first object with the
-    first seed, with which all scales are tried, or, of the scales that were run with all seeds of
-    that one, the one with the largest median.
+    """Return the scale of each line with the largest median dB at the end on the first object, of
+    the scales that were run with all seeds of the one that is best with the first seed.
     """
     rows = [row for row in rows if row["truth"] == BINNED]
     first = (objects_of(rows)[0], rows[0]["seed"]) if rows else ("", "")
